@@ -1,0 +1,3 @@
+from edgevpr.cli import main
+
+raise SystemExit(main())

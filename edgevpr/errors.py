@@ -1,0 +1,33 @@
+"""The errors a user can meet. Every message is one sentence that names the thing and says what to do."""
+
+
+class EdgevprError(Exception):
+    """Something in the user's world is wrong (a file, a link, a map): exit code 1."""
+
+    exit_code = 1
+
+
+class UsageError(EdgevprError):
+    """The user asked for something that makes no sense (an option, a configuration key): exit code 2."""
+
+    exit_code = 2
+
+
+class ConfigError(UsageError):
+    """A configuration, board or model file does not say what it must."""
+
+
+class ImageError(EdgevprError):
+    """One image cannot be used; others may be."""
+
+
+class SourceError(EdgevprError):
+    """A source of frames cannot be opened."""
+
+
+class MapError(EdgevprError):
+    """A place map cannot be opened, written or used with this technique."""
+
+
+class LinkError(EdgevprError):
+    """A MAVLink link cannot be opened."""

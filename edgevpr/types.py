@@ -1,0 +1,154 @@
+"""The values that cross rooms: frozen dataclasses, and the contract of a technique."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+
+@dataclass(frozen=True, slots=True)
+class Position:
+    """A point on the WGS-84 ellipsoid; `alt_m` is metres above sea level, None where unknown."""
+
+    lat_deg: float
+    lon_deg: float
+    alt_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One picture and what is known of it. `image` is uint8, (H, W) grey or (H, W, 3) BGR."""
+
+    image: np.ndarray
+    name: str
+    t_mono_s: float
+    t_utc_s: float | None = None
+    position: Position | None = None
+    heading_deg: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class PartSpec:
+    """Shape and little-endian dtype ("<f4", "<i1", ...) of one part of a descriptor."""
+
+    shape: tuple[int, ...]
+    dtype: str
+
+    @property
+    def nbytes(self) -> int:
+        return int(np.prod(self.shape)) * np.dtype(self.dtype).itemsize
+
+
+@dataclass(frozen=True, slots=True)
+class TechniqueSpec:
+    """What a map must agree with before it is used: name, every parameter, model, and the form of both parts."""
+
+    name: str
+    parameters: dict[str, int | float | str]
+    coarse: PartSpec
+    fine: PartSpec | None = None
+    model_sha256: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Descriptor:
+    """One encoded image. `coarse` is one row of the index in RAM; `fine` lives in the map file and is read for
+    candidates only; `good` (bool, one a row of `fine`) says which regions speak when this image is the query;
+    `quality` (0..1) is the share of the image that says anything."""
+
+    coarse: np.ndarray
+    fine: np.ndarray | None = None
+    good: np.ndarray | None = None
+    quality: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class FineMatch:
+    """One candidate compared in full: `score` in 0..1; the shift (dx, dy in cells) and rotation where it knows them."""
+
+    score: float
+    shift_cells: tuple[float, float] | None = None
+    rotation_deg: float | None = None
+
+
+class Technique(Protocol):
+    """The contract of `edgevpr/techniques/*.py`. A technique without a fine part has no use for `match`."""
+
+    spec: TechniqueSpec
+
+    def encode(self, image: np.ndarray, mask: np.ndarray | None = None) -> Descriptor:
+        """Encode a uint8 image; `mask` (H, W) bool is False where the picture must not be used."""
+        ...
+
+    def coarse_scores(self, query: Descriptor, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+        """Score all places at once: `rows` (N, *coarse.shape) -> scores (N,) float32, hypotheses (N,) or None."""
+        ...
+
+    def match(self, query: Descriptor, fine: np.ndarray, hypothesis: int | None) -> FineMatch:
+        """Compare the query with the fine part of one place."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A place of the map as a person knows it (its descriptors are fetched apart)."""
+
+    place_id: int
+    source_image: str
+    position: Position | None = None
+    t_utc_s: float | None = None
+    heading_deg: float | None = None
+    quality: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A place that may be the one in the query, with its score; retrieval returns these best first."""
+
+    place: Place
+    score: float
+    shift_cells: tuple[float, float] | None = None
+    rotation_deg: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class StageCost:
+    """What one stage cost: wall seconds, and CPU-seconds of all threads of the process."""
+
+    wall_s: float
+    cpu_s: float
+
+    def utilisation(self, cores: int) -> float:
+        """U of equation 5.1: the share of the whole machine that was busy, 0..1."""
+        return min(1.0, self.cpu_s / (self.wall_s * cores)) if self.wall_s > 0 else 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class QueryCost:
+    """Cost of one query by equations 5.1-5.7: times, utilisations of all cores, memory, charge drawn from the pack."""
+
+    t_encode_s: float
+    t_match_s: float
+    u_encode: float
+    u_match: float
+    cpu_s: float
+    rss_mb: float
+    used_mah: float
+    marginal_mah: float
+
+
+@dataclass(frozen=True, slots=True)
+class PlaceMatch:
+    """The event of one query: the best place, whether it is accepted as the place, and what the query cost.
+
+    `position` is the place's, and only there when the match is accepted: a rejected match moves nothing.
+    """
+
+    query: str
+    t_mono_s: float
+    candidate: Candidate | None
+    accepted: bool
+    reason: str
+    position: Position | None
+    accuracy_m: float | None
+    cost: QueryCost
