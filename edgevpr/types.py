@@ -75,6 +75,8 @@ class Technique(Protocol):
     """The contract of `edgevpr/techniques/*.py`. A technique without a fine part has no use for `match`."""
 
     spec: TechniqueSpec
+    min_score: float  # a match is accepted from this score on, unless the configuration says otherwise ...
+    min_margin: float  # ... and when it beats the best place elsewhere by this
 
     def encode(self, image: np.ndarray, mask: np.ndarray | None = None) -> Descriptor:
         """Encode a uint8 image; `mask` (H, W) bool is False where the picture must not be used."""

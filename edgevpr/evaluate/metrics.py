@@ -1,0 +1,87 @@
+"""The figures of thesis 2.7 and 6.3.1, as pure functions on the best match of every query.
+
+`scores` is float (N,): the score of each query's best match. `correct` is bool (N,): whether that match is right. A
+match is accepted when its score is at least the threshold; false negatives are right matches below it.
+"""
+
+import math
+
+import numpy as np
+
+
+def counting(ranked: np.ndarray, ignored: np.ndarray) -> np.ndarray:
+    """Take the references that are neither right nor wrong out of a ranking, so that the next best counts.
+
+    `ranked` is int (K,), numbers of references, best first; `ignored` is bool (references,).
+    """
+    return ranked[~ignored[ranked]]
+
+
+def first_right(ranked: np.ndarray, right: np.ndarray) -> float:
+    """Rank, from 0, of the first right reference of a ranking; infinite where it holds none. `right` is bool."""
+    hits = np.flatnonzero(right[ranked])
+    return float(hits[0]) if len(hits) else math.inf
+
+
+def recall_at(k: int, ranks: np.ndarray) -> float:
+    """Share of the queries that have a right reference among their first `k`; `ranks` (N,) by `first_right`."""
+    return float(np.mean(np.asarray(ranks) < k))
+
+
+def precision_recall(scores: np.ndarray, correct: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Precision and recall (2.1, 2.2) with the threshold at every score that occurs, from the highest down.
+
+    Queries of one score are accepted together, so there is one point a distinct score. Where no match at all is right,
+    recall is taken to be 0.
+    """
+    scores, correct = np.asarray(scores), np.asarray(correct, bool)
+    order = np.argsort(-scores, kind="stable")
+    last_of_its_score = np.append(np.flatnonzero(np.diff(scores[order])), len(scores) - 1)
+    true_positives = np.cumsum(correct[order])[last_of_its_score]
+    accepted = last_of_its_score + 1
+    return true_positives / accepted, true_positives / max(int(correct.sum()), 1)
+
+
+def auc(precision: np.ndarray, recall: np.ndarray) -> float:
+    """Area under the precision-recall curve by 2.3: the points that occur, without an extra one at recall 0.
+
+    It tops out at (N-1)/N, and is 0 where all scores are the same: one point spans no area.
+    """
+    return float(np.sum((precision[:-1] + precision[1:]) / 2 * np.diff(recall)))
+
+
+def recall_at_100_precision(precision: np.ndarray, recall: np.ndarray) -> float:
+    """The largest recall at which every accepted match is right; 0 where the best-scoring match is wrong."""
+    return float(recall[precision == 1].max(initial=0))
+
+
+def precision_at_100_recall(precision: np.ndarray, recall: np.ndarray) -> float:
+    """Precision with the threshold at the lowest-scoring right match: never below recall@1."""
+    return float(precision[np.argmax(recall)])
+
+
+def extended_precision(precision: np.ndarray, recall: np.ndarray) -> float:
+    """EP (2.4): the mean of the precision at the smallest recall and the recall at 100 % precision."""
+    return float(precision[0] + recall_at_100_precision(precision, recall)) / 2
+
+
+def roc_auc(scores: np.ndarray, correct: np.ndarray) -> float | None:
+    """How well the score tells right from wrong: the chance that a right match scores higher than a wrong one.
+
+    This is the area under the ROC curve; ties count half. None where all matches are right, or none is.
+    """
+    scores, correct = np.asarray(scores), np.asarray(correct, bool)
+    right, wrong = scores[correct], np.sort(scores[~correct])
+    if not len(right) or not len(wrong):
+        return None
+    below = np.searchsorted(wrong, right, "left")
+    below_or_equal = np.searchsorted(wrong, right, "right")
+    return float(np.mean((below + below_or_equal) / 2) / len(wrong))
+
+
+def pcu(precision: float, t_encode_s: float, t_encode_max_s: float) -> float:
+    """Performance per compute unit (6.3.1): precision at 100 % recall times log10(t_e,max / t_e + 9).
+
+    `t_encode_max_s` is the encoding time of the slowest technique compared, whose PCU is its precision.
+    """
+    return precision * math.log10(t_encode_max_s / t_encode_s + 9)

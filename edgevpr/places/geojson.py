@@ -1,0 +1,39 @@
+"""A map as GeoJSON (RFC 7946): the places without their descriptors, for any map viewer."""
+
+import json
+from typing import TextIO
+
+from edgevpr.places import geopackage
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.types import Place
+
+
+def write_geojson(place_map: PlaceMap, out: TextIO) -> int:
+    """Write all places as one FeatureCollection, a feature a line; returns how many."""
+    count = 0
+    out.write('{"type": "FeatureCollection", "features": [')
+    for place in place_map.places():
+        out.write(",\n" if count else "\n")
+        out.write(json.dumps(_feature(place)))
+        count += 1
+    out.write("\n]}\n")
+    return count
+
+
+def _feature(place: Place) -> dict:
+    position = place.position
+    geometry = None
+    if position:
+        altitude = [] if position.alt_m is None else [position.alt_m]
+        geometry = {"type": "Point", "coordinates": [position.lon_deg, position.lat_deg, *altitude]}
+    return {
+        "type": "Feature",
+        "id": place.place_id,
+        "geometry": geometry,
+        "properties": {
+            "time": geopackage.utc_text(place.t_utc_s),
+            "heading_deg": place.heading_deg,
+            "source_image": place.source_image,
+            "quality": round(place.quality, 4),
+        },
+    }

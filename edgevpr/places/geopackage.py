@@ -1,0 +1,80 @@
+"""The GeoPackage side of a map file: tables that QGIS, GDAL and `sqlite3` know (OGC 12-128r18, version 1.3)."""
+
+import struct
+from datetime import datetime, timezone
+
+APPLICATION_ID = 0x47504B47  # "GPKG"
+USER_VERSION = 10300
+WGS84 = 4326
+
+_WGS84_WKT = (
+    'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563,AUTHORITY["EPSG","7030"]],'
+    'AUTHORITY["EPSG","6326"]],PRIMEM["Greenwich",0,AUTHORITY["EPSG","8901"]],UNIT["degree",0.0174532925199433,'
+    'AUTHORITY["EPSG","9122"]],AUTHORITY["EPSG","4326"]]'
+)
+
+SCHEMA = f"""
+CREATE TABLE gpkg_spatial_ref_sys (
+    srs_name TEXT NOT NULL, srs_id INTEGER PRIMARY KEY, organization TEXT NOT NULL,
+    organization_coordsys_id INTEGER NOT NULL, definition TEXT NOT NULL, description TEXT);
+INSERT INTO gpkg_spatial_ref_sys VALUES
+    ('Undefined Cartesian', -1, 'NONE', -1, 'undefined', NULL),
+    ('Undefined geographic', 0, 'NONE', 0, 'undefined', NULL),
+    ('WGS 84 geodetic', {WGS84}, 'EPSG', {WGS84}, '{_WGS84_WKT}', 'longitude and latitude in degrees');
+
+CREATE TABLE gpkg_contents (
+    table_name TEXT NOT NULL PRIMARY KEY, data_type TEXT NOT NULL, identifier TEXT UNIQUE,
+    description TEXT DEFAULT '', last_change DATETIME NOT NULL DEFAULT (strftime('%Y-%m-%dT%H:%M:%fZ','now')),
+    min_x DOUBLE, min_y DOUBLE, max_x DOUBLE, max_y DOUBLE,
+    srs_id INTEGER REFERENCES gpkg_spatial_ref_sys(srs_id));
+CREATE TABLE gpkg_geometry_columns (
+    table_name TEXT NOT NULL REFERENCES gpkg_contents(table_name), column_name TEXT NOT NULL,
+    geometry_type_name TEXT NOT NULL, srs_id INTEGER NOT NULL REFERENCES gpkg_spatial_ref_sys(srs_id),
+    z TINYINT NOT NULL, m TINYINT NOT NULL,
+    CONSTRAINT pk_geom_cols PRIMARY KEY (table_name, column_name));
+
+CREATE TABLE places (
+    place_id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, geom POINT, time DATETIME, alt_m DOUBLE, heading_deg DOUBLE,
+    source_image TEXT NOT NULL, quality DOUBLE NOT NULL, coarse BLOB NOT NULL, fine BLOB);
+CREATE TABLE edgevpr_map (
+    id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, key TEXT NOT NULL UNIQUE, value TEXT NOT NULL);
+INSERT INTO gpkg_contents (table_name, data_type, identifier, description, srs_id) VALUES
+    ('places', 'features', 'places', 'places seen by edgevpr, with their descriptors', {WGS84}),
+    ('edgevpr_map', 'attributes', 'edgevpr_map', 'how the descriptors were made', NULL);
+INSERT INTO gpkg_geometry_columns VALUES ('places', 'geom', 'POINT', {WGS84}, 0, 0);
+"""
+
+# The layer's extent grows with every place, in the same transaction.
+GROW_EXTENT = """
+UPDATE gpkg_contents SET last_change = strftime('%Y-%m-%dT%H:%M:%fZ','now'),
+    min_x = min(coalesce(min_x, :lon), :lon), max_x = max(coalesce(max_x, :lon), :lon),
+    min_y = min(coalesce(min_y, :lat), :lat), max_y = max(coalesce(max_y, :lat), :lat)
+WHERE table_name = 'places'
+"""
+
+# "GP", version 0, flags: little-endian, no envelope; srs_id; then well-known binary: little-endian, Point, x, y.
+_POINT = struct.Struct("<2sBBiBIdd")
+
+
+def point_blob(lat_deg: float, lon_deg: float) -> bytes:
+    """GeoPackage geometry of a WGS-84 point."""
+    return _POINT.pack(b"GP", 0, 1, WGS84, 1, 1, lon_deg, lat_deg)
+
+
+def read_point(blob: bytes) -> tuple[float, float]:
+    """(lat_deg, lon_deg) of a point written by `point_blob`, or by another tool with or without an envelope."""
+    wkb = 8 + (0, 32, 48, 48, 64)[(blob[3] >> 1) & 7]  # the header, and the envelope that its flags announce
+    lon_deg, lat_deg = struct.unpack_from(("<" if blob[wkb] else ">") + "dd", blob, wkb + 5)
+    return lat_deg, lon_deg
+
+
+def utc_text(t_utc_s: float | None) -> str | None:
+    """Seconds since 1970 as the GeoPackage's DATETIME, UTC with milliseconds."""
+    if t_utc_s is None:
+        return None
+    return datetime.fromtimestamp(t_utc_s, timezone.utc).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def utc_seconds(text: str | None) -> float | None:
+    """The reverse of `utc_text`."""
+    return datetime.fromisoformat(text.replace("Z", "+00:00")).timestamp() if text else None

@@ -1,0 +1,290 @@
+"""The place map: one GeoPackage file.
+
+Every place is committed before it is confirmed, so a battery pulled while mapping loses at most the place that was
+being written, and never the file.
+"""
+
+import json
+import sqlite3
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from edgevpr import __version__
+from edgevpr.errors import MapError
+from edgevpr.places import geopackage
+from edgevpr.places.sqlite import connect, sentences, settle, settle_left_log, start_log
+from edgevpr.types import Descriptor, Frame, PartSpec, Place, Position, TechniqueSpec
+
+FORMAT_VERSION = 1
+_PLACE_COLUMNS = "place_id, geom, time, alt_m, heading_deg, source_image, quality"
+
+
+@dataclass(frozen=True, slots=True)
+class MapInfo:
+    """What a map holds; `extent` is (lat_min, lon_min, lat_max, lon_max) in degrees, None without positions."""
+
+    path: str
+    spec: TechniqueSpec
+    places: int
+    with_position: int
+    extent: tuple[float, float, float, float] | None
+    first_time: str | None
+    last_time: str | None
+    mean_quality: float | None
+    file_bytes: int
+    made_by: str
+
+
+class PlaceMap:
+    """An open map file. Use `create`, `open` or `open_for_adding`, and close it (it is a context manager)."""
+
+    def __init__(self, path: Path, connection: sqlite3.Connection, spec: TechniqueSpec, writable: bool) -> None:
+        self.path, self.spec = path, spec
+        self._db = connection
+        self._writable = writable
+
+    @classmethod
+    def create(cls, path: str | Path, spec: TechniqueSpec) -> "PlaceMap":
+        """Make an empty map for descriptors of `spec`. Raises MapError if the file is there or cannot be written."""
+        path = Path(path)
+        if path.exists() and path.stat().st_size:
+            raise MapError(f"{path} is there already: choose another name, or add to it with --append.")
+        with sentences(path):
+            db = connect(path, "rwc")
+            db.execute(f"PRAGMA application_id = {geopackage.APPLICATION_ID}")
+            db.execute(f"PRAGMA user_version = {geopackage.USER_VERSION}")
+            start_log(db)
+            db.executescript("BEGIN;" + geopackage.SCHEMA)
+            described = {
+                "format_version": FORMAT_VERSION,
+                "made_by": f"edgevpr {__version__}",
+                "technique": spec.name,
+                "parameters": spec.parameters,
+                "model_sha256": spec.model_sha256,
+                "coarse": asdict(spec.coarse),
+                "fine": asdict(spec.fine) if spec.fine else None,
+            }
+            db.executemany(
+                "INSERT INTO edgevpr_map (key, value) VALUES (?, ?)",
+                [(key, json.dumps(value)) for key, value in described.items()],
+            )
+            db.execute("COMMIT")
+        return cls(path, db, spec, writable=True)
+
+    @classmethod
+    def open(cls, path: str | Path) -> "PlaceMap":
+        """Open for reading. Raises MapError for a file that is missing, no place map, damaged, or from the future."""
+        path = _existing(path)
+        settle_left_log(path)
+        with sentences(path):
+            db = connect(path, "ro")
+            return cls(path, db, _read_spec(path, db), writable=False)
+
+    @classmethod
+    def open_for_adding(cls, path: str | Path) -> "PlaceMap":
+        """Open an existing map to add places to it. Raises MapError as `open` does."""
+        path = _existing(path)
+        with sentences(path):
+            db = connect(path, "rw")
+            spec = _read_spec(path, db)
+            start_log(db)
+            return cls(path, db, spec, writable=True)
+
+    def __enter__(self) -> "PlaceMap":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close; a map that was written becomes one plain file again, readable from a read-only card."""
+        if self._writable:
+            settle(self._db)
+        self._db.close()
+
+    def require(self, spec: TechniqueSpec) -> None:
+        """Raise MapError, naming what differs, unless the map's descriptors were made by exactly `spec`."""
+        differences = [
+            f"{what} is {theirs}, not {ours}" for what, theirs, ours in _compared(self.spec, spec) if theirs != ours
+        ]
+        if differences:
+            raise MapError(
+                f"{self.path} was made differently ({'; '.join(differences)}): use it with its own technique and "
+                "parameters, or build a map with these."
+            )
+
+    def add(self, frame: Frame, descriptor: Descriptor) -> int:
+        """Add one place and return its id once it is safe on the disk. Raises MapError (disk full, ...)."""
+        position = frame.position
+        row = (
+            geopackage.point_blob(position.lat_deg, position.lon_deg) if position else None,
+            geopackage.utc_text(frame.t_utc_s),
+            position.alt_m if position else None,
+            frame.heading_deg,
+            frame.name,
+            descriptor.quality,
+            _blob(descriptor.coarse, self.spec.coarse),
+            _blob(descriptor.fine, self.spec.fine),
+        )
+        with sentences(self.path), self._transaction():
+            cursor = self._db.execute(
+                "INSERT INTO places (geom, time, alt_m, heading_deg, source_image, quality, coarse, fine) "
+                "VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+                row,
+            )
+            if position:
+                self._db.execute(geopackage.GROW_EXTENT, {"lat": position.lat_deg, "lon": position.lon_deg})
+        return cursor.lastrowid
+
+    def absorb(self, other: "PlaceMap") -> tuple[int, int]:
+        """Copy every place of another map of the same technique, all or none; returns (copied, already here).
+
+        A place is already here when image name, time and coarse part are the same. Raises MapError as `require`.
+        """
+        self.require(other.spec)
+        columns = "geom, time, alt_m, heading_deg, source_image, quality, coarse, fine"
+        before = len(self)
+        with sentences(self.path), sentences(other.path), self._transaction():
+            here = {
+                (*key, hash(coarse))
+                for *key, coarse in self._db.execute("SELECT source_image, time, coarse FROM places")
+            }
+            for row in other._db.execute(f"SELECT {columns} FROM places ORDER BY place_id"):
+                if (row[4], row[1], hash(row[6])) not in here:
+                    self._db.execute(f"INSERT INTO places ({columns}) VALUES (?, ?, ?, ?, ?, ?, ?, ?)", row)
+                    if row[0]:
+                        lat_deg, lon_deg = geopackage.read_point(row[0])
+                        self._db.execute(geopackage.GROW_EXTENT, {"lat": lat_deg, "lon": lon_deg})
+        copied = len(self) - before
+        return copied, len(other) - copied
+
+    def info(self) -> MapInfo:
+        """Count and summarise."""
+        with sentences(self.path):
+            places, with_position, first, last, quality = self._db.execute(
+                "SELECT count(*), count(geom), min(time), max(time), avg(quality) FROM places"
+            ).fetchone()
+            extent = self._db.execute(
+                "SELECT min_y, min_x, max_y, max_x FROM gpkg_contents WHERE table_name = 'places'"
+            ).fetchone()
+            (made_by,) = self._db.execute("SELECT value FROM edgevpr_map WHERE key = 'made_by'").fetchone()
+        return MapInfo(
+            str(self.path), self.spec, places, with_position, extent if with_position else None, first, last, quality,
+            self.path.stat().st_size, json.loads(made_by),
+        )  # fmt: skip
+
+    def places(self, place_ids: Iterable[int] | None = None) -> Iterator[Place]:
+        """The named places in the order given, or all of them in the order they were added."""
+        with sentences(self.path):
+            if place_ids is None:
+                for row in self._db.execute(f"SELECT {_PLACE_COLUMNS} FROM places ORDER BY place_id"):
+                    yield _place(row)
+                return
+            for place_id in place_ids:
+                yield _place(
+                    self._db.execute(
+                        f"SELECT {_PLACE_COLUMNS} FROM places WHERE place_id = ?", (int(place_id),)
+                    ).fetchone()
+                )
+
+    def coarse_parts(self) -> Iterator[tuple[int, tuple[float, float] | None, np.ndarray]]:
+        """(place_id, (lat_deg, lon_deg) or None, coarse part) of every place, in the order they were added."""
+        with sentences(self.path):
+            for place_id, geom, coarse in self._db.execute(
+                "SELECT place_id, geom, coarse FROM places ORDER BY place_id"
+            ):
+                part = self._part(coarse, self.spec.coarse, place_id)
+                yield place_id, geopackage.read_point(geom) if geom else None, part
+
+    def fine_part(self, place_id: int) -> np.ndarray:
+        """The fine part of one place, read from the file (read-only array of `spec.fine`)."""
+        with sentences(self.path):
+            row = self._db.execute("SELECT fine FROM places WHERE place_id = ?", (int(place_id),)).fetchone()
+        if row is None:
+            raise MapError(f"{self.path}: place {place_id} is gone; another program changed the map: load it again.")
+        return self._part(row[0], self.spec.fine, place_id)
+
+    def __len__(self) -> int:
+        with sentences(self.path):
+            return self._db.execute("SELECT count(*) FROM places").fetchone()[0]
+
+    @contextmanager
+    def _transaction(self) -> Iterator[None]:
+        self._db.execute("BEGIN IMMEDIATE")
+        try:
+            yield
+            self._db.execute("COMMIT")
+        except BaseException:
+            if self._db.in_transaction:  # SQLite has already rolled back where the disk is full
+                self._db.execute("ROLLBACK")
+            raise
+
+    def _part(self, blob: bytes, spec: PartSpec, place_id: int) -> np.ndarray:
+        if blob is None or len(blob) != spec.nbytes:
+            raise MapError(
+                f"{self.path}: the descriptor of place {place_id} is damaged: build the map again, or delete that "
+                "row with sqlite3."
+            )
+        return np.frombuffer(blob, spec.dtype).reshape(spec.shape)
+
+
+def _existing(path: str | Path) -> Path:
+    path = Path(path)
+    if not path.exists():
+        raise MapError(f"There is no map {path}: make one with `edgevpr map build {path} --images DIR`.")
+    return path
+
+
+def _read_spec(path: Path, db: sqlite3.Connection) -> TechniqueSpec:
+    (application_id,) = db.execute("PRAGMA application_id").fetchone()
+    tables = {name for (name,) in db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+    if application_id != geopackage.APPLICATION_ID or "edgevpr_map" not in tables:
+        raise MapError(f"{path}: this is not a place map: give a .gpkg file made by `edgevpr map build`.")
+    try:
+        stored = {key: json.loads(value) for key, value in db.execute("SELECT key, value FROM edgevpr_map")}
+        if stored["format_version"] > FORMAT_VERSION:
+            raise MapError(
+                f"{path} comes from a newer edgevpr (map format {stored['format_version']}, this one reads up to "
+                f"{FORMAT_VERSION}): update edgevpr."
+            )
+        return TechniqueSpec(
+            stored["technique"],
+            stored["parameters"],
+            _part_spec(stored["coarse"]),
+            _part_spec(stored["fine"]) if stored["fine"] else None,
+            stored["model_sha256"],
+        )
+    except (ValueError, KeyError, TypeError) as error:
+        raise MapError(
+            f"{path}: its table edgevpr_map is damaged ({error!r}): restore a copy or build the map again."
+        ) from error
+
+
+def _part_spec(stored: dict) -> PartSpec:
+    return PartSpec(tuple(stored["shape"]), stored["dtype"])
+
+
+def _blob(part: np.ndarray | None, spec: PartSpec | None) -> bytes | None:
+    if spec is None:
+        return None
+    return np.ascontiguousarray(part, spec.dtype).reshape(spec.shape).tobytes()
+
+
+def _place(row: tuple) -> Place:
+    place_id, geom, time, alt_m, heading_deg, source_image, quality = row
+    position = Position(*geopackage.read_point(geom), alt_m) if geom else None
+    return Place(place_id, source_image, position, geopackage.utc_seconds(time), heading_deg, quality)
+
+
+def _compared(theirs: TechniqueSpec, ours: TechniqueSpec) -> Iterator[tuple[str, object, object]]:
+    yield "technique", theirs.name, ours.name
+    if theirs.name == ours.name:
+        for key in sorted(theirs.parameters.keys() | ours.parameters.keys()):
+            yield key, theirs.parameters.get(key), ours.parameters.get(key)
+        yield "model sha256", theirs.model_sha256, ours.model_sha256
+        yield "form of the coarse part", theirs.coarse, ours.coarse
+        yield "form of the fine part", theirs.fine, ours.fine

@@ -1,0 +1,88 @@
+"""From a query to the places that it may be: one scan of the index, then the best candidates compared in full."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from edgevpr.geodesy import distance_m
+from edgevpr.places.index import PlaceIndex
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.types import Candidate, Descriptor, FineMatch, Technique
+
+_NEIGHBOURS_WITHOUT_POSITION = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Ranking:
+    """Places best first: `slots` int (K,) of the index, `scores` float32 (K,), and their full comparisons (empty for a
+    technique without a fine part)."""
+
+    slots: np.ndarray
+    scores: np.ndarray
+    matches: tuple[FineMatch, ...]
+
+
+def rank(
+    technique: Technique, query: Descriptor, place_map: PlaceMap, index: PlaceIndex, candidates: int | None = None
+) -> Ranking:
+    """Compare the query with every place of the index, and in full with the best `candidates` of them (None: all)."""
+    coarse, hypotheses = technique.coarse_scores(query, index.rows)
+    if technique.spec.fine is None:
+        slots = np.argsort(-coarse, kind="stable")
+        return Ranking(slots, coarse[slots], ())
+    if candidates is None or candidates >= len(index):
+        chosen = np.arange(len(index))
+    else:
+        chosen = np.argpartition(-coarse, candidates)[:candidates]
+    matches = [
+        technique.match(
+            query, place_map.fine_part(index.place_ids[slot]), None if hypotheses is None else int(hypotheses[slot])
+        )
+        for slot in chosen
+    ]
+    scores = np.array([match.score for match in matches], np.float32)
+    order = np.argsort(-scores, kind="stable")
+    return Ranking(chosen[order], scores[order], tuple(matches[i] for i in order))
+
+
+def margin(ranking: Ranking, index: PlaceIndex, neighbour_m: float) -> float:
+    """By how much the best place beats the best one elsewhere: score difference, the whole score if there is none.
+
+    Elsewhere: more than `neighbour_m` metres from the best place, or, where either has no position, more than two
+    places before or after it in the map.
+    """
+    best, others = ranking.slots[0], ranking.slots[1:]
+    away_m = distance_m(index.lat_deg[best], index.lon_deg[best], index.lat_deg[others], index.lon_deg[others])
+    unknown = np.isnan(away_m)
+    elsewhere = np.where(unknown, abs(others - best) > _NEIGHBOURS_WITHOUT_POSITION, away_m > neighbour_m)
+    runners_up = ranking.scores[1:][elsewhere]
+    return float(ranking.scores[0] - (runners_up[0] if len(runners_up) else 0))
+
+
+def named(ranking: Ranking, index: PlaceIndex, place_map: PlaceMap, first: int | None = None) -> list[Candidate]:
+    """The `first` places of a ranking (None: all) with what the map file says of them, best first."""
+    places = place_map.places(index.place_ids[ranking.slots[:first]])
+    found = []
+    for at, place in enumerate(places):
+        match = ranking.matches[at] if ranking.matches else None
+        found.append(
+            Candidate(
+                place,
+                float(ranking.scores[at]),
+                match.shift_cells if match else None,
+                match.rotation_deg if match else None,
+            )
+        )
+    return found
+
+
+def retrieve(
+    technique: Technique,
+    query: Descriptor,
+    place_map: PlaceMap,
+    index: PlaceIndex,
+    candidates: int | None = None,
+    first: int | None = 10,
+) -> list[Candidate]:
+    """`rank`, then `named`: the `first` places that the query may be, best first."""
+    return named(rank(technique, query, place_map, index, candidates), index, place_map, first)

@@ -1,0 +1,97 @@
+"""`cohog`: regional HOG descriptors of the regions that say something, matched by one product (thesis, chapter 6).
+
+Every place is 31x31 overlapping blocks, each described by the histograms of its 2x2 cells. A query asks only with its
+*good* blocks, those of high entropy; each finds its best block in the reference, and the mean of those cosines is the
+score. The blocks are the fine part, 123 KB a place on disk. The coarse part, 1 KB in RAM, is the same blocks averaged
+over an 8x8 grid: it picks candidates when not every place is compared in full.
+"""
+
+import cv2
+import numpy as np
+
+from edgevpr.errors import UsageError
+from edgevpr.techniques import entropy as entropy_maps
+from edgevpr.techniques.gradients import grey_square, mask_square, normalised_blocks, oriented_cells
+from edgevpr.types import Descriptor, FineMatch, PartSpec, TechniqueSpec
+
+_COARSE_GRID = 8
+# The goodness threshold GT of the thesis (6.3.2) and of the authors' public code, each for its own entropy.
+_DEFAULT_GT = {"filled_bins": 0.5, "shannon": 0.4}
+
+
+class CoHog:
+    """CoHOG. The thesis's W1 = H1 is `w1`, W2 = H2 is `w2`, L is `bins`, GT is `gt` (below 0: the default that goes
+    with the entropy); `entropy` is "shannon" or "filled_bins"."""
+
+    min_score = 0.0
+    min_margin = 0.0
+
+    def __init__(self, w1: int = 512, w2: int = 16, bins: int = 8, gt: float = -1.0, entropy: str = "shannon") -> None:
+        if entropy not in _DEFAULT_GT:
+            raise UsageError(f"cohog has no entropy `{entropy}`: use filled_bins or shannon.")
+        if not (w2 >= 2 and w1 % w2 == 0 and w1 // w2 > _COARSE_GRID and w1 <= 4096 and 2 <= bins <= 64):
+            raise UsageError(
+                f"cohog cannot use w1={w1}, w2={w2}, bins={bins}: w1 must be a multiple of w2 (more than "
+                f"{_COARSE_GRID} regions of at least 2 pixels, at most 4096 pixels), bins 2 to 64."
+            )
+        if gt > 1:
+            raise UsageError(f"cohog: gt is {gt:g}; it is a share of the largest entropy, 0 to 1.")
+        self._entropy = getattr(entropy_maps, entropy)
+        self._w1, self._w2, self._bins = w1, w2, bins
+        self._gt = gt if gt >= 0 else _DEFAULT_GT[entropy]
+        self._side = w1 // w2 - 1  # blocks along one side
+        self._pool = _area_weights(self._side, _COARSE_GRID)
+        self.spec = TechniqueSpec(
+            "cohog",
+            {"w1": w1, "w2": w2, "bins": bins, "gt": self._gt, "entropy": entropy},
+            coarse=PartSpec((_COARSE_GRID**2 * bins,), "<f2"),
+            fine=PartSpec((self._side**2, 4 * bins), "<f4"),
+        )
+
+    def encode(self, image: np.ndarray, mask: np.ndarray | None = None) -> Descriptor:
+        """Encode uint8 (H, W[, 3]); a block that touches a pixel where `mask` is False is never good.
+
+        Returns coarse float16 (64 bins,), fine float32 (blocks, 4 bins) (matrix B of 6.2.3), good bool (blocks,).
+        """
+        grey = grey_square(image, self._w1)
+        allowed = mask_square(mask, self._w1)
+        blocks = normalised_blocks(oriented_cells(grey, self._w2, self._bins, signed=True, allowed=allowed))
+        good = self._over_blocks(self._entropy(grey)) >= self._gt
+        if allowed is not None:
+            good &= self._over_blocks(allowed.astype(np.float32)) >= 1.0
+        fine = blocks.reshape(self.spec.fine.shape)
+        return Descriptor(self._coarse(blocks), fine, good.ravel(), quality=float(good.mean()))
+
+    def coarse_scores(self, query: Descriptor, rows: np.ndarray) -> tuple[np.ndarray, None]:
+        """Cosine of the coarse parts: `rows` float16 (N, 64 bins) -> float32 (N,) in 0..1."""
+        return np.clip(rows.astype(np.float32) @ query.coarse.astype(np.float32), 0, 1), None
+
+    def match(self, query: Descriptor, fine: np.ndarray, hypothesis: int | None = None) -> FineMatch:
+        """Thesis 6.2.3: C = A B^T over the good blocks of the query, the maximum of every row, their mean.
+
+        A query without a good block scores 0: it has nothing to say.
+        """
+        asking = query.fine[query.good]
+        if not len(asking):
+            return FineMatch(0.0)
+        return FineMatch(float(np.clip((asking @ fine.T).max(axis=1).mean(), 0, 1)))
+
+    def _over_blocks(self, per_pixel: np.ndarray) -> np.ndarray:
+        """Mean over every block of 2x2 cells: float32 (w1, w1) -> (side, side)."""
+        n = self._side + 1
+        cell = cv2.resize(per_pixel, (n, n), interpolation=cv2.INTER_AREA)
+        return (cell[:-1, :-1] + cell[:-1, 1:] + cell[1:, :-1] + cell[1:, 1:]) / 4
+
+    def _coarse(self, blocks: np.ndarray) -> np.ndarray:
+        """The mean orientations of the blocks on an 8x8 grid, as one vector of length 1."""
+        orientations = blocks.reshape(self._side, self._side, 4, self._bins).mean(axis=2)
+        grid = np.einsum("ai,bj,ijk->abk", self._pool, self._pool, orientations, optimize=True)
+        return (grid.ravel() / max(float(np.linalg.norm(grid)), 1e-6)).astype("<f2")
+
+
+def _area_weights(fine: int, coarse: int) -> np.ndarray:
+    """float32 (coarse, fine) whose rows average the fine intervals that each coarse interval covers."""
+    edge = np.linspace(0, fine, coarse + 1)
+    start = np.arange(fine)
+    covered = np.minimum(edge[1:, None], start + 1) - np.maximum(edge[:-1, None], start)
+    return (np.clip(covered, 0, None) * coarse / fine).astype(np.float32)

@@ -1,0 +1,27 @@
+"""A program of its own that adds places and says which are confirmed; the tests kill it at any moment."""
+
+import sys
+
+import numpy as np
+
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.types import Descriptor, Frame, PartSpec, Position, TechniqueSpec
+
+SPEC = TechniqueSpec("test", {"seed": 1}, PartSpec((64,), "<f2"), PartSpec((40, 32), "<f4"))
+
+
+def frame(number: int) -> Frame:
+    position = None if number % 5 == 0 else Position(50.0 + number * 1e-4, 8.0, 100.0 + number)
+    return Frame(np.zeros((16, 16), np.uint8), f"{number:05d}.jpg", 0.0, 1.7e9 + number, position, number % 360)
+
+
+def descriptor(number: int) -> Descriptor:
+    rng = np.random.default_rng(number)
+    return Descriptor(rng.random(64).astype("<f2"), rng.random((40, 32), dtype=np.float32), quality=0.75)
+
+
+if __name__ == "__main__":
+    path, start = sys.argv[1], int(sys.argv[2])
+    place_map = PlaceMap.open_for_adding(path) if start else PlaceMap.create(path, SPEC)
+    for number in range(start, start + 100_000):
+        print(place_map.add(frame(number), descriptor(number)), flush=True)

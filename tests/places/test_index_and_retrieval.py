@@ -1,0 +1,110 @@
+"""The index under its budget, and retrieval over it with techniques that are simple enough to predict."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from edgevpr.errors import MapError
+from edgevpr.places.index import bytes_per_place, load_index
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.retrieve import margin, named, rank, retrieve
+from edgevpr.types import Descriptor, FineMatch, Frame, PartSpec, Position, TechniqueSpec
+
+
+class Ruler:
+    """Places are numbers: the coarse part is the number to the nearest 10, the fine part the number itself."""
+
+    spec = TechniqueSpec("ruler", {}, PartSpec((1,), "<f4"), PartSpec((1,), "<f8"))
+    min_score = min_margin = 0.0
+    compared = 0
+
+    def encode(self, image, mask=None):
+        number = float(image[0, 0])
+        return Descriptor(np.array([round(number, -1)], "<f4"), np.array([number]))
+
+    def coarse_scores(self, query, rows):
+        return 1 / (1 + abs(rows[:, 0] - query.coarse[0])), None
+
+    def match(self, query, fine, hypothesis):
+        self.compared += 1
+        return FineMatch(1 / (1 + abs(float(fine[0] - query.fine[0]))))
+
+
+@pytest.fixture
+def ruler_map(tmp_path):
+    technique = Ruler()
+    with PlaceMap.create(tmp_path / "ruler.gpkg", technique.spec) as place_map:
+        for number in range(0, 100, 4):
+            image = np.full((1, 1), number)
+            position = Position(0.0, number * 1e-4) if number != 60 else None
+            place_map.add(Frame(image, f"{number}", 0.0, None, position), technique.encode(image))
+    with PlaceMap.open(tmp_path / "ruler.gpkg") as place_map:
+        yield technique, place_map
+
+
+def test_the_index_is_contiguous_and_of_the_size_promised(ruler_map):
+    technique, place_map = ruler_map
+    index = load_index(place_map, 10_000)
+    assert len(index) == 25
+    assert index.nbytes == 25 * bytes_per_place(technique.spec)
+    assert index.rows.flags.c_contiguous
+    assert index.spacing_m() == pytest.approx(44.5, abs=0.1)
+
+
+def test_a_map_beyond_the_budget_is_refused_with_the_figure_that_would_do(ruler_map):
+    technique, place_map = ruler_map
+    each = bytes_per_place(technique.spec)
+    load_index(place_map, 25 * each)
+    with pytest.raises(MapError, match=r"holds 24: raise --budget-mb"):
+        load_index(place_map, 25 * each - 1)
+
+
+def test_an_empty_map_is_refused(tmp_path):
+    with PlaceMap.create(tmp_path / "empty.gpkg", Ruler.spec) as place_map, pytest.raises(MapError, match="no place"):
+        load_index(place_map, 10_000)
+
+
+def test_all_places_are_compared_unless_candidates_are_limited(ruler_map):
+    technique, place_map = ruler_map
+    index = load_index(place_map, 10_000)
+    query = technique.encode(np.full((1, 1), 43))
+    everything = rank(technique, query, place_map, index)
+    assert technique.compared == 25
+    found = named(everything, index, place_map, 3)
+    assert [c.place.source_image for c in found] == ["44", "40", "48"]
+    technique.compared = 0
+    few = retrieve(technique, query, place_map, index, candidates=3, first=None)
+    assert technique.compared == 3
+    assert {c.place.source_image for c in few} == {"36", "40", "44"}  # those that round to 40
+    assert few[0].place.source_image == "44"
+
+
+def test_margin_is_to_the_best_place_elsewhere(ruler_map):
+    technique, place_map = ruler_map
+    index = load_index(place_map, 10_000)
+    ranking = rank(technique, technique.encode(np.full((1, 1), 20)), place_map, index)
+    # 11 m a number: 16 and 24 are 44 m away, 12 and 28 are 89 m.
+    assert margin(ranking, index, 40.0) == pytest.approx(1 - 1 / 5)
+    assert margin(ranking, index, 50.0) == pytest.approx(1 - 1 / 9)
+    assert margin(ranking, index, 1e6) == pytest.approx(1 - 1 / 41), "only the place without a position is elsewhere"
+    nowhere = rank(technique, technique.encode(np.full((1, 1), 60)), place_map, index)
+    assert margin(nowhere, index, 1e6) == pytest.approx(1 - 1 / 13), "without a position, neighbours are the two beside"
+
+
+def test_a_single_place_is_ahead_of_nothing(tmp_path):
+    technique = Ruler()
+    image = np.full((1, 1), 5)
+    with PlaceMap.create(tmp_path / "one.gpkg", technique.spec) as place_map:
+        place_map.add(Frame(image, "5", 0.0), technique.encode(image))
+        index = load_index(place_map, 1000)
+        assert margin(rank(technique, technique.encode(image), place_map, index), index, 50.0) == 1.0
+
+
+def test_a_descriptor_of_the_wrong_size_is_named(tmp_path):
+    spec = dataclasses.replace(Ruler.spec, fine=None)
+    with PlaceMap.create(tmp_path / "bad.gpkg", spec) as place_map:
+        place_map.add(Frame(np.zeros((1, 1)), "a", 0.0), Descriptor(np.zeros(1, "<f4")))
+        place_map._db.execute("UPDATE places SET coarse = x'00'")
+        with pytest.raises(MapError, match="place 1 is damaged"):
+            load_index(place_map, 1000)

@@ -1,0 +1,242 @@
+"""The map file: what is confirmed is there, other tools read it, and a wrong map is refused with a reason."""
+
+import dataclasses
+import io
+import json
+import resource
+import shutil
+import signal
+import sqlite3
+import subprocess
+import sys
+from pathlib import Path
+
+import map_writer
+import numpy as np
+import pytest
+from map_writer import SPEC, descriptor, frame
+
+from edgevpr.errors import MapError
+from edgevpr.places.geojson import write_geojson
+from edgevpr.places.mapfile import PlaceMap
+
+
+@pytest.fixture
+def map_path(tmp_path):
+    path = tmp_path / "valley.gpkg"
+    with PlaceMap.create(path, SPEC) as place_map:
+        for number in range(10):
+            place_map.add(frame(number), descriptor(number))
+    return path
+
+
+def test_what_is_added_comes_back(map_path):
+    with PlaceMap.open(map_path) as place_map:
+        assert place_map.spec == SPEC
+        places = list(place_map.places())
+        for number, place in enumerate(places):
+            added = frame(number)
+            assert place.source_image == added.name
+            assert place.t_utc_s == pytest.approx(added.t_utc_s, abs=1e-3)
+            assert place.heading_deg == added.heading_deg
+            assert place.position == added.position
+            np.testing.assert_array_equal(place_map.fine_part(place.place_id), descriptor(number).fine)
+        for number, (_, position, coarse) in enumerate(place_map.coarse_parts()):
+            np.testing.assert_array_equal(coarse, descriptor(number).coarse)
+            assert (position is None) == (frame(number).position is None)
+        info = place_map.info()
+    assert (info.places, info.with_position) == (10, 8)
+    np.testing.assert_allclose(info.extent, (50.0001, 8.0, 50.0009, 8.0))
+
+
+def test_a_closed_map_is_one_file_that_a_read_only_card_can_hold(map_path):
+    assert [entry.name for entry in map_path.parent.iterdir()] == [map_path.name]
+    card = map_path.parent / "card"
+    card.mkdir()
+    shutil.move(map_path, card / "map.gpkg")
+    (card / "map.gpkg").chmod(0o444)
+    card.chmod(0o555)
+    with PlaceMap.open(card / "map.gpkg") as place_map:
+        assert len(place_map) == 10
+
+
+def test_gdal_reads_the_places(map_path):
+    pyogrio = pytest.importorskip("pyogrio", reason="pyogrio (GDAL) is not installed")
+    assert {name for name, _ in pyogrio.list_layers(map_path)} == {"places", "edgevpr_map"}
+    meta, fids, geometry, fields = pyogrio.raw.read(map_path, layer="places", return_fids=True)
+    assert meta["crs"] == "EPSG:4326"
+    assert meta["geometry_type"] == "Point"
+    columns = dict(zip(meta["fields"], fields, strict=True))
+    assert list(fids) == list(range(1, 11))
+    assert list(columns["source_image"]) == [frame(n).name for n in range(10)]
+    assert columns["time"][3] == np.datetime64("2023-11-14T22:13:23.000")
+    assert geometry[0] is None
+    lon_lat = np.frombuffer(geometry[3][-16:], "<f8")
+    np.testing.assert_allclose(lon_lat, (8.0, 50.0003))
+    np.testing.assert_array_equal(np.frombuffer(columns["coarse"][4], "<f2"), descriptor(4).coarse)
+
+
+def test_sqlite_finds_a_sound_file(map_path):
+    db = sqlite3.connect(map_path)
+    assert db.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+    assert db.execute("PRAGMA foreign_key_check").fetchall() == []
+    assert db.execute("PRAGMA application_id").fetchone() == (int.from_bytes(b"GPKG", "big"),)
+
+
+def test_kill_9_while_adding_loses_nothing_that_was_confirmed(tmp_path):
+    path = tmp_path / "killed.gpkg"
+    confirmed = 0
+    for after in (1, 7, 30, 2, 90, 15):
+        writer = subprocess.Popen(
+            [sys.executable, map_writer.__file__, str(path), str(confirmed)], stdout=subprocess.PIPE, text=True
+        )
+        for _ in range(after):
+            confirmed = int(writer.stdout.readline())
+        writer.send_signal(signal.SIGKILL)
+        said = writer.stdout.read().split("\n")[:-1]  # confirmed between our last look and its death
+        writer.wait()
+        writer.stdout.close()
+        confirmed = int(said[-1]) if said else confirmed
+        with PlaceMap.open(path) as place_map:
+            held = list(place_map.places())
+        assert confirmed <= len(held) <= confirmed + 1, "at most the place being written may be there unconfirmed"
+        assert [place.source_image for place in held] == [frame(n).name for n in range(len(held))]
+        assert sqlite3.connect(path).execute("PRAGMA integrity_check").fetchone() == ("ok",)
+        confirmed = len(held)
+
+
+def test_a_map_left_open_by_a_dead_program_is_read_whole_while_its_log_is_beside_it(tmp_path):
+    path = tmp_path / "left.gpkg"
+    writer = subprocess.Popen([sys.executable, map_writer.__file__, str(path), "0"], stdout=subprocess.PIPE, text=True)
+    for _ in range(5):
+        writer.stdout.readline()
+    with PlaceMap.open(path) as live:  # another program may look while this one maps
+        assert len(live) >= 5
+    writer.kill()
+    writer.communicate()
+    assert path.with_name("left.gpkg-wal").exists()
+    with PlaceMap.open(path) as place_map:
+        assert len(place_map) >= 5
+    assert not path.with_name("left.gpkg-wal").exists()
+
+
+def _limit_file_size():
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))
+
+
+def test_a_full_disk_is_a_sentence_and_keeps_every_confirmed_place(tmp_path):
+    path = tmp_path / "full.gpkg"
+    writer = subprocess.run(
+        [sys.executable, map_writer.__file__, str(path), "0"],
+        capture_output=True, text=True, preexec_fn=_limit_file_size,
+    )  # fmt: skip
+    assert "MapError" in writer.stderr.splitlines()[-1]
+    assert "disk" in writer.stderr.splitlines()[-1]
+    confirmed = len(writer.stdout.split())
+    assert confirmed > 10
+    with PlaceMap.open(path) as place_map:
+        assert len(place_map) >= confirmed
+
+
+def test_sqlite_full_says_make_room(map_path):
+    place_map = PlaceMap.open_for_adding(map_path)
+    (pages,) = place_map._db.execute("PRAGMA page_count").fetchone()
+    place_map._db.execute(f"PRAGMA max_page_count = {pages + 1}")
+    with pytest.raises(MapError, match="the disk is full: make room"):
+        for number in range(10, 20):
+            place_map.add(frame(number), descriptor(number))
+    place_map._db.execute("PRAGMA max_page_count = 100000")
+    place_map.add(frame(20), descriptor(20))  # room again: it goes on
+    place_map.close()
+    with PlaceMap.open(map_path) as again:
+        assert len(again) >= 11
+
+
+def test_another_technique_or_parameter_is_refused_by_name(map_path):
+    with PlaceMap.open(map_path) as place_map:
+        with pytest.raises(MapError, match="seed is 1, not 2"):
+            place_map.require(dataclasses.replace(SPEC, parameters={"seed": 2}))
+        with pytest.raises(MapError, match="technique is test, not hog"):
+            place_map.require(dataclasses.replace(SPEC, name="hog"))
+        with pytest.raises(MapError, match="model sha256 is None, not abc"):
+            place_map.require(dataclasses.replace(SPEC, model_sha256="abc"))
+        place_map.require(SPEC)
+
+
+def test_a_map_from_a_newer_version_is_refused(map_path):
+    db = sqlite3.connect(map_path)
+    db.execute("UPDATE edgevpr_map SET value = '2' WHERE key = 'format_version'")
+    db.commit()
+    db.close()
+    with pytest.raises(MapError, match="newer edgevpr .*update edgevpr"):
+        PlaceMap.open(map_path)
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (b"", "not a place map"),
+        (b"this is no database, but it is long enough to look like one" * 40, "not a place map"),
+        (b"SQLite format 3\0" + bytes(5000), "place map|damaged"),
+    ],
+)
+def test_a_file_that_is_no_map_is_named(tmp_path, content, says):
+    path = tmp_path / "other.gpkg"
+    path.write_bytes(content)
+    with pytest.raises(MapError, match=says):
+        PlaceMap.open(path)
+
+
+def test_a_missing_map_says_how_to_make_one(tmp_path):
+    with pytest.raises(MapError, match="edgevpr map build"):
+        PlaceMap.open(tmp_path / "no.gpkg")
+
+
+def test_a_truncated_map_is_a_sentence(map_path):
+    data = map_path.read_bytes()
+    map_path.write_bytes(data[: len(data) // 3])
+    with pytest.raises(MapError, match="damaged"), PlaceMap.open(map_path) as place_map:
+        [place_map.fine_part(place.place_id) for place in place_map.places()]
+
+
+def test_an_existing_map_is_never_overwritten(map_path):
+    before = map_path.read_bytes()
+    with pytest.raises(MapError, match="there already"):
+        PlaceMap.create(map_path, SPEC)
+    assert map_path.read_bytes() == before
+
+
+def test_merging_copies_what_is_new_and_refuses_what_differs(map_path, tmp_path):
+    with PlaceMap.create(tmp_path / "other.gpkg", SPEC) as other:
+        for number in (8, 9, 10, 11):
+            other.add(frame(number), descriptor(number))
+    with PlaceMap.open_for_adding(map_path) as place_map, PlaceMap.open(tmp_path / "other.gpkg") as other:
+        assert place_map.absorb(other) == (2, 2)
+        assert len(place_map) == 12
+        assert place_map.info().extent[2] == pytest.approx(50.0011)
+        np.testing.assert_array_equal(place_map.fine_part(12), descriptor(11).fine)
+    different = dataclasses.replace(SPEC, parameters={"seed": 3})
+    with PlaceMap.create(tmp_path / "third.gpkg", different) as third, PlaceMap.open(map_path) as place_map:
+        with pytest.raises(MapError, match="seed"):
+            third.absorb(place_map)
+        assert len(third) == 0
+
+
+def test_geojson_has_every_place_and_no_descriptor(map_path):
+    out = io.StringIO()
+    with PlaceMap.open(map_path) as place_map:
+        assert write_geojson(place_map, out) == 10
+    features = json.loads(out.getvalue())["features"]
+    assert features[0]["geometry"] is None
+    assert features[3]["geometry"]["coordinates"] == pytest.approx([8.0, 50.0003, 103.0])
+    assert features[3]["properties"]["source_image"] == "00003.jpg"
+    assert "coarse" not in features[3]["properties"]
+
+
+def test_the_map_file_is_found_by_any_path_spelling(tmp_path):
+    folder = tmp_path / "with space & ümlaut#1?"
+    folder.mkdir()
+    with PlaceMap.create(folder / "m%20.gpkg", SPEC) as place_map:
+        place_map.add(frame(1), descriptor(1))
+    assert [entry.name for entry in Path(folder).iterdir()] == ["m%20.gpkg"]

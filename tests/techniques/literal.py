@@ -1,0 +1,106 @@
+"""Chapter 6 of the thesis, word by word: loops, float64, nothing clever. The golden standard of the techniques."""
+
+import math
+
+import cv2
+import numpy as np
+
+
+def grey_square(image, side):
+    grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    return cv2.resize(grey, (side, side), interpolation=cv2.INTER_LINEAR)
+
+
+def disc(image, x, y, radius):
+    """Intensities of the valid pixels within `radius` of (x, y)."""
+    height, width = image.shape
+    return [
+        int(image[j, i])
+        for j in range(max(0, y - radius), min(height, y + radius + 1))
+        for i in range(max(0, x - radius), min(width, x + radius + 1))
+        if (i - x) ** 2 + (j - y) ** 2 <= radius**2
+    ]
+
+
+def filled_bins(image, radius=5):
+    """Algorithm "Computing Entropy Map", section 6.2.1."""
+    entropy = np.zeros(image.shape)
+    for y in range(image.shape[0]):
+        for x in range(image.shape[1]):
+            bins = [0] * 256
+            for intensity in disc(image, x, y, radius):
+                bins[intensity] += 1
+            entropy[y, x] = math.log2(sum(1 for items in bins if items)) / 8
+    return entropy
+
+
+def shannon(image, radius=5):
+    """Shannon entropy of each disc of a 100x100 copy, scaled back to the image's size."""
+    small = cv2.resize(image, (100, 100), interpolation=cv2.INTER_LINEAR)
+    entropy = np.zeros(small.shape)
+    for y in range(100):
+        for x in range(100):
+            bins = [0] * 256
+            intensities = disc(small, x, y, radius)
+            for intensity in intensities:
+                bins[intensity] += 1
+            shares = [items / len(intensities) for items in bins if items]
+            entropy[y, x] = -sum(p * math.log2(p) for p in shares) / 8
+    return cv2.resize(entropy, image.shape[::-1], interpolation=cv2.INTER_LINEAR)
+
+
+def cell_histograms(image, cell, bins, signed):
+    """Steps 1 and 2 of section 6.2.2: gradient map, then one histogram a region."""
+    height, width = image.shape
+    root = [[math.sqrt(image[y, x] / image.max()) for x in range(width)] for y in range(height)]
+    turn = 2 * math.pi if signed else math.pi
+    cells = np.zeros((height // cell, width // cell, bins))
+    for y in range(height):
+        for x in range(width):
+            # At the border the image is mirrored about its outermost pixels: the difference there is 0.
+            dx = root[y][x + 1] - root[y][x - 1] if 0 < x < width - 1 else 0.0
+            dy = root[y + 1][x] - root[y - 1][x] if 0 < y < height - 1 else 0.0
+            magnitude = math.hypot(dx, dy)
+            at = (math.atan2(dy, dx) % turn) / turn * bins
+            low = math.floor(at)
+            cells[y // cell, x // cell, low % bins] += magnitude * (1 - (at - low))
+            cells[y // cell, x // cell, (low + 1) % bins] += magnitude * (at - low)
+    return cells
+
+
+def blocks(cells):
+    """Step 3 of section 6.2.2: blocks of 2x2 regions, stride one region, L2-normalised."""
+    rows, cols, _ = cells.shape
+    out = []
+    for row in range(rows - 1):
+        for col in range(cols - 1):
+            vector = [
+                *cells[row, col],
+                *cells[row, col + 1],
+                *cells[row + 1, col],
+                *cells[row + 1, col + 1],
+            ]
+            length = math.sqrt(sum(value * value for value in vector))
+            out.append([value / length if length else 0.0 for value in vector])
+    return np.array(out)
+
+
+def good_blocks(entropy, cell, threshold):
+    """Mean entropy of every block of 2x2 regions, stride one region, against GT."""
+    rows, cols = entropy.shape[0] // cell, entropy.shape[1] // cell
+    return np.array(
+        [
+            entropy[row * cell : (row + 2) * cell, col * cell : (col + 2) * cell].mean() >= threshold
+            for row in range(rows - 1)
+            for col in range(cols - 1)
+        ]
+    )
+
+
+def regional_match(query_blocks, good, reference_blocks):
+    """Section 6.2.3: C = A B^T, row-wise maximum D, arithmetic mean of D."""
+    best = []
+    for asking, is_good in zip(query_blocks, good, strict=True):
+        if is_good:
+            best.append(max(sum(a * b for a, b in zip(asking, block, strict=True)) for block in reference_blocks))
+    return sum(best) / len(best) if best else 0.0

@@ -1,0 +1,72 @@
+"""The techniques against the literal transcription of chapter 6."""
+
+import literal
+import numpy as np
+import pytest
+from pictures import textured
+
+from edgevpr.techniques import create, entropy
+from edgevpr.techniques.gradients import normalised_blocks, oriented_cells
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_filled_bins_is_the_printed_algorithm(seed):
+    image = textured(seed, 70, 45)
+    np.testing.assert_allclose(entropy.filled_bins(image), literal.filled_bins(image), atol=1e-6)
+
+
+@pytest.mark.parametrize("radius", [0, 1, 3, 7])
+def test_filled_bins_of_any_disc(radius):
+    image = textured(3, 33, 40)
+    np.testing.assert_allclose(entropy.filled_bins(image, radius), literal.filled_bins(image, radius), atol=1e-6)
+
+
+def test_filled_bins_of_radius_5_tops_out_below_one():
+    all_different = np.add.outer(11 * np.arange(20), np.arange(20)).astype(np.uint8)  # in any 11x11 pixels
+    assert entropy.filled_bins(all_different).max() == pytest.approx(np.log2(81) / 8, abs=1e-6)
+
+
+def test_shannon_is_the_entropy_of_the_disc():
+    image = textured(4, 128, 128)
+    np.testing.assert_allclose(entropy.shannon(image), literal.shannon(image), atol=1e-5)
+
+
+@pytest.mark.parametrize(("bins", "signed"), [(8, True), (9, False), (5, True)])
+def test_cell_histograms_and_blocks(bins, signed):
+    image = textured(5, 64, 80)
+    cells = oriented_cells(image, 8, bins, signed)
+    expected = literal.cell_histograms(image, 8, bins, signed)
+    np.testing.assert_allclose(cells, expected, atol=1e-3, rtol=1e-4)
+    np.testing.assert_allclose(normalised_blocks(cells).reshape(-1, 4 * bins), literal.blocks(expected), atol=1e-4)
+
+
+@pytest.mark.parametrize(("which", "threshold"), [("filled_bins", 0.5), ("shannon", 0.4), ("shannon", 0.55)])
+def test_cohog_descriptor_good_regions_and_score(which, threshold):
+    technique = create("cohog", {"w1": 144, "w2": 16, "gt": threshold, "entropy": which})
+    query_image, reference_image = textured(6), textured(7)
+    query, reference = technique.encode(query_image), technique.encode(reference_image)
+
+    grey = literal.grey_square(query_image, 144)
+    query_blocks = literal.blocks(literal.cell_histograms(grey, 16, 8, True))
+    good = literal.good_blocks(getattr(literal, which)(grey), 16, threshold)
+    reference_blocks = literal.blocks(literal.cell_histograms(literal.grey_square(reference_image, 144), 16, 8, True))
+    assert 0 < good.sum() < len(good), "the picture must have good and confusing regions"
+    np.testing.assert_array_equal(query.good, good)
+    np.testing.assert_allclose(query.fine, query_blocks, atol=1e-4)
+    assert technique.match(query, reference.fine).score == pytest.approx(
+        literal.regional_match(query_blocks, good, reference_blocks), abs=1e-4
+    )
+
+
+def test_hog_is_the_cosine_of_whole_image_histograms():
+    technique = create("hog", {"w1": 64})
+    images = [textured(8), textured(9)]
+    vectors = []
+    for image in images:
+        cells = literal.cell_histograms(literal.grey_square(image, 64), 8, 9, False)
+        vector = literal.blocks(cells).ravel()
+        vectors.append(vector / np.linalg.norm(vector))
+    query, other = (technique.encode(image) for image in images)
+    scores, _ = technique.coarse_scores(query, np.stack([query.coarse, other.coarse]))
+    np.testing.assert_allclose(query.coarse, vectors[0], atol=2e-4)  # half precision
+    np.testing.assert_allclose(scores, [1.0, vectors[0] @ vectors[1]], atol=1e-3)

@@ -1,0 +1,80 @@
+"""What every technique promises, and how it is chosen by name."""
+
+import numpy as np
+import pytest
+from pictures import textured
+
+from edgevpr.errors import UsageError
+from edgevpr.techniques import create, names
+
+
+@pytest.mark.parametrize("name", names())
+def test_descriptors_have_the_form_that_the_spec_says(name):
+    technique = create(name)
+    for image in (textured(1), np.dstack([textured(1)] * 3), np.zeros((16, 16), np.uint8)):
+        descriptor = technique.encode(image)
+        assert descriptor.coarse.shape == technique.spec.coarse.shape
+        assert descriptor.coarse.dtype == np.dtype(technique.spec.coarse.dtype)
+        assert np.isfinite(descriptor.coarse.astype(np.float32)).all()
+        assert 0 <= descriptor.quality <= 1
+        if technique.spec.fine is not None:
+            assert descriptor.fine.shape == technique.spec.fine.shape
+            assert descriptor.good.shape == technique.spec.fine.shape[:1]
+
+
+@pytest.mark.parametrize("name", names())
+def test_an_image_is_most_like_itself(name):
+    technique = create(name)
+    descriptors = [technique.encode(textured(seed)) for seed in range(4)]
+    rows = np.stack([d.coarse for d in descriptors])
+    for at, query in enumerate(descriptors):
+        scores, _ = technique.coarse_scores(query, rows)
+        assert scores.argmax() == at
+        assert (0 <= scores).all()
+        assert (scores <= 1).all()
+        if technique.spec.fine is not None:
+            fine = [technique.match(query, other.fine).score for other in descriptors]
+            assert int(np.argmax(fine)) == at
+            assert 0 <= min(fine) <= max(fine) <= 1
+
+
+def test_a_picture_that_says_nothing_scores_nothing():
+    technique = create("cohog")
+    grey_wall = technique.encode(np.full((120, 160), 128, np.uint8))
+    assert grey_wall.quality == 0
+    assert technique.match(grey_wall, technique.encode(textured(1)).fine).score == 0
+
+
+def test_masked_pixels_do_not_speak():
+    technique = create("cohog")
+    image = textured(3)
+    mask = np.ones(image.shape, bool)
+    mask[:, 80:] = False
+    seen = technique.encode(image, mask)
+    side = int(len(seen.good) ** 0.5)
+    assert not seen.good.reshape(side, side)[:, side // 2 :].any()
+    assert seen.good.any()
+    changed = image.copy()
+    changed[:, 100:] = 255 - changed[:, 100:]
+    np.testing.assert_allclose(technique.encode(changed, mask).fine, seen.fine, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters", "says"),
+    [
+        ("cohg", {}, "There is no technique `cohg`"),
+        ("cohog", {"gtt": 1}, "did you mean `gt`"),
+        ("cohog", {"gt": "much"}, "must be a number"),
+        ("cohog", {"gt": 7}, "share of the largest entropy"),
+        ("cohog", {"w2": 100}, "multiple of w2"),
+        ("cohog", {"entropy": "renyi"}, "filled_bins or shannon"),
+        ("hog", {"cell": 0}, "multiple of cell"),
+    ],
+)
+def test_wrong_names_and_parameters_are_explained(name, parameters, says):
+    with pytest.raises(UsageError, match=says):
+        create(name, parameters)
+
+
+def test_parameters_are_read_from_text():
+    assert create("cohog", {"w1": "256", "gt": "0.45"}).spec.parameters["w1"] == 256
