@@ -148,7 +148,7 @@ class PlaceMatch:
 
     query: str
     t_mono_s: float
-    candidate: Candidate | None
+    candidate: Candidate
     accepted: bool
     reason: str
     position: Position | None

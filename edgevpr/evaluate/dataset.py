@@ -32,15 +32,16 @@ def load_dataset(query_dir: str | Path, ref_dir: str | Path, ground_truth: str |
 
     Columns of the CSV: query_file, ref_files (names separated by spaces); where present ref_files_loose (ignored
     unless they are in ref_files too) and status (only `ok` is scored). Other columns, and queries that the CSV does
-    not name, are left alone. Raises UsageError with file, line, value and what to do.
+    not name, are left alone. Raises UsageError with file, line, value and what to do, and SourceError for a folder
+    without images.
     """
+    query_paths = {path.name: path for path in list_images(query_dir)}
     references = tuple(list_images(ref_dir))
     known = frozenset(path.name for path in references)
-    queries = {}
+    queries: dict[str, Query | None] = {}
     for where, row in _rows(Path(ground_truth)):
         name = row["query_file"]
-        path = Path(query_dir) / name
-        if not name or not path.is_file():
+        if name not in query_paths:
             raise UsageError(f"{where}: the query `{name}` is not in {query_dir}: correct its name, or drop the row.")
         if name in queries:
             raise UsageError(f"{where}: the query `{name}` has a row already: keep one, with all its ref_files.")
@@ -52,7 +53,7 @@ def load_dataset(query_dir: str | Path, ref_dir: str | Path, ground_truth: str |
                 f"{where}: the query `{name}` has no ref_files: name at least one, or give it a status other than "
                 "`ok`, so that it is not scored."
             )
-        queries[name] = Query(path, right, loose - right) if scored else None
+        queries[name] = Query(query_paths[name], right, loose - right) if scored else None
     scored_queries = tuple(query for query in queries.values() if query)
     if not scored_queries:
         raise UsageError(f"{ground_truth} scores no query: it needs a row with ref_files (and status `ok`).")

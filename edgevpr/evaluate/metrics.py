@@ -10,11 +10,11 @@ import numpy as np
 
 
 def counting(ranked: np.ndarray, ignored: np.ndarray) -> np.ndarray:
-    """Take the references that are neither right nor wrong out of a ranking, so that the next best counts.
+    """Where in a ranking the references stand that count: those that are neither right nor wrong are passed over.
 
     `ranked` is int (K,), numbers of references, best first; `ignored` is bool (references,).
     """
-    return ranked[~ignored[ranked]]
+    return np.flatnonzero(~ignored[ranked])
 
 
 def first_right(ranked: np.ndarray, right: np.ndarray) -> float:

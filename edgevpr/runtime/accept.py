@@ -10,7 +10,7 @@ from edgevpr.types import Technique
 
 @dataclass(frozen=True, slots=True)
 class AcceptRule:
-    """Accept from `min_score` on, where the best place beats the best one farther than `neighbour_m` by `min_margin`."""
+    """Accept from `min_score` on, if the best place beats the best one farther than `neighbour_m` by `min_margin`."""
 
     min_score: float
     min_margin: float

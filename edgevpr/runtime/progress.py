@@ -7,19 +7,22 @@ from typing import TextIO, TypeVar
 T = TypeVar("T")
 
 
-def progress(iterable: Iterable[T], total: int, label: str, stream: TextIO | None = None) -> Iterator[T]:
-    """Yield what `iterable` yields, and say on `stream` (None: stderr) how many of `total` are done."""
+def progress(iterable: Iterable[T], total: int | None, label: str, stream: TextIO | None = None) -> Iterator[T]:
+    """Yield what `iterable` yields, and say on `stream` (None: stderr) how many of `total` (None: nobody knows) are done."""
     stream = stream or sys.stderr
     terminal = stream.isatty()
     shown = None
     for done, item in enumerate(iterable, start=1):
         yield item
-        percent = 100 * done // max(total, 1)
-        step = percent if terminal else percent // 10
+        if total:
+            percent = 100 * done // total
+            step, text = percent if terminal else percent // 10, f"{label}  {done}/{total}  {percent} %"
+        else:
+            step, text = done // (1 if terminal else 100), f"{label}  {done}"
         if step != shown:
             shown = step
             # The cursor goes back to the start of the line, so that an error message is written over it.
-            stream.write(f"{label}  {done}/{total}  {percent} %" + ("\r" if terminal else "\n"))
+            stream.write(text + ("\r" if terminal else "\n"))
             stream.flush()
     if terminal and shown is not None:
         stream.write("\n")

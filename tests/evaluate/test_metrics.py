@@ -3,6 +3,7 @@
 import csv
 import math
 import os
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -21,16 +22,14 @@ def literal_curve(scores, correct):
         false_positives = sum(1 for s, c in zip(scores, correct, strict=True) if not c and s >= threshold)
         false_negatives = sum(1 for s, c in zip(scores, correct, strict=True) if c and s < threshold)
         right = true_positives + false_negatives
-        points.append(
-            (true_positives / (true_positives + false_positives), true_positives / right if right else 0.0)
-        )
+        points.append((true_positives / (true_positives + false_positives), true_positives / right if right else 0.0))
     return points
 
 
 def literal_auc(points):
     """2.3, term by term."""
     total = 0.0
-    for (p, r), (p_next, r_next) in zip(points[:-1], points[1:], strict=True):
+    for (p, r), (p_next, r_next) in pairwise(points):
         total += (p + p_next) / 2 * (r_next - r)
     return total
 
@@ -119,8 +118,10 @@ def test_recall_at_k_counts_queries_with_a_right_reference_among_the_first_k():
 
 
 def test_an_ignored_reference_leaves_its_rank_to_the_next():
-    ignored = np.array([True, False, False, True])
-    assert metrics.counting(np.array([3, 2, 0, 1]), ignored).tolist() == [2, 1]
+    ranked, ignored = np.array([3, 2, 0, 1]), np.array([True, False, False, True])
+    at = metrics.counting(ranked, ignored)
+    assert at.tolist() == [1, 3]
+    assert metrics.first_right(ranked[at], right=np.array([False, True, False, False])) == 1
 
 
 def test_pcu_of_the_slowest_technique_is_its_precision():

@@ -144,8 +144,7 @@ def test_sqlite_full_says_make_room(map_path):
     (pages,) = place_map._db.execute("PRAGMA page_count").fetchone()
     place_map._db.execute(f"PRAGMA max_page_count = {pages + 1}")
     with pytest.raises(MapError, match="the disk is full: make room"):
-        for number in range(10, 20):
-            place_map.add(frame(number), descriptor(number))
+        [place_map.add(frame(number), descriptor(number)) for number in range(10, 20)]
     place_map._db.execute("PRAGMA max_page_count = 100000")
     place_map.add(frame(20), descriptor(20))  # room again: it goes on
     place_map.close()
@@ -169,7 +168,7 @@ def test_a_map_from_a_newer_version_is_refused(map_path):
     db.execute("UPDATE edgevpr_map SET value = '2' WHERE key = 'format_version'")
     db.commit()
     db.close()
-    with pytest.raises(MapError, match="newer edgevpr .*update edgevpr"):
+    with pytest.raises(MapError, match=r"newer edgevpr .*update edgevpr"):
         PlaceMap.open(map_path)
 
 

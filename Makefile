@@ -1,0 +1,34 @@
+# Each target does all of its own set-up: a virtual environment in .venv, made once and again when pyproject.toml changes.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+# One thread for the matrix products: what is measured is what one core does, and small products gain nothing from more.
+export OPENBLAS_NUM_THREADS ?= 1
+
+.PHONY: demo test lint results clean
+
+demo: $(VENV)/installed
+	$(BIN)/edgevpr demo --out demo_out
+
+test: $(VENV)/installed lint
+	$(BIN)/python -m pytest
+
+lint: $(VENV)/installed
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports --no-cache
+
+# Figures on real image sets (../shared/data, or the folder named in EDGEVPR_DATA) into benchmarks/results/.
+results: $(VENV)/installed
+	$(BIN)/python benchmarks/run_sets.py
+
+clean:
+	rm -rf $(VENV) demo_out dist build
+
+$(VENV)/installed: pyproject.toml
+	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(None if (3, 10) <= v < (3, 14) else "edgevpr needs Python 3.10 to 3.13, this is %d.%d: make PYTHON=python3.11" % v)'
+	@$(PYTHON) -c 'import struct, sys; sys.exit(None if struct.calcsize("P") == 8 else "edgevpr needs a 64-bit operating system: NumPy, OpenCV and onnxruntime have no wheels for 32 bits")'
+	@$(PYTHON) -m venv $(VENV) || { echo "No venv module: install it (Debian, Ubuntu: sudo apt install python3-venv)"; exit 1; }
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --upgrade pip
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
+	@touch $@

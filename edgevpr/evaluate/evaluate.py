@@ -1,0 +1,185 @@
+"""Measure a technique on a data set through the code that flies: map file, index, retrieval, stage meter."""
+
+import tempfile
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from edgevpr.config import load_config
+from edgevpr.evaluate import metrics
+from edgevpr.evaluate.dataset import Dataset
+from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.retrieve import rank
+from edgevpr.power.boards import load_board
+from edgevpr.power.equations import pack_ah, parse_pack, queries_ah, rail_ah, stage_energy_j
+from edgevpr.power.meter import stage
+from edgevpr.runtime.images import read_image
+from edgevpr.runtime.mapping import build_map
+from edgevpr.techniques import create
+from edgevpr.types import Frame, StageCost, Technique
+
+T = TypeVar("T")
+Progress = Callable[[Iterable[T], int, str], Iterable[T]]
+
+
+@dataclass(frozen=True, slots=True)
+class TechniqueResult:
+    """What a technique reached on a data set, and what it cost.
+
+    Times are means over the queries: `t_match_s` is for all references, `t_match_per_ref_s` for one. `u_encode` and
+    `u_match` are shares of all cores over those times (5.1). `descriptor_bytes` a place are in RAM, `fine_bytes` on
+    disk. `ah_total` (5.7) is drawn from the pack, `ah_total_cpu_rail` from the thesis's rail of 2.5 V; `ah_assumes`
+    says by what. `roc_auc` is None where all best matches are right, or none is. `pcu` needs all techniques that are
+    compared: `compare` fills it in, with the `t_encode_max_s` it used.
+    """
+
+    technique: str
+    parameters: dict[str, int | float | str]
+    queries: int
+    references: int
+    recall_at_1: float
+    recall_at_5: float
+    recall_at_10: float
+    precision_at_100_recall: float
+    recall_at_100_precision: float
+    auc: float
+    ep: float
+    roc_auc: float | None
+    t_encode_s: float
+    t_match_s: float
+    t_match_per_ref_s: float
+    descriptor_bytes: int
+    fine_bytes: int
+    u_encode: float
+    u_match: float
+    ah_total: float
+    ah_total_cpu_rail: float
+    ah_assumes: str
+    pcu: float | None = None
+    t_encode_max_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _Answer:
+    """One query: the score of its best match, the rank of the first right one, the cost of both stages."""
+
+    score: float
+    first_right: float
+    encoding: StageCost
+    matching: StageCost
+
+
+def evaluate(
+    technique_name: str,
+    dataset: Dataset,
+    parameters: dict[str, Any] | None = None,
+    progress: Progress = lambda items, total, label: items,
+) -> TechniqueResult:
+    """Map the references, ask every query (all places compared in full), and score the answers.
+
+    Raises UsageError for an unknown technique or parameter, ImageError for an image that cannot be used, and MapError
+    where the temporary map cannot be written.
+    """
+    technique = create(technique_name, parameters)
+    with tempfile.TemporaryDirectory(prefix="edgevpr-eval-") as folder:
+        map_path = Path(folder) / "references.gpkg"
+        references = progress(dataset.references, len(dataset.references), f"{technique_name}: references")
+        with PlaceMap.create(map_path, technique.spec) as place_map:
+            build_map((Frame(read_image(path), path.name, 0.0) for path in references), technique, place_map)
+        with PlaceMap.open(map_path) as place_map:
+            index = load_index(place_map, len(place_map) * bytes_per_place(technique.spec))
+            answers = list(_answers(technique, dataset, place_map, index, progress))
+    return _summary(technique, len(dataset.references), answers)
+
+
+def compare(results: Iterable[TechniqueResult]) -> list[TechniqueResult]:
+    """Fill in the PCU, which measures each technique against the slowest encoder among them."""
+    results = list(results)
+    slowest_s = max(result.t_encode_s for result in results)
+    return [
+        replace(
+            result,
+            pcu=metrics.pcu(result.precision_at_100_recall, result.t_encode_s, slowest_s),
+            t_encode_max_s=slowest_s,
+        )
+        for result in results
+    ]
+
+
+def as_json(results: Iterable[TechniqueResult]) -> dict[str, Any]:
+    """{"techniques": {name: every field of its result}}, for `json.dump`."""
+    return {"techniques": {result.technique: asdict(result) for result in results}}
+
+
+def _answers(
+    technique: Technique, dataset: Dataset, place_map: PlaceMap, index: PlaceIndex, progress: Progress
+) -> Iterator[_Answer]:
+    names = [path.name for path in dataset.references]  # slots of the index follow the order of mapping
+    # The first query pays for lazy imports, lookup tables and a cold disk: one that is not counted goes before it.
+    rank(technique, technique.encode(read_image(dataset.queries[0].path)), place_map, index)
+    for query in progress(dataset.queries, len(dataset.queries), f"{technique.spec.name}: queries"):
+        image = read_image(query.path)
+        with stage() as encoding:
+            descriptor = technique.encode(image)
+        with stage() as matching:
+            ranking = rank(technique, descriptor, place_map, index)
+        at = metrics.counting(ranking.slots, np.array([name in query.ignored for name in names]))
+        right = np.array([name in query.right for name in names])
+        yield _Answer(
+            float(ranking.scores[at[0]]),
+            metrics.first_right(ranking.slots[at], right),
+            encoding.cost,
+            matching.cost,
+        )
+
+
+def _summary(technique: Technique, references: int, answers: list[_Answer]) -> TechniqueResult:
+    queries = len(answers)
+    scores = np.array([answer.score for answer in answers])
+    ranks = np.array([answer.first_right for answer in answers])
+    precision, recall = metrics.precision_recall(scores, ranks == 0)
+
+    config = load_config(None)
+    board, pack, efficiency = load_board("this"), parse_pack(config.battery.pack), config.battery.regulator_efficiency
+    encoding, matching = _total(answer.encoding for answer in answers), _total(answer.matching for answer in answers)
+    t_encode_s, t_match_s = encoding.wall_s / queries, matching.wall_s / queries
+    u_encode, u_match = encoding.utilisation(board.cores), matching.utilisation(board.cores)
+    query_j = stage_energy_j(board.idle_w, board.full_w, u_encode, t_encode_s)
+    query_j += stage_energy_j(board.idle_w, board.full_w, u_match, t_match_s)
+
+    return TechniqueResult(
+        technique=technique.spec.name,
+        parameters=technique.spec.parameters,
+        queries=queries,
+        references=references,
+        recall_at_1=metrics.recall_at(1, ranks),
+        recall_at_5=metrics.recall_at(5, ranks),
+        recall_at_10=metrics.recall_at(10, ranks),
+        precision_at_100_recall=metrics.precision_at_100_recall(precision, recall),
+        recall_at_100_precision=metrics.recall_at_100_precision(precision, recall),
+        auc=metrics.auc(precision, recall),
+        ep=metrics.extended_precision(precision, recall),
+        roc_auc=metrics.roc_auc(scores, ranks == 0),
+        t_encode_s=t_encode_s,
+        t_match_s=t_match_s,
+        t_match_per_ref_s=t_match_s / references,
+        descriptor_bytes=technique.spec.coarse.nbytes,
+        fine_bytes=technique.spec.fine.nbytes if technique.spec.fine else 0,
+        u_encode=u_encode,
+        u_match=u_match,
+        ah_total=queries_ah(queries, pack_ah(query_j, pack, efficiency)),
+        ah_total_cpu_rail=queries_ah(queries, rail_ah(query_j)),
+        ah_assumes=(
+            f"{board.title}, {board.idle_w:g} W idle and {board.full_w:g} W at full load ({board.source}), "
+            f"pack {config.battery.pack}, regulator efficiency {efficiency:g}"
+        ),
+    )
+
+
+def _total(costs: Iterable[StageCost]) -> StageCost:
+    costs = list(costs)
+    return StageCost(sum(cost.wall_s for cost in costs), sum(cost.cpu_s for cost in costs))

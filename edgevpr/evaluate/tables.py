@@ -1,0 +1,56 @@
+"""Results as tables: plain text for a terminal, Markdown for a page."""
+
+from collections.abc import Sequence
+
+from edgevpr.evaluate.evaluate import TechniqueResult
+
+HEADINGS = (
+    "technique", "recall@1", "@5", "@10", "P@100%R", "R@100%P", "AUC", "EP", "ROC", "PCU",
+    "t_e ms", "t_m ms", "t_m/ref ms", "RAM B/place", "disk B/place", "U_e", "U_m", "mAh/query",
+)  # fmt: skip
+
+
+def cells(result: TechniqueResult) -> list[str]:
+    """One result as texts, in the order of `HEADINGS`."""
+    shares = [
+        result.recall_at_1, result.recall_at_5, result.recall_at_10, result.precision_at_100_recall,
+        result.recall_at_100_precision, result.auc, result.ep, result.roc_auc, result.pcu,
+    ]  # fmt: skip
+    return [
+        result.technique,
+        *("-" if share is None else f"{share:.3f}" for share in shares),
+        f"{result.t_encode_s * 1000:.1f}",
+        f"{result.t_match_s * 1000:.1f}",
+        f"{result.t_match_per_ref_s * 1000:.3f}",
+        str(result.descriptor_bytes),
+        str(result.fine_bytes),
+        f"{result.u_encode:.2f}",
+        f"{result.u_match:.2f}",
+        f"{result.ah_total * 1000 / result.queries:.2g}",
+    ]
+
+
+def text(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Columns in line, the first to the left and the others to the right."""
+    widths = [max(len(line[at]) for line in (headings, *rows)) for at in range(len(headings))]
+    return "\n".join(
+        "  ".join(cell.rjust(width) if at else cell.ljust(width) for at, (cell, width) in enumerate(columns)).rstrip()
+        for columns in (list(zip(line, widths, strict=True)) for line in (headings, *rows))
+    )
+
+
+def markdown(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table, numbers to the right."""
+    ruler = ["---"] + ["---:"] * (len(headings) - 1)
+    return "\n".join("| " + " | ".join(line) + " |" for line in (headings, ruler, *rows))
+
+
+def results_text(results: Sequence[TechniqueResult]) -> str:
+    """The table that `edgevpr eval` prints, with what its figures rest on. `results` come from `compare`."""
+    first = results[0]
+    return (
+        f"{text(HEADINGS, [cells(result) for result in results])}\n\n"
+        f"{first.queries} queries scored against {first.references} references; times are means over the queries.\n"
+        f"PCU: log10(t_e,max / t_e + 9) x P@100%R with t_e,max = {first.t_encode_max_s * 1000:.1f} ms.\n"
+        f"mAh: {first.ah_assumes}."
+    )

@@ -1,0 +1,40 @@
+"""The address of a MAVLink link, as the user writes it."""
+
+from dataclasses import dataclass
+
+from edgevpr.errors import LinkError
+
+FORMS = "udpout:HOST:PORT, udpin:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD"
+BAUD_MIN, BAUD_MAX = 1200, 12_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class LinkAddress:
+    """Where the other end is: `where` is a host or a serial device, `number` a port or a baud rate."""
+
+    kind: str  # "udpout", "udpin", "tcp" or "serial"
+    where: str
+    number: int
+
+    def __str__(self) -> str:
+        return f"{self.kind}:{self.where}:{self.number}"
+
+
+def parse_link(url: str) -> LinkAddress:
+    """Read a link such as `udpout:127.0.0.1:14550`; raises LinkError with one sentence for anything else."""
+    kind, _, rest = url.partition(":")
+    where, _, number = rest.rpartition(":")  # from the right: names in /dev/serial/by-path hold colons
+    if kind not in ("udpout", "udpin", "tcp", "serial") or not where.strip() or not number:
+        raise LinkError(f"{url!r} is no MAVLink link: write {FORMS}.")
+    if kind == "serial":
+        if not _is_whole_number(number, BAUD_MIN, BAUD_MAX):
+            raise LinkError(f"{url}: the baud rate must be a number such as 57600 or 921600, not {number!r}.")
+    elif ":" in where:
+        raise LinkError(f"{url}: {where!r} is no host: give a name or an IPv4 address.")
+    elif not _is_whole_number(number, 1, 65_535):
+        raise LinkError(f"{url}: the port must be a whole number from 1 to 65535, not {number!r}.")
+    return LinkAddress(kind, where, int(number))
+
+
+def _is_whole_number(text: str, low: int, high: int) -> bool:
+    return text.isascii() and text.isdigit() and len(text) < 10 and low <= int(text) <= high

@@ -1,0 +1,255 @@
+"""The link to the flight controller: one thread, the only one to touch the socket or serial port."""
+
+import logging
+import select
+import socket
+import struct
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+
+from edgevpr.errors import LinkError
+from edgevpr.mavlink import messages
+from edgevpr.mavlink.address import LinkAddress, parse_link
+from edgevpr.mavlink.messages import Fix, Health
+from edgevpr.mavlink.outbox import Outbox
+from edgevpr.mavlink.peer import Autopilot
+from edgevpr.mavlink.transport import Transport, open_transport
+from edgevpr.mavlink.wire import Message, Receiver, mavlink
+
+__all__ = ["Link", "LinkAddress", "LinkStats", "parse_link"]
+
+HEARTBEAT_S = 1.0
+TURN_S = 0.25  # how long the thread sleeps where nothing wakes it
+RETRY_FIRST_S, RETRY_MAX_S = 0.2, 2.0
+STUCK_S = 0.5  # a port that has taken no byte for so long is opened anew: what waits in it would come out late
+FLUSH_S = 0.5
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class LinkStats:
+    """What a link has done so far. `trouble` is why it is, or last was, not open: None once something arrives."""
+
+    connected: bool
+    trouble: str | None
+    autopilot_heard: bool
+    autopilot_system_id: int | None
+    sent: dict[str, int]
+    received: dict[str, int]
+    acks: dict[str, int]
+    dropped_stale_fixes: int
+    dropped_queue_full: int
+    bad_bytes: int
+    reopened: int
+
+
+class Link:
+    """Sends what it is given and a heartbeat a second, listens, and outlives every loss of the other end.
+
+    `send`, `send_fix`, `set_health` and `stats` may be called from any thread, never block and never raise.
+    """
+
+    def __init__(self, address: LinkAddress, component_id: int = 197, clock: Callable[[], float] = time.monotonic):
+        self._address = address
+        self._clock = clock
+        self._health = Health.BOOT
+        self._outbox = Outbox()
+        self._autopilot = Autopilot(component_id)
+        self._receiver = Receiver()
+        self._packer = mavlink.MAVLink(None, srcSystem=1, srcComponent=component_id)
+        self._transport: Transport | None = None
+        self._unsent = b""  # the rest of a message of which the port took only a part
+        self._blocked_since_s: float | None = None
+        self._heartbeat_due_s = clock()
+        self._sent: Counter[str] = Counter()
+        self._reopened = 0
+        self._retry_s = RETRY_FIRST_S
+        self._trouble: str | None = None
+        self._closing = threading.Event()
+        self._bell, self._bell_button = socket.socketpair()  # wakes the thread when there is something to send
+        self._bell_button.setblocking(False)
+        self._thread = threading.Thread(target=self._run, name="mavlink", daemon=True)
+
+    def start(self) -> None:
+        """Open the port and start the thread.
+
+        Raises LinkError for what the user must put right. A device or server that is absent is no error: it is
+        tried again and again, and `stats` says so.
+        """
+        try:
+            self._transport = open_transport(self._address)
+        except OSError as error:
+            self._note_trouble(error)
+        except LinkError:
+            self._close_all()
+            raise
+        self._thread.start()
+
+    def send(self, *outgoing: Message) -> None:
+        """Queue messages; where the queue is full, the oldest are dropped and counted."""
+        for message in outgoing:
+            self._outbox.put(message)
+        self._ring()
+
+    def send_fix(self, fix: Fix) -> None:
+        """Queue a position fix. It leaves within a second and to an autopilot that is there, or never."""
+        self._outbox.put_fix(fix, self._clock())
+        self._ring()
+
+    def set_health(self, health: Health) -> None:
+        """Set what the next heartbeats say."""
+        self._health = health
+
+    def stats(self) -> LinkStats:
+        transport = self._transport
+        return LinkStats(
+            connected=transport is not None and transport.connected,
+            trouble=self._trouble,
+            autopilot_heard=self._autopilot.listens(self._clock()),
+            autopilot_system_id=self._autopilot.system_id,
+            sent=dict(self._sent),
+            received=dict(self._receiver.received),
+            acks=dict(self._autopilot.acks),
+            dropped_stale_fixes=self._outbox.dropped_stale_fixes,
+            dropped_queue_full=self._outbox.dropped_queue_full,
+            bad_bytes=self._receiver.bad_bytes,
+            reopened=self._reopened,
+        )
+
+    def close(self) -> None:
+        """Send what waits, for half a second at most, and close the port."""
+        self._closing.set()
+        self._ring()
+        if self._thread.is_alive():
+            self._thread.join(2 * FLUSH_S)
+
+    def __enter__(self) -> "Link":
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # All below runs in the link's own thread.
+
+    def _run(self) -> None:
+        while not self._closing.is_set():
+            try:
+                if self._transport is None:
+                    self._reopen()
+                else:
+                    self._turn(self._transport, timeout_s=TURN_S)
+            except (OSError, LinkError) as error:
+                self._lose(error)
+        self._flush()
+        self._close_all()
+
+    def _reopen(self) -> None:
+        if self._closing.wait(self._retry_s):
+            return
+        self._retry_s = min(2 * self._retry_s, RETRY_MAX_S)
+        self._outbox.drop_stale_fixes(self._clock())
+        self._transport = open_transport(self._address)
+        self._reopened += 1
+
+    def _turn(self, transport: Transport, timeout_s: float) -> None:
+        """Wait until there is something to do, or the time is up; then read and write what can be."""
+        writing = [transport] if self._unsent else []
+        readable, _, _ = select.select([transport, self._bell], writing, [], timeout_s)
+        if self._bell in readable:
+            self._bell.recv(4096)
+        if transport in readable:
+            self._receive(transport)
+        if transport.connected:
+            self._transmit(transport)
+
+    def _receive(self, transport: Transport) -> None:
+        data = transport.read()
+        if data:
+            self._retry_s = RETRY_FIRST_S
+            if self._trouble is not None:
+                log.info("%s is back", self._address)
+                self._trouble = None
+        now_s = self._clock()
+        for message in self._receiver.feed(data):
+            if self._autopilot.hear(message, now_s):
+                self._packer.srcSystem = self._autopilot.system_id
+                transport.answer_sender()
+
+    def _transmit(self, transport: Transport) -> None:
+        while self._unsent or self._pack_next():
+            taken = transport.write(self._unsent)
+            self._unsent = self._unsent[taken:]
+            if taken:
+                self._blocked_since_s = None
+            elif self._blocked_since_s is None:
+                self._blocked_since_s = self._clock()
+            elif self._clock() - self._blocked_since_s > STUCK_S:
+                raise ConnectionError("the port takes no more bytes")
+            if self._unsent:
+                return
+
+    def _pack_next(self) -> bool:
+        """Choose the next message and pack it; False where there is none."""
+        while (message := self._next_message(self._clock())) is not None:
+            try:
+                self._unsent = message.pack(self._packer)
+            except (struct.error, OverflowError) as error:  # a value that its field cannot hold must not end the link
+                log.error("%s is not sent: %s", message, error)
+                continue
+            self._packer.seq = (self._packer.seq + 1) % 256
+            self._sent[message.get_type()] += 1
+            return True
+        return False
+
+    def _next_message(self, now_s: float) -> Message | None:
+        late_s = now_s - self._heartbeat_due_s
+        if late_s >= 0:
+            self._heartbeat_due_s = now_s + HEARTBEAT_S - late_s % HEARTBEAT_S  # in step, whatever was missed
+            return messages.heartbeat(self._health)
+        if self._autopilot.listens(now_s):
+            fix = self._outbox.next_fix(now_s)
+            if fix is not None:
+                return messages.position_fix(fix, now_s, self._autopilot.system_id)
+        else:
+            self._outbox.drop_stale_fixes(now_s)
+        return self._outbox.next_message()
+
+    def _lose(self, error: Exception) -> None:
+        if self._transport is not None:
+            self._transport.close()
+            self._transport = None
+        self._unsent = b""
+        self._blocked_since_s = None
+        self._receiver.forget_partial_message()
+        self._note_trouble(error)
+
+    def _note_trouble(self, error: Exception) -> None:
+        reason = getattr(error, "strerror", None) or str(error)
+        if reason != self._trouble:
+            self._trouble = reason
+            log.warning("%s is not there (%s); trying again", self._address, reason)
+
+    def _flush(self) -> None:
+        give_up_s = time.monotonic() + FLUSH_S
+        with suppress(OSError):
+            while self._transport is not None and self._transport.connected and time.monotonic() < give_up_s:
+                self._turn(self._transport, timeout_s=0.01)
+                if not self._outbox and not self._unsent and self._transport.idle():
+                    break
+
+    def _close_all(self) -> None:
+        if self._transport is not None:
+            self._transport.close()
+            self._transport = None
+        self._bell.close()
+        self._bell_button.close()
+
+    def _ring(self) -> None:
+        with suppress(OSError):  # it rings already, or the link is closed
+            self._bell_button.send(b"!")

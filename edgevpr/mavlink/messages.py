@@ -1,0 +1,158 @@
+"""One pure function a message: values in, a pymavlink message out. No I/O, no clock.
+
+`t_mono_s` is the system's monotonic clock, the only clock of a link: an autopilot keeps one correction of time for
+all that comes over it.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+
+from edgevpr.mavlink.wire import Message, mavlink
+
+POSITION_FIX = mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE  # 43003
+AUTOPILOT = mavlink.MAV_COMP_ID_AUTOPILOT1
+TEXT_BYTES = 50
+
+
+class Health(IntEnum):
+    """What the heartbeat says of this companion (MAV_STATE)."""
+
+    BOOT = mavlink.MAV_STATE_BOOT
+    ACTIVE = mavlink.MAV_STATE_ACTIVE
+    CRITICAL = mavlink.MAV_STATE_CRITICAL  # it runs, but cannot do its job: no frames, no map
+
+
+class Severity(IntEnum):
+    """How much a text matters (MAV_SEVERITY)."""
+
+    ERROR = mavlink.MAV_SEVERITY_ERROR
+    WARNING = mavlink.MAV_SEVERITY_WARNING
+    INFO = mavlink.MAV_SEVERITY_INFO
+
+
+@dataclass(frozen=True, slots=True)
+class Fix:
+    """A position fit to be sent: where the vehicle was when the frame was taken, at `t_frame_s` monotonic.
+
+    Raises ValueError for a position off the Earth and for an accuracy (1 sigma) that is not finite and above zero.
+    """
+
+    lat_deg: float
+    lon_deg: float
+    accuracy_m: float
+    t_frame_s: float
+
+    def __post_init__(self) -> None:
+        if not (abs(self.lat_deg) <= 90 and abs(self.lon_deg) <= 180):  # so written, NaN is refused as well
+            raise ValueError(f"latitude {self.lat_deg}, longitude {self.lon_deg} is no place on the Earth")
+        if not 0 < self.accuracy_m < math.inf:
+            raise ValueError(f"an accuracy of {self.accuracy_m} m says nothing: it must be finite and above zero")
+        if not math.isfinite(self.t_frame_s):
+            raise ValueError(f"a frame taken at {self.t_frame_s} s has no age")
+
+
+def heartbeat(health: Health) -> Message:
+    """HEARTBEAT (0) of an onboard computer."""
+    return mavlink.MAVLink_heartbeat_message(
+        type=mavlink.MAV_TYPE_ONBOARD_CONTROLLER,
+        autopilot=mavlink.MAV_AUTOPILOT_INVALID,
+        base_mode=0,
+        custom_mode=0,
+        system_status=health,
+        mavlink_version=3,
+    )
+
+
+def position_fix(fix: Fix, t_sent_s: float, target_system: int) -> Message:
+    """COMMAND_INT (75) with command 43003, in the form that ArduPilot accepts: global frame, no altitude (NaN).
+
+    The time between `fix.t_frame_s` and `t_sent_s` goes along as the processing time, so that the autopilot knows
+    when the vehicle was there. As a float32, `t_sent_s` is good to 8 ms after a day, to 60 ms after ten.
+    """
+    return mavlink.MAVLink_command_int_message(
+        target_system=target_system,
+        target_component=AUTOPILOT,
+        frame=mavlink.MAV_FRAME_GLOBAL,
+        command=POSITION_FIX,
+        current=0,
+        autocontinue=0,
+        param1=t_sent_s,
+        param2=max(0.0, t_sent_s - fix.t_frame_s),
+        param3=fix.accuracy_m,
+        param4=math.nan,
+        x=round(fix.lat_deg * 1e7),
+        y=round(fix.lon_deg * 1e7),
+        z=math.nan,
+    )
+
+
+def place_match(t_mono_s: float, place_id: int, score: float) -> tuple[Message, Message]:
+    """The event of an accepted match: NAMED_VALUE_INT (252) `vpr_place` and NAMED_VALUE_FLOAT (251) `vpr_score`."""
+    return (
+        mavlink.MAVLink_named_value_int_message(_boot_ms(t_mono_s), b"vpr_place", place_id),
+        _named_float(t_mono_s, b"vpr_score", score),
+    )
+
+
+def query_figures(t_mono_s: float, cpu_share: float, used_mah: float) -> tuple[Message, Message]:
+    """The cost of a query: `vpr_cpu`, the share of the whole machine (0..1), and `vpr_mah`, the charge used so far."""
+    return (_named_float(t_mono_s, b"vpr_cpu", cpu_share), _named_float(t_mono_s, b"vpr_mah", used_mah))
+
+
+def computer_status(
+    t_mono_s: float,
+    core_shares: Sequence[float],
+    ram_used_bytes: int,
+    ram_total_bytes: int,
+    temperature_c: float | None = None,
+) -> Message:
+    """ONBOARD_COMPUTER_STATUS (390): the load of each core (0..1; the first eight are told), RAM, and temperature."""
+    percents = [min(100, max(0, round(100 * share))) for share in core_shares[:8]]
+    temperature = 127 if temperature_c is None else min(126, max(-128, round(temperature_c)))
+    return mavlink.MAVLink_onboard_computer_status_message(
+        time_usec=round(t_mono_s * 1e6),
+        uptime=_boot_ms(t_mono_s),
+        type=0,
+        ram_usage=ram_used_bytes >> 20,
+        ram_total=ram_total_bytes >> 20,
+        cpu_cores=percents + [255] * (8 - len(percents)),
+        temperature_core=[temperature] + [127] * 7,
+        # The rest is not measured; the largest value of its type says so.
+        cpu_combined=[255] * 10,
+        gpu_cores=[255] * 4,
+        gpu_combined=[255] * 10,
+        temperature_board=127,
+        fan_speed=[32_767] * 4,
+        storage_type=[_UNUSED] * 4,
+        storage_usage=[_UNUSED] * 4,
+        storage_total=[_UNUSED] * 4,
+        link_type=[_UNUSED] * 6,
+        link_tx_rate=[_UNUSED] * 6,
+        link_rx_rate=[_UNUSED] * 6,
+        link_tx_max=[_UNUSED] * 6,
+        link_rx_max=[_UNUSED] * 6,
+    )
+
+
+def status_text(severity: Severity, text: str) -> Message:
+    """STATUSTEXT (253), cut to 50 bytes.
+
+    Cut, not sent in chunks: where one chunk is lost, or the ground station knows none, a chunked text is a riddle.
+    """
+    data = text.encode()
+    if len(data) > TEXT_BYTES:
+        data = data[: TEXT_BYTES - 3].decode(errors="ignore").encode() + b"..."
+    return mavlink.MAVLink_statustext_message(severity, data)
+
+
+_UNUSED = 2**32 - 1
+
+
+def _named_float(t_mono_s: float, name: bytes, value: float) -> Message:
+    return mavlink.MAVLink_named_value_float_message(_boot_ms(t_mono_s), name, value)
+
+
+def _boot_ms(t_mono_s: float) -> int:
+    return round(t_mono_s * 1000) % 2**32  # wraps after 49 days, as the field does everywhere

@@ -1,0 +1,59 @@
+"""The autopilot at the other end: who it is, whether it is there, and what it says to our fixes."""
+
+import logging
+import math
+from collections import Counter
+
+from edgevpr.mavlink.messages import AUTOPILOT, POSITION_FIX
+from edgevpr.mavlink.wire import Message, mavlink
+
+SILENT_AFTER_S = 5.0  # of the heartbeats, which come once a second, this many may be lost
+
+log = logging.getLogger(__name__)
+
+_EXPLANATIONS = {
+    mavlink.MAV_RESULT_ACCEPTED: "it takes them",
+    mavlink.MAV_RESULT_FAILED: "GPS still in use, or it has no origin or nothing else to navigate by",
+    mavlink.MAV_RESULT_DENIED: "it does not like their form",
+    mavlink.MAV_RESULT_UNSUPPORTED: "its firmware does not know command 43003",
+}
+
+
+class Autopilot:
+    """Fed with all that arrives; pinned to the first autopilot heard, so that no other vehicle is ever addressed."""
+
+    def __init__(self, own_component: int) -> None:
+        self.system_id: int | None = None
+        self.acks: Counter[str] = Counter()  # answers to our fixes, by name of the result
+        self._own_component = own_component
+        self._heard_s = -math.inf
+        self._last_result: int | None = None
+
+    def listens(self, now_s: float) -> bool:
+        """Say whether its heartbeat was heard in the last five seconds."""
+        return now_s - self._heard_s <= SILENT_AFTER_S
+
+    def hear(self, message: Message, now_s: float) -> bool:
+        """Take note of a message; True for the autopilot's heartbeat."""
+        system_id = message.get_srcSystem()
+        if message.get_srcComponent() != AUTOPILOT or system_id == 0 or self.system_id not in (None, system_id):
+            return False
+        if message.get_type() == "HEARTBEAT" and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID:
+            if self.system_id is None:
+                self.system_id = system_id
+                log.info("autopilot heard: system %d", system_id)
+            self._heard_s = now_s
+            return True
+        if message.get_type() == "COMMAND_ACK" and message.command == POSITION_FIX and self.system_id is not None:
+            if message.target_component in (0, self._own_component):  # 0: it spoke to all
+                self._hear_result(message.result)
+        return False
+
+    def _hear_result(self, result: int) -> None:
+        known = mavlink.enums["MAV_RESULT"].get(result)
+        name = known.name.removeprefix("MAV_RESULT_") if known else str(result)
+        self.acks[name] += 1
+        if result != self._last_result:
+            level = logging.INFO if result == mavlink.MAV_RESULT_ACCEPTED else logging.WARNING
+            log.log(level, "the autopilot's answer to position fixes: %s (%s)", name, _EXPLANATIONS.get(result, "?"))
+            self._last_result = result

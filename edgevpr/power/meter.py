@@ -1,0 +1,49 @@
+"""What a stage costs, and a query: seconds, CPU-seconds, utilisation, charge."""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from edgevpr.power.boards import Board
+from edgevpr.power.equations import Pack, marginal_energy_j, pack_ah, stage_energy_j
+from edgevpr.power.machine import rss_mb
+from edgevpr.types import QueryCost, StageCost
+
+Clock = Callable[[], float]
+
+
+@dataclass(slots=True)
+class Stage:
+    """A stage that is being metered; `cost` is there once it is over."""
+
+    cost: StageCost | None = None
+
+
+@contextmanager
+def stage(wall_clock: Clock = time.perf_counter, cpu_clock: Clock = time.process_time) -> Iterator[Stage]:
+    """Meter a stage: `with stage() as encoding: ...`, then `encoding.cost`. The CPU time is that of all threads."""
+    metered = Stage()
+    wall_s, cpu_s = wall_clock(), cpu_clock()
+    yield metered
+    metered.cost = StageCost(wall_clock() - wall_s, cpu_clock() - cpu_s)
+
+
+def query_cost(encode: StageCost, match: StageCost, board: Board, pack: Pack, regulator_efficiency: float) -> QueryCost:
+    """The cost of one query by 5.1-5.6, as the pack sees it: the energies of both stages are added, not their powers.
+
+    `used_mah` is (a + s U) t, `marginal_mah` s U t: what the query adds to a board that is powered anyway.
+    """
+    stages = [(each.utilisation(board.cores), each.wall_s) for each in (encode, match)]
+    used_j = sum(stage_energy_j(board.idle_w, board.full_w, u, t_s) for u, t_s in stages)
+    marginal_j = sum(marginal_energy_j(board.idle_w, board.full_w, u, t_s) for u, t_s in stages)
+    return QueryCost(
+        t_encode_s=encode.wall_s,
+        t_match_s=match.wall_s,
+        u_encode=stages[0][0],
+        u_match=stages[1][0],
+        cpu_s=encode.cpu_s + match.cpu_s,
+        rss_mb=rss_mb(),
+        used_mah=1000 * pack_ah(used_j, pack, regulator_efficiency),
+        marginal_mah=1000 * pack_ah(marginal_j, pack, regulator_efficiency),
+    )

@@ -1,0 +1,187 @@
+"""The flight log: one JSON object a line, appended. A full disk or a pulled card costs lines, never the flight."""
+
+import json
+import logging
+import math
+import os
+import stat
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import asdict, is_dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from edgevpr import __version__
+from edgevpr.config import Config
+from edgevpr.errors import EdgevprError
+from edgevpr.types import TechniqueSpec
+
+_log = logging.getLogger(__name__)
+_SYNC_EVERY_S = 1.0
+
+
+class FlightLog:
+    """An open flight log; `path=None` writes nothing. Close it (it is a context manager).
+
+    `state` is None while lines arrive, else a sentence that says why they do not; `lost_lines` counts those that are
+    missing. Every write tries again, and the first one that succeeds is preceded by a line of kind "gap".
+    """
+
+    def __init__(self, path: str | Path | None, clock: Callable[[], float] = time.monotonic) -> None:
+        """Open for appending. Raises EdgevprError where the file cannot be opened."""
+        self.path = path
+        self.state: str | None = None
+        self.lost_lines = 0
+        self._clock = clock
+        self._synced_s = -math.inf
+        self._file: BinaryIO | None = None
+        if path is not None:
+            try:
+                self._file = _open(path)
+            except OSError as error:
+                raise EdgevprError(
+                    f"The flight log {path} cannot be opened ({error.strerror}): give a file in a folder that is there "
+                    "and may be written to."
+                ) from error
+
+    def __enter__(self) -> "FlightLog":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def write(self, kind: str, **fields: Any) -> None:
+        """Append one line: `kind`, the time (UTC), `t_mono_s` (now, unless given) and the fields. Never raises OSError.
+
+        Dataclasses become objects, NaN and infinities null. The line is in the file on return, and on the disk
+        within a second of writing.
+        """
+        if self.path is None:
+            return
+        lines = _line(kind, {"t_mono_s": self._clock(), **fields})
+        if self.state is not None:
+            lines = _line("gap", {"t_mono_s": self._clock(), "lost_lines": self.lost_lines}) + lines
+        try:
+            if self._file is None:
+                self._file = _open(self.path)
+            _append(self._file, lines)
+            if self._clock() - self._synced_s >= _SYNC_EVERY_S:
+                self._sync()
+        except OSError as error:
+            self._lost_one(error)
+        else:
+            self._say_recovered()
+
+    def close(self) -> None:
+        """Bring everything to the disk. A failure is said, not raised."""
+        if self._file is None:
+            return
+        try:
+            self._sync()
+            self._file.close()
+        except OSError as error:
+            _log.warning("The end of the flight log %s may be missing (%s).", self.path, error.strerror)
+        self._file = None
+
+    def _sync(self) -> None:
+        if stat.S_ISREG(os.fstat(self._file.fileno()).st_mode):
+            os.fdatasync(self._file.fileno())
+        self._synced_s = self._clock()
+
+    def _lost_one(self, error: OSError) -> None:
+        self.lost_lines += 1
+        if self.state is None:
+            self.state = (
+                f"The flight log {self.path} cannot be written ({error.strerror}): make room or put the medium back; "
+                "the flight goes on without it."
+            )
+            _log.warning("%s", self.state)
+        # The medium may be another one when it comes back: it is opened anew.
+        if self._file is not None:
+            with suppress(OSError):
+                self._file.close()
+            self._file = None
+
+    def _say_recovered(self) -> None:
+        if self.state is not None:
+            self.state = None
+            _log.warning("The flight log %s is written again; %d lines are missing.", self.path, self.lost_lines)
+
+
+def start_fields(config: Config, board_name: str, spec: TechniqueSpec) -> dict[str, Any]:
+    """What the first line of a flight says, of kind "start": who flies with what, and how it was set."""
+    return {
+        "version": __version__,
+        "technique": spec.name,
+        "parameters": spec.parameters,
+        "board": board_name,
+        "map": config.map,
+        "config": asdict(config),
+    }
+
+
+def read_log(path: str | Path) -> Iterator[dict[str, Any]]:
+    """The lines of a flight log as dicts, in order. A line that was cut (battery pulled) is left out."""
+    with open(path, "rb") as handle:
+        for line in handle:
+            try:
+                record = json.loads(line)
+            except ValueError:
+                continue
+            if isinstance(record, dict):
+                yield record
+
+
+def _open(path: str | Path) -> BinaryIO:
+    # Unbuffered: a line that has been written is out of this process, whatever happens to it next.
+    return open(path, "a+b", buffering=0)
+
+
+def _append(file: BinaryIO, lines: bytes) -> None:
+    """Append all of `lines` or, as far as the medium allows, nothing. Raises OSError."""
+    end = file.seek(0, os.SEEK_END)
+    if end:
+        file.seek(end - 1)
+        if file.read(1) != b"\n":  # cut by a pulled battery, or by a failure that could not be undone
+            lines = b"\n" + lines
+    try:
+        rest = memoryview(lines)
+        while rest:  # a disk with a little room left takes a part, and says only at the next part that it is full
+            rest = rest[file.write(rest) :]
+    except OSError:
+        with suppress(OSError):
+            file.truncate(end)
+        raise
+
+
+def _line(kind: str, fields: dict[str, Any]) -> bytes:
+    now = datetime.now(timezone.utc).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+    text = json.dumps(_plain({"kind": kind, "time": now, **fields}), ensure_ascii=False, allow_nan=False)
+    # What is no UTF-8 (a file name from elsewhere) becomes a \u escape, which JSON reads back as it was.
+    return text.encode("utf-8", "backslashreplace") + b"\n"
+
+
+def _plain(value: Any) -> Any:
+    """`value` in JSON's types."""
+    if value is None or isinstance(value, (bool, int, str)):
+        return value
+    if isinstance(value, float):
+        return _readable(value)
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if is_dataclass(value):
+        return _plain(asdict(value))
+    if hasattr(value, "tolist"):  # NumPy's scalars and arrays
+        return _plain(value.tolist())
+    return str(value)
+
+
+def _readable(value: float) -> float | None:
+    """Seven decimals (a centimetre of latitude, and what MAVLink carries) or seven digits, whichever is more."""
+    if not math.isfinite(value):
+        return None
+    return round(value, 7) if abs(value) >= 1 else float(f"{value:.7g}")

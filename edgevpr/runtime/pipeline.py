@@ -1,0 +1,93 @@
+"""The walk of one frame: encode, retrieve, accept or not, what it cost. `Pipeline.step` reads from top to bottom."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from edgevpr import techniques
+from edgevpr.config import Config
+from edgevpr.errors import UsageError
+from edgevpr.places.index import PlaceIndex, load_index
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.retrieve import named, rank
+from edgevpr.power.boards import Board, load_board
+from edgevpr.power.equations import Pack, parse_pack
+from edgevpr.power.meter import query_cost, stage
+from edgevpr.runtime.accept import AcceptRule, accept_rule, accepted
+from edgevpr.runtime.choose import described, fit, probe
+from edgevpr.types import Frame, PlaceMatch, Technique
+
+
+@dataclass(frozen=True, slots=True)
+class Pipeline:
+    """Everything that one query needs. `accuracy_m` is the 1-sigma that a fix claims; `reason` says in one line why this
+    technique flies, and whether the board can afford it."""
+
+    technique: Technique
+    place_map: PlaceMap
+    index: PlaceIndex
+    rule: AcceptRule
+    candidates: int | None
+    board: Board
+    pack: Pack
+    regulator_efficiency: float
+    accuracy_m: float
+    reason: str
+
+    def step(self, frame: Frame) -> PlaceMatch:
+        """Recognise one frame. The position is the place's, and only there when the match is accepted."""
+        with stage() as encoding:
+            query = self.technique.encode(frame.image)
+        with stage() as matching:
+            ranking = rank(self.technique, query, self.place_map, self.index, self.candidates)
+            is_accepted, reason = accepted(ranking, self.index, self.rule)
+            (best,) = named(ranking, self.index, self.place_map, first=1)
+        cost = query_cost(encoding.cost, matching.cost, self.board, self.pack, self.regulator_efficiency)
+        position = best.place.position if is_accepted else None
+        return PlaceMatch(
+            frame.name,
+            frame.t_mono_s,
+            best,
+            is_accepted,
+            reason,
+            position,
+            self.accuracy_m if position else None,
+            cost,
+        )
+
+
+def open_pipeline(config: Config) -> Pipeline:
+    """Open the map, make its technique, load the index. Raises a sentence for anything that does not go together."""
+    if config.map is None:
+        raise UsageError("There is no map to recognise places in: name one with --map, or `map:` in the configuration.")
+    board = load_board(config.board)
+    pack = parse_pack(config.battery.pack)
+    place_map = PlaceMap.open(Path(config.map))
+    technique = technique_of(place_map, config.technique)
+    budget_mb = config.memory.budget_mb or board.budget_mb
+    index = load_index(place_map, int(budget_mb * 1e6))
+    rate_hz = config.source.rate_hz or board.rate_hz
+    compared = min(config.match.candidates or len(index), len(index))
+    found = fit(board, probe(technique), compared, rate_hz, budget_mb)
+    why = "the map was built with it" if config.technique is None else "it was named"
+    return Pipeline(
+        technique,
+        place_map,
+        index,
+        accept_rule(technique, config.match),
+        config.match.candidates,
+        board,
+        pack,
+        config.battery.regulator_efficiency,
+        max(config.mavlink.min_accuracy_m, index.spacing_m() or 0.0),
+        f"technique {technique.spec.name}: {why}; {described(board, found, len(index), rate_hz, budget_mb)}",
+    )
+
+
+def technique_of(place_map: PlaceMap, name: str | None = None, parameters: dict | None = None) -> Technique:
+    """The technique that a map was built with. Raises MapError where `name` or `parameters` ask for another."""
+    if (name is None or name == place_map.spec.name) and not parameters:
+        technique = techniques.create(place_map.spec.name, place_map.spec.parameters)
+    else:
+        technique = techniques.create(name or place_map.spec.name, parameters)
+    place_map.require(technique.spec)
+    return technique

@@ -1,0 +1,133 @@
+"""positions.csv: where the images of a folder were taken."""
+
+import csv
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+from edgevpr.errors import UsageError
+from edgevpr.types import Position
+
+_NEEDED_COLUMNS = ("file", "lat", "lon")
+
+
+@dataclass(frozen=True, slots=True)
+class GeoTag:
+    """Where, which way (0..360 clockwise from true north) and when an image was taken; None is what nobody knows."""
+
+    position: Position | None = None
+    heading_deg: float | None = None
+    t_utc_s: float | None = None
+
+
+def find_positions(folder: str | Path) -> Path | None:
+    """The positions.csv that belongs to a folder of images: in it, else beside it."""
+    folder = Path(folder).absolute()
+    candidates = (folder / "positions.csv", folder.parent / "positions.csv")
+    return next((path for path in candidates if path.is_file()), None)
+
+
+def read_positions(csv_path: str | Path) -> dict[str, GeoTag]:
+    """Read the columns file, lat, lon (degrees) and, where present, alt (m), heading_deg or yaw_deg, and time.
+
+    Returns one tag a file name. A row may leave all but the name empty; other columns are ignored.
+    Raises UsageError with the line and the value of whatever is not as it should be.
+    """
+    try:
+        with open(csv_path, encoding="utf-8-sig", newline="") as handle:
+            return _read_rows(csv.reader(handle, skipinitialspace=True), csv_path)
+    except OSError as error:
+        raise UsageError(f"{csv_path} cannot be read ({error.strerror}): give the path of a CSV file.") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise UsageError(f"{csv_path} is not a text file of commas ({error}): save it as CSV in UTF-8.") from error
+
+
+def position_or_none(lat_deg: float, lon_deg: float, alt_m: float | None) -> Position | None:
+    """The position, or None for exactly (0, 0): that is what a receiver without a fix writes."""
+    return None if lat_deg == lon_deg == 0 else Position(lat_deg, lon_deg, alt_m)
+
+
+def parse_time(text: str) -> float:
+    """Seconds since 1970 (UTC) of `2016:06:23 16:31:59` (EXIF), ISO 8601, or seconds; without a zone it is UTC.
+
+    Raises ValueError for any other text.
+    """
+    try:
+        seconds = float(text)
+    except ValueError:
+        if text[4:5] == text[7:8] == ":":
+            text = text.replace(":", "-", 2)
+        moment = datetime.fromisoformat(text.replace("Z", "+00:00"))  # Python 3.10 does not know Z
+        return (moment if moment.tzinfo else moment.replace(tzinfo=timezone.utc)).timestamp()
+    if not math.isfinite(seconds):
+        raise ValueError(f"{text} is no time")
+    return seconds
+
+
+def _read_rows(reader: Any, csv_path: str | Path) -> dict[str, GeoTag]:
+    header = [name.strip().lower() for name in next(reader, [])]
+    missing = [name for name in _NEEDED_COLUMNS if name not in header]
+    if missing:
+        raise UsageError(
+            f"{csv_path}, line 1 has no column `{missing[0]}`: it must name {', '.join(_NEEDED_COLUMNS)}, "
+            "with commas between them."
+        )
+    tags: dict[str, GeoTag] = {}
+    lines: dict[str, int] = {}
+    for values in reader:
+        if not values:
+            continue
+        where = f"{csv_path}, line {reader.line_num}"
+        if len(values) != len(header):
+            raise UsageError(f"{where} has {len(values)} values; line 1 names {len(header)} columns: make them agree.")
+        row = {name: value.strip() for name, value in zip(header, values, strict=True)}
+        name = row["file"]
+        if not name:
+            raise UsageError(f"{where} names no file: write the image's file name or delete the line.")
+        if name in lines:
+            raise UsageError(f"{where}: {name} stands in line {lines[name]} already: keep one of the two.")
+        lines[name] = reader.line_num
+        tags[name] = _tag(row, where)
+    return tags
+
+
+def _tag(row: Mapping[str, str], where: str) -> GeoTag:
+    lat_deg = _number(row, "lat", -90, 90, where)
+    lon_deg = _number(row, "lon", -180, 180, where)
+    alt_m = _number(row, "alt", -1000, 100_000, where)
+    if (lat_deg is None) != (lon_deg is None):
+        raise UsageError(f"{where} has only one of lat and lon: write both, or leave both empty.")
+    heading_deg = _number(row, "heading_deg" if row.get("heading_deg") else "yaw_deg", -360, 360, where)
+    return GeoTag(
+        None if lat_deg is None or lon_deg is None else position_or_none(lat_deg, lon_deg, alt_m),
+        None if heading_deg is None else heading_deg % 360,
+        _time(row, where),
+    )
+
+
+def _number(row: Mapping[str, str], column: str, low: float, high: float, where: str) -> float | None:
+    text = row.get(column)
+    if not text:
+        return None
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not low <= value <= high:
+        raise UsageError(f"{where}: {column} is `{text}`: write a number from {low:g} to {high:g}.")
+    return value
+
+
+def _time(row: Mapping[str, str], where: str) -> float | None:
+    text = row.get("time")
+    if not text:
+        return None
+    try:
+        return parse_time(text)
+    except ValueError:
+        raise UsageError(
+            f"{where}: time is `{text}`: write 2016-06-23T16:31:59Z, 2016:06:23 16:31:59 or seconds since 1970."
+        ) from None

@@ -1,0 +1,44 @@
+"""What systemd is told: ready, alive, stopping, and a line of status. Without systemd nothing is said.
+
+The protocol is sd_notify(3): `KEY=value` lines in one datagram to the socket that $NOTIFY_SOCKET names.
+"""
+
+import os
+import socket
+
+_SEND_TIMEOUT_S = 0.5
+
+
+def notify(**assignments: object) -> bool:
+    """Send the assignments (`READY=1`, `WATCHDOG=1`, `STOPPING=1`, `STATUS="12 places"`); True if they were sent.
+
+    Never raises: a flight does not end because nobody listens.
+    """
+    address = os.environ.get("NOTIFY_SOCKET", "")
+    if not address:
+        return False
+    if address[0] == "@":  # a name in the abstract namespace, which begins with a zero byte
+        address = "\0" + address[1:]
+    # A line break in a value would begin an assignment of its own.
+    lines = (f"{key}={' '.join(str(value).splitlines())}" for key, value in assignments.items())
+    message = "\n".join(lines).encode("utf-8", "replace")
+    try:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as sender:
+            sender.settimeout(_SEND_TIMEOUT_S)  # the receiver's queue may be full; the main loop must not hang on it
+            sender.sendto(message, address)
+    except OSError:
+        return False
+    return True
+
+
+def watchdog_interval_s() -> float | None:
+    """How often `notify(WATCHDOG=1)` is due: half the unit's WatchdogSec, as sd_watchdog_enabled(3) advises.
+
+    None where no watchdog waits for this process.
+    """
+    try:
+        watched = int(os.environ.get("WATCHDOG_PID", os.getpid())) == os.getpid()
+        timeout_us = int(os.environ["WATCHDOG_USEC"])
+    except (KeyError, ValueError):
+        return None
+    return timeout_us / 2e6 if watched and timeout_us > 0 else None

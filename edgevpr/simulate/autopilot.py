@@ -1,0 +1,195 @@
+"""A simulated flight controller, as strict as the real thing: the other end of a link, for tests and demonstrations."""
+
+import json
+import logging
+import math
+import select
+import signal
+import threading
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+
+from edgevpr.errors import LinkError
+from edgevpr.mavlink.address import parse_link
+from edgevpr.mavlink.messages import AUTOPILOT, POSITION_FIX
+from edgevpr.mavlink.transport import Transport, open_transport
+from edgevpr.mavlink.wire import Message, Receiver, mavlink
+
+HEARTBEAT_S = 1.0
+TURN_S = 0.05
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class ReceivedFix:
+    """An accepted position fix as it arrived; `t_sent_s` and `processing_s` are the sender's."""
+
+    lat_deg: float
+    lon_deg: float
+    accuracy_m: float
+    t_sent_s: float
+    processing_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class AutopilotSummary:
+    """What the simulated flight controller saw. Senders are written "system/component"."""
+
+    messages: dict[str, int]
+    messages_by_sender: dict[str, dict[str, int]]
+    companion: str | None  # the last onboard computer heard
+    fixes_accepted: int
+    fixes_denied: int
+    fixes: tuple[ReceivedFix, ...]
+    lost_packets: int
+    bad_bytes: int
+
+    def to_json(self) -> str:
+        return json.dumps(asdict(self))
+
+    def __str__(self) -> str:
+        counts = ", ".join(f"{name} {count}" for name, count in sorted(self.messages.items())) or "none"
+        return (
+            f"companion: {self.companion or 'not heard'}\n"
+            f"messages:  {counts}\n"
+            f"fixes:     {self.fixes_accepted} accepted, {self.fixes_denied} denied\n"
+            f"line:      {self.lost_packets} packets lost, {self.bad_bytes} bad bytes"
+        )
+
+
+def run_autopilot(
+    link_url: str,
+    duration_s: float | None = None,
+    stop: threading.Event | None = None,
+    system_id: int = 1,
+) -> AutopilotSummary:
+    """Be an ArduPilot copter at `link_url` until the time is up, `stop` is set, a signal comes or the line is cut.
+
+    Raises LinkError where the link cannot be opened.
+    """
+    stop = stop or threading.Event()
+    address = parse_link(link_url)
+    try:
+        transport = open_transport(address)
+    except OSError as error:
+        raise LinkError(f"{address}: it cannot be opened ({error.strerror or error}): is the other end up?") from error
+    autopilot = _Autopilot(transport, system_id)
+    with _set_by_signals(stop):
+        try:
+            autopilot.run(lambda t_s: stop.is_set() or (duration_s is not None and t_s >= duration_s))
+        except OSError as error:
+            log.warning("%s was lost (%s)", address, error)
+        finally:
+            transport.close()
+    return autopilot.summary()
+
+
+def judge(command: Message) -> int:
+    """Give the MAV_RESULT for a COMMAND_INT, by the rules of ArduPilot 4.7 for 43003."""
+    if command.command != POSITION_FIX:
+        return mavlink.MAV_RESULT_UNSUPPORTED
+    global_frame = command.frame in (mavlink.MAV_FRAME_GLOBAL, mavlink.MAV_FRAME_GLOBAL_INT)
+    on_earth = abs(command.x) <= 90e7 and abs(command.y) <= 180e7
+    if global_frame and on_earth and math.isnan(command.z) and 0 < command.param3 < math.inf:
+        return mavlink.MAV_RESULT_ACCEPTED
+    return mavlink.MAV_RESULT_DENIED
+
+
+class _Autopilot:
+    def __init__(self, transport: Transport, system_id: int) -> None:
+        self._transport = transport
+        self._system_id = system_id
+        self._packer = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=AUTOPILOT)
+        self._receiver = Receiver()
+        self._by_sender: defaultdict[str, Counter[str]] = defaultdict(Counter)
+        self._companion: str | None = None
+        self._next_seq: dict[str, int] = {}
+        self._lost_packets = 0
+        self._fixes: list[ReceivedFix] = []
+        self._fixes_denied = 0
+
+    def run(self, ended: Callable[[float], bool]) -> None:
+        start_s = heartbeat_due_s = time.monotonic()
+        while not ended(time.monotonic() - start_s):
+            readable, _, _ = select.select([self._transport], [], [], TURN_S)
+            if readable:
+                for message in self._receiver.feed(self._transport.read()):
+                    self._take(message)
+            if self._transport.connected and time.monotonic() >= heartbeat_due_s:
+                heartbeat_due_s = time.monotonic() + HEARTBEAT_S
+                self._send(_copter_heartbeat())
+
+    def summary(self) -> AutopilotSummary:
+        return AutopilotSummary(
+            messages=dict(self._receiver.received),
+            messages_by_sender={sender: dict(counts) for sender, counts in self._by_sender.items()},
+            companion=self._companion,
+            fixes_accepted=len(self._fixes),
+            fixes_denied=self._fixes_denied,
+            fixes=tuple(self._fixes),
+            lost_packets=self._lost_packets,
+            bad_bytes=self._receiver.bad_bytes,
+        )
+
+    def _take(self, message: Message) -> None:
+        sender = f"{message.get_srcSystem()}/{message.get_srcComponent()}"
+        self._by_sender[sender][message.get_type()] += 1
+        self._lost_packets += (message.get_seq() - self._next_seq.get(sender, message.get_seq())) % 256
+        self._next_seq[sender] = (message.get_seq() + 1) % 256
+        if message.get_type() == "HEARTBEAT" and message.type == mavlink.MAV_TYPE_ONBOARD_CONTROLLER:
+            self._companion = sender
+            self._transport.answer_sender()
+        elif message.get_type() == "COMMAND_INT":
+            # One for another vehicle or component is passed over in silence, as on the real network.
+            if message.target_system in (0, self._system_id) and message.target_component in (0, AUTOPILOT):
+                self._obey(message)
+
+    def _obey(self, command: Message) -> None:
+        result = judge(command)
+        if result == mavlink.MAV_RESULT_ACCEPTED:
+            self._fixes.append(
+                ReceivedFix(command.x / 1e7, command.y / 1e7, command.param3, command.param1, command.param2)
+            )
+        elif command.command == POSITION_FIX:
+            self._fixes_denied += 1
+        self._send(
+            mavlink.MAVLink_command_ack_message(
+                command=command.command,
+                result=result,
+                target_system=command.get_srcSystem(),
+                target_component=command.get_srcComponent(),
+            )
+        )
+
+    def _send(self, message: Message) -> None:
+        self._transport.write(message.pack(self._packer))
+        self._packer.seq = (self._packer.seq + 1) % 256
+
+
+def _copter_heartbeat() -> Message:
+    return mavlink.MAVLink_heartbeat_message(
+        type=mavlink.MAV_TYPE_QUADROTOR,
+        autopilot=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
+        base_mode=mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED,
+        custom_mode=0,
+        system_status=mavlink.MAV_STATE_ACTIVE,
+        mavlink_version=3,
+    )
+
+
+@contextmanager
+def _set_by_signals(stop: threading.Event) -> Iterator[None]:
+    """Let SIGTERM and SIGINT set `stop`, where this is the main thread (no other may handle signals)."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,127 @@
+"""How things are painted on the ground of a scene: noise, ribbons, rows, roofs and crowns of trees."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+Box = tuple[slice, slice]  # rows, columns
+BASE_CM = 300  # of open ground, so that a river bed and a furrow lie above zero
+
+
+@dataclass(frozen=True, slots=True)
+class Canvas:
+    """A scene in the making: `albedo` uint8 (H, W, 3) BGR and `height_cm` uint16 (H, W), both painted in place;
+    north is up, the south-west corner is (0, 0) m."""
+
+    albedo: np.ndarray
+    height_cm: np.ndarray
+    metres_per_pixel: float
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.height_cm.shape
+
+    def pixels(self, points_m: np.ndarray) -> np.ndarray:
+        """(N, 2) east, north in metres -> float32 (N, 2) column, row."""
+        east_m, north_m = np.asarray(points_m, np.float32).T
+        return np.column_stack((east_m, self.shape[0] * self.metres_per_pixel - north_m)) / self.metres_per_pixel
+
+    def box(self, points_m: np.ndarray, margin_m: float = 0.0) -> Box:
+        """The pixels around some points, cut off at the edge of the scene (empty outside of it)."""
+        margin = margin_m / self.metres_per_pixel
+        low, high = self.pixels(points_m).min(axis=0) - margin, self.pixels(points_m).max(axis=0) + margin
+        (left, top), (right, bottom) = np.maximum(low, 0).astype(int), np.maximum(np.ceil(high), 0).astype(int)
+        return slice(top, max(top, min(bottom, self.shape[0]))), slice(left, max(left, min(right, self.shape[1])))
+
+    def grid_m(self, box: Box) -> tuple[np.ndarray, np.ndarray]:
+        """East (1, W) and north (H, 1) in metres of the pixels of a box, float32."""
+        rows, columns = (np.arange(part.start, part.stop, dtype=np.float32) + 0.5 for part in box)
+        return columns[None] * self.metres_per_pixel, ((self.shape[0] - rows) * self.metres_per_pixel)[:, None]
+
+    def polygon(self, box: Box, points_m: np.ndarray) -> np.ndarray:
+        """The cover, float32 0..1, of a polygon over the pixels of a box, with smooth edges."""
+        cover = np.zeros((box[0].stop - box[0].start, box[1].stop - box[1].start), np.uint8)
+        corners = (self.pixels(points_m) - (box[1].start, box[0].start)) * 16
+        cv2.fillPoly(cover, [corners.round().astype(np.int32)], 255, cv2.LINE_AA, 4)
+        return cover.astype(np.float32) / 255
+
+    def distance_m(self, box: Box, line_m: np.ndarray) -> np.ndarray:
+        """Metres from a polyline, float32, for every pixel of a box."""
+        away = np.full((box[0].stop - box[0].start, box[1].stop - box[1].start), 255, np.uint8)
+        points = self.pixels(line_m) - (box[1].start, box[0].start)
+        cv2.polylines(away, [points.round().astype(np.int32)], False, 0)
+        return cv2.distanceTransform(away, cv2.DIST_L2, 5) * self.metres_per_pixel
+
+    def paint(self, box: Box, cover: np.ndarray, colour) -> None:
+        """Lay a colour, (3,) or (H, W, 3) BGR, over a box, as thick as `cover` 0..1 says."""
+        touched = cover > 0
+        below = self.albedo[box][touched].astype(np.float32)
+        above = np.asarray(colour, np.float32)
+        above = above[touched] if above.ndim == 3 else above
+        self.albedo[box][touched] = np.clip(below + cover[touched][:, None] * (above - below), 0, 255)
+
+
+def noise(rng: np.random.Generator, shape: tuple[int, int], first_px: float, octaves: int = 3) -> np.ndarray:
+    """Smooth noise, float32, mean 0 and standard deviation 1; its largest bumps are `first_px` wide."""
+    total = np.zeros(shape, np.float32)
+    for octave in range(octaves):
+        step = max(first_px / 2**octave, 1.0)
+        coarse = rng.standard_normal((int(shape[0] / step) + 3, int(shape[1] / step) + 3), np.float32)
+        # Cut from a wider picture, so that a box of any size has bumps of the same size.
+        size = (round(coarse.shape[1] * step), round(coarse.shape[0] * step))
+        total += cv2.resize(coarse / 1.6**octave, size, interpolation=cv2.INTER_CUBIC)[: shape[0], : shape[1]]
+    total -= total.mean()
+    total /= max(float(total.std()), 1e-6)
+    return total
+
+
+def bgr_mix(low: tuple[int, int, int], high: tuple[int, int, int], share: np.ndarray) -> np.ndarray:
+    """From colour `low` (share 0) to colour `high` (share 1): (H, W) -> float32 (H, W, 3)."""
+    low, high = np.float32(low), np.float32(high)
+    return low + share[..., None] * (high - low)
+
+
+def smooth_step(values: np.ndarray, low: float, high: float) -> np.ndarray:
+    """0 below `low`, 1 above `high`, a straight ramp between; the other way round where low > high."""
+    return np.clip((values - low) / (high - low), 0, 1)
+
+
+def roof(canvas: Canvas, centre_m, length_m: float, width_m: float, turn_rad: float, wall_m: float, colour) -> None:
+    """A building with a gable roof, its ridge along `turn_rad` (anticlockwise from east)."""
+    along, across = np.array([np.cos(turn_rad), np.sin(turn_rad)]), np.array([-np.sin(turn_rad), np.cos(turn_rad)])
+    corners = [
+        np.asarray(centre_m) + a * along * length_m / 2 + b * across * width_m / 2
+        for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))
+    ]
+    box = canvas.box(corners, 1.0)
+    cover = canvas.polygon(box, corners)
+    east_m, north_m = canvas.grid_m(box)
+    u_m = (east_m - centre_m[0]) * along[0] + (north_m - centre_m[1]) * along[1]
+    v_m = np.abs((east_m - centre_m[0]) * across[0] + (north_m - centre_m[1]) * across[1])
+    sheets = 1 + 0.06 * np.sin(u_m * (2 * np.pi / 1.1)) - 0.10 * (v_m < 0.25)
+    canvas.paint(box, cover, np.asarray(colour) * sheets[..., None])
+    gable_cm = BASE_CM + 100 * (wall_m + 0.45 * np.clip(width_m / 2 - v_m, 0, None))
+    canvas.height_cm[box] = np.where(cover > 0.5, gable_cm, canvas.height_cm[box])
+
+
+def crown(rng: np.random.Generator, radius_px: int) -> np.ndarray:
+    """The dome of one tree, float32 (2 r + 1, 2 r + 1) in 0..1, 0 outside of its ragged outline."""
+    axis = np.arange(-radius_px, radius_px + 1, dtype=np.float32) / radius_px
+    lumps = noise(rng, (len(axis), len(axis)), max(radius_px * 0.7, 2.0), 2)
+    leaves = noise(rng, (len(axis), len(axis)), 2.5, 2)
+    dome = 1 - (axis[None] ** 2 + axis[:, None] ** 2) * (1.2 + 0.2 * lumps + 0.12 * leaves)
+    return np.sqrt(np.clip(dome, 0, 1)) * np.clip(1 + 0.08 * lumps + 0.06 * leaves, 0, 1.2)
+
+
+def stand(canvas: Canvas, dome: np.ndarray, centre_m, top_m: float, colour) -> None:
+    """Set one tree (a `crown`) on the canvas; where crowns overlap, the higher one is seen."""
+    radius = len(dome) // 2
+    column, row = canvas.pixels([centre_m])[0].astype(int)
+    if not (radius <= column < canvas.shape[1] - radius and radius <= row < canvas.shape[0] - radius):
+        return
+    box = slice(row - radius, row + radius + 1), slice(column - radius, column + radius + 1)
+    top_cm = BASE_CM + 100 * top_m * (0.35 + 0.65 * dome)
+    seen = (dome > 0.05) & (top_cm > canvas.height_cm[box])
+    canvas.height_cm[box][seen] = top_cm[seen]
+    canvas.albedo[box][seen] = np.clip(np.asarray(colour) * (0.55 + 0.5 * dome[seen][:, None]), 0, 255)

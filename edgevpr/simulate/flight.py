@@ -1,0 +1,136 @@
+"""Two flights over one generated landscape: the first one makes a map, the second one comes back later, and strays."""
+
+import csv
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import datetime, timedelta, timezone
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from edgevpr.geodesy import EARTH_RADIUS_M
+from edgevpr.simulate.camera import Camera, Light, Pose, lit, photograph
+from edgevpr.simulate.scene import Scene
+from edgevpr.types import Position
+
+# The south-west corner of every scene: the home of ArduPilot's simulator (its Tools/autotest/locations.txt, CMAC).
+ORIGIN = Position(-35.363261, 149.165230, 584.0)
+SCENE_WIDTH_M, SCENE_DEPTH_M = 640.0, 420.0  # what the flights below need
+
+_LEG_START_M, _LEG_END_M = 65.0, 345.0  # east; the land east of a leg's end is in no map
+_LEGS_NORTH_M = (70.0, 140.0, 210.0, 280.0, 350.0)
+_HEIGHT_M = 80.0
+
+
+@dataclass(frozen=True, slots=True)
+class Flight:
+    """One picture a pose, every `interval_s` from `start_utc` on; `seed` is that of its clouds and its sensor's noise."""
+
+    poses: tuple[Pose, ...]
+    light: Light
+    camera: Camera
+    start_utc: datetime
+    interval_s: float
+    seed: int
+
+
+def mapping_flight(seed: int) -> Flight:
+    """70 places on five parallel legs, flown to and fro on a clear morning, the nose in the direction of flight."""
+    rng = np.random.default_rng((seed, 1))
+    poses = []
+    for leg, north_m in enumerate(_LEGS_NORTH_M):
+        east_m = np.linspace(_LEG_START_M, _LEG_END_M, 14)
+        for east in east_m if leg % 2 == 0 else east_m[::-1]:
+            off_m, off_deg = rng.normal(0, 0.7, 3), rng.normal(0, 0.8, 3)
+            heading_deg = (90 if leg % 2 == 0 else 270) + off_deg[0]
+            poses.append(
+                Pose(east + off_m[0], north_m + off_m[1], _HEIGHT_M + off_m[2], heading_deg, off_deg[1], off_deg[2])
+            )
+    light = Light(sun_azimuth_deg=48, sun_elevation_deg=52, exposure=1.12)
+    return Flight(tuple(poses), light, Camera(), datetime(2026, 2, 14, 0, 30, tzinfo=timezone.utc), 2.0, seed)
+
+
+def later_flight(seed: int) -> Flight:
+    """40 pictures of an afternoon with clouds and haze: back along the fourth leg, out along the third one and on over
+    land that is in no map. It drifts up to 8 m beside the legs, 10 % in height, 10 degrees in heading, and tilts."""
+    rng = np.random.default_rng((seed, 2))
+    back_m = np.arange(_LEG_END_M - 6, _LEG_START_M, -21.0)
+    out_m = np.arange(_LEG_START_M + 8, SCENE_WIDTH_M - 62, 19.0)
+    east_m = np.concatenate((back_m, out_m))
+    north_m = np.concatenate((np.full(len(back_m), _LEGS_NORTH_M[3]), np.full(len(out_m), _LEGS_NORTH_M[2])))
+    heading_deg = np.concatenate((np.full(len(back_m), 270.0), np.full(len(out_m), 90.0)))
+    drift = [_wander(rng, len(east_m)) for _ in range(5)]
+    poses = np.column_stack(
+        (
+            east_m,
+            north_m + 8 * drift[0],
+            _HEIGHT_M * (1 + 0.1 * drift[1]),
+            heading_deg + 10 * drift[2],
+            3 * drift[3],
+            3 * drift[4],
+        )
+    )
+    light = Light(14, 58, warmth=0.8, cloud_frac=0.35, haze_frac=0.12, exposure=1.0, gamma=1.12)
+    camera = Camera(noise_sigma=4.0, blur_px=2.0, jpeg_quality=80)
+    start_utc = datetime(2026, 2, 14, 6, 10, tzinfo=timezone.utc)
+    return Flight(tuple(Pose(*map(float, row)) for row in poses), light, camera, start_utc, 2.0, seed + 1)
+
+
+def write_flight(
+    folder: str | Path, scene: Scene, flight: Flight, on_frame: Callable[[int], None] = lambda written: None
+) -> None:
+    """Fly: `folder`/images/*.jpg, and `folder`/positions.csv with the true position of every one of them.
+
+    `on_frame(written)` is called after every frame. Raises OSError where the folder cannot be written.
+    """
+    images = Path(folder) / "images"
+    images.mkdir(parents=True, exist_ok=True)
+    ground = lit(scene, flight.light, flight.seed)
+    rng = np.random.default_rng((flight.seed, 3))
+    with open(Path(folder) / "positions.csv", "w", encoding="utf-8", newline="") as table:
+        rows = csv.writer(table)
+        rows.writerow(("file", "lat", "lon", "alt", "rel_alt", "yaw_deg", "time"))
+        for number, pose in enumerate(flight.poses):
+            frame = photograph(ground, scene.metres_per_pixel, pose, flight.camera, flight.light, rng)
+            name = f"frame_{number:04d}.jpg"
+            _, jpeg = cv2.imencode(".jpg", frame, (cv2.IMWRITE_JPEG_QUALITY, flight.camera.jpeg_quality))
+            (images / name).write_bytes(jpeg.tobytes())
+            at = to_position(pose)
+            taken = flight.start_utc + timedelta(seconds=number * flight.interval_s)
+            rows.writerow(
+                (
+                    name,
+                    f"{at.lat_deg:.8f}",
+                    f"{at.lon_deg:.8f}",
+                    f"{at.alt_m:.2f}",
+                    f"{pose.height_m:.2f}",
+                    f"{pose.heading_deg % 360:.2f}",
+                    f"{taken:%Y:%m:%d %H:%M:%S}",
+                )
+            )
+            on_frame(number + 1)
+
+
+def to_position(pose: Pose) -> Position:
+    """Where a pose is on the globe: the scene is a plane that touches it at ORIGIN."""
+    lat_deg = ORIGIN.lat_deg + np.degrees(pose.north_m / EARTH_RADIUS_M)
+    lon_deg = ORIGIN.lon_deg + np.degrees(pose.east_m / _radius_of_latitude_m())
+    return Position(float(lat_deg), float(lon_deg), ORIGIN.alt_m + pose.height_m)
+
+
+def to_metres(lat_deg: float, lon_deg: float) -> tuple[float, float]:
+    """The other way round: metres (east, north) of a position."""
+    north_m = np.radians(lat_deg - ORIGIN.lat_deg) * EARTH_RADIUS_M
+    return float(np.radians(lon_deg - ORIGIN.lon_deg) * _radius_of_latitude_m()), float(north_m)
+
+
+def _radius_of_latitude_m() -> float:
+    return EARTH_RADIUS_M * float(np.cos(np.radians(ORIGIN.lat_deg)))
+
+
+def _wander(rng: np.random.Generator, count: int) -> np.ndarray:
+    """A slow random swing between -1 and 1."""
+    t = np.arange(count)[:, None] / 9
+    waves = np.sin(2 * np.pi * (t * (1, 2.3) + rng.random(2)))
+    return waves @ (0.75, 0.25)
