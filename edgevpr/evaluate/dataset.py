@@ -21,10 +21,11 @@ class Query:
 
 @dataclass(frozen=True, slots=True)
 class Dataset:
-    """`references` is every image of the reference folder, in the order of their names."""
+    """`references` are the names of all images of `ref_dir`, in the order in which it is mapped."""
 
     queries: tuple[Query, ...]
-    references: tuple[Path, ...]
+    ref_dir: Path
+    references: tuple[str, ...]
 
 
 def load_dataset(query_dir: str | Path, ref_dir: str | Path, ground_truth: str | Path) -> Dataset:
@@ -36,8 +37,8 @@ def load_dataset(query_dir: str | Path, ref_dir: str | Path, ground_truth: str |
     without images.
     """
     query_paths = {path.name: path for path in list_images(query_dir)}
-    references = tuple(list_images(ref_dir))
-    known = frozenset(path.name for path in references)
+    references = tuple(path.name for path in list_images(ref_dir))
+    known = frozenset(references)
     queries: dict[str, Query | None] = {}
     for where, row in _rows(Path(ground_truth)):
         name = row["query_file"]
@@ -57,7 +58,7 @@ def load_dataset(query_dir: str | Path, ref_dir: str | Path, ground_truth: str |
     scored_queries = tuple(query for query in queries.values() if query)
     if not scored_queries:
         raise UsageError(f"{ground_truth} scores no query: it needs a row with ref_files (and status `ok`).")
-    return Dataset(scored_queries, references)
+    return Dataset(scored_queries, Path(ref_dir), references)
 
 
 def _rows(path: Path) -> Iterator[tuple[str, dict[str, str]]]:

@@ -17,6 +17,8 @@ from edgevpr.places.retrieve import rank
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import pack_ah, parse_pack, queries_ah, rail_ah, stage_energy_j
 from edgevpr.power.meter import stage
+from edgevpr.runtime.accept import accept_rule, accepted
+from edgevpr.runtime.frames import Source, open_source
 from edgevpr.runtime.images import read_image
 from edgevpr.runtime.mapping import build_map
 from edgevpr.techniques import create
@@ -33,8 +35,9 @@ class TechniqueResult:
     Times are means over the queries: `t_match_s` is for all references, `t_match_per_ref_s` for one. `u_encode` and
     `u_match` are shares of all cores over those times (5.1). `descriptor_bytes` a place are in RAM, `fine_bytes` on
     disk. `ah_total` (5.7) is drawn from the pack, `ah_total_cpu_rail` from the thesis's rail of 2.5 V; `ah_assumes`
-    says by what. `roc_auc` is None where all best matches are right, or none is. `pcu` needs all techniques that are
-    compared: `compare` fills it in, with the `t_encode_max_s` it used.
+    says by what. `accepted` queries would have moved the aircraft by the technique's own rule, `accepted_wrong` of them
+    to a wrong place. `roc_auc` is None where all best matches are right, or none is. `pcu` needs all techniques that
+    are compared: `compare` fills it in, with the `t_encode_max_s` it used.
     """
 
     technique: str
@@ -49,6 +52,8 @@ class TechniqueResult:
     auc: float
     ep: float
     roc_auc: float | None
+    accepted: int
+    accepted_wrong: int
     t_encode_s: float
     t_match_s: float
     t_match_per_ref_s: float
@@ -65,10 +70,13 @@ class TechniqueResult:
 
 @dataclass(frozen=True, slots=True)
 class _Answer:
-    """One query: the score of its best match, the rank of the first right one, the cost of both stages."""
+    """One query: the score of its best match and the rank of the first right one among the references that count;
+    whether the flight would have accepted its match, and wrongly so; the cost of both stages."""
 
     score: float
     first_right: float
+    accepted: bool
+    accepted_wrong: bool
     encoding: StageCost
     matching: StageCost
 
@@ -87,9 +95,9 @@ def evaluate(
     technique = create(technique_name, parameters)
     with tempfile.TemporaryDirectory(prefix="edgevpr-eval-") as folder:
         map_path = Path(folder) / "references.gpkg"
-        references = progress(dataset.references, len(dataset.references), f"{technique_name}: references")
+        source = open_source(str(dataset.ref_dir), live=False)
         with PlaceMap.create(map_path, technique.spec) as place_map:
-            build_map((Frame(read_image(path), path.name, 0.0) for path in references), technique, place_map)
+            build_map(progress(_frames(source), source.total, f"{technique_name}: references"), technique, place_map)
         with PlaceMap.open(map_path) as place_map:
             index = load_index(place_map, len(place_map) * bytes_per_place(technique.spec))
             answers = list(_answers(technique, dataset, place_map, index, progress))
@@ -115,10 +123,16 @@ def as_json(results: Iterable[TechniqueResult]) -> dict[str, Any]:
     return {"techniques": {result.technique: asdict(result) for result in results}}
 
 
+def _frames(source: Source) -> Iterator[Frame]:
+    """All frames of a folder; the first that cannot be used ends it all: a set with holes measures nothing."""
+    while not source.ended:
+        yield source.read(timeout_s=0)
+
+
 def _answers(
     technique: Technique, dataset: Dataset, place_map: PlaceMap, index: PlaceIndex, progress: Progress
 ) -> Iterator[_Answer]:
-    names = [path.name for path in dataset.references]  # slots of the index follow the order of mapping
+    rule = accept_rule(technique, load_config(None).match)
     # The first query pays for lazy imports, lookup tables and a cold disk: one that is not counted goes before it.
     rank(technique, technique.encode(read_image(dataset.queries[0].path)), place_map, index)
     for query in progress(dataset.queries, len(dataset.queries), f"{technique.spec.name}: queries"):
@@ -127,11 +141,16 @@ def _answers(
             descriptor = technique.encode(image)
         with stage() as matching:
             ranking = rank(technique, descriptor, place_map, index)
-        at = metrics.counting(ranking.slots, np.array([name in query.ignored for name in names]))
-        right = np.array([name in query.right for name in names])
+            is_accepted, _ = accepted(ranking, index, rule)
+        # Slots of the index follow the order of mapping, which is that of the references' names.
+        right = np.array([name in query.right for name in dataset.references])
+        ignored = np.array([name in query.ignored for name in dataset.references])
+        at = metrics.counting(ranking.slots, ignored)
         yield _Answer(
             float(ranking.scores[at[0]]),
             metrics.first_right(ranking.slots[at], right),
+            is_accepted,
+            is_accepted and not (right | ignored)[ranking.slots[0]],
             encoding.cost,
             matching.cost,
         )
@@ -164,6 +183,8 @@ def _summary(technique: Technique, references: int, answers: list[_Answer]) -> T
         auc=metrics.auc(precision, recall),
         ep=metrics.extended_precision(precision, recall),
         roc_auc=metrics.roc_auc(scores, ranks == 0),
+        accepted=sum(answer.accepted for answer in answers),
+        accepted_wrong=sum(answer.accepted_wrong for answer in answers),
         t_encode_s=t_encode_s,
         t_match_s=t_match_s,
         t_match_per_ref_s=t_match_s / references,

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from edgevpr.evaluate.evaluate import TechniqueResult
 
 HEADINGS = (
-    "technique", "recall@1", "@5", "@10", "P@100%R", "R@100%P", "AUC", "EP", "ROC", "PCU",
+    "technique", "recall@1", "@5", "@10", "P@100%R", "R@100%P", "AUC", "EP", "ROC", "PCU", "accepted",
     "t_e ms", "t_m ms", "t_m/ref ms", "RAM B/place", "disk B/place", "U_e", "U_m", "mAh/query",
 )  # fmt: skip
 
@@ -19,6 +19,7 @@ def cells(result: TechniqueResult) -> list[str]:
     return [
         result.technique,
         *("-" if share is None else f"{share:.3f}" for share in shares),
+        f"{result.accepted} ({result.accepted_wrong})",
         f"{result.t_encode_s * 1000:.1f}",
         f"{result.t_match_s * 1000:.1f}",
         f"{result.t_match_per_ref_s * 1000:.3f}",
@@ -51,6 +52,7 @@ def results_text(results: Sequence[TechniqueResult]) -> str:
     return (
         f"{text(HEADINGS, [cells(result) for result in results])}\n\n"
         f"{first.queries} queries scored against {first.references} references; times are means over the queries.\n"
+        "accepted: by the technique's own rule, and in brackets how many of those are wrong.\n"
         f"PCU: log10(t_e,max / t_e + 9) x P@100%R with t_e,max = {first.t_encode_max_s * 1000:.1f} ms.\n"
         f"mAh: {first.ah_assumes}."
     )

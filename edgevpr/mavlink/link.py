@@ -86,7 +86,7 @@ class Link:
         except OSError as error:
             self._note_trouble(error)
         except LinkError:
-            self._close_all()
+            self.close()
             raise
         self._thread.start()
 
@@ -125,7 +125,9 @@ class Link:
         """Send what waits, for half a second at most, and close the port."""
         self._closing.set()
         self._ring()
-        if self._thread.is_alive():
+        if self._thread.ident is None:  # never started
+            self._close_all()
+        else:
             self._thread.join(2 * FLUSH_S)
 
     def __enter__(self) -> "Link":
@@ -158,15 +160,15 @@ class Link:
         self._reopened += 1
 
     def _turn(self, transport: Transport, timeout_s: float) -> None:
-        """Wait until there is something to do, or the time is up; then read and write what can be."""
+        """Write what can be written, wait until there is something to do or the time is up, and read."""
+        if transport.connected:
+            self._transmit(transport)
         writing = [transport] if self._unsent else []
         readable, _, _ = select.select([transport, self._bell], writing, [], timeout_s)
         if self._bell in readable:
             self._bell.recv(4096)
         if transport in readable:
             self._receive(transport)
-        if transport.connected:
-            self._transmit(transport)
 
     def _receive(self, transport: Transport) -> None:
         data = transport.read()

@@ -44,10 +44,16 @@ class Autopilot:
                 log.info("autopilot heard: system %d", system_id)
             self._heard_s = now_s
             return True
-        if message.get_type() == "COMMAND_ACK" and message.command == POSITION_FIX and self.system_id is not None:
-            if message.target_component in (0, self._own_component):  # 0: it spoke to all
-                self._hear_result(message.result)
+        if self.system_id is not None and self._answers_our_fix(message):
+            self._hear_result(message.result)
         return False
+
+    def _answers_our_fix(self, message: Message) -> bool:
+        return (
+            message.get_type() == "COMMAND_ACK"
+            and message.command == POSITION_FIX
+            and message.target_component in (0, self._own_component)  # 0: to whom it may concern
+        )
 
     def _hear_result(self, result: int) -> None:
         known = mavlink.enums["MAV_RESULT"].get(result)

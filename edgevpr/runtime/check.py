@@ -1,7 +1,8 @@
-"""`edgevpr check`: would this configuration fly? Everything is opened the way `edgevpr run` opens it, and closed again."""
+"""`edgevpr check`: would this configuration fly? All is opened the way `edgevpr run` opens it, and closed again."""
 
 import os
 import shutil
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -68,18 +69,19 @@ def _battery(config: Config) -> str:
 def _map(config: Config) -> str:
     pipeline = open_pipeline(config)
     pipeline.place_map.close()
-    index = pipeline.index
-    return (
-        f"{config.map}, {len(index)} places of {pipeline.technique.spec.name}, "
-        f"{index.nbytes / 1e6:.2f} of {pipeline.budget_mb:.0f} MB in RAM"
-    )
+    return f"{config.map}, {pipeline.reason}"
 
 
 def _source(config: Config) -> str:
     if config.source.uri is None:
         raise UsageError("There is no source of frames: write `source: {uri: ...}`.")
-    open_source(config.source.uri, live=True).close()
-    return config.source.uri
+    source = open_source(config.source.uri, live=True)
+    # Not closed before FFmpeg has given up (5 s at most): a capture that comes back while Python ends aborts it.
+    while source.state == "opening":
+        time.sleep(0.05)
+    state = source.state
+    source.close()
+    return f"{config.source.uri}, {state}"
 
 
 def _link(config: Config) -> str:

@@ -73,15 +73,14 @@ def probe(technique: Technique) -> TechniqueCosts:
         with stage() as encoding:
             queries.append(technique.encode(frame.image))
         encodings.append(encoding.cost)
-    with TemporaryDirectory(prefix="edgevpr-") as folder:
-        with PlaceMap.create(Path(folder) / "trial.gpkg", technique.spec) as trial_map:
-            for i in range(_PLACES):
-                trial_map.add(frames[i % _ROUNDS], queries[i % _ROUNDS])
-            index = load_index(trial_map, _PLACES * bytes_per_place(technique.spec))
-            for query in queries:
-                with stage() as matching:
-                    rank(technique, query, trial_map, index)
-                matchings.append(matching.cost)
+    with TemporaryDirectory() as folder, PlaceMap.create(Path(folder) / "trial.gpkg", technique.spec) as trial_map:
+        for i in range(_PLACES):
+            trial_map.add(frames[i % _ROUNDS], queries[i % _ROUNDS])
+        index = load_index(trial_map, _PLACES * bytes_per_place(technique.spec))
+        for query in queries:
+            with stage() as matching:
+                rank(technique, query, trial_map, index)
+            matchings.append(matching.cost)
     match = min(matchings, key=lambda cost: cost.wall_s)
     fine = technique.spec.fine
     return TechniqueCosts(

@@ -1,4 +1,4 @@
-"""What each technique will cost a board in a flight, said before take-off. Nothing is measured here: `choose.probe` does.
+"""What each technique will cost a board in a flight, said before take-off, from what `choose.probe` has measured.
 
 `dataclasses.asdict` of an Estimate is ready for JSON.
 """

@@ -23,15 +23,15 @@ _SCHEMES_THAT_NEED_A_PORT = ("udp", "tcp")
 class Source(Protocol):
     """A source of frames.
 
-    `ended`: no frame will come any more. `total`: how many there will be, about, where that can be known. `state`: a
-    few words for the log, which tell more after a comma ("reading", "streaming", "lost, reopening in 2 s").
+    `ended`: no frame will come any more. `total`: about how many there will be, 0 where nobody can know. `state`: a few
+    words for the log, with what changes often behind a comma ("reading", "streaming", "lost, reopening in 2 s").
     """
 
     @property
     def ended(self) -> bool: ...
 
     @property
-    def total(self) -> int | None: ...
+    def total(self) -> int: ...
 
     @property
     def state(self) -> str: ...

@@ -41,7 +41,7 @@ class LiveSource:
     def __init__(self, open_capture: Callable[[], cv2.VideoCapture], clock: Callable[[], float]):
         self.state = "opening"
         self.ended = False
-        self.total = None
+        self.total = 0
         self.dropped = 0
         self._open_capture = open_capture
         self._clock = clock

@@ -7,8 +7,8 @@ from typing import TextIO, TypeVar
 T = TypeVar("T")
 
 
-def progress(iterable: Iterable[T], total: int | None, label: str, stream: TextIO | None = None) -> Iterator[T]:
-    """Yield what `iterable` yields, and say on `stream` (None: stderr) how many of `total` (None: nobody knows) are done."""
+def progress(iterable: Iterable[T], total: int, label: str, stream: TextIO | None = None) -> Iterator[T]:
+    """Yield what `iterable` yields; say on `stream` (None: stderr) how many of `total` (0: nobody knows) are done."""
     stream = stream or sys.stderr
     terminal = stream.isatty()
     shown = None

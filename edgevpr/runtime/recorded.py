@@ -62,7 +62,7 @@ class VideoSource:
         self._clock = clock
         self._frame_s = 1 / (self._capture.get(cv2.CAP_PROP_FPS) or _USUAL_RATE_HZ)
         frames = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)  # below zero where the file does not say
-        self.total = math.ceil(frames * self._frame_s / max(step_s, self._frame_s)) if frames > 0 else None
+        self.total = max(0, math.ceil(frames * self._frame_s / max(step_s, self._frame_s)))
         self._index = -1
         self._t_s = -self._frame_s
         self._t_due_s = 0.0

@@ -13,7 +13,7 @@ from edgevpr.config import Config
 from edgevpr.errors import ImageError, UsageError
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.link import Link, parse_link
-from edgevpr.power import machine
+from edgevpr.power.load import machine_load
 from edgevpr.runtime.flightlog import FlightLog, start_fields
 from edgevpr.runtime.frames import Source, open_source
 from edgevpr.runtime.pipeline import Pipeline, open_pipeline
@@ -40,7 +40,6 @@ class Flight:
         self._watchdog_s = watchdog_interval_s()
         self._stopping = self._recognising = False
         self._next_query_s = self._next_health_s = self._next_watchdog_s = time.monotonic()
-        self._cpu_s = time.process_time()
         self._source_lost = False
         self.queries = self.accepted = self.unusable = 0
         self.used_mah = self.marginal_mah = 0.0
@@ -106,11 +105,7 @@ class Flight:
 
     def _tell_health(self, now_s: float) -> None:
         """Once a second: how it goes, to systemd; the load, to the flight controller; a camera lost or back, to all."""
-        elapsed_s = now_s - self._next_health_s + _HEALTH_S
         self._next_health_s = now_s + _HEALTH_S
-        cpu_s = time.process_time()
-        share = min(1.0, (cpu_s - self._cpu_s) / elapsed_s / self._pipeline.board.cores)
-        self._cpu_s = cpu_s
         state = self._source.state
         notify(STATUS=f"{state}; {self.queries} queries, {self.accepted} accepted, {self.used_mah:.2f} mAh")
         lost = state.startswith(("lost", "nothing there"))
@@ -124,9 +119,12 @@ class Flight:
         if self._link is None:
             return
         self._link.set_health(messages.Health.CRITICAL if lost else messages.Health.ACTIVE)
-        rss_bytes, ram_bytes = int(machine.rss_mb() * 1e6), int(self._pipeline.board.ram_mb * 1e6)
-        shares = [share] * self._pipeline.board.cores
-        self._link.send(messages.computer_status(now_s, shares, rss_bytes, ram_bytes))
+        load = machine_load()
+        self._link.send(
+            messages.computer_status(
+                now_s, load.core_shares, load.ram_used_bytes, load.ram_total_bytes, load.temperature_c
+            )
+        )
 
 
 def fly(config: Config, positions: Path | None = None) -> int:
@@ -137,7 +135,7 @@ def fly(config: Config, positions: Path | None = None) -> int:
     with ExitStack() as stack:
         pipeline = open_pipeline(config)
         stack.callback(pipeline.place_map.close)
-        _log.info("edgevpr %s on %s", __version__, pipeline.board.title)
+        _log.info("version %s on %s", __version__, pipeline.board.title)
         _log.info("%s", pipeline.reason)
         flight_log = stack.enter_context(FlightLog(config.log.path))
         flight_log.write("start", **start_fields(config, pipeline.board.name, pipeline.technique.spec))

@@ -143,10 +143,11 @@ class _Autopilot:
         if message.get_type() == "HEARTBEAT" and message.type == mavlink.MAV_TYPE_ONBOARD_CONTROLLER:
             self._companion = sender
             self._transport.answer_sender()
-        elif message.get_type() == "COMMAND_INT":
-            # One for another vehicle or component is passed over in silence, as on the real network.
-            if message.target_system in (0, self._system_id) and message.target_component in (0, AUTOPILOT):
-                self._obey(message)
+        elif message.get_type() == "COMMAND_INT" and self._is_for_me(message):
+            self._obey(message)
+
+    def _is_for_me(self, command: Message) -> bool:
+        return command.target_system in (0, self._system_id) and command.target_component in (0, AUTOPILOT)
 
     def _obey(self, command: Message) -> None:
         result = judge(command)

@@ -28,7 +28,9 @@ Look = tuple[np.ndarray, np.ndarray]  # colour (H, W, 3) BGR, relief (H, W) cm
 
 def _ploughed(plot: Plot) -> Look:
     furrow = np.sin(plot.across_m * (2 * np.pi / 1.2) + 0.5 * plot.tufts)
-    return bgr_mix(SOIL, MUD, smooth_step(plot.patches + 0.7 * plot.tufts + 0.25 * furrow, -2, 2.4)), 2 * furrow + 2 * plot.tufts
+    return bgr_mix(
+        SOIL, MUD, smooth_step(plot.patches + 0.7 * plot.tufts + 0.25 * furrow, -2, 2.4)
+    ), 2 * furrow + 2 * plot.tufts
 
 
 def _cereal(plot: Plot) -> Look:

@@ -140,7 +140,13 @@ def _farms(rng: np.random.Generator, canvas: Canvas, road_m: np.ndarray, river_m
         ragged = smooth_step(cv2.GaussianBlur(cover, None, 8) + 0.16 * noise(rng, cover.shape, 30), 0.42, 0.58)
         canvas.paint(box, ragged, np.array(_GRAVEL if rng.random() < 0.6 else MUD) * rng.uniform(0.8, 0.95))
         canvas.height_cm[box] = np.where(ragged > 0.3, BASE_CM, canvas.height_cm[box])
-        for u, v, size in ((-9, 8, (17, 8.5)), (8, 9, (12, 7)), (10, -6, (8, 18)), (-8, -8, (11, 7.5)), (-16, -1, (5, 4))):
+        for u, v, size in (
+            (-9, 8, (17, 8.5)),
+            (8, 9, (12, 7)),
+            (10, -6, (8, 18)),
+            (-8, -8, (11, 7.5)),
+            (-16, -1, (5, 4)),
+        ):
             if rng.random() < 0.8:
                 length_m, width_m = np.array(size) * rng.uniform(0.8, 1.25, 2)
                 centre = middle + (u + rng.normal(0, 1)) * along + (v + rng.normal(0, 1)) * beside

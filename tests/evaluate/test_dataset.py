@@ -33,7 +33,7 @@ def test_right_and_ignored_references_of_scored_queries(folder):
         "a.png,,c.png,,ok\n"
         "c.png,0.1,,a.png,loose_only\n",
     )
-    assert [path.name for path in dataset.references] == ["a.png", "b.png", "c.png"]
+    assert dataset.references == ("a.png", "b.png", "c.png")
     first, second = dataset.queries
     assert (first.path, first.right, first.ignored) == (folder / "query" / "b.png", {"a.png", "b.png"}, {"c.png"})
     assert (second.path.name, second.right, second.ignored) == ("a.png", {"c.png"}, set())

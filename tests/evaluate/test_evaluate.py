@@ -48,6 +48,7 @@ def test_recall_costs_and_sizes_of_a_technique(folder, name, parameters):
     assert result.recall_at_10 == 1
     assert result.precision_at_100_recall >= result.recall_at_1
     assert result.pcu == pytest.approx(result.precision_at_100_recall)  # the slowest of one
+    assert (result.accepted, result.accepted_wrong) == (8, 1)
     assert result.t_encode_s > 0
     assert result.t_match_per_ref_s == pytest.approx(result.t_match_s / 8)
     assert 0 < result.u_encode <= 1
@@ -63,7 +64,9 @@ def test_a_loose_reference_is_passed_over_and_the_next_one_counts(folder):
     others = " ".join(f"r{place}.png" for place in range(2, 8))
     (folder / "truth.csv").write_text(f"query_file,ref_files,ref_files_loose\nq0.png,{others},r0.png {others}\n")
     cv2.imwrite(str(folder / "ref" / "r2.png"), cv2.blur(textured(0), (3, 3)))
-    assert evaluate("hog", load(folder), HOG).recall_at_1 == 1
+    result = evaluate("hog", load(folder), HOG)
+    assert result.recall_at_1 == 1
+    assert (result.accepted, result.accepted_wrong) == (1, 0)
 
 
 def test_json_has_every_promised_key_and_survives_a_round_trip(folder):

@@ -31,3 +31,9 @@ def test_nothing_to_do_writes_nothing():
     out = io.StringIO()
     assert list(progress([], 0, "map", out)) == []
     assert out.getvalue() == ""
+
+
+def test_without_a_total_a_file_gets_a_line_for_every_hundred():
+    out = io.StringIO()
+    assert len(list(progress(range(250), 0, "video", out))) == 250
+    assert out.getvalue().splitlines() == ["video  1", "video  100", "video  200"]

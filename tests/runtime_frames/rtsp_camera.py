@@ -1,5 +1,5 @@
-"""A camera that speaks RTSP on loopback, for one viewer: the RTP packets that ffmpeg sends to `rtp_port` are handed on,
-interleaved with the control connection (RFC 2326, section 10.12)."""
+"""A camera that speaks RTSP on loopback, to one viewer at a time: the RTP packets that ffmpeg sends to `rtp_port` are
+handed on, interleaved with the control connection (RFC 2326, section 10.12)."""
 
 import select
 import socket
@@ -8,13 +8,15 @@ import threading
 
 class RtspCamera:
     def __init__(self, sdp: str, rtp_port: int, port: int):
-        self._sdp = sdp.rstrip() + "\r\na=control:track0\r\n"
+        self.uri = f"rtsp://127.0.0.1:{port}/camera"
+        self._sdp = f"{sdp.rstrip()}\r\na=control:track0\r\n"
         self._rtp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._rtp.bind(("127.0.0.1", rtp_port))
         self._listener = socket.create_server(("127.0.0.1", port))
-        self.uri = f"rtsp://127.0.0.1:{port}/camera"
+        self._viewer: socket.socket | None = None
+        self._playing = False
         self._on = True
-        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread = threading.Thread(target=self._serve)
         self._thread.start()
 
     def switch_off(self) -> None:
@@ -22,42 +24,46 @@ class RtspCamera:
         self._thread.join()
 
     def _serve(self) -> None:
-        viewer: socket.socket | None = None
-        playing = False
         while self._on:
-            ready, _, _ = select.select([self._listener, self._rtp] + ([viewer] if viewer else []), [], [], 0.05)
-            if self._listener in ready:
-                viewer, _ = self._listener.accept()
-                playing = False
-            if self._rtp in ready:
-                packet = self._rtp.recv(65536)
-                if viewer and playing:
-                    viewer.sendall(b"$\x00" + len(packet).to_bytes(2, "big") + packet)
-            if viewer and viewer in ready:
-                request = viewer.recv(65536)
-                if request.startswith(b"$"):  # the viewer's receiver reports
-                    continue
-                if not request:
-                    viewer.close()
-                    viewer = None
-                    continue
-                playing = self._answer(viewer, request.decode()) or playing
-        for end in (viewer, self._listener, self._rtp):
+            sockets = [s for s in (self._listener, self._rtp, self._viewer) if s]
+            ready, _, _ = select.select(sockets, [], [], 0.05)
+            try:
+                if self._listener in ready:
+                    self._viewer, _ = self._listener.accept()
+                    self._playing = False
+                elif self._viewer in ready:
+                    self._answer(self._viewer.recv(65536))
+                if self._rtp in ready:
+                    self._hand_on(self._rtp.recv(65536))
+            except OSError:
+                self._let_viewer_go()
+        for end in (self._viewer, self._listener, self._rtp):
             if end:
                 end.close()
 
-    def _answer(self, viewer: socket.socket, request: str) -> bool:
-        """Answer one request; whether it was PLAY."""
-        method = request.split(" ", 1)[0]
-        headers = dict(line.split(": ", 1) for line in request.split("\r\n")[1:] if ": " in line)
-        body, extra = "", {"Session": "1"}
-        if method == "OPTIONS":
-            extra = {"Public": "DESCRIBE, SETUP, PLAY, TEARDOWN"}
-        elif method == "DESCRIBE":
-            body = self._sdp
-            extra = {"Content-Type": "application/sdp", "Content-Base": self.uri + "/"}
-        elif method == "SETUP":
-            extra["Transport"] = "RTP/AVP/TCP;unicast;interleaved=0-1"
-        lines = ["RTSP/1.0 200 OK", f"CSeq: {headers['CSeq']}", *(f"{name}: {value}" for name, value in extra.items())]
-        viewer.sendall("\r\n".join([*lines, f"Content-Length: {len(body)}", "", body]).encode())
-        return method == "PLAY"
+    def _hand_on(self, packet: bytes) -> None:
+        if self._viewer and self._playing:
+            self._viewer.sendall(b"$\x00" + len(packet).to_bytes(2, "big") + packet)
+
+    def _answer(self, request: bytes) -> None:
+        if not request:
+            self._let_viewer_go()
+        if not request or request.startswith(b"$"):  # the viewer's own reports on what it received
+            return
+        method, *lines = request.decode().split("\r\n")
+        method = method.split(" ")[0]
+        number = next(line for line in lines if line.startswith("CSeq"))
+        body = self._sdp if method == "DESCRIBE" else ""
+        headers = {
+            "OPTIONS": "Public: DESCRIBE, SETUP, PLAY, TEARDOWN",
+            "DESCRIBE": f"Content-Type: application/sdp\r\nContent-Base: {self.uri}/",
+            "SETUP": "Transport: RTP/AVP/TCP;unicast;interleaved=0-1",
+        }.get(method, "Range: npt=0-")
+        answer = ["RTSP/1.0 200 OK", number, "Session: 1", headers, f"Content-Length: {len(body)}", "", body]
+        self._viewer.sendall("\r\n".join(answer).encode())
+        self._playing = method == "PLAY"
+
+    def _let_viewer_go(self) -> None:
+        if self._viewer:
+            self._viewer.close()
+        self._viewer, self._playing = None, False

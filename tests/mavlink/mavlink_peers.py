@@ -1,0 +1,183 @@
+"""Other ends for links: a hand-driven autopilot, sockets to speak through, a serial cable, and a clock to turn."""
+
+import os
+import pty
+import select
+import socket
+import threading
+import time
+import tty
+from pathlib import Path
+
+from edgevpr.mavlink.wire import Receiver, mavlink
+from edgevpr.simulate.autopilot import AutopilotSummary, run_autopilot
+
+PATIENCE_S = 10.0
+
+
+def wait_until(condition, what: str = "the condition"):
+    """Wait for something that happens at once on a quiet machine; returns what `condition` gave."""
+    give_up_s = time.monotonic() + PATIENCE_S
+    while time.monotonic() < give_up_s:
+        if result := condition():
+            return result
+        time.sleep(0.005)
+    raise AssertionError(f"{what} did not come true in {PATIENCE_S:.0f} s")
+
+
+def free_port(kind: int = socket.SOCK_DGRAM) -> int:
+    with socket.socket(socket.AF_INET, kind) as sock:
+        sock.bind(("127.0.0.1", 0))
+        return sock.getsockname()[1]
+
+
+class TurnedClock:
+    """A monotonic clock that moves when told to."""
+
+    def __init__(self) -> None:
+        self.now_s = 1000.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+class Peer:
+    """An autopilot worked by hand over a socket-like `port` (recv, send); it sees nothing but what it reads."""
+
+    def __init__(self, port, system_id: int = 1) -> None:
+        self.port = port
+        self.seen = []
+        self.receiver = Receiver()
+        self._senders = {}
+        self._system_id = system_id
+
+    def send(self, message, system_id: int | None = None, component_id: int = 1) -> None:
+        sender = (system_id or self._system_id, component_id)
+        packer = self._senders.setdefault(sender, mavlink.MAVLink(None, *sender))
+        self.port.send(message.pack(packer))
+        packer.seq = (packer.seq + 1) % 256
+
+    def lose(self, packets: int, system_id: int | None = None, component_id: int = 1) -> None:
+        """Go on as if so many packets had been lost on the way."""
+        self._senders[system_id or self._system_id, component_id].seq += packets
+
+    def heartbeat(self, **sender: int) -> None:
+        self.send(mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 1, 0, 4, 3), **sender)
+
+    def answer_fix(self, result: int, command: int = 43003, to: int = 197, **sender: int) -> None:
+        ack = mavlink.MAVLink_command_ack_message(command, result, target_system=1, target_component=to)
+        self.send(ack, **sender)
+
+    def read(self) -> None:
+        """Take what comes next."""
+        self.seen += self.receiver.feed(self.port.recv(65_536))
+
+    def expect(self, name: str):
+        """Read until a message of this name comes; give it and forget it and all before."""
+        for _ in range(1000):
+            for place, message in enumerate(self.seen):
+                if message.get_type() == name:
+                    del self.seen[: place + 1]
+                    return message
+            self.read()
+        raise AssertionError(f"no {name} among a thousand reads")
+
+    def expect_text(self, text: str):
+        """Read up to the STATUSTEXT `text`; give all that came before it."""
+        before = []
+        while True:
+            while self.seen:
+                message = self.seen.pop(0)
+                if message.get_type() == "STATUSTEXT" and message.text == text:
+                    return before
+                before.append(message)
+            self.read()
+
+
+class UdpPort:
+    """A UDP socket that sends to `to`, or to whoever spoke last."""
+
+    def __init__(self, own_port: int = 0, to: int | None = None) -> None:
+        self._sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._sock.settimeout(PATIENCE_S)
+        self._sock.bind(("127.0.0.1", own_port))
+        self.to = ("127.0.0.1", to) if to else None
+        self.number = self._sock.getsockname()[1]
+
+    def recv(self, size: int) -> bytes:
+        data, self.to = self._sock.recvfrom(size)
+        return data
+
+    def send(self, data: bytes) -> None:
+        self._sock.sendto(data, self.to)
+
+    def close(self) -> None:
+        self._sock.close()
+
+
+class TcpServer:
+    """A server for one client at a time, which can die and come back on its port."""
+
+    def __init__(self, number: int) -> None:
+        self._listener = socket.create_server(("127.0.0.1", number))
+        self._listener.settimeout(PATIENCE_S)
+
+    def accept(self) -> socket.socket:
+        self._client, _ = self._listener.accept()
+        self._client.settimeout(PATIENCE_S)
+        return self._client
+
+    def close(self) -> None:
+        self._client.close()
+        self._listener.close()
+
+
+class SerialCable:
+    """Two pseudo terminals joined back to back, at `folder`/a and `folder`/b while it is plugged in."""
+
+    def __init__(self, folder: Path) -> None:
+        self.ends = (folder / "a", folder / "b")
+
+    def plug(self) -> None:
+        masters, self._slaves = zip(*(pty.openpty() for _ in self.ends), strict=True)
+        for end, slave in zip(self.ends, self._slaves, strict=True):
+            tty.setraw(slave)  # a terminal left as it is would echo
+            end.symlink_to(os.ttyname(slave))
+        self._cut = threading.Event()
+        self._copier = threading.Thread(target=self._copy, args=masters)
+        self._copier.start()
+
+    def unplug(self) -> None:
+        for end in self.ends:
+            end.unlink()
+        self._cut.set()
+        self._copier.join()
+        for slave in self._slaves:
+            os.close(slave)
+
+    def _copy(self, a: int, b: int) -> None:
+        while not self._cut.is_set():
+            for ready in select.select([a, b], [], [], 0.01)[0]:
+                os.write(b if ready == a else a, os.read(ready, 4096))
+        os.close(a)
+        os.close(b)
+
+
+class AutopilotThread:
+    """The simulated flight controller, until `finish` is called or its line is cut."""
+
+    def __init__(self, link_url: str, **options) -> None:
+        self._stop = threading.Event()
+        self._summaries: list[AutopilotSummary] = []
+        self._thread = threading.Thread(
+            target=lambda: self._summaries.append(run_autopilot(link_url, stop=self._stop, **options))
+        )
+        self._thread.start()
+
+    def join(self) -> AutopilotSummary:
+        self._thread.join(PATIENCE_S)
+        return self._summaries[0]
+
+    def finish(self) -> AutopilotSummary:
+        self._stop.set()
+        return self.join()

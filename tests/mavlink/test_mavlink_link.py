@@ -1,0 +1,370 @@
+"""One link, real sockets, and an autopilot worked by hand at the other end."""
+
+import logging
+import math
+import random
+import re
+import socket
+import threading
+from contextlib import closing
+
+import pytest
+from mavlink_peers import Peer, TcpServer, TurnedClock, UdpPort, free_port, wait_until
+
+from edgevpr.errors import LinkError
+from edgevpr.mavlink.link import Link, parse_link
+from edgevpr.mavlink.messages import Fix, Health, Severity, place_match, query_figures, status_text
+from edgevpr.mavlink.outbox import MESSAGES_MAX
+from edgevpr.mavlink.wire import mavlink
+
+
+@pytest.fixture
+def clock():
+    return TurnedClock()
+
+
+@pytest.fixture
+def port():
+    port = UdpPort()
+    yield port
+    port.close()
+
+
+@pytest.fixture
+def link(port, clock):
+    with Link(parse_link(f"udpout:127.0.0.1:{port.number}"), clock=clock) as link:
+        yield link
+
+
+@pytest.fixture
+def peer(port, link):
+    peer = Peer(port, system_id=7)
+    peer.expect("HEARTBEAT")
+    return peer
+
+
+def fix_at(t_frame_s: float, lat_deg: float = 50.0) -> Fix:
+    return Fix(lat_deg, 14.0, 25.0, t_frame_s)
+
+
+def heard(link: Link, peer: Peer) -> None:
+    peer.heartbeat()
+    wait_until(lambda: link.stats().autopilot_heard, "hearing the autopilot")
+
+
+def text(words: str):
+    return status_text(Severity.INFO, words)
+
+
+def test_the_heartbeat_comes_once_a_second_with_the_current_health(link, peer, clock):
+    link.set_health(Health.ACTIVE)
+    clock.now_s += 0.9
+    link.send(text("not yet"))
+    assert peer.expect_text("not yet") == []
+    clock.now_s += 0.2
+    assert peer.expect("HEARTBEAT").system_status == mavlink.MAV_STATE_ACTIVE
+    clock.now_s += 0.8  # 1.9: the beat keeps its step
+    link.send(text("nor now"))
+    assert peer.expect_text("nor now") == []
+    clock.now_s += 0.1
+    peer.expect("HEARTBEAT")
+
+
+def test_the_link_takes_the_autopilots_system_id_for_its_own_and_addresses_it(link, peer, clock):
+    link.send(text("before"))
+    assert peer.expect("STATUSTEXT").get_srcSystem() == 1
+    heard(link, peer)
+    link.send_fix(fix_at(clock.now_s - 0.5, 50.1234567))
+    fix = peer.expect("COMMAND_INT")
+    assert (fix.get_srcSystem(), fix.get_srcComponent()) == (7, 197)
+    assert (fix.target_system, fix.target_component) == (7, 1)
+    assert (fix.x, math.isnan(fix.z)) == (501234567, True)
+    assert (fix.param1, fix.param2) == (pytest.approx(clock.now_s), 0.5)
+
+
+def test_only_the_first_autopilot_counts(link, peer, clock):
+    peer.heartbeat(component_id=190)  # a ground station's component
+    peer.send(mavlink.MAVLink_heartbeat_message(18, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 4, 3), system_id=3)
+    heard(link, peer)
+    peer.heartbeat(system_id=9)
+    wait_until(lambda: link.stats().received.get("HEARTBEAT") == 4)
+    assert link.stats().autopilot_system_id == 7
+    link.send_fix(fix_at(clock.now_s))
+    assert peer.expect("COMMAND_INT").target_system == 7
+
+
+def test_answers_to_fixes_are_counted_by_result_and_explained_when_they_change(link, peer, caplog):
+    caplog.set_level(logging.INFO, "edgevpr.mavlink")
+    peer.answer_fix(mavlink.MAV_RESULT_ACCEPTED)  # before it is known: not ours to believe
+    heard(link, peer)
+    for _ in range(3):
+        peer.answer_fix(mavlink.MAV_RESULT_FAILED)
+    peer.answer_fix(mavlink.MAV_RESULT_ACCEPTED)
+    peer.answer_fix(99)
+    peer.answer_fix(mavlink.MAV_RESULT_ACCEPTED, system_id=9)
+    peer.answer_fix(mavlink.MAV_RESULT_ACCEPTED, command=400)
+    peer.answer_fix(mavlink.MAV_RESULT_ACCEPTED, to=191)
+    wait_until(lambda: link.stats().received.get("COMMAND_ACK") == 9)
+    assert link.stats().acks == {"FAILED": 3, "ACCEPTED": 1, "99": 1}
+    said = [record.getMessage() for record in caplog.records if "FAILED" in record.getMessage()]
+    assert len(said) == 1
+    assert "GPS still in use" in said[0]
+
+
+def test_events_and_figures_go_to_anyone_but_a_fix_waits_for_an_autopilot(link, peer, clock):
+    link.send_fix(fix_at(clock.now_s))
+    link.send(*place_match(clock.now_s, 12, 0.5), *query_figures(clock.now_s, 0.25, 1.5), text("end"))
+    assert [m.get_type() for m in peer.expect_text("end")] == ["NAMED_VALUE_INT"] + ["NAMED_VALUE_FLOAT"] * 3
+    clock.now_s += 0.5
+    peer.heartbeat()
+    assert peer.expect("COMMAND_INT").param2 == 0.5  # the wait is part of the fix's age
+
+
+def test_a_fix_that_waited_too_long_is_never_sent(link, peer, clock):
+    link.send_fix(fix_at(clock.now_s))
+    clock.now_s += 1.01
+    heard(link, peer)
+    link.send(text("end"))
+    assert "COMMAND_INT" not in [m.get_type() for m in peer.expect_text("end")]
+    assert link.stats().dropped_stale_fixes == 1
+
+
+def test_a_fix_from_an_old_frame_is_never_sent(link, peer, clock):
+    heard(link, peer)
+    link.send_fix(fix_at(clock.now_s - 5.1, 1.0))
+    link.send_fix(fix_at(clock.now_s - 4.9, 2.0))
+    assert peer.expect("COMMAND_INT").x == 20_000_000
+    assert link.stats().dropped_stale_fixes == 1
+
+
+def test_no_fix_goes_to_an_autopilot_that_has_fallen_silent(link, peer, clock):
+    heard(link, peer)
+    clock.now_s += 5.1
+    link.send_fix(fix_at(clock.now_s))
+    link.send(text("end"))
+    assert "COMMAND_INT" not in [m.get_type() for m in peer.expect_text("end")]
+    assert not link.stats().autopilot_heard
+
+
+def test_noise_between_messages_is_counted_and_the_link_goes_on(link, peer):
+    rng = random.Random(3)
+    heard(link, peer)
+    for _ in range(50):
+        peer.port.send(rng.randbytes(rng.randrange(1, 400)))
+        for _ in range(15):  # more than one beginning of a message can swallow
+            peer.answer_fix(mavlink.MAV_RESULT_ACCEPTED)
+    wait_until(lambda: link.stats().acks.get("ACCEPTED", 0) > 50, "answers among the noise")
+    assert link.stats().bad_bytes > 0
+    link.send(text("alive"))
+    peer.expect_text("alive")
+
+
+def test_a_value_that_its_field_cannot_hold_costs_that_message_only(link, peer, clock, caplog):
+    link.send(*place_match(clock.now_s, 2**40, 0.5), text("next"))
+    assert [m.name for m in peer.expect_text("next")] == ["vpr_score"]
+    assert "NAMED_VALUE_INT" in caplog.text
+
+
+def test_a_udp_peer_that_goes_and_comes_back_is_served_again(clock):
+    port = UdpPort()
+    with Link(parse_link(f"udpout:127.0.0.1:{port.number}"), clock=clock) as link:
+        Peer(port).expect("HEARTBEAT")
+        port.close()
+        for _ in range(5):
+            link.send(text("to nobody"))
+        wait_until(lambda: link.stats().sent.get("STATUSTEXT") == 5)
+        port = UdpPort(port.number)
+        link.send(text("again"))
+        Peer(port).expect_text("again")
+        port.close()
+
+
+def test_a_listening_link_speaks_when_spoken_to_and_follows_the_autopilot_to_a_new_port(clock):
+    number = free_port()
+    with Link(parse_link(f"udpin:127.0.0.1:{number}"), clock=clock) as link:
+        assert not link.stats().connected
+        link.send(text("waits for somebody"))
+        port = UdpPort(to=number)
+        peer = Peer(port)
+        heard(link, peer)
+        peer.expect_text("waits for somebody")
+        port.close()
+        port = UdpPort(to=number)
+        peer = Peer(port)
+        peer.heartbeat()
+        wait_until(lambda: link.stats().received["HEARTBEAT"] == 2)
+        link.send(text("at the new port"))
+        peer.expect_text("at the new port")
+        port.close()
+        assert link.stats().connected
+
+
+def test_a_listening_link_keeps_to_the_autopilot_when_others_speak(clock):
+    number = free_port()
+    with Link(parse_link(f"udpin:127.0.0.1:{number}"), clock=clock) as link:
+        port, stranger = UdpPort(to=number), UdpPort(to=number)
+        peer = Peer(port)
+        heard(link, peer)
+        stranger.send(b"hello")
+        wait_until(lambda: link.stats().bad_bytes >= 5)
+        link.send(text("to you"))
+        peer.expect_text("to you")
+        port.close()
+        stranger.close()
+
+
+def test_a_sending_link_hears_nothing_from_another_host(clock):
+    if not _can_bind("127.0.0.2"):
+        pytest.skip("this system has no 127.0.0.2")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger, closing(UdpPort()) as port:
+        stranger.bind(("127.0.0.2", 0))
+        with Link(parse_link(f"udpout:127.0.0.1:{port.number}"), clock=clock) as link:
+            peer = Peer(port)
+            peer.expect("HEARTBEAT")
+            stranger.sendto(b"hello", port.to)
+            heard(link, peer)
+            assert link.stats().bad_bytes == 0
+
+
+def test_a_udp_port_in_use_is_said_at_the_start(clock):
+    number = free_port()
+    with Link(parse_link(f"udpin:127.0.0.1:{number}"), clock=clock):
+        second = Link(parse_link(f"udpin:0.0.0.0:{number}"), clock=clock)
+        with pytest.raises(LinkError, match=f"port {number} is in use"):
+            second.start()
+
+
+def test_a_udp_port_held_by_another_program_of_pymavlink_is_said_at_the_start():
+    from pymavlink import mavutil
+
+    number = free_port()
+    other = mavutil.mavlink_connection(f"udpin:127.0.0.1:{number}")
+    with pytest.raises(LinkError, match=f"port {number} is in use"):
+        Link(parse_link(f"udpin:127.0.0.1:{number}")).start()
+    other.close()
+
+
+@pytest.mark.parametrize(
+    ("kind", "host"),
+    [("udpout", "no-such-host.invalid"), ("udpout", "a..b"), ("udpin", "a..b"), ("tcp", "a" * 64 + ".example")],
+)
+def test_an_unknown_host_is_said_at_the_start(kind, host):
+    with pytest.raises(LinkError, match=re.escape(f"no host '{host}'")):
+        Link(parse_link(f"{kind}:{host}:14550")).start()
+
+
+def test_a_tcp_server_that_dies_and_comes_back_is_found_again_and_old_fixes_are_not_sent(clock):
+    number = free_port(socket.SOCK_STREAM)
+    server = TcpServer(number)
+    with Link(parse_link(f"tcp:127.0.0.1:{number}"), clock=clock) as link:
+        peer = Peer(server.accept())
+        heard(link, peer)
+        server.close()
+        wait_until(lambda: not link.stats().connected, "noticing the loss")
+        assert "closed" in link.stats().trouble or "reset" in link.stats().trouble
+        link.send_fix(fix_at(clock.now_s, 1.0))
+        clock.now_s += 0.8
+        link.send_fix(fix_at(clock.now_s, 2.0))
+        clock.now_s += 0.8
+        server = TcpServer(number)
+        peer = Peer(server.accept())
+        peer.heartbeat()
+        assert peer.expect("COMMAND_INT").x == 20_000_000  # the one of 1.6 s ago is gone, that of 0.8 s is not
+        assert peer.receiver.bad_bytes == 0
+        wait_until(lambda: link.stats().trouble is None)
+        assert (link.stats().dropped_stale_fixes, link.stats().reopened) == (1, 1)
+    server.close()
+
+
+def test_an_absent_tcp_server_is_no_error_and_the_newest_messages_wait_for_it(clock):
+    number = free_port(socket.SOCK_STREAM)
+    with Link(parse_link(f"tcp:127.0.0.1:{number}"), clock=clock) as link:
+        assert not link.stats().connected
+        assert link.stats().trouble == "Connection refused"
+        for count in range(MESSAGES_MAX + 36):
+            link.send(text(f"{count}"))
+        assert link.stats().dropped_queue_full == 36
+        server = TcpServer(number)
+        peer = Peer(server.accept())
+        texts = [m.text for m in peer.expect_text(f"{MESSAGES_MAX + 35}") if m.get_type() == "STATUSTEXT"]
+        assert texts == [f"{count}" for count in range(36, MESSAGES_MAX + 35)]
+    server.close()
+
+
+def test_a_peer_that_does_not_read_never_blocks_the_sender(clock):
+    number = free_port(socket.SOCK_STREAM)
+    server = TcpServer(number)
+    with Link(parse_link(f"tcp:127.0.0.1:{number}"), clock=clock) as link:
+        server.accept()
+
+        def stuck() -> bool:
+            link.send(*[text("x" * 50)] * MESSAGES_MAX)
+            clock.now_s += 0.01
+            return link.stats().trouble is not None
+
+        wait_until(stuck, "filling the line")
+        assert link.stats().trouble in ("the port takes no more bytes", "Connection timed out")
+    server.close()
+
+
+def test_many_threads_may_send_and_no_packet_is_lost_or_torn(link, peer):
+    def chatter(name: str) -> None:
+        for count in range(20):
+            link.send(text(f"{name}{count}"))
+
+    threads = [threading.Thread(target=chatter, args=(name,)) for name in "abc"]
+    for thread in threads:
+        thread.start()
+    texts = {peer.expect("STATUSTEXT").text for _ in range(60)}
+    for thread in threads:
+        thread.join()
+    assert texts == {f"{name}{count}" for name in "abc" for count in range(20)}
+    assert peer.receiver.bad_bytes == 0
+
+
+def test_closing_sends_what_waits_and_then_nothing(port, clock):
+    link = Link(parse_link(f"udpout:127.0.0.1:{port.number}"), clock=clock)
+    link.start()
+    link.send(*[text(f"{count}") for count in range(30)])
+    link.close()
+    peer = Peer(port)
+    assert len(peer.expect_text("29")) == 30  # 29 texts and the heartbeat
+    link.send(text("late"))
+    link.close()
+    assert not link.stats().connected
+
+
+def test_a_link_that_was_never_started_can_be_closed():
+    Link(parse_link("udpout:127.0.0.1:14550")).close()
+
+
+def test_pymavlinks_own_connection_decodes_all_that_is_sent(monkeypatch, clock):
+    monkeypatch.setenv("MAVLINK20", "1")
+    from pymavlink import mavutil
+
+    number = free_port()
+    other = mavutil.mavlink_connection(f"udpin:127.0.0.1:{number}", dialect="all", source_system=5, source_component=1)
+    with Link(parse_link(f"udpout:127.0.0.1:{number}"), clock=clock) as link:
+        first = other.recv_match(blocking=True, timeout=10)
+        assert first.get_type() == "HEARTBEAT"
+        other.mav.heartbeat_send(
+            mavutil.mavlink.MAV_TYPE_QUADROTOR, mavutil.mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 0, 0, 4
+        )
+        wait_until(lambda: link.stats().autopilot_heard)
+        link.send_fix(fix_at(clock.now_s))
+        assert other.recv_match(type="COMMAND_INT", blocking=True, timeout=10).command == 43003
+        link.send(*place_match(1.0, 2, 0.5), *query_figures(1.0, 0.5, 2.0), text("end"))
+        names = [other.recv_match(blocking=True, timeout=10).get_type() for _ in range(5)]
+        assert names == ["NAMED_VALUE_INT", *["NAMED_VALUE_FLOAT"] * 3, "STATUSTEXT"]
+        assert other.mav.total_receive_errors == 0
+        assert link.stats().bad_bytes == 0
+    other.close()
+
+
+def _can_bind(host: str) -> bool:
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+            sock.bind((host, 0))
+    except OSError:
+        return False
+    return True

@@ -1,0 +1,76 @@
+"""A serial link over a cable of pseudo terminals, pulled out and put back."""
+
+import os
+import pty
+import time
+
+import pytest
+from mavlink_peers import AutopilotThread, SerialCable, wait_until
+
+from edgevpr.errors import LinkError
+from edgevpr.mavlink.link import Link, parse_link
+from edgevpr.mavlink.messages import Fix, Severity, status_text
+
+
+@pytest.fixture
+def terminal():
+    """A serial device whose other end nobody reads."""
+    master, slave = pty.openpty()
+    yield os.ttyname(slave)
+    os.close(master)
+    os.close(slave)
+
+
+def test_an_unplugged_cable_is_found_again_when_it_is_plugged_in(tmp_path):
+    cable = SerialCable(tmp_path)
+    here, there = (f"serial:{end}:57600" for end in cable.ends)
+    with Link(parse_link(here)) as link:
+        assert link.stats().trouble == "No such file or directory"  # absent at the start: no error
+        for times in (1, 2):
+            cable.plug()
+            autopilot = AutopilotThread(there, system_id=7)
+            wait_until(lambda: link.stats().autopilot_heard and link.stats().trouble is None, "hearing the autopilot")
+            link.send_fix(Fix(50.0, 14.0, 25.0, time.monotonic()))
+            wait_until(lambda times=times: link.stats().acks == {"ACCEPTED": times}, "the answer to the fix")
+            cable.unplug()
+            wait_until(lambda: not link.stats().connected, "noticing the loss")
+            summary = autopilot.join()  # a cut line ends it
+            assert (summary.companion, summary.fixes_accepted) == ("7/197", 1)
+            assert (summary.bad_bytes, summary.lost_packets) == (0, 0)
+        assert link.stats().reopened == 2
+        assert link.stats().bad_bytes == 0
+
+
+def test_a_line_that_takes_no_bytes_never_blocks_the_sender(terminal):
+    with Link(parse_link(f"serial:{terminal}:57600")) as link:
+
+        def stuck() -> bool:
+            link.send(*[status_text(Severity.INFO, "x" * 50)] * 64)
+            return link.stats().trouble is not None
+
+        wait_until(stuck, "filling the line")
+        assert link.stats().trouble == "the port takes no more bytes"
+
+
+def test_a_device_in_use_is_said_at_the_start(terminal):
+    with Link(parse_link(f"serial:{terminal}:57600")), pytest.raises(LinkError, match="in use by another program"):
+        Link(parse_link(f"serial:{terminal}:115200")).start()
+
+
+def test_a_device_that_this_user_may_not_open_is_said_at_the_start(terminal):
+    os.chmod(terminal, 0)
+    user = os.geteuid()
+    if user == 0:
+        os.seteuid(65_534)  # root may open everything
+    try:
+        with pytest.raises(LinkError, match="dialout"):
+            Link(parse_link(f"serial:{terminal}:57600")).start()
+    finally:
+        os.seteuid(user)
+
+
+def test_a_path_that_is_no_serial_device_is_said_at_the_start(tmp_path):
+    path = tmp_path / "ttyACM0"
+    path.write_bytes(b"")
+    with pytest.raises(LinkError, match="no serial device"):
+        Link(parse_link(f"serial:{path}:57600")).start()

@@ -1,0 +1,116 @@
+"""The simulated flight controller: strict, and honest about what it saw."""
+
+import json
+import math
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import pytest
+from mavlink_peers import AutopilotThread, Peer, UdpPort, free_port, wait_until
+
+from edgevpr.errors import LinkError
+from edgevpr.mavlink import messages
+from edgevpr.mavlink.link import Link, parse_link
+from edgevpr.mavlink.messages import Fix, Health
+from edgevpr.mavlink.wire import mavlink
+from edgevpr.simulate.autopilot import judge, run_autopilot
+
+
+def a_fix(**changes):
+    command = messages.position_fix(Fix(50.0, 14.0, 25.0, 0.0), 0.5, target_system=1)
+    for field, value in changes.items():
+        setattr(command, field, value)
+    return command
+
+
+@pytest.mark.parametrize(
+    ("command", "result"),
+    [
+        (a_fix(), mavlink.MAV_RESULT_ACCEPTED),
+        (a_fix(frame=mavlink.MAV_FRAME_GLOBAL_INT), mavlink.MAV_RESULT_ACCEPTED),
+        (a_fix(frame=mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT), mavlink.MAV_RESULT_DENIED),
+        (a_fix(z=0.0), mavlink.MAV_RESULT_DENIED),
+        (a_fix(param3=0.0), mavlink.MAV_RESULT_DENIED),
+        (a_fix(param3=-1.0), mavlink.MAV_RESULT_DENIED),
+        (a_fix(param3=math.nan), mavlink.MAV_RESULT_DENIED),
+        (a_fix(param3=math.inf), mavlink.MAV_RESULT_DENIED),
+        (a_fix(x=900_000_001), mavlink.MAV_RESULT_DENIED),
+        (a_fix(y=-1_800_000_001), mavlink.MAV_RESULT_DENIED),
+        (a_fix(command=400), mavlink.MAV_RESULT_UNSUPPORTED),
+    ],
+)
+def test_a_command_is_judged_by_its_form(command, result):
+    assert judge(command) == result
+
+
+def test_it_answers_counts_and_remembers():
+    number = free_port()
+    port = UdpPort(number)
+    companion = Peer(port)
+    autopilot = AutopilotThread(f"udpout:127.0.0.1:{number}")
+    heartbeat = companion.expect("HEARTBEAT")
+
+    def send(message):
+        companion.send(message, component_id=197)
+
+    send(messages.heartbeat(Health.ACTIVE))
+    port.send(b"noise")
+    assert (heartbeat.get_srcSystem(), heartbeat.get_srcComponent()) == (1, 1)
+    assert heartbeat.autopilot == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
+    results = []
+    for command in (a_fix(x=501234567), a_fix(z=3.0), a_fix(command=400)):
+        send(command)
+        results.append(companion.expect("COMMAND_ACK").result)
+    assert results == [mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_DENIED, mavlink.MAV_RESULT_UNSUPPORTED]
+    send(a_fix(target_system=2))  # for another vehicle: no answer
+    companion.lose(3, component_id=197)
+    send(a_fix(x=501234568))
+    assert companion.expect("COMMAND_ACK").result == mavlink.MAV_RESULT_ACCEPTED
+    assert not companion.seen
+    summary = autopilot.finish()
+    port.close()
+    assert summary.companion == "1/197"
+    assert [(fix.lat_deg, fix.lon_deg, fix.accuracy_m) for fix in summary.fixes] == [
+        (50.1234567, 14.0, 25.0),
+        (50.1234568, 14.0, 25.0),
+    ]
+    assert (summary.fixes_accepted, summary.fixes_denied) == (2, 1)
+    assert summary.messages["COMMAND_INT"] == summary.messages_by_sender["1/197"]["COMMAND_INT"] == 5
+    assert (summary.lost_packets, summary.bad_bytes) == (3, 5)
+    assert json.loads(summary.to_json())["fixes"][0]["lat_deg"] == 50.1234567
+    assert "2 accepted, 1 denied" in str(summary)
+
+
+def test_it_is_a_process_that_ends_well_on_sigterm_and_says_what_it_saw():
+    number = free_port()
+    code = f"from edgevpr.simulate.autopilot import run_autopilot as r; print(r('udpin:127.0.0.1:{number}').to_json())"
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    with Link(parse_link(f"udpout:127.0.0.1:{number}")) as link:
+        link.set_health(Health.ACTIVE)
+        wait_until(lambda: link.stats().autopilot_heard, "the other process")
+        link.send_fix(Fix(50.1234567, 14.0, 25.0, time.monotonic()))
+        link.send(*messages.place_match(time.monotonic(), 3, 0.5))
+        wait_until(lambda: link.stats().acks == {"ACCEPTED": 1})
+        wait_until(lambda: link.stats().sent.get("NAMED_VALUE_FLOAT") == 1)
+    process.send_signal(signal.SIGTERM)
+    said, _ = process.communicate(timeout=10)
+    assert process.returncode == 0
+    summary = json.loads(said)
+    assert summary["fixes_accepted"] == 1
+    assert {"HEARTBEAT", "COMMAND_INT", "NAMED_VALUE_INT", "NAMED_VALUE_FLOAT"} <= set(summary["messages"])
+    assert (summary["lost_packets"], summary["bad_bytes"]) == (0, 0)
+
+
+def test_it_ends_when_its_time_is_up():
+    summary = run_autopilot(f"udpin:127.0.0.1:{free_port()}", duration_s=0.1)
+    assert (summary.messages, summary.companion, summary.fixes) == ({}, None, ())
+    assert "not heard" in str(summary)
+
+
+@pytest.mark.parametrize("link", ["tcp:127.0.0.1:{}", "serial:/dev/no-such-device:{}"])
+def test_a_link_that_cannot_be_opened_is_one_sentence(link):
+    with pytest.raises(LinkError, match="cannot be opened"):
+        run_autopilot(link.format(free_port(socket.SOCK_STREAM)))

@@ -1,0 +1,173 @@
+"""Profiles of boards: those that travel with edgevpr, the user's own, and the machine itself."""
+
+import os
+
+import pytest
+
+from edgevpr.errors import ConfigError
+from edgevpr.power.boards import board_names, load_board
+from edgevpr.resources import shipped
+
+PROFILE = (shipped("profiles") / "rpi-4b.yaml").read_text()
+
+
+def own_profile(tmp_path, **changes):
+    """The path of a copy of the Pi 4's profile with some lines changed; None leaves a line out."""
+    lines = [line for line in PROFILE.splitlines() if line.split(":")[0] not in changes]
+    lines += [f"{key}: {value}" for key, value in changes.items() if value is not None]
+    path = tmp_path / "mine.yaml"
+    path.write_text("\n".join(lines))
+    return str(path)
+
+
+def this_root(tmp_path, model=None, ram_kb=4_000_000, **limits):
+    """A root with the memory, the device tree and the control group limits of some machine."""
+    (tmp_path / "proc/self").mkdir(parents=True)
+    (tmp_path / "proc/meminfo").write_text(f"MemTotal: {ram_kb} kB\n")
+    (tmp_path / "proc/self/cgroup").write_text("0::/\n")
+    (tmp_path / "sys/fs/cgroup").mkdir(parents=True)
+    for name, text in limits.items():
+        (tmp_path / "sys/fs/cgroup" / name.replace("_", ".")).write_text(text)
+    if model:
+        (tmp_path / "proc/device-tree").mkdir()
+        (tmp_path / "proc/device-tree/model").write_text(model + "\0")
+    return tmp_path
+
+
+def test_every_board_of_the_thesis_and_of_small_drones_is_there():
+    assert board_names() == (
+        "generic-x86", "jetson-nano", "jetson-orin-nano", "odroid-xu4",
+        "rpi-3b-plus", "rpi-4b", "rpi-5", "rpi-zero-2w", "thesis-xeon",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("name", board_names())
+def test_a_profile_that_travels_is_whole_and_says_where_its_figures_are_from(name):
+    board = load_board(name)
+    assert board.name == name
+    assert board.source
+    assert board.speed_source
+    assert board.relative_speed or not board.speed_verified
+
+
+@pytest.mark.parametrize(
+    ("name", "idle_w", "full_w", "verified"),
+    [
+        ("rpi-zero-2w", 0.6, 3.0, False),
+        ("rpi-3b-plus", 2.0, 5.3, True),
+        ("rpi-4b", 2.29, 6.82, True),
+        ("rpi-5", 4.4, 7.86, True),
+        ("odroid-xu4", 3.0, 8.5, False),
+        ("jetson-orin-nano", 2.6, 25.0, False),
+        ("thesis-xeon", 0.0, 1.0, False),
+    ],
+)
+def test_the_watts_are_the_published_ones(name, idle_w, full_w, verified):
+    board = load_board(name)
+    assert (board.idle_w, board.full_w, board.verified) == (idle_w, full_w, verified)
+
+
+def test_a_profile_of_ones_own_is_named_by_its_path(tmp_path):
+    board = load_board(own_profile(tmp_path, full_w=7.5))
+    assert (board.name, board.full_w) == ("mine", 7.5)
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"full_w": 1.5}, "`full_w` is 1.5, below `idle_w`, 2.29: correct one of them."),
+        ({"idle_w": -1}, "`idle_w` is -1; it must be between 0 and 1000."),
+        ({"ram_mb": 0}, "`ram_mb` is 0; it must be between 64 and 4e+06."),
+        ({"cpu_share": 1.5}, "`cpu_share` is 1.5; it must be between 0.01 and 1."),
+        ({"cores": "four"}, "`cores` must be a whole number, not 'four'."),
+        ({"verified": "maybe"}, "`verified` must be true or false, not 'maybe'."),
+        ({"wats": 3}, "unknown key `wats`"),
+        ({"source": None}, "the key `source` is missing: add it."),
+        (
+            {"budget_mb": 600},
+            "`budget_mb` (600) must fit in `memory_max_mb` (512), and that in `ram_mb` (1024): correct them.",
+        ),
+        (
+            {"memory_max_mb": 2000},
+            "`budget_mb` (256) must fit in `memory_max_mb` (2000), and that in `ram_mb` (1024): correct them.",
+        ),
+    ],
+)
+def test_a_profile_that_makes_no_sense_is_one_sentence(tmp_path, changes, sentence):
+    path = own_profile(tmp_path, **changes)
+    with pytest.raises(ConfigError) as raised:
+        load_board(path)
+    assert str(raised.value).startswith(f"{path}: {sentence}")
+
+
+def test_a_board_that_is_not_there_is_one_sentence(tmp_path):
+    with pytest.raises(ConfigError, match=r"^There is no board `rpi4b`: did you mean `rpi-4b`\?$"):
+        load_board("rpi4b")
+    with pytest.raises(
+        ConfigError, match=r"^There is no board `quantum`: use this, generic-x86, .*, or the path of a YAML"
+    ):
+        load_board("quantum")
+    with pytest.raises(ConfigError, match="cannot be read"):
+        load_board(str(tmp_path / "none.yaml"))
+
+
+def test_this_machine_is_recognised_by_its_device_tree(tmp_path):
+    root = this_root(tmp_path, model="Raspberry Pi 4 Model B Rev 1.4", ram_kb=8_000_000)
+    board, profile = load_board("this", root), load_board("rpi-4b")
+    assert board.name == "rpi-4b"
+    assert board.title == "this machine (Raspberry Pi 4B, 64-bit)"
+    assert (board.idle_w, board.full_w, board.relative_speed) == (profile.idle_w, profile.full_w, 0.38)
+    assert board.ram_mb == 8192.0
+    assert (board.budget_mb, board.memory_max_mb) == (2048.0, 4096.0)  # a quarter and half, as in the profile
+    assert board.cores == os.cpu_count()
+
+
+@pytest.mark.parametrize(
+    ("model", "name"),
+    [
+        ("Raspberry Pi Zero 2 W Rev 1.0", "rpi-zero-2w"),
+        ("Raspberry Pi 3 Model B Plus Rev 1.3", "rpi-3b-plus"),
+        ("Raspberry Pi 5 Model B Rev 1.0", "rpi-5"),
+        ("Hardkernel Odroid XU4", "odroid-xu4"),
+        ("NVIDIA Jetson Nano Developer Kit", "jetson-nano"),
+        ("NVIDIA Jetson Orin Nano Developer Kit", "jetson-orin-nano"),
+    ],
+)
+def test_each_board_is_recognised(tmp_path, model, name):
+    assert load_board("this", this_root(tmp_path, model)).name == name
+
+
+def test_a_machine_without_a_device_tree_is_any_x86(tmp_path):
+    board = load_board("this", this_root(tmp_path))
+    assert (board.name, board.relative_speed, board.verified) == ("generic-x86", 1.0, False)
+
+
+def test_a_board_nobody_has_profiled_has_no_known_speed(tmp_path):
+    board = load_board("this", this_root(tmp_path, "Radxa ZERO 3"))
+    assert board.relative_speed is None
+    assert "Radxa ZERO 3" in board.title
+    assert not board.verified
+
+
+def test_a_control_group_lowers_what_edgevpr_may_take_but_not_what_the_machine_is(tmp_path):
+    root = this_root(tmp_path, "Raspberry Pi 4 Model B", memory_max="400000000\n", cpu_max="20000 100000\n")
+    board = load_board("this", root)
+    assert board.ram_mb == 4096.0
+    assert (board.memory_max_mb, board.budget_mb) == (400.0, 200.0)
+    assert board.cores == os.cpu_count()
+    assert board.cores * board.cpu_share == pytest.approx(0.2)
+
+
+def test_the_services_own_limits_are_not_taken_off_twice(tmp_path):
+    model = "Raspberry Pi 4 Model B"
+    free = load_board("this", this_root(tmp_path / "free", model))
+    quota = f"{round(100_000 * free.cpu_share * free.cores)} 100000\n"
+    memory_max = f"{round(free.memory_max_mb * 1e6)}\n"
+    served = load_board("this", this_root(tmp_path / "served", model, memory_max=memory_max, cpu_max=quota))
+    assert served == free
+
+
+def test_the_real_machine_loads():
+    board = load_board("this")
+    assert board.budget_mb <= board.memory_max_mb <= board.ram_mb
+    assert board.cores == os.cpu_count()

@@ -1,0 +1,107 @@
+"""What the machine has: read from trees that stand for /proc and /sys, and from the real ones."""
+
+import os
+
+import pytest
+
+from edgevpr.power import machine
+
+
+@pytest.fixture
+def tree(tmp_path):
+    """Write files below a root: tree({"proc/meminfo": "..."}) -> the root."""
+
+    def write(files):
+        for name, text in files.items():
+            path = tmp_path / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text)
+        return tmp_path
+
+    return write
+
+
+MEMINFO = "MemTotal:        2000000 kB\nMemFree:          100000 kB\n"
+SERVICE = "1:cpu:/\n0::/system.slice/edgevpr.service\n"
+
+
+def test_without_control_groups_the_machine_is_the_limit(tree):
+    root = tree({"proc/meminfo": MEMINFO})
+    assert machine.ram_limit_mb(root) == machine.ram_mb(root) == 2048.0
+    assert machine.cores(root) == len(os.sched_getaffinity(0))
+
+
+def test_the_memory_limit_of_the_service_binds(tree):
+    root = tree(
+        {
+            "proc/meminfo": MEMINFO,
+            "proc/self/cgroup": SERVICE,
+            "sys/fs/cgroup/system.slice/edgevpr.service/memory.max": "536870912\n",
+            "sys/fs/cgroup/system.slice/memory.max": "max\n",
+        }
+    )
+    assert machine.ram_limit_mb(root) == 536.870912
+    assert machine.ram_mb(root) == 2048.0
+
+
+def test_the_limit_of_a_group_above_binds_too(tree):
+    root = tree(
+        {
+            "proc/meminfo": MEMINFO,
+            "proc/self/cgroup": SERVICE,
+            "sys/fs/cgroup/system.slice/edgevpr.service/memory.max": "536870912\n",
+            "sys/fs/cgroup/system.slice/memory.max": "100000000\n",
+        }
+    )
+    assert machine.ram_limit_mb(root) == 100.0
+
+
+def test_a_limit_above_the_machine_changes_nothing(tree):
+    root = tree({"proc/meminfo": MEMINFO, "proc/self/cgroup": "0::/\n", "sys/fs/cgroup/memory.max": "99999999999999\n"})
+    assert machine.ram_limit_mb(root) == 2048.0
+
+
+@pytest.mark.parametrize(("quota", "expected"), [("50000 100000", 0.5), ("max 100000", None)])
+def test_the_quota_of_the_service_bounds_the_cores(tree, quota, expected):
+    root = tree({"proc/self/cgroup": SERVICE, "sys/fs/cgroup/system.slice/edgevpr.service/cpu.max": f"{quota}\n"})
+    assert machine.cores(root) == (expected or len(os.sched_getaffinity(0)))
+
+
+def test_cores_obey_the_affinity_of_the_process(tree):
+    allowed = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(allowed)})
+    try:
+        assert machine.cores(tree({})) == 1
+    finally:
+        os.sched_setaffinity(0, allowed)
+
+
+def test_the_model_is_read_without_its_closing_zero(tree):
+    root = tree({"proc/device-tree/model": "Raspberry Pi 4 Model B Rev 1.4\0"})
+    assert machine.model(root) == "Raspberry Pi 4 Model B Rev 1.4"
+
+
+def test_a_machine_without_a_device_tree_has_no_model(tmp_path):
+    assert machine.model(tmp_path) is None
+
+
+def test_memory_of_the_process_is_read_in_megabytes(tree):
+    root = tree(
+        {"proc/self/statm": "90000 10000 4000 1 0 20000 0\n", "proc/self/smaps_rollup": "Rss: 9 kB\nPss: 1000 kB\n"}
+    )
+    assert machine.rss_mb(root) == 10000 * os.sysconf("SC_PAGE_SIZE") / 1e6
+    assert machine.pss_mb(root) == 1.024
+
+
+def test_a_kernel_without_proportional_memory_says_none(tmp_path):
+    assert machine.pss_mb(tmp_path) is None
+
+
+def test_the_real_process_grows_by_what_it_touches():
+    before_mb = machine.rss_mb()
+    held = bytearray(os.urandom(30_000_000))
+    grown_mb = machine.rss_mb() - before_mb
+    assert len(held) == 30_000_000
+    assert 25 < grown_mb < 100
+    assert machine.rss_mb() < machine.ram_limit_mb() <= machine.ram_mb()
+    assert 0 < machine.cores() <= os.cpu_count()

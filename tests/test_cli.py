@@ -1,0 +1,206 @@
+"""The commands as a user types them, and one clear sentence for everything that is wrong."""
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from pictures import textured
+
+from edgevpr.cli import main
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory):
+    """A folder of six pictures with positions, and the same six a little darker and shifted as queries."""
+    folder = tmp_path_factory.mktemp("flight")
+    (folder / "ref").mkdir()
+    (folder / "query").mkdir()
+    rows = ["file,lat,lon,alt,yaw_deg"]
+    for number in range(6):
+        picture = textured(number, 240, 320)
+        cv2.imwrite(str(folder / "ref" / f"{number}.png"), picture)
+        seen_again = cv2.convertScaleAbs(np.roll(picture, 9, axis=1), alpha=0.8)
+        cv2.imwrite(str(folder / "query" / f"{number}.png"), seen_again)
+        rows.append(f"{number}.png,{50 + number * 0.001:.6f},8.0,100,{number}")
+    (folder / "positions.csv").write_text("\n".join(rows) + "\n")
+    truth = ["query_file,ref_files"] + [f"{number}.png,{number}.png" for number in range(6)]
+    (folder / "ground_truth.csv").write_text("\n".join(truth) + "\n")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def valley(flight, tmp_path_factory):
+    path = tmp_path_factory.mktemp("maps") / "valley.gpkg"
+    assert main(["map", "build", str(path), "--images", str(flight / "ref"), "--technique", "cohog"]) == 0
+    return path
+
+
+def run_json(capsys, *argv):
+    assert main([str(word) for word in argv]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def refused(capsys, *argv):
+    """The one sentence with which a command fails, and its exit code."""
+    code = main([str(word) for word in argv])
+    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("edgevpr: ")]
+    assert "Traceback" not in "".join(said)
+    return code, said[-1]
+
+
+def test_map_info_tells_what_is_inside(capsys, valley):
+    info = run_json(capsys, "map", "info", valley, "--json")
+    assert info["places"] == info["with_position"] == 6
+    assert info["spec"]["name"] == "cohog"
+    assert main(["map", "info", str(valley)]) == 0
+    assert "6 places, 6 with a position" in capsys.readouterr().out
+
+
+def test_match_finds_every_place_and_says_what_it_cost(capsys, flight, valley):
+    found = run_json(capsys, "match", valley, "--images", flight / "query", "--json")
+    assert [each["query"] for each in found] == [f"{n}.png" for n in range(6)]
+    assert [each["reference_image"] for each in found] == [f"{n}.png" for n in range(6)]
+    for each in found:
+        assert each["accepted"] is True
+        assert 0 < each["score"] <= 1
+        assert each["error_m"] == 0
+        assert each["costs"]["t_encode_s"] > 0
+        assert each["costs"]["used_mah"] > 0
+    assert found[2]["position"] == {"lat_deg": 50.002, "lon_deg": 8.0, "alt_m": 100.0}
+    assert main(["match", str(valley), "--images", str(flight / "query")]) == 0
+    assert "6 queries, 6 accepted" in capsys.readouterr().out
+
+
+def test_a_match_below_the_threshold_is_not_accepted(capsys, flight, valley):
+    found = run_json(capsys, "match", valley, "--images", flight / "query", "--min-score", "0.9999", "--json")
+    assert not any(each["accepted"] for each in found)
+
+
+def test_eval_prints_the_promised_keys(capsys, flight):
+    result = run_json(
+        capsys, "eval", "--query", flight / "query", "--ref", flight / "ref",
+        "--ground-truth", flight / "ground_truth.csv", "--techniques", "hog,cohog",
+        "--param", "cohog.entropy=filled_bins", "--json",
+    )["techniques"]  # fmt: skip
+    promised = {
+        *("recall_at_1", "recall_at_5", "recall_at_10", "precision_at_100_recall", "auc", "ep", "pcu"),
+        *("t_encode_s", "t_match_s", "t_match_per_ref_s", "descriptor_bytes", "u_encode", "u_match", "ah_total"),
+    }
+    assert set(result) == {"hog", "cohog"}
+    for each in result.values():
+        assert promised <= set(each)
+    assert result["cohog"]["recall_at_1"] == 1.0
+    assert result["cohog"]["parameters"]["entropy"] == "filled_bins"
+
+
+def test_profile_says_what_fits(capsys):
+    estimate = run_json(capsys, "profile", "--board", "rpi-zero-2w", "--places", 10_000, "--json")
+    rows = {row["technique"]: row for row in estimate["techniques"]}
+    assert not rows["hog"]["fits"], "286 KB a place is 2.9 GB: more than the board has"
+    assert any("RAM" in why for why in rows["hog"]["shortfalls"])
+    assert main(["profile", "--board", "rpi-4b", "--places", "50"]) == 0
+    assert "Raspberry Pi 4" in capsys.readouterr().out
+
+
+def test_the_technique_is_picked_and_the_reason_logged(capsys, caplog, flight, tmp_path):
+    with caplog.at_level("INFO"):
+        built = run_json(capsys, "map", "build", tmp_path / "m.gpkg", "--images", flight / "ref", "--json")
+    assert built["technique"] == "cohog"
+    assert any("technique cohog: 6 places take" in message for message in caplog.messages)
+
+
+def test_a_broken_off_map_is_continued(capsys, flight, tmp_path):
+    half = tmp_path / "half"
+    half.mkdir()
+    for number in range(3):
+        shutil.copy(flight / "ref" / f"{number}.png", half)
+    path = tmp_path / "m.gpkg"
+    run_json(capsys, "map", "build", path, "--images", half, "--technique", "cohog", "--json")
+    built = run_json(capsys, "map", "build", path, "--images", flight / "ref", "--append", "--json")
+    assert (built["added"], built["already_here"], built["places"]) == (3, 3, 6)
+
+
+def test_maps_are_merged_and_exported(capsys, flight, valley, tmp_path):
+    assert main(["map", "merge", str(tmp_path / "all.gpkg"), str(valley), str(valley)]) == 0
+    assert "6 there already" in capsys.readouterr().out
+    assert main(["map", "export", str(tmp_path / "all.gpkg"), "--geojson", "-"]) == 0
+    assert len(json.loads(capsys.readouterr().out)["features"]) == 6
+
+
+def test_unusable_images_are_named_and_the_others_mapped(capsys, flight, tmp_path):
+    folder = tmp_path / "mixed"
+    shutil.copytree(flight / "ref", folder)
+    (folder / "cut.png").write_bytes((folder / "0.png").read_bytes()[:2000])
+    (folder / "text.jpg").write_text("no picture")
+    cv2.imwrite(str(folder / "dot.png"), np.zeros((1, 1), np.uint8))
+    cv2.imwrite(str(folder / "deep.png"), np.zeros((40, 40), np.uint16))
+    path = tmp_path / "m.gpkg"
+    assert main(["map", "build", str(path), "--images", str(folder), "--technique", "cohog"]) == 1
+    said = capsys.readouterr().err
+    for name in ("cut.png", "text.jpg", "dot.png", "deep.png"):
+        assert any(name in line for line in said.splitlines())
+    assert run_json(capsys, "map", "info", path, "--json")["places"] == 6
+
+
+def test_what_the_world_gets_wrong_is_a_sentence_and_exit_code_1(capsys, flight, valley, tmp_path):
+    query = flight / "query"
+    for argv, says in [
+        (["match", tmp_path / "no.gpkg", "--images", query], "There is no map"),
+        (["match", flight / "positions.csv", "--images", query], "not a place map"),
+        (["match", valley, "--images", tmp_path / "nowhere"], "There is nothing at"),
+        (["match", valley, "--images", query, "--technique", "hog"], "technique is cohog, not hog"),
+        (["match", valley, "--images", query, "--param", "gt=0.7"], "gt is 0.4, not 0.7"),
+        (["map", "build", valley, "--images", query, "--technique", "cohog"], "is there already"),
+        (["map", "build", tmp_path / "no" / "m.gpkg", "--images", query, "--technique", "cohog"], "check the path"),
+        (["run", "--map", valley, "--source", query, "--log", tmp_path / "no" / "x.jsonl"], "flight log"),
+        (["run", "--map", valley, "--source", query, "--log", tmp_path / "x", "--link", "udp:1"], "no MAVLink link"),
+        (["map", "export", valley, "--geojson", tmp_path / "no" / "x.json"], "No such file"),
+    ]:
+        code, sentence = refused(capsys, *argv)
+        assert (code, says in sentence) == (1, True), sentence
+
+
+def test_what_the_user_gets_wrong_is_a_sentence_and_exit_code_2(capsys, flight, valley, tmp_path):
+    query = flight / "query"
+    config = tmp_path / "c.yaml"
+    config.write_text("mach: {min_score: 1}\n")
+    wrong_row = tmp_path / "positions.csv"
+    wrong_row.write_text("file,lat,lon\n0.png,91,8\n")
+    for argv, says in [
+        (["match", valley, "--images", query, "--min-score", "3"], "between 0 and 1"),
+        (["match", valley, "--images", query, "--board", "rpi5"], "did you mean `rpi-5`"),
+        (["match", valley, "--images", query, "--battery", "lots"], "battery pack `lots`"),
+        (["run", "--config", config], "did you mean `match`"),
+        (["run", "--config", tmp_path / "no.yaml"], "cannot be read"),
+        (["run", "--map", valley], "no source of frames"),
+        (["run", "--source", query], "no map"),
+        (["map", "build", tmp_path / "m.gpkg", "--images", query, "--technique", "sift"], "There is no technique"),
+        (["map", "build", tmp_path / "m.gpkg", "--images", query, "--param", "gt"], "write KEY=VALUE"),
+        (["map", "build", tmp_path / "m.gpkg", "--images", query, "--positions", wrong_row], "line 2: lat is `91`"),
+        (["profile"], "--map MAP, or --places N"),
+        (["profile", "--places", "-3"], "above 0"),
+        (["eval", "--query", query, "--ref", query, "--ground-truth", wrong_row], "`query_file` is missing"),
+    ]:
+        code, sentence = refused(capsys, *argv)
+        assert (code, says in sentence) == (2, True), sentence
+    with pytest.raises(SystemExit) as exit_code:
+        main(["mpa"])
+    assert exit_code.value.code == 2
+
+
+def test_debug_shows_the_traceback(capsys, caplog, tmp_path):
+    with caplog.at_level("DEBUG"):
+        assert main(["--debug", "map", "info", str(tmp_path / "no.gpkg")]) == 1
+    assert any(record.exc_info for record in caplog.records)
+
+
+@pytest.mark.parametrize(
+    "path", [[], ["map"], ["map", "build"], ["match"], ["run"], ["eval"], ["profile"], ["simulate"]]
+)
+def test_every_command_explains_itself(capsys, path):
+    with pytest.raises(SystemExit) as exit_code:
+        main([*path, "--help"])
+    assert exit_code.value.code == 0
+    assert "usage: edgevpr" in capsys.readouterr().out
