@@ -27,15 +27,15 @@ from edgevpr.runtime.progress import progress
 REPOSITORY = Path(__file__).resolve().parents[1]
 TECHNIQUES = ("hog", "cohog")
 TUNED_ON = ("corridor", "aerial_caliterra")
-# Why a technique is not measured on a set.
+FIVE_PLACES = "five places only: made for studies of change, recall on them says nothing"
+# What is not measured on a set, and why.
 LEFT_OUT = {
-    ("nordland_tiny", "cohog"): "pictures of 64x32 pixels are too small for its regions, and 994 x 994 comparisons in "
-    "full take a quarter of an hour",
-    **{
-        (name, technique): "five places only: made for studies of change, its recall says nothing"
-        for name in ("grief_michigan_monthly", "grief_stromovka_monthly")
-        for technique in TECHNIQUES
-    },
+    "grief_michigan_monthly": (TECHNIQUES, FIVE_PLACES),
+    "grief_stromovka_monthly": (TECHNIQUES, FIVE_PLACES),
+    "nordland_tiny": (
+        ("cohog",),
+        "64x32 pixels are too few for its regions, and 994 x 994 comparisons in full take a quarter of an hour",
+    ),
 }
 
 
@@ -53,13 +53,16 @@ def main() -> int:
         made_by = provenance()
         measured = {}
         for folder in folders:
-            wanted = [name for name in TECHNIQUES if (folder.name, name) not in LEFT_OUT]
+            left_out, _ = LEFT_OUT.get(folder.name, ((), ""))
+            wanted = [name for name in TECHNIQUES if name not in left_out]
             if wanted:
                 measured[folder.name] = results, positions = measure(folder, wanted)
                 content = {"set": folder.name, "use": use(folder.name), **made_by, **as_json(results)}
                 if positions:
                     content["positions"] = positions
                 (args.out / f"{folder.name}.json").write_text(json.dumps(content, indent=2) + "\n")
+        if not measured:
+            raise UsageError(f"All sets of {args.data} are left out: name another folder with --data or EDGEVPR_DATA.")
         (args.out / "sets.md").write_text(summary(measured, [folder.name for folder in folders], made_by))
     except EdgevprError as error:
         print(f"run_sets: {error}", file=sys.stderr)
@@ -101,10 +104,11 @@ def position_errors(folder: Path, technique: str) -> dict[str, Any]:
         place_map = f"{temporary}/{folder.name}.gpkg"
         edgevpr("map", "build", place_map, "--images", str(folder / "ref"), "--technique", technique, "--json")
         matches = edgevpr("match", place_map, "--images", str(folder / "query"), "--json")
+    placed = [match for match in matches if "error_m" in match]
     return {
-        "queries": len(matches),
-        "best_match": spread([match["error_m"] for match in matches]),
-        "accepted": spread([match["error_m"] for match in matches if match["accepted"]]),
+        "queries": len(placed),
+        "best_match": spread([match["error_m"] for match in placed]),
+        "accepted": spread([match["error_m"] for match in placed if match["accepted"]]),
     }
 
 
@@ -154,50 +158,63 @@ def cpu_model() -> str:
 
 
 def summary(measured: dict[str, tuple[list[TechniqueResult], dict]], names: list[str], made_by: dict[str, Any]) -> str:
-    """The page that says it all: tables of all sets, and what to make of them."""
+    """The page for people: tables of all sets, and what to make of them."""
     machine = made_by["machine"]
-    result_rows = [
-        [name, use(name), f"{result.queries} / {result.references}", *tables.cells(result)]
+    reached = [
+        [name, use(name), f"{result.queries} / {result.references}", result.technique, *tables.quality(result)]
         for name, (results, _) in measured.items()
         for result in results
     ]
-    position_rows = [
-        [name, technique, f"{errors['queries']}", *(metres(errors[kind]) for kind in ("best_match", "accepted"))]
+    paid = [
+        [name, result.technique, *tables.costs(result)] for name, (results, _) in measured.items() for result in results
+    ]
+    away = [
+        [name, technique, str(errors["queries"]), metres(errors["best_match"]), metres(errors["accepted"])]
         for name, (_, positions) in measured.items()
         for technique, errors in positions.items()
     ]
-    left_out = [f"* {name}, {technique}: {why}." for (name, technique), why in LEFT_OUT.items() if name in names]
-    return f"""# hog and cohog on real images
+    left_out = [f"* {name}: {', '.join(LEFT_OUT[name][0])}: {LEFT_OUT[name][1]}." for name in names if name in LEFT_OUT]
+    page = f"""# hog and cohog on real images
 
-Made by `make results` on {made_by["date"]} from commit {made_by["commit"]}. {machine["cpu"]}, {machine["cores"]} cores,
-{machine["blas_threads"]} BLAS thread(s), Python {machine["python"]}, NumPy {machine["numpy"]}, OpenCV {machine["opencv"]}.
+Made by `make results` on {made_by["date"]}, commit {made_by["commit"]}.
+Machine: {machine["cpu"]}, {machine["cores"]} cores, BLAS threads: {machine["blas_threads"]}.
+Python {machine["python"]}, NumPy {machine["numpy"]}, OpenCV {machine["opencv"]}.
 
-Parameters and acceptance rules were chosen on the sets marked *tune* and on no others; *report* sets are for reporting
-only. All places are compared in full. The truth of the aerial sets was computed by image registration: it favours pairs
-that local features can match. `edgevpr eval` gives the same figures for any set; the JSON files beside this page hold
-more of them.
+Parameters and acceptance rules were chosen on the sets marked *tune*; those marked *report* had no say. All places are
+compared in full. The truth of the aerial sets was computed by image registration: it favours pairs that local features
+can match, and says nothing of others. The JSON files beside this page hold every figure.
 
-{tables.markdown(("set", "use", "queries / references", *tables.HEADINGS), result_rows)}
+## Recognition
+
+{tables.markdown(("set", "use", "queries / references", "technique", *tables.QUALITY), reached)}
 
 * P@100%R: precision with the threshold at the lowest-scoring right match. R@100%P: recall with the threshold above the
   highest-scoring wrong one. AUC, EP: equations 2.3 and 2.4 of the thesis.
-* ROC: the chance that a right match scores higher than a wrong one; 0.5 means that the score alone tells nothing.
+* ROC: the chance that a right match scores higher than a wrong one; 0.5 means that the score by itself tells nothing.
 * PCU: P@100%R x log10(t_e,max / t_e + 9), where t_e,max is the slower encoder of the two on the same set.
-* accepted: queries that would have moved the aircraft by the technique's own rule, in brackets how many of them wrongly.
-* Times are means; t_m is for all references. mAh: {next(iter(measured.values()))[0][0].ah_assumes}.
+* accepted: queries that would have moved the aircraft by the technique's own rule; in brackets, how many of them would
+  have moved it to a wrong place.
 
+## Costs
+
+{tables.markdown(("set", "technique", *tables.COSTS), paid)}
+
+* Means over the queries; t_m is for all references. U: share of all cores.
+* mAh: {next(iter(measured.values()))[0][0].ah_assumes}.
+"""
+    if away:
+        page += f"""
 ## Errors in metres
 
-{tables.markdown(("set", "technique", "queries", "best match of all", "accepted"), position_rows)}
+{tables.markdown(("set", "technique", "queries", "best match", "accepted"), away)}
 
-Distance between the GPS position of the query and that of the place, `median / 90 % / worst (how many)`, over all
-queries of the folder, those too that show nothing of the map. It cannot be smaller than the distance to the nearest
-place, and the GPS of these cameras is noisy (swindale: tens of metres; caliterra: 10 to 20 m).
-
-## Left out
-
-{chr(10).join(left_out)}
+Distance between the GPS positions of the query and of the place it was matched to: median / 90 % / worst (how many).
+All queries with a position are in it, those too that show nothing of the map. The error cannot be smaller than the
+distance to the nearest place, and GPS on these cameras is noisy: 10 to 20 m off (caliterra), tens of metres (swindale).
 """
+    if left_out:
+        page += "\n## Left out\n\n" + "\n".join(left_out) + "\n"
+    return page
 
 
 def metres(errors: dict[str, Any]) -> str:

@@ -5,7 +5,9 @@ Each imports what it needs when it is called, so that `edgevpr check` does not p
 
 import json
 import logging
+import os
 import sys
+import threading
 from argparse import Namespace
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -146,7 +148,12 @@ def match(args: Namespace) -> int:
 def run(args: Namespace) -> int:
     from edgevpr.runtime.service import fly
 
-    return fly(_config(args, map=args.map), _path(args.positions))
+    code = fly(_config(args, map=args.map), _path(args.positions))
+    if threading.active_count() > 1:
+        # A capture thread hangs in a stream that does not answer; FFmpeg would abort the end of the interpreter.
+        sys.stderr.flush()
+        os._exit(code)
+    return code
 
 
 def check(args: Namespace) -> int:

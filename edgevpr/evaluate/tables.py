@@ -4,22 +4,25 @@ from collections.abc import Sequence
 
 from edgevpr.evaluate.evaluate import TechniqueResult
 
-HEADINGS = (
-    "technique", "recall@1", "@5", "@10", "P@100%R", "R@100%P", "AUC", "EP", "ROC", "PCU", "accepted",
-    "t_e ms", "t_m ms", "t_m/ref ms", "RAM B/place", "disk B/place", "U_e", "U_m", "mAh/query",
-)  # fmt: skip
+QUALITY = ("recall@1", "@5", "@10", "P@100%R", "R@100%P", "AUC", "EP", "ROC", "PCU", "accepted (wrong)")
+COSTS = ("t_e ms", "t_m ms", "t_m/ref ms", "RAM B/place", "disk B/place", "U_e", "U_m", "mAh/query")
 
 
-def cells(result: TechniqueResult) -> list[str]:
-    """One result as texts, in the order of `HEADINGS`."""
+def quality(result: TechniqueResult) -> list[str]:
+    """What a technique reached, as texts in the order of `QUALITY`."""
     shares = [
         result.recall_at_1, result.recall_at_5, result.recall_at_10, result.precision_at_100_recall,
         result.recall_at_100_precision, result.auc, result.ep, result.roc_auc, result.pcu,
     ]  # fmt: skip
     return [
-        result.technique,
         *("-" if share is None else f"{share:.3f}" for share in shares),
         f"{result.accepted} ({result.accepted_wrong})",
+    ]
+
+
+def costs(result: TechniqueResult) -> list[str]:
+    """What it cost, as texts in the order of `COSTS`."""
+    return [
         f"{result.t_encode_s * 1000:.1f}",
         f"{result.t_match_s * 1000:.1f}",
         f"{result.t_match_per_ref_s * 1000:.3f}",
@@ -47,12 +50,14 @@ def markdown(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def results_text(results: Sequence[TechniqueResult]) -> str:
-    """The table that `edgevpr eval` prints, with what its figures rest on. `results` come from `compare`."""
+    """What `edgevpr eval` prints, with what the figures rest on. `results` come from `compare`."""
     first = results[0]
+    reached = text(("technique", *QUALITY), [[result.technique, *quality(result)] for result in results])
+    paid = text(("technique", *COSTS), [[result.technique, *costs(result)] for result in results])
     return (
-        f"{text(HEADINGS, [cells(result) for result in results])}\n\n"
+        f"{reached}\n\n{paid}\n\n"
         f"{first.queries} queries scored against {first.references} references; times are means over the queries.\n"
-        "accepted: by the technique's own rule, and in brackets how many of those are wrong.\n"
-        f"PCU: log10(t_e,max / t_e + 9) x P@100%R with t_e,max = {first.t_encode_max_s * 1000:.1f} ms.\n"
+        "accepted: queries that would have moved the aircraft, by the technique's own rule.\n"
+        f"PCU: P@100%R x log10(t_e,max / t_e + 9) with t_e,max = {first.t_encode_max_s * 1000:.1f} ms.\n"
         f"mAh: {first.ah_assumes}."
     )

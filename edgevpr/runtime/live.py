@@ -84,8 +84,8 @@ class LiveSource:
             there, image = capture.read()
             if not there:  # the only sign of a loss: `isOpened` stays true
                 return
-            self._put(image)
             self.state = "streaming"
+            self._put(image)
 
     def _put(self, image: np.ndarray) -> None:
         t_mono_s = self._clock()

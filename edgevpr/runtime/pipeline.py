@@ -13,14 +13,14 @@ from edgevpr.power.boards import Board, load_board
 from edgevpr.power.equations import Pack, parse_pack
 from edgevpr.power.meter import query_cost, stage
 from edgevpr.runtime.accept import AcceptRule, accept_rule, accepted
-from edgevpr.runtime.choose import described, fit, probe
+from edgevpr.runtime.choose import described, fit, on_board, probe
 from edgevpr.types import Frame, PlaceMatch, Technique
 
 
 @dataclass(frozen=True, slots=True)
 class Pipeline:
-    """Everything that one query needs. `accuracy_m` is the 1-sigma that a fix claims; `reason` says in one line why this
-    technique flies, and whether the board can afford it."""
+    """Everything that one query needs. `accuracy_m` is the 1-sigma that a fix claims; `reason` says in one line why
+    this technique flies, and whether the board can afford it."""
 
     technique: Technique
     place_map: PlaceMap
@@ -67,7 +67,8 @@ def open_pipeline(config: Config) -> Pipeline:
     index = load_index(place_map, int(budget_mb * 1e6))
     rate_hz = config.source.rate_hz or board.rate_hz
     compared = min(config.match.candidates or len(index), len(index))
-    found = fit(board, probe(technique), compared, rate_hz, budget_mb)
+    costs = on_board(probe(technique), load_board("this"), board)
+    found = fit(board, costs, compared, rate_hz, budget_mb)
     why = "the map was built with it" if config.technique is None else "it was named"
     return Pipeline(
         technique,

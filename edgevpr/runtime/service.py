@@ -107,7 +107,8 @@ class Flight:
         """Once a second: how it goes, to systemd; the load, to the flight controller; a camera lost or back, to all."""
         self._next_health_s = now_s + _HEALTH_S
         state = self._source.state
-        notify(STATUS=f"{state}; {self.queries} queries, {self.accepted} accepted, {self.used_mah:.2f} mAh")
+        counts = f"{self.queries} queries, {self.accepted} accepted, {self.used_mah:.2f} mAh"
+        notify(STATUS="; ".join(filter(None, (state, counts, self._flight_log.state))))
         lost = state.startswith(("lost", "nothing there"))
         if lost != self._source_lost:
             self._source_lost = lost
@@ -148,7 +149,8 @@ def fly(config: Config, positions: Path | None = None) -> int:
             notify(READY=1)
             flight.run()
             notify(STOPPING=1)
-        mavlink = link.stats() if link else None
+        if link:
+            link.close()  # what waits is sent first, so that the log's last line counts it
         flight_log.write(
             "end",
             queries=flight.queries,
@@ -156,7 +158,7 @@ def fly(config: Config, positions: Path | None = None) -> int:
             unusable=flight.unusable,
             used_mah=flight.used_mah,
             marginal_mah=flight.marginal_mah,
-            mavlink=mavlink,
+            mavlink=link.stats() if link else None,
         )
         _log.info(
             "%d queries, %d accepted, %.3f mAh (%.3f of them for recognising)",

@@ -1,7 +1,7 @@
 """Two flights over one generated landscape: the first one makes a map, the second one comes back later, and strays."""
 
 import csv
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
@@ -11,7 +11,7 @@ import numpy as np
 
 from edgevpr.geodesy import EARTH_RADIUS_M
 from edgevpr.simulate.camera import Camera, Light, Pose, lit, photograph
-from edgevpr.simulate.scene import Scene
+from edgevpr.simulate.scene import Scene, make_scene
 from edgevpr.types import Position
 
 # The south-west corner of every scene: the home of ArduPilot's simulator (its Tools/autotest/locations.txt, CMAC).
@@ -77,39 +77,35 @@ def later_flight(seed: int) -> Flight:
     return Flight(tuple(Pose(*map(float, row)) for row in poses), light, camera, start_utc, 2.0, seed + 1)
 
 
-def write_flight(
-    folder: str | Path, scene: Scene, flight: Flight, on_frame: Callable[[int], None] = lambda written: None
-) -> None:
+def write_flight(folder: str | Path, scene: Scene, flight: Flight) -> Iterator[str]:
     """Fly: `folder`/images/*.jpg, and `folder`/positions.csv with the true position of every one of them.
 
-    `on_frame(written)` is called after every frame. Raises OSError where the folder cannot be written.
+    Yields the name of every image once it is written. Raises OSError where the folder cannot be written.
     """
     images = Path(folder) / "images"
     images.mkdir(parents=True, exist_ok=True)
     ground = lit(scene, flight.light, flight.seed)
     rng = np.random.default_rng((flight.seed, 3))
-    with open(Path(folder) / "positions.csv", "w", encoding="utf-8", newline="") as table:
-        rows = csv.writer(table)
-        rows.writerow(("file", "lat", "lon", "alt", "rel_alt", "yaw_deg", "time"))
+    with open(Path(folder) / "positions.csv", "w", encoding="utf-8", newline="") as handle:
+        table = csv.writer(handle)
+        table.writerow(("file", "lat", "lon", "alt", "rel_alt", "yaw_deg", "time"))
         for number, pose in enumerate(flight.poses):
-            frame = photograph(ground, scene.metres_per_pixel, pose, flight.camera, flight.light, rng)
             name = f"frame_{number:04d}.jpg"
+            frame = photograph(ground, scene.metres_per_pixel, pose, flight.camera, flight.light, rng)
             _, jpeg = cv2.imencode(".jpg", frame, (cv2.IMWRITE_JPEG_QUALITY, flight.camera.jpeg_quality))
             (images / name).write_bytes(jpeg.tobytes())
             at = to_position(pose)
             taken = flight.start_utc + timedelta(seconds=number * flight.interval_s)
-            rows.writerow(
-                (
-                    name,
-                    f"{at.lat_deg:.8f}",
-                    f"{at.lon_deg:.8f}",
-                    f"{at.alt_m:.2f}",
-                    f"{pose.height_m:.2f}",
-                    f"{pose.heading_deg % 360:.2f}",
-                    f"{taken:%Y:%m:%d %H:%M:%S}",
-                )
-            )
-            on_frame(number + 1)
+            numbers = (f"{at.lat_deg:.8f}", f"{at.lon_deg:.8f}", f"{at.alt_m:.2f}", f"{pose.height_m:.2f}")
+            table.writerow((name, *numbers, f"{pose.heading_deg % 360:.2f}", f"{taken:%Y:%m:%d %H:%M:%S}"))
+            yield name
+
+
+def fly_and_write(folder: Path, which: str, seed: int) -> str:
+    """Write the "map" or the "query" flight over the landscape of a seed; returns a sentence about it."""
+    flight = mapping_flight(seed) if which == "map" else later_flight(seed)
+    written = list(write_flight(folder, make_scene(seed, SCENE_WIDTH_M, SCENE_DEPTH_M), flight))
+    return f"{folder}: {len(written)} images in images/, where they were taken in positions.csv"
 
 
 def to_position(pose: Pose) -> Position:

@@ -33,7 +33,7 @@ class Scene:
         return self.height_cm.shape[0] * self.metres_per_pixel
 
 
-def make_scene(seed: int, width_m: float = 640.0, depth_m: float = 420.0, metres_per_pixel: float = 0.16) -> Scene:
+def make_scene(seed: int, width_m: float, depth_m: float, metres_per_pixel: float = 0.16) -> Scene:
     """Generate a scene: fields, hedges, woods, a river, a road, lanes and farms. The same seed gives the same scene."""
     rng = np.random.default_rng(seed)
     shape = round(depth_m / metres_per_pixel), round(width_m / metres_per_pixel)

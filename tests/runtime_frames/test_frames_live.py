@@ -70,10 +70,7 @@ def test_a_stream_that_is_lost_is_noticed_and_opened_again_when_it_is_back(kind,
         assert not source.ended
 
         camera.switch_off()
-        turns_without_a_frame = 0
-        while not source.state.startswith("lost, reopening in "):
-            turns_without_a_frame += source.read(0.02) is None
-        assert turns_without_a_frame > 0
+        wait_for(lambda: source.read(0.02) is None and source.state.startswith("lost, reopening in "))
         assert not source.ended
 
         camera.switch_on()

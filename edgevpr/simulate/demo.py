@@ -1,0 +1,179 @@
+"""The demonstration: two generated flights, and between them the real commands, each a process of its own."""
+
+import importlib.util
+import json
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from edgevpr.errors import EdgevprError
+from edgevpr.runtime.flightlog import read_log
+from edgevpr.runtime.progress import progress
+from edgevpr.simulate.camera import lit
+from edgevpr.simulate.flight import (
+    SCENE_DEPTH_M,
+    SCENE_WIDTH_M,
+    Flight,
+    later_flight,
+    mapping_flight,
+    write_flight,
+)
+from edgevpr.simulate.outcome import RIGHT_M, Outcome, outcome, read_answers
+from edgevpr.simulate.scene import Scene, make_scene
+
+_SEED = 1
+_RATE_HZ = 5.0
+_END_TIMEOUT_S = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class DemoSummary:
+    """What the demonstration showed. `costs` are means of a query under the names of the flight log; `messages` is
+    what the simulated flight controller decoded, by name."""
+
+    places: int
+    outcome: Outcome
+    costs: dict[str, float]
+    used_mah: float
+    marginal_mah: float
+    messages: dict[str, int]
+    fixes_accepted: int
+    fixes_denied: int
+    wall_s: float
+    picture: Path
+
+    def __str__(self) -> str:
+        got, cost = self.outcome, self.costs
+        off_map = got.queries - got.on_map
+        messages = ", ".join(f"{name} {count}" for name, count in sorted(self.messages.items()))
+        return "\n".join(
+            (
+                "",
+                f"places            {self.places} in the map",
+                f"queries           {got.queries}: {got.on_map} over the map, {off_map} beyond it",
+                f"recall@1          {got.recall_at_1:.2f} (best place within {RIGHT_M:g} m, of the {got.on_map} over the map)",
+                f"accepted          {got.accepted}, of them wrong: {got.accepted_wrong}",
+                f"rejected          {got.queries - got.accepted}, among them {got.off_map_rejected} of the {off_map} "
+                "beyond the map",
+                f"position error    median {got.error_median_m:.1f} m, 90 % under {got.error_p90_m:.1f} m (accepted matches)",
+                f"a query           {1000 * cost['cpu_s']:.0f} ms of CPU (encode {1000 * cost['t_encode_s']:.0f} ms, "
+                f"match {1000 * cost['t_match_s']:.0f} ms), {cost['rss_mb']:.0f} MB of RAM",
+                f"battery           {self.used_mah:.2f} mAh, {self.marginal_mah:.2f} mAh of them for recognising",
+                f"flight controller {self.fixes_accepted} position fixes accepted, {self.fixes_denied} denied",
+                f"  it received     {messages}",
+                f"time              {self.wall_s:.0f} s",
+                f"picture           {self.picture}",
+            )
+        )
+
+
+def run_demo(folder: str | Path) -> DemoSummary:
+    """Generate both flights, map the first one, fly the second one against a simulated flight controller.
+
+    Leaves in `folder`: flight-1/ and flight-2/ (images, positions.csv), map.gpkg, flight.jsonl and demo.png.
+    Raises EdgevprError where a part of it fails or matplotlib is not installed.
+    """
+    if importlib.util.find_spec("matplotlib") is None:
+        raise EdgevprError("The demo draws a picture with matplotlib: install it with `pip install 'edgevpr[plots]'`.")
+    begin_s = time.monotonic()
+    folder = Path(folder)
+    map_path, log_path, picture_path = folder / "map.gpkg", folder / "flight.jsonl", folder / "demo.png"
+    first, second = folder / "flight-1", folder / "flight-2"
+    for old in (*folder.glob("map.gpkg*"), log_path, picture_path):
+        old.unlink(missing_ok=True)
+
+    scene = make_scene(_SEED, SCENE_WIDTH_M, SCENE_DEPTH_M)
+    mapping, later = mapping_flight(_SEED), later_flight(_SEED)
+    _write(first, scene, mapping, "flight 1, to map     ")
+    _write(second, scene, later, "flight 2, hours later")
+
+    port = _free_udp_port()
+    # The flight controller is started first: it listens long before the map is built.
+    with _edgevpr("simulate", "autopilot", "--link", f"udpin:127.0.0.1:{port}", "--json", output=True) as autopilot:
+        with _edgevpr("map", "build", map_path, "--images", first / "images", "--technique", "cohog") as building:
+            _succeeded(building, "map build")
+        flags = ("--link", f"udpout:127.0.0.1:{port}", "--log", log_path, "--rate-hz", _RATE_HZ)
+        with _edgevpr("run", "--map", map_path, "--source", second / "images", *flags) as flying:
+            for _ in progress(_queries(log_path, flying), len(later.poses), "flying"):
+                pass
+            _succeeded(flying, "run")
+        autopilot.terminate()
+        seen = json.loads(_succeeded(autopilot, "simulate autopilot"))
+
+    answers = read_answers(log_path, first / "images", second / "images")
+    from edgevpr.simulate.picture import draw
+
+    got = outcome(answers)
+    draw(
+        picture_path,
+        lit(scene, mapping.light, mapping.seed),
+        scene.metres_per_pixel,
+        mapping,
+        answers,
+        first / "images",
+        second / "images",
+        f"recall@1 {got.recall_at_1:.2f}  ·  {got.accepted} of {got.queries} matches accepted, {got.accepted_wrong} of them "
+        f"wrong  ·  position error {got.error_median_m:.1f} m (median)",
+    )
+    lines = list(read_log(log_path))
+    costs = [line["costs"] for line in lines if line["kind"] == "query"]
+    return DemoSummary(
+        places=len(mapping.poses),
+        outcome=got,
+        costs={name: sum(cost[name] for cost in costs) / len(costs) for name in costs[0]},
+        used_mah=lines[-1]["used_mah"],
+        marginal_mah=lines[-1]["marginal_mah"],
+        messages=seen["messages"],
+        fixes_accepted=seen["fixes_accepted"],
+        fixes_denied=seen["fixes_denied"],
+        wall_s=time.monotonic() - begin_s,
+        picture=picture_path,
+    )
+
+
+def _write(folder: Path, scene: Scene, flight: Flight, label: str) -> None:
+    for _ in progress(write_flight(folder, scene, flight), len(flight.poses), label):
+        pass
+
+
+def _free_udp_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@contextmanager
+def _edgevpr(*arguments: object, output: bool = False) -> Iterator[subprocess.Popen]:
+    """The real program as a process, ended at the latest with the block; `output` keeps its standard output."""
+    command = [sys.executable, "-m", "edgevpr", *map(str, arguments)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE if output else sys.stderr, text=True)
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            process.kill()
+        process.wait()
+
+
+def _succeeded(process: subprocess.Popen, what: str) -> str:
+    """Wait for the end of a process; returns its output. Raises EdgevprError where it failed."""
+    output, _ = process.communicate()
+    if process.returncode:
+        raise EdgevprError(f"`edgevpr {what}` ended with exit code {process.returncode}: see what it said above.")
+    return output
+
+
+def _queries(log_path: Path, flying: subprocess.Popen) -> Iterator[int]:
+    """Count the queries in the growing flight log until the flight ends."""
+    seen, ended = 0, False
+    while not ended:
+        ended = flying.poll() is not None
+        done = sum(line["kind"] == "query" for line in read_log(log_path)) if log_path.exists() else 0
+        yield from range(seen, done)
+        seen = done
+        time.sleep(0.1)

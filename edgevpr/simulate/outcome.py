@@ -1,0 +1,97 @@
+"""What the runtime answered in a generated flight, beside the truth."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from edgevpr.geodesy import distance_m
+from edgevpr.runtime.flightlog import read_log
+from edgevpr.runtime.positions import find_positions, read_positions
+from edgevpr.types import Position
+
+# A place is the right one when the two pictures share about half of their ground (78 m long from 80 m above it).
+RIGHT_M = 40.0
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """One query: where it was taken, the place that was named and whether the runtime believed it; `nearest_m` is the
+    way to the nearest place of the map."""
+
+    query: str
+    reference_image: str
+    at: Position
+    named: Position
+    score: float
+    accepted: bool
+    error_m: float
+    nearest_m: float
+
+    @property
+    def right(self) -> bool:
+        return self.error_m <= RIGHT_M
+
+    @property
+    def on_map(self) -> bool:
+        """Whether there was a right place to name."""
+        return self.nearest_m <= RIGHT_M
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """Shares and errors of a flight. `recall_at_1` is of the queries on the map; the errors, in metres between a picture
+    and the place that was named, are of the accepted ones (NaN without any)."""
+
+    queries: int
+    on_map: int
+    recall_at_1: float
+    accepted: int
+    accepted_wrong: int
+    off_map_rejected: int
+    error_median_m: float
+    error_p90_m: float
+
+
+def read_answers(log_path: Path, map_images: Path, query_images: Path) -> list[Answer]:
+    """The queries of a flight log, judged by the positions.csv of the two flights."""
+    places = {name: tag.position for name, tag in read_positions(find_positions(map_images)).items()}
+    taken = {name: tag.position for name, tag in read_positions(find_positions(query_images)).items()}
+    lat_deg, lon_deg = np.array([(place.lat_deg, place.lon_deg) for place in places.values()]).T
+    answers = []
+    for line in read_log(log_path):
+        if line["kind"] == "query":
+            at, named = taken[line["query"]], places[line["reference_image"]]
+            error_m = distance_m(at.lat_deg, at.lon_deg, named.lat_deg, named.lon_deg)
+            nearest_m = distance_m(at.lat_deg, at.lon_deg, lat_deg, lon_deg).min()
+            answers.append(
+                Answer(
+                    line["query"],
+                    line["reference_image"],
+                    at,
+                    named,
+                    line["score"],
+                    line["accepted"],
+                    float(error_m),
+                    float(nearest_m),
+                )
+            )
+    return answers
+
+
+def outcome(answers: Sequence[Answer]) -> Outcome:
+    """Sum up."""
+    on_map = [answer for answer in answers if answer.on_map]
+    accepted = [answer for answer in answers if answer.accepted]
+    errors_m = [answer.error_m for answer in accepted] or [np.nan]
+    return Outcome(
+        queries=len(answers),
+        on_map=len(on_map),
+        recall_at_1=sum(answer.right for answer in on_map) / max(len(on_map), 1),
+        accepted=len(accepted),
+        accepted_wrong=sum(not answer.right for answer in accepted),
+        off_map_rejected=sum(not answer.on_map and not answer.accepted for answer in answers),
+        error_median_m=float(np.median(errors_m)),
+        error_p90_m=float(np.quantile(errors_m, 0.9)),
+    )

@@ -1,0 +1,62 @@
+"""`make results` on a folder with one small set."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+from pictures import textured
+
+SCRIPT = Path(__file__).parents[2] / "benchmarks" / "run_sets.py"
+
+
+def run_sets(*arguments):
+    return subprocess.run([sys.executable, str(SCRIPT), *map(str, arguments)], capture_output=True, text=True)
+
+
+def make_set(folder, places=4):
+    """Places about 111 m apart on a line to the north; each query lies 11 m beyond its place."""
+    truth, positions = ["query_file,ref_files"], ["file,lat,lon"]
+    for split, shift_deg in (("ref", 0.0), ("query", 0.0001)):
+        (folder / split).mkdir(parents=True)
+        for place in range(places):
+            cv2.imwrite(str(folder / split / f"{split}{place}.png"), textured(place))
+            positions.append(f"{split}{place}.png,{47 + place / 1000 + shift_deg:.6f},8.5")
+    truth += [f"query{place}.png,ref{place}.png" for place in range(places)]
+    (folder / "ground_truth.csv").write_text("\n".join(truth))
+    (folder / "positions.csv").write_text("\n".join(positions))
+
+
+def test_every_set_gets_a_file_and_a_line_in_the_summary(tmp_path):
+    make_set(tmp_path / "data" / "meadow")
+    make_set(tmp_path / "data" / "grief_stromovka_monthly", places=1)  # one of those that are left out
+    done = run_sets("--data", tmp_path / "data", "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["meadow.json", "sets.md"]
+
+    content = json.loads((tmp_path / "out" / "meadow.json").read_text())
+    assert content["use"] == "report"
+    assert content["machine"]["cores"] >= 1
+    assert [content["techniques"][name]["recall_at_1"] for name in ("hog", "cohog")] == [1, 1]
+    assert content["positions"]["cohog"]["best_match"] == {"count": 4, "median_m": 11.1, "p90_m": 11.1, "worst_m": 11.1}
+
+    page = (tmp_path / "out" / "sets.md").read_text()
+    assert "| meadow | report | 4 / 4 | cohog | 1.000 |" in page
+    assert "| meadow | cohog | 4 | 11 / 11 / 11 (4) |" in page
+    assert "* grief_stromovka_monthly: hog, cohog: five places only" in page
+
+
+def test_a_folder_without_sets_gets_a_sentence(tmp_path):
+    done = run_sets("--data", tmp_path, "--out", tmp_path / "out")
+    assert done.returncode == 2
+    assert done.stderr.startswith("run_sets: There are no image sets")
+    assert "EDGEVPR_DATA" in done.stderr
+
+
+def test_a_broken_image_stops_it(tmp_path):
+    make_set(tmp_path / "data" / "meadow")
+    (tmp_path / "data" / "meadow" / "ref" / "ref2.png").write_bytes(b"")
+    done = run_sets("--data", tmp_path / "data", "--out", tmp_path / "out")
+    assert done.returncode == 1
+    assert "ref2.png is empty" in done.stderr
