@@ -14,6 +14,8 @@ _SOURCE = "a folder of images, a video file, a camera (/dev/video0) or a stream 
 def main(argv: list[str] | None = None) -> int:
     """Run one command; returns the exit code: 0 done, 1 something in the world is wrong, 2 the request is."""
     args = _parser().parse_args(argv)
+    # Before NumPy is imported: its products here are small, and more threads make them slower and dearer.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     logging.basicConfig(
         level=logging.DEBUG if args.debug else logging.INFO, format="edgevpr: %(message)s", stream=sys.stderr
     )

@@ -25,6 +25,7 @@ __all__ = ["Link", "LinkAddress", "LinkStats", "parse_link"]
 HEARTBEAT_S = 1.0
 TURN_S = 0.25  # how long the thread sleeps where nothing wakes it
 RETRY_FIRST_S, RETRY_MAX_S = 0.2, 2.0
+HEALTH_GOOD_FOR_S = 10.0  # a main loop that hangs must not look healthy because this thread does not
 STUCK_S = 0.5  # a port that has taken no byte for so long is opened anew: what waits in it would come out late
 FLUSH_S = 0.5
 
@@ -57,7 +58,7 @@ class Link:
     def __init__(self, address: LinkAddress, component_id: int = 197, clock: Callable[[], float] = time.monotonic):
         self._address = address
         self._clock = clock
-        self._health = Health.BOOT
+        self._health, self._health_set_s = Health.BOOT, clock()
         self._outbox = Outbox()
         self._autopilot = Autopilot(component_id)
         self._receiver = Receiver()
@@ -102,8 +103,8 @@ class Link:
         self._ring()
 
     def set_health(self, health: Health) -> None:
-        """Set what the next heartbeats say."""
-        self._health = health
+        """Set what the heartbeats of the next ten seconds say; a caller that falls silent is reported as critical."""
+        self._health, self._health_set_s = health, self._clock()
 
     def stats(self) -> LinkStats:
         transport = self._transport
@@ -213,7 +214,8 @@ class Link:
         late_s = now_s - self._heartbeat_due_s
         if late_s >= 0:
             self._heartbeat_due_s = now_s + HEARTBEAT_S - late_s % HEARTBEAT_S  # in step, whatever was missed
-            return messages.heartbeat(self._health)
+            stuck = now_s - self._health_set_s > HEALTH_GOOD_FOR_S
+            return messages.heartbeat(Health.CRITICAL if stuck else self._health)
         if self._autopilot.listens(now_s):
             fix = self._outbox.next_fix(now_s)
             if fix is not None:

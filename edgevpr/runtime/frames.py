@@ -4,7 +4,7 @@ import os
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 from urllib.parse import urlsplit
 
 from edgevpr.errors import SourceError, UsageError
@@ -79,10 +79,11 @@ def open_source(
 
 
 def _is_live(uri: str) -> bool:
-    return "://" in uri or uri.startswith("/dev/") or uri.lower().endswith(".sdp")
+    is_device = uri.startswith("/dev/") and not Path(uri).is_file()  # /dev/shm holds plain files
+    return "://" in uri or is_device or uri.lower().endswith(".sdp")
 
 
-def _capture_of(uri: str) -> Callable:
+def _capture_of(uri: str) -> Callable[[], Any]:
     """What opens the camera or stream; raises SourceError for one that can never be opened."""
     if "://" in uri:
         _check_address(uri)

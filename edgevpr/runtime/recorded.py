@@ -76,9 +76,10 @@ class VideoSource:
         deadline_s = self._clock() + timeout_s
         while self._advance():
             if self._t_s >= self._t_due_s - _TIMESTAMP_ROUNDING_S:
-                _, image = self._capture.retrieve()
-                self._t_due_s = self._t_s + self._step_s
-                return Frame(image, f"frame {self._index:06d} t={self._t_s:.3f} s", self._clock())
+                there, image = self._capture.retrieve()
+                if there:
+                    self._t_due_s = self._t_s + self._step_s
+                    return Frame(image, f"frame {self._index:06d} t={self._t_s:.3f} s", self._clock())
             if self._clock() >= deadline_s:
                 break
         return None

@@ -19,7 +19,7 @@ from edgevpr.runtime.frames import Source, open_source
 from edgevpr.runtime.pipeline import Pipeline, open_pipeline
 from edgevpr.runtime.record import record
 from edgevpr.runtime.systemd import notify, watchdog_interval_s
-from edgevpr.types import PlaceMatch
+from edgevpr.types import PlaceMatch, Position
 
 _log = logging.getLogger(__name__)
 _TURN_S = 0.2  # the loop turns at least this often, frames or none
@@ -94,14 +94,20 @@ class Flight:
             return
         now_s, cost = time.monotonic(), event.cost
         if event.position and self._send_fixes:
-            self._link.send_fix(
-                messages.Fix(event.position.lat_deg, event.position.lon_deg, event.accuracy_m, event.t_mono_s)
-            )
+            self._send_fix(event.position, event)
         if event.accepted:
             place = event.candidate.place
             self._link.send(*messages.place_match(now_s, place.place_id, event.candidate.score))
         share = cost.cpu_s / ((cost.t_encode_s + cost.t_match_s) * self._pipeline.board.cores)
         self._link.send(*messages.query_figures(now_s, share, self.used_mah))
+
+    def _send_fix(self, position: Position, event: PlaceMatch) -> None:
+        try:
+            fix = messages.Fix(position.lat_deg, position.lon_deg, event.accuracy_m, event.t_mono_s)
+        except ValueError as error:  # another program wrote nonsense into the map
+            _log.warning("place %d: %s; no fix is sent", event.candidate.place.place_id, error)
+            return
+        self._link.send_fix(fix)
 
     def _tell_health(self, now_s: float) -> None:
         """Once a second: how it goes, to systemd; the load, to the flight controller; a camera lost or back, to all."""

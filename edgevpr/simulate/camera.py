@@ -92,7 +92,7 @@ def _cast_shadows(scene: Scene, towards_sun: tuple[float, float], steepness: flo
     """uint8 (H, W), 255 where something towards the sun stands in its way.
 
     A ray from (x, y) is blocked where max over k of height(k steps on) - k * drop exceeds height(x, y). That maximum
-    over 2k steps is the larger of itself over k steps here, and k steps on: seven passes look 128 pixels far.
+    over 2k steps is the larger of itself over k steps here, and k steps on: eight passes look 256 pixels far.
     """
     drop_cm = 100 * scene.metres_per_pixel * steepness
     blocking, steps = scene.height_cm, 1

@@ -1,7 +1,7 @@
 """The demonstration: two generated flights, and between them the real commands, each a process of its own."""
 
-import importlib.util
 import json
+import logging
 import socket
 import subprocess
 import sys
@@ -56,14 +56,14 @@ class DemoSummary:
                 "",
                 f"places            {self.places} in the map",
                 f"queries           {got.queries}: {got.on_map} over the map, {off_map} beyond it",
-                f"recall@1          {got.recall_at_1:.2f} (best place within {RIGHT_M:g} m, of the {got.on_map} over the map)",
+                f"recall@1          {got.recall_at_1:.2f} of those over the map (best place within {RIGHT_M:g} m)",
                 f"accepted          {got.accepted}, of them wrong: {got.accepted_wrong}",
                 f"rejected          {got.queries - got.accepted}, among them {got.off_map_rejected} of the {off_map} "
                 "beyond the map",
-                f"position error    median {got.error_median_m:.1f} m, 90 % under {got.error_p90_m:.1f} m (accepted matches)",
+                f"position error    median {got.error_median_m:.1f} m, 90 % within {got.error_p90_m:.1f} m (accepted)",
                 f"a query           {1000 * cost['cpu_s']:.0f} ms of CPU (encode {1000 * cost['t_encode_s']:.0f} ms, "
                 f"match {1000 * cost['t_match_s']:.0f} ms), {cost['rss_mb']:.0f} MB of RAM",
-                f"battery           {self.used_mah:.2f} mAh, {self.marginal_mah:.2f} mAh of them for recognising",
+                f"battery           {self.used_mah:.3f} mAh, {self.marginal_mah:.3f} mAh of them for recognising",
                 f"flight controller {self.fixes_accepted} position fixes accepted, {self.fixes_denied} denied",
                 f"  it received     {messages}",
                 f"time              {self.wall_s:.0f} s",
@@ -78,8 +78,13 @@ def run_demo(folder: str | Path) -> DemoSummary:
     Leaves in `folder`: flight-1/ and flight-2/ (images, positions.csv), map.gpkg, flight.jsonl and demo.png.
     Raises EdgevprError where a part of it fails or matplotlib is not installed.
     """
-    if importlib.util.find_spec("matplotlib") is None:
-        raise EdgevprError("The demo draws a picture with matplotlib: install it with `pip install 'edgevpr[plots]'`.")
+    logging.getLogger("matplotlib").setLevel(logging.WARNING)  # its fonts are nobody's business
+    try:
+        from edgevpr.simulate.picture import draw
+    except ModuleNotFoundError as error:
+        raise EdgevprError(
+            f"The demo draws a picture, but {error.name} is not installed: pip install 'edgevpr[plots]'."
+        ) from error
     begin_s = time.monotonic()
     folder = Path(folder)
     map_path, log_path, picture_path = folder / "map.gpkg", folder / "flight.jsonl", folder / "demo.png"
@@ -94,32 +99,29 @@ def run_demo(folder: str | Path) -> DemoSummary:
 
     port = _free_udp_port()
     # The flight controller is started first: it listens long before the map is built.
-    with _edgevpr("simulate", "autopilot", "--link", f"udpin:127.0.0.1:{port}", "--json", output=True) as autopilot:
+    with _edgevpr("simulate", "autopilot", "--link", f"udpin:127.0.0.1:{port}", "--json") as autopilot:
         with _edgevpr("map", "build", map_path, "--images", first / "images", "--technique", "cohog") as building:
-            _succeeded(building, "map build")
+            _output(building)
         flags = ("--link", f"udpout:127.0.0.1:{port}", "--log", log_path, "--rate-hz", _RATE_HZ)
         with _edgevpr("run", "--map", map_path, "--source", second / "images", *flags) as flying:
             for _ in progress(_queries(log_path, flying), len(later.poses), "flying"):
                 pass
-            _succeeded(flying, "run")
+            _output(flying)
         autopilot.terminate()
-        seen = json.loads(_succeeded(autopilot, "simulate autopilot"))
+        seen = json.loads(_output(autopilot))
 
     answers = read_answers(log_path, first / "images", second / "images")
-    from edgevpr.simulate.picture import draw
-
     got = outcome(answers)
-    draw(
-        picture_path,
-        lit(scene, mapping.light, mapping.seed),
-        scene.metres_per_pixel,
-        mapping,
-        answers,
-        first / "images",
-        second / "images",
-        f"recall@1 {got.recall_at_1:.2f}  ·  {got.accepted} of {got.queries} matches accepted, {got.accepted_wrong} of them "
-        f"wrong  ·  position error {got.error_median_m:.1f} m (median)",
+    headline = "   ·   ".join(
+        (
+            f"{len(mapping.poses)} places, {got.queries} queries",
+            f"recall@1 {got.recall_at_1:.2f}",
+            f"{got.accepted} accepted, {got.accepted_wrong} of them wrong",
+            f"position error {got.error_median_m:.1f} m (median)",
+        )
     )
+    ground = lit(scene, mapping.light, mapping.seed)
+    draw(picture_path, ground, scene.metres_per_pixel, mapping, answers, first / "images", second / "images", headline)
     lines = list(read_log(log_path))
     costs = [line["costs"] for line in lines if line["kind"] == "query"]
     return DemoSummary(
@@ -148,23 +150,29 @@ def _free_udp_port() -> int:
 
 
 @contextmanager
-def _edgevpr(*arguments: object, output: bool = False) -> Iterator[subprocess.Popen]:
-    """The real program as a process, ended at the latest with the block; `output` keeps its standard output."""
+def _edgevpr(*arguments: object) -> Iterator[subprocess.Popen]:
+    """The real program as a process of its own, ended at the latest with the block."""
     command = [sys.executable, "-m", "edgevpr", *map(str, arguments)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE if output else sys.stderr, text=True)
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
         yield process
     finally:
         if process.poll() is None:
+            process.terminate()
+        try:
+            process.wait(_END_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
             process.kill()
-        process.wait()
+            process.wait()
+        process.stdout.close()
 
 
-def _succeeded(process: subprocess.Popen, what: str) -> str:
-    """Wait for the end of a process; returns its output. Raises EdgevprError where it failed."""
+def _output(process: subprocess.Popen) -> str:
+    """What a process writes until its end. Raises EdgevprError where it fails."""
     output, _ = process.communicate()
     if process.returncode:
-        raise EdgevprError(f"`edgevpr {what}` ended with exit code {process.returncode}: see what it said above.")
+        command = " ".join(process.args[2:])
+        raise EdgevprError(f"`{command}` ended with exit code {process.returncode}: see what it said above.")
     return output
 
 

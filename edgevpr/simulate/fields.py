@@ -84,7 +84,7 @@ _KINDS = (
     _Kind(5, _cereal),
     _Kind(4, _row_crop),
     _Kind(2.5, _forest_floor, (4.1, 1.4, 2.8)),
-    _Kind(1.5, _pasture, (6.5, 0.25, 1.7)),  # an orchard
+    _Kind(0.8, _pasture, (6.5, 0.25, 1.7)),  # an orchard
 )
 
 

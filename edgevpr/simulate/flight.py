@@ -25,7 +25,7 @@ _HEIGHT_M = 80.0
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """One picture a pose, every `interval_s` from `start_utc` on; `seed` is that of its clouds and its sensor's noise."""
+    """One picture a pose, every `interval_s` from `start_utc` on; `seed` makes its clouds and its sensor's noise."""
 
     poses: tuple[Pose, ...]
     light: Light
@@ -71,7 +71,7 @@ def later_flight(seed: int) -> Flight:
             3 * drift[4],
         )
     )
-    light = Light(14, 58, warmth=0.8, cloud_frac=0.25, haze_frac=0.1, exposure=1.0, gamma=1.12)
+    light = Light(14, 58, warmth=0.8, cloud_frac=0.25, haze_frac=0.1, exposure=1.12, gamma=1.12)
     camera = Camera(noise_sigma=3.0, blur_px=2.0, jpeg_quality=80)
     start_utc = datetime(2026, 2, 14, 6, 10, tzinfo=timezone.utc)
     return Flight(tuple(Pose(*map(float, row)) for row in poses), light, camera, start_utc, 2.0, seed + 1)

@@ -41,8 +41,8 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Shares and errors of a flight. `recall_at_1` is of the queries on the map; the errors, in metres between a picture
-    and the place that was named, are of the accepted ones (NaN without any)."""
+    """Shares and errors of a flight. `recall_at_1` is of the queries on the map; the errors, in metres from where a
+    picture was taken to the place that was named, are of the accepted ones (NaN without any)."""
 
     queries: int
     on_map: int

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 
+from edgevpr.simulate.camera import ground_to_pixel
 from edgevpr.simulate.flight import Flight, to_metres
 from edgevpr.simulate.outcome import Answer
 
@@ -32,19 +33,15 @@ def draw(
     query_images: Path,
     headline: str,
 ) -> None:
-    """Write the picture as PNG. `ground` is the lit landscape, uint8 (H, W, 3) BGR, that both flights were flown over."""
+    """Write the picture as PNG; `ground` is the lit landscape, uint8 (H, W, 3) BGR."""
     figure = Figure(figsize=(19.2, 10.8), dpi=100, facecolor=_PAPER)
-    figure.text(0.017, 0.955, "edgevpr demo", fontsize=23, fontweight="bold", color=_INK, va="center")
-    figure.text(0.142, 0.9535, headline, fontsize=14, color=_FAINT, va="center")
+    figure.text(0.0165, 0.953, "edgevpr demo", fontsize=23, fontweight="bold", color=_INK, va="baseline")
+    figure.text(0.168, 0.953, headline, fontsize=14, color=_FAINT, va="baseline")
     left, right = figure.subfigures(1, 2, width_ratios=(1.34, 1))
     for part in (left, right):
         part.set_facecolor("none")
-    tracks, errors = left.subplots(
-        2,
-        1,
-        height_ratios=(4.6, 1),
-        gridspec_kw={"left": 0.03, "right": 0.985, "top": 0.91, "bottom": 0.065, "hspace": 0.1},
-    )
+    tracks = left.add_axes((0.0285, 0.27, 0.955, 0.65))
+    errors = left.add_axes((0.075, 0.065, 0.908, 0.145))
     _draw_tracks(tracks, ground, metres_per_pixel, mapping, answers)
     _draw_errors(errors, answers)
     _draw_pairs(right, answers, map_images, query_images)
@@ -54,69 +51,73 @@ def draw(
 def _draw_tracks(axes: Axes, ground: np.ndarray, metres_per_pixel: float, mapping: Flight, answers: Sequence[Answer]):
     depth_m, width_m = (side * metres_per_pixel for side in ground.shape[:2])
     small = cv2.resize(ground, (_MAP_WIDTH_PX, round(_MAP_WIDTH_PX * depth_m / width_m)), interpolation=cv2.INTER_AREA)
-    dimmed = (0.72 * small[..., ::-1] + 0.28 * 70).astype(np.uint8)  # so that the tracks stand out
-    axes.imshow(dimmed, extent=(0, width_m, 0, depth_m), interpolation="bilinear")
+    seen = _seen_by(mapping, small.shape[:2], width_m / _MAP_WIDTH_PX)
+    dimmed = np.where(seen[..., None], 0.95 * small, 0.4 * small + 20).astype(np.uint8)
+    axes.imshow(dimmed[..., ::-1], extent=(0, width_m, 0, depth_m), interpolation="bilinear")
     places_m = np.array([(pose.east_m, pose.north_m) for pose in mapping.poses])
     taken_m = np.array([to_metres(answer.at.lat_deg, answer.at.lon_deg) for answer in answers])
     named_m = np.array([to_metres(answer.named.lat_deg, answer.named.lon_deg) for answer in answers])
     colours = [_colour(answer) for answer in answers]
 
+    accepted = np.array([answer.accepted for answer in answers])
+
     axes.plot(*places_m.T, color=_MAPPED, linewidth=1.2, alpha=0.75)
     axes.scatter(*places_m.T, s=26, color=_MAPPED, edgecolor="#00000088", linewidth=0.8, zorder=3)
     axes.plot(*taken_m.T, color=_LATER, linewidth=1.4, alpha=0.9, zorder=3)
-    accepted = [answer.accepted for answer in answers]
-    for shown, style in ((np.array(accepted), "solid"), (~np.array(accepted), (0, (2, 3)))):
-        lines = np.stack((taken_m, named_m), axis=1)[shown]
-        line_colours = [colour for colour, show in zip(colours, shown, strict=True) if show]
-        strong = style == "solid"
-        axes.add_collection(
-            LineCollection(
-                lines, colors=line_colours, linestyles=[style], linewidths=2.6 if strong else 0.9,
-                alpha=1.0 if strong else 0.55, zorder=4,
-            )
-        )  # fmt: skip
     axes.scatter(*taken_m.T, s=46, c=colours, edgecolor="black", linewidth=0.8, zorder=5)
-
-    axes.plot((width_m - 115, width_m - 15), (14, 14), color="white", linewidth=3, path_effects=_OUTLINE)
-    label = {"color": "white", "ha": "center", "path_effects": _OUTLINE, "fontsize": 11}
-    axes.text(width_m - 65, 20, "100 m", **label)
-    axes.annotate(
-        "N",
-        (width_m - 22, depth_m - 14),
-        (width_m - 22, depth_m - 46),
-        arrowprops={"color": "white", "width": 2.5, "headwidth": 9},
-        **label,
+    ways = LineCollection(
+        np.stack((taken_m, named_m), axis=1),
+        colors=colours,
+        linestyles=["solid" if yes else (0, (2, 3)) for yes in accepted],
+        linewidths=np.where(accepted, 2.6, 0.9),
+        alpha=np.where(accepted, 1.0, 0.55),
+        zorder=4,
     )
-    axes.text(
-        (places_m[:, 0].max() + width_m) / 2 + 12,
-        depth_m - 30,
-        "land that is in no map",
-        **label | {"fontsize": 13, "style": "italic"},
-    )
-    axes.legend(
-        handles=[
-            Line2D([], [], color=_MAPPED, marker="o", markeredgecolor="#00000088", label=f"flight 1: {len(places_m)} places"),
-            Line2D([], [], color=_LATER, label=f"flight 2: {len(answers)} queries"),
-            *(
-                Line2D([], [], color=colour, marker="o", markeredgecolor="black", linestyle=style, label=text)
-                for colour, style, text in (
-                    (_RIGHT, "solid", "accepted, right place"),
-                    (_WRONG, "solid", "accepted, wrong place"),
-                    (_REJECTED, "dotted", "rejected: nothing is sent"),
-                )
-            ),
-        ],
-        loc="lower left", ncols=2, fontsize=10, facecolor="#30343acc", labelcolor="white", edgecolor="none",
-    )  # fmt: skip
+    axes.add_collection(ways)
+    _draw_legend(axes, width_m, depth_m, unmapped_m=(places_m[:, 0].max() + 12 + width_m) / 2)
     axes.set_xticks([])
     axes.set_yticks([])
     axes.spines[:].set_visible(False)
 
 
+def _draw_legend(axes: Axes, width_m: float, depth_m: float, unmapped_m: float) -> None:
+    text = {"color": "white", "ha": "center", "path_effects": _OUTLINE}
+    axes.plot((width_m - 115, width_m - 15), (14, 14), color="white", linewidth=3, path_effects=_OUTLINE)
+    axes.text(width_m - 65, 20, "100 m", fontsize=11, **text)
+    tip, tail = (width_m - 22, depth_m - 14), (width_m - 22, depth_m - 46)
+    axes.annotate("N", tip, tail, arrowprops={"color": "white", "width": 2.5, "headwidth": 9}, fontsize=11, **text)
+    axes.text(unmapped_m, depth_m - 30, "land that is in no map", fontsize=13, style="italic", **text)
+    rows = (
+        ("flight 1: the places", _MAPPED, "solid", "o"),
+        ("flight 2: the queries", _LATER, "solid", ""),
+        ("accepted, right place", _RIGHT, "solid", "o"),
+        ("accepted, wrong place", _WRONG, "solid", "o"),
+        ("rejected: no position is sent", _REJECTED, "dotted", "o"),
+    )
+    lines = [
+        Line2D([], [], color=colour, linestyle=style, marker=marker, markeredgecolor="#000000aa", label=label)
+        for label, colour, style, marker in rows
+    ]
+    box = {"facecolor": "#30343acc", "labelcolor": "white", "edgecolor": "none"}
+    axes.legend(handles=lines, loc="lower left", ncols=2, fontsize=10, **box)
+
+
+def _seen_by(flight: Flight, shape: tuple[int, int], metres_per_pixel: float) -> np.ndarray:
+    """bool (H, W): the ground that is in any picture of a flight."""
+    camera = flight.camera
+    corners = np.array([(0, 0), (camera.width, 0), (camera.width, camera.height), (0, camera.height)], np.float64)
+    seen = np.zeros(shape, np.uint8)
+    for pose in flight.poses:
+        on_ground = cv2.perspectiveTransform(corners[None], np.linalg.inv(ground_to_pixel(pose, camera)))[0]
+        pixels = on_ground / metres_per_pixel * (1, -1) + (0, shape[0])
+        cv2.fillConvexPoly(seen, pixels.round().astype(np.int32), 1)
+    return seen.astype(bool)
+
+
 def _draw_errors(axes: Axes, answers: Sequence[Answer]) -> None:
     numbers = np.arange(1, len(answers) + 1)
     errors_m = np.maximum([answer.error_m for answer in answers], 1)
-    axes.bar(numbers, errors_m, bottom=0.8, width=0.72, color=[_colour(answer) for answer in answers])
+    axes.bar(numbers, errors_m - 0.8, bottom=0.8, width=0.72, color=[_colour(answer) for answer in answers])
     axes.set_yscale("log")
     axes.set_yticks([1, 10, 100], ["1 m", "10 m", "100 m"], fontsize=10, color=_FAINT)
     axes.set_ylim(0.8, 900)
@@ -148,10 +149,9 @@ def _draw_pairs(figure: SubFigure, answers: Sequence[Answer], map_images: Path, 
             axes.spines[:].set(color=_colour(answer), linewidth=4)
             if side == 0:
                 axes.set_title(_verdict(answer), loc="left", fontsize=11, color=_INK, pad=5)
-        if row == 0:
-            for side, text in enumerate(("flight 2: the query", "flight 1: the best place")):
-                axes = figure.axes[-2 + side]
-                axes.annotate(text, (0, 1.23), xycoords="axes fraction", fontsize=11, color=_FAINT)
+            if row == 0:
+                heading = ("flight 2: the query", "flight 1: the best place")[side]
+                axes.annotate(heading, (0, 1.23), xycoords="axes fraction", fontsize=11, color=_FAINT)
 
 
 def _chosen(answers: Sequence[Answer], count: int) -> list[Answer]:

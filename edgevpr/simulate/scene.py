@@ -12,6 +12,8 @@ from edgevpr.simulate.layout import Bend, parcels, winding
 # Colours under even white light, BGR.
 _GRAVEL, _ASPHALT, _WATER, _STONE = (160, 178, 190), (120, 122, 122), (50, 56, 46), (150, 154, 156)
 _ROOFS = ((62, 78, 142), (58, 68, 104), (112, 104, 98), (190, 186, 180), (150, 148, 132), (88, 104, 150))
+# Along and beside the road from the middle of the yard, length, width (metres), quarter turns of the ridge.
+_BUILDINGS = ((-9, 8, 17, 8.5, 0), (8, 9, 12, 7, 0), (10, -6, 18, 8, 1), (-8, -8, 11, 7.5, 0), (-16, -1, 5, 4, 0))
 _LEAVES = np.array([(42, 84, 62), (36, 72, 50), (50, 100, 84), (60, 106, 98), (46, 76, 68)], float)
 
 
@@ -124,41 +126,37 @@ def _road(rng: np.random.Generator, canvas: Canvas, line_m: np.ndarray) -> None:
 
 
 def _farms(rng: np.random.Generator, canvas: Canvas, road_m: np.ndarray, river_m: np.ndarray) -> np.ndarray:
-    """Farms and houses beside the road; returns the middles of their yards, (N, 2) metres."""
+    """Farms beside the road, away from the river; returns the middles of their yards, (N, 2) metres."""
     yards = []
     for at in range(18, len(road_m) - 18, 13):
         ahead = road_m[at + 1] - road_m[at]
         turn_rad = float(np.arctan2(ahead[1], ahead[0])) + rng.normal(0, 0.12)
         along, beside = np.array([np.cos(turn_rad), np.sin(turn_rad)]), np.array([-np.sin(turn_rad), np.cos(turn_rad)])
         middle = road_m[at] + beside * rng.choice([-1, 1]) * 24 + along * rng.normal(0, 4)
-        if np.hypot(*(river_m - middle).T).min() < 42 or rng.random() < 0.3:
-            continue
-        yards.append(middle)
-        yard = np.array([middle + a * along * 19 + b * beside * 17 for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))])
-        box = canvas.box(yard, 4.0)
-        cover = canvas.polygon(box, yard)
-        ragged = smooth_step(cv2.GaussianBlur(cover, None, 8) + 0.16 * noise(rng, cover.shape, 30), 0.42, 0.58)
-        canvas.paint(box, ragged, np.array(_GRAVEL if rng.random() < 0.6 else MUD) * rng.uniform(0.8, 0.95))
-        canvas.height_cm[box] = np.where(ragged > 0.3, BASE_CM, canvas.height_cm[box])
-        for u, v, size in (
-            (-9, 8, (17, 8.5)),
-            (8, 9, (12, 7)),
-            (10, -6, (8, 18)),
-            (-8, -8, (11, 7.5)),
-            (-16, -1, (5, 4)),
-        ):
-            if rng.random() < 0.8:
-                length_m, width_m = np.array(size) * rng.uniform(0.8, 1.25, 2)
-                centre = middle + (u + rng.normal(0, 1)) * along + (v + rng.normal(0, 1)) * beside
-                quarter = np.pi / 2 if length_m < width_m else 0.0
-                colour = np.array(_ROOFS[rng.integers(len(_ROOFS))]) * rng.uniform(0.85, 1.1)
-                size = max(length_m, width_m), min(length_m, width_m)
-                roof(canvas, centre, *size, turn_rad + quarter, rng.uniform(2.6, 5), colour)
-        for _ in range(rng.integers(2, 7)):
-            centre = middle + rng.uniform(-14, 14) * along + rng.uniform(-2, 3) * beside
-            paint = rng.uniform(60, 225) * rng.uniform(0.6, 1.2, 3)
-            roof(canvas, centre, 4.3, 1.9, turn_rad + rng.choice([0, np.pi / 2]) + rng.normal(0, 0.2), 1.4, paint)
+        if np.hypot(*(river_m - middle).T).min() > 42 and rng.random() < 0.7:
+            _farm(rng, canvas, middle, turn_rad, along, beside)
+            yards.append(middle)
     return np.array(yards).reshape(-1, 2)
+
+
+def _farm(rng: np.random.Generator, canvas: Canvas, middle, turn_rad: float, along, beside) -> None:
+    """A yard with ragged edges, buildings around it and vehicles on it."""
+    yard = np.array([middle + a * along * 19 + b * beside * 17 for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))])
+    box = canvas.box(yard, 4.0)
+    cover = canvas.polygon(box, yard)
+    ragged = smooth_step(cv2.GaussianBlur(cover, (0, 0), 8) + 0.16 * noise(rng, cover.shape, 30), 0.42, 0.58)
+    canvas.paint(box, ragged, np.array(_GRAVEL if rng.random() < 0.6 else MUD) * rng.uniform(0.8, 0.95))
+    canvas.height_cm[box] = np.where(ragged > 0.3, BASE_CM, canvas.height_cm[box])
+    for u_m, v_m, length_m, width_m, quarter_turns in _BUILDINGS:
+        if rng.random() < 0.8:
+            centre = middle + (u_m + rng.normal(0, 1)) * along + (v_m + rng.normal(0, 1)) * beside
+            size_m = np.array((length_m, width_m)) * rng.uniform(0.8, 1.25, 2)
+            colour = np.array(_ROOFS[rng.integers(len(_ROOFS))]) * rng.uniform(0.85, 1.1)
+            roof(canvas, centre, *size_m, turn_rad + quarter_turns * np.pi / 2, rng.uniform(2.6, 5), colour)
+    for _ in range(rng.integers(2, 7)):
+        centre = middle + rng.uniform(-14, 14) * along + rng.uniform(-2, 3) * beside
+        colour = rng.uniform(60, 225) * rng.uniform(0.6, 1.2, 3)
+        roof(canvas, centre, 4.3, 1.9, turn_rad + rng.integers(2) * np.pi / 2 + rng.normal(0, 0.2), 1.4, colour)
 
 
 def _mottle(rng: np.random.Generator, canvas: Canvas) -> None:
@@ -174,6 +172,7 @@ def _mottle(rng: np.random.Generator, canvas: Canvas) -> None:
 
 
 def _plant(rng: np.random.Generator, canvas: Canvas, trees: np.ndarray, keep_off_m) -> None:
+    """Set the trees, (N, 4) east, north, radius, top, except near the lines (or points) of `keep_off_m`."""
     for line_m, clear_m in keep_off_m:
         gap_m = np.hypot(*(trees[:, None, :2] - line_m[None]).T).T
         trees = trees[(gap_m > clear_m).all(axis=1)]

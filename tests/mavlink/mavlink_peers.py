@@ -116,19 +116,23 @@ class UdpPort:
 
 
 class TcpServer:
-    """A server for one client at a time, which can die and come back on its port."""
+    """A TCP server, which can die and come back on its port."""
 
     def __init__(self, number: int) -> None:
         self._listener = socket.create_server(("127.0.0.1", number))
         self._listener.settimeout(PATIENCE_S)
 
+        self._clients: list[socket.socket] = []
+
     def accept(self) -> socket.socket:
-        self._client, _ = self._listener.accept()
-        self._client.settimeout(PATIENCE_S)
-        return self._client
+        client, _ = self._listener.accept()
+        client.settimeout(PATIENCE_S)
+        self._clients.append(client)
+        return client
 
     def close(self) -> None:
-        self._client.close()
+        for client in self._clients:
+            client.close()
         self._listener.close()
 
 

@@ -2,26 +2,39 @@
 
 import os
 import pty
+import select
+import threading
 import time
 
 import pytest
-from mavlink_peers import AutopilotThread, SerialCable, wait_until
+from mavlink_peers import AutopilotThread, SerialCable, TurnedClock, wait_until
 
 from edgevpr.errors import LinkError
 from edgevpr.mavlink.link import Link, parse_link
 from edgevpr.mavlink.messages import Fix, Severity, status_text
+from edgevpr.mavlink.wire import Receiver
 
 
 @pytest.fixture
-def terminal():
-    """A serial device whose other end nobody reads."""
+def line():
+    """The other end of a serial device, which nobody reads unless the test does, and the device."""
     master, slave = pty.openpty()
-    yield os.ttyname(slave)
+    yield master, os.ttyname(slave)
     os.close(master)
     os.close(slave)
 
 
-def test_an_unplugged_cable_is_found_again_when_it_is_plugged_in(tmp_path):
+@pytest.fixture
+def terminal(line):
+    return line[1]
+
+
+def losses_told(caplog) -> int:
+    told = [record.getMessage() for record in caplog.records if record.name == "edgevpr.mavlink.link"]
+    return sum("the device is gone" in message for message in told)
+
+
+def test_an_unplugged_cable_is_found_again_when_it_is_plugged_in(tmp_path, caplog):
     cable = SerialCable(tmp_path)
     here, there = (f"serial:{end}:57600" for end in cable.ends)
     with Link(parse_link(here)) as link:
@@ -33,7 +46,7 @@ def test_an_unplugged_cable_is_found_again_when_it_is_plugged_in(tmp_path):
             link.send_fix(Fix(50.0, 14.0, 25.0, time.monotonic()))
             wait_until(lambda times=times: link.stats().acks == {"ACCEPTED": times}, "the answer to the fix")
             cable.unplug()
-            wait_until(lambda: not link.stats().connected, "noticing the loss")
+            wait_until(lambda times=times: losses_told(caplog) == times, "noticing the loss")
             summary = autopilot.join()  # a cut line ends it
             assert (summary.companion, summary.fixes_accepted) == ("7/197", 1)
             assert (summary.bad_bytes, summary.lost_packets) == (0, 0)
@@ -50,6 +63,31 @@ def test_a_line_that_takes_no_bytes_never_blocks_the_sender(terminal):
 
         wait_until(stuck, "filling the line")
         assert link.stats().trouble == "the port takes no more bytes"
+
+
+def test_closing_sends_what_waits(line):
+    master, terminal = line
+    link = Link(parse_link(f"serial:{terminal}:57600"), clock=TurnedClock())
+    link.start()
+
+    def full() -> bool:
+        link.send(status_text(Severity.INFO, "x" * 50))
+        return link.stats().dropped_queue_full > 0
+
+    wait_until(full, "filling the line and the queue")
+    link.send(status_text(Severity.INFO, "last"))
+    texts, receiver = [], Receiver()
+
+    def read() -> None:
+        while "last" not in texts and select.select([master], [], [], 1)[0]:
+            texts.extend(m.text for m in receiver.feed(os.read(master, 65_536)) if m.get_type() == "STATUSTEXT")
+
+    reader = threading.Timer(0.02, read)
+    reader.start()
+    link.close()
+    reader.join()
+    assert texts[-1] == "last"
+    assert receiver.bad_bytes == 0
 
 
 def test_a_device_in_use_is_said_at_the_start(terminal):

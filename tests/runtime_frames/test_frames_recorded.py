@@ -1,5 +1,7 @@
 """Folders of images and video files, read through open_source."""
 
+import subprocess
+
 import cv2
 import numpy as np
 import photographs
@@ -157,6 +159,16 @@ def test_a_video_without_time_stamps_is_timed_by_its_frame_rate(tmp_path):
     frames = all_frames(open_source(str(path), step_s=0.2, live=False))  # FFmpeg takes such a file for 25 Hz
     assert shades_of(frames) == [0, 5, 10, 15, 20]
     assert frames[1].name == "frame 000005 t=0.200 s"
+
+
+def test_a_bare_h264_stream_is_timed_by_its_frame_rate(tmp_path):
+    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="the video is made with ffmpeg (pip install imageio-ffmpeg)")
+    path = tmp_path / "bare.h264"
+    picture = ["-f", "lavfi", "-i", "testsrc=size=64x48:rate=25:duration=2"]
+    subprocess.run([ffmpeg.get_ffmpeg_exe(), "-v", "quiet", *picture, "-c:v", "libx264", str(path)], check=True)
+    times_s = [float(frame.name.split("=")[1].split()[0]) for frame in all_frames(open_source(str(path), live=False))]
+    assert len(times_s) == 50
+    assert times_s == sorted(set(times_s))
 
 
 @pytest.mark.parametrize(
