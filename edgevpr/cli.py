@@ -65,6 +65,7 @@ def _parser() -> argparse.ArgumentParser:
     build.add_argument(
         "--board", default="this", metavar="NAME", help="the board that will fly (default: this machine)"
     )
+    _camera(build)
     build.add_argument("--append", action="store_true", help="add to an existing map, going on where it broke off")
     _json(build)
     info = _add(maps, "info", "map_info", "say what a map holds")
@@ -114,6 +115,7 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--query", required=True, metavar="DIR")
     evaluate.add_argument("--ref", required=True, metavar="DIR")
     evaluate.add_argument("--ground-truth", required=True, metavar="CSV")
+    _camera(evaluate)
     evaluate.add_argument("--techniques", default="hog,cohog", metavar="A,B", help="names, comma-separated")
     evaluate.add_argument(
         "--param", action="append", default=[], metavar="TECHNIQUE.KEY=VALUE", help="a parameter of a technique"
@@ -154,7 +156,13 @@ def _source(parser: argparse.ArgumentParser, required: bool) -> None:
     )
 
 
+def _camera(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--camera", choices=("nadir", "forward"), help="straight down, or ahead (the default of a map)")
+
+
 def _matching(parser: argparse.ArgumentParser) -> None:
+    _camera(parser)
+    parser.add_argument("--matching", choices=("displacement", "thesis"), help="how cohog scores (displacement)")
     parser.add_argument("--board", metavar="NAME", help="hardware profile (default: this machine)")
     parser.add_argument(
         "--budget-mb", type=float, metavar="MB", help="limit of the index in RAM (default: the board's)"

@@ -33,13 +33,15 @@ def map_build(args: Namespace) -> int:
     from edgevpr.runtime.pipeline import technique_of
 
     source = open_source(args.source, positions=_path(args.positions), live=False)
-    parameters = _parameters(args.param)
+    settings = _settings(args.param)
+    if args.camera:
+        settings["camera"] = args.camera
     if args.append and Path(args.map).exists():
         place_map = PlaceMap.open_for_adding(args.map)
-        technique = technique_of(place_map, args.technique, parameters)
+        technique = technique_of(place_map, args.technique, settings)
     else:
         name = args.technique or _picked_technique(args.board, source.total)
-        technique = techniques.create(name, parameters)
+        technique = techniques.create(name, settings)
         place_map = PlaceMap.create(args.map, technique.spec)
     unusable: list[ImageError] = []
     with place_map:
@@ -119,7 +121,7 @@ def match(args: Namespace) -> int:
     from edgevpr.runtime.record import record
 
     pipeline = open_pipeline(_config(args, map=args.map))
-    technique_of(pipeline.place_map, args.technique, _parameters(args.param))
+    technique_of(pipeline.place_map, args.technique, _settings(args.param))
     found = []
     unusable: list[ImageError] = []
     source = open_source(args.source, positions=_path(args.positions), live=False)
@@ -214,16 +216,17 @@ def evaluate(args: Namespace) -> int:
     from edgevpr.runtime.progress import progress
 
     wanted = [name.strip() for name in args.techniques.split(",") if name.strip()]
-    parameters: dict[str, dict[str, str]] = {name: {} for name in wanted}
-    for key, value in _parameters(args.param).items():
+    camera = {"camera": args.camera} if args.camera else {}
+    settings = {name: dict(camera) if "camera" in techniques.parameters(name) else {} for name in wanted}
+    for key, value in _settings(args.param).items():
         name, _, parameter = key.partition(".")
-        if name not in parameters or not parameter:
+        if name not in settings or not parameter:
             raise UsageError(f"--param {key}: write TECHNIQUE.KEY=VALUE with a technique of --techniques.")
-        parameters[name][parameter] = value
-    for name in wanted:  # a wrong name or parameter is said before the first hour of work
-        techniques.create(name, parameters[name])
+        settings[name][parameter] = value
+    for name in wanted:  # a wrong setting is said before the first hour of work
+        techniques.create(name, settings[name])
     dataset = load_dataset(args.query, args.ref, args.ground_truth)
-    results = [evaluation.evaluate(name, dataset, parameters[name], progress) for name in wanted]
+    results = [evaluation.evaluate(name, dataset, settings[name], progress) for name in wanted]
     results = evaluation.compare(results)
     if args.json:
         _print_json(evaluation.as_json(results))
@@ -302,7 +305,7 @@ def _said(unusable: list[ImageError]) -> int:
     return 1 if unusable else 0
 
 
-def _parameters(pairs: list[str]) -> dict[str, str]:
+def _settings(pairs: list[str]) -> dict[str, str]:
     """["gt=0.4"] -> {"gt": "0.4"}"""
     for pair in pairs:
         if "=" not in pair:
@@ -316,7 +319,9 @@ def _config(args: Namespace, **others: Any) -> Config:
         "board": args.board,
         "technique": args.technique,
         "source.uri": args.source,
+        "source.camera": args.camera,
         "source.rate_hz": getattr(args, "rate_hz", None),
+        "match.matching": args.matching,
         "match.candidates": args.candidates,
         "match.min_score": args.min_score,
         "match.min_margin": args.min_margin,

@@ -23,11 +23,13 @@ def bounded(low: float, high: float) -> Any:
 @dataclass(frozen=True, slots=True)
 class SourceConfig:
     uri: str | None
+    camera: str | None
     rate_hz: float | None = bounded(0.01, 60)
 
 
 @dataclass(frozen=True, slots=True)
 class MatchConfig:
+    matching: str | None
     candidates: int | None = bounded(1, 1_000_000)
     min_score: float | None = bounded(0, 1)
     min_margin: float | None = bounded(0, 1)

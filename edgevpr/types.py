@@ -53,11 +53,12 @@ class TechniqueSpec:
 @dataclass(frozen=True, slots=True)
 class Descriptor:
     """One encoded image. `coarse` is one row of the index in RAM; `fine` lives in the map file and is read for
-    candidates only; `good` (bool, one a row of `fine`) says which regions speak when this image is the query;
+    candidates only; `regions` are what a query asks with, and `good` (bool, one a region) says which of them speak;
     `quality` (0..1) is the share of the image that says anything."""
 
     coarse: np.ndarray
     fine: np.ndarray | None = None
+    regions: np.ndarray | None = None
     good: np.ndarray | None = None
     quality: float = 1.0
 

@@ -62,7 +62,8 @@ def open_pipeline(config: Config) -> Pipeline:
     board = load_board(config.board)
     pack = parse_pack(config.battery.pack)
     place_map = PlaceMap.open(Path(config.map))
-    technique = technique_of(place_map, config.technique)
+    wanted = {"camera": config.source.camera, "matching": config.match.matching}
+    technique = technique_of(place_map, config.technique, {key: value for key, value in wanted.items() if value})
     budget_mb = config.memory.budget_mb or board.budget_mb
     index = load_index(place_map, int(budget_mb * 1e6))
     rate_hz = config.source.rate_hz or board.rate_hz
@@ -84,11 +85,13 @@ def open_pipeline(config: Config) -> Pipeline:
     )
 
 
-def technique_of(place_map: PlaceMap, name: str | None = None, parameters: dict | None = None) -> Technique:
-    """The technique that a map was built with. Raises MapError where `name` or `parameters` ask for another."""
-    if (name is None or name == place_map.spec.name) and not parameters:
-        technique = techniques.create(place_map.spec.name, place_map.spec.parameters)
+def technique_of(place_map: PlaceMap, name: str | None = None, settings: dict[str, str] | None = None) -> Technique:
+    """The technique that a map was built with. Raises MapError where `name` or `settings` ask for another, and
+    UsageError for a setting that it does not have."""
+    built_with = place_map.spec
+    if name in (None, built_with.name):
+        technique = techniques.create(built_with.name, {**built_with.parameters, **(settings or {})})
     else:
-        technique = techniques.create(name or place_map.spec.name, parameters)
+        technique = techniques.create(name, settings)
     place_map.require(technique.spec)
     return technique

@@ -57,10 +57,11 @@ class DemoSummary:
                 f"places            {self.places} in the map",
                 f"queries           {got.queries}: {got.on_map} over the map, {off_map} beyond it",
                 f"recall@1          {got.recall_at_1:.2f} of those over the map (best place within {RIGHT_M:g} m)",
-                f"accepted          {got.accepted}, of them wrong: {got.accepted_wrong}",
+                f"accepted          {got.accepted}, {got.accepted_wrong} of them wrong",
                 f"rejected          {got.queries - got.accepted}, among them {got.off_map_rejected} of the {off_map} "
                 "beyond the map",
-                f"position error    median {got.error_median_m:.1f} m, 90 % within {got.error_p90_m:.1f} m (accepted)",
+                f"position error    median {got.error_median_m:.1f} m, 90 % within {got.error_p90_m:.1f} m, largest "
+                f"{got.error_max_m:.1f} m (of the accepted; places are 21 m apart)",
                 f"a query           {1000 * cost['cpu_s']:.0f} ms of CPU (encode {1000 * cost['t_encode_s']:.0f} ms, "
                 f"match {1000 * cost['t_match_s']:.0f} ms), {cost['rss_mb']:.0f} MB of RAM",
                 f"battery           {self.used_mah:.3f} mAh, {self.marginal_mah:.3f} mAh of them for recognising",

@@ -11,8 +11,8 @@ from edgevpr.runtime.flightlog import read_log
 from edgevpr.runtime.positions import find_positions, read_positions
 from edgevpr.types import Position
 
-# A place is the right one when the two pictures share about half of their ground (78 m long from 80 m above it).
-RIGHT_M = 40.0
+# A place is the right one where the two pictures share 30 % of their ground, which is 78 m long from a height of 80 m.
+RIGHT_M = 55.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +52,7 @@ class Outcome:
     off_map_rejected: int
     error_median_m: float
     error_p90_m: float
+    error_max_m: float
 
 
 def read_answers(log_path: Path, map_images: Path, query_images: Path) -> list[Answer]:
@@ -94,4 +95,5 @@ def outcome(answers: Sequence[Answer]) -> Outcome:
         off_map_rejected=sum(not answer.on_map and not answer.accepted for answer in answers),
         error_median_m=float(np.median(errors_m)),
         error_p90_m=float(np.quantile(errors_m, 0.9)),
+        error_max_m=float(np.max(errors_m)),
     )

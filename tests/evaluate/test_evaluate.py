@@ -55,7 +55,7 @@ def test_recall_costs_and_sizes_of_a_technique(folder, name, parameters):
     assert result.ah_total > 0
     assert result.ah_total_cpu_rail > result.ah_total  # the rail's voltage is lower than the pack's
     assert "4S5200" in result.ah_assumes
-    sizes = {"hog": (7 * 7 * 36 * 2, 0), "cohog": (64 * 8 * 2, 64 * 32 * 4)}
+    sizes = {"hog": (7 * 7 * 36 * 2, 0), "cohog": (64 * 8 * 2, 64 * 32)}
     assert (result.descriptor_bytes, result.fine_bytes) == sizes[name]
 
 

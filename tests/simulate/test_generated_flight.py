@@ -105,6 +105,7 @@ def test_answers_are_judged_by_the_true_positions(tmp_path):
     got = outcome(answers)
     assert (got.queries, got.on_map, got.accepted, got.accepted_wrong, got.off_map_rejected) == (3, 2, 2, 1, 1)
     assert got.recall_at_1 == 0.5
+    assert got.error_max_m == pytest.approx(111.2, abs=0.1)
     assert got.error_median_m == pytest.approx((11.12 + 111.2) / 2, abs=0.1)
 
 

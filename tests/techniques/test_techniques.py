@@ -19,6 +19,7 @@ def test_descriptors_have_the_form_that_the_spec_says(name):
         assert 0 <= descriptor.quality <= 1
         if technique.spec.fine is not None:
             assert descriptor.fine.shape == technique.spec.fine.shape
+            assert descriptor.fine.dtype == np.dtype(technique.spec.fine.dtype)
             assert descriptor.good.shape == technique.spec.fine.shape[:1]
 
 
@@ -56,7 +57,7 @@ def test_masked_pixels_do_not_speak():
     assert seen.good.any()
     changed = image.copy()
     changed[:, 100:] = 255 - changed[:, 100:]
-    np.testing.assert_allclose(technique.encode(changed, mask).fine, seen.fine, atol=1e-6)
+    np.testing.assert_allclose(technique.encode(changed, mask).regions, seen.regions, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -68,6 +69,8 @@ def test_masked_pixels_do_not_speak():
         ("cohog", {"gt": 7}, "share of the largest entropy"),
         ("cohog", {"w2": 100}, "multiple of w2"),
         ("cohog", {"entropy": "renyi"}, "filled_bins or shannon"),
+        ("cohog", {"matching": "magic"}, "displacement or thesis"),
+        ("cohog", {"camera": "sideways"}, "forward or nadir"),
         ("hog", {"cell": 0}, "multiple of cell"),
     ],
 )

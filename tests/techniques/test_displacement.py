@@ -1,0 +1,52 @@
+"""The displacement vote, against a count by hand."""
+
+import numpy as np
+import pytest
+from pictures import textured
+
+from edgevpr.techniques import create
+from edgevpr.techniques.displacement import displacement
+
+
+def count_by_hand(asking, best, side, window):
+    """Every possible window in turn, every vote in turn: the most votes that any window holds."""
+    steps = [(b % side - a % side, b // side - a // side) for a, b in zip(asking, best, strict=True)]
+    half, most = window // 2, 0
+    for x in range(-side + 1, side):
+        for y in range(-side + 1, side):
+            most = max(most, sum(abs(dx - x) <= half and abs(dy - y) <= half for dx, dy in steps))
+    return most / len(steps)
+
+
+@pytest.mark.parametrize("window", [1, 3, 5])
+def test_the_share_is_that_of_the_fullest_window(window):
+    rng = np.random.default_rng(window)
+    asking = np.sort(rng.choice(49, 40, replace=False))
+    best = rng.integers(0, 49, 40)
+    assert displacement(asking, best, 7, window).share == pytest.approx(count_by_hand(asking, best, 7, window))
+
+
+def test_regions_that_all_moved_alike_agree_entirely():
+    rows, cols = np.divmod(np.arange(900), 30)
+    inside = (rows < 26) & (cols >= 3)
+    asking = np.arange(900)[inside]
+    found = displacement(asking, asking + 4 * 30 - 3, 30, 3)
+    assert found.share == 1.0
+    assert found.shift_cells == (-3.0, 4.0)
+    assert found.covariance_cells2 == pytest.approx((1 / 12, 0, 1 / 12))
+
+
+def test_nobody_asking_agrees_on_nothing():
+    nothing = np.array([], int)
+    assert displacement(nothing, nothing, 31, 5).share == 0.0
+
+
+def test_cohog_finds_how_far_a_picture_has_moved():
+    technique = create("cohog")
+    scene = textured(1, 640, 704)
+    reference = technique.encode(scene[:512, :512])
+    moved = technique.encode(scene[32:544, 64:576])  # 4 cells to the right, 2 down
+    match = technique.match(moved, reference.fine)
+    assert match.shift_cells == pytest.approx((4.0, 2.0), abs=0.3)
+    stranger = technique.encode(textured(2, 512, 512))
+    assert match.score > 0.4 > 0.2 > technique.match(stranger, reference.fine).score
