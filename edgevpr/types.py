@@ -1,6 +1,6 @@
 """The values that cross rooms: frozen dataclasses, and the contract of a technique."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -54,18 +54,22 @@ class TechniqueSpec:
 class Descriptor:
     """One encoded image. `coarse` is one row of the index in RAM; `fine` lives in the map file and is read for
     candidates only; `regions` are what a query asks with, and `good` (bool, one a region) says which of them speak;
-    `quality` (0..1) is the share of the image that says anything."""
+    `quality` (0..1) is the share of the image that says anything. `grey` (uint8, square) is kept where a query may have
+    to be turned, and `turned` collects what was made of it."""
 
     coarse: np.ndarray
     fine: np.ndarray | None = None
     regions: np.ndarray | None = None
     good: np.ndarray | None = None
     quality: float = 1.0
+    grey: np.ndarray | None = None
+    turned: dict = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
 class FineMatch:
-    """One candidate compared in full: `score` in 0..1; the shift (dx, dy in cells) and rotation where it knows them."""
+    """One candidate compared in full: `score` in 0..1 and, where the technique knows them, the step from the query to
+    the place (dx, dy in cells) and how far the camera has turned since the map was made (clockwise, 0..360)."""
 
     score: float
     shift_cells: tuple[float, float] | None = None

@@ -3,6 +3,25 @@
 import cv2
 import numpy as np
 
+_STRIP_ROWS = 64  # rows done at once, so that the planes of a strip stay in cache
+_SIGN_BIT = np.uint32(1 << 31)
+# Fitted to the largest error over -45..45 degrees (it is 2e-6 of the magnitude): see _vote_by_octant.
+_P, _Q, _R = 2.904936713, 2.067222680, 0.162280117
+# Rows: the sums of _vote_by_octant. Columns: 0, 45, ... 315 degrees (x to the right, y down).
+_ORIENTATIONS = np.array(
+    [
+        [0.25, 0, 0, 0, 0.25, 0, 0, 0],
+        [0.25, 0, 0, 0, -0.25, 0, 0, 0],
+        [0, 0, 0.25, 0, 0, 0, 0.25, 0],
+        [0, 0, 0.25, 0, 0, 0, -0.25, 0],
+        [0, 0.25, 0, 0.25, 0, 0.25, 0, 0.25],
+        [0, 0.25, 0, -0.25, 0, -0.25, 0, 0.25],
+        [0, 0.25, 0, 0.25, 0, -0.25, 0, -0.25],
+        [0, 0.25, 0, -0.25, 0, 0.25, 0, -0.25],
+    ],
+    np.float32,
+)
+
 
 def grey_square(image: np.ndarray, side_px: int) -> np.ndarray:
     """Return a uint8 image, (H, W) grey or (H, W, 3) BGR, as uint8 grey of (side_px, side_px)."""
@@ -29,27 +48,86 @@ def oriented_cells(
     are multiples of `cell_px`; pixels where the bool (H, W) `allowed` is False do not vote. Returns float32
     (H/cell_px, W/cell_px, bins), sums of magnitude, all >= 0.
     """
-    # The root is taken in a table of 256 entries: the image has no other values.
-    root = np.sqrt(np.arange(256, dtype=np.float32) / max(int(grey.max()), 1))[grey]
-    dx = cv2.Sobel(root, cv2.CV_32F, 1, 0, ksize=1)
-    dy = cv2.Sobel(root, cv2.CV_32F, 0, 1, ksize=1)
+    rows, cols = grey.shape[0] // cell_px, grey.shape[1] // cell_px
+    vote = _vote_by_octant if signed and bins == 8 else _vote_by_angle
+    mirrored = cv2.copyMakeBorder(grey, 1, 1, 1, 1, cv2.BORDER_REFLECT_101)  # no gradient across the image's border
+    cells = np.empty((rows, cols, bins), np.float32)
+    step = max(1, _STRIP_ROWS // cell_px)
+    for row in range(0, rows, step):
+        top, bottom = row * cell_px, min(row + step, rows) * cell_px
+        root = cv2.sqrt(mirrored[top : bottom + 2].astype(np.float32))
+        dx = cv2.subtract(root[1:-1, 2:], root[1:-1, :-2])
+        dy = cv2.subtract(root[2:, 1:-1], root[:-2, 1:-1])
+        if allowed is not None:
+            dx *= allowed[top:bottom]
+            dy *= allowed[top:bottom]
+        cells[row : row + step] = vote(dx, dy, cell_px, bins, signed)
+    cells /= np.sqrt(max(float(grey.max()), 1.0))
+    return cells
+
+
+def _vote_by_angle(dx: np.ndarray, dy: np.ndarray, cell_px: int, bins: int, signed: bool) -> np.ndarray:
+    """The vote for any number of orientations: float32 (H, W) twice -> (H/cell_px, W/cell_px, bins)."""
     magnitude = cv2.magnitude(dx, dy)
-    if allowed is not None:
-        magnitude *= allowed
-    turn = 2 * np.pi if signed else np.pi
     at = np.arctan2(dy, dx)
-    at *= np.float32(bins / turn)  # in bins; whole numbers are the centres of the orientations
+    at *= np.float32(bins / (2 * np.pi if signed else np.pi))  # in bins; whole numbers are the centres of orientations
     low = np.floor(at)
     to_high = at - low
     low = low.astype(np.intp) % bins
     high = (low + 1) % bins
 
-    rows, cols = grey.shape[0] // cell_px, grey.shape[1] // cell_px
-    cell = np.add.outer(np.arange(grey.shape[0]) // cell_px * cols, np.arange(grey.shape[1]) // cell_px) * bins
+    rows, cols = dx.shape[0] // cell_px, dx.shape[1] // cell_px
+    cell = np.add.outer(np.arange(dx.shape[0]) // cell_px * cols, np.arange(dx.shape[1]) // cell_px) * bins
     size = rows * cols * bins
     votes = np.bincount((cell + low).ravel(), (magnitude * (1 - to_high)).ravel(), size)
     votes += np.bincount((cell + high).ravel(), (magnitude * to_high).ravel(), size)
-    return votes.astype(np.float32).reshape(rows, cols, bins)
+    return votes.reshape(rows, cols, bins)
+
+
+def _vote_by_octant(dx: np.ndarray, dy: np.ndarray, cell_px: int, *_: object) -> np.ndarray:
+    """The same vote for 8 orientations over 360 degrees, without angles, branches or scattered sums.
+
+    A gradient of magnitude m lies in a quadrant, at phi = -45..45 degrees from its diagonal. The orientation of the
+    diagonal gets m - |g|, where g = m phi / 45 degrees; the rest is the y axis's where g > 0, the x axis's where
+    g < 0. With v = sqrt(2) m sin(phi) and u = sqrt(2) m cos(phi), which need no angle,
+    g = v (_P m + _R u) / (_Q m + u) to 2e-6 m. Which of the four diagonals, and which way along an axis, is told by
+    the signs of dx and dy: each plane is summed over the cells once as it is and once with its sign bits flipped by
+    theirs; sums and differences of those are the orientations.
+    """
+    across, along = np.abs(dx), np.abs(dy)
+    u = across + along
+    g = np.subtract(along, across, out=along)
+    m = cv2.magnitude(dx, dy, across)
+    below = cv2.addWeighted(m, _Q, u, 1, 1e-20)  # never 0
+    g *= cv2.addWeighted(m, _P, u, _R, 0, u)
+    g /= below
+    size_g = np.abs(g, out=u)
+    diagonal = np.subtract(m, size_g, out=m)
+    twice_y = np.add(size_g, g, out=below)
+    twice_x = np.subtract(size_g, g, out=g)
+
+    sign_x = np.bitwise_and(dx.view(np.uint32), _SIGN_BIT)
+    sign_y = np.bitwise_and(dy.view(np.uint32), _SIGN_BIT)
+    height, width = dx.shape
+    sums = np.empty((8, height // cell_px, width), np.float32)
+    one = np.ones(cell_px, np.float32)
+    flipped = size_g.view(np.uint32)
+
+    def add_up(at: int, plane: np.ndarray, flip: np.ndarray | None = None) -> None:
+        if flip is not None:
+            plane = np.bitwise_xor(plane.view(np.uint32), flip, out=flipped).view(np.float32)
+        np.matmul(one, plane.reshape(-1, cell_px, width), out=sums[at])
+
+    add_up(0, twice_x)
+    add_up(1, twice_x, sign_x)
+    add_up(2, twice_y)
+    add_up(3, twice_y, sign_y)
+    add_up(4, diagonal)
+    add_up(5, diagonal, sign_x)
+    add_up(6, diagonal, sign_y)
+    add_up(7, diagonal, sign_x ^ sign_y)
+    votes = (sums.reshape(-1, cell_px) @ one).reshape(8, -1).T @ _ORIENTATIONS
+    return np.maximum(votes, 0, out=votes).reshape(height // cell_px, width // cell_px, 8)
 
 
 def normalised_blocks(cells: np.ndarray) -> np.ndarray:

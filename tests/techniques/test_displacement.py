@@ -1,5 +1,6 @@
 """The displacement vote, against a count by hand."""
 
+import cv2
 import numpy as np
 import pytest
 from pictures import textured
@@ -50,3 +51,17 @@ def test_cohog_finds_how_far_a_picture_has_moved():
     assert match.shift_cells == pytest.approx((4.0, 2.0), abs=0.3)
     stranger = technique.encode(textured(2, 512, 512))
     assert match.score > 0.4 > 0.2 > technique.match(stranger, reference.fine).score
+
+
+@pytest.mark.parametrize("turned_deg", [0, 45, 195])
+def test_a_camera_that_looks_down_finds_how_far_it_has_turned(turned_deg):
+    technique = create("cohog", {"camera": "nadir"})
+    scene = textured(3, 720, 720)
+    matrix = cv2.getRotationMatrix2D((359.5, 359.5), turned_deg, 1)  # the ground turns against the camera
+    turned = cv2.warpAffine(scene, matrix, (720, 720))
+    reference = technique.encode(scene[104:616, 104:616])
+    match = technique.match(technique.encode(turned[104:616, 104:616]), reference.fine)
+    assert match.rotation_deg == turned_deg
+    assert match.score > 0.5
+    assert match.shift_cells == pytest.approx((0, 0), abs=0.3)
+    assert technique.match(technique.encode(textured(4, 512, 512)), reference.fine).score < 0.1
