@@ -55,7 +55,7 @@ class Descriptor:
     """One encoded image. `coarse` is one row of the index in RAM; `fine` lives in the map file and is read for
     candidates only; `regions` are what a query asks with, and `good` (bool, one a region) says which of them speak;
     `quality` (0..1) is the share of the image that says anything. `grey` (uint8, square) is kept where a query may have
-    to be turned, and `turned` collects what was made of it."""
+    to be turned, and `asking` collects what was made of it."""
 
     coarse: np.ndarray
     fine: np.ndarray | None = None
@@ -63,16 +63,18 @@ class Descriptor:
     good: np.ndarray | None = None
     quality: float = 1.0
     grey: np.ndarray | None = None
-    turned: dict = field(default_factory=dict)
+    asking: dict = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
 class FineMatch:
     """One candidate compared in full: `score` in 0..1 and, where the technique knows them, the step from the query to
-    the place (dx, dy in cells) and how far the camera has turned since the map was made (clockwise, 0..360)."""
+    the place (dx, dy in cells) with its covariance (var x, cov xy, var y), and how far the camera has turned since the
+    map was made (clockwise, 0..360)."""
 
     score: float
     shift_cells: tuple[float, float] | None = None
+    covariance_cells2: tuple[float, float, float] | None = None
     rotation_deg: float | None = None
 
 
@@ -110,12 +112,10 @@ class Place:
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A place that may be the one in the query, with its score; retrieval returns these best first."""
+    """A place that may be the one in the query, and how it matches; retrieval returns these best first."""
 
     place: Place
-    score: float
-    shift_cells: tuple[float, float] | None = None
-    rotation_deg: float | None = None
+    match: FineMatch
 
 
 @dataclass(frozen=True, slots=True)

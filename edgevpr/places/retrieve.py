@@ -14,8 +14,7 @@ _NEIGHBOURS_WITHOUT_POSITION = 2
 
 @dataclass(frozen=True, slots=True)
 class Ranking:
-    """Places best first: `slots` int (K,) of the index, `scores` float32 (K,), and their full comparisons (empty for a
-    technique without a fine part)."""
+    """Places best first: `slots` int (K,) of the index, `scores` float32 (K,), and what is known of each match."""
 
     slots: np.ndarray
     scores: np.ndarray
@@ -29,7 +28,7 @@ def rank(
     coarse, hypotheses = technique.coarse_scores(query, index.rows)
     if technique.spec.fine is None:
         slots = np.argsort(-coarse, kind="stable")
-        return Ranking(slots, coarse[slots], ())
+        return Ranking(slots, coarse[slots], tuple(FineMatch(float(score)) for score in coarse[slots]))
     if candidates is None or candidates >= len(index):
         chosen = np.arange(len(index))
     else:
@@ -62,18 +61,7 @@ def margin(ranking: Ranking, index: PlaceIndex, neighbour_m: float) -> float:
 def named(ranking: Ranking, index: PlaceIndex, place_map: PlaceMap, first: int | None = None) -> list[Candidate]:
     """The `first` places of a ranking (None: all) with what the map file says of them, best first."""
     places = place_map.places(index.place_ids[ranking.slots[:first]])
-    found = []
-    for at, place in enumerate(places):
-        match = ranking.matches[at] if ranking.matches else None
-        found.append(
-            Candidate(
-                place,
-                float(ranking.scores[at]),
-                match.shift_cells if match else None,
-                match.rotation_deg if match else None,
-            )
-        )
-    return found
+    return [Candidate(place, match) for place, match in zip(places, ranking.matches[:first], strict=True)]
 
 
 def retrieve(

@@ -97,7 +97,7 @@ class Flight:
             self._send_fix(event.position, event)
         if event.accepted:
             place = event.candidate.place
-            self._link.send(*messages.place_match(now_s, place.place_id, event.candidate.score))
+            self._link.send(*messages.place_match(now_s, place.place_id, event.candidate.match.score))
         share = cost.cpu_s / ((cost.t_encode_s + cost.t_match_s) * self._pipeline.board.cores)
         self._link.send(*messages.query_figures(now_s, share, self.used_mah))
 

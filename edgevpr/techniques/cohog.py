@@ -25,13 +25,11 @@ _COARSE_GRID = 8
 _DEFAULT_GT = {"filled_bins": 0.5, "shannon": 0.4}
 # Chosen on corridor (forward) and aerial_caliterra (nadir): a step is known better when the camera looks straight down.
 _VOTE_WINDOW = {"forward": 5, "nadir": 3}
-# (min_score, min_margin). The vote's: no wrong match of corridor (forward) or aerial_caliterra (nadir) reached both, nor
-# did any query of two other sites in the map of aerial_caliterra. The thesis's score has no threshold that is safe:
-# its margin keeps out those queries of other sites, and most right matches with them.
+# (min_score, min_margin). The vote's: no wrong match of corridor (forward) or aerial_caliterra (nadir) reached both,
+# nor did any query of two other sites in the map of aerial_caliterra. The thesis's score has no safe threshold: its
+# margin keeps out those queries of other sites, and most right matches with them.
 _ACCEPT = {"forward": (0.12, 0.05), "nadir": (0.08, 0.03), "thesis": (0.0, 0.02)}
 _ROTATIONS = 24  # of a query that looks straight down and does not know its heading: 15 degrees apart
-# A region is stored as 255 times the root of each value: the small values, of which there are most, keep their digits.
-_VALUE_OF = (np.arange(256, dtype=np.float32) / 255) ** 2
 
 
 class CoHog:
@@ -89,6 +87,7 @@ class CoHog:
         grey = grey_square(image, self._w1)
         blocks, good = self._regions(grey, mask_square(mask, self._w1))
         regions = blocks.reshape(self.spec.fine.shape)
+        # The root of each value in 8 bits: the small values, of which there are most, keep their digits.
         stored = np.rint(255 * np.sqrt(regions)).astype(np.uint8)
         return Descriptor(self._coarse(blocks), stored, regions, good, float(good.mean()), grey)
 
@@ -107,34 +106,41 @@ class CoHog:
     def match(self, query: Descriptor, fine: np.ndarray, hypothesis: int | None = None) -> FineMatch:
         """C = A B^T (thesis 6.2.3) with A the good regions of the query, B those of the place; then the score by
         `matching`. A query without a good region scores 0: it has nothing to say."""
-        reference = _VALUE_OF[fine]
+        reference = fine.astype(np.float32)
+        reference *= reference  # what is stored is the root
         reference /= np.maximum(np.sqrt(np.einsum("ij,ij->i", reference, reference)), 1e-6)[:, None]
         if self._camera == "forward":
-            return self._matched(np.flatnonzero(query.good), query.regions[query.good], reference)
+            return self._matched(self._asking(query, 0), reference)
         turns = range(_ROTATIONS) if hypothesis is None else (hypothesis,)
-        matches = {turn: self._matched(*self._turned(query, turn), reference) for turn in turns}
+        matches = {turn: self._matched(self._asking(query, turn), reference) for turn in turns}
         best = max(matches, key=lambda turn: matches[turn].score)
         return replace(matches[best], rotation_deg=360 * best / _ROTATIONS)
 
-    def _turned(self, query: Descriptor, turn: int) -> tuple[np.ndarray, np.ndarray]:
-        """The asking regions of a query turned back by `turn` steps; kept with it, since many places are asked."""
-        if turn not in query.turned:
-            middle = (self._w1 - 1) / 2
-            matrix = cv2.getRotationMatrix2D((middle, middle), -360 * turn / _ROTATIONS, 1)
-            grey = cv2.warpAffine(query.grey, matrix, (self._w1, self._w1), borderMode=cv2.BORDER_REFLECT)
-            blocks, good = self._regions(grey, self._round)
-            query.turned[turn] = np.flatnonzero(good), blocks.reshape(query.regions.shape)[good]
-        return query.turned[turn]
+    def _asking(self, query: Descriptor, turn: int) -> tuple[np.ndarray, np.ndarray]:
+        """Numbers and descriptors of the good regions of a query turned back by `turn` steps; kept with it, since many
+        places are asked."""
+        if turn not in query.asking:
+            regions, good = query.regions, query.good
+            if turn:
+                middle = (self._w1 - 1) / 2
+                matrix = cv2.getRotationMatrix2D((middle, middle), -360 * turn / _ROTATIONS, 1)
+                grey = cv2.warpAffine(query.grey, matrix, (self._w1, self._w1), borderMode=cv2.BORDER_REFLECT)
+                blocks, good = self._regions(grey, self._round)
+                regions = blocks.reshape(regions.shape)
+            query.asking[turn] = np.flatnonzero(good), regions[good]
+        return query.asking[turn]
 
-    def _thesis(self, asking: np.ndarray, regions: np.ndarray, reference: np.ndarray) -> FineMatch:
-        if not len(asking):
+    def _thesis(self, asking: tuple[np.ndarray, np.ndarray], reference: np.ndarray) -> FineMatch:
+        numbers, regions = asking
+        if not len(numbers):
             return FineMatch(0.0)
         return FineMatch(float(np.clip((regions @ reference.T).max(axis=1).mean(), 0, 1)))
 
-    def _displacement(self, asking: np.ndarray, regions: np.ndarray, reference: np.ndarray) -> FineMatch:
+    def _displacement(self, asking: tuple[np.ndarray, np.ndarray], reference: np.ndarray) -> FineMatch:
+        numbers, regions = asking
         best = (regions @ reference.T).argmax(axis=1)
-        found = displacement(asking, best, self._side, _VOTE_WINDOW[self._camera])
-        return FineMatch(found.share, found.shift_cells)
+        found = displacement(numbers, best, self._side, _VOTE_WINDOW[self._camera])
+        return FineMatch(found.share, found.shift_cells, found.covariance_cells2)
 
     def _over_blocks(self, per_pixel: np.ndarray) -> np.ndarray:
         """Mean over every block of 2x2 cells: float32 (w1, w1) -> (side, side)."""

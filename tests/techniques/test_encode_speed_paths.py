@@ -1,0 +1,146 @@
+"""The short cuts of encoding give what the long way gives: strips, octants for angles, bounds for whole maps."""
+
+import os
+from pathlib import Path
+
+import cv2
+import literal
+import numpy as np
+import pytest
+from pictures import textured
+
+from edgevpr.techniques import entropy, gradients
+
+DATA = Path(os.environ.get("EDGEVPR_DATA") or Path(__file__).resolve().parents[3] / "shared/data")
+ENTROPIES = ("filled_bins", "shannon")
+
+
+def _wall(seed: int) -> np.ndarray:
+    """Almost flat: a few grey levels of noise."""
+    return np.random.default_rng(seed).integers(120, 124, (128, 128), dtype=np.uint8)
+
+
+def _noise(seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (128, 128), dtype=np.uint8)
+
+
+def _stripes() -> np.ndarray:
+    """Two far levels whose last bits are alike: the endings alone see one."""
+    return np.where(np.arange(128) // 3 % 2, 64, 192).astype(np.uint8)[None].repeat(128, axis=0)
+
+
+def _patchwork(seed: int) -> np.ndarray:
+    """Squares of very different contrast: bounds are tight here and loose there."""
+    rng = np.random.default_rng(seed)
+    contrast = cv2.resize(rng.random((8, 8), dtype=np.float32) ** 2, (160, 160), interpolation=cv2.INTER_NEAREST)
+    return np.clip(128 + 128 * contrast * rng.standard_normal((160, 160)), 0, 255).astype(np.uint8)
+
+
+PICTURES = {
+    "textured": textured(1, 128, 128),
+    "textured, not square": textured(2, 96, 160),
+    "black": np.zeros((128, 128), np.uint8),
+    "almost flat": _wall(3),
+    "noise": _noise(4),
+    "ramp": np.add.outer(np.arange(128), np.arange(128)).astype(np.uint8),
+    "stripes": _stripes(),
+    "patchwork": _patchwork(5),
+    "blurred patchwork": cv2.GaussianBlur(_patchwork(6), (0, 0), 1.5),
+}
+
+
+def _assert_same_goodness(grey: np.ndarray, which: str, cell_px: int) -> None:
+    """At the usual thresholds, at the extremes, and at those that split the picture's own blocks, ties included."""
+    means = entropy.block_means(getattr(entropy, which)(grey), cell_px)
+    own = np.quantile(means, [0, 0.02, 0.25, 0.5, 0.75, 0.98, 1], method="nearest")
+    for threshold in (0.0, 0.4, 0.5, 1.0, *own.tolist(), *(own + 3e-4).tolist()):
+        good = entropy.good_blocks(grey, which, cell_px, threshold)
+        np.testing.assert_array_equal(good, means >= threshold, err_msg=f"threshold {threshold}")
+
+
+@pytest.mark.parametrize("which", ENTROPIES)
+@pytest.mark.parametrize("cell_px", [8, 16])
+@pytest.mark.parametrize("name", PICTURES)
+def test_good_blocks_are_those_of_the_whole_map(name, cell_px, which):
+    _assert_same_goodness(PICTURES[name], which, cell_px)
+
+
+@pytest.mark.parametrize("which", ENTROPIES)
+@pytest.mark.parametrize("set_name", ["corridor", "grief_stromovka_seasons", "aerial_caliterra"])
+def test_good_blocks_of_photographs_are_those_of_the_whole_map(set_name, which):
+    paths = sorted((DATA / set_name / "query").glob("*.*"))
+    if not paths:
+        pytest.skip(f"no image set {set_name} in {DATA}: name the folder of the sets in EDGEVPR_DATA")
+    photograph = cv2.imread(str(paths[len(paths) // 2]), cv2.IMREAD_GRAYSCALE)
+    _assert_same_goodness(cv2.resize(photograph, (256, 256)), which, 16)
+
+
+def test_good_blocks_are_those_of_the_equations():
+    grey = _patchwork(7)[:96, :96]
+    good = entropy.good_blocks(grey, "filled_bins", 16, 0.6)
+    expected = literal.good_blocks(literal.filled_bins(grey), 16, 0.6)
+    assert 0 < expected.sum() < len(expected)
+    np.testing.assert_array_equal(good.ravel(), expected)
+
+
+@pytest.mark.parametrize("which", ENTROPIES)
+@pytest.mark.parametrize("name", PICTURES)
+def test_no_entropy_leaves_its_bounds_and_the_exact_one_is_exact(name, which):
+    grey = PICTURES[name]
+    bounds = entropy._BOUNDS[which](grey, 16)
+    means = entropy.block_means(getattr(entropy, which)(grey), 16)
+    assert (bounds.blocks(bounds.low) <= means + 1e-6).all()
+    assert (bounds.blocks(bounds.high) >= means - 1e-6).all()
+    exact = bounds.exact(np.ones(bounds.low.shape, bool)).reshape(bounds.low.shape)
+    np.testing.assert_allclose(bounds.blocks(exact), means, atol=1e-6)
+
+
+def test_most_blocks_are_decided_by_bounds_alone():
+    grey = cv2.resize(textured(8, 256, 256), (512, 512))
+    for which, threshold in (("shannon", 0.4), ("filled_bins", 0.5)):
+        bounds = entropy._BOUNDS[which](grey, 16)
+        decided = (bounds.blocks(bounds.low) >= threshold) | (bounds.blocks(bounds.high) < threshold)
+        assert decided.mean() > 0.5
+
+
+def test_maps_taller_than_a_strip_have_no_seams():
+    grey = textured(9, 150, 30)
+    np.testing.assert_allclose(entropy.filled_bins(grey), literal.filled_bins(grey), atol=1e-6)
+
+
+def test_octants_vote_like_angles_in_every_direction():
+    turn = np.concatenate([np.linspace(0, 2 * np.pi, 4001), np.arange(16) * np.pi / 8])
+    strength = np.array([[1e-3], [0.7], [1.4]])
+    dx, dy = ((strength * function(turn)).astype(np.float32).ravel()[None] for function in (np.cos, np.sin))
+    votes = gradients._vote_by_octant(dx.copy(), dy.copy(), 1, 8, True)
+    expected = gradients._vote_by_angle(dx, dy, 1, 8, True)
+    error = np.abs(votes - expected).max(axis=2) / np.hypot(dx, dy)
+    assert error.max() < 5e-6
+    assert votes.min() >= 0
+
+
+def test_no_gradient_no_vote():
+    zero = np.zeros((4, 4), np.float32)
+    for dx, dy in ((zero, zero), (-zero, zero), (-zero, -zero)):
+        assert not gradients._vote_by_octant(dx.copy(), dy.copy(), 2, 8, True).any()
+    assert not gradients.oriented_cells(np.zeros((32, 32), np.uint8), 8, 8, True).any()
+
+
+@pytest.mark.parametrize(("bins", "signed"), [(8, True), (9, False), (8, False), (12, True)])
+@pytest.mark.parametrize(("height", "cell_px"), [(152, 8), (160, 80), (136, 68)])
+def test_cells_in_strips_are_those_of_the_equations(height, cell_px, bins, signed):
+    grey = textured(10, height, cell_px)
+    cells = gradients.oriented_cells(grey, cell_px, bins, signed)
+    expected = literal.cell_histograms(grey, cell_px, bins, signed)
+    np.testing.assert_allclose(cells, expected, atol=1e-4 * expected.max())
+
+
+@pytest.mark.parametrize(("bins", "signed"), [(8, True), (9, False)])
+def test_only_allowed_pixels_vote_in_every_strip(bins, signed):
+    grey = textured(11, 192, 64)
+    allowed = np.random.default_rng(12).random(grey.shape) < 0.5
+    some, others, all_of_them = (
+        gradients.oriented_cells(grey, 16, bins, signed, allowed=mask) for mask in (allowed, ~allowed, None)
+    )
+    np.testing.assert_allclose(some + others, all_of_them, atol=1e-4)
+    assert (some[..., 0] < all_of_them[..., 0]).any()
