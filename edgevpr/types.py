@@ -41,21 +41,30 @@ class PartSpec:
 
 @dataclass(frozen=True, slots=True)
 class TechniqueSpec:
-    """What a map must agree with before it is used: name, every parameter, model, and the form of both parts."""
+    """What a map must agree with before it is used: name, every parameter, model, and the form of both parts.
+
+    `packed` is the form of a place in RAM where it is not the coarse part as it is: `Technique.pack` makes it.
+    """
 
     name: str
     parameters: dict[str, int | float | str]
     coarse: PartSpec
     fine: PartSpec | None = None
     model_sha256: str | None = None
+    packed: PartSpec | None = None
+
+    @property
+    def row(self) -> PartSpec:
+        """One place of the index in RAM."""
+        return self.packed or self.coarse
 
 
 @dataclass(frozen=True, slots=True)
 class Descriptor:
     """One encoded image. `coarse` is one row of the index in RAM; `fine` lives in the map file and is read for
     candidates only; `regions` are what a query asks with, and `good` (bool, one a region) says which of them speak;
-    `quality` (0..1) is the share of the image that says anything. `grey` (uint8, square) is kept where a query may have
-    to be turned, and `asking` collects what was made of it."""
+    `quality` (0..1) is the share of the image that says anything. `grey` (uint8, square) is kept for a query that may
+    have to be turned, and `asking` collects what was made of it."""
 
     coarse: np.ndarray
     fine: np.ndarray | None = None
@@ -79,7 +88,8 @@ class FineMatch:
 
 
 class Technique(Protocol):
-    """The contract of `edgevpr/techniques/*.py`. A technique without a fine part has no use for `match`."""
+    """The contract of `edgevpr/techniques/*.py`. A technique without a fine part needs no `match`, one whose spec has
+    no `packed` no `pack`."""
 
     spec: TechniqueSpec
     min_score: float  # a match is accepted from this score on, unless the configuration says otherwise ...
@@ -89,8 +99,15 @@ class Technique(Protocol):
         """Encode a uint8 image; `mask` (H, W) bool is False where the picture must not be used."""
         ...
 
-    def coarse_scores(self, query: Descriptor, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-        """Score all places at once: `rows` (N, *coarse.shape) -> scores (N,) float32, hypotheses (N,) or None."""
+    def pack(self, coarse: np.ndarray, mean: np.ndarray) -> np.ndarray:
+        """Rows of the index (N, *row.shape) from coarse parts (N, *coarse.shape) and their mean over the map."""
+        ...
+
+    def coarse_scores(
+        self, query: Descriptor, rows: np.ndarray, mean: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """Score all places at once: `rows` (N, *row.shape) -> scores (N,) float32, hypotheses (N,) or None. `mean` is
+        that of the map for a technique that packs, else None."""
         ...
 
     def match(self, query: Descriptor, fine: np.ndarray, hypothesis: int | None) -> FineMatch:

@@ -99,7 +99,7 @@ def evaluate(
         with PlaceMap.create(map_path, technique.spec) as place_map:
             build_map(progress(_frames(source), source.total, f"{technique_name}: references"), technique, place_map)
         with PlaceMap.open(map_path) as place_map:
-            index = load_index(place_map, len(place_map) * bytes_per_place(technique.spec))
+            index = load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
             answers = list(_answers(technique, dataset, place_map, index, progress))
     return _summary(technique, len(dataset.references), answers)
 

@@ -67,6 +67,7 @@ class PlaceMap:
                 "model_sha256": spec.model_sha256,
                 "coarse": asdict(spec.coarse),
                 "fine": asdict(spec.fine) if spec.fine else None,
+                "packed": asdict(spec.packed) if spec.packed else None,
             }
             db.executemany(
                 "INSERT INTO edgevpr_map (key, value) VALUES (?, ?)",
@@ -200,6 +201,13 @@ class PlaceMap:
                 part = self._part(coarse, self.spec.coarse, place_id)
                 yield place_id, geopackage.read_point(geom) if geom else None, part
 
+    def mean_coarse(self) -> np.ndarray:
+        """Mean of the coarse parts over the map, float32 of the shape of one."""
+        total = np.zeros(self.spec.coarse.shape)
+        for count, (_, _, part) in enumerate(self.coarse_parts(), start=1):
+            total += part
+        return (total / count).astype(np.float32)
+
     def fine_part(self, place_id: int) -> np.ndarray:
         """The fine part of one place, read from the file (read-only array of `spec.fine`)."""
         with sentences(self.path):
@@ -255,8 +263,9 @@ def _read_spec(path: Path, db: sqlite3.Connection) -> TechniqueSpec:
             stored["technique"],
             stored["parameters"],
             _part_spec(stored["coarse"]),
-            _part_spec(stored["fine"]) if stored["fine"] else None,
+            _part_spec(stored["fine"]),
             stored["model_sha256"],
+            _part_spec(stored["packed"]),
         )
     except (ValueError, KeyError, TypeError) as error:
         raise MapError(
@@ -264,8 +273,8 @@ def _read_spec(path: Path, db: sqlite3.Connection) -> TechniqueSpec:
         ) from error
 
 
-def _part_spec(stored: dict) -> PartSpec:
-    return PartSpec(tuple(stored["shape"]), stored["dtype"])
+def _part_spec(stored: dict | None) -> PartSpec | None:
+    return PartSpec(tuple(stored["shape"]), stored["dtype"]) if stored else None
 
 
 def _blob(part: np.ndarray | None, spec: PartSpec | None) -> bytes | None:

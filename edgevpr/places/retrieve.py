@@ -25,7 +25,7 @@ def rank(
     technique: Technique, query: Descriptor, place_map: PlaceMap, index: PlaceIndex, candidates: int | None = None
 ) -> Ranking:
     """Compare the query with every place of the index, and in full with the best `candidates` of them (None: all)."""
-    coarse, hypotheses = technique.coarse_scores(query, index.rows)
+    coarse, hypotheses = technique.coarse_scores(query, index.rows, index.mean)
     if technique.spec.fine is None:
         slots = np.argsort(-coarse, kind="stable")
         return Ranking(slots, coarse[slots], tuple(FineMatch(float(score)) for score in coarse[slots]))

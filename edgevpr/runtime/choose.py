@@ -76,7 +76,7 @@ def probe(technique: Technique) -> TechniqueCosts:
     with TemporaryDirectory() as folder, PlaceMap.create(Path(folder) / "trial.gpkg", technique.spec) as trial_map:
         for i in range(_PLACES):
             trial_map.add(frames[i % _ROUNDS], queries[i % _ROUNDS])
-        index = load_index(trial_map, _PLACES * bytes_per_place(technique.spec))
+        index = load_index(trial_map, technique, _PLACES * bytes_per_place(technique.spec))
         for query in queries:
             with stage() as matching:
                 rank(technique, query, trial_map, index)

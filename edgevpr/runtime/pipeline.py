@@ -65,7 +65,7 @@ def open_pipeline(config: Config) -> Pipeline:
     wanted = {"camera": config.source.camera, "matching": config.match.matching}
     technique = technique_of(place_map, config.technique, {key: value for key, value in wanted.items() if value})
     budget_mb = config.memory.budget_mb or board.budget_mb
-    index = load_index(place_map, int(budget_mb * 1e6))
+    index = load_index(place_map, technique, int(budget_mb * 1e6))
     rate_hz = config.source.rate_hz or board.rate_hz
     compared = min(config.match.candidates or len(index), len(index))
     costs = on_board(probe(technique), load_board("this"), board)

@@ -99,7 +99,7 @@ class CoHog:
             good &= self._over_blocks(allowed.astype(np.float32)) >= 1.0
         return blocks, good.ravel()
 
-    def coarse_scores(self, query: Descriptor, rows: np.ndarray) -> tuple[np.ndarray, None]:
+    def coarse_scores(self, query: Descriptor, rows: np.ndarray, mean: None = None) -> tuple[np.ndarray, None]:
         """Cosine of the coarse parts: `rows` float16 (N, 64 bins) -> float32 (N,) in 0..1."""
         return np.clip(rows.astype(np.float32) @ query.coarse.astype(np.float32), 0, 1), None
 

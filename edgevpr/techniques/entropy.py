@@ -14,8 +14,10 @@ import numpy as np
 
 DISC_RADIUS_PX = 5
 SHANNON_SIDE_PX = 100  # the authors' public code takes the Shannon entropy of a copy of this size
-_STRIP_ROWS = 64  # rows, cells, intensities done at once, so that what is summed stays in cache
-_STRIP_CELLS = 64
+# How much is done at once, so that what is summed stays in cache.
+_STRIP_ROWS = 32
+_STRIP_CELLS = 32
+_STRIP_PIXELS = 256
 _STRIP_INTENSITIES = 16
 _ROUNDING = 1e-5  # more than float32 rounding can move the mean entropy of a block
 _LOG2 = np.log2(np.arange(257, dtype=np.float32).clip(1))
@@ -205,12 +207,18 @@ def _shannon_at(small: np.ndarray, pixels: np.ndarray, radius_px: int) -> np.nda
     r = radius_px
     padded = np.pad(small.astype(np.int16), r, constant_values=256)  # 256: outside
     down, right = np.nonzero(np.hypot(*np.mgrid[-r : r + 1, -r : r + 1]) <= r)
+    disc = down * padded.shape[1] + right
     row, col = np.nonzero(pixels)
-    intensities = padded[row[:, None] + down, col[:, None] + right]
-    bins = np.arange(len(row))[:, None] * 257 + intensities
-    counts = np.bincount(bins.ravel(), minlength=257 * len(row)).reshape(-1, 257)[:, :256]
-    in_disc = counts.sum(axis=1)
-    return (_COUNT_LOG2[in_disc] - _COUNT_LOG2.take(counts).sum(axis=1)) / in_disc / 8
+    corner = row * padded.shape[1] + col
+    entropy = np.empty(len(corner), np.float32)
+    for start in range(0, len(corner), _STRIP_PIXELS):
+        strip = corner[start : start + _STRIP_PIXELS, None]
+        bins = padded.take(strip + disc) + 257 * np.arange(len(strip))[:, None]
+        counts = np.bincount(bins.ravel(), minlength=257 * len(strip)).reshape(-1, 257)[:, :256]
+        in_disc = counts.sum(axis=1)
+        said = _COUNT_LOG2.take(counts).sum(axis=1)
+        entropy[start : start + _STRIP_PIXELS] = (_COUNT_LOG2[in_disc] - said) / in_disc / 8
+    return entropy
 
 
 def over_disc(planes: np.ndarray, radius_px: int, combine: np.ufunc) -> np.ndarray:

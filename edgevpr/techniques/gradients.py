@@ -51,13 +51,13 @@ def oriented_cells(
     rows, cols = grey.shape[0] // cell_px, grey.shape[1] // cell_px
     vote = _vote_by_octant if signed and bins == 8 else _vote_by_angle
     mirrored = cv2.copyMakeBorder(grey, 1, 1, 1, 1, cv2.BORDER_REFLECT_101)  # no gradient across the image's border
+    root = cv2.sqrt(mirrored.astype(np.float32))
     cells = np.empty((rows, cols, bins), np.float32)
     step = max(1, _STRIP_ROWS // cell_px)
     for row in range(0, rows, step):
         top, bottom = row * cell_px, min(row + step, rows) * cell_px
-        root = cv2.sqrt(mirrored[top : bottom + 2].astype(np.float32))
-        dx = cv2.subtract(root[1:-1, 2:], root[1:-1, :-2])
-        dy = cv2.subtract(root[2:, 1:-1], root[:-2, 1:-1])
+        dx = cv2.subtract(root[top + 1 : bottom + 1, 2:], root[top + 1 : bottom + 1, :-2])
+        dy = cv2.subtract(root[top + 2 : bottom + 2, 1:-1], root[top:bottom, 1:-1])
         if allowed is not None:
             dx *= allowed[top:bottom]
             dy *= allowed[top:bottom]

@@ -38,7 +38,7 @@ class Hog:
         vector /= max(float(np.linalg.norm(vector)), 1e-6)
         return Descriptor(vector.astype("<f2"))
 
-    def coarse_scores(self, query: Descriptor, rows: np.ndarray) -> tuple[np.ndarray, None]:
+    def coarse_scores(self, query: Descriptor, rows: np.ndarray, mean: None = None) -> tuple[np.ndarray, None]:
         """Cosine of the query with each row: `rows` float16 (N, length) -> float32 (N,) in 0..1."""
         vector = query.coarse.astype(np.float32)
         scores = np.empty(len(rows), np.float32)

@@ -23,7 +23,7 @@ class Ruler:
         number = float(image[0, 0])
         return Descriptor(np.array([round(number, -1)], "<f4"), np.array([number]))
 
-    def coarse_scores(self, query, rows):
+    def coarse_scores(self, query, rows, mean):
         return 1 / (1 + abs(rows[:, 0] - query.coarse[0])), None
 
     def match(self, query, fine, hypothesis):
@@ -45,7 +45,7 @@ def ruler_map(tmp_path):
 
 def test_the_index_is_contiguous_and_of_the_size_promised(ruler_map):
     technique, place_map = ruler_map
-    index = load_index(place_map, 10_000)
+    index = load_index(place_map, technique, 10_000)
     assert len(index) == 25
     assert index.nbytes == 25 * bytes_per_place(technique.spec)
     assert index.rows.flags.c_contiguous
@@ -55,19 +55,19 @@ def test_the_index_is_contiguous_and_of_the_size_promised(ruler_map):
 def test_a_map_beyond_the_budget_is_refused_with_the_figure_that_would_do(ruler_map):
     technique, place_map = ruler_map
     each = bytes_per_place(technique.spec)
-    load_index(place_map, 25 * each)
+    load_index(place_map, technique, 25 * each)
     with pytest.raises(MapError, match=r"holds 24: raise --budget-mb"):
-        load_index(place_map, 25 * each - 1)
+        load_index(place_map, technique, 25 * each - 1)
 
 
 def test_an_empty_map_is_refused(tmp_path):
     with PlaceMap.create(tmp_path / "empty.gpkg", Ruler.spec) as place_map, pytest.raises(MapError, match="no place"):
-        load_index(place_map, 10_000)
+        load_index(place_map, Ruler(), 10_000)
 
 
 def test_all_places_are_compared_unless_candidates_are_limited(ruler_map):
     technique, place_map = ruler_map
-    index = load_index(place_map, 10_000)
+    index = load_index(place_map, technique, 10_000)
     query = technique.encode(np.full((1, 1), 43))
     everything = rank(technique, query, place_map, index)
     assert technique.compared == 25
@@ -82,7 +82,7 @@ def test_all_places_are_compared_unless_candidates_are_limited(ruler_map):
 
 def test_margin_is_to_the_best_place_elsewhere(ruler_map):
     technique, place_map = ruler_map
-    index = load_index(place_map, 10_000)
+    index = load_index(place_map, technique, 10_000)
     ranking = rank(technique, technique.encode(np.full((1, 1), 20)), place_map, index)
     # 11 m a number: 16 and 24 are 44 m away, 12 and 28 are 89 m.
     assert margin(ranking, index, 40.0) == pytest.approx(1 - 1 / 5)
@@ -97,7 +97,7 @@ def test_a_single_place_is_ahead_of_nothing(tmp_path):
     image = np.full((1, 1), 5)
     with PlaceMap.create(tmp_path / "one.gpkg", technique.spec) as place_map:
         place_map.add(Frame(image, "5", 0.0), technique.encode(image))
-        index = load_index(place_map, 1000)
+        index = load_index(place_map, technique, 1000)
         assert margin(rank(technique, technique.encode(image), place_map, index), index, 50.0) == 1.0
 
 
@@ -107,4 +107,4 @@ def test_a_descriptor_of_the_wrong_size_is_named(tmp_path):
         place_map.add(Frame(np.zeros((1, 1)), "a", 0.0), Descriptor(np.zeros(1, "<f4")))
         place_map._db.execute("UPDATE places SET coarse = x'00'")
         with pytest.raises(MapError, match="place 1 is damaged"):
-            load_index(place_map, 1000)
+            load_index(place_map, Ruler(), 1000)
