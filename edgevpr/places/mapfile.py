@@ -203,10 +203,10 @@ class PlaceMap:
 
     def mean_coarse(self) -> np.ndarray:
         """Mean of the coarse parts over the map, float32 of the shape of one."""
-        total = np.zeros(self.spec.coarse.shape)
+        mean = np.zeros(self.spec.coarse.shape)
         for count, (_, _, part) in enumerate(self.coarse_parts(), start=1):
-            total += part
-        return (total / count).astype(np.float32)
+            mean += (part - mean) / count
+        return mean.astype(np.float32)
 
     def fine_part(self, place_id: int) -> np.ndarray:
         """The fine part of one place, read from the file (read-only array of `spec.fine`)."""

@@ -51,7 +51,8 @@ def oriented_cells(
     rows, cols = grey.shape[0] // cell_px, grey.shape[1] // cell_px
     vote = _vote_by_octant if signed and bins == 8 else _vote_by_angle
     mirrored = cv2.copyMakeBorder(grey, 1, 1, 1, 1, cv2.BORDER_REFLECT_101)  # no gradient across the image's border
-    root = cv2.sqrt(mirrored.astype(np.float32))
+    root = mirrored.astype(np.float32)
+    cv2.sqrt(root, root)
     cells = np.empty((rows, cols, bins), np.float32)
     step = max(1, _STRIP_ROWS // cell_px)
     for row in range(0, rows, step):
