@@ -1,0 +1,128 @@
+"""A place in 64 bytes that is still found when the camera has moved or turned: the coarse stage of `cohog`.
+
+The block-normalised HOG is averaged over a grid of 8x8 cells (its *grid*); the map's mean is taken away and only the
+signs stay, 8x8x8 bits a place. A query is compared under every shift of the grid, for a camera of unknown heading
+under every rotation too: each such *hypothesis* is one row of a matrix, the map is the other, and one product answers
+for all places. Neither shifting nor turning touches the picture: both move the numbers of the grid.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+SIDE = 8  # cells along one side of the grid
+_SAMPLES = 4  # samples along one side of a cell: with 31 blocks about one a block
+_MIN_OVERLAP = 0.35
+_PLACES_AT_ONCE = 256  # their signs (0.5 MB) stay in the second-level cache with a part of the query
+
+# Byte -> its eight bits, first bit first, as +1 and -1: `unpackbits`, conversion and offset in one look-up.
+_SIGNS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).astype(np.float32) * 2 - 1
+
+
+def _shifts() -> np.ndarray:
+    """int8 (S, 2): every (dx, dy) in cells under which at least `_MIN_OVERLAP` of two grids lies on the other."""
+    steps = np.arange(1 - SIDE, SIDE)
+    dy, dx = np.meshgrid(steps, steps, indexing="ij")
+    enough = (SIDE - abs(dx)) * (SIDE - abs(dy)) >= _MIN_OVERLAP * SIDE**2
+    return np.stack([dx[enough], dy[enough]], axis=1).astype(np.int8)
+
+
+SHIFTS = _shifts()
+
+
+@dataclass(frozen=True, slots=True)
+class Hypotheses:
+    """A query as it would look from elsewhere: `matrix` float32 (R S, 64 L) holds its signs (0 where it sees nothing)
+    over the length of a code, turned by `rotations_deg` (R,) and moved by SHIFTS (S, 2), rotations outermost."""
+
+    matrix: np.ndarray
+    rotations_deg: np.ndarray
+
+    def rotation_deg(self, row: int) -> float:
+        """Counter-clockwise, as seen in the picture; the query turned by it lies on the place."""
+        return float(self.rotations_deg[row // len(SHIFTS)])
+
+    def shift(self, row: int) -> tuple[float, float]:
+        """(dx, dy) by which the turned query moves to lie on the place, in sides of the picture, x right, y down."""
+        dx, dy = SHIFTS[row % len(SHIFTS)] / SIDE
+        return float(dx), float(dy)
+
+
+def grid(blocks: np.ndarray) -> np.ndarray:
+    """Mean orientations of the picture's 8x8 cells: blocks float32 (n, n, 4L) -> float32 (8, 8, L), each cell of
+    length 1 (so that contrast and haze do not count)."""
+    return turned_grids(blocks, np.zeros(1))[0][0]
+
+
+def turned_grids(
+    blocks: np.ndarray, rotations_deg: np.ndarray, seen: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """The grids of a picture turned counter-clockwise: blocks float32 (n, n, 4L), angles (R,) -> float32 (R, 8, 8, L),
+    and bool (R, 8, 8), whether at least half of the cell lies in the picture (where bool (n, n) `seen` allows).
+
+    Every cell averages 4x4 samples at the places they came from; the orientations turn with them, shared linearly
+    between the two nearest bins.
+    """
+    n, bins = blocks.shape[0], blocks.shape[2] // 4
+    seen = np.ones((n, n), bool) if seen is None else seen
+    # One row more, for samples from outside the picture: nothing is seen there.
+    known = np.append(seen.ravel(), False)
+    source = np.zeros((n * n + 1, bins), np.float32)
+    source[:-1] = blocks.reshape(n * n, 4, bins).mean(axis=1) * seen.reshape(-1, 1)
+
+    at = _sources(n, rotations_deg)
+    share = known[at].mean(axis=-1)
+    cells = source[at].mean(axis=2)
+    cells = np.stack([_turned_bins(each, angle) for each, angle in zip(cells, rotations_deg, strict=True)])
+    cells /= np.maximum(np.linalg.norm(cells, axis=-1, keepdims=True), 1e-6)
+    square = (len(rotations_deg), SIDE, SIDE)
+    return cells.reshape(*square, bins), (share >= 0.5).reshape(square)
+
+
+def signed(grids: np.ndarray, mean: np.ndarray, own_share: float, seen: np.ndarray | None = None) -> np.ndarray:
+    """What is special: grids (N, 8, 8, L) minus the map's mean (8, 8, L), minus `own_share` of each grid's own mean
+    over its `seen` cells (where the light comes from, which is no place). Returns float32 (N, 8, 8, L).
+    """
+    special = np.asarray(grids, np.float32) - mean
+    weight = np.ones((1, SIDE, SIDE), np.float32) if seen is None else seen.astype(np.float32)
+    total = np.maximum(weight.sum(axis=(1, 2)), 1)[:, None, None, None]
+    special -= own_share * (special * weight[..., None]).sum(axis=(1, 2), keepdims=True) / total
+    return special
+
+
+def pack(grids: np.ndarray, mean: np.ndarray, own_share: float) -> np.ndarray:
+    """Rows of the index: grids (N, 8, 8, L), the map's mean (8, 8, L) -> uint8 (N, 8 L), the signs bit by bit."""
+    special = signed(grids, mean, own_share)
+    return np.packbits((special >= 0).reshape(len(special), -1), axis=1)
+
+
+def hypotheses(
+    grids: np.ndarray, seen: np.ndarray, rotations_deg: np.ndarray, mean: np.ndarray, own_share: float
+) -> Hypotheses:
+    """All rows under which a query is compared; arguments as `turned_grids` and the map give them."""
+    special = np.where(signed(grids, mean, own_share, seen) >= 0, np.float32(1), np.float32(-1)) * seen[..., None]
+    rotations, _, _, bins = special.shape
+    matrix = np.zeros((rotations, len(SHIFTS), SIDE, SIDE, bins), np.float32)
+    for row, (dx, dy) in enumerate(SHIFTS.tolist()):
+        matrix[:, row, _to(dy), _to(dx)] = special[:, _to(-dy), _to(-dx)]
+    matrix /= SIDE * SIDE * bins
+    return Hypotheses(matrix.reshape(rotations * len(SHIFTS), -1), np.asarray(rotations_deg))
+
+
+def scan(matrix: np.ndarray, codes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Compare every hypothesis with every place: float32 (H, 8 B), uint8 (N, B) -> the best score (float32) and the
+    row that gave it (int32), each (N,).
+
+    A score is the bits that agree less those that do not, over all bits: 1 is the same picture, 0 is chance.
+    """
+    best = np.empty(len(codes), np.float32)
+    row = np.empty(len(codes), np.int32)
+    bits = np.empty((_PLACES_AT_ONCE, codes.shape[1], 8), np.float32)
+    scores = np.empty((_PLACES_AT_ONCE, len(matrix)), np.float32)
+    for start in range(0, len(codes), _PLACES_AT_ONCE):
+        part = codes[start : start + _PLACES_AT_ONCE]
+        here, count = slice(start, start + len(part)), len(part)
+        np.take(_SIGNS, part, axis=0, out=bits[:count], mode="clip")
+        np.matmul(bits[:count].reshape(count, -1), matrix.T, out=scores[:count])
+        np.argmax(scores[:count], axis=1, out=row[here].view(np.int32) if False else None)
+    return best, row
