@@ -1,15 +1,18 @@
 """The part of a map that is in RAM: one row a place, in arrays made once, never larger than the budget."""
 
+import logging
 from dataclasses import dataclass
-from itertools import islice
+from itertools import compress, islice
 
 import numpy as np
 
 from edgevpr.errors import MapError
 from edgevpr.geodesy import distance_m
 from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.thin import best_places
 from edgevpr.types import Technique, TechniqueSpec
 
+_log = logging.getLogger(__name__)
 _BYTES_BESIDE_ROW = 8 + 8 + 8  # id, latitude, longitude
 _PACKED_AT_ONCE = 64
 
@@ -48,31 +51,39 @@ def bytes_per_place(spec: TechniqueSpec) -> int:
 def load_index(place_map: PlaceMap, technique: Technique, budget_bytes: int) -> PlaceIndex:
     """Read the coarse parts of a map, packed as the technique wants them.
 
-    Raises MapError, before anything is allocated, where the index would exceed the budget.
+    Where the budget does not hold them all, the best places are loaded (see `thin`) and the map file keeps the rest.
+    Raises MapError for a map without places, and for a budget that holds none.
     """
     spec = technique.spec
     places, each = len(place_map), bytes_per_place(spec)
     if not places:
         raise MapError(f"{place_map.path} holds no place yet: add some with `edgevpr map build --append`.")
-    if places * each > budget_bytes:
+    capacity = min(places, budget_bytes // each)
+    if not capacity:
         raise MapError(
-            f"{place_map.path} needs {places * each / 1e6:.1f} MB in RAM for {places} places and the budget of "
-            f"{budget_bytes / 1e6:g} MB holds {budget_bytes // each}: raise --budget-mb to "
-            f"{np.ceil(places * each / 1e5) / 10:g}, map fewer places, or use a technique with smaller rows "
-            "(see `edgevpr profile`)."
+            f"{place_map.path}: a place takes {each} bytes in RAM and the budget is {budget_bytes}: raise --budget-mb."
         )
     index = PlaceIndex(
-        np.empty(places, np.int64),
-        np.full(places, np.nan),
-        np.full(places, np.nan),
-        np.empty((places, *spec.row.shape), spec.row.dtype),
+        np.empty(capacity, np.int64),
+        np.full(capacity, np.nan),
+        np.full(capacity, np.nan),
+        np.empty((capacity, *spec.row.shape), spec.row.dtype),
         place_map.mean_coarse() if spec.packed else None,
     )
     # A map that another program is adding to may have grown since it was counted: the new places wait for next time.
     parts = islice(place_map.coarse_parts(), places)
+    if capacity < places:
+        _log.warning(
+            f"{place_map.path} needs {places * each / 1e6:.1f} MB in RAM for its {places} places and the budget is "
+            f"{budget_bytes / 1e6:g} MB: the {capacity} best are used; raise --budget-mb to "
+            f"{np.ceil(places * each / 1e5) / 10:g} for all."
+        )
+        kept = np.zeros(places, bool)
+        kept[best_places(*place_map.positions_and_quality(places), capacity)] = True
+        parts = compress(parts, kept)
     waiting = np.empty((_PACKED_AT_ONCE, *spec.coarse.shape), spec.coarse.dtype)
-    for start in range(0, places, _PACKED_AT_ONCE):
-        count = min(_PACKED_AT_ONCE, places - start)
+    for start in range(0, capacity, _PACKED_AT_ONCE):
+        count = min(_PACKED_AT_ONCE, capacity - start)
         for at, (place_id, position, coarse) in enumerate(islice(parts, count)):
             index.place_ids[start + at] = place_id
             if position:

@@ -201,6 +201,15 @@ class PlaceMap:
                 part = self._part(coarse, self.spec.coarse, place_id)
                 yield place_id, geopackage.read_point(geom) if geom else None, part
 
+    def positions_and_quality(self, places: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """lat_deg, lon_deg (NaN where unknown) and quality of the first `places` places, float64 each."""
+        columns = np.full((3, places), np.nan)
+        for at, place in zip(range(places), self.places(), strict=False):
+            if place.position:
+                columns[:2, at] = place.position.lat_deg, place.position.lon_deg
+            columns[2, at] = place.quality
+        return columns[0], columns[1], columns[2]
+
     def mean_coarse(self) -> np.ndarray:
         """Mean of the coarse parts over the map, float32 of the shape of one."""
         mean = np.zeros(self.spec.coarse.shape)

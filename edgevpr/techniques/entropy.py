@@ -99,7 +99,7 @@ def _bound_filled_bins(grey: np.ndarray, cell_px: int) -> _Bounds:
     for top in range(0, len(grey), _STRIP_ROWS):
         endings = over_disc(_bit(padded[top : top + _STRIP_ROWS + 2 * r]), r, np.bitwise_or)
         at_least[top : top + _STRIP_ROWS] = np.bitwise_count(endings)
-    at_most = np.multiply(at_least, (_range(grey) >> 6) + 1)
+    at_most = cv2.multiply(at_least, (_range(grey) >> 6) + 1)  # stops at 255
 
     def exact(cells: np.ndarray) -> np.ndarray:
         side = cell_px + 2 * r
@@ -192,7 +192,7 @@ def _shannon_of(small: np.ndarray, radius_px: int) -> np.ndarray:
     """Shannon entropy over 8 of the disc of every pixel: uint8 (H, W) -> float32 (H, W)."""
     padded = np.pad(small.astype(np.int16), radius_px, constant_values=-1)  # -1: outside, no intensity
     said = np.zeros(small.shape, np.float32)
-    present = np.unique(small)[:, None, None]
+    present = np.flatnonzero(np.bincount(small.ravel()))[:, None, None]
     for start in range(0, len(present), _STRIP_INTENSITIES):
         one_hot = (padded == present[start : start + _STRIP_INTENSITIES]).view(np.uint8)
         counts = over_disc(one_hot, radius_px, np.add)

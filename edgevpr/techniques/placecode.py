@@ -13,7 +13,8 @@ import numpy as np
 SIDE = 8  # cells along one side of the grid
 _SAMPLES = 4  # samples along one side of a cell: with 31 blocks about one a block
 _MIN_OVERLAP = 0.35
-_PLACES_AT_ONCE = 256  # their signs (0.5 MB) stay in the second-level cache with a part of the query
+_OWN_SHARE = 0.5  # of what all cells of a picture have in common, mostly where the light comes from, is left out
+_PLACES_AT_ONCE = 256  # their signs, 0.5 MB as float32, stay in the second-level cache
 
 # Byte -> its eight bits, first bit first, as +1 and -1: `unpackbits`, conversion and offset in one look-up.
 _SIGNS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).astype(np.float32) * 2 - 1
@@ -79,32 +80,29 @@ def turned_grids(
     return cells.reshape(*square, bins), (share >= 0.5).reshape(square)
 
 
-def signed(grids: np.ndarray, mean: np.ndarray, own_share: float, seen: np.ndarray | None = None) -> np.ndarray:
-    """What is special: grids (N, 8, 8, L) minus the map's mean (8, 8, L), minus `own_share` of each grid's own mean
-    over its `seen` cells (where the light comes from, which is no place). Returns float32 (N, 8, 8, L).
+def special(grids: np.ndarray, mean: np.ndarray, seen: np.ndarray | None = None) -> np.ndarray:
+    """What is special: grids (N, 8, 8, L) minus the map's mean (8, 8, L), minus half of each grid's own mean over
+    its `seen` cells. Returns float32 (N, 8, 8, L).
     """
-    special = np.asarray(grids, np.float32) - mean
+    left = np.asarray(grids, np.float32) - mean
     weight = np.ones((1, SIDE, SIDE), np.float32) if seen is None else seen.astype(np.float32)
     total = np.maximum(weight.sum(axis=(1, 2)), 1)[:, None, None, None]
-    special -= own_share * (special * weight[..., None]).sum(axis=(1, 2), keepdims=True) / total
-    return special
+    left -= _OWN_SHARE * (left * weight[..., None]).sum(axis=(1, 2), keepdims=True) / total
+    return left
 
 
-def pack(grids: np.ndarray, mean: np.ndarray, own_share: float) -> np.ndarray:
+def pack(grids: np.ndarray, mean: np.ndarray) -> np.ndarray:
     """Rows of the index: grids (N, 8, 8, L), the map's mean (8, 8, L) -> uint8 (N, 8 L), the signs bit by bit."""
-    special = signed(grids, mean, own_share)
-    return np.packbits((special >= 0).reshape(len(special), -1), axis=1)
+    return np.packbits((special(grids, mean) >= 0).reshape(len(grids), -1), axis=1)
 
 
-def hypotheses(
-    grids: np.ndarray, seen: np.ndarray, rotations_deg: np.ndarray, mean: np.ndarray, own_share: float
-) -> Hypotheses:
+def hypotheses(grids: np.ndarray, seen: np.ndarray, rotations_deg: np.ndarray, mean: np.ndarray) -> Hypotheses:
     """All rows under which a query is compared; arguments as `turned_grids` and the map give them."""
-    special = np.where(signed(grids, mean, own_share, seen) >= 0, np.float32(1), np.float32(-1)) * seen[..., None]
-    rotations, _, _, bins = special.shape
+    signs = np.where(special(grids, mean, seen) >= 0, np.float32(1), np.float32(-1)) * seen[..., None]
+    rotations, _, _, bins = signs.shape
     matrix = np.zeros((rotations, len(SHIFTS), SIDE, SIDE, bins), np.float32)
     for row, (dx, dy) in enumerate(SHIFTS.tolist()):
-        matrix[:, row, _to(dy), _to(dx)] = special[:, _to(-dy), _to(-dx)]
+        matrix[:, row, _to(dy), _to(dx)] = signs[:, _to(-dy), _to(-dx)]
     matrix /= SIDE * SIDE * bins
     return Hypotheses(matrix.reshape(rotations * len(SHIFTS), -1), np.asarray(rotations_deg))
 
@@ -115,6 +113,7 @@ def scan(matrix: np.ndarray, codes: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
     A score is the bits that agree less those that do not, over all bits: 1 is the same picture, 0 is chance.
     """
+    by_bit = np.ascontiguousarray(matrix.T)
     best = np.empty(len(codes), np.float32)
     row = np.empty(len(codes), np.int32)
     bits = np.empty((_PLACES_AT_ONCE, codes.shape[1], 8), np.float32)
@@ -123,6 +122,31 @@ def scan(matrix: np.ndarray, codes: np.ndarray) -> tuple[np.ndarray, np.ndarray]
         part = codes[start : start + _PLACES_AT_ONCE]
         here, count = slice(start, start + len(part)), len(part)
         np.take(_SIGNS, part, axis=0, out=bits[:count], mode="clip")
-        np.matmul(bits[:count].reshape(count, -1), matrix.T, out=scores[:count])
-        np.argmax(scores[:count], axis=1, out=row[here].view(np.int32) if False else None)
+        np.matmul(bits[:count].reshape(count, -1), by_bit, out=scores[:count])
+        row[here] = scores[:count].argmax(axis=1)
+        best[here] = scores[np.arange(count), row[here]]
     return best, row
+
+
+def _sources(n: int, rotations_deg: np.ndarray) -> np.ndarray:
+    """int (R, 64, 16): for every sample of every cell the block it comes from, `n` n where that is outside."""
+    middle = (np.arange(SIDE * _SAMPLES) + 0.5) / (SIDE * _SAMPLES) - 0.5
+    y, x = (part.reshape(SIDE, _SAMPLES, SIDE, _SAMPLES) for part in np.meshgrid(middle, middle, indexing="ij"))
+    x, y = (part.swapaxes(1, 2).reshape(SIDE**2, _SAMPLES**2) for part in (x, y))
+    angle = np.radians(rotations_deg)[:, None, None]
+    column = np.floor((x * np.cos(angle) - y * np.sin(angle) + 0.5) * n).astype(np.intp)
+    row = np.floor((x * np.sin(angle) + y * np.cos(angle) + 0.5) * n).astype(np.intp)
+    inside = (row >= 0) & (row < n) & (column >= 0) & (column < n)
+    return np.where(inside, row * n + column, n * n)
+
+
+def _turned_bins(cells: np.ndarray, rotation_deg: float) -> np.ndarray:
+    """Orientations (..., L) of a picture turned counter-clockwise. They are measured towards y, which points down, so
+    that turning lowers them."""
+    whole, part = divmod(rotation_deg / 360 * cells.shape[-1], 1)
+    return (1 - part) * np.roll(cells, -int(whole), axis=-1) + part * np.roll(cells, -int(whole) - 1, axis=-1)
+
+
+def _to(step: int) -> slice:
+    """The cells of one side that something moved by `step` cells comes to lie on."""
+    return slice(max(0, step), SIDE + min(0, step))

@@ -52,12 +52,26 @@ def test_the_index_is_contiguous_and_of_the_size_promised(ruler_map):
     assert index.spacing_m() == pytest.approx(44.5, abs=0.1)
 
 
-def test_a_map_beyond_the_budget_is_refused_with_the_figure_that_would_do(ruler_map):
+def test_a_map_beyond_the_budget_keeps_its_best_places_in_ram_and_all_on_disk(ruler_map, caplog):
     technique, place_map = ruler_map
     each = bytes_per_place(technique.spec)
-    load_index(place_map, technique, 25 * each)
-    with pytest.raises(MapError, match=r"holds 24: raise --budget-mb"):
-        load_index(place_map, technique, 25 * each - 1)
+    index = load_index(place_map, technique, 25 * each)
+    assert len(index) == 25
+    assert not caplog.messages
+    index = load_index(place_map, technique, 10 * each + 5)
+    assert len(index) == 10
+    assert index.nbytes <= 10 * each + 5
+    assert np.diff(index.place_ids).max() <= 5, "what stays is spread over the whole track"
+    assert "the 10 best are used; raise --budget-mb to" in caplog.messages[0]
+    assert len(place_map) == 25
+    found = retrieve(technique, technique.encode(np.full((1, 1), 43)), place_map, index, first=1)
+    assert found[0].place.place_id in index.place_ids
+
+
+def test_a_budget_that_holds_no_place_is_refused(ruler_map):
+    technique, place_map = ruler_map
+    with pytest.raises(MapError, match="raise --budget-mb"):
+        load_index(place_map, technique, bytes_per_place(technique.spec) - 1)
 
 
 def test_an_empty_map_is_refused(tmp_path):

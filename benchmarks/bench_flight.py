@@ -1,0 +1,154 @@
+"""What `edgevpr run` takes with a large map: peak memory, start to the first match, CPU while there is nothing to see.
+
+A process of its own, as on the aircraft: a generated map of `cohog`, pictures from a folder, a link. What another
+process does is read in /proc. PSS shares pages with whatever else runs Python here, this benchmark included: on an
+aircraft it lies between the figure shown and RSS.
+"""
+
+import os
+import shutil
+import statistics
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+from big_map import file_bytes, make_big_map
+from flight_process import cpu_s, start, wait_for, watch_memory, write_frames
+
+from edgevpr.techniques import create
+
+PLACES = 10_000
+FRAMES = 60
+STARTS = 5
+IDLE_S = 10.0
+SETTLE_S = 2.0
+SPARE_BYTES = 10**9
+NOBODY = "rtsp://127.0.0.1:9/nobody"
+FLAGS = ["--candidates", "20", "--link", "udpout:127.0.0.1:9"]
+NEVER_IMPORTED = ["onnxruntime", "matplotlib"]
+
+
+@dataclass(frozen=True, slots=True)
+class FlightRow:
+    """One line of the table; `target` is the most that `value` may be, None where none was set."""
+
+    what: str
+    value: float
+    unit: str
+    target: float | None
+
+
+def why_not(folder: Path, places: int = PLACES) -> str | None:
+    """Why the map cannot be made in `folder`, None where it can."""
+    needed = file_bytes(create("cohog").spec, places) + SPARE_BYTES
+    free = shutil.disk_usage(folder).free
+    return f"{folder} has {free / 1e9:.1f} GB free and {needed / 1e9:.1f} are needed" if free < needed else None
+
+
+def rows(places: int = PLACES) -> list[FlightRow]:
+    """Make the map in a temporary folder, fly, look. Raises OSError where the disk has no room."""
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        if reason := why_not(folder, places):
+            raise OSError(reason)
+        place_map, frames = folder / "big.gpkg", folder / "frames"
+        make_big_map(place_map, create("cohog").spec, places)
+        write_frames(frames, FRAMES)
+        start_s(place_map, frames, folder)  # compiles the bytecode, and fills the page cache
+        return [
+            *memory_rows(place_map, frames, folder),
+            *start_rows(place_map, frames, folder),
+            *idle_rows(place_map, frames, folder),
+        ]
+
+
+def memory_rows(place_map: Path, frames: Path, folder: Path) -> list[FlightRow]:
+    """The most that a flight of `FRAMES` queries takes."""
+    flight = start(place_map, frames, folder / "memory.jsonl", *FLAGS, "--rate-hz", "10")
+    largest, mapped = watch_memory(flight)
+    assert finished(flight) == 0
+    for name in NEVER_IMPORTED:
+        assert name not in mapped, f"{name} was imported"
+    return [
+        FlightRow("peak RSS (VmHWM)", largest["VmHWM"], "MB", 130.0),
+        FlightRow("peak PSS", largest["Pss"], "MB", None),
+    ]
+
+
+def start_rows(place_map: Path, frames: Path, folder: Path) -> list[FlightRow]:
+    """From the start of the process to the first answer in its log, median of `STARTS`."""
+    warm_s = [start_s(place_map, frames, folder) for _ in range(STARTS)]
+    cold_s = []
+    for _ in range(STARTS):
+        forget_pages(place_map)
+        cold_s.append(start_s(place_map, frames, folder))
+    return [
+        FlightRow("start to first match", statistics.median(warm_s), "s", 2.0),
+        FlightRow("... with the map not in the page cache", statistics.median(cold_s), "s", 2.0),
+    ]
+
+
+def idle_rows(place_map: Path, frames: Path, folder: Path) -> list[FlightRow]:
+    """CPU-seconds a second without frames, in percent of one core."""
+    absent = idle_share(place_map, NOBODY, folder / "absent.jsonl", until="start")
+    waiting = idle_share(place_map, frames, folder / "waiting.jsonl", "--rate-hz", "0.01", until="query")
+    return [
+        FlightRow("idle CPU, stream not there", 100 * absent, "% of a core", 2.0),
+        FlightRow("idle CPU, between two frames", 100 * waiting, "% of a core", 2.0),
+    ]
+
+
+def start_s(place_map: Path, frames: Path, folder: Path) -> float:
+    log = folder / "start.jsonl"
+    log.unlink(missing_ok=True)
+    begin_s = time.monotonic()
+    flight = start(place_map, frames, log, *FLAGS)
+    answer = wait_for("query", log, flight)
+    flight.terminate()
+    assert finished(flight) == 0
+    return answer["t_mono_s"] - begin_s  # one clock for all processes
+
+
+def idle_share(place_map: Path, source: Path | str, log: Path, *flags: str, until: str) -> float:
+    flight = start(place_map, source, log, *FLAGS, *flags)
+    wait_for(until, log, flight)
+    time.sleep(SETTLE_S)
+    before_s, begin_s = cpu_s(flight.pid), time.monotonic()
+    time.sleep(IDLE_S)
+    share = (cpu_s(flight.pid) - before_s) / (time.monotonic() - begin_s)
+    flight.terminate()
+    assert finished(flight) == 0
+    return share
+
+
+def forget_pages(path: Path) -> None:
+    """Let the kernel drop what it holds of a file."""
+    with open(path, "rb") as file:
+        os.fsync(file.fileno())
+        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+
+
+def finished(flight: subprocess.Popen) -> int:
+    """The exit code; what a flight that failed has said goes to standard error."""
+    said = flight.communicate(timeout=60)[1]
+    if flight.returncode:
+        print(said, file=sys.stderr)
+    return flight.returncode
+
+
+def table(results: list[FlightRow]) -> str:
+    """The results as a Markdown table."""
+    lines = [f"| `edgevpr run`, cohog, {PLACES} places | measured | target |", "|---|---|---|"]
+    for row in results:
+        target = "" if row.target is None else f"< {row.target:g} {row.unit}"
+        lines.append(f"| {row.what} | {row.value:.3g} {row.unit} | {target} |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    print(table(rows()))
