@@ -96,7 +96,7 @@ def measure(folder: Path, names: list[str]) -> tuple[list[TechniqueResult], dict
         return progress(items, total, f"{folder.name}, {label}")
 
     results = [
-        replace(evaluate(name.partition("_")[0], dataset, settings(name, folder), shown), technique=name)
+        replace(evaluate(name.partition("_")[0], dataset, settings(name, folder), None, shown), technique=name)
         for name in names
     ]
     known = (folder / "positions.csv").is_file()

@@ -116,6 +116,7 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--ref", required=True, metavar="DIR")
     evaluate.add_argument("--ground-truth", required=True, metavar="CSV")
     _camera(evaluate)
+    evaluate.add_argument("--candidates", type=int, metavar="N", help="places compared in full (default: all, exact)")
     evaluate.add_argument("--techniques", default="hog,cohog", metavar="A,B", help="names, comma-separated")
     evaluate.add_argument(
         "--param", action="append", default=[], metavar="TECHNIQUE.KEY=VALUE", help="a parameter of a technique"
@@ -167,7 +168,7 @@ def _matching(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--budget-mb", type=float, metavar="MB", help="limit of the index in RAM (default: the board's)"
     )
-    parser.add_argument("--candidates", type=int, metavar="N", help="places compared in full (default: all)")
+    parser.add_argument("--candidates", type=int, metavar="N", help="places compared in full (20)")
     parser.add_argument("--min-score", type=float, metavar="S", help="accept from this score on")
     parser.add_argument("--min-margin", type=float, metavar="M", help="accept when this far ahead of a place elsewhere")
     parser.add_argument("--battery", metavar="PACK", help="cells and capacity of the pack, e.g. 4S5200")

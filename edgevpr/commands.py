@@ -226,7 +226,7 @@ def evaluate(args: Namespace) -> int:
     for name in wanted:  # a wrong setting is said before the first hour of work
         techniques.create(name, settings[name])
     dataset = load_dataset(args.query, args.ref, args.ground_truth)
-    results = [evaluation.evaluate(name, dataset, settings[name], progress) for name in wanted]
+    results = [evaluation.evaluate(name, dataset, settings[name], args.candidates, progress) for name in wanted]
     results = evaluation.compare(results)
     if args.json:
         _print_json(evaluation.as_json(results))

@@ -46,7 +46,7 @@ def wait_for(kind: str, log: Path, process: subprocess.Popen) -> dict[str, Any]:
 
 
 def memory_mb(pid: int) -> dict[str, float]:
-    """VmHWM (the largest resident set so far), VmRSS, Pss, ... of a process in MB of 10^6 bytes; {} once it has ended."""
+    """VmHWM (the largest resident set so far), VmRSS, Pss, ... of a process, MB of 10^6 bytes; {} once it has ended."""
     try:
         text = Path(f"/proc/{pid}/status").read_text() + Path(f"/proc/{pid}/smaps_rollup").read_text()
     except (FileNotFoundError, ProcessLookupError):

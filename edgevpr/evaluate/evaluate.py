@@ -85,9 +85,10 @@ def evaluate(
     technique_name: str,
     dataset: Dataset,
     parameters: dict[str, Any] | None = None,
+    candidates: int | None = None,
     progress: Progress = lambda items, total, label: items,
 ) -> TechniqueResult:
-    """Map the references, ask every query (all places compared in full), and score the answers.
+    """Map the references, ask every query, and score the answers; `candidates` places are compared in full (None: all).
 
     Raises UsageError for an unknown technique or parameter, ImageError for an image that cannot be used, and MapError
     where the temporary map cannot be written.
@@ -100,7 +101,7 @@ def evaluate(
             build_map(progress(_frames(source), source.total, f"{technique_name}: references"), technique, place_map)
         with PlaceMap.open(map_path) as place_map:
             index = load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
-            answers = list(_answers(technique, dataset, place_map, index, progress))
+            answers = list(_answers(technique, dataset, place_map, index, candidates, progress))
     return _summary(technique, len(dataset.references), answers)
 
 
@@ -130,24 +131,29 @@ def _frames(source: Source) -> Iterator[Frame]:
 
 
 def _answers(
-    technique: Technique, dataset: Dataset, place_map: PlaceMap, index: PlaceIndex, progress: Progress
+    technique: Technique,
+    dataset: Dataset,
+    place_map: PlaceMap,
+    index: PlaceIndex,
+    candidates: int | None,
+    progress: Progress,
 ) -> Iterator[_Answer]:
     rule = accept_rule(technique, load_config(None).match)
     # The first query pays for lazy imports, lookup tables and a cold disk: one that is not counted goes before it.
-    rank(technique, technique.encode(read_image(dataset.queries[0].path)), place_map, index)
+    rank(technique, technique.encode(read_image(dataset.queries[0].path)), place_map, index, candidates)
     for query in progress(dataset.queries, len(dataset.queries), f"{technique.spec.name}: queries"):
         image = read_image(query.path)
         with stage() as encoding:
             descriptor = technique.encode(image)
         with stage() as matching:
-            ranking = rank(technique, descriptor, place_map, index)
+            ranking = rank(technique, descriptor, place_map, index, candidates)
             is_accepted, _ = accepted(ranking, index, rule)
         # Slots of the index follow the order of mapping, which is that of the references' names.
         right = np.array([name in query.right for name in dataset.references])
         ignored = np.array([name in query.ignored for name in dataset.references])
         at = metrics.counting(ranking.slots, ignored)
         yield _Answer(
-            float(ranking.scores[at[0]]),
+            float(ranking.scores[at[0]]) if len(at) else 0.0,
             metrics.first_right(ranking.slots[at], right),
             is_accepted,
             is_accepted and not (right | ignored)[ranking.slots[0]],
@@ -188,7 +194,7 @@ def _summary(technique: Technique, references: int, answers: list[_Answer]) -> T
         t_encode_s=t_encode_s,
         t_match_s=t_match_s,
         t_match_per_ref_s=t_match_s / references,
-        descriptor_bytes=technique.spec.coarse.nbytes,
+        descriptor_bytes=technique.spec.row.nbytes,
         fine_bytes=technique.spec.fine.nbytes if technique.spec.fine else 0,
         u_encode=u_encode,
         u_match=u_match,

@@ -24,15 +24,19 @@ class Ranking:
 def rank(
     technique: Technique, query: Descriptor, place_map: PlaceMap, index: PlaceIndex, candidates: int | None = None
 ) -> Ranking:
-    """Compare the query with every place of the index, and in full with the best `candidates` of them (None: all)."""
-    coarse, hypotheses = technique.coarse_scores(query, index.rows, index.mean)
+    """Scan all places of the index, and compare the best `candidates` of them in full.
+
+    None, or as many as there are: all places in full under every hypothesis, without a scan (exact, and slow).
+    """
     if technique.spec.fine is None:
-        slots = np.argsort(-coarse, kind="stable")
-        return Ranking(slots, coarse[slots], tuple(FineMatch(float(score)) for score in coarse[slots]))
+        scores, _ = technique.coarse_scores(query, index.rows, index.mean)
+        slots = np.argsort(-scores, kind="stable")
+        return Ranking(slots, scores[slots], tuple(FineMatch(float(score)) for score in scores[slots]))
     if candidates is None or candidates >= len(index):
-        chosen = np.arange(len(index))
+        chosen, hypotheses = np.arange(len(index)), None
     else:
-        chosen = np.argpartition(-coarse, candidates)[:candidates]
+        scores, hypotheses = technique.coarse_scores(query, index.rows, index.mean)
+        chosen = np.argpartition(-scores, candidates)[:candidates]
     matches = [
         technique.match(
             query, place_map.fine_part(index.place_ids[slot]), None if hypotheses is None else int(hypotheses[slot])

@@ -18,8 +18,8 @@ from edgevpr.power.machine import rss_mb
 from edgevpr.power.meter import stage
 from edgevpr.types import Frame, StageCost, Technique
 
-_ROUNDS = 5
-_PLACES = 12
+_ROUNDS = 3
+_PLACES = 6
 _LOWEST_RATE_HZ = 0.01  # what the configuration allows
 _LINK_MB = 13.0  # what importing pymavlink adds to the resident memory (measured on x86-64)
 
@@ -27,17 +27,25 @@ _LINK_MB = 13.0  # what importing pymavlink adds to the resident memory (measure
 @dataclass(frozen=True, slots=True)
 class TechniqueCosts:
     """What a technique costs on one machine: to encode a frame, to compare it in full with one place (read from the map
-    file), bytes of a place in RAM and on disk, and the resident memory of the process without a map."""
+    file), bytes of a place in RAM and on disk, and the resident memory of the process without a map. However large the
+    map, no more than `candidates` places are compared in full (None: all)."""
 
     encode: StageCost
     match_per_place: StageCost
     ram_bytes_per_place: int
     disk_bytes_per_place: int
     process_mb: float
+    candidates: int | None = None
 
     def match(self, places: int) -> StageCost:
-        """Cost of comparing one query with `places` places, all of them in full."""
-        return StageCost(self.match_per_place.wall_s * places, self.match_per_place.cpu_s * places)
+        """Cost of comparing one query in full with the candidates of a map of `places` places."""
+        in_full = places if self.candidates is None else min(self.candidates, places)
+        return StageCost(self.match_per_place.wall_s * in_full, self.match_per_place.cpu_s * in_full)
+
+    def places_within(self, wall_s: float, cpu_s: float) -> float:
+        """How many places a map may have for a query to be found in it within both times."""
+        in_full = min(wall_s / self.match_per_place.wall_s, cpu_s / self.match_per_place.cpu_s)
+        return in_full if self.candidates is None or in_full < self.candidates else math.inf
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,8 +147,7 @@ def fit(board: Board, costs: TechniqueCosts, places: int, rate_hz: float, budget
     if shortfalls:
         most_places = min(
             min(budget_mb, board.memory_max_mb - costs.process_mb) * 1e6 / costs.ram_bytes_per_place,
-            (1 / rate_hz - encode.wall_s) / costs.match_per_place.wall_s,
-            (usable_cores / rate_hz - encode.cpu_s) / costs.match_per_place.cpu_s,
+            costs.places_within(1 / rate_hz - encode.wall_s, usable_cores / rate_hz - encode.cpu_s),
         )
         if most_places >= 1:
             remedies.append(f"with up to {int(most_places)} places")

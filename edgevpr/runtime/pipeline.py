@@ -1,6 +1,6 @@
 """The walk of one frame: encode, retrieve, accept or not, what it cost. `Pipeline.step` reads from top to bottom."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from edgevpr import techniques
@@ -26,7 +26,7 @@ class Pipeline:
     place_map: PlaceMap
     index: PlaceIndex
     rule: AcceptRule
-    candidates: int | None
+    candidates: int
     board: Board
     pack: Pack
     regulator_efficiency: float
@@ -67,10 +67,14 @@ def open_pipeline(config: Config) -> Pipeline:
     budget_mb = config.memory.budget_mb or board.budget_mb
     index = load_index(place_map, technique, int(budget_mb * 1e6))
     rate_hz = config.source.rate_hz or board.rate_hz
-    compared = min(config.match.candidates or len(index), len(index))
-    costs = on_board(probe(technique), load_board("this"), board)
-    found = fit(board, costs, compared, rate_hz, budget_mb)
+    probed = probe(technique)
+    if technique.spec.fine:
+        probed = replace(probed, candidates=config.match.candidates)
+    costs = on_board(probed, load_board("this"), board)
+    found = fit(board, costs, len(index), rate_hz, budget_mb)
     why = "the map was built with it" if config.technique is None else "it was named"
+    left_out = len(place_map) - len(index)
+    thinned = f"{left_out} places are left to the map file; " if left_out else ""
     return Pipeline(
         technique,
         place_map,
@@ -81,7 +85,7 @@ def open_pipeline(config: Config) -> Pipeline:
         pack,
         config.battery.regulator_efficiency,
         max(config.mavlink.min_accuracy_m, index.spacing_m() or 0.0),
-        f"technique {technique.spec.name}: {why}; {described(board, found, len(index), rate_hz, budget_mb)}",
+        f"technique {technique.spec.name}: {why}; {thinned}{described(board, found, len(index), rate_hz, budget_mb)}",
     )
 
 

@@ -5,8 +5,8 @@ Every place is 31x31 overlapping blocks, each described by the histograms of its
 cosines is the score (`matching: thesis`); here, by default, each also votes for how far the picture has moved, and the
 share that agrees is the score (`matching: displacement`, see `displacement`).
 
-The blocks are the fine part, 8 bits a value on disk. The coarse part is the same blocks averaged over an 8x8 grid: it
-picks candidates when not every place is compared in full.
+The blocks are the fine part, 8 bits a value on disk (31 KB a place). The coarse part is the same blocks averaged over
+an 8x8 grid, of which 64 bytes a place stay in RAM (see `placecode`): they pick which places are compared in full.
 """
 
 from dataclasses import replace
@@ -15,12 +15,12 @@ import cv2
 import numpy as np
 
 from edgevpr.errors import UsageError
-from edgevpr.techniques import entropy as entropy_maps
+from edgevpr.techniques import placecode
 from edgevpr.techniques.displacement import displacement
+from edgevpr.techniques.entropy import block_means, good_blocks
 from edgevpr.techniques.gradients import grey_square, mask_square, normalised_blocks, oriented_cells
 from edgevpr.types import Descriptor, FineMatch, PartSpec, TechniqueSpec
 
-_COARSE_GRID = 8
 # The goodness threshold GT of the thesis (6.3.2) and of the authors' public code, each for its own entropy.
 _DEFAULT_GT = {"filled_bins": 0.5, "shannon": 0.4}
 # Chosen on corridor (forward) and aerial_caliterra (nadir): a step is known better when the camera looks straight down.
@@ -54,32 +54,32 @@ class CoHog:
         _require("entropy", entropy, _DEFAULT_GT)
         _require("camera", camera, _VOTE_WINDOW)
         _require("matching", matching, ("displacement", "thesis"))
-        if not (w2 >= 2 and w1 % w2 == 0 and w1 // w2 > _COARSE_GRID and w1 <= 4096 and 2 <= bins <= 64):
+        if not (w2 >= 2 and w1 % w2 == 0 and w1 // w2 > placecode.SIDE and w1 <= 4096 and 2 <= bins <= 64):
             raise UsageError(
                 f"cohog cannot use w1={w1}, w2={w2}, bins={bins}: w1 must be a multiple of w2 (more than "
-                f"{_COARSE_GRID} regions of at least 2 pixels, at most 4096 pixels), bins 2 to 64."
+                f"{placecode.SIDE} regions of at least 2 pixels, at most 4096 pixels), bins 2 to 64."
             )
         if gt > 1:
             raise UsageError(f"cohog: gt is {gt:g}; it is a share of the largest entropy, 0 to 1.")
-        self._entropy = getattr(entropy_maps, entropy)
-        self._w1, self._w2, self._bins, self._camera = w1, w2, bins, camera
+        self._w1, self._w2, self._bins = w1, w2, bins
+        self._entropy, self._camera = entropy, camera
         self._gt = gt if gt >= 0 else _DEFAULT_GT[entropy]
         self._side = w1 // w2 - 1  # blocks along one side
-        self._pool = _area_weights(self._side, _COARSE_GRID)
         self._round = _disc(w1)
         self._matched = self._displacement if matching == "displacement" else self._thesis
         self.min_score, self.min_margin = _ACCEPT[camera if matching == "displacement" else matching]
         self.spec = TechniqueSpec(
             "cohog",
             {"w1": w1, "w2": w2, "bins": bins, "gt": self._gt, "entropy": entropy, "camera": camera},
-            coarse=PartSpec((_COARSE_GRID**2 * bins,), "<f2"),
+            coarse=PartSpec((placecode.SIDE, placecode.SIDE, bins), "<f2"),
             fine=PartSpec((self._side**2, 4 * bins), "|u1"),
+            packed=PartSpec((placecode.SIDE**2 * bins // 8,), "|u1"),
         )
 
     def encode(self, image: np.ndarray, mask: np.ndarray | None = None) -> Descriptor:
         """Encode uint8 (H, W[, 3]); a block that touches a pixel where `mask` is False is never good.
 
-        Returns coarse float16 (64 bins,), fine uint8 (blocks, 4 bins), and for asking: regions float32 (blocks,
+        Returns coarse float16 (8, 8, bins), fine uint8 (blocks, 4 bins), and for asking: regions float32 (blocks,
         4 bins) (matrix B of 6.2.3) and good bool (blocks,).
         """
         if self._camera == "nadir":
@@ -89,19 +89,29 @@ class CoHog:
         regions = blocks.reshape(self.spec.fine.shape)
         # The root of each value in 8 bits: the small values, of which there are most, keep their digits.
         stored = np.rint(255 * np.sqrt(regions)).astype(np.uint8)
-        return Descriptor(self._coarse(blocks), stored, regions, good, float(good.mean()), grey)
+        return Descriptor(placecode.grid(blocks).astype("<f2"), stored, regions, good, float(good.mean()), grey)
 
     def _regions(self, grey: np.ndarray, allowed: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """Blocks float32 (side, side, 4 bins), and which of them are good, bool (blocks,)."""
         blocks = normalised_blocks(oriented_cells(grey, self._w2, self._bins, signed=True, allowed=allowed))
-        good = self._over_blocks(self._entropy(grey)) >= self._gt
+        good = good_blocks(grey, self._entropy, self._w2, self._gt)
         if allowed is not None:
-            good &= self._over_blocks(allowed.astype(np.float32)) >= 1.0
+            good &= block_means(allowed.astype(np.float32), self._w2) >= 1.0
         return blocks, good.ravel()
 
-    def coarse_scores(self, query: Descriptor, rows: np.ndarray, mean: None = None) -> tuple[np.ndarray, None]:
-        """Cosine of the coarse parts: `rows` float16 (N, 64 bins) -> float32 (N,) in 0..1."""
-        return np.clip(rows.astype(np.float32) @ query.coarse.astype(np.float32), 0, 1), None
+    def pack(self, coarse: np.ndarray, mean: np.ndarray) -> np.ndarray:
+        """Rows of the index: coarse float16 (N, 8, 8, bins), the map's mean -> uint8 (N, 8 bins)."""
+        return placecode.pack(coarse.astype(np.float32), mean)
+
+    def coarse_scores(self, query: Descriptor, rows: np.ndarray, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Compare the place codes under all shifts and, looking down, all rotations: `rows` uint8 (N, 8 bins) -> scores
+        float32 (N,), and the rotation (a number for `match`) that gave each of them."""
+        blocks = query.regions.reshape(self._side, self._side, -1)
+        turns = np.arange(_ROTATIONS if self._camera == "nadir" else 1)
+        grids, seen = placecode.turned_grids(blocks, -360 * turns / _ROTATIONS)
+        asked = placecode.hypotheses(grids, seen, turns, mean)
+        scores, hypothesis = placecode.scan(asked.matrix, rows)
+        return np.clip(scores, 0, 1, out=scores), hypothesis // len(placecode.SHIFTS)
 
     def match(self, query: Descriptor, fine: np.ndarray, hypothesis: int | None = None) -> FineMatch:
         """C = A B^T (thesis 6.2.3) with A the good regions of the query, B those of the place; then the score by
@@ -142,18 +152,6 @@ class CoHog:
         found = displacement(numbers, best, self._side, _VOTE_WINDOW[self._camera])
         return FineMatch(found.share, found.shift_cells, found.covariance_cells2)
 
-    def _over_blocks(self, per_pixel: np.ndarray) -> np.ndarray:
-        """Mean over every block of 2x2 cells: float32 (w1, w1) -> (side, side)."""
-        n = self._side + 1
-        cell = cv2.resize(per_pixel, (n, n), interpolation=cv2.INTER_AREA)
-        return (cell[:-1, :-1] + cell[:-1, 1:] + cell[1:, :-1] + cell[1:, 1:]) / 4
-
-    def _coarse(self, blocks: np.ndarray) -> np.ndarray:
-        """The mean orientations of the blocks on an 8x8 grid, as one vector of length 1."""
-        orientations = blocks.reshape(self._side, self._side, 4, self._bins).mean(axis=2)
-        grid = np.einsum("ai,bj,ijk->abk", self._pool, self._pool, orientations, optimize=True)
-        return (grid.ravel() / max(float(np.linalg.norm(grid)), 1e-6)).astype("<f2")
-
 
 def _require(what: str, value: str, allowed) -> None:
     if value not in allowed:
@@ -171,11 +169,3 @@ def _disc(side: int) -> np.ndarray:
     """What stays in the picture however it is turned: bool (side, side)."""
     from_middle = np.arange(side) - (side - 1) / 2
     return np.add.outer(from_middle**2, from_middle**2) <= (side / 2) ** 2
-
-
-def _area_weights(fine: int, coarse: int) -> np.ndarray:
-    """float32 (coarse, fine) whose rows average the fine intervals that each coarse interval covers."""
-    edge = np.linspace(0, fine, coarse + 1)
-    start = np.arange(fine)
-    covered = np.minimum(edge[1:, None], start + 1) - np.maximum(edge[:-1, None], start)
-    return (np.clip(covered, 0, None) * coarse / fine).astype(np.float32)

@@ -10,7 +10,9 @@ try:
 except ImportError:
     simsimd = None
 
-_BYTES_AT_ONCE = 1 << 19  # with as much of the query beside it, this stays in the second-level cache
+_BYTES_AT_ONCE = 1 << 20  # about a second-level cache: smaller blocks cost more calls than they save memory traffic
+_GROUP = 64  # places
+_PLACES_AT_ONCE = 1 << 13  # simsimd answers in float64: few at once leave little to convert
 _EVEN_BYTES = np.uint64(0x00FF00FF00FF00FF)
 _ADD_LANES = np.uint64(0x0001000100010001)
 
@@ -22,31 +24,35 @@ def hamming(query: np.ndarray, codes: np.ndarray) -> np.ndarray:
 
 def hamming_simd(query: np.ndarray, codes: np.ndarray) -> np.ndarray:
     """`hamming` by simsimd, which must be importable."""
-    if not len(codes):
-        return np.empty(0, np.uint16)
-    distances = simsimd.hamming(query[None], np.ascontiguousarray(codes), dtype="bin8")
-    return np.asarray(distances).astype(np.uint16).reshape(len(codes))
+    asked, places = query[None], np.ascontiguousarray(codes)
+    distances = np.empty(len(codes), np.uint16)
+    for start in range(0, len(codes), _PLACES_AT_ONCE):
+        here = slice(start, start + _PLACES_AT_ONCE)
+        distances[here] = simsimd.hamming(asked, places[here], dtype="bin8")
+    return distances
 
 
 def hamming_numpy(query: np.ndarray, codes: np.ndarray) -> np.ndarray:
-    """`hamming` in NumPy: XOR with copies of the query, as long as the block, and count, in the widest words that fit.
+    """`hamming` in NumPy: XOR and count, in the widest words that fit, block by block.
 
-    The counts of eight words, bytes of one 64-bit number, are added inside it: NumPy is slow along short axes.
+    NumPy is slow along short axes. So groups of places meet as many copies of the query at once, and the counts of
+    eight words, bytes of one 64-bit number, are added inside it.
     """
     length = codes.shape[1]
     word = np.dtype(next(form for form in ("u8", "u4", "u2", "u1") if length % np.dtype(form).itemsize == 0))
     words = length // word.itemsize
-    block = max(1, _BYTES_AT_ONCE // length)
-    queries = np.tile(query.view(word), min(block, len(codes))).reshape(-1, words)
-    differ = np.empty_like(queries)
-    counts = np.zeros((len(queries), -(-words // 8) * 8), np.uint8)  # the words beyond the last stay zero
-
+    group = np.tile(query.view(word), _GROUP)
     places = np.ascontiguousarray(codes).view(word)
+
+    block = min(max(1, _BYTES_AT_ONCE // (length * _GROUP)) * _GROUP, len(codes))
+    differ = np.empty((block, words), word)
+    counts = np.zeros((block, -(-words // 8) * 8), np.uint8)  # the words beyond the last stay zero
     distances = np.empty(len(codes), np.uint16)
-    for start in range(0, len(codes), block):
+    for start in range(0, len(codes), max(1, block)):
         part = places[start : start + block]
-        here = slice(0, len(part))
-        np.bitwise_xor(part, queries[here], out=differ[here])
+        here, grouped = slice(0, len(part)), len(part) // _GROUP * _GROUP
+        np.bitwise_xor(part[:grouped].reshape(-1, group.size), group, out=differ[:grouped].reshape(-1, group.size))
+        np.bitwise_xor(part[grouped:], group[:words], out=differ[grouped : len(part)])
         np.bitwise_count(differ[here], out=counts[here, :words])
         distances[start : start + block] = _sums_of_bytes(counts[here].view(np.uint64))
     return distances
@@ -54,6 +60,9 @@ def hamming_numpy(query: np.ndarray, codes: np.ndarray) -> np.ndarray:
 
 def _sums_of_bytes(numbers: np.ndarray) -> np.ndarray:
     """The sum of all bytes of each row: uint64 (n, k) -> (n,); a byte is at most 64."""
-    pairs = (numbers & _EVEN_BYTES) + (numbers >> 8 & _EVEN_BYTES)
-    sums = pairs * _ADD_LANES >> 48
+    sums = numbers >> 8
+    sums &= _EVEN_BYTES
+    sums += numbers & _EVEN_BYTES
+    sums *= _ADD_LANES
+    sums >>= 48
     return sums[:, 0] if sums.shape[1] == 1 else sums.sum(axis=1)

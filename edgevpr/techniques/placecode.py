@@ -81,8 +81,9 @@ def turned_grids(
 
 
 def special(grids: np.ndarray, mean: np.ndarray, seen: np.ndarray | None = None) -> np.ndarray:
-    """What is special: grids (N, 8, 8, L) minus the map's mean (8, 8, L), minus half of each grid's own mean over
-    its `seen` cells. Returns float32 (N, 8, 8, L).
+    """What sets a picture apart: grids (N, 8, 8, L) minus the map's mean (8, 8, L), minus half of each grid's own mean
+    over its `seen` cells (without that, places lit from one side draw every query lit alike). Returns float32
+    (N, 8, 8, L).
     """
     left = np.asarray(grids, np.float32) - mean
     weight = np.ones((1, SIDE, SIDE), np.float32) if seen is None else seen.astype(np.float32)
@@ -113,7 +114,6 @@ def scan(matrix: np.ndarray, codes: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
     A score is the bits that agree less those that do not, over all bits: 1 is the same picture, 0 is chance.
     """
-    by_bit = np.ascontiguousarray(matrix.T)
     best = np.empty(len(codes), np.float32)
     row = np.empty(len(codes), np.int32)
     bits = np.empty((_PLACES_AT_ONCE, codes.shape[1], 8), np.float32)
@@ -122,7 +122,7 @@ def scan(matrix: np.ndarray, codes: np.ndarray) -> tuple[np.ndarray, np.ndarray]
         part = codes[start : start + _PLACES_AT_ONCE]
         here, count = slice(start, start + len(part)), len(part)
         np.take(_SIGNS, part, axis=0, out=bits[:count], mode="clip")
-        np.matmul(bits[:count].reshape(count, -1), by_bit, out=scores[:count])
+        np.matmul(bits[:count].reshape(count, -1), matrix.T, out=scores[:count])
         row[here] = scores[:count].argmax(axis=1)
         best[here] = scores[np.arange(count), row[here]]
     return best, row

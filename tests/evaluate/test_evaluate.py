@@ -55,7 +55,7 @@ def test_recall_costs_and_sizes_of_a_technique(folder, name, parameters):
     assert result.ah_total > 0
     assert result.ah_total_cpu_rail > result.ah_total  # the rail's voltage is lower than the pack's
     assert "4S5200" in result.ah_assumes
-    sizes = {"hog": (7 * 7 * 36 * 2, 0), "cohog": (64 * 8 * 2, 64 * 32)}
+    sizes = {"hog": (7 * 7 * 36 * 2, 0), "cohog": (64, 64 * 32)}
     assert (result.descriptor_bytes, result.fine_bytes) == sizes[name]
 
 
@@ -94,7 +94,7 @@ def test_an_unknown_technique_or_parameter_is_refused(folder):
 
 def test_progress_is_shown_for_references_and_queries(folder):
     out = io.StringIO()
-    evaluate("hog", load(folder), HOG, lambda items, total, label: progress(items, total, label, out))
+    evaluate("hog", load(folder), HOG, None, lambda items, total, label: progress(items, total, label, out))
     assert "hog: references  8/8  100 %" in out.getvalue()
     assert "hog: queries  8/8  100 %" in out.getvalue()
 

@@ -27,9 +27,12 @@ def test_descriptors_have_the_form_that_the_spec_says(name):
 def test_an_image_is_most_like_itself(name):
     technique = create(name)
     descriptors = [technique.encode(textured(seed)) for seed in range(4)]
-    rows = np.stack([d.coarse for d in descriptors])
+    coarse = np.stack([d.coarse for d in descriptors])
+    mean = coarse.astype(np.float32).mean(axis=0)
+    rows = technique.pack(coarse, mean) if technique.spec.packed else coarse
+    assert rows.shape[1:] == technique.spec.row.shape
     for at, query in enumerate(descriptors):
-        scores, _ = technique.coarse_scores(query, rows)
+        scores, _ = technique.coarse_scores(query, rows, mean)
         assert scores.argmax() == at
         assert (scores >= 0).all()
         assert (scores <= 1).all()

@@ -1,0 +1,135 @@
+import cv2
+import numpy as np
+import pytest
+
+from edgevpr.techniques import placecode
+from edgevpr.techniques.gradients import normalised_blocks, oriented_cells
+
+_HERE = np.zeros(1)
+_TURNS_DEG = np.arange(24) * 15.0
+
+
+def _picture(seed: int, side_px: int = 1024) -> np.ndarray:
+    """Ground of soft patches of several sizes."""
+    rng = np.random.default_rng(seed)
+    ground = sum(
+        cv2.resize(rng.random((n, n), dtype=np.float32), (side_px, side_px), interpolation=cv2.INTER_CUBIC)
+        for n in (6, 14, 40)
+    )
+    return cv2.normalize(ground, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+
+
+def _blocks(image: np.ndarray) -> np.ndarray:
+    return normalised_blocks(oriented_cells(np.ascontiguousarray(image), 16, 8, signed=True))
+
+
+def _view(ground: np.ndarray, right_px: int = 0, down_px: int = 0, turned_deg: float = 0) -> np.ndarray:
+    """512x512 of the ground, `right_px` and `down_px` from its middle, then turned counter-clockwise."""
+    middle = ground.shape[0] / 2 - 0.5
+    turn = cv2.getRotationMatrix2D((middle + right_px, middle + down_px), turned_deg, 1)
+    turned = cv2.warpAffine(ground, turn, ground.shape[::-1])
+    top, left = (int(middle + 0.5) - 256 + step for step in (down_px, right_px))
+    return turned[top : top + 512, left : left + 512]
+
+
+@pytest.fixture(scope="module")
+def town() -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
+    """Twelve grounds, the mean of their grids, and their codes."""
+    grounds = [_picture(seed) for seed in range(12)]
+    grids = np.stack([placecode.grid(_blocks(_view(ground))) for ground in grounds])
+    mean = grids.mean(axis=0)
+    return grounds, mean, placecode.pack(grids, mean)
+
+
+def _ask(image: np.ndarray, mean: np.ndarray, rotations_deg: np.ndarray) -> placecode.Hypotheses:
+    grids, seen = placecode.turned_grids(_blocks(image), rotations_deg)
+    return placecode.hypotheses(grids, seen, rotations_deg, mean)
+
+
+def test_a_place_takes_64_bytes(town):
+    assert town[2].shape == (12, 64)
+    assert town[2].dtype == np.uint8
+
+
+def test_the_same_picture_agrees_in_every_bit(town):
+    grounds, mean, codes = town
+    asked = _ask(_view(grounds[3]), mean, _HERE)
+    scores, rows = placecode.scan(asked.matrix, codes)
+    assert scores.argmax() == 3
+    assert scores[3] == pytest.approx(1)
+    assert asked.shift(rows[3]) == (0, 0)
+
+
+@pytest.mark.parametrize(("right", "down"), [(2, 0), (0, -3), (-2, 1), (1, 3)])
+def test_a_moved_camera_finds_the_place_and_how_far_it_moved(town, right, down):
+    grounds, mean, codes = town
+    asked = _ask(_view(grounds[5], 64 * right, 64 * down), mean, _HERE)
+    scores, rows = placecode.scan(asked.matrix, codes)
+    assert scores.argmax() == 5
+    # A camera that moved right sees the place to its left: its picture moves right to lie on the place.
+    assert asked.shift(rows[5]) == (right / 8, down / 8)
+
+
+@pytest.mark.parametrize("turned_deg", [30, 105, 240])
+def test_a_turned_camera_finds_the_place_and_its_rotation(town, turned_deg):
+    grounds, mean, codes = town
+    asked = _ask(_view(grounds[7], turned_deg=turned_deg), mean, _TURNS_DEG)
+    scores, rows = placecode.scan(asked.matrix, codes)
+    assert scores.argmax() == 7
+    assert (asked.rotation_deg(rows[7]) + turned_deg) % 360 == 0
+    assert asked.shift(rows[7]) == (0, 0)
+
+
+def test_turning_the_grid_by_right_angles_is_turning_the_picture():
+    image = _view(_picture(20))
+    angles_deg = np.array([90.0, 180.0, 270.0])
+    turned, seen = placecode.turned_grids(_blocks(image), angles_deg)
+    assert seen.all()
+    for quarter in range(3):
+        expected = placecode.grid(_blocks(np.rot90(image, quarter + 1)))
+        np.testing.assert_allclose(turned[quarter], expected, atol=0.05)
+
+
+def test_corners_that_a_turned_picture_does_not_reach_are_not_seen():
+    _, seen = placecode.turned_grids(_blocks(_view(_picture(21))), np.array([45.0]))
+    assert not seen[0, 0, 0]
+    assert not seen[0, -1, -1]
+    assert seen[0, 2:-2, 2:-2].all()
+
+
+def test_what_a_mask_hides_says_nothing(town):
+    grounds, mean, codes = town
+    image = _view(grounds[2]).copy()
+    image[:, 256:] = 0  # part of the aircraft
+    seen = np.zeros((31, 31), bool)
+    seen[:, :15] = True
+    grids, in_view = placecode.turned_grids(_blocks(image), _HERE, seen)
+    asked = placecode.hypotheses(grids, in_view, _HERE, mean)
+    scores, rows = placecode.scan(asked.matrix, codes)
+    assert scores.argmax() == 2
+    assert asked.shift(rows[2]) == (0, 0)
+    assert abs(asked.matrix).sum(axis=1).max() == pytest.approx(0.5)
+
+
+def test_the_scan_is_the_product_spelt_out(town):
+    _, mean, _ = town
+    rng = np.random.default_rng(1)
+    codes = rng.integers(0, 256, (600, 64), dtype=np.uint8)  # two whole blocks of places and a part
+    asked = _ask(_view(_picture(22)), mean, np.array([0.0, 120.0]))
+    scores, rows = placecode.scan(asked.matrix, codes)
+    every = (np.unpackbits(codes, axis=1) * 2.0 - 1) @ asked.matrix.T
+    np.testing.assert_allclose(scores, every.max(axis=1), atol=1e-6)
+    np.testing.assert_allclose(every[np.arange(600), rows], every.max(axis=1), atol=1e-6)
+
+
+def test_every_shift_leaves_at_least_the_least_overlap():
+    overlap = np.prod(8 - abs(placecode.SHIFTS.astype(int)), axis=1) / 64
+    assert overlap.min() >= 0.35
+    assert len(np.unique(placecode.SHIFTS, axis=0)) == len(placecode.SHIFTS)
+    assert [0, 0] in placecode.SHIFTS.tolist()
+
+
+def test_an_even_picture_is_compared_without_a_warning(town):
+    _, mean, codes = town
+    scores, _ = placecode.scan(_ask(np.full((512, 512), 90, np.uint8), mean, _TURNS_DEG).matrix, codes)
+    assert np.isfinite(scores).all()
