@@ -168,7 +168,7 @@ def _matching(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--budget-mb", type=float, metavar="MB", help="limit of the index in RAM (default: the board's)"
     )
-    parser.add_argument("--candidates", type=int, metavar="N", help="places compared in full (20)")
+    parser.add_argument("--candidates", type=int, metavar="N", help="places compared in full (the technique's)")
     parser.add_argument("--min-score", type=float, metavar="S", help="accept from this score on")
     parser.add_argument("--min-margin", type=float, metavar="M", help="accept when this far ahead of a place elsewhere")
     parser.add_argument("--battery", metavar="PACK", help="cells and capacity of the pack, e.g. 4S5200")

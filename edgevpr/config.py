@@ -30,7 +30,7 @@ class SourceConfig:
 @dataclass(frozen=True, slots=True)
 class MatchConfig:
     matching: str | None
-    candidates: int = bounded(1, 1_000_000)
+    candidates: int | None = bounded(1, 1_000_000)
     min_score: float | None = bounded(0, 1)
     min_margin: float | None = bounded(0, 1)
     neighbour_m: float = bounded(0, 10_000)

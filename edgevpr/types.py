@@ -92,6 +92,7 @@ class Technique(Protocol):
     no `packed` no `pack`."""
 
     spec: TechniqueSpec
+    candidates: int  # places compared in full after the scan, unless the configuration says otherwise
     min_score: float  # a match is accepted from this score on, unless the configuration says otherwise ...
     min_margin: float  # ... and when it beats the best place elsewhere by this
 

@@ -67,9 +67,10 @@ def open_pipeline(config: Config) -> Pipeline:
     budget_mb = config.memory.budget_mb or board.budget_mb
     index = load_index(place_map, technique, int(budget_mb * 1e6))
     rate_hz = config.source.rate_hz or board.rate_hz
+    candidates = config.match.candidates or technique.candidates
     probed = probe(technique)
     if technique.spec.fine:
-        probed = replace(probed, candidates=config.match.candidates)
+        probed = replace(probed, candidates=candidates)
     costs = on_board(probed, load_board("this"), board)
     found = fit(board, costs, len(index), rate_hz, budget_mb)
     why = "the map was built with it" if config.technique is None else "it was named"
@@ -80,7 +81,7 @@ def open_pipeline(config: Config) -> Pipeline:
         place_map,
         index,
         accept_rule(technique, config.match),
-        config.match.candidates,
+        candidates,
         board,
         pack,
         config.battery.regulator_efficiency,

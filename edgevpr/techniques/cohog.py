@@ -29,7 +29,10 @@ _VOTE_WINDOW = {"forward": 5, "nadir": 3}
 # nor did any query of two other sites in the map of aerial_caliterra. The thesis's score has no safe threshold: its
 # margin keeps out those queries of other sites, and most right matches with them.
 _ACCEPT = {"forward": (0.12, 0.05), "nadir": (0.08, 0.03), "thesis": (0.0, 0.02)}
+# A code of a turned picture says less: more places are compared in full, and the rotations beside the one it found.
+_CANDIDATES = {"forward": 40, "nadir": 50}
 _ROTATIONS = 24  # of a query that looks straight down and does not know its heading: 15 degrees apart
+_TURNS_BESIDE = 2
 
 
 class CoHog:
@@ -68,6 +71,7 @@ class CoHog:
         self._round = _disc(w1)
         self._matched = self._displacement if matching == "displacement" else self._thesis
         self.min_score, self.min_margin = _ACCEPT[camera if matching == "displacement" else matching]
+        self.candidates = _CANDIDATES[camera]
         self.spec = TechniqueSpec(
             "cohog",
             {"w1": w1, "w2": w2, "bins": bins, "gt": self._gt, "entropy": entropy, "camera": camera},
@@ -121,7 +125,9 @@ class CoHog:
         reference /= np.maximum(np.sqrt(np.einsum("ij,ij->i", reference, reference)), 1e-6)[:, None]
         if self._camera == "forward":
             return self._matched(self._asking(query, 0), reference)
-        turns = range(_ROTATIONS) if hypothesis is None else (hypothesis,)
+        turns = range(_ROTATIONS)
+        if hypothesis is not None:
+            turns = {(hypothesis + step) % _ROTATIONS for step in range(-_TURNS_BESIDE, _TURNS_BESIDE + 1)}
         matches = {turn: self._matched(self._asking(query, turn), reference) for turn in turns}
         best = max(matches, key=lambda turn: matches[turn].score)
         return replace(matches[best], rotation_deg=360 * best / _ROTATIONS)

@@ -17,6 +17,7 @@ class Ruler:
 
     spec = TechniqueSpec("ruler", {}, PartSpec((1,), "<f4"), PartSpec((1,), "<f8"))
     min_score = min_margin = 0.0
+    candidates = 20
     compared = 0
 
     def encode(self, image, mask=None):
