@@ -10,25 +10,29 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from edgevpr.errors import UsageError
-from edgevpr.places.index import bytes_per_place, load_index
+from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import rank
 from edgevpr.power.boards import Board
 from edgevpr.power.machine import rss_mb
 from edgevpr.power.meter import stage
-from edgevpr.types import Frame, StageCost, Technique
+from edgevpr.types import Descriptor, Frame, StageCost, Technique
 
 _ROUNDS = 3
 _PLACES = 6
+_SCANNED = 4096
 _LOWEST_RATE_HZ = 0.01  # what the configuration allows
+_NOTHING = StageCost(0.0, 0.0)
 _LINK_MB = 13.0  # what importing pymavlink adds to the resident memory (measured on x86-64)
 
 
 @dataclass(frozen=True, slots=True)
 class TechniqueCosts:
     """What a technique costs on one machine: to encode a frame, to compare it in full with one place (read from the map
-    file), bytes of a place in RAM and on disk, and the resident memory of the process without a map. However large the
-    map, no more than `candidates` places are compared in full (None: all)."""
+    file), bytes of a place in RAM and on disk, and the resident memory of the process without a map.
+
+    Where there are more than `candidates` places, all are scanned in RAM and only so many compared in full (None: the
+    technique has one stage, and compares all of them).
+    """
 
     encode: StageCost
     match_per_place: StageCost
@@ -36,16 +40,24 @@ class TechniqueCosts:
     disk_bytes_per_place: int
     process_mb: float
     candidates: int | None = None
+    scan_per_place: StageCost = _NOTHING
 
     def match(self, places: int) -> StageCost:
-        """Cost of comparing one query in full with the candidates of a map of `places` places."""
-        in_full = places if self.candidates is None else min(self.candidates, places)
-        return StageCost(self.match_per_place.wall_s * in_full, self.match_per_place.cpu_s * in_full)
+        """Cost of finding one query in a map of `places` places."""
+        if self.candidates is None or places <= self.candidates:
+            return _times(self.match_per_place, places)
+        in_full, scanned = _times(self.match_per_place, self.candidates), _times(self.scan_per_place, places)
+        return StageCost(in_full.wall_s + scanned.wall_s, in_full.cpu_s + scanned.cpu_s)
 
     def places_within(self, wall_s: float, cpu_s: float) -> float:
         """How many places a map may have for a query to be found in it within both times."""
-        in_full = min(wall_s / self.match_per_place.wall_s, cpu_s / self.match_per_place.cpu_s)
-        return in_full if self.candidates is None or in_full < self.candidates else math.inf
+        full = self.match_per_place
+        in_full = min(wall_s / full.wall_s, cpu_s / full.cpu_s)
+        if self.candidates is None or in_full < self.candidates:
+            return in_full
+        scan = self.scan_per_place
+        rest_wall_s, rest_cpu_s = wall_s - self.candidates * full.wall_s, cpu_s - self.candidates * full.cpu_s
+        return min(rest_wall_s / scan.wall_s, rest_cpu_s / scan.cpu_s) if scan.wall_s else math.inf
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,17 +99,33 @@ def probe(technique: Technique) -> TechniqueCosts:
         index = load_index(trial_map, technique, _PLACES * bytes_per_place(technique.spec))
         for query in queries:
             with stage() as matching:
-                rank(technique, query, trial_map, index)
+                if technique.spec.fine:
+                    for place_id in index.place_ids:
+                        technique.match(query, trial_map.fine_part(place_id), 0)
+                else:
+                    technique.coarse_scores(query, index.rows, index.mean)
             matchings.append(matching.cost)
-    match = min(matchings, key=lambda cost: cost.wall_s)
     fine = technique.spec.fine
     return TechniqueCosts(
-        encode=min(encodings, key=lambda cost: cost.wall_s),
-        match_per_place=StageCost(match.wall_s / _PLACES, match.cpu_s / _PLACES),
+        encode=_quickest(encodings),
+        match_per_place=_times(_quickest(matchings), 1 / _PLACES),
         ram_bytes_per_place=bytes_per_place(technique.spec),
         disk_bytes_per_place=technique.spec.coarse.nbytes + (fine.nbytes if fine else 0),
         process_mb=rss_mb() + (0.0 if "pymavlink" in sys.modules else _LINK_MB),
+        candidates=technique.candidates if fine else None,
+        scan_per_place=_probe_scan(technique, queries, index) if fine else _NOTHING,
     )
+
+
+def _probe_scan(technique: Technique, queries: list[Descriptor], index: PlaceIndex) -> StageCost:
+    """Cost of scanning one place: each query over some thousand rows, which are those of the index again and again."""
+    rows = np.resize(index.rows, (_SCANNED, *index.rows.shape[1:]))
+    scans = []
+    for query in queries:
+        with stage() as scanning:
+            technique.coarse_scores(query, rows, index.mean)
+        scans.append(scanning.cost)
+    return _times(_quickest(scans), 1 / _SCANNED)
 
 
 def probe_each(techniques: Iterable[Technique]) -> Iterator[tuple[str, TechniqueCosts]]:
@@ -120,10 +148,15 @@ def on_board(costs: TechniqueCosts, here: Board, board: Board) -> TechniqueCosts
     ratio = speed_ratio(here, board) or 1.0
 
     def scaled(cost: StageCost) -> StageCost:
-        busy_cores = cost.cpu_s / cost.wall_s
+        busy_cores = cost.cpu_s / cost.wall_s if cost.wall_s else 0.0
         return StageCost(cost.wall_s / ratio * max(1.0, busy_cores / board.cores), cost.cpu_s / ratio)
 
-    return replace(costs, encode=scaled(costs.encode), match_per_place=scaled(costs.match_per_place))
+    return replace(
+        costs,
+        encode=scaled(costs.encode),
+        match_per_place=scaled(costs.match_per_place),
+        scan_per_place=scaled(costs.scan_per_place),
+    )
 
 
 def fit(board: Board, costs: TechniqueCosts, places: int, rate_hz: float, budget_mb: float) -> Fit:
@@ -189,6 +222,14 @@ def described(board: Board, found: Fit, places: int, rate_hz: float, budget_mb: 
         return figures
     remedies = f", it would fit {' or '.join(found.remedies)}" if found.remedies else ""
     return f"{figures}; it does not fit ({' and '.join(found.shortfalls)}{remedies})"
+
+
+def _quickest(costs: list[StageCost]) -> StageCost:
+    return min(costs, key=lambda cost: cost.wall_s)
+
+
+def _times(cost: StageCost, count: float) -> StageCost:
+    return StageCost(cost.wall_s * count, cost.cpu_s * count)
 
 
 def _rounded_down(value: float) -> float:

@@ -27,6 +27,7 @@ def board(**changes):
 class TinyTechnique:
     """Four numbers a place, and regions of 6x2 if `fine`; counts what it is asked."""
 
+    candidates = 3
     min_score = 0.0
     min_margin = 0.0
 
@@ -101,6 +102,14 @@ def test_a_big_board_takes_the_best_technique_for_a_map_that_a_tiny_one_refuses(
     assert choose(big, {"vector": on_board(fast, here, big)}, 1000, 1, big.budget_mb).technique == "vector"
     with pytest.raises(UsageError, match=r"No technique fits Raspberry Pi Zero 2 W with 1000 places at 1 Hz"):
         choose(tiny, {"vector": on_board(fast, here, tiny)}, 1000, 1, tiny.budget_mb)
+
+
+def test_a_large_map_is_scanned_whole_and_compared_in_part():
+    two_stages = dataclasses.replace(REGIONS, candidates=20, scan_per_place=StageCost(1e-6, 1e-6))
+    assert two_stages.match(20).wall_s == pytest.approx(20 * 0.004)
+    assert two_stages.match(10_000).wall_s == pytest.approx(20 * 0.004 + 0.01)
+    assert two_stages.places_within(0.04, 1) == pytest.approx(10)
+    assert two_stages.places_within(0.1, 1) == pytest.approx(20_000)
 
 
 def test_the_whole_map_counts_in_ram_and_only_its_candidates_in_time():
