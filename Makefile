@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # One thread for the matrix products: what is measured is what one core does, and small products gain nothing from more.
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: demo test lint results clean
+.PHONY: demo test lint results bench clean
 
 demo: $(VENV)/installed
 	$(BIN)/edgevpr demo --out demo_out
@@ -21,6 +21,11 @@ lint: $(VENV)/installed
 # Figures on real image sets (../shared/data, or the folder named in EDGEVPR_DATA) into benchmarks/results/.
 results: $(VENV)/installed
 	$(BIN)/python benchmarks/run_sets.py
+
+# Speed and memory against the published way, into benchmarks/results/.
+bench: $(VENV)/installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[bench]'
+	$(BIN)/python benchmarks/bench.py
 
 clean:
 	rm -rf $(VENV) demo_out dist build

@@ -29,7 +29,7 @@ IDLE_S = 10.0
 SETTLE_S = 2.0
 SPARE_BYTES = 10**9
 NOBODY = "rtsp://127.0.0.1:9/nobody"
-FLAGS = ["--candidates", "20", "--link", "udpout:127.0.0.1:9"]
+FLAGS = ["--link", "udpout:127.0.0.1:9"]
 NEVER_IMPORTED = ["onnxruntime", "matplotlib"]
 
 
@@ -43,21 +43,21 @@ class FlightRow:
     target: float | None
 
 
-def why_not(folder: Path, places: int = PLACES) -> str | None:
+def why_not(folder: Path) -> str | None:
     """Why the map cannot be made in `folder`, None where it can."""
-    needed = file_bytes(create("cohog").spec, places) + SPARE_BYTES
+    needed = file_bytes(create("cohog").spec, PLACES) + SPARE_BYTES
     free = shutil.disk_usage(folder).free
     return f"{folder} has {free / 1e9:.1f} GB free and {needed / 1e9:.1f} are needed" if free < needed else None
 
 
-def rows(places: int = PLACES) -> list[FlightRow]:
+def rows() -> list[FlightRow]:
     """Make the map in a temporary folder, fly, look. Raises OSError where the disk has no room."""
     with TemporaryDirectory() as name:
         folder = Path(name)
-        if reason := why_not(folder, places):
+        if reason := why_not(folder):
             raise OSError(reason)
         place_map, frames = folder / "big.gpkg", folder / "frames"
-        make_big_map(place_map, create("cohog").spec, places)
+        make_big_map(place_map, create("cohog").spec, PLACES)
         write_frames(frames, FRAMES)
         start_s(place_map, frames, folder)  # compiles the bytecode, and fills the page cache
         return [

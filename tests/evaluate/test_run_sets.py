@@ -44,7 +44,7 @@ def test_every_set_gets_a_file_and_a_line_in_the_summary(tmp_path):
     page = (tmp_path / "out" / "sets.md").read_text()
     assert "| meadow | report | 4 / 4 | cohog | 1.000 |" in page
     assert "| meadow | cohog | 4 | 11 / 11 / 11 (4) |" in page
-    assert "* grief_stromovka_monthly: hog, cohog, cohog_thesis: five places only" in page
+    assert "* grief_stromovka_monthly: hog, cohog, cohog_exact, cohog_thesis: five places only" in page
 
 
 def test_a_folder_without_sets_gets_a_sentence(tmp_path):

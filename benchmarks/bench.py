@@ -1,0 +1,124 @@
+"""Every speed and memory figure in one run: `make bench` writes benchmarks/results/bench.md, bench.json and growth.png.
+
+Figures of competitors stand beside ours from the same, interleaved run: on a busy machine the ratios hold, the times do
+not.
+"""
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import bench_encode
+import bench_flight
+import bench_match
+import bench_scan
+import bench_two_stage
+from run_sets import provenance
+
+RESULTS = Path(__file__).resolve().parent / "results"
+
+
+def main() -> None:
+    RESULTS.mkdir(exist_ok=True)
+    made_by = provenance()
+    measured = {}
+    for name, measure in {
+        "encode": bench_encode.rows,
+        "match": lambda: [bench_match.row()],
+        "two_stage": bench_two_stage.rows,
+        "binary_scan": bench_scan.binary_rows,
+        "growth": bench_scan.growth_rows,
+        "flight": bench_flight.rows,
+    }.items():
+        print(f"measuring: {name}", flush=True)
+        measured[name] = measure()
+    plain = {name: [row if isinstance(row, dict) else asdict(row) for row in rows] for name, rows in measured.items()}
+    (RESULTS / "bench.json").write_text(json.dumps({**made_by, **plain}, indent=2) + "\n")
+    plot_growth(measured["growth"], RESULTS / "growth.png")
+    page = report(measured, made_by)
+    (RESULTS / "bench.md").write_text(page)
+    print(page)
+
+
+def plot_growth(rows: list[dict], path: Path) -> None:
+    """Time of a query's scan and memory of the index against the number of places, both logarithmic."""
+    import matplotlib.pyplot as plt
+
+    figure, (time_axes, ram_axes) = plt.subplots(1, 2, figsize=(10, 4.2), layout="constrained")
+    for rotations, colour in ((1, "tab:blue"), (24, "tab:orange")):
+        these = [row for row in rows if row["rotations"] == rotations]
+        places, scan_ms = [row["places"] for row in these], [row["t_scan_ms"] for row in these]
+        label = "heading known, or camera ahead" if rotations == 1 else "straight down, 24 rotations"
+        time_axes.loglog(places, scan_ms, "o-", color=colour, label=label)
+        linear_ms = [scan_ms[-1] * count / places[-1] for count in places]
+        time_axes.loglog(places, linear_ms, ":", color=colour, alpha=0.6)
+    time_axes.set(xlabel="places", ylabel="scan of all places, ms", title="time of the scan (dotted: linear)")
+    time_axes.legend(frameon=False)
+    these = [row for row in rows if row["rotations"] == 1]
+    ram_axes.loglog([row["places"] for row in these], [row["index_mb"] for row in these], "o-", color="tab:green")
+    ram_axes.set(xlabel="places", ylabel="codes in RAM, MB", title="64 bytes a place")
+    for axes in (time_axes, ram_axes):
+        axes.grid(alpha=0.3, which="both")
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+def report(measured: dict, made_by: dict) -> str:
+    """The page for people."""
+    machine = made_by["machine"]
+    binary = "\n".join(
+        f"| {row['what']} | {row['t_ms']:.2f} | {row['gb_per_s']:.1f} | {row['of_byte_sum']:.0%} "
+        f"| {row['of_word_sum']:.0%} |"
+        for row in measured["binary_scan"]
+    )
+    growth = "\n".join(
+        f"| {row['places']} | {row['rotations']} | {row['t_scan_ms']:.1f} | {row['index_mb']:.2f} |"
+        for row in measured["growth"]
+    )
+    return f"""# Speed and memory
+
+Made by `make bench` on {made_by["date"]}, commit {made_by["commit"]}.
+Machine: {machine["cpu"]}, {machine["cores"]} cores; one thread; Python {machine["python"]}, NumPy {machine["numpy"]},
+OpenCV {machine["opencv"]}. Medians; ratios are taken turn by turn in one interleaved run.
+
+## Encoding a frame
+
+The published way is written plainly in `benchmarks/competitor.py`; the floor is the resize and two Sobel passes alone.
+
+{bench_encode.table(measured["encode"])}
+
+## Comparing one place in full
+
+{bench_match.table(measured["match"][0])}
+
+## A query over 10 000 places
+
+{bench_two_stage.table(measured["two_stage"])}
+
+## Scan of binary vectors, 100 000 x 512 bits
+
+| what | ms | GB/s | of the sum of bytes | of the sum of 64-bit words |
+|---|---|---|---|---|
+{binary}
+
+## Growth of the scan of place codes
+
+| places | rotations | scan ms | codes MB |
+|---|---|---|---|
+{growth}
+
+![growth](growth.png)
+
+## The whole program
+
+{bench_flight.table(measured["flight"])}
+"""
+
+
+if __name__ == "__main__":
+    main()

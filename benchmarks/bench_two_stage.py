@@ -1,0 +1,104 @@
+"""One query in a map of 10 000 places: the scan of 64-byte codes and the vote over the best of them, against the vote
+over all places, through the map file and the index that fly. One thread; the map is generated, its content random.
+"""
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
+
+import statistics
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+import cv2
+from bench_encode import frames, timed_s
+from big_map import make_big_map
+
+from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.retrieve import rank
+from edgevpr.techniques import create
+from edgevpr.types import Technique
+
+PLACES = 10_000
+TURNS = 9
+
+
+@dataclass(frozen=True, slots=True)
+class QueryRow:
+    """Median seconds of a query, encoding included; `exact_s` and `ratio` are None where it would take minutes."""
+
+    camera: str
+    candidates: int
+    encode_ms: float
+    two_stage_ms: float
+    exact_s: float | None
+    ratio: float | None
+    bytes_per_place: int
+
+
+def rows(places: int = PLACES) -> list[QueryRow]:
+    """A camera that looks ahead, or straight down with a known heading, is `forward`; `nadir` tries 24 rotations."""
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    found = []
+    for camera in ("forward", "nadir"):
+        technique = create("cohog", {"camera": camera})
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / "big.gpkg"
+            make_big_map(path, technique.spec, places)
+            with PlaceMap.open(path) as place_map:
+                index = load_index(place_map, technique, 100_000_000)
+                found.append(measure(camera, technique, place_map, index))
+    cv2.setNumThreads(threads)
+    return found
+
+
+def measure(camera: str, technique: Technique, place_map: PlaceMap, index: PlaceIndex) -> QueryRow:
+    picture = frames()[0]
+
+    def query(candidates: int | None) -> None:
+        rank(technique, technique.encode(picture), place_map, index, candidates)
+
+    query(technique.candidates)
+    encode_s = statistics.median(timed_s(technique.encode, picture) for _ in range(TURNS))
+    two_stage_s, exact_s = [], []
+    for turn in range(TURNS):
+        two_stage_s.append(timed_s(query, technique.candidates))
+        if camera == "forward" and turn % 3 == 0:
+            exact_s.append(timed_s(query, None))
+    two_stage = statistics.median(two_stage_s)
+    exact = statistics.median(exact_s) if exact_s else None
+    return QueryRow(
+        camera,
+        technique.candidates,
+        1000 * encode_s,
+        1000 * two_stage,
+        exact,
+        exact / two_stage if exact else None,
+        bytes_per_place(technique.spec),
+    )
+
+
+def table(results: list[QueryRow]) -> str:
+    """The results as a Markdown table."""
+    lines = [
+        f"| a query, {PLACES} places | compared in full | encode ms | whole query ms | exact over all s | ratio "
+        "| bytes a place in RAM |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for row in results:
+        exact, ratio = (f"{row.exact_s:.1f}", f"{row.ratio:.0f}") if row.exact_s else ("not run", "")
+        lines.append(
+            f"| {row.camera} | {row.candidates} | {row.encode_ms:.1f} | {row.two_stage_ms:.0f} | {exact} | {ratio} "
+            f"| {row.bytes_per_place} |"
+        )
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    print(table(rows()))
