@@ -182,9 +182,11 @@ def profile(args: Namespace) -> int:
             print(f"{name:<20} {load_board(name).title}")
         return 0
     board, here = load_board(args.board), load_board("this")
+    settings = {}
     if args.map:
         with PlaceMap.open(args.map) as place_map:
             places = len(place_map)
+            settings[place_map.spec.name] = place_map.spec.parameters
     elif args.places is not None:
         places = args.places
     else:
@@ -199,7 +201,8 @@ def profile(args: Namespace) -> int:
         board.budget_mb if args.budget_mb is None else args.budget_mb,
     )
     names = techniques.names()
-    probed = progress(probe_each(map(techniques.create, names)), len(names), "probing techniques")
+    tried = (techniques.create(name, settings.get(name)) for name in names)
+    probed = progress(probe_each(tried), len(names), "probing techniques")
     result = estimate(board, here, dict(probed), plan)
     if args.json:
         _print_json(asdict(result))
