@@ -64,13 +64,13 @@ def growth_rows(
     for turns in rotations:
         angles_deg = np.arange(turns) * 360 / turns
 
-        def ask(angles_deg: np.ndarray = angles_deg) -> placecode.Hypotheses:
-            return placecode.hypotheses(*placecode.turned_grids(blocks, angles_deg), angles_deg, mean)
+        def ask(angles_deg: np.ndarray = angles_deg) -> np.ndarray:
+            return placecode.hypotheses(*placecode.turned_grids(blocks, angles_deg), mean)
 
-        matrix = ask().matrix
+        asked = ask()
         for count in places:
             codes = rng.integers(0, 256, (count, 64), dtype=np.uint8)
-            ways = {"query": ask, "scan": lambda codes=codes, matrix=matrix: placecode.scan(matrix, codes)}
+            ways = {"query": ask, "scan": lambda codes=codes, asked=asked: placecode.scan(asked, codes)}
             taken = medians_s(ways, rounds=max(1, min(20, 2_000_000 // (count * turns))))
             rows.append(
                 {

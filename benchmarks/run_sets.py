@@ -198,8 +198,8 @@ Machine: {machine["cpu"]}, {machine["cores"]} cores, BLAS threads: {machine["bla
 Python {machine["python"]}, NumPy {machine["numpy"]}, OpenCV {machine["opencv"]}.
 
 `cohog` is as it flies: a scan of 64 bytes a place, then the displacement vote over the best places; in the aerial
-sets its camera looks straight down (`--camera nadir`: centred squares, rotations of the query). `cohog_exact` votes over
-all places, under all 24 rotations. `cohog_thesis` scores as published, on the whole picture, all places.
+sets its camera looks straight down (`--camera nadir`: the picture laid into a square, 24 rotations of the query).
+`cohog_exact` votes over all places, under all rotations. `cohog_thesis` scores as published, on the whole picture.
 Entropy, vote windows and the acceptance limits of the vote were chosen on the sets marked *tune*. Three figures were
 fixed after all sets had been seen, and are to be judged with that in mind: the share of a picture's own mean that its
 place code leaves out (0.5), the number of places compared in full (40 ahead, 50 straight down), and the margin of

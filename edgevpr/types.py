@@ -63,16 +63,26 @@ class TechniqueSpec:
 class Descriptor:
     """One encoded image. `coarse` is one row of the index in RAM; `fine` lives in the map file and is read for
     candidates only; `regions` are what a query asks with, and `good` (bool, one a region) says which of them speak;
-    `quality` (0..1) is the share of the image that says anything. `grey` (uint8, square) is kept for a query that may
-    have to be turned, and `asking` collects what was made of it."""
+    `quality` (0..1) is the share of the image that says anything. `picture` is kept for a query that may have to be
+    turned, and `asking` collects what was made of it."""
 
     coarse: np.ndarray
     fine: np.ndarray | None = None
     regions: np.ndarray | None = None
     good: np.ndarray | None = None
     quality: float = 1.0
-    grey: np.ndarray | None = None
+    picture: "Picture | None" = None
     asking: dict = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """What an image was encoded from: `grey` uint8 (side, side), `allowed` bool of the same shape (None: all of it),
+    and `seen` bool, the blocks that are wholly allowed."""
+
+    grey: np.ndarray
+    allowed: np.ndarray | None
+    seen: np.ndarray
 
 
 @dataclass(frozen=True, slots=True)

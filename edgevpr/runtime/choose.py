@@ -99,11 +99,11 @@ def probe(technique: Technique) -> TechniqueCosts:
         index = load_index(trial_map, technique, _PLACES * bytes_per_place(technique.spec))
         for query in queries:
             with stage() as matching:
+                _, hypotheses = technique.coarse_scores(query, index.rows, index.mean)
                 if technique.spec.fine:
-                    for place_id in index.place_ids:
-                        technique.match(query, trial_map.fine_part(place_id), 0)
-                else:
-                    technique.coarse_scores(query, index.rows, index.mean)
+                    for slot, place_id in enumerate(index.place_ids):
+                        hypothesis = None if hypotheses is None else int(hypotheses[slot])
+                        technique.match(query, trial_map.fine_part(place_id), hypothesis)
             matchings.append(matching.cost)
     fine = technique.spec.fine
     return TechniqueCosts(

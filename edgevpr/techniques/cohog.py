@@ -19,7 +19,7 @@ from edgevpr.techniques import placecode
 from edgevpr.techniques.displacement import displacement
 from edgevpr.techniques.entropy import block_means, good_blocks
 from edgevpr.techniques.gradients import grey_square, mask_square, normalised_blocks, oriented_cells
-from edgevpr.types import Descriptor, FineMatch, PartSpec, TechniqueSpec
+from edgevpr.types import Descriptor, FineMatch, PartSpec, Picture, TechniqueSpec
 
 # The goodness threshold GT of the thesis (6.3.2) and of the authors' public code, each for its own entropy.
 _DEFAULT_GT = {"filled_bins": 0.5, "shannon": 0.4}
@@ -29,19 +29,19 @@ _VOTE_WINDOW = {"forward": 5, "nadir": 3}
 # nor did any query of two other sites in the map of aerial_caliterra. The thesis's score has no safe threshold: its
 # margin keeps out those queries of other sites, and most right matches with them.
 _ACCEPT = {"forward": (0.12, 0.05), "nadir": (0.08, 0.03), "thesis": (0.0, 0.02)}
-# A code of a turned picture says less: more places are compared in full, and the rotations beside the one it found.
+# A code of a turned picture says less: more places are compared in full, each under half of all rotations.
 _CANDIDATES = {"forward": 40, "nadir": 50}
 _ROTATIONS = 24  # of a query that looks straight down and does not know its heading: 15 degrees apart
-_TURNS_BESIDE = 2
+_TURNS_TRIED = 12
 
 
 class CoHog:
     """CoHOG. The thesis's W1 = H1 is `w1`, W2 = H2 is `w2`, L is `bins`, GT is `gt` (below 0: the default that goes
     with the entropy); `entropy` is "shannon" or "filled_bins".
 
-    `camera` "nadir" uses the largest centred square of the picture, so that a turned one shows the same ground, and
-    tries a query in 24 rotations. It is recorded in the map; `matching`, "displacement" or "thesis", is not: both read
-    the same map.
+    `camera` "nadir" keeps the shape of the picture, which is laid into a square, so that a turned one shows the same
+    ground, and tries a query in 24 rotations. It is recorded in the map; `matching`, "displacement" or "thesis", is
+    not: both read the same map.
     """
 
     def __init__(
@@ -68,7 +68,6 @@ class CoHog:
         self._entropy, self._camera = entropy, camera
         self._gt = gt if gt >= 0 else _DEFAULT_GT[entropy]
         self._side = w1 // w2 - 1  # blocks along one side
-        self._round = _disc(w1)
         self._matched = self._displacement if matching == "displacement" else self._thesis
         self.min_score, self.min_margin = _ACCEPT[camera if matching == "displacement" else matching]
         self.candidates = _CANDIDATES[camera]
@@ -87,21 +86,25 @@ class CoHog:
         4 bins) (matrix B of 6.2.3) and good bool (blocks,).
         """
         if self._camera == "nadir":
-            image, mask = _centred_square(image), None if mask is None else _centred_square(mask)
-        grey = grey_square(image, self._w1)
-        blocks, good = self._regions(grey, mask_square(mask, self._w1))
+            image, mask = _in_square(image, mask)
+        grey, allowed = grey_square(image, self._w1), mask_square(mask, self._w1)
+        blocks, seen, good = self._regions(grey, allowed)
         regions = blocks.reshape(self.spec.fine.shape)
         # The root of each value in 8 bits: the small values, of which there are most, keep their digits.
         stored = np.rint(255 * np.sqrt(regions)).astype(np.uint8)
-        return Descriptor(placecode.grid(blocks).astype("<f2"), stored, regions, good, float(good.mean()), grey)
+        coarse = placecode.grid(_middle(blocks, seen)).astype("<f2")
+        quality = float(good.sum() / max(seen.sum(), 1))
+        return Descriptor(coarse, stored, regions, good.ravel(), quality, Picture(grey, allowed, seen))
 
-    def _regions(self, grey: np.ndarray, allowed: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-        """Blocks float32 (side, side, 4 bins), and which of them are good, bool (blocks,)."""
+    def _regions(self, grey: np.ndarray, allowed: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Blocks float32 (side, side, 4 bins); which of them are wholly allowed, and of these which are good, both bool
+        (side, side)."""
         blocks = normalised_blocks(oriented_cells(grey, self._w2, self._bins, signed=True, allowed=allowed))
         good = good_blocks(grey, self._entropy, self._w2, self._gt)
-        if allowed is not None:
-            good &= block_means(allowed.astype(np.float32), self._w2) >= 1.0
-        return blocks, good.ravel()
+        if allowed is None:
+            return blocks, np.ones_like(good), good
+        seen = block_means(allowed.astype(np.float32), self._w2) >= 1.0
+        return blocks, seen, good & seen
 
     def pack(self, coarse: np.ndarray, mean: np.ndarray) -> np.ndarray:
         """Rows of the index: coarse float16 (N, 8, 8, bins), the map's mean -> uint8 (N, 8 bins)."""
@@ -109,13 +112,14 @@ class CoHog:
 
     def coarse_scores(self, query: Descriptor, rows: np.ndarray, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Compare the place codes under all shifts and, looking down, all rotations: `rows` uint8 (N, 8 bins) -> scores
-        float32 (N,), and the rotation (a number for `match`) that gave each of them."""
-        blocks = query.regions.reshape(self._side, self._side, -1)
+        float32 (N,), and the rotations for `match` to try, the bits of an int32 (N,)."""
+        seen = query.picture.seen
+        blocks = _middle(query.regions.reshape(self._side, self._side, -1), seen)
         turns = np.arange(_ROTATIONS if self._camera == "nadir" else 1)
-        grids, seen = placecode.turned_grids(blocks, -360 * turns / _ROTATIONS)
-        asked = placecode.hypotheses(grids, seen, turns, mean)
-        scores, hypothesis = placecode.scan(asked.matrix, rows)
-        return np.clip(scores, 0, 1, out=scores), hypothesis // len(placecode.SHIFTS)
+        grids, in_view = placecode.turned_grids(blocks, -360 * turns / _ROTATIONS, _middle(seen, seen))
+        scores = placecode.scan(placecode.hypotheses(grids, in_view, mean), rows)
+        tried = np.argsort(-scores, axis=1)[:, :_TURNS_TRIED]
+        return np.clip(scores.max(axis=1), 0, 1), np.bitwise_or.reduce(1 << tried, axis=1)
 
     def match(self, query: Descriptor, fine: np.ndarray, hypothesis: int | None = None) -> FineMatch:
         """C = A B^T (thesis 6.2.3) with A the good regions of the query, B those of the place; then the score by
@@ -125,9 +129,7 @@ class CoHog:
         reference /= np.maximum(np.sqrt(np.einsum("ij,ij->i", reference, reference)), 1e-6)[:, None]
         if self._camera == "forward":
             return self._matched(self._asking(query, 0), reference)
-        turns = range(_ROTATIONS)
-        if hypothesis is not None:
-            turns = {(hypothesis + step) % _ROTATIONS for step in range(-_TURNS_BESIDE, _TURNS_BESIDE + 1)}
+        turns = [turn for turn in range(_ROTATIONS) if hypothesis is None or hypothesis >> turn & 1]
         matches = {turn: self._matched(self._asking(query, turn), reference) for turn in turns}
         best = max(matches, key=lambda turn: matches[turn].score)
         return replace(matches[best], rotation_deg=360 * best / _ROTATIONS)
@@ -138,13 +140,21 @@ class CoHog:
         if turn not in query.asking:
             regions, good = query.regions, query.good
             if turn:
-                middle = (self._w1 - 1) / 2
-                matrix = cv2.getRotationMatrix2D((middle, middle), -360 * turn / _ROTATIONS, 1)
-                grey = cv2.warpAffine(query.grey, matrix, (self._w1, self._w1), borderMode=cv2.BORDER_REFLECT)
-                blocks, good = self._regions(grey, self._round)
-                regions = blocks.reshape(regions.shape)
+                blocks, _, good = self._regions(*self._turned_back(query.picture, turn))
+                regions, good = blocks.reshape(regions.shape), good.ravel()
             query.asking[turn] = np.flatnonzero(good), regions[good]
         return query.asking[turn]
+
+    def _turned_back(self, picture: Picture, turn: int) -> tuple[np.ndarray, np.ndarray]:
+        """A picture and where it is allowed, turned back by `turn` steps about its middle; its corners are cut off."""
+        middle = (self._w1 - 1) / 2
+        matrix = cv2.getRotationMatrix2D((middle, middle), -360 * turn / _ROTATIONS, 1)
+        size = self._w1, self._w1
+        allowed = picture.allowed.astype(np.uint8)
+        return (
+            cv2.warpAffine(picture.grey, matrix, size, borderMode=cv2.BORDER_REPLICATE),
+            cv2.warpAffine(allowed, matrix, size, flags=cv2.INTER_NEAREST).astype(bool),
+        )
 
     def _thesis(self, asking: tuple[np.ndarray, np.ndarray], reference: np.ndarray) -> FineMatch:
         numbers, regions = asking
@@ -164,14 +174,22 @@ def _require(what: str, value: str, allowed) -> None:
         raise UsageError(f"cohog has no {what} `{value}`: use {' or '.join(sorted(allowed))}.")
 
 
-def _centred_square(image: np.ndarray) -> np.ndarray:
+def _middle(per_block: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """The largest square in the middle that a picture fills that was laid into a larger one: (side, side, ...) ->
+    (n, n, ...)."""
+    n = max(min(int(seen.any(axis=0).sum()), int(seen.any(axis=1).sum())), placecode.SIDE)
+    start = (len(seen) - n) // 2
+    return per_block[start : start + n, start : start + n]
+
+
+def _in_square(image: np.ndarray, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """Lay a picture into the middle of a square; returns it, and bool where it is the picture and allowed."""
     height, width = image.shape[:2]
-    side = min(height, width)
-    top, left = (height - side) // 2, (width - side) // 2
-    return image[top : top + side, left : left + side]
-
-
-def _disc(side: int) -> np.ndarray:
-    """What stays in the picture however it is turned: bool (side, side)."""
-    from_middle = np.arange(side) - (side - 1) / 2
-    return np.add.outer(from_middle**2, from_middle**2) <= (side / 2) ** 2
+    side = max(height, width)
+    top, left = (side - height) // 2, (side - width) // 2
+    border = top, side - height - top, left, side - width - left
+    allowed = np.ones((height, width), bool) if mask is None else mask
+    return (
+        cv2.copyMakeBorder(image, *border, cv2.BORDER_REPLICATE),
+        cv2.copyMakeBorder(allowed.astype(np.uint8), *border, cv2.BORDER_CONSTANT, value=0).astype(bool),
+    )

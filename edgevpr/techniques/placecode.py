@@ -6,8 +6,6 @@ under every rotation too: each such *hypothesis* is one row of a matrix, the map
 for all places. Neither shifting nor turning touches the picture: both move the numbers of the grid.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 SIDE = 8  # cells along one side of the grid
@@ -29,24 +27,6 @@ def _shifts() -> np.ndarray:
 
 
 SHIFTS = _shifts()
-
-
-@dataclass(frozen=True, slots=True)
-class Hypotheses:
-    """A query as it would look from elsewhere: `matrix` float32 (R S, 64 L) holds its signs (0 where it sees nothing)
-    over the length of a code, turned by `rotations_deg` (R,) and moved by SHIFTS (S, 2), rotations outermost."""
-
-    matrix: np.ndarray
-    rotations_deg: np.ndarray
-
-    def rotation_deg(self, row: int) -> float:
-        """Counter-clockwise, as seen in the picture; the query turned by it lies on the place."""
-        return float(self.rotations_deg[row // len(SHIFTS)])
-
-    def shift(self, row: int) -> tuple[float, float]:
-        """(dx, dy) by which the turned query moves to lie on the place, in sides of the picture, x right, y down."""
-        dx, dy = SHIFTS[row % len(SHIFTS)] / SIDE
-        return float(dx), float(dy)
 
 
 def grid(blocks: np.ndarray) -> np.ndarray:
@@ -97,35 +77,36 @@ def pack(grids: np.ndarray, mean: np.ndarray) -> np.ndarray:
     return np.packbits((special(grids, mean) >= 0).reshape(len(grids), -1), axis=1)
 
 
-def hypotheses(grids: np.ndarray, seen: np.ndarray, rotations_deg: np.ndarray, mean: np.ndarray) -> Hypotheses:
-    """All rows under which a query is compared; arguments as `turned_grids` and the map give them."""
+def hypotheses(grids: np.ndarray, seen: np.ndarray, mean: np.ndarray) -> np.ndarray:
+    """A query as it would look from elsewhere: grids and `seen` of its R rotations by `turned_grids`, the map's mean ->
+    float32 (R, S, 64 L), its signs (0 where it sees nothing) over the length of a code, moved by SHIFTS (S, 2)."""
     signs = np.where(special(grids, mean, seen) >= 0, np.float32(1), np.float32(-1)) * seen[..., None]
     rotations, _, _, bins = signs.shape
-    matrix = np.zeros((rotations, len(SHIFTS), SIDE, SIDE, bins), np.float32)
-    for row, (dx, dy) in enumerate(SHIFTS.tolist()):
-        matrix[:, row, _to(dy), _to(dx)] = signs[:, _to(-dy), _to(-dx)]
-    matrix /= SIDE * SIDE * bins
-    return Hypotheses(matrix.reshape(rotations * len(SHIFTS), -1), np.asarray(rotations_deg))
+    asked = np.zeros((rotations, len(SHIFTS), SIDE, SIDE, bins), np.float32)
+    for at, (dx, dy) in enumerate(SHIFTS.tolist()):
+        asked[:, at, _to(dy), _to(dx)] = signs[:, _to(-dy), _to(-dx)]
+    asked /= SIDE * SIDE * bins
+    return asked.reshape(rotations, len(SHIFTS), -1)
 
 
-def scan(matrix: np.ndarray, codes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compare every hypothesis with every place: float32 (H, 8 B), uint8 (N, B) -> the best score (float32) and the
-    row that gave it (int32), each (N,).
+def scan(asked: np.ndarray, codes: np.ndarray) -> np.ndarray:
+    """Compare every hypothesis, float32 (R, S, 8 B), with every place, uint8 (N, B): the best score of each rotation,
+    float32 (N, R).
 
     A score is the bits that agree less those that do not, over all bits: 1 is the same picture, 0 is chance.
     """
-    best = np.empty(len(codes), np.float32)
-    row = np.empty(len(codes), np.int32)
+    rotations, shifts, _ = asked.shape
+    by_bit = np.ascontiguousarray(asked.reshape(rotations * shifts, -1).T)
+    best = np.empty((len(codes), rotations), np.float32)
     bits = np.empty((_PLACES_AT_ONCE, codes.shape[1], 8), np.float32)
-    scores = np.empty((_PLACES_AT_ONCE, len(matrix)), np.float32)
+    scores = np.empty((_PLACES_AT_ONCE, rotations * shifts), np.float32)
     for start in range(0, len(codes), _PLACES_AT_ONCE):
         part = codes[start : start + _PLACES_AT_ONCE]
-        here, count = slice(start, start + len(part)), len(part)
+        count = len(part)
         np.take(_SIGNS, part, axis=0, out=bits[:count], mode="clip")
-        np.matmul(bits[:count].reshape(count, -1), matrix.T, out=scores[:count])
-        row[here] = scores[:count].argmax(axis=1)
-        best[here] = scores[np.arange(count), row[here]]
-    return best, row
+        np.matmul(bits[:count].reshape(count, -1), by_bit, out=scores[:count])
+        np.max(scores[:count].reshape(count, rotations, shifts), axis=2, out=best[start : start + count])
+    return best
 
 
 def _sources(n: int, rotations_deg: np.ndarray) -> np.ndarray:

@@ -41,9 +41,13 @@ def town() -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
     return grounds, mean, placecode.pack(grids, mean)
 
 
-def _ask(image: np.ndarray, mean: np.ndarray, rotations_deg: np.ndarray) -> placecode.Hypotheses:
-    grids, seen = placecode.turned_grids(_blocks(image), rotations_deg)
-    return placecode.hypotheses(grids, seen, rotations_deg, mean)
+def _ask(image: np.ndarray, mean: np.ndarray, rotations_deg: np.ndarray) -> np.ndarray:
+    return placecode.hypotheses(*placecode.turned_grids(_blocks(image), rotations_deg), mean)
+
+
+def _best_shift(asked: np.ndarray, code: np.ndarray) -> list[int]:
+    """The shift (dx, dy) in cells under which one place agrees best with a query that is not turned."""
+    return placecode.SHIFTS[np.argmax(asked[0] @ (np.unpackbits(code) * 2.0 - 1))].tolist()
 
 
 def test_a_place_takes_64_bytes(town):
@@ -54,30 +58,28 @@ def test_a_place_takes_64_bytes(town):
 def test_the_same_picture_agrees_in_every_bit(town):
     grounds, mean, codes = town
     asked = _ask(_view(grounds[3]), mean, _HERE)
-    scores, rows = placecode.scan(asked.matrix, codes)
+    scores = placecode.scan(asked, codes)[:, 0]
     assert scores.argmax() == 3
     assert scores[3] == pytest.approx(1)
-    assert asked.shift(rows[3]) == (0, 0)
+    assert _best_shift(asked, codes[3]) == [0, 0]
 
 
 @pytest.mark.parametrize(("right", "down"), [(2, 0), (0, -3), (-2, 1), (1, 3)])
 def test_a_moved_camera_finds_the_place_and_how_far_it_moved(town, right, down):
     grounds, mean, codes = town
     asked = _ask(_view(grounds[5], 64 * right, 64 * down), mean, _HERE)
-    scores, rows = placecode.scan(asked.matrix, codes)
-    assert scores.argmax() == 5
+    assert placecode.scan(asked, codes).argmax() == 5
     # A camera that moved right sees the place to its left: its picture moves right to lie on the place.
-    assert asked.shift(rows[5]) == (right / 8, down / 8)
+    assert _best_shift(asked, codes[5]) == [right, down]
 
 
 @pytest.mark.parametrize("turned_deg", [30, 105, 240])
 def test_a_turned_camera_finds_the_place_and_its_rotation(town, turned_deg):
     grounds, mean, codes = town
     asked = _ask(_view(grounds[7], turned_deg=turned_deg), mean, _TURNS_DEG)
-    scores, rows = placecode.scan(asked.matrix, codes)
-    assert scores.argmax() == 7
-    assert (asked.rotation_deg(rows[7]) + turned_deg) % 360 == 0
-    assert asked.shift(rows[7]) == (0, 0)
+    scores = placecode.scan(asked, codes)
+    assert scores.max(axis=1).argmax() == 7
+    assert (_TURNS_DEG[scores[7].argmax()] + turned_deg) % 360 == 0
 
 
 def test_turning_the_grid_by_right_angles_is_turning_the_picture():
@@ -104,11 +106,10 @@ def test_what_a_mask_hides_says_nothing(town):
     seen = np.zeros((31, 31), bool)
     seen[:, :15] = True
     grids, in_view = placecode.turned_grids(_blocks(image), _HERE, seen)
-    asked = placecode.hypotheses(grids, in_view, _HERE, mean)
-    scores, rows = placecode.scan(asked.matrix, codes)
-    assert scores.argmax() == 2
-    assert asked.shift(rows[2]) == (0, 0)
-    assert abs(asked.matrix).sum(axis=1).max() == pytest.approx(0.5)
+    asked = placecode.hypotheses(grids, in_view, mean)
+    assert placecode.scan(asked, codes).argmax() == 2
+    assert _best_shift(asked, codes[2]) == [0, 0]
+    assert abs(asked).sum(axis=2).max() == pytest.approx(0.5)
 
 
 def test_the_scan_is_the_product_spelt_out(town):
@@ -116,10 +117,9 @@ def test_the_scan_is_the_product_spelt_out(town):
     rng = np.random.default_rng(1)
     codes = rng.integers(0, 256, (600, 64), dtype=np.uint8)  # two whole blocks of places and a part
     asked = _ask(_view(_picture(22)), mean, np.array([0.0, 120.0]))
-    scores, rows = placecode.scan(asked.matrix, codes)
-    every = (np.unpackbits(codes, axis=1) * 2.0 - 1) @ asked.matrix.T
-    np.testing.assert_allclose(scores, every.max(axis=1), atol=1e-6)
-    np.testing.assert_allclose(every[np.arange(600), rows], every.max(axis=1), atol=1e-6)
+    signs = np.unpackbits(codes, axis=1) * 2.0 - 1
+    expected = np.stack([(signs @ asked[turn].T).max(axis=1) for turn in range(2)], axis=1)
+    np.testing.assert_allclose(placecode.scan(asked, codes), expected, atol=1e-6)
 
 
 def test_every_shift_leaves_at_least_the_least_overlap():
@@ -131,5 +131,5 @@ def test_every_shift_leaves_at_least_the_least_overlap():
 
 def test_an_even_picture_is_compared_without_a_warning(town):
     _, mean, codes = town
-    scores, _ = placecode.scan(_ask(np.full((512, 512), 90, np.uint8), mean, _TURNS_DEG).matrix, codes)
-    assert np.isfinite(scores).all()
+    asked = _ask(np.full((512, 512), 90, np.uint8), mean, _TURNS_DEG)
+    assert np.isfinite(placecode.scan(asked, codes)).all()
