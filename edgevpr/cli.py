@@ -8,6 +8,7 @@ import sys
 from edgevpr import __version__
 from edgevpr.errors import EdgevprError
 
+_RECORDING = "a folder of images or a video file"
 _SOURCE = "a folder of images, a video file, a camera (/dev/video0) or a stream (rtsp://, udp://, tcp://, http://)"
 
 
@@ -66,6 +67,9 @@ def _parser() -> argparse.ArgumentParser:
         "--board", default="this", metavar="NAME", help="the board that will fly (default: this machine)"
     )
     _camera(build)
+    build.add_argument(
+        "--rate-hz", type=_positive, metavar="HZ", help="places a second of a video (default: every frame)"
+    )
     build.add_argument("--append", action="store_true", help="add to an existing map, going on where it broke off")
     _json(build)
     info = _add(maps, "info", "map_info", "say what a map holds")
@@ -145,20 +149,33 @@ def _parser() -> argparse.ArgumentParser:
 
 def _add(commands, name: str, command: str | None, text: str) -> argparse.ArgumentParser:
     parser = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+    # Also after the command, where everybody types it.
+    parser.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=argparse.SUPPRESS)
     if command:
         parser.set_defaults(command=command)
     return parser
 
 
 def _source(parser: argparse.ArgumentParser, required: bool) -> None:
-    parser.add_argument("--images", "--source", dest="source", required=required, metavar="SOURCE", help=_SOURCE)
+    parser.add_argument(
+        "--images",
+        "--source",
+        dest="source",
+        required=required,
+        metavar="SOURCE",
+        help=_RECORDING if required else _SOURCE,
+    )
     parser.add_argument(
         "--positions", metavar="CSV", help="file,lat,lon[,alt,yaw_deg,time] (default: beside the images)"
     )
 
 
 def _camera(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--camera", choices=("nadir", "forward"), help="straight down, or ahead (the default of a map)")
+    parser.add_argument(
+        "--camera",
+        choices=("nadir", "forward"),
+        help="straight down, or ahead (default: the map's; a new map's is forward)",
+    )
 
 
 def _matching(parser: argparse.ArgumentParser) -> None:
@@ -172,6 +189,13 @@ def _matching(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--min-score", type=float, metavar="S", help="accept from this score on")
     parser.add_argument("--min-margin", type=float, metavar="M", help="accept when this far ahead of a place elsewhere")
     parser.add_argument("--battery", metavar="PACK", help="cells and capacity of the pack, e.g. 4S5200")
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not 0 < value < float("inf"):
+        raise ValueError
+    return value
 
 
 def _json(parser: argparse.ArgumentParser) -> None:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from edgevpr.config import Config, load_config
-from edgevpr.errors import ImageError, UsageError
+from edgevpr.errors import EdgevprError, ImageError, UsageError
 
 if TYPE_CHECKING:
     from edgevpr.runtime.frames import Source
@@ -32,7 +32,8 @@ def map_build(args: Namespace) -> int:
     from edgevpr.runtime.mapping import build_map
     from edgevpr.runtime.pipeline import technique_of
 
-    source = open_source(args.source, positions=_path(args.positions), live=False)
+    step_s = 1 / args.rate_hz if args.rate_hz else None
+    source = open_source(args.source, step_s=step_s, positions=_path(args.positions), live=False)
     settings = _settings(args.param)
     if args.camera:
         settings["camera"] = args.camera
@@ -92,10 +93,14 @@ def map_merge(args: Namespace) -> int:
     for other in inputs[1:]:
         other.require(inputs[0].spec)
     with PlaceMap.create(args.out, inputs[0].spec) as merged:
-        for path, place_map in zip(args.maps, inputs, strict=True):
-            copied, already_here = merged.absorb(place_map)
-            print(f"{path}: {copied} places copied" + (f", {already_here} there already" if already_here else ""))
-            place_map.close()
+        try:
+            for path, place_map in zip(args.maps, inputs, strict=True):
+                copied, already_here = merged.absorb(place_map)
+                print(f"{path}: {copied} places copied" + (f", {already_here} there already" if already_here else ""))
+                place_map.close()
+        except EdgevprError:
+            Path(args.out).unlink()  # half a merge would look like a whole one
+            raise
         print(f"{args.out}: {len(merged)} places")
     return 0
 
@@ -108,9 +113,14 @@ def map_export(args: Namespace) -> int:
         if args.geojson == "-":
             write_geojson(place_map, sys.stdout)
             return 0
-        with open(args.geojson, "w", encoding="utf-8") as out:
+        out_path = Path(args.geojson)
+        if out_path.exists() and out_path.samefile(args.map):
+            raise UsageError(f"--geojson {out_path} is the map itself: give another name.")
+        unfinished = out_path.with_name(out_path.name + ".part")
+        with open(unfinished, "w", encoding="utf-8") as out:
             count = write_geojson(place_map, out)
-    print(f"{args.geojson}: {count} places")
+        unfinished.replace(out_path)
+    print(f"{out_path}: {count} places")
     return 0
 
 
@@ -219,6 +229,10 @@ def evaluate(args: Namespace) -> int:
     from edgevpr.runtime.progress import progress
 
     wanted = [name.strip() for name in args.techniques.split(",") if name.strip()]
+    if not wanted:
+        raise UsageError(f"--techniques names none: use some of {', '.join(techniques.names())}.")
+    if args.candidates is not None and args.candidates < 1:
+        raise UsageError(f"--candidates is {args.candidates}: compare at least 1 place in full.")
     camera = {"camera": args.camera} if args.camera else {}
     settings = {name: dict(camera) if "camera" in techniques.parameters(name) else {} for name in wanted}
     for key, value in _settings(args.param).items():
@@ -252,6 +266,8 @@ def simulate_autopilot(args: Namespace) -> int:
 def simulate_flight(args: Namespace) -> int:
     from edgevpr.simulate.flight import fly_and_write
 
+    if args.seed < 0:
+        raise UsageError(f"--seed is {args.seed}: give 0 or more.")
     print(fly_and_write(Path(args.out), args.which, args.seed))
     return 0
 

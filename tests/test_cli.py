@@ -122,6 +122,33 @@ def test_a_broken_off_map_is_continued(capsys, flight, tmp_path):
     assert (built["added"], built["already_here"], built["places"]) == (3, 3, 6)
 
 
+def test_another_flight_whose_camera_starts_its_numbers_anew_is_added(capsys, flight, tmp_path):
+    path = tmp_path / "m.gpkg"
+    run_json(capsys, "map", "build", path, "--images", flight / "ref", "--technique", "cohog", "--json")
+    built = run_json(capsys, "map", "build", path, "--images", flight / "query", "--append", "--json")
+    assert (built["added"], built["already_here"], built["places"]) == (6, 0, 12)
+
+
+@pytest.mark.parametrize("flags", [["--technique", "hog"], ["--technique", "cohog", "--matching", "thesis"]])
+def test_a_score_that_says_nothing_is_not_accepted_for_want_of_another_place(capsys, flight, tmp_path, flags):
+    small = tmp_path / "small"
+    small.mkdir()
+    shutil.copy(flight / "ref" / "0.png", small)
+    path = tmp_path / "m.gpkg"
+    run_json(capsys, "map", "build", path, "--images", small, *flags[:2], "--json")
+    found = run_json(capsys, "match", path, "--images", flight / "query", *flags[2:], "--json")
+    assert not any(each["accepted"] for each in found)
+
+
+def test_a_map_is_never_overwritten_by_its_own_export(capsys, valley):
+    before = valley.read_bytes()
+    assert refused(capsys, "map", "export", valley, "--geojson", valley) == (
+        2,
+        f"edgevpr: --geojson {valley} is the map itself: give another name.",
+    )
+    assert valley.read_bytes() == before
+
+
 def test_maps_are_merged_and_exported(capsys, flight, valley, tmp_path):
     assert main(["map", "merge", str(tmp_path / "all.gpkg"), str(valley), str(valley)]) == 0
     assert "6 there already" in capsys.readouterr().out
@@ -166,6 +193,8 @@ def test_what_the_user_gets_wrong_is_a_sentence_and_exit_code_2(capsys, flight, 
     query = flight / "query"
     config = tmp_path / "c.yaml"
     config.write_text("mach: {min_score: 1}\n")
+    date = tmp_path / "date.yaml"
+    date.write_text("map: 2024-13-45\n")
     wrong_row = tmp_path / "positions.csv"
     wrong_row.write_text("file,lat,lon\n0.png,91,8\n")
     for argv, says in [
@@ -174,11 +203,15 @@ def test_what_the_user_gets_wrong_is_a_sentence_and_exit_code_2(capsys, flight, 
         (["match", valley, "--images", query, "--battery", "lots"], "battery pack `lots`"),
         (["run", "--config", config], "did you mean `match`"),
         (["run", "--config", tmp_path / "no.yaml"], "cannot be read"),
+        (["run", "--config", date], "is not valid YAML"),
         (["run", "--map", valley], "no source of frames"),
         (["run", "--source", query], "no map"),
         (["map", "build", tmp_path / "m.gpkg", "--images", query, "--technique", "sift"], "There is no technique"),
         (["map", "build", tmp_path / "m.gpkg", "--images", query, "--param", "gt"], "write KEY=VALUE"),
         (["map", "build", tmp_path / "m.gpkg", "--images", query, "--positions", wrong_row], "line 2: lat is `91`"),
+        (["eval", "--query", query, "--ref", query, "--ground-truth", wrong_row, "--candidates", "0"], "at least 1"),
+        (["eval", "--query", query, "--ref", query, "--ground-truth", wrong_row, "--techniques", ","], "names none"),
+        (["simulate", "flight", tmp_path / "f", "--seed", "-1"], "0 or more"),
         (["profile"], "--map MAP, or --places N"),
         (["profile", "--places", "-3"], "above 0"),
         (["eval", "--query", query, "--ref", query, "--ground-truth", wrong_row], "`query_file` is missing"),

@@ -146,7 +146,7 @@ def _answers(
         with stage() as encoding:
             descriptor = technique.encode(image)
         with stage() as matching:
-            ranking = rank(technique, descriptor, place_map, index, candidates)
+            ranking = rank(technique, descriptor, place_map, index, candidates, rule.neighbour_m)
             is_accepted, _ = accepted(ranking, index, rule)
         # Slots of the index follow the order of mapping, which is that of the references' names.
         right = np.array([name in query.right for name in dataset.references])

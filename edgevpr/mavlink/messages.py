@@ -21,7 +21,7 @@ class Health(IntEnum):
 
     BOOT = mavlink.MAV_STATE_BOOT
     ACTIVE = mavlink.MAV_STATE_ACTIVE
-    CRITICAL = mavlink.MAV_STATE_CRITICAL  # it runs, but cannot do its job: no frames, no map
+    CRITICAL = mavlink.MAV_STATE_CRITICAL  # it runs, but cannot do its job: no frames come, or its main loop hangs
 
 
 class Severity(IntEnum):

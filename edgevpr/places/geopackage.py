@@ -62,9 +62,17 @@ def point_blob(lat_deg: float, lon_deg: float) -> bytes:
 
 
 def read_point(blob: bytes) -> tuple[float, float]:
-    """(lat_deg, lon_deg) of a point written by `point_blob`, or by another tool with or without an envelope."""
-    wkb = 8 + (0, 32, 48, 48, 64)[(blob[3] >> 1) & 7]  # the header, and the envelope that its flags announce
-    lon_deg, lat_deg = struct.unpack_from(("<" if blob[wkb] else ">") + "dd", blob, wkb + 5)
+    """(lat_deg, lon_deg) of a point written by `point_blob`, or by another tool with or without an envelope.
+
+    Raises ValueError for what is no point on the Earth.
+    """
+    try:
+        wkb = 8 + (0, 32, 48, 48, 64)[(blob[3] >> 1) & 7]  # the header, and the envelope that its flags announce
+        lon_deg, lat_deg = struct.unpack_from(("<" if blob[wkb] else ">") + "dd", blob, wkb + 5)
+    except (IndexError, struct.error) as error:
+        raise ValueError("its geometry is no point") from error
+    if not (abs(lat_deg) <= 90 and abs(lon_deg) <= 180):
+        raise ValueError(f"latitude {lat_deg:g}, longitude {lon_deg:g} is not on the Earth")
     return lat_deg, lon_deg
 
 
@@ -76,5 +84,8 @@ def utc_text(t_utc_s: float | None) -> str | None:
 
 
 def utc_seconds(text: str | None) -> float | None:
-    """The reverse of `utc_text`."""
-    return datetime.fromisoformat(text.replace("Z", "+00:00")).timestamp() if text else None
+    """The reverse of `utc_text`; None for a text of another form, as other tools may write."""
+    try:
+        return datetime.fromisoformat(text.replace("Z", "+00:00")).timestamp() if text else None
+    except ValueError:
+        return None

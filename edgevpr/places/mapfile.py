@@ -183,10 +183,10 @@ class PlaceMap:
         with sentences(self.path):
             if place_ids is None:
                 for row in self._db.execute(f"SELECT {_PLACE_COLUMNS} FROM places ORDER BY place_id"):
-                    yield _place(row)
+                    yield self._place(row)
                 return
             for place_id in place_ids:
-                yield _place(
+                yield self._place(
                     self._db.execute(
                         f"SELECT {_PLACE_COLUMNS} FROM places WHERE place_id = ?", (int(place_id),)
                     ).fetchone()
@@ -199,7 +199,20 @@ class PlaceMap:
                 "SELECT place_id, geom, coarse FROM places ORDER BY place_id"
             ):
                 part = self._part(coarse, self.spec.coarse, place_id)
-                yield place_id, geopackage.read_point(geom) if geom else None, part
+                if not np.isfinite(part).all():
+                    raise self._damaged(place_id)
+                yield place_id, self._point(place_id, geom), part
+
+    def fingerprint(self, source_image: str, descriptor: Descriptor) -> tuple[str, int]:
+        """What tells one frame from another: its name, and a hash of its coarse part."""
+        return source_image, hash(_blob(descriptor.coarse, self.spec.coarse))
+
+    def fingerprints(self) -> set[tuple[str, int]]:
+        """Those of all places of the map."""
+        with sentences(self.path):
+            return {
+                (name, hash(coarse)) for name, coarse in self._db.execute("SELECT source_image, coarse FROM places")
+            }
 
     def positions_and_quality(self, places: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """lat_deg, lon_deg (NaN where unknown) and quality of the first `places` places, float64 each."""
@@ -240,12 +253,30 @@ class PlaceMap:
                 self._db.execute("ROLLBACK")
             raise
 
+    def _place(self, row: tuple | None) -> Place:
+        if row is None:
+            raise MapError(f"{self.path}: a place is gone, another program changed the map: load it again.")
+        place_id, geom, time, alt_m, heading_deg, source_image, quality = row
+        point = self._point(place_id, geom)
+        position = Position(*point, alt_m) if point else None
+        return Place(place_id, source_image, position, geopackage.utc_seconds(time), heading_deg, quality)
+
+    def _point(self, place_id: int, geom: bytes | None) -> tuple[float, float] | None:
+        try:
+            return geopackage.read_point(geom) if geom else None
+        except ValueError as error:
+            raise MapError(
+                f"{self.path}: place {place_id}: {error}: correct it in the program that wrote it."
+            ) from error
+
+    def _damaged(self, place_id: int) -> MapError:
+        return MapError(
+            f"{self.path}: place {place_id} is damaged: build the map again, or delete that row with sqlite3."
+        )
+
     def _part(self, blob: bytes, spec: PartSpec, place_id: int) -> np.ndarray:
         if blob is None or len(blob) != spec.nbytes:
-            raise MapError(
-                f"{self.path}: the descriptor of place {place_id} is damaged: build the map again, or delete that "
-                "row with sqlite3."
-            )
+            raise self._damaged(place_id)
         return np.frombuffer(blob, spec.dtype).reshape(spec.shape)
 
 
@@ -290,12 +321,6 @@ def _blob(part: np.ndarray | None, spec: PartSpec | None) -> bytes | None:
     if spec is None:
         return None
     return np.ascontiguousarray(part, spec.dtype).reshape(spec.shape).tobytes()
-
-
-def _place(row: tuple) -> Place:
-    place_id, geom, time, alt_m, heading_deg, source_image, quality = row
-    position = Position(*geopackage.read_point(geom), alt_m) if geom else None
-    return Place(place_id, source_image, position, geopackage.utc_seconds(time), heading_deg, quality)
 
 
 def _compared(theirs: TechniqueSpec, ours: TechniqueSpec) -> Iterator[tuple[str, object, object]]:

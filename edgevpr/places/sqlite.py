@@ -6,13 +6,20 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from edgevpr.errors import MapError
+from edgevpr.places.geopackage import read_point
 
 
 def connect(path: Path, mode: str) -> sqlite3.Connection:
+    """Open a map file; `mode` is SQLite's: ro, rw or rwc."""
     # Autocommit: transactions are begun by hand, so that nothing is ever half committed.
-    return sqlite3.connect(
+    db = sqlite3.connect(
         f"{path.absolute().as_uri()}?mode={mode}", uri=True, isolation_level=None, timeout=5, check_same_thread=False
     )
+    # What the triggers of a spatial index call that QGIS or GDAL has added to the map (OGC 12-128r18, annex F.3).
+    db.create_function("ST_IsEmpty", 1, lambda geom: geom is None)
+    for name, axis in {"ST_MinX": 1, "ST_MaxX": 1, "ST_MinY": 0, "ST_MaxY": 0}.items():
+        db.create_function(name, 1, lambda geom, axis=axis: read_point(geom)[axis] if geom else None)
+    return db
 
 
 def start_log(db: sqlite3.Connection) -> None:

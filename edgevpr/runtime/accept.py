@@ -29,9 +29,13 @@ def accept_rule(technique: Technique, config: MatchConfig) -> AcceptRule:
 def accepted(ranking: Ranking, index: PlaceIndex, rule: AcceptRule) -> tuple[bool, str]:
     """Whether the best place is accepted, and why (not), in a few words for the log."""
     score = float(ranking.scores[0])
-    if score < rule.min_score:
+    if not score >= rule.min_score:  # so written, a score that is no number is refused as well
         return False, f"score {score:.3f} is below {rule.min_score:.3f}"
     ahead = margin(ranking, index, rule.neighbour_m)
-    if ahead < rule.min_margin:
+    if ahead is None:
+        if rule.min_score == 0:
+            return False, "there is no place elsewhere to compare with, and this score alone says nothing"
+        return True, f"score {score:.3f}; there is no place elsewhere to compare with"
+    if not ahead >= rule.min_margin:
         return False, f"only {ahead:.3f} ahead of a place elsewhere, {rule.min_margin:.3f} needed"
     return True, f"score {score:.3f}, {ahead:.3f} ahead of any place elsewhere"

@@ -17,15 +17,19 @@ class MappingResult:
 
 
 def build_map(frames: Iterable[Frame], technique: Technique, place_map: PlaceMap) -> MappingResult:
-    """Add a place for every frame whose name is not in the map yet: a map that was broken off is continued."""
+    """Add a place for every frame that is not in the map yet, so that a map that was broken off is continued.
+
+    A frame is there already when one of its name looks exactly the same: cameras start their numbers anew.
+    """
     place_map.require(technique.spec)
-    here = {place.source_image for place in place_map.places()}
+    here = place_map.fingerprints()
     added = without_position = already_here = 0
     for frame in frames:
-        if frame.name in here:
+        descriptor = technique.encode(frame.image)
+        if place_map.fingerprint(frame.name, descriptor) in here:
             already_here += 1
             continue
-        place_map.add(frame, technique.encode(frame.image))
+        place_map.add(frame, descriptor)
         added += 1
         without_position += frame.position is None
     return MappingResult(added, without_position, already_here)

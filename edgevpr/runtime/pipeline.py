@@ -5,7 +5,7 @@ from pathlib import Path
 
 from edgevpr import techniques
 from edgevpr.config import Config
-from edgevpr.errors import UsageError
+from edgevpr.errors import MapError, UsageError
 from edgevpr.places.index import PlaceIndex, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import named, rank
@@ -38,7 +38,7 @@ class Pipeline:
         with stage() as encoding:
             query = self.technique.encode(frame.image)
         with stage() as matching:
-            ranking = rank(self.technique, query, self.place_map, self.index, self.candidates)
+            ranking = rank(self.technique, query, self.place_map, self.index, self.candidates, self.rule.neighbour_m)
             is_accepted, reason = accepted(ranking, self.index, self.rule)
             (best,) = named(ranking, self.index, self.place_map, first=1)
         cost = query_cost(encoding.cost, matching.cost, self.board, self.pack, self.regulator_efficiency)
@@ -94,6 +94,11 @@ def technique_of(place_map: PlaceMap, name: str | None = None, settings: dict[st
     """The technique that a map was built with. Raises MapError where `name` or `settings` ask for another, and
     UsageError for a setting that it does not have."""
     built_with = place_map.spec
+    if built_with.name not in techniques.names():
+        raise MapError(
+            f"{place_map.path} was built with `{built_with.name}`, which this edgevpr does not have: update "
+            f"edgevpr, or build the map with one of {', '.join(techniques.names())}."
+        )
     if name in (None, built_with.name):
         technique = techniques.create(built_with.name, {**built_with.parameters, **(settings or {})})
     else:

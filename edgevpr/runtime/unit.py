@@ -25,7 +25,7 @@ def render_unit(board: Board, config_path: str | Path = DEFAULT_CONFIG) -> str:
     for key, value in {
         "# Board: ": board.name,
         "ExecStart=/opt/edgevpr/bin/edgevpr run --config ": _quoted(str(config_path)),
-        "MemoryMax=": f"{board.memory_max_mb:.0f}M",
+        "MemoryMax=": f"{board.memory_max_mb * 1e6:.0f}",
         "CPUQuota=": f"{100 * board.cpu_share * board.cores:.0f}%",
     }.items():
         text = re.sub(f"(?m)^{re.escape(key)}.*$", lambda _, line=key + value: line, text)

@@ -8,7 +8,7 @@ import pytest
 from edgevpr.errors import MapError
 from edgevpr.places.index import bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import margin, named, rank, retrieve
+from edgevpr.places.retrieve import margin, named, rank
 from edgevpr.types import Descriptor, FineMatch, Frame, PartSpec, Position, TechniqueSpec
 
 
@@ -65,7 +65,7 @@ def test_a_map_beyond_the_budget_keeps_its_best_places_in_ram_and_all_on_disk(ru
     assert np.diff(index.place_ids).max() <= 5, "what stays is spread over the whole track"
     assert "the 10 best are used; raise --budget-mb to" in caplog.messages[0]
     assert len(place_map) == 25
-    found = retrieve(technique, technique.encode(np.full((1, 1), 43)), place_map, index, first=1)
+    found = named(rank(technique, technique.encode(np.full((1, 1), 43)), place_map, index), index, place_map, 1)
     assert found[0].place.place_id in index.place_ids
 
 
@@ -89,7 +89,7 @@ def test_all_places_are_compared_unless_candidates_are_limited(ruler_map):
     found = named(everything, index, place_map, 3)
     assert [c.place.source_image for c in found] == ["44", "40", "48"]
     technique.compared = 0
-    few = retrieve(technique, query, place_map, index, candidates=3, first=None)
+    few = named(rank(technique, query, place_map, index, candidates=3), index, place_map)
     assert technique.compared == 3
     assert {c.place.source_image for c in few} == {"36", "40", "44"}  # those that round to 40
     assert few[0].place.source_image == "44"
@@ -107,13 +107,23 @@ def test_margin_is_to_the_best_place_elsewhere(ruler_map):
     assert margin(nowhere, index, 1e6) == pytest.approx(1 - 1 / 13), "without a position, neighbours are the two beside"
 
 
+def test_where_all_candidates_are_neighbours_places_elsewhere_are_compared_too(ruler_map):
+    technique, place_map = ruler_map
+    index = load_index(place_map, technique, 10_000)
+    query = technique.encode(np.full((1, 1), 43))
+    ranking = rank(technique, query, place_map, index, candidates=3, neighbour_m=150.0)
+    assert technique.compared == 3 + 5
+    assert margin(ranking, index, 150.0) is not None
+    assert named(ranking, index, place_map, 1)[0].place.source_image == "44"
+
+
 def test_a_single_place_is_ahead_of_nothing(tmp_path):
     technique = Ruler()
     image = np.full((1, 1), 5)
     with PlaceMap.create(tmp_path / "one.gpkg", technique.spec) as place_map:
         place_map.add(Frame(image, "5", 0.0), technique.encode(image))
         index = load_index(place_map, technique, 1000)
-        assert margin(rank(technique, technique.encode(image), place_map, index), index, 50.0) == 1.0
+        assert margin(rank(technique, technique.encode(image), place_map, index), index, 50.0) is None
 
 
 def test_a_descriptor_of_the_wrong_size_is_named(tmp_path):

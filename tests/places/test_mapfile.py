@@ -239,3 +239,49 @@ def test_the_map_file_is_found_by_any_path_spelling(tmp_path):
     with PlaceMap.create(folder / "m%20.gpkg", SPEC) as place_map:
         place_map.add(frame(1), descriptor(1))
     assert [entry.name for entry in Path(folder).iterdir()] == ["m%20.gpkg"]
+
+
+def test_a_spatial_index_of_another_tool_does_not_stop_mapping(map_path):
+    db = sqlite3.connect(map_path)
+    db.executescript(
+        """
+        CREATE VIRTUAL TABLE rtree_places_geom USING rtree(id, minx, maxx, miny, maxy);
+        CREATE TRIGGER rtree_places_geom_insert AFTER INSERT ON places
+        WHEN (new.geom NOT NULL AND NOT ST_IsEmpty(NEW.geom))
+        BEGIN
+          INSERT OR REPLACE INTO rtree_places_geom VALUES (NEW.place_id,
+            ST_MinX(NEW.geom), ST_MaxX(NEW.geom), ST_MinY(NEW.geom), ST_MaxY(NEW.geom));
+        END;
+        """
+    )
+    db.close()
+    with PlaceMap.open_for_adding(map_path) as place_map:
+        place_id = place_map.add(frame(11), descriptor(11))
+    (box,) = sqlite3.connect(map_path).execute("SELECT * FROM rtree_places_geom").fetchall()
+    assert box == pytest.approx((place_id, 8.0, 8.0, 50.0011, 50.0011), abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ("geom = x'4750000100'", "place 3: its geometry is no point"),
+        (f"coarse = x'{'00' * 126}007c'", "place 3 is damaged"),  # an infinity, in half precision
+        ("coarse = x'00'", "place 3 is damaged"),
+    ],
+)
+def test_what_another_program_has_spoilt_is_named(map_path, change, says):
+    db = sqlite3.connect(map_path)
+    db.execute(f"UPDATE places SET {change} WHERE place_id = 3")
+    db.commit()
+    db.close()
+    with PlaceMap.open(map_path) as place_map, pytest.raises(MapError, match=says):
+        list(place_map.coarse_parts())
+
+
+def test_a_time_of_another_form_is_no_time(map_path):
+    db = sqlite3.connect(map_path)
+    db.execute("UPDATE places SET time = '2016/06/23 10:00'")
+    db.commit()
+    db.close()
+    with PlaceMap.open(map_path) as place_map:
+        assert {place.t_utc_s for place in place_map.places()} == {None}

@@ -71,7 +71,7 @@ def test_the_committed_unit_is_that_of_the_default_board():
 def test_the_limits_are_those_of_the_board():
     board = replace(load_board("rpi-zero-2w"), name="mine", cores=8, cpu_share=0.3, memory_max_mb=777.0)
     unit = render_unit(board, "/etc/edgevpr/night.yaml")
-    assert directives(unit)["MemoryMax"] == "777M"
+    assert directives(unit)["MemoryMax"] == "777000000"
     assert directives(unit)["CPUQuota"] == "240%"
     assert directives(unit)["ExecStart"] == "/opt/edgevpr/bin/edgevpr run --config /etc/edgevpr/night.yaml"
     assert "# Board: mine\n" in unit
