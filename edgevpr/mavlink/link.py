@@ -16,11 +16,11 @@ from edgevpr.mavlink import messages
 from edgevpr.mavlink.address import LinkAddress, parse_link
 from edgevpr.mavlink.messages import Fix, Health
 from edgevpr.mavlink.outbox import Outbox
-from edgevpr.mavlink.peer import Autopilot
+from edgevpr.mavlink.peer import Autopilot, VehiclePosition
 from edgevpr.mavlink.transport import Transport, open_transport
 from edgevpr.mavlink.wire import Message, Receiver, mavlink
 
-__all__ = ["Link", "LinkAddress", "LinkStats", "parse_link"]
+__all__ = ["Link", "LinkAddress", "LinkStats", "VehiclePosition", "parse_link"]
 
 HEARTBEAT_S = 1.0
 TURN_S = 0.25  # how long the thread sleeps where nothing wakes it
@@ -52,7 +52,8 @@ class LinkStats:
 class Link:
     """Sends what it is given and a heartbeat a second, listens, and outlives every loss of the other end.
 
-    `send`, `send_fix`, `set_health` and `stats` may be called from any thread, never block and never raise.
+    `send`, `send_fix`, `set_health`, `vehicle_position` and `stats` may be called from any thread, never block and
+    never raise.
     """
 
     def __init__(self, address: LinkAddress, component_id: int = 197, clock: Callable[[], float] = time.monotonic):
@@ -105,6 +106,11 @@ class Link:
     def set_health(self, health: Health) -> None:
         """Set what the heartbeats of the next ten seconds say; a caller that falls silent is reported as critical."""
         self._health, self._health_set_s = health, self._clock()
+
+    def vehicle_position(self, max_age_s: float) -> VehiclePosition | None:
+        """Where the autopilot says it is; None where it does not know or last said so more than `max_age_s` ago."""
+        position = self._autopilot.position
+        return position if position and self._clock() - position.t_heard_s <= max_age_s else None
 
     def stats(self) -> LinkStats:
         transport = self._transport

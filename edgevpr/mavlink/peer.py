@@ -3,6 +3,7 @@
 import logging
 import math
 from collections import Counter
+from dataclasses import dataclass
 
 from edgevpr.mavlink.messages import AUTOPILOT, POSITION_FIX
 from edgevpr.mavlink.wire import Message, mavlink
@@ -19,12 +20,25 @@ _EXPLANATIONS = {
 }
 
 
+@dataclass(frozen=True, slots=True)
+class VehiclePosition:
+    """Where the autopilot believes to be; `alt_m` above sea level, `heading_deg` 0..360 or None where it does not know,
+    `t_heard_s` on the clock of the link."""
+
+    lat_deg: float
+    lon_deg: float
+    alt_m: float
+    heading_deg: float | None
+    t_heard_s: float
+
+
 class Autopilot:
     """Fed with all that arrives; pinned to the first autopilot heard, so that no other vehicle is ever addressed."""
 
     def __init__(self, own_component: int) -> None:
         self.system_id: int | None = None
         self.acks: Counter[str] = Counter()  # answers to our fixes, by name of the result
+        self.position: VehiclePosition | None = None  # the last one heard, however old
         self._own_component = own_component
         self._heard_s = -math.inf
         self._last_result: int | None = None
@@ -44,8 +58,12 @@ class Autopilot:
                 log.info("autopilot heard: system %d", system_id)
             self._heard_s = now_s
             return True
-        if self.system_id is not None and self._answers_our_fix(message):
+        if self.system_id is None:
+            return False
+        if self._answers_our_fix(message):
             self._hear_result(message.result)
+        elif message.get_type() == "GLOBAL_POSITION_INT":
+            self.position = _position(message, now_s)
         return False
 
     def _answers_our_fix(self, message: Message) -> bool:
@@ -63,3 +81,11 @@ class Autopilot:
             level = logging.INFO if result == mavlink.MAV_RESULT_ACCEPTED else logging.WARNING
             log.log(level, "the autopilot's answer to position fixes: %s (%s)", name, _EXPLANATIONS.get(result, "?"))
             self._last_result = result
+
+
+def _position(message: Message, now_s: float) -> VehiclePosition | None:
+    """None for 0, 0, which is what an autopilot without a position says, and for what is not on Earth."""
+    if (message.lat == 0 and message.lon == 0) or abs(message.lat) > 90e7 or abs(message.lon) > 180e7:
+        return None
+    heading_deg = message.hdg / 100 if message.hdg <= 36_000 else None  # 65535: unknown
+    return VehiclePosition(message.lat / 1e7, message.lon / 1e7, message.alt / 1e3, heading_deg, now_s)

@@ -1,6 +1,7 @@
 """The part of a map that is in RAM: one row a place, in arrays made once, never larger than the budget."""
 
 import logging
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import compress, islice
 
@@ -48,8 +49,10 @@ def bytes_per_place(spec: TechniqueSpec) -> int:
     return spec.row.nbytes + _BYTES_BESIDE_ROW
 
 
-def load_index(place_map: PlaceMap, technique: Technique, budget_bytes: int) -> PlaceIndex:
-    """Read the coarse parts of a map, packed as the technique wants them.
+def load_index(
+    place_map: PlaceMap, technique: Technique, budget_bytes: int, into: PlaceIndex | None = None
+) -> PlaceIndex:
+    """Read the coarse parts of a map, packed as the technique wants them, into new arrays or those of `into`.
 
     Where the budget does not hold them all, the best places are loaded (see `thin`) and the map file keeps the rest.
     Raises MapError for a map without places, and for a budget that holds none.
@@ -63,13 +66,8 @@ def load_index(place_map: PlaceMap, technique: Technique, budget_bytes: int) -> 
         raise MapError(
             f"{place_map.path}: a place takes {each} bytes in RAM and the budget is {budget_bytes}: raise --budget-mb."
         )
-    index = PlaceIndex(
-        np.empty(capacity, np.int64),
-        np.full(capacity, np.nan),
-        np.full(capacity, np.nan),
-        np.empty((capacity, *spec.row.shape), spec.row.dtype),
-        place_map.mean_coarse() if spec.packed else None,
-    )
+    if into is None:
+        into = empty_index(spec, capacity, place_map.mean_coarse() if spec.packed else None)
     # A map that another program is adding to may have grown since it was counted: the new places wait for next time.
     parts = islice(place_map.coarse_parts(), places)
     if capacity < places:
@@ -81,9 +79,29 @@ def load_index(place_map: PlaceMap, technique: Technique, budget_bytes: int) -> 
         kept = np.zeros(places, bool)
         kept[best_places(*place_map.positions_and_quality(places), capacity)] = True
         parts = compress(parts, kept)
+    fill(into, parts, technique)
+    return into
+
+
+def empty_index(spec: TechniqueSpec, capacity: int, mean: np.ndarray | None) -> PlaceIndex:
+    """Arrays for `capacity` places: the system gives the memory of ids and rows only as they are written."""
+    return PlaceIndex(
+        np.empty(capacity, np.int64),
+        np.full(capacity, np.nan),
+        np.full(capacity, np.nan),
+        np.empty((capacity, *spec.row.shape), spec.row.dtype),
+        mean,
+    )
+
+
+def fill(
+    index: PlaceIndex, parts: Iterator[tuple[int, tuple[float, float] | None, np.ndarray]], technique: Technique
+) -> None:
+    """Write as many `parts` (of `PlaceMap.coarse_parts`) as the index has slots, a block at a time."""
+    spec = technique.spec
     waiting = np.empty((_PACKED_AT_ONCE, *spec.coarse.shape), spec.coarse.dtype)
-    for start in range(0, capacity, _PACKED_AT_ONCE):
-        count = min(_PACKED_AT_ONCE, capacity - start)
+    for start in range(0, len(index), _PACKED_AT_ONCE):
+        count = min(_PACKED_AT_ONCE, len(index) - start)
         for at, (place_id, position, coarse) in enumerate(islice(parts, count)):
             index.place_ids[start + at] = place_id
             if position:
@@ -91,4 +109,3 @@ def load_index(place_map: PlaceMap, technique: Technique, budget_bytes: int) -> 
             waiting[at] = coarse
         rows = technique.pack(waiting[:count], index.mean) if spec.packed else waiting[:count]
         index.rows[start : start + count] = rows
-    return index

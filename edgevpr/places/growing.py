@@ -1,0 +1,93 @@
+"""An index that takes new places while it is in use: it never outgrows its arrays, and gives up its worst places."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from edgevpr.errors import MapError
+from edgevpr.places.index import PlaceIndex, bytes_per_place, empty_index, fill, load_index
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.thin import best_places
+from edgevpr.types import Position, Technique
+
+_MOVED_AT_ONCE = 256
+
+
+class GrowingIndex:
+    """The places of an open map, with room for more. `index` is what retrieval takes: views, valid until the next add.
+
+    When all slots are taken, the best three quarters stay (see `thin`); the map file keeps every place.
+    """
+
+    def __init__(self, place_map: PlaceMap, technique: Technique, budget_bytes: int, room: int) -> None:
+        """Read the map, which may be empty, and leave room for `room` more places as far as the budget allows.
+
+        Raises MapError for a budget that holds no place.
+        """
+        each = bytes_per_place(technique.spec)
+        self._in_file = len(place_map)
+        capacity = min(budget_bytes // each, self._in_file + room)
+        if not capacity:
+            raise MapError(
+                f"{place_map.path}: a place takes {each} bytes in RAM and the budget is {budget_bytes}: "
+                "raise --budget-mb."
+            )
+        self._map, self._technique = place_map, technique
+        self._packs = technique.spec.packed is not None
+        self._mean = place_map.mean_coarse() if self._packs else None
+        self._mean_of = self._in_file  # places
+        self._slots = empty_index(technique.spec, capacity, self._mean)
+        self._taken = 0
+        if self._in_file:
+            self._taken = min(self._in_file, capacity)
+            load_index(place_map, technique, self._taken * each, into=self.index)
+
+    @property
+    def index(self) -> PlaceIndex:
+        taken, slots = self._taken, self._slots
+        return PlaceIndex(
+            slots.place_ids[:taken], slots.lat_deg[:taken], slots.lon_deg[:taken], slots.rows[:taken], self._mean
+        )
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all slots, taken or not: what the index will ever take."""
+        return self._slots.nbytes
+
+    def add(self, place_id: int, position: Position | None, coarse: np.ndarray) -> None:
+        """Take a place that `PlaceMap.add` has confirmed; ids grow. Raises MapError where the file cannot be read."""
+        if self._taken == len(self._slots):
+            self._thin()
+        at, slots = self._taken, self._slots
+        slots.place_ids[at] = place_id
+        slots.lat_deg[at], slots.lon_deg[at] = (position.lat_deg, position.lon_deg) if position else (np.nan, np.nan)
+        slots.rows[at] = self._technique.pack(coarse[None], self._mean)[0] if self._packs else coarse
+        self._taken += 1
+        self._in_file += 1
+        # Rows are packed by their difference from the mean, which a few first places do not tell.
+        if self._packs and self._in_file >= 2 * self._mean_of:
+            self._repack()
+
+    def _thin(self) -> None:
+        index = self.index
+        # Quality is in the file alone: this happens too seldom for four bytes a place in RAM.
+        quality = np.fromiter((place.quality for place in self._map.places(index.place_ids)), float, len(index))
+        kept = best_places(index.lat_deg, index.lon_deg, quality, 3 * len(index) // 4, index.place_ids)
+        # A slot moves down or stays, so what is overwritten has been moved already or is given up.
+        for start in range(0, len(kept), _MOVED_AT_ONCE):
+            block = kept[start : start + _MOVED_AT_ONCE]
+            for array in (index.place_ids, index.lat_deg, index.lon_deg, index.rows):
+                array[start : start + len(block)] = array[block]
+        self._taken = len(kept)
+
+    def _repack(self) -> None:
+        self._mean, self._mean_of = self._map.mean_coarse(), self._in_file
+        fill(self.index, self._held_parts(), self._technique)
+
+    def _held_parts(self) -> Iterator[tuple[int, tuple[float, float] | None, np.ndarray]]:
+        held = iter(self.index.place_ids.tolist())
+        wanted = next(held, None)
+        for part in self._map.coarse_parts():
+            if part[0] == wanted:
+                yield part
+                wanted = next(held, None)

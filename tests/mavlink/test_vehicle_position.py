@@ -1,0 +1,76 @@
+"""Where the autopilot says it is: from the pinned autopilot only, only while fresh, and never at 0, 0."""
+
+import pytest
+from mavlink_peers import Peer, TurnedClock, UdpPort, wait_until
+
+from edgevpr.mavlink.link import Link, VehiclePosition, parse_link
+from edgevpr.mavlink.wire import mavlink
+
+
+@pytest.fixture
+def clock():
+    return TurnedClock()
+
+
+@pytest.fixture
+def link_and_peer(clock):
+    port = UdpPort()
+    with Link(parse_link(f"udpout:127.0.0.1:{port.number}"), clock=clock) as link:
+        peer = Peer(port, system_id=7)
+        peer.expect("HEARTBEAT")
+        yield link, peer
+    port.close()
+
+
+def say(link, peer, lat_deg, lon_deg, hdg=9050, **sender):
+    before = link.stats().received.get("GLOBAL_POSITION_INT", 0)
+    peer.send(
+        mavlink.MAVLink_global_position_int_message(
+            0, round(lat_deg * 1e7), round(lon_deg * 1e7), 312_500, 80_000, 0, 0, 0, hdg
+        ),
+        **sender,
+    )
+    wait_until(lambda: link.stats().received.get("GLOBAL_POSITION_INT", 0) == before + 1, "the message arrives")
+
+
+def test_the_position_of_the_pinned_autopilot_is_known_while_it_is_fresh(link_and_peer, clock):
+    link, peer = link_and_peer
+    peer.heartbeat()
+    wait_until(lambda: link.stats().autopilot_heard)
+    assert link.vehicle_position(1.0) is None
+    say(link, peer, 50.1234567, -14.5)
+    expected = VehiclePosition(50.1234567, -14.5, 312.5, 90.5, clock.now_s)
+    assert wait_until(lambda: link.vehicle_position(1.0)) == expected
+    clock.now_s += 1.0
+    assert link.vehicle_position(1.0) == expected
+    clock.now_s += 0.1
+    assert link.vehicle_position(1.0) is None
+    say(link, peer, 50.2, -14.5, hdg=65535)
+    assert wait_until(lambda: link.vehicle_position(1.0)).heading_deg is None
+
+
+def test_nobody_else_says_where_we_are(link_and_peer):
+    link, peer = link_and_peer
+    another = {"system_id": 9, "component_id": 1}
+    peer.send(mavlink.MAVLink_global_position_int_message(0, 1, 1, 0, 0, 0, 0, 0, 0), **another)
+    peer.heartbeat()
+    wait_until(lambda: link.stats().autopilot_heard)
+    say(link, peer, 1.0, 1.0, **another)
+    say(link, peer, 2.0, 2.0, component_id=190)  # a ground station's component
+    say(link, peer, 3.0, 3.0)
+    assert wait_until(lambda: link.vehicle_position(1.0)).lat_deg == 3.0
+    say(link, peer, 4.0, 4.0, **another)
+    say(link, peer, 5.0, 5.0, component_id=190)
+    say(link, peer, 3.0, 3.0)  # messages are counted before they are heard: the last but one has been by now
+    assert link.vehicle_position(1.0).lat_deg == 3.0
+
+
+@pytest.mark.parametrize("nowhere", [(0.0, 0.0), (91.0, 8.0), (50.0, 181.0)])
+def test_a_position_lost_is_not_remembered(link_and_peer, nowhere):
+    link, peer = link_and_peer
+    peer.heartbeat()
+    wait_until(lambda: link.stats().autopilot_heard)
+    say(link, peer, 50.0, 8.0)
+    wait_until(lambda: link.vehicle_position(1.0))
+    say(link, peer, *nowhere)
+    wait_until(lambda: link.vehicle_position(1.0) is None)

@@ -1,0 +1,133 @@
+"""An index that grows in flight: within its budget, with its best places, and no different from one loaded afresh."""
+
+import tracemalloc
+
+import numpy as np
+import pytest
+
+from edgevpr.errors import MapError
+from edgevpr.places.growing import GrowingIndex
+from edgevpr.places.index import bytes_per_place, load_index
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.retrieve import rank
+from edgevpr.techniques import create
+from edgevpr.types import Descriptor, FineMatch, Frame, PartSpec, Position, TechniqueSpec
+
+
+class Signs:
+    """Packs as cohog does, simply: the sign of what a place has more of than the mean of the map."""
+
+    spec = TechniqueSpec("signs", {}, PartSpec((256,), "<f4"), None, None, PartSpec((256,), "<i1"))
+    candidates = 5
+    min_score = min_margin = 0.0
+
+    def pack(self, coarse, mean):
+        return np.where(coarse > mean, 1, -1).astype("<i1")
+
+    def coarse_scores(self, query, rows, mean):
+        asked = self.pack(query.coarse, mean)
+        return (rows @ asked.astype(np.float32) / 256).astype(np.float32), None
+
+    def match(self, query, fine, hypothesis):
+        return FineMatch(0.0)
+
+
+def descriptor(number, quality=1.0):
+    # A strong common part: without the mean, all signs would be alike.
+    return Descriptor(5 + np.random.default_rng(number).random(256, np.float32), quality=quality)
+
+
+def learn(place_map, growing, numbers, quality=lambda number: 1.0):
+    for number in numbers:
+        position = Position(50.0 + number * 1e-4, 8.0) if number % 7 else None
+        made = descriptor(number, quality(number))
+        place_id = place_map.add(Frame(np.zeros((1, 1)), f"{number}", 0.0, None, position), made)
+        growing.add(place_id, position, made.coarse)
+
+
+@pytest.fixture
+def empty_map(tmp_path):
+    with PlaceMap.create(tmp_path / "m.gpkg", Signs.spec) as place_map:
+        yield place_map
+
+
+def assert_same(index, fresh):
+    for name in ("place_ids", "lat_deg", "lon_deg", "rows", "mean"):
+        np.testing.assert_array_equal(getattr(index, name), getattr(fresh, name))
+
+
+def test_an_index_that_began_empty_is_what_a_fresh_load_gives_whenever_it_has_doubled(empty_map):
+    growing = GrowingIndex(empty_map, Signs(), 10**6, room=1000)
+    assert len(growing.index) == 0
+    learn(empty_map, growing, range(127))
+    fresh = load_index(empty_map, Signs(), 10**6)
+    assert not np.array_equal(growing.index.mean, fresh.mean), "the mean of 64 places until there are 128"
+    learn(empty_map, growing, [127])
+    fresh = load_index(empty_map, Signs(), 10**6)
+    assert_same(growing.index, fresh)
+    for number in (0, 64, 127):
+        ours = rank(Signs(), descriptor(number), empty_map, growing.index)
+        theirs = rank(Signs(), descriptor(number), empty_map, fresh)
+        assert ours.slots[0] == theirs.slots[0] == number
+        np.testing.assert_array_equal(ours.scores, theirs.scores)
+
+
+def test_a_map_with_places_is_loaded_as_ever_and_goes_on(empty_map):
+    learn(empty_map, GrowingIndex(empty_map, Signs(), 10**6, room=50), range(30))
+    growing = GrowingIndex(empty_map, Signs(), 10**6, room=50)
+    assert_same(growing.index, load_index(empty_map, Signs(), 10**6))
+    learn(empty_map, growing, range(30, 40))
+    assert growing.index.place_ids.tolist() == list(range(1, 41))
+    assert rank(Signs(), descriptor(35), empty_map, growing.index).slots[0] == 35
+
+
+def test_a_full_index_keeps_its_best_places_and_the_file_keeps_all(empty_map):
+    growing = GrowingIndex(empty_map, Signs(), 40 * bytes_per_place(Signs.spec) + 5, room=10**6)
+    learn(empty_map, growing, range(400), quality=lambda number: 0.9 if number % 2 else 0.1)
+    index = growing.index
+    assert len(empty_map) == 400
+    assert 30 < len(index) <= 40
+    assert growing.nbytes <= 40 * bytes_per_place(Signs.spec) + 5
+    assert index.place_ids[0] == 1, "age does not matter"
+    assert np.mean((index.place_ids - 1) % 2) > 0.7, "places that say much stay"
+    assert np.diff(index.place_ids).max() < 100, "and what stays is spread over the track"
+    parts = {place_id: (position, part) for place_id, position, part in empty_map.coarse_parts()}
+    for slot, place_id in enumerate(index.place_ids.tolist()):
+        position, part = parts[place_id]
+        np.testing.assert_array_equal(index.rows[slot], Signs().pack(part, index.mean))
+        np.testing.assert_array_equal([index.lat_deg[slot], index.lon_deg[slot]], position or [np.nan, np.nan])
+
+
+def test_the_budget_holds_at_every_moment_of_growing(empty_map):
+    technique, places = Signs(), 4000
+    each = bytes_per_place(technique.spec)
+    tracemalloc.start()
+    growing = GrowingIndex(empty_map, technique, places * each, room=10**6)
+    empty_map._db.execute("PRAGMA synchronous = OFF")  # four thousand syncs would only take time
+    learn(empty_map, growing, range(places))
+    tracemalloc.reset_peak()
+    learn(empty_map, growing, range(places, places + 10))  # thins
+    peak_bytes = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(growing.index) == 3 * places // 4 + 10
+    assert growing.nbytes <= places * each
+    # Choosing takes lists of all places for a moment; a second copy of the rows would not fit under this.
+    assert peak_bytes < places * each + 600 * places + 200_000
+
+
+def test_a_budget_that_holds_no_place_is_refused(empty_map):
+    with pytest.raises(MapError, match="raise --budget-mb"):
+        GrowingIndex(empty_map, Signs(), bytes_per_place(Signs.spec) - 1, room=10)
+
+
+def test_cohog_grows_as_it_would_be_loaded(tmp_path):
+    technique = create("cohog")
+    spec = technique.spec
+    rng = np.random.default_rng(1)
+    with PlaceMap.create(tmp_path / "c.gpkg", spec) as place_map:
+        growing = GrowingIndex(place_map, technique, 10**6, room=100)
+        for number in range(8):
+            coarse = rng.random(spec.coarse.shape).astype(spec.coarse.dtype)
+            made = Descriptor(coarse, np.zeros(spec.fine.shape, spec.fine.dtype))
+            growing.add(place_map.add(Frame(np.zeros((1, 1)), f"{number}", 0.0), made), None, coarse)
+        assert_same(growing.index, load_index(place_map, technique, 10**6))
