@@ -42,6 +42,7 @@ class Autopilot:
         self._own_component = own_component
         self._heard_s = -math.inf
         self._last_result: int | None = None
+        self._warned = False
 
     def listens(self, now_s: float) -> bool:
         """Say whether its heartbeat was heard in the last five seconds."""
@@ -50,6 +51,7 @@ class Autopilot:
     def hear(self, message: Message, now_s: float) -> bool:
         """Take note of a message; True for the autopilot's heartbeat."""
         system_id = message.get_srcSystem()
+        self._warn_of_another(message)
         if message.get_srcComponent() != AUTOPILOT or system_id == 0 or self.system_id not in (None, system_id):
             return False
         if message.get_type() == "HEARTBEAT" and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID:
@@ -72,6 +74,23 @@ class Autopilot:
             and message.command == POSITION_FIX
             and message.target_component in (0, self._own_component)  # 0: to whom it may concern
         )
+
+    def _warn_of_another(self, message: Message) -> None:
+        """Once: two vehicles on one link are an accident waiting to happen."""
+        if (
+            not self._warned
+            and message.get_type() == "HEARTBEAT"
+            and message.get_srcComponent() == AUTOPILOT
+            and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID
+            and self.system_id not in (None, message.get_srcSystem())
+        ):
+            self._warned = True
+            log.warning(
+                "a second autopilot, system %d, is on this link; fixes go to system %d only: give each vehicle a link "
+                "of its own",
+                message.get_srcSystem(),
+                self.system_id,
+            )
 
     def _hear_result(self, result: int) -> None:
         known = mavlink.enums["MAV_RESULT"].get(result)

@@ -102,10 +102,14 @@ def fill(
     waiting = np.empty((_PACKED_AT_ONCE, *spec.coarse.shape), spec.coarse.dtype)
     for start in range(0, len(index), _PACKED_AT_ONCE):
         count = min(_PACKED_AT_ONCE, len(index) - start)
+        read = 0
         for at, (place_id, position, coarse) in enumerate(islice(parts, count)):
+            read += 1
             index.place_ids[start + at] = place_id
             if position:
                 index.lat_deg[start + at], index.lon_deg[start + at] = position
             waiting[at] = coarse
+        if read < count:
+            raise MapError("The map has lost places while it was read, another program changes it: load it again.")
         rows = technique.pack(waiting[:count], index.mean) if spec.packed else waiting[:count]
         index.rows[start : start + count] = rows

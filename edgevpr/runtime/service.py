@@ -56,7 +56,7 @@ class Flight:
             while not (self._stopping or self._source.ended):
                 self._turn()
         except _Stop:
-            pass
+            self._recognising = False  # a second signal finds nothing more to break off
 
     def _turn(self) -> None:
         now_s = time.monotonic()
@@ -145,11 +145,27 @@ def fly(config: Config, positions: Path | None = None) -> int:
         _log.info("version %s on %s", __version__, pipeline.board.title)
         _log.info("%s", pipeline.reason)
         flight_log = stack.enter_context(FlightLog(config.log.path))
-        flight_log.write("start", **start_fields(config, pipeline.board.name, pipeline.technique.spec))
+        board, rate_hz = pipeline.board, config.source.rate_hz or pipeline.board.rate_hz
+        if not board.verified:
+            _log.warning("mAh are estimates: the power of %s is unverified (%s)", board.title, board.source)
+        decided = {
+            "reason": pipeline.reason,
+            "rule": pipeline.rule,
+            "candidates": pipeline.candidates,
+            "accuracy_m": pipeline.accuracy_m,
+            "rate_hz": rate_hz,
+            "idle_w": board.idle_w,
+            "full_w": board.full_w,
+            "power_verified": board.verified,
+        }
+        flight_log.write("start", **start_fields(config, board.name, pipeline.technique.spec), decided=decided)
         link = stack.enter_context(Link(address, config.mavlink.component_id)) if address else None
-        rate_hz = config.source.rate_hz or pipeline.board.rate_hz
         source = open_source(config.source.uri, step_s=1 / rate_hz, positions=positions, live=True)
         stack.callback(source.close)
+        if link and config.mavlink.send_fixes and source.total:
+            _log.warning(
+                "%s is a recording: the fixes sent say where it was made, not where you are", config.source.uri
+            )
         flight = Flight(pipeline, source, flight_log, link, config)
         with _signals(flight):
             notify(READY=1)

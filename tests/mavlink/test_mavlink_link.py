@@ -79,6 +79,17 @@ def test_a_main_loop_that_falls_silent_is_not_reported_as_healthy(link, peer, cl
     assert peer.expect("HEARTBEAT").system_status == mavlink.MAV_STATE_ACTIVE
 
 
+def test_a_second_autopilot_on_the_link_is_told_once_and_never_addressed(link, peer, clock, port, caplog):
+    heard(link, peer)
+    stranger = Peer(port, system_id=9)
+    stranger.heartbeat()
+    stranger.heartbeat()
+    wait_until(lambda: "a second autopilot, system 9" in caplog.text, "the warning")
+    link.send_fix(fix_at(clock()))
+    assert peer.expect("COMMAND_INT").target_system == 7
+    assert caplog.text.count("a second autopilot") == 1
+
+
 def test_the_link_takes_the_autopilots_system_id_for_its_own_and_addresses_it(link, peer, clock):
     link.send(text("before"))
     assert peer.expect("STATUSTEXT").get_srcSystem() == 1
