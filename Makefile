@@ -21,11 +21,13 @@ lint: $(VENV)/installed
 # Figures on real image sets (../shared/data, or the folder named in EDGEVPR_DATA) into benchmarks/results/.
 results: $(VENV)/installed
 	$(BIN)/python benchmarks/run_sets.py
+	$(BIN)/python benchmarks/readme.py
 
 # Speed and memory against the published way, into benchmarks/results/.
 bench: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[bench]'
 	$(BIN)/python benchmarks/bench.py
+	$(BIN)/python benchmarks/readme.py
 
 clean:
 	rm -rf $(VENV) demo_out dist build

@@ -61,10 +61,10 @@ class TechniqueSpec:
 
 @dataclass(frozen=True, slots=True)
 class Descriptor:
-    """One encoded image. `coarse` makes one row of the index in RAM (see `Technique.pack`); `fine` lives in the map file
-    and is read for candidates only; `regions` are what a query asks with, and `good` (bool, one a region) says which of
-    them speak; `quality` (0..1) is the share of the image that says anything. `picture` is kept for a query that may
-    have to be turned, and `asking` collects what was made of it."""
+    """One encoded image. `coarse` makes one row of the index in RAM (see `Technique.pack`); `fine` lives in the map
+    file and is read for candidates only; `regions` are what a query asks with, and `good` (bool, one a region) says
+    which of them speak; `quality` (0..1) is the share of the image that says anything. `picture` is kept for a query
+    that may have to be turned, and `asking` collects what was made of it."""
 
     coarse: np.ndarray
     fine: np.ndarray | None = None
