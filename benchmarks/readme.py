@@ -27,8 +27,9 @@ def recall() -> str:
             continue
         found = content["techniques"]
         shares = [f"{found[form]['recall_at_1']:.2f}" if form in found else "-" for form in FORMS]
-        flown = found.get("cohog", found["hog"])
-        accepted = f"{flown['accepted']} of {flown['queries']}, {flown['accepted_wrong']} wrong"
+        name = "cohog" if "cohog" in found else "hog"
+        flown = found[name]
+        accepted = f"`{name}`: {flown['accepted']} of {flown['queries']}, {flown['accepted_wrong']} wrong"
         rows.append([f"{content['set']} ({content['use']})", *shares, accepted])
     heads = ("set", "`hog`", "`cohog`, thesis", "`cohog`, exact vote", "**`cohog`, as flown**", "accepted in flight")
     return f"Recall@1, made by `make results`:\n\n{markdown(heads, rows)}"

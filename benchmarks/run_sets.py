@@ -1,4 +1,4 @@
-"""Measure hog and cohog on every image set of a folder: `make results`.
+"""Measure hog, and cohog in three forms, on every image set of a folder: `make results`.
 
 Writes one JSON file a set and a summary, `sets.md`, into benchmarks/results/. The sets are not part of edgevpr; each is
 a folder with query/, ref/, ground_truth.csv and, where GPS is known, positions.csv.
@@ -36,7 +36,7 @@ LEFT_OUT = {
     "grief_stromovka_monthly": (TECHNIQUES, FIVE_PLACES),
     "nordland_tiny": (
         ("cohog", "cohog_exact", "cohog_thesis"),
-        "64x32 pixels are too few for its regions, and 994 x 994 comparisons in full take a quarter of an hour",
+        "64x32 pixels are too few for its regions",
     ),
 }
 
@@ -214,7 +214,7 @@ figure.
 * P@100%R: precision with the threshold at the lowest-scoring right match. R@100%P: recall with the threshold above the
   highest-scoring wrong one. AUC, EP: equations 2.3 and 2.4 of the thesis.
 * ROC: the chance that a right match scores higher than a wrong one; 0.5 means that the score by itself tells nothing.
-* PCU: P@100%R x log10(t_e,max / t_e + 9), where t_e,max is the slower encoder of the two on the same set.
+* PCU: P@100%R x log10(t_e,max / t_e + 9), where t_e,max is the slowest encoder on the same set.
 * accepted: queries that would have moved the aircraft by the technique's own rule; in brackets, how many of them would
   have moved it to a wrong place.
 

@@ -66,13 +66,7 @@ def open_pipeline(config: Config) -> Pipeline:
     technique = technique_of(place_map, config.technique, {key: value for key, value in wanted.items() if value})
     budget_mb = config.memory.budget_mb or board.budget_mb
     index = load_index(place_map, technique, int(budget_mb * 1e6))
-    rate_hz = config.source.rate_hz or board.rate_hz
     candidates = config.match.candidates or technique.candidates
-    probed = probe(technique)
-    if technique.spec.fine:
-        probed = replace(probed, candidates=candidates)
-    costs = on_board(probed, load_board("this"), board)
-    found = fit(board, costs, len(index), rate_hz, budget_mb)
     why = "the map was built with it" if config.technique is None else "it was named"
     left_out = len(place_map) - len(index)
     thinned = f"{left_out} places are left to the map file; " if left_out else ""
@@ -86,8 +80,21 @@ def open_pipeline(config: Config) -> Pipeline:
         pack,
         config.battery.regulator_efficiency,
         max(config.mavlink.min_accuracy_m, index.spacing_m() or 0.0),
-        f"technique {technique.spec.name}: {why}; {thinned}{described(board, found, len(index), rate_hz, budget_mb)}",
+        f"technique {technique.spec.name}: {why}; {thinned}"
+        f"{_affordable(technique, board, config, len(index), candidates)}",
     )
+
+
+def _affordable(technique: Technique, board: Board, config: Config, places: int, candidates: int) -> str:
+    """What the technique takes of the board, tried here and now, in a line: no reason not to fly."""
+    rate_hz, budget_mb = config.source.rate_hz or board.rate_hz, config.memory.budget_mb or board.budget_mb
+    try:
+        costs = on_board(probe(technique), load_board("this"), board)
+    except (MapError, OSError) as error:  # the trial map needs a little room for temporary files
+        return f"what it takes could not be tried ({error})"
+    if technique.spec.fine:
+        costs = replace(costs, candidates=candidates)
+    return described(board, fit(board, costs, places, rate_hz, budget_mb), places, rate_hz, budget_mb)
 
 
 def technique_of(place_map: PlaceMap, name: str | None = None, settings: dict[str, str] | None = None) -> Technique:
