@@ -29,8 +29,11 @@ class FlightLog:
     missing. Every write tries again, and the first one that succeeds is preceded by a line of kind "gap".
     """
 
-    def __init__(self, path: str | Path | None, clock: Callable[[], float] = time.monotonic) -> None:
-        """Open for appending. Raises EdgevprError where the file cannot be opened."""
+    def __init__(
+        self, path: str | Path | None, clock: Callable[[], float] = time.monotonic, wait: bool = False
+    ) -> None:
+        """Open for appending. Raises EdgevprError where the file cannot be opened; with `wait`, for a service that may
+        be started again in the air, it is tried again with every line instead."""
         self.path = path
         self.state: str | None = None
         self.lost_lines = 0
@@ -41,6 +44,9 @@ class FlightLog:
             try:
                 self._file = _open(path)
             except OSError as error:
+                if wait:
+                    self._note_trouble(error)
+                    return
                 raise EdgevprError(
                     f"The flight log {path} cannot be opened ({error.strerror}): give a file in a folder that is there "
                     "and may be written to."
@@ -92,17 +98,20 @@ class FlightLog:
 
     def _lost_one(self, error: OSError) -> None:
         self.lost_lines += 1
+        self._note_trouble(error)
+        # The medium may be another one when it comes back: it is opened anew.
+        if self._file is not None:
+            with suppress(OSError):
+                self._file.close()
+            self._file = None
+
+    def _note_trouble(self, error: OSError) -> None:
         if self.state is None:
             self.state = (
                 f"The flight log {self.path} cannot be written ({error.strerror}): make room or put the medium back; "
                 "the flight goes on without it."
             )
             _log.warning("%s", self.state)
-        # The medium may be another one when it comes back: it is opened anew.
-        if self._file is not None:
-            with suppress(OSError):
-                self._file.close()
-            self._file = None
 
     def _say_recovered(self) -> None:
         if self.state is not None:

@@ -2,6 +2,7 @@
 watchdog. It ends when the source does, or on SIGTERM or SIGINT."""
 
 import logging
+import os
 import signal
 import time
 from collections.abc import Iterator
@@ -144,7 +145,7 @@ def fly(config: Config, positions: Path | None = None) -> int:
         stack.callback(pipeline.place_map.close)
         _log.info("version %s on %s", __version__, pipeline.board.title)
         _log.info("%s", pipeline.reason)
-        flight_log = stack.enter_context(FlightLog(config.log.path))
+        flight_log = stack.enter_context(FlightLog(config.log.path, wait="NOTIFY_SOCKET" in os.environ))
         board, rate_hz = pipeline.board, config.source.rate_hz or pipeline.board.rate_hz
         if not board.verified:
             _log.warning("mAh are estimates: the power of %s is unverified (%s)", board.title, board.source)

@@ -258,3 +258,15 @@ def test_a_log_that_was_killed_loses_nothing_that_was_written(path):
     script += "log = FlightLog(sys.argv[1])\nfor i in range(50): log.write('match', i=i)\nos.kill(os.getpid(), 9)"
     assert subprocess.run([sys.executable, "-c", script, str(path)]).returncode == -9
     assert [record["i"] for record in read_log(path)] == list(range(50))
+
+
+def test_a_service_waits_for_the_medium_of_its_log(tmp_path, caplog):
+    path = tmp_path / "card" / "flight.jsonl"
+    log = FlightLog(path, wait=True)
+    assert "the flight goes on without it" in log.state
+    log.write("query", n=1)
+    path.parent.mkdir()  # the card is put back
+    log.write("query", n=2)
+    log.close()
+    assert [(line["kind"], line.get("n")) for line in read_log(path)] == [("gap", None), ("query", 2)]
+    assert log.state is None
