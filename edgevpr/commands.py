@@ -127,11 +127,10 @@ def map_export(args: Namespace) -> int:
 def match(args: Namespace) -> int:
     from edgevpr.geodesy import distance_m
     from edgevpr.runtime.frames import open_source
-    from edgevpr.runtime.pipeline import open_pipeline, technique_of
+    from edgevpr.runtime.pipeline import open_pipeline
     from edgevpr.runtime.record import record
 
-    pipeline = open_pipeline(_config(args, map=args.map))
-    technique_of(pipeline.place_map, args.technique, _settings(args.param))
+    pipeline = open_pipeline(_config(args, map=args.map), _settings(args.param))
     found = []
     unusable: list[ImageError] = []
     source = open_source(args.source, positions=_path(args.positions), live=False)

@@ -78,6 +78,12 @@ def test_a_match_below_the_threshold_is_not_accepted(capsys, flight, valley):
     assert not any(each["accepted"] for each in found)
 
 
+def test_a_setting_of_the_technique_is_used_for_matching(capsys, flight, valley):
+    by_flag = run_json(capsys, "match", valley, "--images", flight / "query", "--matching", "thesis", "--json")
+    by_param = run_json(capsys, "match", valley, "--images", flight / "query", "--param", "matching=thesis", "--json")
+    assert [each["score"] for each in by_param] == [each["score"] for each in by_flag]
+
+
 def test_eval_prints_the_promised_keys(capsys, flight):
     result = run_json(
         capsys, "eval", "--query", flight / "query", "--ref", flight / "ref",

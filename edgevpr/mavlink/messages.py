@@ -27,7 +27,6 @@ class Health(IntEnum):
 class Severity(IntEnum):
     """How much a text matters (MAV_SEVERITY)."""
 
-    ERROR = mavlink.MAV_SEVERITY_ERROR
     WARNING = mavlink.MAV_SEVERITY_WARNING
     INFO = mavlink.MAV_SEVERITY_INFO
 

@@ -57,9 +57,8 @@ def rank(
     matches = compared(chosen)
     if len(chosen) < len(index):
         best = chosen[max(range(len(chosen)), key=lambda at: matches[at].score)]
-        away = elsewhere(index, best, np.arange(len(index)), neighbour_m)
-        if away.any() and not away[chosen].any():
-            others = np.flatnonzero(away)
+        if not elsewhere(index, best, chosen, neighbour_m).any():
+            others = np.flatnonzero(elsewhere(index, best, np.arange(len(index)), neighbour_m))
             others = others[np.argsort(-scanned[others])[:_COMPARED_ELSEWHERE]]
             matches += compared(others)
             chosen = np.append(chosen, others)

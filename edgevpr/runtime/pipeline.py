@@ -20,7 +20,7 @@ from edgevpr.types import Frame, PlaceMatch, Technique
 @dataclass(frozen=True, slots=True)
 class Pipeline:
     """Everything that one query needs. `accuracy_m` is the 1-sigma that a fix claims; `reason` says in one line why
-    this technique flies, and whether the board can afford it."""
+    this technique flies, and whether the board can afford it; `rate_hz` is how often it is asked."""
 
     technique: Technique
     place_map: PlaceMap
@@ -31,6 +31,7 @@ class Pipeline:
     pack: Pack
     regulator_efficiency: float
     accuracy_m: float
+    rate_hz: float
     reason: str
 
     def step(self, frame: Frame) -> PlaceMatch:
@@ -55,15 +56,18 @@ class Pipeline:
         )
 
 
-def open_pipeline(config: Config) -> Pipeline:
-    """Open the map, make its technique, load the index. Raises a sentence for anything that does not go together."""
+def open_pipeline(config: Config, settings: dict[str, str] | None = None) -> Pipeline:
+    """Open the map, make its technique, load the index. Raises a sentence for anything that does not go together, and
+    for `settings` of the technique that the map was not built with."""
     if config.map is None:
         raise UsageError("There is no map to recognise places in: name one with --map, or `map:` in the configuration.")
     board = load_board(config.board)
     pack = parse_pack(config.battery.pack)
     place_map = PlaceMap.open(Path(config.map))
     wanted = {"camera": config.source.camera, "matching": config.match.matching}
-    technique = technique_of(place_map, config.technique, {key: value for key, value in wanted.items() if value})
+    wanted = {key: value for key, value in wanted.items() if value} | (settings or {})
+    technique = technique_of(place_map, config.technique, wanted)
+    rate_hz = config.source.rate_hz or board.rate_hz
     budget_mb = config.memory.budget_mb or board.budget_mb
     index = load_index(place_map, technique, int(budget_mb * 1e6))
     candidates = config.match.candidates or technique.candidates
@@ -80,14 +84,16 @@ def open_pipeline(config: Config) -> Pipeline:
         pack,
         config.battery.regulator_efficiency,
         max(config.mavlink.min_accuracy_m, index.spacing_m() or 0.0),
+        rate_hz,
         f"technique {technique.spec.name}: {why}; {thinned}"
-        f"{_affordable(technique, board, config, len(index), candidates)}",
+        f"{_affordable(technique, board, len(index), candidates, rate_hz, budget_mb)}",
     )
 
 
-def _affordable(technique: Technique, board: Board, config: Config, places: int, candidates: int) -> str:
+def _affordable(
+    technique: Technique, board: Board, places: int, candidates: int, rate_hz: float, budget_mb: float
+) -> str:
     """What the technique takes of the board, tried here and now, in a line: no reason not to fly."""
-    rate_hz, budget_mb = config.source.rate_hz or board.rate_hz, config.memory.budget_mb or board.budget_mb
     try:
         costs = on_board(probe(technique), load_board("this"), board)
     except (MapError, OSError) as error:  # the trial map needs a little room for temporary files

@@ -37,7 +37,7 @@ class Flight:
     def __init__(self, pipeline: Pipeline, source: Source, flight_log: FlightLog, link: Link | None, config: Config):
         self._pipeline, self._source, self._flight_log, self._link = pipeline, source, flight_log, link
         self._send_fixes = config.mavlink.send_fixes
-        self._step_s = 1 / (config.source.rate_hz or pipeline.board.rate_hz)
+        self._step_s = 1 / pipeline.rate_hz
         self._watchdog_s = watchdog_interval_s()
         self._stopping = self._recognising = False
         self._next_query_s = self._next_health_s = self._next_watchdog_s = time.monotonic()
@@ -146,7 +146,7 @@ def fly(config: Config, positions: Path | None = None) -> int:
         _log.info("version %s on %s", __version__, pipeline.board.title)
         _log.info("%s", pipeline.reason)
         flight_log = stack.enter_context(FlightLog(config.log.path, wait="NOTIFY_SOCKET" in os.environ))
-        board, rate_hz = pipeline.board, config.source.rate_hz or pipeline.board.rate_hz
+        board = pipeline.board
         if not board.verified:
             _log.warning("mAh are estimates: the power of %s is unverified (%s)", board.title, board.source)
         decided = {
@@ -154,14 +154,14 @@ def fly(config: Config, positions: Path | None = None) -> int:
             "rule": pipeline.rule,
             "candidates": pipeline.candidates,
             "accuracy_m": pipeline.accuracy_m,
-            "rate_hz": rate_hz,
+            "rate_hz": pipeline.rate_hz,
             "idle_w": board.idle_w,
             "full_w": board.full_w,
             "power_verified": board.verified,
         }
         flight_log.write("start", **start_fields(config, board.name, pipeline.technique.spec), decided=decided)
         link = stack.enter_context(Link(address, config.mavlink.component_id)) if address else None
-        source = open_source(config.source.uri, step_s=1 / rate_hz, positions=positions, live=True)
+        source = open_source(config.source.uri, step_s=1 / pipeline.rate_hz, positions=positions, live=True)
         stack.callback(source.close)
         if link and config.mavlink.send_fixes and source.total:
             _log.warning(
