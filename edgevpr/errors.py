@@ -31,3 +31,7 @@ class MapError(EdgevprError):
 
 class LinkError(EdgevprError):
     """A MAVLink link cannot be opened."""
+
+
+class ModelError(EdgevprError):
+    """A network cannot be used: its card, its file, what it puts out, the words learned on it, or onnxruntime."""

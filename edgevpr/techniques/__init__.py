@@ -3,21 +3,44 @@
 import difflib
 import importlib
 import inspect
+from functools import partial
 from typing import Any
 
-from edgevpr.errors import UsageError
+from edgevpr.errors import EdgevprError, UsageError
 from edgevpr.types import Technique
 
-# Best first: where several fit a board, the first is taken.
+# The first are what a board is offered by itself, best first: see AUTOMATIC.
 _REGISTRY = {
     "cohog": "edgevpr.techniques.cohog:CoHog",
     "hog": "edgevpr.techniques.hog:Hog",
+    "seqslam": "edgevpr.techniques.seqslam:SeqSlam",
+    "calc": "edgevpr.techniques.calc:Calc",
+    "alexnet": "edgevpr.techniques.alexnet:AlexNet",
+    "amosnet": "edgevpr.techniques.amosnet:AmosNet",
+    "hybridnet": "edgevpr.techniques.hybridnet:HybridNet",
+    "netvlad": "edgevpr.techniques.netvlad:NetVlad",
+    "rmac": "edgevpr.techniques.rmac:RMac",
+    "region_vlad": "edgevpr.techniques.region_vlad:RegionVlad",
+    "cross_region_bow": "edgevpr.techniques.cross_region_bow:CrossRegionBow",
 }
+# Where several fit a board, the first is taken. Networks are used when they are asked for: they want onnxruntime in
+# RAM, and weights that somebody has chosen. A sequence wants a flight along the way that was mapped.
+AUTOMATIC = ("cohog", "hog")
 
 
 def names() -> tuple[str, ...]:
-    """Names of all techniques, best first."""
-    return tuple(_REGISTRY)
+    """Names of all techniques: those of edgevpr, then the networks whose cards make a descriptor by themselves.
+
+    A card that cannot be read is left out here, and says what is wrong with it when it is asked for by name.
+    """
+    return (*_REGISTRY, *(name for name in _cards() if name not in _REGISTRY))
+
+
+def is_known(name: str) -> bool:
+    """Whether there is a technique, or the card of a network, of this name."""
+    from edgevpr.techniques.networks.card import card_names
+
+    return name in _REGISTRY or name in card_names()
 
 
 def parameters(name: str) -> dict[str, Any]:
@@ -25,10 +48,21 @@ def parameters(name: str) -> dict[str, Any]:
     return {key: p.default for key, p in inspect.signature(_class(name)).parameters.items()}
 
 
+def labelled(name: str, form: str | None) -> str:
+    """A technique and its form as one name; that of `float` (None: it has no forms) is left out."""
+    return name if form in (None, "float") else f"{name} {form}"
+
+
+def network_output(name: str) -> str | None:
+    """Which output of its `model`, "features" or "descriptor", the technique `name` uses; None: it has no model."""
+    return getattr(_class(name), "network_output", "features") if "model" in parameters(name) else None
+
+
 def create(name: str, settings: dict[str, Any] | None = None) -> Technique:
     """Make the technique `name` with `settings` (texts are read as the parameter's type; the rest is default).
 
-    Raises UsageError for an unknown technique or parameter, a value that cannot be read, or one out of range.
+    Raises UsageError for an unknown technique or parameter, a value that cannot be read, or one out of range, and
+    ModelError for a network that cannot be used.
     """
     defaults = parameters(name)
     values = {}
@@ -46,10 +80,35 @@ def create(name: str, settings: dict[str, Any] | None = None) -> Technique:
 
 
 def _class(name: str) -> Any:
-    if name not in _REGISTRY:
-        raise UsageError(f"There is no technique `{name}`: use one of {', '.join(_REGISTRY)}.")
-    module, _, class_name = _REGISTRY[name].partition(":")
-    return getattr(importlib.import_module(module), class_name)
+    if name in _REGISTRY:
+        module, _, class_name = _REGISTRY[name].partition(":")
+        return getattr(importlib.import_module(module), class_name)
+    if not is_known(name):
+        raise UsageError(f"There is no technique `{name}`: use one of {', '.join(names())}.")
+    from edgevpr.techniques.networks.card import load_card
+
+    card = load_card(name)
+    if not card.is_technique:
+        raise UsageError(
+            f"The network `{name}` gives feature maps only: use it as the `model` of a technique, or name a head on "
+            "its card."
+        )
+    from edgevpr.techniques.networks.network import CardNetwork
+
+    return partial(CardNetwork, card)
+
+
+def _cards() -> list[str]:
+    from edgevpr.techniques.networks.card import card_names, load_card
+
+    found = []
+    for name in card_names():
+        try:
+            if load_card(name).is_technique:
+                found.append(name)
+        except EdgevprError:
+            continue
+    return found
 
 
 _words = {int: "a whole number", float: "a number", str: "a word"}

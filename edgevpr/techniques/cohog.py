@@ -110,16 +110,25 @@ class CoHog:
         """Rows of the index: coarse float16 (N, 8, 8, bins), the map's mean -> uint8 (N, 8 bins)."""
         return placecode.pack(coarse.astype(np.float32), mean)
 
-    def coarse_scores(self, query: Descriptor, rows: np.ndarray, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Compare the place codes under all shifts and, looking down, all rotations: `rows` uint8 (N, 8 bins) -> scores
-        float32 (N,), and the rotations for `match` to try, the bits of an int32 (N,)."""
+    def coarse_scores(
+        self, query: Descriptor, rows: np.ndarray, mean: np.ndarray, turned_deg: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Compare the place codes under all shifts and, looking down, all rotations, or those within 22.5 degrees of
+        `turned_deg` (N,): `rows` uint8 (N, 8 bins) -> scores float32 (N,), and the rotations for `match` to try, the
+        bits of an int32 (N,)."""
         seen = query.picture.seen
         blocks = _middle(query.regions.reshape(self._side, self._side, -1), seen)
         turns = np.arange(_ROTATIONS if self._camera == "nadir" else 1)
         grids, in_view = placecode.turned_grids(blocks, -360 * turns / _ROTATIONS, _middle(seen, seen))
-        scores = placecode.scan(placecode.hypotheses(grids, in_view, mean), rows)
+        asked = placecode.hypotheses(grids, in_view, mean)
+        if turned_deg is None or self._camera == "forward":
+            scores = placecode.scan(asked, rows)
+        else:
+            steps = np.rint(turned_deg * (_ROTATIONS / 360)) % _ROTATIONS
+            scores = placecode.scan_near(asked, rows, np.nan_to_num(steps, nan=-1).astype(np.intp))
         tried = np.argsort(-scores, axis=1)[:, :_TURNS_TRIED]
-        return np.clip(scores.max(axis=1), 0, 1), np.bitwise_or.reduce(1 << tried, axis=1)
+        bits = np.where(np.isneginf(np.take_along_axis(scores, tried, axis=1)), 0, 1 << tried)
+        return np.clip(scores.max(axis=1), 0, 1), np.bitwise_or.reduce(bits, axis=1)
 
     def match(self, query: Descriptor, fine: np.ndarray, hypothesis: int | None = None) -> FineMatch:
         """C = A B^T (thesis 6.2.3) with A the good regions of the query, B those of the place; then the score by

@@ -18,14 +18,14 @@ _ADD_LANES = np.uint64(0x0001000100010001)
 
 
 def hamming(query: np.ndarray, codes: np.ndarray) -> np.ndarray:
-    """Differing bits: uint8 (B,), uint8 (N, B) -> uint16 (N,); B is at most 8191 bytes."""
+    """Differing bits: uint8 (B,), uint8 (N, B) -> uint16 (N,), uint32 for more than 8191 bytes."""
     return hamming_numpy(query, codes) if simsimd is None else hamming_simd(query, codes)
 
 
 def hamming_simd(query: np.ndarray, codes: np.ndarray) -> np.ndarray:
     """`hamming` by simsimd, which must be importable."""
     asked, places = query[None], np.ascontiguousarray(codes)
-    distances = np.empty(len(codes), np.uint16)
+    distances = np.empty(len(codes), _counts_of(codes))
     for start in range(0, len(codes), _PLACES_AT_ONCE):
         here = slice(start, start + _PLACES_AT_ONCE)
         distances[here] = simsimd.hamming(asked, places[here], dtype="bin8")
@@ -47,7 +47,7 @@ def hamming_numpy(query: np.ndarray, codes: np.ndarray) -> np.ndarray:
     block = min(max(1, _BYTES_AT_ONCE // (length * _GROUP)) * _GROUP, len(codes))
     differ = np.empty((block, words), word)
     counts = np.zeros((block, -(-words // 8) * 8), np.uint8)  # the words beyond the last stay zero
-    distances = np.empty(len(codes), np.uint16)
+    distances = np.empty(len(codes), _counts_of(codes))
     for start in range(0, len(codes), max(1, block)):
         part = places[start : start + block]
         here, grouped = slice(0, len(part)), len(part) // _GROUP * _GROUP
@@ -56,6 +56,10 @@ def hamming_numpy(query: np.ndarray, codes: np.ndarray) -> np.ndarray:
         np.bitwise_count(differ[here], out=counts[here, :words])
         distances[start : start + block] = _sums_of_bytes(counts[here].view(np.uint64))
     return distances
+
+
+def _counts_of(codes: np.ndarray) -> type:
+    return np.uint16 if 8 * codes.shape[1] < 1 << 16 else np.uint32
 
 
 def _sums_of_bytes(numbers: np.ndarray) -> np.ndarray:

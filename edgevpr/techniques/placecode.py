@@ -109,6 +109,20 @@ def scan(asked: np.ndarray, codes: np.ndarray) -> np.ndarray:
     return best
 
 
+def scan_near(asked: np.ndarray, codes: np.ndarray, expected: np.ndarray) -> np.ndarray:
+    """`scan` where the heading is known: place n only under rotation `expected` [n] and the two beside it, -inf for the
+    others. int (N,), below 0 where nobody knows: such a place under all of them.
+
+    Places that expect the same rotation are one product, so the work is that of three rotations.
+    """
+    best = np.full((len(codes), len(asked)), -np.inf, np.float32)
+    for turn in np.unique(expected):
+        group = np.flatnonzero(expected == turn)
+        near = np.arange(len(asked)) if turn < 0 else np.arange(turn - 1, turn + 2) % len(asked)
+        best[group[:, None], near] = scan(asked[near], codes[group])
+    return best
+
+
 def _sources(n: int, rotations_deg: np.ndarray) -> np.ndarray:
     """int (R, 64, 16): for every sample of every cell the block it comes from, `n` n where that is outside."""
     middle = (np.arange(SIDE * _SAMPLES) + 0.5) / (SIDE * _SAMPLES) - 0.5

@@ -122,6 +122,21 @@ def test_the_scan_is_the_product_spelt_out(town):
     np.testing.assert_allclose(placecode.scan(asked, codes), expected, atol=1e-6)
 
 
+def test_a_known_heading_is_the_full_scan_of_three_rotations(town):
+    _, mean, _ = town
+    rng = np.random.default_rng(2)
+    codes = rng.integers(0, 256, (700, 64), dtype=np.uint8)
+    expected = rng.integers(-1, 24, 700)
+    expected[:24] = np.arange(24)  # every rotation, and the first and the last that are neighbours
+    asked = _ask(_view(_picture(23)), mean, _TURNS_DEG)
+    full, near = placecode.scan(asked, codes), placecode.scan_near(asked, codes, expected)
+    apart = abs((np.arange(24) - expected[:, None] + 12) % 24 - 12)
+    scanned = (apart <= 1) | (expected[:, None] < 0)
+    np.testing.assert_array_equal(near[scanned], full[scanned])
+    assert np.isneginf(near[~scanned]).all()
+    assert (scanned.sum(axis=1) == np.where(expected < 0, 24, 3)).all()
+
+
 def test_every_shift_leaves_at_least_the_least_overlap():
     overlap = np.prod(8 - abs(placecode.SHIFTS.astype(int)), axis=1) / 64
     assert overlap.min() >= 0.35

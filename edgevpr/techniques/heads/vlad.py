@@ -1,0 +1,70 @@
+"""VLAD: how the local descriptors of a picture lie about learned words (Jégou et al., CVPR 2010)."""
+
+import numpy as np
+
+_TINY = 1e-12
+
+
+def local_descriptors(features: np.ndarray) -> np.ndarray:
+    """The activations at each position as one L2-normalised descriptor: (C, H, W) -> float32 (H W, C).
+
+    What NetVLAD collects (Arandjelović et al. 2016, section 3.1), in rows from the top left.
+    """
+    return unit(features.reshape(len(features), -1).T).astype(np.float32, copy=False)
+
+
+def hard_weights(local: np.ndarray, words: np.ndarray) -> np.ndarray:
+    """1 where a word is the nearest of a descriptor, else 0: (N, D), (K, D) -> float32 (N, K)."""
+    weights = np.zeros((len(local), len(words)), np.float32)
+    weights[np.arange(len(local)), nearest(local, words)] = 1
+    return weights
+
+
+def soft_weights(local: np.ndarray, words: np.ndarray, sharpness: float) -> np.ndarray:
+    """softmax over the words of -sharpness |x - c|^2 (Arandjelović et al. 2016, equation 2): -> float32 (N, K)."""
+    closeness = sharpness * _closeness(local, words)
+    closeness -= closeness.max(axis=1, keepdims=True)
+    weights = np.exp(closeness, out=closeness)
+    weights /= weights.sum(axis=1, keepdims=True)
+    return weights
+
+
+def sharpness(words: np.ndarray) -> float:
+    """How sharply `soft_weights` decides: at a word, its own weight is on average 100 times that of the next word.
+
+    NetVLAD asks for that ratio over the training descriptors (section 5, "Training"); the words are all that is kept.
+    """
+    squares = np.einsum("kd,kd->k", words, words)
+    apart = squares[:, None] + squares - 2 * words @ words.T
+    np.fill_diagonal(apart, np.inf)
+    return float(np.log(100) / max(apart.min(axis=1).mean(), _TINY)) if len(words) > 1 else 1.0
+
+
+def residuals(local: np.ndarray, words: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """V(k) = sum over descriptors of a_k(x) (x - c_k) (Arandjelović et al. 2016, equation 1): -> float32 (K, D)."""
+    return weights.T @ local - weights.sum(axis=0)[:, None] * words
+
+
+def intra_normalised(sums: np.ndarray) -> np.ndarray:
+    """Each word's residual to length 1 (Arandjelović and Zisserman 2013), then the whole: (K, D) -> float32 (K D,)."""
+    return unit(unit(sums).ravel())
+
+
+def root_normalised(sums: np.ndarray) -> np.ndarray:
+    """Signed square root of each value (Jégou et al. 2012), then the whole to length 1: (K, D) -> float32 (K D,)."""
+    return unit((np.sign(sums) * np.sqrt(np.abs(sums))).ravel())
+
+
+def nearest(local: np.ndarray, words: np.ndarray) -> np.ndarray:
+    """The number of the word nearest to each descriptor: (N, D), (K, D) -> int (N,); of equals the first."""
+    return _closeness(local, words).argmax(axis=1)
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Rows (or the one vector) to length 1; a zero stays zero."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), _TINY)
+
+
+def _closeness(local: np.ndarray, words: np.ndarray) -> np.ndarray:
+    """-|x - c|^2 up to what is the same for all words of a descriptor: (N, K)."""
+    return 2 * local @ words.T - np.einsum("kd,kd->k", words, words)

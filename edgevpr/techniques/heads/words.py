@@ -1,0 +1,93 @@
+"""Learned words: what `edgevpr train words` wrote, and the bag of words over regions."""
+
+import hashlib
+import io
+import zipfile
+from dataclasses import dataclass
+
+import numpy as np
+
+from edgevpr.errors import ModelError
+from edgevpr.resources import model_folders
+from edgevpr.techniques.heads.vlad import nearest, unit
+from edgevpr.techniques.networks.card import load_card
+
+_ROWS_AT_ONCE = 64  # of an 8-bit matrix turned to float32 together
+
+
+@dataclass(frozen=True, slots=True)
+class Words:
+    """`words` float32 (K, D); `sha256` of model and words together, for the map. Where the descriptor made of them is
+    to be whitened: `mean` float32 (K D,) and `whitening` int8 (P, K D), to be multiplied by `scale` float32 (P,)."""
+
+    words: np.ndarray
+    sha256: str
+    mean: np.ndarray | None = None
+    whitening: np.ndarray | None = None
+    scale: np.ndarray | None = None
+
+    @property
+    def length(self) -> int:
+        """Values of a VLAD descriptor, whitened where that was learned."""
+        return self.words.size if self.whitening is None else len(self.whitening)
+
+
+def load_words(model: str, kind: str, count: int) -> Words:
+    """The `count` words of `kind` ("vlad", "regions", "bow") learned on the feature map of the card `model`.
+
+    Raises ModelError for a file that is missing, damaged or learned on another network (weights, how a picture is laid
+    before them, or output: the card's fingerprint), naming the command that makes it.
+    """
+    name = f"{model}_{kind}{count}.npz"
+    command = f"make them with `edgevpr train words --images DIR --model {model} --kind {kind} --count {count}`"
+    path = next((folder / name for folder in model_folders() if (folder / name).is_file()), None)
+    if path is None:
+        raise ModelError(f"There are no words {name} for the model `{model}`: {command}.")
+    wanted = load_card(model).fingerprint
+    try:
+        content = path.read_bytes()
+        with np.load(io.BytesIO(content), allow_pickle=False) as file:
+            arrays = {key: file[key] for key in file.files}
+        learned_on = str(arrays["model_sha256"])
+        words = arrays["words"].astype(np.float32)
+    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise ModelError(f"{path} cannot be read as words ({error}): {command}.") from error
+    if learned_on != wanted:
+        raise ModelError(
+            f"{path} was learned on another network ({learned_on[:12]}...) than `{model}` is now ({wanted[:12]}...): "
+            f"{command}."
+        )
+    if words.ndim != 2 or len(words) != count or not np.isfinite(words).all():
+        raise ModelError(f"{path} must hold {count} words, and holds an array {words.shape}: {command}.")
+    sha256 = hashlib.sha256((wanted + hashlib.sha256(content).hexdigest()).encode()).hexdigest()
+    if "whitening" not in arrays:
+        return Words(words, sha256)
+    mean, whitening, scale = (arrays.get(key) for key in ("mean", "whitening", "whitening_scale"))
+    if mean is None or scale is None or whitening.shape != (scale.size, words.size) or mean.shape != (words.size,):
+        raise ModelError(f"{path} holds a whitening that does not fit its words: {command}.")
+    return Words(words, sha256, mean.astype(np.float32), whitening, scale.astype(np.float32).ravel())
+
+
+def bag_of_words(local: np.ndarray, words: np.ndarray) -> np.ndarray:
+    """Which of the words (K, D) any of the descriptors (N, D) falls to, L2-normalised: float32 (K,).
+
+    Whether, not how often: many channels mark the same part of a picture, so that counts say little; on corridor and
+    aerial_caliterra, the sets tuned on, they find fewer places. Nor with the inverse document frequency, which
+    would weigh words by a map that is still being made.
+    """
+    present = np.zeros(len(words), np.float32)
+    present[nearest(local, words)] = 1
+    return unit(present)
+
+
+def whitened(vector: np.ndarray, words: Words) -> np.ndarray:
+    """W (v - mean), L2-normalised, where a whitening was learned (Jégou and Chum, ECCV 2012): (K D,) -> float32
+    (length,)."""
+    if words.whitening is None:
+        return vector
+    centred = vector - words.mean
+    product = np.empty(words.length, np.float32)
+    for start in range(0, words.length, _ROWS_AT_ONCE):
+        rows = words.whitening[start : start + _ROWS_AT_ONCE]
+        product[start : start + _ROWS_AT_ONCE] = rows.astype(np.float32) @ centred
+    return unit(product * words.scale)

@@ -1,0 +1,223 @@
+"""A network is a card: a YAML file that says which weights, how a picture is laid before them, and what comes out.
+
+Everything that could be wrong with a card is said when it is read, and not in the air.
+"""
+
+import difflib
+import hashlib
+import json
+import re
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+
+from edgevpr.config import bounded, build, read_yaml
+from edgevpr.errors import ModelError
+from edgevpr.resources import model_folders
+from edgevpr.types import TechniqueSpec
+
+SIMILARITIES = ("cosine", "l1", "l2")
+_CHOICES = {
+    "input.layout": ("NCHW", "NHWC"),
+    "input.colour": ("grey", "bgr", "rgb"),
+    "input.resize": ("area", "linear", "cubic"),
+    "similarity": SIMILARITIES,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class InputRule:
+    """How a picture becomes the network's input: (pixel * `scale` - `mean`) / `std`, the last two one number or one a
+    channel. `equalise` equalises the histogram of its brightness first; `resize` stretches it to the size. With
+    `layout` NHWC feature maps are (1, H, W, C) as well."""
+
+    layout: str
+    height: int = bounded(8, 4096)
+    width: int = bounded(8, 4096)
+    colour: str
+    equalise: bool
+    resize: str
+    scale: float = bounded(1e-9, 1e9)
+    mean: list
+    std: list | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Outputs:
+    """Names in the ONNX file of a vector (1, D) and of a feature map (1, C, H, W)."""
+
+    descriptor: str | None = None
+    features: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class NoParameters:
+    """Of the heads `flatten`, `max` and `rmac`."""
+
+
+@dataclass(frozen=True, slots=True)
+class GemParameters:
+    p: float = bounded(0.1, 100)
+
+
+@dataclass(frozen=True, slots=True)
+class GridParameters:
+    rows: int = bounded(1, 1024)
+    columns: int = bounded(1, 1024)
+    how: str
+
+
+@dataclass(frozen=True, slots=True)
+class PyramidParameters:
+    levels: list
+
+
+@dataclass(frozen=True, slots=True)
+class ProjectionParameters:
+    length: int = bounded(8, 65_536)
+    seed: int = bounded(0, 2**31)
+
+
+@dataclass(frozen=True, slots=True)
+class VladParameters:
+    words: int = bounded(1, 65_536)
+
+
+HEADS = {
+    "flatten": NoParameters,
+    "max": NoParameters,
+    "gem": GemParameters,
+    "grid": GridParameters,
+    "pyramid": PyramidParameters,
+    "projection": ProjectionParameters,
+    "vlad": VladParameters,
+    "rmac": NoParameters,
+}
+
+
+@dataclass(frozen=True)
+class Card:
+    """One network. `path` is the card's own; `head` a name of `HEADS` and its parameters, or None."""
+
+    path: Path
+    title: str
+    file: str
+    sha256: str
+    licence: str
+    source: str
+    input: InputRule
+    outputs: Outputs
+    head: dict | None
+    similarity: str
+
+    @property
+    def name(self) -> str:
+        return self.path.stem
+
+    @property
+    def file_path(self) -> Path:
+        return self.path.with_name(self.file)
+
+    @property
+    def is_technique(self) -> bool:
+        """Whether it makes a descriptor by itself, and not only for the techniques that take a `model`."""
+        return self.head is not None or self.outputs.descriptor is not None
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """SHA-256 of all that a feature map or vector depends on: the weights, how the picture is prepared for them,
+        and which outputs are read."""
+        said = json.dumps([self.sha256, asdict(self.input), asdict(self.outputs)], sort_keys=True)
+        return hashlib.sha256(said.encode()).hexdigest()
+
+
+def card_names() -> tuple[str, ...]:
+    """Names of all cards, in the user's folder and the shipped one, whether or not they can be read."""
+    return tuple(sorted({path.stem for folder in model_folders() for path in folder.glob("*.yaml")}))
+
+
+def load_card(name: str) -> Card:
+    """The card called `name`. Raises ModelError where there is none, and ConfigError or ModelError for one that does
+    not say what it must."""
+    for folder in model_folders():
+        path = folder / f"{name}.yaml"
+        if "/" not in name and path.is_file():
+            return read_card(path)
+    near = difflib.get_close_matches(name, card_names(), n=1)
+    known = ", ".join(card_names()) or "there are none yet"
+    raise ModelError(
+        f"There is no model `{name}`: "
+        + (f"did you mean `{near[0]}`?" if near else f"use one of `edgevpr models list` ({known}).")
+    )
+
+
+def weights_of(spec: TechniqueSpec) -> str | None:
+    """Which weights a technique uses, in the words of its card; None for one without a network."""
+    if spec.model_sha256 is None:
+        return None
+    card = load_card(str(spec.parameters.get("model", spec.name)))
+    return f"{card.name}: {card.title} ({card.licence}; {card.source})"
+
+
+def read_card(path: Path, needs_hash: bool = True) -> Card:
+    """Read one card; `needs_hash` False lets `sha256` be missing or empty, for a card that is not filled in yet."""
+    values = read_yaml(path)
+    if not needs_hash:
+        values = {**values, "sha256": values.get("sha256") or ""}
+    card = build(Card, {"path": path, "head": None, **values}, str(path))
+    for key, choices in _CHOICES.items():
+        section, _, last = key.rpartition(".")
+        said = getattr(getattr(card, section) if section else card, last)
+        if said not in choices:
+            raise ModelError(f"{path}: `{key}` is `{said}`: write {', '.join(choices[:-1])} or {choices[-1]}.")
+    if not re.fullmatch("[0-9a-f]{64}" if needs_hash else "([0-9a-f]{64})?", card.sha256):
+        raise ModelError(f"{path}: `sha256` must be the 64 hexadecimal digits that `sha256sum {card.file}` prints.")
+    if card.file in ("", ".", "..") or "/" in card.file:
+        raise ModelError(f"{path}: `file` is `{card.file}`: write the name of a file that lies beside the card.")
+    if not (card.outputs.descriptor or card.outputs.features):
+        raise ModelError(f"{path}: `outputs` names none: write the ONNX output of a descriptor or of features.")
+    channels = 1 if card.input.colour == "grey" else 3
+    for key in ("mean", "std"):
+        numbers = getattr(card.input, key)
+        if numbers is not None and not _are_numbers(numbers, (1, channels), positive=key == "std"):
+            raise ModelError(
+                f"{path}: `input.{key}` is {numbers}: write one number or {channels}, one a channel"
+                + (", all above 0." if key == "std" else ".")
+            )
+    head_parameters(card)
+    return card
+
+
+def head_parameters(card: Card) -> object | None:
+    """The parameters of the card's head as the dataclass of `HEADS`; None for a card without. Raises ModelError for a
+    head that does not exist or lacks a feature map, ConfigError for a parameter."""
+    if card.head is None:
+        return None
+    name = card.head.get("name")
+    if name not in HEADS:
+        near = difflib.get_close_matches(str(name), HEADS, n=1)
+        raise ModelError(
+            f"{card.path}: there is no head `{name}`: "
+            + (f"did you mean `{near[0]}`?" if near else f"use {', '.join(HEADS)}, or null.")
+        )
+    if card.outputs.features is None:
+        raise ModelError(
+            f"{card.path}: the head `{name}` needs a feature map: name it in `outputs: {{features: ...}}`."
+        )
+    said = {key: value for key, value in card.head.items() if key != "name"}
+    parameters = build(HEADS[name], said, str(card.path), "head.")
+    if name == "pyramid":
+        levels = parameters.levels
+        if not levels or not all(type(level) is int and 1 <= level <= 64 for level in levels):
+            raise ModelError(
+                f"{card.path}: `head.levels` is {levels}: write whole numbers from 1 to 64, e.g. [1, 2, 3]."
+            )
+    if name == "grid" and parameters.how not in ("mean", "max"):
+        raise ModelError(f"{card.path}: `head.how` is `{parameters.how}`: write mean or max.")
+    return parameters
+
+
+def _are_numbers(values: list, counts: tuple[int, int], positive: bool) -> bool:
+    return len(values) in counts and all(
+        type(value) in (int, float) and abs(value) < 1e9 and (value > 0 or not positive) for value in values
+    )

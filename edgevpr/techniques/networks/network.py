@@ -1,0 +1,68 @@
+"""A card that makes a vector by itself is a technique by the card's own name: a network is added without any code."""
+
+import hashlib
+import json
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from edgevpr.techniques.heads import pooling, projection, rmac, vlad, words
+from edgevpr.techniques.networks.card import Card, head_parameters
+from edgevpr.techniques.networks.session import Backbone, backbone_of
+from edgevpr.techniques.vectors import VectorTechnique
+
+Head = Callable[[np.ndarray], np.ndarray]
+
+
+class CardNetwork(VectorTechnique):
+    """The network of a card: the vector that it puts out or, where the card names a head, what that makes of the
+    feature map. All of it is in the model hash of a map, so there are no parameters."""
+
+    def __init__(self, card: Card, form: str = "float", threads: int = 1) -> None:
+        self._backbone = backbone_of(card, "descriptor" if card.head is None else "features", threads)
+        self._head, words_sha256 = _head(card, self._backbone)
+        said = json.dumps([self._backbone.sha256, card.head, card.similarity, words_sha256], sort_keys=True)
+        sha256 = hashlib.sha256(said.encode()).hexdigest()
+        noise = np.random.default_rng(0).integers(0, 256, (card.input.height, card.input.width), np.uint8)
+        length = len(self.vector(noise, None))  # a feature map too small for the head is said here
+        super().__init__(card.name, {}, length, form, card.similarity, sha256)
+
+    def vector(self, image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
+        """uint8 (H, W[, 3]) -> float32 (D,)."""
+        return self._head(self._backbone.run(image, mask))
+
+
+def _head(card: Card, backbone: Backbone) -> tuple[Head, str | None]:
+    """What the card's head makes of a feature map, float32 (C, H, W) -> (D,), and the hash of learned words."""
+    if card.head is None:
+        return lambda vector: vector, None
+    asked = head_parameters(card)
+    if card.head["name"] == "vlad":
+        learned = words.load_words(card.name, "vlad", asked.words)
+        return partial(_vlad, learned=learned), learned.sha256
+    size, (_, height, width) = int(np.prod(backbone.shape)), backbone.shape
+    heads: dict[str, Callable[[], Head]] = {
+        "flatten": lambda: pooling.flatten,
+        "max": lambda: pooling.maximum,
+        "gem": lambda: partial(pooling.gem, p=asked.p),
+        "grid": lambda: partial(pooling.grid, rows=asked.rows, columns=asked.columns, how=asked.how),
+        "pyramid": lambda: partial(pooling.pyramid, levels=tuple(asked.levels)),
+        "projection": lambda: partial(_projected, by=projection.gaussian_projection(size, asked.length, asked.seed)),
+        "rmac": lambda: partial(_rmac, squares=rmac.square_regions(height, width)),
+    }
+    return heads[card.head["name"]](), None
+
+
+def _projected(features: np.ndarray, by: projection.Projection) -> np.ndarray:
+    return by(features.ravel())
+
+
+def _rmac(features: np.ndarray, squares: list[tuple[int, int, int]]) -> np.ndarray:
+    return rmac.aggregate(rmac.regional_vectors(features, squares))
+
+
+def _vlad(features: np.ndarray, learned: words.Words) -> np.ndarray:
+    local = vlad.local_descriptors(features)
+    sums = vlad.residuals(local, learned.words, vlad.hard_weights(local, learned.words))
+    return words.whitened(vlad.intra_normalised(sums), learned)

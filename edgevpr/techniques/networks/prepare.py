@@ -1,0 +1,49 @@
+"""From a picture to the input of a network, by the `input` of its card."""
+
+import cv2
+import numpy as np
+
+from edgevpr.techniques.networks.card import InputRule
+
+_RESIZE = {"area": cv2.INTER_AREA, "linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC}
+_NOTHING_ALLOWED = 128
+
+
+def prepare(image: np.ndarray, rule: InputRule) -> np.ndarray:
+    """uint8 (H, W) grey or (H, W, 3) BGR -> float32 (1, C, height, width), or (1, height, width, C) for NHWC.
+
+    Equalising is that of CALC: BGR to YUV, the histogram of Y equalised, back to BGR, all before the picture is made
+    grey and smaller. A grey picture has no U and V: its own histogram is equalised.
+    """
+    if rule.equalise:
+        image = _equalised(image)
+    if rule.colour == "grey":
+        image = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    elif image.ndim == 2:
+        image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+    elif rule.colour == "rgb":
+        image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    image = cv2.resize(image, (rule.width, rule.height), interpolation=_RESIZE[rule.resize])
+    values = np.multiply(image, np.float32(rule.scale), dtype=np.float32).reshape(rule.height, rule.width, -1)
+    values -= np.array(rule.mean, np.float32)
+    if rule.std is not None:
+        values /= np.array(rule.std, np.float32)
+    return np.ascontiguousarray(values[None] if rule.layout == "NHWC" else values.transpose(2, 0, 1)[None])
+
+
+def without_masked(image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
+    """The picture with every pixel where the bool (H, W) `mask` is False set to the mean of the others: a network needs
+    a whole picture, and an even patch says the least."""
+    if mask is None or mask.all():
+        return image
+    filled = image.copy()
+    filled[~mask] = np.rint(image[mask].mean(axis=0)) if mask.any() else _NOTHING_ALLOWED
+    return filled
+
+
+def _equalised(image: np.ndarray) -> np.ndarray:
+    if image.ndim == 2:
+        return cv2.equalizeHist(image)
+    yuv = cv2.cvtColor(image, cv2.COLOR_BGR2YUV)
+    yuv[..., 0] = cv2.equalizeHist(np.ascontiguousarray(yuv[..., 0]))
+    return cv2.cvtColor(yuv, cv2.COLOR_YUV2BGR)

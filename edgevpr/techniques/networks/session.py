@@ -1,0 +1,188 @@
+"""Running a network: the only place that knows onnxruntime, imported when the first network is opened.
+
+What a file promises is not believed: it is run once before it may fly, and each result is looked at.
+"""
+
+import hashlib
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from edgevpr.errors import ModelError
+from edgevpr.techniques.networks.card import Card, load_card
+from edgevpr.techniques.networks.prepare import prepare, without_masked
+
+_RANKS = {"descriptor": 2, "features": 4}
+_FORMS = {"descriptor": "(1, D)", "features": "(1, C, H, W)"}
+_SEED = 7
+
+
+@dataclass(frozen=True, slots=True)
+class Backbone:
+    """One output of a network that has been seen to work. `shape` is (C, H, W) of features, (D,) of a descriptor;
+    `sha256` is the card's fingerprint: weights, preparation and outputs (that of the file alone is `card.sha256`)."""
+
+    card: Card
+    output: str
+    shape: tuple[int, ...]
+    sha256: str
+    session: Any
+
+    def run(self, image: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
+        """uint8 (H, W[, 3]) -> float32 of `shape`; pixels where bool (H, W) `mask` is False are filled with the mean of
+        the others. Raises ModelError for a result with NaN or infinities, and for one of zeros only."""
+        return _run(self.card, self.output, self.session, without_masked(image, mask))
+
+
+def open_backbone(model: str, output: str, threads: int = 1) -> Backbone:
+    """The network of the card `model`, for its output "features" or "descriptor".
+
+    Raises ModelError, one sentence: no onnxruntime, no card, no file or another one than the card's, no ONNX, inputs or
+    outputs of another form, axes without a size, a result that is not finite or says nothing.
+    """
+    return backbone_of(load_card(model), output, threads)
+
+
+def backbone_of(card: Card, output: str, threads: int = 1) -> Backbone:
+    """`open_backbone` of a card that is at hand."""
+    if getattr(card.outputs, output) is None:
+        raise ModelError(
+            f"{card.path} names no output for `{output}`: use another model, or name its ONNX output in "
+            f"`outputs: {{{output}: ...}}`."
+        )
+    session = _session(card.file_path, card.sha256, threads)
+    _require_input(card, session)
+    _require_output(card, output, session)
+    # A picture with something in it: an even one is all zeros after many a network that is whole.
+    noise = np.random.default_rng(_SEED).integers(0, 256, (card.input.height, card.input.width), np.uint8)
+    result = _run(card, output, session, noise)
+    return Backbone(card, output, result.shape, card.fingerprint, session)
+
+
+def file_sha256(path: Path) -> str:
+    """SHA-256 of a model file. Raises ModelError where it cannot be read."""
+    try:
+        with open(path, "rb") as handle:
+            digest = hashlib.sha256()
+            while block := handle.read(1 << 20):
+                digest.update(block)
+    except OSError as error:
+        raise ModelError(
+            f"{path} cannot be read ({error.strerror}): put the weights there, or take the card away."
+        ) from error
+    return digest.hexdigest()
+
+
+@cache
+def _session(path: Path, sha256: str, threads: int) -> Any:
+    """One session a file and process, however many techniques use it."""
+    found = file_sha256(path)
+    if found != sha256:
+        raise ModelError(
+            f"{path} is not the file of its card: its SHA-256 is {found} and the card says {sha256}; get the right "
+            "file, or correct the card."
+        )
+    runtime = import_onnxruntime()
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+    # The arena stays on: without it the memory of the same network went from 20 to 60 MB, as malloc had it, and was
+    # less in few of six tried.
+    options.log_severity_level = 4  # what goes wrong is said by us
+    # Threads that wait for work by spinning draw power and do nothing.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    # Weights in a second file, which the hash would not cover, are refused: of bytes they would be looked for where the
+    # program was started, so a place is named where there is none.
+    options.add_session_config_entry("session.model_external_initializers_file_folder_path", str(path))
+    try:
+        return runtime.InferenceSession(path.read_bytes(), options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime's own classes, and RuntimeError
+        raise ModelError(
+            f"{path} cannot be opened as an ONNX model with its weights inside ({_first_line(error)}): export it again."
+        ) from error
+
+
+def import_onnxruntime() -> Any:
+    """The library, imported now. Raises ModelError where it cannot be."""
+    try:
+        import onnxruntime
+    except Exception as error:  # also a broken library of it: OSError, and NumPy's complaints
+        raise ModelError(
+            f"onnxruntime cannot be imported ({_first_line(error)}): install it again (`pip install onnxruntime`) for "
+            "the techniques with networks; hog, cohog and seqslam fly without it."
+        ) from error
+    return onnxruntime
+
+
+def _require_input(card: Card, session: Any) -> None:
+    rule, inputs = card.input, session.get_inputs()
+    if len(inputs) != 1:
+        raise ModelError(
+            f"{card.file_path} has {len(inputs)} inputs: only networks with one, the picture, can be used."
+        )
+    (it,) = inputs
+    channels = 1 if rule.colour == "grey" else 3
+    size = (rule.height, rule.width)
+    wanted = [1, *size, channels] if rule.layout == "NHWC" else [1, channels, *size]
+    shape = list(it.shape)
+    if any(type(axis) is not int for axis in shape[1:]):
+        raise ModelError(
+            f"{card.file_path}: its input {_axes(shape)} has axes without a size (only the first, the batch, may be "
+            f"such): export it with the fixed size {_axes(wanted)}."
+        )
+    if shape[:1] and type(shape[0]) is not int:
+        shape[0] = 1
+    if shape != wanted or it.type != "tensor(float)":
+        raise ModelError(
+            f"{card.file_path}: its input is {it.type} {_axes(shape)} and the card says float {_axes(wanted)}: correct "
+            "`input` of the card, or export the network for it."
+        )
+
+
+def _require_output(card: Card, output: str, session: Any) -> None:
+    name = getattr(card.outputs, output)
+    found = {each.name: each for each in session.get_outputs()}
+    if name not in found:
+        raise ModelError(
+            f"{card.file_path} has no output `{name}`, which its card names for `{output}`: it has {', '.join(found)}."
+        )
+    if found[name].type not in ("tensor(float)", "tensor(float16)"):
+        raise ModelError(f"{card.file_path}: its output `{name}` is {found[name].type}: it must be float.")
+
+
+def _run(card: Card, output: str, session: Any, image: np.ndarray) -> np.ndarray:
+    name = getattr(card.outputs, output)
+    feed = {session.get_inputs()[0].name: prepare(image, card.input)}
+    try:
+        (result,) = session.run([name], feed)
+    except Exception as error:
+        raise ModelError(f"{card.file_path} cannot be run ({_first_line(error)}): export it again.") from error
+    if result.ndim != _RANKS[output] or len(result) != 1 or not result.size:
+        raise ModelError(
+            f"{card.file_path}: its output `{name}` is {_axes(result.shape)} and `{output}` must be {_FORMS[output]}: "
+            "correct `outputs` of the card."
+        )
+    values = result[0].astype(np.float32, copy=False)
+    if not np.isfinite(values).all():
+        raise ModelError(
+            f"{card.file_path} gives numbers that are not finite for `{name}`: its weights or `input` of its card are "
+            "wrong."
+        )
+    if not values.any():
+        raise ModelError(
+            f"{card.file_path} gives nothing but zeros for `{name}`: its weights or `input` of its card are wrong, or "
+            "the picture shows nothing at all."
+        )
+    if output == "features" and card.input.layout == "NHWC":
+        values = np.ascontiguousarray(values.transpose(2, 0, 1))
+    return values
+
+
+def _axes(shape) -> str:
+    return f"({', '.join(str(axis) if type(axis) is int else '?' for axis in shape)})"
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip() or type(error).__name__).splitlines()[0][:200]

@@ -1,0 +1,100 @@
+"""Learned words: the file that is read, and what is made of them."""
+
+import literal_heads as literal
+import numpy as np
+import pytest
+
+from edgevpr.errors import ModelError
+from edgevpr.techniques.heads import words
+
+CARD = """
+title: a card for tests
+file: tiny.onnx
+sha256: "{digit}"
+licence: MIT
+source: none
+input: {{layout: NCHW, height: 16, width: 16, colour: grey, equalise: false, resize: area, scale: 1.0, mean: [0.0]}}
+outputs: {{features: features}}
+similarity: cosine
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    (tmp_path / "tiny.yaml").write_text(CARD.format(digit="0" * 64))
+    monkeypatch.setenv("EDGEVPR_MODELS", str(tmp_path))
+    return tmp_path
+
+
+def write(folder, kind="vlad", count=3, **changes):
+    arrays = {
+        "words": np.arange(2 * count, dtype=np.float16).reshape(count, 2),
+        "model_sha256": words.load_card("tiny").fingerprint,
+    }
+    np.savez(folder / f"tiny_{kind}{count}.npz", **{**arrays, **changes})
+
+
+def test_words_are_read_and_belong_to_their_file(folder):
+    write(folder)
+    first = words.load_words("tiny", "vlad", 3)
+    assert first.words.dtype == np.float32
+    assert first.words.tolist() == [[0, 1], [2, 3], [4, 5]]
+    assert first.length == 6
+    write(folder, words=np.ones((3, 2), np.float16))
+    second = words.load_words("tiny", "vlad", 3)
+    assert second.sha256 != first.sha256
+    np.testing.assert_array_equal(words.whitened(np.arange(6.0), second), np.arange(6.0))
+
+
+def test_words_that_are_missing_name_the_command(folder):
+    with pytest.raises(ModelError, match="edgevpr train words --images DIR --model tiny --kind bow --count 7"):
+        words.load_words("tiny", "bow", 7)
+
+
+def test_words_of_another_network_are_refused(folder):
+    write(folder)
+    (folder / "tiny.yaml").write_text(CARD.format(digit="1" * 64))
+    with pytest.raises(ModelError, match=r"learned on another network.*edgevpr train words"):
+        words.load_words("tiny", "vlad", 3)
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"words": np.zeros((2, 2), np.float16)}, r"must hold 3 words.*\(2, 2\)"),
+        ({"words": np.full((3, 2), np.nan, np.float16)}, "must hold 3 words"),
+        ({"words": np.array([{}, {}, {}], object)}, "cannot be read"),
+        ({"whitening": np.zeros((2, 5), np.int8)}, "whitening that does not fit"),
+    ],
+)
+def test_damaged_words_are_refused(folder, changes, says):
+    write(folder, **changes)
+    with pytest.raises(ModelError, match=says):
+        words.load_words("tiny", "vlad", 3)
+
+
+@pytest.mark.parametrize("content", [b"", b"not a zip", b"PK\x03\x04 cut off"])
+def test_a_file_that_is_none_is_refused(folder, content):
+    (folder / "tiny_vlad3.npz").write_bytes(content)
+    with pytest.raises(ModelError, match=r"cannot be read as words.*train words"):
+        words.load_words("tiny", "vlad", 3)
+
+
+def test_whitening_of_8_bits(folder):
+    rng = np.random.default_rng(1)
+    count, length = 80, 150  # more rows than are multiplied at once
+    mean, scale = rng.normal(size=2 * count).astype(np.float32), rng.random(length).astype(np.float32)
+    whitening = rng.integers(-127, 128, (length, 2 * count)).astype(np.int8)
+    write(folder, count=count, mean=mean, whitening=whitening, whitening_scale=scale)
+    learned = words.load_words("tiny", "vlad", count)
+    assert learned.length == length
+    vector = rng.normal(size=2 * count).astype(np.float32)
+    found = words.whitened(vector, learned)
+    np.testing.assert_allclose(found, literal.whitened(vector, mean, whitening, scale), rtol=1e-3, atol=1e-5)
+
+
+def test_bag_of_words():
+    rng = np.random.default_rng(2)
+    local, known = rng.normal(size=(30, 4)).astype(np.float32), rng.normal(size=(20, 4)).astype(np.float32)
+    np.testing.assert_allclose(words.bag_of_words(local, known), literal.bag_of_words(local, known), rtol=1e-6)
+    assert not words.bag_of_words(np.zeros((0, 4), np.float32), known).any()

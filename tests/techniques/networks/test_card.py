@@ -1,0 +1,100 @@
+"""Cards: what a good one says, and one sentence for everything that a bad one may."""
+
+import pytest
+from tiny_networks import CARD, write_card, write_network
+
+from edgevpr.errors import ConfigError, EdgevprError, ModelError
+from edgevpr.resources import model_folders, shipped
+from edgevpr.techniques.networks.card import card_names, load_card, read_card, weights_of
+from edgevpr.types import PartSpec, TechniqueSpec
+
+SHA256 = "0" * 64
+
+
+def test_a_card_says_what_the_network_is(models):
+    write_network(models)
+    card = load_card("tiny")
+    assert (card.name, card.title, card.licence) == ("tiny", "A tiny network", "MIT")
+    assert card.file_path == models / "tiny.onnx"
+    assert (card.input.height, card.input.width, card.input.colour) == (24, 32, "grey")
+    assert card.outputs.features == "features"
+    assert card.is_technique
+    assert "tiny" in card_names()
+
+
+def test_the_users_card_of_a_name_comes_before_the_shipped_one(tmp_path, monkeypatch):
+    monkeypatch.delenv("EDGEVPR_MODELS", raising=False)
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    assert model_folders() == (tmp_path / "edgevpr" / "models", shipped("models"))
+    write_network(tmp_path / "edgevpr" / "models", "calc", card={"title": "My own"})
+    assert load_card("calc").title == "My own"
+
+
+def test_the_fingerprint_changes_with_all_that_a_descriptor_depends_on(models):
+    whole = {"file": "tiny.onnx", "sha256": SHA256}
+    found = {
+        read_card(write_card(models / "tiny.yaml", {**whole, **changes})).fingerprint
+        for changes in (
+            {},
+            {"sha256": "1" * 64},
+            {"input": {**CARD["input"], "equalise": True}},
+            {"outputs": {"descriptor": "other", "features": "features"}},
+        )
+    }
+    assert len(found) == 4
+    assert read_card(write_card(models / "tiny.yaml", {**whole, "title": "Better named"})).fingerprint in found
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"sha256": "abc"}, r"`sha256` must be the 64 hexadecimal digits that `sha256sum tiny.onnx` prints"),
+        ({"file": "../tiny.onnx"}, "write the name of a file that lies beside the card"),
+        ({"head": {"name": "rmak"}}, "there is no head `rmak`: did you mean `rmac`"),
+        ({"head": {"name": "transformer"}}, "there is no head `transformer`: use flatten, max, gem"),
+        ({"head": {"name": "gem"}}, "the key `head.p` is missing"),
+        ({"head": {"name": "gem", "p": 0}}, "`head.p` is 0; it must be between 0.1 and 100"),
+        ({"head": {"name": "grid", "rows": 2, "columns": 2, "how": "median"}}, "`head.how` is `median`"),
+        ({"head": {"name": "pyramid", "levels": [1, "two"]}}, "write whole numbers from 1 to 64"),
+        ({"head": {"name": "max", "p": 3}}, "unknown key `head.p`"),
+        ({"head": "max"}, "`head` must be a section, not 'max'"),
+        ({"head": {"name": "max"}, "outputs": {"descriptor": "descriptor"}}, "`max` needs a feature map"),
+        ({"outputs": {}}, "`outputs` names none"),
+        ({"similarity": "cosin"}, "`similarity` is `cosin`: write cosine, l1 or l2"),
+        ({"input": {**CARD["input"], "colour": "gray"}}, "`input.colour` is `gray`: write grey, bgr or rgb"),
+        ({"input": {**CARD["input"], "layout": "CHW"}}, "`input.layout` is `CHW`: write NCHW or NHWC"),
+        ({"input": {**CARD["input"], "resize": "crop"}}, "`input.resize` is `crop`: write area, linear or cubic"),
+        ({"input": {**CARD["input"], "mean": [1.0, 2.0]}}, "`input.mean` is .*: write one number or 1"),
+        ({"input": {**CARD["input"], "mean": 0.5}}, "`input.mean` must be a list, not 0.5"),
+        ({"input": {**CARD["input"], "std": [0.0]}}, "`input.std` is .* all above 0"),
+        ({"input": {**CARD["input"], "height": 4}}, "`input.height` is 4; it must be between 8"),
+        ({"lisence": "MIT"}, "unknown key `lisence`.*did you mean `licence`"),
+        ({"path": "/etc"}, "`path` must be"),
+    ],
+)
+def test_a_wrong_card_is_one_sentence_that_names_it(models, changes, says):
+    path = write_card(models / "tiny.yaml", {"file": "tiny.onnx", "sha256": SHA256, **changes})
+    with pytest.raises(EdgevprError, match=says) as raised:
+        load_card("tiny")
+    assert str(raised.value).startswith(str(path))
+    assert "\n" not in str(raised.value)
+
+
+def test_a_missing_key_and_a_missing_card_are_said(models):
+    path = write_card(models / "tiny.yaml", {"sha256": SHA256})
+    path.write_text(path.read_text().replace("licence", "#"))
+    with pytest.raises(ConfigError, match="the key `licence` is missing"):
+        load_card("tiny")
+    with pytest.raises(ModelError, match="There is no model `tinny`: did you mean `tiny`"):
+        load_card("tinny")
+    with pytest.raises(ModelError, match=r"There is no model `\.\./tiny`"):
+        load_card("../tiny")
+
+
+def test_the_weights_of_a_result_are_named(models):
+    write_network(models)
+    part = PartSpec((1,), "<f2")
+    assert weights_of(TechniqueSpec("hog", {}, part)) is None
+    said = "tiny: A tiny network (MIT; made by a test)"
+    assert weights_of(TechniqueSpec("tiny", {}, part, model_sha256=SHA256)) == said
+    assert weights_of(TechniqueSpec("calc", {"model": "tiny"}, part, model_sha256=SHA256)) == said

@@ -1,0 +1,160 @@
+"""Networks that work, and one sentence for each that does not: none of them may fly."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from pictures import textured
+from tiny_networks import CARD, FEATURES, HEIGHT, WIDTH, write_card, write_network
+
+from edgevpr.errors import ModelError
+from edgevpr.techniques.networks import session
+from edgevpr.techniques.networks.session import open_backbone
+
+
+def test_both_outputs_of_a_network_and_their_shapes(models):
+    write_network(models)
+    features, descriptor = open_backbone("tiny", "features"), open_backbone("tiny", "descriptor")
+    assert (features.shape, descriptor.shape) == (FEATURES, (16,))
+    image = textured(1)
+    found = features.run(image)
+    assert found.dtype == np.float32
+    pooled = found.reshape(4, 2, 5, 2, 7).mean(axis=(2, 4))
+    np.testing.assert_allclose(descriptor.run(image), pooled.ravel(), rtol=1e-5)
+    assert len(features.sha256) == 64
+    assert features.sha256 == descriptor.sha256 != features.card.sha256
+
+
+def test_one_session_serves_all_techniques_of_a_file(models):
+    write_network(models)
+    assert open_backbone("tiny", "features").session is open_backbone("tiny", "descriptor").session
+
+
+def test_a_batch_of_any_size_counts_as_one(models):
+    write_network(models, fault="dynamic batch")
+    assert open_backbone("tiny", "features").shape == FEATURES
+
+
+def test_masked_pixels_do_not_count(models):
+    write_network(models)
+    backbone, image = open_backbone("tiny", "features"), textured(1)
+    mask = np.ones(image.shape, bool)
+    mask[60:] = False
+    changed = np.where(mask, image, 255 - image)
+    np.testing.assert_array_equal(backbone.run(image, mask), backbone.run(changed, mask))
+    assert (backbone.run(image) != backbone.run(changed)).any()
+
+
+@pytest.mark.parametrize(
+    ("fault", "says"),
+    [
+        ("no onnx", "cannot be opened as an ONNX model"),
+        ("weights outside", "cannot be opened as an ONNX model with its weights inside"),
+        ("dynamic size", r"input \(1, 1, \?, \?\) has axes without a size .* fixed size \(1, 1, 24, 32\)"),
+        ("other size", r"input is tensor\(float\) \(1, 1, 24, 40\) and the card says float \(1, 1, 24, 32\)"),
+        ("double", r"input is tensor\(double\)"),
+        ("two inputs", "has 2 inputs"),
+        ("nan", "not finite for `features`"),
+        ("zeros", "nothing but zeros for `features`"),
+    ],
+)
+def test_a_file_that_must_not_fly_is_one_sentence(models, monkeypatch, fault, says):
+    write_network(models, fault=fault)
+    monkeypatch.chdir(models)  # where weights in a second file would be found
+    with pytest.raises(ModelError, match=says) as raised:
+        open_backbone("tiny", "features")
+    assert str(raised.value).startswith(str(models / "tiny.onnx"))
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("card", "output", "says"),
+    [
+        ({"outputs": {"features": "conv5"}}, "features", "no output `conv5`.*it has descriptor, features"),
+        ({"outputs": {"features": "descriptor"}}, "features", r"is \(1, 16\) and `features` must be \(1, C, H, W\)"),
+        ({"outputs": {"descriptor": "features"}}, "descriptor", r"is \(1, 4, 10, 14\) and .* must be \(1, D\)"),
+        ({"outputs": {"features": "features"}}, "descriptor", "names no output for `descriptor`"),
+        ({"input": {**CARD["input"], "colour": "rgb"}}, "features", r"the card says float \(1, 3, 24, 32\)"),
+        ({"input": {**CARD["input"], "layout": "NHWC"}}, "features", r"the card says float \(1, 24, 32, 1\)"),
+        (
+            {"sha256": "0" * 64},
+            "features",
+            "is not the file of its card: its SHA-256 is [0-9a-f]{64} and the card says 0",
+        ),
+        ({"file": "gone.onnx"}, "features", "gone.onnx cannot be read"),
+    ],
+)
+def test_a_card_that_does_not_fit_its_file_is_one_sentence(models, card, output, says):
+    write_network(models, card=card)
+    with pytest.raises(ModelError, match=says):
+        open_backbone("tiny", output)
+
+
+def test_whole_numbers_are_no_descriptor(models):
+    write_network(models, fault="whole numbers", card={"outputs": {"features": "number"}})
+    with pytest.raises(ModelError, match="`number` is tensor\\(int64\\): it must be float"):
+        open_backbone("tiny", "features")
+
+
+def test_a_picture_of_which_nothing_is_made_is_refused_in_flight_too(models):
+    write_network(models)
+    backbone = open_backbone("tiny", "features")
+    with pytest.raises(ModelError, match="not finite"):
+        session._run(backbone.card, "features", FakeSession(np.full((1, *FEATURES), np.inf, np.float32)), textured(1))
+    with pytest.raises(ModelError, match="nothing but zeros"):
+        session._run(backbone.card, "features", FakeSession(np.zeros((1, *FEATURES), np.float32)), textured(1))
+
+
+class FakeSession:
+    """Gives the same whatever it is asked, as a network on the ground cannot be made to."""
+
+    def __init__(self, result):
+        self._result = result
+
+    def get_inputs(self):
+        return [type("Input", (), {"name": "picture"})]
+
+    def run(self, names, feed):
+        assert feed["picture"].shape == (1, 1, HEIGHT, WIDTH)
+        return [self._result]
+
+
+def test_a_file_that_changes_on_the_disk_is_noticed_by_the_next_process(models):
+    write_network(models)
+    card = (models / "tiny.yaml").read_text()
+    write_network(models, fault="zeros")
+    (models / "tiny.yaml").write_text(card)
+    with pytest.raises(ModelError, match="is not the file of its card"):
+        open_backbone("tiny", "features")
+
+
+BROKEN = """
+import sys
+sys.modules["onnxruntime"] = None  # what an import of a broken one does
+from edgevpr import techniques
+for name in ("hog", "cohog", "seqslam"):
+    techniques.create(name)
+try:
+    techniques.create("calc", {"model": "tiny"})
+except techniques.EdgevprError as error:
+    print(error)
+"""
+
+
+def test_without_onnxruntime_the_others_fly(models):
+    write_network(models)
+    done = subprocess.run([sys.executable, "-c", BROKEN], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("onnxruntime cannot be imported (")
+    assert done.stdout.endswith("hog, cohog and seqslam fly without it.\n")
+    assert done.stdout.count("\n") == 1
+
+
+def test_a_card_alone_imports_no_onnxruntime(models):
+    write_card(models / "tiny.yaml", {"sha256": "0" * 64})
+    script = "import sys; from edgevpr import techniques as t; t.names(); t.parameters('calc'); print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    loaded = done.stdout.split()
+    assert "edgevpr.techniques.calc" in loaded
+    assert "onnxruntime" not in loaded

@@ -1,0 +1,227 @@
+"""The techniques that take the feature map of a network, on the backbone that edgevpr ships."""
+
+import hashlib
+
+import cv2
+import numpy as np
+import pytest
+from pictures import textured
+
+from edgevpr.errors import ModelError, UsageError
+from edgevpr.techniques import create
+from edgevpr.techniques.heads.regions import describe, find_regions
+from edgevpr.techniques.heads.vlad import local_descriptors
+from edgevpr.techniques.networks.session import open_backbone
+
+SETTINGS = {
+    "alexnet": {"dims": 256},
+    "amosnet": {"levels": 3},
+    "hybridnet": {},
+    "netvlad": {"words": 8},
+    "rmac": {},
+    "region_vlad": {"words": 12, "regions": 50},
+    "cross_region_bow": {"words": 40, "regions": 60},
+}
+FORMS = ("float", "8bit", "1bit")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_words(tmp_path_factory):
+    """Words for the shipped backbone, some descriptors of pictures as they are: learning is tested elsewhere."""
+    folder = tmp_path_factory.mktemp("models")
+    backbone = open_backbone("calc", "features")
+    features = [backbone.run(textured(seed)) for seed in (20, 21, 22)]
+    local = np.concatenate([local_descriptors(each) for each in features])
+    found = np.concatenate([describe(each, find_regions(each, 60)[0]) for each in features])
+    for kind, points, count in (("vlad", local, 8), ("vlad", local, 9), ("regions", found, 12), ("bow", found, 40)):
+        words = points[np.random.default_rng(0).permutation(len(points))[:count]]
+        np.savez(folder / f"calc_{kind}{count}.npz", words=words.astype(np.float16), model_sha256=backbone.sha256)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("EDGEVPR_MODELS", str(folder))
+        yield
+
+
+def technique(name, **settings):
+    return create(name, {**SETTINGS[name], **settings})
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_every_picture_makes_a_descriptor_of_the_form_of_the_spec(name):
+    it = technique(name)
+    image = textured(1)
+    for picture in (
+        image,
+        np.dstack([image, textured(2), textured(3)]),
+        cv2.resize(image, (33, 71)),
+        np.full((120, 160), 128, np.uint8),
+        np.zeros((16, 16), np.uint8),
+        np.full((5, 4, 3), 255, np.uint8),
+    ):
+        descriptor = it.encode(picture)
+        assert descriptor.coarse.shape == it.spec.coarse.shape
+        assert descriptor.coarse.dtype == np.dtype("<f2")
+        assert np.isfinite(descriptor.coarse).all()
+        assert 0 <= descriptor.quality <= 1
+        if it.spec.fine:
+            assert descriptor.fine.shape == it.spec.fine.shape
+            assert descriptor.fine.dtype == np.int8
+            assert descriptor.good.shape == it.spec.fine.shape[:1]
+            np.testing.assert_array_equal(descriptor.fine.any(axis=1), descriptor.good)
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("name", SETTINGS)
+def test_a_picture_finds_itself_darker_and_noisier(name, form):
+    it = technique(name, form=form)
+    pictures = [textured(seed) for seed in range(8)]
+    places = [it.encode(picture) for picture in pictures]
+    coarse = np.stack([place.coarse for place in places])
+    mean = coarse.astype(np.float32).mean(axis=0)
+    rows = it.pack(coarse, mean) if it.spec.packed else coarse
+    assert rows.shape[1:] == it.spec.row.shape
+    noise = np.random.default_rng(0)
+    for at, picture in enumerate(pictures):
+        seen = np.clip(0.8 * picture + noise.normal(0, 3, picture.shape), 0, 255).astype(np.uint8)
+        query = it.encode(seen)
+        scores, hypotheses = it.coarse_scores(query, rows, mean)
+        assert hypotheses is None
+        assert scores.dtype == np.float32
+        assert 0 <= scores.min() <= scores.max() <= 1
+        if it.spec.fine:
+            assert at in np.argsort(-scores)[:3]
+            scores = [it.match(query, place.fine).score for place in places]
+            assert 0 <= min(scores) <= max(scores) <= 1
+        assert int(np.argmax(scores)) == at
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_a_descriptor_is_the_same_each_time(name):
+    first, second = technique(name), technique(name)
+    assert first.spec == second.spec
+    one, other = first.encode(textured(4)), second.encode(textured(4))
+    assert one.coarse.tobytes() == other.coarse.tobytes()
+    if one.fine is not None:
+        assert one.fine.tobytes() == other.fine.tobytes()
+        assert first.match(one, other.fine) == second.match(other, one.fine)
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_masked_pixels_do_not_count(name):
+    it = technique(name)
+    image, mask = textured(5), np.ones((120, 160), bool)
+    mask[70:] = False
+    changed = np.where(mask, image, textured(6))
+    assert (changed != image).any()
+    assert it.encode(image, mask).coarse.tobytes() == it.encode(changed, mask).coarse.tobytes()
+    assert it.encode(image, mask).coarse.tobytes() != it.encode(image).coarse.tobytes()
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_a_map_knows_model_and_head_but_not_the_form(name):
+    specs = [technique(name, form=form).spec for form in FORMS]
+    assert specs[0].parameters == {"model": "calc", **create(name, SETTINGS[name]).spec.parameters}
+    assert SETTINGS[name].items() <= specs[0].parameters.items()
+    assert len({(spec.coarse, spec.fine, spec.model_sha256) for spec in specs}) == 1
+    assert len(specs[0].model_sha256) == 64
+    assert specs[0].row.nbytes > specs[1].row.nbytes > specs[2].row.nbytes
+
+
+def test_other_words_are_another_map():
+    eight, nine = technique("netvlad").spec, technique("netvlad", words=9).spec
+    assert eight.model_sha256 != nine.model_sha256
+    assert eight.model_sha256 != technique("rmac").spec.model_sha256
+
+
+def test_amosnet_and_hybridnet_differ_by_their_weights_alone():
+    amosnet, hybridnet = technique("amosnet", levels=4), technique("hybridnet")
+    assert amosnet.encode(textured(1)).coarse.tobytes() == hybridnet.encode(textured(1)).coarse.tobytes()
+    assert (amosnet.spec.name, hybridnet.spec.name) == ("amosnet", "hybridnet")
+
+
+def test_hard_and_soft_assignment_differ():
+    hard, soft = (technique("netvlad", assignment=how).encode(textured(1)).coarse for how in ("hard", "soft"))
+    assert 0.5 < hard.astype(np.float32) @ soft.astype(np.float32) < 0.9999
+
+
+def test_a_seed_is_a_projection_of_its_own():
+    vectors = [technique("alexnet", seed=seed).encode(textured(1)).coarse.astype(np.float32) for seed in (0, 1)]
+    assert abs(vectors[0] @ vectors[1]) < 0.4
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "error", "says"),
+    [
+        ("alexnet", {"dims": 0}, UsageError, "dims must be 8"),
+        ("alexnet", {"seed": -1}, UsageError, "seed 0 or more"),
+        ("alexnet", {"dims": 60_000}, ModelError, "cannot be projected to 60000"),
+        ("amosnet", {"levels": 0}, UsageError, "amosnet: levels is 0"),
+        ("hybridnet", {"levels": 40}, ModelError, "too small for a grid"),
+        ("netvlad", {"assignment": "fuzzy"}, UsageError, "use soft or hard"),
+        ("netvlad", {"words": 7}, ModelError, "train words --images DIR --model calc --kind vlad --count 7"),
+        ("region_vlad", {"regions": 0}, UsageError, "region_vlad: regions is 0"),
+        ("region_vlad", {"words": 7}, ModelError, "--kind regions --count 7"),
+        ("cross_region_bow", {"words": 7}, ModelError, "--kind bow --count 7"),
+        ("rmac", {"form": "2bit"}, UsageError, "rmac has no form `2bit`"),
+        ("rmac", {"model": "kalc"}, ModelError, "did you mean `calc`"),
+    ],
+)
+def test_what_cannot_be_is_said_before_take_off(name, settings, error, says):
+    with pytest.raises(error, match=says):
+        technique(name, **settings)
+
+
+def write_network(folder, name, side, shift):
+    """A card `name` and its network: 4 channels, `side` x `side`, of a picture of 32x32, averages plus `shift`."""
+    onnx = pytest.importorskip("onnx", reason="writing a network for this test needs the package onnx")
+    step = 32 // side
+    weights = onnx.numpy_helper.from_array(np.full((4, 1, step, step), step**-2, np.float32), "weights")
+    bias = onnx.numpy_helper.from_array(np.full(4, shift, np.float32), "bias")
+    picture, features = (
+        onnx.helper.make_tensor_value_info(*each)
+        for each in (("picture", 1, [1, 1, 32, 32]), ("features", 1, [1, 4, side, side]))
+    )
+    node = onnx.helper.make_node("Conv", ["picture", "weights", "bias"], ["features"], strides=[step, step])
+    graph = onnx.helper.make_graph([node], "g", [picture], [features], [weights, bias])
+    model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)], ir_version=8)
+    content = model.SerializeToString()
+    (folder / f"{name}.onnx").write_bytes(content)
+    (folder / f"{name}.yaml").write_text(
+        f"title: {name}\nfile: {name}.onnx\nsha256: {hashlib.sha256(content).hexdigest()}\nlicence: MIT\n"
+        "source: a test\ninput: {layout: NCHW, height: 32, width: 32, colour: grey, equalise: false, resize: area, "
+        "scale: 0.004, mean: [0.0]}\noutputs: {features: features}\nsimilarity: cosine\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "side", "shift", "says"),
+    [
+        ("amosnet", 2, 0, "2x2 is too small for a grid of 3x3"),
+        ("rmac", 1, 0, "1x1 is too small for the regions of R-MAC"),
+        ("alexnet", 4, 0, "64 values cannot be projected to 256"),
+        ("region_vlad", 2, 0, "2x2, too small for regions"),
+        ("cross_region_bow", 1, 0, "1x1, too small for regions"),
+        ("region_vlad", 8, -5, "nothing above zero"),
+    ],
+)
+def test_a_network_that_does_not_fit_is_refused_before_take_off(name, side, shift, says, tmp_path, monkeypatch):
+    monkeypatch.setenv("EDGEVPR_MODELS", str(tmp_path))
+    write_network(tmp_path, "tiny", side, shift)
+    with pytest.raises(ModelError, match=says):
+        technique(name, model="tiny")
+
+
+def test_a_picture_without_any_region_says_nothing(tmp_path, monkeypatch):
+    monkeypatch.setenv("EDGEVPR_MODELS", str(tmp_path))
+    write_network(tmp_path, "dim", 8, -0.2)  # active where it is brighter than 50
+    sha256 = open_backbone("dim", "features").sha256
+    for kind, count in (("regions", 12), ("bow", 40)):
+        words = np.random.default_rng(0).random((count, 4)).astype(np.float16)
+        np.savez(tmp_path / f"dim_{kind}{count}.npz", words=words, model_sha256=sha256)
+    for name in ("region_vlad", "cross_region_bow"):
+        it = technique(name, model="dim")
+        night, day = it.encode(np.full((32, 32), 9, np.uint8)), it.encode(textured(1))
+        assert (night.quality, day.quality) == (0, 1)
+        scores, _ = it.coarse_scores(night, np.stack([day.coarse, night.coarse]), None)
+        assert scores.tolist() == [0, 0]
+        if it.spec.fine:
+            assert it.match(night, day.fine).score == it.match(day, night.fine).score == 0

@@ -1,0 +1,135 @@
+"""The three forms of a vector, against literal transcriptions place by place."""
+
+import tracemalloc
+
+import numpy as np
+import pytest
+
+from edgevpr.errors import ModelError, UsageError
+from edgevpr.techniques.vectors import FORMS, VectorTechnique
+
+LENGTH = 131  # no multiple of anything
+
+
+class Given(VectorTechnique):
+    """Encodes the vector that the test hands it as the image."""
+
+    accept = {"8bit": (0.1, 0.2)}  # noqa: RUF012
+    min_margin = 0.05
+
+    def __init__(self, form="float", similarity="cosine", length=LENGTH):
+        super().__init__("given", {}, length, form, similarity)
+
+    def vector(self, image, mask):
+        return image
+
+
+def places(count=40, seed=0, length=LENGTH):
+    """Vectors with a large common part, as those of networks have."""
+    rng = np.random.default_rng(seed)
+    return (1.0 + rng.normal(0, 0.3, (count, length))).astype(np.float32)
+
+
+def made(form, similarity, vectors):
+    """Technique, coarse parts, their mean, and the rows of the index."""
+    technique = Given(form, similarity, vectors.shape[1])
+    coarse = np.stack([technique.encode(vector).coarse for vector in vectors])
+    mean = coarse.astype(np.float32).mean(axis=0)
+    rows = technique.pack(coarse, mean) if technique.spec.packed else coarse
+    assert rows.shape[1:] == technique.spec.row.shape
+    assert rows.dtype == np.dtype(technique.spec.row.dtype)
+    return technique, coarse, mean, rows
+
+
+def literal_score(form, similarity, query, place, mean):
+    """One place, in the words of the module."""
+    query, place, mean = (each.astype(np.float64) for each in (query, place, mean))
+    if form == "1bit":
+        return sum((q > m) == (p > m) for q, p, m in zip(query, place, mean, strict=True)) / len(mean)
+    if form == "8bit":
+        query, place = query - mean, place - mean
+        largest = max(abs(place))
+        place = np.array([round(value / largest * 127) for value in place]) * largest / 127
+    if similarity == "cosine":
+        cosine = float(query @ place) / np.sqrt(float(query @ query) * float(place @ place))
+        return max(cosine, 0.0) if form == "float" else (1 + cosine) / 2
+    if similarity == "l1":
+        return 1 / (1 + sum(abs(q - p) for q, p in zip(query, place, strict=True)))
+    return 1 / (1 + np.sqrt(sum((q - p) ** 2 for q, p in zip(query, place, strict=True))))
+
+
+@pytest.mark.parametrize("similarity", ["cosine", "l1", "l2"])
+@pytest.mark.parametrize("form", FORMS)
+def test_scores_are_those_of_a_literal_loop(form, similarity):
+    technique, coarse, mean, rows = made(form, similarity, places())
+    query = technique.encode(places(1, seed=5)[0])
+    scores, hypotheses = technique.coarse_scores(query, rows, mean, turned_deg=np.zeros(len(rows)))
+    assert hypotheses is None
+    assert scores.dtype == np.float32
+    expected = [literal_score(form, similarity, query.coarse, place, mean) for place in coarse]
+    np.testing.assert_allclose(scores, expected, atol=1e-3)
+
+
+@pytest.mark.parametrize("similarity", ["cosine", "l1", "l2"])
+@pytest.mark.parametrize("form", FORMS)
+def test_the_place_itself_scores_best_and_all_scores_are_shares(form, similarity):
+    technique, coarse, mean, rows = made(form, similarity, places())
+    for at in (0, 17, 39):
+        scores, _ = technique.coarse_scores(technique.encode(coarse[at].astype(np.float32)), rows, mean)
+        assert int(scores.argmax()) == at
+        assert 0 <= scores.min() <= scores.max() <= 1
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_map_of_one_place_or_of_the_same_place_has_finite_scores(form):
+    technique, coarse, mean, rows = made(form, "cosine", np.repeat(places(1), 3, axis=0))
+    for query in (coarse[0], places(1, seed=3)[0], np.zeros(LENGTH)):
+        scores, _ = technique.coarse_scores(technique.encode(query.astype(np.float32)), rows, mean)
+        assert np.isfinite(scores).all()
+        assert ((scores >= 0) & (scores <= 1)).all()
+
+
+def test_sizes_of_a_place_in_ram():
+    assert [Given(form).spec.row.nbytes for form in FORMS] == [262, 139, 24]
+    assert Given("float").spec.packed is None
+    assert {(Given(form).spec.coarse, Given(form).spec.model_sha256) for form in FORMS} == {(Given().spec.coarse, None)}
+
+
+def test_a_form_may_have_its_own_rule():
+    assert (Given("8bit").min_score, Given("8bit").min_margin) == (0.1, 0.2)
+    assert (Given("1bit").min_score, Given("1bit").min_margin) == (0.0, 0.05)
+    with pytest.raises(UsageError, match="given has no form `2bit`: use float, 8bit or 1bit"):
+        Given("2bit")
+
+
+def test_numbers_beyond_half_precision_are_an_error_and_not_infinite():
+    with pytest.raises(ModelError, match="beyond half precision"):
+        Given(similarity="l1").encode(np.full(LENGTH, 1e6, np.float32))
+    assert Given().encode(np.full(LENGTH, 1e6, np.float32)).quality == 1
+
+
+def test_a_vector_of_zeros_says_that_it_says_nothing():
+    assert Given().encode(np.zeros(LENGTH, np.float32)).quality == 0
+    assert Given().encode(places(1)[0]).quality == 1
+
+
+@pytest.mark.parametrize("similarity", ["cosine", "l1", "l2"])
+@pytest.mark.parametrize("form", FORMS)
+def test_scoring_takes_little_beside_the_rows(form, similarity):
+    technique, _, mean, rows = made(form, similarity, places(16, length=4096))
+    many = np.resize(rows, (8192, rows.shape[1]))  # as float32 all of them would be 134 MB
+    query = technique.encode(places(1, length=4096)[0])
+    tracemalloc.start()
+    scores, _ = technique.coarse_scores(query, many, mean)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    np.testing.assert_array_equal(scores[:16], scores[-16:])
+    assert peak < 12e6
+
+
+def test_a_long_binary_vector_is_counted_in_full():
+    technique, coarse, mean, rows = made("1bit", "cosine", places(4, length=142_884))  # that of hog
+    scores, _ = technique.coarse_scores(technique.encode(-coarse[0].astype(np.float32)), rows, mean)
+    assert scores.max() < 0.7
+    same, _ = technique.coarse_scores(technique.encode(coarse[1].astype(np.float32)), rows, mean)
+    assert same[1] == 1

@@ -1,0 +1,99 @@
+"""ONNX files of a few hundred bytes, whole and broken, with their cards."""
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+from onnx import TensorProto, helper, numpy_helper, save
+
+HEIGHT, WIDTH = 24, 32
+FEATURES = (4, 10, 14)
+CARD = {
+    "title": "A tiny network",
+    "file": "tiny.onnx",
+    "licence": "MIT",
+    "source": "made by a test",
+    "input": {
+        "layout": "NCHW",
+        "height": HEIGHT,
+        "width": WIDTH,
+        "colour": "grey",
+        "equalise": False,
+        "resize": "area",
+        "scale": 1 / 255,
+        "mean": [0.5],
+    },
+    "outputs": {"descriptor": "descriptor", "features": "features"},
+    "head": None,
+    "similarity": "cosine",
+}
+
+
+def write_network(folder: Path, name: str = "tiny", fault: str | None = None, card: dict | None = None) -> Path:
+    """Write NAME.onnx and NAME.yaml, with a `fault` of the file or other keys on the `card`; returns the card."""
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / f"{name}.onnx"
+    if fault == "no onnx":
+        file.write_text("this is a letter to the pilot")
+    else:
+        save(_network(fault), str(file), save_as_external_data=fault == "weights outside", size_threshold=0)
+    sha256 = hashlib.sha256(file.read_bytes()).hexdigest()
+    return write_card(folder / f"{name}.yaml", {"file": file.name, "sha256": sha256, **(card or {})})
+
+
+def write_card(path: Path, changes: dict) -> Path:
+    """The card `CARD` with some keys changed."""
+    values = {**CARD, **changes}
+    path.write_text("".join(f"{key}: {_flow(value)}\n" for key, value in values.items()))
+    return path
+
+
+def _flow(value) -> str:
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key}: {_flow(each)}" for key, each in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_flow, value)) + "]"
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f'"{value}"' if isinstance(value, str) else repr(value)
+
+
+def _network(fault: str | None):
+    rng = np.random.default_rng(1)
+    weights = rng.normal(0, 0.3, (FEATURES[0], 1, 5, 5)).astype(np.float32)
+    bias = np.full(FEATURES[0], 0.2, np.float32)
+    if fault == "nan":
+        weights[1, 0, 2, 2] = np.nan
+    if fault == "zeros":
+        weights[:], bias[:] = 0, -1
+    if fault == "no bias":
+        bias[:] = 0
+    size: list = [1, 1, HEIGHT, WIDTH]
+    if fault == "dynamic size":
+        size = [1, 1, "high", "wide"]
+    if fault == "dynamic batch":
+        size[0] = "batch"
+    if fault == "other size":
+        size = [1, 1, HEIGHT, WIDTH + 8]
+    kind = TensorProto.DOUBLE if fault == "double" else TensorProto.FLOAT
+    nodes = [
+        helper.make_node("Conv", ["picture", "weights", "bias"], ["conv"], strides=[2, 2]),
+        helper.make_node("Relu", ["conv"], ["features"]),
+        helper.make_node("AveragePool", ["features"], ["pooled"], kernel_shape=[5, 7], strides=[5, 7]),
+        helper.make_node("Flatten", ["pooled"], ["descriptor"]),
+    ]
+    inputs = [helper.make_tensor_value_info("picture", TensorProto.FLOAT, size)]
+    if fault == "double":
+        inputs = [helper.make_tensor_value_info("picture64", kind, size)]
+        nodes.insert(0, helper.make_node("Cast", ["picture64"], ["picture"], to=TensorProto.FLOAT))
+    if fault == "two inputs":
+        inputs.append(helper.make_tensor_value_info("scale", TensorProto.FLOAT, [1]))
+    outputs = [helper.make_tensor_value_info(each, TensorProto.FLOAT, None) for each in ("descriptor", "features")]
+    if fault == "whole numbers":
+        nodes.append(helper.make_node("ArgMax", ["features"], ["number"], axis=1))
+        outputs.append(helper.make_tensor_value_info("number", TensorProto.INT64, None))
+    initial = [numpy_helper.from_array(weights, "weights"), numpy_helper.from_array(bias, "bias")]
+    graph = helper.make_graph(nodes, "tiny", inputs, outputs, initial)
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
