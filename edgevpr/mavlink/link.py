@@ -26,6 +26,7 @@ HEARTBEAT_S = 1.0
 TURN_S = 0.25  # how long the thread sleeps where nothing wakes it
 RETRY_FIRST_S, RETRY_MAX_S = 0.2, 2.0
 HEALTH_GOOD_FOR_S = 10.0  # a main loop that hangs must not look healthy because this thread does not
+ASK_AGAIN_S = 5.0
 STUCK_S = 0.5  # a port that has taken no byte for so long is opened anew: what waits in it would come out late
 FLUSH_S = 0.5
 
@@ -52,8 +53,8 @@ class LinkStats:
 class Link:
     """Sends what it is given and a heartbeat a second, listens, and outlives every loss of the other end.
 
-    `send`, `send_fix`, `set_health`, `vehicle_position` and `stats` may be called from any thread, never block and
-    never raise.
+    `send`, `send_fix`, `set_health`, `want_position`, `vehicle_position` and `stats` may be called from any thread,
+    never block and never raise.
     """
 
     def __init__(self, address: LinkAddress, component_id: int = 197, clock: Callable[[], float] = time.monotonic):
@@ -68,6 +69,7 @@ class Link:
         self._unsent = b""  # the rest of a message of which the port took only a part
         self._blocked_since_s: float | None = None
         self._heartbeat_due_s = clock()
+        self._ask_position_s: float | None = None  # when to ask for it next; None: nobody wants it
         self._sent: Counter[str] = Counter()
         self._reopened = 0
         self._retry_s = RETRY_FIRST_S
@@ -106,6 +108,10 @@ class Link:
     def set_health(self, health: Health) -> None:
         """Set what the heartbeats of the next ten seconds say; a caller that falls silent is reported as critical."""
         self._health, self._health_set_s = health, self._clock()
+
+    def want_position(self) -> None:
+        """Ask the autopilot to say where it is, now and whenever it has fallen silent about it."""
+        self._ask_position_s = self._clock()
 
     def vehicle_position(self, max_age_s: float) -> VehiclePosition | None:
         """Where the autopilot says it is; None where it does not know or last said so more than `max_age_s` ago."""
@@ -223,12 +229,23 @@ class Link:
             stuck = now_s - self._health_set_s > HEALTH_GOOD_FOR_S
             return messages.heartbeat(Health.CRITICAL if stuck else self._health)
         if self._autopilot.listens(now_s):
+            self._ask_for_position(now_s)
             fix = self._outbox.next_fix(now_s)
             if fix is not None:
                 return messages.position_fix(fix, now_s, self._autopilot.system_id)
         else:
             self._outbox.drop_stale_fixes(now_s)
         return self._outbox.next_message()
+
+    def _ask_for_position(self, now_s: float) -> None:
+        """An autopilot that has started anew has forgotten what it was asked for."""
+        if self._ask_position_s is None or now_s < self._ask_position_s:
+            return
+        self._ask_position_s = now_s + ASK_AGAIN_S
+        position = self._autopilot.position
+        if position is None or now_s - position.t_heard_s > ASK_AGAIN_S:
+            for request in messages.position_requests(self._autopilot.system_id):
+                self._outbox.put(request)
 
     def _lose(self, error: Exception) -> None:
         if self._transport is not None:

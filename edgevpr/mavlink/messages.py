@@ -87,6 +87,21 @@ def position_fix(fix: Fix, t_sent_s: float, target_system: int) -> Message:
     )
 
 
+def position_requests(target_system: int) -> tuple[Message, Message]:
+    """Two COMMAND_LONG (76) with SET_MESSAGE_INTERVAL (511): GLOBAL_POSITION_INT (33) five times a second, GPS_RAW_INT
+    (24) twice. Many a companion's port is set to stream neither."""
+    wanted_us = {
+        mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 200_000,
+        mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 500_000,
+    }
+    return tuple(
+        mavlink.MAVLink_command_long_message(
+            target_system, AUTOPILOT, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, message_id, interval_us, 0, 0, 0, 0, 0
+        )
+        for message_id, interval_us in wanted_us.items()
+    )
+
+
 def place_match(t_mono_s: float, place_id: int, score: float) -> tuple[Message, Message]:
     """The event of an accepted match: NAMED_VALUE_INT (252) `vpr_place` and NAMED_VALUE_FLOAT (251) `vpr_score`."""
     return (

@@ -8,7 +8,10 @@ from dataclasses import dataclass
 from edgevpr.mavlink.messages import AUTOPILOT, POSITION_FIX
 from edgevpr.mavlink.wire import Message, mavlink
 
+GPS_GONE_AFTER_S = 2.5  # of its reports, which come at least once a second, one may be lost
 SILENT_AFTER_S = 5.0  # of the heartbeats, which come once a second, this many may be lost
+
+_GPS_REPORTS = ("GPS_RAW_INT", "GPS2_RAW")
 
 log = logging.getLogger(__name__)
 
@@ -23,13 +26,15 @@ _EXPLANATIONS = {
 @dataclass(frozen=True, slots=True)
 class VehiclePosition:
     """Where the autopilot believes to be; `alt_m` above sea level, `heading_deg` 0..360 or None where it does not know,
-    `t_heard_s` on the clock of the link."""
+    `t_heard_s` on the clock of the link. `has_gps`: a receiver of its had a 3D fix then. It goes on saying where it
+    believes to be long after it has lost that."""
 
     lat_deg: float
     lon_deg: float
     alt_m: float
     heading_deg: float | None
     t_heard_s: float
+    has_gps: bool
 
 
 class Autopilot:
@@ -40,7 +45,7 @@ class Autopilot:
         self.acks: Counter[str] = Counter()  # answers to our fixes, by name of the result
         self.position: VehiclePosition | None = None  # the last one heard, however old
         self._own_component = own_component
-        self._heard_s = -math.inf
+        self._heard_s = self._gps_s = -math.inf
         self._last_result: int | None = None
         self._warned = False
 
@@ -65,7 +70,9 @@ class Autopilot:
         if self._answers_our_fix(message):
             self._hear_result(message.result)
         elif message.get_type() == "GLOBAL_POSITION_INT":
-            self.position = _position(message, now_s)
+            self.position = _position(message, now_s, has_gps=now_s - self._gps_s <= GPS_GONE_AFTER_S)
+        elif message.get_type() in _GPS_REPORTS and message.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX:
+            self._gps_s = now_s
         return False
 
     def _answers_our_fix(self, message: Message) -> bool:
@@ -102,9 +109,9 @@ class Autopilot:
             self._last_result = result
 
 
-def _position(message: Message, now_s: float) -> VehiclePosition | None:
+def _position(message: Message, now_s: float, has_gps: bool) -> VehiclePosition | None:
     """None for 0, 0, which is what an autopilot without a position says, and for what is not on Earth."""
     if (message.lat == 0 and message.lon == 0) or abs(message.lat) > 90e7 or abs(message.lon) > 180e7:
         return None
     heading_deg = message.hdg / 100 if message.hdg <= 36_000 else None  # 65535: unknown
-    return VehiclePosition(message.lat / 1e7, message.lon / 1e7, message.alt / 1e3, heading_deg, now_s)
+    return VehiclePosition(message.lat / 1e7, message.lon / 1e7, message.alt / 1e3, heading_deg, now_s, has_gps)

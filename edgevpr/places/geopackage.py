@@ -52,6 +52,63 @@ UPDATE gpkg_contents SET last_change = strftime('%Y-%m-%dT%H:%M:%fZ','now'),
 WHERE table_name = 'places'
 """
 
+# The standard's spatial index (OGC 12-128r18, annex F.3), which other programs use and keep as well: an R-tree, and
+# triggers that follow every change of the places.
+SPATIAL_INDEX = """
+CREATE TABLE IF NOT EXISTS gpkg_extensions (
+    table_name TEXT, column_name TEXT, extension_name TEXT NOT NULL, definition TEXT NOT NULL, scope TEXT NOT NULL,
+    CONSTRAINT ge_tce UNIQUE (table_name, column_name, extension_name));
+INSERT INTO gpkg_extensions VALUES
+    ('places', 'geom', 'gpkg_rtree_index', 'http://www.geopackage.org/spec120/#extension_rtree', 'write-only');
+CREATE VIRTUAL TABLE rtree_places_geom USING rtree(id, minx, maxx, miny, maxy);
+INSERT INTO rtree_places_geom
+    SELECT place_id, ST_MinX(geom), ST_MaxX(geom), ST_MinY(geom), ST_MaxY(geom) FROM places
+    WHERE geom NOT NULL AND NOT ST_IsEmpty(geom);
+CREATE TRIGGER rtree_places_geom_insert AFTER INSERT ON places
+WHEN (new.geom NOT NULL AND NOT ST_IsEmpty(NEW.geom))
+BEGIN
+    INSERT OR REPLACE INTO rtree_places_geom VALUES
+        (NEW.place_id, ST_MinX(NEW.geom), ST_MaxX(NEW.geom), ST_MinY(NEW.geom), ST_MaxY(NEW.geom));
+END;
+CREATE TRIGGER rtree_places_geom_update6 AFTER UPDATE OF geom ON places
+WHEN OLD.place_id = NEW.place_id AND (NEW.geom NOTNULL AND NOT ST_IsEmpty(NEW.geom))
+    AND (OLD.geom NOTNULL AND NOT ST_IsEmpty(OLD.geom))
+BEGIN
+    UPDATE rtree_places_geom SET
+        minx = ST_MinX(NEW.geom), maxx = ST_MaxX(NEW.geom), miny = ST_MinY(NEW.geom), maxy = ST_MaxY(NEW.geom)
+        WHERE id = NEW.place_id;
+END;
+CREATE TRIGGER rtree_places_geom_update7 AFTER UPDATE OF geom ON places
+WHEN OLD.place_id = NEW.place_id AND (NEW.geom NOTNULL AND NOT ST_IsEmpty(NEW.geom))
+    AND (OLD.geom ISNULL OR ST_IsEmpty(OLD.geom))
+BEGIN
+    INSERT INTO rtree_places_geom VALUES
+        (NEW.place_id, ST_MinX(NEW.geom), ST_MaxX(NEW.geom), ST_MinY(NEW.geom), ST_MaxY(NEW.geom));
+END;
+CREATE TRIGGER rtree_places_geom_update2 AFTER UPDATE OF geom ON places
+WHEN OLD.place_id = NEW.place_id AND (NEW.geom ISNULL OR ST_IsEmpty(NEW.geom))
+BEGIN
+    DELETE FROM rtree_places_geom WHERE id = OLD.place_id;
+END;
+CREATE TRIGGER rtree_places_geom_update5 AFTER UPDATE ON places
+WHEN OLD.place_id != NEW.place_id AND (NEW.geom NOTNULL AND NOT ST_IsEmpty(NEW.geom))
+BEGIN
+    DELETE FROM rtree_places_geom WHERE id = OLD.place_id;
+    INSERT OR REPLACE INTO rtree_places_geom VALUES
+        (NEW.place_id, ST_MinX(NEW.geom), ST_MaxX(NEW.geom), ST_MinY(NEW.geom), ST_MaxY(NEW.geom));
+END;
+CREATE TRIGGER rtree_places_geom_update4 AFTER UPDATE ON places
+WHEN OLD.place_id != NEW.place_id AND (NEW.geom ISNULL OR ST_IsEmpty(NEW.geom))
+BEGIN
+    DELETE FROM rtree_places_geom WHERE id IN (OLD.place_id, NEW.place_id);
+END;
+CREATE TRIGGER rtree_places_geom_delete AFTER DELETE ON places
+WHEN old.geom NOT NULL
+BEGIN
+    DELETE FROM rtree_places_geom WHERE id = OLD.place_id;
+END;
+"""
+
 # "GP", version 0, flags: little-endian, no envelope; srs_id; then well-known binary: little-endian, Point, x, y.
 _POINT = struct.Struct("<2sBBiBIdd")
 

@@ -19,12 +19,15 @@ class GrowingIndex:
     When all slots are taken, the best three quarters stay (see `thin`); the map file keeps every place.
     """
 
-    def __init__(self, place_map: PlaceMap, technique: Technique, budget_bytes: int, room: int) -> None:
+    def __init__(
+        self, place_map: PlaceMap, technique: Technique, budget_bytes: int, room: int, beside_bytes: int = 0
+    ) -> None:
         """Read the map, which may be empty, and leave room for `room` more places as far as the budget allows.
 
-        Raises MapError for a budget that holds no place.
+        `beside_bytes` of it a place are left to what grows with the index. Raises MapError for a budget that holds no
+        place.
         """
-        each = bytes_per_place(technique.spec)
+        each = bytes_per_place(technique.spec) + beside_bytes
         self._in_file = len(place_map)
         capacity = min(budget_bytes // each, self._in_file + room)
         if not capacity:
@@ -40,27 +43,31 @@ class GrowingIndex:
         self._taken = 0
         if self._in_file:
             self._taken = min(self._in_file, capacity)
-            load_index(place_map, technique, self._taken * each, into=self.index)
+            load_index(place_map, technique, self._taken * each, into=self.index, beside_bytes=beside_bytes)
 
     @property
     def index(self) -> PlaceIndex:
-        taken, slots = self._taken, self._slots
-        return PlaceIndex(
-            slots.place_ids[:taken], slots.lat_deg[:taken], slots.lon_deg[:taken], slots.rows[:taken], self._mean
-        )
+        return self._view(0, self._taken, self._mean)
 
     @property
     def nbytes(self) -> int:
         """Bytes of all slots, taken or not: what the index will ever take."""
         return self._slots.nbytes
 
-    def add(self, place_id: int, position: Position | None, coarse: np.ndarray) -> None:
-        """Take a place that `PlaceMap.add` has confirmed; ids grow. Raises MapError where the file cannot be read."""
+    def add(
+        self, place_id: int, position: Position | None, coarse: np.ndarray, heading_deg: float | None = None
+    ) -> None:
+        """Take a place that `PlaceMap.add` has confirmed; ids grow.
+
+        Raises MapError where the file cannot be read. The index may be used as before even then: it holds the places
+        that it has read, all packed alike.
+        """
         if self._taken == len(self._slots):
             self._thin()
         at, slots = self._taken, self._slots
         slots.place_ids[at] = place_id
         slots.lat_deg[at], slots.lon_deg[at] = (position.lat_deg, position.lon_deg) if position else (np.nan, np.nan)
+        slots.heading_deg[at] = np.nan if heading_deg is None else heading_deg
         slots.rows[at] = self._technique.pack(coarse[None], self._mean)[0] if self._packs else coarse
         self._taken += 1
         self._in_file += 1
@@ -76,18 +83,34 @@ class GrowingIndex:
         # A slot moves down or stays, so what is overwritten has been moved already or is given up.
         for start in range(0, len(kept), _MOVED_AT_ONCE):
             block = kept[start : start + _MOVED_AT_ONCE]
-            for array in (index.place_ids, index.lat_deg, index.lon_deg, index.rows):
+            for array in _arrays(index):
                 array[start : start + len(block)] = array[block]
         self._taken = len(kept)
 
     def _repack(self) -> None:
-        self._mean, self._mean_of = self._map.mean_coarse(), self._in_file
-        fill(self.index, self._held_parts(), self._technique)
+        mean, parts = self._map.mean_coarse(), self._held_parts()
+        packed = 0
+        try:
+            while packed < self._taken:
+                block = self._view(packed, min(packed + _MOVED_AT_ONCE, self._taken), mean)
+                fill(block, parts, self._technique)
+                packed += len(block)
+        finally:
+            if packed:  # rows packed by the old mean must not stand beside those packed by the new one
+                self._mean, self._mean_of, self._taken = mean, self._in_file, packed
+
+    def _view(self, start: int, end: int, mean: np.ndarray | None) -> PlaceIndex:
+        return PlaceIndex(*(array[start:end] for array in _arrays(self._slots)), mean)
 
     def _held_parts(self) -> Iterator[tuple[int, tuple[float, float] | None, np.ndarray]]:
-        held = iter(self.index.place_ids.tolist())
+        held = map(int, self.index.place_ids)
         wanted = next(held, None)
         for part in self._map.coarse_parts():
             if part[0] == wanted:
                 yield part
                 wanted = next(held, None)
+
+
+def _arrays(index: PlaceIndex) -> tuple[np.ndarray, ...]:
+    """Those with one entry a place, in the order in which `PlaceIndex` takes them."""
+    return index.place_ids, index.lat_deg, index.lon_deg, index.heading_deg, index.rows

@@ -5,6 +5,7 @@ being written, and never the file.
 """
 
 import json
+import math
 import sqlite3
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -15,12 +16,17 @@ import numpy as np
 
 from edgevpr import __version__
 from edgevpr.errors import MapError
+from edgevpr.geodesy import EARTH_RADIUS_M, distance_m
 from edgevpr.places import geopackage
 from edgevpr.places.sqlite import connect, sentences, settle, settle_left_log, start_log
 from edgevpr.types import Descriptor, Frame, PartSpec, Place, Position, TechniqueSpec
 
 FORMAT_VERSION = 1
 _PLACE_COLUMNS = "place_id, geom, time, alt_m, heading_deg, source_image, quality"
+_IN_BOX = """
+SELECT place_id, geom FROM rtree_places_geom JOIN places ON place_id = id
+WHERE maxy >= ? AND miny <= ? AND maxx >= ? AND minx <= ?
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,6 +147,31 @@ class PlaceMap:
                 self._db.execute(geopackage.GROW_EXTENT, {"lat": position.lat_deg, "lon": position.lon_deg})
         return cursor.lastrowid
 
+    def index_positions(self) -> None:
+        """Make `nearest_m` quick whatever the map's size: with the standard's R-tree, unless the map has it already."""
+        with sentences(self.path):
+            if not self._db.execute("SELECT 1 FROM sqlite_master WHERE name = 'rtree_places_geom'").fetchone():
+                try:
+                    self._db.executescript("BEGIN IMMEDIATE;" + geopackage.SPATIAL_INDEX + "COMMIT;")
+                except sqlite3.Error:
+                    if self._db.in_transaction:
+                        self._db.execute("ROLLBACK")
+                    raise
+
+    def nearest_m(self, position: Position, within_m: float) -> float | None:
+        """Metres to the nearest place of the file; None where none lies within `within_m`. See `index_positions`."""
+        lat_deg, lon_deg = position.lat_deg, position.lon_deg
+        north_deg = math.degrees(within_m / EARTH_RADIUS_M)
+        east_deg = min(180.0, north_deg / max(math.cos(math.radians(min(abs(lat_deg) + north_deg, 90.0))), 1e-9))
+        nearest_m = math.inf
+        with sentences(self.path):
+            for turn_deg in (-360.0, 0.0, 360.0):  # places on the other side of the date line
+                box = (lat_deg - north_deg, lat_deg + north_deg, lon_deg + turn_deg - east_deg)
+                for place_id, geom in self._db.execute(_IN_BOX, (*box, lon_deg + turn_deg + east_deg)):
+                    away_m = distance_m(lat_deg, lon_deg, *self._point(place_id, geom))
+                    nearest_m = min(nearest_m, float(away_m))
+        return nearest_m if nearest_m <= within_m else None
+
     def absorb(self, other: "PlaceMap") -> tuple[int, int]:
         """Copy every place of another map of the same technique, all or none; returns (copied, already here).
 
@@ -202,6 +233,12 @@ class PlaceMap:
                 if not np.isfinite(part).all():
                     raise self._damaged(place_id)
                 yield place_id, self._point(place_id, geom), part
+
+    def headings_deg(self) -> Iterator[float]:
+        """Heading of every place, 0 up to 360 or NaN where unknown, in the order they were added."""
+        with sentences(self.path):
+            for (heading_deg,) in self._db.execute("SELECT CAST(heading_deg AS REAL) FROM places ORDER BY place_id"):
+                yield math.nan if heading_deg is None else heading_deg % 360
 
     def fingerprint(self, source_image: str, descriptor: Descriptor) -> tuple[str, int]:
         """What tells one frame from another: its name, and a hash of its coarse part."""

@@ -29,24 +29,26 @@ def rank(
     index: PlaceIndex,
     candidates: int | None = None,
     neighbour_m: float = 0.0,
+    allowed: np.ndarray | None = None,
+    turned_deg: np.ndarray | None = None,
 ) -> Ranking:
     """Scan all places of the index, and compare the best `candidates` of them in full.
 
     None, or as many as there are: all places in full under every hypothesis, without a scan (exact, and slow). Where
     all candidates turn out to be neighbours of the best one, the best-scanned places elsewhere are compared as well:
     without them nobody could say how far ahead it is.
+
+    `allowed` bool (N,), at least one True, leaves all other places out. To be ahead of the few that are left would say
+    little: places elsewhere are compared, five at least, the best-scanned of the whole index where too few are allowed.
+    `turned_deg` (N,) goes to `Technique.coarse_scores`, and its hypotheses to `match`, however small the map.
     """
-    if technique.spec.fine is None:
-        scores, _ = technique.coarse_scores(query, index.rows, index.mean)
-        slots = np.argsort(-scores, kind="stable")
-        return Ranking(slots, scores[slots], tuple(FineMatch(float(score)) for score in scores[slots]))
-    if candidates is None or candidates >= len(index):
-        chosen, hypotheses = np.arange(len(index)), None
-    else:
-        scanned, hypotheses = technique.coarse_scores(query, index.rows, index.mean)
-        chosen = np.argpartition(-scanned, candidates)[:candidates]
+    one_stage = technique.spec.fine is None
+    picked = None if one_stage else allowed  # the rows of one stage are large, and to pick some is to copy them
+    scanned = hypotheses = None
 
     def compared(slots: np.ndarray) -> list[FineMatch]:
+        if one_stage:
+            return [FineMatch(float(scanned[slot])) for slot in slots]
         return [
             technique.match(
                 query, place_map.fine_part(index.place_ids[slot]), None if hypotheses is None else int(hypotheses[slot])
@@ -54,17 +56,49 @@ def rank(
             for slot in slots
         ]
 
+    chosen = np.arange(len(index)) if allowed is None else np.flatnonzero(allowed)
+    if one_stage or candidates is None:
+        candidates = len(chosen)
+    if one_stage or candidates < len(index) or turned_deg is not None:
+        scanned, hypotheses = _scanned(technique, query, index, picked, turned_deg)
+    if candidates < len(chosen):
+        chosen = np.argpartition(-scanned, candidates)[:candidates]
     matches = compared(chosen)
     if len(chosen) < len(index):
         best = chosen[max(range(len(chosen)), key=lambda at: matches[at].score)]
-        if not elsewhere(index, best, chosen, neighbour_m).any():
-            others = np.flatnonzero(elsewhere(index, best, np.arange(len(index)), neighbour_m))
-            others = others[np.argsort(-scanned[others])[:_COMPARED_ELSEWHERE]]
+        rivals = np.count_nonzero(elsewhere(index, best, chosen, neighbour_m))
+        if rivals < (1 if allowed is None else _COMPARED_ELSEWHERE):
+            if picked is not None:
+                scanned, hypotheses = _scanned(technique, query, index, None, turned_deg)
+            others = elsewhere(index, best, np.arange(len(index)), neighbour_m)
+            others[chosen] = False
+            others = np.flatnonzero(others)
+            others = others[np.argsort(-scanned[others])[: _COMPARED_ELSEWHERE - rivals]]
             matches += compared(others)
             chosen = np.append(chosen, others)
     scores = np.array([match.score for match in matches], np.float32)
     order = np.argsort(-scores, kind="stable")
     return Ranking(chosen[order], scores[order], tuple(matches[i] for i in order))
+
+
+def _scanned(
+    technique: Technique,
+    query: Descriptor,
+    index: PlaceIndex,
+    picked: np.ndarray | None,
+    turned_deg: np.ndarray | None,
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Scores and hypotheses (N,) of `Technique.coarse_scores`; -inf for places that are not picked (None: all are)."""
+    some = slice(None) if picked is None else picked
+    hint = {} if turned_deg is None else {"turned_deg": turned_deg[some]}
+    some_scores, some_hypotheses = technique.coarse_scores(query, index.rows[some], index.mean, **hint)
+    scores = np.full(len(index), -np.inf, np.float32)
+    scores[some] = some_scores
+    if some_hypotheses is None:
+        return scores, None
+    hypotheses = np.zeros(len(index), some_hypotheses.dtype)
+    hypotheses[some] = some_hypotheses
+    return scores, hypotheses
 
 
 def elsewhere(index: PlaceIndex, best: int, slots: np.ndarray, neighbour_m: float) -> np.ndarray:

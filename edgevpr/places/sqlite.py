@@ -59,6 +59,8 @@ def sentences(path: Path) -> Iterator[None]:
             advice = "the disk is full: make room; every place confirmed so far is kept"
         elif "not a database" in said:
             advice = "this is not a place map: give a .gpkg file made by `edgevpr map build`"
+        elif "no such module" in said:
+            advice = f"the SQLite of this Python lacks what learning needs ({said}): use the system's own Python"
         elif "malformed" in said or "no such" in said:
             advice = f"the file is damaged or no place map ({said}): restore a copy or build it again"
         elif "readonly" in said:

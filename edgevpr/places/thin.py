@@ -1,11 +1,12 @@
 """Which places stay in RAM when not all of a map fits: the map keeps its best ones, and the file keeps all."""
 
-import heapq
 import math
 
 import numpy as np
 
 from edgevpr.geodesy import metres
+
+_BLOCK = 256  # places of which the least worth is known, so that the least of all is found quickly
 
 
 def best_places(
@@ -27,36 +28,39 @@ def best_places(
     count = len(quality)
     if count <= capacity:
         return np.arange(count)
-    before, after = list(range(-1, count - 1)), list(range(1, count + 1))
-    kept = np.ones(count, bool)
     east_m, north_m = metres(lat_deg, lon_deg)
     # Where a position is unknown, places are taken to be as far apart as they usually are.
-    number = (np.arange(count) if numbers is None else numbers).tolist()
+    number = np.arange(count) if numbers is None else numbers
     steps_m = np.hypot(np.diff(east_m), np.diff(north_m)) / np.diff(number)
     usual_m = (float(np.nanmedian(steps_m)) if np.isfinite(steps_m).any() else 0.0) or 1.0
-    at_m = list(zip(east_m.tolist(), north_m.tolist(), strict=True))  # of Python's floats: the loop below is of scalars
 
     def apart_m(a: int, b: int) -> float:
-        away_m = math.dist(at_m[a], at_m[b])
-        return usual_m * (number[b] - number[a]) if math.isnan(away_m) else away_m
+        away_m = math.hypot(east_m[b] - east_m[a], north_m[b] - north_m[a])
+        return usual_m * float(number[b] - number[a]) if math.isnan(away_m) else away_m
 
-    def worth(at: int) -> float:
-        if before[at] < 0 or after[at] >= count:
+    def worth(before: int, at: int, after: int) -> float:
+        if before < 0 or after >= count:
             return math.inf
         # A tiny share of the way between its neighbours decides among places that lie on each other.
-        nearer_m = min(apart_m(before[at], at), apart_m(at, after[at]))
-        return (nearer_m + 1e-6 * apart_m(before[at], after[at])) * max(float(quality[at]), 1e-3)
+        nearer_m = min(apart_m(before, at), apart_m(at, after))
+        return (nearer_m + 1e-6 * apart_m(before, after)) * max(float(quality[at]), 1e-3)
 
-    heap = [(worth(at), at) for at in range(count)]
-    heapq.heapify(heap)
-    remaining = count
-    while remaining > max(capacity, 2):
-        value, at = heapq.heappop(heap)
-        if not kept[at] or value != worth(at):  # its neighbours have changed since it was valued
-            continue
-        kept[at] = False
-        remaining -= 1
-        after[before[at]], before[after[at]] = after[at], before[at]
-        for neighbour in (before[at], after[at]):
-            heapq.heappush(heap, (worth(neighbour), neighbour))
+    # No lists, and few arrays: in flight this happens beside an index that may take no more memory than it has.
+    before, after = np.arange(-1, count - 1, dtype=np.int32), np.arange(1, count + 1, dtype=np.int32)
+    worths = np.full(-(-count // _BLOCK) * _BLOCK, np.inf)  # of what has been given up, too
+    for at in range(count):
+        worths[at] = worth(at - 1, at, at + 1)
+    blocks = worths.reshape(-1, _BLOCK)
+    least = blocks.min(axis=1)
+    kept = np.ones(count, bool)
+    for _ in range(count - max(capacity, 2)):
+        block = int(least.argmin())
+        at = block * _BLOCK + int(blocks[block].argmin())
+        kept[at], worths[at] = False, np.inf
+        ends = int(before[at]), int(after[at])
+        after[ends[0]], before[ends[1]] = ends[1], ends[0]
+        for end in ends:
+            worths[end] = worth(int(before[end]), end, int(after[end]))
+        for touched in {block, *(end // _BLOCK for end in ends)}:
+            least[touched] = blocks[touched].min()
     return np.flatnonzero(kept)[:capacity]

@@ -11,14 +11,19 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from pathlib import Path
 
-from edgevpr.errors import LinkError
+import numpy as np
+
+from edgevpr.errors import LinkError, UsageError
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.messages import AUTOPILOT, POSITION_FIX
 from edgevpr.mavlink.transport import Transport, open_transport
 from edgevpr.mavlink.wire import Message, Receiver, mavlink
+from edgevpr.runtime.positions import read_positions
 
 HEARTBEAT_S = 1.0
+POSITION_S = 0.2
 TURN_S = 0.05
 
 log = logging.getLogger(__name__)
@@ -33,6 +38,33 @@ class ReceivedFix:
     accuracy_m: float
     t_sent_s: float
     processing_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """Where the simulated vehicle flies: seconds from its start on, degrees, metres above sea level, each (N,) float64;
+    `heading_deg` is NaN where nobody knows."""
+
+    t_s: np.ndarray
+    lat_deg: np.ndarray
+    lon_deg: np.ndarray
+    alt_m: np.ndarray
+    heading_deg: np.ndarray
+
+
+def read_track(csv_path: str | Path) -> Track:
+    """The rows of a positions.csv that have a position and a time, in the order of time. Raises UsageError where there
+    are none."""
+    tags = [tag for tag in read_positions(csv_path).values() if tag.position and tag.t_utc_s is not None]
+    if not tags:
+        raise UsageError(f"{csv_path} has no row with lat, lon and time: a track needs them.")
+    tags.sort(key=lambda tag: tag.t_utc_s)
+    start_s = tags[0].t_utc_s
+    rows = [
+        (tag.t_utc_s - start_s, tag.position.lat_deg, tag.position.lon_deg, tag.position.alt_m or 0.0, tag.heading_deg)
+        for tag in tags
+    ]
+    return Track(*np.array(rows, float).T)
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,8 +98,12 @@ def run_autopilot(
     duration_s: float | None = None,
     stop: threading.Event | None = None,
     system_id: int = 1,
+    track: Track | None = None,
 ) -> AutopilotSummary:
     """Be an ArduPilot copter at `link_url` until the time is up, `stop` is set, a signal comes or the line is cut.
+
+    With a `track` it flies along it from when a companion is first heard, tells five times a second where it is, and
+    stays where the track ends.
 
     Raises LinkError where the link cannot be opened.
     """
@@ -77,7 +113,7 @@ def run_autopilot(
         transport = open_transport(address)
     except OSError as error:
         raise LinkError(f"{address}: it cannot be opened ({error.strerror or error}): is the other end up?") from error
-    autopilot = _Autopilot(transport, system_id)
+    autopilot = _Autopilot(transport, system_id, track)
     with _set_by_signals(stop):
         try:
             autopilot.run(lambda t_s: stop.is_set() or (duration_s is not None and t_s >= duration_s))
@@ -100,8 +136,10 @@ def judge(command: Message) -> int:
 
 
 class _Autopilot:
-    def __init__(self, transport: Transport, system_id: int) -> None:
+    def __init__(self, transport: Transport, system_id: int, track: Track | None) -> None:
         self._transport = transport
+        self._track = track
+        self._start_s: float | None = None  # of the track
         self._system_id = system_id
         self._packer = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=AUTOPILOT)
         self._receiver = Receiver()
@@ -113,7 +151,7 @@ class _Autopilot:
         self._fixes_denied = 0
 
     def run(self, ended: Callable[[float], bool]) -> None:
-        start_s = heartbeat_due_s = time.monotonic()
+        start_s = heartbeat_due_s = position_due_s = time.monotonic()
         while not ended(time.monotonic() - start_s):
             readable, _, _ = select.select([self._transport], [], [], TURN_S)
             if readable:
@@ -122,6 +160,10 @@ class _Autopilot:
             if self._transport.connected and time.monotonic() >= heartbeat_due_s:
                 heartbeat_due_s = time.monotonic() + HEARTBEAT_S
                 self._send(_copter_heartbeat())
+            if self._track and self._start_s is not None and time.monotonic() >= position_due_s:
+                position_due_s = time.monotonic() + POSITION_S
+                self._send(_position(self._track, time.monotonic() - self._start_s))
+                self._send(_gps())
 
     def summary(self) -> AutopilotSummary:
         return AutopilotSummary(
@@ -142,6 +184,7 @@ class _Autopilot:
         self._next_seq[sender] = (message.get_seq() + 1) % 256
         if message.get_type() == "HEARTBEAT" and message.type == mavlink.MAV_TYPE_ONBOARD_CONTROLLER:
             self._companion = sender
+            self._start_s = self._start_s or time.monotonic()
             self._transport.answer_sender()
         elif message.get_type() == "COMMAND_INT" and self._is_for_me(message):
             self._obey(message)
@@ -179,6 +222,29 @@ def _copter_heartbeat() -> Message:
         custom_mode=0,
         system_status=mavlink.MAV_STATE_ACTIVE,
         mavlink_version=3,
+    )
+
+
+def _position(track: Track, t_s: float) -> Message:
+    lat_deg, lon_deg, alt_m = (np.interp(t_s, track.t_s, each) for each in (track.lat_deg, track.lon_deg, track.alt_m))
+    heading_deg = track.heading_deg[max(0, np.searchsorted(track.t_s, t_s, side="right") - 1)]
+    return mavlink.MAVLink_global_position_int_message(
+        time_boot_ms=round(t_s * 1000),
+        lat=round(lat_deg * 1e7),
+        lon=round(lon_deg * 1e7),
+        alt=round(alt_m * 1e3),
+        relative_alt=0,
+        vx=0,
+        vy=0,
+        vz=0,
+        hdg=65_535 if math.isnan(heading_deg) else round(heading_deg * 100) % 36_000,
+    )
+
+
+def _gps() -> Message:
+    unknown = 65_535
+    return mavlink.MAVLink_gps_raw_int_message(
+        0, mavlink.GPS_FIX_TYPE_3D_FIX, 0, 0, 0, eph=80, epv=120, vel=unknown, cog=unknown, satellites_visible=14
     )
 
 

@@ -11,12 +11,12 @@ import time
 import pytest
 from mavlink_peers import AutopilotThread, Peer, UdpPort, free_port, wait_until
 
-from edgevpr.errors import LinkError
+from edgevpr.errors import LinkError, UsageError
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.link import Link, parse_link
 from edgevpr.mavlink.messages import Fix, Health
 from edgevpr.mavlink.wire import mavlink
-from edgevpr.simulate.autopilot import judge, run_autopilot
+from edgevpr.simulate.autopilot import judge, read_track, run_autopilot
 
 
 def a_fix(**changes):
@@ -102,6 +102,40 @@ def test_it_is_a_process_that_ends_well_on_sigterm_and_says_what_it_saw():
     assert summary["fixes_accepted"] == 1
     assert {"HEARTBEAT", "COMMAND_INT", "NAMED_VALUE_INT", "NAMED_VALUE_FLOAT"} <= set(summary["messages"])
     assert (summary["lost_packets"], summary["bad_bytes"]) == (0, 0)
+
+
+def test_it_flies_along_a_track_from_when_a_companion_is_heard(tmp_path):
+    csv = tmp_path / "positions.csv"
+    rows = [
+        "b.jpg,50.002,8.0,110,90,2026-02-14T00:30:00.4Z",
+        "a.jpg,50.000,8.0,100,0,2026-02-14T00:30:00Z",
+        "c.jpg,,,,,",
+    ]
+    csv.write_text("\n".join(["file,lat,lon,alt,yaw_deg,time", *rows]))
+    number = free_port()
+    with Link(parse_link(f"udpin:127.0.0.1:{number}")) as link:
+        autopilot = AutopilotThread(f"udpout:127.0.0.1:{number}", track=read_track(csv))
+        seen = []
+
+        def at_the_end():
+            position = link.vehicle_position(1.0)
+            if position and (not seen or position.t_heard_s != seen[-1].t_heard_s):
+                seen.append(position)
+            return len(seen) > 3 and seen[-1].lat_deg == seen[-2].lat_deg
+
+        wait_until(at_the_end, "the end of the track")
+        autopilot.finish()
+    north = [position.lat_deg for position in seen]
+    assert north == sorted(north)
+    assert len(set(north)) >= 2, "on the way, too"
+    assert (seen[-1].lat_deg, seen[-1].lon_deg, seen[-1].alt_m, seen[-1].heading_deg) == (50.002, 8.0, 110.0, 90.0)
+    assert seen[0].heading_deg in (0.0, 90.0)
+
+
+def test_a_track_without_times_is_refused(tmp_path):
+    (tmp_path / "p.csv").write_text("file,lat,lon\na.jpg,50,8\n")
+    with pytest.raises(UsageError, match="lat, lon and time"):
+        read_track(tmp_path / "p.csv")
 
 
 def test_it_ends_when_its_time_is_up():

@@ -39,7 +39,7 @@ def test_the_position_of_the_pinned_autopilot_is_known_while_it_is_fresh(link_an
     wait_until(lambda: link.stats().autopilot_heard)
     assert link.vehicle_position(1.0) is None
     say(link, peer, 50.1234567, -14.5)
-    expected = VehiclePosition(50.1234567, -14.5, 312.5, 90.5, clock.now_s)
+    expected = VehiclePosition(50.1234567, -14.5, 312.5, 90.5, clock.now_s, has_gps=False)
     assert wait_until(lambda: link.vehicle_position(1.0)) == expected
     clock.now_s += 1.0
     assert link.vehicle_position(1.0) == expected
@@ -74,3 +74,54 @@ def test_a_position_lost_is_not_remembered(link_and_peer, nowhere):
     wait_until(lambda: link.vehicle_position(1.0))
     say(link, peer, *nowhere)
     wait_until(lambda: link.vehicle_position(1.0) is None)
+
+
+def say_gps(link, peer, fix_type, message="GPS_RAW_INT"):
+    before = link.stats().received.get(message, 0)
+    if message == "GPS_RAW_INT":
+        peer.send(mavlink.MAVLink_gps_raw_int_message(0, fix_type, 0, 0, 0, 80, 120, 0, 0, 14))
+    else:
+        peer.send(mavlink.MAVLink_gps2_raw_message(0, fix_type, 0, 0, 0, 80, 120, 0, 0, 14, 0, 0))
+    wait_until(lambda: link.stats().received.get(message, 0) == before + 1, "the report arrives")
+
+
+@pytest.mark.parametrize("message", ["GPS_RAW_INT", "GPS2_RAW"])
+def test_a_position_says_whether_gps_stands_behind_it(link_and_peer, clock, message):
+    link, peer = link_and_peer
+    peer.heartbeat()
+    wait_until(lambda: link.stats().autopilot_heard)
+
+    def has_gps(lat_deg):
+        say(link, peer, lat_deg, 8.0)
+        wait_until(lambda: link.vehicle_position(1.0) and link.vehicle_position(1.0).lat_deg == lat_deg)
+        return link.vehicle_position(1.0).has_gps
+
+    say_gps(link, peer, mavlink.GPS_FIX_TYPE_2D_FIX, message)
+    assert not has_gps(50.0)
+    say_gps(link, peer, mavlink.GPS_FIX_TYPE_3D_FIX, message)
+    assert has_gps(50.1)
+    say_gps(link, peer, mavlink.GPS_FIX_TYPE_NO_FIX, message)
+    clock.now_s += 3.0
+    peer.heartbeat()
+    assert not has_gps(50.2), "it reckons where it is, and goes on saying so"
+
+
+def test_a_silent_autopilot_is_asked_where_it_is_until_it_says_so(link_and_peer, clock):
+    link, peer = link_and_peer
+    peer.heartbeat()
+    wait_until(lambda: link.stats().autopilot_heard)
+    assert link.stats().sent.get("COMMAND_LONG", 0) == 0, "nobody wants to know"
+    link.want_position()
+    asked = [peer.expect("COMMAND_LONG") for _ in range(2)]
+    assert {command.command for command in asked} == {mavlink.MAV_CMD_SET_MESSAGE_INTERVAL}
+    assert {(command.param1, command.param2) for command in asked} == {(33, 200_000), (24, 500_000)}
+    assert all(command.target_system == 7 for command in asked)
+    say(link, peer, 50.0, 8.0)
+    for _ in range(2):  # what is heard needs no asking
+        clock.now_s += 4.0
+        peer.heartbeat()
+        say(link, peer, 50.0, 8.0)
+    assert link.stats().sent["COMMAND_LONG"] == 2
+    clock.now_s += 6.0  # it has started anew
+    peer.heartbeat()
+    assert peer.expect("COMMAND_LONG").param1 in (24, 33)

@@ -52,8 +52,14 @@ def empty_map(tmp_path):
 
 
 def assert_same(index, fresh):
-    for name in ("place_ids", "lat_deg", "lon_deg", "rows", "mean"):
+    for name in ("place_ids", "lat_deg", "lon_deg", "heading_deg", "rows", "mean"):
         np.testing.assert_array_equal(getattr(index, name), getattr(fresh, name))
+
+
+def assert_packed_alike(index, parts):
+    """Every row is packed by the mean that the index has."""
+    for slot, place_id in enumerate(index.place_ids.tolist()):
+        np.testing.assert_array_equal(index.rows[slot], Signs().pack(parts[place_id], index.mean))
 
 
 def test_an_index_that_began_empty_is_what_a_fresh_load_gives_whenever_it_has_doubled(empty_map):
@@ -111,8 +117,73 @@ def test_the_budget_holds_at_every_moment_of_growing(empty_map):
     tracemalloc.stop()
     assert len(growing.index) == 3 * places // 4 + 10
     assert growing.nbytes <= places * each
-    # Choosing takes lists of all places for a moment; a second copy of the rows would not fit under this.
-    assert peak_bytes < places * each + 600 * places + 200_000
+    # Choosing takes a few numbers a place for a moment; a second copy of the rows would not fit under this.
+    assert peak_bytes < places * each + 80 * places + 100_000
+
+
+def test_a_map_larger_than_the_budget_begins_with_its_best_places_and_goes_on(empty_map):
+    learn(empty_map, GrowingIndex(empty_map, Signs(), 10**6, room=100), range(60))
+    growing = GrowingIndex(empty_map, Signs(), 20 * bytes_per_place(Signs.spec), room=100)
+    assert_same(growing.index, load_index(empty_map, Signs(), 20 * bytes_per_place(Signs.spec)))
+    learn(empty_map, growing, range(60, 130))  # its mean is that of 120 places by then
+    index = growing.index
+    assert len(index) <= 20
+    assert index.place_ids[-1] == len(empty_map) == 130
+    assert np.diff(index.place_ids).max() < 40, "what stays is spread over the old places and the new ones"
+    assert_packed_alike(index, {place_id: part for place_id, _, part in empty_map.coarse_parts()})
+
+
+def test_what_grows_beside_the_index_is_left_room_in_the_budget(empty_map):
+    each = bytes_per_place(Signs.spec)
+    growing = GrowingIndex(empty_map, Signs(), 40 * each, room=100, beside_bytes=each)
+    assert growing.nbytes == 20 * each
+
+
+def test_a_file_that_fails_while_all_is_packed_anew_leaves_rows_of_one_mean(empty_map, monkeypatch):
+    growing = GrowingIndex(empty_map, Signs(), 10**6, room=2000)
+    empty_map._db.execute("PRAGMA synchronous = OFF")
+    learn(empty_map, growing, range(1023))
+    parts = {place_id: part for place_id, _, part in empty_map.coarse_parts()}
+    parts[1024] = descriptor(1023).coarse
+    mean, read = growing.index.mean, PlaceMap.coarse_parts
+    calls = []
+
+    def card_is_pulled(place_map):
+        calls.append(place_map)
+        for count, part in enumerate(read(place_map)):
+            if len(calls) == 2 and count == 600:  # the mean has been read, and half of the places
+                raise MapError("the card is gone")
+            yield part
+
+    monkeypatch.setattr(PlaceMap, "coarse_parts", card_is_pulled)
+    with pytest.raises(MapError, match="gone"):
+        learn(empty_map, growing, [1023])
+    assert 500 < len(growing.index) < 600
+    assert not np.array_equal(growing.index.mean, mean)
+    assert_packed_alike(growing.index, parts)
+
+
+def test_a_place_damaged_since_it_was_read_changes_nothing_in_ram(empty_map):
+    growing = GrowingIndex(empty_map, Signs(), 10**6, room=100)
+    learn(empty_map, growing, range(15))
+    parts = {place_id: part for place_id, _, part in empty_map.coarse_parts()}
+    parts[16] = descriptor(15).coarse
+    empty_map._db.execute("UPDATE places SET coarse = x'00' WHERE place_id = 3")
+    with pytest.raises(MapError, match="place 3 is damaged"):
+        learn(empty_map, growing, [15])
+    assert growing.index.place_ids.tolist() == list(range(1, 17))
+    assert_packed_alike(growing.index, parts)
+    with pytest.raises(MapError, match="place 3 is damaged"):
+        GrowingIndex(empty_map, Signs(), 10**6, room=100)
+
+
+def test_a_place_gone_when_the_worst_are_given_up_changes_nothing_in_ram(empty_map):
+    growing = GrowingIndex(empty_map, Signs(), 10 * bytes_per_place(Signs.spec), room=100)
+    learn(empty_map, growing, range(10))
+    empty_map._db.execute("DELETE FROM places WHERE place_id = 3")
+    with pytest.raises(MapError, match="a place is gone"):
+        learn(empty_map, growing, [10])
+    assert growing.index.place_ids.tolist() == list(range(1, 11))
 
 
 def test_a_budget_that_holds_no_place_is_refused(empty_map):

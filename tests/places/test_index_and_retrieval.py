@@ -133,3 +133,90 @@ def test_a_descriptor_of_the_wrong_size_is_named(tmp_path):
         place_map._db.execute("UPDATE places SET coarse = x'00'")
         with pytest.raises(MapError, match="place 1 is damaged"):
             load_index(place_map, Ruler(), 1000)
+
+
+def within(index, *numbers):
+    """Only the places of these numbers are in reach."""
+    return np.isin(index.place_ids, [1 + number // 4 for number in numbers])
+
+
+def test_places_out_of_reach_are_no_candidates(ruler_map):
+    technique, place_map = ruler_map
+    index = load_index(place_map, technique, 10_000)
+    query = technique.encode(np.full((1, 1), 43))
+    allowed = within(index, *range(64, 100, 4))
+    technique.compared = 0
+    ranking = rank(technique, query, place_map, index, candidates=3, allowed=allowed)
+    assert technique.compared == 3 + 3, "three in reach, two of them elsewhere than the best, and three more rivals"
+    technique.compared = 0
+    ranking = rank(technique, query, place_map, index, candidates=8, allowed=allowed)
+    assert technique.compared == 8
+    assert {c.place.source_image for c in named(ranking, index, place_map)} <= {str(n) for n in range(64, 100, 4)}
+    assert named(ranking, index, place_map, 1)[0].place.source_image == "64"
+
+
+def test_a_lone_place_in_reach_has_its_rivals_from_the_whole_map(ruler_map):
+    technique, place_map = ruler_map
+    index = load_index(place_map, technique, 10_000)
+    query = technique.encode(np.full((1, 1), 20))
+    alone = rank(technique, query, place_map, index, 20, 40.0, within(index, 80))
+    assert len(alone.slots) == 1 + 5
+    # The picture shows another place: the one in reach must not be taken for want of it.
+    assert named(alone, index, place_map, 1)[0].place.source_image == "20"
+    assert margin(alone, index, 40.0) == pytest.approx(1 - 1 / 5)
+    right = rank(technique, technique.encode(np.full((1, 1), 80)), place_map, index, 20, 40.0, within(index, 80))
+    assert named(right, index, place_map, 1)[0].place.source_image == "80"
+    assert margin(right, index, 40.0) == pytest.approx(1 - 1 / 5)
+
+
+def test_all_places_in_reach_are_the_same_as_no_reach(ruler_map):
+    technique, place_map = ruler_map
+    index = load_index(place_map, technique, 10_000)
+    query = technique.encode(np.full((1, 1), 43))
+    everywhere = rank(technique, query, place_map, index, 20, 40.0)
+    allowed = rank(technique, query, place_map, index, 20, 40.0, np.ones(25, bool))
+    np.testing.assert_array_equal(allowed.slots, everywhere.slots)
+    np.testing.assert_array_equal(allowed.scores, everywhere.scores)
+
+
+def test_reach_counts_for_a_technique_of_one_stage_too(tmp_path):
+    class Short(Ruler):
+        spec = dataclasses.replace(Ruler.spec, fine=None)
+
+    technique = Short()
+    with PlaceMap.create(tmp_path / "short.gpkg", technique.spec) as place_map:
+        for number in range(0, 200, 10):
+            position = Position(0.0, number * 1e-4)
+            made = technique.encode(np.full((1, 1), number))
+            place_map.add(Frame(np.zeros((1, 1)), f"{number}", 0.0, None, position), Descriptor(made.coarse))
+        index = load_index(place_map, technique, 10_000)
+        allowed = np.isin(index.place_ids, [11, 12])
+        ranking = rank(technique, technique.encode(np.full((1, 1), 10)), place_map, index, None, 200.0, allowed)
+        assert named(ranking, index, place_map, 1)[0].place.source_image == "10"
+        assert len(ranking.slots) == 2 + 5
+        ranking = rank(technique, technique.encode(np.full((1, 1), 100)), place_map, index, None, 200.0, allowed)
+        assert [c.place.source_image for c in named(ranking, index, place_map, 2)] == ["100", "110"]
+
+
+def test_the_index_knows_distances_and_headings(tmp_path):
+    technique = Ruler()
+    headings = (0.0, 359.99, 123.4, None, -90.0, 720.5)
+    image = np.zeros((1, 1))
+    with PlaceMap.create(tmp_path / "turned.gpkg", technique.spec) as place_map:
+        for number, heading_deg in enumerate(headings):
+            position = Position(0.0, 179.9995 + number * 1e-3 - 360 * (number > 0)) if number < 5 else None
+            place_map.add(Frame(image, f"{number}", 0.0, None, position, heading_deg), technique.encode(image))
+        index = load_index(place_map, technique, 10_000)
+    expected = [0.0, 359.99, 123.4, np.nan, 270.0, 0.5]
+    np.testing.assert_allclose(index.heading_deg, expected, atol=0.13)  # half a step of half precision
+    assert index.within(Position(0.0, -179.999), 120.0).tolist() == [False, True, True, False, False, False]
+    assert index.within(Position(0.0, -179.999), 180.0).tolist() == [True, True, True, True, False, False]
+
+
+def test_a_thinned_index_keeps_each_place_its_heading(ruler_map):
+    technique, place_map = ruler_map
+    with PlaceMap.open_for_adding(place_map.path) as adding:
+        adding._db.execute("UPDATE places SET heading_deg = 10 * place_id")
+    index = load_index(place_map, technique, 10 * bytes_per_place(technique.spec))
+    assert len(index) == 10
+    np.testing.assert_array_equal(index.heading_deg, index.place_ids * 10)

@@ -18,7 +18,9 @@ from map_writer import SPEC, descriptor, frame
 
 from edgevpr.errors import MapError
 from edgevpr.places.geojson import write_geojson
+from edgevpr.places.geopackage import point_blob
 from edgevpr.places.mapfile import PlaceMap
+from edgevpr.types import Position
 
 
 @pytest.fixture
@@ -259,6 +261,62 @@ def test_a_spatial_index_of_another_tool_does_not_stop_mapping(map_path):
         place_id = place_map.add(frame(11), descriptor(11))
     (box,) = sqlite3.connect(map_path).execute("SELECT * FROM rtree_places_geom").fetchall()
     assert box == pytest.approx((place_id, 8.0, 8.0, 50.0011, 50.0011), abs=1e-4)
+
+
+def at(lat_deg, lon_deg):
+    return dataclasses.replace(frame(1), position=Position(lat_deg, lon_deg))
+
+
+def test_the_nearest_place_is_found_whenever_it_was_added(map_path):
+    with PlaceMap.open_for_adding(map_path) as place_map:
+        place_map.index_positions()
+        place_map.index_positions()  # once is enough, twice does no harm
+        place_map.add(at(50.01, 8.0), descriptor(11))
+        for lat_deg in (50.0003, 50.01):
+            assert place_map.nearest_m(Position(lat_deg, 8.0), 1.0) == 0
+        assert place_map.nearest_m(Position(50.0003, 8.0001), 5.0) is None
+        assert place_map.nearest_m(Position(50.0003, 8.0001), 50.0) == pytest.approx(7.147, abs=0.01)
+        assert place_map.nearest_m(Position(50.0096, 8.0), 1000.0) == pytest.approx(44.48, abs=0.05)
+        assert place_map.nearest_m(Position(0.0, 0.0), 1000.0) is None
+
+
+def test_near_knows_neither_the_date_line_nor_the_poles(tmp_path):
+    with PlaceMap.create(tmp_path / "m.gpkg", SPEC) as place_map:
+        place_map.index_positions()
+        for number, where in enumerate([(0.0, 179.99999), (10.0, -179.99999), (89.99999, 10.0)]):
+            place_map.add(at(*where), descriptor(number))
+        assert place_map.nearest_m(Position(0.0, -179.99999), 10.0) == pytest.approx(2.22, abs=0.01)
+        assert place_map.nearest_m(Position(10.0, 179.99999), 10.0) == pytest.approx(2.19, abs=0.01)
+        assert place_map.nearest_m(Position(89.99999, -150.0), 10.0) is not None
+
+
+def test_gdal_uses_the_spatial_index_and_keeps_it(map_path):
+    pyogrio = pytest.importorskip("pyogrio", reason="pyogrio (GDAL) is not installed")
+    with PlaceMap.open_for_adding(map_path) as place_map:
+        place_map.index_positions()
+        place_map.add(frame(11), descriptor(11))
+    box = (7.99, 50.00055, 8.01, 50.01)
+    _, fids, _, _ = pyogrio.raw.read(map_path, layer="places", bbox=box, return_fids=True)
+    assert list(fids) == [7, 8, 9, 10, 11]
+    assert pyogrio.read_info(map_path, layer="places")["capabilities"]["fast_spatial_filter"]
+
+
+def test_the_spatial_index_follows_what_other_programs_change(map_path):
+    with PlaceMap.open_for_adding(map_path) as place_map:
+        place_map.index_positions()
+        changes = {
+            "moved": f"UPDATE places SET geom = x'{point_blob(60.0, 8.0).hex()}' WHERE place_id = 4",
+            "placed": f"UPDATE places SET geom = x'{point_blob(61.0, 8.0).hex()}' WHERE place_id = 1",
+            "lost": "UPDATE places SET geom = NULL WHERE place_id = 5",
+            "deleted": "DELETE FROM places WHERE place_id = 7",
+            "renumbered": "UPDATE places SET place_id = 100 WHERE place_id = 8",
+        }
+        for change in changes.values():
+            place_map._db.execute(change)
+        boxes = dict(place_map._db.execute("SELECT id, miny FROM rtree_places_geom"))
+        points = {place.place_id: place.position.lat_deg for place in place_map.places() if place.position}
+        assert boxes == pytest.approx(points, abs=1e-4)
+        assert {1, 4, 100} <= boxes.keys()
 
 
 @pytest.mark.parametrize(

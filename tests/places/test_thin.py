@@ -1,5 +1,7 @@
 """Which places stay in RAM when the budget does not hold them all."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -53,3 +55,14 @@ def test_places_without_positions_are_thinned_along_their_order(capacity):
 def test_places_on_one_spot_do_not_confuse_it():
     lat, lon = track(np.zeros(30))
     assert len(best_places(lat, lon, np.ones(30), 10)) == 10
+
+
+def test_choosing_takes_little_memory():
+    places = 20_000
+    lat, lon = track(np.random.default_rng(1).random(places) * 1e5)
+    quality = np.ones(places)
+    tracemalloc.start()
+    best_places(lat, lon, quality, places // 2)
+    peak_bytes = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak_bytes < 80 * places

@@ -1,0 +1,179 @@
+"""Sequences against the paper's search, word by word; when a sequence begins anew; how much memory it takes."""
+
+import math
+import tracemalloc
+
+import numpy as np
+import pytest
+from map_writer import SPEC
+
+from edgevpr.places.index import PlaceIndex, empty_index
+from edgevpr.places.retrieve import Ranking
+from edgevpr.places.sequence import Sequence, bytes_beside_place, length_of, offline
+from edgevpr.types import FineMatch
+
+FOLLOWED = (0.8, 0.9, 1.0, 1.1, 1.2)
+OTHERS = [quarter / 4 for quarter in range(-10, 13) if quarter != 4]
+
+
+def literal(scores, length, velocities=FOLLOWED):
+    """Equations 4 to 6 of Milford and Wyeth 2012, each path from its end at the newest query, as mean scores."""
+    queries, places = len(scores), len(scores[0])
+    found = np.zeros((queries, places))
+    for newest in range(queries):
+        frames = min(newest + 1, length)
+        for end in range(places):
+            for velocity in velocities:
+                total = 0.0
+                for age in range(frames):
+                    place = end - math.floor(velocity * age + 0.5 + 1e-9)
+                    if 0 <= place < places:
+                        total += float(scores[newest - age][place])
+                found[newest, end] = max(found[newest, end], total / frames)
+    return found
+
+
+def index_of(place_ids):
+    index = empty_index(SPEC, len(place_ids), None)
+    index.place_ids[:] = place_ids
+    return index
+
+
+def ranked(scores, slots=None):
+    """The ranking of one query: all slots, or those that were compared in full."""
+    slots = np.arange(len(scores)) if slots is None else np.array(slots)
+    slots = slots[np.argsort(-scores[slots], kind="stable")]
+    matches = tuple(FineMatch(float(scores[slot]), (float(slot), 1.0), None, 30.0) for slot in slots)
+    return Ranking(slots, scores[slots].astype(np.float32), matches)
+
+
+def dense(ranking, places):
+    scores = np.zeros(places, np.float32)
+    scores[ranking.slots] = ranking.scores
+    return scores
+
+
+def followed(sequence, scores, index, step_s=1.0):
+    return [sequence.follow(ranked(row), index, at * step_s) for at, row in enumerate(scores)]
+
+
+@pytest.fixture
+def scores():
+    return np.random.default_rng(7).random((25, 40), dtype=np.float32)
+
+
+@pytest.mark.parametrize("length", [2, 5, 10, 30])
+def test_online_and_offline_are_one_and_both_are_the_papers_search(scores, length):
+    sequence = Sequence(length)
+    online = np.stack([dense(each, 40) for each in followed(sequence, scores, index_of(range(40)))])
+    np.testing.assert_array_equal(online, offline(scores, length))
+    np.testing.assert_allclose(online, literal(scores, length), rtol=1e-5)
+    assert sequence.frames == min(length, 25)
+    np.testing.assert_allclose(sequence.rivals, literal(scores, length, OTHERS)[-1], rtol=1e-5)
+
+
+def test_two_stages_leave_places_out_and_are_the_same_search(scores):
+    candidates = np.argsort(-scores, axis=1)[:, :6]
+    sparse = np.zeros_like(scores)
+    np.put_along_axis(sparse, candidates, np.take_along_axis(scores, candidates, axis=1), axis=1)
+    sequence, index = Sequence(4), index_of(range(40))
+    rankings = [sequence.follow(ranked(scores[at], candidates[at]), index, at) for at in range(25)]
+    np.testing.assert_array_equal(np.stack([dense(each, 40) for each in rankings]), offline(sparse, 4))
+
+
+def test_a_flight_through_lookalikes_is_told_by_what_came_before():
+    """Place 30 looks a little more like the query than place 12, where the aircraft is; the way there does not."""
+    scores = np.full((6, 40), 0.3, np.float32)
+    for at in range(6):
+        scores[at, 7 + at] = 0.6
+    scores[5, 30] = 0.7
+    index = index_of(range(40))
+    best = [each.slots[0] for each in followed(Sequence(5), scores, index)]
+    assert best == [7, 8, 9, 10, 11, 12]
+
+
+def test_matches_keep_the_step_of_the_newest_query_and_have_the_score_of_the_sequence(scores):
+    sequence, index = Sequence(3), index_of(range(40))
+    sequence.follow(ranked(scores[0], range(20)), index, 0.0)
+    ranking = sequence.follow(ranked(scores[1], range(10, 30)), index, 1.0)
+    assert (np.diff(ranking.scores) <= 0).all()
+    for slot, score, match in zip(ranking.slots, ranking.scores, ranking.matches, strict=True):
+        assert match.score == score
+        compared = 10 <= slot < 30
+        assert match.shift_cells == ((slot, 1.0) if compared else None)
+        assert match.rotation_deg == (30.0 if compared else None)
+    assert set(ranking.slots) == set(range(1, 30))  # place 0 was compared with the first query alone
+
+
+def test_a_gap_in_time_begins_a_new_sequence(scores):
+    sequence, index = Sequence(5), index_of(range(40))
+    followed(sequence, scores[:5], index)
+    assert sequence.frames == 5
+    fresh = sequence.follow(ranked(scores[5]), index, 4.0 + 5.1)
+    assert sequence.frames == 1
+    np.testing.assert_array_equal(dense(fresh, 40), scores[5])
+    sequence.follow(ranked(scores[6]), index, 10.0)
+    assert sequence.frames == 2
+
+
+def test_a_board_that_is_always_slow_leaves_no_gaps(scores):
+    sequence = Sequence(4)
+    followed(sequence, scores[:6], index_of(range(40)), step_s=8.0)
+    assert sequence.frames == 4
+
+
+def test_an_index_that_grows_keeps_the_sequence(scores):
+    sequence = Sequence(6)
+    grown = [scores[at, : 20 + 2 * at] for at in range(8)]
+    padded = np.zeros((8, 34), np.float32)
+    for at, row in enumerate(grown):
+        padded[at, : len(row)] = row
+        ranking = sequence.follow(ranked(row), index_of(range(1, len(row) + 1)), float(at))
+    assert sequence.frames == 6
+    np.testing.assert_array_equal(dense(ranking, 34), offline(padded, 6)[-1])
+
+
+@pytest.mark.parametrize(
+    "changed", [range(0, 40, 2), [*range(10), *range(11, 41)], [*range(10), *range(11, 60)]], ids=str
+)
+def test_an_index_that_gave_up_places_begins_a_new_sequence(scores, changed):
+    sequence = Sequence(6)
+    followed(sequence, scores[:4], index_of(range(40)))
+    row = np.resize(scores[5], len(changed))
+    ranking = sequence.follow(ranked(row), index_of(changed), 4.0)
+    assert sequence.frames == 1
+    np.testing.assert_array_equal(dense(ranking, len(row)), row)
+
+
+def test_a_map_of_fewer_places_than_the_sequence_is_searched():
+    scores = np.random.default_rng(1).random((12, 3), dtype=np.float32)
+    online = np.stack([dense(each, 3) for each in followed(Sequence(10), scores, index_of(range(3)))])
+    np.testing.assert_allclose(online, literal(scores, 10), rtol=1e-5)
+
+
+def test_memory_is_what_the_budget_is_told_and_no_more_is_kept():
+    places, length = 50_000, 10
+    index: PlaceIndex = index_of(range(places))
+    scores = np.random.default_rng(2).random(places, dtype=np.float32)
+    few = ranked(scores, np.argsort(-scores)[:40])
+    sequence = Sequence(length)
+    tracemalloc.start()
+    for at in range(3 * length):
+        sequence.follow(few, index, float(at))
+    kept, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert sequence.nbytes == places * bytes_beside_place(length) == places * 44
+    assert kept < 1.02 * sequence.nbytes
+
+
+def test_the_length_is_what_is_asked_for_or_the_techniques_own():
+    class Own:
+        sequence = 10
+
+    assert [length_of(Own(), None), length_of(Own(), 3), length_of(object(), None), length_of(object(), 7)] == [
+        10,
+        3,
+        1,
+        7,
+    ]
+    assert bytes_beside_place(1) == 0
