@@ -2,15 +2,33 @@
 
 import difflib
 import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from edgevpr.config import bounded, build, read_yaml
 from edgevpr.errors import ConfigError
-from edgevpr.power import machine
+from edgevpr.power import machine, thermal
 from edgevpr.resources import shipped
 
 _ANY_MACHINE = "generic-x86"
+_SAME_RAM = 1.02  # a kernel keeps some for itself, another amount with every version
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """How fast a machine is beside one core of the reference, which `profiles/generic-x86.yaml` names (None: unknown).
+
+    `single` is one thread at integer code and bytes, `multi` all cores together at the same; `products` and `passes`
+    are one thread at matrix products and at passes over bytes, where they are known apart. `verified` is whether
+    `source` measured it on this very board.
+    """
+
+    single: float | None = bounded(0.0001, 100)
+    multi: float | None = bounded(0.0001, 10_000)
+    products: float | None = bounded(0.0001, 100)
+    passes: float | None = bounded(0.0001, 100)
+    verified: bool
+    source: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,8 +38,10 @@ class Board:
     `idle_w` and `full_w` are the thesis's a and a + s in watts at the board's input; `verified` is whether `source`
     measured them on this very board. `cpu_share` (of all cores), `budget_mb` (index of the map) and `memory_max_mb`
     (whole process) are what edgevpr may take; `rate_hz` is how often it is asked, unless the user says otherwise.
-    `relative_speed` is the speed of one thread, 1 on the machine that `profiles/generic-x86.yaml` names, None where
-    nobody has published it. A machine whose device tree's model contains `recognised_by` is this board.
+    `technique` is flown where none is named, if it fits (None: the best that fits). `threads` is how many a network may
+    use. From `thermal_limit_c` on the board slows itself down (None: its kernel says where). A machine whose device
+    tree's model contains `recognised_by` is this board, and so is the one that calls itself `machine`: a profile that
+    was written on it says so.
     """
 
     name: str
@@ -37,9 +57,11 @@ class Board:
     cpu_share: float = bounded(0.01, 1)
     budget_mb: float = bounded(1, 65_536)
     memory_max_mb: float = bounded(1, 4_000_000)
-    relative_speed: float | None = bounded(0.001, 100)
-    speed_verified: bool
-    speed_source: str
+    thermal_limit_c: float | None = bounded(30, 125)
+    benchmark_score: Score
+    technique: str | None = None
+    threads: int = field(default=1, metadata={"range": (1, 64)})
+    machine: str | None = None
 
 
 def board_names() -> tuple[str, ...]:
@@ -50,20 +72,33 @@ def board_names() -> tuple[str, ...]:
 def load_board(name: str, root: Path = Path("/")) -> Board:
     """The board called `name`: "this" (the machine itself), one of `board_names()`, or the path of a YAML file.
 
-    Raises ConfigError for a board that is not there, and for a file that does not say what it must. `root` is where
-    the machine's /proc and /sys are.
+    Raises ConfigError for a board that is not there, for a file that does not say what it must, and for one of this
+    very machine that promises more memory than there is. `root` is where the machine's /proc and /sys are.
     """
     if name == "this":
         return _this_machine(root)
     if name in board_names():
         return _read(shipped("profiles") / f"{name}.yaml")
     if name.endswith((".yaml", ".yml")) or "/" in name:
-        return _read(Path(name))
+        board, there_mb = _read(Path(name)), machine.ram_mb(root)
+        if is_this_machine(board, root) and board.ram_mb > _SAME_RAM * there_mb:
+            raise ConfigError(
+                f"{name}: `ram_mb` is {board.ram_mb:g}, and this machine, whose profile it is, has {there_mb:.0f}: "
+                "correct it."
+            )
+        return board
     near = difflib.get_close_matches(name, ["this", *board_names()], n=1)
     hint = (
         f"did you mean `{near[0]}`?" if near else f"use this, {', '.join(board_names())}, or the path of a YAML file."
     )
     raise ConfigError(f"There is no board `{name}`: {hint}")
+
+
+def is_this_machine(board: Board, root: Path = Path("/")) -> bool:
+    """Whether a profile is of the machine that this runs on."""
+    model = machine.model(root)
+    recognised = board.recognised_by and model and board.recognised_by.lower() in model.lower()
+    return bool(recognised) or (board.machine is not None and board.machine == machine.title(root))
 
 
 def _read(path: Path) -> Board:
@@ -92,7 +127,8 @@ def _this_machine(root: Path) -> Board:
         if recognised:
             profile, title = recognised, f"this machine ({recognised.title})"
         else:
-            profile = replace(profile, relative_speed=None, speed_source=f"nobody has measured a {model}")
+            unknown = Score(None, None, None, None, False, f"nobody has measured a {model}")
+            profile = replace(profile, benchmark_score=unknown)
             title = f"this machine ({model}, which has no profile: the figures of {_ANY_MACHINE})"
 
     ram_mb = machine.ram_mb(root)
@@ -100,12 +136,16 @@ def _this_machine(root: Path) -> Board:
     memory_max_mb = min(profile.memory_max_mb / profile.ram_mb * ram_mb, machine.ram_limit_mb(root))
     # The power model speaks of all cores of the machine, so a quota lowers the share and not their number.
     cores = os.cpu_count() or 1
+    cpu_share = min(profile.cpu_share, machine.cores(root) / cores)
     return replace(
         profile,
         title=title,
         ram_mb=ram_mb,
         cores=cores,
-        cpu_share=min(profile.cpu_share, machine.cores(root) / cores),
+        cpu_share=cpu_share,
+        thermal_limit_c=profile.thermal_limit_c or thermal.limit_c(root),
+        machine=machine.title(root),
+        threads=max(1, min(profile.threads, round(cpu_share * cores))),
         budget_mb=memory_max_mb * profile.budget_mb / profile.memory_max_mb,
         memory_max_mb=memory_max_mb,
     )

@@ -4,10 +4,25 @@
 """
 
 import os
+import platform
+import re
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
 _ROOT = Path("/")
+# What boards say where their maker has written nothing.
+_FILLERS = re.compile(
+    r"to be filled|default string|system (product|manufacturer|version)|not (applicable|specified)|o\.?e\.?m\.?$|none$|"
+    r"unknown|invalid|type\d|x\.x",
+    re.IGNORECASE,
+)
+# Arm's part numbers in /proc/cpuinfo (implementer 0x41), of the processors that such boards have.
+_ARM_PARTS = {
+    "0xc07": "Cortex-A7", "0xc0f": "Cortex-A15", "0xd03": "Cortex-A53", "0xd04": "Cortex-A35", "0xd05": "Cortex-A55",
+    "0xd07": "Cortex-A57", "0xd08": "Cortex-A72", "0xd09": "Cortex-A73", "0xd0a": "Cortex-A75", "0xd0b": "Cortex-A76",
+    "0xd0d": "Cortex-A77", "0xd41": "Cortex-A78", "0xd42": "Cortex-A78AE", "0xd46": "Cortex-A510",
+}  # fmt: skip
 
 
 def model(root: Path = _ROOT) -> str | None:
@@ -16,6 +31,36 @@ def model(root: Path = _ROOT) -> str | None:
         return (root / "proc/device-tree/model").read_text().strip("\0\n ")
     except OSError:
         return None
+
+
+def dmi_model(root: Path = _ROOT) -> str | None:
+    """Maker and product by the firmware of an x86 machine; its mainboard where the product is not filled in."""
+    said = {
+        name: words
+        for name in ("sys_vendor", "product_name", "board_vendor", "board_name")
+        if (words := text(root / "sys/class/dmi/id" / name)) and not _FILLERS.search(words)
+    }
+    for vendor, product in (("sys_vendor", "product_name"), ("board_vendor", "board_name")):
+        if product in said:
+            maker = said.get(vendor, "")
+            return said[product] if said[product].startswith(maker) else f"{maker} {said[product]}"
+    return None
+
+
+def cpu(root: Path = _ROOT) -> str:
+    """The processor by /proc/cpuinfo: its name (x86, 32-bit ARM), or its kinds of cores by Arm's part numbers."""
+    info = text(root / "proc/cpuinfo") or ""
+    if name := re.search(r"^model name\s*:\s*(.+)$", info, re.MULTILINE):
+        return " ".join(name[1].split())
+    parts = Counter(re.findall(r"^CPU part\s*:\s*(\w+)$", info, re.MULTILINE))
+    kinds = [f"{count} x {_ARM_PARTS.get(part, f'CPU part {part}')}" for part, count in parts.items()]
+    return " + ".join(kinds) or f"unknown {platform.machine()} processor"
+
+
+def title(root: Path = _ROOT) -> str:
+    """What this machine calls itself, with its processor: the same words every time, so that it is known again."""
+    words = f"{model(root) or dmi_model(root) or 'a machine without a name'} ({cpu(root)})"
+    return "".join(c if c.isprintable() else " " for c in words)
 
 
 def cores(root: Path = _ROOT) -> float:
@@ -42,10 +87,32 @@ def rss_mb(root: Path = _ROOT) -> float:
     return resident_pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
+def forget_peak(root: Path = _ROOT) -> bool:
+    """Let `peak_mb` begin anew with what is resident now; whether the kernel does that."""
+    try:
+        (root / "proc/self/clear_refs").write_text("5")
+    except OSError:
+        return False
+    return True
+
+
+def peak_mb(root: Path = _ROOT) -> float:
+    """The most that this process had resident at once."""
+    return _kib_line(root / "proc/self/status", "VmHWM:")
+
+
 def pss_mb(root: Path = _ROOT) -> float | None:
     """Memory of this process with shared pages counted in proportion; None where the kernel does not say."""
     try:
         return _kib_line(root / "proc/self/smaps_rollup", "Pss:")
+    except OSError:
+        return None
+
+
+def text(path: Path) -> str | None:
+    """What a small file says, without what ends it; None where it cannot be read."""
+    try:
+        return path.read_text(errors="replace").strip("\0\n ")
     except OSError:
         return None
 

@@ -1,5 +1,6 @@
 """What a stage costs, and a query: seconds, CPU-seconds, utilisation, charge."""
 
+import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -7,10 +8,11 @@ from dataclasses import dataclass
 
 from edgevpr.power.boards import Board
 from edgevpr.power.equations import Pack, marginal_energy_j, pack_ah, stage_energy_j
-from edgevpr.power.machine import rss_mb
+from edgevpr.power.machine import pss_mb, rss_mb
 from edgevpr.types import QueryCost, StageCost
 
 Clock = Callable[[], float]
+_PSS_EVERY_S = 20.0
 
 
 @dataclass(slots=True)
@@ -29,7 +31,30 @@ def stage(wall_clock: Clock = time.perf_counter, cpu_clock: Clock = time.process
     metered.cost = StageCost(wall_clock() - wall_s, cpu_clock() - cpu_s)
 
 
-def query_cost(encode: StageCost, match: StageCost, board: Board, pack: Pack, regulator_efficiency: float) -> QueryCost:
+class PssMeter:
+    """PSS of this process, read at most once in twenty seconds: the kernel walks through all pages for it, which takes
+    some hundredths of a query."""
+
+    def __init__(self, clock: Clock = time.monotonic, read: Callable[[], float | None] = pss_mb) -> None:
+        self._clock, self._read = clock, read
+        self._read_s, self._pss_mb = -math.inf, None
+
+    def look(self) -> float | None:
+        """What was read last, MB; None where the kernel does not say."""
+        now_s = self._clock()
+        if now_s - self._read_s >= _PSS_EVERY_S:
+            self._read_s, self._pss_mb = now_s, self._read()
+        return self._pss_mb
+
+
+def query_cost(
+    encode: StageCost,
+    match: StageCost,
+    board: Board,
+    pack: Pack,
+    regulator_efficiency: float,
+    pss_mb: float | None = None,
+) -> QueryCost:
     """The cost of one query by 5.1-5.6, as the pack sees it: the energies of both stages are added, not their powers.
 
     `used_mah` is (a + s U) t, `marginal_mah` s U t: what the query adds to a board that is powered anyway.
@@ -46,4 +71,5 @@ def query_cost(encode: StageCost, match: StageCost, board: Board, pack: Pack, re
         rss_mb=rss_mb(),
         used_mah=1000 * pack_ah(used_j, pack, regulator_efficiency),
         marginal_mah=1000 * pack_ah(marginal_j, pack, regulator_efficiency),
+        pss_mb=pss_mb,
     )

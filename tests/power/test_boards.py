@@ -14,7 +14,9 @@ PROFILE = (shipped("profiles") / "rpi-4b.yaml").read_text()
 def own_profile(tmp_path, **changes):
     """The path of a copy of the Pi 4's profile with some lines changed; None leaves a line out."""
     lines = [line for line in PROFILE.splitlines() if line.split(":")[0] not in changes]
-    lines += [f"{key}: {value}" for key, value in changes.items() if value is not None]
+    # At the end stands a section, which an indented line belongs to: what is not indented goes before it.
+    more = [f"{key}: {value}" for key, value in changes.items() if value is not None]
+    lines = [line for line in more if line[0] != " "] + lines + [line for line in more if line[0] == " "]
     path = tmp_path / "mine.yaml"
     path.write_text("\n".join(lines))
     return str(path)
@@ -46,8 +48,9 @@ def test_a_profile_that_travels_is_whole_and_says_where_its_figures_are_from(nam
     board = load_board(name)
     assert board.name == name
     assert board.source
-    assert board.speed_source
-    assert board.relative_speed or not board.speed_verified
+    assert board.benchmark_score.source
+    assert board.benchmark_score.single or not board.benchmark_score.verified
+    assert board.technique == "cohog"
 
 
 @pytest.mark.parametrize(
@@ -82,6 +85,8 @@ def test_a_profile_of_ones_own_is_named_by_its_path(tmp_path):
         ({"cores": "four"}, "`cores` must be a whole number, not 'four'."),
         ({"verified": "maybe"}, "`verified` must be true or false, not 'maybe'."),
         ({"wats": 3}, "unknown key `wats`"),
+        ({"thermal_limit_c": 200}, "`thermal_limit_c` is 200; it must be between 30 and 125."),
+        ({"technique": 5}, "`technique` must be a text, not 5."),
         ({"source": None}, "the key `source` is missing: add it."),
         (
             {"budget_mb": 600},
@@ -116,7 +121,7 @@ def test_this_machine_is_recognised_by_its_device_tree(tmp_path):
     board, profile = load_board("this", root), load_board("rpi-4b")
     assert board.name == "rpi-4b"
     assert board.title == "this machine (Raspberry Pi 4B, 64-bit)"
-    assert (board.idle_w, board.full_w, board.relative_speed) == (profile.idle_w, profile.full_w, 0.38)
+    assert (board.idle_w, board.full_w, board.benchmark_score.single) == (profile.idle_w, profile.full_w, 0.38)
     assert board.ram_mb == 8192.0
     assert (board.budget_mb, board.memory_max_mb) == (2048.0, 4096.0)  # a quarter and half, as in the profile
     assert board.cores == os.cpu_count()
@@ -139,12 +144,15 @@ def test_each_board_is_recognised(tmp_path, model, name):
 
 def test_a_machine_without_a_device_tree_is_any_x86(tmp_path):
     board = load_board("this", this_root(tmp_path))
-    assert (board.name, board.relative_speed, board.verified) == ("generic-x86", 1.0, False)
+    assert (board.name, board.verified) == ("generic-x86", False)
+    score = board.benchmark_score
+    assert (score.single, score.products, score.passes, score.verified) == (1.0, 1.0, 1.0, False)
 
 
 def test_a_board_nobody_has_profiled_has_no_known_speed(tmp_path):
     board = load_board("this", this_root(tmp_path, "Radxa ZERO 3"))
-    assert board.relative_speed is None
+    assert board.benchmark_score.single is None
+    assert "Radxa ZERO 3" in board.benchmark_score.source
     assert "Radxa ZERO 3" in board.title
     assert not board.verified
 
@@ -156,6 +164,18 @@ def test_a_control_group_lowers_what_edgevpr_may_take_but_not_what_the_machine_i
     assert (board.memory_max_mb, board.budget_mb) == (400.0, 200.0)
     assert board.cores == os.cpu_count()
     assert board.cores * board.cpu_share == pytest.approx(0.2)
+
+
+def test_a_network_gets_no_more_threads_than_the_board_spares_cores(tmp_path):
+    assert [load_board(name).threads for name in ("rpi-zero-2w", "rpi-4b", "jetson-orin-nano")] == [1, 2, 3]
+    for name in board_names():
+        board = load_board(name)
+        assert 1 <= board.threads <= max(1, round(board.cores * board.cpu_share))
+    assert load_board(own_profile(tmp_path, threads=None)).threads == 1
+    with pytest.raises(ConfigError, match="`threads` is 0; it must be between 1 and 64"):
+        load_board(own_profile(tmp_path, threads=0))
+    root = this_root(tmp_path / "this", "Raspberry Pi 4 Model B", cpu_max="20000 100000\n")
+    assert load_board("this", root).threads == 1
 
 
 def test_the_services_own_limits_are_not_taken_off_twice(tmp_path):
@@ -171,3 +191,62 @@ def test_the_real_machine_loads():
     board = load_board("this")
     assert board.budget_mb <= board.memory_max_mb <= board.ram_mb
     assert board.cores == os.cpu_count()
+
+
+@pytest.mark.parametrize(
+    ("name", "single", "multi", "products", "thermal_limit_c"),
+    [
+        ("rpi-zero-2w", 838, 3030, None, 80),
+        ("rpi-3b-plus", 856, 3040, None, 60),
+        ("rpi-4b", 1741, 5760, 11.889, 80),
+        ("rpi-5", 3160, None, 30.249, 80),
+        ("odroid-xu4", 1604, 8980, None, None),
+        ("jetson-nano", 1578, 5250, None, None),
+        ("jetson-orin-nano", 2153, None, None, None),
+    ],
+)
+def test_the_scores_are_the_published_figures_beside_the_references(name, single, multi, products, thermal_limit_c):
+    board = load_board(name)
+    score = board.benchmark_score
+    assert score.single == pytest.approx(single / 4630, abs=0.006)
+    assert score.multi == (multi and pytest.approx(multi / 4630, abs=0.006))
+    assert score.products == (products and pytest.approx(products / 4 / 53, rel=0.02))
+    assert score.passes is None
+    assert board.thermal_limit_c == thermal_limit_c
+
+
+def test_a_score_is_a_whole_section(tmp_path):
+    path = own_profile(tmp_path, **{"  single": 0})
+    with pytest.raises(ConfigError, match=r"`benchmark_score.single` is 0; it must be between 0.0001 and 100"):
+        load_board(path)
+
+
+def test_this_machine_knows_where_it_begins_to_slow_down(tmp_path):
+    assert load_board("this", this_root(tmp_path / "pi", "Raspberry Pi 3 Model B Plus Rev 1.3")).thermal_limit_c == 60
+    root = this_root(tmp_path / "nano", "NVIDIA Jetson Nano Developer Kit")
+    zone = root / "sys/class/thermal/thermal_zone0"
+    zone.mkdir(parents=True)
+    for name, content in {"type": "CPU-therm", "trip_point_0_type": "passive", "trip_point_0_temp": "97000"}.items():
+        (zone / name).write_text(content + "\n")
+    assert load_board("this", root).thermal_limit_c == 97
+
+
+def test_a_profile_of_this_very_machine_cannot_promise_more_memory_than_there_is(tmp_path):
+    root = this_root(tmp_path / "root", "Raspberry Pi 4 Model B Rev 1.4", ram_kb=1_000_000)
+    path = own_profile(tmp_path, ram_mb=8192)
+    with pytest.raises(ConfigError) as raised:
+        load_board(path, root)
+    assert str(raised.value) == (
+        f"{path}: `ram_mb` is 8192, and this machine, whose profile it is, has 1024: correct it."
+    )
+    assert load_board(path, this_root(tmp_path / "other", "Raspberry Pi 5 Model B")).ram_mb == 8192
+    assert load_board(own_profile(tmp_path, ram_mb=1030), root).ram_mb == 1030
+
+
+def test_a_machine_without_a_device_tree_is_known_again_by_what_it_calls_itself(tmp_path):
+    root = this_root(tmp_path / "root", ram_kb=1_000_000)
+    (root / "proc/cpuinfo").write_text("model name\t: Intel(R) N100\n")
+    mine = own_profile(tmp_path, machine="a machine without a name (Intel(R) N100)", recognised_by="null", ram_mb=8192)
+    with pytest.raises(ConfigError, match="whose profile it is, has 1024"):
+        load_board(mine, root)
+    assert load_board("this", root).machine == "a machine without a name (Intel(R) N100)"

@@ -7,7 +7,7 @@ import pytest
 
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import Pack
-from edgevpr.power.meter import query_cost, stage
+from edgevpr.power.meter import PssMeter, query_cost, stage
 from edgevpr.types import StageCost
 
 
@@ -65,3 +65,20 @@ def test_energy_summed_over_many_short_stages_is_the_closed_form():
     wall_s, core_s = (sum(column) for column in zip(*ticks, strict=True))
     closed_j = board.idle_w * wall_s + (board.full_w - board.idle_w) * core_s / board.cores
     assert summed_mah == pytest.approx(closed_j / (11.1 * 0.9 * 3.6), abs=1e-9)
+
+
+def test_the_memory_that_takes_long_to_read_is_read_every_twenty_seconds():
+    now_s, answers = [0.0], iter([80.0, 81.0, None])
+    pss = PssMeter(lambda: now_s[0], lambda: next(answers))
+    seen = []
+    for now_s[0] in (0.0, 0.1, 19.9, 20.0, 39.9, 40.0, 59.9):
+        seen.append(pss.look())
+    assert seen == [80.0, 80.0, 80.0, 81.0, 81.0, None, None]
+
+
+def test_the_real_process_has_its_share_of_the_memory_it_shows():
+    pss_mb = PssMeter().look()
+    if pss_mb is None:
+        pytest.skip("this kernel does not say")
+    cost = query_cost(StageCost(0.1, 0.1), StageCost(0.1, 0.1), load_board("rpi-4b"), Pack(4, 5200), 0.85, pss_mb)
+    assert 1 < cost.pss_mb <= 1.05 * cost.rss_mb

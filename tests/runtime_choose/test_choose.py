@@ -1,15 +1,21 @@
 """What a technique costs here, and which one a board can afford."""
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
 
 from edgevpr import techniques
-from edgevpr.errors import UsageError
+from edgevpr.errors import ConfigError, ModelError, UsageError
+from edgevpr.power import machine
 from edgevpr.power.boards import load_board
 from edgevpr.runtime import choose as choosing
-from edgevpr.runtime.choose import TechniqueCosts, choose, fit, on_board, probe, probe_each, speed_ratio
+from edgevpr.runtime import pipeline
+from edgevpr.runtime import probe as choosing_probe
+from edgevpr.runtime.choose import choose, fit, preferred
+from edgevpr.runtime.probe import TechniqueCosts, noise, probe, probe_each
+from edgevpr.runtime.scale import on_board
 from edgevpr.types import Descriptor, FineMatch, PartSpec, StageCost, TechniqueSpec
 
 # Round figures of the size that cohog and hog have: exact matching of many regions, or a long vector in RAM.
@@ -53,10 +59,41 @@ def test_a_technique_is_tried_on_frames_of_a_camera_and_a_map_on_disk():
     costs = probe(technique)
     assert technique.shapes == {((480, 640), np.dtype(np.uint8))}
     assert technique.matched >= 6
-    assert costs.ram_bytes_per_place == 4 * 4 + 24  # its row, and id, latitude and longitude
+    assert costs.ram_bytes_per_place == 4 * 4 + 26  # its row, and id, latitude, longitude and heading
     assert costs.disk_bytes_per_place == 4 * 4 + 6 * 2 * 4
     assert 10 < costs.process_mb < 2_000
     assert min(costs.encode.wall_s, costs.match_per_place.wall_s, costs.match_per_place.cpu_s) > 0
+
+
+def test_given_pictures_are_all_encoded_and_the_median_counts(monkeypatch):
+    technique = TinyTechnique(fine=True)
+    seconds = iter([9.0, 1.0, 3.0, 2.0])
+
+    def slow(image, mask=None):
+        clock[0] += next(seconds)
+        return TinyTechnique.encode(technique, image, mask)
+
+    clock = [0.0]
+    technique.encode = slow
+    timed = functools.partial(choosing_probe.stage, wall_clock=lambda: clock[0], cpu_clock=lambda: clock[0] / 2)
+    monkeypatch.setattr(choosing_probe, "stage", timed)
+    costs = probe(technique, [image[:200] for image in noise(3)])
+    assert costs.encode == StageCost(2.0, 1.0)
+    assert technique.shapes == {((200, 640), np.dtype(np.uint8))}
+
+
+def test_the_peak_is_the_most_that_was_resident_not_what_is_left():
+    class Greedy(TinyTechnique):
+        def encode(self, image, mask=None):
+            np.ones(100_000_000, np.uint8).sum()
+            return super().encode(image, mask)
+
+    if not machine.forget_peak():
+        pytest.skip("this kernel does not forget peaks")
+    costs = probe(Greedy(fine=True))
+    assert 90 < costs.encode_mb < 130
+    assert costs.process_mb > machine.rss_mb() + 50
+    assert probe(TinyTechnique(fine=True)).encode_mb < 50, "the peak of another is forgotten"
 
 
 def test_a_technique_without_a_fine_part_is_tried_too():
@@ -68,8 +105,8 @@ def test_a_technique_without_a_fine_part_is_tried_too():
 
 
 def test_the_real_techniques_are_probed_best_first():
-    costs = dict(probe_each(techniques.create(name) for name in techniques.names()))
-    assert tuple(costs) == techniques.names()
+    costs = dict(probe_each(techniques.create(name) for name in techniques.AUTOMATIC))
+    assert tuple(costs) == techniques.AUTOMATIC
     assert costs["hog"].ram_bytes_per_place > 100 * costs["cohog"].ram_bytes_per_place
 
 
@@ -160,28 +197,43 @@ def test_the_cpu_share_limits_a_technique_that_keeps_all_cores_busy():
     assert fit(board(cpu_share=0.25), four_threads, 100, 1, 100).reachable_hz == pytest.approx(1 / 0.8)
 
 
-def test_times_are_scaled_to_a_slower_board_and_memory_is_not():
-    here, there = load_board("generic-x86"), load_board("rpi-4b")
-    scaled = on_board(REGIONS, here, there)
-    assert scaled.encode == StageCost(pytest.approx(0.1 / 0.38), pytest.approx(0.1 / 0.38))
-    assert scaled.match_per_place.cpu_s == pytest.approx(0.004 / 0.38)
-    assert (scaled.ram_bytes_per_place, scaled.process_mb) == (1_000, 90.0)
-
-
-def test_more_busy_cores_than_the_board_has_take_longer():
-    here, there = load_board("generic-x86"), board(cores=2)
-    eight_threads = dataclasses.replace(REGIONS, encode=StageCost(0.1, 0.8))
-    assert on_board(eight_threads, here, there).encode.wall_s == pytest.approx(0.1 / 0.38 * 4)
-
-
-def test_an_unknown_speed_leaves_the_times_as_they_are():
-    here, there = load_board("generic-x86"), load_board("thesis-xeon")
-    assert speed_ratio(here, there) is None
-    assert on_board(REGIONS, here, there) == REGIONS
-    assert speed_ratio(there, there) == 1.0
-
-
 def test_what_is_reached_is_never_rounded_up():
     assert [choosing._rounded_down(value) for value in (0.249, 1.99, 9.99, 123.0)] == pytest.approx(
         [0.24, 1.9, 9.9, 120]
     )
+
+
+def test_the_boards_own_technique_is_tried_before_those_offered_to_all():
+    assert preferred(board(technique=None)) == techniques.AUTOMATIC
+    assert preferred(board(technique="hog")) == ("hog", "cohog")
+    assert preferred(board(technique="seqslam")) == ("seqslam", *techniques.AUTOMATIC)
+
+
+def test_a_technique_of_the_board_that_is_not_there_is_one_sentence():
+    with pytest.raises(
+        ConfigError, match=r"^The profile of Test board names the technique `cohgo`, which is not there: "
+    ):
+        preferred(board(technique="cohgo"))
+
+
+def test_the_technique_that_is_picked_is_the_boards_only_if_it_fits(monkeypatch, caplog):
+    # The process that runs the tests is large by itself.
+    small = board(technique="hog", budget_mb=1.0, memory_max_mb=4000.0)
+    for own, places, taken in ((small, 2, "hog"), (small, 100, "cohog")):
+        monkeypatch.setattr(pipeline, "load_board", lambda name, own=own: own)
+        assert pipeline.picked_technique("this", places) == taken
+
+
+def test_a_network_that_the_board_wants_and_that_is_not_there_is_passed_over(monkeypatch, caplog):
+    really = pipeline.made_for
+
+    def made_for(board, name, settings=None):
+        if name == "netvlad":
+            raise ModelError("There is no model.")
+        return really(board, name, settings)
+
+    monkeypatch.setattr(pipeline, "made_for", made_for)
+    own = board(technique="netvlad", budget_mb=20.0, memory_max_mb=4000.0)
+    monkeypatch.setattr(pipeline, "load_board", lambda name: own)
+    assert pipeline.picked_technique("this", 10) == "cohog"
+    assert any("netvlad is passed over" in message for message in caplog.messages)

@@ -6,10 +6,12 @@ from dataclasses import asdict, replace
 import pytest
 
 from edgevpr.errors import UsageError
-from edgevpr.power.boards import load_board
+from edgevpr.power.boards import Score, load_board
 from edgevpr.power.equations import parse_pack
-from edgevpr.runtime.choose import TechniqueCosts
-from edgevpr.runtime.estimate import FlightPlan, estimate, format_table
+from edgevpr.runtime.estimate import FlightPlan
+from edgevpr.runtime.estimate import estimate as estimate_of
+from edgevpr.runtime.probe import TechniqueCosts
+from edgevpr.runtime.trial import Trial
 from edgevpr.types import StageCost
 
 COSTS = {
@@ -20,6 +22,16 @@ PLAN = FlightPlan(
     100, rate_hz=1.0, flight_min=20.0, pack=parse_pack("4S5200"), regulator_efficiency=0.85, budget_mb=256
 )
 PI = load_board("rpi-4b")
+NOBODY = Score(None, None, None, None, False, "nobody")
+NO_HOVER = "Give the hover power of the aircraft (--hover-w W) to see how many minutes of flight this costs."
+
+
+def trials(costs, stored=False):
+    return [(Trial(label, label.split()[0], {}, each), stored) for label, each in costs.items()]
+
+
+def estimate(board, here, costs, plan, *more):
+    return estimate_of(board, here, trials(costs), plan, *more)
 
 
 def test_a_flight_on_the_board_itself_by_hand():
@@ -35,16 +47,16 @@ def test_a_flight_on_the_board_itself_by_hand():
     assert regions.query_marginal_mah == pytest.approx(1000 * 4.53 * 0.25 * 0.5 / volt_hours, abs=1e-9)
     # 1200 queries; the board idles from start to end, and the queries come on top.
     marginal_j, idle_j = 1200 * 4.53 * 0.25 * 0.5, 1200 * 2.29
-    assert regions.flight_marginal_ah == pytest.approx(marginal_j / volt_hours, abs=1e-9)
-    assert regions.flight_ah == pytest.approx((idle_j + marginal_j) / volt_hours, abs=1e-9)
-    assert regions.flight_pack_frac == pytest.approx(regions.flight_ah / 5.2)
+    assert regions.flight_marginal_mah == pytest.approx(1000 * marginal_j / volt_hours, abs=1e-6)
+    assert regions.flight_mah == pytest.approx(1000 * (idle_j + marginal_j) / volt_hours, abs=1e-6)
+    assert regions.flight_pack_frac == pytest.approx(regions.flight_mah / 5200)
 
 
 def test_a_rate_out_of_reach_is_not_charged_for():
     fast = estimate(PI, PI, COSTS, replace(PLAN, rate_hz=50.0)).techniques[0]
     reached = estimate(PI, PI, COSTS, replace(PLAN, rate_hz=2.0)).techniques[0]
     assert not fast.fits
-    assert fast.flight_ah == pytest.approx(reached.flight_ah)
+    assert fast.flight_mah == pytest.approx(reached.flight_mah)
 
 
 def test_a_technique_that_does_not_fit_says_why_and_what_would():
@@ -57,16 +69,23 @@ def test_a_technique_that_does_not_fit_says_why_and_what_would():
 
 def test_figures_of_the_machine_itself_are_measured_and_carry_no_note():
     found = estimate(PI, PI, COSTS, PLAN)
-    assert (found.times, found.verified, found.notes) == ("measured", True, ())
+    assert (found.times, found.verified, found.notes) == ("measured", True, (NO_HOVER,))
 
 
 def test_figures_of_another_board_are_scaled_and_say_so():
     found = estimate(PI, load_board("generic-x86"), COSTS, PLAN)
     assert found.times == "scaled"
     assert found.techniques[0].t_encode_s == pytest.approx(0.1 / 0.38)
-    assert len(found.notes) == 1
-    assert "scaled from this machine to 0.38 of its speed (unverified; 7-zip" in found.notes[0]
-    assert "not measured on this board" in found.notes[0]
+    assert asdict(found.ratios) == {"products": 0.056, "passes": 0.38}
+    assert found.notes[0].startswith(
+        "The times are scaled from this machine, not measured on this board: networks and full comparisons to 0.056 of "
+        "its speed, everything else to 0.38 (unverified; the board by 7-zip"
+    )
+
+
+def test_a_board_whose_products_are_not_known_apart_says_so():
+    found = estimate(load_board("rpi-3b-plus"), load_board("generic-x86"), COSTS, PLAN)
+    assert found.notes[0].endswith("; its products are not known apart: 0.15 of its single thread.")
 
 
 def test_figures_for_a_board_of_unknown_speed_are_unscaled_and_say_so():
@@ -79,7 +98,7 @@ def test_figures_for_a_board_of_unknown_speed_are_unscaled_and_say_so():
 
 
 def test_a_machine_of_unknown_speed_is_named_when_its_times_cannot_be_scaled():
-    here = replace(load_board("generic-x86"), title="this machine (Radxa)", relative_speed=None, speed_source="nobody")
+    here = replace(load_board("generic-x86"), title="this machine (Radxa)", benchmark_score=NOBODY)
     found = estimate(PI, here, COSTS, PLAN)
     assert "the speed of this machine (Radxa) is not known (nobody)" in found.notes[0]
 
@@ -88,20 +107,7 @@ def test_unverified_power_is_said_with_its_source():
     board = load_board("rpi-zero-2w")
     found = estimate(board, board, COSTS, PLAN)
     assert not found.verified
-    assert found.notes == (f"The power of Raspberry Pi Zero 2 W is unverified: {board.source}.",)
-
-
-def test_the_table_has_a_line_for_each_technique_in_columns_and_every_note():
-    board = load_board("rpi-zero-2w")
-    found = estimate(board, load_board("generic-x86"), COSTS, replace(PLAN, places=1000))
-    heading, heads, regions, vector, *rest = format_table(found).splitlines()
-    assert heading.startswith("Raspberry Pi Zero 2 W: 1000 places, 1 Hz, 20 min, 4S5200 at 85% regulator efficiency")
-    assert heading.endswith("times scaled")
-    assert regions.split()[:4] == ["regions", "no", "1000", "1.0"]
-    assert heads.index("disk MB") + len("disk MB") == regions.index("124.0") + len("124.0")
-    assert len(heads) == len(regions) == len(vector)
-    assert rest[0].startswith("regions does not fit: it reaches 0.043 Hz of 1; it would fit with up to 19 ")
-    assert tuple(rest[2:]) == found.notes
+    assert found.notes == (f"The power of Raspberry Pi Zero 2 W is unverified: {board.source}.", NO_HOVER)
 
 
 def test_the_estimate_is_ready_for_json():
@@ -120,9 +126,84 @@ def test_the_estimate_is_ready_for_json():
         ({"flight_min": -20.0}, "The length of the flight in minutes is -20: give a number above 0."),
         ({"flight_min": float("nan")}, "The length of the flight in minutes is nan: give a number above 0."),
         ({"budget_mb": float("inf")}, "The budget in MB is inf: give a number above 0."),
+        ({"hover_w": 0.0}, "The hover power in W is 0: give a number above 0."),
+        ({"hover_w": float("nan")}, "The hover power in W is nan: give a number above 0."),
     ],
 )
 def test_a_plan_that_makes_no_sense_is_one_sentence(change, sentence):
     with pytest.raises(UsageError) as raised:
         replace(PLAN, **change)
     assert str(raised.value) == sentence
+
+
+def test_minutes_lost_by_hand():
+    found = estimate(PI, PI, COSTS, replace(PLAN, hover_w=180.0))
+    regions = found.techniques[0]
+    pack_wh, idle_w, marginal_w = 14.8 * 5.2, 2.29 / 0.85, 4.53 * 0.25 * 0.5 / 0.85
+    whole, idling, flying = (60 * pack_wh / (180 + more) for more in (0, idle_w, idle_w + marginal_w))
+    assert regions.lost_min == pytest.approx(whole - flying, rel=1e-9)
+    assert regions.lost_marginal_min == pytest.approx(idling - flying, rel=1e-9)
+    assert found.notes == ()
+    longer = estimate(PI, PI, COSTS, replace(PLAN, hover_w=180.0, flight_min=40.0)).techniques[0]
+    assert longer.lost_min == pytest.approx(regions.lost_min), "it is power that counts, not how long was planned"
+
+
+def test_without_a_hover_power_nothing_is_said_to_be_lost():
+    assert estimate(PI, PI, COSTS, PLAN).techniques[0].lost_min is None
+
+
+FORMS = {
+    "cohog": COSTS["regions"],
+    "hog": COSTS["vector"],
+    "hog 1bit": replace(COSTS["vector"], ram_bytes_per_place=17_900),
+}
+
+
+def test_the_first_that_fits_is_recommended_and_why():
+    found = estimate(replace(PI, technique=None), PI, FORMS, PLAN)
+    assert found.recommended == "cohog"
+    assert found.reason == (
+        "cohog: it is the first, in order of preference, of the 3 that fit: 90 of 512 MB, 2 Hz where 1 are asked, and "
+        "15 mAh a flight beside the 60.7 of the idle board."
+    )
+
+
+def test_the_boards_own_technique_goes_before_a_better_one_if_it_fits():
+    own = replace(PI, technique="hog")
+    found = estimate(own, PI, FORMS, PLAN)
+    assert found.recommended == "hog"
+    assert "it is what the board's profile prefers, and it fits" in found.reason
+    assert estimate(own, PI, FORMS, replace(PLAN, places=190, budget_mb=1.0)).recommended == "cohog"
+
+
+def test_with_a_map_only_what_its_file_can_serve_is_recommended():
+    found = estimate(PI, PI, FORMS, replace(PLAN, places=200, budget_mb=20.0), "hog")
+    assert found.recommended == "hog 1bit"
+    assert found.reason.startswith(
+        "hog 1bit: the map was built with hog, and it is the first, in order of preference, "
+    )
+    nothing = estimate(PI, PI, FORMS, PLAN, "netvlad")
+    assert (nothing.recommended, nothing.reason) == (
+        None, "None: the map was built with netvlad, which cannot be used here."
+    )  # fmt: skip
+
+
+def test_where_nothing_fits_the_reason_says_what_would():
+    found = estimate(PI, PI, COSTS, replace(PLAN, places=2000))
+    assert found.recommended is None
+    assert found.reason == (
+        "None: nothing that was tried fits Raspberry Pi 4B, 64-bit; what would fit is regions with up to 225 places or "
+        "at up to 0.12 Hz, or vector with up to 895 places."
+    )
+    tiny = replace(PI, memory_max_mb=64.0)
+    assert estimate(tiny, PI, COSTS, PLAN).reason.endswith("; use a larger board.")
+
+
+def test_what_cannot_be_used_is_kept_beside_and_the_date_only_where_it_counts():
+    broken = (Trial("calc", "calc", {}, problem="There is no model `calc`."), False)
+    stored = trials({"cohog": COSTS["regions"]}, stored=True)
+    found = estimate_of(PI, PI, [*stored, *trials({"hog": COSTS["vector"]}), broken], PLAN, None, "today")
+    assert found.unusable == {"calc": "There is no model `calc`."}
+    assert [row.measured for row in found.techniques] == [True, False]
+    assert found.measured_on == "today"
+    assert estimate_of(PI, PI, trials(COSTS), PLAN, None, "today").measured_on is None

@@ -1,0 +1,174 @@
+"""How hot the machine is, how fast it runs, and whether it slows itself down: one cheap look.
+
+A look opens two or three files of /sys: microseconds. What costs more (the Raspberry Pi's firmware, the heat counters
+of x86) is asked once in `SLOW_S` seconds, and `vcgencmd` in a process of its own that a later look collects, so no
+look ever waits for it.
+"""
+
+import contextlib
+import os
+import re
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from edgevpr.power import vcgencmd
+
+SLOW_S = 5.0
+_UNKNOWN_LIMIT_C = 80.0  # where the firmware of a Raspberry Pi begins to slow down, and modest for anything else
+_CPU_ZONE = re.compile(r"cpu|soc|pkg|tj|acpitz|bigcore|littlecore", re.IGNORECASE)
+_CPU_CHIPS = ("coretemp", "k10temp", "zenpower", "cpu_thermal")
+# Bits of the firmware's answer that say what is so now; the same 16 bits higher: has been so since start.
+_BITS = ((1, "under-voltage"), (2, "frequency capped"), (4, "throttled"), (8, "soft temperature limit"))
+_SLOWS = 2 | 4 | 8
+
+
+@dataclass(frozen=True, slots=True)
+class ThermalState:
+    """`temperature_c` of the hottest CPU sensor and `frequency_mhz` of the fastest cluster, None where nothing says;
+    `throttled` None where the machine cannot tell; `why` says what was seen, "" for nothing."""
+
+    temperature_c: float | None
+    frequency_mhz: float | None
+    throttled: bool | None
+    why: str
+
+
+class ThermalWatch:
+    """Looks at the sensors found when it is made. `close` it when done."""
+
+    def __init__(self, root: Path = Path("/"), clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._temperatures = [zone / "temp" for zone in _cpu_zones(root)] or list(_chip_files(root))
+        self._limit_c = limit_c(root)
+        policies = sorted((root / "sys/devices/system/cpu/cpufreq").glob("policy*"))
+        self._policy = max(policies, key=lambda policy: _number(policy / "cpuinfo_max_freq") or 0, default=None)
+        self._top_khz = (self._policy and _number(self._policy / "cpuinfo_max_freq")) or 0.0
+        self._allowed_khz = 0.0
+        self._counters = sorted((root / "sys/devices/system/cpu").glob("cpu[0-9]*/thermal_throttle/*_throttle_count"))
+        self._counted = sum(_number(path) or 0 for path in self._counters)
+        self._firmware = next((root / "sys/devices/platform").glob("soc*/*firmware/get_throttled"), None)
+        self._program = vcgencmd.find(root)
+        self._asking: subprocess.Popen | None = None
+        self._bits: int | None = None
+        self._heat_events = 0.0
+        self._slow_at_s = float("-inf")
+
+    def look(self) -> ThermalState:
+        """Look once; never raises: a sensor that has gone, or says what cannot be, is None."""
+        now_s = self._clock()
+        if now_s - self._slow_at_s >= SLOW_S:
+            self._slow_at_s = now_s
+            self._look_slowly()
+        self._collect()
+        degrees = [value / 1000 for value in map(_number, self._temperatures) if value is not None]
+        temperature_c = max((value for value in degrees if -40 <= value <= 150), default=None)
+        khz = _number(self._policy / "scaling_cur_freq") if self._policy else None
+        frequency_mhz = khz / 1000 if khz is not None and khz > 0 else None
+        reasons = list(self._reasons(temperature_c, khz))
+        can_tell = self._bits is not None or self._counters or self._top_khz > 0
+        throttled = any(slows for slows, _ in reasons) if can_tell else None
+        return ThermalState(temperature_c, frequency_mhz, throttled, "; ".join(why for _, why in reasons))
+
+    def close(self) -> None:
+        """Leave no process behind."""
+        if self._asking:
+            self._asking.kill()
+            self._asking.communicate()
+            self._asking = None
+
+    def _reasons(self, temperature_c: float | None, khz: float | None) -> Iterator[tuple[bool, str]]:
+        """(whether it slows the machine down, what it is)."""
+        bits = self._bits or 0
+        if now := [word for bit, word in _BITS if bits & bit]:
+            yield bool(bits & _SLOWS), f"{', '.join(now)} now"
+        if before := [word for bit, word in _BITS if bits >> 16 & bit and not bits & bit]:
+            yield False, f"{', '.join(before)} since start"
+        if self._heat_events > 0:
+            yield True, f"the processor has slowed down {self._heat_events:g} times in {SLOW_S:g} s for heat"
+        if self._policy:
+            # What cools a board lowers this limit. A power mode may hold it low for good: the highest seen is normal.
+            allowed_khz = _number(self._policy / "scaling_max_freq") or 0.0
+            self._allowed_khz = max(self._allowed_khz, allowed_khz)
+            normal_khz = self._allowed_khz or self._top_khz
+            hot = temperature_c is not None and temperature_c >= self._limit_c
+            if 0 < allowed_khz < 0.98 * normal_khz:
+                yield True, f"frequency limited to {allowed_khz / 1000:g} of {normal_khz / 1000:g} MHz"
+            # A low frequency alone says nothing, since idle cores slow down; a hot machine is not idle.
+            elif hot and khz and khz < 0.9 * normal_khz:
+                yield True, f"{khz / 1000:g} of {normal_khz / 1000:g} MHz at {temperature_c:g} degrees"
+
+    def _look_slowly(self) -> None:
+        counted = sum(_number(path) or 0 for path in self._counters)
+        self._heat_events, self._counted = counted - self._counted, counted
+        if self._firmware:
+            self._bits = _hexadecimal(_content(self._firmware))
+        elif self._program:
+            self.close()  # one that has not answered by now hangs: ask again
+            with contextlib.suppress(OSError):
+                self._asking = subprocess.Popen(
+                    [self._program, "get_throttled"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+                )
+
+    def _collect(self) -> None:
+        if self._asking and self._asking.poll() is not None:
+            answer, _ = self._asking.communicate()
+            self._bits = _hexadecimal(answer.decode(errors="replace").rpartition("=")[2])
+            self._asking = None
+
+
+def limit_c(root: Path = Path("/")) -> float:
+    """Where this machine begins to slow down: the lowest passive trip point of its CPU's zones.
+
+    A board whose kernel has none (Raspberry Pi: its firmware does it) is held at 80 degrees, or 10 below the point
+    where it switches off if that is lower.
+    """
+    trips: dict[str, list[float]] = {}
+    for zone in _cpu_zones(root):
+        for path in zone.glob("trip_point_*_type"):
+            value = _number(path.with_name(path.name.replace("_type", "_temp")))
+            if value is not None and 40_000 <= value <= 125_000:
+                trips.setdefault((_content(path) or "").strip(), []).append(value / 1000)
+    if "passive" in trips:
+        return min(trips["passive"])
+    return min([_UNKNOWN_LIMIT_C, *(value - 10 for value in trips.get("critical", []))])
+
+
+def _cpu_zones(root: Path) -> list[Path]:
+    zones = sorted((root / "sys/class/thermal").glob("thermal_zone*"))
+    return [zone for zone in zones if _CPU_ZONE.search(_content(zone / "type") or "")] or zones
+
+
+def _chip_files(root: Path) -> Iterator[Path]:
+    for chip in sorted((root / "sys/class/hwmon").glob("hwmon*")):
+        if (_content(chip / "name") or "").strip() in _CPU_CHIPS:
+            yield from sorted(chip.glob("temp*_input"))
+
+
+def _content(path: Path) -> str | None:
+    """What a small file says. Opened by hand: a third of the time that `read_text` takes."""
+    try:
+        handle = os.open(path, os.O_RDONLY)
+        try:
+            return os.read(handle, 64).decode("ascii", errors="replace")
+        finally:
+            os.close(handle)
+    except OSError:
+        return None
+
+
+def _number(path: Path) -> float | None:
+    try:
+        value = float(_content(path) or "")
+    except ValueError:
+        return None
+    return value if abs(value) < float("inf") else None
+
+
+def _hexadecimal(text: str | None) -> int | None:
+    try:
+        return int((text or "").strip(), 16)
+    except ValueError:
+        return None

@@ -1,0 +1,206 @@
+"""Temperature, frequency and throttling from trees that stand for /sys, and from firmware that is a shell script."""
+
+import os
+import time
+
+import pytest
+
+from edgevpr.power.thermal import SLOW_S, ThermalState, ThermalWatch, limit_c
+
+ZONE = "sys/class/thermal/thermal_zone"
+CPU = "sys/devices/system/cpu"
+POLICY = f"{CPU}/cpufreq/policy0"
+PI = {
+    f"{ZONE}0/type": "cpu-thermal\n",
+    f"{ZONE}0/temp": "48312\n",
+    f"{ZONE}0/trip_point_0_type": "critical\n",
+    f"{ZONE}0/trip_point_0_temp": "110000\n",
+    f"{POLICY}/cpuinfo_max_freq": "1800000\n",
+    f"{POLICY}/scaling_max_freq": "1800000\n",
+    f"{POLICY}/scaling_cur_freq": "600000\n",
+}
+FIRMWARE = "sys/devices/platform/soc/soc:firmware/get_throttled"
+
+
+def test_a_cool_board_that_idles_is_not_throttled(tree, clock):
+    assert ThermalWatch(tree(PI), clock).look() == ThermalState(48.312, 600.0, False, "")
+
+
+def test_the_hottest_sensor_of_the_cpu_counts_and_no_other(tree, clock):
+    zones = {
+        f"{ZONE}1/type": "wifi-thermal\n",
+        f"{ZONE}1/temp": "90000\n",
+        f"{ZONE}2/type": "soc0-thermal\n",
+        f"{ZONE}2/temp": "51000\n",
+    }
+    assert ThermalWatch(tree(PI | zones), clock).look().temperature_c == 51.0
+
+
+def test_without_zones_the_chip_of_the_cpu_is_asked(tree, clock):
+    chips = {
+        "sys/class/hwmon/hwmon0/name": "nvme\n",
+        "sys/class/hwmon/hwmon0/temp1_input": "70000\n",
+        "sys/class/hwmon/hwmon1/name": "k10temp\n",
+        "sys/class/hwmon/hwmon1/temp1_input": "44500\n",
+    }
+    assert ThermalWatch(tree(chips), clock).look() == ThermalState(44.5, None, None, "")
+
+
+def test_a_machine_that_says_nothing_is_unknown(tmp_path, clock):
+    assert ThermalWatch(tmp_path, clock).look() == ThermalState(None, None, None, "")
+
+
+@pytest.mark.parametrize("nonsense", ["", "hot\n", "999999999\n", "-300000\n", "nan\n", "\udcff"])
+def test_a_sensor_that_says_nonsense_is_none(tree, clock, nonsense):
+    root = tree(PI)
+    (root / f"{ZONE}0/temp").write_bytes(nonsense.encode(errors="surrogateescape"))
+    (root / f"{POLICY}/scaling_cur_freq").write_bytes(b"-1\n")
+    assert ThermalWatch(root, clock).look() == ThermalState(None, None, False, "")
+
+
+def test_sensors_that_go_do_not_raise(tree, clock):
+    root = tree(PI)
+    watch = ThermalWatch(root, clock)
+    for name in PI:
+        (root / name).unlink()
+    assert watch.look() == ThermalState(None, None, False, "")
+
+
+def test_a_frequency_limit_that_sinks_is_throttling(tree, clock):
+    root = tree(PI)
+    watch = ThermalWatch(root, clock)
+    assert watch.look().throttled is False
+    tree({f"{POLICY}/scaling_max_freq": "1200000\n"})
+    state = watch.look()
+    assert (state.throttled, state.why) == (True, "frequency limited to 1200 of 1800 MHz")
+    tree({f"{POLICY}/scaling_max_freq": "1800000\n"})
+    assert watch.look().throttled is False
+
+
+def test_a_power_mode_that_holds_the_frequency_low_is_not(tree, clock):
+    watch = ThermalWatch(tree(PI | {f"{POLICY}/scaling_max_freq": "1000000\n"}), clock)
+    assert watch.look().throttled is False
+
+
+def test_a_hot_machine_that_runs_slowly_is_throttled(tree, clock):
+    state = ThermalWatch(tree(PI | {f"{ZONE}0/temp": "82500\n"}), clock).look()
+    assert (state.throttled, state.why) == (True, "600 of 1800 MHz at 82.5 degrees")
+
+
+def test_the_fastest_of_two_clusters_is_looked_at(tree, clock):
+    big = f"{CPU}/cpufreq/policy4"
+    files = {f"{big}/cpuinfo_max_freq": "2400000", f"{big}/scaling_cur_freq": "2300000"}
+    assert ThermalWatch(tree(PI | files), clock).look().frequency_mhz == 2300.0
+
+
+@pytest.mark.parametrize(
+    ("answer", "throttled", "why"),
+    [
+        ("0\n", False, ""),
+        ("4\n", True, "throttled now"),
+        ("a\n", True, "frequency capped, soft temperature limit now"),
+        ("1\n", False, "under-voltage now"),
+        ("50000\n", False, "under-voltage, throttled since start"),
+        ("50005\n", True, "under-voltage, throttled now"),
+        ("50004\n", True, "throttled now; under-voltage since start"),
+        ("what\n", False, ""),
+    ],
+)
+def test_the_firmware_says_what_slows_it_down(tree, clock, answer, throttled, why):
+    state = ThermalWatch(tree(PI | {FIRMWARE: answer}), clock).look()
+    assert (state.throttled, state.why) == (throttled, why)
+
+
+def test_the_firmware_is_asked_once_in_some_seconds(tree, clock):
+    watch = ThermalWatch(tree(PI | {FIRMWARE: "0\n"}), clock)
+    assert watch.look().throttled is False
+    tree({FIRMWARE: "4\n"})
+    clock.sleep(SLOW_S - 0.1)
+    assert watch.look().throttled is False
+    clock.sleep(0.2)
+    assert watch.look().throttled is True
+
+
+def vcgencmd(tree, script):
+    root = tree(PI | {"usr/bin/vcgencmd": f"#!/bin/sh\n{script}\n"})
+    (root / "usr/bin/vcgencmd").chmod(0o755)
+    return root
+
+
+def until(condition):
+    give_up_s = time.monotonic() + 10
+    while not condition():
+        assert time.monotonic() < give_up_s
+        time.sleep(0.01)
+
+
+def test_vcgencmd_is_never_waited_for_and_its_answer_comes_later(tree, clock):
+    root = vcgencmd(tree, f'while [ ! -e "{tree({})}/go" ]; do sleep 0.01; done\necho "throttled=0x80008"')
+    watch = ThermalWatch(root, clock)
+    assert watch.look() == ThermalState(48.312, 600.0, False, "")  # still at work
+    tree({"go": ""})
+    until(lambda: watch.look().throttled)
+    assert watch.look().why == "soft temperature limit now"
+    watch.close()
+
+
+def test_a_vcgencmd_that_hangs_is_ended(tree, clock):
+    root = vcgencmd(tree, 'echo $$ >> "$0.pids"; exec sleep 60')
+    watch = ThermalWatch(root, clock)
+    watch.look()
+    pids = root / "usr/bin/vcgencmd.pids"
+    until(lambda: pids.exists() and pids.read_text().endswith("\n"))
+    clock.sleep(SLOW_S + 1)
+    assert watch.look().throttled is False
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(pids.read_text().split()[0]), 0)
+    watch.close()
+
+
+@pytest.mark.parametrize("script", ["exit 1", "echo no; exit 3", "echo 'throttled=0xzz'"])
+def test_a_vcgencmd_that_fails_says_nothing(tree, clock, script):
+    watch = ThermalWatch(vcgencmd(tree, script), clock)
+    for _ in range(20):
+        assert watch.look() == ThermalState(48.312, 600.0, False, "")
+        time.sleep(0.01)
+    watch.close()
+
+
+def test_a_vcgencmd_that_cannot_be_started_says_nothing(tree, clock):
+    assert ThermalWatch(tree(PI | {"usr/bin/vcgencmd": "no program"}), clock).look().throttled is False
+
+
+def test_heat_counters_of_x86_that_move_are_throttling(tree, clock):
+    folder = f"{CPU}/cpu0/thermal_throttle"
+    counters = {f"{folder}/core_throttle_count": "17\n", f"{folder}/package_throttle_count": "20\n"}
+    watch = ThermalWatch(tree(counters), clock)
+    assert watch.look().throttled is False  # what was before it was made does not count
+    tree({f"{folder}/core_throttle_count": "19\n"})
+    clock.sleep(SLOW_S)
+    state = watch.look()
+    assert (state.throttled, state.why) == (True, "the processor has slowed down 2 times in 5 s for heat")
+    clock.sleep(SLOW_S)
+    assert watch.look().throttled is False
+
+
+def trips(**points):
+    return {
+        f"{ZONE}0/trip_point_{n}_{what}": f"{value}\n"
+        for n, (kind, millidegrees) in enumerate(points.items())
+        for what, value in (("type", kind.rstrip("0123456789")), ("temp", millidegrees))
+    }
+
+
+@pytest.mark.parametrize(
+    ("points", "expected_c"),
+    [
+        ({"passive1": 95_000, "passive2": 70_000, "critical": 105_000}, 70.0),
+        ({"critical": 110_000}, 80.0),
+        ({"critical": 75_000}, 65.0),
+        ({"active": 50_000}, 80.0),
+        ({"passive": -274_000, "critical": 0}, 80.0),
+        ({}, 80.0),
+    ],
+)
+def test_the_limit_is_the_first_point_where_the_kernel_slows_down(tree, points, expected_c):
+    assert limit_c(tree({f"{ZONE}0/type": "x86_pkg_temp\n"} | trips(**points))) == expected_c
