@@ -1,30 +1,42 @@
-"""What `edgevpr run` takes with a large map: peak memory, start to the first match, CPU while there is nothing to see.
+"""What `edgevpr run` takes with a large map: peak memory, start to the first match, CPU while there is nothing to see,
+and how much of it the measuring takes.
 
 A process of its own, as on the aircraft: a generated map of `cohog`, pictures from a folder, a link. What another
 process does is read in /proc. PSS shares pages with whatever else runs Python here, this benchmark included: on an
 aircraft it lies between the figure shown and RSS.
 """
 
+import itertools
+import json
 import os
 import shutil
 import statistics
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+
+import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from big_map import file_bytes, make_big_map
 from flight_process import cpu_s, start, wait_for, watch_memory, write_frames
 
+from edgevpr.power.boards import load_board
+from edgevpr.power.equations import Pack
+from edgevpr.power.meter import PssMeter, query_cost, stage
+from edgevpr.runtime.flightlog import read_log
+from edgevpr.runtime.metering import FlightMeter
 from edgevpr.techniques import create
 
 PLACES = 10_000
 FRAMES = 60
 STARTS = 5
+MEASURED = 200
+STAGES = 5  # of a query: the turn of the loop, reading, encoding, matching, telling
 IDLE_S = 10.0
 SETTLE_S = 2.0
 SPARE_BYTES = 10**9
@@ -62,6 +74,7 @@ def rows() -> list[FlightRow]:
         start_s(place_map, frames, folder)  # compiles the bytecode, and fills the page cache
         return [
             *memory_rows(place_map, frames, folder),
+            metering_row(folder / "memory.jsonl"),
             *start_rows(place_map, frames, folder),
             *idle_rows(place_map, frames, folder),
         ]
@@ -78,6 +91,35 @@ def memory_rows(place_map: Path, frames: Path, folder: Path) -> list[FlightRow]:
         FlightRow("peak RSS (VmHWM)", largest["VmHWM"], "MB", 130.0),
         FlightRow("peak PSS", largest["Pss"], "MB", None),
     ]
+
+
+def metering_row(log: Path) -> FlightRow:
+    """The CPU time that measuring takes, of that of a query (the median of the flight in `log`), at a query a second:
+    stages, memory, charge and heat, and their part of the log's line.
+
+    Between two measurements as much memory is gone through as a query does: all is slower when it has left the caches.
+    """
+    queries = [line for line in read_log(log) if line["kind"] == "query"]
+    query_s = statistics.median(line["costs"]["cpu_s"] + line["reading"]["cpu_s"] for line in queries)
+    board, pack = load_board("this"), Pack(4, 5200)
+    meter, pss = FlightMeter(board, pack, 0.85), PssMeter(itertools.count().__next__)
+    elsewhere = np.ones(8_000_000, np.float32)
+    taken_s = []
+    for _ in range(MEASURED):
+        elsewhere += 1
+        begin_s = time.process_time()
+        for _ in range(STAGES):
+            with stage() as metered:
+                pass
+        cost = query_cost(metered.cost, metered.cost, board, pack, 0.85, pss.look())
+        meter.count(metered.cost, metered.cost)
+        meter.busy(metered.cost)
+        json.dumps([asdict(cost), asdict(metered.cost), meter.heat_fields(), meter.totals()])
+        meter.look_at_heat()
+        meter.reading()
+        taken_s.append(time.process_time() - begin_s)
+    meter.close()
+    return FlightRow("metering, of a query", 100 * statistics.mean(taken_s) / query_s, "%", 1.0)
 
 
 def start_rows(place_map: Path, frames: Path, folder: Path) -> list[FlightRow]:

@@ -1,5 +1,6 @@
 """One query in a map of 10 000 places: the scan of 64-byte codes and the vote over the best of them, against the vote
-over all places, through the map file and the index that fly. One thread; the map is generated, its content random.
+over all places, through the map file and the index that fly; and with what may be known beforehand. One thread; the
+map is generated, its content random.
 """
 
 import os
@@ -15,6 +16,7 @@ from tempfile import TemporaryDirectory
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 import cv2
+import numpy as np
 from bench_encode import frames, timed_s
 from big_map import make_big_map
 
@@ -22,17 +24,20 @@ from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import rank
 from edgevpr.techniques import create
-from edgevpr.types import Technique
+from edgevpr.types import Position, Technique
 
 PLACES = 10_000
 TURNS = 9
+REACH_M = 300.0
 
 
 @dataclass(frozen=True, slots=True)
 class QueryRow:
-    """Median seconds of a query, encoding included; `exact_s` and `ratio` are None where it would take minutes."""
+    """Median seconds of a query, encoding included; `exact_s` and `ratio` are None where it would take minutes.
+    `beside` says what was searched."""
 
     camera: str
+    beside: str
     candidates: int
     encode_ms: float
     two_stage_ms: float
@@ -42,7 +47,7 @@ class QueryRow:
 
 
 def rows(places: int = PLACES) -> list[QueryRow]:
-    """A camera that looks ahead, or straight down with a known heading, is `forward`; `nadir` tries 24 rotations."""
+    """`forward` looks ahead; `nadir` tries 24 rotations, or 3 where the heading is known."""
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     found = []
@@ -53,16 +58,37 @@ def rows(places: int = PLACES) -> list[QueryRow]:
             make_big_map(path, technique.spec, places)
             with PlaceMap.open(path) as place_map:
                 index = load_index(place_map, technique, 100_000_000)
-                found.append(measure(camera, technique, place_map, index))
+                if camera == "forward":
+                    found.append(measure("forward", "", technique, place_map, index))
+                else:
+                    found += looking_down(technique, place_map, index)
     cv2.setNumThreads(threads)
     return found
 
 
-def measure(camera: str, technique: Technique, place_map: PlaceMap, index: PlaceIndex) -> QueryRow:
+def looking_down(technique: Technique, place_map: PlaceMap, index: PlaceIndex) -> list[QueryRow]:
+    # A map as it is flown, on parallel legs to and fro, with some sway.
+    rng = np.random.default_rng(0)
+    turned = {"turned_deg": (rng.choice([0, 180], len(index)) + rng.normal(0, 5, len(index))) % 360}
+    middle = Position(float(index.lat_deg.mean()), float(index.lon_deg.mean()))
+    near = {"allowed": index.within(middle, REACH_M)}
+    in_reach = f"{np.count_nonzero(near['allowed'])} places within {REACH_M:.0f} m"
+    cases = (
+        ("nadir", "24 rotations", {}),
+        ("nadir, heading known", "3 rotations", turned),
+        ("nadir, in reach", in_reach, near),
+        ("nadir, both", f"{in_reach}, 3 rotations", turned | near),
+    )
+    return [measure(name, beside, technique, place_map, index, **hints) for name, beside, hints in cases]
+
+
+def measure(
+    camera: str, beside: str, technique: Technique, place_map: PlaceMap, index: PlaceIndex, **hints: np.ndarray
+) -> QueryRow:
     picture = frames()[0]
 
     def query(candidates: int | None) -> None:
-        rank(technique, technique.encode(picture), place_map, index, candidates)
+        rank(technique, technique.encode(picture), place_map, index, candidates, **hints)
 
     query(technique.candidates)
     encode_s = statistics.median(timed_s(technique.encode, picture) for _ in range(TURNS))
@@ -75,6 +101,7 @@ def measure(camera: str, technique: Technique, place_map: PlaceMap, index: Place
     exact = statistics.median(exact_s) if exact_s else None
     return QueryRow(
         camera,
+        beside,
         technique.candidates,
         1000 * encode_s,
         1000 * two_stage,

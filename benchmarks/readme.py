@@ -3,12 +3,14 @@
 import json
 from pathlib import Path
 
+import sets_page
+
 from edgevpr.evaluate.tables import markdown
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 RESULTS = REPOSITORY / "benchmarks" / "results"
 BEGIN, END = "<!-- figures: made by benchmarks/readme.py -->\n", "<!-- end of figures -->"
-FORMS = ("hog", "cohog_thesis", "cohog_exact", "cohog")
+FORMS = (" 8bit", " 1bit")
 
 
 def main() -> None:
@@ -19,20 +21,26 @@ def main() -> None:
 
 
 def recall() -> str:
-    """Recall@1 of every form on every set, and what the rule of the flight would have let through."""
-    rows = []
-    for path in sorted(RESULTS.glob("*.json")):
-        content = json.loads(path.read_text())
-        if "techniques" not in content:
-            continue
-        found = content["techniques"]
-        shares = [f"{found[form]['recall_at_1']:.2f}" if form in found else "-" for form in FORMS]
-        name = "cohog" if "cohog" in found else "hog"
-        flown = found[name]
-        accepted = f"`{name}`: {flown['accepted']} of {flown['queries']}, {flown['accepted_wrong']} wrong"
-        rows.append([f"{content['set']} ({content['use']})", *shares, accepted])
-    heads = ("set", "`hog`", "`cohog`, thesis", "`cohog`, exact vote", "**`cohog`, as flown**", "accepted in flight")
-    return f"Recall@1, made by `make results`:\n\n{markdown(heads, rows)}"
+    """Recall@1 of every technique on every set, then that of the forms, and what the rule of the flight let through."""
+    contents = [json.loads(path.read_text()) for path in sorted(RESULTS.glob("*.json"))]
+    contents = [content for content in contents if "techniques" in content]
+    weights = {row["weights"] for content in contents for row in content["techniques"].values() if row["weights"]}
+    by_flight = []
+    for content in contents:
+        name = "cohog" if "cohog" in content["techniques"] else "hog"
+        flown = content["techniques"][name]
+        by_flight.append(
+            f"* {content['set']}: `{name}`, {flown['accepted']} of {flown['queries']}, {flown['accepted_wrong']} wrong"
+        )
+    return (
+        "Recall@1, made by `make results` (bytes: of a place in RAM; number of queries after the use of a set):\n\n"
+        f"{sets_page.overview(contents, lambda label: not label.endswith(FORMS))}\n\n"
+        "The same vectors less the map's mean, a byte or a bit a number:\n\n"
+        f"{sets_page.overview(contents, lambda label: label.endswith(FORMS))}\n\n"
+        f"Weights in use: {'; '.join(sorted(weights))}.\n\n"
+        f"![Precision-recall curves of all techniques on all sets](benchmarks/results/{sets_page.CURVES})\n\n"
+        "Accepted as the place by the rule of the flight:\n\n" + "\n".join(by_flight)
+    )
 
 
 def speed() -> str:
@@ -46,7 +54,7 @@ def speed() -> str:
     (match,) = content["match"]
     rows.append(["compare one place in full", f"{match['ours_ms']:.2f} ms", f"{match['ratio']:.1f}x the published way"])
     for row in content["two_stage"]:
-        ratio = f"{row['ratio']:.0f}x the vote over all" if row["ratio"] else "24 rotations"
+        ratio = f"{row['ratio']:.0f}x the vote over all" if row["ratio"] else row["beside"]
         rows.append([f"query, 10 000 places, {row['camera']}", f"{row['two_stage_ms']:.0f} ms", ratio])
     rows.append(["RAM of a place", f"{content['two_stage'][0]['bytes_per_place']} bytes", "the thesis's: 123 008"])
     rows += [[row["what"], f"{row['value']:.3g} {row['unit']}", "10 000 places"] for row in content["flight"]]

@@ -1,75 +1,114 @@
-"""Measure hog, and cohog in three forms, on every image set of a folder: `make results`.
+"""Measure every technique, in every form, on every image set of a folder: `make results`.
 
-Writes one JSON file a set and a summary, `sets.md`, into benchmarks/results/. The sets are not part of edgevpr; each is
-a folder with query/, ref/, ground_truth.csv and, where GPS is known, positions.csv.
+Writes one JSON file a set into benchmarks/results/ and, from all files that are there, a summary, `sets.md`, and the
+precision-recall curves. The sets are not part of edgevpr; each is a folder with query/, ref/, ground_truth.csv and,
+where GPS is known, positions.csv.
 """
 
 import argparse
+import hashlib
 import json
 import os
 import platform
 import subprocess
 import sys
 import tempfile
-from dataclasses import replace
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import sets_page
+import yaml
 
 from edgevpr import techniques
 from edgevpr.errors import EdgevprError, UsageError
-from edgevpr.evaluate import tables
 from edgevpr.evaluate.dataset import load_dataset
-from edgevpr.evaluate.evaluate import TechniqueResult, as_json, compare, evaluate
+from edgevpr.evaluate.evaluate import compare, evaluate
 from edgevpr.runtime.progress import progress
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-TECHNIQUES = ("hog", "cohog", "cohog_exact", "cohog_thesis")
 TUNED_ON = ("corridor", "aerial_caliterra")
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """One row of the tables: a technique, how it is set, how many queries are matched together (None: its own number),
+    and whether all places are compared in full."""
+
+    label: str
+    technique: str
+    settings: dict[str, str] = field(default_factory=dict)
+    sequence: int | None = None
+    exact: bool = False
+
+
+HOG, SEQSLAM, CALC = Variant("hog", "hog"), Variant("seqslam", "seqslam"), Variant("calc", "calc")
+COHOG = (
+    Variant("cohog", "cohog"),
+    Variant("cohog, exact", "cohog", exact=True),
+    Variant("cohog, thesis", "cohog", {"matching": "thesis"}, exact=True),
+    Variant("cohog, sequence 10", "cohog", sequence=10),
+)
+ORIGINAL_CALC = Variant("calc, original weights", "calc", {"model": "calc_original"})
+ON_SHIPPED_BACKBONE = tuple(
+    Variant(name, name)
+    for name in ("alexnet", "amosnet", "hybridnet", "netvlad", "rmac", "region_vlad", "cross_region_bow")
+)
+VECTORS = ("hog", "calc", "alexnet", "amosnet", "hybridnet", "netvlad", "region_vlad")
+PACKED = tuple(Variant(f"{name} {form}", name, {"form": form}) for name in VECTORS for form in ("8bit", "1bit"))
+VARIANTS = (*COHOG, HOG, SEQSLAM, Variant("seqslam, one frame", "seqslam", sequence=1), CALC, ORIGINAL_CALC,
+            *ON_SHIPPED_BACKBONE, *PACKED)  # fmt: skip
+
 FIVE_PLACES = "five places only: made for studies of change, recall on them says nothing"
 # What is not measured on a set, and why.
 LEFT_OUT = {
-    "grief_michigan_monthly": (TECHNIQUES, FIVE_PLACES),
-    "grief_stromovka_monthly": (TECHNIQUES, FIVE_PLACES),
-    "nordland_tiny": (
-        ("cohog", "cohog_exact", "cohog_thesis"),
-        "64x32 pixels are too few for its regions",
-    ),
+    "grief_michigan_monthly": (VARIANTS, FIVE_PLACES),
+    "grief_stromovka_monthly": (VARIANTS, FIVE_PLACES),
+    "nordland_tiny": (COHOG, "64x32 pixels are too few for its regions"),
 }
 
 
 def main() -> int:
+    beside = REPOSITORY.parent / "shared"
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "--data", type=Path, default=os.environ.get("EDGEVPR_DATA") or REPOSITORY.parent / "shared/data"
-    )
+    parser.add_argument("--data", type=Path, default=os.environ.get("EDGEVPR_DATA") or beside / "data")
     parser.add_argument("--sets", metavar="A,B", help="names of sets, comma-separated (default: all)")
+    parser.add_argument("--variants", metavar="A;B", help="rows of the tables, separated by semicolons (default: all)")
+    parser.add_argument(
+        "--models", type=Path, default=beside / "models", help="a folder with the original weights: calc/model.onnx"
+    )
     parser.add_argument("--out", type=Path, default=REPOSITORY / "benchmarks" / "results")
     args = parser.parse_args()
     try:
-        folders = find_sets(args.data, args.sets.split(",") if args.sets else None)
-        args.out.mkdir(parents=True, exist_ok=True)
-        made_by = provenance()
-        measured = {}
-        for folder in folders:
-            left_out, _ = LEFT_OUT.get(folder.name, ((), ""))
-            wanted = [name for name in TECHNIQUES if name not in left_out]
-            if wanted:
-                measured[folder.name] = results, positions = measure(folder, wanted)
-                content = {"set": folder.name, "use": use(folder.name), **made_by, **as_json(results)}
-                if positions:
-                    content["positions"] = positions
-                (args.out / f"{folder.name}.json").write_text(json.dumps(content, indent=2) + "\n")
+        with ExitStack() as stack:
+            folders = find_sets(args.data, args.sets.split(",") if args.sets else None)
+            wanted = find_variants(args.variants.split(";") if args.variants else None)
+            cards = stack.enter_context(tempfile.TemporaryDirectory(prefix="edgevpr-cards-"))
+            weights = args.models / "calc" / "model.onnx"
+            if ORIGINAL_CALC in wanted and weights.is_file():
+                write_original_calc(Path(cards), weights)
+            else:
+                wanted = [variant for variant in wanted if variant is not ORIGINAL_CALC]
+            args.out.mkdir(parents=True, exist_ok=True)
+            commit = commit_of()
+            measured = False
+            for folder in folders:
+                left_out, _ = LEFT_OUT.get(folder.name, ((), ""))
+                here = [variant for variant in wanted if variant not in left_out]
+                if here:
+                    measured = True
+                    write_set(args.out / f"{folder.name}.json", folder, here, commit)
         if not measured:
             raise UsageError(f"All sets of {args.data} are left out: name another folder with --data or EDGEVPR_DATA.")
-        (args.out / "sets.md").write_text(summary(measured, [folder.name for folder in folders], made_by))
+        left_out = {folder.name: LEFT_OUT[folder.name] for folder in folders if folder.name in LEFT_OUT}
+        sets_page.write(args.out, {name: (len(each), why) for name, (each, why) in left_out.items()})
     except EdgevprError as error:
         print(f"run_sets: {error}", file=sys.stderr)
         return error.exit_code
-    print((args.out / "sets.md").read_text())
     return 0
 
 
@@ -83,42 +122,86 @@ def find_sets(data: Path, names: list[str] | None) -> list[Path]:
     return [folder for name, folder in found.items() if names is None or name in names]
 
 
-def use(name: str) -> str:
-    """Whether edgevpr's parameters were chosen on a set ("tune") or it is only reported on ("report")."""
-    return "tune" if name in TUNED_ON else "report"
+def find_variants(labels: list[str] | None) -> list[Variant]:
+    """The variants with these labels (None: all). Raises UsageError for one that is not there."""
+    known = {variant.label: variant for variant in VARIANTS}
+    for label in labels or ():
+        if label not in known:
+            raise UsageError(f"There is no row `{label}`: use some of {'; '.join(known)}.")
+    return [variant for label, variant in known.items() if labels is None or label in labels]
 
 
-def measure(folder: Path, names: list[str]) -> tuple[list[TechniqueResult], dict[str, Any]]:
-    """Recall and costs of each technique and, where GPS is known, its errors in metres."""
+def write_original_calc(cards: Path, weights: Path) -> None:
+    """Put CALC's published weights and a card for them where edgevpr looks for the models of a user."""
+    (cards / "calc_original.onnx").symlink_to(weights.resolve())
+    card = yaml.safe_load((REPOSITORY / "models" / "calc.yaml").read_text())
+    card |= {
+        "title": "CALC, the authors' weights",
+        "file": "calc_original.onnx",
+        "sha256": hashlib.sha256(weights.read_bytes()).hexdigest(),
+        "licence": "see the file's own",
+        "source": "Merrill and Huang 2018, as an ONNX file",
+        "outputs": {"descriptor": "descriptor", "features": None},
+    }
+    (cards / "calc_original.yaml").write_text(yaml.safe_dump(card))
+    os.environ["EDGEVPR_MODELS"] = str(cards)
+
+
+def write_set(path: Path, folder: Path, wanted: list[Variant], commit: str) -> None:
+    """Measure a set and write its file: rows measured before and not now stay as they are, each with its commit."""
     dataset = load_dataset(folder / "query", folder / "ref", folder / "ground_truth.csv")
+    before = json.loads(path.read_text()) if path.exists() else {}
+    rows: dict[str, Any] = before.get("techniques", {})
+    for variant in wanted:
 
-    def shown(items, total, label):
-        return progress(items, total, f"{folder.name}, {label}")
+        def shown(items, total, label, variant=variant):
+            return progress(items, total, f"{folder.name}, {variant.label}, {label.partition(': ')[2]}")
 
-    results = []
-    for name in names:
-        technique, _, form = name.partition("_")
-        chosen = settings(name, folder)
-        candidates = None if form else techniques.create(technique, chosen).candidates
-        results.append(replace(evaluate(technique, dataset, chosen, candidates, shown), technique=name))
-    known = (folder / "positions.csv").is_file()
-    flown = [name for name in names if name in techniques.names()]
-    return compare(results), {name: position_errors(folder, name) for name in flown} if known else {}
+        chosen = settings(variant, folder)
+        candidates = None if variant.exact else techniques.create(variant.technique, chosen).candidates
+        result = evaluate(variant.technique, dataset, chosen, candidates, shown, variant.sequence)
+        rows[variant.label] = {
+            **asdict(replace(result, technique=variant.label)),
+            "encode_ram_mb": encode_ram_mb(variant.technique, chosen),
+            "commit": commit,
+        }
+    in_order = [rows[variant.label] for variant in VARIANTS if variant.label in rows]
+    for row, each in zip(in_order, compare(sets_page.result(row) for row in in_order), strict=True):
+        row |= asdict(each)  # the slowest encoder of all may be another now
+    content = {
+        "set": folder.name,
+        "use": "tune" if folder.name in TUNED_ON else "report",
+        "date": datetime.now(timezone.utc).strftime("%Y-%m-%d"),
+        "machine": machine(),
+        "techniques": {row["technique"]: row for row in in_order},
+    }
+    if (folder / "positions.csv").is_file():
+        flown = [name for name in ("hog", "cohog") if any(variant.label == name for variant in wanted)]
+        content["positions"] = before.get("positions", {}) | {name: position_errors(folder, name) for name in flown}
+    path.write_text(json.dumps(content, indent=1) + "\n")
 
 
-def settings(name: str, folder: Path) -> dict[str, str]:
-    """How a technique is used on a set: its camera looks down in the aerial ones; `cohog_thesis` scores as published,
-    on the whole picture as it is."""
-    if name == "cohog_thesis":
-        return {"matching": "thesis"}
-    return {"camera": "nadir"} if name != "hog" and folder.name.startswith("aerial_") else {}
+def settings(variant: Variant, folder: Path) -> dict[str, str]:
+    """How a variant is used on a set: `cohog` looks down in the aerial ones; the thesis's has no camera."""
+    looks_down = variant.technique == "cohog" and "matching" not in variant.settings
+    return {**variant.settings, **({"camera": "nadir"} if looks_down and folder.name.startswith("aerial_") else {})}
+
+
+def encode_ram_mb(technique: str, chosen: dict[str, str]) -> float:
+    """What a technique adds to the resident memory of a process that has NumPy and OpenCV, until it has encoded one
+    picture of 640x480: its libraries, its weights, and the work itself at its highest. Each in a process of its own."""
+    script = Path(__file__).with_name("encode_ram.py")
+    done = subprocess.run(
+        [sys.executable, str(script), technique, json.dumps(chosen)], stdout=subprocess.PIPE, text=True, check=True
+    )
+    return float(done.stdout)
 
 
 def position_errors(folder: Path, technique: str) -> dict[str, Any]:
     """Map the references and match all queries, scored or not, by the commands that a user has."""
     with tempfile.TemporaryDirectory(prefix="edgevpr-sets-") as temporary:
         place_map = f"{temporary}/{folder.name}.gpkg"
-        flags = [f"--param={key}={value}" for key, value in settings(technique, folder).items()]
+        flags = [f"--param={key}={value}" for key, value in settings(Variant(technique, technique), folder).items()]
         edgevpr("map", "build", place_map, "--images", str(folder / "ref"), "--technique", technique, *flags, "--json")
         matches = edgevpr("match", place_map, "--images", str(folder / "query"), "--json")
     placed = [match for match in matches if "error_m" in match]
@@ -145,25 +228,26 @@ def spread(errors_m: list[float]) -> dict[str, float | int | None]:
     return {"count": len(errors_m), "median_m": median_m, "p90_m": p90_m, "worst_m": worst_m}
 
 
-def provenance() -> dict[str, Any]:
-    """Where, when and from what the figures were made."""
+def commit_of() -> str:
+    """The commit that is measured, and whether something has changed since."""
 
     def git(*arguments: str) -> str:
         done = subprocess.run(["git", "-C", str(REPOSITORY), *arguments], capture_output=True, text=True)
         return done.stdout.strip()
 
-    changed = git("status", "--porcelain", "--", "edgevpr")
+    changed = git("status", "--porcelain", "--", "edgevpr", "models")
+    return (git("rev-parse", "--short", "HEAD") or "unknown") + (" with changes" if changed else "")
+
+
+def machine() -> dict[str, Any]:
+    """Where the figures are made."""
     return {
-        "date": datetime.now(timezone.utc).strftime("%Y-%m-%d"),
-        "commit": (git("rev-parse", "--short", "HEAD") or "unknown") + (" with changes" if changed else ""),
-        "machine": {
-            "cpu": cpu_model(),
-            "cores": len(os.sched_getaffinity(0)),
-            "blas_threads": os.environ.get("OPENBLAS_NUM_THREADS", "all"),
-            "python": platform.python_version(),
-            "numpy": np.__version__,
-            "opencv": cv2.__version__,
-        },
+        "cpu": cpu_model(),
+        "cores": len(os.sched_getaffinity(0)),
+        "blas_threads": os.environ.get("OPENBLAS_NUM_THREADS", "all"),
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "opencv": cv2.__version__,
     }
 
 
@@ -172,78 +256,6 @@ def cpu_model() -> str:
         if line.startswith(("model name", "Model")):
             return line.partition(":")[2].strip()
     return platform.machine()
-
-
-def summary(measured: dict[str, tuple[list[TechniqueResult], dict]], names: list[str], made_by: dict[str, Any]) -> str:
-    """The page for people: tables of all sets, and what to make of them."""
-    machine = made_by["machine"]
-    reached = [
-        [name, use(name), f"{result.queries} / {result.references}", result.technique, *tables.quality(result)]
-        for name, (results, _) in measured.items()
-        for result in results
-    ]
-    paid = [
-        [name, result.technique, *tables.costs(result)] for name, (results, _) in measured.items() for result in results
-    ]
-    away = [
-        [name, technique, str(errors["queries"]), metres(errors["best_match"]), metres(errors["accepted"])]
-        for name, (_, positions) in measured.items()
-        for technique, errors in positions.items()
-    ]
-    left_out = [f"* {name}: {', '.join(LEFT_OUT[name][0])}: {LEFT_OUT[name][1]}." for name in names if name in LEFT_OUT]
-    page = f"""# hog and cohog on real images
-
-Made by `make results` on {made_by["date"]}, commit {made_by["commit"]}.
-Machine: {machine["cpu"]}, {machine["cores"]} cores, BLAS threads: {machine["blas_threads"]}.
-Python {machine["python"]}, NumPy {machine["numpy"]}, OpenCV {machine["opencv"]}.
-
-`cohog` is as it flies: a scan of 64 bytes a place, then the displacement vote over the best places; in the aerial
-sets its camera looks straight down (`--camera nadir`: the picture laid into a square, 24 rotations of the query).
-`cohog_exact` votes over all places, under all rotations. `cohog_thesis` scores as published, on the whole picture.
-Entropy, vote windows and the acceptance limits of the vote were chosen on the sets marked *tune*. Three figures were
-fixed after all sets had been seen, and are to be judged with that in mind: the share of a picture's own mean that its
-place code leaves out (0.5), the number of places compared in full (40 ahead, 50 straight down), and the margin of
-`cohog_thesis` (0.02, with pictures of foreign sites). The truth of the aerial sets was computed by image registration:
-it favours pairs that local features can match, and says nothing of others. The JSON files beside this page hold every
-figure.
-
-## Recognition
-
-{tables.markdown(("set", "use", "queries / references", "technique", *tables.QUALITY), reached)}
-
-* P@100%R: precision with the threshold at the lowest-scoring right match. R@100%P: recall with the threshold above the
-  highest-scoring wrong one. AUC, EP: equations 2.3 and 2.4 of the thesis.
-* ROC: the chance that a right match scores higher than a wrong one; 0.5 means that the score by itself tells nothing.
-* PCU: P@100%R x log10(t_e,max / t_e + 9), where t_e,max is the slowest encoder on the same set.
-* accepted: queries that would have moved the aircraft by the technique's own rule; in brackets, how many of them would
-  have moved it to a wrong place.
-
-## Costs
-
-{tables.markdown(("set", "technique", *tables.COSTS), paid)}
-
-* Means over the queries; t_m is for all references. U: share of all cores.
-* mAh: {next(iter(measured.values()))[0][0].ah_assumes}.
-"""
-    if away:
-        page += f"""
-## Errors in metres
-
-{tables.markdown(("set", "technique", "queries", "best match", "accepted"), away)}
-
-Distance between the GPS positions of the query and of the place it was matched to: median / 90 % / worst (how many).
-All queries with a position are in it, those too that show nothing of the map. The error cannot be smaller than the
-distance to the nearest place, and GPS on these cameras is noisy: 10 to 20 m off (caliterra), tens of metres (swindale).
-"""
-    if left_out:
-        page += "\n## Left out\n\n" + "\n".join(left_out) + "\n"
-    return page
-
-
-def metres(errors: dict[str, Any]) -> str:
-    if not errors["count"]:
-        return "none"
-    return f"{errors['median_m']:.0f} / {errors['p90_m']:.0f} / {errors['worst_m']:.0f} ({errors['count']})"
 
 
 if __name__ == "__main__":

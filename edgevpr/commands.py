@@ -15,10 +15,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from edgevpr.config import Config, load_config
-from edgevpr.errors import EdgevprError, ImageError, UsageError
+from edgevpr.errors import EdgevprError, ImageError, ModelError, UsageError
 
 if TYPE_CHECKING:
+    from edgevpr.power.boards import Board
+    from edgevpr.runtime.estimate import FlightPlan
     from edgevpr.runtime.frames import Source
+    from edgevpr.runtime.models import Verified
+    from edgevpr.runtime.offers import Offer
     from edgevpr.types import Frame
 
 _log = logging.getLogger(__name__)
@@ -26,11 +30,11 @@ _READ_TIMEOUT_S = 1.0
 
 
 def map_build(args: Namespace) -> int:
-    from edgevpr import techniques
     from edgevpr.places.mapfile import PlaceMap
+    from edgevpr.power.boards import load_board
     from edgevpr.runtime.frames import open_source
     from edgevpr.runtime.mapping import build_map
-    from edgevpr.runtime.pipeline import technique_of
+    from edgevpr.runtime.pipeline import made_for, picked_technique, technique_of
 
     step_s = 1 / args.rate_hz if args.rate_hz else None
     source = open_source(args.source, step_s=step_s, positions=_path(args.positions), live=False)
@@ -39,14 +43,15 @@ def map_build(args: Namespace) -> int:
         settings["camera"] = args.camera
     if args.append and Path(args.map).exists():
         place_map = PlaceMap.open_for_adding(args.map)
-        technique = technique_of(place_map, args.technique, settings)
+        technique = technique_of(place_map, args.technique, settings, load_board("this"))
     else:
-        name = args.technique or _picked_technique(args.board, source.total)
-        technique = techniques.create(name, settings)
+        name = args.technique or picked_technique(args.board, source.total or 1)
+        technique = made_for(load_board("this"), name, settings)
         place_map = PlaceMap.create(args.map, technique.spec)
     unusable: list[ImageError] = []
     with place_map:
-        result = build_map(_frames(source, "mapping", unusable), technique, place_map)
+        frames = _frames(source, "mapping", unusable)
+        result = build_map(frames, technique, place_map, lambda error: _left_out(error, unusable))
         places = len(place_map)
     if args.json:
         _print_json({"map": args.map, "technique": technique.spec.name, "places": places, **asdict(result)})
@@ -129,13 +134,18 @@ def match(args: Namespace) -> int:
     from edgevpr.runtime.frames import open_source
     from edgevpr.runtime.pipeline import open_pipeline
     from edgevpr.runtime.record import record
+    from edgevpr.techniques.networks.card import weights_of
 
     pipeline = open_pipeline(_config(args, map=args.map), _settings(args.param))
     found = []
     unusable: list[ImageError] = []
     source = open_source(args.source, positions=_path(args.positions), live=False)
     for frame in _frames(source, "matching", unusable):
-        fields = record(pipeline.step(frame))
+        try:
+            fields = record(pipeline.step(frame))
+        except ModelError as error:
+            _left_out(ImageError(f"{frame.name}: {error}"), unusable)
+            continue
         here, there = frame.position, fields["position"]
         if here and there:
             away_m = distance_m(here.lat_deg, here.lon_deg, there["lat_deg"], there["lon_deg"])
@@ -153,6 +163,8 @@ def match(args: Namespace) -> int:
                 f" {error}"
             )
         print(f"{len(found)} queries, {sum(each['accepted'] for each in found)} accepted")
+        if weights := weights_of(pipeline.technique.spec):
+            print(f"Weights of {weights}.")
     return _said(unusable)
 
 
@@ -177,29 +189,66 @@ def check(args: Namespace) -> int:
 
 
 def profile(args: Namespace) -> int:
-    from edgevpr import techniques
-    from edgevpr.config import load_config
-    from edgevpr.places.mapfile import PlaceMap
     from edgevpr.power.boards import board_names, load_board
-    from edgevpr.power.equations import parse_pack
-    from edgevpr.runtime.choose import probe_each
-    from edgevpr.runtime.estimate import FlightPlan, estimate, format_table
+    from edgevpr.runtime.choose import require_technique
+    from edgevpr.runtime.estimate import estimate
+    from edgevpr.runtime.estimate_text import format_table
+    from edgevpr.runtime.measured import default_path, known_and_tried, load, scaled_from
+    from edgevpr.runtime.pictures import require_picture
     from edgevpr.runtime.progress import progress
 
     if args.list:
         for name in board_names():
             print(f"{name:<20} {load_board(name).title}")
         return 0
-    board, here = load_board(args.board), load_board("this")
-    settings = {}
+    if args.out and not (args.detect or args.measure):
+        raise UsageError("--out is for --detect and --measure: name one of them too.")
+    if args.images and not args.measure:
+        raise UsageError("--images is for --measure: give both.")
+    if args.detect:
+        return _profile_detect(args)
+    asked = args.map is not None or args.places is not None
+    if not asked and (args.plot or not args.measure):
+        raise UsageError("Say how many places will be flown with: --map MAP, or --places N.")
+    if args.plot:
+        require_picture(Path(args.plot))
+    board = load_board(args.board)
+    require_technique(board)
+    plan, map_technique, wanted = _plan(args, board) if asked else (None, None, ())
+    code = _profile_measure(args, quiet=asked) if args.measure else 0
+    if plan is None:
+        return code
+    stored, refused = load(Path(args.out) if args.measure and args.out else default_path())
+    if refused:
+        print(f"edgevpr: {refused}", file=sys.stderr)
+    trials = progress(known_and_tried(wanted, board, stored), len(wanted), "trying techniques")
+    here = scaled_from(load_board("this"), board, stored)
+    result = estimate(board, here, trials, plan, map_technique, stored.date if stored else None)
+    if args.plot:
+        from edgevpr.runtime.chart import plot
+
+        plot(result, board, Path(args.plot))
+    if args.json:
+        _print_json(asdict(result))
+    else:
+        print(format_table(result))
+    return code
+
+
+def _plan(args: Namespace, board: "Board") -> "tuple[FlightPlan, str | None, tuple[Offer, ...]]":
+    """What is asked of `profile`, the technique of the map if there is one, and what is to be tried."""
+    from edgevpr import techniques
+    from edgevpr.config import load_config
+    from edgevpr.places.mapfile import PlaceMap
+    from edgevpr.power.equations import parse_pack
+    from edgevpr.runtime.estimate import FlightPlan
+    from edgevpr.runtime.offers import offers
+
+    settings, places, map_technique = {}, args.places, None
     if args.map:
         with PlaceMap.open(args.map) as place_map:
-            places = len(place_map)
-            settings[place_map.spec.name] = place_map.spec.parameters
-    elif args.places is not None:
-        places = args.places
-    else:
-        raise UsageError("Say how many places will be flown with: --map MAP, or --places N.")
+            places, map_technique = len(place_map), place_map.spec.name
+            settings[map_technique] = place_map.spec.parameters
     battery = load_config(None, {"battery.pack": args.battery}).battery
     plan = FlightPlan(
         places,
@@ -208,23 +257,69 @@ def profile(args: Namespace) -> int:
         parse_pack(battery.pack),
         battery.regulator_efficiency,
         board.budget_mb if args.budget_mb is None else args.budget_mb,
+        args.hover_w,
     )
-    names = techniques.names()
-    tried = (techniques.create(name, settings.get(name)) for name in names)
-    probed = progress(probe_each(tried), len(names), "probing techniques")
-    result = estimate(board, here, dict(probed), plan)
+    return plan, map_technique, offers(techniques.names(), settings=settings)
+
+
+def _profile_detect(args: Namespace) -> int:
+    from edgevpr.power.detect import detect, findings, profile_text
+    from edgevpr.runtime.measured import micro_benchmark
+    from edgevpr.runtime.ownprofile import require_new_profile, write_profile
+
+    found = detect()
+    if args.out:
+        require_new_profile(Path(args.out))
     if args.json:
-        _print_json(asdict(result))
+        _print_json(asdict(found))
     else:
-        print(format_table(result))
+        print("\n".join(findings(found)))
+    if args.out:
+        write_profile(Path(args.out), profile_text(found, micro_benchmark()))
+        print(f"edgevpr: {args.out} is written: use it with --board {args.out}.", file=sys.stderr)
+    elif found.board is None and not args.json:
+        print("--out FILE.yaml writes a profile of it.")
+    return 0
+
+
+def _profile_measure(args: Namespace, quiet: bool) -> int:
+    """Measure this machine and keep the figures; `quiet` leaves the table to who asked for more."""
+    from edgevpr import techniques
+    from edgevpr.power.boards import load_board
+    from edgevpr.runtime import measured
+    from edgevpr.runtime.measured_text import format_measured
+    from edgevpr.runtime.offers import offers
+    from edgevpr.runtime.ownprofile import measured_profile
+    from edgevpr.runtime.progress import progress
+
+    path = Path(args.out) if args.out else measured.default_path()
+    measured.require_room(path, make=not args.out)
+    images, pictures = measured.pictures_of(args.images)
+    threads, wanted = load_board("this").threads, offers(techniques.names())
+    score = measured.micro_benchmark()
+    trials = progress(measured.measure_each(wanted, threads, images), len(wanted), "measuring techniques")
+    found = measured.gathered(trials, pictures, threads, score)
+    measured.save(found, path)
+    try:
+        own, said = measured_profile(path, score)
+    except EdgevprError as error:
+        own, said = None, str(error)
+    if args.json and not quiet:
+        _print_json({**asdict(found), "file": str(path), "profile": own and str(own), "power": said})
+    elif not args.json:
+        print(format_measured(found))
+        print(f"Kept in {path}.\n{said}\n" if quiet else f"Kept in {path}.\n{said}")
     return 0
 
 
 def evaluate(args: Namespace) -> int:
     from edgevpr import techniques
     from edgevpr.evaluate import evaluate as evaluation
+    from edgevpr.evaluate.curves import plot
     from edgevpr.evaluate.dataset import load_dataset
     from edgevpr.evaluate.tables import results_text
+    from edgevpr.runtime.offers import offers, usable
+    from edgevpr.runtime.pictures import require_picture
     from edgevpr.runtime.progress import progress
 
     wanted = [name.strip() for name in args.techniques.split(",") if name.strip()]
@@ -232,6 +327,8 @@ def evaluate(args: Namespace) -> int:
         raise UsageError(f"--techniques names none: use some of {', '.join(techniques.names())}.")
     if args.candidates is not None and args.candidates < 1:
         raise UsageError(f"--candidates is {args.candidates}: compare at least 1 place in full.")
+    if args.sequence is not None and not 1 <= args.sequence <= 100:
+        raise UsageError(f"--sequence is {args.sequence}; it must be between 1 and 100.")
     camera = {"camera": args.camera} if args.camera else {}
     settings = {name: dict(camera) if "camera" in techniques.parameters(name) else {} for name in wanted}
     for key, value in _settings(args.param).items():
@@ -239,22 +336,36 @@ def evaluate(args: Namespace) -> int:
         if name not in settings or not parameter:
             raise UsageError(f"--param {key}: write TECHNIQUE.KEY=VALUE with a technique of --techniques.")
         settings[name][parameter] = value
-    for name in wanted:  # a wrong setting is said before the first hour of work
-        techniques.create(name, settings[name])
+    if args.plot:
+        require_picture(Path(args.plot))
+    forms = [form.strip() for form in args.form.split(",")]
+    # A wrong setting is said before the first hour of work, and a network that cannot be used stops no other.
+    tried = list(usable(offers(wanted, forms, settings)))
+    errors = {offer.label: each for offer, each in tried if isinstance(each, ModelError)}
+    if len(errors) == len(tried):
+        raise next(iter(errors.values()))
     dataset = load_dataset(args.query, args.ref, args.ground_truth)
-    results = [evaluation.evaluate(name, dataset, settings[name], args.candidates, progress) for name in wanted]
+    results = [
+        evaluation.evaluate(offer.name, dataset, offer.settings, args.candidates, progress, args.sequence)
+        for offer, _ in tried
+        if offer.label not in errors
+    ]
     results = evaluation.compare(results)
+    if args.plot:
+        plot({Path(args.ground_truth).resolve().parent.name: results}, Path(args.plot))
     if args.json:
         _print_json(evaluation.as_json(results))
     else:
         print(results_text(results))
-    return 0
+    for label, error in errors.items():
+        print(f"edgevpr: {label} was not measured: {error}", file=sys.stderr)
+    return 1 if errors else 0
 
 
 def simulate_autopilot(args: Namespace) -> int:
-    from edgevpr.simulate.autopilot import run_autopilot
+    from edgevpr.simulate.autopilot import read_track, run_autopilot
 
-    summary = run_autopilot(args.link, args.duration_s)
+    summary = run_autopilot(args.link, args.duration_s, track=read_track(args.track) if args.track else None)
     if args.json:
         _print_json(asdict(summary))
     else:
@@ -269,6 +380,135 @@ def simulate_flight(args: Namespace) -> int:
         raise UsageError(f"--seed is {args.seed}: give 0 or more.")
     print(fly_and_write(Path(args.out), args.which, args.seed))
     return 0
+
+
+def train_calc(args: Namespace) -> int:
+    from edgevpr.training.job import train_calc
+
+    unusable: list[ImageError] = []
+    result = train_calc(args.images, Path(args.out), args.steps, args.seed, args.resume, unusable)
+    if args.json:
+        _print_json(asdict(result))
+    else:
+        print(
+            f"{result.model} and {result.card}: {result.steps} steps on {result.pictures} images, equal to PyTorch to "
+            f"{result.largest_difference:.1e}"
+        )
+    return _said(unusable)
+
+
+def train_words(args: Namespace) -> int:
+    from edgevpr.training.words import train_words
+
+    unusable: list[ImageError] = []
+    result = train_words(
+        args.images, args.model, args.kind, args.count, args.whiten, _path(args.out), args.seed, unusable
+    )
+    if args.json:
+        _print_json(asdict(result))
+    else:
+        print(
+            f"{result.file}: {args.count} words of {result.descriptors} descriptors in {result.pictures} images, mean "
+            f"square distance {result.distance:.3f}"
+        )
+    return _said(unusable)
+
+
+def models_list(args: Namespace) -> int:
+    from edgevpr.resources import model_folders
+    from edgevpr.runtime.models import list_models
+
+    found = list_models()
+    if args.json:
+        _print_json([asdict(each) for each in found])
+        return 0
+    for each in found:
+        print(f"{each.name:<20} {'ok   ' if each.ok else 'WRONG'}  {each.title or ''}")
+        if each.title:
+            head = f", head {each.head}" if each.head else ""
+            print(f"{'':<27} {each.licence}; {each.source}")
+            print(f"{'':<27} {each.file}; {' and '.join(each.outputs)}{head}")
+            print(f"{'':<27} used by {', '.join(each.techniques) or 'none, unless told: --param model=' + each.name}")
+        if each.problem:
+            print(f"{'':<27} {each.problem}")
+    print(f"{len(found)} networks in {' and '.join(map(str, model_folders()))}")
+    return 0
+
+
+def models_verify(args: Namespace) -> int:
+    from edgevpr.power.boards import load_board
+    from edgevpr.runtime.models import verify
+    from edgevpr.techniques.networks.card import card_names, load_card
+
+    threads = load_board("this").threads
+    names = [args.name] if args.name else card_names()
+    if not names:
+        raise ModelError("There is no network yet: add one with `edgevpr models add FILE.onnx --card CARD.yaml`.")
+    works, wrong = [], {}
+    for name in names:
+        try:
+            works.append(verify(load_card(name), threads))
+            if not args.json:
+                print(_verified_text(works[-1]))
+        except EdgevprError as error:
+            wrong[name] = str(error)
+    if args.json:
+        _print_json({"works": [asdict(each) for each in works], "wrong": wrong})
+    for name, problem in wrong.items():
+        print(f"edgevpr: {name} cannot be used: {problem}", file=sys.stderr)
+    return 1 if wrong else 0
+
+
+def models_add(args: Namespace) -> int:
+    from edgevpr.power.boards import load_board
+    from edgevpr.runtime.models import add
+
+    verified, card = add(Path(args.file), Path(args.card), load_board("this").threads)
+    if args.json:
+        _print_json({"card": str(card), **asdict(verified)})
+    else:
+        print(f"{_verified_text(verified)}\nadded as {card}")
+    return 0
+
+
+def models_quantise(args: Namespace) -> int:
+    from edgevpr.evaluate.dataset import load_dataset
+    from edgevpr.evaluate.evaluate import evaluate as measured
+    from edgevpr.power.boards import load_board
+    from edgevpr.runtime.models import technique_with
+    from edgevpr.runtime.progress import progress
+    from edgevpr.training.quantise import quantise
+
+    data = (args.query, args.ref, args.ground_truth)
+    if any(data) and not all(data):
+        raise UsageError("Recall needs all of --query, --ref and --ground-truth: give those that are missing, or none.")
+    dataset = load_dataset(*data) if all(data) else None
+    result = quantise(args.name, Path(args.calibrate), load_board("this").threads)
+    recall = None
+    if dataset:
+        recall = {
+            each.name: measured(technique, dataset, settings, progress=progress).recall_at_1
+            for each in (result.before, result.after)
+            for technique, settings in [technique_with(each.name)]
+        }
+    if args.json:
+        _print_json({**asdict(result), "recall_at_1": recall})
+        return 0
+    for each in (result.before, result.after):
+        print(_verified_text(each) + (f", recall@1 {recall[each.name]:.3f}" if recall else ""))
+    print(f"calibrated with {result.images} images, written as {result.card}")
+    return 0
+
+
+def _verified_text(verified: "Verified") -> str:
+    shapes = ", ".join(f"{output} {'x'.join(map(str, shape))}" for output, shape in verified.shapes.items())
+    vector = f"a descriptor of {verified.vector_length} numbers, " if verified.vector_length else ""
+    return (
+        f"{verified.name}: {verified.title}\n"
+        f"  works: {shapes}; {vector}{verified.image_ms:.1f} ms an image with {verified.threads} threads, "
+        f"{verified.network_mb:.0f} MB of RAM beside {verified.runtime_mb:.0f} of onnxruntime, "
+        f"{verified.file_mb:.2f} MB on disk"
+    )
 
 
 def demo(args: Namespace) -> int:
@@ -296,25 +536,16 @@ def _frames(source: "Source", label: str, unusable: list[ImageError]) -> "Iterat
             try:
                 yield source.read(_READ_TIMEOUT_S)
             except ImageError as error:
-                print(f"edgevpr: {error}", file=sys.stderr)
-                unusable.append(error)
+                _left_out(error, unusable)
                 yield None
         source.close()
 
     return (frame for frame in progress(until_it_ends(), source.total, label) if frame is not None)
 
 
-def _picked_technique(board_name: str, places: int | None) -> str:
-    """The best technique that the board can afford; the reason is logged in one line."""
-    from edgevpr import techniques
-    from edgevpr.power.boards import load_board
-    from edgevpr.runtime.choose import choose, on_board, probe_each
-
-    board, here = load_board(board_name), load_board("this")
-    costs = {name: on_board(cost, here, board) for name, cost in probe_each(map(techniques.create, techniques.names()))}
-    choice = choose(board, costs, places or 1, board.rate_hz, board.budget_mb)
-    _log.info("technique %s", choice.reason)
-    return choice.technique
+def _left_out(error: ImageError, unusable: list[ImageError]) -> None:
+    print(f"edgevpr: {error}", file=sys.stderr)
+    unusable.append(error)
 
 
 def _said(unusable: list[ImageError]) -> int:
@@ -340,10 +571,14 @@ def _config(args: Namespace, **others: Any) -> Config:
         "source.camera": args.camera,
         "source.rate_hz": getattr(args, "rate_hz", None),
         "match.matching": args.matching,
+        "match.form": args.form,
         "match.candidates": args.candidates,
+        "match.sequence": args.sequence,
         "match.min_score": args.min_score,
         "match.min_margin": args.min_margin,
+        "match.reach_m_s": getattr(args, "reach_m_s", None),
         "memory.budget_mb": args.budget_mb,
+        "mapping.learn": getattr(args, "learn", None),
         "mavlink.link": getattr(args, "link", None),
         "log.path": getattr(args, "log", None),
         "battery.pack": args.battery,

@@ -13,6 +13,14 @@ from edgevpr.errors import ConfigError
 from edgevpr.resources import shipped
 
 T = TypeVar("T")
+_WORDS = {
+    float: "a number",
+    int: "a whole number",
+    str: "a text",
+    bool: "true or false",
+    list: "a list",
+    dict: "a section",
+}
 
 
 def bounded(low: float, high: float) -> Any:
@@ -30,15 +38,24 @@ class SourceConfig:
 @dataclass(frozen=True, slots=True)
 class MatchConfig:
     matching: str | None
+    form: str | None
     candidates: int | None = bounded(1, 1_000_000)
+    sequence: int | None = bounded(1, 100)
     min_score: float | None = bounded(0, 1)
     min_margin: float | None = bounded(0, 1)
     neighbour_m: float = bounded(0, 10_000)
+    reach_m_s: float | None = bounded(0.1, 100)
 
 
 @dataclass(frozen=True, slots=True)
 class MemoryConfig:
     budget_mb: float | None = bounded(1, 65_536)
+
+
+@dataclass(frozen=True, slots=True)
+class MappingConfig:
+    learn: bool
+    spacing_m: float = bounded(1, 1000)
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +87,7 @@ class Config:
     source: SourceConfig
     match: MatchConfig
     memory: MemoryConfig
+    mapping: MappingConfig
     mavlink: MavlinkConfig
     log: LogConfig
     battery: BatteryConfig
@@ -161,7 +179,7 @@ def _converted(value: Any, hint: Any, limits: tuple[float, float] | None, where:
     if wanted is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if not isinstance(value, wanted) or (isinstance(value, bool) and wanted is not bool):
-        word = {float: "a number", int: "a whole number", str: "a text", bool: "true or false"}.get(wanted, str(wanted))
+        word = _WORDS.get(wanted, str(wanted))
         raise ConfigError(f"{where}: `{key}` must be {word}, not {value!r}.")
     if limits and not limits[0] <= value <= limits[1]:
         raise ConfigError(f"{where}: `{key}` is {value:g}; it must be between {limits[0]:g} and {limits[1]:g}.")

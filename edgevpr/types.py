@@ -99,7 +99,7 @@ class FineMatch:
 
 class Technique(Protocol):
     """The contract of `edgevpr/techniques/*.py`. A technique without a fine part needs no `match`, one whose spec has
-    no `packed` no `pack`."""
+    no `packed` no `pack`. One that is meant for sequences says by an attribute `sequence` of how many queries."""
 
     spec: TechniqueSpec
     candidates: int  # places compared in full after the scan, unless the configuration says otherwise
@@ -115,10 +115,12 @@ class Technique(Protocol):
         ...
 
     def coarse_scores(
-        self, query: Descriptor, rows: np.ndarray, mean: np.ndarray | None
+        self, query: Descriptor, rows: np.ndarray, mean: np.ndarray | None, turned_deg: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray | None]:
         """Score all places at once: `rows` (N, *row.shape) -> scores (N,) float32, hypotheses (N,) or None. `mean` is
-        that of the map for a technique that packs, else None."""
+        that of the map for a technique that packs, else None. `turned_deg` float (N,) is how far the camera should
+        have turned since each place was mapped, as `FineMatch.rotation_deg` (NaN: nobody knows); it is given only to a
+        technique with a parameter `camera` that is "nadir", which then tries only such rotations."""
         ...
 
     def match(self, query: Descriptor, fine: np.ndarray, hypothesis: int | None) -> FineMatch:
@@ -160,7 +162,10 @@ class StageCost:
 
 @dataclass(frozen=True, slots=True)
 class QueryCost:
-    """Cost of one query by equations 5.1-5.7: times, utilisations of all cores, memory, charge drawn from the pack."""
+    """Cost of one query by equations 5.1-5.7: times, utilisations of all cores, memory, charge drawn from the pack.
+
+    `rss_mb` is now; `pss_mb`, with shared pages in proportion, may be some seconds old (None: the kernel does not say).
+    """
 
     t_encode_s: float
     t_match_s: float
@@ -170,20 +175,24 @@ class QueryCost:
     rss_mb: float
     used_mah: float
     marginal_mah: float
+    pss_mb: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class PlaceMatch:
-    """The event of one query: the best place, whether it is accepted as the place, and what the query cost.
+    """The event of one query: the best place (None: the map has none yet), whether it is accepted as the place, and
+    what the query cost.
 
-    `position` is the place's, and only there when the match is accepted: a rejected match moves nothing.
+    `position` is the place's, and only there when the match is accepted: a rejected match moves nothing. `descriptor`
+    is what the frame was encoded as, for a flight that learns it.
     """
 
     query: str
     t_mono_s: float
-    candidate: Candidate
+    candidate: Candidate | None
     accepted: bool
     reason: str
     position: Position | None
     accuracy_m: float | None
     cost: QueryCost
+    descriptor: Descriptor | None = None

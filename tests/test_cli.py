@@ -101,15 +101,6 @@ def test_eval_prints_the_promised_keys(capsys, flight):
     assert result["cohog"]["parameters"]["entropy"] == "filled_bins"
 
 
-def test_profile_says_what_fits(capsys):
-    estimate = run_json(capsys, "profile", "--board", "rpi-zero-2w", "--places", 10_000, "--json")
-    rows = {row["technique"]: row for row in estimate["techniques"]}
-    assert not rows["hog"]["fits"], "286 KB a place is 2.9 GB: more than the board has"
-    assert any("RAM" in why for why in rows["hog"]["shortfalls"])
-    assert main(["profile", "--board", "rpi-4b", "--places", "50"]) == 0
-    assert "Raspberry Pi 4" in capsys.readouterr().out
-
-
 def test_the_technique_is_picked_and_the_reason_logged(capsys, caplog, flight, tmp_path):
     with caplog.at_level("INFO"):
         built = run_json(capsys, "map", "build", tmp_path / "m.gpkg", "--images", flight / "ref", "--json")
@@ -236,7 +227,7 @@ def test_debug_shows_the_traceback(capsys, caplog, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "path", [[], ["map"], ["map", "build"], ["match"], ["run"], ["eval"], ["profile"], ["simulate"]]
+    "path", [[], ["map"], ["map", "build"], ["match"], ["run"], ["eval"], ["profile"], ["simulate"], ["models"]]
 )
 def test_every_command_explains_itself(capsys, path):
     with pytest.raises(SystemExit) as exit_code:

@@ -85,9 +85,11 @@ def test_the_flight_controller_receives_what_the_log_says(flight, tmp_path):
         assert 0 < cost["u_encode"] <= 1
         assert 0 < cost["u_match"] <= 1
         assert cost["rss_mb"] > 10
-    assert queries[-1]["totals"]["used_mah"] == pytest.approx(
-        sum(line["costs"]["used_mah"] for line in queries), rel=1e-4
-    )
+    # The board draws between the queries too, and the process does more than its queries' stages.
+    totals, slack = queries[-1]["totals"], 1 + 1e-4
+    assert totals["used_mah"] * slack > sum(line["costs"]["used_mah"] for line in queries)
+    assert totals["process_mah"] * slack > totals["marginal_mah"]
+    assert totals["marginal_mah"] * slack > sum(line["costs"]["marginal_mah"] for line in queries) > 0
 
 
 def test_fixes_are_withheld_when_told_so_and_events_still_go_out(flight, tmp_path):

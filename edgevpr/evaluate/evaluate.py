@@ -14,14 +14,16 @@ from edgevpr.evaluate.dataset import Dataset
 from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import rank
+from edgevpr.places.sequence import Sequence, length_of
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import pack_ah, parse_pack, queries_ah, rail_ah, stage_energy_j
 from edgevpr.power.meter import stage
 from edgevpr.runtime.accept import accept_rule, accepted
 from edgevpr.runtime.frames import Source, open_source
-from edgevpr.runtime.images import read_image
+from edgevpr.runtime.images import list_images, read_image
 from edgevpr.runtime.mapping import build_map
-from edgevpr.techniques import create
+from edgevpr.techniques import create, labelled
+from edgevpr.techniques.networks.card import weights_of
 from edgevpr.types import Frame, StageCost, Technique
 
 T = TypeVar("T")
@@ -30,14 +32,15 @@ Progress = Callable[[Iterable[T], int, str], Iterable[T]]
 
 @dataclass(frozen=True, slots=True)
 class TechniqueResult:
-    """What a technique reached on a data set, and what it cost.
+    """What a technique (and its form) reached on a data set, with which weights, and what it cost.
 
     Times are means over the queries: `t_match_s` is for all references, `t_match_per_ref_s` for one. `u_encode` and
     `u_match` are shares of all cores over those times (5.1). `descriptor_bytes` a place are in RAM, `fine_bytes` on
     disk. `ah_total` (5.7) is drawn from the pack, `ah_total_cpu_rail` from the thesis's rail of 2.5 V; `ah_assumes`
-    says by what. `accepted` queries would have moved the aircraft by the technique's own rule, `accepted_wrong` of them
-    to a wrong place. `roc_auc` is None where all best matches are right, or none is. `pcu` needs all techniques that
-    are compared: `compare` fills it in, with the `t_encode_max_s` it used.
+    says by what. `precision_recall` are the points of the curve, from the highest threshold down. `accepted` queries
+    would have moved the aircraft by the technique's own rule, `accepted_wrong` of them to a wrong place. `roc_auc` is
+    None where all best matches are right, or none is. `pcu` needs all techniques that are compared: `compare` fills it
+    in, with the `t_encode_max_s` it used. So many queries as `sequence` says were matched together.
     """
 
     technique: str
@@ -64,6 +67,9 @@ class TechniqueResult:
     ah_total: float
     ah_total_cpu_rail: float
     ah_assumes: str
+    precision_recall: tuple[tuple[float, float], ...]
+    sequence: int = 1
+    weights: str | None = None
     pcu: float | None = None
     t_encode_max_s: float | None = None
 
@@ -87,8 +93,10 @@ def evaluate(
     parameters: dict[str, Any] | None = None,
     candidates: int | None = None,
     progress: Progress = lambda items, total, label: items,
+    sequence: int | None = None,
 ) -> TechniqueResult:
-    """Map the references, ask every query, and score the answers; `candidates` places are compared in full (None: all).
+    """Map the references, ask every query, and score the answers; `candidates` places are compared in full (None: all),
+    and `sequence` queries are matched together, in the order of their names (None: the technique's own number).
 
     Raises UsageError for an unknown technique or parameter, ImageError for an image that cannot be used, and MapError
     where the temporary map cannot be written.
@@ -101,8 +109,9 @@ def evaluate(
             build_map(progress(_frames(source), source.total, f"{technique_name}: references"), technique, place_map)
         with PlaceMap.open(map_path) as place_map:
             index = load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
-            answers = list(_answers(technique, dataset, place_map, index, candidates, progress))
-    return _summary(technique, len(dataset.references), answers)
+            length = length_of(technique, sequence)
+            answers = list(_answers(technique, dataset, place_map, index, candidates, length, progress))
+    return replace(_summary(technique, len(dataset.references), answers), sequence=length)
 
 
 def compare(results: Iterable[TechniqueResult]) -> list[TechniqueResult]:
@@ -136,18 +145,28 @@ def _answers(
     place_map: PlaceMap,
     index: PlaceIndex,
     candidates: int | None,
+    length: int,
     progress: Progress,
 ) -> Iterator[_Answer]:
-    rule = accept_rule(technique, load_config(None).match)
+    sequence = Sequence(length) if length > 1 else None
+    # Of a sequence, those that are not scored are a part as well.
+    scored = {query.path.name: query for query in dataset.queries}
+    asked = list_images(dataset.queries[0].path.parent) if sequence else [query.path for query in dataset.queries]
+    rule = accept_rule(technique, load_config(None).match, length)
     # The first query pays for lazy imports, lookup tables and a cold disk: one that is not counted goes before it.
     rank(technique, technique.encode(read_image(dataset.queries[0].path)), place_map, index, candidates)
-    for query in progress(dataset.queries, len(dataset.queries), f"{technique.spec.name}: queries"):
-        image = read_image(query.path)
+    for path in progress(asked, len(asked), f"{technique.spec.name}: queries"):
+        image = read_image(path)
         with stage() as encoding:
             descriptor = technique.encode(image)
         with stage() as matching:
             ranking = rank(technique, descriptor, place_map, index, candidates, rule.neighbour_m)
-            is_accepted, _ = accepted(ranking, index, rule)
+            if sequence:
+                ranking = sequence.follow(ranking, index, t_mono_s=0.0)  # a folder has no gaps
+            is_accepted, _ = accepted(ranking, index, rule, sequence)
+        if path.name not in scored:
+            continue
+        query = scored[path.name]
         # Slots of the index follow the order of mapping, which is that of the references' names.
         right = np.array([name in query.right for name in dataset.references])
         ignored = np.array([name in query.ignored for name in dataset.references])
@@ -177,7 +196,8 @@ def _summary(technique: Technique, references: int, answers: list[_Answer]) -> T
     query_j += stage_energy_j(board.idle_w, board.full_w, u_match, t_match_s)
 
     return TechniqueResult(
-        technique=technique.spec.name,
+        technique=labelled(technique.spec.name, getattr(technique, "form", None)),
+        weights=weights_of(technique.spec),
         parameters=technique.spec.parameters,
         queries=queries,
         references=references,
@@ -204,6 +224,7 @@ def _summary(technique: Technique, references: int, answers: list[_Answer]) -> T
             f"{board.title}, {board.idle_w:g} W idle and {board.full_w:g} W at full load ({board.source}), "
             f"pack {config.battery.pack}, regulator efficiency {efficiency:g}"
         ),
+        precision_recall=tuple(zip(precision.round(5).tolist(), recall.round(5).tolist(), strict=True)),
     )
 
 

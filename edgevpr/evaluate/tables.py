@@ -57,7 +57,14 @@ def results_text(results: Sequence[TechniqueResult]) -> str:
     return (
         f"{reached}\n\n{paid}\n\n"
         f"{first.queries} queries scored against {first.references} references; times are means over the queries.\n"
+        f"{_sequences(results)}"
         "accepted: queries that would have moved the aircraft, by the technique's own rule.\n"
         f"PCU: P@100%R x log10(t_e,max / t_e + 9) with t_e,max = {first.t_encode_max_s * 1000:.1f} ms.\n"
         f"mAh: {first.ah_assumes}."
+        + "".join(f"\nWeights of {each}." for each in dict.fromkeys(result.weights for result in results) if each)
     )
+
+
+def _sequences(results: Sequence[TechniqueResult]) -> str:
+    lengths = [f"{result.technique} of {result.sequence}" for result in results if result.sequence > 1]
+    return f"Matched in sequences of queries: {', '.join(lengths)}.\n" if lengths else ""

@@ -8,12 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from edgevpr.config import Config, load_config
-from edgevpr.errors import EdgevprError, LinkError, UsageError
+from edgevpr.errors import EdgevprError, LinkError, MapError, UsageError
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.transport import open_transport
+from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import parse_pack
 from edgevpr.runtime.frames import open_source
+from edgevpr.runtime.learn import check_positions
 from edgevpr.runtime.pipeline import open_pipeline
 
 _LOG_ROOM_MB = 10  # some hours of queries
@@ -67,6 +69,16 @@ def _battery(config: Config) -> str:
 
 
 def _map(config: Config) -> str:
+    if config.mapping.learn and config.map is not None:
+        path = Path(config.map).absolute()
+        # Neither made nor opened for writing, as with the log.
+        if not os.access(path.parent, os.W_OK) or (path.exists() and not os.access(path, os.W_OK)):
+            raise MapError(f"{path} or its folder may not be written by this user: learning needs both.")
+        if not path.exists():
+            return f"{path}, to be made by the first flight"
+        with PlaceMap.open(path) as place_map:
+            if not len(place_map):
+                return f"{path}, empty so far"
     pipeline = open_pipeline(config)
     pipeline.place_map.close()
     return f"{config.map}, {pipeline.reason}"
@@ -75,6 +87,8 @@ def _map(config: Config) -> str:
 def _source(config: Config) -> str:
     if config.source.uri is None:
         raise UsageError("There is no source of frames: write `source: {uri: ...}`.")
+    if config.mapping.learn:
+        check_positions(config, None)
     source = open_source(config.source.uri, live=True)
     # Not closed before FFmpeg has given up (5 s at most): a capture that comes back while Python ends aborts it.
     while source.state == "opening":

@@ -3,24 +3,35 @@
 from dataclasses import asdict
 from typing import Any
 
-from edgevpr.types import PlaceMatch
+from edgevpr.types import Candidate, PlaceMatch
+
+_OF_THE_BEST = ("place", "reference_image", "score", "position", "shift_cells", "covariance_cells2", "rotation_deg")
 
 
 def record(event: PlaceMatch) -> dict[str, Any]:
     """query, place (id), reference_image, score, accepted, reason, position (of the place), accuracy_m, the match's
-    step, its covariance and the rotation, costs."""
-    place, match = event.candidate.place, event.candidate.match
+    step, its covariance and the rotation (all null while the map has no place), costs."""
     return {
         "query": event.query,
-        "place": place.place_id,
-        "reference_image": place.source_image,
-        "score": round(match.score, 5),
+        **_best(event.candidate),
         "accepted": event.accepted,
         "reason": event.reason,
-        "position": asdict(place.position) if place.position else None,
         "accuracy_m": event.accuracy_m,
-        "shift_cells": match.shift_cells,
-        "covariance_cells2": match.covariance_cells2,
-        "rotation_deg": match.rotation_deg,
-        "costs": {key: float(f"{value:.6g}") for key, value in asdict(event.cost).items()},
+        "costs": {key: value and float(f"{value:.6g}") for key, value in asdict(event.cost).items()},
     }
+
+
+def _best(candidate: Candidate | None) -> dict[str, Any]:
+    if candidate is None:  # the map has no place yet
+        return dict.fromkeys(_OF_THE_BEST)
+    place, match = candidate.place, candidate.match
+    values = (
+        place.place_id,
+        place.source_image,
+        round(match.score, 5),
+        asdict(place.position) if place.position else None,
+        match.shift_cells,
+        match.covariance_cells2,
+        match.rotation_deg,
+    )
+    return dict(zip(_OF_THE_BEST, values, strict=True))

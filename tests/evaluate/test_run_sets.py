@@ -28,23 +28,35 @@ def make_set(folder, places=4):
     (folder / "positions.csv").write_text("\n".join(positions))
 
 
-def test_every_set_gets_a_file_and_a_line_in_the_summary(tmp_path):
+def test_every_set_gets_a_file_and_its_lines_in_the_summary(tmp_path):
     make_set(tmp_path / "data" / "meadow")
     make_set(tmp_path / "data" / "grief_stromovka_monthly", places=1)  # one of those that are left out
-    done = run_sets("--data", tmp_path / "data", "--out", tmp_path / "out")
-    assert done.returncode == 0, done.stderr
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["meadow.json", "sets.md"]
+    some = ("--data", tmp_path / "data", "--out", tmp_path / "out", "--variants")
+    for variants in ("hog;cohog", "seqslam"):  # the second adds to what the first has written
+        done = run_sets(*some, variants)
+        assert done.returncode == 0, done.stderr
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["curves.png", "meadow.json", "sets.md"]
 
     content = json.loads((tmp_path / "out" / "meadow.json").read_text())
     assert content["use"] == "report"
     assert content["machine"]["cores"] >= 1
+    assert list(content["techniques"]) == ["cohog", "hog", "seqslam"]
     assert [content["techniques"][name]["recall_at_1"] for name in ("hog", "cohog")] == [1, 1]
+    assert all(row["encode_ram_mb"] > 0 and row["commit"] for row in content["techniques"].values())
     assert content["positions"]["cohog"]["best_match"] == {"count": 4, "median_m": 11.1, "p90_m": 11.1, "worst_m": 11.1}
 
     page = (tmp_path / "out" / "sets.md").read_text()
-    assert "| meadow | report | 4 / 4 | cohog | 1.000 |" in page
+    assert "| technique | RAM B/place | meadow (report, 4) |" in page
+    assert "| cohog | 64 | 1.00 |" in page
     assert "| meadow | cohog | 4 | 11 / 11 / 11 (4) |" in page
-    assert "* grief_stromovka_monthly: hog, cohog, cohog_exact, cohog_thesis: five places only" in page
+    assert "* grief_stromovka_monthly, all of it: five places only" in page
+
+
+def test_a_row_that_is_not_there_gets_a_sentence(tmp_path):
+    make_set(tmp_path / "data" / "meadow")
+    done = run_sets("--data", tmp_path / "data", "--out", tmp_path / "out", "--variants", "cohogg")
+    assert done.returncode == 2
+    assert done.stderr.startswith("run_sets: There is no row `cohogg`: use some of cohog; ")
 
 
 def test_a_folder_without_sets_gets_a_sentence(tmp_path):
@@ -57,6 +69,6 @@ def test_a_folder_without_sets_gets_a_sentence(tmp_path):
 def test_a_broken_image_stops_it(tmp_path):
     make_set(tmp_path / "data" / "meadow")
     (tmp_path / "data" / "meadow" / "ref" / "ref2.png").write_bytes(b"")
-    done = run_sets("--data", tmp_path / "data", "--out", tmp_path / "out")
+    done = run_sets("--data", tmp_path / "data", "--out", tmp_path / "out", "--variants", "hog")
     assert done.returncode == 1
     assert "ref2.png is empty" in done.stderr

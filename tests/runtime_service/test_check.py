@@ -117,6 +117,24 @@ def test_a_map_of_another_technique_is_found(settings, config_file):
     assert "technique is hog, not cohog" in finding.message
 
 
+def test_a_flight_that_learns_needs_no_map_yet_and_none_is_made(settings, config_file, tmp_path):
+    settings |= {"mapping": {"learn": True}, "map": str(tmp_path / "new.gpkg")}
+    assert wrong(config_file, settings) == []
+    assert not (tmp_path / "new.gpkg").exists()
+    PlaceMap.create(tmp_path / "new.gpkg", techniques.create("hog").spec).close()
+    assert wrong(config_file, settings) == []
+    settings["map"] = str(tmp_path / "absent" / "new.gpkg")
+    (finding,) = wrong(config_file, settings)
+    assert (finding.what, "may not be written" in finding.message) == ("map", True)
+
+
+def test_learning_without_link_and_positions_is_found(settings, config_file):
+    settings |= {"mapping": {"learn": True}, "mavlink": {"link": None}}
+    (finding,) = wrong(config_file, settings)
+    assert finding.what == "source"
+    assert finding.message.startswith("There is nothing to learn positions from")
+
+
 def test_places_that_the_budget_does_not_hold_are_told(flight_folder, settings, config_file):
     big = config_file.with_name("big.gpkg")
     shutil.copy(settings["map"], big)

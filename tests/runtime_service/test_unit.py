@@ -112,3 +112,11 @@ def test_every_udev_rule_is_well_formed():
         assert re.fullmatch(rf'({keys}(==|!=|=|\+=)"[^"]+"(, (?!$)|$))+', rule), rule
     labels = set(re.findall(r'LABEL="(\w+)"', "\n".join(rules)))
     assert set(re.findall(r'GOTO="(\w+)"', "\n".join(rules))) == labels
+
+
+def test_networks_of_ones_own_are_looked_for_where_the_service_can_see():
+    assert "\nEnvironment=EDGEVPR_MODELS=/var/lib/edgevpr/models\n" in UNIT.read_text()
+    assert (
+        "EDGEVPR_MODELS=/var/lib/edgevpr/models /opt/edgevpr/bin/edgevpr models add"
+        in (DEPLOY / "README.md").read_text()
+    )

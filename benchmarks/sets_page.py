@@ -1,0 +1,142 @@
+"""The page that sums up the result files of the image sets, `sets.md`, and its precision-recall curves."""
+
+import json
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from edgevpr.evaluate import tables
+from edgevpr.evaluate.curves import plot
+from edgevpr.evaluate.evaluate import TechniqueResult
+
+CURVES = "curves.png"
+# What is drawn: the forms of a vector, and what is the same technique under other conditions, would hide the rest.
+_NOT_DRAWN = (" 8bit", " 1bit", ", exact", ", one frame")
+
+
+def result(row: dict[str, Any]) -> TechniqueResult:
+    """A row of a file as what it was."""
+    known = {each.name for each in fields(TechniqueResult)}
+    return TechniqueResult(**{key: value for key, value in row.items() if key in known})
+
+
+def write(folder: Path, left_out: dict[str, tuple[int, str]]) -> None:
+    """Sum up all files of `folder`; `left_out` says of a set how many rows were left out, and why."""
+    contents = [json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))]
+    contents = [content for content in contents if "techniques" in content]
+    results = {content["set"]: [result(row) for row in content["techniques"].values()] for content in contents}
+    drawn = {name: [each for each in rows if not each.technique.endswith(_NOT_DRAWN)] for name, rows in results.items()}
+    plot(drawn, folder / CURVES)
+    (folder / "sets.md").write_text(_page(contents, results, left_out))
+
+
+def _page(contents: list[dict[str, Any]], results: dict[str, list[TechniqueResult]], left_out: dict) -> str:
+    made = [
+        [content["set"], content["use"], content["date"], ", ".join(sorted({row["commit"] for row in _rows(content)}))]
+        for content in contents
+    ]
+    machine = contents[0]["machine"]
+    reached = [[name, each.technique, *tables.quality(each)] for name, rows in results.items() for each in rows]
+    paid = [
+        [content["set"], label, *tables.costs(result(row)), f"{row['encode_ram_mb']:.0f}"]
+        for content in contents
+        for label, row in content["techniques"].items()
+    ]
+    weights = sorted({each.weights for rows in results.values() for each in rows if each.weights})
+    assumed = next(iter(results.values()))[0].ah_assumes
+    page = f"""# Every technique on real images
+
+Made by `make results`. Machine: {machine["cpu"]}, {machine["cores"]} cores, BLAS threads: {machine["blas_threads"]}.
+Python {machine["python"]}, NumPy {machine["numpy"]}, OpenCV {machine["opencv"]}.
+
+{tables.markdown(("set", "use", "date", "commit"), made)}
+
+`cohog` is as it flies: a scan of 64 bytes a place, then the displacement vote over the best places; in the aerial
+sets its camera looks straight down (`--camera nadir`: the picture laid into a square, 24 rotations of the query).
+`cohog, exact` votes over all places, under all rotations. `cohog, thesis` scores as published, on the whole picture.
+A vector is kept in half precision; as `8bit` or `1bit` it is less the map's mean, a byte or a bit a number.
+Parameters and limits of acceptance were chosen on the sets marked *tune*. Three figures of cohog were fixed after all
+sets had been seen, and are to be judged with that in mind: the share of a picture's own mean that its place code
+leaves out (0.5), the number of places compared in full (40 ahead, 50 straight down), and the margin of `cohog, thesis`
+(0.02, with pictures of foreign sites). The truth of the aerial sets was computed by image registration: it favours
+pairs that local features can match, and says nothing of others. The JSON files beside this page hold every figure.
+
+Weights in use:
+
+{chr(10).join(f"* {each}" for each in weights)}
+
+## Recall@1
+
+{overview(contents)}
+
+![Precision-recall curves]({CURVES})
+
+## Recognition
+
+{tables.markdown(("set", "technique", *tables.QUALITY), reached)}
+
+* P@100%R: precision with the threshold at the lowest-scoring right match. R@100%P: recall with the threshold above the
+  highest-scoring wrong one. AUC, EP: equations 2.3 and 2.4 of the thesis.
+* ROC: the chance that a right match scores higher than a wrong one; 0.5 means that the score by itself tells nothing.
+* PCU: P@100%R x log10(t_e,max / t_e + 9), where t_e,max is the slowest encoder on the same set.
+* accepted: queries that would have moved the aircraft by the technique's own rule; in brackets, how many of them would
+  have moved it to a wrong place.
+
+## Costs
+
+{tables.markdown(("set", "technique", *tables.COSTS, "encode RAM MB"), paid)}
+
+* Means over the queries; t_m is for all references. U: share of all cores.
+* encode RAM: what the technique adds to a process that has NumPy and OpenCV, until it has encoded one 640x480 picture:
+  its libraries, its weights and the work itself at its highest.
+* mAh: {assumed}.
+"""
+    if any("positions" in content for content in contents):
+        away = [
+            [
+                content["set"],
+                technique,
+                str(errors["queries"]),
+                _metres(errors["best_match"]),
+                _metres(errors["accepted"]),
+            ]
+            for content in contents
+            for technique, errors in content.get("positions", {}).items()
+        ]
+        page += f"""
+## Errors in metres
+
+{tables.markdown(("set", "technique", "queries", "best match", "accepted"), away)}
+
+Distance between the GPS positions of the query and of the place it was matched to: median / 90 % / worst (how many).
+All queries with a position are in it, those too that show nothing of the map. The error cannot be smaller than the
+distance to the nearest place, and GPS on these cameras is noisy: 10 to 20 m off (caliterra), tens of metres (swindale).
+"""
+    if left_out:
+        page += "\n## Left out\n\n"
+        for name, (count, why) in left_out.items():
+            what = "all of it" if name not in results else f"{count} rows"
+            page += f"* {name}, {what}: {why}.\n"
+    return page
+
+
+def overview(contents: list[dict[str, Any]], wanted: Callable[[str], bool] = lambda label: True) -> str:
+    """Recall@1 of every `wanted` technique (down) on every set (across), as a Markdown table."""
+    rows = []
+    for label in filter(wanted, dict.fromkeys(label for content in contents for label in content["techniques"])):
+        found = [content["techniques"].get(label) for content in contents]
+        size = next(row["descriptor_bytes"] for row in found if row)
+        rows.append([label, f"{size}", *("-" if row is None else f"{row['recall_at_1']:.2f}" for row in found)])
+    heads = [f"{content['set']} ({content['use']}, {_rows(content)[0]['queries']})" for content in contents]
+    return tables.markdown(("technique", "RAM B/place", *heads), rows)
+
+
+def _rows(content: dict[str, Any]) -> list[dict[str, Any]]:
+    return list(content["techniques"].values())
+
+
+def _metres(errors: dict[str, Any]) -> str:
+    if not errors["count"]:
+        return "none"
+    return f"{errors['median_m']:.0f} / {errors['p90_m']:.0f} / {errors['worst_m']:.0f} ({errors['count']})"

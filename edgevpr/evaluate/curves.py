@@ -1,0 +1,38 @@
+"""Precision-recall curves as a picture (needs matplotlib, extra `plots`)."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from edgevpr.evaluate.evaluate import TechniqueResult
+from edgevpr.runtime.pictures import figure
+
+_PANELS_A_ROW = 3
+# Of ten or more curves no ten colours are told apart: after them the lines change.
+_LINES = ("-", "--", ":", "-.")
+
+
+def plot(results: Mapping[str, Sequence[TechniqueResult]], path: Path) -> None:
+    """Draw one panel a data set, one curve a technique, best AUC first in the key.
+
+    A technique that is right (or wrong) with all of one score gives a curve of one point: it is drawn as a mark.
+    """
+    columns = min(len(results), _PANELS_A_ROW)
+    rows = -(-len(results) // columns)
+    drawn = figure(5.2 * columns, 4.6 * rows)
+    for at, (title, compared) in enumerate(results.items(), start=1):
+        axes = drawn.add_subplot(rows, columns, at)
+        # Always the same look for the same technique, in whatever order the key is.
+        for number, result in sorted(enumerate(compared), key=lambda pair: -pair[1].auc):
+            precision, recall = zip(*result.precision_recall, strict=True)
+            axes.plot(
+                recall,
+                precision,
+                _LINES[number // 10 % len(_LINES)],
+                color=f"C{number % 10}",
+                marker="o" if len(recall) == 1 else None,
+                label=f"{result.technique} {result.auc:.2f}",
+            )
+        axes.set(xlim=(0, 1.02), ylim=(0, 1.02), xlabel="recall", ylabel="precision", title=title)
+        axes.grid(alpha=0.3)
+        axes.legend(title="AUC (2.3)", fontsize=7, title_fontsize=7, ncols=2, loc="lower left")
+    drawn.savefig(path, dpi=100)
