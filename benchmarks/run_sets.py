@@ -58,7 +58,7 @@ ON_SHIPPED_BACKBONE = tuple(
     Variant(name, name)
     for name in ("alexnet", "amosnet", "hybridnet", "netvlad", "rmac", "region_vlad", "cross_region_bow")
 )
-VECTORS = ("hog", "calc", "alexnet", "amosnet", "hybridnet", "netvlad", "region_vlad")
+VECTORS = ("hog", "calc", *(variant.technique for variant in ON_SHIPPED_BACKBONE))
 PACKED = tuple(Variant(f"{name} {form}", name, {"form": form}) for name in VECTORS for form in ("8bit", "1bit"))
 VARIANTS = (*COHOG, HOG, SEQSLAM, Variant("seqslam, one frame", "seqslam", sequence=1), CALC, ORIGINAL_CALC,
             *ON_SHIPPED_BACKBONE, *PACKED)  # fmt: skip

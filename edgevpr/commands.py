@@ -205,9 +205,11 @@ def profile(args: Namespace) -> int:
         raise UsageError("--out is for --detect and --measure: name one of them too.")
     if args.images and not args.measure:
         raise UsageError("--images is for --measure: give both.")
-    if args.detect:
-        return _profile_detect(args)
     asked = args.map is not None or args.places is not None
+    if args.detect:
+        if asked or args.plot:
+            raise UsageError("--detect says what this machine is: ask what a flight costs without it.")
+        return _profile_detect(args)
     if not asked and (args.plot or not args.measure):
         raise UsageError("Say how many places will be flown with: --map MAP, or --places N.")
     if args.plot:

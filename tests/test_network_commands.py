@@ -134,6 +134,14 @@ def test_eval_goes_on_without_a_network_that_cannot_be_used(models, capsys, flig
     assert "not finite" in said
 
 
+def test_eval_goes_on_without_a_network_whose_card_is_wrong(models, capsys, flight):
+    (models / "calc.yaml").write_text("title: x\ntitel: y\n")
+    code, found, said = evaluated(capsys, flight, "--techniques", "calc,cohog")
+    assert (code, list(found)) == (1, ["cohog"])
+    assert "calc was not measured:" in said
+    assert "did you mean `title`?" in said
+
+
 def test_eval_of_an_unknown_form_is_a_wrong_request(capsys, flight):
     code, _, said = evaluated(capsys, flight, "--techniques", "hog", "--form", "4bit")
     assert code == 2

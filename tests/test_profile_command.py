@@ -216,6 +216,8 @@ def test_the_boards_are_listed(capsys):
         (["--places", "50", "--images", "."], "--images is for --measure"),
         (["--measure", "--images", "nowhere"], "The folder nowhere does not exist"),
         (["--measure", "--out", "nowhere/m.json"], "nowhere/m.json: there is no such folder"),
+        (["--measure", "--out", "mine.yaml"], "mine.yaml: the name of a file of figures ends in .json"),
+        (["--detect", "--places", "50"], "--detect says what this machine is: ask what a flight costs without it."),
         (["--detect", "--out", "mine.json"], "mine.json: a profile's name ends in .yaml"),
         (["--detect", "--out", "nowhere/mine.yaml"], "nowhere/mine.yaml: there is no such folder"),
         (["--places", "50", "--board", "rpi4"], "There is no board `rpi4`"),

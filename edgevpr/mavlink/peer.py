@@ -5,10 +5,12 @@ import math
 from collections import Counter
 from dataclasses import dataclass
 
+from edgevpr.geodesy import distance_m
 from edgevpr.mavlink.messages import AUTOPILOT, POSITION_FIX
 from edgevpr.mavlink.wire import Message, mavlink
 
 GPS_GONE_AFTER_S = 2.5  # of its reports, which come at least once a second, one may be lost
+GPS_AGREES_WITHIN_M = 50.0  # a vehicle at 25 m/s, and its reports a second or two apart
 SILENT_AFTER_S = 5.0  # of the heartbeats, which come once a second, this many may be lost
 
 _GPS_REPORTS = ("GPS_RAW_INT", "GPS2_RAW")
@@ -26,8 +28,8 @@ _EXPLANATIONS = {
 @dataclass(frozen=True, slots=True)
 class VehiclePosition:
     """Where the autopilot believes to be; `alt_m` above sea level, `heading_deg` 0..360 or None where it does not know,
-    `t_heard_s` on the clock of the link. `has_gps`: a receiver of its had a 3D fix then. It goes on saying where it
-    believes to be long after it has lost that."""
+    `t_heard_s` on the clock of the link. `has_gps`: a receiver of its had a 3D fix then, and there. It goes on
+    saying where it believes to be long after it has lost that, and does not follow a receiver it does not trust."""
 
     lat_deg: float
     lon_deg: float
@@ -45,7 +47,8 @@ class Autopilot:
         self.acks: Counter[str] = Counter()  # answers to our fixes, by name of the result
         self.position: VehiclePosition | None = None  # the last one heard, however old
         self._own_component = own_component
-        self._heard_s = self._gps_s = -math.inf
+        self._heard_s = -math.inf
+        self._gps: dict[str, tuple[float, float, float]] = {}  # of each receiver with a fix: lat_deg, lon_deg, when
         self._last_result: int | None = None
         self._warned = False
 
@@ -70,10 +73,23 @@ class Autopilot:
         if self._answers_our_fix(message):
             self._hear_result(message.result)
         elif message.get_type() == "GLOBAL_POSITION_INT":
-            self.position = _position(message, now_s, has_gps=now_s - self._gps_s <= GPS_GONE_AFTER_S)
-        elif message.get_type() in _GPS_REPORTS and message.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX:
-            self._gps_s = now_s
+            self.position = _position(message, now_s, self._has_gps(message, now_s))
+        elif message.get_type() in _GPS_REPORTS:
+            self._hear_gps(message, now_s)
         return False
+
+    def _hear_gps(self, message: Message, now_s: float) -> None:
+        if message.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX:
+            self._gps[message.get_type()] = message.lat / 1e7, message.lon / 1e7, now_s
+        else:
+            self._gps.pop(message.get_type(), None)
+
+    def _has_gps(self, position: Message, now_s: float) -> bool:
+        here = position.lat / 1e7, position.lon / 1e7
+        return any(
+            now_s - t_s <= GPS_GONE_AFTER_S and float(distance_m(*here, lat_deg, lon_deg)) <= GPS_AGREES_WITHIN_M
+            for lat_deg, lon_deg, t_s in self._gps.values()
+        )
 
     def _answers_our_fix(self, message: Message) -> bool:
         return (

@@ -38,12 +38,13 @@ def rank(
     all candidates turn out to be neighbours of the best one, the best-scanned places elsewhere are compared as well:
     without them nobody could say how far ahead it is.
 
-    `allowed` bool (N,), at least one True, leaves all other places out. To be ahead of the few that are left would say
-    little: places elsewhere are compared, five at least, the best-scanned of the whole index where too few are allowed.
-    `turned_deg` (N,) goes to `Technique.coarse_scores`, and its hypotheses to `match`, however small the map.
+    `allowed` bool (N,), at least one True, says where the aircraft should be: the candidates are taken from there, and
+    the five best-scanned of all others are compared as well. Where it is false, it would hide the right place behind
+    the best of the wrong ones; and to be ahead of the few that are left would say little, so five places elsewhere are
+    compared at least. `turned_deg` (N,) goes to `Technique.coarse_scores`, and its hypotheses to `match`, however small
+    the map.
     """
     one_stage = technique.spec.fine is None
-    picked = None if one_stage else allowed  # the rows of one stage are large, and to pick some is to copy them
     scanned = hypotheses = None
 
     def compared(slots: np.ndarray) -> list[FineMatch]:
@@ -56,24 +57,25 @@ def rank(
             for slot in slots
         ]
 
-    chosen = np.arange(len(index)) if allowed is None else np.flatnonzero(allowed)
     if one_stage or candidates is None:
-        candidates = len(chosen)
-    if one_stage or candidates < len(index) or turned_deg is not None:
-        scanned, hypotheses = _scanned(technique, query, index, picked, turned_deg)
-    if candidates < len(chosen):
+        candidates = len(index)
+    if one_stage or candidates < len(index) or allowed is not None or turned_deg is not None:
+        hint = {} if turned_deg is None else {"turned_deg": turned_deg}
+        scanned, hypotheses = technique.coarse_scores(query, index.rows, index.mean, **hint)
+    if allowed is not None:
+        chosen = np.append(_best(scanned, allowed, candidates), _best(scanned, ~allowed, _COMPARED_ELSEWHERE))
+    elif candidates < len(index):
         chosen = np.argpartition(-scanned, candidates)[:candidates]
+    else:
+        chosen = np.arange(len(index))
     matches = compared(chosen)
     if len(chosen) < len(index):
         best = chosen[max(range(len(chosen)), key=lambda at: matches[at].score)]
         rivals = np.count_nonzero(elsewhere(index, best, chosen, neighbour_m))
         if rivals < (1 if allowed is None else _COMPARED_ELSEWHERE):
-            if picked is not None:
-                scanned, hypotheses = _scanned(technique, query, index, None, turned_deg)
             others = elsewhere(index, best, np.arange(len(index)), neighbour_m)
             others[chosen] = False
-            others = np.flatnonzero(others)
-            others = others[np.argsort(-scanned[others])[: _COMPARED_ELSEWHERE - rivals]]
+            others = _best(scanned, others, _COMPARED_ELSEWHERE - rivals)
             matches += compared(others)
             chosen = np.append(chosen, others)
     scores = np.array([match.score for match in matches], np.float32)
@@ -81,24 +83,10 @@ def rank(
     return Ranking(chosen[order], scores[order], tuple(matches[i] for i in order))
 
 
-def _scanned(
-    technique: Technique,
-    query: Descriptor,
-    index: PlaceIndex,
-    picked: np.ndarray | None,
-    turned_deg: np.ndarray | None,
-) -> tuple[np.ndarray, np.ndarray | None]:
-    """Scores and hypotheses (N,) of `Technique.coarse_scores`; -inf for places that are not picked (None: all are)."""
-    some = slice(None) if picked is None else picked
-    hint = {} if turned_deg is None else {"turned_deg": turned_deg[some]}
-    some_scores, some_hypotheses = technique.coarse_scores(query, index.rows[some], index.mean, **hint)
-    scores = np.full(len(index), -np.inf, np.float32)
-    scores[some] = some_scores
-    if some_hypotheses is None:
-        return scores, None
-    hypotheses = np.zeros(len(index), some_hypotheses.dtype)
-    hypotheses[some] = some_hypotheses
-    return scores, hypotheses
+def _best(scanned: np.ndarray, among: np.ndarray, count: int) -> np.ndarray:
+    """The `count` best-scanned slots of those `among` (N,) bool is True of, best first."""
+    slots = np.flatnonzero(among)
+    return slots[np.argsort(-scanned[slots], kind="stable")[:count]]
 
 
 def elsewhere(index: PlaceIndex, best: int, slots: np.ndarray, neighbour_m: float) -> np.ndarray:

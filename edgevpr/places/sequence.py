@@ -51,6 +51,7 @@ class Sequence:
         self.rivals = np.empty(0, np.float32)
         self._gap_s = gap_s
         self._rows: deque[np.ndarray] = deque(maxlen=length)  # newest first
+        self._usual: deque[float] = deque(maxlen=_NEWEST_ALONE)  # score of the places that were not compared
         self._known = (0, 0)  # places of the index, and the checksum of their ids
         self._t_last_s: float | None = None
         self._interval_s = 0.0
@@ -67,14 +68,18 @@ class Sequence:
     def follow(self, ranking: Ranking, index: PlaceIndex, t_mono_s: float) -> Ranking:
         """Take the ranking of the newest query, made at `t_mono_s`, and rank the places by their best trajectory.
 
-        A place that a query was not compared with has score 0 there, and so has what lies before the first place of
-        the map. Matches keep what the newest query says of the place (step, rotation), where it was compared.
+        A place that a query was not compared with has the usual score there, the median of those that were: with 0,
+        rivals would sink, and any place that is always compared would seem ahead. What lies before the first place of
+        the map has score 0. Matches keep what the newest query says of the place (step, rotation), where it was
+        compared.
         """
         if self._broken(index, t_mono_s):
             self._rows.clear()
         if self.frames == self.length:
             self._rows.pop()
-        row = np.zeros(len(index), np.float32)
+        usual = float(np.median(ranking.scores)) if len(ranking.slots) < len(index) else 0.0
+        self._usual.appendleft(usual)
+        row = np.full(len(index), usual, np.float32)
         row[ranking.slots] = ranking.scores
         self._rows.appendleft(row)
         self._known = (len(index), zlib.crc32(index.place_ids))
@@ -97,9 +102,10 @@ class Sequence:
         together = best_means(newest, [trajectory[:_NEWEST] for trajectory in self._trajectories])
         if not near[together.argmax()]:
             return False
-        for row in newest[:_NEWEST_ALONE]:
+        for row, usual in zip(newest[:_NEWEST_ALONE], self._usual, strict=False):
             seen = float(row[near[: len(row)]].max(initial=0))
-            if seen < min_score or np.count_nonzero(row > seen) * near.sum() > _BEST_SHARE * len(row):
+            # The usual score is that of a place not compared, which a technique without a limit would let pass.
+            if seen <= usual or seen < min_score or np.count_nonzero(row > seen) * near.sum() > _BEST_SHARE * len(row):
                 return False
         return True
 

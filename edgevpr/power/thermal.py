@@ -48,7 +48,8 @@ class ThermalWatch:
         self._top_khz = (self._policy and _number(self._policy / "cpuinfo_max_freq")) or 0.0
         self._allowed_khz = 0.0
         self._counters = sorted((root / "sys/devices/system/cpu").glob("cpu[0-9]*/thermal_throttle/*_throttle_count"))
-        self._counted = sum(_number(path) or 0 for path in self._counters)
+        self._counted: dict[Path, float] = {}
+        self._count_heat_events()
         self._firmware = next((root / "sys/devices/platform").glob("soc*/*firmware/get_throttled"), None)
         self._program = vcgencmd.find(root)
         self._asking: subprocess.Popen | None = None
@@ -101,8 +102,7 @@ class ThermalWatch:
                 yield True, f"{khz / 1000:g} of {normal_khz / 1000:g} MHz at {temperature_c:g} degrees"
 
     def _look_slowly(self) -> None:
-        counted = sum(_number(path) or 0 for path in self._counters)
-        self._heat_events, self._counted = counted - self._counted, counted
+        self._heat_events = self._count_heat_events()
         if self._firmware:
             self._bits = _hexadecimal(_content(self._firmware))
         elif self._program:
@@ -111,6 +111,12 @@ class ThermalWatch:
                 self._asking = subprocess.Popen(
                     [self._program, "get_throttled"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
                 )
+
+    def _count_heat_events(self) -> float:
+        """Since the last count. A core that is switched off takes its counters with it, and brings them back as new."""
+        counted = {path: count for path in self._counters if (count := _number(path)) is not None}
+        before, self._counted = self._counted, self._counted | counted
+        return sum(max(0.0, count - before.get(path, count)) for path, count in counted.items())
 
     def _collect(self) -> None:
         if self._asking and self._asking.poll() is not None:

@@ -5,10 +5,11 @@ Figures of another machine, or of another version of what was measured, are neve
 
 import contextlib
 import json
+import math
 import os
 import platform
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, astuple, dataclass, replace
 from datetime import datetime, timezone
 from importlib import metadata
 from itertools import groupby
@@ -16,7 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from edgevpr import techniques
-from edgevpr.errors import EdgevprError, UsageError
+from edgevpr.config import build
+from edgevpr.errors import ConfigError, EdgevprError, UsageError
 from edgevpr.power import machine
 from edgevpr.power.boards import Board, Score
 from edgevpr.resources import own_folder
@@ -117,6 +119,8 @@ def gathered(trials: Iterable[Trial], pictures: str, threads: int, score: Score)
 def require_room(path: Path, make: bool) -> None:
     """Raise a sentence where `save` could not write to `path`: before the measuring, not after it. `make`: the folder
     may be made."""
+    if path.suffix != ".json":
+        raise UsageError(f"{path}: the name of a file of figures ends in .json: choose such a name.")
     folder = path.resolve().parent
     if make:
         if not folder.is_absolute() or str(path).startswith("~"):
@@ -144,10 +148,9 @@ def write_whole(path: Path, text: str, instead: bool = True) -> None:
             out.write(text)
             out.flush()
             os.fsync(out.fileno())
-        if instead:
-            unfinished.replace(path)
-        else:
-            os.link(unfinished, path)  # which never replaces
+        if not instead:
+            open(path, "x").close()  # never one that is there; a link would do it at once, but FAT has none
+        unfinished.replace(path)
     finally:
         unfinished.unlink(missing_ok=True)
 
@@ -161,14 +164,29 @@ def load(path: Path) -> tuple[Measured | None, str | None]:
             return None, f"{path} is of another version of edgevpr: {again}"
         trials = tuple(trial_of(each) for each in fields["trials"])
         found = Measured(**{**fields, "score": Score(**fields["score"]), "trials": trials})
+        _require_figures(found)
         different = _differences(found.identity, identity())
     except FileNotFoundError:
         return None, None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, ConfigError):
         return None, f"{path} holds no figures that can be read: {again}"
     if different:
         return None, f"The figures in {path} are of another machine or installation ({different}): {again}"
     return found, None
+
+
+def _require_figures(found: Measured) -> None:
+    """Raise ConfigError, TypeError or ValueError where a file has the form of figures and holds none."""
+    build(Score, asdict(found.score), "score")
+    for trial in found.trials:
+        if not (isinstance(trial.settings, dict) and isinstance(trial.parameters, dict)):
+            raise TypeError(f"the settings of {trial.label} are none")
+        if costs := trial.costs:
+            stages = [*astuple(costs.encode), *astuple(costs.match_per_place)]
+            above_0 = [*stages, costs.ram_bytes_per_place, costs.disk_bytes_per_place, costs.process_mb]
+            others = [*astuple(costs.scan_per_place), costs.encode_mb or 0.0, costs.candidates or 0]
+            if not (all(0 < each < math.inf for each in above_0) and all(0 <= each < math.inf for each in others)):
+                raise ValueError(f"the costs of {trial.label} are no figures")
 
 
 def _differences(there: dict[str, Any], here: dict[str, Any]) -> str:

@@ -8,6 +8,9 @@ import multiprocessing
 import os
 import shutil
 import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -65,9 +68,16 @@ def list_models() -> tuple[Listed, ...]:
 
 
 def verify(card: Card, threads: int = 1, learned: bool = True) -> Verified:
-    """`verify_here` in a process of its own, since what another network has loaded is not counted again."""
-    with multiprocessing.get_context("spawn").Pool(1) as pool:
-        return pool.apply(verify_here, (card, threads, learned))
+    """`verify_here` in a process of its own, since what another network has loaded is not counted again, and a network
+    too large for the board ends that process and not ours. Raises ModelError where it does."""
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        try:
+            return pool.submit(verify_here, card, threads, learned).result()
+        except BrokenProcessPool as error:
+            raise ModelError(
+                f"{card.file_path} ended the process that tried it, most likely for want of memory: use a smaller "
+                "network, or a board with more RAM."
+            ) from error
 
 
 def verify_here(card: Card, threads: int = 1, learned: bool = True) -> Verified:
@@ -124,7 +134,10 @@ def add(file: Path, card_path: Path, threads: int = 1) -> tuple[Verified, Path]:
 def technique_with(name: str) -> tuple[str, dict[str, str]]:
     """A technique, and its settings, that shows what the network of a card is worth: its own or, of one that gives
     feature maps only, `rmac`, which needs nothing learned."""
-    return (name, {}) if load_card(name).is_technique else ("rmac", {"model": name})
+    card = load_card(name)
+    if card.is_technique and not techniques.is_own(name):
+        return name, {}
+    return "calc" if card.outputs.descriptor else "rmac", {"model": name}
 
 
 def install(file: Path, sha256: str, card_path: Path, file_name: str, text: str) -> None:
@@ -139,12 +152,8 @@ def install(file: Path, sha256: str, card_path: Path, file_name: str, text: str)
         raise ModelError(f"{target} is there already and is another file: write another `file` on the card.")
     folder.mkdir(parents=True, exist_ok=True)
     if not target.exists():
-        unfinished = target.with_name(target.name + ".part")
-        shutil.copyfile(file, unfinished)
-        _settle(unfinished, target)
-    unfinished = card_path.with_name(card_path.name + ".part")
-    unfinished.write_text(text, "utf-8")
-    _settle(unfinished, card_path)
+        _settle(target, lambda unfinished: shutil.copyfile(file, unfinished))
+    _settle(card_path, lambda unfinished: unfinished.write_text(text, "utf-8"))
 
 
 def card_text(values: dict) -> str:
@@ -152,11 +161,17 @@ def card_text(values: dict) -> str:
     return "".join(f"{key}: {json.dumps(value, ensure_ascii=False)}\n" for key, value in values.items())
 
 
-def _settle(unfinished: Path, target: Path) -> None:
-    """On the disk before it has its name."""
-    with open(unfinished, "rb") as handle:
-        os.fsync(handle.fileno())
-    unfinished.replace(target)
+def _settle(target: Path, write: Callable[[Path], object]) -> None:
+    """On the disk before it has its name; a full disk is not left fuller."""
+    unfinished = target.with_name(target.name + ".part")
+    try:
+        write(unfinished)
+        with open(unfinished, "rb") as handle:
+            os.fsync(handle.fileno())
+        unfinished.replace(target)
+    except OSError:
+        unfinished.unlink(missing_ok=True)
+        raise
 
 
 def _listed(name: str) -> Listed:
@@ -176,7 +191,7 @@ def _listed(name: str) -> Listed:
         for each in techniques.names()
         if techniques.parameters(each).get("model") == name and getattr(card.outputs, techniques.network_output(each))
     ]
-    if card.is_technique and name not in users:
+    if card.is_technique and not techniques.is_own(name):
         users.insert(0, name)
     return Listed(
         name,

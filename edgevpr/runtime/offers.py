@@ -27,7 +27,7 @@ def offers(
     names: Iterable[str], forms: Iterable[str] = FORMS, settings: Mapping[str, Mapping[str, Any]] | None = None
 ) -> tuple[Offer, ...]:
     """Each technique in each of `forms`, or once where it has none; `settings` by name. Raises UsageError for an
-    unknown name, and ConfigError or ModelError for a card that does not say what it must."""
+    unknown name, and ModelError for a card that does not say what it must."""
     found = []
     for name in names:
         own = dict((settings or {}).get(name, {}))

@@ -162,8 +162,9 @@ class _Autopilot:
                 self._send(_copter_heartbeat())
             if self._track and self._start_s is not None and time.monotonic() >= position_due_s:
                 position_due_s = time.monotonic() + POSITION_S
-                self._send(_position(self._track, time.monotonic() - self._start_s))
-                self._send(_gps())
+                position = _position(self._track, time.monotonic() - self._start_s)
+                self._send(_gps(position))
+                self._send(position)
 
     def summary(self) -> AutopilotSummary:
         return AutopilotSummary(
@@ -241,10 +242,20 @@ def _position(track: Track, t_s: float) -> Message:
     )
 
 
-def _gps() -> Message:
+def _gps(position: Message) -> Message:
+    """A receiver that sees what is so."""
     unknown = 65_535
     return mavlink.MAVLink_gps_raw_int_message(
-        0, mavlink.GPS_FIX_TYPE_3D_FIX, 0, 0, 0, eph=80, epv=120, vel=unknown, cog=unknown, satellites_visible=14
+        0,
+        mavlink.GPS_FIX_TYPE_3D_FIX,
+        position.lat,
+        position.lon,
+        position.alt,
+        eph=80,
+        epv=120,
+        vel=unknown,
+        cog=unknown,
+        satellites_visible=14,
     )
 
 

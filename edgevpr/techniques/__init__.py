@@ -33,7 +33,12 @@ def names() -> tuple[str, ...]:
 
     A card that cannot be read is left out here, and says what is wrong with it when it is asked for by name.
     """
-    return (*_REGISTRY, *(name for name in _cards() if name not in _REGISTRY))
+    return (*_REGISTRY, *(name for name in _cards() if not is_own(name)))
+
+
+def is_own(name: str) -> bool:
+    """Whether edgevpr itself has a technique of this name: a card that is called the same is only its `model`."""
+    return name in _REGISTRY
 
 
 def is_known(name: str) -> bool:

@@ -14,6 +14,10 @@ from edgevpr.techniques.hamming import hamming
 from edgevpr.types import Descriptor, PartSpec, TechniqueSpec
 
 FORMS = ("float", "8bit", "1bit")
+# Ahead by more than any match can be: how far ahead the wrong matches of a network are is known for the weights that
+# edgevpr ships. With others none is accepted until the configuration says from when on.
+NEVER = 2.0
+_SHIPPED = "calc"
 _TINY = 1e-6
 _BYTES_AT_ONCE = 4 << 20  # of places turned to float32 together
 _FEWEST_AT_ONCE = 16
@@ -27,7 +31,7 @@ class VectorTechnique:
     `similarity` is "cosine", "l1" or "l2"; in 1 bit it is always Hamming's. All scores are 0 to 1: the cosine itself,
     below 0 as 0 (unrelated), for `float`; (1 + cosine) / 2 of what is left without the mean for `8bit`; 1 / (1 +
     distance) for both others; the share of equal bits for `1bit`. `accept` gives (min_score, min_margin) of a form
-    where it is not that of the class.
+    where it is not that of the class; with another `model` than the one shipped, nothing is accepted.
     """
 
     candidates = 1  # there is no fine part to compare
@@ -48,6 +52,8 @@ class VectorTechnique:
             raise UsageError(f"{name} has no form `{form}`: use {', '.join(FORMS[:-1])} or {FORMS[-1]}.")
         self.form = form
         self.min_score, self.min_margin = self.accept.get(form, (self.min_score, self.min_margin))
+        if parameters.get("model", _SHIPPED) != _SHIPPED:
+            self.min_margin = NEVER
         self._similarity, self._length = similarity, length
         packed = {
             "float": None,
@@ -62,7 +68,8 @@ class VectorTechnique:
 
     def encode(self, image: np.ndarray, mask: np.ndarray | None = None) -> Descriptor:
         """Encode uint8 (H, W[, 3]) -> coarse float16 (D,), of length 1 where the similarity is the cosine. A vector of
-        zeros has quality 0. Raises ModelError for numbers beyond half precision."""
+        zeros, or of what half precision takes for such, has quality 0. Raises ModelError for numbers beyond half
+        precision."""
         vector = self.vector(image, mask)
         length = float(np.linalg.norm(vector))
         if self._similarity == "cosine":
@@ -72,7 +79,8 @@ class VectorTechnique:
                 f"{self.spec.name}: its vector has numbers beyond half precision ({np.abs(vector).max():.3g}): scale "
                 "what the network puts out, or compare by cosine."
             )
-        return Descriptor(vector.astype("<f2"), quality=float(length > 0))
+        coarse = vector.astype("<f2")
+        return Descriptor(coarse, quality=float(coarse.any()))
 
     def pack(self, coarse: np.ndarray, mean: np.ndarray) -> np.ndarray:
         """Rows of the index in 8 or 1 bit: coarse float16 (N, D), the map's mean (D,) -> (N, *row shape)."""
@@ -98,8 +106,10 @@ class VectorTechnique:
         turned_deg: np.ndarray | None = None,
     ) -> tuple[np.ndarray, None]:
         """Compare a query with all places: `rows` (N, *row shape), the map's mean (D,) unless the form is `float` ->
-        scores float32 (N,). Nothing is known of rotations: `turned_deg` changes nothing."""
+        scores float32 (N,), all 0 for a query of zeros. Nothing is known of rotations: `turned_deg` changes nothing."""
         asked = query.coarse.astype(np.float32)
+        if not asked.any():  # less the mean it would be like some place, and another picture of nothing the very same
+            return np.zeros(len(rows), np.float32), None
         if self.form == "1bit":
             code = np.zeros(self.spec.row.shape, np.uint8)
             code[: -(-self._length // 8)] = np.packbits(asked > mean)

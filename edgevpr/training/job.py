@@ -82,7 +82,11 @@ def train_calc(
     encoder = training.encoder()
     export.write_onnx(encoder, out)
     inputs, _ = batch(pictures, _CHECKED_INPUTS, np.random.default_rng(seed))
-    largest = export.require_equal(encoder, out, inputs)
+    try:
+        largest = export.require_equal(encoder, out, inputs)
+    except EdgevprError:
+        out.unlink()  # what is wrong must not be taken for a model, nor be in the way of another try
+        raise
     names = ", ".join(Path(folder).as_posix() for folder in folders)
     source = f"edgevpr train calc --steps {steps} --seed {seed}; {len(pictures)} images of {names}"
     export.write_card(card, out, "CALC (Merrill and Huang 2018), trained by edgevpr", source)

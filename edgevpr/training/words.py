@@ -27,6 +27,7 @@ _POINTS = 60_000  # local descriptors that words are learnt from at least, where
 _POINTS_PER_WORD = 12  # ... and as many a word
 _ROUNDS = 10
 _STEP = 256
+_ALIKE = 1e-9  # variance of vectors of length 1 that are the same but for rounding
 _LEAST_VARIANCE = 1e-3  # of the largest: what varies less is mostly noise, and whitening must not blow it up
 
 
@@ -91,7 +92,9 @@ def train_words(
         arrays |= _whitening(backbone, folders, pictures, words.astype(np.float32), whiten)
     content = io.BytesIO()
     np.savez_compressed(content, **arrays)
-    path.write_bytes(content.getbuffer())
+    part = path.with_name(path.name + ".part")
+    part.write_bytes(content.getbuffer())
+    part.replace(path)
     some, words = points[:: max(1, len(points) // 5000)], words.astype(np.float32)
     distance = np.square(some - words[vlad.nearest(some, words)]).sum(axis=1).mean()
     return WordsResult(str(path), pictures, len(points), float(distance))
@@ -129,6 +132,8 @@ def _whitening(
     # Fewer pictures than values: the components come from the small product of pictures with pictures.
     variance, mixing = np.linalg.eigh((vectors @ vectors.T).astype(np.float64) / len(vectors))
     variance, mixing = variance[::-1][:length], mixing[:, ::-1][:, :length]
+    if not variance[0] > _ALIKE:
+        raise UsageError("The images are all alike, and a whitening needs what tells them apart: give others.")
     variance = np.maximum(variance, _LEAST_VARIANCE * variance[0])
     matrix = (mixing / (np.sqrt(len(vectors)) * variance)).T.astype(np.float32) @ vectors
     scale = np.abs(matrix).max(axis=1) / 127

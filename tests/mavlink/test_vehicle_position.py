@@ -76,12 +76,13 @@ def test_a_position_lost_is_not_remembered(link_and_peer, nowhere):
     wait_until(lambda: link.vehicle_position(1.0) is None)
 
 
-def say_gps(link, peer, fix_type, message="GPS_RAW_INT"):
+def say_gps(link, peer, fix_type, message="GPS_RAW_INT", lat_deg=50.0):
     before = link.stats().received.get(message, 0)
+    where = (round(lat_deg * 1e7), 80_000_000)
     if message == "GPS_RAW_INT":
-        peer.send(mavlink.MAVLink_gps_raw_int_message(0, fix_type, 0, 0, 0, 80, 120, 0, 0, 14))
+        peer.send(mavlink.MAVLink_gps_raw_int_message(0, fix_type, *where, 0, 80, 120, 0, 0, 14))
     else:
-        peer.send(mavlink.MAVLink_gps2_raw_message(0, fix_type, 0, 0, 0, 80, 120, 0, 0, 14, 0, 0))
+        peer.send(mavlink.MAVLink_gps2_raw_message(0, fix_type, *where, 0, 80, 120, 0, 0, 14, 0, 0))
     wait_until(lambda: link.stats().received.get(message, 0) == before + 1, "the report arrives")
 
 
@@ -99,11 +100,16 @@ def test_a_position_says_whether_gps_stands_behind_it(link_and_peer, clock, mess
     say_gps(link, peer, mavlink.GPS_FIX_TYPE_2D_FIX, message)
     assert not has_gps(50.0)
     say_gps(link, peer, mavlink.GPS_FIX_TYPE_3D_FIX, message)
-    assert has_gps(50.1)
+    assert has_gps(50.0003), "33 m flown since its last report"
+    assert not has_gps(50.001), "it does not follow its receiver: jammed, deceived or switched off"
+    say_gps(link, peer, mavlink.GPS_FIX_TYPE_3D_FIX, message, lat_deg=50.001)
+    assert has_gps(50.0011)
     say_gps(link, peer, mavlink.GPS_FIX_TYPE_NO_FIX, message)
+    assert not has_gps(50.0012), "it reckons where it is, and goes on saying so"
+    say_gps(link, peer, mavlink.GPS_FIX_TYPE_3D_FIX, message, lat_deg=50.0012)
     clock.now_s += 3.0
     peer.heartbeat()
-    assert not has_gps(50.2), "it reckons where it is, and goes on saying so"
+    assert not has_gps(50.00121), "its receiver has fallen silent"
 
 
 def test_a_silent_autopilot_is_asked_where_it_is_until_it_says_so(link_and_peer, clock):

@@ -183,6 +183,22 @@ def test_heat_counters_of_x86_that_move_are_throttling(tree, clock):
     assert watch.look().throttled is False
 
 
+def test_heat_counters_that_go_and_come_back_are_none(tree, clock):
+    path = f"{CPU}/cpu0/thermal_throttle/core_throttle_count"
+    root = tree({path: "1700\n"})
+    watch = ThermalWatch(root, clock)
+    watch.look()
+    (root / path).unlink()  # its core is switched off
+    for count in (None, "1700\n", "3\n"):
+        if count:
+            tree({path: count})
+        clock.sleep(SLOW_S)
+        assert watch.look().throttled is False
+    tree({path: "4\n"})
+    clock.sleep(SLOW_S)
+    assert watch.look().throttled is True
+
+
 def trips(**points):
     return {
         f"{ZONE}0/trip_point_{n}_{what}": f"{value}\n"

@@ -63,10 +63,20 @@ def test_a_score_too_low_for_one_query_is_too_low_for_the_newest():
     index = empty_index(TechniqueSpec("test", {}, PartSpec((1,), "<f4")), PLACES, None)
     index.place_ids[:] = np.arange(PLACES)
     for query, score in enumerate((0.5, 0.4, 0.3)):
-        slots = np.array([5 + query])
-        sequence.follow(Ranking(slots, np.array([score], np.float32), (FineMatch(score),)), index, float(query))
+        slots, scores = np.array([5 + query, 50, 60]), np.array([score, 0.1, 0.1], np.float32)
+        sequence.follow(Ranking(slots, scores, tuple(map(FineMatch, scores))), index, float(query))
     assert sequence.goes_on(near, min_score=0.3 - 1e-6)
     assert not sequence.goes_on(near, min_score=0.31)
+
+
+def test_a_place_that_the_newest_query_was_not_compared_with_is_not_seen():
+    sequence, near = Sequence(3), abs(np.arange(PLACES) - 7) <= 2
+    index = empty_index(TechniqueSpec("test", {}, PartSpec((1,), "<f4")), PLACES, None)
+    index.place_ids[:] = np.arange(PLACES)
+    for query, (slot, score) in enumerate([(5, 0.9), (60, 0.1), (20, 0.1)]):
+        ranking = Ranking(np.array([slot]), np.array([score], np.float32), (FineMatch(score),))
+        sequence.follow(ranking, index, float(query))
+    assert not sequence.goes_on(near, min_score=0.0)
 
 
 def test_an_aircraft_twice_as_fast_is_told_why():
@@ -77,5 +87,8 @@ def test_the_margin_of_a_mean_is_that_of_one_query_over_the_root_of_their_number
     technique, config = create("hog"), load_config(None).match
     assert accept_rule(technique, config, 9).min_margin == pytest.approx(technique.min_margin / math.sqrt(9))
     assert accept_rule(technique, config).min_margin == technique.min_margin
+    assert accept_rule(technique, config, 40).min_margin == accept_rule(technique, config, 10).min_margin
+    technique.min_margin = 1.0  # what is never to be accepted is not in a sequence either
+    assert accept_rule(technique, config, 9).min_margin == 1.0
     told = load_config(None, {"match.min_margin": 0.2}).match
     assert accept_rule(technique, told, 9).min_margin == 0.2

@@ -1,7 +1,9 @@
 """`edgevpr models`: what is listed, tried, added and refused."""
 
+import errno
 import hashlib
 import json
+import os
 
 import pytest
 from tiny_networks import CARD, write_card, write_network
@@ -185,3 +187,35 @@ def test_which_technique_shows_what_a_network_is_worth(models):
     write_network(models, "backbone", card={"outputs": {"features": "features"}})
     assert technique_with("mine") == ("mine", {})
     assert technique_with("backbone") == ("rmac", {"model": "backbone"})
+
+
+def test_a_card_called_like_a_technique_is_not_said_to_be_it(models):
+    write_network(models, "hog")
+    assert listed("hog").techniques == ()
+    assert technique_with("hog") == ("calc", {"model": "hog"})
+
+
+class TooLarge:
+    """Ends the process that it is sent to, as the kernel does where memory runs out."""
+
+    file_path = "large.onnx"
+
+    def __reduce__(self):
+        return os._exit, (9,)
+
+
+def test_a_network_that_ends_the_process_that_tries_it_is_one_sentence():
+    with pytest.raises(ModelError, match=r"large\.onnx ended the process that tried it"):
+        verify(TooLarge())
+
+
+@pytest.mark.usefixtures("tried_here")
+def test_a_full_disk_leaves_nothing_half_written(models, download, monkeypatch):
+    def full(_source, target):
+        target.write_bytes(b"the first half")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("edgevpr.runtime.models.shutil.copyfile", full)
+    with pytest.raises(OSError, match="No space left"):
+        add(download / "mine.onnx", download / "mine.yaml")
+    assert not list(models.iterdir())

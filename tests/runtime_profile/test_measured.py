@@ -84,6 +84,32 @@ def test_a_file_that_cannot_be_read_is_said_and_not_used(tmp_path, text):
     assert refused.startswith(f"{path} holds no figures that can be read: ")
 
 
+@pytest.mark.parametrize(
+    ("keys", "value"),
+    [
+        (["trials", 0, "costs", "encode", "wall_s"], "fast"),
+        (["trials", 0, "costs", "encode", "wall_s"], -1.0),
+        (["trials", 0, "costs", "match_per_place", "cpu_s"], 0),
+        (["trials", 0, "costs", "scan_per_place", "cpu_s"], float("nan")),
+        (["trials", 1, "costs", "process_mb"], None),
+        (["trials", 0, "settings"], None),
+        (["trials", 0, "parameters"], [1]),
+        (["score", "single"], 0),
+        (["score", "products"], "quick"),
+    ],
+)
+def test_figures_that_are_none_are_said_and_not_used(kept, keys, value):
+    fields = json.loads(kept.read_text())
+    at = fields
+    for key in keys[:-1]:
+        at = at[key]
+    at[keys[-1]] = value
+    kept.write_text(json.dumps(fields))
+    found, refused = load(kept)
+    assert found is None
+    assert refused.startswith(f"{kept} holds no figures that can be read: ")
+
+
 def test_another_version_of_the_file_is_said_and_no_file_is_nothing_to_say(kept):
     kept.write_text('{"format": 2}')
     assert load(kept)[1].startswith(f"{kept} is of another version of edgevpr")
@@ -145,8 +171,11 @@ def test_a_file_is_replaced_as_a_whole_or_stays_as_it_was(kept, monkeypatch):
 def test_where_nothing_can_be_written_is_said_before_the_work(tmp_path, monkeypatch):
     with pytest.raises(UsageError, match="there is no such folder: make it first"):
         require_room(tmp_path / "no" / "m.json", make=False)
+    (tmp_path / "folder.json").mkdir()
     with pytest.raises(EdgevprError, match="cannot be written"):
-        require_room(tmp_path, make=False)
+        require_room(tmp_path / "folder.json", make=False)
+    with pytest.raises(UsageError, match="the name of a file of figures ends in"):
+        require_room(tmp_path / "valley.gpkg", make=False)
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     require_room(default_path(), make=True)
     assert default_path() == tmp_path / "data/edgevpr/measured.json"

@@ -15,11 +15,11 @@ from pictures import textured
 from edgevpr.cli import main
 from edgevpr.config import load_config
 from edgevpr.resources import shipped
-from edgevpr.runtime import service
+from edgevpr.runtime import flight as loop
+from edgevpr.runtime.flight import Flight
 from edgevpr.runtime.flightlog import FlightLog, read_log
 from edgevpr.runtime.governor import Reading
 from edgevpr.runtime.pipeline import open_learning, open_pipeline
-from edgevpr.runtime.service import Flight
 from edgevpr.types import Frame
 
 PLACES = 30
@@ -76,7 +76,7 @@ class Script:
     def __init__(self, flight, readings, monkeypatch):
         self._readings, self._now_s = list(readings), 0.0
         self._look = flight._governor.look
-        monkeypatch.setattr(type(flight._meter), "age_s", property(lambda meter: service._GOVERN_S))
+        monkeypatch.setattr(type(flight._meter), "age_s", property(lambda meter: loop._GOVERN_S))
         monkeypatch.setattr(flight._governor, "look", self._scripted)
 
     def _scripted(self, now_s, reading):
@@ -103,8 +103,8 @@ def governed(config, log, readings, monkeypatch, count):
 def test_a_change_is_logged_and_announced_once_and_taken_back(maps, tmp_path, monkeypatch, caplog):
     config = load_config(None, {"map": str(maps / "cohog.gpkg"), "source.rate_hz": 60.0})
     statuses = []
-    monkeypatch.setattr(service, "notify", lambda **said: statuses.append(said.get("STATUS", "")))
-    monkeypatch.setattr(service, "_HEALTH_S", 0.0)
+    monkeypatch.setattr(loop, "notify", lambda **said: statuses.append(said.get("STATUS", "")))
+    monkeypatch.setattr(loop, "_HEALTH_S", 0.0)
     changes, _, texts = governed(config, tmp_path / "log", [BUSY] * 2 + [CALM] * 3, monkeypatch, 8)
     down, back = changes
     asked, half = {"rate_hz": 60.0, "candidates": 40, "form": None}, {"rate_hz": 30.0, "candidates": 40, "form": None}
@@ -129,9 +129,9 @@ def test_a_lower_rate_is_kept(maps, tmp_path, monkeypatch):
 
 def test_fewer_candidates_are_compared_when_the_rate_is_at_its_least(maps, tmp_path, monkeypatch):
     compared = []
-    step = service.Pipeline.step
+    step = loop.Pipeline.step
     monkeypatch.setattr(
-        service.Pipeline, "step", lambda self, *asked: (compared.append(self.candidates), step(self, *asked))[1]
+        loop.Pipeline, "step", lambda self, *asked: (compared.append(self.candidates), step(self, *asked))[1]
     )
     config = load_config(None, {"map": str(maps / "cohog.gpkg"), "source.rate_hz": 60.0})
     changes, _, texts = governed(config, tmp_path / "log", [BUSY] * 99, monkeypatch, 12)
@@ -147,9 +147,9 @@ def test_memory_that_runs_short_loads_the_index_in_a_smaller_form_and_places_are
 ):
     config = load_config(None, {"map": str(maps / "hog.gpkg"), "source.rate_hz": 60.0})
     held = []
-    step = service.Pipeline.step
+    step = loop.Pipeline.step
     monkeypatch.setattr(
-        service.Pipeline, "step", lambda self, *asked: (held.append(self.index.nbytes), step(self, *asked))[1]
+        loop.Pipeline, "step", lambda self, *asked: (held.append(self.index.nbytes), step(self, *asked))[1]
     )
     full = Reading(0.01, 0.0, 0.97 * open_pipeline(config).board.memory_max_mb, 40.0, False)
     changes, lines, texts = governed(config, tmp_path / "log", [full] * 4 + [CALM] * 6, monkeypatch, 12)
@@ -215,29 +215,33 @@ def share_of(core):
     allowed = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {core})
     try:
-        until_s, before_s = time.monotonic() + 0.3, time.thread_time()
+        until_s, before_s = time.monotonic() + 0.6, time.thread_time()
         while time.monotonic() < until_s:
             pass
-        return (time.thread_time() - before_s) / 0.3
+        return (time.thread_time() - before_s) / 0.6
     finally:
         os.sched_setaffinity(0, allowed)
 
 
 def wait_for_change(log, number, flight):
-    give_up_s = time.monotonic() + 60
+    give_up_s = time.monotonic() + 30
     while time.monotonic() < give_up_s and flight.poll() is None:
         changes = [line for line in read_log(log) if line["kind"] == "governor"] if log.exists() else []
         if len(changes) >= number:
             return changes
         time.sleep(0.05)
-    pytest.fail(f"no change number {number} in the log; the flight says: {flight.poll()}")
+    last = [line for line in read_log(log) if line["kind"] == "query"][-60:]
+    ran_s = sum(line["costs"]["cpu_s"] for line in last)
+    if number > 1 and ran_s < 0.9 * sum(line["costs"]["t_encode_s"] + line["costs"]["t_match_s"] for line in last):
+        pytest.skip("other programs than the test's own go on to take the core")
+    pytest.fail(f"no change number {number} in the log; the flight has ended with: {flight.poll()}")
 
 
 def test_a_flight_that_must_share_its_core_asks_less_often_until_it_has_it_back(maps, tmp_path):
     if not shutil.which("taskset"):
         pytest.skip("this machine has no taskset")
-    core = max(os.sched_getaffinity(0), key=share_of)
-    if share_of(core) < 0.8:
+    core = next((core for core in sorted(os.sched_getaffinity(0))[:4] if share_of(core) > 0.9), None)
+    if core is None:
         pytest.skip("other programs take every core of this machine")
     through = ["taskset", "-c", str(core)]
     rate_hz = 0.65 / cost_s(maps, tmp_path, through)  # it needs two thirds of the core, and of two programs gets half

@@ -53,6 +53,7 @@ def test_the_rate_is_lowered_first_then_the_candidates_then_the_form():
     changes = flight.fly(60)
     assert [change.after for change in changes[:-1]] == list(settings[1:])
     assert [change.before for change in changes[:-1]] == list(settings[:-1])
+    assert {b - a for (a, _), (b, _) in itertools.pairwise(flight.changes)} == {4.0}, "each step is given time to tell"
     assert changes[0].why == "90% of all cores taken, and 50% allowed"
     assert changes[-1] == Change(
         settings[-1], settings[-1], "90% of all cores taken, and 50% allowed, and nothing is left to lower"
@@ -154,6 +155,32 @@ def test_it_cools_between_two_steps_for_heat():
     assert [b - a for a, b in itertools.pairwise(at_s)] == [20.0, 20.0]
 
 
+def test_after_heat_it_goes_back_no_faster_than_it_went():
+    flight = Flight(lambda setting, now_s: Reading(0.1, 0.0, 100.0, 85.0 if now_s <= 30 else 60.0, None))
+    flight.fly(120)
+    assert flight.governor.setting == ASKED
+    back_at_s = [at for at, change in flight.changes if change.back]
+    assert min(b - a for a, b in itertools.pairwise([30.0, *back_at_s])) >= 20
+
+
+def wait_s(flight, trouble_s):
+    """How long after this long a trouble all is as it was asked."""
+    until_s = flight.now_s + trouble_s
+    flight.reading = lambda setting, now_s: BUSY if now_s <= until_s else CALM
+    flight.fly(trouble_s)
+    while flight.governor.setting != ASKED:
+        flight.fly(1)
+    return flight.now_s - until_s
+
+
+def test_the_wait_doubles_with_each_failure_and_begins_anew_when_all_was_well_for_long():
+    flight = Flight(lambda setting, now_s: CALM, settings=steps(ASKED, keeps_rate=False, compares=False))
+    assert [wait_s(flight, 5) for _ in range(3)] == [7, 13, 25]
+    assert wait_s(flight, 13) == 3 * 49, "one failure, however many steps it takes"
+    flight.fly(600)
+    assert wait_s(flight, 5) == 7
+
+
 def test_without_a_temperature_a_board_that_throttles_is_believed():
     flight = Flight(lambda setting, now_s: Reading(0.1, 0.0, 100.0, None, None))
     assert flight.fly(600) == []
@@ -224,3 +251,14 @@ def test_memory_and_load_may_both_ask_for_a_form_and_each_is_given_back_for_itse
     trouble["mb"] = 100.0
     flight.fly(600)
     assert flight.governor.setting.form == "float"
+
+
+def test_a_form_that_load_took_comes_back_only_where_it_fits():
+    settings = steps(Setting(1.0, 1, "float"), keeps_rate=True, compares=False, forms=FORMS[1:])
+    flight = Flight(lambda setting, now_s: BUSY, settings, FORMS_MB)
+    flight.fly(60)
+    other_mb = [400.0]  # taken meanwhile
+    flight.reading = lambda setting, now_s: Reading(0.01, 0.0, other_mb[0] + FORMS_MB[setting.form], None, None)
+    assert flight.fly(600) == []
+    other_mb[0] = 150.0
+    assert [change.after.form for change in flight.fly(600)] == ["8bit", "float"]

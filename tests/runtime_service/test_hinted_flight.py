@@ -13,11 +13,11 @@ from edgevpr.cli import main
 from edgevpr.config import load_config
 from edgevpr.mavlink.link import VehiclePosition
 from edgevpr.places.mapfile import PlaceMap
+from edgevpr.runtime.flight import Flight
 from edgevpr.runtime.flightlog import FlightLog, read_log
 from edgevpr.runtime.frames import open_source
 from edgevpr.runtime.mapping import build_map
 from edgevpr.runtime.pipeline import open_pipeline
-from edgevpr.runtime.service import Flight
 from edgevpr.techniques import create
 from edgevpr.types import Frame
 

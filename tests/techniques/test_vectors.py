@@ -110,7 +110,17 @@ def test_numbers_beyond_half_precision_are_an_error_and_not_infinite():
 
 def test_a_vector_of_zeros_says_that_it_says_nothing():
     assert Given().encode(np.zeros(LENGTH, np.float32)).quality == 0
+    assert Given(similarity="l2").encode(np.full(LENGTH, 1e-9, np.float32)).quality == 0  # zeros in half precision
     assert Given().encode(places(1)[0]).quality == 1
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_picture_of_nothing_is_like_no_place_not_even_like_another_of_nothing(form):
+    technique, nothing = Given(form), Given().encode(np.zeros(LENGTH, np.float32))
+    coarse = np.stack([nothing.coarse, *(technique.encode(place).coarse for place in places(5))])
+    mean = coarse.astype(np.float32).mean(axis=0)
+    rows = coarse if form == "float" else technique.pack(coarse, mean)
+    assert not technique.coarse_scores(nothing, rows, mean)[0].any()
 
 
 @pytest.mark.parametrize("similarity", ["cosine", "l1", "l2"])

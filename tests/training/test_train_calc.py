@@ -144,6 +144,15 @@ def test_the_command_makes_a_model_that_edgevpr_opens(folder, tmp_path, capsys, 
     assert open_backbone("mine", "features").shape == (128, 16, 21)
 
 
+def test_a_file_that_differs_is_not_left_and_another_try_goes_on(folder, tmp_path, capsys, monkeypatch):
+    with monkeypatch.context() as patched:
+        patched.setattr(export, "LARGEST_DIFFERENCE", -1.0)
+        assert train(folder, tmp_path / "mine.onnx") == 1
+    assert "run the command again with --resume" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.checkpoint"]
+    assert train(folder, tmp_path / "mine.onnx", "--resume") == 0
+
+
 def test_interrupted_the_command_keeps_what_was_done(folder, tmp_path, capsys, monkeypatch):
     one_step = calc.Training._one_step
 

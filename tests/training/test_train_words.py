@@ -102,6 +102,15 @@ def test_what_makes_no_sense_is_refused(folder, own_models, capsys):
     assert "is there already" in capsys.readouterr().err
 
 
+def test_a_whitening_of_pictures_that_are_all_alike_is_refused(folder, own_models, capsys):
+    first, *others = sorted(folder.iterdir())
+    for other in others:
+        shutil.copyfile(first, other)
+    assert train(folder, "--kind", "vlad", "--count", "8", "--whiten", "6") == 2
+    assert "The images are all alike" in capsys.readouterr().err
+    assert not list(own_models.glob("*.npz*"))
+
+
 def test_an_unknown_model_is_refused(folder, capsys):
     assert main(["train", "words", "--images", str(folder), "--model", "mina", "--kind", "vlad", "--count", "8"]) == 1
     assert "There is no model `mina`" in capsys.readouterr().err

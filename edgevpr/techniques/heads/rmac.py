@@ -3,10 +3,10 @@
 import numpy as np
 
 from edgevpr.errors import ModelError
+from edgevpr.techniques.heads.vlad import unit
 
 _OVERLAP = 0.4  # of neighbouring regions, wanted (section 3.2)
 _SCALES = 3
-_TINY = 1e-12
 
 
 def square_regions(height: int, width: int) -> list[tuple[int, int, int]]:
@@ -38,17 +38,13 @@ def regional_vectors(features: np.ndarray, regions: list[tuple[int, int, int]]) 
     which would have to be learned.
     """
     vectors = np.stack([features[:, y : y + side, x : x + side].max(axis=(1, 2)) for y, x, side in regions])
-    return _unit(np.sign(vectors) * np.sqrt(np.abs(vectors))).astype(np.float32, copy=False)
+    return unit(np.sign(vectors) * np.sqrt(np.abs(vectors))).astype(np.float32, copy=False)
 
 
 def aggregate(vectors: np.ndarray) -> np.ndarray:
     """The sum of the regional vectors, L2-normalised (section 3.2): (R, C) -> float32 (C,)."""
-    return _unit(vectors.sum(axis=0))
+    return unit(vectors.sum(axis=0))
 
 
 def _starts(length: int, side: int, count: int) -> list[int]:
     return [i * (length - side) // max(count - 1, 1) for i in range(count)]
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), _TINY)

@@ -50,11 +50,6 @@ def intra_normalised(sums: np.ndarray) -> np.ndarray:
     return unit(unit(sums).ravel())
 
 
-def root_normalised(sums: np.ndarray) -> np.ndarray:
-    """Signed square root of each value (Jégou et al. 2012), then the whole to length 1: (K, D) -> float32 (K D,)."""
-    return unit((np.sign(sums) * np.sqrt(np.abs(sums))).ravel())
-
-
 def nearest(local: np.ndarray, words: np.ndarray) -> np.ndarray:
     """The number of the word nearest to each descriptor: (N, D), (K, D) -> int (N,); of equals the first."""
     return _closeness(local, words).argmax(axis=1)

@@ -12,7 +12,7 @@ from functools import cached_property
 from pathlib import Path
 
 from edgevpr.config import bounded, build, read_yaml
-from edgevpr.errors import ModelError
+from edgevpr.errors import ConfigError, ModelError
 from edgevpr.resources import model_folders
 from edgevpr.types import TechniqueSpec
 
@@ -137,12 +137,14 @@ def card_names() -> tuple[str, ...]:
 
 
 def load_card(name: str) -> Card:
-    """The card called `name`. Raises ModelError where there is none, and ConfigError or ModelError for one that does
-    not say what it must."""
+    """The card called `name`. Raises ModelError where there is none, and for one that does not say what it must."""
     for folder in model_folders():
         path = folder / f"{name}.yaml"
         if "/" not in name and path.is_file():
-            return read_card(path)
+            try:
+                return read_card(path)
+            except ConfigError as error:  # it keeps one network on the ground, and is no wrong request of the user's
+                raise ModelError(str(error)) from error
     near = difflib.get_close_matches(name, card_names(), n=1)
     known = ", ".join(card_names()) or "there are none yet"
     raise ModelError(

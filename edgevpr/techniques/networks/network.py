@@ -10,14 +10,19 @@ import numpy as np
 from edgevpr.techniques.heads import pooling, projection, rmac, vlad, words
 from edgevpr.techniques.networks.card import Card, head_parameters
 from edgevpr.techniques.networks.session import Backbone, backbone_of
-from edgevpr.techniques.vectors import VectorTechnique
+from edgevpr.techniques.vectors import NEVER, VectorTechnique
 
 Head = Callable[[np.ndarray], np.ndarray]
 
 
 class CardNetwork(VectorTechnique):
     """The network of a card: the vector that it puts out or, where the card names a head, what that makes of the
-    feature map. All of it is in the model hash of a map, so there are no parameters."""
+    feature map. All of it is in the model hash of a map, so there are no parameters.
+
+    Nobody has measured how far ahead its wrong matches are: none is accepted until the configuration says from when on.
+    """
+
+    min_margin = NEVER
 
     def __init__(self, card: Card, form: str = "float", threads: int = 1) -> None:
         self._backbone = backbone_of(card, "descriptor" if card.head is None else "features", threads)
@@ -27,6 +32,7 @@ class CardNetwork(VectorTechnique):
         noise = np.random.default_rng(0).integers(0, 256, (card.input.height, card.input.width), np.uint8)
         length = len(self.vector(noise, None))  # a feature map too small for the head is said here
         super().__init__(card.name, {}, length, form, card.similarity, sha256)
+        self.encode(noise)  # and so are numbers that half precision does not hold
 
     def vector(self, image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
         """uint8 (H, W[, 3]) -> float32 (D,)."""

@@ -11,13 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from edgevpr.errors import ModelError
+from edgevpr.errors import ModelError, UsageError
 from edgevpr.techniques.networks.card import Card, load_card
 from edgevpr.techniques.networks.prepare import prepare, without_masked
 
 _RANKS = {"descriptor": 2, "features": 4}
 _FORMS = {"descriptor": "(1, D)", "features": "(1, C, H, W)"}
 _SEED = 7
+_MOST_THREADS = 256
+_LARGEST = 1e12  # in float32 the length of a vector of much larger numbers is infinite, and the vector nothing
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +35,7 @@ class Backbone:
 
     def run(self, image: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
         """uint8 (H, W[, 3]) -> float32 of `shape`; pixels where bool (H, W) `mask` is False are filled with the mean of
-        the others. Raises ModelError for a result with NaN or infinities, and for one of zeros only."""
+        the others. Raises ModelError for a result with NaN or numbers without measure, and for one of zeros only."""
         return _run(self.card, self.output, self.session, without_masked(image, mask))
 
 
@@ -41,13 +43,16 @@ def open_backbone(model: str, output: str, threads: int = 1) -> Backbone:
     """The network of the card `model`, for its output "features" or "descriptor".
 
     Raises ModelError, one sentence: no onnxruntime, no card, no file or another one than the card's, no ONNX, inputs or
-    outputs of another form, axes without a size, a result that is not finite or says nothing.
+    outputs of another form, axes without a size, a result that is not finite or says nothing. UsageError for a number
+    of threads that makes no sense.
     """
     return backbone_of(load_card(model), output, threads)
 
 
 def backbone_of(card: Card, output: str, threads: int = 1) -> Backbone:
     """`open_backbone` of a card that is at hand."""
+    if not 1 <= threads <= _MOST_THREADS:
+        raise UsageError(f"{card.name} cannot run with threads={threads}: give 1 to {_MOST_THREADS}.")
     if getattr(card.outputs, output) is None:
         raise ModelError(
             f"{card.path} names no output for `{output}`: use another model, or name its ONNX output in "
@@ -165,10 +170,10 @@ def _run(card: Card, output: str, session: Any, image: np.ndarray) -> np.ndarray
             "correct `outputs` of the card."
         )
     values = result[0].astype(np.float32, copy=False)
-    if not np.isfinite(values).all():
+    if not np.abs(values).max() <= _LARGEST:  # so written, NaN is refused as well
         raise ModelError(
-            f"{card.file_path} gives numbers that are not finite for `{name}`: its weights or `input` of its card are "
-            "wrong."
+            f"{card.file_path} gives numbers that are not finite, or beyond {_LARGEST:g}, for `{name}`: its weights or "
+            "`input` of its card are wrong."
         )
     if not values.any():
         raise ModelError(

@@ -121,11 +121,6 @@ def intra_normalised(sums):
     return flat / math.sqrt(sum(v * v for v in flat))
 
 
-def root_normalised(sums):
-    flat = np.array([math.copysign(math.sqrt(abs(v)), v) for v in sums.ravel()])
-    return flat / math.sqrt(sum(v * v for v in flat))
-
-
 def regions(features, count):
     """Fill each region from its first pixel; then the `count` of largest mean: [(channel, set of (y, x), mean)]."""
     found = []

@@ -3,7 +3,7 @@
 import pytest
 from tiny_networks import CARD, write_card, write_network
 
-from edgevpr.errors import ConfigError, EdgevprError, ModelError
+from edgevpr.errors import EdgevprError, ModelError
 from edgevpr.resources import model_folders, shipped
 from edgevpr.techniques.networks.card import card_names, load_card, read_card, weights_of
 from edgevpr.types import PartSpec, TechniqueSpec
@@ -83,7 +83,7 @@ def test_a_wrong_card_is_one_sentence_that_names_it(models, changes, says):
 def test_a_missing_key_and_a_missing_card_are_said(models):
     path = write_card(models / "tiny.yaml", {"sha256": SHA256})
     path.write_text(path.read_text().replace("licence", "#"))
-    with pytest.raises(ConfigError, match="the key `licence` is missing"):
+    with pytest.raises(ModelError, match="the key `licence` is missing"):
         load_card("tiny")
     with pytest.raises(ModelError, match="There is no model `tinny`: did you mean `tiny`"):
         load_card("tinny")

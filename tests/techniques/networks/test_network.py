@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from pictures import textured
-from tiny_networks import FEATURES, write_card, write_network
+from tiny_networks import CARD, FEATURES, write_card, write_network
 
 from edgevpr import techniques
 from edgevpr.errors import ModelError, UsageError
@@ -93,6 +93,21 @@ def test_a_backbone_is_no_technique_and_a_broken_card_hides_nothing_else(models)
         techniques.create("mine")
     with pytest.raises(ModelError, match=r"broken\.yaml: `sha256` must be"):
         techniques.create("broken")
+
+
+def test_numbers_beyond_half_precision_are_said_before_take_off(models):
+    rule = {**CARD["input"], "scale": 1e6}
+    write_network(models, "mine", card={"input": rule, "similarity": "l2"})
+    with pytest.raises(ModelError, match="beyond half precision"):
+        techniques.create("mine")
+    write_network(models, "mine", card={"input": rule})
+    assert techniques.create("mine").encode(textured(1)).quality == 1
+
+
+def test_nothing_is_accepted_of_a_network_that_nobody_has_measured(models):
+    write_network(models, "mine")
+    for form in ("float", "8bit", "1bit"):
+        assert techniques.create("mine", {"form": form}).min_margin > 1
 
 
 def test_a_card_may_be_called_like_a_technique(models):

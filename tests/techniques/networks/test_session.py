@@ -8,7 +8,7 @@ import pytest
 from pictures import textured
 from tiny_networks import CARD, FEATURES, HEIGHT, WIDTH, write_card, write_network
 
-from edgevpr.errors import ModelError
+from edgevpr.errors import ModelError, UsageError
 from edgevpr.techniques.networks import session
 from edgevpr.techniques.networks.session import open_backbone
 
@@ -55,7 +55,7 @@ def test_masked_pixels_do_not_count(models):
         ("other size", r"input is tensor\(float\) \(1, 1, 24, 40\) and the card says float \(1, 1, 24, 32\)"),
         ("double", r"input is tensor\(double\)"),
         ("two inputs", "has 2 inputs"),
-        ("nan", "not finite for `features`"),
+        ("nan", "not finite, or beyond .* for `features`"),
         ("zeros", "nothing but zeros for `features`"),
     ],
 )
@@ -102,6 +102,8 @@ def test_a_picture_of_which_nothing_is_made_is_refused_in_flight_too(models):
     backbone = open_backbone("tiny", "features")
     with pytest.raises(ModelError, match="not finite"):
         session._run(backbone.card, "features", FakeSession(np.full((1, *FEATURES), np.inf, np.float32)), textured(1))
+    with pytest.raises(ModelError, match="beyond 1e\\+12"):  # its length is infinite in float32: all would become zero
+        session._run(backbone.card, "features", FakeSession(np.full((1, *FEATURES), 1e30, np.float32)), textured(1))
     with pytest.raises(ModelError, match="nothing but zeros"):
         session._run(backbone.card, "features", FakeSession(np.zeros((1, *FEATURES), np.float32)), textured(1))
 
@@ -118,6 +120,13 @@ class FakeSession:
     def run(self, names, feed):
         assert feed["picture"].shape == (1, 1, HEIGHT, WIDTH)
         return [self._result]
+
+
+@pytest.mark.parametrize("threads", [-3, 0, 1000])
+def test_a_number_of_threads_that_makes_no_sense_is_a_wrong_request(models, threads):
+    write_network(models)
+    with pytest.raises(UsageError, match=rf"threads={threads}: give 1 to 256"):
+        open_backbone("tiny", "features", threads)
 
 
 def test_a_file_that_changes_on_the_disk_is_noticed_by_the_next_process(models):
