@@ -10,6 +10,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
 
 import json
 from dataclasses import asdict
+from datetime import datetime, timezone
 from pathlib import Path
 
 import bench_encode
@@ -17,14 +18,14 @@ import bench_flight
 import bench_match
 import bench_scan
 import bench_two_stage
-from run_sets import provenance
+from run_sets import commit_of, machine
 
 RESULTS = Path(__file__).resolve().parent / "results"
 
 
 def main() -> None:
     RESULTS.mkdir(exist_ok=True)
-    made_by = provenance()
+    made_by = {"date": datetime.now(timezone.utc).strftime("%Y-%m-%d"), "commit": commit_of(), "machine": machine()}
     measured = {}
     for name, measure in {
         "encode": bench_encode.rows,
@@ -70,7 +71,7 @@ def plot_growth(rows: list[dict], path: Path) -> None:
 
 def report(measured: dict, made_by: dict) -> str:
     """The page for people."""
-    machine = made_by["machine"]
+    ran_on = made_by["machine"]
     binary = "\n".join(
         f"| {row['what']} | {row['t_ms']:.2f} | {row['gb_per_s']:.1f} | {row['of_byte_sum']:.0%} "
         f"| {row['of_word_sum']:.0%} |"
@@ -83,8 +84,8 @@ def report(measured: dict, made_by: dict) -> str:
     return f"""# Speed and memory
 
 Made by `make bench` on {made_by["date"]}, commit {made_by["commit"]}.
-Machine: {machine["cpu"]}, {machine["cores"]} cores; one thread; Python {machine["python"]}, NumPy {machine["numpy"]},
-OpenCV {machine["opencv"]}. Medians; ratios are taken turn by turn in one interleaved run.
+Machine: {ran_on["cpu"]}, {ran_on["cores"]} cores; one thread; Python {ran_on["python"]}, NumPy {ran_on["numpy"]},
+OpenCV {ran_on["opencv"]}. Medians; ratios are taken turn by turn in one interleaved run.
 
 ## Encoding a frame
 

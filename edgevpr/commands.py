@@ -507,7 +507,7 @@ def _verified_text(verified: "Verified") -> str:
     vector = f"a descriptor of {verified.vector_length} numbers, " if verified.vector_length else ""
     return (
         f"{verified.name}: {verified.title}\n"
-        f"  works: {shapes}; {vector}{verified.image_ms:.1f} ms an image with {verified.threads} threads, "
+        f"  works: {shapes}; {vector}{verified.image_ms:.1f} ms an image, threads: {verified.threads}, "
         f"{verified.network_mb:.0f} MB of RAM beside {verified.runtime_mb:.0f} of onnxruntime, "
         f"{verified.file_mb:.2f} MB on disk"
     )
