@@ -19,10 +19,13 @@ def plot(results: Mapping[str, Sequence[TechniqueResult]], path: Path) -> None:
     columns = min(len(results), _PANELS_A_ROW)
     rows = -(-len(results) // columns)
     drawn = figure(5.2 * columns, 4.6 * rows)
+    # A technique looks the same in every panel, whatever is beside it and in whatever order the key is.
+    names = dict.fromkeys(result.technique for compared in results.values() for result in compared)
+    looks = {name: look for look, name in enumerate(names)}
     for at, (title, compared) in enumerate(results.items(), start=1):
         axes = drawn.add_subplot(rows, columns, at)
-        # Always the same look for the same technique, in whatever order the key is.
-        for number, result in sorted(enumerate(compared), key=lambda pair: -pair[1].auc):
+        for result in sorted(compared, key=lambda result: -result.auc):
+            number = looks[result.technique]
             precision, recall = zip(*result.precision_recall, strict=True)
             axes.plot(
                 recall,
