@@ -14,6 +14,21 @@ CURVES = "curves.png"
 # What is drawn: the forms of a vector, and what is the same technique under other conditions, would hide the rest.
 _NOT_DRAWN = (" 8bit", " 1bit", ", exact", ", one frame")
 
+# Recall@1 on corridor with the papers' own weights, from the similarity matrices that the thesis's authors published
+# with their benchmark (VPR-Bench), and what is different here.
+SMALL = "the small network that is shipped stands in for a large one trained for places or ImageNet"
+PUBLISHED = {
+    "cohog, thesis": (0.622, "the true gradient magnitude, regions in 8 bits"),
+    "hog": (0.477, "512x512 pixels in cells of 8, of the root of the image"),
+    "calc, original weights": (0.324, "the same weights and preparation"),
+    "calc": (0.324, "other weights"),
+    "alexnet": (0.685, SMALL),
+    "amosnet": (0.847, SMALL),
+    "hybridnet": (0.901, SMALL),
+    "netvlad": (0.676, SMALL),
+    "region_vlad": (0.432, SMALL),
+}
+
 
 def result(row: dict[str, Any]) -> TechniqueResult:
     """A row of a file as what it was."""
@@ -116,6 +131,21 @@ Weights in use:
 Distance between the GPS positions of the query and of the place it was matched to: median / 90 % / worst (how many).
 All queries with a position are in it, those too that show nothing of the map. The error cannot be smaller than the
 distance to the nearest place, and GPS on these cameras is noisy: 10 to 20 m off (caliterra), tens of metres (swindale).
+"""
+    corridor = next((content["techniques"] for content in contents if content["set"] == "corridor"), {})
+    beside = [
+        [name, f"{theirs:.3f}", f"{ours:.3f}", f"{ours - theirs:+.3f}", different]
+        for name, (theirs, different) in PUBLISHED.items()
+        if (ours := corridor.get(name, {}).get("recall_at_1")) is not None
+    ]
+    if beside:
+        page += f"""
+## Beside the published figures
+
+Recall@1 on corridor; published: computed from the similarity matrices that the thesis's authors gave out with their
+benchmark (VPR-Bench), each technique with its paper's weights.
+
+{tables.markdown(("technique", "published", "here", "difference", "what is different here"), beside)}
 """
     if left_out:
         page += "\n## Left out\n\n"
