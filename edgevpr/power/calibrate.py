@@ -47,13 +47,14 @@ class Calibration:
 
     @property
     def verified(self) -> bool:
-        """Whether these are watts at the board's input: the CPU package alone is less than the board draws."""
-        return self.meter.covers == "board"
+        """Whether these are watts at the board's input: the CPU package alone is less than the board draws, and how a
+        meter is wired may only be taken to be so."""
+        return self.meter.covers == "board" and self.meter.certain
 
     @property
     def source(self) -> str:
         """What a profile says of its figures."""
-        doubt = "" if self.verified else "CPU only, the rest of the board draws more; "
+        doubt = "" if self.meter.covers == "board" else "CPU only, the rest of the board draws more; "
         return (
             f"{doubt}straight line through {len(self.fit.samples)} loads measured on this machine with its "
             f"{self.meter.title}; residual {self.fit.residual_w:.2g} W, R2 {self.fit.r2:.3f}"

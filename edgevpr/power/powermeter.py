@@ -34,7 +34,8 @@ class Meter:
     rest of the machine draws more) or "rail" (some other part).
 
     `kind` is "ina", "rapl" or "pmic"; `period_s` is how often reading it makes sense; the counters of a meter with
-    `wraps_j` start again from 0 after so many joules, one number a counter.
+    `wraps_j` start again from 0 after so many joules, one number a counter. A meter is not `certain` where its title
+    says what is only taken to be so.
     """
 
     kind: Literal["ina", "rapl", "pmic"]
@@ -43,6 +44,7 @@ class Meter:
     period_s: float
     look: Callable[[], tuple[float, ...]]
     wraps_j: tuple[float, ...] = ()
+    certain: bool = True
 
     def read(self, clock: Callable[[], float] = time.monotonic) -> PowerSample:
         """Read once, stamped with the middle of the reading. Raises MeterError."""

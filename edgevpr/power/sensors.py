@@ -48,7 +48,7 @@ def _ina_meters(root: Path) -> Iterator[Meter]:
             label = _text(folder / "in1_label")
             where = f", channel {label}" if label else ", taken to be wired to the board's input"
             covers = "board" if label is None or label in _INPUT_RAILS else "rail"
-            yield _ina_channel(folder, 1, f"{name.upper()} ({folder.name}){where}", covers)
+            yield _ina_channel(folder, 1, f"{name.upper()} ({folder.name}){where}", covers, label is not None)
         elif name == "ina3221":
             for channel in (1, 2, 3):  # in4 to in7 are shunt voltages
                 if _text(folder / f"in{channel}_enable") == "0" or not (folder / f"curr{channel}_input").exists():
@@ -58,7 +58,9 @@ def _ina_meters(root: Path) -> Iterator[Meter]:
                 yield _ina_channel(folder, channel, f"INA3221 ({folder.name}), channel {label}", covers)
 
 
-def _ina_channel(folder: Path, channel: int, title: str, covers: Literal["board", "rail"]) -> Meter:
+def _ina_channel(
+    folder: Path, channel: int, title: str, covers: Literal["board", "rail"], certain: bool = True
+) -> Meter:
     power = folder / f"power{channel}_input"
 
     def look() -> tuple[float, ...]:
@@ -68,7 +70,7 @@ def _ina_channel(folder: Path, channel: int, title: str, covers: Literal["board"
         current_ma = number(folder / f"curr{channel}_input")
         return (number(folder / f"in{channel}_input") * (0.0 if -5 < current_ma < 0 else current_ma) / 1e6,)
 
-    return Meter("ina", title, covers, 0.05, look)
+    return Meter("ina", title, covers, 0.05, look, certain=certain)
 
 
 def _rapl_meters(root: Path, notes: list[str]) -> Iterator[Meter]:
@@ -110,6 +112,7 @@ def _pmic_meters(root: Path) -> Iterator[Meter]:
             "board",
             0.5,  # a reading starts a process: more often would be a load of its own
             lambda: (_pmic_w(program),),
+            certain=False,
         )
 
 

@@ -2,6 +2,7 @@
 
 import time
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -88,8 +89,11 @@ def test_a_board_is_calibrated_with_what_the_whole_machine_did(tree, clock):
     calibration = run(Board(tree, clock))
     assert (calibration.fit.idle_w, calibration.fit.full_w) == pytest.approx((2.0, 5.0), abs=0.002)
     assert [u for u, _ in calibration.fit.samples] == pytest.approx([0.04, 0.29, 0.54, 0.79, 1.0], abs=0.002)
-    assert calibration.verified
     assert calibration.source.startswith("straight line through 5 loads measured on this machine with its INA219")
+    assert "taken to be wired to the board's input" in calibration.source
+    assert not calibration.verified, "nobody has said where this meter is"
+    labelled = replace(calibration, meter=replace(calibration.meter, certain=True))
+    assert labelled.verified
 
 
 def test_a_meter_that_goes_while_calibrating_is_one_sentence(tree, clock):
