@@ -6,7 +6,6 @@ where GPS is known, positions.csv.
 """
 
 import argparse
-import hashlib
 import json
 import os
 import platform
@@ -29,6 +28,7 @@ from edgevpr.errors import EdgevprError, UsageError
 from edgevpr.evaluate.dataset import load_dataset
 from edgevpr.evaluate.evaluate import compare, evaluate
 from edgevpr.runtime.progress import progress
+from edgevpr.techniques.networks.session import file_sha256
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 TUNED_ON = ("corridor", "aerial_caliterra")
@@ -138,7 +138,7 @@ def write_original_calc(cards: Path, weights: Path) -> None:
     card |= {
         "title": "CALC, the authors' weights",
         "file": "calc_original.onnx",
-        "sha256": hashlib.sha256(weights.read_bytes()).hexdigest(),
+        "sha256": file_sha256(weights),
         "licence": "see the file's own",
         "source": "Merrill and Huang 2018, as an ONNX file",
         "outputs": {"descriptor": "descriptor", "features": None},

@@ -14,7 +14,7 @@ from edgevpr.evaluate.dataset import Dataset
 from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import rank
-from edgevpr.places.sequence import Sequence, length_of
+from edgevpr.places.sequence import length_of, sequence_of
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import pack_ah, parse_pack, queries_ah, rail_ah, stage_energy_j
 from edgevpr.power.meter import stage
@@ -148,7 +148,7 @@ def _answers(
     length: int,
     progress: Progress,
 ) -> Iterator[_Answer]:
-    sequence = Sequence(length) if length > 1 else None
+    sequence = sequence_of(length)
     # Of a sequence, those that are not scored are a part as well.
     scored = {query.path.name: query for query in dataset.queries}
     asked = list_images(dataset.queries[0].path.parent) if sequence else [query.path for query in dataset.queries]

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 from edgevpr.evaluate.evaluate import TechniqueResult
+from edgevpr.runtime.estimate_text import aligned
 
 QUALITY = ("recall@1", "@5", "@10", "P@100%R", "R@100%P", "AUC", "EP", "ROC", "PCU", "accepted (wrong)")
 COSTS = ("t_e ms", "t_m ms", "t_m/ref ms", "RAM B/place", "disk B/place", "U_e", "U_m", "mAh/query")
@@ -36,11 +37,7 @@ def costs(result: TechniqueResult) -> list[str]:
 
 def text(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Columns in line, the first to the left and the others to the right."""
-    widths = [max(len(line[at]) for line in (headings, *rows)) for at in range(len(headings))]
-    return "\n".join(
-        "  ".join(cell.rjust(width) if at else cell.ljust(width) for at, (cell, width) in enumerate(columns)).rstrip()
-        for columns in (list(zip(line, widths, strict=True)) for line in (headings, *rows))
-    )
+    return "\n".join(aligned([headings, *rows]))
 
 
 def markdown(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

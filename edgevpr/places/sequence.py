@@ -30,6 +30,11 @@ def length_of(technique: Technique, asked: int | None) -> int:
     return asked or getattr(technique, "sequence", 1)
 
 
+def sequence_of(length: int) -> "Sequence | None":
+    """A new sequence of `length` queries; None where each is matched alone."""
+    return Sequence(length) if length > 1 else None
+
+
 def bytes_beside_place(length: int) -> int:
     """What a sequence adds to the resident bytes of a place: a score a query, and that of its rivals."""
     return 4 * (length + 1) if length > 1 else 0

@@ -43,17 +43,20 @@ def find_meters(root: Path = _ROOT) -> Found:
 
 def _ina_meters(root: Path) -> Iterator[Meter]:
     for folder in sorted((root / "sys/class/hwmon").glob("hwmon*")):
-        name = _text(folder / "name")
+        name = machine.text(folder / "name")
         if name in _ONE_CHANNEL:
-            label = _text(folder / "in1_label")
+            label = machine.text(folder / "in1_label")
             where = f", channel {label}" if label else ", taken to be wired to the board's input"
             covers = "board" if label is None or label in _INPUT_RAILS else "rail"
             yield _ina_channel(folder, 1, f"{name.upper()} ({folder.name}){where}", covers, label is not None)
         elif name == "ina3221":
             for channel in (1, 2, 3):  # in4 to in7 are shunt voltages
-                if _text(folder / f"in{channel}_enable") == "0" or not (folder / f"curr{channel}_input").exists():
+                if (
+                    machine.text(folder / f"in{channel}_enable") == "0"
+                    or not (folder / f"curr{channel}_input").exists()
+                ):
                     continue
-                label = _text(folder / f"in{channel}_label") or str(channel)
+                label = machine.text(folder / f"in{channel}_label") or str(channel)
                 covers = "board" if label in _INPUT_RAILS else "rail"
                 yield _ina_channel(folder, channel, f"INA3221 ({folder.name}), channel {label}", covers)
 
@@ -78,7 +81,7 @@ def _rapl_meters(root: Path, notes: list[str]) -> Iterator[Meter]:
     the platform that contains them: adding those would count energy twice."""
     counters, wraps_j = [], []
     for folder in sorted((root / "sys/class/powercap").glob("intel-rapl:*")):
-        if not (_text(folder / "name") or "").startswith("package"):
+        if not (machine.text(folder / "name") or "").startswith("package"):
             continue
         try:
             number(folder / "energy_uj")
@@ -135,10 +138,3 @@ def _pmic_w(program: Path) -> float:
     if not both:
         raise MeterError(f"{program} pmic_read_adc lists no rail with volts and amperes: this firmware cannot be used.")
     return 1.1451 * sum(rails["A"][name] * rails["V"][name] for name in both) + 0.5879
-
-
-def _text(path: Path) -> str | None:
-    try:
-        return path.read_text(errors="replace").strip()
-    except OSError:
-        return None

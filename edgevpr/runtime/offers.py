@@ -9,9 +9,8 @@ from edgevpr.errors import ModelError
 from edgevpr.power.boards import Board
 from edgevpr.runtime.pipeline import made_for
 from edgevpr.techniques import labelled
+from edgevpr.techniques.vectors import FORMS
 from edgevpr.types import Technique
-
-FORMS = ("float", "8bit", "1bit")
 
 
 @dataclass(frozen=True, slots=True)

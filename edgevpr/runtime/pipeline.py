@@ -13,7 +13,7 @@ from edgevpr.places.growing import GrowingIndex
 from edgevpr.places.index import PlaceIndex, bytes_per_place, empty_index, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import named, rank
-from edgevpr.places.sequence import Sequence, bytes_beside_place, length_of
+from edgevpr.places.sequence import Sequence, bytes_beside_place, length_of, sequence_of
 from edgevpr.power.boards import Board, load_board
 from edgevpr.power.equations import Pack, parse_pack
 from edgevpr.power.meter import PssMeter, query_cost, stage
@@ -121,7 +121,7 @@ def in_form(pipeline: Pipeline, config: Config, form: str) -> Pipeline:
         technique=technique,
         index=index,
         rule=accept_rule(technique, config.match, length),
-        sequence=Sequence(length) if length > 1 else None,
+        sequence=sequence_of(length),
         accuracy_m=claimed_accuracy_m(config, index),
     )
 
@@ -207,7 +207,7 @@ def _pipeline(config: Config, board: Board, technique: Technique, place_map: Pla
         index,
         accept_rule(technique, config.match, length),
         candidates,
-        Sequence(length) if length > 1 else None,
+        sequence_of(length),
         board,
         parse_pack(config.battery.pack),
         config.battery.regulator_efficiency,

@@ -1,6 +1,5 @@
 """A trained encoder as an ONNX file and its card. The file is written node by node: the same for every PyTorch."""
 
-import hashlib
 import json
 import math
 from pathlib import Path
@@ -11,6 +10,7 @@ import torch
 from onnx import TensorProto, helper, numpy_helper
 
 from edgevpr.errors import EdgevprError
+from edgevpr.techniques.networks.session import file_sha256
 from edgevpr.training.network import CODE, FEATURES, LRN_ALPHA, LRN_BETA, LRN_SIZE, Encoder
 from edgevpr.training.pictures import HEIGHT, WIDTH
 
@@ -93,7 +93,7 @@ def require_equal(encoder: Encoder, path: Path, inputs: np.ndarray) -> float:
 
 def write_card(path: Path, model: Path, title: str, source: str) -> None:
     """Write the card of a CALC model that lies beside it."""
-    sha256 = hashlib.sha256(model.read_bytes()).hexdigest()
+    sha256 = file_sha256(model)
     path.write_text(
         f"title: {json.dumps(title)}\n"
         f"file: {json.dumps(model.name)}\n"

@@ -6,21 +6,6 @@ import pytest
 
 from edgevpr.power import machine
 
-
-@pytest.fixture
-def tree(tmp_path):
-    """Write files below a root: tree({"proc/meminfo": "..."}) -> the root."""
-
-    def write(files):
-        for name, text in files.items():
-            path = tmp_path / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(text)
-        return tmp_path
-
-    return write
-
-
 MEMINFO = "MemTotal:        2000000 kB\nMemFree:          100000 kB\n"
 SERVICE = "1:cpu:/\n0::/system.slice/edgevpr.service\n"
 

@@ -14,14 +14,6 @@ from edgevpr.runtime.models import add, list_models, technique_with, verify, ver
 from edgevpr.techniques.networks.card import load_card
 
 
-@pytest.fixture
-def models(tmp_path, monkeypatch):
-    folder = tmp_path / "models"
-    folder.mkdir()
-    monkeypatch.setenv("EDGEVPR_MODELS", str(folder))
-    return folder
-
-
 def listed(name):
     return next(each for each in list_models() if each.name == name)
 

@@ -17,12 +17,9 @@ from edgevpr.training.quantise import quantise
 
 
 @pytest.fixture
-def models(tmp_path, monkeypatch):
-    folder = tmp_path / "models"
-    folder.mkdir()
-    monkeypatch.setenv("EDGEVPR_MODELS", str(folder))
+def models(models, monkeypatch):
     monkeypatch.setattr("edgevpr.training.quantise.verify", verify_here)
-    return folder
+    return models
 
 
 def test_the_integers_give_nearly_the_same_descriptor(models, tmp_path):
