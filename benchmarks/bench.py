@@ -53,7 +53,7 @@ def plot_growth(rows: list[dict], path: Path) -> None:
     for rotations, colour in ((1, "tab:blue"), (24, "tab:orange")):
         these = [row for row in rows if row["rotations"] == rotations]
         places, scan_ms = [row["places"] for row in these], [row["t_scan_ms"] for row in these]
-        label = "heading known, or camera ahead" if rotations == 1 else "straight down, 24 rotations"
+        label = "camera ahead" if rotations == 1 else "straight down, 24 rotations"
         time_axes.loglog(places, scan_ms, "o-", color=colour, label=label)
         linear_ms = [scan_ms[-1] * count / places[-1] for count in places]
         time_axes.loglog(places, linear_ms, ":", color=colour, alpha=0.6)
