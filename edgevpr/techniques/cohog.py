@@ -19,18 +19,20 @@ from edgevpr.techniques import placecode
 from edgevpr.techniques.displacement import displacement
 from edgevpr.techniques.entropy import block_means, good_blocks
 from edgevpr.techniques.gradients import grey_square, mask_square, normalised_blocks, oriented_cells
+from edgevpr.techniques.patterns import slow_patterns
 from edgevpr.types import Descriptor, FineMatch, PartSpec, Picture, TechniqueSpec
 
 # The goodness threshold GT of the thesis (6.3.2) and of the authors' public code, each for its own entropy.
 _DEFAULT_GT = {"filled_bins": 0.5, "shannon": 0.4}
-# Chosen on corridor (forward) and aerial_caliterra (nadir): a step is known better when the camera looks straight down.
-_VOTE_WINDOW = {"forward": 5, "nadir": 3}
+# What a vote counts that is 0, 1, 2 ... cells off the peak. Looking ahead, near and far ground move differently; a step
+# is known better when the camera looks straight down.
+_VOTES_COUNT = {"forward": (1.0, 1.0, 0.75, 0.5), "nadir": (1.0, 1.0)}
 # (min_score, min_margin). The vote's: no wrong match of corridor (forward) or aerial_caliterra (nadir) reached both,
 # nor did any query of two other sites in the map of aerial_caliterra. The thesis's score has no safe threshold: its
 # margin keeps out those queries of other sites, and most right matches with them.
 _ACCEPT = {"forward": (0.12, 0.05), "nadir": (0.08, 0.03), "thesis": (0.0, 0.02)}
 # A code of a turned picture says less: more places are compared in full, each under half of all rotations.
-_CANDIDATES = {"forward": 40, "nadir": 50}
+_CANDIDATES = {"forward": 45, "nadir": 50}
 _ROTATIONS = 24  # of a query that looks straight down and does not know its heading: 15 degrees apart
 _TURNS_TRIED = 12
 
@@ -55,7 +57,7 @@ class CoHog:
         matching: str = "displacement",
     ) -> None:
         _require("entropy", entropy, _DEFAULT_GT)
-        _require("camera", camera, _VOTE_WINDOW)
+        _require("camera", camera, _VOTES_COUNT)
         _require("matching", matching, ("displacement", "thesis"))
         if not (w2 >= 2 and w1 % w2 == 0 and w1 // w2 > placecode.SIDE and w1 <= 4096 and 2 <= bins <= 64):
             raise UsageError(
@@ -69,6 +71,7 @@ class CoHog:
         self._gt = gt if gt >= 0 else _DEFAULT_GT[entropy]
         self._side = w1 // w2 - 1  # blocks along one side
         self._matched = self._displacement if matching == "displacement" else self._thesis
+        self._compared = slow_patterns(bins) if matching == "displacement" else None
         self.min_score, self.min_margin = _ACCEPT[camera if matching == "displacement" else matching]
         self.candidates = _CANDIDATES[camera]
         self.spec = TechniqueSpec(
@@ -133,9 +136,9 @@ class CoHog:
     def match(self, query: Descriptor, fine: np.ndarray, hypothesis: int | None = None) -> FineMatch:
         """C = A B^T (thesis 6.2.3) with A the good regions of the query, B those of the place; then the score by
         `matching`. A query without a good region scores 0: it has nothing to say."""
-        reference = fine.astype(np.float32)
-        reference *= reference  # what is stored is the root
-        reference /= np.maximum(np.sqrt(np.einsum("ij,ij->i", reference, reference)), 1e-6)[:, None]
+        blocks = fine.astype(np.float32)
+        blocks *= blocks  # what is stored is the root
+        reference = self._comparable(blocks)
         if self._camera == "forward":
             return self._matched(self._asking(query, 0), reference)
         turns = [turn for turn in range(_ROTATIONS) if hypothesis is None or hypothesis >> turn & 1]
@@ -151,8 +154,15 @@ class CoHog:
             if turn:
                 blocks, _, good = self._regions(*self._turned_back(query.picture, turn))
                 regions, good = blocks.reshape(regions.shape), good.ravel()
-            query.asking[turn] = np.flatnonzero(good), regions[good]
+            query.asking[turn] = np.flatnonzero(good), self._comparable(regions[good])
         return query.asking[turn]
+
+    def _comparable(self, blocks: np.ndarray) -> np.ndarray:
+        """Blocks float32 (N, 4 bins), or what the vote compares of them, (N, patterns), each of length 1."""
+        if self._compared is not None:
+            blocks = blocks @ self._compared
+        blocks /= np.maximum(np.sqrt(np.einsum("ij,ij->i", blocks, blocks)), 1e-6)[:, None]
+        return blocks
 
     def _turned_back(self, picture: Picture, turn: int) -> tuple[np.ndarray, np.ndarray]:
         """A picture and where it is allowed, turned back by `turn` steps about its middle; its corners are cut off."""
@@ -174,7 +184,7 @@ class CoHog:
     def _displacement(self, asking: tuple[np.ndarray, np.ndarray], reference: np.ndarray) -> FineMatch:
         numbers, regions = asking
         best = (regions @ reference.T).argmax(axis=1)
-        found = displacement(numbers, best, self._side, _VOTE_WINDOW[self._camera])
+        found = displacement(numbers, best, self._side, _VOTES_COUNT[self._camera])
         return FineMatch(found.share, found.shift_cells, found.covariance_cells2)
 
 

@@ -25,35 +25,37 @@ class Displacement:
 _NOTHING = Displacement(0.0, (0.0, 0.0), (0.0, 0.0, 0.0))
 
 
-def displacement(asking: np.ndarray, best: np.ndarray, side: int, window: int) -> Displacement:
+def displacement(asking: np.ndarray, best: np.ndarray, side: int, counts: tuple[float, ...]) -> Displacement:
     """Count the votes of regions on a grid of `side` x `side`.
 
     `asking` and `best` are int (G,): each asking region, and the region of the reference that is most like it, both
-    numbered row by row. The peak is the `window` x `window` (odd) square of steps with the most votes.
+    numbered row by row. The peak is the step with the most votes about it, where a vote that is n cells off, along the
+    rows or along the columns, counts `counts[n]`, and further off nothing.
     """
     if not len(asking):
         return _NOTHING
-    # Both numbers in rows as wide as the steps are many: the difference is the number of the step.
-    wide = 2 * side - 1
+    # Both numbers in rows as wide as the steps are many: the difference is the number of the step. Around the steps
+    # that there are, room for the square about the peak.
+    room = len(counts) - 1
+    wide = 2 * (side - 1 + room) + 1
     number = _numbers(side, wide)
-    step = number[best] - number[asking] + (side - 1) * (wide + 1)
+    step = number[best] - number[asking] + wide // 2 * (wide + 1)
     votes = np.bincount(step, minlength=wide * wide).reshape(wide, wide).astype(np.float32)
-    around = cv2.boxFilter(votes, -1, (window, window), normalize=False, borderType=cv2.BORDER_CONSTANT)
-    peak_y, peak_x = divmod(int(around.argmax()), wide)
-    half = window // 2
-    top, left = max(peak_y - half, 0), max(peak_x - half, 0)
-    agreeing = votes[top : peak_y + half + 1, left : peak_x + half + 1]
+    weights = _weights(counts)
+    around = cv2.filter2D(votes, -1, weights, borderType=cv2.BORDER_CONSTANT)[room : wide - room, room : wide - room]
+    peak_y, peak_x = divmod(int(around.argmax()), 2 * side - 1)
+    agreeing = votes[peak_y : peak_y + len(weights), peak_x : peak_x + len(weights)] * weights
     count = float(agreeing.sum())
     shares_x, shares_y = agreeing.sum(axis=0) / count, agreeing.sum(axis=1) / count
-    x, y = np.arange(len(shares_x)), np.arange(len(shares_y))
-    mean_x, mean_y = float(shares_x @ x), float(shares_y @ y)
+    off = np.arange(-room, room + 1)
+    mean_x, mean_y = float(shares_x @ off), float(shares_y @ off)
     # A step is known to a cell at best: 1/12 is the variance within one.
     covariance = (
-        float(shares_x @ (x - mean_x) ** 2) + 1 / 12,
-        float((y - mean_y) @ agreeing @ (x - mean_x)) / count,
-        float(shares_y @ (y - mean_y) ** 2) + 1 / 12,
+        float(shares_x @ (off - mean_x) ** 2) + 1 / 12,
+        float((off - mean_y) @ agreeing @ (off - mean_x)) / count,
+        float(shares_y @ (off - mean_y) ** 2) + 1 / 12,
     )
-    shift = (left + mean_x - (side - 1), top + mean_y - (side - 1))
+    shift = (peak_x - (side - 1) + mean_x, peak_y - (side - 1) + mean_y)
     return Displacement(count / len(asking), shift, covariance)
 
 
@@ -61,3 +63,10 @@ def displacement(asking: np.ndarray, best: np.ndarray, side: int, window: int) -
 def _numbers(side: int, wide: int) -> np.ndarray:
     """The numbers of `side` x `side` regions in a grid that is `wide` wide."""
     return np.add.outer(np.arange(side) * wide, np.arange(side)).ravel()
+
+
+@lru_cache
+def _weights(counts: tuple[float, ...]) -> np.ndarray:
+    """What a vote counts, by how far it is off: float32 (2 n - 1, 2 n - 1) for n counts."""
+    off = np.abs(np.arange(1 - len(counts), len(counts)))
+    return np.array(counts, np.float32)[np.maximum.outer(off, off)]

@@ -9,29 +9,46 @@ from edgevpr.techniques import create
 from edgevpr.techniques.displacement import displacement
 
 
-def count_by_hand(asking, best, side, window):
-    """Every possible window in turn, every vote in turn: the most votes that any window holds."""
+def count_by_hand(asking, best, side, counts):
+    """Every possible step in turn, every vote in turn: the most that the votes about any step count for."""
     steps = [(b % side - a % side, b // side - a // side) for a, b in zip(asking, best, strict=True)]
-    half, most = window // 2, 0
+    worth, most = dict(enumerate(counts)), 0
     for x in range(-side + 1, side):
         for y in range(-side + 1, side):
-            most = max(most, sum(abs(dx - x) <= half and abs(dy - y) <= half for dx, dy in steps))
+            most = max(most, sum(worth.get(max(abs(dx - x), abs(dy - y)), 0) for dx, dy in steps))
     return most / len(steps)
 
 
-@pytest.mark.parametrize("window", [1, 3, 5])
-def test_the_share_is_that_of_the_fullest_window(window):
-    rng = np.random.default_rng(window)
+@pytest.mark.parametrize("counts", [(1.0,), (1.0, 1.0), (1.0, 0.5), (1.0, 1.0, 0.75, 0.5)])
+def test_the_share_is_that_of_the_step_with_the_most_votes_about_it(counts):
+    rng = np.random.default_rng(len(counts))
     asking = np.sort(rng.choice(49, 40, replace=False))
     best = rng.integers(0, 49, 40)
-    assert displacement(asking, best, 7, window).share == pytest.approx(count_by_hand(asking, best, 7, window))
+    assert displacement(asking, best, 7, counts).share == pytest.approx(count_by_hand(asking, best, 7, counts))
+
+
+def test_a_step_at_the_edge_of_what_is_possible_is_found():
+    asking, best = np.full(5, 48), np.zeros(5, int)  # from the last region to the first
+    found = displacement(asking, best, 7, (1.0, 1.0, 0.75, 0.5))
+    assert found.share == 1.0
+    assert found.shift_cells == (-6.0, -6.0)
+
+
+def test_votes_beside_the_peak_move_it_by_less_than_a_cell():
+    asking = np.arange(900)[np.arange(900) % 30 < 25]
+    moved = np.where(np.arange(len(asking)) % 4, 1, 2)  # three of four moved by one cell, one by two
+    found = displacement(asking, asking + moved, 30, (1.0, 0.5))
+    assert found.share == pytest.approx(0.75 + 0.25 * 0.5, abs=0.01)
+    assert found.shift_cells == pytest.approx(((0.75 * 1 + 0.125 * 2) / 0.875, 0), abs=0.01)
+    assert found.covariance_cells2[2] == pytest.approx(1 / 12)
+    assert found.covariance_cells2[0] > found.covariance_cells2[2]
 
 
 def test_regions_that_all_moved_alike_agree_entirely():
     rows, cols = np.divmod(np.arange(900), 30)
     inside = (rows < 26) & (cols >= 3)
     asking = np.arange(900)[inside]
-    found = displacement(asking, asking + 4 * 30 - 3, 30, 3)
+    found = displacement(asking, asking + 4 * 30 - 3, 30, (1.0, 0.5))
     assert found.share == 1.0
     assert found.shift_cells == (-3.0, 4.0)
     assert found.covariance_cells2 == pytest.approx((1 / 12, 0, 1 / 12))
@@ -39,7 +56,7 @@ def test_regions_that_all_moved_alike_agree_entirely():
 
 def test_nobody_asking_agrees_on_nothing():
     nothing = np.array([], int)
-    assert displacement(nothing, nothing, 31, 5).share == 0.0
+    assert displacement(nothing, nothing, 31, (1.0, 0.5)).share == 0.0
 
 
 def test_cohog_finds_how_far_a_picture_has_moved():

@@ -139,7 +139,7 @@ def test_a_known_heading_is_the_full_scan_of_three_rotations(town):
 
 def test_every_shift_leaves_at_least_the_least_overlap():
     overlap = np.prod(8 - abs(placecode.SHIFTS.astype(int)), axis=1) / 64
-    assert overlap.min() >= 0.35
+    assert overlap.min() >= 0.5
     assert len(np.unique(placecode.SHIFTS, axis=0)) == len(placecode.SHIFTS)
     assert [0, 0] in placecode.SHIFTS.tolist()
 

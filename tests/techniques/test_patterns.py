@@ -1,0 +1,41 @@
+"""The slow patterns of a block: what they are, and that comparing them is comparing the blocks."""
+
+import numpy as np
+import pytest
+from pictures import textured
+
+from edgevpr.techniques import create
+from edgevpr.techniques.displacement import displacement
+from edgevpr.techniques.patterns import slow_patterns
+
+
+@pytest.mark.parametrize("bins", [2, 3, 5, 8, 9, 64])
+def test_patterns_have_length_one_and_stand_at_right_angles(bins):
+    patterns = slow_patterns(bins).astype(float)
+    assert patterns.shape[0] == 4 * bins
+    np.testing.assert_allclose(patterns.T @ patterns, np.eye(patterns.shape[1]), atol=1e-6)
+
+
+def test_of_eight_orientations_twenty_of_thirty_two_numbers_are_left():
+    assert slow_patterns(8).shape == (32, 20)
+
+
+def test_what_all_cells_have_in_common_is_kept_whole():
+    patterns = slow_patterns(8)
+    block = np.tile(np.random.default_rng(1).random(8), 4)
+    np.testing.assert_allclose(patterns @ (patterns.T @ block), block, atol=1e-6)
+
+
+def test_what_changes_from_cell_to_cell_and_from_bin_to_bin_is_left_out():
+    fast = np.kron([1, -1, 1, -1], [1, -1, 1, -1, 1, -1, 1, -1])
+    np.testing.assert_allclose(fast @ slow_patterns(8), 0, atol=1e-6)
+
+
+def test_nearly_as_many_regions_agree_as_if_all_numbers_were_compared():
+    technique = create("cohog")
+    scene = textured(5, 544, 544)
+    query, place = (technique.encode(scene[at : at + 512, at : at + 512]) for at in (0, 32))
+    asking = np.flatnonzero(query.good)
+    best = (query.regions[asking] @ place.regions.T).argmax(axis=1)
+    in_full = displacement(asking, best, 31, (1.0, 1.0, 0.75, 0.5)).share
+    assert technique.match(query, place.fine).score > 0.95 * in_full > 0.4
