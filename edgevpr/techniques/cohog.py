@@ -111,7 +111,7 @@ class CoHog:
 
     def pack(self, coarse: np.ndarray, mean: np.ndarray) -> np.ndarray:
         """Rows of the index: coarse float16 (N, 8, 8, bins), the map's mean -> uint8 (N, 8 bins)."""
-        return placecode.pack(coarse.astype(np.float32), mean)
+        return placecode.pack(coarse.astype(np.float32), mean, locally=self._camera == "nadir")
 
     def coarse_scores(
         self, query: Descriptor, rows: np.ndarray, mean: np.ndarray, turned_deg: np.ndarray | None = None
@@ -123,7 +123,7 @@ class CoHog:
         blocks = _middle(query.regions.reshape(self._side, self._side, -1), seen)
         turns = np.arange(_ROTATIONS if self._camera == "nadir" else 1)
         grids, in_view = placecode.turned_grids(blocks, -360 * turns / _ROTATIONS, _middle(seen, seen))
-        asked = placecode.hypotheses(grids, in_view, mean)
+        asked = placecode.hypotheses(grids, in_view, mean, locally=self._camera == "nadir")
         if turned_deg is None or self._camera == "forward":
             scores = placecode.scan(asked, rows)
         else:

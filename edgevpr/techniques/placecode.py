@@ -11,7 +11,7 @@ import numpy as np
 SIDE = 8  # cells along one side of the grid
 _SAMPLES = 4  # samples along one side of a cell: with 31 blocks about one a block
 _MIN_OVERLAP = 0.5  # down to 0.35 found no place more on any set, and takes twice as long
-_OWN_SHARE = 0.5  # of what all cells of a picture have in common, mostly where the light comes from, is left out
+_AROUND_CELLS = 3.0  # standard deviation
 _PLACES_AT_ONCE = 256  # their signs, 0.5 MB as float32, stay in the second-level cache
 
 # Byte -> its eight bits, first bit first, as +1 and -1: `unpackbits`, conversion and offset in one look-up.
@@ -27,6 +27,16 @@ def _shifts() -> np.ndarray:
 
 
 SHIFTS = _shifts()
+
+
+def _around() -> np.ndarray:
+    """float32 (64, 64): how much each cell counts for what the cells around another have in common."""
+    away = np.subtract.outer(np.arange(SIDE), np.arange(SIDE))
+    near = np.exp(-(away**2) / (2 * _AROUND_CELLS**2))
+    return np.kron(near, near).astype(np.float32)
+
+
+_AROUND = _around()
 
 
 def grid(blocks: np.ndarray) -> np.ndarray:
@@ -60,27 +70,31 @@ def turned_grids(
     return cells.reshape(*square, bins), (share >= 0.5).reshape(square)
 
 
-def special(grids: np.ndarray, mean: np.ndarray, seen: np.ndarray | None = None) -> np.ndarray:
-    """What sets a picture apart: grids (N, 8, 8, L) minus the map's mean (8, 8, L), minus half of each grid's own mean
-    over its `seen` cells (without that, places lit from one side draw every query lit alike). Returns float32
-    (N, 8, 8, L).
+def special(grids: np.ndarray, mean: np.ndarray, seen: np.ndarray | None = None, locally: bool = False) -> np.ndarray:
+    """What sets a picture apart: grids (N, 8, 8, L) less the map's mean (8, 8, L). Returns float32 (N, 8, 8, L).
+
+    `locally`, also less what the (`seen`) cells around have in common: where any rotation may meet any place, the mean
+    of a cell over the map leaves in what comes from the light and from fields that all run one way.
     """
     left = np.asarray(grids, np.float32) - mean
-    weight = np.ones((1, SIDE, SIDE), np.float32) if seen is None else seen.astype(np.float32)
-    total = np.maximum(weight.sum(axis=(1, 2)), 1)[:, None, None, None]
-    left -= _OWN_SHARE * (left * weight[..., None]).sum(axis=(1, 2), keepdims=True) / total
-    return left
+    if not locally:
+        return left
+    weight = np.ones(left.shape[:3], np.float32) if seen is None else seen.astype(np.float32)
+    cells = left.shape[0], SIDE * SIDE, -1
+    common = _AROUND @ (left * weight[..., None]).reshape(cells)
+    common /= np.maximum(_AROUND @ weight.reshape(cells), 1e-6)
+    return left - common.reshape(left.shape)
 
 
-def pack(grids: np.ndarray, mean: np.ndarray) -> np.ndarray:
+def pack(grids: np.ndarray, mean: np.ndarray, locally: bool = False) -> np.ndarray:
     """Rows of the index: grids (N, 8, 8, L), the map's mean (8, 8, L) -> uint8 (N, 8 L), the signs bit by bit."""
-    return np.packbits((special(grids, mean) >= 0).reshape(len(grids), -1), axis=1)
+    return np.packbits((special(grids, mean, locally=locally) >= 0).reshape(len(grids), -1), axis=1)
 
 
-def hypotheses(grids: np.ndarray, seen: np.ndarray, mean: np.ndarray) -> np.ndarray:
+def hypotheses(grids: np.ndarray, seen: np.ndarray, mean: np.ndarray, locally: bool = False) -> np.ndarray:
     """A query as it would look from elsewhere: grids and `seen` of its R rotations by `turned_grids`, the map's mean ->
     float32 (R, S, 64 L), its signs (0 where it sees nothing) over the length of a code, moved by SHIFTS (S, 2)."""
-    signs = np.where(special(grids, mean, seen) >= 0, np.float32(1), np.float32(-1)) * seen[..., None]
+    signs = np.where(special(grids, mean, seen, locally) >= 0, np.float32(1), np.float32(-1)) * seen[..., None]
     rotations, _, _, bins = signs.shape
     asked = np.zeros((rotations, len(SHIFTS), SIDE, SIDE, bins), np.float32)
     for at, (dx, dy) in enumerate(SHIFTS.tolist()):

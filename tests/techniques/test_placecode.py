@@ -112,6 +112,30 @@ def test_what_a_mask_hides_says_nothing(town):
     assert abs(asked).sum(axis=2).max() == pytest.approx(0.5)
 
 
+def test_what_the_cells_around_have_in_common_is_left_out():
+    rng = np.random.default_rng(3)
+    grids, mean = rng.random((2, 8, 8, 8), dtype=np.float32), rng.random((8, 8, 8), dtype=np.float32)
+    seen = rng.random((2, 8, 8)) > 0.2
+    left = grids - mean
+    np.testing.assert_array_equal(placecode.special(grids, mean, seen), left)
+    apart = placecode.special(grids, mean, seen, locally=True)
+    for n, y, x in [(0, 0, 0), (1, 3, 5), (1, 7, 7)]:
+        near = [
+            (v, u, np.exp(-((v - y) ** 2 + (u - x) ** 2) / 18)) for v in range(8) for u in range(8) if seen[n, v, u]
+        ]
+        common = sum(weight * left[n, v, u] for v, u, weight in near) / sum(weight for _, _, weight in near)
+        np.testing.assert_allclose(apart[n, y, x], left[n, y, x] - common, atol=1e-5)
+
+
+def test_an_even_light_from_one_side_changes_no_local_code():
+    rng = np.random.default_rng(4)
+    grids, light = rng.random((1, 8, 8, 8), dtype=np.float32), rng.random(8, dtype=np.float32)
+    mean = np.zeros((8, 8, 8), np.float32)
+    np.testing.assert_array_equal(
+        placecode.pack(grids, mean, locally=True), placecode.pack(grids + light, mean, locally=True)
+    )
+
+
 def test_the_scan_is_the_product_spelt_out(town):
     _, mean, _ = town
     rng = np.random.default_rng(1)
