@@ -52,30 +52,30 @@ def binary_rows(places: int = 100_000, code_bytes: int = 64, rounds: int = 30) -
     ]
 
 
-def growth_rows(
-    places: tuple[int, ...] = (1_000, 3_000, 10_000, 30_000, 100_000), rotations: tuple[int, ...] = (1, 24)
-) -> list[dict]:
-    """The scan of place codes as the map grows: the data of the plot. The query's own part does not grow, and stands
-    apart as `t_query_ms`."""
+def growth_rows(places: tuple[int, ...] = (1_000, 3_000, 10_000, 30_000, 100_000)) -> list[dict]:
+    """The scan of place codes as the map grows, ahead (64 bytes a place) and looking down (24 rotations, 144 bytes a
+    place): the data of the plot. The query's own part does not grow, and stands apart as `t_query_ms`."""
     rng = np.random.default_rng(0)
     blocks = rng.random((31, 31, 32), dtype=np.float32)
-    mean = rng.random((placecode.SIDE, placecode.SIDE, 8), dtype=np.float32)
     rows = []
-    for turns in rotations:
+    for side, turns in ((8, 1), (12, 24)):
+        mean = rng.random((side, side, 8), dtype=np.float32)
         angles_deg = np.arange(turns) * 360 / turns
 
-        def ask(angles_deg: np.ndarray = angles_deg) -> np.ndarray:
-            return placecode.hypotheses(*placecode.turned_grids(blocks, angles_deg), mean)
+        def ask(mean: np.ndarray = mean, angles_deg: np.ndarray = angles_deg) -> np.ndarray:
+            grids, seen = placecode.turned_grids(blocks, angles_deg, len(mean))
+            return placecode.hypotheses(grids, seen, mean, locally=len(angles_deg) > 1)
 
         asked = ask()
         for count in places:
-            codes = rng.integers(0, 256, (count, 64), dtype=np.uint8)
+            codes = rng.integers(0, 256, (count, side * side), dtype=np.uint8)
             ways = {"query": ask, "scan": lambda codes=codes, asked=asked: placecode.scan(asked, codes)}
             taken = medians_s(ways, rounds=max(1, min(20, 2_000_000 // (count * turns))))
             rows.append(
                 {
                     "places": count,
                     "rotations": turns,
+                    "code_bytes": codes.shape[1],
                     "t_query_ms": 1e3 * taken["query"],
                     "t_scan_ms": 1e3 * taken["scan"],
                     "index_mb": codes.nbytes / 1e6,

@@ -1,4 +1,4 @@
-"""One query in a map of 10 000 places: the scan of 64-byte codes and the vote over the best of them, against the vote
+"""One query in a map of 10 000 places: the scan of place codes and the vote over the best of them, against the vote
 over all places, through the map file and the index that fly; and with what may be known beforehand. One thread; the
 map is generated, its content random.
 """

@@ -1,58 +1,49 @@
-"""A place in 64 bytes that is still found when the camera has moved or turned: the coarse stage of `cohog`.
+"""A place in 64 or 144 bytes that is still found when the camera has moved or turned: the coarse stage of `cohog`.
 
-The block-normalised HOG is averaged over a grid of 8x8 cells (its *grid*); the map's mean is taken away and only the
-signs stay, 8x8x8 bits a place. A query is compared under every shift of the grid, for a camera of unknown heading
-under every rotation too: each such *hypothesis* is one row of a matrix, the map is the other, and one product answers
-for all places. Neither shifting nor turning touches the picture: both move the numbers of the grid.
+The block-normalised HOG is averaged over a grid of 8x8 or 12x12 cells (its *grid*); the map's mean is taken away and
+only the signs stay, one bit for each of the L orientations of each cell. A query is compared under every shift of the
+grid, for a camera of unknown heading under every rotation too: each such *hypothesis* is one row of a matrix, the map
+is the other, and one product answers for all places. Neither shifting nor turning touches the picture: both move the
+numbers of the grid.
 """
+
+from functools import lru_cache
 
 import numpy as np
 
-SIDE = 8  # cells along one side of the grid
-_SAMPLES = 4  # samples along one side of a cell: with 31 blocks about one a block
+_SAMPLES = 32  # along one side of the grid: with 31 blocks about one a block
 _MIN_OVERLAP = 0.5  # down to 0.35 found no place more on any set, and takes twice as long
 _AROUND_CELLS = 3.0  # standard deviation
-_PLACES_AT_ONCE = 256  # their signs, 0.5 MB as float32, stay in the second-level cache
+_BITS_AT_ONCE = 1 << 17  # of places; as float32, 0.5 MB, they stay in the second-level cache
 
 # Byte -> its eight bits, first bit first, as +1 and -1: `unpackbits`, conversion and offset in one look-up.
 _SIGNS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).astype(np.float32) * 2 - 1
 
 
-def _shifts() -> np.ndarray:
+@lru_cache
+def shifts(side: int) -> np.ndarray:
     """int8 (S, 2): every (dx, dy) in cells under which at least `_MIN_OVERLAP` of two grids lies on the other."""
-    steps = np.arange(1 - SIDE, SIDE)
+    steps = np.arange(1 - side, side)
     dy, dx = np.meshgrid(steps, steps, indexing="ij")
-    enough = (SIDE - abs(dx)) * (SIDE - abs(dy)) >= _MIN_OVERLAP * SIDE**2
+    enough = (side - abs(dx)) * (side - abs(dy)) >= _MIN_OVERLAP * side**2
     return np.stack([dx[enough], dy[enough]], axis=1).astype(np.int8)
 
 
-SHIFTS = _shifts()
-
-
-def _around() -> np.ndarray:
-    """float32 (64, 64): how much each cell counts for what the cells around another have in common."""
-    away = np.subtract.outer(np.arange(SIDE), np.arange(SIDE))
-    near = np.exp(-(away**2) / (2 * _AROUND_CELLS**2))
-    return np.kron(near, near).astype(np.float32)
-
-
-_AROUND = _around()
-
-
-def grid(blocks: np.ndarray) -> np.ndarray:
-    """Mean orientations of the picture's 8x8 cells: blocks float32 (n, n, 4L) -> float32 (8, 8, L), each cell of
-    length 1 (so that contrast and haze do not count)."""
-    return turned_grids(blocks, np.zeros(1))[0][0]
+def grid(blocks: np.ndarray, side: int) -> np.ndarray:
+    """Mean orientations of the `side` x `side` cells of a picture: blocks float32 (n, n, 4L) -> float32 (side, side,
+    L), each cell of length 1 (so that contrast and haze do not count)."""
+    return turned_grids(blocks, np.zeros(1), side)[0][0]
 
 
 def turned_grids(
-    blocks: np.ndarray, rotations_deg: np.ndarray, seen: np.ndarray | None = None
+    blocks: np.ndarray, rotations_deg: np.ndarray, side: int, seen: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The grids of a picture turned counter-clockwise: blocks float32 (n, n, 4L), angles (R,) -> float32 (R, 8, 8, L),
-    and bool (R, 8, 8), whether at least half of the cell lies in the picture (where bool (n, n) `seen` allows).
+    """The grids of a picture turned counter-clockwise: blocks float32 (n, n, 4L), angles (R,) -> float32 (R, side,
+    side, L), and bool (R, side, side), whether at least half of the cell lies in the picture (where bool (n, n) `seen`
+    allows).
 
-    Every cell averages 4x4 samples at the places they came from; the orientations turn with them, shared linearly
-    between the two nearest bins.
+    Every cell averages samples at the places they came from; the orientations turn with them, shared linearly between
+    the two nearest bins.
     """
     n, bins = blocks.shape[0], blocks.shape[2] // 4
     seen = np.ones((n, n), bool) if seen is None else seen
@@ -61,17 +52,18 @@ def turned_grids(
     source = np.zeros((n * n + 1, bins), np.float32)
     source[:-1] = blocks.reshape(n * n, 4, bins).mean(axis=1) * seen.reshape(-1, 1)
 
-    at = _sources(n, rotations_deg)
+    at = _sources(n, rotations_deg, side)
     share = known[at].mean(axis=-1)
     cells = source[at].mean(axis=2)
     cells = np.stack([_turned_bins(each, angle) for each, angle in zip(cells, rotations_deg, strict=True)])
     cells /= np.maximum(np.linalg.norm(cells, axis=-1, keepdims=True), 1e-6)
-    square = (len(rotations_deg), SIDE, SIDE)
+    square = (len(rotations_deg), side, side)
     return cells.reshape(*square, bins), (share >= 0.5).reshape(square)
 
 
 def special(grids: np.ndarray, mean: np.ndarray, seen: np.ndarray | None = None, locally: bool = False) -> np.ndarray:
-    """What sets a picture apart: grids (N, 8, 8, L) less the map's mean (8, 8, L). Returns float32 (N, 8, 8, L).
+    """What sets a picture apart: grids (N, side, side, L) less the map's mean (side, side, L). Returns float32 of the
+    shape of `grids`.
 
     `locally`, also less what the (`seen`) cells around have in common: where any rotation may meet any place, the mean
     of a cell over the map leaves in what comes from the light and from fields that all run one way.
@@ -80,27 +72,29 @@ def special(grids: np.ndarray, mean: np.ndarray, seen: np.ndarray | None = None,
     if not locally:
         return left
     weight = np.ones(left.shape[:3], np.float32) if seen is None else seen.astype(np.float32)
-    cells = left.shape[0], SIDE * SIDE, -1
-    common = _AROUND @ (left * weight[..., None]).reshape(cells)
-    common /= np.maximum(_AROUND @ weight.reshape(cells), 1e-6)
+    around, cells = _around(left.shape[1]), (len(left), left.shape[1] ** 2, -1)
+    common = around @ (left * weight[..., None]).reshape(cells)
+    common /= np.maximum(around @ weight.reshape(cells), 1e-6)
     return left - common.reshape(left.shape)
 
 
 def pack(grids: np.ndarray, mean: np.ndarray, locally: bool = False) -> np.ndarray:
-    """Rows of the index: grids (N, 8, 8, L), the map's mean (8, 8, L) -> uint8 (N, 8 L), the signs bit by bit."""
+    """Rows of the index: grids (N, side, side, L), the map's mean (side, side, L) -> uint8 (N, side side L / 8), the
+    signs bit by bit."""
     return np.packbits((special(grids, mean, locally=locally) >= 0).reshape(len(grids), -1), axis=1)
 
 
 def hypotheses(grids: np.ndarray, seen: np.ndarray, mean: np.ndarray, locally: bool = False) -> np.ndarray:
     """A query as it would look from elsewhere: grids and `seen` of its R rotations by `turned_grids`, the map's mean ->
-    float32 (R, S, 64 L), its signs (0 where it sees nothing) over the length of a code, moved by SHIFTS (S, 2)."""
+    float32 (R, S, side side L), its signs (0 where it sees nothing) over the length of a code, moved by the S
+    `shifts`."""
     signs = np.where(special(grids, mean, seen, locally) >= 0, np.float32(1), np.float32(-1)) * seen[..., None]
-    rotations, _, _, bins = signs.shape
-    asked = np.zeros((rotations, len(SHIFTS), SIDE, SIDE, bins), np.float32)
-    for at, (dx, dy) in enumerate(SHIFTS.tolist()):
-        asked[:, at, _to(dy), _to(dx)] = signs[:, _to(-dy), _to(-dx)]
-    asked /= SIDE * SIDE * bins
-    return asked.reshape(rotations, len(SHIFTS), -1)
+    rotations, side, _, bins = signs.shape
+    asked = np.zeros((rotations, len(shifts(side)), side, side, bins), np.float32)
+    for at, (dx, dy) in enumerate(shifts(side).tolist()):
+        asked[:, at, _to(dy, side), _to(dx, side)] = signs[:, _to(-dy, side), _to(-dx, side)]
+    asked /= side * side * bins
+    return asked.reshape(rotations, len(shifts(side)), -1)
 
 
 def scan(asked: np.ndarray, codes: np.ndarray) -> np.ndarray:
@@ -109,17 +103,18 @@ def scan(asked: np.ndarray, codes: np.ndarray) -> np.ndarray:
 
     A score is the bits that agree less those that do not, over all bits: 1 is the same picture, 0 is chance.
     """
-    rotations, shifts, _ = asked.shape
-    by_bit = np.ascontiguousarray(asked.reshape(rotations * shifts, -1).T)
+    rotations, moves, _ = asked.shape
+    by_bit = np.ascontiguousarray(asked.reshape(rotations * moves, -1).T)
     best = np.empty((len(codes), rotations), np.float32)
-    bits = np.empty((_PLACES_AT_ONCE, codes.shape[1], 8), np.float32)
-    scores = np.empty((_PLACES_AT_ONCE, rotations * shifts), np.float32)
-    for start in range(0, len(codes), _PLACES_AT_ONCE):
-        part = codes[start : start + _PLACES_AT_ONCE]
+    at_once = max(1, _BITS_AT_ONCE // asked.shape[2])
+    bits = np.empty((at_once, codes.shape[1], 8), np.float32)
+    scores = np.empty((at_once, rotations * moves), np.float32)
+    for start in range(0, len(codes), at_once):
+        part = codes[start : start + at_once]
         count = len(part)
         np.take(_SIGNS, part, axis=0, out=bits[:count], mode="clip")
         np.matmul(bits[:count].reshape(count, -1), by_bit, out=scores[:count])
-        np.max(scores[:count].reshape(count, rotations, shifts), axis=2, out=best[start : start + count])
+        np.max(scores[:count].reshape(count, rotations, moves), axis=2, out=best[start : start + count])
     return best
 
 
@@ -137,11 +132,20 @@ def scan_near(asked: np.ndarray, codes: np.ndarray, expected: np.ndarray) -> np.
     return best
 
 
-def _sources(n: int, rotations_deg: np.ndarray) -> np.ndarray:
-    """int (R, 64, 16): for every sample of every cell the block it comes from, `n` n where that is outside."""
-    middle = (np.arange(SIDE * _SAMPLES) + 0.5) / (SIDE * _SAMPLES) - 0.5
-    y, x = (part.reshape(SIDE, _SAMPLES, SIDE, _SAMPLES) for part in np.meshgrid(middle, middle, indexing="ij"))
-    x, y = (part.swapaxes(1, 2).reshape(SIDE**2, _SAMPLES**2) for part in (x, y))
+@lru_cache
+def _around(side: int) -> np.ndarray:
+    """float32 (side^2, side^2): how much each cell counts for what the cells around another have in common."""
+    away = np.subtract.outer(np.arange(side), np.arange(side))
+    near = np.exp(-(away**2) / (2 * _AROUND_CELLS**2))
+    return np.kron(near, near).astype(np.float32)
+
+
+def _sources(n: int, rotations_deg: np.ndarray, side: int) -> np.ndarray:
+    """int (R, side^2, samples): for every sample of every cell the block it comes from, `n` n where that is outside."""
+    samples = round(_SAMPLES / side)
+    middle = (np.arange(side * samples) + 0.5) / (side * samples) - 0.5
+    y, x = (part.reshape(side, samples, side, samples) for part in np.meshgrid(middle, middle, indexing="ij"))
+    x, y = (part.swapaxes(1, 2).reshape(side**2, samples**2) for part in (x, y))
     angle = np.radians(rotations_deg)[:, None, None]
     column = np.floor((x * np.cos(angle) - y * np.sin(angle) + 0.5) * n).astype(np.intp)
     row = np.floor((x * np.sin(angle) + y * np.cos(angle) + 0.5) * n).astype(np.intp)
@@ -156,6 +160,6 @@ def _turned_bins(cells: np.ndarray, rotation_deg: float) -> np.ndarray:
     return (1 - part) * np.roll(cells, -int(whole), axis=-1) + part * np.roll(cells, -int(whole) - 1, axis=-1)
 
 
-def _to(step: int) -> slice:
+def _to(step: int, side: int) -> slice:
     """The cells of one side that something moved by `step` cells comes to lie on."""
-    return slice(max(0, step), SIDE + min(0, step))
+    return slice(max(0, step), side + min(0, step))

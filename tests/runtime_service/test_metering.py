@@ -60,7 +60,7 @@ def clocks(monkeypatch):
 @pytest.fixture(scope="module")
 def place_map(tmp_path_factory):
     folder = tmp_path_factory.mktemp("metering")
-    write_frames(folder / "ref", 45)  # more than are compared in full
+    write_frames(folder / "ref", 60)  # more than are compared in full
     path = folder / "m.gpkg"
     assert main(["map", "build", str(path), "--images", str(folder / "ref"), "--technique", "cohog"]) == 0
     return path

@@ -36,18 +36,18 @@ def _view(ground: np.ndarray, right_px: int = 0, down_px: int = 0, turned_deg: f
 def town() -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
     """Twelve grounds, the mean of their grids, and their codes."""
     grounds = [_picture(seed) for seed in range(12)]
-    grids = np.stack([placecode.grid(_blocks(_view(ground))) for ground in grounds])
+    grids = np.stack([placecode.grid(_blocks(_view(ground)), 8) for ground in grounds])
     mean = grids.mean(axis=0)
     return grounds, mean, placecode.pack(grids, mean)
 
 
 def _ask(image: np.ndarray, mean: np.ndarray, rotations_deg: np.ndarray) -> np.ndarray:
-    return placecode.hypotheses(*placecode.turned_grids(_blocks(image), rotations_deg), mean)
+    return placecode.hypotheses(*placecode.turned_grids(_blocks(image), rotations_deg, 8), mean)
 
 
 def _best_shift(asked: np.ndarray, code: np.ndarray) -> list[int]:
     """The shift (dx, dy) in cells under which one place agrees best with a query that is not turned."""
-    return placecode.SHIFTS[np.argmax(asked[0] @ (np.unpackbits(code) * 2.0 - 1))].tolist()
+    return placecode.shifts(8)[np.argmax(asked[0] @ (np.unpackbits(code) * 2.0 - 1))].tolist()
 
 
 def test_a_place_takes_64_bytes(town):
@@ -85,15 +85,15 @@ def test_a_turned_camera_finds_the_place_and_its_rotation(town, turned_deg):
 def test_turning_the_grid_by_right_angles_is_turning_the_picture():
     image = _view(_picture(20))
     angles_deg = np.array([90.0, 180.0, 270.0])
-    turned, seen = placecode.turned_grids(_blocks(image), angles_deg)
+    turned, seen = placecode.turned_grids(_blocks(image), angles_deg, 8)
     assert seen.all()
     for quarter in range(3):
-        expected = placecode.grid(_blocks(np.rot90(image, quarter + 1)))
+        expected = placecode.grid(_blocks(np.rot90(image, quarter + 1)), 8)
         np.testing.assert_allclose(turned[quarter], expected, atol=0.05)
 
 
 def test_corners_that_a_turned_picture_does_not_reach_are_not_seen():
-    _, seen = placecode.turned_grids(_blocks(_view(_picture(21))), np.array([45.0]))
+    _, seen = placecode.turned_grids(_blocks(_view(_picture(21))), np.array([45.0]), 8)
     assert not seen[0, 0, 0]
     assert not seen[0, -1, -1]
     assert seen[0, 2:-2, 2:-2].all()
@@ -105,7 +105,7 @@ def test_what_a_mask_hides_says_nothing(town):
     image[:, 256:] = 0  # part of the aircraft
     seen = np.zeros((31, 31), bool)
     seen[:, :15] = True
-    grids, in_view = placecode.turned_grids(_blocks(image), _HERE, seen)
+    grids, in_view = placecode.turned_grids(_blocks(image), _HERE, 8, seen)
     asked = placecode.hypotheses(grids, in_view, mean)
     assert placecode.scan(asked, codes).argmax() == 2
     assert _best_shift(asked, codes[2]) == [0, 0]
@@ -162,10 +162,10 @@ def test_a_known_heading_is_the_full_scan_of_three_rotations(town):
 
 
 def test_every_shift_leaves_at_least_the_least_overlap():
-    overlap = np.prod(8 - abs(placecode.SHIFTS.astype(int)), axis=1) / 64
+    overlap = np.prod(8 - abs(placecode.shifts(8).astype(int)), axis=1) / 64
     assert overlap.min() >= 0.5
-    assert len(np.unique(placecode.SHIFTS, axis=0)) == len(placecode.SHIFTS)
-    assert [0, 0] in placecode.SHIFTS.tolist()
+    assert len(np.unique(placecode.shifts(8), axis=0)) == len(placecode.shifts(8))
+    assert [0, 0] in placecode.shifts(8).tolist()
 
 
 def test_an_even_picture_is_compared_without_a_warning(town):
