@@ -34,15 +34,14 @@ def rank(
 ) -> Ranking:
     """Scan all places of the index, and compare the best `candidates` of them in full.
 
-    None, or as many as there are: all places in full under every hypothesis, without a scan (exact, and slow). Where
-    all candidates turn out to be neighbours of the best one, the best-scanned places elsewhere are compared as well:
-    without them nobody could say how far ahead it is.
+    None, or as many as there are and more than the technique's own number: all places in full under every hypothesis,
+    without a scan (exact, and slow). Where all candidates turn out to be neighbours of the best one, the best-scanned
+    places elsewhere are compared as well: without them nobody could say how far ahead it is.
 
     `allowed` bool (N,), at least one True, says where the aircraft should be: the candidates are taken from there, and
     the five best-scanned of all others are compared as well. Where it is false, it would hide the right place behind
     the best of the wrong ones; and to be ahead of the few that are left would say little, so five places elsewhere are
-    compared at least. `turned_deg` (N,) goes to `Technique.coarse_scores`, and its hypotheses to `match`, however small
-    the map.
+    compared at least. `turned_deg` (N,) goes to `Technique.coarse_scores`, and its hypotheses to `match`.
     """
     one_stage = technique.spec.fine is None
     scanned = hypotheses = None
@@ -57,11 +56,12 @@ def rank(
             for slot in slots
         ]
 
-    if one_stage or candidates is None:
-        candidates = len(index)
-    if one_stage or candidates < len(index) or allowed is not None or turned_deg is not None:
+    exact = candidates is None or technique.candidates < candidates >= len(index)
+    if one_stage or not exact or allowed is not None or turned_deg is not None:
         hint = {} if turned_deg is None else {"turned_deg": turned_deg}
         scanned, hypotheses = technique.coarse_scores(query, index.rows, index.mean, **hint)
+    if one_stage or exact:
+        candidates = len(index)
     if allowed is not None:
         chosen = np.append(_best(scanned, allowed, candidates), _best(scanned, ~allowed, _COMPARED_ELSEWHERE))
     elif candidates < len(index):

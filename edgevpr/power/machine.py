@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
 _ROOT = Path("/")
+_PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 # What boards say where their maker has written nothing.
 _FILLERS = re.compile(
     r"to be filled|default string|system (product|manufacturer|version)|not (applicable|specified)|o\.?e\.?m\.?$|none$|"
@@ -83,8 +84,10 @@ def ram_limit_mb(root: Path = _ROOT) -> float:
 
 def rss_mb(root: Path = _ROOT) -> float:
     """Resident memory of this process, pages that it shares with others included."""
-    resident_pages = int((root / "proc/self/statm").read_text().split()[1])
-    return resident_pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+    # Every query asks twice: `read_text` would take three times as long.
+    with open(f"{root}/proc/self/statm", "rb", buffering=0) as statm:
+        resident_pages = int(statm.read(256).split()[1])
+    return resident_pages * _PAGE_BYTES / 1e6
 
 
 def forget_peak(root: Path = _ROOT) -> bool:

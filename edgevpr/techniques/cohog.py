@@ -36,7 +36,7 @@ _ACCEPT = {"forward": (0.12, 0.05), "nadir": (0.08, 0.03), "thesis": (0.0, 0.02)
 _GRID = {"forward": 8, "nadir": 12}
 _CANDIDATES = {"forward": 45, "nadir": 40}
 _ROTATIONS = 24  # of a query that looks straight down and does not know its heading: 15 degrees apart
-_TURNS_TRIED = 6
+_TURNS_TRIED = 6  # of each place; more of them where there are fewer places than are compared in full
 
 
 class CoHog:
@@ -133,7 +133,8 @@ class CoHog:
         else:
             steps = np.rint(turned_deg * (_ROTATIONS / 360)) % _ROTATIONS
             scores = placecode.scan_near(asked, rows, np.nan_to_num(steps, nan=-1).astype(np.intp))
-        tried = np.argsort(-scores, axis=1)[:, :_TURNS_TRIED]
+        tries = _TURNS_TRIED * max(1, self.candidates // max(1, len(rows)))
+        tried = np.argsort(-scores, axis=1)[:, :tries]
         bits = np.where(np.isneginf(np.take_along_axis(scores, tried, axis=1)), 0, 1 << tried)
         return np.clip(scores.max(axis=1), 0, 1), np.bitwise_or.reduce(bits, axis=1)
 

@@ -42,11 +42,18 @@ def test_only_the_rotation_expected_and_those_beside_it_are_tried(town):
     sets = tried(hypotheses)
     assert sets[:3] == [[0, 15, 345], [0, 15, 345], [0, 15, 30]]
     assert sets[3:7] == [[90, 105, 120], [0, 330, 345], [0, 15, 345], [0, 15, 345]]
-    assert len(sets[7]) == 6
-    everything, _ = technique.coarse_scores(places[0], rows, mean)
+    everything, hypotheses = technique.coarse_scores(places[0], rows, mean)
+    assert sets[7] == tried(hypotheses)[7]
     assert (scores <= everything).all()
     assert scores[0] == everything[0]
     assert scores[7] == everything[7]
+
+
+@pytest.mark.parametrize(("places_in_map", "rotations"), [(1, 24), (8, 24), (13, 18), (20, 12), (21, 6), (400, 6)])
+def test_where_there_are_few_places_more_rotations_are_tried(town, places_in_map, rotations):
+    technique, _, places, rows, mean = town
+    _, hypotheses = technique.coarse_scores(places[0], np.resize(rows, (places_in_map, rows.shape[1])), mean)
+    assert {len(found) for found in tried(hypotheses)} == {rotations}
 
 
 @pytest.mark.parametrize("wrong_deg", [0.0, 12.0, -12.0])
