@@ -12,8 +12,8 @@ from edgevpr.places.sequence import Sequence
 from edgevpr.types import Technique
 
 # They are many, so one of them is good by chance. With half the margin no wrong sequence of corridor was accepted from
-# hog, seqslam or cohog, flown as it was mapped, twice as fast, or the other way. At half the speed cohog accepted places
-# three away from the right one.
+# hog, seqslam or cohog, flown as it was mapped, twice as fast, or the other way. At half the speed cohog accepted
+# places three away from the right one.
 _OF_MARGIN_AT_OTHER_SPEEDS = 0.5
 _LONGEST = 10
 
