@@ -38,6 +38,9 @@ class PartSpec:
     def nbytes(self) -> int:
         return int(np.prod(self.shape)) * np.dtype(self.dtype).itemsize
 
+    def __str__(self) -> str:
+        return f"{'x'.join(map(str, self.shape))} {np.dtype(self.dtype)}"
+
 
 @dataclass(frozen=True, slots=True)
 class TechniqueSpec:

@@ -20,7 +20,7 @@ from edgevpr.errors import MapError
 from edgevpr.places.geojson import write_geojson
 from edgevpr.places.geopackage import point_blob
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.types import Position
+from edgevpr.types import PartSpec, Position
 
 
 @pytest.fixture
@@ -162,6 +162,8 @@ def test_another_technique_or_parameter_is_refused_by_name(map_path):
             place_map.require(dataclasses.replace(SPEC, name="hog"))
         with pytest.raises(MapError, match="model sha256 is None, not abc"):
             place_map.require(dataclasses.replace(SPEC, model_sha256="abc"))
+        with pytest.raises(MapError, match=r"coarse part is \S+ float16, not 12x12x8 float16"):
+            place_map.require(dataclasses.replace(SPEC, coarse=PartSpec((12, 12, 8), "<f2")))
         place_map.require(SPEC)
 
 
