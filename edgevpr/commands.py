@@ -113,6 +113,7 @@ def map_merge(args: Namespace) -> int:
 def map_export(args: Namespace) -> int:
     from edgevpr.places.geojson import write_geojson
     from edgevpr.places.mapfile import PlaceMap
+    from edgevpr.runtime.files import write_whole
 
     with PlaceMap.open(args.map) as place_map:
         if args.geojson == "-":
@@ -121,10 +122,12 @@ def map_export(args: Namespace) -> int:
         out_path = Path(args.geojson)
         if out_path.exists() and out_path.samefile(args.map):
             raise UsageError(f"--geojson {out_path} is the map itself: give another name.")
-        unfinished = out_path.with_name(out_path.name + ".part")
-        with open(unfinished, "w", encoding="utf-8") as out:
-            count = write_geojson(place_map, out)
-        unfinished.replace(out_path)
+
+        def write(unfinished: Path) -> int:
+            with open(unfinished, "w", encoding="utf-8") as out:
+                return write_geojson(place_map, out)
+
+        count = write_whole(out_path, write)
     print(f"{out_path}: {count} places")
     return 0
 

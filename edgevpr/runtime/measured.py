@@ -22,6 +22,7 @@ from edgevpr.errors import ConfigError, EdgevprError, UsageError
 from edgevpr.power import machine
 from edgevpr.power.boards import Board, Score
 from edgevpr.resources import own_folder
+from edgevpr.runtime.files import require_folder, write_whole
 from edgevpr.runtime.images import list_images, read_image
 from edgevpr.runtime.offers import Offer
 from edgevpr.runtime.scale import is_same
@@ -128,8 +129,7 @@ def require_room(path: Path, make: bool) -> None:
                 f"{path}: there is no home to keep figures in: set XDG_DATA_HOME, or give --out FILE.json."
             )
         folder.mkdir(parents=True, exist_ok=True)
-    if not folder.is_dir():
-        raise UsageError(f"{path}: there is no such folder: make it first.")
+    require_folder(path)
     if path.is_dir() or not os.access(folder, os.W_OK) or (path.exists() and not os.access(path, os.W_OK)):
         raise EdgevprError(f"{path} cannot be written: give another --out, or correct the permissions.")
 
@@ -137,22 +137,7 @@ def require_room(path: Path, make: bool) -> None:
 def save(found: Measured, path: Path) -> None:
     """Write the figures: as a whole, or not at all."""
     text = json.dumps({"format": _FORMAT, **asdict(found)}, indent=1)
-    write_whole(path, text + "\n")
-
-
-def write_whole(path: Path, text: str, instead: bool = True) -> None:
-    """Write a file that is there as a whole or not at all; `instead` of one of that name, or FileExistsError."""
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        with open(unfinished, "w", encoding="utf-8") as out:
-            out.write(text)
-            out.flush()
-            os.fsync(out.fileno())
-        if not instead:
-            open(path, "x").close()  # never one that is there; a link would do it at once, but FAT has none
-        unfinished.replace(path)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    write_whole(path, lambda unfinished: unfinished.write_text(text + "\n", "utf-8"))
 
 
 def load(path: Path) -> tuple[Measured | None, str | None]:

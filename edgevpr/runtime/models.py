@@ -5,10 +5,8 @@
 
 import json
 import multiprocessing
-import os
 import shutil
 import time
-from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, replace
@@ -21,6 +19,7 @@ from edgevpr.config import read_yaml
 from edgevpr.errors import EdgevprError, ModelError
 from edgevpr.power.machine import rss_mb
 from edgevpr.resources import own_models
+from edgevpr.runtime.files import write_whole
 from edgevpr.techniques.networks.card import Card, card_names, load_card, read_card
 from edgevpr.techniques.networks.session import Backbone, backbone_of, file_sha256, import_onnxruntime
 
@@ -152,26 +151,13 @@ def install(file: Path, sha256: str, card_path: Path, file_name: str, text: str)
         raise ModelError(f"{target} is there already and is another file: write another `file` on the card.")
     folder.mkdir(parents=True, exist_ok=True)
     if not target.exists():
-        _settle(target, lambda unfinished: shutil.copyfile(file, unfinished))
-    _settle(card_path, lambda unfinished: unfinished.write_text(text, "utf-8"))
+        write_whole(target, lambda unfinished: shutil.copyfile(file, unfinished))
+    write_whole(card_path, lambda unfinished: unfinished.write_text(text, "utf-8"))
 
 
 def card_text(values: dict) -> str:
     """A card as YAML, a line a key: what is JSON is YAML too."""
     return "".join(f"{key}: {json.dumps(value, ensure_ascii=False)}\n" for key, value in values.items())
-
-
-def _settle(target: Path, write: Callable[[Path], object]) -> None:
-    """On the disk before it has its name; a full disk is not left fuller."""
-    unfinished = target.with_name(target.name + ".part")
-    try:
-        write(unfinished)
-        with open(unfinished, "rb") as handle:
-            os.fsync(handle.fileno())
-        unfinished.replace(target)
-    except OSError:
-        unfinished.unlink(missing_ok=True)
-        raise
 
 
 def _listed(name: str) -> Listed:

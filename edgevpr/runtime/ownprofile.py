@@ -6,7 +6,7 @@ from pathlib import Path
 
 from edgevpr.errors import EdgevprError, UsageError
 from edgevpr.power.boards import Score
-from edgevpr.runtime.measured import write_whole
+from edgevpr.runtime.files import require_folder, write_whole
 
 _ENDINGS = (".yaml", ".yml")
 
@@ -15,8 +15,7 @@ def require_new_profile(path: Path) -> None:
     """Raise UsageError where `write_profile` would not write."""
     if path.suffix not in _ENDINGS:
         raise UsageError(f"{path}: a profile's name ends in .yaml: choose such a name.")
-    if not path.resolve().parent.is_dir():
-        raise UsageError(f"{path}: there is no such folder: make it first.")
+    require_folder(path)
     if path.exists():
         raise UsageError(f"{path} is there already: move it away, or choose another name.")
 
@@ -24,7 +23,7 @@ def require_new_profile(path: Path) -> None:
 def write_profile(path: Path, text: str) -> None:
     """Write a profile that is not there yet, as a whole. Raises EdgevprError where one has come meanwhile."""
     try:
-        write_whole(path, text, instead=False)
+        write_whole(path, lambda unfinished: unfinished.write_text(text, "utf-8"), instead=False)
     except FileExistsError:
         raise EdgevprError(f"{path} is there already: move it away, or choose another name.") from None
 

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from edgevpr.errors import EdgevprError, UsageError
+from edgevpr.runtime.files import require_folder
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -16,8 +17,7 @@ def require_picture(path: Path) -> None:
     """Raise UsageError or EdgevprError where no picture could be written to `path`: before the work, not after it."""
     if path.suffix.lower() not in _ENDINGS:
         raise UsageError(f"{path}: a picture's name ends in {', '.join(_ENDINGS)}: choose one of these.")
-    if not path.resolve().parent.is_dir():
-        raise UsageError(f"{path}: there is no such folder: make it first.")
+    require_folder(path)
     _hush()
     try:
         import matplotlib.figure  # noqa: F401

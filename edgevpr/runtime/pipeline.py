@@ -253,8 +253,13 @@ def _usable(board: Board, names: tuple[str, ...]) -> Iterator[Technique]:
 
 def made_for(board: Board | None, name: str, settings: dict[str, str] | None = None) -> Technique:
     """The technique `name`; a network with as many threads as the board spares for it (None: one)."""
-    threads = {"threads": board.threads} if board and "threads" in techniques.parameters(name) else {}
-    return techniques.create(name, {**threads, **(settings or {})})
+    return made_with(board.threads if board else None, name, settings)
+
+
+def made_with(threads: int | None, name: str, settings: dict[str, str] | None = None) -> Technique:
+    """The technique `name`; a network with `threads` (None: one), where `settings` do not say how many."""
+    own = {"threads": threads} if threads and "threads" in techniques.parameters(name) else {}
+    return techniques.create(name, {**own, **(settings or {})})
 
 
 def technique_of(

@@ -17,6 +17,7 @@ from edgevpr import techniques
 from edgevpr.errors import EdgevprError
 from edgevpr.runtime.images import read_image
 from edgevpr.runtime.offers import Offer
+from edgevpr.runtime.pipeline import made_with
 from edgevpr.runtime.probe import TechniqueCosts, noise, probe
 from edgevpr.techniques.networks.card import load_card, weights_of
 from edgevpr.types import StageCost
@@ -120,8 +121,7 @@ def _tried(job: dict[str, Any]) -> Trial:
     offer = Offer(job["label"], job["name"], job["settings"])
     try:
         pictures = [read_image(path) for path in job["images"]] or (noise(job["rounds"]) if job["rounds"] else None)
-        threads = {"threads": job["threads"]} if "threads" in techniques.parameters(offer.name) else {}
-        technique = techniques.create(offer.name, {**threads, **offer.settings})
+        technique = made_with(job["threads"], offer.name, offer.settings)
         costs = probe(technique, pictures)
         model = model_of(offer.name, offer.settings)
     except EdgevprError as error:

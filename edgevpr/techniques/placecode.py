@@ -52,7 +52,7 @@ def turned_grids(
     source = np.zeros((n * n + 1, bins), np.float32)
     source[:-1] = blocks.reshape(n * n, 4, bins).mean(axis=1) * seen.reshape(-1, 1)
 
-    at = _sources(n, rotations_deg, side)
+    at = _sources(n, tuple(rotations_deg.tolist()), side)
     share = known[at].mean(axis=-1)
     cells = source[at].mean(axis=2)
     cells = np.stack([_turned_bins(each, angle) for each, angle in zip(cells, rotations_deg, strict=True)])
@@ -139,7 +139,8 @@ def _around(side: int) -> np.ndarray:
     return np.kron(near, near).astype(np.float32)
 
 
-def _sources(n: int, rotations_deg: np.ndarray, side: int) -> np.ndarray:
+@lru_cache(maxsize=8)
+def _sources(n: int, rotations_deg: tuple[float, ...], side: int) -> np.ndarray:
     """int (R, side^2, samples): for every sample of every cell the block it comes from, `n` n where that is outside."""
     samples = round(_SAMPLES / side)
     middle = (np.arange(side * samples) + 0.5) / (side * samples) - 0.5

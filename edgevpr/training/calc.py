@@ -8,7 +8,6 @@ cosine instead of plain momentum.
 import hashlib
 import io
 import math
-import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ import torch
 from torch.nn import functional
 
 from edgevpr.errors import UsageError
+from edgevpr.runtime.files import write_whole
 from edgevpr.training.network import Autoencoder, Encoder
 from edgevpr.training.pictures import batch, gradients_of, require_enough, two_sights
 
@@ -83,9 +83,7 @@ class Training:
         }
         content = io.BytesIO()
         torch.save(state, content)
-        part = path.with_name(path.name + ".part")
-        part.write_bytes(content.getbuffer())
-        os.replace(part, path)
+        write_whole(path, lambda unfinished: unfinished.write_bytes(content.getbuffer()))
 
     def load(self, path: Path) -> None:
         """Go on from a checkpoint. Raises UsageError for one of another training."""

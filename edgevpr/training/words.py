@@ -14,6 +14,7 @@ import numpy as np
 
 from edgevpr.errors import ImageError, UsageError
 from edgevpr.resources import model_folders
+from edgevpr.runtime.files import write_whole
 from edgevpr.runtime.images import list_images
 from edgevpr.runtime.progress import progress
 from edgevpr.techniques.heads import vlad
@@ -92,9 +93,7 @@ def train_words(
         arrays |= _whitening(backbone, folders, pictures, words.astype(np.float32), whiten)
     content = io.BytesIO()
     np.savez_compressed(content, **arrays)
-    part = path.with_name(path.name + ".part")
-    part.write_bytes(content.getbuffer())
-    part.replace(path)
+    write_whole(path, lambda unfinished: unfinished.write_bytes(content.getbuffer()))
     some, words = points[:: max(1, len(points) // 5000)], words.astype(np.float32)
     distance = np.square(some - words[vlad.nearest(some, words)]).sum(axis=1).mean()
     return WordsResult(str(path), pictures, len(points), float(distance))

@@ -1,6 +1,7 @@
 """The training itself: needs PyTorch and onnx, which are not among the development tools because of their size."""
 
 import json
+import os
 
 import numpy as np
 import pytest
@@ -178,7 +179,7 @@ def test_interrupted_the_command_keeps_what_was_done(folder, tmp_path, capsys, m
 
 def test_a_full_disk_is_one_sentence(folder, tmp_path, capsys):
     out = tmp_path / "m.onnx"
-    out.with_suffix(".checkpoint.part").symlink_to("/dev/full")
+    (tmp_path / f".m.checkpoint.{os.getpid()}").symlink_to("/dev/full")
     assert train(folder, out) == 1
     said = capsys.readouterr().err.strip().splitlines()[-1]
     assert "No space left on device" in said
