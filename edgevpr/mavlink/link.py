@@ -135,7 +135,7 @@ class Link:
         )
 
     def close(self) -> None:
-        """Send what waits, for half a second at most, and close the port."""
+        """Send what waits, hear the answers to the fixes sent, for half a second at most, and close the port."""
         self._closing.set()
         self._ring()
         if self._thread.ident is None:  # never started
@@ -267,8 +267,12 @@ class Link:
         with suppress(OSError):
             while self._transport is not None and self._transport.connected and time.monotonic() < give_up_s:
                 self._turn(self._transport, timeout_s=0.01)
-                if not self._outbox and not self._unsent and self._transport.idle():
+                if not self._outbox and not self._unsent and self._transport.idle() and self._all_answered():
                     break
+
+    def _all_answered(self) -> bool:
+        """Say whether as many answers came as fixes went, so that what is counted at the end is what was taken."""
+        return self._autopilot.acks.total() >= self._sent["COMMAND_INT"]
 
     def _close_all(self) -> None:
         if self._transport is not None:

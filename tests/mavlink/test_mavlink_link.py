@@ -359,6 +359,27 @@ def test_a_closed_link_sends_nothing_more_and_can_be_closed_again(port, clock):
     assert not link.stats().connected
 
 
+def test_a_closing_link_waits_for_the_answer_to_its_last_fix(link, peer, clock):
+    heard(link, peer)
+    link.send_fix(fix_at(clock()))
+    closing_link = threading.Thread(target=link.close)
+    closing_link.start()
+    peer.expect("COMMAND_INT")
+    closing_link.join(0.1)
+    assert closing_link.is_alive()
+    peer.answer_fix(mavlink.MAV_RESULT_ACCEPTED)
+    closing_link.join()
+    assert link.stats().acks == {"ACCEPTED": 1}
+
+
+def test_an_autopilot_that_answers_no_fix_does_not_hold_up_the_end(link, peer, clock):
+    heard(link, peer)
+    link.send_fix(fix_at(clock()))
+    link.close()
+    peer.expect("COMMAND_INT")
+    assert not link.stats().connected
+
+
 def test_a_link_that_was_never_started_can_be_closed():
     Link(parse_link("udpout:127.0.0.1:14550")).close()
 
