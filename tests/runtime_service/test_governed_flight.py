@@ -107,7 +107,7 @@ def test_a_change_is_logged_and_announced_once_and_taken_back(maps, tmp_path, mo
     monkeypatch.setattr(loop, "_HEALTH_S", 0.0)
     changes, _, texts = governed(config, tmp_path / "log", [BUSY] * 2 + [CALM] * 3, monkeypatch, 8)
     down, back = changes
-    asked, half = {"rate_hz": 60.0, "candidates": 45, "form": None}, {"rate_hz": 30.0, "candidates": 45, "form": None}
+    asked, half = {"rate_hz": 60.0, "candidates": 40, "form": None}, {"rate_hz": 30.0, "candidates": 40, "form": None}
     assert (down["from"], down["to"], back["from"], back["to"]) == (asked, half, half, asked)
     assert down["why"].startswith("100% of all cores taken, and ")
     assert [(text.severity, text.text) for text in texts] == [
@@ -135,8 +135,8 @@ def test_fewer_candidates_are_compared_when_the_rate_is_at_its_least(maps, tmp_p
     )
     config = load_config(None, {"map": str(maps / "cohog.gpkg"), "source.rate_hz": 60.0})
     changes, _, texts = governed(config, tmp_path / "log", [BUSY] * 99, monkeypatch, 12)
-    assert [line["to"]["candidates"] for line in changes] == [45, 45, 45, 22, 22]
-    assert set(compared) == {45, 22}
+    assert [line["to"]["candidates"] for line in changes] == [40, 40, 40, 20, 20]
+    assert set(compared) == {40, 20}
     assert changes[-1]["from"] == changes[-1]["to"]
     assert changes[-1]["why"].endswith("nothing is left to lower")
     assert texts[-1].text == "edgevpr: over a limit of its board, see its log"
@@ -205,9 +205,13 @@ def cost_s(maps, folder, through):
     flight = start(maps / "cohog.gpkg", folder / "some", folder / "some.jsonl", "--rate-hz", "60", through=through)
     assert flight.wait(timeout=60) == 0
     flight.stderr.close()
-    queries = [line for line in read_log(folder / "some.jsonl") if line["kind"] == "query"]
-    costs_s = [line["costs"]["t_encode_s"] + line["costs"]["t_match_s"] + line["reading"]["wall_s"] for line in queries]
-    return statistics.median(costs_s)
+    return median_cost_s([line for line in read_log(folder / "some.jsonl") if line["kind"] == "query"])
+
+
+def median_cost_s(queries):
+    return statistics.median(
+        line["costs"]["t_encode_s"] + line["costs"]["t_match_s"] + line["reading"]["wall_s"] for line in queries
+    )
 
 
 def share_of(core):
@@ -223,17 +227,19 @@ def share_of(core):
         os.sched_setaffinity(0, allowed)
 
 
-def wait_for_change(log, number, flight):
+def wait_for_change(log, number, flight, expected_cost_s):
     give_up_s = time.monotonic() + 30
     while time.monotonic() < give_up_s and flight.poll() is None:
         changes = [line for line in read_log(log) if line["kind"] == "governor"] if log.exists() else []
         if len(changes) >= number:
             return changes
-        time.sleep(0.05)
+        time.sleep(0.3)  # to read a log takes time too, maybe of that core
     last = [line for line in read_log(log) if line["kind"] == "query"][-60:]
     ran_s = sum(line["costs"]["cpu_s"] for line in last)
     if number > 1 and ran_s < 0.9 * sum(line["costs"]["t_encode_s"] + line["costs"]["t_match_s"] for line in last):
         pytest.skip("other programs than the test's own go on to take the core")
+    if number > 1 and median_cost_s(last) > 1.2 * expected_cost_s:
+        pytest.skip("this machine has become slower: the rate asked needs more of the core than it did")
     pytest.fail(f"no change number {number} in the log; the flight has ended with: {flight.poll()}")
 
 
@@ -244,7 +250,8 @@ def test_a_flight_that_must_share_its_core_asks_less_often_until_it_has_it_back(
     if core is None:
         pytest.skip("other programs take every core of this machine")
     through = ["taskset", "-c", str(core)]
-    rate_hz = 0.65 / cost_s(maps, tmp_path, through)  # it needs two thirds of the core, and of two programs gets half
+    a_query_s = cost_s(maps, tmp_path, through)
+    rate_hz = 0.65 / a_query_s  # it needs two thirds of the core, and of two programs gets half
     write_frames(tmp_path / "query", 10)
     for number in range(10, 3000):
         os.link(tmp_path / "query" / f"{number % 10:04d}.jpg", tmp_path / "query" / f"{number:04d}.jpg")
@@ -252,12 +259,12 @@ def test_a_flight_that_must_share_its_core_asks_less_often_until_it_has_it_back(
     flight = start(maps / "cohog.gpkg", tmp_path / "query", log, "--rate-hz", f"{rate_hz:.3f}", through=through)
     load = subprocess.Popen([*through, sys.executable, "-c", "while True: pass"])
     try:
-        lowered = wait_for_change(log, 1, flight)
+        lowered = wait_for_change(log, 1, flight, a_query_s)
         load.kill()
         load.wait()
         changes = lowered
         while changes[-1]["to"] != changes[0]["from"]:
-            changes = wait_for_change(log, len(changes) + 1, flight)
+            changes = wait_for_change(log, len(changes) + 1, flight, a_query_s)
     finally:
         load.kill()
         load.wait()
