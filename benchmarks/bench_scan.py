@@ -53,23 +53,23 @@ def binary_rows(places: int = 100_000, code_bytes: int = 64, rounds: int = 30) -
 
 
 def growth_rows(places: tuple[int, ...] = (1_000, 3_000, 10_000, 30_000, 100_000)) -> list[dict]:
-    """The scan of place codes as the map grows, ahead (64 bytes a place) and looking down (24 rotations, 144 bytes a
-    place): the data of the plot. The query's own part does not grow, and stands apart as `t_query_ms`."""
+    """The scan of place codes as the map grows, ahead and looking down (24 rotations): the data of the plot. The
+    query's own part does not grow, and stands apart as `t_query_ms`."""
     rng = np.random.default_rng(0)
     blocks = rng.random((31, 31, 32), dtype=np.float32)
+    mean = rng.random((placecode.SIDE, placecode.SIDE, 8), dtype=np.float32)
     rows = []
-    for side, turns in ((8, 1), (12, 24)):
-        mean = rng.random((side, side, 8), dtype=np.float32)
+    for turns, scan in ((1, placecode.scan_ahead), (24, placecode.scan)):
         angles_deg = np.arange(turns) * 360 / turns
 
-        def ask(mean: np.ndarray = mean, angles_deg: np.ndarray = angles_deg) -> np.ndarray:
-            grids, seen = placecode.turned_grids(blocks, angles_deg, len(mean))
+        def ask(angles_deg: np.ndarray = angles_deg) -> np.ndarray:
+            grids, seen = placecode.turned_grids(blocks, angles_deg)
             return placecode.hypotheses(grids, seen, mean, locally=len(angles_deg) > 1)
 
         asked = ask()
         for count in places:
-            codes = rng.integers(0, 256, (count, side * side), dtype=np.uint8)
-            ways = {"query": ask, "scan": lambda codes=codes, asked=asked: placecode.scan(asked, codes)}
+            codes = rng.integers(0, 256, (count, placecode.SIDE**2), dtype=np.uint8)
+            ways = {"query": ask, "scan": lambda codes=codes, asked=asked, scan=scan: scan(asked, codes)}
             taken = medians_s(ways, rounds=max(1, min(20, 2_000_000 // (count * turns))))
             rows.append(
                 {

@@ -15,7 +15,7 @@ from edgevpr.types import Position, Technique, TechniqueSpec
 
 _log = logging.getLogger(__name__)
 _BYTES_BESIDE_ROW = 8 + 8 + 8 + 2  # id, latitude, longitude, heading
-_PACKED_AT_ONCE = 64
+_PACKED_AT_ONCE = 32
 
 
 @dataclass(frozen=True, slots=True)

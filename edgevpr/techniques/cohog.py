@@ -6,8 +6,7 @@ cosines is the score (`matching: thesis`); here, by default, each also votes for
 share that agrees is the score (`matching: displacement`, see `displacement`).
 
 The blocks are the fine part, 8 bits a value on disk (31 KB a place). The coarse part is the same blocks averaged over
-a grid, of which 64 bytes a place, or 144 looking down, stay in RAM (see `placecode`): they pick which places are
-compared in full.
+a grid, of which 144 bytes a place stay in RAM (see `placecode`): they pick which places are compared in full.
 """
 
 from dataclasses import replace
@@ -32,9 +31,7 @@ _VOTES_COUNT = {"forward": (1.0, 1.0, 0.75, 0.5), "nadir": (1.0, 1.0)}
 # nor did any query of two other sites in the map of aerial_caliterra. The thesis's score has no safe threshold: its
 # margin keeps out those queries of other sites, and most right matches with them.
 _ACCEPT = {"forward": (0.12, 0.05), "nadir": (0.08, 0.03), "thesis": (0.0, 0.02)}
-# A turned picture needs a finer code, for the place and for the rotations under which it is then compared in full.
-_GRID = {"forward": 8, "nadir": 12}
-_CANDIDATES = {"forward": 45, "nadir": 40}
+_CANDIDATES = 40
 _ROTATIONS = 24  # of a query that looks straight down and does not know its heading: 15 degrees apart
 _TURNS_TRIED = 6  # of each place; more of them where there are fewer places than are compared in full
 
@@ -61,7 +58,7 @@ class CoHog:
         _require("entropy", entropy, _DEFAULT_GT)
         _require("camera", camera, _VOTES_COUNT)
         _require("matching", matching, ("displacement", "thesis"))
-        grid = _GRID[camera]
+        grid = placecode.SIDE
         if not (w2 >= 2 and w1 % w2 == 0 and w1 // w2 > grid and w1 <= 4096 and 2 <= bins <= 64):
             raise UsageError(
                 f"cohog cannot use w1={w1}, w2={w2}, bins={bins}: w1 must be a multiple of w2 (more than "
@@ -72,11 +69,11 @@ class CoHog:
         self._w1, self._w2, self._bins = w1, w2, bins
         self._entropy, self._camera = entropy, camera
         self._gt = gt if gt >= 0 else _DEFAULT_GT[entropy]
-        self._side, self._grid = w1 // w2 - 1, grid  # blocks along one side, and cells of the place code
+        self._side = w1 // w2 - 1  # blocks along one side
         self._matched = self._displacement if matching == "displacement" else self._thesis
         self._compared = slow_patterns(bins) if matching == "displacement" else None
         self.min_score, self.min_margin = _ACCEPT[camera if matching == "displacement" else matching]
-        self.candidates = _CANDIDATES[camera]
+        self.candidates = _CANDIDATES
         self.spec = TechniqueSpec(
             "cohog",
             {"w1": w1, "w2": w2, "bins": bins, "gt": self._gt, "entropy": entropy, "camera": camera},
@@ -88,8 +85,8 @@ class CoHog:
     def encode(self, image: np.ndarray, mask: np.ndarray | None = None) -> Descriptor:
         """Encode uint8 (H, W[, 3]); a block that touches a pixel where `mask` is False is never good.
 
-        Returns coarse float16 (8, 8, bins) or (12, 12, bins), fine uint8 (blocks, 4 bins), and for asking: regions
-        float32 (blocks, 4 bins) (matrix B of 6.2.3) and good bool (blocks,).
+        Returns coarse float16 (12, 12, bins), fine uint8 (blocks, 4 bins), and for asking: regions float32 (blocks,
+        4 bins) (matrix B of 6.2.3) and good bool (blocks,).
         """
         if self._camera == "nadir":
             image, mask = _in_square(image, mask)
@@ -98,7 +95,7 @@ class CoHog:
         regions = blocks.reshape(self.spec.fine.shape)
         # The root of each value in 8 bits: the small values, of which there are most, keep their digits.
         stored = np.rint(255 * np.sqrt(regions)).astype(np.uint8)
-        coarse = placecode.grid(self._middle(blocks, seen), self._grid).astype("<f2")
+        coarse = placecode.grid(self._middle(blocks, seen)).astype("<f2")
         quality = float(good.sum() / max(seen.sum(), 1))
         return Descriptor(coarse, stored, regions, good.ravel(), quality, Picture(grey, allowed, seen))
 
@@ -113,22 +110,24 @@ class CoHog:
         return blocks, seen, good & seen
 
     def pack(self, coarse: np.ndarray, mean: np.ndarray) -> np.ndarray:
-        """Rows of the index: coarse float16 (N, 8, 8, bins) or (N, 12, 12, bins), the map's mean -> uint8 (N, B)."""
+        """Rows of the index: coarse float16 (N, 12, 12, bins), the map's mean -> uint8 (N, B)."""
         return placecode.pack(coarse.astype(np.float32), mean, locally=self._camera == "nadir")
 
     def coarse_scores(
         self, query: Descriptor, rows: np.ndarray, mean: np.ndarray, turned_deg: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Compare the place codes under all shifts and, looking down, all rotations, or those within 22.5 degrees of
+        """Compare the place codes under shifts and, looking down, rotations, all or those within 22.5 degrees of
         `turned_deg` (N,): `rows` uint8 (N, B) -> scores float32 (N,), and the rotations for `match` to try, the
         bits of an int32 (N,)."""
         seen = query.picture.seen
         blocks = self._middle(query.regions.reshape(self._side, self._side, -1), seen)
         turns = np.arange(_ROTATIONS if self._camera == "nadir" else 1)
         seen = self._middle(seen, seen)
-        grids, in_view = placecode.turned_grids(blocks, -360 * turns / _ROTATIONS, self._grid, seen)
+        grids, in_view = placecode.turned_grids(blocks, -360 * turns / _ROTATIONS, seen)
         asked = placecode.hypotheses(grids, in_view, mean, locally=self._camera == "nadir")
-        if turned_deg is None or self._camera == "forward":
+        if self._camera == "forward":
+            scores = placecode.scan_ahead(asked, rows)
+        elif turned_deg is None:
             scores = placecode.scan(asked, rows)
         else:
             steps = np.rint(turned_deg * (_ROTATIONS / 360)) % _ROTATIONS
@@ -165,7 +164,7 @@ class CoHog:
     def _middle(self, per_block: np.ndarray, seen: np.ndarray) -> np.ndarray:
         """The largest square in the middle that a picture fills that was laid into a larger one: (side, side, ...) ->
         (n, n, ...)."""
-        n = max(min(int(seen.any(axis=0).sum()), int(seen.any(axis=1).sum())), self._grid)
+        n = max(min(int(seen.any(axis=0).sum()), int(seen.any(axis=1).sum())), placecode.SIDE)
         start = (len(seen) - n) // 2
         return per_block[start : start + n, start : start + n]
 

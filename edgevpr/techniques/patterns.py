@@ -24,23 +24,27 @@ _KEPT = (
 def slow_patterns(bins: int) -> np.ndarray:
     """The kept patterns of blocks of 2x2 cells of `bins` orientations, each of length 1 and at right angles to all
     others: float32 (4 bins, patterns)."""
-    frequency, waves = _waves(bins)
+    frequency = _frequencies(bins)
     return np.vstack(
         [
             np.kron(np.array(cells) / 2, wave)
             for cells, kept in _KEPT
-            for at, wave in zip(frequency, waves, strict=True)
+            for at, wave in zip(frequency, waves(bins), strict=True)
             if kept is None or at in kept
         ]
     ).T.astype(np.float32, order="C")
 
 
-def _waves(bins: int) -> tuple[np.ndarray, np.ndarray]:
-    """The real Fourier series over `bins` orientations: the frequency of each wave, and the waves (bins, bins), each
-    of length 1."""
+@lru_cache
+def waves(bins: int) -> np.ndarray:
+    """The real Fourier series over `bins` orientations, float32 (bins, bins): a wave a row, each of length 1: the
+    constant, then cosine and sine of each frequency; the highest of an even number of bins has a cosine only."""
     turn = 2 * np.pi * np.arange(bins) / bins
-    number = np.arange(bins)
-    frequency = (number + 1) // 2
-    # The constant, then cosine and sine of each frequency; the highest of an even number of bins has a cosine only.
-    waves = np.cos(frequency[:, None] * turn - np.pi / 2 * (number[:, None] % 2 == 0) * (number[:, None] > 0))
-    return frequency, waves / np.linalg.norm(waves, axis=1, keepdims=True)
+    frequency, number = _frequencies(bins), np.arange(bins)
+    series = np.cos(frequency[:, None] * turn - np.pi / 2 * (number[:, None] % 2 == 0) * (number[:, None] > 0))
+    return (series / np.linalg.norm(series, axis=1, keepdims=True)).astype(np.float32)
+
+
+def _frequencies(bins: int) -> np.ndarray:
+    """The frequency of each of the `waves`."""
+    return (np.arange(bins) + 1) // 2

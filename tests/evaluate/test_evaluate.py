@@ -14,7 +14,7 @@ from edgevpr.evaluate.evaluate import as_json, compare, evaluate
 from edgevpr.runtime.progress import progress
 
 HOG = {"w1": 64}
-COHOG = {"w1": 144}
+COHOG = {"w1": 208}
 KEYS = (
     "recall_at_1", "recall_at_5", "recall_at_10", "precision_at_100_recall", "auc", "ep", "pcu", "t_encode_s",
     "t_match_s", "t_match_per_ref_s", "descriptor_bytes", "u_encode", "u_match", "ah_total",
@@ -55,7 +55,7 @@ def test_recall_costs_and_sizes_of_a_technique(folder, name, parameters):
     assert result.ah_total > 0
     assert result.ah_total_cpu_rail > result.ah_total  # the rail's voltage is lower than the pack's
     assert "4S5200" in result.ah_assumes
-    sizes = {"hog": (7 * 7 * 36 * 2, 0), "cohog": (64, 64 * 32)}
+    sizes = {"hog": (7 * 7 * 36 * 2, 0), "cohog": (144, 144 * 32)}
     assert (result.descriptor_bytes, result.fine_bytes) == sizes[name]
 
 

@@ -42,14 +42,14 @@ def test_cell_histograms_and_blocks(bins, signed):
 
 @pytest.mark.parametrize(("which", "threshold"), [("filled_bins", 0.5), ("shannon", 0.4), ("shannon", 0.55)])
 def test_cohog_descriptor_good_regions_and_score(which, threshold):
-    technique = create("cohog", {"w1": 144, "w2": 16, "gt": threshold, "entropy": which, "matching": "thesis"})
+    technique = create("cohog", {"w1": 208, "w2": 16, "gt": threshold, "entropy": which, "matching": "thesis"})
     query_image, reference_image = textured(6), textured(7)
     query, reference = technique.encode(query_image), technique.encode(reference_image)
 
-    grey = literal.grey_square(query_image, 144)
+    grey = literal.grey_square(query_image, 208)
     query_blocks = literal.blocks(literal.cell_histograms(grey, 16, 8, True))
     good = literal.good_blocks(getattr(literal, which)(grey), 16, threshold)
-    reference_blocks = literal.blocks(literal.cell_histograms(literal.grey_square(reference_image, 144), 16, 8, True))
+    reference_blocks = literal.blocks(literal.cell_histograms(literal.grey_square(reference_image, 208), 16, 8, True))
     assert 0 < good.sum() < len(good), "the picture must have good and confusing regions"
     np.testing.assert_array_equal(query.good, good)
     np.testing.assert_allclose(query.regions, query_blocks, atol=1e-4)
