@@ -73,15 +73,15 @@ exact` votes over all places, under all rotations. `cohog, thesis` scores as pub
 is kept in half precision; as `8bit` or `1bit` it is less the map's mean, a byte or a bit a number. Parameters and
 limits of acceptance were chosen on the sets marked *tune*. Some figures of cohog were fixed after other sets had been
 seen, and are to be judged with that in mind: of a place code the least overlap (half), its size (12x12 cells), its
-Fourier series and, looking down, the neighbourhood whose common part it leaves out (3 cells) and the rotations it
-leaves to be tried (6); the number of places compared in full (40); what a vote counts that is off the peak (ahead 1, 1,
-0.75, 0.5) and how many patterns of a region are compared (20 of 32), both with grief_stromovka_seasons; and the margin
-of `cohog, thesis` (0.02, with pictures of foreign sites). The shipped weights of calc, on which the networks run, have
-seen the pictures of aerial_caliterra and aerial_brighton in training: what networks reach there is not clean. A
-sequence wants a flight along the mapped way; only corridor, grief_stromovka_seasons and nordland_tiny are such. Of a
-network other than the shipped one nothing is accepted before the user says from when on. The truth of the aerial sets
-was computed by image registration: it favours pairs that local features can match, and says nothing of others. The JSON
-files beside this page hold every figure.
+Fourier series and, looking down, the neighbourhood whose common part it leaves out (3 cells); how many places are
+compared in full (40) or, looking down, pairs of place and rotation (300, of one place 6 at most), with aerial_swindale;
+what a vote counts that is off the peak (ahead 1, 1, 0.75, 0.5) and how many patterns of a region are compared (20 of
+32), both with grief_stromovka_seasons; and the margin of `cohog, thesis` (0.02, with pictures of foreign sites). The
+shipped weights of calc, on which the networks run, have seen the pictures of aerial_caliterra and aerial_brighton in
+training: what networks reach there is not clean. A sequence wants a flight along the mapped way; only corridor,
+grief_stromovka_seasons and nordland_tiny are such. Of a network other than the shipped one nothing is accepted before
+the user says from when on. The truth of the aerial sets was computed by image registration: it favours pairs that local
+features can match, and says nothing of others. The JSON files beside this page hold every figure.
 
 Weights in use:
 

@@ -1,5 +1,6 @@
 """The values that cross rooms: frozen dataclasses, and the contract of a technique."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -120,14 +121,16 @@ class Technique(Protocol):
     def coarse_scores(
         self, query: Descriptor, rows: np.ndarray, mean: np.ndarray | None, turned_deg: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Score all places at once: `rows` (N, *row.shape) -> scores (N,) float32, hypotheses (N,) or None. `mean` is
-        that of the map for a technique that packs, else None. `turned_deg` float (N,) is how far the camera should
-        have turned since each place was mapped, as `FineMatch.rotation_deg` (NaN: nobody knows); it is given only to a
-        technique with a parameter `camera` that is "nadir", which then tries only such rotations."""
+        """Score all places at once: `rows` (N, *row.shape) -> scores (N,) float32 and, where `match` has several
+        hypotheses to try, those of each, float32 (N, H), -inf where it is out of the question; else None.
+
+        `mean` is that of the map for a technique that packs, else None. `turned_deg` float (N,) is how far the camera
+        should have turned since each place was mapped, as `FineMatch.rotation_deg` (NaN: nobody knows); it is given
+        only to a technique with a parameter `camera` that is "nadir", which then allows only such rotations."""
         ...
 
-    def match(self, query: Descriptor, fine: np.ndarray, hypothesis: int | None) -> FineMatch:
-        """Compare the query with the fine part of one place."""
+    def match(self, query: Descriptor, fine: np.ndarray, hypotheses: Sequence[int] | None) -> FineMatch:
+        """Compare the query with the fine part of one place, under some of its hypotheses or all (None)."""
         ...
 
 

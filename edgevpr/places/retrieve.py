@@ -11,6 +11,9 @@ from edgevpr.types import Candidate, Descriptor, FineMatch, Technique
 
 _NEIGHBOURS_WITHOUT_POSITION = 2
 _COMPARED_ELSEWHERE = 5
+_TRIED_EACH = 6  # hypotheses of a place
+
+_Chosen = tuple[int, list[int] | None]  # a slot, and the hypotheses to try (None: all there are)
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,52 +44,67 @@ def rank(
     `allowed` bool (N,), at least one True, says where the aircraft should be: the candidates are taken from there, and
     the five best-scanned of all others are compared as well. Where it is false, it would hide the right place behind
     the best of the wrong ones; and to be ahead of the few that are left would say little, so five places elsewhere are
-    compared at least. `turned_deg` (N,) goes to `Technique.coarse_scores`, and its hypotheses to `match`.
+    compared at least. `turned_deg` (N,) goes to `Technique.coarse_scores`.
     """
     one_stage = technique.spec.fine is None
-    scanned = hypotheses = None
+    scanned = by_hypothesis = None
 
-    def compared(slots: np.ndarray) -> list[FineMatch]:
+    def compared(chosen: list[_Chosen]) -> list[FineMatch]:
         if one_stage:
-            return [FineMatch(float(scanned[slot])) for slot in slots]
+            return [FineMatch(float(scanned[slot])) for slot, _ in chosen]
         return [
-            technique.match(
-                query, place_map.fine_part(index.place_ids[slot]), None if hypotheses is None else int(hypotheses[slot])
-            )
-            for slot in slots
+            technique.match(query, place_map.fine_part(index.place_ids[slot]), hypotheses)
+            for slot, hypotheses in chosen
         ]
 
     exact = candidates is None or technique.candidates < candidates >= len(index)
     if one_stage or not exact or allowed is not None or turned_deg is not None:
         hint = {} if turned_deg is None else {"turned_deg": turned_deg}
-        scanned, hypotheses = technique.coarse_scores(query, index.rows, index.mean, **hint)
+        scanned, by_hypothesis = technique.coarse_scores(query, index.rows, index.mean, **hint)
     if one_stage or exact:
         candidates = len(index)
-    if allowed is not None:
-        chosen = np.append(_best(scanned, allowed, candidates), _best(scanned, ~allowed, _COMPARED_ELSEWHERE))
-    elif candidates < len(index):
-        chosen = np.argpartition(-scanned, candidates)[:candidates]
+    if scanned is None or (one_stage and allowed is None):
+        chosen = [(slot, None) for slot in range(len(index))]
     else:
-        chosen = np.arange(len(index))
+        there = np.ones(len(index), bool) if allowed is None else allowed
+        chosen = best_scanned(scanned, by_hypothesis, there, candidates)
+        chosen += best_scanned(scanned, by_hypothesis, ~there, _COMPARED_ELSEWHERE)
     matches = compared(chosen)
-    if len(chosen) < len(index):
-        best = chosen[max(range(len(chosen)), key=lambda at: matches[at].score)]
-        rivals = np.count_nonzero(elsewhere(index, best, chosen, neighbour_m))
+    slots = np.array([slot for slot, _ in chosen])
+    if len(slots) < len(index):
+        best = slots[max(range(len(slots)), key=lambda at: matches[at].score)]
+        rivals = np.count_nonzero(elsewhere(index, best, slots, neighbour_m))
         if rivals < (1 if allowed is None else _COMPARED_ELSEWHERE):
             others = elsewhere(index, best, np.arange(len(index)), neighbour_m)
-            others[chosen] = False
-            others = _best(scanned, others, _COMPARED_ELSEWHERE - rivals)
-            matches += compared(others)
-            chosen = np.append(chosen, others)
+            others[slots] = False
+            more = best_scanned(scanned, by_hypothesis, others, _COMPARED_ELSEWHERE - rivals)
+            matches += compared(more)
+            slots = np.append(slots, [slot for slot, _ in more]).astype(np.intp)
     scores = np.array([match.score for match in matches], np.float32)
     order = np.argsort(-scores, kind="stable")
-    return Ranking(chosen[order], scores[order], tuple(matches[i] for i in order))
+    return Ranking(slots[order], scores[order], tuple(matches[i] for i in order))
 
 
-def _best(scanned: np.ndarray, among: np.ndarray, count: int) -> np.ndarray:
-    """The `count` best-scanned slots of those `among` (N,) bool is True of, best first."""
+def best_scanned(scanned: np.ndarray, by_hypothesis: np.ndarray | None, among: np.ndarray, count: int) -> list[_Chosen]:
+    """The `count` best-scanned slots of those `among` (N,) bool is True of, and which hypotheses to try of each.
+
+    Where there are several (`by_hypothesis` float32 (N, H), see `Technique.coarse_scores`), the best of all places are
+    tried, six for each of `count`: a place of which only two look likely leaves room for others. Of one place they are
+    six at most, or more where there are not enough places.
+    """
     slots = np.flatnonzero(among)
-    return slots[np.argsort(-scanned[slots], kind="stable")[:count]]
+    best = slots[np.argsort(-scanned[slots], kind="stable")]
+    if by_hypothesis is None or not len(slots):
+        return [(int(slot), None) for slot in best[:count]]
+    tries = count * min(_TRIED_EACH, int(np.isfinite(by_hypothesis[slots]).sum(axis=1).max()))
+    best = best[:tries]
+    scores = by_hypothesis[best]
+    of_place = np.argsort(np.argsort(-scores, axis=1, kind="stable"), axis=1)
+    scores = np.where(of_place < max(_TRIED_EACH, tries // len(best)), scores, -np.inf)
+    tried = np.zeros(scores.shape, bool)
+    tried.flat[np.argsort(-scores, axis=None, kind="stable")[:tries]] = True
+    tried &= np.isfinite(scores)
+    return [(int(best[at]), np.flatnonzero(tried[at]).tolist()) for at in np.flatnonzero(tried.any(axis=1))]
 
 
 def elsewhere(index: PlaceIndex, best: int, slots: np.ndarray, neighbour_m: float) -> np.ndarray:

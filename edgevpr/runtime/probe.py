@@ -12,7 +12,7 @@ import numpy as np
 
 from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import margin, rank
+from edgevpr.places.retrieve import best_scanned, margin, rank
 from edgevpr.places.sequence import Sequence, bytes_beside_place, length_of
 from edgevpr.power import machine
 from edgevpr.power.meter import stage
@@ -95,11 +95,10 @@ def probe(technique: Technique, images: Several[np.ndarray] | None = None) -> Te
         index = load_index(trial_map, technique, _PLACES * bytes_per_place(technique.spec))
         for query in queries:
             with stage() as matching:
-                _, hypotheses = technique.coarse_scores(query, index.rows, index.mean)
+                scanned = technique.coarse_scores(query, index.rows, index.mean)
                 if technique.spec.fine:
-                    for slot, place_id in enumerate(index.place_ids):
-                        hypothesis = None if hypotheses is None else int(hypotheses[slot])
-                        technique.match(query, trial_map.fine_part(place_id), hypothesis)
+                    for slot, hypotheses in best_scanned(*scanned, np.ones(_PLACES, bool), _PLACES):
+                        technique.match(query, trial_map.fine_part(index.place_ids[slot]), hypotheses)
             matchings.append(matching.cost)
     fine = technique.spec.fine
     process_mb = machine.peak_mb() if peak_is_new else machine.rss_mb()

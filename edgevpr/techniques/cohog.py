@@ -5,10 +5,11 @@ Every place is 31x31 overlapping blocks, each described by the histograms of its
 cosines is the score (`matching: thesis`); here, by default, each also votes for how far the picture has moved, and the
 share that agrees is the score (`matching: displacement`, see `displacement`).
 
-The blocks are the fine part, 8 bits a value on disk (31 KB a place). The coarse part is the same blocks averaged over
+The blocks are the fine part, 8 bits a value (31 KB a place, on disk). The coarse part is the same blocks averaged over
 a grid, of which 144 bytes a place stay in RAM (see `placecode`): they pick which places are compared in full.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import cv2
@@ -31,9 +32,8 @@ _VOTES_COUNT = {"forward": (1.0, 1.0, 0.75, 0.5), "nadir": (1.0, 1.0)}
 # nor did any query of two other sites in the map of aerial_caliterra. The thesis's score has no safe threshold: its
 # margin keeps out those queries of other sites, and most right matches with them.
 _ACCEPT = {"forward": (0.12, 0.05), "nadir": (0.08, 0.03), "thesis": (0.0, 0.02)}
-_CANDIDATES = 40
+_CANDIDATES = {"forward": 40, "nadir": 50}
 _ROTATIONS = 24  # of a query that looks straight down and does not know its heading: 15 degrees apart
-_TURNS_TRIED = 6  # of each place; more of them where there are fewer places than are compared in full
 
 
 class CoHog:
@@ -73,11 +73,11 @@ class CoHog:
         self._matched = self._displacement if matching == "displacement" else self._thesis
         self._compared = slow_patterns(bins) if matching == "displacement" else None
         self.min_score, self.min_margin = _ACCEPT[camera if matching == "displacement" else matching]
-        self.candidates = _CANDIDATES
+        self.candidates = _CANDIDATES[camera]
         self.spec = TechniqueSpec(
             "cohog",
             {"w1": w1, "w2": w2, "bins": bins, "gt": self._gt, "entropy": entropy, "camera": camera},
-            coarse=PartSpec((grid, grid, bins), "<f2"),
+            coarse=PartSpec((grid, grid, bins), "|u1"),
             fine=PartSpec((self._side**2, 4 * bins), "|u1"),
             packed=PartSpec((grid**2 * bins // 8,), "|u1"),
         )
@@ -85,7 +85,7 @@ class CoHog:
     def encode(self, image: np.ndarray, mask: np.ndarray | None = None) -> Descriptor:
         """Encode uint8 (H, W[, 3]); a block that touches a pixel where `mask` is False is never good.
 
-        Returns coarse float16 (12, 12, bins), fine uint8 (blocks, 4 bins), and for asking: regions float32 (blocks,
+        Returns coarse uint8 (12, 12, bins), fine uint8 (blocks, 4 bins), and for asking: regions float32 (blocks,
         4 bins) (matrix B of 6.2.3) and good bool (blocks,).
         """
         if self._camera == "nadir":
@@ -95,7 +95,7 @@ class CoHog:
         regions = blocks.reshape(self.spec.fine.shape)
         # The root of each value in 8 bits: the small values, of which there are most, keep their digits.
         stored = np.rint(255 * np.sqrt(regions)).astype(np.uint8)
-        coarse = placecode.grid(self._middle(blocks, seen)).astype("<f2")
+        coarse = np.rint(255 * placecode.grid(self._middle(blocks, seen))).astype(np.uint8)
         quality = float(good.sum() / max(seen.sum(), 1))
         return Descriptor(coarse, stored, regions, good.ravel(), quality, Picture(grey, allowed, seen))
 
@@ -110,34 +110,31 @@ class CoHog:
         return blocks, seen, good & seen
 
     def pack(self, coarse: np.ndarray, mean: np.ndarray) -> np.ndarray:
-        """Rows of the index: coarse float16 (N, 12, 12, bins), the map's mean -> uint8 (N, B)."""
-        return placecode.pack(coarse.astype(np.float32), mean, locally=self._camera == "nadir")
+        """Rows of the index: coarse uint8 (N, 12, 12, bins), the map's mean -> uint8 (N, B)."""
+        return placecode.pack(coarse.astype(np.float32) / 255, mean / 255, locally=self._camera == "nadir")
 
     def coarse_scores(
         self, query: Descriptor, rows: np.ndarray, mean: np.ndarray, turned_deg: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Compare the place codes under shifts and, looking down, rotations, all or those within 22.5 degrees of
-        `turned_deg` (N,): `rows` uint8 (N, B) -> scores float32 (N,), and the rotations for `match` to try, the
-        bits of an int32 (N,)."""
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """Compare the place codes, `rows` uint8 (N, B), under shifts and, looking down, rotations, all or those within
+        22.5 degrees of `turned_deg` (N,). Returns scores float32 (N,) and, looking down, those of each rotation,
+        float32 (N, 24)."""
         seen = query.picture.seen
         blocks = self._middle(query.regions.reshape(self._side, self._side, -1), seen)
         turns = np.arange(_ROTATIONS if self._camera == "nadir" else 1)
         seen = self._middle(seen, seen)
         grids, in_view = placecode.turned_grids(blocks, -360 * turns / _ROTATIONS, seen)
-        asked = placecode.hypotheses(grids, in_view, mean, locally=self._camera == "nadir")
+        asked = placecode.hypotheses(grids, in_view, mean / 255, locally=self._camera == "nadir")
         if self._camera == "forward":
-            scores = placecode.scan_ahead(asked, rows)
-        elif turned_deg is None:
+            return np.clip(placecode.scan_ahead(asked, rows)[:, 0], 0, 1), None
+        if turned_deg is None:
             scores = placecode.scan(asked, rows)
         else:
             steps = np.rint(turned_deg * (_ROTATIONS / 360)) % _ROTATIONS
             scores = placecode.scan_near(asked, rows, np.nan_to_num(steps, nan=-1).astype(np.intp))
-        tries = _TURNS_TRIED * max(1, self.candidates // max(1, len(rows)))
-        tried = np.argsort(-scores, axis=1)[:, :tries]
-        bits = np.where(np.isneginf(np.take_along_axis(scores, tried, axis=1)), 0, 1 << tried)
-        return np.clip(scores.max(axis=1), 0, 1), np.bitwise_or.reduce(bits, axis=1)
+        return np.clip(scores.max(axis=1), 0, 1), scores
 
-    def match(self, query: Descriptor, fine: np.ndarray, hypothesis: int | None = None) -> FineMatch:
+    def match(self, query: Descriptor, fine: np.ndarray, hypotheses: Sequence[int] | None = None) -> FineMatch:
         """C = A B^T (thesis 6.2.3) with A the good regions of the query, B those of the place; then the score by
         `matching`. A query without a good region scores 0: it has nothing to say."""
         blocks = fine.astype(np.float32)
@@ -145,7 +142,7 @@ class CoHog:
         reference = self._comparable(blocks)
         if self._camera == "forward":
             return self._matched(self._asking(query, 0), reference)
-        turns = [turn for turn in range(_ROTATIONS) if hypothesis is None or hypothesis >> turn & 1]
+        turns = range(_ROTATIONS) if hypotheses is None else hypotheses
         matches = {turn: self._matched(self._asking(query, turn), reference) for turn in turns}
         best = max(matches, key=lambda turn: matches[turn].score)
         return replace(matches[best], rotation_deg=360 * best / _ROTATIONS)

@@ -54,6 +54,6 @@ class CrossRegionBow(VectorTechnique):
         good = np.arange(self._regions) < len(found)
         return Descriptor(coarse, to_bytes(regions), regions, good, float(len(found) > 0))
 
-    def match(self, query: Descriptor, fine: np.ndarray, hypothesis: int | None = None) -> FineMatch:
+    def match(self, query: Descriptor, fine: np.ndarray, hypotheses: None = None) -> FineMatch:
         """Score the mutually best pairs of regions, 0 to 1 (see `mutual_score`)."""
         return FineMatch(mutual_score(query.regions, from_bytes(fine)))

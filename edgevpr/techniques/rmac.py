@@ -41,6 +41,6 @@ class RMac(VectorTechnique):
         coarse = aggregate(squares).astype("<f2")
         return Descriptor(coarse, to_bytes(squares), squares, good, float(good.mean()))
 
-    def match(self, query: Descriptor, fine: np.ndarray, hypothesis: int | None = None) -> FineMatch:
+    def match(self, query: Descriptor, fine: np.ndarray, hypotheses: None = None) -> FineMatch:
         """Score the mutually best pairs of squares, 0 to 1 (see `mutual_score`)."""
         return FineMatch(mutual_score(query.regions, from_bytes(fine)))

@@ -8,7 +8,7 @@ import pytest
 from edgevpr.errors import MapError
 from edgevpr.places.index import bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import elsewhere, margin, named, rank
+from edgevpr.places.retrieve import best_scanned, elsewhere, margin, named, rank
 from edgevpr.types import Descriptor, FineMatch, Frame, PartSpec, Position, TechniqueSpec
 
 
@@ -220,3 +220,53 @@ def test_a_thinned_index_keeps_each_place_its_heading(ruler_map):
     index = load_index(place_map, technique, 10 * bytes_per_place(technique.spec))
     assert len(index) == 10
     np.testing.assert_array_equal(index.heading_deg, index.place_ids * 10)
+
+
+def tried(by_hypothesis, count, among=None):
+    among = np.ones(len(by_hypothesis), bool) if among is None else among
+    return dict(best_scanned(by_hypothesis.max(axis=1), by_hypothesis, among, count))
+
+
+def test_of_many_places_the_best_hypotheses_of_all_are_tried_six_for_each_candidate():
+    by_hypothesis = np.random.default_rng(1).random((500, 24), dtype=np.float32)
+    found = tried(by_hypothesis, 10)
+    assert sum(len(each) for each in found.values()) == 60
+    least = min(by_hypothesis[slot, each].min() for slot, each in found.items())
+    left = by_hypothesis.copy()
+    for slot, each in found.items():
+        left[slot, each] = 0
+    assert left.max() <= least
+    assert len(found) > 10
+
+
+def test_no_place_takes_more_than_six_hypotheses_from_the_others():
+    by_hypothesis = np.random.default_rng(2).random((500, 24), dtype=np.float32)
+    by_hypothesis[7] += 1
+    found = tried(by_hypothesis, 10)
+    assert sorted(found[7]) == sorted(np.argsort(-by_hypothesis[7])[:6].tolist())
+    assert sum(len(each) for each in found.values()) == 60
+
+
+@pytest.mark.parametrize(("places", "most"), [(1, 24), (2, 24), (5, 12), (9, 6), (10, 6), (60, 6)])
+def test_where_there_are_few_places_more_hypotheses_of_each_are_tried(places, most):
+    by_hypothesis = np.random.default_rng(3).random((places, 24), dtype=np.float32)
+    by_hypothesis[0] += 1
+    found = tried(by_hypothesis, 10)
+    assert len(found[0]) == most
+    assert sum(len(each) for each in found.values()) == min(60, places * most)
+
+
+def test_what_is_out_of_the_question_is_not_tried_and_nor_are_more_places_for_it():
+    by_hypothesis = np.random.default_rng(4).random((500, 24), dtype=np.float32)
+    by_hypothesis[:, 3:] = -np.inf
+    found = tried(by_hypothesis, 10)
+    assert sum(len(each) for each in found.values()) == 30
+    assert {number for each in found.values() for number in each} == {0, 1, 2}
+
+
+def test_only_hypotheses_of_the_places_asked_for_are_tried():
+    by_hypothesis = np.random.default_rng(5).random((500, 24), dtype=np.float32)
+    among = np.zeros(500, bool)
+    assert not tried(by_hypothesis, 10, among)
+    among[100:103] = True
+    assert sorted(tried(by_hypothesis, 10, among)) == [100, 101, 102]
