@@ -57,12 +57,11 @@ def plot_growth(rows: list[dict], path: Path) -> None:
         time_axes.loglog(places, scan_ms, "o-", color=colour, label=label)
         linear_ms = [scan_ms[-1] * count / places[-1] for count in places]
         time_axes.loglog(places, linear_ms, ":", color=colour, alpha=0.6)
-        memory = f"{label.split(',')[0]}, {these[0]['code_bytes']} bytes a place"
-        ram_axes.loglog(places, [row["index_mb"] for row in these], "o-", color=colour, label=memory)
     time_axes.set(xlabel="places", ylabel="scan of all places, ms", title="time of the scan (dotted: linear)")
     time_axes.legend(frameon=False)
-    ram_axes.set(xlabel="places", ylabel="codes in RAM, MB", title="memory of the codes")
-    ram_axes.legend(frameon=False)
+    ram_axes.loglog(places, [row["index_mb"] for row in these], "o-", color="tab:green")
+    title = f"memory of the codes, {these[0]['code_bytes']} bytes a place"
+    ram_axes.set(xlabel="places", ylabel="codes in RAM, MB", title=title)
     for axes in (time_axes, ram_axes):
         axes.grid(alpha=0.3, which="both")
         axes.spines[["top", "right"]].set_visible(False)
