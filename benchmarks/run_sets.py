@@ -64,12 +64,8 @@ VARIANTS = (*COHOG, HOG, SEQSLAM, Variant("seqslam, one frame", "seqslam", seque
             *ON_SHIPPED_BACKBONE, *PACKED)  # fmt: skip
 
 FIVE_PLACES = "five places only: made for studies of change, recall on them says nothing"
-# What is not measured on a set, and why.
-LEFT_OUT = {
-    "grief_michigan_monthly": (VARIANTS, FIVE_PLACES),
-    "grief_stromovka_monthly": (VARIANTS, FIVE_PLACES),
-    "nordland_tiny": (COHOG, "64x32 pixels are too few for its regions"),
-}
+# What is not measured, and why.
+LEFT_OUT = {"grief_michigan_monthly": FIVE_PLACES, "grief_stromovka_monthly": FIVE_PLACES}
 
 
 def main() -> int:
@@ -86,6 +82,11 @@ def main() -> int:
     try:
         with ExitStack() as stack:
             folders = find_sets(args.data, args.sets.split(",") if args.sets else None)
+            kept = [folder for folder in folders if folder.name not in LEFT_OUT]
+            if not kept:
+                raise UsageError(
+                    f"All sets of {args.data} are left out: name another folder with --data or EDGEVPR_DATA."
+                )
             wanted = find_variants(args.variants.split(";") if args.variants else None)
             cards = stack.enter_context(tempfile.TemporaryDirectory(prefix="edgevpr-cards-"))
             weights = args.models / "calc" / "model.onnx"
@@ -95,17 +96,9 @@ def main() -> int:
                 wanted = [variant for variant in wanted if variant is not ORIGINAL_CALC]
             args.out.mkdir(parents=True, exist_ok=True)
             commit = commit_of()
-            measured = False
-            for folder in folders:
-                left_out, _ = LEFT_OUT.get(folder.name, ((), ""))
-                here = [variant for variant in wanted if variant not in left_out]
-                if here:
-                    measured = True
-                    write_set(args.out / f"{folder.name}.json", folder, here, commit)
-        if not measured:
-            raise UsageError(f"All sets of {args.data} are left out: name another folder with --data or EDGEVPR_DATA.")
-        left_out = {folder.name: LEFT_OUT[folder.name] for folder in folders if folder.name in LEFT_OUT}
-        sets_page.write(args.out, {name: (len(each), why) for name, (each, why) in left_out.items()})
+            for folder in kept:
+                write_set(args.out / f"{folder.name}.json", folder, wanted, commit)
+        sets_page.write(args.out, {folder.name: LEFT_OUT[folder.name] for folder in folders if folder.name in LEFT_OUT})
     except EdgevprError as error:
         print(f"run_sets: {error}", file=sys.stderr)
         return error.exit_code

@@ -36,8 +36,8 @@ def result(row: dict[str, Any]) -> TechniqueResult:
     return TechniqueResult(**{key: value for key, value in row.items() if key in known})
 
 
-def write(folder: Path, left_out: dict[str, tuple[int, str]]) -> None:
-    """Sum up all files of `folder`; `left_out` says of a set how many rows were left out, and why."""
+def write(folder: Path, left_out: dict[str, str]) -> None:
+    """Sum up all files of `folder`; `left_out` says of sets that are not there why."""
     contents = [json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))]
     contents = [content for content in contents if "techniques" in content]
     results = {content["set"]: [result(row) for row in content["techniques"].values()] for content in contents}
@@ -46,7 +46,7 @@ def write(folder: Path, left_out: dict[str, tuple[int, str]]) -> None:
     (folder / "sets.md").write_text(_page(contents, results, left_out))
 
 
-def _page(contents: list[dict[str, Any]], results: dict[str, list[TechniqueResult]], left_out: dict) -> str:
+def _page(contents: list[dict[str, Any]], results: dict[str, list[TechniqueResult]], left_out: dict[str, str]) -> str:
     made = [
         [content["set"], content["use"], content["date"], ", ".join(sorted({row["commit"] for row in _rows(content)}))]
         for content in contents
@@ -151,9 +151,8 @@ benchmark (VPR-Bench), each technique with its paper's weights.
 """
     if left_out:
         page += "\n## Left out\n\n"
-        for name, (count, why) in left_out.items():
-            what = "all of it" if name not in results else f"{count} rows"
-            page += f"* {name}, {what}: {why}.\n"
+        for name, why in left_out.items():
+            page += f"* {name}: {why}.\n"
     return page
 
 

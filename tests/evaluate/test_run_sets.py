@@ -49,7 +49,7 @@ def test_every_set_gets_a_file_and_its_lines_in_the_summary(tmp_path):
     assert "| technique | RAM B/place | meadow (report, 4) |" in page
     assert "| cohog | 144 | 1.00 |" in page
     assert "| meadow | cohog | 4 | 11 / 11 / 11 (4) |" in page
-    assert "* grief_stromovka_monthly, all of it: five places only" in page
+    assert "* grief_stromovka_monthly: five places only" in page
 
 
 def test_a_row_that_is_not_there_gets_a_sentence(tmp_path):
