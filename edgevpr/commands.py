@@ -113,7 +113,7 @@ def map_merge(args: Namespace) -> int:
 def map_export(args: Namespace) -> int:
     from edgevpr.places.geojson import write_geojson
     from edgevpr.places.mapfile import PlaceMap
-    from edgevpr.runtime.files import write_whole
+    from edgevpr.runtime.files import require_folder, write_whole
 
     with PlaceMap.open(args.map) as place_map:
         if args.geojson == "-":
@@ -122,6 +122,7 @@ def map_export(args: Namespace) -> int:
         out_path = Path(args.geojson)
         if out_path.exists() and out_path.samefile(args.map):
             raise UsageError(f"--geojson {out_path} is the map itself: give another name.")
+        require_folder(out_path)
 
         def write(unfinished: Path) -> int:
             with open(unfinished, "w", encoding="utf-8") as out:

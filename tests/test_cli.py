@@ -180,7 +180,6 @@ def test_what_the_world_gets_wrong_is_a_sentence_and_exit_code_1(capsys, flight,
         (["map", "build", tmp_path / "no" / "m.gpkg", "--images", query, "--technique", "cohog"], "check the path"),
         (["run", "--map", valley, "--source", query, "--log", tmp_path / "no" / "x.jsonl"], "flight log"),
         (["run", "--map", valley, "--source", query, "--log", tmp_path / "x", "--link", "udp:1"], "no MAVLink link"),
-        (["map", "export", valley, "--geojson", tmp_path / "no" / "x.json"], "No such file"),
     ]:
         code, sentence = refused(capsys, *argv)
         assert (code, says in sentence) == (1, True), sentence
@@ -196,6 +195,7 @@ def test_what_the_user_gets_wrong_is_a_sentence_and_exit_code_2(capsys, flight, 
     wrong_row.write_text("file,lat,lon\n0.png,91,8\n")
     for argv, says in [
         (["match", valley, "--images", query, "--min-score", "3"], "between 0 and 1"),
+        (["map", "export", valley, "--geojson", tmp_path / "no" / "x.json"], "no such folder: make it first"),
         (["match", valley, "--images", query, "--board", "rpi5"], "did you mean `rpi-5`"),
         (["match", valley, "--images", query, "--battery", "lots"], "battery pack `lots`"),
         (["run", "--config", config], "did you mean `match`"),

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from edgevpr.errors import EdgevprError, ImageError, UsageError
+from edgevpr.runtime.files import require_folder
 from edgevpr.runtime.opencv import cv2
 from edgevpr.runtime.progress import progress
 from edgevpr.training.pictures import batch, read_pictures, require_enough, small_grey
@@ -59,8 +60,7 @@ def train_calc(
             raise UsageError(f"{path} is there already: give another --out, or delete it.")
     if checkpoint.exists() and not resume:
         raise UsageError(f"{checkpoint} is of a training that was stopped: add --resume to go on, or delete it.")
-    if not out.parent.is_dir():
-        raise UsageError(f"The folder {out.parent} does not exist: make it, or give another --out.")
+    require_folder(out)
     pictures = [small_grey(picture) for picture in read_pictures(folders, "reading", unusable)]
     require_enough(pictures)
     require_packages()

@@ -24,7 +24,7 @@ def test_settings_that_make_no_sense(folder, tmp_path, capsys):
     assert refused(capsys, *images, "m.onnx", "--steps", "0")[0] == 2
     assert refused(capsys, *images, "m.onnx", "--seed", "-1")[0] == 2
     assert "ends in .onnx" in refused(capsys, *images, "m.pt")[1]
-    assert "does not exist" in refused(capsys, *images, str(tmp_path / "none" / "m.onnx"))[1]
+    assert "no such folder: make it first" in refused(capsys, *images, str(tmp_path / "none" / "m.onnx"))[1]
     (tmp_path / "m.yaml").write_text("")
     assert "is there already" in refused(capsys, *images, str(tmp_path / "m.onnx"))[1]
 
