@@ -91,9 +91,9 @@ class Picture:
 
 @dataclass(frozen=True, slots=True)
 class FineMatch:
-    """One candidate compared in full: `score` in 0..1 and, where the technique knows them, the step from the query to
-    the place (dx, dy in cells) with its covariance (var x, cov xy, var y), and how far the camera has turned since the
-    map was made (clockwise, 0..360)."""
+    """One place compared with the query: `score` in 0..1 and, where the technique knows them, the step from the query
+    to the place (dx, dy in cells) with its covariance (var x, cov xy, var y), and how far the camera has turned since
+    the map was made (clockwise, 0..360)."""
 
     score: float
     shift_cells: tuple[float, float] | None = None
@@ -103,7 +103,8 @@ class FineMatch:
 
 class Technique(Protocol):
     """The contract of `edgevpr/techniques/*.py`. A technique without a fine part needs no `match`, one whose spec has
-    no `packed` no `pack`. One that is meant for sequences says by an attribute `sequence` of how many queries."""
+    no `packed` no `pack`. One that is meant for sequences says by an attribute `sequence` of how many queries, and one
+    whose scan sees what its comparison does not, by an attribute `scan_counts` that both count (see `rank`)."""
 
     spec: TechniqueSpec
     candidates: int  # places compared in full after the scan, unless the configuration says otherwise

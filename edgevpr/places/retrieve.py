@@ -1,6 +1,6 @@
 """From a query to the places that it may be: one scan of the index, then the best candidates compared in full."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -41,29 +41,38 @@ def rank(
     without a scan (exact, and slow). Where all candidates turn out to be neighbours of the best one, the best-scanned
     places elsewhere are compared as well: without them nobody could say how far ahead it is.
 
+    Of a technique with `scan_counts` the score is that of the comparison times the mean of that of the scan and 1: what
+    the two say of a wrong place has little to do with each other.
+
     `allowed` bool (N,), at least one True, says where the aircraft should be: the candidates are taken from there, and
     the five best-scanned of all others are compared as well. Where it is false, it would hide the right place behind
     the best of the wrong ones; and to be ahead of the few that are left would say little, so five places elsewhere are
     compared at least. `turned_deg` (N,) goes to `Technique.coarse_scores`.
     """
     one_stage = technique.spec.fine is None
+    scan_counts = getattr(technique, "scan_counts", False)
     scanned = by_hypothesis = None
 
     def compared(chosen: list[_Chosen]) -> list[FineMatch]:
         if one_stage:
             return [FineMatch(float(scanned[slot])) for slot, _ in chosen]
-        return [
+        found = [
             technique.match(query, place_map.fine_part(index.place_ids[slot]), hypotheses)
             for slot, hypotheses in chosen
         ]
+        if scan_counts:
+            times = (scanned[[slot for slot, _ in chosen]] / 2 + 0.5).tolist()
+            found = [replace(each, score=each.score * by) for each, by in zip(found, times, strict=True)]
+        return found
 
     exact = candidates is None or technique.candidates < candidates >= len(index)
-    if one_stage or not exact or allowed is not None or turned_deg is not None:
+    all_in_full = exact and allowed is None and turned_deg is None
+    if one_stage or scan_counts or not all_in_full:
         hint = {} if turned_deg is None else {"turned_deg": turned_deg}
         scanned, by_hypothesis = technique.coarse_scores(query, index.rows, index.mean, **hint)
     if one_stage or exact:
         candidates = len(index)
-    if scanned is None or (one_stage and allowed is None):
+    if all_in_full or (one_stage and allowed is None):
         chosen = [(slot, None) for slot in range(len(index))]
     else:
         there = np.ones(len(index), bool) if allowed is None else allowed
@@ -93,18 +102,22 @@ def best_scanned(scanned: np.ndarray, by_hypothesis: np.ndarray | None, among: n
     six at most, or more where there are not enough places.
     """
     slots = np.flatnonzero(among)
-    best = slots[np.argsort(-scanned[slots], kind="stable")]
     if by_hypothesis is None or not len(slots):
-        return [(int(slot), None) for slot in best[:count]]
+        return [(slot, None) for slot in slots[_largest(scanned[slots], count)].tolist()]
     tries = count * min(_TRIED_EACH, int(np.isfinite(by_hypothesis[slots]).sum(axis=1).max()))
-    best = best[:tries]
-    scores = by_hypothesis[best]
+    slots = slots[_largest(scanned[slots], tries)]
+    scores = by_hypothesis[slots]
     of_place = np.argsort(np.argsort(-scores, axis=1, kind="stable"), axis=1)
-    scores = np.where(of_place < max(_TRIED_EACH, tries // len(best)), scores, -np.inf)
+    scores = np.where(of_place < max(_TRIED_EACH, tries // len(slots)), scores, -np.inf)
     tried = np.zeros(scores.shape, bool)
-    tried.flat[np.argsort(-scores, axis=None, kind="stable")[:tries]] = True
+    tried.flat[_largest(scores.ravel(), tries)] = True
     tried &= np.isfinite(scores)
-    return [(int(best[at]), np.flatnonzero(tried[at]).tolist()) for at in np.flatnonzero(tried.any(axis=1))]
+    return [(int(slots[at]), np.flatnonzero(tried[at]).tolist()) for at in np.flatnonzero(tried.any(axis=1))]
+
+
+def _largest(scores: np.ndarray, count: int) -> np.ndarray:
+    """Where the `count` largest of scores (N,) are, in no order."""
+    return np.argpartition(-scores, count)[:count] if count < len(scores) else np.arange(len(scores))
 
 
 def elsewhere(index: PlaceIndex, best: int, slots: np.ndarray, neighbour_m: float) -> np.ndarray:

@@ -222,6 +222,23 @@ def test_a_thinned_index_keeps_each_place_its_heading(ruler_map):
     np.testing.assert_array_equal(index.heading_deg, index.place_ids * 10)
 
 
+@pytest.mark.parametrize("candidates", [3, None])
+def test_where_the_scan_counts_it_is_part_of_the_score(ruler_map, candidates):
+    technique, place_map = ruler_map
+    index = load_index(place_map, technique, 10_000)
+    query = technique.encode(np.full((1, 1), 43))
+    plain = rank(technique, query, place_map, index, candidates)
+    scanned, _ = technique.coarse_scores(query, index.rows, index.mean)
+    technique.scan_counts = True
+    ranking = rank(technique, query, place_map, index, candidates)
+    assert sorted(ranking.slots) == sorted(plain.slots)
+    compared = dict(zip(plain.slots.tolist(), plain.scores.tolist(), strict=True))
+    expected = [compared[slot] * (1 + scanned[slot]) / 2 for slot in ranking.slots.tolist()]
+    np.testing.assert_allclose(ranking.scores, expected, rtol=1e-6)
+    assert (np.diff(ranking.scores) <= 0).all()
+    assert [match.score for match in ranking.matches] == pytest.approx(expected)
+
+
 def tried(by_hypothesis, count, among=None):
     among = np.ones(len(by_hypothesis), bool) if among is None else among
     return dict(best_scanned(by_hypothesis.max(axis=1), by_hypothesis, among, count))

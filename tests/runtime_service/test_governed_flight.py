@@ -107,7 +107,7 @@ def test_a_change_is_logged_and_announced_once_and_taken_back(maps, tmp_path, mo
     monkeypatch.setattr(loop, "_HEALTH_S", 0.0)
     changes, _, texts = governed(config, tmp_path / "log", [BUSY] * 2 + [CALM] * 3, monkeypatch, 8)
     down, back = changes
-    asked, half = {"rate_hz": 60.0, "candidates": 40, "form": None}, {"rate_hz": 30.0, "candidates": 40, "form": None}
+    asked, half = {"rate_hz": 60.0, "candidates": 42, "form": None}, {"rate_hz": 30.0, "candidates": 42, "form": None}
     assert (down["from"], down["to"], back["from"], back["to"]) == (asked, half, half, asked)
     assert down["why"].startswith("100% of all cores taken, and ")
     assert [(text.severity, text.text) for text in texts] == [
@@ -135,8 +135,8 @@ def test_fewer_candidates_are_compared_when_the_rate_is_at_its_least(maps, tmp_p
     )
     config = load_config(None, {"map": str(maps / "cohog.gpkg"), "source.rate_hz": 60.0})
     changes, _, texts = governed(config, tmp_path / "log", [BUSY] * 99, monkeypatch, 12)
-    assert [line["to"]["candidates"] for line in changes] == [40, 40, 40, 20, 20]
-    assert set(compared) == {40, 20}
+    assert [line["to"]["candidates"] for line in changes] == [42, 42, 42, 21, 21]
+    assert set(compared) == {42, 21}
     assert changes[-1]["from"] == changes[-1]["to"]
     assert changes[-1]["why"].endswith("nothing is left to lower")
     assert texts[-1].text == "edgevpr: over a limit of its board, see its log"
