@@ -75,10 +75,11 @@ limits of acceptance were chosen on the sets marked *tune*. Some figures of coho
 seen, and are to be judged with that in mind: of a place code the least overlap (half), its size (12x12 cells), its
 Fourier series and, looking down, the neighbourhood whose common part it leaves out (3 cells); how many places are
 compared in full (42) or, looking down, pairs of place and rotation (300, of one place 6 at most), with aerial_swindale;
-what a vote counts that is off the peak (ahead 1, 1, 0.75, 0.5) and how many patterns of a region are compared (20 of
-32), both with grief_stromovka_seasons; and the margin of `cohog, thesis` (0.02, with pictures of foreign sites). The
-shipped weights of calc, on which the networks run, have seen the pictures of aerial_caliterra and aerial_brighton in
-training: what networks reach there is not clean. A sequence wants a flight along the mapped way; only corridor,
+that the scan counts in the score, ahead, with grief_stromovka_seasons and nordland_tiny; what a vote counts that is off
+the peak (ahead 1, 1, 0.75, 0.5) and how many patterns of a region are compared (20 of 32), both with
+grief_stromovka_seasons; and the margin of `cohog, thesis` (0.02, with pictures of foreign sites). The shipped weights
+of calc, on which the networks run, have seen the pictures of aerial_caliterra and aerial_brighton in training: what
+networks reach there is not clean. A sequence wants a flight along the mapped way; only corridor,
 grief_stromovka_seasons and nordland_tiny are such. Of a network other than the shipped one nothing is accepted before
 the user says from when on. The truth of the aerial sets was computed by image registration: it favours pairs that local
 features can match, and says nothing of others. The JSON files beside this page hold every figure.
