@@ -30,8 +30,9 @@ _DEFAULT_GT = {"filled_bins": 0.5, "shannon": 0.4}
 # is known better when the camera looks straight down.
 _VOTES_COUNT = {"forward": (1.0, 1.0, 0.75, 0.5), "nadir": (1.0, 1.0)}
 # (min_score, min_margin). The vote's: no wrong match of corridor (forward; alone, or ten in a sequence) or of
-# aerial_caliterra (nadir) reached both, nor did any query of two other sites in the map of aerial_caliterra. The thesis's score has no safe threshold: its
-# margin keeps out those queries of other sites, and most right matches with them.
+# aerial_caliterra (nadir) reached both, nor did any query of two other sites in the map of aerial_caliterra. The
+# thesis's score has no safe threshold: its margin keeps out those queries of other sites, and most right matches with
+# them.
 _ACCEPT = {"forward": (0.07, 0.035), "nadir": (0.08, 0.03), "thesis": (0.0, 0.02)}
 _CANDIDATES = {"forward": 42, "nadir": 50}
 _ROTATIONS = 24  # of a query that looks straight down and does not know its heading: 15 degrees apart
