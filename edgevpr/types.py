@@ -107,7 +107,7 @@ class Technique(Protocol):
     whose scan sees what its comparison does not, by an attribute `scan_counts` that both count (see `rank`)."""
 
     spec: TechniqueSpec
-    candidates: int  # places compared in full after the scan, unless the configuration says otherwise
+    candidates: int  # places compared in full after the scan (see `rank`), unless the configuration says otherwise
     min_score: float  # a match is accepted from this score on, unless the configuration says otherwise ...
     min_margin: float  # ... and when it beats the best place elsewhere by this
 

@@ -38,15 +38,15 @@ def rank(
     """Scan all places of the index, and compare the best `candidates` of them in full.
 
     None, or as many as there are and more than the technique's own number: all places in full under every hypothesis,
-    without a scan (exact, and slow). Where all candidates turn out to be neighbours of the best one, the best-scanned
-    places elsewhere are compared as well: without them nobody could say how far ahead it is.
+    whatever the scan says (exact, and slow). Where all candidates turn out to be neighbours of the best one, the
+    best-scanned places elsewhere are compared as well: without them nobody could say how far ahead it is.
 
     Of a technique with `scan_counts` the score is that of the comparison times the mean of that of the scan and 1: what
     the two say of a wrong place has little to do with each other.
 
     `allowed` bool (N,), at least one True, says where the aircraft should be: the candidates are taken from there, and
-    the five best-scanned of all others are compared as well. Where it is false, it would hide the right place behind
-    the best of the wrong ones; and to be ahead of the few that are left would say little, so five places elsewhere are
+    five candidates of all others are compared as well. Where it is false, it would hide the right place behind the
+    best of the wrong ones; and to be ahead of the few that are left would say little, so five places elsewhere are
     compared at least. `turned_deg` (N,) goes to `Technique.coarse_scores`.
     """
     one_stage = technique.spec.fine is None
@@ -95,16 +95,18 @@ def rank(
 
 
 def best_scanned(scanned: np.ndarray, by_hypothesis: np.ndarray | None, among: np.ndarray, count: int) -> list[_Chosen]:
-    """The `count` best-scanned slots of those `among` (N,) bool is True of, and which hypotheses to try of each.
+    """The `count` best-scanned slots of those `among` (N,) bool is True of, and which hypotheses to try of each (None:
+    all).
 
-    Where there are several (`by_hypothesis` float32 (N, H), see `Technique.coarse_scores`), the best of all places are
-    tried, six for each of `count`: a place of which only two look likely leaves room for others. Of one place they are
-    six at most, or more where there are not enough places.
+    Where there are several (`by_hypothesis` float32 (N, H), see `Technique.coarse_scores`), it is the best hypotheses
+    of all places, `count` times six or, where fewer are possible, so many: a place of which only two look likely leaves
+    room for others. Of one place they are six at most, or more where there are not enough places.
     """
     slots = np.flatnonzero(among)
     if by_hypothesis is None or not len(slots):
         return [(slot, None) for slot in slots[_largest(scanned[slots], count)].tolist()]
-    tries = count * min(_TRIED_EACH, int(np.isfinite(by_hypothesis[slots]).sum(axis=1).max()))
+    possible = round(np.isfinite(by_hypothesis[slots]).sum(axis=1).mean())
+    tries = count * max(1, min(_TRIED_EACH, possible))
     slots = slots[_largest(scanned[slots], tries)]
     scores = by_hypothesis[slots]
     of_place = np.argsort(np.argsort(-scores, axis=1, kind="stable"), axis=1)

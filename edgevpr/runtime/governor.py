@@ -19,8 +19,9 @@ _LATE = 0.95
 _COOLER_C = 5.0
 _NEAR_MEMORY, _MEMORY_ROOM = 0.95, 0.9
 _SLOWEST = 8  # times less often than asked
-# With fewer places to beat, a wrong one is more easily ahead. With 20 no wrong match of corridor or aerial_caliterra
-# was accepted, as with 45; with 10 one of corridor was. A scan alone says only which places are worth a comparison.
+# With fewer places to beat, a wrong one is more easily ahead, and the right one more often is not among them. With half
+# as many as usual (21, or 25 looking down) no wrong match of corridor or aerial_caliterra was accepted. A scan alone
+# says only which places are worth a comparison.
 _FEWEST_CANDIDATES = 20
 _OTHER_FORM = 2.0  # times the work, about, in the larger form
 

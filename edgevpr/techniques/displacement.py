@@ -2,7 +2,7 @@
 
 Every asking region finds its best region in the reference; the step between the two, in cells, is one vote. Where the
 place is the same the votes pile up on one step, where it is another they scatter. The share of the votes at the peak
-is the score: a share of agreeing regions, which a mean of cosines is not.
+says how well: a share of agreeing regions, which a mean of cosines is not.
 """
 
 from dataclasses import dataclass

@@ -121,11 +121,11 @@ def scan(asked: np.ndarray, codes: np.ndarray) -> np.ndarray:
 
 
 def scan_ahead(asked: np.ndarray, codes: np.ndarray) -> np.ndarray:
-    """`scan` for a camera that looks ahead, where neighbouring shifts score alike: all places under every second shift
-    of every second row of them, and the best of those under all."""
+    """`scan` for a camera that looks ahead: all places under a quarter of the shifts, each blurred with those around
+    it so that none is overlooked, and the best of those under all."""
     if len(codes) <= _LOOKED_CLOSER:
         return scan(asked, codes)
-    scores = scan(asked[:, (shifts() % 2 == 0).all(axis=1)], codes)
+    scores = scan(_blurred() @ asked, codes)
     best = np.argpartition(-scores[:, 0], _LOOKED_CLOSER)[:_LOOKED_CLOSER]
     scores[best] = scan(asked, codes[best])
     return scores
@@ -143,6 +143,14 @@ def scan_near(asked: np.ndarray, codes: np.ndarray, expected: np.ndarray) -> np.
         near = np.arange(len(asked)) if turn < 0 else np.arange(turn - 1, turn + 2) % len(asked)
         best[group[:, None], near] = scan(asked[near], codes[group])
     return best
+
+
+@lru_cache
+def _blurred() -> np.ndarray:
+    """float32 (shifts even both ways, S): the weights of the shifts in the mean about each, by how far they are off."""
+    kept = shifts()[(shifts() % 2 == 0).all(axis=1)]
+    weight = np.maximum(1 - abs(kept[:, None] - shifts()) / 2, 0).prod(axis=2)
+    return (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
 
 
 @lru_cache

@@ -28,7 +28,7 @@ class Signs:
         asked = self.pack(query.coarse, mean)
         return (rows @ asked.astype(np.float32) / 256).astype(np.float32), None
 
-    def match(self, query, fine, hypothesis):
+    def match(self, query, fine, hypotheses):
         return FineMatch(0.0)
 
 

@@ -27,7 +27,7 @@ class Ruler:
     def coarse_scores(self, query, rows, mean):
         return 1 / (1 + abs(rows[:, 0] - query.coarse[0])), None
 
-    def match(self, query, fine, hypothesis):
+    def match(self, query, fine, hypotheses):
         self.compared += 1
         return FineMatch(1 / (1 + abs(float(fine[0] - query.fine[0]))))
 
@@ -222,6 +222,49 @@ def test_a_thinned_index_keeps_each_place_its_heading(ruler_map):
     np.testing.assert_array_equal(index.heading_deg, index.place_ids * 10)
 
 
+class Turned(Ruler):
+    """A ruler that may have been turned in three ways, of which only the last one matches."""
+
+    def __init__(self):
+        self.tried = []
+
+    def coarse_scores(self, query, rows, mean):
+        scores, _ = super().coarse_scores(query, rows, mean)
+        return scores, np.stack([scores / 3, scores / 2, scores], axis=1)
+
+    def match(self, query, fine, hypotheses):
+        self.tried.append(hypotheses)
+        found = super().match(query, fine, hypotheses)
+        return found if hypotheses is None or 2 in hypotheses else FineMatch(0.0)
+
+
+def test_a_match_is_asked_for_the_hypotheses_chosen_and_for_all_where_all_is_compared(ruler_map):
+    _, place_map = ruler_map
+    technique = Turned()
+    index = load_index(place_map, technique, 10_000)
+    query = technique.encode(np.full((1, 1), 43))
+    few = rank(technique, query, place_map, index, 4)
+    assert sum(len(hypotheses) for hypotheses in technique.tried) == 12
+    assert len(few.slots) > 4
+    assert [2] in technique.tried
+    technique.tried.clear()
+    everything = rank(technique, query, place_map, index)
+    assert technique.tried == [None] * 25
+    assert few.slots[0] == everything.slots[0]
+    assert few.scores[0] == everything.scores[0]
+
+
+def test_rivals_elsewhere_are_compared_under_their_best_hypotheses_too(ruler_map):
+    _, place_map = ruler_map
+    technique = Turned()
+    index = load_index(place_map, technique, 10_000)
+    allowed = np.zeros(25, bool)
+    allowed[10:12] = True
+    ranking = rank(technique, technique.encode(np.full((1, 1), 43)), place_map, index, 2, 50.0, allowed)
+    assert {10, 11} <= set(ranking.slots.tolist())
+    assert np.count_nonzero(ranking.scores[~allowed[ranking.slots]] > 0) >= 5
+
+
 @pytest.mark.parametrize("candidates", [3, None])
 def test_where_the_scan_counts_it_is_part_of_the_score(ruler_map, candidates):
     technique, place_map = ruler_map
@@ -276,9 +319,12 @@ def test_where_there_are_few_places_more_hypotheses_of_each_are_tried(places, mo
 def test_what_is_out_of_the_question_is_not_tried_and_nor_are_more_places_for_it():
     by_hypothesis = np.random.default_rng(4).random((500, 24), dtype=np.float32)
     by_hypothesis[:, 3:] = -np.inf
+    by_hypothesis[7] = 0.5  # one place of which nothing is known does not change what all take
     found = tried(by_hypothesis, 10)
     assert sum(len(each) for each in found.values()) == 30
-    assert {number for each in found.values() for number in each} == {0, 1, 2}
+    assert {number for slot, each in found.items() for number in each if slot != 7} == {0, 1, 2}
+    by_hypothesis[:] = -np.inf
+    assert not tried(by_hypothesis, 10)
 
 
 def test_only_hypotheses_of_the_places_asked_for_are_tried():

@@ -49,7 +49,7 @@ class TinyTechnique:
     def coarse_scores(self, query, rows, mean):
         return rows @ query.coarse, None
 
-    def match(self, query, fine, hypothesis=None):
+    def match(self, query, fine, hypotheses=None):
         self.matched += 1
         return FineMatch(float((query.fine * fine).mean()))
 
