@@ -80,9 +80,10 @@ the peak (ahead 1, 1, 0.75, 0.5) and how many patterns of a region are compared 
 grief_stromovka_seasons; and the margin of `cohog, thesis` (0.02, with pictures of foreign sites). The shipped weights
 of calc, on which the networks run, have seen the pictures of aerial_caliterra and aerial_brighton in training: what
 networks reach there is not clean. A sequence wants a flight along the mapped way; only corridor,
-grief_stromovka_seasons and nordland_tiny are such. Of a network other than the shipped one nothing is accepted before
-the user says from when on. The truth of the aerial sets was computed by image registration: it favours pairs that local
-features can match, and says nothing of others. The JSON files beside this page hold every figure.
+grief_stromovka_seasons and nordland_tiny are such. The pictures of nordland_tiny have 64x32 pixels, which every
+technique enlarges: it is here for its thousand places. Of a network other than the shipped one nothing is accepted
+before the user says from when on. The truth of the aerial sets was computed by image registration: it favours pairs
+that local features can match, and says nothing of others. The JSON files beside this page hold every figure.
 
 Weights in use:
 
