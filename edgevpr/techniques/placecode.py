@@ -72,8 +72,7 @@ def special(grids: np.ndarray, mean: np.ndarray, seen: np.ndarray | None = None,
     `locally`, also less what the (`seen`) cells around have in common: where any rotation may meet any place, the mean
     of a cell over the map leaves in what comes from the light and from fields that all run one way.
     """
-    left = np.asarray(grids, np.float32) - mean
-    left = left @ waves(left.shape[-1]).T
+    left = (np.asarray(grids, np.float32) - mean) @ waves(grids.shape[-1]).T
     if not locally:
         return left
     weight = np.ones(left.shape[:3], np.float32) if seen is None else seen.astype(np.float32)
