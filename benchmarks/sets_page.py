@@ -163,10 +163,8 @@ def overview(contents: list[dict[str, Any]], wanted: Callable[[str], bool] = lam
     rows = []
     for label in filter(wanted, dict.fromkeys(label for content in contents for label in content["techniques"])):
         found = [content["techniques"].get(label) for content in contents]
-        sizes = sorted({row["descriptor_bytes"] for row in found if row})
-        rows.append(
-            [label, ", ".join(map(str, sizes)), *("-" if row is None else f"{row['recall_at_1']:.2f}" for row in found)]
-        )
+        size = next(row["descriptor_bytes"] for row in found if row)
+        rows.append([label, f"{size}", *("-" if row is None else f"{row['recall_at_1']:.2f}" for row in found)])
     heads = [f"{content['set']} ({content['use']}, {_rows(content)[0]['queries']})" for content in contents]
     return tables.markdown(("technique", "RAM B/place", *heads), rows)
 

@@ -51,34 +51,24 @@ def rank(
     """
     one_stage = technique.spec.fine is None
     scan_counts = getattr(technique, "scan_counts", False)
-    scanned = by_hypothesis = None
+    hint = {} if turned_deg is None else {"turned_deg": turned_deg}
+    scanned, by_hypothesis = technique.coarse_scores(query, index.rows, index.mean, **hint)
 
-    def compared(chosen: list[_Chosen]) -> list[FineMatch]:
+    def compared(slot: int, hypotheses: list[int] | None) -> FineMatch:
         if one_stage:
-            return [FineMatch(float(scanned[slot])) for slot, _ in chosen]
-        found = [
-            technique.match(query, place_map.fine_part(index.place_ids[slot]), hypotheses)
-            for slot, hypotheses in chosen
-        ]
-        if scan_counts:
-            times = (scanned[[slot for slot, _ in chosen]] / 2 + 0.5).tolist()
-            found = [replace(each, score=each.score * by) for each, by in zip(found, times, strict=True)]
-        return found
+            return FineMatch(float(scanned[slot]))
+        match = technique.match(query, place_map.fine_part(index.place_ids[slot]), hypotheses)
+        return replace(match, score=match.score * (1 + float(scanned[slot])) / 2) if scan_counts else match
 
     exact = candidates is None or technique.candidates < candidates >= len(index)
-    all_in_full = exact and allowed is None and turned_deg is None
-    if one_stage or scan_counts or not all_in_full:
-        hint = {} if turned_deg is None else {"turned_deg": turned_deg}
-        scanned, by_hypothesis = technique.coarse_scores(query, index.rows, index.mean, **hint)
     if one_stage or exact:
         candidates = len(index)
-    if all_in_full or (one_stage and allowed is None):
-        chosen = [(slot, None) for slot in range(len(index))]
-    else:
-        there = np.ones(len(index), bool) if allowed is None else allowed
-        chosen = best_scanned(scanned, by_hypothesis, there, candidates)
-        chosen += best_scanned(scanned, by_hypothesis, ~there, _COMPARED_ELSEWHERE)
-    matches = compared(chosen)
+    if exact and allowed is None and turned_deg is None:
+        by_hypothesis = None  # all are tried
+    there = np.ones(len(index), bool) if allowed is None else allowed
+    chosen = best_scanned(scanned, by_hypothesis, there, candidates)
+    chosen += best_scanned(scanned, by_hypothesis, ~there, _COMPARED_ELSEWHERE)
+    matches = [compared(*each) for each in chosen]
     slots = np.array([slot for slot, _ in chosen])
     if len(slots) < len(index):
         best = slots[max(range(len(slots)), key=lambda at: matches[at].score)]
@@ -87,7 +77,7 @@ def rank(
             others = elsewhere(index, best, np.arange(len(index)), neighbour_m)
             others[slots] = False
             more = best_scanned(scanned, by_hypothesis, others, _COMPARED_ELSEWHERE - rivals)
-            matches += compared(more)
+            matches += [compared(*each) for each in more]
             slots = np.append(slots, [slot for slot, _ in more]).astype(np.intp)
     scores = np.array([match.score for match in matches], np.float32)
     order = np.argsort(-scores, kind="stable")

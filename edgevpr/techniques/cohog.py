@@ -60,11 +60,10 @@ class CoHog:
         _require("entropy", entropy, _DEFAULT_GT)
         _require("camera", camera, _VOTES_COUNT)
         _require("matching", matching, ("displacement", "thesis"))
-        grid = placecode.SIDE
-        if not (w2 >= 2 and w1 % w2 == 0 and w1 // w2 > grid and w1 <= 4096 and 2 <= bins <= 64):
+        if not (w2 >= 2 and w1 % w2 == 0 and w1 // w2 > placecode.SIDE and w1 <= 4096 and 2 <= bins <= 64):
             raise UsageError(
                 f"cohog cannot use w1={w1}, w2={w2}, bins={bins}: w1 must be a multiple of w2 (more than "
-                f"{grid} regions of at least 2 pixels, at most 4096 pixels), bins 2 to 64."
+                f"{placecode.SIDE} regions of at least 2 pixels, at most 4096 pixels), bins 2 to 64."
             )
         if gt > 1:
             raise UsageError(f"cohog: gt is {gt:g}; it is a share of the largest entropy, 0 to 1.")
@@ -80,9 +79,9 @@ class CoHog:
         self.spec = TechniqueSpec(
             "cohog",
             {"w1": w1, "w2": w2, "bins": bins, "gt": self._gt, "entropy": entropy, "camera": camera},
-            coarse=PartSpec((grid, grid, bins), "|u1"),
+            coarse=PartSpec((placecode.SIDE, placecode.SIDE, bins), "|u1"),
             fine=PartSpec((self._side**2, 4 * bins), "|u1"),
-            packed=PartSpec((grid**2 * bins // 8,), "|u1"),
+            packed=PartSpec((placecode.SIDE**2 * bins // 8,), "|u1"),
         )
 
     def encode(self, image: np.ndarray, mask: np.ndarray | None = None) -> Descriptor:
@@ -98,7 +97,7 @@ class CoHog:
         regions = blocks.reshape(self.spec.fine.shape)
         # The root of each value in 8 bits: the small values, of which there are most, keep their digits.
         stored = np.rint(255 * np.sqrt(regions)).astype(np.uint8)
-        coarse = np.rint(255 * placecode.grid(self._middle(blocks, seen))).astype(np.uint8)
+        coarse = np.rint(255 * placecode.grid(_middle(blocks, seen))).astype(np.uint8)
         quality = float(good.sum() / max(seen.sum(), 1))
         return Descriptor(coarse, stored, regions, good.ravel(), quality, Picture(grey, allowed, seen))
 
@@ -123,10 +122,9 @@ class CoHog:
         22.5 degrees of `turned_deg` (N,). Returns scores float32 (N,) and, looking down, those of each rotation,
         float32 (N, 24)."""
         seen = query.picture.seen
-        blocks = self._middle(query.regions.reshape(self._side, self._side, -1), seen)
+        blocks = _middle(query.regions.reshape(self._side, self._side, -1), seen)
         turns = np.arange(_ROTATIONS if self._camera == "nadir" else 1)
-        seen = self._middle(seen, seen)
-        grids, in_view = placecode.turned_grids(blocks, -360 * turns / _ROTATIONS, seen)
+        grids, in_view = placecode.turned_grids(blocks, -360 * turns / _ROTATIONS, _middle(seen, seen))
         asked = placecode.hypotheses(grids, in_view, mean / 255, locally=self._camera == "nadir")
         if self._camera == "forward":
             return np.clip(placecode.scan_ahead(asked, rows)[:, 0], 0, 1), None
@@ -160,13 +158,6 @@ class CoHog:
                 regions, good = blocks.reshape(regions.shape), good.ravel()
             query.asking[turn] = np.flatnonzero(good), self._comparable(regions[good])
         return query.asking[turn]
-
-    def _middle(self, per_block: np.ndarray, seen: np.ndarray) -> np.ndarray:
-        """The largest square in the middle that a picture fills that was laid into a larger one: (side, side, ...) ->
-        (n, n, ...)."""
-        n = max(min(int(seen.any(axis=0).sum()), int(seen.any(axis=1).sum())), placecode.SIDE)
-        start = (len(seen) - n) // 2
-        return per_block[start : start + n, start : start + n]
 
     def _comparable(self, blocks: np.ndarray) -> np.ndarray:
         """Blocks float32 (N, 4 bins), or what the vote compares of them, (N, patterns), each of length 1."""
@@ -202,6 +193,14 @@ class CoHog:
 def _require(what: str, value: str, allowed) -> None:
     if value not in allowed:
         raise UsageError(f"cohog has no {what} `{value}`: use {' or '.join(sorted(allowed))}.")
+
+
+def _middle(per_block: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """The largest square in the middle that a picture fills that was laid into a larger one: (side, side, ...) ->
+    (n, n, ...)."""
+    n = max(min(int(seen.any(axis=0).sum()), int(seen.any(axis=1).sum())), placecode.SIDE)
+    start = (len(seen) - n) // 2
+    return per_block[start : start + n, start : start + n]
 
 
 def _in_square(image: np.ndarray, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:

@@ -25,13 +25,15 @@ _BITS_AT_ONCE = 1 << 19  # of places: 2 MB as float32
 _SIGNS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).astype(np.float32) * 2 - 1
 
 
-@lru_cache
-def shifts() -> np.ndarray:
-    """int8 (S, 2): every (dx, dy) in cells under which at least `_MIN_OVERLAP` of two grids lies on the other."""
+def _shifts() -> np.ndarray:
     steps = np.arange(1 - SIDE, SIDE)
     dy, dx = np.meshgrid(steps, steps, indexing="ij")
     enough = (SIDE - abs(dx)) * (SIDE - abs(dy)) >= _MIN_OVERLAP * SIDE**2
     return np.stack([dx[enough], dy[enough]], axis=1).astype(np.int8)
+
+
+# int8 (S, 2): every (dx, dy) in cells under which enough of two grids lies on the other.
+SHIFTS = _shifts()
 
 
 def grid(blocks: np.ndarray) -> np.ndarray:
@@ -89,10 +91,10 @@ def pack(grids: np.ndarray, mean: np.ndarray, locally: bool = False) -> np.ndarr
 
 def hypotheses(grids: np.ndarray, seen: np.ndarray, mean: np.ndarray, locally: bool = False) -> np.ndarray:
     """A query as it would look from elsewhere: grids and `seen` of its R rotations by `turned_grids`, the map's mean ->
-    float32 (R, S, 144 L), its signs (0 where it sees nothing), moved by the S `shifts`."""
+    float32 (R, S, 144 L), its signs (0 where it sees nothing), moved by the S `SHIFTS`."""
     signs = np.where(special(grids, mean, seen, locally) >= 0, np.float32(1), np.float32(-1)) * seen[..., None]
-    asked = np.zeros((len(signs), len(shifts()), *signs.shape[1:]), np.float32)
-    for at, (dx, dy) in enumerate(shifts().tolist()):
+    asked = np.zeros((len(signs), len(SHIFTS), *signs.shape[1:]), np.float32)
+    for at, (dx, dy) in enumerate(SHIFTS.tolist()):
         asked[:, at, _to(dy), _to(dx)] = signs[:, _to(-dy), _to(-dx)]
     return asked.reshape(*asked.shape[:2], -1)
 
@@ -147,8 +149,8 @@ def scan_near(asked: np.ndarray, codes: np.ndarray, expected: np.ndarray) -> np.
 @lru_cache
 def _blurred() -> np.ndarray:
     """float32 (shifts even both ways, S): the weights of the shifts in the mean about each, by how far they are off."""
-    kept = shifts()[(shifts() % 2 == 0).all(axis=1)]
-    weight = np.maximum(1 - abs(kept[:, None] - shifts()) / 2, 0).prod(axis=2)
+    kept = SHIFTS[(SHIFTS % 2 == 0).all(axis=1)]
+    weight = np.maximum(1 - abs(kept[:, None] - SHIFTS) / 2, 0).prod(axis=2)
     return (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
 
 

@@ -49,7 +49,7 @@ def _ask(image: np.ndarray, mean: np.ndarray, rotations_deg: np.ndarray) -> np.n
 
 def _best_shift(asked: np.ndarray, code: np.ndarray) -> list[int]:
     """The shift (dx, dy) in cells under which one place agrees best with a query that is not turned."""
-    return placecode.shifts()[np.argmax(asked[0] @ (np.unpackbits(code) * 2.0 - 1))].tolist()
+    return placecode.SHIFTS[np.argmax(asked[0] @ (np.unpackbits(code) * 2.0 - 1))].tolist()
 
 
 def test_a_place_takes_144_bytes(town):
@@ -179,10 +179,10 @@ def test_of_many_places_the_best_are_looked_at_under_every_shift(town, right, do
 
 
 def test_every_shift_leaves_at_least_the_least_overlap():
-    overlap = np.prod(12 - abs(placecode.shifts().astype(int)), axis=1) / 144
+    overlap = np.prod(12 - abs(placecode.SHIFTS.astype(int)), axis=1) / 144
     assert overlap.min() >= 0.5
-    assert len(np.unique(placecode.shifts(), axis=0)) == len(placecode.shifts())
-    assert [0, 0] in placecode.shifts().tolist()
+    assert len(np.unique(placecode.SHIFTS, axis=0)) == len(placecode.SHIFTS)
+    assert [0, 0] in placecode.SHIFTS.tolist()
 
 
 def test_an_even_picture_is_compared_without_a_warning(town):
