@@ -142,7 +142,8 @@ def _cell_means(per_pixel: np.ndarray, cell_px: int) -> np.ndarray:
 
 
 def _shannon_copy(grey: np.ndarray) -> np.ndarray:
-    return cv2.resize(grey, (SHANNON_SIDE_PX, SHANNON_SIDE_PX), interpolation=cv2.INTER_LINEAR)
+    # Exact, as in `gradients.grey_square`: the same on any processor.
+    return cv2.resize(grey, (SHANNON_SIDE_PX, SHANNON_SIDE_PX), interpolation=cv2.INTER_LINEAR_EXACT)
 
 
 @lru_cache(maxsize=4)

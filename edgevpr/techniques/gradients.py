@@ -28,7 +28,8 @@ def grey_square(image: np.ndarray, side_px: int) -> np.ndarray:
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     if grey.shape == (side_px, side_px):
         return grey
-    return cv2.resize(grey, (side_px, side_px), interpolation=cv2.INTER_LINEAR)
+    # Exact: the plain one differs by a grey level between processors, and a map must fly on any of them.
+    return cv2.resize(grey, (side_px, side_px), interpolation=cv2.INTER_LINEAR_EXACT)
 
 
 def mask_square(mask: np.ndarray | None, side_px: int) -> np.ndarray | None:

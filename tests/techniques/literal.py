@@ -8,7 +8,7 @@ import numpy as np
 
 def grey_square(image, side):
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-    return cv2.resize(grey, (side, side), interpolation=cv2.INTER_LINEAR)
+    return cv2.resize(grey, (side, side), interpolation=cv2.INTER_LINEAR_EXACT)
 
 
 def disc(image, x, y, radius):
@@ -36,7 +36,7 @@ def filled_bins(image, radius=5):
 
 def shannon(image, radius=5):
     """Shannon entropy of each disc of a 100x100 copy, scaled back to the image's size."""
-    small = cv2.resize(image, (100, 100), interpolation=cv2.INTER_LINEAR)
+    small = cv2.resize(image, (100, 100), interpolation=cv2.INTER_LINEAR_EXACT)
     entropy = np.zeros(small.shape)
     for y in range(100):
         for x in range(100):

@@ -5,7 +5,7 @@ import numpy as np
 
 from edgevpr.techniques.networks.card import InputRule
 
-_RESIZE = {"area": cv2.INTER_AREA, "linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC}
+_RESIZE = {"area": cv2.INTER_AREA, "linear": cv2.INTER_LINEAR_EXACT, "cubic": cv2.INTER_CUBIC}
 _NOTHING_ALLOWED = 128
 
 

@@ -1,0 +1,43 @@
+"""A map made on one processor flies on another: what is made of a picture is the same to the last bit.
+
+The expected numbers are those of x86-64 and of aarch64 (a Cortex-A53), of which every one was seen to be the same.
+"""
+
+import zlib
+
+import numpy as np
+import pytest
+
+from edgevpr.techniques import create, entropy
+from edgevpr.techniques.gradients import grey_square
+from edgevpr.techniques.networks.card import InputRule
+from edgevpr.techniques.networks.prepare import prepare
+
+
+@pytest.fixture
+def picture():
+    """Made of whole numbers alone, 480 x 640."""
+    y, x = np.mgrid[:480, :640]
+    return ((x * x // 97 + y * y // 61 + x * y // 173 + (x // 9 * 37 ^ y // 7 * 29)) % 256).astype(np.uint8)
+
+
+def test_a_picture_is_scaled_to_the_same_pixels(picture):
+    assert zlib.crc32(grey_square(picture, 512)) == 2049827080
+    assert zlib.crc32(entropy._shannon_copy(picture)) == 274043403
+
+
+def test_a_network_sees_the_same_picture(picture):
+    rule = InputRule("NCHW", 512, 512, "grey", False, "linear", 1.0, [0.0])
+    assert zlib.crc32(prepare(picture, rule).astype(np.uint8)) == 2049827080
+
+
+@pytest.mark.parametrize(("camera", "coarse", "code"), [
+    ("forward", 1653823508, 2527873653),
+    ("nadir", 1730405609, 2984172271),
+])  # fmt: skip
+def test_a_place_has_the_same_code(picture, camera, coarse, code):
+    technique = create("cohog", {"camera": camera})
+    found = technique.encode(picture)
+    mean = np.full((12, 12, 8), 90.0, np.float32)
+    assert zlib.crc32(found.coarse) == coarse
+    assert zlib.crc32(technique.pack(found.coarse[None], mean)) == code
