@@ -32,6 +32,7 @@ from edgevpr.techniques.networks.session import file_sha256
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 TUNED_ON = ("corridor", "aerial_caliterra")
+FROM_THE_AIR = ("aerial_", "kite_")  # how the names of such sets begin
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,9 +180,10 @@ def write_set(path: Path, folder: Path, wanted: list[Variant], commit: str) -> N
 
 
 def settings(variant: Variant, folder: Path) -> dict[str, str]:
-    """How a variant is used on a set: `cohog` looks down in the aerial ones; the thesis's has no camera."""
+    """How a variant is used on a set: `cohog` looks down in those from the air; the thesis's has no camera."""
     looks_down = variant.technique == "cohog" and "matching" not in variant.settings
-    return {**variant.settings, **({"camera": "nadir"} if looks_down and folder.name.startswith("aerial_") else {})}
+    from_the_air = folder.name.startswith(FROM_THE_AIR)
+    return {**variant.settings, **({"camera": "nadir"} if looks_down and from_the_air else {})}
 
 
 def encode_ram_mb(technique: str, chosen: dict[str, str]) -> float:
