@@ -81,10 +81,10 @@ class Descriptor:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """What an image was encoded from: `grey` uint8 (side, side), `allowed` bool of the same shape (None: all of it),
-    and `seen` bool, the blocks that are wholly allowed."""
+    """What an image was encoded from: `grey` float32 (side, side) where it may have to be turned (None: it need not),
+    `allowed` bool of the same shape (None: all of it), and `seen` bool, the blocks that are wholly allowed."""
 
-    grey: np.ndarray
+    grey: np.ndarray | None
     allowed: np.ndarray | None
     seen: np.ndarray
 

@@ -20,7 +20,7 @@ from edgevpr.errors import UsageError
 from edgevpr.techniques import placecode
 from edgevpr.techniques.displacement import displacement
 from edgevpr.techniques.entropy import block_means, good_blocks
-from edgevpr.techniques.gradients import grey_square, mask_square, normalised_blocks, oriented_cells
+from edgevpr.techniques.gradients import grey_square, levels, mask_square, normalised_blocks, oriented_cells
 from edgevpr.techniques.patterns import slow_patterns
 from edgevpr.types import Descriptor, FineMatch, PartSpec, Picture, TechniqueSpec
 
@@ -99,13 +99,14 @@ class CoHog:
         stored = np.rint(255 * np.sqrt(regions)).astype(np.uint8)
         coarse = np.rint(255 * placecode.grid(_middle(blocks, seen))).astype(np.uint8)
         quality = float(good.sum() / max(seen.sum(), 1))
-        return Descriptor(coarse, stored, regions, good.ravel(), quality, Picture(grey, allowed, seen))
+        picture = Picture(grey if self._camera == "nadir" else None, allowed, seen)
+        return Descriptor(coarse, stored, regions, good.ravel(), quality, picture)
 
     def _regions(self, grey: np.ndarray, allowed: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Blocks float32 (side, side, 4 bins); which of them are wholly allowed, and of these which are good, both bool
         (side, side)."""
         blocks = normalised_blocks(oriented_cells(grey, self._w2, self._bins, signed=True, allowed=allowed))
-        good = good_blocks(grey, self._entropy, self._w2, self._gt)
+        good = good_blocks(levels(grey), self._entropy, self._w2, self._gt)
         if allowed is None:
             return blocks, np.ones_like(good), good
         seen = block_means(allowed.astype(np.float32), self._w2) >= 1.0

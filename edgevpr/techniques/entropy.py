@@ -142,7 +142,7 @@ def _cell_means(per_pixel: np.ndarray, cell_px: int) -> np.ndarray:
 
 
 def _shannon_copy(grey: np.ndarray) -> np.ndarray:
-    # Exact, as in `gradients.grey_square`: the same on any processor.
+    # Exact: the plain one differs by a grey level between processors, and a map must fly on any of them.
     return cv2.resize(grey, (SHANNON_SIDE_PX, SHANNON_SIDE_PX), interpolation=cv2.INTER_LINEAR_EXACT)
 
 

@@ -24,12 +24,18 @@ _ORIENTATIONS = np.array(
 
 
 def grey_square(image: np.ndarray, side_px: int) -> np.ndarray:
-    """Return a uint8 image, (H, W) grey or (H, W, 3) BGR, as uint8 grey of (side_px, side_px)."""
+    """Return a uint8 image, (H, W) grey or (H, W, 3) BGR, as float32 grey of (side_px, side_px), 0 to 255.
+
+    Not rounded to grey levels: between the pixels of a small picture steps are fractions of one, and how they are
+    rounded differs from processor to processor, while a map must fly on any of them.
+    """
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-    if grey.shape == (side_px, side_px):
-        return grey
-    # Exact: the plain one differs by a grey level between processors, and a map must fly on any of them.
-    return cv2.resize(grey, (side_px, side_px), interpolation=cv2.INTER_LINEAR_EXACT)
+    return cv2.resize(grey.astype(np.float32), (side_px, side_px), interpolation=cv2.INTER_LINEAR)
+
+
+def levels(grey: np.ndarray) -> np.ndarray:
+    """Round grey, float32 0 to 255, to the 256 levels of uint8, halves up."""
+    return (grey + np.float32(0.5)).astype(np.uint8)
 
 
 def mask_square(mask: np.ndarray | None, side_px: int) -> np.ndarray | None:
@@ -45,15 +51,14 @@ def oriented_cells(
     """Histograms of gradient orientation, one a cell (Dalal and Triggs 2005; thesis 6.2.2, steps 1 and 2).
 
     The square root of the image over its maximum, central differences, gradient magnitude, and a linear vote into
-    the two nearest of `bins` orientations over 360 degrees (`signed`) or 180. `grey` is uint8 (H, W) with sides that
-    are multiples of `cell_px`; pixels where the bool (H, W) `allowed` is False do not vote. Returns float32
-    (H/cell_px, W/cell_px, bins), sums of magnitude, all >= 0.
+    the two nearest of `bins` orientations over 360 degrees (`signed`) or 180. `grey` is float32 or uint8 (H, W), 0 to
+    255, with sides that are multiples of `cell_px`; pixels where the bool (H, W) `allowed` is False do not vote.
+    Returns float32 (H/cell_px, W/cell_px, bins), sums of magnitude, all >= 0.
     """
     rows, cols = grey.shape[0] // cell_px, grey.shape[1] // cell_px
     vote = _vote_by_octant if signed and bins == 8 else _vote_by_angle
     mirrored = cv2.copyMakeBorder(grey, 1, 1, 1, 1, cv2.BORDER_REFLECT_101)  # no gradient across the image's border
-    root = mirrored.astype(np.float32)
-    cv2.sqrt(root, root)
+    root = cv2.sqrt(mirrored.astype(np.float32, copy=False))
     cells = np.empty((rows, cols, bins), np.float32)
     step = max(1, _STRIP_ROWS // cell_px)
     for row in range(0, rows, step):

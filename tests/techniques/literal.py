@@ -8,7 +8,11 @@ import numpy as np
 
 def grey_square(image, side):
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-    return cv2.resize(grey, (side, side), interpolation=cv2.INTER_LINEAR_EXACT)
+    return cv2.resize(grey.astype(np.float64), (side, side), interpolation=cv2.INTER_LINEAR)
+
+
+def levels(grey):
+    return np.floor(grey + 0.5).astype(np.uint8)
 
 
 def disc(image, x, y, radius):
