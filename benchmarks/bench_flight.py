@@ -28,8 +28,8 @@ from flight_process import cpu_s, start, wait_for, watch_memory, write_frames
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import Pack
 from edgevpr.power.meter import PssMeter, query_cost, stage
-from edgevpr.runtime.flightlog import read_log
-from edgevpr.runtime.metering import FlightMeter
+from edgevpr.runtime.flight.flightlog import read_log
+from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.techniques import create
 
 PLACES = 10_000

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import sets_page
 
-from edgevpr.evaluate.tables import markdown
+from edgevpr.helpers.tables import markdown
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 RESULTS = REPOSITORY / "benchmarks" / "results"

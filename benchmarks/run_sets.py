@@ -27,7 +27,7 @@ from edgevpr import techniques
 from edgevpr.errors import EdgevprError, UsageError
 from edgevpr.evaluate.dataset import load_dataset
 from edgevpr.evaluate.evaluate import compare, evaluate
-from edgevpr.runtime.progress import progress
+from edgevpr.helpers.progress import progress
 from edgevpr.techniques.networks.session import file_sha256
 
 REPOSITORY = Path(__file__).resolve().parents[1]

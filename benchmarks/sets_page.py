@@ -9,6 +9,7 @@ from typing import Any
 from edgevpr.evaluate import tables
 from edgevpr.evaluate.curves import plot
 from edgevpr.evaluate.evaluate import TechniqueResult
+from edgevpr.helpers.tables import markdown
 
 CURVES = "curves.png"
 # What is drawn: the forms of a vector, and what is the same technique under other conditions, would hide the rest.
@@ -65,7 +66,7 @@ def _page(contents: list[dict[str, Any]], results: dict[str, list[TechniqueResul
 Made by `make results`. Machine: {machine["cpu"]}, {machine["cores"]} cores, BLAS threads: {machine["blas_threads"]}.
 Python {machine["python"]}, NumPy {machine["numpy"]}, OpenCV {machine["opencv"]}.
 
-{tables.markdown(("set", "use", "date", "commit"), made)}
+{markdown(("set", "use", "date", "commit"), made)}
 
 `cohog` is as it flies: a scan of 144 bytes a place, then the displacement vote over the best places; in the aerial sets
 its camera looks straight down (`--camera nadir`: the picture laid into a square, 24 rotations of the query). `cohog,
@@ -97,7 +98,7 @@ Weights in use:
 
 ## Recognition
 
-{tables.markdown(("set", "technique", *tables.QUALITY), reached)}
+{markdown(("set", "technique", *tables.QUALITY), reached)}
 
 * P@100%R: precision with the threshold at the lowest-scoring right match. R@100%P: recall with the threshold above the
   highest-scoring wrong one. AUC, EP: equations 2.3 and 2.4 of the thesis.
@@ -108,7 +109,7 @@ Weights in use:
 
 ## Costs
 
-{tables.markdown(("set", "technique", *tables.COSTS, "encode RAM MB"), paid)}
+{markdown(("set", "technique", *tables.COSTS, "encode RAM MB"), paid)}
 
 * Means over the queries; t_m is for all references. U: share of all cores.
 * encode RAM: what the technique adds to a process that has NumPy and OpenCV, until it has encoded one 640x480 picture:
@@ -130,7 +131,7 @@ Weights in use:
         page += f"""
 ## Errors in metres
 
-{tables.markdown(("set", "technique", "queries", "best match", "accepted"), away)}
+{markdown(("set", "technique", "queries", "best match", "accepted"), away)}
 
 Distance between the GPS positions of the query and of the place it was matched to: median / 90 % / worst (how many).
 All queries with a position are in it, those too that show nothing of the map. The error cannot be smaller than the
@@ -149,7 +150,7 @@ distance to the nearest place, and GPS on these cameras is noisy: 10 to 20 m off
 Recall@1 on corridor; published: computed from the similarity matrices that the thesis's authors gave out with their
 benchmark (VPR-Bench), each technique with its paper's weights.
 
-{tables.markdown(("technique", "published", "here", "difference", "what is different here"), beside)}
+{markdown(("technique", "published", "here", "difference", "what is different here"), beside)}
 """
     if left_out:
         page += "\n## Left out\n\n"
@@ -166,7 +167,7 @@ def overview(contents: list[dict[str, Any]], wanted: Callable[[str], bool] = lam
         size = next(row["descriptor_bytes"] for row in found if row)
         rows.append([label, f"{size}", *("-" if row is None else f"{row['recall_at_1']:.2f}" for row in found)])
     heads = [f"{content['set']} ({content['use']}, {_rows(content)[0]['queries']})" for content in contents]
-    return tables.markdown(("technique", "RAM B/place", *heads), rows)
+    return markdown(("technique", "RAM B/place", *heads), rows)
 
 
 def _rows(content: dict[str, Any]) -> list[dict[str, Any]]:

@@ -18,11 +18,11 @@ from edgevpr.config import Config, load_config
 from edgevpr.errors import EdgevprError, ImageError, ModelError, UsageError
 
 if TYPE_CHECKING:
+    from edgevpr.frames.source import Source
     from edgevpr.power.boards import Board
-    from edgevpr.runtime.estimate import FlightPlan
-    from edgevpr.runtime.frames import Source
-    from edgevpr.runtime.models import Verified
-    from edgevpr.runtime.offers import Offer
+    from edgevpr.runtime.preflight.estimate import FlightPlan
+    from edgevpr.runtime.preflight.networks import Verified
+    from edgevpr.runtime.preflight.offers import Offer
     from edgevpr.types import Frame
 
 _log = logging.getLogger(__name__)
@@ -30,11 +30,11 @@ _READ_TIMEOUT_S = 1.0
 
 
 def map_build(args: Namespace) -> int:
+    from edgevpr.frames.source import open_source
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.power.boards import load_board
-    from edgevpr.runtime.frames import open_source
-    from edgevpr.runtime.mapping import build_map
-    from edgevpr.runtime.pipeline import made_for, picked_technique, technique_of
+    from edgevpr.runtime.recognise.mapping import build_map
+    from edgevpr.runtime.recognise.pipeline import made_for, picked_technique, technique_of
 
     step_s = 1 / args.rate_hz if args.rate_hz else None
     source = open_source(args.source, step_s=step_s, positions=_path(args.positions), live=False)
@@ -91,7 +91,7 @@ def map_info(args: Namespace) -> int:
 
 def map_merge(args: Namespace) -> int:
     from edgevpr.places.mapfile import PlaceMap
-    from edgevpr.runtime.pipeline import technique_of
+    from edgevpr.runtime.recognise.pipeline import technique_of
 
     inputs = [PlaceMap.open(path) for path in args.maps]
     technique_of(inputs[0])
@@ -111,9 +111,9 @@ def map_merge(args: Namespace) -> int:
 
 
 def map_export(args: Namespace) -> int:
+    from edgevpr.helpers.files import require_folder, write_whole
     from edgevpr.places.geojson import write_geojson
     from edgevpr.places.mapfile import PlaceMap
-    from edgevpr.runtime.files import require_folder, write_whole
 
     with PlaceMap.open(args.map) as place_map:
         if args.geojson == "-":
@@ -134,10 +134,10 @@ def map_export(args: Namespace) -> int:
 
 
 def match(args: Namespace) -> int:
+    from edgevpr.frames.source import open_source
     from edgevpr.geodesy import distance_m
-    from edgevpr.runtime.frames import open_source
-    from edgevpr.runtime.pipeline import open_pipeline
-    from edgevpr.runtime.record import record
+    from edgevpr.runtime.recognise.pipeline import open_pipeline
+    from edgevpr.runtime.recognise.record import record
     from edgevpr.techniques.networks.card import weights_of
 
     pipeline = open_pipeline(_config(args, map=args.map), _settings(args.param))
@@ -173,7 +173,7 @@ def match(args: Namespace) -> int:
 
 
 def run(args: Namespace) -> int:
-    from edgevpr.runtime.service import fly
+    from edgevpr.runtime.service.fly import fly
 
     code = fly(_config(args, map=args.map), _path(args.positions))
     if threading.active_count() > 1:
@@ -184,7 +184,7 @@ def run(args: Namespace) -> int:
 
 
 def check(args: Namespace) -> int:
-    from edgevpr.runtime.check import check as findings_of
+    from edgevpr.runtime.service.check import check as findings_of
 
     findings = findings_of(args.config)
     for finding in findings:
@@ -193,13 +193,13 @@ def check(args: Namespace) -> int:
 
 
 def profile(args: Namespace) -> int:
+    from edgevpr.helpers.figures import require_picture
+    from edgevpr.helpers.progress import progress
     from edgevpr.power.boards import board_names, load_board
-    from edgevpr.runtime.choose import require_technique
-    from edgevpr.runtime.estimate import estimate
-    from edgevpr.runtime.estimate_text import format_table
-    from edgevpr.runtime.measured import default_path, known_and_tried, load, scaled_from
-    from edgevpr.runtime.pictures import require_picture
-    from edgevpr.runtime.progress import progress
+    from edgevpr.runtime.preflight.choose import require_technique
+    from edgevpr.runtime.preflight.estimate import estimate
+    from edgevpr.runtime.preflight.estimate_text import format_table
+    from edgevpr.runtime.preflight.stored import default_path, known_and_tried, load, scaled_from
 
     if args.list:
         for name in board_names():
@@ -231,7 +231,7 @@ def profile(args: Namespace) -> int:
     here = scaled_from(load_board("this"), board, stored)
     result = estimate(board, here, trials, plan, map_technique, stored.date if stored else None)
     if args.plot:
-        from edgevpr.runtime.chart import plot
+        from edgevpr.runtime.preflight.chart import plot
 
         plot(result, board, Path(args.plot))
     if args.json:
@@ -247,8 +247,8 @@ def _plan(args: Namespace, board: "Board") -> "tuple[FlightPlan, str | None, tup
     from edgevpr.config import load_config
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.power.equations import parse_pack
-    from edgevpr.runtime.estimate import FlightPlan
-    from edgevpr.runtime.offers import offers
+    from edgevpr.runtime.preflight.estimate import FlightPlan
+    from edgevpr.runtime.preflight.offers import offers
 
     settings, places, map_technique = {}, args.places, None
     if args.map:
@@ -270,8 +270,8 @@ def _plan(args: Namespace, board: "Board") -> "tuple[FlightPlan, str | None, tup
 
 def _profile_detect(args: Namespace) -> int:
     from edgevpr.power.detect import detect, findings, profile_text
-    from edgevpr.runtime.measured import micro_benchmark
-    from edgevpr.runtime.ownprofile import require_new_profile, write_profile
+    from edgevpr.runtime.preflight.ownprofile import require_new_profile, write_profile
+    from edgevpr.runtime.preflight.stored import micro_benchmark
 
     found = detect()
     if args.out:
@@ -291,12 +291,12 @@ def _profile_detect(args: Namespace) -> int:
 def _profile_measure(args: Namespace, quiet: bool) -> int:
     """Measure this machine and keep the figures; `quiet` leaves the table to who asked for more."""
     from edgevpr import techniques
+    from edgevpr.helpers.progress import progress
     from edgevpr.power.boards import load_board
-    from edgevpr.runtime import measured
-    from edgevpr.runtime.measured_text import format_measured
-    from edgevpr.runtime.offers import offers
-    from edgevpr.runtime.ownprofile import measured_profile
-    from edgevpr.runtime.progress import progress
+    from edgevpr.runtime.preflight import stored as measured
+    from edgevpr.runtime.preflight.offers import offers
+    from edgevpr.runtime.preflight.ownprofile import measured_profile
+    from edgevpr.runtime.preflight.stored_text import format_measured
 
     path = Path(args.out) if args.out else measured.default_path()
     measured.require_room(path, make=not args.out)
@@ -324,9 +324,9 @@ def evaluate(args: Namespace) -> int:
     from edgevpr.evaluate.curves import plot
     from edgevpr.evaluate.dataset import load_dataset
     from edgevpr.evaluate.tables import results_text
-    from edgevpr.runtime.offers import offers, usable
-    from edgevpr.runtime.pictures import require_picture
-    from edgevpr.runtime.progress import progress
+    from edgevpr.helpers.figures import require_picture
+    from edgevpr.helpers.progress import progress
+    from edgevpr.runtime.preflight.offers import offers, usable
 
     wanted = [name.strip() for name in args.techniques.split(",") if name.strip()]
     if not wanted:
@@ -422,7 +422,7 @@ def train_words(args: Namespace) -> int:
 
 def models_list(args: Namespace) -> int:
     from edgevpr.resources import model_folders
-    from edgevpr.runtime.models import list_models
+    from edgevpr.runtime.preflight.networks import list_models
 
     found = list_models()
     if args.json:
@@ -443,7 +443,7 @@ def models_list(args: Namespace) -> int:
 
 def models_verify(args: Namespace) -> int:
     from edgevpr.power.boards import load_board
-    from edgevpr.runtime.models import verify
+    from edgevpr.runtime.preflight.networks import verify
     from edgevpr.techniques.networks.card import card_names, load_card
 
     threads = load_board("this").threads
@@ -467,7 +467,7 @@ def models_verify(args: Namespace) -> int:
 
 def models_add(args: Namespace) -> int:
     from edgevpr.power.boards import load_board
-    from edgevpr.runtime.models import add
+    from edgevpr.runtime.preflight.networks import add
 
     verified, card = add(Path(args.file), Path(args.card), load_board("this").threads)
     if args.json:
@@ -480,9 +480,9 @@ def models_add(args: Namespace) -> int:
 def models_quantise(args: Namespace) -> int:
     from edgevpr.evaluate.dataset import load_dataset
     from edgevpr.evaluate.evaluate import evaluate as measured
+    from edgevpr.helpers.progress import progress
     from edgevpr.power.boards import load_board
-    from edgevpr.runtime.models import technique_with
-    from edgevpr.runtime.progress import progress
+    from edgevpr.runtime.preflight.networks import technique_with
     from edgevpr.training.quantise import quantise
 
     data = (args.query, args.ref, args.ground_truth)
@@ -526,7 +526,7 @@ def demo(args: Namespace) -> int:
 
 def service(args: Namespace) -> int:
     from edgevpr.power.boards import load_board
-    from edgevpr.runtime.unit import render_unit
+    from edgevpr.runtime.service.unit import render_unit
 
     print(render_unit(load_board(args.board), args.config), end="")
     return 0
@@ -535,7 +535,7 @@ def service(args: Namespace) -> int:
 def _frames(source: "Source", label: str, unusable: list[ImageError]) -> "Iterator[Frame]":
     """Every frame of a source that ends, with progress; an image that cannot be used is said, kept in `unusable`, and
     left out."""
-    from edgevpr.runtime.progress import progress
+    from edgevpr.helpers.progress import progress
 
     def until_it_ends() -> "Iterator[Frame | None]":
         while not source.ended:

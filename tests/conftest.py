@@ -1,6 +1,11 @@
 """What the tests of several rooms share."""
 
+import os
+
 import pytest
+
+# As edgevpr's command line does, before anything imports NumPy.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from edgevpr.evaluate.evaluate import TechniqueResult
-from edgevpr.runtime.pictures import figure
+from edgevpr.helpers.figures import figure
 
 _PANELS_A_ROW = 3
 # Of ten or more curves no ten colours are told apart: after them the lines change.

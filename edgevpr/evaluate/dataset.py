@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from edgevpr.errors import UsageError
-from edgevpr.runtime.images import list_images
+from edgevpr.frames.images import list_images
 
 
 @dataclass(frozen=True, slots=True)

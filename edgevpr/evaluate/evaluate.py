@@ -11,6 +11,8 @@ import numpy as np
 from edgevpr.config import load_config
 from edgevpr.evaluate import metrics
 from edgevpr.evaluate.dataset import Dataset
+from edgevpr.frames.images import list_images, read_image
+from edgevpr.frames.source import Source, open_source
 from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import rank
@@ -18,10 +20,8 @@ from edgevpr.places.sequence import length_of, sequence_of
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import pack_ah, parse_pack, queries_ah, rail_ah, stage_energy_j
 from edgevpr.power.meter import stage
-from edgevpr.runtime.accept import accept_rule, accepted
-from edgevpr.runtime.frames import Source, open_source
-from edgevpr.runtime.images import list_images, read_image
-from edgevpr.runtime.mapping import build_map
+from edgevpr.runtime.recognise.judge import accept_rule, accepted
+from edgevpr.runtime.recognise.mapping import build_map
 from edgevpr.techniques import create, labelled
 from edgevpr.techniques.networks.card import weights_of
 from edgevpr.types import Frame, StageCost, Technique

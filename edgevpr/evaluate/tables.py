@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from edgevpr.evaluate.evaluate import TechniqueResult
-from edgevpr.runtime.estimate_text import aligned
+from edgevpr.helpers.tables import aligned
 
 QUALITY = ("recall@1", "@5", "@10", "P@100%R", "R@100%P", "AUC", "EP", "ROC", "PCU", "accepted (wrong)")
 COSTS = ("t_e ms", "t_m ms", "t_m/ref ms", "RAM B/place", "disk B/place", "U_e", "U_m", "mAh/query")
@@ -35,33 +35,26 @@ def costs(result: TechniqueResult) -> list[str]:
     ]
 
 
-def text(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Columns in line, the first to the left and the others to the right."""
-    return "\n".join(aligned([headings, *rows]))
-
-
-def markdown(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table, numbers to the right."""
-    ruler = ["---"] + ["---:"] * (len(headings) - 1)
-    return "\n".join("| " + " | ".join(line) + " |" for line in (headings, ruler, *rows))
-
-
 def results_text(results: Sequence[TechniqueResult]) -> str:
     """What `edgevpr eval` prints, with what the figures rest on. `results` come from `compare`."""
     first = results[0]
-    reached = text(("technique", *QUALITY), [[result.technique, *quality(result)] for result in results])
-    paid = text(("technique", *COSTS), [[result.technique, *costs(result)] for result in results])
-    return (
-        f"{reached}\n\n{paid}\n\n"
-        f"{first.queries} queries scored against {first.references} references; times are means over the queries.\n"
-        f"{_sequences(results)}"
-        "accepted: queries that would have moved the aircraft, by the technique's own rule.\n"
-        f"PCU: P@100%R x log10(t_e,max / t_e + 9) with t_e,max = {first.t_encode_max_s * 1000:.1f} ms.\n"
-        f"mAh: {first.ah_assumes}."
-        + "".join(f"\nWeights of {each}." for each in dict.fromkeys(result.weights for result in results) if each)
-    )
+    reached = aligned([("technique", *QUALITY), *([result.technique, *quality(result)] for result in results)])
+    paid = aligned([("technique", *COSTS), *([result.technique, *costs(result)] for result in results)])
+    lines = [
+        *reached,
+        "",
+        *paid,
+        "",
+        f"{first.queries} queries scored against {first.references} references; times are means over the queries.",
+        *_sequences(results),
+        "accepted: queries that would have moved the aircraft, by the technique's own rule.",
+        f"PCU: P@100%R x log10(t_e,max / t_e + 9) with t_e,max = {first.t_encode_max_s * 1000:.1f} ms.",
+        f"mAh: {first.ah_assumes}.",
+        *(f"Weights of {each}." for each in dict.fromkeys(result.weights for result in results) if each),
+    ]
+    return "\n".join(lines)
 
 
-def _sequences(results: Sequence[TechniqueResult]) -> str:
+def _sequences(results: Sequence[TechniqueResult]) -> list[str]:
     lengths = [f"{result.technique} of {result.sequence}" for result in results if result.sequence > 1]
-    return f"Matched in sequences of queries: {', '.join(lengths)}.\n" if lengths else ""
+    return [f"Matched in sequences of queries: {', '.join(lengths)}."] if lengths else []

@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 
 from edgevpr.errors import LinkError, UsageError
+from edgevpr.frames.positions import read_positions
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.messages import AUTOPILOT, POSITION_FIX
 from edgevpr.mavlink.transport import Transport, open_transport
 from edgevpr.mavlink.wire import Message, Receiver, mavlink
-from edgevpr.runtime.positions import read_positions
 
 HEARTBEAT_S = 1.0
 POSITION_S = 0.2

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from edgevpr.errors import EdgevprError
-from edgevpr.runtime.flightlog import read_log
-from edgevpr.runtime.progress import progress
+from edgevpr.helpers.progress import progress
+from edgevpr.runtime.flight.flightlog import read_log
 from edgevpr.simulate.camera import lit
 from edgevpr.simulate.flight import (
     SCENE_DEPTH_M,

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from edgevpr.frames.positions import find_positions, read_positions
 from edgevpr.geodesy import distance_m
-from edgevpr.runtime.flightlog import read_log
-from edgevpr.runtime.positions import find_positions, read_positions
+from edgevpr.runtime.flight.flightlog import read_log
 from edgevpr.types import Position
 
 # A place is the right one where the two pictures share 30 % of their ground, which is 78 m long from a height of 80 m.

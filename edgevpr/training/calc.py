@@ -17,7 +17,7 @@ import torch
 from torch.nn import functional
 
 from edgevpr.errors import UsageError
-from edgevpr.runtime.files import write_whole
+from edgevpr.helpers.files import write_whole
 from edgevpr.training.network import Autoencoder, Encoder
 from edgevpr.training.pictures import batch, gradients_of, require_enough, two_sights
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from edgevpr.errors import EdgevprError, ImageError, UsageError
-from edgevpr.runtime.files import require_folder
-from edgevpr.runtime.opencv import cv2
-from edgevpr.runtime.progress import progress
+from edgevpr.frames.opencv import cv2
+from edgevpr.helpers.files import require_folder
+from edgevpr.helpers.progress import progress
 from edgevpr.training.pictures import batch, read_pictures, require_enough, small_grey
 
 _CHECKED_INPUTS = 16

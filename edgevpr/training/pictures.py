@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from edgevpr.errors import ImageError, UsageError
-from edgevpr.runtime.images import list_images, read_image
-from edgevpr.runtime.opencv import cv2
-from edgevpr.runtime.progress import progress
+from edgevpr.frames.images import list_images, read_image
+from edgevpr.frames.opencv import cv2
+from edgevpr.helpers.progress import progress
 from edgevpr.techniques.gradients import normalised_blocks, oriented_cells
 
 HEIGHT, WIDTH = 120, 160  # of the network's input

@@ -7,9 +7,9 @@ from typing import Any
 
 from edgevpr.config import read_yaml
 from edgevpr.errors import ModelError, SourceError
+from edgevpr.frames.images import list_images, read_image
 from edgevpr.resources import own_models
-from edgevpr.runtime.images import list_images, read_image
-from edgevpr.runtime.models import Verified, card_text, install, verify
+from edgevpr.runtime.preflight.networks import Verified, card_text, install, verify
 from edgevpr.techniques.networks.card import load_card, read_card
 from edgevpr.techniques.networks.prepare import prepare
 from edgevpr.techniques.networks.session import backbone_of, file_sha256

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from edgevpr.errors import ImageError, UsageError
+from edgevpr.frames.images import list_images
+from edgevpr.helpers.files import write_whole
+from edgevpr.helpers.progress import progress
 from edgevpr.resources import model_folders
-from edgevpr.runtime.files import write_whole
-from edgevpr.runtime.images import list_images
-from edgevpr.runtime.progress import progress
 from edgevpr.techniques.heads import vlad
 from edgevpr.techniques.heads.regions import describe, find_regions
 from edgevpr.techniques.networks.session import Backbone, open_backbone

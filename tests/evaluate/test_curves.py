@@ -8,7 +8,7 @@ import pytest
 from edgevpr.errors import UsageError
 from edgevpr.evaluate.curves import plot
 from edgevpr.evaluate.evaluate import TechniqueResult
-from edgevpr.runtime.pictures import require_picture
+from edgevpr.helpers.figures import require_picture
 
 pytest.importorskip("matplotlib", reason="pictures need the extra `plots`")
 

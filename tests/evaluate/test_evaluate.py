@@ -8,10 +8,11 @@ import pytest
 from pictures import textured
 
 from edgevpr.errors import ImageError, UsageError
-from edgevpr.evaluate import tables
 from edgevpr.evaluate.dataset import load_dataset
 from edgevpr.evaluate.evaluate import as_json, compare, evaluate
-from edgevpr.runtime.progress import progress
+from edgevpr.evaluate.tables import results_text
+from edgevpr.helpers.progress import progress
+from edgevpr.helpers.tables import markdown
 
 HOG = {"w1": 64}
 COHOG = {"w1": 208}
@@ -100,7 +101,7 @@ def test_progress_is_shown_for_references_and_queries(folder):
 
 
 def test_the_text_tables_line_up_and_name_what_their_figures_rest_on(folder):
-    printed = tables.results_text(compare([evaluate("hog", load(folder), HOG)]))
+    printed = results_text(compare([evaluate("hog", load(folder), HOG)]))
     reached, paid, notes = printed.split("\n\n")
     for table in (reached, paid):
         head, row = table.splitlines()
@@ -112,5 +113,5 @@ def test_the_text_tables_line_up_and_name_what_their_figures_rest_on(folder):
 
 
 def test_a_markdown_table_has_a_cell_for_every_heading():
-    lines = tables.markdown(("set", "recall"), [["corridor", "0.66"], ["park", "0.2"]]).splitlines()
+    lines = markdown(("set", "recall"), [["corridor", "0.66"], ["park", "0.2"]]).splitlines()
     assert lines == ["| set | recall |", "| --- | ---: |", "| corridor | 0.66 |", "| park | 0.2 |"]

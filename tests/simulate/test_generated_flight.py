@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
+from edgevpr.frames.positions import read_positions
 from edgevpr.geodesy import distance_m
-from edgevpr.runtime.flightlog import FlightLog
-from edgevpr.runtime.positions import read_positions
+from edgevpr.runtime.flight.flightlog import FlightLog
 from edgevpr.simulate.camera import ground_to_pixel
 from edgevpr.simulate.flight import (
     SCENE_DEPTH_M,

@@ -3,7 +3,7 @@ import pytest
 from pictures_on_disk import write_pictures
 
 from edgevpr.errors import ImageError, SourceError, UsageError
-from edgevpr.runtime.opencv import cv2
+from edgevpr.frames.opencv import cv2
 from edgevpr.techniques.gradients import normalised_blocks, oriented_cells
 from edgevpr.training.pictures import (
     TARGET_LENGTH,

@@ -11,7 +11,7 @@ from tiny_networks import write_network
 
 from edgevpr.cli import main
 from edgevpr.errors import ModelError, SourceError
-from edgevpr.runtime.models import verify_here
+from edgevpr.runtime.preflight.networks import verify_here
 from edgevpr.techniques.networks.session import open_backbone
 from edgevpr.training.quantise import quantise
 

@@ -1,0 +1,119 @@
+"""Image files: which of a folder, and the pixels of one. A file that is not whole is refused, never half decoded."""
+
+import re
+import zlib
+from pathlib import Path
+
+import numpy as np
+
+from edgevpr.errors import ImageError, SourceError
+from edgevpr.frames.opencv import cv2
+
+EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm")
+MIN_SIDE_PX = 16
+
+_JPEG_START = b"\xff\xd8\xff"
+_PNG_START = b"\x89PNG\r\n\x1a\n"
+# In the scan data of a JPEG, 0xFF followed by 00 (stuffing) or D0..D7 (restart) is no marker that ends it.
+_MARKER = re.compile(rb"\xff+[^\x00\xd0-\xd7\xff]")
+_END_OF_IMAGE = 0xD9
+
+
+def list_images(folder: str | Path) -> list[Path]:
+    """The images that lie in `folder`, in the order a person counts (2 before 10).
+
+    Raises SourceError for a folder that is missing, cannot be read or holds no images.
+    """
+    folder = Path(folder)
+    try:
+        names = [path.name for path in folder.iterdir()]
+    except FileNotFoundError:
+        raise SourceError(f"The folder {folder} does not exist: give the folder that holds the images.") from None
+    except OSError as error:
+        raise SourceError(f"{folder} cannot be listed ({error.strerror}): give a folder of images.") from error
+    # Names that begin with a dot are other systems' notes (._IMG_1.jpg), not photographs.
+    images = [name for name in names if name.lower().endswith(EXTENSIONS) and not name.startswith(".")]
+    if not images:
+        raise SourceError(f"The folder {folder} holds no images ({' '.join(EXTENSIONS)}): give the one that does.")
+    return [folder / name for name in sorted(images, key=_counting_order)]
+
+
+def read_image(path: str | Path) -> np.ndarray:
+    """Decode an image file to uint8, (H, W, 3) BGR or (H, W) grey; turned as its EXIF says, without transparency.
+
+    Raises ImageError for a file that is missing, cut short, no image, not 8 bit, or smaller than 16x16 pixels.
+    """
+    try:
+        data = Path(path).read_bytes()
+    except FileNotFoundError:
+        raise ImageError(f"The image {path} does not exist: check the name.") from None
+    except OSError as error:
+        raise ImageError(f"The image {path} cannot be read ({error.strerror}): give a readable file.") from error
+    if not data:
+        raise ImageError(f"{path} is empty: copy it again from the camera.")
+    if _is_incomplete(data):
+        raise ImageError(f"{path} is cut short or damaged: copy it again from the camera.")
+    image = _decoded(data)
+    if image is None:
+        raise ImageError(f"{path} is not an image edgevpr can decode: give a JPEG, PNG, TIFF, BMP or WebP file.")
+    if image.dtype != np.uint8:
+        bits = 8 * image.dtype.itemsize
+        raise ImageError(f"{path} has {bits} bits a channel; edgevpr reads 8-bit images: convert it first.")
+    height, width = image.shape[:2]
+    if min(height, width) < MIN_SIDE_PX:
+        raise ImageError(
+            f"{path} is {width}x{height} pixels; at least {MIN_SIDE_PX}x{MIN_SIDE_PX} are needed: give a larger image."
+        )
+    return image
+
+
+def _counting_order(name: str) -> tuple[list[str | int], str]:
+    parts = re.split(r"(\d+)", name.lower())
+    return [int(part) if i % 2 else part for i, part in enumerate(parts)], name
+
+
+def _decoded(data: bytes) -> np.ndarray | None:
+    try:
+        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
+    except cv2.error:  # a header that promises more pixels than OpenCV is willing to hold
+        return None
+
+
+def _is_incomplete(data: bytes) -> bool:
+    """Whether a JPEG ends before its end mark (OpenCV 4 fills the missing part with grey and says nothing), or a PNG
+    does not have all its chunks intact (OpenCV does not look at their checksums).
+
+    The decoders of the other formats notice by themselves. Bytes after the end mark are harmless.
+    """
+    if data.startswith(_JPEG_START):
+        return not _jpeg_is_whole(data)
+    if data.startswith(_PNG_START):
+        return not _png_is_whole(data)
+    return False
+
+
+def _jpeg_is_whole(data: bytes) -> bool:
+    """Walk from marker to marker (ITU-T T.81, annex B) to the end of the image.
+
+    Segments are skipped by their length, so that the end mark of an EXIF thumbnail is not taken for the picture's.
+    """
+    position = 2
+    while marker := _MARKER.search(data, position):
+        code = data[marker.end() - 1]
+        if code == _END_OF_IMAGE:
+            return True
+        position = marker.end() + int.from_bytes(data[marker.end() : marker.end() + 2], "big")
+    return False
+
+
+def _png_is_whole(data: bytes) -> bool:
+    """Walk from chunk to chunk (length, kind, content, checksum) to the end of the image."""
+    position = len(_PNG_START)
+    while position + 12 <= len(data):
+        end = position + 8 + int.from_bytes(data[position : position + 4], "big")
+        if zlib.crc32(data[position + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
+            return False
+        if data[position + 4 : position + 8] == b"IEND":
+            return True
+        position = end + 4
+    return False

@@ -1,0 +1,100 @@
+"""Recorded pictures, read in order to their end: a folder of images, a video file."""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+from edgevpr.errors import SourceError, UsageError
+from edgevpr.frames.exif import read_exif
+from edgevpr.frames.images import list_images, read_image
+from edgevpr.frames.opencv import cv2
+from edgevpr.frames.positions import find_positions, read_positions
+from edgevpr.types import Frame
+
+_TIMESTAMP_ROUNDING_S = 0.001  # Matroska counts in milliseconds
+_USUAL_RATE_HZ = 25.0
+
+
+class FolderSource:
+    """Each image of a folder once, placed by positions.csv where it has a line there, else by its EXIF."""
+
+    def __init__(self, folder: Path, positions: Path | None, clock: Callable[[], float]):
+        self._paths = list_images(folder)
+        self.total = len(self._paths)
+        self._read = 0
+        self._clock = clock
+        csv_path = positions or find_positions(folder)
+        self._tags = read_positions(csv_path) if csv_path else {}
+        if positions and not any(path.name in self._tags for path in self._paths):
+            raise UsageError(f"{positions} names none of the images in {folder}: its column `file` must.")
+
+    @property
+    def state(self) -> str:
+        return "ended" if self.ended else "reading"
+
+    @property
+    def ended(self) -> bool:
+        return self._read == self.total
+
+    def read(self, timeout_s: float) -> Frame | None:
+        """The next image. Raises ImageError for one that cannot be used; the call after it goes on."""
+        if self.ended:
+            return None
+        path = self._paths[self._read]
+        self._read += 1
+        image = read_image(path)
+        tag = self._tags.get(path.name) or read_exif(path)
+        return Frame(image, path.name, self._clock(), tag.t_utc_s, tag.position, tag.heading_deg)
+
+    def close(self) -> None:
+        """Nothing is held open between images."""
+
+
+class VideoSource:
+    """The frames of a video file, at least `step_s` of video time apart: the same ones each time."""
+
+    def __init__(self, path: Path, step_s: float, clock: Callable[[], float]):
+        self.ended = False
+        self._capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+        if not self._capture.isOpened():
+            raise SourceError(f"{path} is not a video that can be decoded: give a video file or a folder of images.")
+        self._step_s = step_s
+        self._clock = clock
+        self._frame_s = 1 / (self._capture.get(cv2.CAP_PROP_FPS) or _USUAL_RATE_HZ)
+        frames = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)  # below zero where the file does not say
+        self.total = max(0, math.ceil(frames * self._frame_s / max(step_s, self._frame_s)))
+        self._index = -1
+        self._t_s = -self._frame_s
+        self._t_due_s = 0.0
+
+    @property
+    def state(self) -> str:
+        return "ended" if self.ended else "reading"
+
+    def read(self, timeout_s: float) -> Frame | None:
+        """The next frame that is due; None where it takes longer to get there, or the video has ended."""
+        deadline_s = self._clock() + timeout_s
+        while self._advance():
+            if self._t_s >= self._t_due_s - _TIMESTAMP_ROUNDING_S:
+                there, image = self._capture.retrieve()
+                if there:
+                    self._t_due_s = self._t_s + self._step_s
+                    return Frame(image, f"frame {self._index:06d} t={self._t_s:.3f} s", self._clock())
+            if self._clock() >= deadline_s:
+                break
+        return None
+
+    def close(self) -> None:
+        self.ended = True
+        self._capture.release()
+
+    def _advance(self) -> bool:
+        """Decode one frame; False at the end."""
+        if not self._capture.grab():
+            self.ended = True
+            return False
+        self._index += 1
+        stamp_s = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+        # A bare H.264 or MJPEG file has no time stamps (they come as zero, or worse): then the frame rate counts.
+        self._t_s = stamp_s if stamp_s > self._t_s else self._t_s + self._frame_s
+        return True

@@ -1,0 +1,143 @@
+"""The estimate of a flight as a picture: RAM against charge, and the projected memory of the map (figure 5.7 of the
+thesis) beside the RAM of the boards that edgevpr knows (needs matplotlib, extra `plots`)."""
+
+import math
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from edgevpr.helpers.figures import figure
+from edgevpr.power.boards import Board, board_names, load_board
+from edgevpr.runtime.preflight.estimate import Estimate
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_FITS, _FITS_NOT = "C0", "C3"
+_LINE = {"color": "0.45", "linewidth": 1, "linestyle": "--"}
+_FAR_PT = (8, 14, 22, 32, 44, 58, 74, 92, 112, 134)  # how far from its point a label may be
+_WAYS = 24
+
+
+def plot(estimate: Estimate, board: Board, path: Path) -> None:
+    """Draw both panels to `path`; techniques that do not fit are red."""
+    rows = 0.24 * max(14, len(estimate.techniques)) + 1.6
+    drawn = figure(14.5, rows)
+    needs, projected = drawn.subplots(1, 2)
+    _needs(needs, estimate, board)
+    _projected(projected, estimate)
+    # Labels are placed by what is really drawn, so the layout must stand first.
+    drawn.draw_without_rendering()
+    _label(needs, [(row.technique, row.flight_marginal_mah, row.process_ram_mb) for row in estimate.techniques])
+    drawn.savefig(path, dpi=100)
+
+
+def _needs(axes: "Axes", estimate: Estimate, board: Board) -> None:
+    plan, rows = estimate.plan, estimate.techniques
+    for row in rows:
+        axes.plot(
+            row.flight_marginal_mah, row.process_ram_mb, "o", markersize=5, color=_FITS if row.fits else _FITS_NOT
+        )
+    idle_mah = rows[0].flight_mah - rows[0].flight_marginal_mah if rows else 0.0
+    axes.set(
+        xscale="log",
+        yscale="log",
+        xlabel=f"mAh that recognising takes in {plan.flight_min:g} min"
+        + (f" (the idle board takes {idle_mah:.0f} more)" if idle_mah else ""),
+        ylabel="peak RAM of the process with its map, MB",
+        title=f"{estimate.title}: {plan.places} places at {plan.rate_hz:g} Hz",
+    )
+    for ram_mb, what in ((board.memory_max_mb, "allowed"), (board.ram_mb, "RAM of the board")):
+        axes.axhline(ram_mb, **_LINE)
+        axes.annotate(
+            f"{what}: {ram_mb:.0f} MB", (0.01, ram_mb), (0, 2), xycoords=axes.get_yaxis_transform(),
+            textcoords="offset points", fontsize=8, color="0.3",
+        )  # fmt: skip
+    pack_mah = plan.pack.capacity_mah - idle_mah
+    if pack_mah > 0:
+        axes.axvline(pack_mah, **_LINE)
+        axes.annotate(
+            f"pack, less idle: {pack_mah:.0f} mAh", (pack_mah, 0.02), (-10, 0), xycoords=axes.get_xaxis_transform(),
+            textcoords="offset points", fontsize=8, color="0.3", rotation=90, va="bottom",
+        )  # fmt: skip
+    low, high = axes.get_ylim()
+    axes.set_ylim(low / 1.3, high * 1.3)
+    low, high = axes.get_xlim()
+    axes.set_xlim(low / 2, high * 2)
+    axes.grid(alpha=0.3)
+
+
+def _projected(axes: "Axes", estimate: Estimate) -> None:
+    rows = list(reversed(estimate.techniques))
+    values = [row.map_ram_mb for row in rows]
+    axes.barh(range(len(rows)), values, color=[_FITS if row.fits else _FITS_NOT for row in rows], height=0.6)
+    axes.set_yticks(range(len(rows)), [row.technique for row in rows], fontsize=8)
+    lines = defaultdict(list)
+    for name in board_names():
+        lines[load_board(name).ram_mb].append(name)
+    axes.set_xscale("log")
+    axes.set_xlim(min([*values, 1.0]) / 3, max([*values, *lines]) * 4)
+    axes.set_ylim(-0.7, len(rows) - 0.3)
+    for place, value in enumerate(values):
+        axes.annotate(
+            f"{value:.3g}" if value < 100 else f"{value:.0f}",
+            (value, place),
+            (3, 0),
+            textcoords="offset points",
+            fontsize=7,
+            va="center",
+        )
+    for ram_mb, names in lines.items():
+        axes.axvline(ram_mb, **_LINE)
+        axes.annotate(
+            ", ".join(names), (ram_mb, 1), (-2, 2), xycoords=axes.get_xaxis_transform(),
+            textcoords="offset points", fontsize=7, color="0.3", rotation=35,
+        )  # fmt: skip
+    axes.set_xlabel(f"MB of RAM that a map of {estimate.plan.places} places takes; lines: RAM of the boards")
+    axes.set_title("Projected memory (thesis, figure 5.7)", loc="left")
+    axes.grid(alpha=0.3, axis="x")
+
+
+def _label(axes: "Axes", points: Sequence[tuple[str, float, float]]) -> None:
+    """Write each name as near to its point as it covers no other name, no point and no edge; from afar with a line."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.transforms import Bbox
+
+    renderer = FigureCanvasAgg(axes.figure).get_renderer()
+    frame = axes.get_window_extent(renderer)
+    px = axes.figure.dpi / 72
+    centres = axes.transData.transform([(x, y) for _, x, y in points])
+    axes.set(xlim=axes.get_xlim(), ylim=axes.get_ylim())  # lines to points move no limit
+    taken = [Bbox.from_bounds(x - 3 * px, y - 3 * px, 6 * px, 6 * px) for x, y in centres]
+    taken += [text.get_window_extent(renderer) for text in axes.texts]
+    for (name, x, y), (at_x, at_y) in zip(points, centres, strict=True):
+        text = axes.annotate(name, (x, y), (0, 0), textcoords="offset points", fontsize=8)
+        size = text.get_window_extent(renderer)
+        best = None
+        for dx, dy, near in _places(size.width / px, size.height / px):
+            box = Bbox.from_bounds(at_x + dx * px, at_y + dy * px, size.width, size.height)
+            inside = frame.x0 < box.x0 and box.x1 < frame.x1 and frame.y0 < box.y0 and box.y1 < frame.y1
+            covered = sum(box.overlaps(other) for other in taken) + (0 if inside else len(points))
+            if best is None or covered < best[0]:
+                best = (covered, dx, dy, box, near)
+            if not covered:
+                break
+        _, dx, dy, box, near = best
+        text.set_position((dx, dy))
+        taken.append(box)
+        if not near:
+            edge = (min(max(at_x, box.x0), box.x1), min(max(at_y, box.y0), box.y1))
+            line = axes.transData.inverted().transform([(at_x, at_y), edge])
+            axes.plot(*line.T, color="0.6", linewidth=0.6, zorder=1)
+
+
+def _places(width_pt: float, height_pt: float) -> Iterator[tuple[float, float, bool]]:
+    """Lower left corners of a label, in points from what it names, and whether that is near: to the right first, then
+    round and further away."""
+    for far in _FAR_PT:
+        for way in range(_WAYS):
+            turn = 2 * math.pi * way / _WAYS
+            across, up = math.cos(turn), math.sin(turn)
+            # The near edge is `far` away, whichever side the label is on.
+            yield across * far + (across - 1) / 2 * width_pt, up * far + (up - 1) / 2 * height_pt, far == _FAR_PT[0]

@@ -1,0 +1,120 @@
+"""Which technique a board can afford: what was tried for a moment is held against the board, and the best that fits is
+taken."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from edgevpr import techniques
+from edgevpr.errors import ConfigError, UsageError
+from edgevpr.power.boards import Board
+from edgevpr.runtime.preflight.probe import TechniqueCosts
+
+_LOWEST_RATE_HZ = 0.01  # what the configuration allows
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """How a technique would sit on a board. It fits where there are no `shortfalls`; `remedies` would make it fit."""
+
+    map_ram_mb: float
+    process_ram_mb: float
+    reachable_hz: float
+    shortfalls: tuple[str, ...]
+    remedies: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """The technique taken, and why, in one line."""
+
+    technique: str
+    reason: str
+
+
+def fit(board: Board, costs: TechniqueCosts, places: int, rate_hz: float, budget_mb: float) -> Fit:
+    """Whether a technique fits: the map in `budget_mb`, the process in its memory, the queries in the CPU's time.
+
+    A query is over before the next one begins, and all of them together take `cpu_share` of the cores at most.
+    """
+    encode, match = costs.encode, costs.match(places)
+    usable_cores = board.cores * board.cpu_share
+    map_ram_mb = costs.ram_bytes_per_place * places / 1e6
+    process_ram_mb = costs.process_mb + map_ram_mb
+    reachable_hz = min(1 / (encode.wall_s + match.wall_s), usable_cores / (encode.cpu_s + match.cpu_s))
+
+    shortfalls, remedies = [], []
+    if map_ram_mb > budget_mb:
+        shortfalls.append(f"its map takes {map_ram_mb:.1f} MB of RAM and {budget_mb:.1f} are allowed")
+    if process_ram_mb > board.memory_max_mb:
+        shortfalls.append(f"the process takes {process_ram_mb:.0f} MB and {board.memory_max_mb:.0f} are allowed")
+    if reachable_hz < rate_hz:
+        shortfalls.append(f"it reaches {_rounded_down(reachable_hz):g} Hz of {rate_hz:g}")
+    if shortfalls:
+        most_places = min(
+            min(budget_mb, board.memory_max_mb - costs.process_mb) * 1e6 / costs.ram_bytes_per_place,
+            costs.places_within(1 / rate_hz - encode.wall_s, usable_cores / rate_hz - encode.cpu_s),
+        )
+        if most_places >= 1:
+            remedies.append(f"with up to {int(most_places)} places")
+        if process_ram_mb <= board.memory_max_mb:
+            if map_ram_mb <= budget_mb and reachable_hz >= _LOWEST_RATE_HZ:
+                remedies.append(f"at up to {_rounded_down(reachable_hz):g} Hz")
+            elif reachable_hz >= rate_hz:
+                remedies.append(f"with a budget of {math.ceil(map_ram_mb)} MB")
+    return Fit(map_ram_mb, process_ram_mb, reachable_hz, tuple(shortfalls), tuple(remedies))
+
+
+def require_technique(board: Board) -> None:
+    """Raise ConfigError for a board whose profile names a technique that is not there."""
+    if board.technique is not None and not techniques.is_known(board.technique):
+        raise ConfigError(
+            f"The profile of {board.title} names the technique `{board.technique}`, which is not there: use one of "
+            f"{', '.join(techniques.names())}."
+        )
+
+
+def preferred(board: Board) -> tuple[str, ...]:
+    """What is tried for a board where no technique is named, best first: its own, then those offered to any board.
+    Raises ConfigError for a technique of the board that is not there."""
+    require_technique(board)
+    own = () if board.technique is None else (board.technique,)
+    return (*own, *(name for name in techniques.AUTOMATIC if name not in own))
+
+
+def choose(board: Board, costs: Mapping[str, TechniqueCosts], places: int, rate_hz: float, budget_mb: float) -> Choice:
+    """Take the first technique that fits: `costs`, as they are on `board`, come best technique first.
+
+    Raises UsageError, saying what would make one fit, where none does.
+    """
+    passed_over, remedies = [], []
+    for name, each in costs.items():
+        found = fit(board, each, places, rate_hz, budget_mb)
+        if not found.shortfalls:
+            reason = f"{name}: {described(board, found, places, rate_hz, budget_mb)}"
+            return Choice(name, "; ".join([reason, *passed_over]))
+        passed_over.append(f"{name} does not fit, {' and '.join(found.shortfalls)}")
+        remedies += [f"{name} {' or '.join(found.remedies)}"] if found.remedies else []
+    raise UsageError(
+        f"No technique fits {board.title} with {places} places at {rate_hz:g} Hz ({'; '.join(passed_over)}): "
+        + (f"what would fit is {', or '.join(remedies)}." if remedies else "use a larger board.")
+    )
+
+
+def described(board: Board, found: Fit, places: int, rate_hz: float, budget_mb: float) -> str:
+    """A fit in one line of figures, with what is wrong and what would mend it where it does not fit."""
+    figures = (
+        f"{places} places take {found.map_ram_mb:.1f} of {budget_mb:.1f} MB, the process {found.process_ram_mb:.0f} of "
+        f"{board.memory_max_mb:.0f} MB, and {_rounded_down(found.reachable_hz):g} Hz of {rate_hz:g} are reached with "
+        f"{board.cores * board.cpu_share:.2g} of {board.cores} cores"
+    )
+    if not found.shortfalls:
+        return figures
+    remedies = f", it would fit {' or '.join(found.remedies)}" if found.remedies else ""
+    return f"{figures}; it does not fit ({' and '.join(found.shortfalls)}{remedies})"
+
+
+def _rounded_down(value: float) -> float:
+    """To two digits, and never up: what is said to be reached is reached."""
+    step = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return math.floor(value / step) * step

@@ -1,0 +1,203 @@
+"""What `edgevpr models` does with networks: list them, try one, add one.
+
+`dataclasses.asdict` of every result is ready for JSON.
+"""
+
+import json
+import multiprocessing
+import shutil
+import time
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from edgevpr import techniques
+from edgevpr.config import read_yaml
+from edgevpr.errors import EdgevprError, ModelError
+from edgevpr.helpers.files import write_whole
+from edgevpr.power.machine import rss_mb
+from edgevpr.resources import own_models
+from edgevpr.techniques.networks.card import Card, card_names, load_card, read_card
+from edgevpr.techniques.networks.session import Backbone, backbone_of, file_sha256, import_onnxruntime
+
+_ROUNDS = 10
+_FRAME = (480, 640)
+
+
+@dataclass(frozen=True, slots=True)
+class Listed:
+    """One card. `ok` is whether card and file agree, `problem` in one sentence why not; `techniques` use it unless told
+    otherwise. Of a card that cannot be read nothing else is known."""
+
+    name: str
+    ok: bool
+    problem: str | None
+    title: str | None = None
+    licence: str | None = None
+    source: str | None = None
+    file: str | None = None
+    outputs: tuple[str, ...] = ()
+    head: str | None = None
+    techniques: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Verified:
+    """A network that works here. `shapes` of its outputs; `vector_length` of the technique of its own (None: it has
+    none); milliseconds for an image of 640x480, the quickest of ten; megabytes that onnxruntime took by being imported,
+    and that the network took beside it."""
+
+    name: str
+    title: str
+    threads: int
+    file_mb: float
+    shapes: dict[str, tuple[int, ...]]
+    vector_length: int | None
+    image_ms: float
+    runtime_mb: float
+    network_mb: float
+
+
+def list_models() -> tuple[Listed, ...]:
+    """Every card, whether or not it can be read; nothing is run."""
+    return tuple(_listed(name) for name in card_names())
+
+
+def verify(card: Card, threads: int = 1, learned: bool = True) -> Verified:
+    """`verify_here` in a process of its own, since what another network has loaded is not counted again, and a network
+    too large for the board ends that process and not ours. Raises ModelError where it does."""
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        try:
+            return pool.submit(verify_here, card, threads, learned).result()
+        except BrokenProcessPool as error:
+            raise ModelError(
+                f"{card.file_path} ended the process that tried it, most likely for want of memory: use a smaller "
+                "network, or a board with more RAM."
+            ) from error
+
+
+def verify_here(card: Card, threads: int = 1, learned: bool = True) -> Verified:
+    """Open the network of a card, run it, and say what it takes. Raises ModelError, one sentence, for anything that
+    would keep it on the ground; with `learned` False not for the words of a VLAD head, which are learned on the network
+    once it has its place."""
+    rng = np.random.default_rng(0)
+    before_mb = rss_mb()
+    import_onnxruntime()
+    imported_mb = rss_mb()
+    outputs = [output for output, name in asdict(card.outputs).items() if name]
+    backbones = {output: backbone_of(card, output, threads) for output in outputs}
+    network = backbones.get("descriptor" if card.head is None and card.outputs.descriptor else "features")
+    times_s = []
+    for _ in range(_ROUNDS):
+        frame = rng.integers(0, 256, _FRAME, np.uint8)
+        start_s = time.perf_counter()
+        network.run(frame)
+        times_s.append(time.perf_counter() - start_s)
+    return Verified(
+        card.name,
+        card.title,
+        threads,
+        card.file_path.stat().st_size / 1e6,
+        {output: backbone.shape for output, backbone in backbones.items()},
+        _vector_length(card, backbones, learned),
+        1000 * min(times_s),
+        imported_mb - before_mb,
+        rss_mb() - imported_mb,
+    )
+
+
+def add(file: Path, card_path: Path, threads: int = 1) -> tuple[Verified, Path]:
+    """Copy a network and its card to the user's models folder, if it works; returns what was found, and the card there.
+
+    The hash of the card must be that of the file; a card without one gets it. Raises ModelError or ConfigError.
+    """
+    card = read_card(card_path, needs_hash=False)
+    found = file_sha256(file)
+    if card.sha256 not in ("", found):
+        raise ModelError(
+            f"{file} is not the file of {card_path}: its SHA-256 is {found} and the card says {card.sha256}; get the "
+            "right file, or correct the card."
+        )
+    target = own_models() / f"{card.name}.yaml"
+    # Tried where it is: the card's name for the file counts only in the folder that both are copied to.
+    tried = replace(card, sha256=found, path=file.absolute().with_name(target.name), file=file.name)
+    verified = verify(tried, threads, learned=False)
+    text = card_path.read_text("utf-8") if card.sha256 else card_text({**read_yaml(card_path), "sha256": found})
+    install(file, found, target, card.file, text)
+    return verified, target
+
+
+def technique_with(name: str) -> tuple[str, dict[str, str]]:
+    """A technique, and its settings, that shows what the network of a card is worth: its own or, of one that gives
+    feature maps only, `rmac`, which needs nothing learned."""
+    card = load_card(name)
+    if card.is_technique and not techniques.is_own(name):
+        return name, {}
+    return "calc" if card.outputs.descriptor else "rmac", {"model": name}
+
+
+def install(file: Path, sha256: str, card_path: Path, file_name: str, text: str) -> None:
+    """Put a file, by `file_name`, and then its card into a folder, each as a whole or not at all. Raises ModelError
+    where another network has either name."""
+    folder, target = card_path.parent, card_path.parent / file_name
+    if card_path.exists() and card_path.read_text("utf-8") != text:
+        raise ModelError(
+            f"{card_path} is there already and says something else: take it away, or name yours otherwise."
+        )
+    if target.exists() and file_sha256(target) != sha256:
+        raise ModelError(f"{target} is there already and is another file: write another `file` on the card.")
+    folder.mkdir(parents=True, exist_ok=True)
+    if not target.exists():
+        write_whole(target, lambda unfinished: shutil.copyfile(file, unfinished))
+    write_whole(card_path, lambda unfinished: unfinished.write_text(text, "utf-8"))
+
+
+def card_text(values: dict) -> str:
+    """A card as YAML, a line a key: what is JSON is YAML too."""
+    return "".join(f"{key}: {json.dumps(value, ensure_ascii=False)}\n" for key, value in values.items())
+
+
+def _listed(name: str) -> Listed:
+    try:
+        card = load_card(name)
+    except EdgevprError as error:
+        return Listed(name, False, str(error))
+    problem = None
+    try:
+        found = file_sha256(card.file_path)
+        if found != card.sha256:
+            problem = f"{card.file_path} is not the file of its card: its SHA-256 is {found}, not {card.sha256}."
+    except ModelError as error:
+        problem = str(error)
+    users = [
+        each
+        for each in techniques.names()
+        if techniques.parameters(each).get("model") == name and getattr(card.outputs, techniques.network_output(each))
+    ]
+    if card.is_technique and not techniques.is_own(name):
+        users.insert(0, name)
+    return Listed(
+        name,
+        problem is None,
+        problem,
+        card.title,
+        card.licence,
+        card.source,
+        str(card.file_path),
+        tuple(output for output, said in asdict(card.outputs).items() if said),
+        card.head["name"] if card.head else None,
+        tuple(users),
+    )
+
+
+def _vector_length(card: Card, backbones: dict[str, Backbone], learned: bool) -> int | None:
+    if not card.is_technique:
+        return None
+    if card.head and card.head["name"] == "vlad" and not learned:
+        return card.head["words"] * backbones["features"].shape[0]
+    from edgevpr.techniques.networks.network import CardNetwork
+
+    return CardNetwork(card).spec.coarse.shape[0]

@@ -1,0 +1,50 @@
+"""Every technique in every form that it has, for the commands that list them, and what cannot be used here and why."""
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from edgevpr import techniques
+from edgevpr.errors import ModelError
+from edgevpr.power.boards import Board
+from edgevpr.runtime.recognise.pipeline import made_for
+from edgevpr.techniques import labelled
+from edgevpr.techniques.vectors import FORMS
+from edgevpr.types import Technique
+
+
+@dataclass(frozen=True, slots=True)
+class Offer:
+    """A technique with its settings, one of which may be its form; `label` tells it from the others."""
+
+    label: str
+    name: str
+    settings: dict[str, Any]
+
+
+def offers(
+    names: Iterable[str], forms: Iterable[str] = FORMS, settings: Mapping[str, Mapping[str, Any]] | None = None
+) -> tuple[Offer, ...]:
+    """Each technique in each of `forms`, or once where it has none; `settings` by name. Raises UsageError for an
+    unknown name, and ModelError for a card that does not say what it must."""
+    found = []
+    for name in names:
+        own = dict((settings or {}).get(name, {}))
+        if "form" in own or "form" not in techniques.parameters(name):
+            found.append(Offer(labelled(name, own.get("form")), name, own))
+        else:
+            found += [Offer(labelled(name, form), name, {**own, "form": form}) for form in forms]
+    return tuple(found)
+
+
+def usable(wanted: Iterable[Offer], board: Board | None = None) -> Iterator[tuple[Offer, Technique | ModelError]]:
+    """Make each technique, for `board`, or say why it cannot be used: that of all its forms once, with its name."""
+    refused = set()
+    for offer in wanted:
+        if offer.name in refused:
+            continue
+        try:
+            yield offer, made_for(board, offer.name, offer.settings)
+        except ModelError as error:
+            refused.add(offer.name)
+            yield Offer(offer.name, offer.name, offer.settings), error

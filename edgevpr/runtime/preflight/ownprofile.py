@@ -1,0 +1,55 @@
+"""Writing a profile of this machine: what `edgevpr profile --detect` and `--measure` leave behind."""
+
+import sys
+from datetime import datetime
+from pathlib import Path
+
+from edgevpr.errors import EdgevprError, UsageError
+from edgevpr.helpers.files import require_folder, write_whole
+from edgevpr.power.boards import Score
+
+_ENDINGS = (".yaml", ".yml")
+
+
+def require_new_profile(path: Path) -> None:
+    """Raise UsageError where `write_profile` would not write."""
+    if path.suffix not in _ENDINGS:
+        raise UsageError(f"{path}: a profile's name ends in .yaml: choose such a name.")
+    require_folder(path)
+    if path.exists():
+        raise UsageError(f"{path} is there already: move it away, or choose another name.")
+
+
+def write_profile(path: Path, text: str) -> None:
+    """Write a profile that is not there yet, as a whole. Raises EdgevprError where one has come meanwhile."""
+    try:
+        write_whole(path, lambda unfinished: unfinished.write_text(text, "utf-8"), instead=False)
+    except FileExistsError:
+        raise EdgevprError(f"{path} is there already: move it away, or choose another name.") from None
+
+
+def measured_profile(figures: Path, score: Score) -> tuple[Path | None, str]:
+    """Where this machine has a power meter: measure idle and load (minutes), and write a profile beside the file
+    `figures`. Returns where it is (None: no meter can be read), and a sentence. Raises MeterError."""
+    from edgevpr.power.calibrate import LOADS, calibrate
+    from edgevpr.power.detect import detect, profile_text
+    from edgevpr.power.sensors import find_meters
+
+    found = find_meters()
+    if not found.meters:
+        return None, " ".join(found.notes)
+    meter = found.meters[0]
+    held = iter(range(1, len(LOADS) + 1))
+    calibration = calibrate(
+        meter,
+        progress=lambda share: print(
+            f"measuring power with the {meter.title}  {next(held)}/{len(LOADS)}  load {share:.0%}", file=sys.stderr
+        ),
+    )
+    path = figures.with_name(f"{figures.stem}-{datetime.now():%Y%m%d-%H%M%S}.yaml")
+    write_profile(path, profile_text(detect(), score, calibration))
+    fit = calibration.fit
+    return path, (
+        f"Power: {fit.idle_w:.3g} W idle, {fit.full_w:.3g} W with every core busy, by the {meter.title} "
+        f"(residual {fit.residual_w:.2g} W, R2 {fit.r2:.3f}); written to {path}: use it with --board {path}."
+    )

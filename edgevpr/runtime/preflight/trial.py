@@ -1,0 +1,134 @@
+"""Trying techniques in processes of their own: what one has loaded is not counted as another's memory, and a library
+that dies on this processor takes nothing with it but its own row.
+
+`python -m edgevpr.runtime.preflight.trial` is such a process: a job as JSON comes in, a Trial as JSON goes out.
+"""
+
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from edgevpr import techniques
+from edgevpr.errors import EdgevprError
+from edgevpr.frames.images import read_image
+from edgevpr.runtime.preflight.offers import Offer
+from edgevpr.runtime.preflight.probe import TechniqueCosts, noise, probe
+from edgevpr.runtime.recognise.pipeline import made_with
+from edgevpr.techniques.networks.card import load_card, weights_of
+from edgevpr.types import StageCost
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """What became of an offer: its costs, or in one sentence why it cannot be used here. `model` is the fingerprint of
+    its network, `weights` whose they are; `parameters` are all that the technique then had."""
+
+    label: str
+    name: str
+    settings: dict[str, Any]
+    costs: TechniqueCosts | None = None
+    problem: str | None = None
+    model: str | None = None
+    weights: str | None = None
+    parameters: dict[str, Any] = field(default_factory=dict)
+
+
+def try_each(wanted: Iterable[Offer], threads: int, images: Sequence[Path] = (), rounds: int = 0) -> Iterator[Trial]:
+    """Try each offer, each in a process; a technique that cannot be used is one row, of its name.
+
+    Pictures are those of `images`; without them as many of noise as `rounds` (0: a quick look). `threads` are those of
+    a network.
+    """
+    refused = set()
+    for offer in wanted:
+        if offer.name in refused:
+            continue
+        problem = _missing(offer)
+        trial = _refused(offer, problem) if problem else _in_a_process(offer, threads, images, rounds)
+        if trial.problem:
+            refused.add(offer.name)
+        yield trial
+
+
+def model_of(name: str, settings: dict[str, Any]) -> str | None:
+    """The fingerprint of the network that a technique would use now; None for one without. Raises ModelError."""
+    parameters = techniques.parameters(name)
+    if "threads" not in parameters:  # which every network has, and nothing else
+        return None
+    return load_card(settings.get("model") or parameters.get("model", name)).fingerprint
+
+
+def _missing(offer: Offer) -> str | None:
+    """Why a technique cannot be used, if its card says so already: that needs no process."""
+    try:
+        model_of(offer.name, offer.settings)
+    except EdgevprError as error:
+        return str(error)
+    return None
+
+
+def _refused(offer: Offer, problem: str) -> Trial:
+    return Trial(offer.name, offer.name, offer.settings, problem=problem)
+
+
+def _in_a_process(offer: Offer, threads: int, images: Sequence[Path], rounds: int) -> Trial:
+    job = {**asdict(offer), "threads": threads, "images": [str(path) for path in images], "rounds": rounds}
+    # A session of its own: Ctrl-C is for us to act on.
+    process = subprocess.Popen(
+        [sys.executable, "-m", "edgevpr.runtime.preflight.trial"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    try:
+        answer, said = process.communicate(json.dumps(job))
+    finally:
+        process.kill()
+        process.wait()
+    if process.returncode:
+        return _refused(offer, _end(offer.label, process.returncode, said))
+    return trial_of(json.loads(answer))
+
+
+def _end(label: str, code: int, said: str) -> str:
+    if code < 0:
+        how = f"ended by {signal.Signals(-code).name}"
+        hint = (
+            "memory ran out" if code == -signal.SIGKILL else "a library does not suit this processor: install another"
+        )
+        return f"Trying {label} was {how}: {hint}."
+    last = (said.strip().splitlines() or [f"exit code {code}"])[-1][:200]
+    return f"Trying {label} failed ({last}): install edgevpr and its packages again."
+
+
+def trial_of(fields: dict[str, Any]) -> Trial:
+    """A Trial from what `asdict` made of it. Raises TypeError, KeyError or ValueError for anything else."""
+    costs = fields["costs"]
+    if costs is not None:
+        stages = {key: StageCost(**costs[key]) for key in ("encode", "match_per_place", "scan_per_place")}
+        costs = TechniqueCosts(**{**costs, **stages})
+    return Trial(**{**fields, "costs": costs})
+
+
+def _tried(job: dict[str, Any]) -> Trial:
+    offer = Offer(job["label"], job["name"], job["settings"])
+    try:
+        pictures = [read_image(path) for path in job["images"]] or (noise(job["rounds"]) if job["rounds"] else None)
+        technique = made_with(job["threads"], offer.name, offer.settings)
+        costs = probe(technique, pictures)
+        model = model_of(offer.name, offer.settings)
+    except EdgevprError as error:
+        return _refused(offer, str(error))
+    spec = technique.spec
+    return Trial(offer.label, offer.name, offer.settings, costs, None, model, weights_of(spec), spec.parameters)
+
+
+if __name__ == "__main__":
+    print(json.dumps(asdict(_tried(json.load(sys.stdin)))))

@@ -1,0 +1,126 @@
+"""`edgevpr check`: would this configuration fly? All is opened the way `edgevpr run` opens it, and closed again."""
+
+import os
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from edgevpr.config import Config, load_config
+from edgevpr.errors import EdgevprError, LinkError, MapError, UsageError
+from edgevpr.frames.source import open_source
+from edgevpr.mavlink.address import parse_link
+from edgevpr.mavlink.transport import open_transport
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.power.boards import load_board
+from edgevpr.power.equations import parse_pack
+from edgevpr.runtime.recognise.learn import check_positions
+from edgevpr.runtime.recognise.pipeline import open_pipeline
+
+_LOG_ROOM_MB = 10  # some hours of queries
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that was looked at; `message` says what it is or, in one sentence, what is wrong with it."""
+
+    what: str
+    ok: bool
+    message: str
+
+
+def check(config_path: str | Path) -> list[Finding]:
+    """Look at everything that a flight needs; never raises for what the user can put right."""
+    try:
+        config = load_config(config_path)
+    except EdgevprError as error:
+        return [Finding("configuration", False, str(error))]
+    findings = [
+        Finding("configuration", True, str(config_path)),
+        _looked_at("board", _board, config),
+        _looked_at("battery", _battery, config),
+    ]
+    if all(finding.ok for finding in findings):
+        findings.append(_looked_at("map", _map, config))
+    else:
+        findings.append(Finding("map", False, "Not looked at: correct the board or the battery first."))
+    findings += [_looked_at("source", _source, config), _looked_at("link", _link, config)]
+    return [*findings, _looked_at("log", _log, config)]
+
+
+def _looked_at(what: str, look: Callable[[Config], str], config: Config) -> Finding:
+    try:
+        return Finding(what, True, look(config))
+    except EdgevprError as error:
+        return Finding(what, False, str(error))
+    except OSError as error:
+        return Finding(what, False, f"{error.filename}: {error.strerror}: check the path and its permissions.")
+
+
+def _board(config: Config) -> str:
+    board = load_board(config.board)
+    return f"{board.title}, {board.cores} cores, up to {board.memory_max_mb:.0f} MB for edgevpr"
+
+
+def _battery(config: Config) -> str:
+    pack = parse_pack(config.battery.pack)
+    return f"{pack.cells} cells in series, {pack.capacity_mah} mAh"
+
+
+def _map(config: Config) -> str:
+    if config.mapping.learn and config.map is not None:
+        path = Path(config.map).absolute()
+        # Neither made nor opened for writing, as with the log.
+        if not os.access(path.parent, os.W_OK) or (path.exists() and not os.access(path, os.W_OK)):
+            raise MapError(f"{path} or its folder may not be written by this user: learning needs both.")
+        if not path.exists():
+            return f"{path}, to be made by the first flight"
+        with PlaceMap.open(path) as place_map:
+            if not len(place_map):
+                return f"{path}, empty so far"
+    pipeline = open_pipeline(config)
+    pipeline.place_map.close()
+    return f"{config.map}, {pipeline.reason}"
+
+
+def _source(config: Config) -> str:
+    if config.source.uri is None:
+        raise UsageError("There is no source of frames: write `source: {uri: ...}`.")
+    if config.mapping.learn:
+        check_positions(config, None)
+    source = open_source(config.source.uri, live=True)
+    # Not closed before FFmpeg has given up (5 s at most): a capture that comes back while Python ends aborts it.
+    while source.state == "opening":
+        time.sleep(0.05)
+    state = source.state
+    source.close()
+    return f"{config.source.uri}, {state}"
+
+
+def _link(config: Config) -> str:
+    if config.mavlink.link is None:
+        return "none, so what is recognised goes into the log only"
+    address = parse_link(config.mavlink.link)
+    try:
+        open_transport(address).close()
+    except OSError as error:
+        raise LinkError(
+            f"{address} is not there ({error.strerror}): connect it or start the other end, or correct the link."
+        ) from error
+    return str(address)
+
+
+def _log(config: Config) -> str:
+    if config.log.path is None:
+        return "none, so nothing of the flight is kept"
+    # Not opened, unlike all else: whoever checks as root would leave a file that the service may not write.
+    path = Path(config.log.path).absolute()
+    if path.is_dir() or not path.parent.is_dir():
+        raise UsageError(f"{path} is no file in a folder that is there: correct `log: {{path: ...}}`.")
+    if not os.access(path if path.exists() else path.parent, os.W_OK):
+        raise UsageError(f"{path} may not be written by this user: change its permissions or `log: {{path: ...}}`.")
+    free_mb = shutil.disk_usage(path.parent).free / 1e6
+    if free_mb < _LOG_ROOM_MB:
+        raise UsageError(f"{path}: only {free_mb:.1f} MB are free there, {_LOG_ROOM_MB} are needed: make room.")
+    return str(path)

@@ -1,0 +1,196 @@
+"""Networks and forms through the commands: one map for all forms, and what cannot be used stops nothing else."""
+
+import json
+import sys
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from pictures import textured
+from tiny_networks import write_network
+
+from edgevpr.cli import _FORMS, main
+from edgevpr.config import load_config
+from edgevpr.errors import ConfigError, ModelError, UsageError
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.power.boards import load_board
+from edgevpr.runtime.preflight.offers import FORMS, offers, usable
+from edgevpr.runtime.recognise.pipeline import made_for, open_pipeline, technique_of
+from edgevpr.techniques import vectors
+
+
+@pytest.fixture
+def models(tmp_path, monkeypatch):
+    folder = tmp_path / "models"
+    monkeypatch.setenv("EDGEVPR_MODELS", str(folder))
+    write_network(folder, "tiny")
+    return folder
+
+
+@pytest.fixture
+def flight(tmp_path):
+    """Six pictures, the same darker as queries, and the truth."""
+    for split in ("ref", "query"):
+        (tmp_path / split).mkdir()
+    for number in range(6):
+        cv2.imwrite(str(tmp_path / "ref" / f"{number}.png"), textured(number))
+        cv2.imwrite(str(tmp_path / "query" / f"{number}.png"), cv2.convertScaleAbs(textured(number), alpha=0.9))
+    truth = ["query_file,ref_files", *(f"{number}.png,{number}.png" for number in range(6))]
+    (tmp_path / "truth.csv").write_text("\n".join(truth))
+    return tmp_path
+
+
+def built(flight, *flags):
+    path = flight / "m.gpkg"
+    assert main(["map", "build", str(path), "--images", str(flight / "ref"), *flags]) == 0
+    return path
+
+
+def evaluated(capsys, flight, *flags):
+    data = ["--query", flight / "query", "--ref", flight / "ref", "--ground-truth", flight / "truth.csv"]
+    code = main(["eval", *map(str, data), *flags, "--json"])
+    said = capsys.readouterr()
+    return code, json.loads(said.out)["techniques"] if said.out else None, said.err
+
+
+def test_the_forms_have_the_same_names_everywhere():
+    assert _FORMS == FORMS == vectors.FORMS
+
+
+@pytest.mark.usefixtures("models")
+def test_one_map_serves_all_forms(capsys, flight):
+    path = built(flight, "--technique", "calc", "--param", "model=tiny")
+    content = path.read_bytes()
+    for form in FORMS:
+        capsys.readouterr()
+        assert main(["match", str(path), "--images", str(flight / "query"), "--form", form, "--json"]) == 0
+        found = json.loads(capsys.readouterr().out)
+        assert [each["reference_image"] for each in found] == [each["query"] for each in found]
+    assert path.read_bytes() == content
+    assert main(["match", str(path), "--images", str(flight / "query")]) == 0
+    assert "Weights of tiny: A tiny network (MIT; made by a test)." in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("models")
+def test_the_form_of_the_configuration_is_flown_and_said(flight):
+    path = built(flight, "--technique", "calc", "--param", "model=tiny")
+    config = load_config(None, {"map": str(path), "match.form": "1bit"})
+    pipeline = open_pipeline(config)
+    assert pipeline.index.rows.shape == (6, 8)
+    assert pipeline.reason.startswith("technique calc 1bit: the map was built with it; weights of tiny: A tiny network")
+    pipeline.place_map.close()
+    with pytest.raises(ConfigError, match=r"`match\.form` must be a text"):
+        load_config(None, {"match.form": 1})
+
+
+def test_a_technique_without_forms_says_so(flight):
+    path = built(flight, "--technique", "cohog")
+    with pytest.raises(UsageError, match="cohog has no parameter `form`"):
+        open_pipeline(load_config(None, {"map": str(path), "match.form": "8bit"}))
+
+
+def test_a_map_of_other_weights_is_refused_naming_the_model(models, flight, capsys):
+    path = built(flight, "--technique", "calc", "--param", "model=tiny")
+    write_network(models, "tiny", fault="dynamic batch")
+    capsys.readouterr()
+    assert main(["match", str(path), "--images", str(flight / "query")]) == 1
+    assert "model sha256 is" in capsys.readouterr().err
+    (models / "tiny.yaml").unlink()
+    assert main(["match", str(path), "--images", str(flight / "query")]) == 1
+    assert "There is no model `tiny`" in capsys.readouterr().err
+
+
+def test_a_map_of_a_network_that_is_not_here_says_how_to_get_it(models, flight, capsys):
+    path = built(flight, "--technique", "tiny")
+    (models / "tiny.yaml").unlink()
+    capsys.readouterr()
+    assert main(["match", str(path), "--images", str(flight / "query")]) == 1
+    said = capsys.readouterr().err
+    assert "was built with `tiny`, which this edgevpr does not have" in said
+    assert "`edgevpr models add`" in said
+
+
+@pytest.mark.usefixtures("models")
+def test_eval_measures_each_form_in_a_row_of_its_own(capsys, flight):
+    flags = ["--techniques", "tiny,hog,cohog", "--form", "float,1bit", "--param", "hog.w1=64"]
+    code, found, _ = evaluated(capsys, flight, *flags)
+    assert code == 0
+    assert list(found) == ["tiny", "tiny 1bit", "hog", "hog 1bit", "cohog"]
+    assert found["tiny"]["descriptor_bytes"] == 32
+    assert found["tiny 1bit"]["descriptor_bytes"] == 8
+    assert found["tiny"]["weights"] == found["tiny 1bit"]["weights"] == "tiny: A tiny network (MIT; made by a test)"
+    assert found["hog"]["weights"] is None
+
+
+def test_eval_goes_on_without_a_network_that_cannot_be_used(models, capsys, flight):
+    write_network(models, "wrong", fault="nan")
+    code, found, said = evaluated(capsys, flight, "--techniques", "wrong,cohog", "--form", "float,8bit")
+    assert code == 1
+    assert list(found) == ["cohog"]
+    assert said.count("edgevpr: wrong was not measured:") == 1
+    code, found, said = evaluated(capsys, flight, "--techniques", "wrong")
+    assert (code, found) == (1, None)
+    assert "not finite" in said
+
+
+def test_eval_goes_on_without_a_network_whose_card_is_wrong(models, capsys, flight):
+    (models / "calc.yaml").write_text("title: x\ntitel: y\n")
+    code, found, said = evaluated(capsys, flight, "--techniques", "calc,cohog")
+    assert (code, list(found)) == (1, ["cohog"])
+    assert "calc was not measured:" in said
+    assert "did you mean `title`?" in said
+
+
+def test_eval_of_an_unknown_form_is_a_wrong_request(capsys, flight):
+    code, _, said = evaluated(capsys, flight, "--techniques", "hog", "--form", "4bit")
+    assert code == 2
+    assert "hog has no form `4bit`" in said
+
+
+def test_profile_lists_every_form_and_says_in_a_sentence_what_cannot_be_used(models, capsys, monkeypatch):
+    wanted = ("cohog", "seqslam", "tiny", "calc", "rmac")
+    monkeypatch.setattr("edgevpr.techniques.names", lambda: wanted)
+    monkeypatch.setattr("edgevpr.techniques.networks.card.model_folders", lambda: (models,))
+    assert main(["profile", "--places", "100", "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert [row["technique"] for row in said["techniques"]] == ["cohog", "seqslam", "tiny", "tiny 8bit", "tiny 1bit"]
+    assert set(said["unusable"]) == {"calc", "rmac"}
+    assert said["weights"] == ["tiny: A tiny network (MIT; made by a test)"]
+    assert main(["profile", "--places", "100"]) == 0
+    out = capsys.readouterr().out
+    assert "calc, rmac cannot be used: There is no model `calc`" in out
+    assert "Weights of tiny: A tiny network" in out
+
+
+def test_offers_and_profile_survive_a_missing_onnxruntime(models, monkeypatch):
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    write_network(models, "unopened", fault="dynamic batch")
+    found = {offer.label: each for offer, each in usable(offers(["hog", "unopened"], ("float", "1bit")))}
+    assert list(found) == ["hog", "hog 1bit", "unopened"]
+    assert isinstance(found["unopened"], ModelError)
+    assert "hog, cohog and seqslam fly without it" in str(found["unopened"])
+
+
+@pytest.mark.usefixtures("models")
+def test_a_network_takes_as_many_threads_as_the_board_spares(monkeypatch, flight):
+    asked = []
+    monkeypatch.setattr("edgevpr.techniques.create", lambda name, settings: asked.append((name, settings)))
+    board = replace(load_board("rpi-4b"), threads=3)
+    made_for(board, "calc", {"model": "tiny"})
+    made_for(board, "calc", {"model": "tiny", "threads": 1})
+    made_for(board, "hog")
+    assert asked == [
+        ("calc", {"threads": 3, "model": "tiny"}),
+        ("calc", {"threads": 1, "model": "tiny"}),
+        ("hog", {}),
+    ]
+
+
+@pytest.mark.usefixtures("models")
+def test_threads_are_no_part_of_what_a_map_asks_for(flight):
+    path = built(flight, "--technique", "calc", "--param", "model=tiny")
+    with PlaceMap.open(path) as place_map:
+        assert place_map.spec.parameters == {"model": "tiny"}
+        technique = technique_of(place_map, board=replace(load_board("rpi-5"), threads=2))
+    np.testing.assert_allclose(np.linalg.norm(technique.encode(textured(1)).coarse.astype(np.float32)), 1, atol=1e-3)

@@ -1,0 +1,252 @@
+"""`edgevpr profile` as a user meets it: before the flight, on which board, and measured rather than guessed."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from edgevpr import techniques
+from edgevpr.cli import main
+from edgevpr.power import machine, sensors, speed
+from edgevpr.power.boards import board_names, load_board
+from edgevpr.resources import shipped
+from edgevpr.runtime.preflight import stored as measured
+from edgevpr.runtime.preflight.probe import TechniqueCosts
+from edgevpr.runtime.preflight.trial import Trial
+from edgevpr.types import StageCost
+
+COSTS = TechniqueCosts(StageCost(0.1, 0.1), StageCost(0.004, 0.004), 90, 31_776, 88.0, 40, StageCost(1e-6, 1e-6))
+HOG = TechniqueCosts(StageCost(0.01, 0.01), StageCost(0.0003, 0.0003), 285_794, 285_768, 88.0)
+
+
+@pytest.fixture(autouse=True)
+def alone(monkeypatch, tmp_path):
+    """Nobody's stored figures, no meter, and a micro-benchmark without patience."""
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    monkeypatch.setattr(speed, "_LEAST_S", 0.01)
+    monkeypatch.setattr(sensors, "find_meters", lambda: sensors.Found((), ("There is no power meter.",)))
+
+
+@pytest.fixture
+def tried(monkeypatch):
+    """What was tried, by trials that take no time."""
+    asked = []
+
+    def try_each(wanted, threads, images=(), rounds=0):
+        for offer in wanted:
+            asked.append(offer.label)
+            if offer.name == "calc":
+                yield Trial("calc", "calc", {}, problem="There is no model `calc`.")
+                continue
+            yield Trial(offer.label, offer.name, offer.settings, HOG if offer.name == "hog" else COSTS)
+
+    monkeypatch.setattr(measured, "try_each", try_each)
+    monkeypatch.setattr(techniques, "names", lambda: ("cohog", "hog", "seqslam", "calc"))
+    return asked
+
+
+def run(capsys, *argv):
+    assert main(["profile", *map(str, argv)]) == 0
+    return capsys.readouterr()
+
+
+def refused(capsys, *argv):
+    code = main(["profile", *map(str, argv)])
+    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("edgevpr: ")]
+    assert "Traceback" not in "".join(said)
+    return code, said[-1].removeprefix("edgevpr: ")
+
+
+def a_map(tmp_path, technique="hog"):
+    folder = tmp_path / "flight"
+    folder.mkdir()
+    for number in range(3):
+        image = np.random.default_rng(number).integers(0, 256, (96, 128), np.uint8)
+        cv2.imwrite(str(folder / f"{number}.png"), image)
+    path = tmp_path / "valley.gpkg"
+    assert main(["map", "build", str(path), "--images", str(folder), "--technique", technique]) == 0
+    return path, folder
+
+
+def test_the_real_techniques_are_tried_and_said(capsys, monkeypatch):
+    monkeypatch.setattr(techniques, "names", lambda: ("cohog", "hog"))
+    found = json.loads(run(capsys, "--board", "rpi-zero-2w", "--places", 10_000, "--hover-w", 90, "--json").out)
+    rows = {row["technique"]: row for row in found["techniques"]}
+    assert list(rows) == ["cohog", "hog", "hog 8bit", "hog 1bit"]
+    assert not rows["hog"]["fits"], "286 KB a place is 2.9 GB: more than the board has"
+    assert any("RAM" in why for why in rows["hog"]["shortfalls"])
+    assert found["times"] == "scaled"
+    assert 0 < rows["cohog"]["lost_marginal_min"] < rows["cohog"]["lost_min"]
+    assert rows["cohog"]["u_encode"] <= 1
+    assert found["recommended"] == "cohog"
+
+
+def test_progress_is_shown_and_the_text_has_both_tables(capsys, tried):
+    said = run(capsys, "--board", "rpi-4b", "--places", 20)
+    assert "trying techniques" in said.err
+    assert said.out.startswith("Raspberry Pi 4B, 64-bit: 20 places, 0.5 Hz")
+    assert "\nRecommended: cohog: " in said.out
+    assert "calc cannot be used: There is no model `calc`." in said.out
+    assert all(len(line) <= 120 for line in said.out.splitlines())
+
+
+def test_with_a_map_its_places_count_and_only_its_forms_are_recommended(capsys, tmp_path, tried):
+    path, _ = a_map(tmp_path)
+    capsys.readouterr()
+    found = json.loads(run(capsys, "--map", path, "--board", "rpi-4b", "--json").out)
+    assert found["plan"]["places"] == 3
+    assert found["recommended"] == "hog"
+    assert "the map was built with hog" in found["reason"]
+    small = json.loads(run(capsys, "--map", path, "--board", "rpi-4b", "--budget-mb", 0.5, "--json").out)
+    assert small["recommended"] is None
+
+
+def test_what_was_measured_is_kept_used_and_dated(capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr(techniques, "names", lambda: ("cohog", "seqslam"))
+    _, folder = a_map(tmp_path, "seqslam")
+    capsys.readouterr()
+    said = run(capsys, "--measure", "--images", folder)
+    assert "measuring techniques" in said.err
+    kept = tmp_path / "data/edgevpr/measured.json"
+    assert f"Kept in {kept}.\nThere is no power meter." in said.out
+    assert f"3 pictures of {folder}" in said.out
+    fields = json.loads(kept.read_text())
+    assert [trial["label"] for trial in fields["trials"]] == ["cohog", "seqslam"]
+    assert fields["trials"][0]["costs"]["encode"]["cpu_s"] > 0
+    monkeypatch.setattr(measured, "try_each", lambda wanted, threads: iter(wanted and pytest.fail("anew")))
+    found = json.loads(run(capsys, "--places", 50, "--json").out)
+    assert (found["measured_on"], found["times"]) == (fields["date"], "measured")
+    assert found["techniques"][0]["t_encode_s"] == fields["trials"][0]["costs"]["encode"]["wall_s"]
+    assert f"times measured on {fields['date']}" in run(capsys, "--places", 50).out
+    other = json.loads(run(capsys, "--places", 50, "--board", "rpi-4b", "--json").out)
+    assert other["times"] == "scaled"
+    assert other["ratios"]["products"] == pytest.approx(0.056 / fields["score"]["products"])
+    mapped = json.loads(run(capsys, "--map", tmp_path / "valley.gpkg", "--json").out)
+    assert mapped["techniques"][1]["measured"], "a map of the default settings is what was measured"
+
+
+def test_figures_of_another_machine_are_refused_and_tried_anew(capsys, tmp_path, tried):
+    run(capsys, "--measure")
+    kept = tmp_path / "data/edgevpr/measured.json"
+    fields = json.loads(kept.read_text())
+    fields["identity"]["kernel"] = "2.6.32"
+    kept.write_text(json.dumps(fields))
+    tried.clear()
+    said = run(capsys, "--places", 50, "--json")
+    assert "are of another machine or installation (kernel: 2.6.32 there" in said.err
+    assert json.loads(said.out)["measured_on"] is None
+    assert tried[0] == "cohog"
+
+
+def test_figures_are_kept_where_one_says_and_can_be_had_as_json(capsys, tmp_path, tried):
+    found = json.loads(run(capsys, "--measure", "--out", tmp_path / "m.json", "--json").out)
+    assert found["file"] == str(tmp_path / "m.json")
+    assert (found["profile"], found["power"]) == (None, "There is no power meter.")
+    assert json.loads((tmp_path / "m.json").read_text())["trials"] == found["trials"]
+    assert not (tmp_path / "data").exists()
+
+
+def test_measuring_and_planning_go_together(capsys, tmp_path, tried):
+    said = run(capsys, "--measure", "--places", 100)
+    assert said.out.index("Kept in ") < said.out.index("100 places")
+    assert tried.count("cohog") == 1, "what was just measured is not tried again"
+    assert json.loads(run(capsys, "--measure", "--places", 100, "--json").out)["measured_on"]
+
+
+def test_an_interruption_leaves_the_old_figures_as_they_were(capsys, tmp_path, monkeypatch, tried):
+    run(capsys, "--measure")
+    folder = tmp_path / "data/edgevpr"
+    before = (folder / "measured.json").read_bytes()
+
+    def interrupted(*_, **__):
+        yield Trial("cohog", "cohog", {}, COSTS)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(measured, "try_each", interrupted)
+    assert main(["profile", "--measure"]) == 130
+    assert "stopped" in capsys.readouterr().err
+    assert (folder / "measured.json").read_bytes() == before
+    assert [path.name for path in folder.iterdir()] == ["measured.json"]
+
+
+def test_it_says_which_board_this_is_and_writes_a_profile_that_can_be_flown(capsys, tmp_path, tried):
+    path = tmp_path / "mine.yaml"
+    said = run(capsys, "--detect", "--out", path)
+    assert "cores are switched on" in said.out
+    assert f"use it with --board {path}" in said.err
+    board = load_board(str(path))
+    assert (board.machine, board.benchmark_score.verified) == (machine.title(), True)
+    assert board.benchmark_score.passes > 0
+    before = path.read_bytes()
+    assert refused(capsys, "--detect", "--out", path) == (
+        2,
+        f"{path} is there already: move it away, or choose another name.",
+    )
+    assert path.read_bytes() == before
+    found = json.loads(run(capsys, "--places", 50, "--board", path, "--json").out)
+    assert (found["board"], found["times"]) == ("mine", "measured")
+    assert set(json.loads(run(capsys, "--detect", "--json").out)) >= {"board", "cpu", "usable_cores", "ram_limit_mb"}
+
+
+def test_the_picture_is_written(capsys, tmp_path, tried):
+    pytest.importorskip("matplotlib", reason="pictures need matplotlib")
+    run(capsys, "--places", 50, "--board", "rpi-4b", "--plot", tmp_path / "chart.png")
+    assert (tmp_path / "chart.png").stat().st_size > 10_000
+
+
+def test_the_boards_are_listed(capsys):
+    assert [line.split()[0] for line in run(capsys, "--list").out.splitlines()] == list(board_names())
+
+
+@pytest.mark.parametrize(
+    ("argv", "sentence"),
+    [
+        (["--places", "50", "--hover-w", "0"], "The hover power in W is 0: give a number above 0."),
+        (["--places", "50", "--hover-w", "nan"], "The hover power in W is nan: give a number above 0."),
+        (["--places", "50", "--battery", "4X"], "The battery pack `4X` cannot be read: write its cells in series"),
+        (
+            ["--places", "50", "--plot", "nowhere/chart.png"],
+            "nowhere/chart.png: there is no such folder: make it first.",
+        ),
+        (["--places", "50", "--plot", "chart.txt"], "chart.txt: a picture's name ends in .png"),
+        (["--map", "nowhere.gpkg"], "There is no map"),
+        (["--plot", "chart.png", "--measure"], "Say how many places will be flown with"),
+        (["--places", "50", "--out", "x.json"], "--out is for --detect and --measure"),
+        (["--places", "50", "--images", "."], "--images is for --measure"),
+        (["--measure", "--images", "nowhere"], "The folder nowhere does not exist"),
+        (["--measure", "--out", "nowhere/m.json"], "nowhere/m.json: there is no such folder"),
+        (["--measure", "--out", "mine.yaml"], "mine.yaml: the name of a file of figures ends in .json"),
+        (["--detect", "--places", "50"], "--detect says what this machine is: ask what a flight costs without it."),
+        (["--detect", "--out", "mine.json"], "mine.json: a profile's name ends in .yaml"),
+        (["--detect", "--out", "nowhere/mine.yaml"], "nowhere/mine.yaml: there is no such folder"),
+        (["--places", "50", "--board", "rpi4"], "There is no board `rpi4`"),
+    ],
+)
+def test_what_makes_no_sense_is_one_sentence_before_any_work(capsys, monkeypatch, tmp_path, tried, argv, sentence):
+    monkeypatch.chdir(tmp_path)
+    code, said = refused(capsys, *argv)
+    assert code in (1, 2)
+    assert said.startswith(sentence)
+    assert not tried, "said before the measuring"
+
+
+@pytest.mark.parametrize(
+    ("line", "sentence"),
+    [
+        ("idle_w: -1", "`idle_w` is -1; it must be between 0 and 1000."),
+        ("full_w: 1", "`full_w` is 1, below `idle_w`, 2.29: correct one of them."),
+        ("wats: 3", "unknown key `wats`"),
+        ("ram_mb: 4000000", "`ram_mb` is 4e+06, and this machine, whose profile it is, has "),
+        ("technique: cohgo", "The profile of Raspberry Pi 4B, 64-bit names the technique `cohgo`, which is not there"),
+    ],
+)
+def test_a_profile_that_makes_no_sense_is_one_sentence(capsys, tmp_path, tried, line, sentence):
+    key = line.split(":")[0]
+    lines = [each for each in (shipped("profiles") / "rpi-4b.yaml").read_text().splitlines() if each[: len(key)] != key]
+    path = tmp_path / "mine.yaml"
+    path.write_text("\n".join([line, f"machine: {json.dumps(machine.title())}", *lines]))
+    code, said = refused(capsys, "--places", "50", "--board", path)
+    assert code == 2
+    assert sentence in said
+    assert not tried

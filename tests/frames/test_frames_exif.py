@@ -1,0 +1,121 @@
+"""Positions, headings and times from EXIF; the tags are numbered as in the EXIF standard (JEITA CP-3451)."""
+
+import random
+
+import photographs
+import pytest
+
+from edgevpr.frames.exif import read_exif
+from edgevpr.frames.images import read_image
+from edgevpr.frames.positions import GeoTag
+from edgevpr.types import Position
+
+pytest.importorskip("PIL", reason="the photographs with EXIF are made with Pillow")
+
+LAT_REF, LAT, LON_REF, LON, ALT_REF, ALT, TIME, STATUS, DIRECTION_REF, DIRECTION, DATE = (
+    1,
+    2,
+    3,
+    4,
+    5,
+    6,
+    7,
+    9,
+    16,
+    17,
+    29,
+)
+GPS = {LAT_REF: "N", LAT: (46.0, 50.0, 33.0), LON_REF: "W", LON: (91.0, 59.0, 42.0)}
+POSITION = Position(46.8425, -91.995, None)
+TAKEN, ZONE = 0x9003, 0x9011
+
+
+def tag_of(path, gps=None, **tags):
+    photographs.write_jpeg(path / "photo.jpg", gps, **tags)
+    return read_exif(path / "photo.jpg")
+
+
+def test_a_photograph_with_everything(tmp_path):
+    gps = GPS | {ALT_REF: b"\x00", ALT: 198.5, TIME: (16.0, 31.0, 59.5), DATE: "2016:06:23"}
+    tag = tag_of(tmp_path, gps | {DIRECTION_REF: "T", DIRECTION: 123.25})
+    assert tag.position.lat_deg == pytest.approx(46.8425, abs=1e-9)
+    assert tag.position.lon_deg == pytest.approx(-91.995, abs=1e-9)
+    assert tag.position.alt_m == 198.5
+    assert tag.heading_deg == 123.25
+    assert tag.t_utc_s == 1466699519.5  # date -u -d '2016-06-23 16:31:59' +%s
+
+
+def test_south_and_east_and_below_the_sea(tmp_path):
+    tag = tag_of(tmp_path, GPS | {LAT_REF: "S", LON_REF: "E", ALT_REF: b"\x01", ALT: 3.0})
+    assert tag.position == Position(-46.8425, 91.995, -3.0)
+
+
+def test_a_height_above_the_ellipsoid_is_not_taken_for_one_above_the_sea(tmp_path):
+    assert tag_of(tmp_path, GPS | {ALT_REF: b"\x02", ALT: 198.5}).position == POSITION
+
+
+def test_a_magnetic_heading_is_not_taken_for_a_true_one(tmp_path):
+    assert tag_of(tmp_path, {DIRECTION_REF: "M", DIRECTION: 10.0}).heading_deg is None
+
+
+@pytest.mark.parametrize(
+    "gps",
+    [
+        {LAT: (0.0, 0.0, 0.0), LON: (0.0, 0.0, 0.0)},  # a receiver without a fix
+        {STATUS: "V"},  # the receiver itself says that the position is void
+        {LAT: (96.0, 0.0, 0.0)},
+        {LON: (190.0, 0.0, 0.0)},
+        {LAT_REF: "W"},
+        {LAT_REF: ""},  # a hemisphere that is not named is not guessed
+        {LAT: (46.0, 50.0)},
+    ],
+)
+def test_a_senseless_position_is_no_position(gps, tmp_path):
+    assert tag_of(tmp_path, GPS).position == POSITION
+    assert tag_of(tmp_path, GPS | gps).position is None
+
+
+def test_the_camera_clock_counts_where_the_receiver_gives_no_time(tmp_path):
+    assert tag_of(tmp_path, camera={TAKEN: "2016:06:23 16:31:59"}).t_utc_s == 1466699519
+    assert tag_of(tmp_path, camera={TAKEN: "2016:06:23 18:31:59", ZONE: "+02:00"}).t_utc_s == 1466699519
+    assert tag_of(tmp_path, camera={TAKEN: "0000:00:00 00:00:00"}).t_utc_s is None
+
+
+def test_a_photograph_lying_on_its_side_is_set_upright(tmp_path):
+    photographs.write_jpeg(tmp_path / "lying.jpg", image={0x0112: 6})
+    photographs.write_jpeg(tmp_path / "upright.jpg")
+    assert read_image(tmp_path / "upright.jpg").shape == (48, 64, 3)
+    assert read_image(tmp_path / "lying.jpg").shape == (64, 48, 3)
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"rubbish", b"II*\x00", b"MM\x00*\xff\xff\xff\xff", b"II*\x00\x08\x00\x00\x00" * 9]
+)
+def test_rubbish_in_place_of_exif_is_no_tag_at_all(content, tmp_path, capfd):
+    path = tmp_path / "rubbish.jpg"
+    path.write_bytes(photographs.with_app1(photographs.encoded(".jpg", photographs.picture()), content))
+    assert read_exif(path) == GeoTag()
+    assert read_image(path).shape == (48, 64, 3)
+    assert capfd.readouterr().err == ""
+
+
+def test_a_file_that_is_missing_or_no_image_has_no_tag(tmp_path, capfd):
+    (tmp_path / "text.jpg").write_text("no image")
+    assert read_exif(tmp_path / "text.jpg") == read_exif(tmp_path / "missing.jpg") == GeoTag()
+    assert capfd.readouterr().err == ""
+
+
+def test_exif_with_bytes_gone_wrong_never_raises_and_never_leaves_the_earth(tmp_path):
+    gps = GPS | {ALT: 198.5, TIME: (16.0, 31.0, 59.5), DATE: "2016:06:23", DIRECTION: 10.0}
+    photographs.write_jpeg(tmp_path / "photo.jpg", gps, {TAKEN: "2016:06:23 16:31:59"})
+    whole = (tmp_path / "photo.jpg").read_bytes()
+    chance = random.Random(3)
+    end_of_exif = 4 + int.from_bytes(whole[4:6], "big")
+    for _ in range(300):
+        broken = bytearray(whole)
+        for _ in range(chance.choice((1, 2, 8))):
+            broken[chance.randrange(6, end_of_exif)] = chance.choice((0, 255, chance.randrange(256)))
+        (tmp_path / "broken.jpg").write_bytes(broken)
+        tag = read_exif(tmp_path / "broken.jpg")
+        assert tag.position is None or (abs(tag.position.lat_deg) <= 90 and abs(tag.position.lon_deg) <= 180)
+        assert tag.heading_deg is None or 0 <= tag.heading_deg < 360

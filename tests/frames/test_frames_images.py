@@ -1,0 +1,163 @@
+"""Image files that are right, and all the ways in which they can be wrong."""
+
+import numpy as np
+import photographs
+import pytest
+
+from edgevpr.errors import ImageError, SourceError
+from edgevpr.frames.images import list_images, read_image
+from edgevpr.frames.opencv import cv2
+
+THUMBNAIL = photographs.encoded(".jpg", photographs.picture(24, 32))
+JPEGS = {
+    "baseline": photographs.encoded(".jpg", photographs.picture()),
+    "progressive": photographs.encoded(".jpg", photographs.picture(), cv2.IMWRITE_JPEG_PROGRESSIVE, 1),
+    "restart markers": photographs.encoded(".jpg", photographs.picture(), cv2.IMWRITE_JPEG_RST_INTERVAL, 2),
+}
+JPEGS["thumbnail"] = photographs.with_app1(JPEGS["baseline"], b"not even TIFF" + THUMBNAIL)
+
+
+def write(path, data):
+    path.write_bytes(data)
+    return path
+
+
+def complaint(path):
+    with pytest.raises(ImageError) as refusal:
+        read_image(path)
+    sentence = str(refusal.value)
+    assert str(path) in sentence
+    assert sentence.endswith(".")
+    return sentence
+
+
+@pytest.mark.parametrize("extension", [".jpg", ".png", ".tif", ".bmp", ".webp", ".ppm"])
+def test_a_colour_image_of_each_format_is_read_as_bgr(extension, tmp_path):
+    blue = np.zeros((20, 30, 3), np.uint8)
+    blue[..., 0] = 200
+    image = read_image(write(tmp_path / f"blue{extension}", photographs.encoded(extension, blue)))
+    assert image.dtype == np.uint8
+    assert image.shape == (20, 30, 3)
+    np.testing.assert_allclose(image.mean((0, 1)), (200, 0, 0), atol=3)
+
+
+@pytest.mark.parametrize("extension", [".jpg", ".png", ".tif", ".pgm"])
+def test_a_grey_image_stays_grey(extension, tmp_path):
+    grey = photographs.picture()[..., 0]
+    assert read_image(write(tmp_path / f"grey{extension}", photographs.encoded(extension, grey))).shape == grey.shape
+
+
+@pytest.mark.parametrize("extension", [".png", ".tif", ".webp"])
+def test_transparency_is_dropped(extension, tmp_path):
+    colour = np.full((20, 30, 3), (10, 200, 90), np.uint8)
+    transparent = np.dstack([colour, np.zeros((20, 30), np.uint8)])
+    image = read_image(write(tmp_path / f"clear{extension}", photographs.encoded(extension, transparent)))
+    assert image.shape == colour.shape
+
+
+@pytest.mark.parametrize("kind", JPEGS)
+def test_a_whole_jpeg_is_read_also_with_bytes_behind_its_end(kind, tmp_path):
+    whole = read_image(write(tmp_path / "a.jpg", JPEGS[kind]))
+    with_more = read_image(write(tmp_path / "b.jpg", JPEGS[kind] + bytes(100) + THUMBNAIL[:50]))
+    np.testing.assert_array_equal(whole, with_more)
+
+
+@pytest.mark.parametrize("kind", JPEGS)
+@pytest.mark.parametrize("share", [0.05, 0.3, 0.5, 0.7, 0.9, 0.99])
+def test_a_truncated_jpeg_is_refused(kind, share, tmp_path, capfd):
+    cut = JPEGS[kind][: int(share * len(JPEGS[kind]))]
+    assert "cut short" in complaint(write(tmp_path / "cut.jpg", cut))
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("kind", JPEGS)
+@pytest.mark.parametrize("missing", [1, 2, 3])
+def test_a_jpeg_without_its_last_bytes_is_refused(kind, missing, tmp_path):
+    assert "cut short" in complaint(write(tmp_path / "cut.jpg", JPEGS[kind][:-missing]))
+
+
+def test_a_jpeg_that_ends_in_zeros_is_refused(tmp_path):
+    """What a card holds when the power went while the camera was writing."""
+    half = len(JPEGS["baseline"]) // 2
+    assert "cut short" in complaint(write(tmp_path / "zeros.jpg", JPEGS["baseline"][:half] + bytes(half)))
+
+
+@pytest.mark.parametrize("extension", [".png", ".tif", ".bmp", ".webp", ".ppm"])
+@pytest.mark.parametrize("share", [0.02, 0.2, 0.5, 0.9, 0.995])
+def test_a_truncated_image_of_another_format_is_refused(extension, share, tmp_path, capfd):
+    whole = photographs.encoded(extension, photographs.picture())
+    complaint(write(tmp_path / f"cut{extension}", whole[: int(share * len(whole))]))
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("missing", [1, 4, 8, 12, 13])
+def test_a_png_without_its_last_bytes_is_refused(missing, tmp_path):
+    png = photographs.encoded(".png", photographs.picture())
+    assert "cut short" in complaint(write(tmp_path / "cut.png", png[:-missing]))
+
+
+def test_a_png_with_a_wrong_bit_is_refused(tmp_path, capfd):
+    png = bytearray(photographs.encoded(".png", photographs.picture()))
+    png[len(png) // 2] ^= 1
+    assert "damaged" in complaint(write(tmp_path / "bit.png", png))
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "what"),
+    [
+        ("empty.jpg", b"", "is empty"),
+        ("text.jpg", b"To whom it may concern: this is no photograph.", "is not an image"),
+        ("video.png", b"\x00\x00\x00\x20ftypisom" + bytes(100), "is not an image"),
+    ],
+)
+def test_a_file_that_is_no_image_is_refused(name, content, what, tmp_path, capfd):
+    assert what in complaint(write(tmp_path / name, content))
+    assert capfd.readouterr().err == ""
+
+
+def test_an_image_that_promises_more_pixels_than_can_be_held_is_refused(tmp_path, capfd):
+    header = b"P5\n60000 60000\n255\n"
+    assert "is not an image" in complaint(write(tmp_path / "vast.pgm", header + bytes(100)))
+    assert capfd.readouterr().err == ""
+
+
+def test_a_missing_image_and_a_folder_are_refused(tmp_path):
+    assert "does not exist" in complaint(tmp_path / "nothing.jpg")
+    (tmp_path / "folder.jpg").mkdir()
+    assert "cannot be read (Is a directory)" in complaint(tmp_path / "folder.jpg")
+
+
+@pytest.mark.parametrize(("dtype", "bits"), [(np.uint16, 16), (np.float32, 32)])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_an_image_of_more_than_8_bits_is_refused(dtype, bits, channels, tmp_path):
+    deep = np.zeros((20, 20, channels), dtype)
+    path = write(tmp_path / "deep.tif", photographs.encoded(".tif", deep))
+    assert f"has {bits} bits a channel; edgevpr reads 8-bit images: convert it first" in complaint(path)
+
+
+@pytest.mark.parametrize(("height", "width"), [(1, 1), (15, 40), (40, 15)])
+def test_an_image_too_small_to_be_a_place_is_refused(height, width, tmp_path):
+    path = write(tmp_path / "small.png", photographs.encoded(".png", np.zeros((height, width), np.uint8)))
+    assert f"is {width}x{height} pixels; at least 16x16 are needed" in complaint(path)
+
+
+def test_an_image_of_16x16_is_large_enough(tmp_path):
+    path = write(tmp_path / "just.png", photographs.encoded(".png", np.zeros((16, 16), np.uint8)))
+    assert read_image(path).shape == (16, 16)
+
+
+def test_images_are_listed_as_a_person_counts(tmp_path):
+    for name in ("IMG_10.jpg", "IMG_9.JPG", "img_2.Png", "a.tif", "notes.txt", "positions.csv", "._IMG_9.JPG"):
+        (tmp_path / name).touch()
+    assert [path.name for path in list_images(tmp_path)] == ["a.tif", "img_2.Png", "IMG_9.JPG", "IMG_10.jpg"]
+
+
+def test_a_folder_without_images_is_refused(tmp_path):
+    (tmp_path / "notes.txt").touch()
+    with pytest.raises(SourceError, match=r"holds no images \(\.jpg"):
+        list_images(tmp_path)
+    with pytest.raises(SourceError, match=r"nowhere does not exist: give the folder"):
+        list_images(tmp_path / "nowhere")
+    with pytest.raises(SourceError, match=r"cannot be listed \(Not a directory\)"):
+        list_images(tmp_path / "notes.txt")

@@ -1,0 +1,129 @@
+"""positions.csv, right and wrong."""
+
+import pytest
+
+from edgevpr.errors import UsageError
+from edgevpr.frames.positions import GeoTag, find_positions, parse_time, read_positions
+from edgevpr.types import Position
+
+HEADER = "file,split,lat,lon,alt,rel_alt,yaw_deg,time\n"
+FIRST = "0000.jpg,ref,46.84260708,-91.99455989,198.309,39.8,46.0,2016:06:23 16:31:59\n"
+
+
+@pytest.fixture
+def written(tmp_path):
+    def write(text, encoding="utf-8"):
+        (tmp_path / "positions.csv").write_bytes(text.encode(encoding))
+        return tmp_path / "positions.csv"
+
+    return write
+
+
+def test_a_full_row_is_read_and_other_columns_are_ignored(written):
+    tags = read_positions(written(HEADER + FIRST))
+    assert tags == {"0000.jpg": GeoTag(Position(46.84260708, -91.99455989, 198.309), 46.0, 1466699519.0)}
+
+
+def test_file_lat_and_lon_are_enough(written):
+    assert read_positions(written("file,lat,lon\na.jpg,-54.5,2\n")) == {"a.jpg": GeoTag(Position(-54.5, 2.0))}
+
+
+def test_what_is_empty_is_not_known(written):
+    assert read_positions(written(HEADER + "a.jpg,ref,,,,,,\n")) == {"a.jpg": GeoTag()}
+
+
+def test_zero_zero_is_a_receiver_without_a_fix(written):
+    tags = read_positions(written("file,lat,lon\na.jpg,0,0.0\nb.jpg,0,0.1\n"))
+    assert tags == {"a.jpg": GeoTag(), "b.jpg": GeoTag(Position(0.0, 0.1))}
+
+
+def test_headings_are_turned_into_0_to_360(written):
+    text = "file,lat,lon,heading_deg,yaw_deg\na.jpg,,,-90,5\nb.jpg,,,,360\nc.jpg,,,,-180\n"
+    assert [tag.heading_deg for tag in read_positions(written(text)).values()] == [270, 0, 180]
+
+
+def test_what_spreadsheets_write_is_read(written):
+    text = 'File, Lat, Lon\r\n"a, b.jpg", 1.5, 2\r\n\r\nc.jpg,3,4\r\n'
+    tags = read_positions(written(text, "utf-8-sig"))
+    assert tags == {"a, b.jpg": GeoTag(Position(1.5, 2.0)), "c.jpg": GeoTag(Position(3.0, 4.0))}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "2016:06:23 16:31:59",
+        "2016-06-23 16:31:59",
+        "2016-06-23T16:31:59Z",
+        "2016-06-23T18:31:59+02:00",
+        "2016:06:23 18:31:59+02:00",
+        "1466699519",
+        "1466699519.0",
+    ],
+)
+def test_a_time_is_understood_in_each_of_its_forms(text):
+    assert parse_time(text) == 1466699519
+
+
+@pytest.mark.parametrize("text", ["", "yesterday", "nan", "-inf", "2016:13:23 16:31:59", "2016:06:23 25:00:00"])
+def test_what_is_no_time_is_refused(text):
+    with pytest.raises(ValueError):
+        parse_time(text)
+
+
+@pytest.mark.parametrize(
+    ("row", "complaint"),
+    [
+        ("b.jpg,ref,north,2,,,,", "line 3: lat is `north`: write a number from -90 to 90."),
+        ("b.jpg,ref,90.5,2,,,,", "line 3: lat is `90.5`: write a number from -90 to 90."),
+        ("b.jpg,ref,nan,2,,,,", "line 3: lat is `nan`"),
+        ("b.jpg,ref,46,-181,,,,", "line 3: lon is `-181`: write a number from -180 to 180."),
+        ("b.jpg,ref,46,2,high,,,", "line 3: alt is `high`"),
+        ("b.jpg,ref,46,2,,,NE,", "line 3: yaw_deg is `NE`"),
+        ("b.jpg,ref,46,2,,,,noon", "line 3: time is `noon`"),
+        ("b.jpg,ref,46,,,,,", "line 3 has only one of lat and lon"),
+        ("b.jpg,ref,,2,,,,", "line 3 has only one of lat and lon"),
+        ("b.jpg,46,2", "line 3 has 3 values; line 1 names 8 columns"),
+        ("b.jpg,ref,46,84,2,0,,,,", "line 3 has 10 values; line 1 names 8 columns"),
+        (",ref,46,2,,,,", "line 3 names no file"),
+        ("0000.jpg,ref,46,2,,,,", "line 3: 0000.jpg stands in line 2 already"),
+    ],
+)
+def test_a_wrong_row_is_refused_with_its_line_and_value(row, complaint, written):
+    path = written(HEADER + FIRST + row + "\n")
+    with pytest.raises(UsageError) as refusal:
+        read_positions(path)
+    assert str(refusal.value).startswith(str(path))
+    assert complaint in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "column"),
+    [("", "file"), ("name,lat,lon\n", "file"), ("file;lat;lon\n", "file"), ("file,lat,lng\n", "lon")],
+)
+def test_a_missing_column_is_named(text, column, written):
+    with pytest.raises(UsageError, match=f"line 1 has no column `{column}`: it must name file, lat, lon"):
+        read_positions(written(text))
+
+
+def test_a_file_that_is_missing_or_no_text_is_refused(written, tmp_path):
+    with pytest.raises(UsageError, match=r"nothing\.csv cannot be read \(No such file or directory\)"):
+        read_positions(tmp_path / "nothing.csv")
+    with pytest.raises(UsageError, match="is not a text file of commas"):
+        read_positions(written("file,lat,lon\nö.jpg,1,2\n", "latin-1"))
+
+
+def test_positions_are_found_in_the_folder_or_else_beside_it(tmp_path):
+    folder = tmp_path / "ref"
+    folder.mkdir()
+    assert find_positions(folder) is None
+    (tmp_path / "positions.csv").touch()
+    assert find_positions(folder) == tmp_path / "positions.csv"
+    (folder / "positions.csv").touch()
+    assert find_positions(folder) == folder / "positions.csv"
+
+
+def test_positions_beside_a_relative_folder_are_found(tmp_path, monkeypatch):
+    (tmp_path / "positions.csv").touch()
+    (tmp_path / "ref").mkdir()
+    monkeypatch.chdir(tmp_path / "ref")
+    assert find_positions(".") == tmp_path / "positions.csv"

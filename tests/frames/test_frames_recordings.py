@@ -1,0 +1,189 @@
+"""Folders of images and video files, read through open_source."""
+
+import subprocess
+
+import cv2
+import numpy as np
+import photographs
+import pytest
+
+from edgevpr.errors import ImageError, SourceError, UsageError
+from edgevpr.frames.source import open_source
+from edgevpr.types import Position
+
+RATE_HZ = 10
+SHADES = range(0, 250, 10)  # of the frames of the test video: 2.5 s
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "ref").mkdir()
+    return tmp_path / "ref"
+
+
+def write_picture(path):
+    path.write_bytes(photographs.encoded(path.suffix, photographs.picture()))
+
+
+def shade(value):
+    return np.full((48, 64, 3), value, np.uint8)
+
+
+@pytest.fixture
+def video(tmp_path):
+    path = tmp_path / "flight.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), RATE_HZ, (64, 48))
+    for value in SHADES:
+        writer.write(shade(value))
+    writer.release()
+    return path
+
+
+def all_frames(source):
+    frames = []
+    while not source.ended:
+        frame = source.read(1.0)
+        if frame:
+            frames.append(frame)
+    source.close()
+    return frames
+
+
+def shades_of(frames):
+    """Which frames of the test video these are."""
+    return [round(frame.image.mean() / 10) for frame in frames]
+
+
+def test_a_folder_gives_each_image_once_in_order(folder):
+    for name in ("img10.png", "img9.jpg", "img1.png"):
+        write_picture(folder / name)
+    source = open_source(str(folder), live=False, clock=lambda: 12.5)
+    assert source.total == 3
+    assert source.state == "reading"
+    frames = all_frames(source)
+    assert [frame.name for frame in frames] == ["img1.png", "img9.jpg", "img10.png"]
+    assert {frame.t_mono_s for frame in frames} == {12.5}
+    assert source.state == "ended"
+    assert source.read(1.0) is None
+
+
+def test_a_bad_image_is_said_once_and_the_next_one_follows(folder):
+    write_picture(folder / "1.jpg")
+    (folder / "2.jpg").write_bytes((folder / "1.jpg").read_bytes()[:-200])
+    write_picture(folder / "3.jpg")
+    source = open_source(str(folder), live=False)
+    assert source.read(1.0).name == "1.jpg"
+    with pytest.raises(ImageError, match=r"2\.jpg is cut short"):
+        source.read(1.0)
+    assert source.read(1.0).name == "3.jpg"
+    assert source.ended
+
+
+def test_positions_come_from_the_csv_and_for_images_it_does_not_name_from_exif(folder):
+    pytest.importorskip("PIL", reason="the photographs with EXIF are made with Pillow")
+    gps = {1: "N", 2: (50.0, 30.0, 0.0), 3: "E", 4: (14.0, 15.0, 0.0)}
+    for name in ("in csv.jpg", "not in csv.jpg", "without.jpg"):
+        photographs.write_jpeg(folder / name, gps)
+    (folder.parent / "positions.csv").write_text("file,lat,lon,yaw_deg,time\nin csv.jpg,1,2,90,7\nwithout.jpg,,,,\n")
+    in_csv, not_in_csv, without = all_frames(open_source(str(folder), live=False))
+    assert (in_csv.position, in_csv.heading_deg, in_csv.t_utc_s) == (Position(1.0, 2.0), 90.0, 7.0)
+    assert not_in_csv.position == Position(50.5, 14.25)
+    assert without.position is None
+
+
+def test_positions_named_by_the_user_count_before_those_that_lie_there(folder, tmp_path):
+    write_picture(folder / "a.jpg")
+    (folder / "positions.csv").write_text("file,lat,lon\na.jpg,1,2\n")
+    (tmp_path / "better.csv").write_text("file,lat,lon\na.jpg,3,4\n")
+    source = open_source(str(folder), positions=tmp_path / "better.csv", live=False)
+    assert source.read(1.0).position == Position(3.0, 4.0)
+
+
+def test_positions_that_cannot_be_meant_for_the_source_are_refused(folder, video, tmp_path):
+    write_picture(folder / "a.jpg")
+    (tmp_path / "other.csv").write_text("file,lat,lon\nb.jpg,3,4\n")
+    with pytest.raises(UsageError, match=r"other\.csv names none of the images in"):
+        open_source(str(folder), positions=tmp_path / "other.csv", live=False)
+    with pytest.raises(UsageError, match=r"other\.csv can only place the images of a folder"):
+        open_source(str(video), positions=tmp_path / "other.csv", live=False)
+
+
+def test_a_wrong_positions_csv_is_found_out_before_the_first_image(folder):
+    write_picture(folder / "a.jpg")
+    (folder / "positions.csv").write_text("file,lat,lon\na.jpg,north,4\n")
+    with pytest.raises(UsageError, match="line 2: lat is `north`"):
+        open_source(str(folder), live=False)
+
+
+def test_a_video_gives_every_frame_to_its_end(video):
+    source = open_source(str(video), live=False, clock=lambda: 12.5)
+    assert source.total == len(SHADES)
+    frames = all_frames(source)
+    assert shades_of(frames) == list(range(len(SHADES)))
+    assert [frame.name for frame in frames[:3]] == [
+        "frame 000000 t=0.000 s",
+        "frame 000001 t=0.100 s",
+        "frame 000002 t=0.200 s",
+    ]
+    assert frames[0].t_mono_s == 12.5
+    assert (source.state, source.read(1.0)) == ("ended", None)
+
+
+@pytest.mark.parametrize(("step_s", "stride"), [(0.1, 1), (0.3, 3), (0.25, 3), (1.0, 10), (60.0, 25)])
+def test_frames_of_a_video_are_at_least_a_step_apart(step_s, stride, video):
+    source = open_source(str(video), step_s=step_s, live=False)
+    frames = all_frames(source)
+    assert shades_of(frames) == list(range(len(SHADES)))[::stride]
+    assert abs(source.total - len(frames)) <= 1
+
+
+def test_a_reader_in_a_hurry_gets_the_same_frames_of_a_video(video):
+    seconds = iter(range(10_000))
+    hurried = open_source(str(video), step_s=0.5, live=False, clock=lambda: next(seconds))
+    turns, frames = 0, []
+    while not hurried.ended:
+        frame = hurried.read(1.5)
+        turns += 1
+        if frame:
+            frames.append(frame)
+    assert turns > len(frames) + 1  # some turns gave nothing
+    patient = all_frames(open_source(str(video), step_s=0.5, live=False))
+    assert [frame.name for frame in frames] == [frame.name for frame in patient]
+    for one, other in zip(frames, patient, strict=True):
+        np.testing.assert_array_equal(one.image, other.image)
+
+
+def test_a_video_without_time_stamps_is_timed_by_its_frame_rate(tmp_path):
+    path = tmp_path / "bare.mjpeg"
+    path.write_bytes(b"".join(photographs.encoded(".jpg", shade(value)) for value in SHADES))
+    frames = all_frames(open_source(str(path), step_s=0.2, live=False))  # FFmpeg takes such a file for 25 Hz
+    assert shades_of(frames) == [0, 5, 10, 15, 20]
+    assert frames[1].name == "frame 000005 t=0.200 s"
+
+
+def test_a_bare_h264_stream_is_timed_by_its_frame_rate(tmp_path):
+    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="the video is made with ffmpeg (pip install imageio-ffmpeg)")
+    path = tmp_path / "bare.h264"
+    picture = ["-f", "lavfi", "-i", "testsrc=size=64x48:rate=25:duration=2"]
+    subprocess.run([ffmpeg.get_ffmpeg_exe(), "-v", "quiet", *picture, "-c:v", "libx264", str(path)], check=True)
+    times_s = [float(frame.name.split("=")[1].split()[0]) for frame in all_frames(open_source(str(path), live=False))]
+    assert len(times_s) == 50
+    assert times_s == sorted(set(times_s))
+
+
+@pytest.mark.parametrize(
+    ("name", "content"), [("text.mp4", b"no video" * 100), ("empty.mp4", b""), ("data.bin", bytes(9999))]
+)
+def test_a_file_that_is_no_video_is_refused(name, content, tmp_path, capfd):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(SourceError, match=f"{name} is not a video that can be decoded: give a video file or a folder"):
+        open_source(str(tmp_path / name), live=False)
+    assert capfd.readouterr().err == ""
+
+
+def test_a_single_image_and_an_empty_folder_are_refused(folder, tmp_path):
+    write_picture(tmp_path / "photo.jpg")
+    with pytest.raises(SourceError, match=r"photo\.jpg is a single image: give the folder that holds it"):
+        open_source(str(tmp_path / "photo.jpg"), live=False)
+    with pytest.raises(SourceError, match="holds no images"):
+        open_source(str(folder), live=False)

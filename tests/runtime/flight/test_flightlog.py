@@ -1,0 +1,272 @@
+"""The flight log on real files, a full device, a file size limit and a small file system."""
+
+import json
+import logging
+import os
+import resource
+import shutil
+import subprocess
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edgevpr.config import load_config
+from edgevpr.errors import EdgevprError
+from edgevpr.runtime.flight.flightlog import FlightLog, read_log, start_fields
+from edgevpr.types import PartSpec, PlaceMatch, Position, QueryCost, TechniqueSpec
+
+COST = QueryCost(0.01, 0.02, 0.25, 0.25, 0.03, 61.5, 1.23456789e-05, float("nan"))
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now_s = 100.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+@pytest.fixture
+def path(tmp_path) -> Path:
+    return tmp_path / "flight.jsonl"
+
+
+@pytest.fixture
+def syncs(monkeypatch) -> list[int]:
+    """The calls of fdatasync, which still happen."""
+    calls = []
+    fdatasync = os.fdatasync
+    monkeypatch.setattr(os, "fdatasync", lambda fd: (calls.append(fd), fdatasync(fd)))
+    return calls
+
+
+@contextmanager
+def no_file_larger_than(limit_bytes: int):
+    """A disk that is full, for this process: writes past the limit fail, and the one that crosses it is cut."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def kinds(path: Path) -> list[str]:
+    """Kinds of all lines, each of which must be whole."""
+    return [json.loads(line)["kind"] for line in path.read_bytes().splitlines()]
+
+
+def test_every_line_can_be_read_before_the_log_is_closed(path):
+    log = FlightLog(path, Clock())
+    log.write("state", camera="lost")
+    (record,) = read_log(path)
+    assert record["kind"] == "state"
+    assert record["camera"] == "lost"
+    assert record["t_mono_s"] == 100.0
+    assert record["time"].endswith("Z")
+    log.close()
+
+
+def test_a_match_is_written_as_it_is_with_nan_as_null(path):
+    match = PlaceMatch("q.jpg", 12.5, None, True, "score 0.9", Position(50.12345678901, -1.5, None), 20.0, COST)
+    with FlightLog(path) as log:
+        log.write("match", t_mono_s=match.t_mono_s, event=match)
+    (record,) = read_log(path)
+    assert record["t_mono_s"] == 12.5
+    assert record["event"]["position"] == {"lat_deg": 50.1234568, "lon_deg": -1.5, "alt_m": None}
+    assert record["event"]["cost"]["used_mah"] == 1.234568e-05
+    assert record["event"]["cost"]["marginal_mah"] is None
+
+
+def test_numpy_paths_infinities_and_foreign_file_names_are_written(path):
+    with FlightLog(path) as log:
+        log.write("x", score=np.float32(0.1), n=np.int64(3), row=np.array([1.0, np.inf]), file=Path("a/b"), ok=np.True_)
+        log.write("y", file="flight \udcff.mp4", place="Přeštice")
+    first, second = read_log(path)
+    assert (first["score"], first["n"], first["row"], first["file"], first["ok"]) == (0.1, 3, [1.0, None], "a/b", True)
+    assert (second["file"], second["place"]) == ("flight \udcff.mp4", "Přeštice")
+    assert "Přeštice" in path.read_text(errors="strict")
+
+
+def test_the_first_line_says_who_flies_with_what(path):
+    spec = TechniqueSpec("cohog", {"image": 512}, PartSpec((4,), "<f4"))
+    config = load_config(None, {"map": "valley.gpkg"})
+    with FlightLog(path) as log:
+        log.write("start", **start_fields(config, "rpi-zero-2w", spec))
+    (record,) = read_log(path)
+    assert record["technique"] == "cohog"
+    assert record["parameters"] == {"image": 512}
+    assert record["board"] == "rpi-zero-2w"
+    assert record["map"] == "valley.gpkg"
+    assert record["config"]["match"]["neighbour_m"] == 50
+    assert record["version"]
+
+
+def test_the_disk_is_synced_at_most_once_a_second_and_at_the_end(path, syncs):
+    clock = Clock()
+    log = FlightLog(path, clock)
+    for _ in range(9):  # two seconds at four lines a second
+        log.write("match")
+        clock.now_s += 0.25
+    assert len(syncs) == 3
+    log.close()
+    assert len(syncs) == 4
+
+
+def test_flights_are_appended_one_after_another(path):
+    for flight in ("first", "second"):
+        with FlightLog(path) as log:
+            log.write(flight)
+    assert kinds(path) == ["first", "second"]
+
+
+def test_after_a_pulled_battery_it_goes_on_on_a_new_line(path):
+    path.write_bytes(b'{"kind": "match"}\n{"kind": "ma')
+    with FlightLog(path) as log:
+        log.write("start")
+    assert [record["kind"] for record in read_log(path)] == ["match", "start"]
+    assert path.read_bytes().startswith(b'{"kind": "match"}\n{"kind": "ma\n{"kind": "start"')
+
+
+def test_reading_leaves_out_a_cut_last_line_and_what_is_no_record(path):
+    path.write_bytes(b'{"kind": "a"}\n\n[1]\n\0\0\0\0\n\xff\xfe\n{"kind": "b"}\n{"kind": "c", "x": 1')
+    assert list(read_log(path)) == [{"kind": "a"}, {"kind": "b"}]
+
+
+def test_a_full_device_is_said_once_counted_and_never_raised(caplog):
+    with FlightLog("/dev/full") as log:
+        for _ in range(5):
+            log.write("match")
+        assert log.lost_lines == 5
+        assert log.state.startswith("The flight log /dev/full cannot be written (No space left on device): make room")
+    assert [record.getMessage() for record in caplog.records] == [log.state]
+
+
+def test_a_disk_that_has_room_again_is_written_again_without_half_a_line(path, caplog):
+    caplog.set_level(logging.INFO)
+    log = FlightLog(path)
+    log.write("before")
+    whole = path.read_bytes()
+    with no_file_larger_than(len(whole) + 10):
+        log.write("lost")
+        log.write("lost")
+        assert path.read_bytes() == whole
+        assert log.state
+    log.write("after")
+    log.close()
+    assert kinds(path) == ["before", "gap", "after"]
+    assert next(r for r in read_log(path) if r["kind"] == "gap")["lost_lines"] == 2
+    assert (log.state, log.lost_lines) == (None, 2)
+    said = [record.getMessage() for record in caplog.records]
+    assert len(said) == 2
+    assert said[1] == f"The flight log {path} is written again; 2 lines are missing."
+
+
+def test_a_second_failure_is_said_again(path, caplog):
+    with FlightLog(path) as log:
+        for _ in range(2):
+            with no_file_larger_than(0):
+                log.write("lost")
+            log.write("kept")
+    assert kinds(path) == ["gap", "kept", "gap", "kept"]
+    assert [record["lost_lines"] for record in read_log(path) if record["kind"] == "gap"] == [1, 2]
+    assert len(caplog.records) == 4
+
+
+def test_a_medium_that_was_put_back_is_opened_anew(tmp_path):
+    medium, log_path = tmp_path / "medium", tmp_path / "flight.jsonl"
+    log_path.symlink_to("/dev/full")  # the medium fails ...
+    log = FlightLog(log_path)
+    log.write("lost")
+    log_path.unlink()
+    log_path.symlink_to(medium / "flight.jsonl")  # ... is gone ...
+    log.write("lost")
+    assert log.state
+    medium.mkdir()  # ... and is back
+    log.write("after")
+    log.close()
+    assert kinds(log_path) == ["gap", "after"]
+    assert log.lost_lines == 2
+
+
+def test_a_sync_that_fails_is_a_failure_too(path, monkeypatch):
+    def failing(fd: int) -> None:
+        raise OSError(5, "Input/output error")
+
+    with FlightLog(path) as log:
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "fdatasync", failing)
+            log.write("match")
+        assert "Input/output error" in log.state
+        log.write("match")
+        assert log.state is None
+
+
+_ON_A_SMALL_FILE_SYSTEM = """
+import sys
+from pathlib import Path
+from edgevpr.runtime.flight.flightlog import FlightLog
+folder = Path(sys.argv[1])
+log = FlightLog(folder / "flight.jsonl")
+ballast = folder / "ballast"
+ballast.write_bytes(bytes(16 * 4096))
+while log.state is None:
+    log.write("match", fill="x" * 3000)
+lost_while_full = log.lost_lines
+log.write("match", fill="x" * 3000)
+assert log.lost_lines == lost_while_full + 1
+ballast.unlink()
+log.write("after")
+log.close()
+assert log.state is None
+sys.stdout.write(log.path.read_text())
+"""
+
+
+def test_a_file_system_that_fills_up_and_is_cleared_holds_only_whole_lines(tmp_path):
+    enter = ["unshare", "--user", "--map-root-user", "--mount", "sh", "-c"]
+    mount = f"mount -t tmpfs -o size=256k tmpfs {tmp_path}"
+    if not shutil.which("unshare") or subprocess.run([*enter, mount], capture_output=True).returncode:
+        pytest.skip("this machine does not let a test mount a small file system of its own (unshare)")
+    run = f"{mount} && exec {sys.executable} -c '{_ON_A_SMALL_FILE_SYSTEM}' {tmp_path}"
+    written = subprocess.run([*enter, run], capture_output=True, text=True, check=True).stdout
+    lines = [json.loads(line)["kind"] for line in written.splitlines()]
+    assert lines[-2:] == ["gap", "after"]
+    assert set(lines[:-2]) == {"match"}
+
+
+def test_without_a_path_nothing_is_written(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with FlightLog(None) as log:
+        log.write("match")
+    assert log.state is None
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["", "absent/flight.jsonl", "file/flight.jsonl"])
+def test_a_path_that_cannot_be_opened_is_one_sentence(tmp_path, name):
+    (tmp_path / "file").touch()
+    with pytest.raises(EdgevprError, match=r"^The flight log .* cannot be opened \(.*\): give a file in a folder"):
+        FlightLog(tmp_path / name)
+
+
+def test_a_log_that_was_killed_loses_nothing_that_was_written(path):
+    script = "import os, sys; from edgevpr.runtime.flight.flightlog import FlightLog\n"
+    script += "log = FlightLog(sys.argv[1])\nfor i in range(50): log.write('match', i=i)\nos.kill(os.getpid(), 9)"
+    assert subprocess.run([sys.executable, "-c", script, str(path)]).returncode == -9
+    assert [record["i"] for record in read_log(path)] == list(range(50))
+
+
+def test_a_service_waits_for_the_medium_of_its_log(tmp_path, caplog):
+    path = tmp_path / "card" / "flight.jsonl"
+    log = FlightLog(path, wait=True)
+    assert "the flight goes on without it" in log.state
+    log.write("query", n=1)
+    path.parent.mkdir()  # the card is put back
+    log.write("query", n=2)
+    log.close()
+    assert [(line["kind"], line.get("n")) for line in read_log(path)] == [("gap", None), ("query", 2)]
+    assert log.state is None

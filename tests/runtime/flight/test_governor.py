@@ -1,0 +1,264 @@
+"""The governor with a clock and readings that say what the test wants."""
+
+import itertools
+import random
+
+import pytest
+
+from edgevpr.runtime.flight.governor import Change, Governor, Limits, Reading, Setting, lowered, steps
+
+LIMITS = Limits(cpu_share=0.5, memory_max_mb=512, temperature_c=80)
+ASKED = Setting(2.0, 40)
+CALM = Reading(0.05, 0.0, 100.0, 50.0, False)
+BUSY = Reading(0.9, 0.0, 100.0, 50.0, False)
+
+
+class Flight:
+    """Looks once a second; `reading` says what is measured of a setting at a time."""
+
+    def __init__(self, reading, settings=None, index_mb=None):
+        self.settings = settings or steps(ASKED, keeps_rate=False, compares=True)
+        self.governor = Governor(LIMITS, self.settings, index_mb or {None: 1.0})
+        self.reading, self.now_s = reading, 0.0
+        self.changes = []
+
+    def fly(self, seconds):
+        """The changes of these seconds."""
+        before = len(self.changes)
+        for _ in range(seconds):
+            self.now_s += 1
+            change = self.governor.look(self.now_s, self.reading(self.governor.setting, self.now_s))
+            if change:
+                self.changes.append((self.now_s, change))
+        return [change for _, change in self.changes[before:]]
+
+
+def busy(share_at_full):
+    """A load that grows with the rate, as with 40 candidates it would be at 2 Hz."""
+    return lambda setting, now_s: Reading(share_at_full * setting.rate_hz / 2, 0.0, 100.0, None, None)
+
+
+def test_the_rate_is_lowered_first_then_the_candidates_then_the_form():
+    settings = steps(Setting(1.0, 40, "float"), keeps_rate=False, compares=True, forms=("8bit", "1bit"))
+    assert settings == (
+        Setting(1.0, 40, "float"),
+        Setting(0.5, 40, "float"),
+        Setting(0.25, 40, "float"),
+        Setting(0.125, 40, "float"),
+        Setting(0.125, 20, "float"),
+        Setting(0.125, 20, "8bit"),
+        Setting(0.125, 20, "1bit"),
+    )
+    flight = Flight(lambda setting, now_s: BUSY, settings, {"float": 4.0, "8bit": 2.0, "1bit": 1.0})
+    changes = flight.fly(60)
+    assert [change.after for change in changes[:-1]] == list(settings[1:])
+    assert [change.before for change in changes[:-1]] == list(settings[:-1])
+    assert {b - a for (a, _), (b, _) in itertools.pairwise(flight.changes)} == {4.0}, "each step is given time to tell"
+    assert changes[0].why == "90% of all cores taken, and 50% allowed"
+    assert changes[-1] == Change(
+        settings[-1], settings[-1], "90% of all cores taken, and 50% allowed, and nothing is left to lower"
+    )
+
+
+def test_it_goes_back_in_the_opposite_order():
+    flight = Flight(lambda setting, now_s: BUSY if now_s <= 60 else CALM)
+    flight.fly(60)
+    assert flight.governor.setting == Setting(0.25, 20)
+    flight.fly(600)
+    assert [change.after for _, change in flight.changes if change.why == "there is room again"] == [
+        *reversed(flight.settings[:-1])
+    ]
+    assert flight.governor.setting == flight.governor.asked == ASKED
+
+
+def test_a_sequence_keeps_its_rate_and_a_technique_of_one_stage_has_no_candidates():
+    assert steps(ASKED, keeps_rate=True, compares=True) == (ASKED, Setting(2.0, 20))
+    assert steps(ASKED, keeps_rate=True, compares=False) == (ASKED,)
+    assert steps(Setting(2.0, 30), keeps_rate=True, compares=True) == (Setting(2.0, 30),)
+    assert [each.candidates for each in steps(Setting(2.0, 100), keeps_rate=True, compares=True)] == [100, 50, 25]
+    assert [each.rate_hz for each in steps(ASKED, keeps_rate=False, compares=False)] == [2.0, 1.0, 0.5, 0.25]
+
+
+def test_what_is_lowered_is_said_in_a_few_words():
+    assert lowered(ASKED, ASKED) == ""
+    assert lowered(Setting(0.5, 20, "8bit"), Setting(2.0, 40, "float")) == "0.5 of 2 Hz, 20 of 40 candidates, form 8bit"
+
+
+def test_a_short_peak_changes_nothing():
+    flight = Flight(lambda setting, now_s: BUSY if now_s % 10 < 3 else CALM)
+    assert flight.fly(600) == []
+
+
+def test_a_constant_overload_is_lowered_once_and_for_all():
+    flight = Flight(busy(0.8))
+    assert [change.after.rate_hz for change in flight.fly(3600)] == [1.0]
+    assert flight.changes[0][0] < 6
+
+
+def test_what_it_cannot_help_is_said_once():
+    flight = Flight(lambda setting, now_s: BUSY, settings=(ASKED,))
+    (change,) = flight.fly(600)
+    assert change.before == change.after == ASKED
+    assert change.why.endswith("nothing is left to lower")
+    flight.reading = lambda setting, now_s: CALM
+    assert flight.fly(60) == []
+    flight.reading = lambda setting, now_s: BUSY
+    assert len(flight.fly(60)) == 1, "a trouble that had gone is said again"
+
+
+@pytest.mark.parametrize("half_period_s", [5, 10, 20, 60, 150])
+def test_a_square_wave_load_settles(half_period_s):
+    """What others take comes and goes: the waits between two tries grow."""
+
+    def reading(setting, now_s):
+        share = 0.8 if now_s % (2 * half_period_s) < half_period_s else 0.2
+        return Reading(share * setting.rate_hz / 2, 0.0, 100.0, None, None)
+
+    flight = Flight(reading)
+    flight.fly(7200)
+    assert len([at for at, _ in flight.changes if at <= 3600]) <= 16
+    assert len([at for at, _ in flight.changes if at > 3600]) <= 12
+
+
+def test_noise_around_the_limit_changes_the_rate_once_at_most():
+    script = random.Random(3)
+    flight = Flight(lambda setting, now_s: Reading(script.gauss(0.5, 0.05) * setting.rate_hz / 2, 0, 100.0, None, None))
+    assert len(flight.fly(3600)) <= 1
+    flight = Flight(lambda setting, now_s: Reading(0.1, 0.0, 100.0, script.gauss(80, 2), None))
+    changes = flight.fly(3600)
+    assert all(change.why != "there is room again" for change in changes), "never clearly below the limit"
+
+
+@pytest.mark.parametrize("full_c", [81, 84, 90, 100])
+def test_a_board_that_heats_slowly_is_held_below_its_limit(full_c):
+    """A first-order board: 90 s to react, `full_c` degrees at the rate asked, 40 idle."""
+    hottest_c, temperature_c = [], [40.0]
+
+    def reading(setting, now_s):
+        aim_c = 40 + (full_c - 40) * setting.rate_hz / 2
+        temperature_c[0] += (aim_c - temperature_c[0]) / 90
+        hottest_c.append(temperature_c[0])
+        return Reading(0.1, 0.0, 100.0, temperature_c[0], False)
+
+    flight = Flight(reading)
+    first = flight.fly(3600)
+    assert first
+    assert "degrees, and 80 are the limit" in first[0].why
+    assert max(hottest_c) < 81.5
+    assert len(flight.fly(3600)) <= 13, "one try every ten minutes"
+
+
+def test_it_cools_between_two_steps_for_heat():
+    flight = Flight(lambda setting, now_s: Reading(0.1, 0.0, 100.0, 85.0, None))
+    flight.fly(60)
+    at_s = [at for at, _ in flight.changes]
+    assert [b - a for a, b in itertools.pairwise(at_s)] == [20.0, 20.0]
+
+
+def test_after_heat_it_goes_back_no_faster_than_it_went():
+    flight = Flight(lambda setting, now_s: Reading(0.1, 0.0, 100.0, 85.0 if now_s <= 30 else 60.0, None))
+    flight.fly(120)
+    assert flight.governor.setting == ASKED
+    back_at_s = [at for at, change in flight.changes if change.back]
+    assert min(b - a for a, b in itertools.pairwise([30.0, *back_at_s])) >= 20
+
+
+def wait_s(flight, trouble_s):
+    """How long after this long a trouble all is as it was asked."""
+    until_s = flight.now_s + trouble_s
+    flight.reading = lambda setting, now_s: BUSY if now_s <= until_s else CALM
+    flight.fly(trouble_s)
+    while flight.governor.setting != ASKED:
+        flight.fly(1)
+    return flight.now_s - until_s
+
+
+def test_the_wait_doubles_with_each_failure_and_begins_anew_when_all_was_well_for_long():
+    flight = Flight(lambda setting, now_s: CALM, settings=steps(ASKED, keeps_rate=False, compares=False))
+    assert [wait_s(flight, 5) for _ in range(3)] == [7, 13, 25]
+    assert wait_s(flight, 13) == 3 * 49, "one failure, however many steps it takes"
+    flight.fly(600)
+    assert wait_s(flight, 5) == 7
+
+
+def test_without_a_temperature_a_board_that_throttles_is_believed():
+    flight = Flight(lambda setting, now_s: Reading(0.1, 0.0, 100.0, None, None))
+    assert flight.fly(600) == []
+    flight.reading = lambda setting, now_s: Reading(0.1, 0.0, 100.0, None, True)
+    (change,) = flight.fly(10)
+    assert (change.after.rate_hz, change.why) == (1.0, "the board slows itself down")
+
+
+def test_a_sensor_that_goes_away_while_it_is_hot_does_not_hold_the_rate_down():
+    flight = Flight(lambda setting, now_s: Reading(0.1, 0.0, 100.0, 85.0 if now_s < 10 else None, None))
+    flight.fly(60)
+    assert flight.governor.setting == ASKED
+
+
+def test_queries_that_others_make_late_are_asked_less_often_until_the_others_are_gone():
+    def reading(setting, now_s):
+        takes = 0.35 * setting.rate_hz  # of the time, at 2 Hz 0.7; another program doubles it until 100 s
+        return Reading(0.2, min(1.0, 2 * takes) if now_s < 100 else takes, 100.0, None, None)
+
+    flight = Flight(reading)
+    (change,) = flight.fly(99)
+    assert (change.after.rate_hz, change.why) == (1.0, "queries come late, kept waiting by other programs or the disk")
+    (change,) = flight.fly(20)
+    assert (change.after, change.why) == (ASKED, "there is room again")
+
+
+FORMS = ("float", "8bit", "1bit")
+FORMS_MB = {"float": 300.0, "8bit": 150.0, "1bit": 20.0}
+
+
+def test_memory_that_runs_short_is_saved_by_the_form_alone_and_given_back_when_it_fits():
+    other_mb = [200.0]
+    settings = steps(Setting(1.0, 1, "float"), keeps_rate=False, compares=False, forms=FORMS[1:])
+    flight = Flight(
+        lambda setting, now_s: Reading(0.1, 0.0, other_mb[0] + FORMS_MB[setting.form], None, None), settings, FORMS_MB
+    )
+    (change,) = flight.fly(600)
+    assert (change.after, change.why) == (Setting(1.0, 1, "8bit"), "500 MB of memory taken, and 512 allowed")
+    other_mb[0] = 100.0
+    (change,) = flight.fly(600)
+    assert change.after == Setting(1.0, 1, "float")
+    other_mb[0] = 490.0
+    changes = flight.fly(600)
+    assert [change.after.form for change in changes] == ["8bit", "1bit", "1bit"]
+    assert changes[-1].why == "510 MB of memory taken, and 512 allowed, and nothing is left to lower"
+
+
+def test_a_map_that_serves_no_other_form_has_its_memory_said_once():
+    flight = Flight(lambda setting, now_s: Reading(0.1, 0.0, 500.0, None, None))
+    (change,) = flight.fly(600)
+    assert change.before == change.after == ASKED
+    assert change.why == "500 MB of memory taken, and 512 allowed, and nothing is left to lower"
+
+
+def test_memory_and_load_may_both_ask_for_a_form_and_each_is_given_back_for_itself():
+    settings = steps(Setting(1.0, 1, "float"), keeps_rate=True, compares=False, forms=FORMS[1:])
+    trouble = {"cpu": 0.9, "mb": 200.0}
+    flight = Flight(
+        lambda setting, now_s: Reading(trouble["cpu"], 0.0, trouble["mb"] + FORMS_MB[setting.form], None, None),
+        settings,
+        FORMS_MB,
+    )
+    flight.fly(60)
+    assert flight.governor.setting.form == "1bit"
+    trouble["cpu"] = 0.1
+    flight.fly(600)
+    assert flight.governor.setting.form == "8bit", "the float form would not fit"
+    trouble["mb"] = 100.0
+    flight.fly(600)
+    assert flight.governor.setting.form == "float"
+
+
+def test_a_form_that_load_took_comes_back_only_where_it_fits():
+    settings = steps(Setting(1.0, 1, "float"), keeps_rate=True, compares=False, forms=FORMS[1:])
+    flight = Flight(lambda setting, now_s: BUSY, settings, FORMS_MB)
+    flight.fly(60)
+    other_mb = [400.0]  # taken meanwhile
+    flight.reading = lambda setting, now_s: Reading(0.01, 0.0, other_mb[0] + FORMS_MB[setting.form], None, None)
+    assert flight.fly(600) == []
+    other_mb[0] = 150.0
+    assert [change.after.form for change in flight.fly(600)] == ["8bit", "float"]

@@ -1,0 +1,87 @@
+"""sd_notify on real sockets: one in the file system, one in the abstract namespace."""
+
+import os
+import socket
+
+import pytest
+
+from edgevpr.runtime.flight.systemd import notify, watchdog_interval_s
+
+
+@pytest.fixture
+def manager(tmp_path, monkeypatch):
+    """A bound datagram socket in the place of systemd's."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as receiver:
+        receiver.settimeout(5)
+        receiver.bind(str(tmp_path / "notify"))
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+        yield receiver
+
+
+def test_all_assignments_arrive_in_one_datagram(manager):
+    assert notify(READY=1, STATUS="240 places of cohog")
+    assert manager.recv(4096) == b"READY=1\nSTATUS=240 places of cohog"
+
+
+def test_an_abstract_socket_is_reached(monkeypatch):
+    name = f"edgevpr-test-{os.getpid()}"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as receiver:
+        receiver.settimeout(5)
+        receiver.bind("\0" + name)
+        monkeypatch.setenv("NOTIFY_SOCKET", "@" + name)
+        assert notify(WATCHDOG=1)
+        assert receiver.recv(4096) == b"WATCHDOG=1"
+
+
+def test_a_line_break_in_a_value_cannot_become_an_assignment(manager):
+    notify(STATUS="no camera\nSTOPPING=1\r\n")
+    assert manager.recv(4096) == b"STATUS=no camera STOPPING=1"
+
+
+def test_a_file_name_that_is_not_utf8_still_makes_a_status(manager):
+    notify(STATUS="flight \udcff.mp4")
+    assert manager.recv(4096).decode() == "STATUS=flight ?.mp4"
+
+
+def test_without_systemd_nothing_is_sent(monkeypatch):
+    monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
+    assert not notify(READY=1)
+
+
+@pytest.mark.parametrize("address", ["/nowhere/notify", "vsock:2:1234", "/" + "x" * 200, "@" + "x" * 200])
+def test_an_address_that_cannot_be_reached_is_no_error(monkeypatch, address):
+    monkeypatch.setenv("NOTIFY_SOCKET", address)
+    assert not notify(WATCHDOG=1)
+
+
+def test_a_manager_that_does_not_read_does_not_hang_the_flight(manager):
+    sent = [notify(WATCHDOG=1)]
+    while sent[-1] and len(sent) < 10_000:
+        sent.append(notify(WATCHDOG=1))
+    assert not sent[-1]
+    manager.recv(4096)
+    assert notify(WATCHDOG=1)
+
+
+def test_the_watchdog_is_fed_twice_in_its_time(monkeypatch):
+    monkeypatch.setenv("WATCHDOG_USEC", "30000000")
+    monkeypatch.delenv("WATCHDOG_PID", raising=False)
+    assert watchdog_interval_s() == 15.0
+    monkeypatch.setenv("WATCHDOG_PID", str(os.getpid()))
+    assert watchdog_interval_s() == 15.0
+
+
+def test_a_watchdog_of_another_process_is_not_ours(monkeypatch):
+    monkeypatch.setenv("WATCHDOG_USEC", "30000000")
+    monkeypatch.setenv("WATCHDOG_PID", str(os.getpid() + 1))
+    assert watchdog_interval_s() is None
+
+
+@pytest.mark.parametrize("timeout_us", [None, "", "soon", "0", "-5"])
+def test_no_watchdog_without_a_time(monkeypatch, timeout_us):
+    monkeypatch.delenv("WATCHDOG_PID", raising=False)
+    if timeout_us is None:
+        monkeypatch.delenv("WATCHDOG_USEC", raising=False)
+    else:
+        monkeypatch.setenv("WATCHDOG_USEC", timeout_us)
+    assert watchdog_interval_s() is None

@@ -1,0 +1,73 @@
+"""`edgevpr run` as a process of its own, looked at from outside: its log, its memory, its CPU time."""
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+from pictures import textured
+
+from edgevpr.runtime.flight.flightlog import read_log
+
+_PATIENCE_S = 60.0
+_TICK_S = 1 / os.sysconf("SC_CLK_TCK")
+
+
+def write_frames(folder: Path, count: int) -> None:
+    """Pictures as a camera gives them, 640x480 in colour, as JPEG files."""
+    folder.mkdir()
+    for number in range(count):
+        picture = cv2.cvtColor(textured(number, 480, 640), cv2.COLOR_GRAY2BGR)
+        cv2.imwrite(str(folder / f"{number:04d}.jpg"), picture)
+
+
+def start(place_map: Path, source: Path | str, log: Path, *flags: str, through: Sequence[str] = ()) -> subprocess.Popen:
+    """Start a flight, by way of the program `through` where one is named (`prlimit ...`)."""
+    command = ["-m", "edgevpr", "run", "--map", place_map, "--source", source, "--log", log, *flags]
+    return subprocess.Popen([*through, sys.executable, *map(str, command)], stderr=subprocess.PIPE, text=True)
+
+
+def wait_for(kind: str, log: Path, process: subprocess.Popen) -> dict[str, Any]:
+    """The first line of a kind in the flight log, as soon as it is there. Raises RuntimeError where none comes."""
+    give_up_s = time.monotonic() + _PATIENCE_S
+    while time.monotonic() < give_up_s:
+        over = process.poll() is not None
+        line = next((line for line in read_log(log) if line["kind"] == kind), None) if log.exists() else None
+        if line is not None:
+            return line
+        if over:
+            raise RuntimeError(f"the flight has ended without a line `{kind}`: {process.communicate()[1]}")
+        time.sleep(0.02)
+    raise RuntimeError(f"no line `{kind}` in {log} after {_PATIENCE_S:g} s")
+
+
+def memory_mb(pid: int) -> dict[str, float]:
+    """VmHWM (the largest resident set so far), VmRSS, Pss, ... of a process, MB of 10^6 bytes; {} once it has ended."""
+    try:
+        text = Path(f"/proc/{pid}/status").read_text() + Path(f"/proc/{pid}/smaps_rollup").read_text()
+    except (FileNotFoundError, ProcessLookupError):
+        return {}
+    words = (line.split() for line in text.splitlines() if line.endswith(" kB"))
+    return {name.rstrip(":"): int(kib) * 1024 / 1e6 for name, kib, _ in words}
+
+
+def watch_memory(process: subprocess.Popen, every_s: float = 0.05) -> tuple[dict[str, float], str]:
+    """Until the flight ends: (the largest value of each figure of `memory_mb`, the names of all files mapped)."""
+    largest: dict[str, float] = {}
+    mapped = ""
+    while process.poll() is None:
+        for name, value in memory_mb(process.pid).items():
+            largest[name] = max(value, largest.get(name, 0.0))
+        mapped = Path(f"/proc/{process.pid}/maps").read_text() or mapped
+        time.sleep(every_s)
+    return largest, mapped
+
+
+def cpu_s(pid: int) -> float:
+    """CPU-seconds of all threads of a process so far, from /proc/PID/stat, to 10 ms."""
+    after_name = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(after_name[11]) + int(after_name[12])) * _TICK_S

@@ -1,0 +1,239 @@
+"""What a technique costs here, and which one a board can afford."""
+
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+
+from edgevpr import techniques
+from edgevpr.errors import ConfigError, ModelError, UsageError
+from edgevpr.power import machine
+from edgevpr.power.boards import load_board
+from edgevpr.runtime.preflight import choose as choosing
+from edgevpr.runtime.preflight import probe as choosing_probe
+from edgevpr.runtime.preflight.choose import choose, fit, preferred
+from edgevpr.runtime.preflight.probe import TechniqueCosts, noise, probe, probe_each
+from edgevpr.runtime.preflight.scale import on_board
+from edgevpr.runtime.recognise import pipeline
+from edgevpr.types import Descriptor, FineMatch, PartSpec, StageCost, TechniqueSpec
+
+# Round figures of the size that cohog and hog have: exact matching of many regions, or a long vector in RAM.
+REGIONS = TechniqueCosts(StageCost(0.1, 0.1), StageCost(0.004, 0.004), 1_000, 124_000, 90.0)
+VECTOR = TechniqueCosts(StageCost(0.05, 0.05), StageCost(0.001, 0.001), 286_000, 286_000, 90.0)
+COSTS = {"regions": REGIONS, "vector": VECTOR}
+
+
+def board(**changes):
+    """A board of 4 cores, of which 2 may be used, with 100 MB for the map and 300 MB for the process."""
+    whole = {"title": "Test board", "cores": 4, "cpu_share": 0.5, "budget_mb": 100.0, "memory_max_mb": 300.0}
+    return dataclasses.replace(load_board("rpi-4b"), **{**whole, **changes})
+
+
+class TinyTechnique:
+    """Four numbers a place, and regions of 6x2 if `fine`; counts what it is asked."""
+
+    candidates = 3
+    min_score = 0.0
+    min_margin = 0.0
+
+    def __init__(self, fine):
+        parts = (PartSpec((4,), "<f4"), PartSpec((6, 2), "<f4") if fine else None)
+        self.spec = TechniqueSpec("tiny", {"side": 2}, *parts)
+        self.shapes, self.matched = set(), 0
+
+    def encode(self, image, mask=None):
+        self.shapes.add((image.shape, image.dtype))
+        return Descriptor(np.ones(4, np.float32), np.ones((6, 2), np.float32) if self.spec.fine else None)
+
+    def coarse_scores(self, query, rows, mean):
+        return rows @ query.coarse, None
+
+    def match(self, query, fine, hypotheses=None):
+        self.matched += 1
+        return FineMatch(float((query.fine * fine).mean()))
+
+
+def test_a_technique_is_tried_on_frames_of_a_camera_and_a_map_on_disk():
+    technique = TinyTechnique(fine=True)
+    costs = probe(technique)
+    assert technique.shapes == {((480, 640), np.dtype(np.uint8))}
+    assert technique.matched >= 6
+    assert costs.ram_bytes_per_place == 4 * 4 + 26  # its row, and id, latitude, longitude and heading
+    assert costs.disk_bytes_per_place == 4 * 4 + 6 * 2 * 4
+    assert 10 < costs.process_mb < 2_000
+    assert min(costs.encode.wall_s, costs.match_per_place.wall_s, costs.match_per_place.cpu_s) > 0
+
+
+def test_given_pictures_are_all_encoded_and_the_median_counts(monkeypatch):
+    technique = TinyTechnique(fine=True)
+    seconds = iter([9.0, 1.0, 3.0, 2.0])
+
+    def slow(image, mask=None):
+        clock[0] += next(seconds)
+        return TinyTechnique.encode(technique, image, mask)
+
+    clock = [0.0]
+    technique.encode = slow
+    timed = functools.partial(choosing_probe.stage, wall_clock=lambda: clock[0], cpu_clock=lambda: clock[0] / 2)
+    monkeypatch.setattr(choosing_probe, "stage", timed)
+    costs = probe(technique, [image[:200] for image in noise(3)])
+    assert costs.encode == StageCost(2.0, 1.0)
+    assert technique.shapes == {((200, 640), np.dtype(np.uint8))}
+
+
+def test_the_peak_is_the_most_that_was_resident_not_what_is_left():
+    class Greedy(TinyTechnique):
+        def encode(self, image, mask=None):
+            np.ones(100_000_000, np.uint8).sum()
+            return super().encode(image, mask)
+
+    if not machine.forget_peak():
+        pytest.skip("this kernel does not forget peaks")
+    costs = probe(Greedy(fine=True))
+    assert 90 < costs.encode_mb < 130
+    assert costs.process_mb > machine.rss_mb() + 50
+    assert probe(TinyTechnique(fine=True)).encode_mb < 50, "the peak of another is forgotten"
+
+
+def test_a_technique_without_a_fine_part_is_tried_too():
+    technique = TinyTechnique(fine=False)
+    costs = probe(technique)
+    assert technique.matched == 0
+    assert costs.disk_bytes_per_place == 16
+    assert costs.match_per_place.wall_s > 0
+
+
+def test_the_real_techniques_are_probed_best_first():
+    costs = dict(probe_each(techniques.create(name) for name in techniques.AUTOMATIC))
+    assert tuple(costs) == techniques.AUTOMATIC
+    assert costs["hog"].ram_bytes_per_place > 100 * costs["cohog"].ram_bytes_per_place
+
+
+def test_the_best_technique_is_taken_where_it_fits():
+    found = choose(board(), COSTS, places=100, rate_hz=1, budget_mb=100)
+    assert found.technique == "regions"
+    assert found.reason == (
+        "regions: 100 places take 0.1 of 100.0 MB, the process 90 of 300 MB, and 2 Hz of 1 are reached with 2 of 4 "
+        "cores"
+    )
+
+
+def test_the_next_is_taken_where_the_best_is_too_slow():
+    found = choose(board(), COSTS, places=300, rate_hz=1, budget_mb=100)
+    assert found.technique == "vector"
+    assert "\n" not in found.reason
+    assert found.reason.startswith("vector: 300 places take 85.8 of 100.0 MB")
+    assert found.reason.endswith("; regions does not fit, it reaches 0.76 Hz of 1")
+
+
+def test_the_order_of_the_costs_is_the_rank():
+    backwards = dict(reversed(COSTS.items()))
+    assert choose(board(), backwards, places=100, rate_hz=1, budget_mb=100).technique == "vector"
+
+
+def test_a_big_board_takes_the_best_technique_for_a_map_that_a_tiny_one_refuses():
+    here = load_board("generic-x86")
+    tiny, big = load_board("rpi-zero-2w"), load_board("thesis-xeon")
+    fast = TechniqueCosts(StageCost(0.02, 0.02), StageCost(0.0001, 0.0001), 286_000, 286_000, 90.0)
+    assert choose(big, {"vector": on_board(fast, here, big)}, 1000, 1, big.budget_mb).technique == "vector"
+    with pytest.raises(UsageError, match=r"No technique fits Raspberry Pi Zero 2 W with 1000 places at 1 Hz"):
+        choose(tiny, {"vector": on_board(fast, here, tiny)}, 1000, 1, tiny.budget_mb)
+
+
+def test_a_large_map_is_scanned_whole_and_compared_in_part():
+    two_stages = dataclasses.replace(REGIONS, candidates=20, scan_per_place=StageCost(1e-6, 1e-6))
+    assert two_stages.match(20).wall_s == pytest.approx(20 * 0.004)
+    assert two_stages.match(10_000).wall_s == pytest.approx(20 * 0.004 + 0.01)
+    assert two_stages.places_within(0.04, 1) == pytest.approx(10)
+    assert two_stages.places_within(0.1, 1) == pytest.approx(20_000)
+
+
+def test_the_whole_map_counts_in_ram_and_only_its_candidates_in_time():
+    two_stages = dataclasses.replace(REGIONS, candidates=20)
+    found = fit(board(), two_stages, places=50_000, rate_hz=1, budget_mb=100)
+    assert not found.shortfalls
+    assert found.map_ram_mb == pytest.approx(50.0)
+    assert found.reachable_hz == pytest.approx(1 / (0.1 + 20 * 0.004))
+    assert fit(board(), two_stages, 150_000, 1, 100).remedies[0] == "with up to 100000 places"
+    assert fit(board(), two_stages, 50_000, 8, 100).remedies[0] == "with up to 6 places"
+
+
+def test_where_none_fits_the_sentence_says_what_would():
+    with pytest.raises(UsageError) as raised:
+        choose(board(), COSTS, places=1000, rate_hz=1, budget_mb=100)
+    assert str(raised.value) == (
+        "No technique fits Test board with 1000 places at 1 Hz (regions does not fit, it reaches 0.24 Hz of 1; vector "
+        "does not fit, its map takes 286.0 MB of RAM and 100.0 are allowed and the process takes 376 MB and 300 are "
+        "allowed and it reaches 0.95 Hz of 1): what would fit is regions with up to 225 places or at up to 0.24 Hz, or "
+        "vector with up to 349 places."
+    )
+    assert raised.value.exit_code == 2
+
+
+def test_what_is_said_to_fit_fits():
+    for places, rate_hz, budget_mb in ((225, 1, 100), (1000, 0.24, 100)):
+        assert not fit(board(), REGIONS, places, rate_hz, budget_mb).shortfalls
+    assert fit(board(), REGIONS, 226, 1, 100).shortfalls
+    assert not fit(board(), VECTOR, 349, 1, 100).shortfalls
+    assert fit(board(), VECTOR, 350, 1, 100).shortfalls
+
+
+def test_a_small_budget_is_the_only_thing_in_the_way():
+    found = fit(board(), VECTOR, places=500, rate_hz=1, budget_mb=100)
+    assert found.shortfalls == ("its map takes 143.0 MB of RAM and 100.0 are allowed",)
+    assert found.remedies == ("with up to 349 places", "with a budget of 143 MB")
+    assert not fit(board(), VECTOR, places=500, rate_hz=1, budget_mb=143).shortfalls
+
+
+def test_a_board_too_small_for_the_process_itself_has_no_remedy():
+    with pytest.raises(UsageError, match=r"the process takes 90 MB and 64 are allowed\): use a larger board\.$"):
+        choose(board(memory_max_mb=64.0), {"regions": REGIONS}, places=10, rate_hz=1, budget_mb=50)
+
+
+def test_the_cpu_share_limits_a_technique_that_keeps_all_cores_busy():
+    four_threads = dataclasses.replace(REGIONS, encode=StageCost(0.1, 0.4), match_per_place=StageCost(0.001, 0.004))
+    assert fit(board(cpu_share=1.0), four_threads, 100, 1, 100).reachable_hz == pytest.approx(1 / 0.2)
+    assert fit(board(cpu_share=0.25), four_threads, 100, 1, 100).reachable_hz == pytest.approx(1 / 0.8)
+
+
+def test_what_is_reached_is_never_rounded_up():
+    assert [choosing._rounded_down(value) for value in (0.249, 1.99, 9.99, 123.0)] == pytest.approx(
+        [0.24, 1.9, 9.9, 120]
+    )
+
+
+def test_the_boards_own_technique_is_tried_before_those_offered_to_all():
+    assert preferred(board(technique=None)) == techniques.AUTOMATIC
+    assert preferred(board(technique="hog")) == ("hog", "cohog")
+    assert preferred(board(technique="seqslam")) == ("seqslam", *techniques.AUTOMATIC)
+
+
+def test_a_technique_of_the_board_that_is_not_there_is_one_sentence():
+    with pytest.raises(
+        ConfigError, match=r"^The profile of Test board names the technique `cohgo`, which is not there: "
+    ):
+        preferred(board(technique="cohgo"))
+
+
+def test_the_technique_that_is_picked_is_the_boards_only_if_it_fits(monkeypatch, caplog):
+    # The process that runs the tests is large by itself.
+    small = board(technique="hog", budget_mb=1.0, memory_max_mb=4000.0)
+    for own, places, taken in ((small, 2, "hog"), (small, 100, "cohog")):
+        monkeypatch.setattr(pipeline, "load_board", lambda name, own=own: own)
+        assert pipeline.picked_technique("this", places) == taken
+
+
+def test_a_network_that_the_board_wants_and_that_is_not_there_is_passed_over(monkeypatch, caplog):
+    really = pipeline.made_for
+
+    def made_for(board, name, settings=None):
+        if name == "netvlad":
+            raise ModelError("There is no model.")
+        return really(board, name, settings)
+
+    monkeypatch.setattr(pipeline, "made_for", made_for)
+    own = board(technique="netvlad", budget_mb=20.0, memory_max_mb=4000.0)
+    monkeypatch.setattr(pipeline, "load_board", lambda name: own)
+    assert pipeline.picked_technique("this", 10) == "cohog"
+    assert any("netvlad is passed over" in message for message in caplog.messages)

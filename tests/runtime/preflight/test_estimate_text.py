@@ -1,0 +1,73 @@
+"""The estimate as a person reads it."""
+
+from dataclasses import replace
+
+import pytest
+
+from edgevpr import techniques
+from edgevpr.power.boards import load_board
+from edgevpr.power.equations import parse_pack
+from edgevpr.runtime.preflight.estimate import FlightPlan, estimate
+from edgevpr.runtime.preflight.estimate_text import format_table
+from edgevpr.runtime.preflight.probe import TechniqueCosts
+from edgevpr.runtime.preflight.trial import Trial
+from edgevpr.types import StageCost
+
+ZERO, HERE = load_board("rpi-zero-2w"), load_board("generic-x86")
+PLAN = FlightPlan(1000, 1.0, 20.0, parse_pack("4S5200"), 0.85, 256)
+REGIONS = TechniqueCosts(StageCost(0.1, 0.1), StageCost(0.004, 0.004), 1_000, 124_000, 90.0)
+VECTOR = TechniqueCosts(StageCost(0.05, 0.1), StageCost(0.001, 0.002), 286_000, 286_000, 90.0)
+
+
+def text(trials, plan=PLAN, board=ZERO, **more):
+    return format_table(estimate(board, HERE, trials, plan, **more))
+
+
+def test_two_tables_have_a_line_for_each_technique_in_columns():
+    said = text([(Trial("regions", "regions", {}, REGIONS), False), (Trial("vector", "vector", {}, VECTOR), False)])
+    heading, _, heads, regions, vector, _, draws, regions_draws, _, _, *rest = said.splitlines()
+    assert heading == (
+        "Raspberry Pi Zero 2 W: 1000 places, 1 Hz, 20 min, 4S5200 at 85% regulator efficiency; times measured, scaled"
+    )
+    assert regions.split()[:4] == ["regions", "no", "1000", "1.0"]
+    assert heads.index("disk MB") + len("disk MB") == regions.index("124.0") + len("124.0")
+    assert len(heads) == len(regions) == len(vector)
+    assert len(draws) == len(regions_draws)
+    assert "lost" not in draws
+    assert rest[0].startswith("regions does not fit: it reaches 0.043 Hz of 1; it would fit with up to 19 ")
+    assert "The power of Raspberry Pi Zero 2 W is unverified" in said
+    assert rest[-2].startswith("Recommended: None: nothing that was tried fits")
+
+
+def test_minutes_lost_are_there_when_the_hover_power_is():
+    said = text([(Trial("regions", "regions", {}, REGIONS), False)], replace(PLAN, hover_w=150.0))
+    assert "hovering at 150 W" in said.splitlines()[0]
+    assert said.splitlines()[5].split()[-4:] == ["pack", "min", "lost", "marginal"]
+
+
+def test_what_cannot_be_used_is_a_row_and_a_reason():
+    broken = [(Trial(name, name, {}, problem="There is no model `calc`."), False) for name in ("calc", "alexnet")]
+    lines = text([(Trial("regions", "regions", {}, REGIONS), False), *broken]).splitlines()
+    assert [line.split() for line in lines[4:6]] == [["calc", "n/a"], ["alexnet", "n/a"]]
+    assert "calc, alexnet cannot be used: There is no model `calc`." in lines
+
+
+@pytest.mark.parametrize("places", [10, 1_000_000])
+def test_every_technique_and_form_fits_in_120_columns(places):
+    offered = [f"{name} {form}".strip() for name in techniques.names() for form in ("", "8bit", "1bit")]
+    trials = [
+        (Trial(label, label.split()[0], {}, VECTOR, weights="calc: " + 30 * "weights "), True) for label in offered
+    ]
+    said = text(
+        trials, replace(PLAN, places=places, hover_w=1234.5), load_board("thesis-xeon"), measured_on="2026-01-01"
+    )
+    assert all(len(line) <= 120 for line in said.splitlines()[1:])
+    assert "times measured on 2026-01-01 here, unscaled" in said.splitlines()[0]
+
+
+def test_what_was_tried_now_among_stored_figures_is_said():
+    said = text(
+        [(Trial("regions", "regions", {}, REGIONS), True), (Trial("vector", "vector", {}, VECTOR), False)],
+        measured_on="2026-01-01",
+    )
+    assert "Not among the stored figures, and tried now: vector." in said

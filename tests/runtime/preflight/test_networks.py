@@ -1,0 +1,213 @@
+"""`edgevpr models`: what is listed, tried, added and refused."""
+
+import errno
+import hashlib
+import json
+import os
+
+import pytest
+from tiny_networks import CARD, write_card, write_network
+
+from edgevpr.cli import main
+from edgevpr.errors import EdgevprError, ModelError
+from edgevpr.runtime.preflight.networks import add, list_models, technique_with, verify, verify_here
+from edgevpr.techniques.networks.card import load_card
+
+
+def listed(name):
+    return next(each for each in list_models() if each.name == name)
+
+
+def test_the_list_says_whose_weights_and_what_uses_them(models):
+    write_network(models, "mine", card={"head": {"name": "max"}})
+    mine = listed("mine")
+    assert (mine.ok, mine.problem, mine.licence, mine.source) == (True, None, "MIT", "made by a test")
+    assert (mine.outputs, mine.head, mine.techniques) == (("descriptor", "features"), "max", ("mine",))
+    write_network(models, "calc")
+    assert {"calc", "alexnet", "netvlad", "rmac", "region_vlad", "cross_region_bow"} <= set(listed("calc").techniques)
+    write_network(models, "calc", card={"outputs": {"descriptor": "descriptor"}})
+    assert listed("calc").techniques == ("calc",)
+
+
+def test_the_list_goes_on_after_a_card_or_file_that_is_wrong(models):
+    write_network(models, "good")
+    write_network(models, "other", card={"sha256": "0" * 64})
+    write_card(models / "gone.yaml", {"sha256": "0" * 64, "file": "gone.onnx"})
+    write_card(models / "broken.yaml", {"sha256": "0" * 64, "titel": "x"})
+    assert listed("good").ok
+    for name, says in (("other", "is not the file of its card"), ("gone", "cannot be read"), ("broken", "`titel`")):
+        assert not listed(name).ok
+        assert says in listed(name).problem
+
+
+def test_the_list_is_printed_and_is_json(models, capsys):
+    write_network(models, "mine", card={"outputs": {"features": "features"}})
+    assert main(["models", "list", "--json"]) == 0
+    (mine,) = [each for each in json.loads(capsys.readouterr().out) if each["name"] == "mine"]
+    assert mine["title"] == "A tiny network"
+    assert main(["models", "list"]) == 0
+    out = capsys.readouterr().out
+    assert "MIT; made by a test" in out
+    assert "used by none, unless told: --param model=mine" in out
+
+
+def test_verifying_says_shapes_time_and_memory(models):
+    write_network(models, "mine")
+    found = verify_here(load_card("mine"), threads=1)
+    assert found.shapes == {"descriptor": (16,), "features": (4, 10, 14)}
+    assert found.vector_length == 16
+    assert 0 < found.image_ms < 1000
+    assert found.file_mb == pytest.approx((models / "mine.onnx").stat().st_size / 1e6)
+    write_network(models, "backbone", card={"outputs": {"features": "features"}})
+    assert verify_here(load_card("backbone")).vector_length is None
+
+
+def test_verifying_is_done_apart_so_that_memory_is_that_of_the_network(models):
+    write_network(models, "mine")
+    found = verify(load_card("mine"))
+    assert found.runtime_mb > 3  # onnxruntime is imported anew
+    assert found.network_mb > 0
+    write_network(models, "mine", fault="nan")
+    with pytest.raises(ModelError, match="not finite"):
+        verify(load_card("mine"))
+
+
+def test_the_command_verifies_all_and_says_which_cannot_be_used(models, capsys, monkeypatch):
+    monkeypatch.setattr("edgevpr.runtime.preflight.networks.verify", verify_here)
+    monkeypatch.setattr("edgevpr.techniques.networks.card.model_folders", lambda: (models,))
+    write_network(models, "mine")
+    write_network(models, "wrong", fault="zeros")
+    assert main(["models", "verify"]) == 1
+    said = capsys.readouterr()
+    assert "works: descriptor 16, features 4x10x14; a descriptor of 16 numbers" in said.out
+    assert "edgevpr: wrong cannot be used:" in said.err
+    assert main(["models", "verify", "mine", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["works"][0]["vector_length"] == 16
+    assert main(["models", "verify", "none"]) == 1
+    assert "There is no model `none`" in capsys.readouterr().err
+
+
+@pytest.fixture
+def download(tmp_path):
+    """A network and its card somewhere else, as they come from the net."""
+    folder = tmp_path / "download"
+    write_network(folder, "mine")
+    return folder
+
+
+@pytest.fixture
+def tried_here(monkeypatch):
+    monkeypatch.setattr("edgevpr.runtime.preflight.networks.verify", verify_here)
+
+
+@pytest.mark.usefixtures("tried_here")
+def test_a_network_is_added_with_its_card_as_it_is(models, download):
+    (download / "mine.yaml").write_text((download / "mine.yaml").read_text() + "# mine, and nobody else's\n")
+    (download / "mine.onnx").rename(download / "v2-final.onnx")
+    verified, card = add(download / "v2-final.onnx", download / "mine.yaml")
+    assert verified.vector_length == 16
+    assert card == models / "mine.yaml"
+    assert card.read_text().endswith("# mine, and nobody else's\n")
+    assert listed("mine").ok
+    assert sorted(path.name for path in models.iterdir()) == ["mine.onnx", "mine.yaml"]
+    add(download / "v2-final.onnx", download / "mine.yaml")  # again: nothing to do
+
+
+@pytest.mark.parametrize("missing", ["sha256: null\n", 'sha256: ""\n', ""])
+@pytest.mark.usefixtures("tried_here")
+def test_a_card_without_a_hash_gets_it(models, download, missing):
+    lines = (download / "mine.yaml").read_text().splitlines(keepends=True)
+    (download / "mine.yaml").write_text("".join(line for line in lines if not line.startswith("sha256")) + missing)
+    add(download / "mine.onnx", download / "mine.yaml")
+    assert load_card("mine").sha256 == hashlib.sha256((download / "mine.onnx").read_bytes()).hexdigest()
+    assert load_card("mine").input == load_card("mine").input
+
+
+@pytest.mark.parametrize(
+    ("card", "fault", "says"),
+    [
+        ({"sha256": "0" * 64}, None, "is not the file of .*mine.yaml: its SHA-256 is"),
+        ({"head": {"name": "rmak"}}, None, "no head `rmak`"),
+        ({"outputs": {"features": "conv9"}}, None, "no output `conv9`"),
+        ({"head": {"name": "pyramid", "levels": [1, 11]}}, None, "too small for a grid of 11x11"),
+        ({}, "no onnx", "cannot be opened as an ONNX model"),
+        ({}, "dynamic size", "axes without a size"),
+        ({}, "nan", "not finite"),
+        ({"input": {**CARD["input"], "width": 64}}, None, "the card says"),
+    ],
+)
+@pytest.mark.usefixtures("tried_here")
+def test_what_would_not_fly_is_not_added(models, tmp_path, card, fault, says):
+    folder = tmp_path / "download"
+    write_network(folder, "mine", fault, card)
+    with pytest.raises(EdgevprError, match=says) as raised:
+        add(folder / "mine.onnx", folder / "mine.yaml")
+    assert "\n" not in str(raised.value)
+    assert not list(models.iterdir())
+
+
+@pytest.mark.usefixtures("tried_here")
+def test_nothing_of_another_network_is_overwritten(models, download):
+    write_network(models, "mine", card={"title": "An older one"})
+    with pytest.raises(ModelError, match="is there already and says something else"):
+        add(download / "mine.onnx", download / "mine.yaml")
+    write_network(models, "other", fault="dynamic batch")
+    (models / "mine.yaml").unlink()
+    write_network(download, "mine", card={"file": "other.onnx"})
+    with pytest.raises(ModelError, match=r"other\.onnx is there already and is another file"):
+        add(download / "mine.onnx", download / "mine.yaml")
+
+
+@pytest.mark.usefixtures("tried_here")
+def test_a_file_or_card_that_is_not_there_is_one_sentence(models, download, capsys):
+    assert main(["models", "add", str(download / "none.onnx"), "--card", str(download / "mine.yaml")]) == 1
+    assert "none.onnx cannot be read (No such file" in capsys.readouterr().err
+    assert main(["models", "add", str(download / "mine.onnx"), "--card", str(download / "none.yaml")]) == 2
+    assert "none.yaml cannot be read (No such file" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("tried_here")
+def test_a_network_is_added_before_its_words_are_learned(models, download):
+    write_network(download, "mine", card={"head": {"name": "vlad", "words": 5}})
+    assert add(download / "mine.onnx", download / "mine.yaml")[0].vector_length == 5 * 4
+    with pytest.raises(ModelError, match="train words"):
+        verify_here(load_card("mine"))
+
+
+def test_which_technique_shows_what_a_network_is_worth(models):
+    write_network(models, "mine")
+    write_network(models, "backbone", card={"outputs": {"features": "features"}})
+    assert technique_with("mine") == ("mine", {})
+    assert technique_with("backbone") == ("rmac", {"model": "backbone"})
+
+
+def test_a_card_called_like_a_technique_is_not_said_to_be_it(models):
+    write_network(models, "hog")
+    assert listed("hog").techniques == ()
+    assert technique_with("hog") == ("calc", {"model": "hog"})
+
+
+class TooLarge:
+    """Ends the process that it is sent to, as the kernel does where memory runs out."""
+
+    file_path = "large.onnx"
+
+    def __reduce__(self):
+        return os._exit, (9,)
+
+
+def test_a_network_that_ends_the_process_that_tries_it_is_one_sentence():
+    with pytest.raises(ModelError, match=r"large\.onnx ended the process that tried it"):
+        verify(TooLarge())
+
+
+@pytest.mark.usefixtures("tried_here")
+def test_a_full_disk_leaves_nothing_half_written(models, download, monkeypatch):
+    def full(_source, target):
+        target.write_bytes(b"the first half")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("edgevpr.runtime.preflight.networks.shutil.copyfile", full)
+    with pytest.raises(OSError, match="No space left"):
+        add(download / "mine.onnx", download / "mine.yaml")
+    assert not list(models.iterdir())

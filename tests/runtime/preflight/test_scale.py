@@ -1,0 +1,95 @@
+"""Costs of one machine as they would be on another."""
+
+from dataclasses import replace
+
+import pytest
+
+from edgevpr.power.boards import Score, load_board
+from edgevpr.runtime.preflight.probe import TechniqueCosts
+from edgevpr.runtime.preflight.scale import UNKNOWN_PRODUCTS, Ratios, is_same, on_board, ratios
+from edgevpr.types import StageCost
+
+REGIONS = TechniqueCosts(StageCost(0.1, 0.1), StageCost(0.004, 0.004), 1_000, 124_000, 90.0, 40, StageCost(1e-6, 1e-6))
+VECTOR = TechniqueCosts(StageCost(0.05, 0.05), StageCost(0.001, 0.001), 286_000, 286_000, 90.0)
+HERE, PI = load_board("generic-x86"), load_board("rpi-4b")
+
+
+def scored(single=None, multi=None, products=None, passes=None, **changes):
+    return replace(PI, benchmark_score=Score(single, multi, products, passes, True, "by hand"), **changes)
+
+
+def test_products_and_passes_are_scaled_apart_and_memory_is_not():
+    there = scored(single=0.4, products=0.05, passes=0.2)
+    scaled = on_board(REGIONS, HERE, there)
+    assert scaled.encode == StageCost(pytest.approx(0.1 / 0.2), pytest.approx(0.1 / 0.2))
+    assert scaled.match_per_place.cpu_s == pytest.approx(0.004 / 0.05), "region against region is a product"
+    assert scaled.scan_per_place.wall_s == pytest.approx(1e-6 / 0.2)
+    assert (scaled.ram_bytes_per_place, scaled.process_mb) == (1_000, 90.0)
+
+
+def test_a_network_is_products_and_a_scan_of_vectors_is_passes():
+    there = scored(single=0.4, products=0.05, passes=0.2)
+    assert on_board(replace(VECTOR, is_network=True), HERE, there).encode.wall_s == pytest.approx(0.05 / 0.05)
+    assert on_board(VECTOR, HERE, there).encode.wall_s == pytest.approx(0.05 / 0.2)
+    assert on_board(VECTOR, HERE, there).match_per_place.wall_s == pytest.approx(0.001 / 0.2)
+
+
+def test_what_is_not_known_apart_is_taken_from_the_single_thread_and_products_modestly():
+    assert ratios(HERE, scored(single=0.4)) == Ratios(pytest.approx(0.4 * UNKNOWN_PRODUCTS), 0.4)
+    assert ratios(HERE, scored(single=0.4, products=0.1)) == Ratios(0.1, 0.4)
+    twice = replace(HERE, benchmark_score=Score(2.0, 4.0, 4.0, 1.0, True, "by hand"))
+    assert ratios(twice, scored(single=0.4, products=0.1)) == Ratios(pytest.approx(0.025), 0.4)
+    assert ratios(HERE, scored(products=0.1, passes=0.2)) == Ratios(0.1, 0.2)
+
+
+def test_no_board_is_taken_to_be_quicker_at_products_because_nobody_has_measured_them():
+    known = PI.benchmark_score.products / PI.benchmark_score.single
+    assert pytest.approx(known, abs=0.005) == UNKNOWN_PRODUCTS
+    products = {
+        name: ratios(HERE, load_board(name)).products for name in ("rpi-zero-2w", "rpi-3b-plus", "rpi-4b", "rpi-5")
+    }
+    assert products["rpi-zero-2w"] <= products["rpi-3b-plus"] < products["rpi-4b"] < products["rpi-5"]
+
+
+def test_the_pi_4_is_slower_at_products_than_at_anything_else():
+    assert ratios(HERE, PI) == Ratios(0.056, 0.38)
+
+
+def test_more_busy_cores_than_the_board_has_take_longer():
+    eight_threads = replace(REGIONS, encode=StageCost(0.1, 0.8))
+    scaled = on_board(eight_threads, HERE, scored(single=0.4, cores=2)).encode
+    assert scaled == StageCost(pytest.approx(0.1 / 0.4 * 4), pytest.approx(0.8 / 0.4))
+
+
+def test_busy_cores_slow_each_other_down_as_the_score_of_all_says():
+    four_threads = replace(REGIONS, encode=StageCost(0.1, 0.4))
+    alone = on_board(four_threads, HERE, scored(single=0.4, cores=4)).encode
+    together = on_board(four_threads, HERE, scored(single=0.4, multi=0.8, cores=4)).encode
+    assert alone.wall_s == pytest.approx(0.1 / 0.4)
+    assert together.wall_s == pytest.approx(2 * alone.wall_s), "four cores do the work of two"
+    assert together.cpu_s == pytest.approx(4 * together.wall_s), "and are busy all the time"
+    one_thread = on_board(REGIONS, HERE, scored(single=0.4, multi=0.8, cores=4)).encode
+    assert one_thread.wall_s == pytest.approx(0.1 / 0.4)
+
+
+def test_a_network_keeps_no_more_cores_busy_than_the_board_gives_it():
+    eight_threads = replace(VECTOR, encode=StageCost(0.1, 0.8), is_network=True)
+    two = on_board(eight_threads, HERE, scored(single=0.4, products=0.4, cores=4, threads=2)).encode
+    assert two == StageCost(pytest.approx(0.8 / 0.4 / 2), pytest.approx(0.8 / 0.4))
+
+
+def test_an_unknown_speed_leaves_the_times_as_they_are():
+    there = load_board("thesis-xeon")
+    assert ratios(HERE, there) is None
+    assert ratios(there, HERE) is None
+    assert on_board(REGIONS, HERE, there) == REGIONS
+
+
+def test_a_profile_written_on_this_machine_is_this_machine():
+    here = replace(HERE, machine="a box (N100)")
+    mine = scored(name="mine", machine="a box (N100)")
+    assert is_same(here, mine)
+    assert ratios(here, mine) == Ratios(1.0, 1.0)
+    assert on_board(REGIONS, here, mine) == REGIONS
+    assert not is_same(here, scored(name="mine", machine="a box (N5105)"))
+    assert not is_same(replace(here, machine=None), scored(name="mine"))

@@ -1,0 +1,112 @@
+"""What is known beforehand narrows a query, and never keeps the next one from looking everywhere."""
+
+import numpy as np
+import pytest
+
+from edgevpr.places.index import PlaceIndex
+from edgevpr.runtime.recognise.hints import Hints, Sighting, agree, allowed, hints_of, reach, turned_deg, use_next
+from edgevpr.types import Candidate, FineMatch, Place, Position
+
+HOME = Position(50.0, 8.0)
+A_METRE_DEG = 1 / 111_195  # of latitude
+
+
+def north(metres):
+    return Position(50.0 + metres * A_METRE_DEG, 8.0)
+
+
+@pytest.fixture
+def index():
+    """Places every 100 m to the north, the last without a position; headings 0, 10, 20, unknown, 40."""
+    lat_deg = np.array([north(metres).lat_deg for metres in (0, 100, 200, 300)] + [np.nan])
+    lon_deg = np.where(np.isnan(lat_deg), np.nan, 8.0)
+    heading_deg = np.array([0, 10, 20, np.nan, 350], np.float16)
+    return PlaceIndex(np.arange(1, 6), lat_deg, lon_deg, heading_deg, np.zeros((5, 1)), None)
+
+
+def found(metres=0.0, heading_deg=None, rotation_deg=None):
+    return Candidate(Place(1, "a", north(metres), heading_deg=heading_deg), FineMatch(0.5, rotation_deg=rotation_deg))
+
+
+def test_reach_grows_with_the_time_since_the_position_was_known():
+    assert reach(10.0, None, Sighting(HOME, 8.0), 15.0, 50.0) == (HOME, 80.0)
+    assert reach(10.0, None, Sighting(HOME, 10.0), 15.0, 50.0) == (HOME, 50.0)
+
+
+def test_a_fresh_autopilot_goes_before_our_own_fix_and_both_grow_old():
+    autopilot, fix = Sighting(north(500), 9.5), Sighting(HOME, 0.0)
+    assert reach(10.0, autopilot, fix, 10.0, 50.0) == (north(500), 55.0)
+    assert reach(10.6, autopilot, fix, 10.0, 50.0) == (HOME, pytest.approx(156.0))
+    assert reach(60.1, None, fix, 10.0, 50.0) is None
+    assert reach(10.0, None, None, 10.0, 50.0) is None
+
+
+def test_a_position_heard_after_the_frame_was_taken_is_as_far_off_in_time():
+    assert reach(10.0, Sighting(HOME, 10.5), None, 10.0, 50.0) == (HOME, 55.0)
+
+
+def test_only_places_in_reach_are_allowed_and_none_without_a_position(index):
+    hints = hints_of(index, (north(120), 90.0), None)
+    assert hints == Hints(north(120), 90.0)
+    assert allowed(hints, index).tolist() == [False, True, True, False, False]
+    assert turned_deg(hints, index) is None
+
+
+def test_where_no_place_is_in_reach_all_are_searched(index):
+    assert hints_of(index, (north(5000), 100.0), None) is None
+    assert allowed(None, index) is None
+    assert turned_deg(None, index) is None
+
+
+def test_a_heading_says_how_far_each_place_is_turned(index):
+    hints = hints_of(index, None, 5.0)
+    assert allowed(hints, index) is None
+    np.testing.assert_array_equal(turned_deg(hints, index), [5, 355, 345, np.nan, 15])
+
+
+def test_a_heading_is_no_hint_where_no_place_has_one(index):
+    index.heading_deg[:] = np.nan
+    assert hints_of(index, None, 5.0) is None
+    assert hints_of(index, (HOME, 50.0), 5.0) == Hints(HOME, 50.0)
+
+
+def test_what_the_log_says():
+    assert Hints(HOME, 61.26, 90.0).fields() == {"reach_m": 61.3, "heading": True}
+    assert Hints(heading_deg=0.0).fields() == {"reach_m": None, "heading": True}
+
+
+@pytest.mark.parametrize(
+    ("hints", "candidate", "agrees"),
+    [
+        (Hints(HOME, 100.0), found(90), True),
+        (Hints(HOME, 100.0), found(110), False),
+        (Hints(HOME, 100.0), Candidate(Place(1, "a"), FineMatch(0.5)), True),
+        (Hints(heading_deg=10.0), found(0, 350.0, 30.0), True),
+        (Hints(heading_deg=10.0), found(0, 350.0, 0.0), True),
+        (Hints(heading_deg=10.0), found(0, 350.0, 345.0), False),
+        (Hints(heading_deg=10.0), found(0, 350.0, 45.0), False),
+        (Hints(heading_deg=10.0), found(0, None, 180.0), True),
+        (Hints(HOME, 100.0, 10.0), found(0, 10.0, 180.0), False),
+        (Hints(HOME, 100.0, 10.0), found(110, 10.0, 0.0), False),
+    ],
+)
+def test_a_place_found_agrees_with_hints_that_would_have_led_to_it(hints, candidate, agrees):
+    assert agree(hints, candidate) is agrees
+
+
+def test_queries_look_with_and_without_hints_in_turn_until_one_is_accepted():
+    hints, nothing = Hints(HOME, 100.0), found(0)
+    used, seen = True, []
+    for _ in range(4):
+        seen.append(used)
+        used = use_next(hints, used, nothing, accepted=False)
+    assert seen == [True, False, True, False]
+
+
+def test_an_accepted_match_says_whether_the_hints_can_be_believed():
+    hints = Hints(HOME, 100.0)
+    assert use_next(hints, False, found(50), accepted=True) is True
+    assert use_next(hints, True, found(50), accepted=True) is True
+    assert use_next(hints, False, found(500), accepted=True) is False
+    assert use_next(hints, False, None, accepted=False) is True
+    assert use_next(None, False, None, accepted=False) is True

@@ -1,0 +1,94 @@
+"""When the best place of a sequence is accepted: never before it is full, nor at a speed that is not followed."""
+
+import math
+
+import numpy as np
+import pytest
+
+from edgevpr.config import load_config
+from edgevpr.places.index import empty_index
+from edgevpr.places.retrieve import Ranking
+from edgevpr.places.sequence import Sequence
+from edgevpr.runtime.recognise.judge import AcceptRule, accept_rule, accepted
+from edgevpr.techniques import create
+from edgevpr.types import FineMatch, PartSpec, TechniqueSpec
+
+PLACES, LENGTH = 80, 6
+RULE = AcceptRule(min_score=0.1, min_margin=0.05, neighbour_m=50.0)
+
+
+def flown(velocity, start, leaves=18, seed=3):
+    """(accepted, why, slot) of each query of a flight along places that look a little like the two around them; from
+    query `leaves` on it shows nothing of the map."""
+    index = empty_index(TechniqueSpec("test", {}, PartSpec((1,), "<f4")), PLACES, None)
+    index.place_ids[:] = np.arange(PLACES)
+    noise = np.random.default_rng(seed)
+    sequence, found = Sequence(LENGTH), []
+    for query in range(18):
+        away = np.abs(np.arange(PLACES) - (start + velocity * query))
+        here = np.exp(-away) if query < leaves else 0.0
+        scores = (0.3 + 0.4 * here + 0.02 * noise.random(PLACES)).astype(np.float32)
+        slots = np.argsort(-scores)
+        ranking = Ranking(slots, scores[slots], tuple(FineMatch(float(score)) for score in scores[slots]))
+        ranking = sequence.follow(ranking, index, float(query))
+        found.append((*accepted(ranking, index, RULE, sequence), int(ranking.slots[0])))
+    return found
+
+
+@pytest.mark.parametrize("velocity", [0.8, 1.0, 1.2])
+def test_a_flight_like_the_mapping_flight_is_accepted_from_the_first_full_sequence_on(velocity):
+    found = flown(velocity, 5)
+    assert [yes for yes, _, _ in found] == [False] * (LENGTH - 1) + [True] * (18 - LENGTH + 1)
+    assert all(abs(slot - (5 + velocity * query)) <= 1 for query, (yes, _, slot) in enumerate(found) if yes)
+    assert found[3][1] == "the sequence has 4 queries of 6 yet"
+
+
+@pytest.mark.parametrize(("velocity", "start"), [(2.0, 5), (3.0, 5), (0.0, 30), (0.3, 30), (-1.0, 60), (-2.0, 60)])
+def test_at_another_speed_or_the_other_way_nothing_wrong_is_accepted(velocity, start):
+    for query, (yes, _, slot) in enumerate(flown(velocity, start)):
+        assert not yes or abs(slot - (start + velocity * query)) <= 2  # neighbours are no other place
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_an_aircraft_that_leaves_the_mapped_way_is_not_followed_beyond_it(seed):
+    found = flown(1.0, 5, leaves=11, seed=seed)
+    assert found[10][0]
+    # The mean would bear it for some queries yet: it is far ahead of all other places.
+    assert not any(yes for yes, _, _ in found[13:])
+    assert any("no longer see" in why for _, why, _ in found[11:14])
+
+
+def test_a_score_too_low_for_one_query_is_too_low_for_the_newest():
+    sequence, near = Sequence(3), abs(np.arange(PLACES) - 7) <= 2
+    index = empty_index(TechniqueSpec("test", {}, PartSpec((1,), "<f4")), PLACES, None)
+    index.place_ids[:] = np.arange(PLACES)
+    for query, score in enumerate((0.5, 0.4, 0.3)):
+        slots, scores = np.array([5 + query, 50, 60]), np.array([score, 0.1, 0.1], np.float32)
+        sequence.follow(Ranking(slots, scores, tuple(map(FineMatch, scores))), index, float(query))
+    assert sequence.goes_on(near, min_score=0.3 - 1e-6)
+    assert not sequence.goes_on(near, min_score=0.31)
+
+
+def test_a_place_that_the_newest_query_was_not_compared_with_is_not_seen():
+    sequence, near = Sequence(3), abs(np.arange(PLACES) - 7) <= 2
+    index = empty_index(TechniqueSpec("test", {}, PartSpec((1,), "<f4")), PLACES, None)
+    index.place_ids[:] = np.arange(PLACES)
+    for query, (slot, score) in enumerate([(5, 0.9), (60, 0.1), (20, 0.1)]):
+        ranking = Ranking(np.array([slot]), np.array([score], np.float32), (FineMatch(score),))
+        sequence.follow(ranking, index, float(query))
+    assert not sequence.goes_on(near, min_score=0.0)
+
+
+def test_an_aircraft_twice_as_fast_is_told_why():
+    assert "at another speed" in flown(2.0, 5)[-1][1]
+
+
+def test_the_margin_of_a_mean_is_that_of_one_query_over_the_root_of_their_number():
+    technique, config = create("hog"), load_config(None).match
+    assert accept_rule(technique, config, 9).min_margin == pytest.approx(technique.min_margin / math.sqrt(9))
+    assert accept_rule(technique, config).min_margin == technique.min_margin
+    assert accept_rule(technique, config, 40).min_margin == accept_rule(technique, config, 10).min_margin
+    technique.min_margin = 1.0  # what is never to be accepted is not in a sequence either
+    assert accept_rule(technique, config, 9).min_margin == 1.0
+    told = load_config(None, {"match.min_margin": 0.2}).match
+    assert accept_rule(technique, told, 9).min_margin == 0.2

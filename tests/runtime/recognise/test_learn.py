@@ -1,0 +1,171 @@
+"""Which frames become places: with a real map file, a real index, and a clock to turn."""
+
+import math
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from edgevpr.config import load_config
+from edgevpr.errors import UsageError
+from edgevpr.mavlink.link import VehiclePosition
+from edgevpr.places.growing import GrowingIndex
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.runtime.recognise.learn import Learner, check_positions
+from edgevpr.techniques import create
+from edgevpr.types import Candidate, Descriptor, FineMatch, Frame, Place, PlaceMatch, Position, QueryCost
+
+TECHNIQUE = create("hog", {"w1": 32})
+SPACING_M = 10.0
+METRE_DEG = 1 / 111_195  # of latitude
+COST = QueryCost(0.1, 0.1, 0.5, 0.5, 0.1, 80.0, 0.01, 0.01)
+
+
+class Bench:
+    """A learner over an empty map, and the moment it is."""
+
+    def __init__(self, path, places_in_ram=100):
+        self.now_s = 1000.0
+        self.map = PlaceMap.create(path, TECHNIQUE.spec)
+        self.map.index_positions()
+        self.growing = GrowingIndex(self.map, TECHNIQUE, 10**6, places_in_ram)
+        self.learner = Learner(self.map, self.growing, SPACING_M, clock=lambda: self.now_s)
+
+    def see(self, north_m=0.0, heard_s_ago=0.1, has_gps=True, t_fix_s=None, quality=0.9, position=None):
+        """Show a frame, at a place that the autopilot or the frame itself tells."""
+        frame = Frame(np.zeros((8, 8), np.uint8), f"{north_m}", self.now_s, position=position)
+        vehicle = None
+        if heard_s_ago is not None:
+            vehicle = VehiclePosition(50 + north_m * METRE_DEG, 8.0, 312.0, 90.0, self.now_s - heard_s_ago, has_gps)
+        part = np.random.default_rng(int(abs(north_m))).random(TECHNIQUE.spec.coarse.shape).astype("<f2")
+        return self.learner.learn(frame, Descriptor(part, quality=quality), vehicle, t_fix_s)
+
+
+@pytest.fixture
+def bench(tmp_path):
+    bench = Bench(tmp_path / "m.gpkg")
+    yield bench
+    bench.map.close()
+
+
+def test_a_frame_becomes_a_place_in_file_and_index_where_the_autopilot_is(bench):
+    place = bench.see(north_m=40.0)
+    assert place.position == Position(50 + 40 * METRE_DEG, 8.0, 312.0)
+    (held,) = bench.map.places()
+    assert held.place_id == place.place_id == bench.learner.index.place_ids[0]
+    assert (held.heading_deg, held.quality, held.source_image) == (90.0, 0.9, "40.0")
+    assert held.position.lat_deg == bench.learner.index.lat_deg[0]
+    assert held.t_utc_s is not None
+    assert bench.learner.learnt == 1
+
+
+def test_a_recordings_own_position_counts_before_the_autopilots_and_is_no_echo(bench):
+    own = Position(51.0, 9.0)
+    assert bench.see(position=own, t_fix_s=bench.now_s).position == own
+    assert bench.see(position=Position(52.0, 9.0), heard_s_ago=None) is not None
+
+
+def test_where_the_autopilot_only_reckons_nothing_is_learnt(bench):
+    assert bench.see(has_gps=False) is None
+    assert bench.learner.passed_over == {"without GPS": 1}
+    assert bench.see(has_gps=True) is not None
+
+
+@pytest.mark.parametrize("heard_s_ago", [None, 1.1, -1.1])
+def test_without_a_position_of_that_moment_nothing_is_learnt(bench, heard_s_ago):
+    assert bench.see(heard_s_ago=heard_s_ago) is None
+    assert bench.learner.passed_over == {"without a fresh position": 1}
+    assert len(bench.map) == 0
+
+
+def test_near_a_place_of_the_file_nothing_is_learnt(bench):
+    assert bench.see(0.0)
+    assert bench.see(9.9) is None
+    assert bench.see(10.2)
+    assert bench.see(15.0) is None
+    assert bench.see(-10.2)
+    assert bench.learner.passed_over == {"near a place": 2}
+    assert len(bench.map) == 3
+
+
+def test_a_place_that_was_given_up_in_ram_is_not_learnt_again(tmp_path):
+    bench = Bench(tmp_path / "m.gpkg", places_in_ram=4)
+    for turn in range(2):
+        for number in range(12):
+            assert (bench.see(20.0 * number) is None) == (turn == 1)
+    assert len(bench.map) == 12
+    assert len(bench.learner.index) <= 4
+    bench.map.close()
+
+
+@pytest.mark.parametrize("quality", [0.19, math.nan])
+def test_a_frame_that_says_little_is_left_out(bench, quality):
+    assert bench.see(quality=quality) is None
+    assert bench.learner.passed_over == {"of low quality": 1}
+    assert bench.see(quality=0.2)
+
+
+def test_after_a_fix_of_ours_the_autopilot_may_only_repeat_it(bench):
+    sent_s = bench.now_s
+    for seconds, expected in ((0.0, False), (9.9, False), (10.0, True)):
+        bench.now_s = sent_s + seconds
+        assert (bench.see(t_fix_s=sent_s) is not None) == expected
+    assert bench.learner.passed_over == {"just after a fix": 2}
+
+
+def accepted(place_id):
+    candidate = Candidate(Place(place_id, "a.jpg", Position(50.0, 8.0)), FineMatch(0.9))
+    return PlaceMatch("q", 0.0, candidate, True, "score 0.9", Position(50.0, 8.0), 20.0, COST)
+
+
+def test_a_place_learnt_a_moment_ago_moves_nothing(bench):
+    place = bench.see()
+    bench.now_s += 29.9
+    event = bench.learner.unless_new(accepted(place.place_id))
+    assert (event.accepted, event.position, event.accuracy_m) == (False, None, None)
+    assert "learnt within the last 30 s" in event.reason
+    assert bench.learner.unless_new(accepted(place.place_id + 1)).accepted
+    rejected = replace(accepted(place.place_id), accepted=False, reason="score 0.1")
+    assert bench.learner.unless_new(rejected) is rejected
+    bench.now_s += 0.2
+    assert bench.learner.unless_new(accepted(place.place_id)).accepted
+
+
+def test_trouble_with_the_file_ends_the_learning_and_nothing_else(bench):
+    assert bench.see(0.0)
+    (pages,) = bench.map._db.execute("PRAGMA page_count").fetchone()
+    bench.map._db.execute(f"PRAGMA max_page_count = {pages}")
+    places = [bench.see(20.0 * number) for number in range(1, 30)]
+    assert None in places
+    assert "make room" in bench.learner.trouble
+    learnt = bench.learner.learnt
+    assert learnt == 1 + len([place for place in places if place]) == len(bench.map)
+    bench.map._db.execute("PRAGMA max_page_count = 100000")
+    assert bench.see(1000.0) is None, "it has stopped for good"
+    assert len(bench.learner.index) == learnt
+    assert "then stopped" in bench.learner.summary
+
+
+def test_a_place_that_is_in_the_file_is_told_though_the_index_cannot_follow(bench):
+    bench.growing.add = lambda *_: (_ for _ in ()).throw(bench.map._damaged(1))
+    assert bench.see(0.0).place_id == 1
+    assert "damaged" in bench.learner.trouble
+    assert len(bench.map) == 1
+
+
+def test_a_flight_that_could_never_know_where_it_is_is_refused(tmp_path):
+    (tmp_path / "images").mkdir()
+    cv2.imwrite(str(tmp_path / "images" / "0.png"), np.zeros((8, 8), np.uint8))
+
+    def config(**overrides):
+        return load_config(None, {"source.uri": str(tmp_path / "images")} | overrides)
+
+    with pytest.raises(UsageError, match="--link"):
+        check_positions(config(), None)
+    with pytest.raises(UsageError, match="--link"):
+        check_positions(config(**{"source.uri": "/dev/video0"}), None)
+    check_positions(config(**{"mavlink.link": "udpout:127.0.0.1:9"}), None)
+    check_positions(config(), tmp_path / "positions.csv")
+    (tmp_path / "positions.csv").write_text("file,lat,lon\n")
+    check_positions(config(), None)

@@ -1,0 +1,230 @@
+"""`edgevpr check` on a real map, folder, socket and pty; and on each thing that can be wrong."""
+
+import os
+import shutil
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import pytest
+import yaml
+from pictures import textured
+
+from edgevpr import techniques
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.runtime.service.check import Finding, check
+from edgevpr.types import Frame
+
+ITEMS = ["configuration", "board", "battery", "map", "source", "link", "log"]
+
+
+def free_port(kind: socket.SocketKind) -> int:
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@pytest.fixture(scope="module")
+def flight_folder(tmp_path_factory) -> Path:
+    """A folder with a map of `hog` and the images it was made of."""
+    folder = tmp_path_factory.mktemp("flight")
+    (folder / "images").mkdir()
+    technique = techniques.create("hog")
+    with PlaceMap.create(folder / "valley.gpkg", technique.spec) as place_map:
+        for seed in range(2):
+            image = textured(seed)
+            cv2.imwrite(str(folder / "images" / f"{seed}.png"), image)
+            place_map.add(Frame(image, f"{seed}.png", 0.0), technique.encode(image))
+    return folder
+
+
+@pytest.fixture
+def settings(flight_folder, tmp_path) -> dict:
+    """A configuration with which all is well."""
+    return {
+        "board": "rpi-zero-2w",
+        "map": str(flight_folder / "valley.gpkg"),
+        "source": {"uri": str(flight_folder / "images")},
+        "mavlink": {"link": f"udpin:127.0.0.1:{free_port(socket.SOCK_DGRAM)}"},
+        "log": {"path": str(tmp_path / "flight.jsonl")},
+    }
+
+
+@pytest.fixture
+def config_file(tmp_path) -> Path:
+    return tmp_path / "config.yaml"
+
+
+def wrong(config_file: Path, settings: dict) -> list[Finding]:
+    """What `check` finds wrong."""
+    config_file.write_text(yaml.safe_dump(settings))
+    findings = check(config_file)
+    assert [finding.what for finding in findings] == ITEMS
+    return [finding for finding in findings if not finding.ok]
+
+
+def test_all_is_well_and_nothing_is_left_behind(settings, config_file, tmp_path, flight_folder):
+    assert wrong(config_file, settings) == []
+    assert list(tmp_path.iterdir()) == [config_file]
+    assert sorted(path.name for path in flight_folder.iterdir()) == ["images", "valley.gpkg"]
+
+
+def test_a_configuration_without_link_and_log_may_fly(settings, config_file):
+    settings["mavlink"]["link"] = settings["log"]["path"] = None
+    assert wrong(config_file, settings) == []
+
+
+@pytest.mark.parametrize("text", ["map: [", "mapp: valley.gpkg", "source: {rate_hz: 1000}", "\x00", "- 1"])
+def test_a_configuration_that_cannot_be_read_is_the_only_finding(config_file, text):
+    config_file.write_text(text)
+    (finding,) = check(config_file)
+    assert (finding.what, finding.ok) == ("configuration", False)
+    assert str(config_file) in finding.message
+
+
+def test_a_configuration_that_is_not_there_is_a_finding(tmp_path):
+    (finding,) = check(tmp_path / "absent.yaml")
+    assert "absent.yaml cannot be read (No such file or directory)" in finding.message
+
+
+def test_everything_that_is_wrong_is_found_at_once(settings, config_file, tmp_path):
+    settings["map"] = str(tmp_path / "absent.gpkg")
+    settings["source"]["uri"] = str(tmp_path / "absent")
+    settings["mavlink"]["link"] = "udp:127.0.0.1"
+    settings["log"]["path"] = str(tmp_path / "absent" / "flight.jsonl")
+    assert [finding.what for finding in wrong(config_file, settings)] == ["map", "source", "link", "log"]
+
+
+def test_without_map_and_source_there_is_nothing_to_fly(settings, config_file):
+    settings["map"] = settings["source"]["uri"] = None
+    map_finding, source_finding = wrong(config_file, settings)
+    assert map_finding.message.startswith("There is no map")
+    assert source_finding.message.startswith("There is no source of frames")
+
+
+@pytest.mark.parametrize(("key", "value"), [("board", "rpi-zero-2"), ("battery", {"pack": "4x5200"})])
+def test_the_map_waits_for_board_and_battery(settings, config_file, key, value):
+    first, map_finding = wrong(config_file, settings | {key: value})
+    assert first.what == key
+    assert map_finding.message.startswith("Not looked at")
+
+
+def test_a_map_of_another_technique_is_found(settings, config_file):
+    (finding,) = wrong(config_file, settings | {"technique": "cohog"})
+    assert finding.what == "map"
+    assert "technique is hog, not cohog" in finding.message
+
+
+def test_a_flight_that_learns_needs_no_map_yet_and_none_is_made(settings, config_file, tmp_path):
+    settings |= {"mapping": {"learn": True}, "map": str(tmp_path / "new.gpkg")}
+    assert wrong(config_file, settings) == []
+    assert not (tmp_path / "new.gpkg").exists()
+    PlaceMap.create(tmp_path / "new.gpkg", techniques.create("hog").spec).close()
+    assert wrong(config_file, settings) == []
+    settings["map"] = str(tmp_path / "absent" / "new.gpkg")
+    (finding,) = wrong(config_file, settings)
+    assert (finding.what, "may not be written" in finding.message) == ("map", True)
+
+
+def test_learning_without_link_and_positions_is_found(settings, config_file):
+    settings |= {"mapping": {"learn": True}, "mavlink": {"link": None}}
+    (finding,) = wrong(config_file, settings)
+    assert finding.what == "source"
+    assert finding.message.startswith("There is nothing to learn positions from")
+
+
+def test_places_that_the_budget_does_not_hold_are_told(flight_folder, settings, config_file):
+    big = config_file.with_name("big.gpkg")
+    shutil.copy(settings["map"], big)
+    with PlaceMap.open_for_adding(big) as place_map:
+        frame, technique = Frame(textured(3), "3.png", 0.0), techniques.create("hog")
+        descriptor = technique.encode(frame.image)
+        while len(place_map) * technique.spec.coarse.nbytes < 1e6:
+            place_map.add(frame, descriptor)
+    config_file.write_text(yaml.safe_dump(settings | {"map": str(big), "memory": {"budget_mb": 1}}))
+    (finding,) = (each for each in check(config_file) if each.what == "map")
+    assert "places are left to the map file" in finding.message
+
+
+def test_a_camera_that_does_not_deliver_yet_is_no_mistake(settings, config_file):
+    settings["source"]["uri"] = f"rtsp://127.0.0.1:{free_port(socket.SOCK_STREAM)}/camera"
+    assert wrong(config_file, settings) == []
+
+
+@pytest.mark.parametrize("uri", ["/dev/video99", "ftp://camera/x", "udp://127.0.0.1"])
+def test_a_camera_that_cannot_be_is_found(settings, config_file, uri):
+    settings["source"]["uri"] = uri
+    (finding,) = wrong(config_file, settings)
+    assert finding.what == "source"
+    assert uri in finding.message
+
+
+def test_a_port_that_another_program_has_is_found(settings, config_file):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        settings["mavlink"]["link"] = f"udpin:127.0.0.1:{other.getsockname()[1]}"
+        (finding,) = wrong(config_file, settings)
+    assert "is in use by another program" in finding.message
+
+
+def test_a_serial_port_is_looked_for(settings, config_file):
+    controller, port = os.openpty()
+    settings["mavlink"]["link"] = f"serial:{os.ttyname(port)}:921600"
+    assert wrong(config_file, settings) == []
+    settings["mavlink"]["link"] = "serial:/dev/ttyACM99:921600"
+    (finding,) = wrong(config_file, settings)
+    assert finding.message.startswith(
+        "serial:/dev/ttyACM99:921600 is not there (No such file or directory): connect it"
+    )
+    os.close(controller)
+    os.close(port)
+
+
+def test_a_server_that_is_not_up_is_found(settings, config_file):
+    settings["mavlink"]["link"] = f"tcp:127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    (finding,) = wrong(config_file, settings)
+    assert "is not there (Connection refused)" in finding.message
+
+
+def test_a_log_that_is_a_folder_is_found(settings, config_file, tmp_path):
+    settings["log"]["path"] = str(tmp_path)
+    (finding,) = wrong(config_file, settings)
+    assert finding.message.startswith(f"{tmp_path} is no file in a folder that is there")
+
+
+@pytest.mark.skipif(os.getuid() == 0, reason="root may write everywhere")
+def test_a_log_that_may_not_be_written_is_found(settings, config_file, tmp_path):
+    log_path = tmp_path / "flight.jsonl"
+    log_path.touch(mode=0o400)
+    (finding,) = wrong(config_file, settings)
+    assert finding.message.startswith(f"{log_path} may not be written by this user")
+
+
+def test_a_disk_without_room_for_the_log_is_found(settings, config_file, monkeypatch):
+    usage = type(shutil.disk_usage("/"))
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(8_000_000_000, 7_999_000_000, 1_000_000))
+    (finding,) = wrong(config_file, settings)
+    assert "only 1.0 MB are free there" in finding.message
+
+
+def edgevpr_check(config_file: Path) -> subprocess.CompletedProcess:
+    return subprocess.run(
+        [sys.executable, "-m", "edgevpr", "check", "--config", str(config_file)], capture_output=True, text=True
+    )
+
+
+def test_the_command_prints_a_line_for_each_thing_and_exits_with_0(settings, config_file):
+    config_file.write_text(yaml.safe_dump(settings))
+    done = edgevpr_check(config_file)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert [line.split()[1] for line in done.stdout.splitlines()] == ITEMS
+
+
+def test_the_command_exits_with_1_and_a_sentence_also_for_a_typo(config_file):
+    config_file.write_text("bord: rpi-5\n")
+    done = edgevpr_check(config_file)
+    assert done.returncode == 1
+    assert "unknown key `bord` (did you mean `board`?)" in done.stdout
+    assert "Traceback" not in done.stderr

@@ -1,0 +1,108 @@
+"""Memory is a promise: `edgevpr run` with a map of some size, as a process of its own under a hard limit."""
+
+import os
+import shutil
+import tracemalloc
+
+import pytest
+from big_map import file_bytes, make_big_map
+from flight_process import start, watch_memory, write_frames
+
+from edgevpr.places.index import bytes_per_place, load_index
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.runtime.flight.flightlog import read_log
+from edgevpr.techniques import create
+
+PLACES = 1500
+FRAMES = 70
+LIMIT_BYTES = 700_000_000  # of address space: libraries that are mapped and never touched count as well
+WARM_AFTER = 10  # queries, until every buffer is there
+SPARE_BYTES = 1_000_000_000
+
+
+@pytest.fixture(scope="module")
+def big_map(tmp_path_factory):
+    """A map of cohog; forgotten with the last test, since it is large."""
+    folder = tmp_path_factory.mktemp("memory")
+    spec = create("cohog").spec
+    if shutil.disk_usage(folder).free < SPARE_BYTES + file_bytes(spec, PLACES):
+        pytest.skip(f"less than 1 GB is free in {folder}")
+    make_big_map(folder / "big.gpkg", spec, PLACES)
+    yield folder / "big.gpkg"
+    shutil.rmtree(folder)
+
+
+@pytest.fixture(scope="module")
+def flight(big_map):
+    """A whole flight within the limit: (its log, the largest memory figures, files mapped).
+
+    Two cores, as boards have few: every thread of a pool takes address space of its own.
+    """
+    if not (shutil.which("prlimit") and shutil.which("taskset")):
+        pytest.skip("prlimit and taskset are not on this machine (Debian: apt install util-linux)")
+    write_frames(big_map.parent / "frames", FRAMES)
+    two_cores = ",".join(map(str, sorted(os.sched_getaffinity(0))[:2]))
+    log = big_map.parent / "flight.jsonl"
+    process = start(
+        big_map, big_map.parent / "frames", log, "--link", "udpout:127.0.0.1:9", "--rate-hz", "60",
+        through=["prlimit", f"--as={LIMIT_BYTES}", "taskset", "--cpu-list", two_cores],
+    )  # fmt: skip
+    largest, mapped = watch_memory(process)
+    said = process.communicate()[1]
+    assert process.returncode == 0, said
+    return list(read_log(log)), largest, mapped
+
+
+def test_a_flight_completes_within_a_hard_limit_of_memory(flight):
+    lines, largest, _ = flight
+    assert lines[-1]["kind"] == "end"
+    assert lines[-1]["queries"] == FRAMES
+    assert largest["VmPeak"] < LIMIT_BYTES / 1e6
+
+
+def test_the_whole_process_stays_under_130_mb(flight):
+    largest = flight[1]
+    assert 30 < largest["Pss"] <= largest["VmHWM"] < 130
+
+
+def test_the_log_tells_the_memory_that_the_kernel_counts(flight):
+    lines, largest, _ = flight
+    told_mb = max(line["costs"]["rss_mb"] for line in lines if line["kind"] == "query")
+    assert 0.7 * largest["VmHWM"] < told_mb <= largest["VmHWM"] + 1
+
+
+def test_memory_does_not_grow_from_query_to_query(flight):
+    told_mb = [line["costs"]["rss_mb"] for line in flight[0] if line["kind"] == "query"]
+    assert max(told_mb[WARM_AFTER:]) < told_mb[WARM_AFTER - 1] + 4
+
+
+def test_what_a_flight_does_not_need_is_not_in_its_memory(flight):
+    mapped = flight[2]
+    assert "cv2" in mapped
+    assert "onnxruntime" not in mapped
+    assert "matplotlib" not in mapped
+
+
+# Choosing which places stay takes lists of all of them, for a moment.
+@pytest.mark.parametrize(("share", "beside_bytes"), [(1.0, 1_000_000), (0.5, 2_500_000)])
+def test_the_index_stays_within_its_budget_and_loading_takes_little_beside_it(big_map, share, beside_bytes):
+    technique = create("cohog")
+    budget_bytes = int(share * PLACES) * bytes_per_place(technique.spec)
+    with PlaceMap.open(big_map) as place_map:
+        tracemalloc.start()
+        index = load_index(place_map, technique, budget_bytes)
+        peak_bytes = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    assert len(index) == share * PLACES
+    assert index.nbytes <= budget_bytes
+    assert peak_bytes < budget_bytes + beside_bytes
+
+
+def test_a_flight_with_a_map_beyond_the_budget_says_so_and_uses_what_fits(tmp_path):
+    make_big_map(tmp_path / "m.gpkg", create("hog").spec, 4)  # 286 KB a place
+    write_frames(tmp_path / "frames", 1)
+    process = start(tmp_path / "m.gpkg", tmp_path / "frames", tmp_path / "flight.jsonl", "--budget-mb", "1")
+    said = process.communicate(timeout=60)[1]
+    assert process.returncode == 0, said
+    assert "needs 1.1 MB in RAM for its 4 places and the budget is 1 MB: the 3 best are used" in said
+    assert "3 places take 0.9 of 1.0 MB" in said

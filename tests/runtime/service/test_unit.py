@@ -1,0 +1,122 @@
+"""The systemd unit, judged by systemd's own tools, and the udev rules."""
+
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from edgevpr.errors import UsageError
+from edgevpr.power.boards import board_names, load_board
+from edgevpr.runtime.service.unit import DEFAULT_CONFIG, render_unit
+
+DEPLOY = Path(__file__).parents[3] / "deploy"
+UNIT = DEPLOY / "edgevpr.service"
+
+needs_systemd = pytest.mark.skipif(
+    shutil.which("systemd-analyze") is None,
+    reason="systemd-analyze is not on this machine (Debian: apt install systemd)",
+)
+
+
+def verify(text: str, folder: Path) -> str:
+    """What `systemd-analyze verify` complains of; a real program stands in for one that may not be installed."""
+    unit = folder / "edgevpr.service"
+    unit.write_text(text.replace("/opt/edgevpr/bin/edgevpr", shutil.which("true")))
+    done = subprocess.run(["systemd-analyze", "verify", unit], capture_output=True, text=True)
+    return done.stderr + ("" if done.returncode == 0 else f"exit code {done.returncode}")
+
+
+def directives(text: str) -> dict[str, str]:
+    """The last value of each directive of a unit."""
+    return dict(re.findall(r"(?m)^(\w+)=(.*)$", text))
+
+
+@needs_systemd
+def test_systemd_has_nothing_to_say_about_the_unit(tmp_path):
+    assert verify(UNIT.read_text(), tmp_path) == ""
+
+
+@needs_systemd
+def test_systemd_does_notice_what_it_passes_with_exit_code_zero(tmp_path):
+    assert "service type" in verify(UNIT.read_text().replace("Type=notify", "Type=notfy"), tmp_path)
+
+
+@needs_systemd
+def test_every_boards_unit_passes(tmp_path):
+    for name in board_names():
+        assert verify(render_unit(load_board(name), "/etc/edgevpr/other.yaml"), tmp_path) == ""
+
+
+@needs_systemd
+def test_the_exposure_stays_under_two(tmp_path):
+    unit = tmp_path / "edgevpr.service"
+    unit.write_text(UNIT.read_text())
+    judged = subprocess.run(
+        ["systemd-analyze", "security", "--offline=true", "--threshold=20", "--no-pager", unit],
+        capture_output=True,
+        text=True,
+    )
+    if "unrecognized option" in judged.stderr:
+        pytest.skip("this systemd-analyze (before 250) cannot judge a unit that is not loaded")
+    assert judged.returncode == 0, judged.stdout
+
+
+def test_the_committed_unit_is_that_of_the_default_board():
+    assert UNIT.read_text() == render_unit(load_board("rpi-zero-2w"))
+
+
+def test_the_limits_are_those_of_the_board():
+    board = replace(load_board("rpi-zero-2w"), name="mine", cores=8, cpu_share=0.3, memory_max_mb=777.0)
+    unit = render_unit(board, "/etc/edgevpr/night.yaml")
+    assert directives(unit)["MemoryMax"] == "777000000"
+    assert directives(unit)["CPUQuota"] == "240%"
+    assert directives(unit)["ExecStart"] == "/opt/edgevpr/bin/edgevpr run --config /etc/edgevpr/night.yaml"
+    assert "# Board: mine\n" in unit
+    assert "rpi-zero-2w" not in unit
+
+
+@needs_systemd
+def test_a_configuration_with_an_odd_name_is_handed_over_as_it_is(tmp_path):
+    unit = render_unit(load_board("rpi-zero-2w"), '/etc/edgevpr/50% of "my" $HOME\\x.yaml')
+    assert directives(unit)["ExecStart"].endswith('--config "/etc/edgevpr/50%% of \\"my\\" $$HOME\\\\x.yaml"')
+    assert verify(unit, tmp_path) == ""
+
+
+@pytest.mark.parametrize("path", ["/home/pi/config.yaml", "/root/c.yaml", "/tmp/c.yaml"])
+def test_a_configuration_that_the_service_cannot_see_is_refused(path):
+    with pytest.raises(UsageError, match=f"^{path} is out of sight of the service.*copy it to {DEFAULT_CONFIG}"):
+        render_unit(load_board("rpi-zero-2w"), path)
+
+
+def test_the_unit_keeps_trying_in_flight_but_not_after_a_usage_error():
+    unit = directives(UNIT.read_text())
+    assert unit["Restart"] == "always"
+    assert unit["StartLimitIntervalSec"] == "0"
+    assert unit["RestartPreventExitStatus"] == str(UsageError.exit_code)
+
+
+def test_serial_ports_and_cameras_stay_within_reach():
+    unit = directives(UNIT.read_text())
+    assert "PrivateDevices" not in unit
+    assert unit["DeviceAllow"] == "char-* rw"  # ProtectClock alone would shut them out
+    assert unit["SupplementaryGroups"] == "dialout video"
+
+
+def test_every_udev_rule_is_well_formed():
+    rules = [line for line in (DEPLOY / "99-edgevpr.rules").read_text().splitlines() if line and line[0] != "#"]
+    keys = r"(ACTION|SUBSYSTEMS?|KERNEL|ATTRS?\{\w+\}|ENV\{\w+\}|GROUP|MODE|SYMLINK|LABEL|GOTO)"
+    for rule in rules:
+        assert re.fullmatch(rf'({keys}(==|!=|=|\+=)"[^"]+"(, (?!$)|$))+', rule), rule
+    labels = set(re.findall(r'LABEL="(\w+)"', "\n".join(rules)))
+    assert set(re.findall(r'GOTO="(\w+)"', "\n".join(rules))) == labels
+
+
+def test_networks_of_ones_own_are_looked_for_where_the_service_can_see():
+    assert "\nEnvironment=EDGEVPR_MODELS=/var/lib/edgevpr/models\n" in UNIT.read_text()
+    assert (
+        "EDGEVPR_MODELS=/var/lib/edgevpr/models /opt/edgevpr/bin/edgevpr models add"
+        in (DEPLOY / "README.md").read_text()
+    )
