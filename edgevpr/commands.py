@@ -257,13 +257,13 @@ def _plan(args: Namespace, board: "Board") -> "tuple[FlightPlan, str | None, tup
             settings[map_technique] = place_map.spec.parameters
     battery = load_config(None, {"battery.pack": args.battery}).battery
     plan = FlightPlan(
-        places,
-        board.rate_hz if args.rate_hz is None else args.rate_hz,
-        args.flight_min,
-        parse_pack(battery.pack),
-        battery.regulator_efficiency,
-        board.budget_mb if args.budget_mb is None else args.budget_mb,
-        args.hover_w,
+        places=places,
+        rate_hz=board.rate_hz if args.rate_hz is None else args.rate_hz,
+        flight_min=args.flight_min,
+        pack=parse_pack(battery.pack),
+        regulator_efficiency=battery.regulator_efficiency,
+        budget_mb=board.budget_mb if args.budget_mb is None else args.budget_mb,
+        hover_w=args.hover_w,
     )
     return plan, map_technique, offers(techniques.names(), settings=settings)
 

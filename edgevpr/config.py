@@ -35,7 +35,7 @@ class SourceConfig:
     rate_hz: float | None = bounded(0.01, 60)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class MatchConfig:
     matching: str | None
     form: str | None
@@ -77,7 +77,7 @@ class BatteryConfig:
     regulator_efficiency: float = bounded(0.1, 1)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Config:
     """The whole configuration; `deploy/config.yaml` documents every key and holds every default."""
 

@@ -16,7 +16,22 @@ class Position:
     alt_m: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Vehicle:
+    """What the autopilot says of the aircraft: where it believes to be (degrees, metres above sea level), where its
+    nose points (0..360 clockwise from north, None where it does not know), and when it said so (`t_heard_s`, on the
+    clock of the frames). `has_gps`: a receiver had a 3D fix then, and there. An autopilot goes on saying where it
+    believes to be long after it has lost that, and does not follow a receiver it does not trust."""
+
+    lat_deg: float
+    lon_deg: float
+    alt_m: float
+    heading_deg: float | None
+    t_heard_s: float
+    has_gps: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Frame:
     """One picture and what is known of it. `image` is uint8, (H, W) grey or (H, W, 3) BGR."""
 
@@ -43,7 +58,7 @@ class PartSpec:
         return f"{'x'.join(map(str, self.shape))} {np.dtype(self.dtype)}"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class TechniqueSpec:
     """What a map must agree with before it is used: name, every parameter, model, and the form of both parts.
 
@@ -63,7 +78,7 @@ class TechniqueSpec:
         return self.packed or self.coarse
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Descriptor:
     """One encoded image. `coarse` makes one row of the index in RAM (see `Technique.pack`); `fine` lives in the map
     file and is read for candidates only; `regions` are what a query asks with, and `good` (bool, one a region) says
@@ -135,7 +150,7 @@ class Technique(Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Place:
     """A place of the map as a person knows it (its descriptors are fetched apart)."""
 
@@ -167,7 +182,7 @@ class StageCost:
         return min(1.0, self.cpu_s / (self.wall_s * cores)) if self.wall_s > 0 else 0.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class QueryCost:
     """Cost of one query by equations 5.1-5.7: times, utilisations of all cores, memory, charge drawn from the pack.
 

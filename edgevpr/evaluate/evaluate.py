@@ -30,7 +30,7 @@ T = TypeVar("T")
 Progress = Callable[[Iterable[T], int, str], Iterable[T]]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class TechniqueResult:
     """What a technique (and its form) reached on a data set, with which weights, and what it cost.
 
@@ -74,7 +74,7 @@ class TechniqueResult:
     t_encode_max_s: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Answer:
     """One query: the score of its best match and the rank of the first right one among the references that count;
     whether the flight would have accepted its match, and wrongly so; the cost of both stages."""
@@ -172,12 +172,12 @@ def _answers(
         ignored = np.array([name in query.ignored for name in dataset.references])
         at = metrics.counting(ranking.slots, ignored)
         yield _Answer(
-            float(ranking.scores[at[0]]) if len(at) else 0.0,
-            metrics.first_right(ranking.slots[at], right),
-            is_accepted,
-            is_accepted and not (right | ignored)[ranking.slots[0]],
-            encoding.cost,
-            matching.cost,
+            score=float(ranking.scores[at[0]]) if len(at) else 0.0,
+            first_right=metrics.first_right(ranking.slots[at], right),
+            accepted=is_accepted,
+            accepted_wrong=is_accepted and not (right | ignored)[ranking.slots[0]],
+            encoding=encoding.cost,
+            matching=matching.cost,
         )
 
 

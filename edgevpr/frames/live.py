@@ -89,7 +89,9 @@ class LiveSource:
 
     def _put(self, image: np.ndarray) -> None:
         t_mono_s = self._clock()
-        frame = Frame(image, f"frame {self._captured:06d} t={t_mono_s - self._t_start_s:.3f} s", t_mono_s)
+        frame = Frame(
+            image=image, name=f"frame {self._captured:06d} t={t_mono_s - self._t_start_s:.3f} s", t_mono_s=t_mono_s
+        )
         self._captured += 1
         with self._arrived:
             self.dropped += self._newest is not None

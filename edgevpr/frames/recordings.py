@@ -44,7 +44,14 @@ class FolderSource:
         self._read += 1
         image = read_image(path)
         tag = self._tags.get(path.name) or read_exif(path)
-        return Frame(image, path.name, self._clock(), tag.t_utc_s, tag.position, tag.heading_deg)
+        return Frame(
+            image=image,
+            name=path.name,
+            t_mono_s=self._clock(),
+            t_utc_s=tag.t_utc_s,
+            position=tag.position,
+            heading_deg=tag.heading_deg,
+        )
 
     def close(self) -> None:
         """Nothing is held open between images."""
@@ -79,7 +86,9 @@ class VideoSource:
                 there, image = self._capture.retrieve()
                 if there:
                     self._t_due_s = self._t_s + self._step_s
-                    return Frame(image, f"frame {self._index:06d} t={self._t_s:.3f} s", self._clock())
+                    return Frame(
+                        image=image, name=f"frame {self._index:06d} t={self._t_s:.3f} s", t_mono_s=self._clock()
+                    )
             if self._clock() >= deadline_s:
                 break
         return None

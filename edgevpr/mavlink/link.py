@@ -13,14 +13,13 @@ from dataclasses import dataclass
 
 from edgevpr.errors import LinkError
 from edgevpr.mavlink import messages
-from edgevpr.mavlink.address import LinkAddress, parse_link
+from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.messages import Fix, Health
 from edgevpr.mavlink.outbox import Outbox
-from edgevpr.mavlink.peer import Autopilot, VehiclePosition
+from edgevpr.mavlink.peer import Autopilot
 from edgevpr.mavlink.transport import Transport, open_transport
 from edgevpr.mavlink.wire import Message, Receiver, mavlink
-
-__all__ = ["Link", "LinkAddress", "LinkStats", "VehiclePosition", "parse_link"]
+from edgevpr.types import Vehicle
 
 HEARTBEAT_S = 1.0
 TURN_S = 0.25  # how long the thread sleeps where nothing wakes it
@@ -33,7 +32,7 @@ FLUSH_S = 0.5
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LinkStats:
     """What a link has done so far. `trouble` is why it is, or last was, not open: None once something arrives."""
 
@@ -113,7 +112,7 @@ class Link:
         """Ask the autopilot to say where it is, now and whenever it has fallen silent about it."""
         self._ask_position_s = self._clock()
 
-    def vehicle_position(self, max_age_s: float) -> VehiclePosition | None:
+    def vehicle_position(self, max_age_s: float) -> Vehicle | None:
         """Where the autopilot says it is; None where it does not know or last said so more than `max_age_s` ago."""
         position = self._autopilot.position
         return position if position and self._clock() - position.t_heard_s <= max_age_s else None

@@ -3,11 +3,11 @@
 import logging
 import math
 from collections import Counter
-from dataclasses import dataclass
 
 from edgevpr.geodesy import distance_m
 from edgevpr.mavlink.messages import AUTOPILOT, POSITION_FIX
 from edgevpr.mavlink.wire import Message, mavlink
+from edgevpr.types import Vehicle
 
 GPS_GONE_AFTER_S = 2.5  # of its reports, which come at least once a second, one may be lost
 GPS_AGREES_WITHIN_M = 50.0  # a vehicle at 25 m/s, and its reports a second or two apart
@@ -25,27 +25,13 @@ _EXPLANATIONS = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class VehiclePosition:
-    """Where the autopilot believes to be; `alt_m` above sea level, `heading_deg` 0..360 or None where it does not know,
-    `t_heard_s` on the clock of the link. `has_gps`: a receiver of its had a 3D fix then, and there. It goes on
-    saying where it believes to be long after it has lost that, and does not follow a receiver it does not trust."""
-
-    lat_deg: float
-    lon_deg: float
-    alt_m: float
-    heading_deg: float | None
-    t_heard_s: float
-    has_gps: bool
-
-
 class Autopilot:
     """Fed with all that arrives; pinned to the first autopilot heard, so that no other vehicle is ever addressed."""
 
     def __init__(self, own_component: int) -> None:
         self.system_id: int | None = None
         self.acks: Counter[str] = Counter()  # answers to our fixes, by name of the result
-        self.position: VehiclePosition | None = None  # the last one heard, however old
+        self.position: Vehicle | None = None  # the last one heard, however old
         self._own_component = own_component
         self._heard_s = -math.inf
         self._gps: dict[str, tuple[float, float, float]] = {}  # of each receiver with a fix: lat_deg, lon_deg, when
@@ -125,9 +111,16 @@ class Autopilot:
             self._last_result = result
 
 
-def _position(message: Message, now_s: float, has_gps: bool) -> VehiclePosition | None:
+def _position(message: Message, now_s: float, has_gps: bool) -> Vehicle | None:
     """None for 0, 0, which is what an autopilot without a position says, and for what is not on Earth."""
     if (message.lat == 0 and message.lon == 0) or abs(message.lat) > 90e7 or abs(message.lon) > 180e7:
         return None
     heading_deg = message.hdg / 100 if message.hdg <= 36_000 else None  # 65535: unknown
-    return VehiclePosition(message.lat / 1e7, message.lon / 1e7, message.alt / 1e3, heading_deg, now_s, has_gps)
+    return Vehicle(
+        lat_deg=message.lat / 1e7,
+        lon_deg=message.lon / 1e7,
+        alt_m=message.alt / 1e3,
+        heading_deg=heading_deg,
+        t_heard_s=now_s,
+        has_gps=has_gps,
+    )

@@ -20,7 +20,7 @@ class GrowingIndex:
     """
 
     def __init__(
-        self, place_map: PlaceMap, technique: Technique, budget_bytes: int, room: int, beside_bytes: int = 0
+        self, place_map: PlaceMap, technique: Technique, *, budget_bytes: int, room: int, beside_bytes: int = 0
     ) -> None:
         """Read the map, which may be empty, and leave room for `room` more places as far as the budget allows.
 
@@ -83,7 +83,7 @@ class GrowingIndex:
         # A slot moves down or stays, so what is overwritten has been moved already or is given up.
         for start in range(0, len(kept), _MOVED_AT_ONCE):
             block = kept[start : start + _MOVED_AT_ONCE]
-            for array in _arrays(index):
+            for array in index.arrays.values():
                 array[start : start + len(block)] = array[block]
         self._taken = len(kept)
 
@@ -100,7 +100,7 @@ class GrowingIndex:
                 self._mean, self._mean_of, self._taken = mean, self._in_file, packed
 
     def _view(self, start: int, end: int, mean: np.ndarray | None) -> PlaceIndex:
-        return PlaceIndex(*(array[start:end] for array in _arrays(self._slots)), mean)
+        return PlaceIndex(**{name: array[start:end] for name, array in self._slots.arrays.items()}, mean=mean)
 
     def _held_parts(self) -> Iterator[tuple[int, tuple[float, float] | None, np.ndarray]]:
         held = map(int, self.index.place_ids)
@@ -109,8 +109,3 @@ class GrowingIndex:
             if part[0] == wanted:
                 yield part
                 wanted = next(held, None)
-
-
-def _arrays(index: PlaceIndex) -> tuple[np.ndarray, ...]:
-    """Those with one entry a place, in the order in which `PlaceIndex` takes them."""
-    return index.place_ids, index.lat_deg, index.lon_deg, index.heading_deg, index.rows

@@ -18,7 +18,7 @@ _BYTES_BESIDE_ROW = 8 + 8 + 8 + 2  # id, latitude, longitude, heading
 _PACKED_AT_ONCE = 32
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PlaceIndex:
     """`place_ids` int64 (N,), `lat_deg` and `lon_deg` float64 (N,) with NaN where a place has no position,
     `heading_deg` float16 (N,), to a quarter of a degree and NaN where unknown, and `rows` (N, *row shape): all
@@ -36,9 +36,19 @@ class PlaceIndex:
         return len(self.place_ids)
 
     @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Those with one entry a place, by name."""
+        return {
+            "place_ids": self.place_ids,
+            "lat_deg": self.lat_deg,
+            "lon_deg": self.lon_deg,
+            "heading_deg": self.heading_deg,
+            "rows": self.rows,
+        }
+
+    @property
     def nbytes(self) -> int:
-        beside = self.place_ids.nbytes + self.lat_deg.nbytes + self.lon_deg.nbytes + self.heading_deg.nbytes
-        return beside + self.rows.nbytes
+        return sum(array.nbytes for array in self.arrays.values())
 
     def spacing_m(self) -> float | None:
         """Median distance from a place to the next one mapped, metres; None where no two have a position."""
@@ -104,12 +114,12 @@ def load_index(
 def empty_index(spec: TechniqueSpec, capacity: int, mean: np.ndarray | None) -> PlaceIndex:
     """Arrays for `capacity` places: the system gives the memory of ids and rows only as they are written."""
     return PlaceIndex(
-        np.empty(capacity, np.int64),
-        np.full(capacity, np.nan),
-        np.full(capacity, np.nan),
-        np.full(capacity, np.nan, np.float16),
-        np.empty((capacity, *spec.row.shape), spec.row.dtype),
-        mean,
+        place_ids=np.empty(capacity, np.int64),
+        lat_deg=np.full(capacity, np.nan),
+        lon_deg=np.full(capacity, np.nan),
+        heading_deg=np.full(capacity, np.nan, np.float16),
+        rows=np.empty((capacity, *spec.row.shape), spec.row.dtype),
+        mean=mean,
     )
 
 

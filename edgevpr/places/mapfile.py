@@ -29,7 +29,7 @@ WHERE maxy >= ? AND miny <= ? AND maxx >= ? AND minx <= ?
 """
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class MapInfo:
     """What a map holds; `extent` is (lat_min, lon_min, lat_max, lon_max) in degrees, None without positions."""
 
@@ -205,9 +205,17 @@ class PlaceMap:
             ).fetchone()
             (made_by,) = self._db.execute("SELECT value FROM edgevpr_map WHERE key = 'made_by'").fetchone()
         return MapInfo(
-            str(self.path), self.spec, places, with_position, extent if with_position else None, first, last, quality,
-            self.path.stat().st_size, json.loads(made_by),
-        )  # fmt: skip
+            path=str(self.path),
+            spec=self.spec,
+            places=places,
+            with_position=with_position,
+            extent=extent if with_position else None,
+            first_time=first,
+            last_time=last,
+            mean_quality=quality,
+            file_bytes=self.path.stat().st_size,
+            made_by=json.loads(made_by),
+        )
 
     def places(self, place_ids: Iterable[int] | None = None) -> Iterator[Place]:
         """The named places in the order given, or all of them in the order they were added."""
@@ -296,7 +304,14 @@ class PlaceMap:
         place_id, geom, time, alt_m, heading_deg, source_image, quality = row
         point = self._point(place_id, geom)
         position = Position(*point, alt_m) if point else None
-        return Place(place_id, source_image, position, geopackage.utc_seconds(time), heading_deg, quality)
+        return Place(
+            place_id=place_id,
+            source_image=source_image,
+            position=position,
+            t_utc_s=geopackage.utc_seconds(time),
+            heading_deg=heading_deg,
+            quality=quality,
+        )
 
     def _point(self, place_id: int, geom: bytes | None) -> tuple[float, float] | None:
         try:
@@ -337,12 +352,12 @@ def _read_spec(path: Path, db: sqlite3.Connection) -> TechniqueSpec:
                 f"{FORMAT_VERSION}): update edgevpr."
             )
         return TechniqueSpec(
-            stored["technique"],
-            stored["parameters"],
-            _part_spec(stored["coarse"]),
-            _part_spec(stored["fine"]),
-            stored["model_sha256"],
-            _part_spec(stored["packed"]),
+            name=stored["technique"],
+            parameters=stored["parameters"],
+            coarse=_part_spec(stored["coarse"]),
+            fine=_part_spec(stored["fine"]),
+            model_sha256=stored["model_sha256"],
+            packed=_part_spec(stored["packed"]),
         )
     except (ValueError, KeyError, TypeError) as error:
         raise MapError(

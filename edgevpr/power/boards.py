@@ -14,7 +14,7 @@ _ANY_MACHINE = "generic-x86"
 _SAME_RAM = 1.02  # a kernel keeps some for itself, another amount with every version
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Score:
     """How fast a machine is beside one core of the reference, which `profiles/generic-x86.yaml` names (None: unknown).
 
@@ -31,7 +31,7 @@ class Score:
     source: str
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Board:
     """A board's profile.
 
@@ -127,7 +127,14 @@ def _this_machine(root: Path) -> Board:
         if recognised:
             profile, title = recognised, f"this machine ({recognised.title})"
         else:
-            unknown = Score(None, None, None, None, False, f"nobody has measured a {model}")
+            unknown = Score(
+                single=None,
+                multi=None,
+                products=None,
+                passes=None,
+                verified=False,
+                source=f"nobody has measured a {model}",
+            )
             profile = replace(profile, benchmark_score=unknown)
             title = f"this machine ({model}, which has no profile: the figures of {_ANY_MACHINE})"
 

@@ -21,7 +21,7 @@ _APART = 0.05  # utilisations nearer than this are one load
 _LEAST_R2 = 0.5  # less than half of the power's changes follow the load: by chance, or another program's
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PowerFit:
     """P = `idle_w` + `span_w` U (a and s), with the root mean square of what the line leaves over, in watts, and R2."""
 
@@ -120,9 +120,9 @@ def fit_power(samples: Sequence[tuple[float, float]]) -> PowerFit:
             "the meter is wired to what feeds the CPU, and measure for longer."
         )
     return PowerFit(
-        max(0.0, float(idle_w)),
-        float(span_w),
-        float(np.sqrt((left**2).mean())),
-        r2,
-        tuple((float(a), float(b)) for a, b in samples),
+        idle_w=max(0.0, float(idle_w)),
+        span_w=float(span_w),
+        residual_w=float(np.sqrt((left**2).mean())),
+        r2=r2,
+        samples=tuple((float(a), float(b)) for a, b in samples),
     )

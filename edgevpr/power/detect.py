@@ -23,7 +23,7 @@ if TYPE_CHECKING:  # imports NumPy, which recognising a board does not need
 _ANY_MACHINE = "generic-x86"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Detected:
     """What this machine is. `board` is the name of its profile, None where it has none; `model` is what its device tree
     or DMI calls it; `usable_cores` and `ram_limit_mb` are what affinity and control groups leave of `cores` and
@@ -107,7 +107,9 @@ def profile_text(found: Detected, score: Score | None = None, calibration: Calib
     elif found.board:
         speed = base.benchmark_score
     else:
-        speed = Score(None, None, None, None, False, "nobody has measured it")
+        speed = Score(
+            single=None, multi=None, products=None, passes=None, verified=False, source="nobody has measured it"
+        )
     memory_max_mb = max(1.0, min(found.ram_mb * base.memory_max_mb / base.ram_mb, found.ram_limit_mb))
     budget_mb = max(1.0, memory_max_mb * base.budget_mb / base.memory_max_mb)
     cpu_share = max(0.01, min(base.cpu_share, found.usable_cores / found.cores))

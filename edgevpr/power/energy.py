@@ -13,7 +13,7 @@ from edgevpr.power.equations import marginal_energy_j
 from edgevpr.types import StageCost
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class EnergySoFar:
     """Since the start: seconds, joules at the board's input, CPU-seconds of the stages and of the whole process."""
 
@@ -52,9 +52,9 @@ class RunningEnergy:
         """The totals until now."""
         elapsed_s = self._clock() - self._start_s
         return EnergySoFar(
-            elapsed_s,
-            self._board.idle_w * elapsed_s,
-            self._marginal_j,
-            self._stages_cpu_s,
-            self._cpu_clock() - self._cpu_start_s,
+            elapsed_s=elapsed_s,
+            idle_j=self._board.idle_w * elapsed_s,
+            marginal_j=self._marginal_j,
+            stages_cpu_s=self._stages_cpu_s,
+            process_cpu_s=self._cpu_clock() - self._cpu_start_s,
         )

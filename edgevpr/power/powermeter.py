@@ -28,7 +28,7 @@ class PowerSample:
     energies_j: tuple[float, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Meter:
     """A power meter. `covers` is "board" (its input: what a profile's watts mean), "cpu" (the CPU package alone, the
     rest of the machine draws more) or "rail" (some other part).

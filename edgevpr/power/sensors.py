@@ -73,7 +73,7 @@ def _ina_channel(
         current_ma = number(folder / f"curr{channel}_input")
         return (number(folder / f"in{channel}_input") * (0.0 if -5 < current_ma < 0 else current_ma) / 1e6,)
 
-    return Meter("ina", title, covers, 0.05, look, certain=certain)
+    return Meter(kind="ina", title=title, covers=covers, period_s=0.05, look=look, certain=certain)
 
 
 def _rapl_meters(root: Path, notes: list[str]) -> Iterator[Meter]:
@@ -97,12 +97,12 @@ def _rapl_meters(root: Path, notes: list[str]) -> Iterator[Meter]:
     if counters:
         packages = "1 CPU package" if len(counters) == 1 else f"{len(counters)} CPU packages"
         yield Meter(
-            "rapl",
-            f"RAPL ({packages}, without memory, disks and converters)",
-            "cpu",
-            1.0,  # a counter wraps once in many minutes at most, and moves on every millisecond
-            lambda: tuple(number(path) / 1e6 for path in counters),
-            tuple(wraps_j),
+            kind="rapl",
+            title=f"RAPL ({packages}, without memory, disks and converters)",
+            covers="cpu",
+            period_s=1.0,  # a counter wraps once in many minutes at most, and moves on every millisecond
+            look=lambda: tuple(number(path) / 1e6 for path in counters),
+            wraps_j=tuple(wraps_j),
         )
 
 
@@ -110,11 +110,11 @@ def _pmic_meters(root: Path) -> Iterator[Meter]:
     program = vcgencmd.find(root)
     if program and re.search(r"Raspberry Pi (5|Compute Module 5)", machine.model(root) or ""):
         yield Meter(
-            "pmic",
-            "power chip of the Raspberry Pi 5 (sum of its rails, corrected; without USB devices)",
-            "board",
-            0.5,  # a reading starts a process: more often would be a load of its own
-            lambda: (_pmic_w(program),),
+            kind="pmic",
+            title="power chip of the Raspberry Pi 5 (sum of its rails, corrected; without USB devices)",
+            covers="board",
+            period_s=0.5,  # a reading starts a process: more often would be a load of its own
+            look=lambda: (_pmic_w(program),),
             certain=False,
         )
 

@@ -29,7 +29,7 @@ TURN_S = 0.05
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ReceivedFix:
     """An accepted position fix as it arrived; `t_sent_s` and `processing_s` are the sender's."""
 
@@ -40,7 +40,7 @@ class ReceivedFix:
     processing_s: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Track:
     """Where the simulated vehicle flies: seconds from its start on, degrees, metres above sea level, each (N,) float64;
     `heading_deg` is NaN where nobody knows."""
@@ -64,10 +64,11 @@ def read_track(csv_path: str | Path) -> Track:
         (tag.t_utc_s - start_s, tag.position.lat_deg, tag.position.lon_deg, tag.position.alt_m or 0.0, tag.heading_deg)
         for tag in tags
     ]
-    return Track(*np.array(rows, float).T)
+    t_s, lat_deg, lon_deg, alt_m, heading_deg = np.array(rows, float).T
+    return Track(t_s=t_s, lat_deg=lat_deg, lon_deg=lon_deg, alt_m=alt_m, heading_deg=heading_deg)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class AutopilotSummary:
     """What the simulated flight controller saw. Senders are written "system/component"."""
 
@@ -197,7 +198,13 @@ class _Autopilot:
         result = judge(command)
         if result == mavlink.MAV_RESULT_ACCEPTED:
             self._fixes.append(
-                ReceivedFix(command.x / 1e7, command.y / 1e7, command.param3, command.param1, command.param2)
+                ReceivedFix(
+                    lat_deg=command.x / 1e7,
+                    lon_deg=command.y / 1e7,
+                    accuracy_m=command.param3,
+                    t_sent_s=command.param1,
+                    processing_s=command.param2,
+                )
             )
         elif command.command == POSITION_FIX:
             self._fixes_denied += 1

@@ -12,7 +12,7 @@ _LONGEST_SHADOW_M = 30.0
 _STRIP = 256  # rows lit at a time: the working memory stays small
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Light:
     """The hour and the weather. `warmth` shifts sunlight from blue (-1) to orange (+1); `cloud_frac` of the ground lies
     in the shadow of clouds; `haze_frac` of the picture is grey veil; `exposure` multiplies, `gamma` bends."""
@@ -26,7 +26,7 @@ class Light:
     gamma: float = 1.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Camera:
     """A pinhole camera that looks straight down, the top of its picture towards the nose, and its faults."""
 
@@ -38,7 +38,7 @@ class Camera:
     jpeg_quality: int = 88
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Pose:
     """Where the camera is: metres from the scene's south-west corner and over its ground, degrees of the airframe
     (heading clockwise from north, roll right wing down, pitch nose up)."""

@@ -31,7 +31,7 @@ _RATE_HZ = 5.0
 _END_TIMEOUT_S = 10.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class DemoSummary:
     """What the demonstration showed. `costs` are means of a query under the names of the flight log; `messages` is
     what the simulated flight controller decoded, by name."""

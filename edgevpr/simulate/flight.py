@@ -23,7 +23,7 @@ _LEGS_NORTH_M = (70.0, 140.0, 210.0, 280.0, 350.0)
 _HEIGHT_M = 80.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Flight:
     """One picture a pose, every `interval_s` from `start_utc` on; `seed` makes its clouds and its sensor's noise."""
 
@@ -45,10 +45,18 @@ def mapping_flight(seed: int) -> Flight:
             off_m, off_deg = rng.normal(0, 0.7, 3), rng.normal(0, 0.8, 3)
             heading_deg = (90 if leg % 2 == 0 else 270) + off_deg[0]
             poses.append(
-                Pose(east + off_m[0], north_m + off_m[1], _HEIGHT_M + off_m[2], heading_deg, off_deg[1], off_deg[2])
+                Pose(
+                    east_m=east + off_m[0],
+                    north_m=north_m + off_m[1],
+                    height_m=_HEIGHT_M + off_m[2],
+                    heading_deg=heading_deg,
+                    roll_deg=off_deg[1],
+                    pitch_deg=off_deg[2],
+                )
             )
     light = Light(sun_azimuth_deg=48, sun_elevation_deg=52, exposure=1.12)
-    return Flight(tuple(poses), light, Camera(), datetime(2026, 2, 14, 0, 30, tzinfo=timezone.utc), 2.0, seed)
+    start_utc = datetime(2026, 2, 14, 0, 30, tzinfo=timezone.utc)
+    return Flight(poses=tuple(poses), light=light, camera=Camera(), start_utc=start_utc, interval_s=2.0, seed=seed)
 
 
 def later_flight(seed: int) -> Flight:
@@ -61,20 +69,21 @@ def later_flight(seed: int) -> Flight:
     north_m = np.concatenate((np.full(len(back_m), _LEGS_NORTH_M[3]), np.full(len(out_m), _LEGS_NORTH_M[2])))
     heading_deg = np.concatenate((np.full(len(back_m), 270.0), np.full(len(out_m), 90.0)))
     drift = [_wander(rng, len(east_m)) for _ in range(5)]
-    poses = np.column_stack(
-        (
-            east_m,
-            north_m + 8 * drift[0],
-            _HEIGHT_M * (1 + 0.1 * drift[1]),
-            heading_deg + 10 * drift[2],
-            3 * drift[3],
-            3 * drift[4],
-        )
+    columns = {
+        "east_m": east_m,
+        "north_m": north_m + 8 * drift[0],
+        "height_m": _HEIGHT_M * (1 + 0.1 * drift[1]),
+        "heading_deg": heading_deg + 10 * drift[2],
+        "roll_deg": 3 * drift[3],
+        "pitch_deg": 3 * drift[4],
+    }
+    poses = tuple(Pose(**{name: float(column[at]) for name, column in columns.items()}) for at in range(len(east_m)))
+    light = Light(
+        sun_azimuth_deg=14, sun_elevation_deg=58, warmth=0.8, cloud_frac=0.25, haze_frac=0.1, exposure=1.12, gamma=1.12
     )
-    light = Light(14, 58, warmth=0.8, cloud_frac=0.25, haze_frac=0.1, exposure=1.12, gamma=1.12)
     camera = Camera(noise_sigma=3.0, blur_px=2.0, jpeg_quality=80)
     start_utc = datetime(2026, 2, 14, 6, 10, tzinfo=timezone.utc)
-    return Flight(tuple(Pose(*map(float, row)) for row in poses), light, camera, start_utc, 2.0, seed + 1)
+    return Flight(poses=poses, light=light, camera=camera, start_utc=start_utc, interval_s=2.0, seed=seed + 1)
 
 
 def write_flight(folder: str | Path, scene: Scene, flight: Flight) -> Iterator[str]:

@@ -15,7 +15,7 @@ from edgevpr.types import Position
 RIGHT_M = 55.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Answer:
     """One query: where it was taken, the place that was named and whether the runtime believed it; `nearest_m` is the
     way to the nearest place of the map."""
@@ -39,7 +39,7 @@ class Answer:
         return self.nearest_m <= RIGHT_M
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Outcome:
     """Shares and errors of a flight. `recall_at_1` is of the queries on the map; the errors, in metres from where a
     picture was taken to the place that was named, are of the accepted ones (NaN without any)."""
@@ -68,14 +68,14 @@ def read_answers(log_path: Path, map_images: Path, query_images: Path) -> list[A
             nearest_m = distance_m(at.lat_deg, at.lon_deg, lat_deg, lon_deg).min()
             answers.append(
                 Answer(
-                    line["query"],
-                    line["reference_image"],
-                    at,
-                    named,
-                    line["score"],
-                    line["accepted"],
-                    float(error_m),
-                    float(nearest_m),
+                    query=line["query"],
+                    reference_image=line["reference_image"],
+                    at=at,
+                    named=named,
+                    score=line["score"],
+                    accepted=line["accepted"],
+                    error_m=float(error_m),
+                    nearest_m=float(nearest_m),
                 )
             )
     return answers

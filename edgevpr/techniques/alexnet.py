@@ -24,14 +24,14 @@ class AlexNet(VectorTechnique):
     accept: ClassVar = {"float": (0.0, 0.15), "8bit": (0.0, 0.12), "1bit": (0.0, 0.1)}
 
     def __init__(
-        self, model: str = "calc", form: str = "float", threads: int = 1, dims: int = 1064, seed: int = 0
+        self, *, model: str = "calc", form: str = "float", threads: int = 1, dims: int = 1064, seed: int = 0
     ) -> None:
         if not (8 <= dims <= 65_536 and 0 <= seed < 2**31):
             raise UsageError(f"alexnet cannot use dims={dims}, seed={seed}: dims must be 8 to 65536, seed 0 or more.")
         self._backbone = open_backbone(model, "features", threads)
         self._project = gaussian_projection(int(np.prod(self._backbone.shape)), dims, seed)
         parameters = {"model": model, "dims": dims, "seed": seed}
-        super().__init__("alexnet", parameters, dims, form, model_sha256=self._backbone.sha256)
+        super().__init__("alexnet", parameters, dims, form=form, model_sha256=self._backbone.sha256)
 
     def vector(self, image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
         """uint8 (H, W[, 3]) -> float32 (dims,)."""

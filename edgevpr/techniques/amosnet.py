@@ -36,7 +36,7 @@ class AmosNet(VectorTechnique):
             pyramid(np.zeros(self._backbone.shape, np.float32), self._levels)
         )  # says it where this is too small
         parameters = {"model": model, "levels": levels}
-        super().__init__(self.name, parameters, length, form, "l1", self._backbone.sha256)
+        super().__init__(self.name, parameters, length, form=form, similarity="l1", model_sha256=self._backbone.sha256)
 
     def vector(self, image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
         """uint8 (H, W[, 3]) -> float32 (cells C,), the sum of its magnitudes 1."""

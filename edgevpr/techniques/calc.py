@@ -23,7 +23,7 @@ class Calc(VectorTechnique):
     def __init__(self, model: str = "calc", form: str = "float", threads: int = 1) -> None:
         self._backbone = open_backbone(model, "descriptor", threads)
         (length,) = self._backbone.shape
-        super().__init__("calc", {"model": model}, length, form, model_sha256=self._backbone.sha256)
+        super().__init__("calc", {"model": model}, length, form=form, model_sha256=self._backbone.sha256)
 
     def vector(self, image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
         """uint8 (H, W[, 3]) -> float32 (D,)."""

@@ -49,6 +49,7 @@ class CoHog:
 
     def __init__(
         self,
+        *,
         w1: int = 512,
         w2: int = 16,
         bins: int = 8,
@@ -77,8 +78,8 @@ class CoHog:
         self.candidates = _CANDIDATES[camera]
         self.scan_counts = matching == "displacement" and camera == "forward"  # looking down it would say no more
         self.spec = TechniqueSpec(
-            "cohog",
-            {"w1": w1, "w2": w2, "bins": bins, "gt": self._gt, "entropy": entropy, "camera": camera},
+            name="cohog",
+            parameters={"w1": w1, "w2": w2, "bins": bins, "gt": self._gt, "entropy": entropy, "camera": camera},
             coarse=PartSpec((placecode.SIDE, placecode.SIDE, bins), "|u1"),
             fine=PartSpec((self._side**2, 4 * bins), "|u1"),
             packed=PartSpec((placecode.SIDE**2 * bins // 8,), "|u1"),
@@ -100,7 +101,9 @@ class CoHog:
         coarse = np.rint(255 * placecode.grid(_middle(blocks, seen))).astype(np.uint8)
         quality = float(good.sum() / max(seen.sum(), 1))
         picture = Picture(grey if self._camera == "nadir" else None, allowed, seen)
-        return Descriptor(coarse, stored, regions, good.ravel(), quality, picture)
+        return Descriptor(
+            coarse=coarse, fine=stored, regions=regions, good=good.ravel(), quality=quality, picture=picture
+        )
 
     def _regions(self, grey: np.ndarray, allowed: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Blocks float32 (side, side, 4 bins); which of them are wholly allowed, and of these which are good, both bool

@@ -28,6 +28,7 @@ class CrossRegionBow(VectorTechnique):
 
     def __init__(
         self,
+        *,
         model: str = "calc",
         form: str = "float",
         threads: int = 1,
@@ -39,7 +40,7 @@ class CrossRegionBow(VectorTechnique):
         self._words = load_words(model, "bow", words)
         self._regions = regions
         parameters = {"model": model, "regions": regions, "words": words}
-        super().__init__("cross_region_bow", parameters, words, form, model_sha256=self._words.sha256)
+        super().__init__("cross_region_bow", parameters, words, form=form, model_sha256=self._words.sha256)
         self.spec = replace(self.spec, fine=PartSpec((regions, channels), "|i1"))
 
     def encode(self, image: np.ndarray, mask: np.ndarray | None = None) -> Descriptor:
@@ -52,7 +53,9 @@ class CrossRegionBow(VectorTechnique):
         regions[: len(found)] = found
         coarse = bag_of_words(found, self._words.words).astype("<f2")
         good = np.arange(self._regions) < len(found)
-        return Descriptor(coarse, to_bytes(regions), regions, good, float(len(found) > 0))
+        return Descriptor(
+            coarse=coarse, fine=to_bytes(regions), regions=regions, good=good, quality=float(len(found) > 0)
+        )
 
     def match(self, query: Descriptor, fine: np.ndarray, hypotheses: None = None) -> FineMatch:
         """Score the mutually best pairs of regions, 0 to 1 (see `mutual_score`)."""

@@ -6,8 +6,8 @@ question that CoHOG asks of such a map, mostly without making the map.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -72,7 +72,8 @@ def good_blocks(grey: np.ndarray, which: str, cell_px: int, threshold: float) ->
     return bounds.blocks(low) >= threshold
 
 
-class _Bounds(NamedTuple):
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Bounds:
     """What an entropy is at least and at most, float32 (h, w) on some grid over the image. `down` (rows, h) and
     `across` (cols, w), nowhere negative, make the means of the blocks; `exact` tells the entropy at the points of a
     bool (h, w)."""
@@ -112,7 +113,7 @@ def _bound_filled_bins(grey: np.ndarray, cell_px: int) -> _Bounds:
 
     low, high = (_cell_means(cv2.LUT(number, _LOG2_OVER_8[:256]), cell_px) for number in (at_least, at_most))
     down, across = (_pairs(side // cell_px) for side in grey.shape)
-    return _Bounds(low, high, down, across, exact)
+    return _Bounds(low=low, high=high, down=down, across=across, exact=exact)
 
 
 def _bound_shannon(grey: np.ndarray, cell_px: int) -> _Bounds:
@@ -129,7 +130,7 @@ def _bound_shannon(grey: np.ndarray, cell_px: int) -> _Bounds:
         return _shannon_at(small, pixels, DISC_RADIUS_PX)
 
     down, across = (_scaled_pairs(side, cell_px) for side in grey.shape)
-    return _Bounds(low, high, down, across, exact)
+    return _Bounds(low=low, high=high, down=down, across=across, exact=exact)
 
 
 _MAPS = {"filled_bins": filled_bins, "shannon": shannon}

@@ -27,7 +27,7 @@ class Hog(VectorTechnique):
             )
         self._w1, self._cell, self._bins = w1, cell, bins
         length = (w1 // cell - 1) ** 2 * 4 * bins
-        super().__init__("hog", {"w1": w1, "cell": cell, "bins": bins}, length, form)
+        super().__init__("hog", {"w1": w1, "cell": cell, "bins": bins}, length, form=form)
 
     def vector(self, image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
         """uint8 (H, W[, 3]) -> float32 (length,); where `mask` is False the gradient is left out."""

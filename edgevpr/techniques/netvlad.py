@@ -27,6 +27,7 @@ class NetVlad(VectorTechnique):
 
     def __init__(
         self,
+        *,
         model: str = "calc",
         form: str = "float",
         threads: int = 1,
@@ -39,7 +40,7 @@ class NetVlad(VectorTechnique):
         self._words = load_words(model, "vlad", words)
         self._sharpness = vlad.sharpness(self._words.words) if assignment == "soft" else None
         parameters = {"model": model, "words": words, "assignment": assignment}
-        super().__init__("netvlad", parameters, self._words.length, form, model_sha256=self._words.sha256)
+        super().__init__("netvlad", parameters, self._words.length, form=form, model_sha256=self._words.sha256)
 
     def vector(self, image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
         """uint8 (H, W[, 3]) -> float32 (words C,), or as long as the whitening makes it."""

@@ -27,6 +27,7 @@ class RegionVlad(VectorTechnique):
 
     def __init__(
         self,
+        *,
         model: str = "calc",
         form: str = "float",
         threads: int = 1,
@@ -37,7 +38,7 @@ class RegionVlad(VectorTechnique):
         self._words = load_words(model, "regions", words)
         self._regions = regions
         parameters = {"model": model, "regions": regions, "words": words}
-        super().__init__("region_vlad", parameters, self._words.words.size, form, model_sha256=self._words.sha256)
+        super().__init__("region_vlad", parameters, self._words.words.size, form=form, model_sha256=self._words.sha256)
 
     def vector(self, image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
         """uint8 (H, W[, 3]) -> float32 (words C,); zeros for a picture without any region."""

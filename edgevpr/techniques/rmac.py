@@ -30,7 +30,7 @@ class RMac(VectorTechnique):
         self._backbone = open_backbone(model, "features", threads)
         channels, height, width = self._backbone.shape
         self._squares = square_regions(height, width)
-        super().__init__("rmac", {"model": model}, channels, form, model_sha256=self._backbone.sha256)
+        super().__init__("rmac", {"model": model}, channels, form=form, model_sha256=self._backbone.sha256)
         self.spec = replace(self.spec, fine=PartSpec((len(self._squares), channels), "|i1"))
 
     def encode(self, image: np.ndarray, mask: np.ndarray | None = None) -> Descriptor:
@@ -39,7 +39,7 @@ class RMac(VectorTechnique):
         squares = regional_vectors(self._backbone.run(image, mask), self._squares)
         good = squares.any(axis=1)
         coarse = aggregate(squares).astype("<f2")
-        return Descriptor(coarse, to_bytes(squares), squares, good, float(good.mean()))
+        return Descriptor(coarse=coarse, fine=to_bytes(squares), regions=squares, good=good, quality=float(good.mean()))
 
     def match(self, query: Descriptor, fine: np.ndarray, hypotheses: None = None) -> FineMatch:
         """Score the mutually best pairs of squares, 0 to 1 (see `mutual_score`)."""

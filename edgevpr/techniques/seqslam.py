@@ -40,7 +40,9 @@ class SeqSlam:
         self._width, self._height, self._patch = width, height, patch
         self.sequence = sequence
         self.spec = TechniqueSpec(
-            "seqslam", {"width": width, "height": height, "patch": patch}, PartSpec((width * height,), "|u1")
+            name="seqslam",
+            parameters={"width": width, "height": height, "patch": patch},
+            coarse=PartSpec((width * height,), "|u1"),
         )
 
     def encode(self, image: np.ndarray, mask: np.ndarray | None = None) -> Descriptor:
@@ -59,7 +61,7 @@ class SeqSlam:
         levels = np.clip(np.rint(_STEPS * z) + _GREYEST, 0, 255).astype(np.uint8)
         rows, columns = self._height // self._patch, self._width // self._patch
         coarse = levels.reshape(rows, columns, self._patch, self._patch).swapaxes(1, 2).ravel()
-        return Descriptor(coarse, quality=float(np.mean(spread >= _LEAST_SPREAD)))
+        return Descriptor(coarse=coarse, quality=float(np.mean(spread >= _LEAST_SPREAD)))
 
     def _patches(self, picture: np.ndarray) -> np.ndarray:
         """(height, width) -> (patches, patch * patch)."""

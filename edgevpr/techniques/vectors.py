@@ -44,6 +44,7 @@ class VectorTechnique:
         name: str,
         parameters: dict[str, int | float | str],
         length: int,
+        *,
         form: str = "float",
         similarity: str = "cosine",
         model_sha256: str | None = None,
@@ -60,7 +61,14 @@ class VectorTechnique:
             "8bit": PartSpec((length + _BESIDE_BYTES,), "|i1"),
             "1bit": PartSpec((-(-length // _WORD_BITS) * _WORD_BITS // 8,), "|u1"),
         }
-        self.spec = TechniqueSpec(name, parameters, PartSpec((length,), "<f2"), None, model_sha256, packed[form])
+        self.spec = TechniqueSpec(
+            name=name,
+            parameters=parameters,
+            coarse=PartSpec((length,), "<f2"),
+            fine=None,
+            model_sha256=model_sha256,
+            packed=packed[form],
+        )
 
     def vector(self, image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
         """The vector of a uint8 image, float32 (D,); what lies where `mask` (H, W) is False must not count."""
@@ -80,7 +88,7 @@ class VectorTechnique:
                 "what the network puts out, or compare by cosine."
             )
         coarse = vector.astype("<f2")
-        return Descriptor(coarse, quality=float(coarse.any()))
+        return Descriptor(coarse=coarse, quality=float(coarse.any()))
 
     def pack(self, coarse: np.ndarray, mean: np.ndarray) -> np.ndarray:
         """Rows of the index in 8 or 1 bit: coarse float16 (N, D), the map's mean (D,) -> (N, *row shape)."""

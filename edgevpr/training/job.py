@@ -17,7 +17,7 @@ _CHECKED_INPUTS = 16
 _LOSSES_SAID = 50  # the mean of as many steps is what is said: one batch says little
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class TrainingResult:
     """What a training came to: pictures learnt from, steps, the mean loss of its first and last 50 steps of this run
     (None where a checkpoint was of the last step), and how far the file is from PyTorch."""
@@ -92,7 +92,15 @@ def train_calc(
     export.write_card(card, out, "CALC (Merrill and Huang 2018), trained by edgevpr", source)
     checkpoint.unlink()
     first, last = _mean(training.losses[:_LOSSES_SAID]), _mean(training.losses[-_LOSSES_SAID:])
-    return TrainingResult(str(out), str(card), len(pictures), steps, first, last, largest)
+    return TrainingResult(
+        model=str(out),
+        card=str(card),
+        pictures=len(pictures),
+        steps=steps,
+        first_loss=first,
+        last_loss=last,
+        largest_difference=largest,
+    )
 
 
 def _mean(values: list[float]) -> float | None:

@@ -16,8 +16,22 @@ from edgevpr.runtime.preflight.probe import TechniqueCosts
 from edgevpr.runtime.preflight.trial import Trial
 from edgevpr.types import StageCost
 
-COSTS = TechniqueCosts(StageCost(0.1, 0.1), StageCost(0.004, 0.004), 90, 31_776, 88.0, 40, StageCost(1e-6, 1e-6))
-HOG = TechniqueCosts(StageCost(0.01, 0.01), StageCost(0.0003, 0.0003), 285_794, 285_768, 88.0)
+COSTS = TechniqueCosts(
+    encode=StageCost(0.1, 0.1),
+    match_per_place=StageCost(0.004, 0.004),
+    ram_bytes_per_place=90,
+    disk_bytes_per_place=31_776,
+    process_mb=88.0,
+    candidates=40,
+    scan_per_place=StageCost(1e-6, 1e-6),
+)
+HOG = TechniqueCosts(
+    encode=StageCost(0.01, 0.01),
+    match_per_place=StageCost(0.0003, 0.0003),
+    ram_bytes_per_place=285_794,
+    disk_bytes_per_place=285_768,
+    process_mb=88.0,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -37,9 +51,11 @@ def tried(monkeypatch):
         for offer in wanted:
             asked.append(offer.label)
             if offer.name == "calc":
-                yield Trial("calc", "calc", {}, problem="There is no model `calc`.")
+                yield Trial(label="calc", name="calc", settings={}, problem="There is no model `calc`.")
                 continue
-            yield Trial(offer.label, offer.name, offer.settings, HOG if offer.name == "hog" else COSTS)
+            yield Trial(
+                label=offer.label, name=offer.name, settings=offer.settings, costs=HOG if offer.name == "hog" else COSTS
+            )
 
     monkeypatch.setattr(measured, "try_each", try_each)
     monkeypatch.setattr(techniques, "names", lambda: ("cohog", "hog", "seqslam", "calc"))
@@ -160,7 +176,7 @@ def test_an_interruption_leaves_the_old_figures_as_they_were(capsys, tmp_path, m
     before = (folder / "measured.json").read_bytes()
 
     def interrupted(*_, **__):
-        yield Trial("cohog", "cohog", {}, COSTS)
+        yield Trial(label="cohog", name="cohog", settings={}, costs=COSTS)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(measured, "try_each", interrupted)

@@ -13,9 +13,32 @@ from edgevpr.helpers.figures import require_picture
 pytest.importorskip("matplotlib", reason="pictures need the extra `plots`")
 
 _RESULT = TechniqueResult(
-    "cohog", {}, 4, 4, 0.75, 1, 1, 0.75, 0.5, 0.6, 0.7, 0.9, 1, 0, 0.01, 0.01, 0.001, 64, 0, 0.1, 0.1, 1e-3, 1e-3,
-    "one watt", ((1.0, 0.33), (1.0, 0.66), (0.66, 0.66), (0.75, 1.0)),
-)  # fmt: skip
+    technique="cohog",
+    parameters={},
+    queries=4,
+    references=4,
+    recall_at_1=0.75,
+    recall_at_5=1,
+    recall_at_10=1,
+    precision_at_100_recall=0.75,
+    recall_at_100_precision=0.5,
+    auc=0.6,
+    ep=0.7,
+    roc_auc=0.9,
+    accepted=1,
+    accepted_wrong=0,
+    t_encode_s=0.01,
+    t_match_s=0.01,
+    t_match_per_ref_s=0.001,
+    descriptor_bytes=64,
+    fine_bytes=0,
+    u_encode=0.1,
+    u_match=0.1,
+    ah_total=1e-3,
+    ah_total_cpu_rail=1e-3,
+    ah_assumes="one watt",
+    precision_recall=((1.0, 0.33), (1.0, 0.66), (0.66, 0.66), (0.75, 1.0)),
+)
 
 
 def test_a_panel_a_set_and_also_a_curve_of_one_point_is_drawn(tmp_path):

@@ -12,7 +12,8 @@ import pytest
 from mavlink_peers import Peer, TcpServer, TurnedClock, UdpPort, free_port, wait_until
 
 from edgevpr.errors import LinkError
-from edgevpr.mavlink.link import Link, parse_link
+from edgevpr.mavlink.address import parse_link
+from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Fix, Health, Severity, place_match, query_figures, status_text
 from edgevpr.mavlink.outbox import MESSAGES_MAX
 from edgevpr.mavlink.wire import mavlink

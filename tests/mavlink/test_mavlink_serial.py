@@ -10,7 +10,8 @@ import pytest
 from mavlink_peers import AutopilotThread, SerialCable, TurnedClock, wait_until
 
 from edgevpr.errors import LinkError
-from edgevpr.mavlink.link import Link, parse_link
+from edgevpr.mavlink.address import parse_link
+from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Fix, Severity, status_text
 from edgevpr.mavlink.wire import Receiver
 

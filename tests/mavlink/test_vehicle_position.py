@@ -3,8 +3,10 @@
 import pytest
 from mavlink_peers import Peer, TurnedClock, UdpPort, wait_until
 
-from edgevpr.mavlink.link import Link, VehiclePosition, parse_link
+from edgevpr.mavlink.address import parse_link
+from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.wire import mavlink
+from edgevpr.types import Vehicle
 
 
 @pytest.fixture
@@ -39,7 +41,9 @@ def test_the_position_of_the_pinned_autopilot_is_known_while_it_is_fresh(link_an
     wait_until(lambda: link.stats().autopilot_heard)
     assert link.vehicle_position(1.0) is None
     say(link, peer, 50.1234567, -14.5)
-    expected = VehiclePosition(50.1234567, -14.5, 312.5, 90.5, clock.now_s, has_gps=False)
+    expected = Vehicle(
+        lat_deg=50.1234567, lon_deg=-14.5, alt_m=312.5, heading_deg=90.5, t_heard_s=clock.now_s, has_gps=False
+    )
     assert wait_until(lambda: link.vehicle_position(1.0)) == expected
     clock.now_s += 1.0
     assert link.vehicle_position(1.0) == expected

@@ -7,17 +7,24 @@ import numpy as np
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.types import Descriptor, Frame, PartSpec, Position, TechniqueSpec
 
-SPEC = TechniqueSpec("test", {"seed": 1}, PartSpec((64,), "<f2"), PartSpec((40, 32), "<f4"))
+SPEC = TechniqueSpec(name="test", parameters={"seed": 1}, coarse=PartSpec((64,), "<f2"), fine=PartSpec((40, 32), "<f4"))
 
 
 def frame(number: int) -> Frame:
     position = None if number % 5 == 0 else Position(50.0 + number * 1e-4, 8.0, 100.0 + number)
-    return Frame(np.zeros((16, 16), np.uint8), f"{number:05d}.jpg", 0.0, 1.7e9 + number, position, number % 360)
+    return Frame(
+        image=np.zeros((16, 16), np.uint8),
+        name=f"{number:05d}.jpg",
+        t_mono_s=0.0,
+        t_utc_s=1.7e9 + number,
+        position=position,
+        heading_deg=number % 360,
+    )
 
 
 def descriptor(number: int) -> Descriptor:
     rng = np.random.default_rng(number)
-    return Descriptor(rng.random(64).astype("<f2"), rng.random((40, 32), dtype=np.float32), quality=0.75)
+    return Descriptor(coarse=rng.random(64).astype("<f2"), fine=rng.random((40, 32), dtype=np.float32), quality=0.75)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,14 @@ from edgevpr.types import Descriptor, FineMatch, Frame, PartSpec, Position, Tech
 class Signs:
     """Packs as cohog does, simply: the sign of what a place has more of than the mean of the map."""
 
-    spec = TechniqueSpec("signs", {}, PartSpec((256,), "<f4"), None, None, PartSpec((256,), "<i1"))
+    spec = TechniqueSpec(
+        name="signs",
+        parameters={},
+        coarse=PartSpec((256,), "<f4"),
+        fine=None,
+        model_sha256=None,
+        packed=PartSpec((256,), "<i1"),
+    )
     candidates = 5
     min_score = min_margin = 0.0
 
@@ -34,14 +41,16 @@ class Signs:
 
 def descriptor(number, quality=1.0):
     # A strong common part: without the mean, all signs would be alike.
-    return Descriptor(5 + np.random.default_rng(number).random(256, np.float32), quality=quality)
+    return Descriptor(coarse=5 + np.random.default_rng(number).random(256, np.float32), quality=quality)
 
 
 def learn(place_map, growing, numbers, quality=lambda number: 1.0):
     for number in numbers:
         position = Position(50.0 + number * 1e-4, 8.0) if number % 7 else None
         made = descriptor(number, quality(number))
-        place_id = place_map.add(Frame(np.zeros((1, 1)), f"{number}", 0.0, None, position), made)
+        place_id = place_map.add(
+            Frame(image=np.zeros((1, 1)), name=f"{number}", t_mono_s=0.0, t_utc_s=None, position=position), made
+        )
         growing.add(place_id, position, made.coarse)
 
 
@@ -63,7 +72,7 @@ def assert_packed_alike(index, parts):
 
 
 def test_an_index_that_began_empty_is_what_a_fresh_load_gives_whenever_it_has_doubled(empty_map):
-    growing = GrowingIndex(empty_map, Signs(), 10**6, room=1000)
+    growing = GrowingIndex(place_map=empty_map, technique=Signs(), budget_bytes=10**6, room=1000)
     assert len(growing.index) == 0
     learn(empty_map, growing, range(127))
     fresh = load_index(empty_map, Signs(), 10**6)
@@ -79,8 +88,8 @@ def test_an_index_that_began_empty_is_what_a_fresh_load_gives_whenever_it_has_do
 
 
 def test_a_map_with_places_is_loaded_as_ever_and_goes_on(empty_map):
-    learn(empty_map, GrowingIndex(empty_map, Signs(), 10**6, room=50), range(30))
-    growing = GrowingIndex(empty_map, Signs(), 10**6, room=50)
+    learn(empty_map, GrowingIndex(place_map=empty_map, technique=Signs(), budget_bytes=10**6, room=50), range(30))
+    growing = GrowingIndex(place_map=empty_map, technique=Signs(), budget_bytes=10**6, room=50)
     assert_same(growing.index, load_index(empty_map, Signs(), 10**6))
     learn(empty_map, growing, range(30, 40))
     assert growing.index.place_ids.tolist() == list(range(1, 41))
@@ -88,7 +97,9 @@ def test_a_map_with_places_is_loaded_as_ever_and_goes_on(empty_map):
 
 
 def test_a_full_index_keeps_its_best_places_and_the_file_keeps_all(empty_map):
-    growing = GrowingIndex(empty_map, Signs(), 40 * bytes_per_place(Signs.spec) + 5, room=10**6)
+    growing = GrowingIndex(
+        place_map=empty_map, technique=Signs(), budget_bytes=40 * bytes_per_place(Signs.spec) + 5, room=10**6
+    )
     learn(empty_map, growing, range(400), quality=lambda number: 0.9 if number % 2 else 0.1)
     index = growing.index
     assert len(empty_map) == 400
@@ -108,7 +119,7 @@ def test_the_budget_holds_at_every_moment_of_growing(empty_map):
     technique, places = Signs(), 4000
     each = bytes_per_place(technique.spec)
     tracemalloc.start()
-    growing = GrowingIndex(empty_map, technique, places * each, room=10**6)
+    growing = GrowingIndex(place_map=empty_map, technique=technique, budget_bytes=places * each, room=10**6)
     empty_map._db.execute("PRAGMA synchronous = OFF")  # four thousand syncs would only take time
     learn(empty_map, growing, range(places))
     tracemalloc.reset_peak()
@@ -122,8 +133,10 @@ def test_the_budget_holds_at_every_moment_of_growing(empty_map):
 
 
 def test_a_map_larger_than_the_budget_begins_with_its_best_places_and_goes_on(empty_map):
-    learn(empty_map, GrowingIndex(empty_map, Signs(), 10**6, room=100), range(60))
-    growing = GrowingIndex(empty_map, Signs(), 20 * bytes_per_place(Signs.spec), room=100)
+    learn(empty_map, GrowingIndex(place_map=empty_map, technique=Signs(), budget_bytes=10**6, room=100), range(60))
+    growing = GrowingIndex(
+        place_map=empty_map, technique=Signs(), budget_bytes=20 * bytes_per_place(Signs.spec), room=100
+    )
     assert_same(growing.index, load_index(empty_map, Signs(), 20 * bytes_per_place(Signs.spec)))
     learn(empty_map, growing, range(60, 130))  # its mean is that of 120 places by then
     index = growing.index
@@ -135,12 +148,12 @@ def test_a_map_larger_than_the_budget_begins_with_its_best_places_and_goes_on(em
 
 def test_what_grows_beside_the_index_is_left_room_in_the_budget(empty_map):
     each = bytes_per_place(Signs.spec)
-    growing = GrowingIndex(empty_map, Signs(), 40 * each, room=100, beside_bytes=each)
+    growing = GrowingIndex(place_map=empty_map, technique=Signs(), budget_bytes=40 * each, room=100, beside_bytes=each)
     assert growing.nbytes == 20 * each
 
 
 def test_a_file_that_fails_while_all_is_packed_anew_leaves_rows_of_one_mean(empty_map, monkeypatch):
-    growing = GrowingIndex(empty_map, Signs(), 10**6, room=2000)
+    growing = GrowingIndex(place_map=empty_map, technique=Signs(), budget_bytes=10**6, room=2000)
     empty_map._db.execute("PRAGMA synchronous = OFF")
     learn(empty_map, growing, range(1023))
     parts = {place_id: part for place_id, _, part in empty_map.coarse_parts()}
@@ -164,7 +177,7 @@ def test_a_file_that_fails_while_all_is_packed_anew_leaves_rows_of_one_mean(empt
 
 
 def test_a_place_damaged_since_it_was_read_changes_nothing_in_ram(empty_map):
-    growing = GrowingIndex(empty_map, Signs(), 10**6, room=100)
+    growing = GrowingIndex(place_map=empty_map, technique=Signs(), budget_bytes=10**6, room=100)
     learn(empty_map, growing, range(15))
     parts = {place_id: part for place_id, _, part in empty_map.coarse_parts()}
     parts[16] = descriptor(15).coarse
@@ -174,11 +187,13 @@ def test_a_place_damaged_since_it_was_read_changes_nothing_in_ram(empty_map):
     assert growing.index.place_ids.tolist() == list(range(1, 17))
     assert_packed_alike(growing.index, parts)
     with pytest.raises(MapError, match="place 3 is damaged"):
-        GrowingIndex(empty_map, Signs(), 10**6, room=100)
+        GrowingIndex(place_map=empty_map, technique=Signs(), budget_bytes=10**6, room=100)
 
 
 def test_a_place_gone_when_the_worst_are_given_up_changes_nothing_in_ram(empty_map):
-    growing = GrowingIndex(empty_map, Signs(), 10 * bytes_per_place(Signs.spec), room=100)
+    growing = GrowingIndex(
+        place_map=empty_map, technique=Signs(), budget_bytes=10 * bytes_per_place(Signs.spec), room=100
+    )
     learn(empty_map, growing, range(10))
     empty_map._db.execute("DELETE FROM places WHERE place_id = 3")
     with pytest.raises(MapError, match="a place is gone"):
@@ -188,7 +203,7 @@ def test_a_place_gone_when_the_worst_are_given_up_changes_nothing_in_ram(empty_m
 
 def test_a_budget_that_holds_no_place_is_refused(empty_map):
     with pytest.raises(MapError, match="raise --budget-mb"):
-        GrowingIndex(empty_map, Signs(), bytes_per_place(Signs.spec) - 1, room=10)
+        GrowingIndex(place_map=empty_map, technique=Signs(), budget_bytes=bytes_per_place(Signs.spec) - 1, room=10)
 
 
 def test_cohog_grows_as_it_would_be_loaded(tmp_path):
@@ -196,9 +211,11 @@ def test_cohog_grows_as_it_would_be_loaded(tmp_path):
     spec = technique.spec
     rng = np.random.default_rng(1)
     with PlaceMap.create(tmp_path / "c.gpkg", spec) as place_map:
-        growing = GrowingIndex(place_map, technique, 10**6, room=100)
+        growing = GrowingIndex(place_map=place_map, technique=technique, budget_bytes=10**6, room=100)
         for number in range(8):
             coarse = rng.random(spec.coarse.shape).astype(spec.coarse.dtype)
-            made = Descriptor(coarse, np.zeros(spec.fine.shape, spec.fine.dtype))
-            growing.add(place_map.add(Frame(np.zeros((1, 1)), f"{number}", 0.0), made), None, coarse)
+            made = Descriptor(coarse=coarse, fine=np.zeros(spec.fine.shape, spec.fine.dtype))
+            growing.add(
+                place_map.add(Frame(image=np.zeros((1, 1)), name=f"{number}", t_mono_s=0.0), made), None, coarse
+            )
         assert_same(growing.index, load_index(place_map, technique, 10**6))

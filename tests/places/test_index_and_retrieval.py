@@ -15,14 +15,14 @@ from edgevpr.types import Descriptor, FineMatch, Frame, PartSpec, Position, Tech
 class Ruler:
     """Places are numbers: the coarse part is the number to the nearest 10, the fine part the number itself."""
 
-    spec = TechniqueSpec("ruler", {}, PartSpec((1,), "<f4"), PartSpec((1,), "<f8"))
+    spec = TechniqueSpec(name="ruler", parameters={}, coarse=PartSpec((1,), "<f4"), fine=PartSpec((1,), "<f8"))
     min_score = min_margin = 0.0
     candidates = 20
     compared = 0
 
     def encode(self, image, mask=None):
         number = float(image[0, 0])
-        return Descriptor(np.array([round(number, -1)], "<f4"), np.array([number]))
+        return Descriptor(coarse=np.array([round(number, -1)], "<f4"), fine=np.array([number]))
 
     def coarse_scores(self, query, rows, mean):
         return 1 / (1 + abs(rows[:, 0] - query.coarse[0])), None
@@ -39,7 +39,10 @@ def ruler_map(tmp_path):
         for number in range(0, 100, 4):
             image = np.full((1, 1), number)
             position = Position(0.0, number * 1e-4) if number != 60 else None
-            place_map.add(Frame(image, f"{number}", 0.0, None, position), technique.encode(image))
+            place_map.add(
+                Frame(image=image, name=f"{number}", t_mono_s=0.0, t_utc_s=None, position=position),
+                technique.encode(image),
+            )
     with PlaceMap.open(tmp_path / "ruler.gpkg") as place_map:
         yield technique, place_map
 
@@ -121,7 +124,7 @@ def test_a_single_place_is_ahead_of_nothing(tmp_path):
     technique = Ruler()
     image = np.full((1, 1), 5)
     with PlaceMap.create(tmp_path / "one.gpkg", technique.spec) as place_map:
-        place_map.add(Frame(image, "5", 0.0), technique.encode(image))
+        place_map.add(Frame(image=image, name="5", t_mono_s=0.0), technique.encode(image))
         index = load_index(place_map, technique, 1000)
         assert margin(rank(technique, technique.encode(image), place_map, index), index, 50.0) is None
 
@@ -129,7 +132,7 @@ def test_a_single_place_is_ahead_of_nothing(tmp_path):
 def test_a_descriptor_of_the_wrong_size_is_named(tmp_path):
     spec = dataclasses.replace(Ruler.spec, fine=None)
     with PlaceMap.create(tmp_path / "bad.gpkg", spec) as place_map:
-        place_map.add(Frame(np.zeros((1, 1)), "a", 0.0), Descriptor(np.zeros(1, "<f4")))
+        place_map.add(Frame(image=np.zeros((1, 1)), name="a", t_mono_s=0.0), Descriptor(coarse=np.zeros(1, "<f4")))
         place_map._db.execute("UPDATE places SET coarse = x'00'")
         with pytest.raises(MapError, match="place 1 is damaged"):
             load_index(place_map, Ruler(), 1000)
@@ -187,7 +190,10 @@ def test_reach_counts_for_a_technique_of_one_stage_too(tmp_path):
         for number in range(0, 200, 10):
             position = Position(0.0, number * 1e-4)
             made = technique.encode(np.full((1, 1), number))
-            place_map.add(Frame(np.zeros((1, 1)), f"{number}", 0.0, None, position), Descriptor(made.coarse))
+            place_map.add(
+                Frame(image=np.zeros((1, 1)), name=f"{number}", t_mono_s=0.0, t_utc_s=None, position=position),
+                Descriptor(coarse=made.coarse),
+            )
         index = load_index(place_map, technique, 10_000)
         allowed = np.isin(index.place_ids, [11, 12])
         ranking = rank(technique, technique.encode(np.full((1, 1), 10)), place_map, index, None, 200.0, allowed)
@@ -205,7 +211,17 @@ def test_the_index_knows_distances_and_headings(tmp_path):
     with PlaceMap.create(tmp_path / "turned.gpkg", technique.spec) as place_map:
         for number, heading_deg in enumerate(headings):
             position = Position(0.0, 179.9995 + number * 1e-3 - 360 * (number > 0)) if number < 5 else None
-            place_map.add(Frame(image, f"{number}", 0.0, None, position, heading_deg), technique.encode(image))
+            place_map.add(
+                Frame(
+                    image=image,
+                    name=f"{number}",
+                    t_mono_s=0.0,
+                    t_utc_s=None,
+                    position=position,
+                    heading_deg=heading_deg,
+                ),
+                technique.encode(image),
+            )
         index = load_index(place_map, technique, 10_000)
     expected = [0.0, 359.99, 123.4, np.nan, 270.0, 0.5]
     np.testing.assert_allclose(index.heading_deg, expected, atol=0.13)  # half a step of half precision

@@ -107,7 +107,14 @@ def test_a_meter_that_goes_while_calibrating_is_one_sentence(tree, clock):
 
 def test_a_meter_of_the_cpu_alone_verifies_no_board(clock, tree):
     board = Board(tree, clock)
-    meter = Meter("rapl", "RAPL (1 CPU package)", "cpu", 1.0, lambda: (10 * clock() + board.ticks[0] / 40,), (1e6,))
+    meter = Meter(
+        kind="rapl",
+        title="RAPL (1 CPU package)",
+        covers="cpu",
+        period_s=1.0,
+        look=lambda: (10 * clock() + board.ticks[0] / 40,),
+        wraps_j=(1e6,),
+    )
     calibration = run(board, meter)
     assert calibration.fit.idle_w == pytest.approx(10, abs=0.05)
     assert not calibration.verified

@@ -78,7 +78,9 @@ def test_an_unknown_arm_board_gets_a_profile_that_invents_nothing(tree, tmp_path
     assert (board.recognised_by, board.cores, board.ram_mb) == ("Radxa ROCK 5B", 8, 16384.0)
     assert (board.idle_w, board.full_w, board.verified) == (0.0, 1.0, False)
     assert board.source.startswith("nobody has measured a Radxa ROCK 5B: relative figures")
-    assert board.benchmark_score == Score(None, None, None, None, False, "nobody has measured it")
+    assert board.benchmark_score == Score(
+        single=None, multi=None, products=None, passes=None, verified=False, source="nobody has measured it"
+    )
     assert (board.thermal_limit_c, board.technique) == (85.0, "cohog")
 
 
@@ -139,10 +141,14 @@ def test_whatever_a_board_calls_itself_the_file_can_be_read(tree, tmp_path, mode
 
 
 def test_a_score_and_a_calibration_replace_what_nobody_knows(tree, tmp_path):
-    meter = Meter("ina", "INA3221 (hwmon1), channel VDD_IN", "board", 0.05, tuple)
-    calibration = Calibration(PowerFit(2.123456, 4.5, 0.08, 0.997, ((0, 2.1), (0.5, 4.4), (1, 6.6))), meter, 0)
+    meter = Meter(kind="ina", title="INA3221 (hwmon1), channel VDD_IN", covers="board", period_s=0.05, look=tuple)
+    calibration = Calibration(
+        PowerFit(idle_w=2.123456, span_w=4.5, residual_w=0.08, r2=0.997, samples=((0, 2.1), (0.5, 4.4), (1, 6.6))),
+        meter,
+        0,
+    )
     found = detect(tree(arm("Radxa ZERO 3", *["0xd05"] * 4)))
-    score = Score(0.21, 0.8, 0.11, 0.4, True, "edgevpr's micro-benchmark")
+    score = Score(single=0.21, multi=0.8, products=0.11, passes=0.4, verified=True, source="edgevpr's micro-benchmark")
     board = written(tmp_path, found, score, calibration)
     assert (board.idle_w, board.full_w, board.verified) == (2.123, 6.623, True)
     assert board.source == (

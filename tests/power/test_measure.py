@@ -16,7 +16,7 @@ def watts(clock, power, period_s=0.1):
             raise MeterError(value)
         return (value,)
 
-    return Meter("ina", "INA219 (hwmon0)", "board", period_s, look)
+    return Meter(kind="ina", title="INA219 (hwmon0)", covers="board", period_s=period_s, look=look)
 
 
 def joules(clock, power_w, wraps_j, first_j):
@@ -24,7 +24,7 @@ def joules(clock, power_w, wraps_j, first_j):
         passed_s = clock() - 1000.0
         return tuple((first + power_w * passed_s) % wrap for first, wrap in zip(first_j, wraps_j, strict=True))
 
-    return Meter("rapl", "RAPL", "cpu", 1.0, look, wraps_j)
+    return Meter(kind="rapl", title="RAPL", covers="cpu", period_s=1.0, look=look, wraps_j=wraps_j)
 
 
 def test_a_ramp_is_integrated_exactly(clock):
@@ -54,7 +54,14 @@ def test_counters_that_wrap_go_on_each_for_itself(clock):
 
 def test_a_counter_that_was_reset_is_no_power(clock):
     start_j = [5000.0]
-    meter = Meter("rapl", "RAPL", "cpu", 1.0, lambda: (start_j[0] + clock() - 1000.0,), (262143.0,))
+    meter = Meter(
+        kind="rapl",
+        title="RAPL",
+        covers="cpu",
+        period_s=1.0,
+        look=lambda: (start_j[0] + clock() - 1000.0,),
+        wraps_j=(262143.0,),
+    )
     clock.at(4.5, lambda: start_j.__setitem__(0, 0.0))
     with pytest.raises(MeterError, match=r"RAPL failed 3 times in a row; the last time: its counter moved by"):
         measure(meter, 10.0, clock, clock.sleep)

@@ -33,14 +33,30 @@ def mark_in(frame: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(
     ("pose", "column", "row"),
     [
-        (Pose(70, 90, 80, 0), 0, 0),
-        (Pose(60, 90, 80, 0), F * 10 / 80, 0),  # the mark is 10 m to the right of a nose that points north
-        (Pose(70, 80, 80, 0), 0, -F * 10 / 80),  # ... 10 m ahead: up in the picture
-        (Pose(60, 90, 80, 90), 0, -F * 10 / 80),  # nose east: ahead
-        (Pose(70, 80, 80, 90), -F * 10 / 80, 0),  # nose east: 10 m to the left
-        (Pose(70, 80, 40, 180), 0, F * 10 / 40),  # nose south, half as high: twice as far behind
-        (Pose(70, 90, 80, 0, roll_deg=5), F * np.tan(np.radians(5)), 0),  # right wing down: the camera looks left
-        (Pose(70, 90, 80, 0, pitch_deg=5), 0, F * np.tan(np.radians(5))),  # nose up: it looks ahead
+        (Pose(east_m=70, north_m=90, height_m=80, heading_deg=0), 0, 0),
+        (
+            Pose(east_m=60, north_m=90, height_m=80, heading_deg=0),
+            F * 10 / 80,
+            0,
+        ),  # the mark is 10 m to the right of a nose that points north
+        (Pose(east_m=70, north_m=80, height_m=80, heading_deg=0), 0, -F * 10 / 80),  # ... 10 m ahead: up in the picture
+        (Pose(east_m=60, north_m=90, height_m=80, heading_deg=90), 0, -F * 10 / 80),  # nose east: ahead
+        (Pose(east_m=70, north_m=80, height_m=80, heading_deg=90), -F * 10 / 80, 0),  # nose east: 10 m to the left
+        (
+            Pose(east_m=70, north_m=80, height_m=40, heading_deg=180),
+            0,
+            F * 10 / 40,
+        ),  # nose south, half as high: twice as far behind
+        (
+            Pose(east_m=70, north_m=90, height_m=80, heading_deg=0, roll_deg=5),
+            F * np.tan(np.radians(5)),
+            0,
+        ),  # right wing down: the camera looks left
+        (
+            Pose(east_m=70, north_m=90, height_m=80, heading_deg=0, pitch_deg=5),
+            0,
+            F * np.tan(np.radians(5)),
+        ),  # nose up: it looks ahead
     ],
 )
 def test_a_known_point_appears_where_it_must(marked, pose, column, row):
@@ -54,15 +70,22 @@ def test_the_homography_and_the_picture_agree_at_any_pose(marked):
     rng = np.random.default_rng(5)
     for _ in range(10):
         off = rng.uniform(-1, 1, 6)
-        pose = Pose(70 + 15 * off[0], 90 + 12 * off[1], 80 + 10 * off[2], 180 * off[3], 4 * off[4], 4 * off[5])
+        pose = Pose(
+            east_m=70 + 15 * off[0],
+            north_m=90 + 12 * off[1],
+            height_m=80 + 10 * off[2],
+            heading_deg=180 * off[3],
+            roll_deg=4 * off[4],
+            pitch_deg=4 * off[5],
+        )
         expected = ground_to_pixel(pose, CAMERA) @ (*MARK_M, 1)
         frame = photograph(ground, 0.25, pose, CAMERA, NOON, rng)
         assert mark_in(frame) == pytest.approx(expected[:2] / expected[2], abs=0.6)
 
 
 def test_light_changes_the_picture_and_not_its_geometry(marked):
-    pose = Pose(75, 84, 78, 30, 2, -1)
-    evening = Light(300, 20, warmth=1, haze_frac=0.2, exposure=0.9, gamma=1.2)
+    pose = Pose(east_m=75, north_m=84, height_m=78, heading_deg=30, roll_deg=2, pitch_deg=-1)
+    evening = Light(sun_azimuth_deg=300, sun_elevation_deg=20, warmth=1, haze_frac=0.2, exposure=0.9, gamma=1.2)
     centres, frames = [], []
     for light in (NOON, evening):
         frames.append(photograph(lit(marked, light, 0), 0.25, pose, CAMERA, light, np.random.default_rng(0)))
@@ -73,7 +96,7 @@ def test_light_changes_the_picture_and_not_its_geometry(marked):
 
 def test_every_part_of_the_light_and_the_camera_has_its_effect():
     scene = make_scene(2, 120, 100, metres_per_pixel=0.4)
-    pose = Pose(60, 50, 40, 0)
+    pose = Pose(east_m=60, north_m=50, height_m=40, heading_deg=0)
 
     def frame(light: Light, camera: Camera) -> np.ndarray:
         return photograph(lit(scene, light, 1), 0.4, pose, camera, light, np.random.default_rng(0)).astype(int)
@@ -93,7 +116,14 @@ def test_every_part_of_the_light_and_the_camera_has_its_effect():
 def test_motion_blurs_along_the_flight_only(marked):
     def extent(blur_px: float) -> tuple[int, int]:
         camera = replace(CAMERA, blur_px=blur_px)
-        frame = photograph(lit(marked, NOON, 0), 0.25, Pose(*MARK_M, 80, 0), camera, NOON, np.random.default_rng(0))
+        frame = photograph(
+            lit(marked, NOON, 0),
+            0.25,
+            Pose(east_m=MARK_M[0], north_m=MARK_M[1], height_m=80, heading_deg=0),
+            camera,
+            NOON,
+            np.random.default_rng(0),
+        )
         rows, columns = np.nonzero(frame.max(axis=2) > 40)
         return int(np.ptp(columns)), int(np.ptp(rows))
 

@@ -43,7 +43,7 @@ def test_a_scene_has_texture_everywhere_and_things_that_stand_on_it():
 def test_a_mast_casts_its_shadow_away_from_the_sun(sun_azimuth_deg, shaded, sunny):
     scene = plain()
     scene.height_cm[59:62, 59:62] += 1000
-    ground = lit(scene, Light(sun_azimuth_deg, sun_elevation_deg=45), seed=0)
+    ground = lit(scene, Light(sun_azimuth_deg=sun_azimuth_deg, sun_elevation_deg=45), seed=0)
     assert ground[shaded].max() < 0.6 * ground[sunny].max()
 
 
@@ -57,5 +57,5 @@ def test_a_shadow_is_as_long_as_the_sun_is_low():
 def test_flat_ground_in_full_sun_is_evenly_lit_and_clouds_take_their_share():
     clear = lit(plain(), NOON, seed=1)
     assert np.ptp(clear.reshape(-1, 3), axis=0).max() == 0
-    cloudy = lit(plain(), Light(180, 60, cloud_frac=0.4), seed=1)
+    cloudy = lit(plain(), Light(sun_azimuth_deg=180, sun_elevation_deg=60, cloud_frac=0.4), seed=1)
     assert np.mean(cloudy[..., 1] < 0.85 * clear[0, 0, 1]) == pytest.approx(0.4, abs=0.15)

@@ -13,7 +13,8 @@ from mavlink_peers import AutopilotThread, Peer, UdpPort, free_port, wait_until
 
 from edgevpr.errors import LinkError, UsageError
 from edgevpr.mavlink import messages
-from edgevpr.mavlink.link import Link, parse_link
+from edgevpr.mavlink.address import parse_link
+from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Fix, Health
 from edgevpr.mavlink.wire import mavlink
 from edgevpr.simulate.autopilot import judge, read_track, run_autopilot

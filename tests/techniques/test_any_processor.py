@@ -28,7 +28,9 @@ def test_a_picture_is_scaled_to_the_same_pixels(picture):
 
 
 def test_a_network_sees_the_same_picture(picture):
-    rule = InputRule("NCHW", 512, 512, "grey", False, "linear", 1.0, [0.0])
+    rule = InputRule(
+        layout="NCHW", height=512, width=512, colour="grey", equalise=False, resize="linear", scale=1.0, mean=[0.0]
+    )
     assert zlib.crc32(prepare(picture, rule).astype(np.uint8)) == 2049827080
 
 

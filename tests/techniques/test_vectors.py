@@ -18,7 +18,7 @@ class Given(VectorTechnique):
     min_margin = 0.05
 
     def __init__(self, form="float", similarity="cosine", length=LENGTH):
-        super().__init__("given", {}, length, form, similarity)
+        super().__init__("given", {}, length, form=form, similarity=similarity)
 
     def vector(self, image, mask):
         return image

@@ -45,7 +45,7 @@ class Limits:
     temperature_c: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Reading:
     """What was measured since the last reading: the process's share of all cores (0..1), and the share of the time that
     queries took, 0 where nothing kept them waiting; and what is so now, None where nothing says."""

@@ -10,7 +10,7 @@ from edgevpr.errors import ImageError, ModelError
 from edgevpr.frames.live import LiveSource
 from edgevpr.frames.source import Source
 from edgevpr.mavlink import messages
-from edgevpr.mavlink.link import Link, VehiclePosition
+from edgevpr.mavlink.link import Link
 from edgevpr.power.load import machine_load
 from edgevpr.power.meter import stage
 from edgevpr.power.thermal import limit_c
@@ -22,7 +22,7 @@ from edgevpr.runtime.recognise.hints import AUTOPILOT_FRESH_S, Hints, Sighting, 
 from edgevpr.runtime.recognise.learn import POSITION_FRESH_S, Learner
 from edgevpr.runtime.recognise.pipeline import Pipeline, claimed_accuracy_m, in_form, without_index
 from edgevpr.runtime.recognise.record import record
-from edgevpr.types import Frame, PlaceMatch, Position, StageCost
+from edgevpr.types import Frame, PlaceMatch, Position, StageCost, Vehicle
 
 _log = logging.getLogger(__name__)
 _TURN_S = 0.2  # the loop turns at least this often, frames or none
@@ -145,7 +145,7 @@ class Flight:
         _log.warning("%s", error)
         self._flight_log.write("unusable", problem=str(error))
 
-    def _learn(self, learner: Learner, frame: Frame, event: PlaceMatch, vehicle: VehiclePosition | None) -> None:
+    def _learn(self, learner: Learner, frame: Frame, event: PlaceMatch, vehicle: Vehicle | None) -> None:
         """Make a place of the frame, where it is worth one; what is recognised from now on may be that place."""
         well = learner.trouble is None
         place = learner.learn(frame, event.descriptor, vehicle, self._t_fix_s)

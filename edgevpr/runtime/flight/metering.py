@@ -67,7 +67,14 @@ class FlightMeter:
 
     def reading(self) -> Reading:
         """For the governor, since the last one."""
-        return Reading(*self._load.look(), rss_mb(), self.thermal.temperature_c, self.thermal.throttled)
+        cpu_share, late_share = self._load.look()
+        return Reading(
+            cpu_share=cpu_share,
+            late_share=late_share,
+            rss_mb=rss_mb(),
+            temperature_c=self.thermal.temperature_c,
+            throttled=self.thermal.throttled,
+        )
 
     def close(self) -> None:
         self._watch.close()

@@ -13,7 +13,7 @@ from edgevpr.runtime.preflight.probe import TechniqueCosts
 _LOWEST_RATE_HZ = 0.01  # what the configuration allows
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Fit:
     """How a technique would sit on a board. It fits where there are no `shortfalls`; `remedies` would make it fit."""
 
@@ -62,7 +62,13 @@ def fit(board: Board, costs: TechniqueCosts, places: int, rate_hz: float, budget
                 remedies.append(f"at up to {_rounded_down(reachable_hz):g} Hz")
             elif reachable_hz >= rate_hz:
                 remedies.append(f"with a budget of {math.ceil(map_ram_mb)} MB")
-    return Fit(map_ram_mb, process_ram_mb, reachable_hz, tuple(shortfalls), tuple(remedies))
+    return Fit(
+        map_ram_mb=map_ram_mb,
+        process_ram_mb=process_ram_mb,
+        reachable_hz=reachable_hz,
+        shortfalls=tuple(shortfalls),
+        remedies=tuple(remedies),
+    )
 
 
 def require_technique(board: Board) -> None:

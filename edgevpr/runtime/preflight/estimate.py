@@ -16,7 +16,7 @@ from edgevpr.runtime.preflight.scale import UNKNOWN_PRODUCTS, Ratios, is_same, o
 from edgevpr.runtime.preflight.trial import Trial
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FlightPlan:
     """What is asked of the board: places in the map, queries a second, minutes in the air, from which pack, how much
     memory the map's index may take, and what the aircraft draws to hover (None: not said). Raises UsageError for a
@@ -43,7 +43,7 @@ class FlightPlan:
                 raise UsageError(f"The {what} is {value:g}: give a number above 0.")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class TechniqueEstimate:
     """One technique, in one form, on the board.
 
@@ -81,7 +81,7 @@ class TechniqueEstimate:
     measured: bool
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Estimate:
     """All techniques on one board. `times` is "measured" (on this machine, for this machine), "scaled" (from this
     machine to the board, by `ratios`) or "unscaled" (this machine's, for want of a figure); `measured_on` is the date

@@ -27,7 +27,7 @@ _ROUNDS = 10
 _FRAME = (480, 640)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Listed:
     """One card. `ok` is whether card and file agree, `problem` in one sentence why not; `techniques` use it unless told
     otherwise. Of a card that cannot be read nothing else is known."""
@@ -44,7 +44,7 @@ class Listed:
     techniques: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Verified:
     """A network that works here. `shapes` of its outputs; `vector_length` of the technique of its own (None: it has
     none); milliseconds for an image of 640x480, the quickest of ten; megabytes that onnxruntime took by being imported,
@@ -97,15 +97,15 @@ def verify_here(card: Card, threads: int = 1, learned: bool = True) -> Verified:
         network.run(frame)
         times_s.append(time.perf_counter() - start_s)
     return Verified(
-        card.name,
-        card.title,
-        threads,
-        card.file_path.stat().st_size / 1e6,
-        {output: backbone.shape for output, backbone in backbones.items()},
-        _vector_length(card, backbones, learned),
-        1000 * min(times_s),
-        imported_mb - before_mb,
-        rss_mb() - imported_mb,
+        name=card.name,
+        title=card.title,
+        threads=threads,
+        file_mb=card.file_path.stat().st_size / 1e6,
+        shapes={output: backbone.shape for output, backbone in backbones.items()},
+        vector_length=_vector_length(card, backbones, learned),
+        image_ms=1000 * min(times_s),
+        runtime_mb=imported_mb - before_mb,
+        network_mb=rss_mb() - imported_mb,
     )
 
 
@@ -164,7 +164,7 @@ def _listed(name: str) -> Listed:
     try:
         card = load_card(name)
     except EdgevprError as error:
-        return Listed(name, False, str(error))
+        return Listed(name=name, ok=False, problem=str(error))
     problem = None
     try:
         found = file_sha256(card.file_path)
@@ -180,16 +180,16 @@ def _listed(name: str) -> Listed:
     if card.is_technique and not techniques.is_own(name):
         users.insert(0, name)
     return Listed(
-        name,
-        problem is None,
-        problem,
-        card.title,
-        card.licence,
-        card.source,
-        str(card.file_path),
-        tuple(output for output, said in asdict(card.outputs).items() if said),
-        card.head["name"] if card.head else None,
-        tuple(users),
+        name=name,
+        ok=problem is None,
+        problem=problem,
+        title=card.title,
+        licence=card.licence,
+        source=card.source,
+        file=str(card.file_path),
+        outputs=tuple(output for output, said in asdict(card.outputs).items() if said),
+        head=card.head["name"] if card.head else None,
+        techniques=tuple(users),
     )
 
 

@@ -26,7 +26,7 @@ _NOTHING = StageCost(0.0, 0.0)
 _LINK_MB = 13.0  # what importing pymavlink adds to the resident memory (measured on x86-64)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class TechniqueCosts:
     """What a technique costs on one machine: to encode a frame, to compare it in full with one place (read from the map
     file), bytes of a place in RAM and on disk, and the most memory that the process has resident, without a map
@@ -79,7 +79,7 @@ def probe(technique: Technique, images: Several[np.ndarray] | None = None) -> Te
     moment is no cost of the technique.
     """
     counted = _quickest if images is None else _median
-    frames = [Frame(image, f"trial {i}", t_mono_s=0.0) for i, image in enumerate(images or noise(_ROUNDS))]
+    frames = [Frame(image=image, name=f"trial {i}", t_mono_s=0.0) for i, image in enumerate(images or noise(_ROUNDS))]
     peak_is_new = machine.forget_peak()
     before_mb = machine.rss_mb()
     technique.encode(frames[0].image)  # the first time also starts threads and imports what is imported late
@@ -122,7 +122,14 @@ def _many(technique: Technique, index: PlaceIndex) -> PlaceIndex:
     count = max(_PLACES, min(_SCANNED, _SCANNED_BYTES // technique.spec.row.nbytes))
     unknown = np.full(count, np.nan)
     rows = np.resize(index.rows, (count, *index.rows.shape[1:]))
-    return PlaceIndex(np.arange(count), unknown, unknown, unknown.astype(np.float16), rows, index.mean)
+    return PlaceIndex(
+        place_ids=np.arange(count),
+        lat_deg=unknown,
+        lon_deg=unknown,
+        heading_deg=unknown.astype(np.float16),
+        rows=rows,
+        mean=index.mean,
+    )
 
 
 def _scans(

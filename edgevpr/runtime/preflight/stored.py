@@ -39,7 +39,7 @@ _PACKAGES = {
 }
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Measured:
     """All techniques on one machine: when (local time), on which `pictures`, with how many `threads` of a network, and
     what the machine is (`identity`) and how fast (`score`, by the micro-benchmark)."""
@@ -107,14 +107,17 @@ def micro_benchmark() -> Score:
     from edgevpr.power import speed
 
     found = speed.score()
-    figures = (float(f"{value:.3g}") for value in (found.single, found.multi, found.products, found.passes))
-    return Score(*figures, True, "edgevpr's micro-benchmark, run on it; single and multi are means of both kinds")
+    figures = {name: float(f"{value:.3g}") for name, value in asdict(found).items()}
+    source = "edgevpr's micro-benchmark, run on it; single and multi are means of both kinds"
+    return Score(**figures, verified=True, source=source)
 
 
 def gathered(trials: Iterable[Trial], pictures: str, threads: int, score: Score) -> Measured:
     """What was measured just now on this machine."""
     now = datetime.now(timezone.utc).astimezone().isoformat(timespec="minutes")
-    return Measured(now, identity(), pictures, threads, score, tuple(trials))
+    return Measured(
+        date=now, identity=identity(), pictures=pictures, threads=threads, score=score, trials=tuple(trials)
+    )
 
 
 def require_room(path: Path, make: bool) -> None:

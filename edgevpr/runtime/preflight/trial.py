@@ -23,7 +23,7 @@ from edgevpr.techniques.networks.card import load_card, weights_of
 from edgevpr.types import StageCost
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Trial:
     """What became of an offer: its costs, or in one sentence why it cannot be used here. `model` is the fingerprint of
     its network, `weights` whose they are; `parameters` are all that the technique then had."""
@@ -73,7 +73,7 @@ def _missing(offer: Offer) -> str | None:
 
 
 def _refused(offer: Offer, problem: str) -> Trial:
-    return Trial(offer.name, offer.name, offer.settings, problem=problem)
+    return Trial(label=offer.name, name=offer.name, settings=offer.settings, problem=problem)
 
 
 def _in_a_process(offer: Offer, threads: int, images: Sequence[Path], rounds: int) -> Trial:
@@ -127,7 +127,16 @@ def _tried(job: dict[str, Any]) -> Trial:
     except EdgevprError as error:
         return _refused(offer, str(error))
     spec = technique.spec
-    return Trial(offer.label, offer.name, offer.settings, costs, None, model, weights_of(spec), spec.parameters)
+    return Trial(
+        label=offer.label,
+        name=offer.name,
+        settings=offer.settings,
+        costs=costs,
+        problem=None,
+        model=model,
+        weights=weights_of(spec),
+        parameters=spec.parameters,
+    )
 
 
 if __name__ == "__main__":

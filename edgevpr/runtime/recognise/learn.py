@@ -16,11 +16,10 @@ from edgevpr.errors import MapError, UsageError
 from edgevpr.frames.exif import read_exif
 from edgevpr.frames.images import list_images
 from edgevpr.frames.positions import find_positions
-from edgevpr.mavlink.link import VehiclePosition
 from edgevpr.places.growing import GrowingIndex
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.types import Descriptor, Frame, Place, PlaceMatch, Position
+from edgevpr.types import Descriptor, Frame, Place, PlaceMatch, Position, Vehicle
 
 POSITION_FRESH_S = 1.0
 _ECHO_S = 10.0  # for so long after a fix of ours, the autopilot's position may be what we told it
@@ -63,7 +62,7 @@ class Learner:
         return {"places": self.learnt, "left_out": dict(self.passed_over), "stopped": self.trouble}
 
     def learn(
-        self, frame: Frame, descriptor: Descriptor, vehicle: VehiclePosition | None, t_fix_s: float | None
+        self, frame: Frame, descriptor: Descriptor, vehicle: Vehicle | None, t_fix_s: float | None
     ) -> Place | None:
         """Make a place of the frame and give it, or None where it is not worth one; never raises MapError.
 
@@ -81,7 +80,14 @@ class Learner:
             place_id = self._map.add(here, descriptor)
             self.learnt += 1
             self._new.append((place_id, self._clock()))
-            place = Place(place_id, here.name, here.position, here.t_utc_s, here.heading_deg, descriptor.quality)
+            place = Place(
+                place_id=place_id,
+                source_image=here.name,
+                position=here.position,
+                t_utc_s=here.t_utc_s,
+                heading_deg=here.heading_deg,
+                quality=descriptor.quality,
+            )
             self._growing.add(place_id, here.position, descriptor.coarse, here.heading_deg)
         except MapError as error:
             self.trouble = str(error)
@@ -97,7 +103,7 @@ class Learner:
         reason = f"this place was learnt within the last {_NEW_FOR_S:g} s and says nothing new"
         return replace(event, accepted=False, reason=reason, position=None, accuracy_m=None)
 
-    def _placed(self, frame: Frame, vehicle: VehiclePosition | None, t_fix_s: float | None) -> tuple[Frame, str | None]:
+    def _placed(self, frame: Frame, vehicle: Vehicle | None, t_fix_s: float | None) -> tuple[Frame, str | None]:
         """The frame where it was taken, and what is to be said against learning it there."""
         if frame.position:  # a recording's own: no echo of anything
             return frame, None

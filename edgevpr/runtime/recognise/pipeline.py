@@ -162,7 +162,13 @@ def open_learning(config: Config) -> tuple[Pipeline, GrowingIndex]:
         place_map = _new_map(path, technique)
     place_map.index_positions()
     beside_bytes = bytes_beside_place(length_of(technique, config.match.sequence))
-    growing = GrowingIndex(place_map, technique, int(_budget_mb(config, board) * 1e6), _ROOM, beside_bytes)
+    growing = GrowingIndex(
+        place_map=place_map,
+        technique=technique,
+        budget_bytes=int(_budget_mb(config, board) * 1e6),
+        room=_ROOM,
+        beside_bytes=beside_bytes,
+    )
     return _pipeline(config, board, technique, place_map, growing.index), growing
 
 

@@ -11,7 +11,8 @@ from edgevpr import __version__
 from edgevpr.config import Config
 from edgevpr.errors import MapError, UsageError
 from edgevpr.frames.source import open_source
-from edgevpr.mavlink.link import Link, parse_link
+from edgevpr.mavlink.address import parse_link
+from edgevpr.mavlink.link import Link
 from edgevpr.runtime.flight.flightlog import FlightLog, start_fields
 from edgevpr.runtime.flight.loop import Flight, say_learning_stopped
 from edgevpr.runtime.flight.systemd import notify

@@ -15,7 +15,7 @@ from edgevpr.techniques.networks.card import load_card
 _ROWS_AT_ONCE = 64  # of an 8-bit matrix turned to float32 together
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Words:
     """`words` float32 (K, D); `sha256` of model and words together, for the map. Where the descriptor made of them is
     to be whitened: `mean` float32 (K D,) and `whitening` int8 (P, K D), to be multiplied by `scale` float32 (P,)."""
@@ -61,11 +61,17 @@ def load_words(model: str, kind: str, count: int) -> Words:
         raise ModelError(f"{path} must hold {count} words, and holds an array {words.shape}: {command}.")
     sha256 = hashlib.sha256((wanted + hashlib.sha256(content).hexdigest()).encode()).hexdigest()
     if "whitening" not in arrays:
-        return Words(words, sha256)
+        return Words(words=words, sha256=sha256)
     mean, whitening, scale = (arrays.get(key) for key in ("mean", "whitening", "whitening_scale"))
     if mean is None or scale is None or whitening.shape != (scale.size, words.size) or mean.shape != (words.size,):
         raise ModelError(f"{path} holds a whitening that does not fit its words: {command}.")
-    return Words(words, sha256, mean.astype(np.float32), whitening, scale.astype(np.float32).ravel())
+    return Words(
+        words=words,
+        sha256=sha256,
+        mean=mean.astype(np.float32),
+        whitening=whitening,
+        scale=scale.astype(np.float32).ravel(),
+    )
 
 
 def bag_of_words(local: np.ndarray, words: np.ndarray) -> np.ndarray:

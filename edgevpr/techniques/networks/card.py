@@ -25,7 +25,7 @@ _CHOICES = {
 }
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class InputRule:
     """How a picture becomes the network's input: (pixel * `scale` - `mean`) / `std`, the last two one number or one a
     channel. `equalise` equalises the histogram of its brightness first; `resize` stretches it to the size. With
@@ -95,7 +95,7 @@ HEADS = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Card:
     """One network. `path` is the card's own; `head` a name of `HEADS` and its parameters, or None."""
 

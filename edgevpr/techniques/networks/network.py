@@ -31,7 +31,7 @@ class CardNetwork(VectorTechnique):
         sha256 = hashlib.sha256(said.encode()).hexdigest()
         noise = np.random.default_rng(0).integers(0, 256, (card.input.height, card.input.width), np.uint8)
         length = len(self.vector(noise, None))  # a feature map too small for the head is said here
-        super().__init__(card.name, {}, length, form, card.similarity, sha256)
+        super().__init__(card.name, {}, length, form=form, similarity=card.similarity, model_sha256=sha256)
         self.encode(noise)  # and so are numbers that half precision does not hold
 
     def vector(self, image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:

@@ -22,7 +22,7 @@ _MOST_THREADS = 256
 _LARGEST = 1e12  # in float32 the length of a vector of much larger numbers is infinite, and the vector nothing
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Backbone:
     """One output of a network that has been seen to work. `shape` is (C, H, W) of features, (D,) of a descriptor;
     `sha256` is the card's fingerprint: weights, preparation and outputs (that of the file alone is `card.sha256`)."""
@@ -64,7 +64,7 @@ def backbone_of(card: Card, output: str, threads: int = 1) -> Backbone:
     # A picture with something in it: an even one is all zeros after many a network that is whole.
     noise = np.random.default_rng(_SEED).integers(0, 256, (card.input.height, card.input.width), np.uint8)
     result = _run(card, output, session, noise)
-    return Backbone(card, output, result.shape, card.fingerprint, session)
+    return Backbone(card=card, output=output, shape=result.shape, sha256=card.fingerprint, session=session)
 
 
 def file_sha256(path: Path) -> str:

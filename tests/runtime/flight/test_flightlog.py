@@ -18,7 +18,16 @@ from edgevpr.errors import EdgevprError
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log, start_fields
 from edgevpr.types import PartSpec, PlaceMatch, Position, QueryCost, TechniqueSpec
 
-COST = QueryCost(0.01, 0.02, 0.25, 0.25, 0.03, 61.5, 1.23456789e-05, float("nan"))
+COST = QueryCost(
+    t_encode_s=0.01,
+    t_match_s=0.02,
+    u_encode=0.25,
+    u_match=0.25,
+    cpu_s=0.03,
+    rss_mb=61.5,
+    used_mah=1.23456789e-05,
+    marginal_mah=float("nan"),
+)
 
 
 class Clock:
@@ -92,7 +101,7 @@ def test_numpy_paths_infinities_and_foreign_file_names_are_written(path):
 
 
 def test_the_first_line_says_who_flies_with_what(path):
-    spec = TechniqueSpec("cohog", {"image": 512}, PartSpec((4,), "<f4"))
+    spec = TechniqueSpec(name="cohog", parameters={"image": 512}, coarse=PartSpec((4,), "<f4"))
     config = load_config(None, {"map": "valley.gpkg"})
     with FlightLog(path) as log:
         log.write("start", **start_fields(config, "rpi-zero-2w", spec))

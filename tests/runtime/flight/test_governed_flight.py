@@ -49,7 +49,7 @@ class Camera:
 
     def read(self, timeout_s):
         self._left -= 1
-        return Frame(textured(0, 480, 640), "frame", time.monotonic())
+        return Frame(image=textured(0, 480, 640), name="frame", t_mono_s=time.monotonic())
 
 
 class Ground:
@@ -84,8 +84,8 @@ class Script:
         return self._look(self._now_s, self._readings.pop(0) if self._readings else CALM)
 
 
-CALM = Reading(0.01, 0.0, 100.0, 40.0, False)
-BUSY = Reading(1.0, 0.0, 100.0, 40.0, False)
+CALM = Reading(cpu_share=0.01, late_share=0.0, rss_mb=100.0, temperature_c=40.0, throttled=False)
+BUSY = Reading(cpu_share=1.0, late_share=0.0, rss_mb=100.0, temperature_c=40.0, throttled=False)
 
 
 def governed(config, log, readings, monkeypatch, count):
@@ -151,7 +151,13 @@ def test_memory_that_runs_short_loads_the_index_in_a_smaller_form_and_places_are
     monkeypatch.setattr(
         loop.Pipeline, "step", lambda self, *asked: (held.append(self.index.nbytes), step(self, *asked))[1]
     )
-    full = Reading(0.01, 0.0, 0.97 * open_pipeline(config).board.memory_max_mb, 40.0, False)
+    full = Reading(
+        cpu_share=0.01,
+        late_share=0.0,
+        rss_mb=0.97 * open_pipeline(config).board.memory_max_mb,
+        temperature_c=40.0,
+        throttled=False,
+    )
     changes, lines, texts = governed(config, tmp_path / "log", [full] * 4 + [CALM] * 6, monkeypatch, 12)
     assert [line["to"]["form"] for line in changes] == ["8bit", "1bit", "8bit", "float"]
     assert changes[0]["to"]["rate_hz"] == 60.0, "memory is no question of the rate"

@@ -9,8 +9,8 @@ from edgevpr.runtime.flight.governor import Change, Governor, Limits, Reading, S
 
 LIMITS = Limits(cpu_share=0.5, memory_max_mb=512, temperature_c=80)
 ASKED = Setting(2.0, 40)
-CALM = Reading(0.05, 0.0, 100.0, 50.0, False)
-BUSY = Reading(0.9, 0.0, 100.0, 50.0, False)
+CALM = Reading(cpu_share=0.05, late_share=0.0, rss_mb=100.0, temperature_c=50.0, throttled=False)
+BUSY = Reading(cpu_share=0.9, late_share=0.0, rss_mb=100.0, temperature_c=50.0, throttled=False)
 
 
 class Flight:
@@ -35,7 +35,9 @@ class Flight:
 
 def busy(share_at_full):
     """A load that grows with the rate, as with 40 candidates it would be at 2 Hz."""
-    return lambda setting, now_s: Reading(share_at_full * setting.rate_hz / 2, 0.0, 100.0, None, None)
+    return lambda setting, now_s: Reading(
+        cpu_share=share_at_full * setting.rate_hz / 2, late_share=0.0, rss_mb=100.0, temperature_c=None, throttled=None
+    )
 
 
 def test_the_rate_is_lowered_first_then_the_candidates_then_the_form():
@@ -112,7 +114,9 @@ def test_a_square_wave_load_settles(half_period_s):
 
     def reading(setting, now_s):
         share = 0.8 if now_s % (2 * half_period_s) < half_period_s else 0.2
-        return Reading(share * setting.rate_hz / 2, 0.0, 100.0, None, None)
+        return Reading(
+            cpu_share=share * setting.rate_hz / 2, late_share=0.0, rss_mb=100.0, temperature_c=None, throttled=None
+        )
 
     flight = Flight(reading)
     flight.fly(7200)
@@ -122,9 +126,21 @@ def test_a_square_wave_load_settles(half_period_s):
 
 def test_noise_around_the_limit_changes_the_rate_once_at_most():
     script = random.Random(3)
-    flight = Flight(lambda setting, now_s: Reading(script.gauss(0.5, 0.05) * setting.rate_hz / 2, 0, 100.0, None, None))
+    flight = Flight(
+        lambda setting, now_s: Reading(
+            cpu_share=script.gauss(0.5, 0.05) * setting.rate_hz / 2,
+            late_share=0,
+            rss_mb=100.0,
+            temperature_c=None,
+            throttled=None,
+        )
+    )
     assert len(flight.fly(3600)) <= 1
-    flight = Flight(lambda setting, now_s: Reading(0.1, 0.0, 100.0, script.gauss(80, 2), None))
+    flight = Flight(
+        lambda setting, now_s: Reading(
+            cpu_share=0.1, late_share=0.0, rss_mb=100.0, temperature_c=script.gauss(80, 2), throttled=None
+        )
+    )
     changes = flight.fly(3600)
     assert all(change.why != "there is room again" for change in changes), "never clearly below the limit"
 
@@ -138,7 +154,7 @@ def test_a_board_that_heats_slowly_is_held_below_its_limit(full_c):
         aim_c = 40 + (full_c - 40) * setting.rate_hz / 2
         temperature_c[0] += (aim_c - temperature_c[0]) / 90
         hottest_c.append(temperature_c[0])
-        return Reading(0.1, 0.0, 100.0, temperature_c[0], False)
+        return Reading(cpu_share=0.1, late_share=0.0, rss_mb=100.0, temperature_c=temperature_c[0], throttled=False)
 
     flight = Flight(reading)
     first = flight.fly(3600)
@@ -149,14 +165,20 @@ def test_a_board_that_heats_slowly_is_held_below_its_limit(full_c):
 
 
 def test_it_cools_between_two_steps_for_heat():
-    flight = Flight(lambda setting, now_s: Reading(0.1, 0.0, 100.0, 85.0, None))
+    flight = Flight(
+        lambda setting, now_s: Reading(cpu_share=0.1, late_share=0.0, rss_mb=100.0, temperature_c=85.0, throttled=None)
+    )
     flight.fly(60)
     at_s = [at for at, _ in flight.changes]
     assert [b - a for a, b in itertools.pairwise(at_s)] == [20.0, 20.0]
 
 
 def test_after_heat_it_goes_back_no_faster_than_it_went():
-    flight = Flight(lambda setting, now_s: Reading(0.1, 0.0, 100.0, 85.0 if now_s <= 30 else 60.0, None))
+    flight = Flight(
+        lambda setting, now_s: Reading(
+            cpu_share=0.1, late_share=0.0, rss_mb=100.0, temperature_c=85.0 if now_s <= 30 else 60.0, throttled=None
+        )
+    )
     flight.fly(120)
     assert flight.governor.setting == ASKED
     back_at_s = [at for at, change in flight.changes if change.back]
@@ -182,15 +204,23 @@ def test_the_wait_doubles_with_each_failure_and_begins_anew_when_all_was_well_fo
 
 
 def test_without_a_temperature_a_board_that_throttles_is_believed():
-    flight = Flight(lambda setting, now_s: Reading(0.1, 0.0, 100.0, None, None))
+    flight = Flight(
+        lambda setting, now_s: Reading(cpu_share=0.1, late_share=0.0, rss_mb=100.0, temperature_c=None, throttled=None)
+    )
     assert flight.fly(600) == []
-    flight.reading = lambda setting, now_s: Reading(0.1, 0.0, 100.0, None, True)
+    flight.reading = lambda setting, now_s: Reading(
+        cpu_share=0.1, late_share=0.0, rss_mb=100.0, temperature_c=None, throttled=True
+    )
     (change,) = flight.fly(10)
     assert (change.after.rate_hz, change.why) == (1.0, "the board slows itself down")
 
 
 def test_a_sensor_that_goes_away_while_it_is_hot_does_not_hold_the_rate_down():
-    flight = Flight(lambda setting, now_s: Reading(0.1, 0.0, 100.0, 85.0 if now_s < 10 else None, None))
+    flight = Flight(
+        lambda setting, now_s: Reading(
+            cpu_share=0.1, late_share=0.0, rss_mb=100.0, temperature_c=85.0 if now_s < 10 else None, throttled=None
+        )
+    )
     flight.fly(60)
     assert flight.governor.setting == ASKED
 
@@ -198,7 +228,13 @@ def test_a_sensor_that_goes_away_while_it_is_hot_does_not_hold_the_rate_down():
 def test_queries_that_others_make_late_are_asked_less_often_until_the_others_are_gone():
     def reading(setting, now_s):
         takes = 0.35 * setting.rate_hz  # of the time, at 2 Hz 0.7; another program doubles it until 100 s
-        return Reading(0.2, min(1.0, 2 * takes) if now_s < 100 else takes, 100.0, None, None)
+        return Reading(
+            cpu_share=0.2,
+            late_share=min(1.0, 2 * takes) if now_s < 100 else takes,
+            rss_mb=100.0,
+            temperature_c=None,
+            throttled=None,
+        )
 
     flight = Flight(reading)
     (change,) = flight.fly(99)
@@ -215,7 +251,15 @@ def test_memory_that_runs_short_is_saved_by_the_form_alone_and_given_back_when_i
     other_mb = [200.0]
     settings = steps(Setting(1.0, 1, "float"), keeps_rate=False, compares=False, forms=FORMS[1:])
     flight = Flight(
-        lambda setting, now_s: Reading(0.1, 0.0, other_mb[0] + FORMS_MB[setting.form], None, None), settings, FORMS_MB
+        lambda setting, now_s: Reading(
+            cpu_share=0.1,
+            late_share=0.0,
+            rss_mb=other_mb[0] + FORMS_MB[setting.form],
+            temperature_c=None,
+            throttled=None,
+        ),
+        settings,
+        FORMS_MB,
     )
     (change,) = flight.fly(600)
     assert (change.after, change.why) == (Setting(1.0, 1, "8bit"), "500 MB of memory taken, and 512 allowed")
@@ -229,7 +273,9 @@ def test_memory_that_runs_short_is_saved_by_the_form_alone_and_given_back_when_i
 
 
 def test_a_map_that_serves_no_other_form_has_its_memory_said_once():
-    flight = Flight(lambda setting, now_s: Reading(0.1, 0.0, 500.0, None, None))
+    flight = Flight(
+        lambda setting, now_s: Reading(cpu_share=0.1, late_share=0.0, rss_mb=500.0, temperature_c=None, throttled=None)
+    )
     (change,) = flight.fly(600)
     assert change.before == change.after == ASKED
     assert change.why == "500 MB of memory taken, and 512 allowed, and nothing is left to lower"
@@ -239,7 +285,13 @@ def test_memory_and_load_may_both_ask_for_a_form_and_each_is_given_back_for_itse
     settings = steps(Setting(1.0, 1, "float"), keeps_rate=True, compares=False, forms=FORMS[1:])
     trouble = {"cpu": 0.9, "mb": 200.0}
     flight = Flight(
-        lambda setting, now_s: Reading(trouble["cpu"], 0.0, trouble["mb"] + FORMS_MB[setting.form], None, None),
+        lambda setting, now_s: Reading(
+            cpu_share=trouble["cpu"],
+            late_share=0.0,
+            rss_mb=trouble["mb"] + FORMS_MB[setting.form],
+            temperature_c=None,
+            throttled=None,
+        ),
         settings,
         FORMS_MB,
     )
@@ -258,7 +310,9 @@ def test_a_form_that_load_took_comes_back_only_where_it_fits():
     flight = Flight(lambda setting, now_s: BUSY, settings, FORMS_MB)
     flight.fly(60)
     other_mb = [400.0]  # taken meanwhile
-    flight.reading = lambda setting, now_s: Reading(0.01, 0.0, other_mb[0] + FORMS_MB[setting.form], None, None)
+    flight.reading = lambda setting, now_s: Reading(
+        cpu_share=0.01, late_share=0.0, rss_mb=other_mb[0] + FORMS_MB[setting.form], temperature_c=None, throttled=None
+    )
     assert flight.fly(600) == []
     other_mb[0] = 150.0
     assert [change.after.form for change in flight.fly(600)] == ["8bit", "float"]

@@ -12,14 +12,13 @@ from pictures import textured
 from edgevpr.cli import main
 from edgevpr.config import load_config
 from edgevpr.frames.source import open_source
-from edgevpr.mavlink.link import VehiclePosition
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log
 from edgevpr.runtime.flight.loop import Flight
 from edgevpr.runtime.recognise.mapping import build_map
 from edgevpr.runtime.recognise.pipeline import open_pipeline
 from edgevpr.techniques import create
-from edgevpr.types import Frame
+from edgevpr.types import Frame, Vehicle
 
 SIDE_PX = 256
 PLACES = 8
@@ -92,7 +91,7 @@ class Camera:
 
     def read(self, timeout_s):
         place = self._places.pop(0)
-        return Frame(view(place, self._heading_deg), f"{place}", time.monotonic())
+        return Frame(image=view(place, self._heading_deg), name=f"{place}", t_mono_s=time.monotonic())
 
 
 class Autopilot:
@@ -103,7 +102,14 @@ class Autopilot:
 
     def vehicle_position(self, max_age_s):
         lat_deg = 50 + self._place * SPACING_DEG
-        return VehiclePosition(lat_deg, 8.0, 300.0, self._heading_deg, time.monotonic() - 0.5, True)
+        return Vehicle(
+            lat_deg=lat_deg,
+            lon_deg=8.0,
+            alt_m=300.0,
+            heading_deg=self._heading_deg,
+            t_heard_s=time.monotonic() - 0.5,
+            has_gps=True,
+        )
 
     def send(self, *messages):
         pass

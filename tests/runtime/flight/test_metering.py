@@ -81,7 +81,7 @@ class Camera:
     def read(self, timeout_s):
         self._work()
         self._left -= 1
-        return Frame(self._picture, "frame", time.monotonic())
+        return Frame(image=self._picture, name="frame", t_mono_s=time.monotonic())
 
 
 class Ground:

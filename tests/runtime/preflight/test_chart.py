@@ -17,19 +17,35 @@ from edgevpr.runtime.preflight.trial import Trial
 from edgevpr.types import StageCost
 
 PI = load_board("rpi-4b")
-COSTS = TechniqueCosts(StageCost(0.1, 0.1), StageCost(1e-6, 1e-6), 1_000, 124_000, 90.0)
-PLAN = FlightPlan(1000, 1.0, 20.0, parse_pack("4S5200"), 0.85, 256)
+COSTS = TechniqueCosts(
+    encode=StageCost(0.1, 0.1),
+    match_per_place=StageCost(1e-6, 1e-6),
+    ram_bytes_per_place=1_000,
+    disk_bytes_per_place=124_000,
+    process_mb=90.0,
+)
+PLAN = FlightPlan(
+    places=1000, rate_hz=1.0, flight_min=20.0, pack=parse_pack("4S5200"), regulator_efficiency=0.85, budget_mb=256
+)
 
 
 def estimated(labels, plan=PLAN, costs=COSTS):
-    return estimate(PI, PI, [(Trial(label, label, {}, costs), False) for label in labels], plan)
+    return estimate(
+        PI, PI, [(Trial(label=label, name=label, settings={}, costs=costs), False) for label in labels], plan
+    )
 
 
 def test_techniques_limits_and_boards_are_on_the_picture(tmp_path):
     path = tmp_path / "chart.svg"
     monstrous = replace(COSTS, ram_bytes_per_place=1_000_000)
     result = estimate(
-        PI, PI, [(Trial("hog", "hog", {}, monstrous), False), (Trial("calc 1bit", "calc", {}, COSTS), False)], PLAN
+        PI,
+        PI,
+        [
+            (Trial(label="hog", name="hog", settings={}, costs=monstrous), False),
+            (Trial(label="calc 1bit", name="calc", settings={}, costs=COSTS), False),
+        ],
+        PLAN,
     )
     chart.plot(result, PI, path)
     drawn = path.read_text()

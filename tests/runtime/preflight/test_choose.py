@@ -19,8 +19,20 @@ from edgevpr.runtime.recognise import pipeline
 from edgevpr.types import Descriptor, FineMatch, PartSpec, StageCost, TechniqueSpec
 
 # Round figures of the size that cohog and hog have: exact matching of many regions, or a long vector in RAM.
-REGIONS = TechniqueCosts(StageCost(0.1, 0.1), StageCost(0.004, 0.004), 1_000, 124_000, 90.0)
-VECTOR = TechniqueCosts(StageCost(0.05, 0.05), StageCost(0.001, 0.001), 286_000, 286_000, 90.0)
+REGIONS = TechniqueCosts(
+    encode=StageCost(0.1, 0.1),
+    match_per_place=StageCost(0.004, 0.004),
+    ram_bytes_per_place=1_000,
+    disk_bytes_per_place=124_000,
+    process_mb=90.0,
+)
+VECTOR = TechniqueCosts(
+    encode=StageCost(0.05, 0.05),
+    match_per_place=StageCost(0.001, 0.001),
+    ram_bytes_per_place=286_000,
+    disk_bytes_per_place=286_000,
+    process_mb=90.0,
+)
 COSTS = {"regions": REGIONS, "vector": VECTOR}
 
 
@@ -39,12 +51,12 @@ class TinyTechnique:
 
     def __init__(self, fine):
         parts = (PartSpec((4,), "<f4"), PartSpec((6, 2), "<f4") if fine else None)
-        self.spec = TechniqueSpec("tiny", {"side": 2}, *parts)
+        self.spec = TechniqueSpec(name="tiny", parameters={"side": 2}, coarse=parts[0], fine=parts[1])
         self.shapes, self.matched = set(), 0
 
     def encode(self, image, mask=None):
         self.shapes.add((image.shape, image.dtype))
-        return Descriptor(np.ones(4, np.float32), np.ones((6, 2), np.float32) if self.spec.fine else None)
+        return Descriptor(coarse=np.ones(4, np.float32), fine=np.ones((6, 2), np.float32) if self.spec.fine else None)
 
     def coarse_scores(self, query, rows, mean):
         return rows @ query.coarse, None
@@ -135,7 +147,13 @@ def test_the_order_of_the_costs_is_the_rank():
 def test_a_big_board_takes_the_best_technique_for_a_map_that_a_tiny_one_refuses():
     here = load_board("generic-x86")
     tiny, big = load_board("rpi-zero-2w"), load_board("thesis-xeon")
-    fast = TechniqueCosts(StageCost(0.02, 0.02), StageCost(0.0001, 0.0001), 286_000, 286_000, 90.0)
+    fast = TechniqueCosts(
+        encode=StageCost(0.02, 0.02),
+        match_per_place=StageCost(0.0001, 0.0001),
+        ram_bytes_per_place=286_000,
+        disk_bytes_per_place=286_000,
+        process_mb=90.0,
+    )
     assert choose(big, {"vector": on_board(fast, here, big)}, 1000, 1, big.budget_mb).technique == "vector"
     with pytest.raises(UsageError, match=r"No technique fits Raspberry Pi Zero 2 W with 1000 places at 1 Hz"):
         choose(tiny, {"vector": on_board(fast, here, tiny)}, 1000, 1, tiny.budget_mb)

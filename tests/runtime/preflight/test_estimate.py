@@ -15,19 +15,33 @@ from edgevpr.runtime.preflight.trial import Trial
 from edgevpr.types import StageCost
 
 COSTS = {
-    "regions": TechniqueCosts(StageCost(0.1, 0.1), StageCost(0.004, 0.004), 1_000, 124_000, 90.0),
-    "vector": TechniqueCosts(StageCost(0.05, 0.1), StageCost(0.001, 0.002), 286_000, 286_000, 90.0),
+    "regions": TechniqueCosts(
+        encode=StageCost(0.1, 0.1),
+        match_per_place=StageCost(0.004, 0.004),
+        ram_bytes_per_place=1_000,
+        disk_bytes_per_place=124_000,
+        process_mb=90.0,
+    ),
+    "vector": TechniqueCosts(
+        encode=StageCost(0.05, 0.1),
+        match_per_place=StageCost(0.001, 0.002),
+        ram_bytes_per_place=286_000,
+        disk_bytes_per_place=286_000,
+        process_mb=90.0,
+    ),
 }
 PLAN = FlightPlan(
-    100, rate_hz=1.0, flight_min=20.0, pack=parse_pack("4S5200"), regulator_efficiency=0.85, budget_mb=256
+    places=100, rate_hz=1.0, flight_min=20.0, pack=parse_pack("4S5200"), regulator_efficiency=0.85, budget_mb=256
 )
 PI = load_board("rpi-4b")
-NOBODY = Score(None, None, None, None, False, "nobody")
+NOBODY = Score(single=None, multi=None, products=None, passes=None, verified=False, source="nobody")
 NO_HOVER = "Give the hover power of the aircraft (--hover-w W) to see how many minutes of flight this costs."
 
 
 def trials(costs, stored=False):
-    return [(Trial(label, label.split()[0], {}, each), stored) for label, each in costs.items()]
+    return [
+        (Trial(label=label, name=label.split()[0], settings={}, costs=each), stored) for label, each in costs.items()
+    ]
 
 
 def estimate(board, here, costs, plan, *more):
@@ -200,7 +214,7 @@ def test_where_nothing_fits_the_reason_says_what_would():
 
 
 def test_what_cannot_be_used_is_kept_beside_and_the_date_only_where_it_counts():
-    broken = (Trial("calc", "calc", {}, problem="There is no model `calc`."), False)
+    broken = (Trial(label="calc", name="calc", settings={}, problem="There is no model `calc`."), False)
     stored = trials({"cohog": COSTS["regions"]}, stored=True)
     found = estimate_of(PI, PI, [*stored, *trials({"hog": COSTS["vector"]}), broken], PLAN, None, "today")
     assert found.unusable == {"calc": "There is no model `calc`."}

@@ -14,9 +14,23 @@ from edgevpr.runtime.preflight.trial import Trial
 from edgevpr.types import StageCost
 
 ZERO, HERE = load_board("rpi-zero-2w"), load_board("generic-x86")
-PLAN = FlightPlan(1000, 1.0, 20.0, parse_pack("4S5200"), 0.85, 256)
-REGIONS = TechniqueCosts(StageCost(0.1, 0.1), StageCost(0.004, 0.004), 1_000, 124_000, 90.0)
-VECTOR = TechniqueCosts(StageCost(0.05, 0.1), StageCost(0.001, 0.002), 286_000, 286_000, 90.0)
+PLAN = FlightPlan(
+    places=1000, rate_hz=1.0, flight_min=20.0, pack=parse_pack("4S5200"), regulator_efficiency=0.85, budget_mb=256
+)
+REGIONS = TechniqueCosts(
+    encode=StageCost(0.1, 0.1),
+    match_per_place=StageCost(0.004, 0.004),
+    ram_bytes_per_place=1_000,
+    disk_bytes_per_place=124_000,
+    process_mb=90.0,
+)
+VECTOR = TechniqueCosts(
+    encode=StageCost(0.05, 0.1),
+    match_per_place=StageCost(0.001, 0.002),
+    ram_bytes_per_place=286_000,
+    disk_bytes_per_place=286_000,
+    process_mb=90.0,
+)
 
 
 def text(trials, plan=PLAN, board=ZERO, **more):
@@ -24,7 +38,12 @@ def text(trials, plan=PLAN, board=ZERO, **more):
 
 
 def test_two_tables_have_a_line_for_each_technique_in_columns():
-    said = text([(Trial("regions", "regions", {}, REGIONS), False), (Trial("vector", "vector", {}, VECTOR), False)])
+    said = text(
+        [
+            (Trial(label="regions", name="regions", settings={}, costs=REGIONS), False),
+            (Trial(label="vector", name="vector", settings={}, costs=VECTOR), False),
+        ]
+    )
     heading, _, heads, regions, vector, _, draws, regions_draws, _, _, *rest = said.splitlines()
     assert heading == (
         "Raspberry Pi Zero 2 W: 1000 places, 1 Hz, 20 min, 4S5200 at 85% regulator efficiency; times measured, scaled"
@@ -40,14 +59,19 @@ def test_two_tables_have_a_line_for_each_technique_in_columns():
 
 
 def test_minutes_lost_are_there_when_the_hover_power_is():
-    said = text([(Trial("regions", "regions", {}, REGIONS), False)], replace(PLAN, hover_w=150.0))
+    said = text(
+        [(Trial(label="regions", name="regions", settings={}, costs=REGIONS), False)], replace(PLAN, hover_w=150.0)
+    )
     assert "hovering at 150 W" in said.splitlines()[0]
     assert said.splitlines()[5].split()[-4:] == ["pack", "min", "lost", "marginal"]
 
 
 def test_what_cannot_be_used_is_a_row_and_a_reason():
-    broken = [(Trial(name, name, {}, problem="There is no model `calc`."), False) for name in ("calc", "alexnet")]
-    lines = text([(Trial("regions", "regions", {}, REGIONS), False), *broken]).splitlines()
+    broken = [
+        (Trial(label=name, name=name, settings={}, problem="There is no model `calc`."), False)
+        for name in ("calc", "alexnet")
+    ]
+    lines = text([(Trial(label="regions", name="regions", settings={}, costs=REGIONS), False), *broken]).splitlines()
     assert [line.split() for line in lines[4:6]] == [["calc", "n/a"], ["alexnet", "n/a"]]
     assert "calc, alexnet cannot be used: There is no model `calc`." in lines
 
@@ -56,7 +80,8 @@ def test_what_cannot_be_used_is_a_row_and_a_reason():
 def test_every_technique_and_form_fits_in_120_columns(places):
     offered = [f"{name} {form}".strip() for name in techniques.names() for form in ("", "8bit", "1bit")]
     trials = [
-        (Trial(label, label.split()[0], {}, VECTOR, weights="calc: " + 30 * "weights "), True) for label in offered
+        (Trial(label=label, name=label.split()[0], settings={}, costs=VECTOR, weights="calc: " + 30 * "weights "), True)
+        for label in offered
     ]
     said = text(
         trials, replace(PLAN, places=places, hover_w=1234.5), load_board("thesis-xeon"), measured_on="2026-01-01"
@@ -67,7 +92,10 @@ def test_every_technique_and_form_fits_in_120_columns(places):
 
 def test_what_was_tried_now_among_stored_figures_is_said():
     said = text(
-        [(Trial("regions", "regions", {}, REGIONS), True), (Trial("vector", "vector", {}, VECTOR), False)],
+        [
+            (Trial(label="regions", name="regions", settings={}, costs=REGIONS), True),
+            (Trial(label="vector", name="vector", settings={}, costs=VECTOR), False),
+        ],
         measured_on="2026-01-01",
     )
     assert "Not among the stored figures, and tried now: vector." in said

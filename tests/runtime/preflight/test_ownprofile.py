@@ -10,7 +10,7 @@ from edgevpr.power.boards import Score, load_board
 from edgevpr.power.powermeter import Meter, MeterError
 from edgevpr.runtime.preflight.ownprofile import measured_profile, require_new_profile, write_profile
 
-SCORE = Score(0.2, 0.7, 0.1, 0.4, True, "edgevpr's micro-benchmark")
+SCORE = Score(single=0.2, multi=0.7, products=0.1, passes=0.4, verified=True, source="edgevpr's micro-benchmark")
 
 
 @pytest.fixture
@@ -50,7 +50,13 @@ def board_with(monkeypatch, *meters, notes=()):
 
 
 def test_the_watts_of_a_meter_are_fitted_and_written_into_a_profile_that_names_it(monkeypatch, tmp_path, quick, capsys):
-    meter = Meter("ina", "INA3221 (hwmon1), channel VDD_IN", "board", 0.05, lambda: (2.0 + 4.5 * quick["share"],))
+    meter = Meter(
+        kind="ina",
+        title="INA3221 (hwmon1), channel VDD_IN",
+        covers="board",
+        period_s=0.05,
+        look=lambda: (2.0 + 4.5 * quick["share"],),
+    )
     board_with(monkeypatch, meter)
     path, said = measured_profile(tmp_path / "measured.json", SCORE)
     board = load_board(str(path))
@@ -66,7 +72,10 @@ def test_the_watts_of_a_meter_are_fitted_and_written_into_a_profile_that_names_i
 
 
 def test_a_meter_of_the_cpu_alone_is_not_verified(monkeypatch, tmp_path, quick):
-    board_with(monkeypatch, Meter("rapl", "RAPL", "cpu", 0.05, lambda: (5.0 + 10 * quick["share"],)))
+    board_with(
+        monkeypatch,
+        Meter(kind="rapl", title="RAPL", covers="cpu", period_s=0.05, look=lambda: (5.0 + 10 * quick["share"],)),
+    )
     path, _ = measured_profile(tmp_path / "measured.json", SCORE)
     board = load_board(str(path))
     assert not board.verified
@@ -80,7 +89,7 @@ def test_without_a_meter_it_is_one_line_and_no_file(monkeypatch, tmp_path):
 
 
 def test_a_meter_that_says_nonsense_leaves_no_file(monkeypatch, tmp_path, quick):
-    board_with(monkeypatch, Meter("ina", "INA219", "board", 0.05, lambda: (math.nan,)))
+    board_with(monkeypatch, Meter(kind="ina", title="INA219", covers="board", period_s=0.05, look=lambda: (math.nan,)))
     with pytest.raises(MeterError, match="INA219 failed 3 times in a row"):
         measured_profile(tmp_path / "m.json", SCORE)
     assert not list(tmp_path.iterdir())

@@ -9,13 +9,33 @@ from edgevpr.runtime.preflight.probe import TechniqueCosts
 from edgevpr.runtime.preflight.scale import UNKNOWN_PRODUCTS, Ratios, is_same, on_board, ratios
 from edgevpr.types import StageCost
 
-REGIONS = TechniqueCosts(StageCost(0.1, 0.1), StageCost(0.004, 0.004), 1_000, 124_000, 90.0, 40, StageCost(1e-6, 1e-6))
-VECTOR = TechniqueCosts(StageCost(0.05, 0.05), StageCost(0.001, 0.001), 286_000, 286_000, 90.0)
+REGIONS = TechniqueCosts(
+    encode=StageCost(0.1, 0.1),
+    match_per_place=StageCost(0.004, 0.004),
+    ram_bytes_per_place=1_000,
+    disk_bytes_per_place=124_000,
+    process_mb=90.0,
+    candidates=40,
+    scan_per_place=StageCost(1e-6, 1e-6),
+)
+VECTOR = TechniqueCosts(
+    encode=StageCost(0.05, 0.05),
+    match_per_place=StageCost(0.001, 0.001),
+    ram_bytes_per_place=286_000,
+    disk_bytes_per_place=286_000,
+    process_mb=90.0,
+)
 HERE, PI = load_board("generic-x86"), load_board("rpi-4b")
 
 
 def scored(single=None, multi=None, products=None, passes=None, **changes):
-    return replace(PI, benchmark_score=Score(single, multi, products, passes, True, "by hand"), **changes)
+    return replace(
+        PI,
+        benchmark_score=Score(
+            single=single, multi=multi, products=products, passes=passes, verified=True, source="by hand"
+        ),
+        **changes,
+    )
 
 
 def test_products_and_passes_are_scaled_apart_and_memory_is_not():
@@ -37,7 +57,9 @@ def test_a_network_is_products_and_a_scan_of_vectors_is_passes():
 def test_what_is_not_known_apart_is_taken_from_the_single_thread_and_products_modestly():
     assert ratios(HERE, scored(single=0.4)) == Ratios(pytest.approx(0.4 * UNKNOWN_PRODUCTS), 0.4)
     assert ratios(HERE, scored(single=0.4, products=0.1)) == Ratios(0.1, 0.4)
-    twice = replace(HERE, benchmark_score=Score(2.0, 4.0, 4.0, 1.0, True, "by hand"))
+    twice = replace(
+        HERE, benchmark_score=Score(single=2.0, multi=4.0, products=4.0, passes=1.0, verified=True, source="by hand")
+    )
     assert ratios(twice, scored(single=0.4, products=0.1)) == Ratios(pytest.approx(0.025), 0.4)
     assert ratios(HERE, scored(products=0.1, passes=0.2)) == Ratios(0.1, 0.2)
 

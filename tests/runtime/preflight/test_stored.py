@@ -26,11 +26,22 @@ from edgevpr.runtime.preflight.stored_text import format_measured
 from edgevpr.runtime.preflight.trial import Trial
 from edgevpr.types import StageCost
 
-COSTS = TechniqueCosts(StageCost(0.1, 0.2), StageCost(0.004, 0.005), 90, 31_776, 88.5, 40, StageCost(2e-6, 3e-6), 11.0)
-SCORE = Score(0.2, 0.7, 0.1, 0.4, True, "edgevpr's micro-benchmark")
-COHOG = Trial("cohog", "cohog", {}, COSTS, parameters={"w1": 512, "gt": 0.4})
-HOG = Trial("hog 1bit", "hog", {"form": "1bit"}, replace(COSTS, candidates=None, encode_mb=None))
-CALC = Trial("calc", "calc", {}, problem="There is no model `calc`.")
+COSTS = TechniqueCosts(
+    encode=StageCost(0.1, 0.2),
+    match_per_place=StageCost(0.004, 0.005),
+    ram_bytes_per_place=90,
+    disk_bytes_per_place=31_776,
+    process_mb=88.5,
+    candidates=40,
+    scan_per_place=StageCost(2e-6, 3e-6),
+    encode_mb=11.0,
+)
+SCORE = Score(single=0.2, multi=0.7, products=0.1, passes=0.4, verified=True, source="edgevpr's micro-benchmark")
+COHOG = Trial(label="cohog", name="cohog", settings={}, costs=COSTS, parameters={"w1": 512, "gt": 0.4})
+HOG = Trial(
+    label="hog 1bit", name="hog", settings={"form": "1bit"}, costs=replace(COSTS, candidates=None, encode_mb=None)
+)
+CALC = Trial(label="calc", name="calc", settings={}, problem="There is no model `calc`.")
 
 
 @pytest.fixture
@@ -129,7 +140,12 @@ def test_what_is_stored_is_not_tried_again_and_what_is_not_is(kept, monkeypatch)
     def try_each(wanted, threads):
         for offer in wanted:
             asked.append(offer.label)
-            yield Trial(offer.label, offer.name, offer.settings, problem="No." if offer.name == "calc" else None)
+            yield Trial(
+                label=offer.label,
+                name=offer.name,
+                settings=offer.settings,
+                problem="No." if offer.name == "calc" else None,
+            )
             if offer.name == "calc":
                 return
 
@@ -157,7 +173,7 @@ def test_figures_of_another_network_are_not_used(kept, monkeypatch):
     fingerprints = {"calc": "old"}
     monkeypatch.setattr(trial, "load_card", lambda name: type("Card", (), {"fingerprint": fingerprints[name]}))
     path = kept
-    save(gathered([Trial("calc", "calc", {}, COSTS, model="old")], "", 1, SCORE), path)
+    save(gathered([Trial(label="calc", name="calc", settings={}, costs=COSTS, model="old")], "", 1, SCORE), path)
     stored, _ = load(path)
     assert stored.of(Offer("calc", "calc", {})) is not None
     fingerprints["calc"] = "new"

@@ -95,7 +95,7 @@ def test_ctrl_c_leaves_no_process_behind(monkeypatch):
 def test_a_trial_goes_through_json_and_back():
     (found,) = try_each(offers(["seqslam"]), threads=1)
     assert trial_of(json.loads(json.dumps(asdict(found)))) == found
-    broken = Trial("calc", "calc", {"form": "1bit"}, problem="There is no model.")
+    broken = Trial(label="calc", name="calc", settings={"form": "1bit"}, problem="There is no model.")
     assert trial_of(json.loads(json.dumps(asdict(broken)))) == broken
     with pytest.raises((TypeError, KeyError)):
         trial_of({"label": "x"})

@@ -21,11 +21,21 @@ def index():
     lat_deg = np.array([north(metres).lat_deg for metres in (0, 100, 200, 300)] + [np.nan])
     lon_deg = np.where(np.isnan(lat_deg), np.nan, 8.0)
     heading_deg = np.array([0, 10, 20, np.nan, 350], np.float16)
-    return PlaceIndex(np.arange(1, 6), lat_deg, lon_deg, heading_deg, np.zeros((5, 1)), None)
+    return PlaceIndex(
+        place_ids=np.arange(1, 6),
+        lat_deg=lat_deg,
+        lon_deg=lon_deg,
+        heading_deg=heading_deg,
+        rows=np.zeros((5, 1)),
+        mean=None,
+    )
 
 
 def found(metres=0.0, heading_deg=None, rotation_deg=None):
-    return Candidate(Place(1, "a", north(metres), heading_deg=heading_deg), FineMatch(0.5, rotation_deg=rotation_deg))
+    return Candidate(
+        Place(place_id=1, source_image="a", position=north(metres), heading_deg=heading_deg),
+        FineMatch(0.5, rotation_deg=rotation_deg),
+    )
 
 
 def test_reach_grows_with_the_time_since_the_position_was_known():
@@ -80,7 +90,7 @@ def test_what_the_log_says():
     [
         (Hints(HOME, 100.0), found(90), True),
         (Hints(HOME, 100.0), found(110), False),
-        (Hints(HOME, 100.0), Candidate(Place(1, "a"), FineMatch(0.5)), True),
+        (Hints(HOME, 100.0), Candidate(Place(place_id=1, source_image="a"), FineMatch(0.5)), True),
         (Hints(heading_deg=10.0), found(0, 350.0, 30.0), True),
         (Hints(heading_deg=10.0), found(0, 350.0, 0.0), True),
         (Hints(heading_deg=10.0), found(0, 350.0, 345.0), False),

@@ -20,7 +20,7 @@ RULE = AcceptRule(min_score=0.1, min_margin=0.05, neighbour_m=50.0)
 def flown(velocity, start, leaves=18, seed=3):
     """(accepted, why, slot) of each query of a flight along places that look a little like the two around them; from
     query `leaves` on it shows nothing of the map."""
-    index = empty_index(TechniqueSpec("test", {}, PartSpec((1,), "<f4")), PLACES, None)
+    index = empty_index(TechniqueSpec(name="test", parameters={}, coarse=PartSpec((1,), "<f4")), PLACES, None)
     index.place_ids[:] = np.arange(PLACES)
     noise = np.random.default_rng(seed)
     sequence, found = Sequence(LENGTH), []
@@ -60,7 +60,7 @@ def test_an_aircraft_that_leaves_the_mapped_way_is_not_followed_beyond_it(seed):
 
 def test_a_score_too_low_for_one_query_is_too_low_for_the_newest():
     sequence, near = Sequence(3), abs(np.arange(PLACES) - 7) <= 2
-    index = empty_index(TechniqueSpec("test", {}, PartSpec((1,), "<f4")), PLACES, None)
+    index = empty_index(TechniqueSpec(name="test", parameters={}, coarse=PartSpec((1,), "<f4")), PLACES, None)
     index.place_ids[:] = np.arange(PLACES)
     for query, score in enumerate((0.5, 0.4, 0.3)):
         slots, scores = np.array([5 + query, 50, 60]), np.array([score, 0.1, 0.1], np.float32)
@@ -71,7 +71,7 @@ def test_a_score_too_low_for_one_query_is_too_low_for_the_newest():
 
 def test_a_place_that_the_newest_query_was_not_compared_with_is_not_seen():
     sequence, near = Sequence(3), abs(np.arange(PLACES) - 7) <= 2
-    index = empty_index(TechniqueSpec("test", {}, PartSpec((1,), "<f4")), PLACES, None)
+    index = empty_index(TechniqueSpec(name="test", parameters={}, coarse=PartSpec((1,), "<f4")), PLACES, None)
     index.place_ids[:] = np.arange(PLACES)
     for query, (slot, score) in enumerate([(5, 0.9), (60, 0.1), (20, 0.1)]):
         ranking = Ranking(np.array([slot]), np.array([score], np.float32), (FineMatch(score),))

@@ -9,17 +9,18 @@ import pytest
 
 from edgevpr.config import load_config
 from edgevpr.errors import UsageError
-from edgevpr.mavlink.link import VehiclePosition
 from edgevpr.places.growing import GrowingIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.recognise.learn import Learner, check_positions
 from edgevpr.techniques import create
-from edgevpr.types import Candidate, Descriptor, FineMatch, Frame, Place, PlaceMatch, Position, QueryCost
+from edgevpr.types import Candidate, Descriptor, FineMatch, Frame, Place, PlaceMatch, Position, QueryCost, Vehicle
 
 TECHNIQUE = create("hog", {"w1": 32})
 SPACING_M = 10.0
 METRE_DEG = 1 / 111_195  # of latitude
-COST = QueryCost(0.1, 0.1, 0.5, 0.5, 0.1, 80.0, 0.01, 0.01)
+COST = QueryCost(
+    t_encode_s=0.1, t_match_s=0.1, u_encode=0.5, u_match=0.5, cpu_s=0.1, rss_mb=80.0, used_mah=0.01, marginal_mah=0.01
+)
 
 
 class Bench:
@@ -29,17 +30,24 @@ class Bench:
         self.now_s = 1000.0
         self.map = PlaceMap.create(path, TECHNIQUE.spec)
         self.map.index_positions()
-        self.growing = GrowingIndex(self.map, TECHNIQUE, 10**6, places_in_ram)
+        self.growing = GrowingIndex(place_map=self.map, technique=TECHNIQUE, budget_bytes=10**6, room=places_in_ram)
         self.learner = Learner(self.map, self.growing, SPACING_M, clock=lambda: self.now_s)
 
     def see(self, north_m=0.0, heard_s_ago=0.1, has_gps=True, t_fix_s=None, quality=0.9, position=None):
         """Show a frame, at a place that the autopilot or the frame itself tells."""
-        frame = Frame(np.zeros((8, 8), np.uint8), f"{north_m}", self.now_s, position=position)
+        frame = Frame(image=np.zeros((8, 8), np.uint8), name=f"{north_m}", t_mono_s=self.now_s, position=position)
         vehicle = None
         if heard_s_ago is not None:
-            vehicle = VehiclePosition(50 + north_m * METRE_DEG, 8.0, 312.0, 90.0, self.now_s - heard_s_ago, has_gps)
+            vehicle = Vehicle(
+                lat_deg=50 + north_m * METRE_DEG,
+                lon_deg=8.0,
+                alt_m=312.0,
+                heading_deg=90.0,
+                t_heard_s=self.now_s - heard_s_ago,
+                has_gps=has_gps,
+            )
         part = np.random.default_rng(int(abs(north_m))).random(TECHNIQUE.spec.coarse.shape).astype("<f2")
-        return self.learner.learn(frame, Descriptor(part, quality=quality), vehicle, t_fix_s)
+        return self.learner.learn(frame, Descriptor(coarse=part, quality=quality), vehicle, t_fix_s)
 
 
 @pytest.fixture
@@ -115,7 +123,7 @@ def test_after_a_fix_of_ours_the_autopilot_may_only_repeat_it(bench):
 
 
 def accepted(place_id):
-    candidate = Candidate(Place(place_id, "a.jpg", Position(50.0, 8.0)), FineMatch(0.9))
+    candidate = Candidate(Place(place_id=place_id, source_image="a.jpg", position=Position(50.0, 8.0)), FineMatch(0.9))
     return PlaceMatch("q", 0.0, candidate, True, "score 0.9", Position(50.0, 8.0), 20.0, COST)
 
 

@@ -36,7 +36,7 @@ def flight_folder(tmp_path_factory) -> Path:
         for seed in range(2):
             image = textured(seed)
             cv2.imwrite(str(folder / "images" / f"{seed}.png"), image)
-            place_map.add(Frame(image, f"{seed}.png", 0.0), technique.encode(image))
+            place_map.add(Frame(image=image, name=f"{seed}.png", t_mono_s=0.0), technique.encode(image))
     return folder
 
 
@@ -139,7 +139,7 @@ def test_places_that_the_budget_does_not_hold_are_told(flight_folder, settings, 
     big = config_file.with_name("big.gpkg")
     shutil.copy(settings["map"], big)
     with PlaceMap.open_for_adding(big) as place_map:
-        frame, technique = Frame(textured(3), "3.png", 0.0), techniques.create("hog")
+        frame, technique = Frame(image=textured(3), name="3.png", t_mono_s=0.0), techniques.create("hog")
         descriptor = technique.encode(frame.image)
         while len(place_map) * technique.spec.coarse.nbytes < 1e6:
             place_map.add(frame, descriptor)

@@ -94,7 +94,9 @@ def test_a_missing_key_and_a_missing_card_are_said(models):
 def test_the_weights_of_a_result_are_named(models):
     write_network(models)
     part = PartSpec((1,), "<f2")
-    assert weights_of(TechniqueSpec("hog", {}, part)) is None
+    assert weights_of(TechniqueSpec(name="hog", parameters={}, coarse=part)) is None
     said = "tiny: A tiny network (MIT; made by a test)"
-    assert weights_of(TechniqueSpec("tiny", {}, part, model_sha256=SHA256)) == said
-    assert weights_of(TechniqueSpec("calc", {"model": "tiny"}, part, model_sha256=SHA256)) == said
+    assert weights_of(TechniqueSpec(name="tiny", parameters={}, coarse=part, model_sha256=SHA256)) == said
+    assert (
+        weights_of(TechniqueSpec(name="calc", parameters={"model": "tiny"}, coarse=part, model_sha256=SHA256)) == said
+    )
