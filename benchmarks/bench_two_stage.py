@@ -20,11 +20,12 @@ import numpy as np
 from bench_encode import frames, timed_s
 from big_map import make_big_map
 
+from edgevpr.contract import Technique
 from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import rank
 from edgevpr.techniques import create
-from edgevpr.types import Position, Technique
+from edgevpr.types import Position
 
 PLACES = 10_000
 TURNS = 9

@@ -1,3 +1,3 @@
-from edgevpr.cli import main
+from edgevpr.cli.main import main
 
 raise SystemExit(main())

@@ -3,14 +3,20 @@
 import difflib
 import types
 import typing
+from collections.abc import Iterator
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-import yaml
-
 from edgevpr.errors import ConfigError
 from edgevpr.resources import shipped
+
+FORMS = ("float", "8bit", "1bit")  # of a vector in RAM, each smaller than the one before: see techniques.vectors
+LOWEST_RATE_HZ, HIGHEST_RATE_HZ = 0.01, 60.0  # of queries
+BUDGET_MB = (1, 65_536)  # of the index in RAM
+SOURCES = (
+    "a folder of images, a video file, a camera (/dev/video0) or a stream (rtsp://, udp://, tcp://, http://, FILE.sdp)"
+)
 
 T = TypeVar("T")
 _WORDS = {
@@ -23,44 +29,94 @@ _WORDS = {
 }
 
 
-def bounded(low: float, high: float) -> Any:
-    """A dataclass field whose value, where it is not None, must lie in low..high."""
-    return field(metadata={"range": (low, high)})
+@dataclass(frozen=True, slots=True)
+class Flag:
+    """A key as a flag of the command line: its names, what stands for its value in the help, the text of the help, and
+    the values that it may have (none: any). Everything else about it is in the key."""
+
+    names: tuple[str, ...]
+    metavar: str | None
+    text: str
+    choices: tuple[str, ...] = ()
+
+
+def keyed(flag: Flag | None = None) -> Any:
+    """Make a dataclass field that may be a flag."""
+    return field(metadata={"flag": flag})
+
+
+def bounded(low: float, high: float, flag: Flag | None = None) -> Any:
+    """Make a dataclass field whose value, where it is not None, must lie in low..high, and that may be a flag."""
+    return field(metadata={"range": (low, high), "flag": flag})
 
 
 @dataclass(frozen=True, slots=True)
 class SourceConfig:
-    uri: str | None
-    camera: str | None
-    rate_hz: float | None = bounded(0.01, 60)
+    uri: str | None = keyed(Flag(("--images", "--source"), "SOURCE", SOURCES))
+    camera: str | None = keyed(
+        Flag(
+            ("--camera",),
+            None,
+            "straight down, or ahead (default: the map's; a new map's is forward)",
+            choices=("nadir", "forward"),
+        )
+    )
+    rate_hz: float | None = bounded(
+        LOWEST_RATE_HZ, HIGHEST_RATE_HZ, Flag(("--rate-hz",), "HZ", "queries a second (default: the board's)")
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MatchConfig:
-    matching: str | None
-    form: str | None
-    candidates: int | None = bounded(1, 1_000_000)
-    sequence: int | None = bounded(1, 100)
-    min_score: float | None = bounded(0, 1)
-    min_margin: float | None = bounded(0, 1)
+    matching: str | None = keyed(
+        Flag(("--matching",), None, "how cohog scores (displacement)", choices=("displacement", "thesis"))
+    )
+    form: str | None = keyed(
+        Flag(
+            ("--form",),
+            None,
+            "what a number of a vector takes in RAM: half precision, a byte or a bit (float)",
+            choices=FORMS,
+        )
+    )
+    candidates: int | None = bounded(
+        1, 1_000_000, Flag(("--candidates",), "N", "places compared in full (the technique's)")
+    )
+    sequence: int | None = bounded(1, 100, Flag(("--sequence",), "N", "queries matched together (the technique's)"))
+    min_score: float | None = bounded(0, 1, Flag(("--min-score",), "S", "accept from this score on"))
+    min_margin: float | None = bounded(
+        0, 1, Flag(("--min-margin",), "M", "accept when this far ahead of a place elsewhere")
+    )
     neighbour_m: float = bounded(0, 10_000)
-    reach_m_s: float | None = bounded(0.1, 100)
+    reach_m_s: float | None = bounded(
+        0.1, 100, Flag(("--reach-m-s",), "V", "look only where this speed can have led (default: everywhere)")
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class MemoryConfig:
-    budget_mb: float | None = bounded(1, 65_536)
+    budget_mb: float | None = bounded(
+        *BUDGET_MB, Flag(("--budget-mb",), "MB", "limit of the index in RAM (default: the board's)")
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class MappingConfig:
-    learn: bool
+    learn: bool = keyed(
+        Flag(
+            ("--learn",),
+            None,
+            "add to the map what it does not know, or make a new one, by the flight controller's position",
+        )
+    )
     spacing_m: float = bounded(1, 1000)
 
 
 @dataclass(frozen=True, slots=True)
 class MavlinkConfig:
-    link: str | None
+    link: str | None = keyed(
+        Flag(("--link",), "URL", "udpout:HOST:PORT, udpin:HOST:PORT, tcp:HOST:PORT, serial:DEV:BAUD")
+    )
     component_id: int = bounded(1, 255)
     send_fixes: bool = field()
     min_accuracy_m: float = bounded(1, 10_000)
@@ -68,12 +124,12 @@ class MavlinkConfig:
 
 @dataclass(frozen=True, slots=True)
 class LogConfig:
-    path: str | None
+    path: str | None = keyed(Flag(("--log",), "FILE", "flight log, JSON lines"))
 
 
 @dataclass(frozen=True, slots=True)
 class BatteryConfig:
-    pack: str
+    pack: str = keyed(Flag(("--battery",), "PACK", "cells and capacity of the pack, e.g. 4S5200"))
     regulator_efficiency: float = bounded(0.1, 1)
 
 
@@ -81,9 +137,9 @@ class BatteryConfig:
 class Config:
     """The whole configuration; `deploy/config.yaml` documents every key and holds every default."""
 
-    board: str
-    map: str | None
-    technique: str | None
+    board: str = keyed(Flag(("--board",), "NAME", "hardware profile (default: this machine)"))
+    map: str | None = keyed(Flag(("--map",), "MAP", "the place map"))
+    technique: str | None = keyed(Flag(("--technique",), "NAME", "insist on this technique"))
     source: SourceConfig
     match: MatchConfig
     memory: MemoryConfig
@@ -91,6 +147,26 @@ class Config:
     mavlink: MavlinkConfig
     log: LogConfig
     battery: BatteryConfig
+
+
+@dataclass(frozen=True, slots=True)
+class Key:
+    """A key of the configuration by its dotted name, the type of its value (None apart), and its flag."""
+
+    name: str
+    kind: type
+    flag: Flag
+
+
+def flagged_keys(cls: type = Config, prefix: str = "") -> Iterator[Key]:
+    """Give every key of the configuration that is a flag too, in the order in which they stand."""
+    hints = typing.get_type_hints(cls)
+    for each in fields(cls):
+        kind = _kind(hints[each.name])
+        if is_dataclass(kind):
+            yield from flagged_keys(kind, f"{each.name}.")
+        elif each.metadata.get("flag"):
+            yield Key(prefix + each.name, kind, each.metadata["flag"])
 
 
 def load_config(path: str | Path | None, overrides: dict[str, Any] | None = None) -> Config:
@@ -114,6 +190,8 @@ def load_config(path: str | Path | None, overrides: dict[str, Any] | None = None
 
 def read_yaml(path: str | Path) -> dict[str, Any]:
     """Read a YAML mapping; raises ConfigError for a file that is missing, unreadable or not a mapping."""
+    import yaml  # the command line knows its flags without
+
     try:
         with open(path, encoding="utf-8") as handle:
             content = yaml.safe_load(handle)
@@ -166,12 +244,11 @@ def _suggestion(key: str, known: typing.Iterable[str]) -> str:
 
 
 def _converted(value: Any, hint: Any, limits: tuple[float, float] | None, where: str, key: str) -> Any:
-    options = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+    wanted = _kind(hint)
     if value is None:
-        if type(None) in options:
+        if wanted is not hint:
             return None
         raise ConfigError(f"{where}: `{key}` has no value: write one.")
-    wanted = next(option for option in options if option is not type(None))
     if is_dataclass(wanted):
         if not isinstance(value, dict):
             raise ConfigError(f"{where}: `{key}` is a section: write its keys below it, indented.")
@@ -184,3 +261,9 @@ def _converted(value: Any, hint: Any, limits: tuple[float, float] | None, where:
     if limits and not limits[0] <= value <= limits[1]:
         raise ConfigError(f"{where}: `{key}` is {value:g}; it must be between {limits[0]:g} and {limits[1]:g}.")
     return value
+
+
+def _kind(hint: Any) -> Any:
+    """Give the type of a value that may also be None, or is never."""
+    options = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+    return next(option for option in options if option is not type(None))

@@ -1,10 +1,14 @@
-"""The values that cross rooms: frozen dataclasses, and the contract of a technique."""
+"""The values that cross rooms: frozen dataclasses."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Protocol
+from dataclasses import dataclass
 
 import numpy as np
+
+from edgevpr.contract import FineMatch
+
+# ArduPilot takes an older frame for one of 5 s ago, and would set the vehicle back too little: no such fix is sent.
+FIX_MAX_AGE_S = 5.0
+_FRESH_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +34,10 @@ class Vehicle:
     t_heard_s: float
     has_gps: bool
 
+    def is_fresh_at(self, t_mono_s: float) -> bool:
+        """Say whether this was said within a second of a moment, such as that at which a frame was taken."""
+        return abs(t_mono_s - self.t_heard_s) <= _FRESH_S
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Frame:
@@ -41,113 +49,6 @@ class Frame:
     t_utc_s: float | None = None
     position: Position | None = None
     heading_deg: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class PartSpec:
-    """Shape and little-endian dtype ("<f4", "<i1", ...) of one part of a descriptor."""
-
-    shape: tuple[int, ...]
-    dtype: str
-
-    @property
-    def nbytes(self) -> int:
-        return int(np.prod(self.shape)) * np.dtype(self.dtype).itemsize
-
-    def __str__(self) -> str:
-        return f"{'x'.join(map(str, self.shape))} {np.dtype(self.dtype)}"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TechniqueSpec:
-    """What a map must agree with before it is used: name, every parameter, model, and the form of both parts.
-
-    `packed` is the form of a place in RAM where it is not the coarse part as it is: `Technique.pack` makes it.
-    """
-
-    name: str
-    parameters: dict[str, int | float | str]
-    coarse: PartSpec
-    fine: PartSpec | None = None
-    model_sha256: str | None = None
-    packed: PartSpec | None = None
-
-    @property
-    def row(self) -> PartSpec:
-        """One place of the index in RAM."""
-        return self.packed or self.coarse
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Descriptor:
-    """One encoded image. `coarse` makes one row of the index in RAM (see `Technique.pack`); `fine` lives in the map
-    file and is read for candidates only; `regions` are what a query asks with, and `good` (bool, one a region) says
-    which of them speak; `quality` (0..1) is the share of the image that says anything. `picture` is kept for a query
-    that may have to be turned, and `asking` collects what was made of it."""
-
-    coarse: np.ndarray
-    fine: np.ndarray | None = None
-    regions: np.ndarray | None = None
-    good: np.ndarray | None = None
-    quality: float = 1.0
-    picture: "Picture | None" = None
-    asking: dict = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
-class Picture:
-    """What an image was encoded from: `grey` float32 (side, side) where it may have to be turned (None: it need not),
-    `allowed` bool of the same shape (None: all of it), and `seen` bool, the blocks that are wholly allowed."""
-
-    grey: np.ndarray | None
-    allowed: np.ndarray | None
-    seen: np.ndarray
-
-
-@dataclass(frozen=True, slots=True)
-class FineMatch:
-    """One place compared with the query: `score` in 0..1 and, where the technique knows them, the step from the query
-    to the place (dx, dy in cells) with its covariance (var x, cov xy, var y), and how far the camera has turned since
-    the map was made (clockwise, 0..360)."""
-
-    score: float
-    shift_cells: tuple[float, float] | None = None
-    covariance_cells2: tuple[float, float, float] | None = None
-    rotation_deg: float | None = None
-
-
-class Technique(Protocol):
-    """The contract of `edgevpr/techniques/*.py`. A technique without a fine part needs no `match`, one whose spec has
-    no `packed` no `pack`. One that is meant for sequences says by an attribute `sequence` of how many queries, and one
-    whose scan sees what its comparison does not, by an attribute `scan_counts` that both count (see `rank`)."""
-
-    spec: TechniqueSpec
-    candidates: int  # places compared in full after the scan (see `rank`), unless the configuration says otherwise
-    min_score: float  # a match is accepted from this score on, unless the configuration says otherwise ...
-    min_margin: float  # ... and when it beats the best place elsewhere by this
-
-    def encode(self, image: np.ndarray, mask: np.ndarray | None = None) -> Descriptor:
-        """Encode a uint8 image; `mask` (H, W) bool is False where the picture must not be used."""
-        ...
-
-    def pack(self, coarse: np.ndarray, mean: np.ndarray) -> np.ndarray:
-        """Rows of the index (N, *row.shape) from coarse parts (N, *coarse.shape) and their mean over the map."""
-        ...
-
-    def coarse_scores(
-        self, query: Descriptor, rows: np.ndarray, mean: np.ndarray | None, turned_deg: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Score all places at once: `rows` (N, *row.shape) -> scores (N,) float32 and, where `match` has several
-        hypotheses to try, those of each, float32 (N, H), -inf where it is out of the question; else None.
-
-        `mean` is that of the map for a technique that packs, else None. `turned_deg` float (N,) is how far the camera
-        should have turned since each place was mapped, as `FineMatch.rotation_deg` (NaN: nobody knows); it is given
-        only to a technique with a parameter `camera` that is "nadir", which then allows only such rotations."""
-        ...
-
-    def match(self, query: Descriptor, fine: np.ndarray, hypotheses: Sequence[int] | None) -> FineMatch:
-        """Compare the query with the fine part of one place, under some of its hypotheses or all (None)."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -177,9 +78,34 @@ class StageCost:
     wall_s: float
     cpu_s: float
 
+    def __add__(self, other: "StageCost") -> "StageCost":
+        return StageCost(self.wall_s + other.wall_s, self.cpu_s + other.cpu_s)
+
+    def __mul__(self, times: float) -> "StageCost":
+        return StageCost(self.wall_s * times, self.cpu_s * times)
+
     def utilisation(self, cores: int) -> float:
-        """U of equation 5.1: the share of the whole machine that was busy, 0..1."""
+        """Reckon U of equation 5.1: the share of the whole machine that was busy, 0..1."""
         return min(1.0, self.cpu_s / (self.wall_s * cores)) if self.wall_s > 0 else 0.0
+
+
+NO_COST = StageCost(0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Steps:
+    """What the steps of one query cost: its picture read (in a flight) and encoded, all places scanned, candidates
+    compared and judged; none where the query did not come to it."""
+
+    read: StageCost = NO_COST
+    encode: StageCost = NO_COST
+    scan: StageCost = NO_COST
+    compare: StageCost = NO_COST
+
+    @property
+    def match(self) -> StageCost:
+        """Give the thesis's matching: everything after encoding."""
+        return self.scan + self.compare
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -199,22 +125,18 @@ class QueryCost:
     marginal_mah: float
     pss_mb: float | None = None
 
+    @property
+    def whole(self) -> StageCost:
+        """Give both stages as one."""
+        return StageCost(self.t_encode_s + self.t_match_s, self.cpu_s)
+
 
 @dataclass(frozen=True, slots=True)
-class PlaceMatch:
-    """The event of one query: the best place (None: the map has none yet), whether it is accepted as the place, and
-    what the query cost.
-
-    `position` is the place's, and only there when the match is accepted: a rejected match moves nothing. `descriptor`
-    is what the frame was encoded as, for a flight that learns it.
-    """
+class FixReport:
+    """What became of the position fix of a `query`: `sent` is True, False (and `why`), or None while it waits for its
+    turn; `answer` is the autopilot's, the name of a MAV_RESULT, None where there is none (yet)."""
 
     query: str
-    t_mono_s: float
-    candidate: Candidate | None
-    accepted: bool
-    reason: str
-    position: Position | None
-    accuracy_m: float | None
-    cost: QueryCost
-    descriptor: Descriptor | None = None
+    sent: bool | None
+    why: str | None = None
+    answer: str | None = None

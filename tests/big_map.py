@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from edgevpr.contract import PartSpec, TechniqueSpec
 from edgevpr.places import geopackage
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.types import PartSpec, TechniqueSpec
 
 _SPACING_DEG = 0.0005  # of latitude: 56 m
 _INSERT = """

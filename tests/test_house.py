@@ -24,8 +24,4 @@ def test_what_has_more_than_four_fields_is_made_by_keyword():
         for each in node.body:
             if isinstance(each, ast.FunctionDef) and each.name == "__init__" and len(each.args.args) > 5:
                 positional.append(name)
-    assert positional == [
-        "runtime/flight/loop.py: Flight",
-        "runtime/recognise/pipeline.py: Pipeline",
-        "types.py: PlaceMatch",
-    ]
+    assert not positional

@@ -9,22 +9,25 @@ from typing import Any, TypeVar
 import numpy as np
 
 from edgevpr.config import load_config
+from edgevpr.contract import Technique
+from edgevpr.errors import ModelError
 from edgevpr.evaluate import metrics
 from edgevpr.evaluate.dataset import Dataset
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.source import Source, open_source
-from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
+from edgevpr.places.index import bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import rank
-from edgevpr.places.sequence import length_of, sequence_of
+from edgevpr.places.sequence import length_of, search_of
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import pack_ah, parse_pack, queries_ah, rail_ah, stage_energy_j
-from edgevpr.power.meter import stage
-from edgevpr.runtime.recognise.judge import accept_rule, accepted
+from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.mapping import build_map
+from edgevpr.runtime.recognise.opening import meter_of
+from edgevpr.runtime.recognise.recogniser import Recogniser
+from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.techniques import create, labelled
 from edgevpr.techniques.networks.card import weights_of
-from edgevpr.types import Frame, StageCost, Technique
+from edgevpr.types import NO_COST, Frame, StageCost
 
 T = TypeVar("T")
 Progress = Callable[[Iterable[T], int, str], Iterable[T]]
@@ -102,15 +105,33 @@ def evaluate(
     where the temporary map cannot be written.
     """
     technique = create(technique_name, parameters)
+    config = load_config(None)
+    meter = meter_of(config, load_board("this"))
     with tempfile.TemporaryDirectory(prefix="edgevpr-eval-") as folder:
         map_path = Path(folder) / "references.gpkg"
         source = open_source(str(dataset.ref_dir), live=False)
         with PlaceMap.create(map_path, technique.spec) as place_map:
-            build_map(progress(_frames(source), source.total, f"{technique_name}: references"), technique, place_map)
+            frames = progress(_frames(source), source.total, f"{technique_name}: references")
+            build_map(frames, technique, place_map, meter)
         with PlaceMap.open(map_path) as place_map:
+            length = length_of(technique.spec, sequence)
             index = load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
-            length = length_of(technique, sequence)
-            answers = list(_answers(technique, dataset, place_map, index, candidates, length, progress))
+            rule = accept_rule(technique, config.match, length)
+
+            def walk(length: int) -> Recogniser:
+                return Recogniser(
+                    technique=technique,
+                    place_map=place_map,
+                    index=index,
+                    rule=rule,
+                    meter=meter,
+                    candidates=candidates,
+                    search=search_of(length),
+                )
+
+            # The first query pays for lazy imports, lookup tables and a cold disk: one that is not counted goes before.
+            _asked(walk(1), dataset.queries[0].path)
+            answers = list(_answers(walk(length), dataset, progress))
     return replace(_summary(technique, len(dataset.references), answers), sequence=length)
 
 
@@ -139,34 +160,17 @@ def _frames(source: Source) -> Iterator[Frame]:
         yield source.read(timeout_s=0)
 
 
-def _answers(
-    technique: Technique,
-    dataset: Dataset,
-    place_map: PlaceMap,
-    index: PlaceIndex,
-    candidates: int | None,
-    length: int,
-    progress: Progress,
-) -> Iterator[_Answer]:
-    sequence = sequence_of(length)
+def _answers(recogniser: Recogniser, dataset: Dataset, progress: Progress) -> Iterator[_Answer]:
     # Of a sequence, those that are not scored are a part as well.
     scored = {query.path.name: query for query in dataset.queries}
-    asked = list_images(dataset.queries[0].path.parent) if sequence else [query.path for query in dataset.queries]
-    rule = accept_rule(technique, load_config(None).match, length)
-    # The first query pays for lazy imports, lookup tables and a cold disk: one that is not counted goes before it.
-    rank(technique, technique.encode(read_image(dataset.queries[0].path)), place_map, index, candidates)
-    for path in progress(asked, len(asked), f"{technique.spec.name}: queries"):
-        image = read_image(path)
-        with stage() as encoding:
-            descriptor = technique.encode(image)
-        with stage() as matching:
-            ranking = rank(technique, descriptor, place_map, index, candidates, rule.neighbour_m)
-            if sequence:
-                ranking = sequence.follow(ranking, index, t_mono_s=0.0)  # a folder has no gaps
-            is_accepted, _ = accepted(ranking, index, rule, sequence)
+    in_sequence = recogniser.search.length > 1
+    folder = dataset.queries[0].path.parent
+    asked = list_images(folder) if in_sequence else [query.path for query in dataset.queries]
+    for path in progress(asked, len(asked), f"{recogniser.technique.spec.name}: queries"):
+        event = _asked(recogniser, path)
         if path.name not in scored:
             continue
-        query = scored[path.name]
+        query, ranking = scored[path.name], event.ranking
         # Slots of the index follow the order of mapping, which is that of the references' names.
         right = np.array([name in query.right for name in dataset.references])
         ignored = np.array([name in query.ignored for name in dataset.references])
@@ -174,11 +178,19 @@ def _answers(
         yield _Answer(
             score=float(ranking.scores[at[0]]) if len(at) else 0.0,
             first_right=metrics.first_right(ranking.slots[at], right),
-            accepted=is_accepted,
-            accepted_wrong=is_accepted and not (right | ignored)[ranking.slots[0]],
-            encoding=encoding.cost,
-            matching=matching.cost,
+            accepted=event.accepted,
+            accepted_wrong=event.accepted and not (right | ignored)[ranking.slots[0]],
+            encoding=event.steps.encode,
+            matching=event.steps.match,
         )
+
+
+def _asked(recogniser: Recogniser, path: Path) -> Recognition:
+    """Ask about one image; a set with holes measures nothing, so what fails ends it all."""
+    event = recogniser.step(Frame(image=read_image(path), name=path.name, t_mono_s=0.0))  # a folder has no gaps
+    if event.failed:
+        raise ModelError(event.reason)
+    return event
 
 
 def _summary(technique: Technique, references: int, answers: list[_Answer]) -> TechniqueResult:
@@ -196,7 +208,7 @@ def _summary(technique: Technique, references: int, answers: list[_Answer]) -> T
     query_j += stage_energy_j(board.idle_w, board.full_w, u_match, t_match_s)
 
     return TechniqueResult(
-        technique=labelled(technique.spec.name, getattr(technique, "form", None)),
+        technique=labelled(technique.spec.name, technique.spec.form),
         weights=weights_of(technique.spec),
         parameters=technique.spec.parameters,
         queries=queries,
@@ -229,5 +241,4 @@ def _summary(technique: Technique, references: int, answers: list[_Answer]) -> T
 
 
 def _total(costs: Iterable[StageCost]) -> StageCost:
-    costs = list(costs)
-    return StageCost(sum(cost.wall_s for cost in costs), sum(cost.cpu_s for cost in costs))
+    return sum(costs, start=NO_COST)

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from edgevpr.frames.condition import Condition
 from edgevpr.frames.opencv import cv2
 from edgevpr.types import Frame
 
@@ -38,10 +39,12 @@ class LiveSource:
     waited for, not interrupted. `close` waits a second, then leaves the thread to its time-out.
     """
 
+    is_live = True
+    total = 0
+
     def __init__(self, open_capture: Callable[[], cv2.VideoCapture], clock: Callable[[], float]):
-        self.state = "opening"
+        self._condition, self.state = Condition.OPENING, "opening"
         self.ended = False
-        self.total = 0
         self.dropped = 0
         self._open_capture = open_capture
         self._clock = clock
@@ -52,6 +55,10 @@ class LiveSource:
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._capture, name="capture", daemon=True)
         self._thread.start()
+
+    @property
+    def condition(self) -> Condition:
+        return Condition.ENDED if self.ended else self._condition
 
     def read(self, timeout_s: float) -> Frame | None:
         """The newest frame, where it was not read before; None where none comes within `timeout_s`."""
@@ -76,6 +83,7 @@ class LiveSource:
             capture.release()
             failures = 1 if self._captured > before else failures + 1
             wait_s = wait_before_reopening_s(failures)
+            self._condition = Condition.LOST
             self.state = f"{'lost' if self._captured else 'nothing there'}, reopening in {wait_s:g} s"
             self._closing.wait(wait_s)
 
@@ -84,7 +92,7 @@ class LiveSource:
             there, image = capture.read()
             if not there:  # the only sign of a loss: `isOpened` stays true
                 return
-            self.state = "streaming"
+            self._condition, self.state = Condition.RUNNING, "streaming"
             self._put(image)
 
     def _put(self, image: np.ndarray) -> None:

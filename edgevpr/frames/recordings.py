@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from edgevpr.errors import SourceError, UsageError
+from edgevpr.frames.condition import Condition
 from edgevpr.frames.exif import read_exif
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.opencv import cv2
@@ -15,7 +16,23 @@ _TIMESTAMP_ROUNDING_S = 0.001  # Matroska counts in milliseconds
 _USUAL_RATE_HZ = 25.0
 
 
-class FolderSource:
+class _Recording:
+    """What every recording has in common: a subclass says whether it has `ended`."""
+
+    is_live = False
+    dropped = None
+    ended: bool
+
+    @property
+    def condition(self) -> Condition:
+        return Condition.ENDED if self.ended else Condition.RUNNING
+
+    @property
+    def state(self) -> str:
+        return "ended" if self.ended else "reading"
+
+
+class FolderSource(_Recording):
     """Each image of a folder once, placed by positions.csv where it has a line there, else by its EXIF."""
 
     def __init__(self, folder: Path, positions: Path | None, clock: Callable[[], float]):
@@ -27,10 +44,6 @@ class FolderSource:
         self._tags = read_positions(csv_path) if csv_path else {}
         if positions and not any(path.name in self._tags for path in self._paths):
             raise UsageError(f"{positions} names none of the images in {folder}: its column `file` must.")
-
-    @property
-    def state(self) -> str:
-        return "ended" if self.ended else "reading"
 
     @property
     def ended(self) -> bool:
@@ -57,7 +70,7 @@ class FolderSource:
         """Nothing is held open between images."""
 
 
-class VideoSource:
+class VideoSource(_Recording):
     """The frames of a video file, at least `step_s` of video time apart: the same ones each time."""
 
     def __init__(self, path: Path, step_s: float, clock: Callable[[], float]):
@@ -73,10 +86,6 @@ class VideoSource:
         self._index = -1
         self._t_s = -self._frame_s
         self._t_due_s = 0.0
-
-    @property
-    def state(self) -> str:
-        return "ended" if self.ended else "reading"
 
     def read(self, timeout_s: float) -> Frame | None:
         """The next frame that is due; None where it takes longer to get there, or the video has ended."""

@@ -7,15 +7,14 @@ from pathlib import Path
 from typing import Any, Protocol
 from urllib.parse import urlsplit
 
+from edgevpr.config import SOURCES
 from edgevpr.errors import SourceError, UsageError
+from edgevpr.frames.condition import Condition
 from edgevpr.frames.images import EXTENSIONS
 from edgevpr.frames.live import LiveSource, open_camera, open_stream
 from edgevpr.frames.recordings import FolderSource, VideoSource
 from edgevpr.types import Frame
 
-UNDERSTOOD = (
-    "a folder of images, a video file, a camera (/dev/video0) or a stream (rtsp://, udp://, tcp://, http://, FILE.sdp)"
-)
 _SCHEMES = ("rtsp", "rtsps", "udp", "tcp", "http", "https")
 _SCHEMES_THAT_NEED_A_PORT = ("udp", "tcp")
 
@@ -23,15 +22,24 @@ _SCHEMES_THAT_NEED_A_PORT = ("udp", "tcp")
 class Source(Protocol):
     """A source of frames.
 
-    `ended`: no frame will come any more. `total`: about how many there will be, 0 where nobody can know. `state`: a few
-    words for the log, with what changes often behind a comma ("reading", "streaming", "lost, reopening in 2 s").
-    """
+    `is_live`: its pictures are of now, and the newest counts; a recording is read in order to its end. `ended`: no
+    frame will come any more. `total`: about how many there will be, 0 where nobody can know. `dropped`: how many
+    pictures nobody took in time, None of a recording, which drops none. `condition`, and as `state` in a few words for
+    people ("reading", "streaming", "lost, reopening in 2 s")."""
+
+    is_live: bool
 
     @property
     def ended(self) -> bool: ...
 
     @property
     def total(self) -> int: ...
+
+    @property
+    def dropped(self) -> int | None: ...
+
+    @property
+    def condition(self) -> Condition: ...
 
     @property
     def state(self) -> str: ...
@@ -67,18 +75,19 @@ def open_source(
         raise UsageError(f"{positions} can only place the images of a folder, and {uri} is none: leave it out.")
     if path.is_dir():
         return FolderSource(path, positions, clock)
-    if _is_live(uri):
+    if is_live(uri):
         if not live:
             raise SourceError(f"{uri} is live and never ends: give a folder of images or a video file here.")
         return LiveSource(_capture_of(uri), clock)
     if not path.is_file():
-        raise SourceError(f"There is nothing at `{uri}`: give {UNDERSTOOD}.")
+        raise SourceError(f"There is nothing at `{uri}`: give {SOURCES}.")
     if path.name.lower().endswith(EXTENSIONS):
         raise SourceError(f"{uri} is a single image: give the folder that holds it.")
     return VideoSource(path, step_s or 0.0, clock)
 
 
-def _is_live(uri: str) -> bool:
+def is_live(uri: str) -> bool:
+    """Say whether `uri` names a camera or a stream; all else is a recording."""
     is_device = uri.startswith("/dev/") and not Path(uri).is_file()  # /dev/shm holds plain files
     return "://" in uri or is_device or uri.lower().endswith(".sdp")
 
@@ -109,7 +118,7 @@ def _check_address(uri: str) -> None:
     except ValueError as error:
         raise SourceError(f"{uri} is not a proper address ({error}): write it like rtsp://HOST:PORT/PATH.") from None
     if address.scheme not in _SCHEMES:
-        raise SourceError(f"{uri}: {address.scheme}:// is not understood: give {UNDERSTOOD}.")
+        raise SourceError(f"{uri}: {address.scheme}:// is not understood: give {SOURCES}.")
     if port is None and address.scheme in _SCHEMES_THAT_NEED_A_PORT:
         raise SourceError(f"{uri} names no port: write it like {address.scheme}://HOST:PORT.")
     if host is None and address.scheme != "udp":  # udp://:PORT listens on all interfaces

@@ -15,7 +15,7 @@ from edgevpr.errors import LinkError
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.messages import Fix, Health
-from edgevpr.mavlink.outbox import Outbox
+from edgevpr.mavlink.outbox import Outbox, Sending
 from edgevpr.mavlink.peer import Autopilot
 from edgevpr.mavlink.transport import Transport, open_transport
 from edgevpr.mavlink.wire import Message, Receiver, mavlink
@@ -48,11 +48,16 @@ class LinkStats:
     bad_bytes: int
     reopened: int
 
+    @property
+    def fixes_sent(self) -> int:
+        """Count the position fixes among what was sent."""
+        return self.sent.get("COMMAND_INT", 0)
+
 
 class Link:
     """Sends what it is given and a heartbeat a second, listens, and outlives every loss of the other end.
 
-    `send`, `send_fix`, `set_health`, `want_position`, `vehicle_position` and `stats` may be called from any thread,
+    `send`, `send_fix`, `set_health`, `want_position`, `vehicle`, `listens` and `stats` may be called from any thread,
     never block and never raise.
     """
 
@@ -66,6 +71,8 @@ class Link:
         self._packer = mavlink.MAVLink(None, srcSystem=1, srcComponent=component_id)
         self._transport: Transport | None = None
         self._unsent = b""  # the rest of a message of which the port took only a part
+        self._sending: Sending | None = None  # the fix that this rest is of, if it is one
+        self._last_sent: Sending | None = None
         self._blocked_since_s: float | None = None
         self._heartbeat_due_s = clock()
         self._ask_position_s: float | None = None  # when to ask for it next; None: nobody wants it
@@ -99,10 +106,12 @@ class Link:
             self._outbox.put(message)
         self._ring()
 
-    def send_fix(self, fix: Fix) -> None:
-        """Queue a position fix. It leaves within a second and to an autopilot that is there, or never."""
-        self._outbox.put_fix(fix, self._clock())
+    def send_fix(self, fix: Fix) -> Sending:
+        """Queue a position fix. It leaves within a second and to an autopilot that is there, or never: what it gives
+        says so as soon as it is known."""
+        sending = self._outbox.put_fix(fix, self._clock())
         self._ring()
+        return sending
 
     def set_health(self, health: Health) -> None:
         """Set what the heartbeats of the next ten seconds say; a caller that falls silent is reported as critical."""
@@ -112,10 +121,14 @@ class Link:
         """Ask the autopilot to say where it is, now and whenever it has fallen silent about it."""
         self._ask_position_s = self._clock()
 
-    def vehicle_position(self, max_age_s: float) -> Vehicle | None:
-        """Where the autopilot says it is; None where it does not know or last said so more than `max_age_s` ago."""
-        position = self._autopilot.position
-        return position if position and self._clock() - position.t_heard_s <= max_age_s else None
+    def vehicle(self) -> Vehicle | None:
+        """Give what the autopilot last said of its vehicle; None where it does not know where it is."""
+        return self._autopilot.vehicle
+
+    def listens(self) -> bool:
+        """Say whether there is an autopilot that a fix can be sent to now."""
+        transport = self._transport
+        return transport is not None and transport.connected and self._autopilot.listens(self._clock())
 
     def stats(self) -> LinkStats:
         transport = self._transport
@@ -194,6 +207,8 @@ class Link:
             if self._autopilot.hear(message, now_s):
                 self._packer.srcSystem = self._autopilot.system_id
                 transport.answer_sender()
+            if self._last_sent and (answer := self._autopilot.take_answer()):
+                self._last_sent.answer = answer  # an answer does not say to which fix: the newest has waited for it
 
     def _transmit(self, transport: Transport) -> None:
         while self._unsent or self._pack_next():
@@ -201,6 +216,9 @@ class Link:
             self._unsent = self._unsent[taken:]
             if taken:
                 self._blocked_since_s = None
+                if self._sending and not self._unsent:
+                    self._sending.settle(True)
+                    self._last_sent, self._sending = self._sending, None
             elif self._blocked_since_s is None:
                 self._blocked_since_s = self._clock()
             elif self._clock() - self._blocked_since_s > STUCK_S:
@@ -215,6 +233,9 @@ class Link:
                 self._unsent = message.pack(self._packer)
             except (struct.error, OverflowError) as error:  # a value that its field cannot hold must not end the link
                 log.error("%s is not sent: %s", message, error)
+                if self._sending:
+                    self._sending.settle(False, f"it does not fit its message ({error})")
+                    self._sending = None
                 continue
             self._packer.seq = (self._packer.seq + 1) % 256
             self._sent[message.get_type()] += 1
@@ -229,9 +250,9 @@ class Link:
             return messages.heartbeat(Health.CRITICAL if stuck else self._health)
         if self._autopilot.listens(now_s):
             self._ask_for_position(now_s)
-            fix = self._outbox.next_fix(now_s)
-            if fix is not None:
-                return messages.position_fix(fix, now_s, self._autopilot.system_id)
+            self._sending = self._outbox.next_fix(now_s)
+            if self._sending is not None:
+                return messages.position_fix(self._sending.fix, now_s, self._autopilot.system_id)
         else:
             self._outbox.drop_stale_fixes(now_s)
         return self._outbox.next_message()
@@ -241,8 +262,8 @@ class Link:
         if self._ask_position_s is None or now_s < self._ask_position_s:
             return
         self._ask_position_s = now_s + ASK_AGAIN_S
-        position = self._autopilot.position
-        if position is None or now_s - position.t_heard_s > ASK_AGAIN_S:
+        vehicle = self._autopilot.vehicle
+        if vehicle is None or now_s - vehicle.t_heard_s > ASK_AGAIN_S:
             for request in messages.position_requests(self._autopilot.system_id):
                 self._outbox.put(request)
 
@@ -251,6 +272,9 @@ class Link:
             self._transport.close()
             self._transport = None
         self._unsent = b""
+        if self._sending:
+            self._sending.settle(False, "the link was lost before it had left")
+            self._sending = None
         self._blocked_since_s = None
         self._receiver.forget_partial_message()
         self._note_trouble(error)
@@ -271,7 +295,7 @@ class Link:
 
     def _all_answered(self) -> bool:
         """Say whether as many answers came as fixes went, so that what is counted at the end is what was taken."""
-        return self._autopilot.acks.total() >= self._sent["COMMAND_INT"]
+        return self._autopilot.acks.total() >= self.stats().fixes_sent
 
     def _close_all(self) -> None:
         if self._transport is not None:

@@ -1,15 +1,36 @@
 """What waits to be sent: messages, of which the newest matter, and fixes, which are never sent late."""
 
 from collections import deque
-from threading import Lock
+from threading import Event, Lock
 
 from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.wire import Message
+from edgevpr.types import FIX_MAX_AGE_S
 
 MESSAGES_MAX = 64
 FIXES_MAX = 8
 FIX_MAX_WAIT_S = 1.0
-FIX_MAX_AGE_S = 5.0  # ArduPilot takes an older frame for one of 5 s ago, and would set the vehicle back too little
+
+
+class Sending:
+    """A fix on its way. `sent` is None while it waits, then True, or False and `why`; `answer` is the autopilot's, the
+    name of a MAV_RESULT, None while there is none. Only the link's thread changes it once it is queued."""
+
+    def __init__(self, fix: Fix) -> None:
+        self.fix = fix
+        self.sent: bool | None = None
+        self.why: str | None = None
+        self.answer: str | None = None
+        self._settled = Event()
+
+    def settle(self, sent: bool, why: str | None = None) -> None:
+        """Say what became of it."""
+        self.sent, self.why = sent, why
+        self._settled.set()
+
+    def wait(self, timeout_s: float) -> None:
+        """Wait until it has left or never will, for so long at most."""
+        self._settled.wait(timeout_s)
 
 
 class Outbox:
@@ -18,7 +39,7 @@ class Outbox:
     def __init__(self) -> None:
         self._lock = Lock()
         self._messages: deque[Message] = deque(maxlen=MESSAGES_MAX)
-        self._fixes: deque[tuple[float, Fix]] = deque(maxlen=FIXES_MAX)
+        self._fixes: deque[tuple[float, Sending]] = deque()
         self.dropped_queue_full = 0
         self.dropped_stale_fixes = 0
 
@@ -28,27 +49,40 @@ class Outbox:
             self.dropped_queue_full += len(self._messages) == MESSAGES_MAX
             self._messages.append(message)
 
-    def put_fix(self, fix: Fix, now_s: float) -> None:
+    def put_fix(self, fix: Fix, now_s: float) -> Sending:
         """Queue a fix, to be sent soon or not at all."""
+        sending = Sending(fix)
+        age_s = now_s - fix.t_frame_s
         with self._lock:
-            self.dropped_stale_fixes += len(self._fixes) == FIXES_MAX
-            self._fixes.append((min(now_s + FIX_MAX_WAIT_S, fix.t_frame_s + FIX_MAX_AGE_S), fix))
+            if age_s > FIX_MAX_AGE_S:
+                self._drop(sending, f"its frame is {age_s:.1f} s old, and {FIX_MAX_AGE_S:g} s are the limit")
+                return sending
+            if len(self._fixes) == FIXES_MAX:
+                self._drop(self._fixes.popleft()[1], "newer ones came before its turn")
+            self._fixes.append((min(now_s + FIX_MAX_WAIT_S, fix.t_frame_s + FIX_MAX_AGE_S), sending))
+        return sending
 
     def next_message(self) -> Message | None:
         with self._lock:
             return self._messages.popleft() if self._messages else None
 
-    def next_fix(self, now_s: float) -> Fix | None:
+    def next_fix(self, now_s: float) -> Sending | None:
         """Give the oldest fix that is still true, and drop those before it."""
         self.drop_stale_fixes(now_s)
         with self._lock:
             return self._fixes.popleft()[1] if self._fixes else None
 
     def drop_stale_fixes(self, now_s: float) -> None:
+        """Drop what has waited too long."""
         with self._lock:
-            fresh = [entry for entry in self._fixes if now_s <= entry[0]]
-            self.dropped_stale_fixes += len(self._fixes) - len(fresh)
-            self._fixes = deque(fresh, maxlen=FIXES_MAX)
+            for due_s, sending in self._fixes:
+                if now_s > due_s:
+                    self._drop(sending, f"no autopilot was there to take it within {FIX_MAX_WAIT_S:g} s")
+            self._fixes = deque(entry for entry in self._fixes if entry[1].sent is None)
+
+    def _drop(self, sending: Sending, why: str) -> None:
+        self.dropped_stale_fixes += 1
+        sending.settle(False, why)
 
     def __len__(self) -> int:
         """Count the messages that wait."""

@@ -31,7 +31,8 @@ class Autopilot:
     def __init__(self, own_component: int) -> None:
         self.system_id: int | None = None
         self.acks: Counter[str] = Counter()  # answers to our fixes, by name of the result
-        self.position: Vehicle | None = None  # the last one heard, however old
+        self.vehicle: Vehicle | None = None  # what was last heard of it, however old
+        self._answer: str | None = None  # one that nobody has taken
         self._own_component = own_component
         self._heard_s = -math.inf
         self._gps: dict[str, tuple[float, float, float]] = {}  # of each receiver with a fix: lat_deg, lon_deg, when
@@ -41,6 +42,11 @@ class Autopilot:
     def listens(self, now_s: float) -> bool:
         """Say whether its heartbeat was heard in the last five seconds."""
         return now_s - self._heard_s <= SILENT_AFTER_S
+
+    def take_answer(self) -> str | None:
+        """Give the newest answer to a fix, once."""
+        answer, self._answer = self._answer, None
+        return answer
 
     def hear(self, message: Message, now_s: float) -> bool:
         """Take note of a message; True for the autopilot's heartbeat."""
@@ -59,7 +65,7 @@ class Autopilot:
         if self._answers_our_fix(message):
             self._hear_result(message.result)
         elif message.get_type() == "GLOBAL_POSITION_INT":
-            self.position = _position(message, now_s, self._has_gps(message, now_s))
+            self.vehicle = _vehicle(message, now_s, self._has_gps(message, now_s))
         elif message.get_type() in _GPS_REPORTS:
             self._hear_gps(message, now_s)
         return False
@@ -105,13 +111,14 @@ class Autopilot:
         known = mavlink.enums["MAV_RESULT"].get(result)
         name = known.name.removeprefix("MAV_RESULT_") if known else str(result)
         self.acks[name] += 1
+        self._answer = name
         if result != self._last_result:
             level = logging.INFO if result == mavlink.MAV_RESULT_ACCEPTED else logging.WARNING
             log.log(level, "the autopilot's answer to position fixes: %s (%s)", name, _EXPLANATIONS.get(result, "?"))
             self._last_result = result
 
 
-def _position(message: Message, now_s: float, has_gps: bool) -> Vehicle | None:
+def _vehicle(message: Message, now_s: float, has_gps: bool) -> Vehicle | None:
     """None for 0, 0, which is what an autopilot without a position says, and for what is not on Earth."""
     if (message.lat == 0 and message.lon == 0) or abs(message.lat) > 90e7 or abs(message.lon) > 180e7:
         return None

@@ -111,6 +111,7 @@ END;
 
 # "GP", version 0, flags: little-endian, no envelope; srs_id; then well-known binary: little-endian, Point, x, y.
 _POINT = struct.Struct("<2sBBiBIdd")
+_KINDS_OF_POINT = (1, 1001, 2001, 3001)  # x and y; and z, and m, and both, which are not looked at
 
 
 def point_blob(lat_deg: float, lon_deg: float) -> bytes:
@@ -124,10 +125,15 @@ def read_point(blob: bytes) -> tuple[float, float]:
     Raises ValueError for what is no point on the Earth.
     """
     try:
+        if blob[:2] != b"GP":
+            raise ValueError("its geometry is no point")
         wkb = 8 + (0, 32, 48, 48, 64)[(blob[3] >> 1) & 7]  # the header, and the envelope that its flags announce
-        lon_deg, lat_deg = struct.unpack_from(("<" if blob[wkb] else ">") + "dd", blob, wkb + 5)
-    except (IndexError, struct.error) as error:
+        order = {0: ">", 1: "<"}[blob[wkb]]
+        kind, lon_deg, lat_deg = struct.unpack_from(f"{order}Idd", blob, wkb + 1)
+    except (IndexError, KeyError, TypeError, struct.error) as error:
         raise ValueError("its geometry is no point") from error
+    if kind not in _KINDS_OF_POINT:
+        raise ValueError("its geometry is no point")
     if not (abs(lat_deg) <= 90 and abs(lon_deg) <= 180):
         raise ValueError(f"latitude {lat_deg:g}, longitude {lon_deg:g} is not on the Earth")
     return lat_deg, lon_deg

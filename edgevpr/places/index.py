@@ -7,11 +7,12 @@ from itertools import compress, islice
 
 import numpy as np
 
+from edgevpr.contract import Technique, TechniqueSpec
 from edgevpr.errors import MapError
 from edgevpr.geodesy import distance_m
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.thin import best_places
-from edgevpr.types import Position, Technique, TechniqueSpec
+from edgevpr.types import Position
 
 _log = logging.getLogger(__name__)
 _BYTES_BESIDE_ROW = 8 + 8 + 8 + 2  # id, latitude, longitude, heading
@@ -49,6 +50,11 @@ class PlaceIndex:
     @property
     def nbytes(self) -> int:
         return sum(array.nbytes for array in self.arrays.values())
+
+    @property
+    def knows_headings(self) -> bool:
+        """Say whether any place has a heading."""
+        return not np.isnan(self.heading_deg).all()
 
     def spacing_m(self) -> float | None:
         """Median distance from a place to the next one mapped, metres; None where no two have a position."""

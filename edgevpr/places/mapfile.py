@@ -15,11 +15,12 @@ from pathlib import Path
 import numpy as np
 
 from edgevpr import __version__
+from edgevpr.contract import Descriptor, PartSpec, TechniqueSpec
 from edgevpr.errors import MapError
 from edgevpr.geodesy import EARTH_RADIUS_M, distance_m
 from edgevpr.places import geopackage
 from edgevpr.places.sqlite import connect, sentences, settle, settle_left_log, start_log
-from edgevpr.types import Descriptor, Frame, PartSpec, Place, Position, TechniqueSpec
+from edgevpr.types import Frame, Place, Position
 
 FORMAT_VERSION = 1
 _PLACE_COLUMNS = "place_id, geom, time, alt_m, heading_deg, source_image, quality"

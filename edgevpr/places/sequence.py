@@ -8,14 +8,13 @@ found would lag behind. So that none of them is accepted, all other speeds are t
 
 import zlib
 from collections import deque
-from collections.abc import Iterator
-from collections.abc import Sequence as Rows
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from edgevpr.contract import FineMatch, TechniqueSpec
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.retrieve import Ranking
-from edgevpr.types import FineMatch, Technique
 
 V_MIN, V_MAX, _V_STEP = 0.8, 1.2, 0.1  # places a query, as in the paper
 _OTHER_SPEEDS = np.arange(-2.5, 3.01, 0.25)  # places a query; ten queries tell them from those between
@@ -25,14 +24,14 @@ _NEWEST, _NEWEST_ALONE, _BEST_SHARE = 3, 2, 0.1
 _USUAL_INTERVALS = 3  # a technique that takes 6 s a query leaves gaps of 6 s, and they are none
 
 
-def length_of(technique: Technique, asked: int | None) -> int:
-    """How many queries are matched together: what is asked for, else the technique's own number, else 1."""
-    return asked or getattr(technique, "sequence", 1)
+def length_of(spec: TechniqueSpec, asked: int | None) -> int:
+    """Say how many queries are matched together: what is asked for, else the technique's own number."""
+    return asked or spec.sequence
 
 
-def sequence_of(length: int) -> "Sequence | None":
-    """A new sequence of `length` queries; None where each is matched alone."""
-    return Sequence(length) if length > 1 else None
+def search_of(length: int) -> "Search":
+    """Make the search over sequences of `length` queries; of one query, none."""
+    return SequenceSearch(length) if length > 1 else Alone()
 
 
 def bytes_beside_place(length: int) -> int:
@@ -40,7 +39,17 @@ def bytes_beside_place(length: int) -> int:
     return 4 * (length + 1) if length > 1 else 0
 
 
-class Sequence:
+class Alone:
+    """Each query by itself: what a `SequenceSearch` is where nothing is searched."""
+
+    length = frames = 1
+
+    def follow(self, ranking: Ranking, index: PlaceIndex, t_mono_s: float) -> Ranking:
+        """Give the ranking of the newest query as it is."""
+        return ranking
+
+
+class SequenceSearch:
     """The last `length` queries' scores of all places, followed from query to query.
 
     `frames` of them are there: until there are `length`, nothing may be accepted. `rivals`, float32 (N,), are the best
@@ -141,7 +150,7 @@ def _followed(v_min: float, v_max: float) -> np.ndarray:
     return np.linspace(v_min, v_max, round((v_max - v_min) / _V_STEP) + 1)
 
 
-def best_means(rows: Rows[np.ndarray], trajectories: Rows[Rows[int]]) -> np.ndarray:
+def best_means(rows: Sequence[np.ndarray], trajectories: Sequence[Sequence[int]]) -> np.ndarray:
     """The best mean score of the trajectories that end at each slot: rows float32 (up to N,), newest first -> (N,).
 
     Older rows may be shorter, where the index has grown since.
@@ -159,7 +168,8 @@ def best_means(rows: Rows[np.ndarray], trajectories: Rows[Rows[int]]) -> np.ndar
 
 
 def offline(scores: np.ndarray, length: int, v_min: float = V_MIN, v_max: float = V_MAX) -> np.ndarray:
-    """What `Sequence` makes of all queries of a flight, at once: float32 (Q, N) -> float32 (Q, N), the same numbers."""
+    """Give what `SequenceSearch` makes of all queries of a flight at once, the same numbers: float32 (Q, N) -> (Q,
+    N)."""
     queries, places = scores.shape
     best = np.zeros((queries, places), np.float32)
     for trajectory in trajectories(length, _followed(v_min, v_max)):
@@ -178,3 +188,6 @@ def _scored(scores: np.ndarray, matches: Iterator[FineMatch | None]) -> Iterator
             yield FineMatch(score)
         else:
             yield FineMatch(score, match.shift_cells, match.covariance_cells2, match.rotation_deg)
+
+
+Search = Alone | SequenceSearch

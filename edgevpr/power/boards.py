@@ -5,7 +5,7 @@ import os
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from edgevpr.config import bounded, build, read_yaml
+from edgevpr.config import BUDGET_MB, HIGHEST_RATE_HZ, LOWEST_RATE_HZ, bounded, build, read_yaml
 from edgevpr.errors import ConfigError
 from edgevpr.power import machine, thermal
 from edgevpr.resources import shipped
@@ -15,7 +15,7 @@ _SAME_RAM = 1.02  # a kernel keeps some for itself, another amount with every ve
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Score:
+class MachineSpeed:
     """How fast a machine is beside one core of the reference, which `profiles/generic-x86.yaml` names (None: unknown).
 
     `single` is one thread at integer code and bytes, `multi` all cores together at the same; `products` and `passes`
@@ -53,12 +53,12 @@ class Board:
     full_w: float = bounded(0.01, 1000)
     verified: bool
     source: str
-    rate_hz: float = bounded(0.01, 60)
+    rate_hz: float = bounded(LOWEST_RATE_HZ, HIGHEST_RATE_HZ)
     cpu_share: float = bounded(0.01, 1)
-    budget_mb: float = bounded(1, 65_536)
+    budget_mb: float = bounded(*BUDGET_MB)
     memory_max_mb: float = bounded(1, 4_000_000)
     thermal_limit_c: float | None = bounded(30, 125)
-    benchmark_score: Score
+    benchmark_score: MachineSpeed
     technique: str | None = None
     threads: int = field(default=1, metadata={"range": (1, 64)})
     machine: str | None = None
@@ -127,7 +127,7 @@ def _this_machine(root: Path) -> Board:
         if recognised:
             profile, title = recognised, f"this machine ({recognised.title})"
         else:
-            unknown = Score(
+            unknown = MachineSpeed(
                 single=None,
                 multi=None,
                 products=None,

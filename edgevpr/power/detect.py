@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from edgevpr.power import machine
-from edgevpr.power.boards import Score, board_names, load_board
+from edgevpr.power.boards import MachineSpeed, board_names, load_board
 from edgevpr.power.thermal import limit_c
 
 if TYPE_CHECKING:  # imports NumPy, which recognising a board does not need
@@ -86,7 +86,7 @@ def findings(found: Detected) -> tuple[str, ...]:
     )
 
 
-def profile_text(found: Detected, score: Score | None = None, calibration: Calibration | None = None) -> str:
+def profile_text(found: Detected, score: MachineSpeed | None = None, calibration: Calibration | None = None) -> str:
     """A whole profile for `found` as YAML, which `load_board` accepts.
 
     Its watts are the calibration's; without one those of the known board; else relative figures that say nobody has
@@ -107,7 +107,7 @@ def profile_text(found: Detected, score: Score | None = None, calibration: Calib
     elif found.board:
         speed = base.benchmark_score
     else:
-        speed = Score(
+        speed = MachineSpeed(
             single=None, multi=None, products=None, passes=None, verified=False, source="nobody has measured it"
         )
     memory_max_mb = max(1.0, min(found.ram_mb * base.memory_max_mb / base.ram_mb, found.ram_limit_mb))

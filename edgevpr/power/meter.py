@@ -1,4 +1,4 @@
-"""What a stage costs, and a query: seconds, CPU-seconds, utilisation, charge."""
+"""Metering of what a step of a query costs, and a query: seconds, CPU-seconds, utilisation, charge."""
 
 import math
 import time
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from edgevpr.power.boards import Board
 from edgevpr.power.equations import Pack, marginal_energy_j, pack_ah, stage_energy_j
 from edgevpr.power.machine import pss_mb, rss_mb
-from edgevpr.types import QueryCost, StageCost
+from edgevpr.types import QueryCost, StageCost, Steps
 
 Clock = Callable[[], float]
 _PSS_EVERY_S = 20.0
@@ -17,7 +17,7 @@ _PSS_EVERY_S = 20.0
 
 @dataclass(slots=True)
 class Stage:
-    """A stage that is being metered; `cost` is there once it is over."""
+    """A stage that is being metered; `cost` is there once it is over, however it ends."""
 
     cost: StageCost | None = None
 
@@ -27,8 +27,10 @@ def stage(wall_clock: Clock = time.perf_counter, cpu_clock: Clock = time.process
     """Meter a stage: `with stage() as encoding: ...`, then `encoding.cost`. The CPU time is that of all threads."""
     metered = Stage()
     wall_s, cpu_s = wall_clock(), cpu_clock()
-    yield metered
-    metered.cost = StageCost(wall_clock() - wall_s, cpu_clock() - cpu_s)
+    try:
+        yield metered
+    finally:
+        metered.cost = StageCost(wall_clock() - wall_s, cpu_clock() - cpu_s)
 
 
 class PssMeter:
@@ -40,11 +42,56 @@ class PssMeter:
         self._read_s, self._pss_mb = -math.inf, None
 
     def look(self) -> float | None:
-        """What was read last, MB; None where the kernel does not say."""
+        """Give what was read last, MB; None where the kernel does not say."""
         now_s = self._clock()
         if now_s - self._read_s >= _PSS_EVERY_S:
             self._read_s, self._pss_mb = now_s, self._read()
         return self._pss_mb
+
+
+class QueryMeter:
+    """Meters the steps of query after query, and reckons what each query draws from the pack of a board. `wall_clock`
+    and `cpu_clock` (all threads) give seconds."""
+
+    def __init__(
+        self,
+        board: Board,
+        pack: Pack,
+        regulator_efficiency: float,
+        *,
+        wall_clock: Clock = time.perf_counter,
+        cpu_clock: Clock = time.process_time,
+    ) -> None:
+        self.board = board
+        self._pack, self._regulator_efficiency = pack, regulator_efficiency
+        self._wall_clock, self._cpu_clock = wall_clock, cpu_clock
+        self._pss = PssMeter()
+        self._taken: dict[str, StageCost] = {}
+
+    def begin(self) -> None:
+        """Begin with a new query."""
+        self._taken = {}
+
+    @contextmanager
+    def step(self, name: str) -> Iterator[None]:
+        """Meter a step of the query (a field of `Steps`): `with meter.step("encode"): ...`."""
+        metered = Stage()
+        try:
+            with stage(self._wall_clock, self._cpu_clock) as metered:
+                yield
+        finally:
+            self._taken[name] = metered.cost
+
+    def steps(self) -> Steps:
+        """Give the cost of every step that the query has come to."""
+        return Steps(**self._taken)
+
+    def cost(self) -> QueryCost:
+        """Give the cost of the query so far."""
+        steps = self.steps()
+        return query_cost(
+            steps.encode, steps.match, self.board, self._pack, self._regulator_efficiency, pss_mb=self._pss.look()
+        )
 
 
 def query_cost(
@@ -53,9 +100,11 @@ def query_cost(
     board: Board,
     pack: Pack,
     regulator_efficiency: float,
+    *,
     pss_mb: float | None = None,
 ) -> QueryCost:
-    """The cost of one query by 5.1-5.6, as the pack sees it: the energies of both stages are added, not their powers.
+    """Reckon the cost of one query by 5.1-5.6, as the pack sees it: the energies of both stages are added, not their
+    powers.
 
     `used_mah` is (a + s U) t, `marginal_mah` s U t: what the query adds to a board that is powered anyway.
     """

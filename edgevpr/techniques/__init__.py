@@ -3,25 +3,35 @@
 import difflib
 import importlib
 import inspect
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+from edgevpr.contract import Technique
 from edgevpr.errors import EdgevprError, UsageError
-from edgevpr.types import Technique
+
+
+@dataclass(frozen=True, slots=True)
+class _Own:
+    """Where the class of a technique is, and which output of its `model` it uses (None: it has no model)."""
+
+    where: str
+    network_output: str | None = None
+
 
 # The first are what a board is offered by itself, best first: see AUTOMATIC.
 _REGISTRY = {
-    "cohog": "edgevpr.techniques.cohog:CoHog",
-    "hog": "edgevpr.techniques.hog:Hog",
-    "seqslam": "edgevpr.techniques.seqslam:SeqSlam",
-    "calc": "edgevpr.techniques.calc:Calc",
-    "alexnet": "edgevpr.techniques.alexnet:AlexNet",
-    "amosnet": "edgevpr.techniques.amosnet:AmosNet",
-    "hybridnet": "edgevpr.techniques.hybridnet:HybridNet",
-    "netvlad": "edgevpr.techniques.netvlad:NetVlad",
-    "rmac": "edgevpr.techniques.rmac:RMac",
-    "region_vlad": "edgevpr.techniques.region_vlad:RegionVlad",
-    "cross_region_bow": "edgevpr.techniques.cross_region_bow:CrossRegionBow",
+    "cohog": _Own("edgevpr.techniques.cohog:CoHog"),
+    "hog": _Own("edgevpr.techniques.hog:Hog"),
+    "seqslam": _Own("edgevpr.techniques.seqslam:SeqSlam"),
+    "calc": _Own("edgevpr.techniques.calc:Calc", "descriptor"),
+    "alexnet": _Own("edgevpr.techniques.alexnet:AlexNet", "features"),
+    "amosnet": _Own("edgevpr.techniques.amosnet:AmosNet", "features"),
+    "hybridnet": _Own("edgevpr.techniques.hybridnet:HybridNet", "features"),
+    "netvlad": _Own("edgevpr.techniques.netvlad:NetVlad", "features"),
+    "rmac": _Own("edgevpr.techniques.rmac:RMac", "features"),
+    "region_vlad": _Own("edgevpr.techniques.region_vlad:RegionVlad", "features"),
+    "cross_region_bow": _Own("edgevpr.techniques.cross_region_bow:CrossRegionBow", "features"),
 }
 # Where several fit a board, the first is taken. Networks are used when they are asked for: they want onnxruntime in
 # RAM, and weights that somebody has chosen. A sequence wants a flight along the way that was mapped.
@@ -60,7 +70,7 @@ def labelled(name: str, form: str | None) -> str:
 
 def network_output(name: str) -> str | None:
     """Which output of its `model`, "features" or "descriptor", the technique `name` uses; None: it has no model."""
-    return getattr(_class(name), "network_output", "features") if "model" in parameters(name) else None
+    return _REGISTRY[name].network_output if is_own(name) else None
 
 
 def create(name: str, settings: dict[str, Any] | None = None) -> Technique:
@@ -86,7 +96,7 @@ def create(name: str, settings: dict[str, Any] | None = None) -> Technique:
 
 def _class(name: str) -> Any:
     if name in _REGISTRY:
-        module, _, class_name = _REGISTRY[name].partition(":")
+        module, _, class_name = _REGISTRY[name].where.partition(":")
         return getattr(importlib.import_module(module), class_name)
     if not is_known(name):
         raise UsageError(f"There is no technique `{name}`: use one of {', '.join(names())}.")

@@ -15,7 +15,6 @@ from edgevpr.techniques.vectors import VectorTechnique
 class Calc(VectorTechnique):
     """CALC with the weights of the card `model`, of which the output `descriptor` is taken."""
 
-    network_output = "descriptor"
     # No wrong match of corridor or aerial_caliterra (the sets tuned on) was ahead by 0.089, 0.12, 0.078, with the
     # weights that edgevpr ships or with the original ones.
     accept: ClassVar = {"float": (0.0, 0.11), "8bit": (0.0, 0.15), "1bit": (0.0, 0.10)}

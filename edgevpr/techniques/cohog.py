@@ -16,13 +16,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from edgevpr.contract import Descriptor, FineMatch, PartSpec, Picture, TechniqueSpec
 from edgevpr.errors import UsageError
 from edgevpr.techniques import placecode
 from edgevpr.techniques.displacement import displacement
 from edgevpr.techniques.entropy import block_means, good_blocks
 from edgevpr.techniques.gradients import grey_square, levels, mask_square, normalised_blocks, oriented_cells
 from edgevpr.techniques.patterns import slow_patterns
-from edgevpr.types import Descriptor, FineMatch, PartSpec, Picture, TechniqueSpec
 
 # The goodness threshold GT of the thesis (6.3.2) and of the authors' public code, each for its own entropy.
 _DEFAULT_GT = {"filled_bins": 0.5, "shannon": 0.4}
@@ -36,6 +36,7 @@ _VOTES_COUNT = {"forward": (1.0, 1.0, 0.75, 0.5), "nadir": (1.0, 1.0)}
 _ACCEPT = {"forward": (0.07, 0.035), "nadir": (0.08, 0.03), "thesis": (0.0, 0.02)}
 _CANDIDATES = {"forward": 42, "nadir": 50}
 _ROTATIONS = 24  # of a query that looks straight down and does not know its heading: 15 degrees apart
+_HEADING_WITHIN_DEG = 1.5 * 360 / _ROTATIONS  # the expected rotation, and the two beside it
 
 
 class CoHog:
@@ -76,13 +77,15 @@ class CoHog:
         self._compared = slow_patterns(bins) if matching == "displacement" else None
         self.min_score, self.min_margin = _ACCEPT[camera if matching == "displacement" else matching]
         self.candidates = _CANDIDATES[camera]
-        self.scan_counts = matching == "displacement" and camera == "forward"  # looking down it would say no more
+        self._asked, self._by_turn = None, {}
         self.spec = TechniqueSpec(
             name="cohog",
             parameters={"w1": w1, "w2": w2, "bins": bins, "gt": self._gt, "entropy": entropy, "camera": camera},
             coarse=PartSpec((placecode.SIDE, placecode.SIDE, bins), "|u1"),
             fine=PartSpec((self._side**2, 4 * bins), "|u1"),
             packed=PartSpec((placecode.SIDE**2 * bins // 8,), "|u1"),
+            scan_counts=matching == "displacement" and camera == "forward",  # looking down it would say no more
+            heading_within_deg=_HEADING_WITHIN_DEG if camera == "nadir" else None,
         )
 
     def encode(self, image: np.ndarray, mask: np.ndarray | None = None) -> Descriptor:
@@ -123,8 +126,8 @@ class CoHog:
         self, query: Descriptor, rows: np.ndarray, mean: np.ndarray, turned_deg: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray | None]:
         """Compare the place codes, `rows` uint8 (N, B), under shifts and, looking down, rotations, all or those within
-        22.5 degrees of `turned_deg` (N,). Returns scores float32 (N,) and, looking down, those of each rotation,
-        float32 (N, 24)."""
+        `spec.heading_within_deg` of `turned_deg` (N,). Returns scores float32 (N,) and, looking down, those of each
+        rotation, float32 (N, 24)."""
         seen = query.picture.seen
         blocks = _middle(query.regions.reshape(self._side, self._side, -1), seen)
         turns = np.arange(_ROTATIONS if self._camera == "nadir" else 1)
@@ -153,15 +156,17 @@ class CoHog:
         return replace(matches[best], rotation_deg=360 * best / _ROTATIONS)
 
     def _asking(self, query: Descriptor, turn: int) -> tuple[np.ndarray, np.ndarray]:
-        """Numbers and descriptors of the good regions of a query turned back by `turn` steps; kept with it, since many
-        places are asked."""
-        if turn not in query.asking:
+        """Numbers and descriptors of the good regions of a query turned back by `turn` steps; those of the newest query
+        are kept, since many places are asked."""
+        if query is not self._asked:
+            self._asked, self._by_turn = query, {}
+        if turn not in self._by_turn:
             regions, good = query.regions, query.good
             if turn:
                 blocks, _, good = self._regions(*self._turned_back(query.picture, turn))
                 regions, good = blocks.reshape(regions.shape), good.ravel()
-            query.asking[turn] = np.flatnonzero(good), self._comparable(regions[good])
-        return query.asking[turn]
+            self._by_turn[turn] = np.flatnonzero(good), self._comparable(regions[good])
+        return self._by_turn[turn]
 
     def _comparable(self, blocks: np.ndarray) -> np.ndarray:
         """Blocks float32 (N, 4 bins), or what the vote compares of them, (N, patterns), each of length 1."""

@@ -11,11 +11,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from edgevpr.contract import Descriptor, FineMatch, PartSpec
 from edgevpr.techniques.heads.regions import describe, find_regions, from_bytes, mutual_score, to_bytes
 from edgevpr.techniques.heads.words import bag_of_words, load_words
 from edgevpr.techniques.region_vlad import region_backbone
 from edgevpr.techniques.vectors import VectorTechnique
-from edgevpr.types import Descriptor, FineMatch, PartSpec
 
 
 class CrossRegionBow(VectorTechnique):
@@ -58,5 +58,5 @@ class CrossRegionBow(VectorTechnique):
         )
 
     def match(self, query: Descriptor, fine: np.ndarray, hypotheses: None = None) -> FineMatch:
-        """Score the mutually best pairs of regions, 0 to 1 (see `mutual_score`)."""
+        """MachineSpeed the mutually best pairs of regions, 0 to 1 (see `mutual_score`)."""
         return FineMatch(mutual_score(query.regions, from_bytes(fine)))

@@ -11,11 +11,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from edgevpr.contract import Descriptor, FineMatch, PartSpec
 from edgevpr.techniques.heads.regions import from_bytes, mutual_score, to_bytes
 from edgevpr.techniques.heads.rmac import aggregate, regional_vectors, square_regions
 from edgevpr.techniques.networks.session import open_backbone
 from edgevpr.techniques.vectors import VectorTechnique
-from edgevpr.types import Descriptor, FineMatch, PartSpec
 
 
 class RMac(VectorTechnique):
@@ -42,5 +42,5 @@ class RMac(VectorTechnique):
         return Descriptor(coarse=coarse, fine=to_bytes(squares), regions=squares, good=good, quality=float(good.mean()))
 
     def match(self, query: Descriptor, fine: np.ndarray, hypotheses: None = None) -> FineMatch:
-        """Score the mutually best pairs of squares, 0 to 1 (see `mutual_score`)."""
+        """MachineSpeed the mutually best pairs of squares, 0 to 1 (see `mutual_score`)."""
         return FineMatch(mutual_score(query.regions, from_bytes(fine)))

@@ -10,8 +10,8 @@ import math
 import cv2
 import numpy as np
 
+from edgevpr.contract import Descriptor, PartSpec, TechniqueSpec
 from edgevpr.errors import UsageError
-from edgevpr.types import Descriptor, PartSpec, TechniqueSpec
 
 _WINDOW = 10  # R_window of the paper: five places before and five after
 _GREYEST = 128  # a pixel that is as bright as its patch is on average
@@ -38,11 +38,11 @@ class SeqSlam:
         if not 1 <= sequence <= 100:
             raise UsageError(f"seqslam cannot match {sequence} queries together: sequence must be 1 to 100.")
         self._width, self._height, self._patch = width, height, patch
-        self.sequence = sequence
         self.spec = TechniqueSpec(
             name="seqslam",
             parameters={"width": width, "height": height, "patch": patch},
             coarse=PartSpec((width * height,), "|u1"),
+            sequence=sequence,
         )
 
     def encode(self, image: np.ndarray, mask: np.ndarray | None = None) -> Descriptor:

@@ -9,11 +9,11 @@ from typing import ClassVar
 
 import numpy as np
 
+from edgevpr.config import FORMS
+from edgevpr.contract import Descriptor, PartSpec, TechniqueSpec
 from edgevpr.errors import ModelError, UsageError
 from edgevpr.techniques.hamming import hamming
-from edgevpr.types import Descriptor, PartSpec, TechniqueSpec
 
-FORMS = ("float", "8bit", "1bit")
 # Ahead by more than any match can be: how far ahead the wrong matches of a network are is known for the weights that
 # edgevpr ships. With others none is accepted until the configuration says from when on.
 NEVER = 2.0
@@ -51,7 +51,6 @@ class VectorTechnique:
     ) -> None:
         if form not in FORMS:
             raise UsageError(f"{name} has no form `{form}`: use {', '.join(FORMS[:-1])} or {FORMS[-1]}.")
-        self.form = form
         self.min_score, self.min_margin = self.accept.get(form, (self.min_score, self.min_margin))
         if parameters.get("model", _SHIPPED) != _SHIPPED:
             self.min_margin = NEVER
@@ -68,6 +67,8 @@ class VectorTechnique:
             fine=None,
             model_sha256=model_sha256,
             packed=packed[form],
+            form=form,
+            forms=FORMS,
         )
 
     def vector(self, image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
@@ -96,7 +97,7 @@ class VectorTechnique:
         for block in _blocks(len(coarse), self._length):
             left = coarse[block].astype(np.float32)
             left -= mean
-            if self.form == "1bit":
+            if self.spec.form == "1bit":
                 rows[block, : -(-self._length // 8)] = np.packbits(left > 0, axis=1)
                 continue
             step = np.maximum(np.abs(left).max(axis=1), np.finfo(np.float32).tiny) / 127
@@ -118,11 +119,11 @@ class VectorTechnique:
         asked = query.coarse.astype(np.float32)
         if not asked.any():  # less the mean it would be like some place, and another picture of nothing the very same
             return np.zeros(len(rows), np.float32), None
-        if self.form == "1bit":
+        if self.spec.form == "1bit":
             code = np.zeros(self.spec.row.shape, np.uint8)
             code[: -(-self._length // 8)] = np.packbits(asked > mean)
             return (1 - hamming(code, rows) / np.float32(self._length)).astype(np.float32, copy=False), None
-        if self.form == "8bit":
+        if self.spec.form == "8bit":
             asked -= mean
         scores = np.empty(len(rows), np.float32)
         values = None

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pictures import textured
 
-from edgevpr.cli import main
+from edgevpr.cli.main import main
 
 
 @pytest.fixture(scope="module")
@@ -206,7 +206,10 @@ def test_what_the_user_gets_wrong_is_a_sentence_and_exit_code_2(capsys, flight, 
         (["map", "build", tmp_path / "m.gpkg", "--images", query, "--technique", "sift"], "There is no technique"),
         (["map", "build", tmp_path / "m.gpkg", "--images", query, "--param", "gt"], "write KEY=VALUE"),
         (["map", "build", tmp_path / "m.gpkg", "--images", query, "--positions", wrong_row], "line 2: lat is `91`"),
-        (["eval", "--query", query, "--ref", query, "--ground-truth", wrong_row, "--candidates", "0"], "at least 1"),
+        (
+            ["eval", "--query", query, "--ref", query, "--ground-truth", wrong_row, "--candidates", "0"],
+            "must be between 1 and",
+        ),
         (["eval", "--query", query, "--ref", query, "--ground-truth", wrong_row, "--techniques", ","], "names none"),
         (["simulate", "flight", tmp_path / "f", "--seed", "-1"], "0 or more"),
         (["profile"], "--map MAP, or --places N"),

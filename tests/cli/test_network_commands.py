@@ -10,14 +10,15 @@ import pytest
 from pictures import textured
 from tiny_networks import write_network
 
-from edgevpr.cli import _FORMS, main
-from edgevpr.config import load_config
+from edgevpr.cli.main import main
+from edgevpr.config import FORMS, load_config
 from edgevpr.errors import ConfigError, ModelError, UsageError
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.preflight.offers import FORMS, offers, usable
-from edgevpr.runtime.recognise.pipeline import made_for, open_pipeline, technique_of
-from edgevpr.techniques import vectors
+from edgevpr.runtime.preflight.offers import offers, usable
+from edgevpr.runtime.preflight.pick import outlook
+from edgevpr.runtime.recognise.opening import made_for, open_recogniser, technique_of
+from edgevpr.techniques import create, vectors
 
 
 @pytest.fixture
@@ -55,7 +56,7 @@ def evaluated(capsys, flight, *flags):
 
 
 def test_the_forms_have_the_same_names_everywhere():
-    assert _FORMS == FORMS == vectors.FORMS
+    assert create("hog").spec.forms == FORMS == vectors.FORMS
 
 
 @pytest.mark.usefixtures("models")
@@ -76,10 +77,11 @@ def test_one_map_serves_all_forms(capsys, flight):
 def test_the_form_of_the_configuration_is_flown_and_said(flight):
     path = built(flight, "--technique", "calc", "--param", "model=tiny")
     config = load_config(None, {"map": str(path), "match.form": "1bit"})
-    pipeline = open_pipeline(config)
-    assert pipeline.index.rows.shape == (6, 8)
-    assert pipeline.reason.startswith("technique calc 1bit: the map was built with it; weights of tiny: A tiny network")
-    pipeline.place_map.close()
+    recogniser = open_recogniser(config, load_board("this"))
+    assert recogniser.index.rows.shape == (6, 8)
+    reason = outlook(recogniser, config).reason
+    assert reason.startswith("technique calc 1bit: the map was built with it; weights of tiny: A tiny network")
+    recogniser.place_map.close()
     with pytest.raises(ConfigError, match=r"`match\.form` must be a text"):
         load_config(None, {"match.form": 1})
 
@@ -87,7 +89,7 @@ def test_the_form_of_the_configuration_is_flown_and_said(flight):
 def test_a_technique_without_forms_says_so(flight):
     path = built(flight, "--technique", "cohog")
     with pytest.raises(UsageError, match="cohog has no parameter `form`"):
-        open_pipeline(load_config(None, {"map": str(path), "match.form": "8bit"}))
+        open_recogniser(load_config(None, {"map": str(path), "match.form": "8bit"}), load_board("this"))
 
 
 def test_a_map_of_other_weights_is_refused_naming_the_model(models, flight, capsys):

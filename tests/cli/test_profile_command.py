@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from edgevpr import techniques
-from edgevpr.cli import main
+from edgevpr.cli.main import main
 from edgevpr.power import machine, sensors, speed
 from edgevpr.power.boards import board_names, load_board
 from edgevpr.resources import shipped

@@ -6,11 +6,13 @@ import cv2
 import pytest
 from pictures import textured
 
-from edgevpr.cli import main
+from edgevpr.cli.main import main
 from edgevpr.config import load_config
 from edgevpr.places.index import bytes_per_place
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.runtime.recognise.pipeline import open_pipeline
+from edgevpr.power.boards import load_board
+from edgevpr.runtime.preflight.pick import outlook
+from edgevpr.runtime.recognise.opening import open_recogniser
 
 PLACES = 24
 
@@ -106,7 +108,7 @@ def test_a_length_out_of_range_is_refused_in_a_sentence(capsys, flight, maps, le
     for command in (["eval", *data], ["match", maps / "hog.gpkg", "--images", flight / "query"]):
         assert main([str(word) for word in [*command, "--sequence", length]]) == 2
         said = capsys.readouterr().err
-        assert f"sequence{'`' if command[0] == 'match' else ''} is {length}; it must be between 1 and 100." in said
+        assert f"`match.sequence` is {length}; it must be between 1 and 100." in said
 
 
 def test_the_budget_holds_the_sequence_as_well(maps):
@@ -114,7 +116,9 @@ def test_the_budget_holds_the_sequence_as_well(maps):
         each = bytes_per_place(place_map.spec)
     budget_mb = 1.0
     config = {"map": str(maps / "seqslam.gpkg"), "memory.budget_mb": budget_mb, "match.sequence": 100}
-    pipeline = open_pipeline(load_config(None, config))
-    pipeline.place_map.close()
-    assert len(pipeline.index) == PLACES
-    assert f"take {PLACES * (each + 404) / 1e6:.1f} of {budget_mb:.1f} MB" in pipeline.reason
+    config = load_config(None, config)
+    recogniser = open_recogniser(config, load_board("this"))
+    with recogniser.place_map:
+        assert len(recogniser.index) == PLACES
+        said = outlook(recogniser, config).reason
+    assert f"take {PLACES * (each + 404) / 1e6:.1f} of {budget_mb:.1f} MB" in said

@@ -24,6 +24,12 @@ def link_and_peer(clock):
     port.close()
 
 
+def fresh(link, clock):
+    """What the autopilot has said within the last second."""
+    vehicle = link.vehicle()
+    return vehicle if vehicle and vehicle.is_fresh_at(clock.now_s) else None
+
+
 def say(link, peer, lat_deg, lon_deg, hdg=9050, **sender):
     before = link.stats().received.get("GLOBAL_POSITION_INT", 0)
     peer.send(
@@ -39,21 +45,21 @@ def test_the_position_of_the_pinned_autopilot_is_known_while_it_is_fresh(link_an
     link, peer = link_and_peer
     peer.heartbeat()
     wait_until(lambda: link.stats().autopilot_heard)
-    assert link.vehicle_position(1.0) is None
+    assert fresh(link, clock) is None
     say(link, peer, 50.1234567, -14.5)
     expected = Vehicle(
         lat_deg=50.1234567, lon_deg=-14.5, alt_m=312.5, heading_deg=90.5, t_heard_s=clock.now_s, has_gps=False
     )
-    assert wait_until(lambda: link.vehicle_position(1.0)) == expected
+    assert wait_until(lambda: fresh(link, clock)) == expected
     clock.now_s += 1.0
-    assert link.vehicle_position(1.0) == expected
+    assert fresh(link, clock) == expected
     clock.now_s += 0.1
-    assert link.vehicle_position(1.0) is None
+    assert fresh(link, clock) is None
     say(link, peer, 50.2, -14.5, hdg=65535)
-    assert wait_until(lambda: link.vehicle_position(1.0)).heading_deg is None
+    assert wait_until(lambda: fresh(link, clock)).heading_deg is None
 
 
-def test_nobody_else_says_where_we_are(link_and_peer):
+def test_nobody_else_says_where_we_are(link_and_peer, clock):
     link, peer = link_and_peer
     another = {"system_id": 9, "component_id": 1}
     peer.send(mavlink.MAVLink_global_position_int_message(0, 1, 1, 0, 0, 0, 0, 0, 0), **another)
@@ -62,22 +68,22 @@ def test_nobody_else_says_where_we_are(link_and_peer):
     say(link, peer, 1.0, 1.0, **another)
     say(link, peer, 2.0, 2.0, component_id=190)  # a ground station's component
     say(link, peer, 3.0, 3.0)
-    assert wait_until(lambda: link.vehicle_position(1.0)).lat_deg == 3.0
+    assert wait_until(lambda: fresh(link, clock)).lat_deg == 3.0
     say(link, peer, 4.0, 4.0, **another)
     say(link, peer, 5.0, 5.0, component_id=190)
     say(link, peer, 3.0, 3.0)  # messages are counted before they are heard: the last but one has been by now
-    assert link.vehicle_position(1.0).lat_deg == 3.0
+    assert fresh(link, clock).lat_deg == 3.0
 
 
 @pytest.mark.parametrize("nowhere", [(0.0, 0.0), (91.0, 8.0), (50.0, 181.0)])
-def test_a_position_lost_is_not_remembered(link_and_peer, nowhere):
+def test_a_position_lost_is_not_remembered(link_and_peer, clock, nowhere):
     link, peer = link_and_peer
     peer.heartbeat()
     wait_until(lambda: link.stats().autopilot_heard)
     say(link, peer, 50.0, 8.0)
-    wait_until(lambda: link.vehicle_position(1.0))
+    wait_until(lambda: fresh(link, clock))
     say(link, peer, *nowhere)
-    wait_until(lambda: link.vehicle_position(1.0) is None)
+    wait_until(lambda: fresh(link, clock) is None)
 
 
 def say_gps(link, peer, fix_type, message="GPS_RAW_INT", lat_deg=50.0):
@@ -98,8 +104,8 @@ def test_a_position_says_whether_gps_stands_behind_it(link_and_peer, clock, mess
 
     def has_gps(lat_deg):
         say(link, peer, lat_deg, 8.0)
-        wait_until(lambda: link.vehicle_position(1.0) and link.vehicle_position(1.0).lat_deg == lat_deg)
-        return link.vehicle_position(1.0).has_gps
+        wait_until(lambda: fresh(link, clock) and fresh(link, clock).lat_deg == lat_deg)
+        return fresh(link, clock).has_gps
 
     say_gps(link, peer, mavlink.GPS_FIX_TYPE_2D_FIX, message)
     assert not has_gps(50.0)

@@ -4,8 +4,9 @@ import sys
 
 import numpy as np
 
+from edgevpr.contract import Descriptor, PartSpec, TechniqueSpec
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.types import Descriptor, Frame, PartSpec, Position, TechniqueSpec
+from edgevpr.types import Frame, Position
 
 SPEC = TechniqueSpec(name="test", parameters={"seed": 1}, coarse=PartSpec((64,), "<f2"), fine=PartSpec((40, 32), "<f4"))
 

@@ -4,14 +4,15 @@ import tracemalloc
 
 import numpy as np
 import pytest
+from ranking import rank
 
+from edgevpr.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
 from edgevpr.errors import MapError
 from edgevpr.places.growing import GrowingIndex
 from edgevpr.places.index import bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import rank
 from edgevpr.techniques import create
-from edgevpr.types import Descriptor, FineMatch, Frame, PartSpec, Position, TechniqueSpec
+from edgevpr.types import Frame, Position
 
 
 class Signs:

@@ -4,12 +4,14 @@ import dataclasses
 
 import numpy as np
 import pytest
+from ranking import rank
 
+from edgevpr.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
 from edgevpr.errors import MapError
 from edgevpr.places.index import bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import best_scanned, elsewhere, margin, named, rank
-from edgevpr.types import Descriptor, FineMatch, Frame, PartSpec, Position, TechniqueSpec
+from edgevpr.places.retrieve import best_scanned, elsewhere, margin, named
+from edgevpr.types import Frame, Position
 
 
 class Ruler:
@@ -149,7 +151,7 @@ def test_places_out_of_reach_are_no_candidates(ruler_map):
     query = technique.encode(np.full((1, 1), 43))
     allowed = within(index, *range(64, 100, 4))
     technique.compared = 0
-    ranking = rank(technique, query, place_map, index, candidates=3, allowed=allowed)
+    ranking = rank(technique, query, place_map, index, candidates=3, in_reach=allowed)
     assert technique.compared == 3 + 5, "three in reach, and the five best-scanned of all others"
     found = {c.place.source_image for c in named(ranking, index, place_map)}
     assert {"64", "68", "72"} <= found, "in reach, the nearest to what the picture shows"
@@ -288,7 +290,7 @@ def test_where_the_scan_counts_it_is_part_of_the_score(ruler_map, candidates):
     query = technique.encode(np.full((1, 1), 43))
     plain = rank(technique, query, place_map, index, candidates)
     scanned, _ = technique.coarse_scores(query, index.rows, index.mean)
-    technique.scan_counts = True
+    technique.spec = dataclasses.replace(technique.spec, scan_counts=True)
     ranking = rank(technique, query, place_map, index, candidates)
     assert sorted(ranking.slots) == sorted(plain.slots)
     compared = dict(zip(plain.slots.tolist(), plain.scores.tolist(), strict=True))

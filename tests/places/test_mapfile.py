@@ -16,11 +16,12 @@ import numpy as np
 import pytest
 from map_writer import SPEC, descriptor, frame
 
+from edgevpr.contract import PartSpec
 from edgevpr.errors import MapError
 from edgevpr.places.geojson import write_geojson
 from edgevpr.places.geopackage import point_blob
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.types import PartSpec, Position
+from edgevpr.types import Position
 
 
 @pytest.fixture

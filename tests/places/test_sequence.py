@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from map_writer import SPEC
 
+from edgevpr.contract import FineMatch
 from edgevpr.places.index import PlaceIndex, empty_index
 from edgevpr.places.retrieve import Ranking
-from edgevpr.places.sequence import Sequence, bytes_beside_place, length_of, offline
-from edgevpr.types import FineMatch
+from edgevpr.places.sequence import SequenceSearch, bytes_beside_place, length_of, offline
+from edgevpr.techniques import create
 
 FOLLOWED = (0.8, 0.9, 1.0, 1.1, 1.2)
 OTHERS = [quarter / 4 for quarter in range(-10, 13) if quarter != 4]
@@ -64,7 +65,7 @@ def scores():
 
 @pytest.mark.parametrize("length", [2, 5, 10, 30])
 def test_online_and_offline_are_one_and_both_are_the_papers_search(scores, length):
-    sequence = Sequence(length)
+    sequence = SequenceSearch(length)
     online = np.stack([dense(each, 40) for each in followed(sequence, scores, index_of(range(40)))])
     np.testing.assert_array_equal(online, offline(scores, length))
     np.testing.assert_allclose(online, literal(scores, length), rtol=1e-5)
@@ -77,7 +78,7 @@ def test_two_stages_leave_places_out_and_are_the_same_search(scores):
     compared = np.take_along_axis(scores, candidates, axis=1)
     sparse = np.repeat(np.median(compared, axis=1)[:, None], 40, axis=1)  # the usual score, where none was made
     np.put_along_axis(sparse, candidates, compared, axis=1)
-    sequence, index = Sequence(4), index_of(range(40))
+    sequence, index = SequenceSearch(4), index_of(range(40))
     rankings = [sequence.follow(ranked(scores[at], candidates[at]), index, at) for at in range(25)]
     np.testing.assert_array_equal(np.stack([dense(each, 40) for each in rankings]), offline(sparse, 4))
 
@@ -89,12 +90,12 @@ def test_a_flight_through_lookalikes_is_told_by_what_came_before():
         scores[at, 7 + at] = 0.6
     scores[5, 30] = 0.7
     index = index_of(range(40))
-    best = [each.slots[0] for each in followed(Sequence(5), scores, index)]
+    best = [each.slots[0] for each in followed(SequenceSearch(5), scores, index)]
     assert best == [7, 8, 9, 10, 11, 12]
 
 
 def test_matches_keep_the_step_of_the_newest_query_and_have_the_score_of_the_sequence(scores):
-    sequence, index = Sequence(3), index_of(range(40))
+    sequence, index = SequenceSearch(3), index_of(range(40))
     sequence.follow(ranked(scores[0], range(20)), index, 0.0)
     ranking = sequence.follow(ranked(scores[1], range(10, 30)), index, 1.0)
     assert (np.diff(ranking.scores) <= 0).all()
@@ -107,7 +108,7 @@ def test_matches_keep_the_step_of_the_newest_query_and_have_the_score_of_the_seq
 
 
 def test_a_gap_in_time_begins_a_new_sequence(scores):
-    sequence, index = Sequence(5), index_of(range(40))
+    sequence, index = SequenceSearch(5), index_of(range(40))
     followed(sequence, scores[:5], index)
     assert sequence.frames == 5
     fresh = sequence.follow(ranked(scores[5]), index, 4.0 + 5.1)
@@ -118,13 +119,13 @@ def test_a_gap_in_time_begins_a_new_sequence(scores):
 
 
 def test_a_board_that_is_always_slow_leaves_no_gaps(scores):
-    sequence = Sequence(4)
+    sequence = SequenceSearch(4)
     followed(sequence, scores[:6], index_of(range(40)), step_s=8.0)
     assert sequence.frames == 4
 
 
 def test_an_index_that_grows_keeps_the_sequence(scores):
-    sequence = Sequence(6)
+    sequence = SequenceSearch(6)
     grown = [scores[at, : 20 + 2 * at] for at in range(8)]
     padded = np.zeros((8, 34), np.float32)
     for at, row in enumerate(grown):
@@ -138,7 +139,7 @@ def test_an_index_that_grows_keeps_the_sequence(scores):
     "changed", [range(0, 40, 2), [*range(10), *range(11, 41)], [*range(10), *range(11, 60)]], ids=str
 )
 def test_an_index_that_gave_up_places_begins_a_new_sequence(scores, changed):
-    sequence = Sequence(6)
+    sequence = SequenceSearch(6)
     followed(sequence, scores[:4], index_of(range(40)))
     row = np.resize(scores[5], len(changed))
     ranking = sequence.follow(ranked(row), index_of(changed), 4.0)
@@ -148,7 +149,7 @@ def test_an_index_that_gave_up_places_begins_a_new_sequence(scores, changed):
 
 def test_a_map_of_fewer_places_than_the_sequence_is_searched():
     scores = np.random.default_rng(1).random((12, 3), dtype=np.float32)
-    online = np.stack([dense(each, 3) for each in followed(Sequence(10), scores, index_of(range(3)))])
+    online = np.stack([dense(each, 3) for each in followed(SequenceSearch(10), scores, index_of(range(3)))])
     np.testing.assert_allclose(online, literal(scores, 10), rtol=1e-5)
 
 
@@ -157,7 +158,7 @@ def test_memory_is_what_the_budget_is_told_and_no_more_is_kept():
     index: PlaceIndex = index_of(range(places))
     scores = np.random.default_rng(2).random(places, dtype=np.float32)
     few = ranked(scores, np.argsort(-scores)[:40])
-    sequence = Sequence(length)
+    sequence = SequenceSearch(length)
     tracemalloc.start()
     for at in range(3 * length):
         sequence.follow(few, index, float(at))
@@ -168,13 +169,11 @@ def test_memory_is_what_the_budget_is_told_and_no_more_is_kept():
 
 
 def test_the_length_is_what_is_asked_for_or_the_techniques_own():
-    class Own:
-        sequence = 10
-
-    assert [length_of(Own(), None), length_of(Own(), 3), length_of(object(), None), length_of(object(), 7)] == [
-        10,
-        3,
-        1,
-        7,
-    ]
+    own, other = create("seqslam"), create("hog")
+    assert [
+        length_of(own.spec, None),
+        length_of(own.spec, 3),
+        length_of(other.spec, None),
+        length_of(other.spec, 7),
+    ] == [10, 3, 1, 7]
     assert bytes_beside_place(1) == 0

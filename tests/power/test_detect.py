@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from edgevpr.power.boards import Score, is_this_machine, load_board
+from edgevpr.power.boards import MachineSpeed, is_this_machine, load_board
 from edgevpr.power.calibrate import Calibration, PowerFit
 from edgevpr.power.detect import detect, findings, profile_text
 from edgevpr.power.powermeter import Meter
@@ -78,7 +78,7 @@ def test_an_unknown_arm_board_gets_a_profile_that_invents_nothing(tree, tmp_path
     assert (board.recognised_by, board.cores, board.ram_mb) == ("Radxa ROCK 5B", 8, 16384.0)
     assert (board.idle_w, board.full_w, board.verified) == (0.0, 1.0, False)
     assert board.source.startswith("nobody has measured a Radxa ROCK 5B: relative figures")
-    assert board.benchmark_score == Score(
+    assert board.benchmark_score == MachineSpeed(
         single=None, multi=None, products=None, passes=None, verified=False, source="nobody has measured it"
     )
     assert (board.thermal_limit_c, board.technique) == (85.0, "cohog")
@@ -148,7 +148,9 @@ def test_a_score_and_a_calibration_replace_what_nobody_knows(tree, tmp_path):
         0,
     )
     found = detect(tree(arm("Radxa ZERO 3", *["0xd05"] * 4)))
-    score = Score(single=0.21, multi=0.8, products=0.11, passes=0.4, verified=True, source="edgevpr's micro-benchmark")
+    score = MachineSpeed(
+        single=0.21, multi=0.8, products=0.11, passes=0.4, verified=True, source="edgevpr's micro-benchmark"
+    )
     board = written(tmp_path, found, score, calibration)
     assert (board.idle_w, board.full_w, board.verified) == (2.123, 6.623, True)
     assert board.source == (

@@ -80,5 +80,7 @@ def test_the_real_process_has_its_share_of_the_memory_it_shows():
     pss_mb = PssMeter().look()
     if pss_mb is None:
         pytest.skip("this kernel does not say")
-    cost = query_cost(StageCost(0.1, 0.1), StageCost(0.1, 0.1), load_board("rpi-4b"), Pack(4, 5200), 0.85, pss_mb)
+    cost = query_cost(
+        StageCost(0.1, 0.1), StageCost(0.1, 0.1), load_board("rpi-4b"), Pack(4, 5200), 0.85, pss_mb=pss_mb
+    )
     assert 1 < cost.pss_mb <= 1.05 * cost.rss_mb

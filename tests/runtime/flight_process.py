@@ -25,10 +25,17 @@ def write_frames(folder: Path, count: int) -> None:
         cv2.imwrite(str(folder / f"{number:04d}.jpg"), picture)
 
 
-def start(place_map: Path, source: Path | str, log: Path, *flags: str, through: Sequence[str] = ()) -> subprocess.Popen:
+def start(
+    place_map: Path, source: Path | str, log: Path, *flags: str, through: Sequence[str] = (), **environment: str
+) -> subprocess.Popen:
     """Start a flight, by way of the program `through` where one is named (`prlimit ...`)."""
     command = ["-m", "edgevpr", "run", "--map", place_map, "--source", source, "--log", log, *flags]
-    return subprocess.Popen([*through, sys.executable, *map(str, command)], stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen(
+        [*through, sys.executable, *map(str, command)],
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, **environment},
+    )
 
 
 def wait_for(kind: str, log: Path, process: subprocess.Popen) -> dict[str, Any]:

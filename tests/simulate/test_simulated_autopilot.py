@@ -119,7 +119,7 @@ def test_it_flies_along_a_track_from_when_a_companion_is_heard(tmp_path):
         seen = []
 
         def at_the_end():
-            position = link.vehicle_position(1.0)
+            position = link.vehicle()
             if position and (not seen or position.t_heard_s != seen[-1].t_heard_s):
                 seen.append(position)
             return len(seen) > 3 and seen[-1].lat_deg == seen[-2].lat_deg

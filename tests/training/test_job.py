@@ -5,7 +5,7 @@ import sys
 import pytest
 from pictures_on_disk import write_pictures
 
-from edgevpr.cli import main
+from edgevpr.cli.main import main
 
 
 def refused(capsys, *arguments):

@@ -9,7 +9,7 @@ from pictures import textured
 from pictures_on_disk import write_pictures
 from tiny_networks import write_network
 
-from edgevpr.cli import main
+from edgevpr.cli.main import main
 from edgevpr.errors import ModelError, SourceError
 from edgevpr.runtime.preflight.networks import verify_here
 from edgevpr.techniques.networks.session import open_backbone

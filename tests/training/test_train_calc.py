@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pictures_on_disk import write_pictures
 
-from edgevpr.cli import main
+from edgevpr.cli.main import main
 from edgevpr.errors import EdgevprError, UsageError
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed (pip install 'edgevpr[train]')")

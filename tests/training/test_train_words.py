@@ -7,7 +7,7 @@ import pytest
 from pictures_on_disk import write_pictures
 
 from edgevpr import techniques
-from edgevpr.cli import main
+from edgevpr.cli.main import main
 from edgevpr.resources import shipped
 from edgevpr.techniques.heads import vlad
 from edgevpr.techniques.heads.words import load_words, whitened

@@ -15,8 +15,8 @@ from typing import Any, BinaryIO
 
 from edgevpr import __version__
 from edgevpr.config import Config
+from edgevpr.contract import TechniqueSpec
 from edgevpr.errors import EdgevprError
-from edgevpr.types import TechniqueSpec
 
 _log = logging.getLogger(__name__)
 _SYNC_EVERY_S = 1.0

@@ -6,17 +6,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from edgevpr import techniques
+from edgevpr.config import LOWEST_RATE_HZ
 from edgevpr.errors import ConfigError, UsageError
 from edgevpr.power.boards import Board
 from edgevpr.runtime.preflight.probe import TechniqueCosts
-
-_LOWEST_RATE_HZ = 0.01  # what the configuration allows
+from edgevpr.types import FIX_MAX_AGE_S
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fit:
-    """How a technique would sit on a board. It fits where there are no `shortfalls`; `remedies` would make it fit."""
+    """How a technique would sit on a board: `t_query_s` is what a query takes. It fits where there are no `shortfalls`;
+    `remedies` would make it fit."""
 
+    t_query_s: float
     map_ram_mb: float
     process_ram_mb: float
     reachable_hz: float
@@ -33,15 +35,17 @@ class Choice:
 
 
 def fit(board: Board, costs: TechniqueCosts, places: int, rate_hz: float, budget_mb: float) -> Fit:
-    """Whether a technique fits: the map in `budget_mb`, the process in its memory, the queries in the CPU's time.
+    """Say whether a technique fits: the map in `budget_mb`, the process in its memory, the queries in the CPU's time.
 
-    A query is over before the next one begins, and all of them together take `cpu_share` of the cores at most.
+    A query is over before the next one begins and before its fix is too old to be sent, and all of them together take
+    `cpu_share` of the cores at most.
     """
     encode, match = costs.encode, costs.match(places)
     usable_cores = board.cores * board.cpu_share
     map_ram_mb = costs.ram_bytes_per_place * places / 1e6
     process_ram_mb = costs.process_mb + map_ram_mb
-    reachable_hz = min(1 / (encode.wall_s + match.wall_s), usable_cores / (encode.cpu_s + match.cpu_s))
+    query = encode + match
+    reachable_hz = min(1 / query.wall_s, usable_cores / query.cpu_s)
 
     shortfalls, remedies = [], []
     if map_ram_mb > budget_mb:
@@ -50,25 +54,33 @@ def fit(board: Board, costs: TechniqueCosts, places: int, rate_hz: float, budget
         shortfalls.append(f"the process takes {process_ram_mb:.0f} MB and {board.memory_max_mb:.0f} are allowed")
     if reachable_hz < rate_hz:
         shortfalls.append(f"it reaches {_rounded_down(reachable_hz):g} Hz of {rate_hz:g}")
+    if query.wall_s > FIX_MAX_AGE_S:
+        shortfalls.append(too_late(query.wall_s))
     if shortfalls:
         most_places = min(
             min(budget_mb, board.memory_max_mb - costs.process_mb) * 1e6 / costs.ram_bytes_per_place,
-            costs.places_within(1 / rate_hz - encode.wall_s, usable_cores / rate_hz - encode.cpu_s),
+            costs.places_within(min(1 / rate_hz, FIX_MAX_AGE_S) - encode.wall_s, usable_cores / rate_hz - encode.cpu_s),
         )
         if most_places >= 1:
             remedies.append(f"with up to {int(most_places)} places")
-        if process_ram_mb <= board.memory_max_mb:
-            if map_ram_mb <= budget_mb and reachable_hz >= _LOWEST_RATE_HZ:
+        if process_ram_mb <= board.memory_max_mb and query.wall_s <= FIX_MAX_AGE_S:
+            if map_ram_mb <= budget_mb and reachable_hz >= LOWEST_RATE_HZ:
                 remedies.append(f"at up to {_rounded_down(reachable_hz):g} Hz")
             elif reachable_hz >= rate_hz:
                 remedies.append(f"with a budget of {math.ceil(map_ram_mb)} MB")
     return Fit(
+        t_query_s=query.wall_s,
         map_ram_mb=map_ram_mb,
         process_ram_mb=process_ram_mb,
         reachable_hz=reachable_hz,
         shortfalls=tuple(shortfalls),
         remedies=tuple(remedies),
     )
+
+
+def too_late(t_query_s: float) -> str:
+    """Say that none of the fixes of such slow queries would be sent."""
+    return f"a query takes {t_query_s:.1f} s, and no fix of a frame older than {FIX_MAX_AGE_S:g} s is ever sent"
 
 
 def require_technique(board: Board) -> None:
@@ -80,12 +92,14 @@ def require_technique(board: Board) -> None:
         )
 
 
-def preferred(board: Board) -> tuple[str, ...]:
-    """What is tried for a board where no technique is named, best first: its own, then those offered to any board.
-    Raises ConfigError for a technique of the board that is not there."""
+def preferred(board: Board, camera: str | None = None) -> tuple[str, ...]:
+    """List what is tried for a board where no technique is named, best first: its own, then those offered to any board.
+    For a `camera` that looks down ("nadir") they are those that can be told so. Raises ConfigError for a technique of
+    the board that is not there."""
     require_technique(board)
     own = () if board.technique is None else (board.technique,)
-    return (*own, *(name for name in techniques.AUTOMATIC if name not in own))
+    names = (*own, *(name for name in techniques.AUTOMATIC if name not in own))
+    return tuple(name for name in names if camera != "nadir" or "camera" in techniques.parameters(name))
 
 
 def choose(board: Board, costs: Mapping[str, TechniqueCosts], places: int, rate_hz: float, budget_mb: float) -> Choice:

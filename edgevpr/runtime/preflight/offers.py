@@ -5,12 +5,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from edgevpr import techniques
+from edgevpr.config import FORMS
+from edgevpr.contract import Technique
 from edgevpr.errors import ModelError
 from edgevpr.power.boards import Board
-from edgevpr.runtime.recognise.pipeline import made_for
+from edgevpr.runtime.recognise.opening import made_for
 from edgevpr.techniques import labelled
-from edgevpr.techniques.vectors import FORMS
-from edgevpr.types import Technique
 
 
 @dataclass(frozen=True, slots=True)

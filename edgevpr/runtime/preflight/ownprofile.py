@@ -6,7 +6,7 @@ from pathlib import Path
 
 from edgevpr.errors import EdgevprError, UsageError
 from edgevpr.helpers.files import require_folder, write_whole
-from edgevpr.power.boards import Score
+from edgevpr.power.boards import MachineSpeed
 
 _ENDINGS = (".yaml", ".yml")
 
@@ -28,7 +28,7 @@ def write_profile(path: Path, text: str) -> None:
         raise EdgevprError(f"{path} is there already: move it away, or choose another name.") from None
 
 
-def measured_profile(figures: Path, score: Score) -> tuple[Path | None, str]:
+def measured_profile(figures: Path, score: MachineSpeed) -> tuple[Path | None, str]:
     """Where this machine has a power meter: measure idle and load (minutes), and write a profile beside the file
     `figures`. Returns where it is (None: no meter can be read), and a sentence. Raises MeterError."""
     from edgevpr.power.calibrate import LOADS, calibrate

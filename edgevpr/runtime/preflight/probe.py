@@ -2,27 +2,33 @@
 
 import math
 import sys
-from collections.abc import Iterable, Iterator
-from collections.abc import Sequence as Several
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
+from edgevpr.contract import Technique
+from edgevpr.errors import ModelError
+from edgevpr.places.index import PlaceIndex, bytes_per_place, empty_index, load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import best_scanned, margin, rank
-from edgevpr.places.sequence import Sequence, bytes_beside_place, length_of
+from edgevpr.places.sequence import bytes_beside_place, length_of, search_of
 from edgevpr.power import machine
-from edgevpr.power.meter import stage
-from edgevpr.types import Descriptor, Frame, StageCost, Technique
+from edgevpr.power.boards import load_board
+from edgevpr.power.equations import Pack
+from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.recognise.judge import AcceptRule
+from edgevpr.runtime.recognise.recogniser import Recogniser
+from edgevpr.runtime.recognise.recognition import Recognition
+from edgevpr.types import NO_COST, Frame, StageCost
 
 _ROUNDS = 3
 _PLACES = 6
 _SCANNED = 4096
 _SCANNED_BYTES = 8 << 20  # at most: on a small board this much is to spare before the map is loaded, and no more
-_NOTHING = StageCost(0.0, 0.0)
+_ANY_PACK = Pack(cells=1, capacity_mah=1)  # seconds are wanted, not charge
 _LINK_MB = 13.0  # what importing pymavlink adds to the resident memory (measured on x86-64)
 
 
@@ -43,16 +49,15 @@ class TechniqueCosts:
     disk_bytes_per_place: int
     process_mb: float
     candidates: int | None = None
-    scan_per_place: StageCost = _NOTHING
+    scan_per_place: StageCost = NO_COST
     encode_mb: float | None = None
     is_network: bool = False
 
     def match(self, places: int) -> StageCost:
         """Cost of finding one query in a map of `places` places."""
         if self.candidates is None or places <= self.candidates:
-            return _times(self.match_per_place, places)
-        in_full, scanned = _times(self.match_per_place, self.candidates), _times(self.scan_per_place, places)
-        return StageCost(in_full.wall_s + scanned.wall_s, in_full.cpu_s + scanned.cpu_s)
+            return self.match_per_place * places
+        return self.match_per_place * self.candidates + self.scan_per_place * places
 
     def places_within(self, wall_s: float, cpu_s: float) -> float:
         """How many places a map may have for a query to be found in it within both times."""
@@ -71,91 +76,92 @@ def noise(count: int) -> list[np.ndarray]:
     return [rng.integers(0, 256, (480, 640), np.uint8) for _ in range(count)]
 
 
-def probe(technique: Technique, images: Several[np.ndarray] | None = None) -> TechniqueCosts:
-    """Try a technique here and now: encode some pictures, and match them in a small map on disk.
+def probe(
+    technique: Technique,
+    images: Sequence[np.ndarray] | None = None,
+    *,
+    wall_clock: Callable[[], float] = time.perf_counter,
+    cpu_clock: Callable[[], float] = time.process_time,
+) -> TechniqueCosts:
+    """Try a technique here and now: some pictures take the walk of a query, first with nothing to find, then in a small
+    map on disk, then in a large index.
 
     `images` (uint8, (H, W[, 3])) are all encoded, and the median counts, since a real picture may be quick or slow.
     Without them there are a few of `noise`, all alike, and the quickest counts: what other programs take away at the
-    moment is no cost of the technique.
+    moment is no cost of the technique. Raises ModelError for a technique that makes nothing of a picture.
     """
     counted = _quickest if images is None else _median
-    frames = [Frame(image=image, name=f"trial {i}", t_mono_s=0.0) for i, image in enumerate(images or noise(_ROUNDS))]
-    peak_is_new = machine.forget_peak()
-    before_mb = machine.rss_mb()
-    technique.encode(frames[0].image)  # the first time also starts threads and imports what is imported late
-    queries, encodings, matchings = [], [], []
-    for frame in frames:
-        with stage() as encoding:
-            queries.append(technique.encode(frame.image))
-        encodings.append(encoding.cost)
-    encode_mb = machine.peak_mb() - before_mb if peak_is_new else None
-    with TemporaryDirectory() as folder, PlaceMap.create(Path(folder) / "trial.gpkg", technique.spec) as trial_map:
-        for i in range(_PLACES):
-            trial_map.add(frames[i % len(frames)], queries[i % len(frames)])
-        index = load_index(trial_map, technique, _PLACES * bytes_per_place(technique.spec))
-        for query in queries:
-            with stage() as matching:
-                scanned = technique.coarse_scores(query, index.rows, index.mean)
-                if technique.spec.fine:
-                    for slot, hypotheses in best_scanned(*scanned, np.ones(_PLACES, bool), _PLACES):
-                        technique.match(query, trial_map.fine_part(index.place_ids[slot]), hypotheses)
-            matchings.append(matching.cost)
-    fine = technique.spec.fine
-    process_mb = machine.peak_mb() if peak_is_new else machine.rss_mb()
-    scan = counted(list(_scans(technique, queries, _many(technique, index), trial_map)))
+    pictures = noise(_ROUNDS) if images is None else images
+    frames = [Frame(image=image, name=f"trial {i}", t_mono_s=0.1 * i) for i, image in enumerate(pictures)]
+    spec, length = technique.spec, length_of(technique.spec, None)
+    meter = QueryMeter(load_board("this"), _ANY_PACK, 1.0, wall_clock=wall_clock, cpu_clock=cpu_clock)
+
+    def walk(place_map: PlaceMap, index: PlaceIndex, candidates: int) -> Recogniser:
+        return Recogniser(
+            technique=technique,
+            place_map=place_map,
+            index=index,
+            rule=AcceptRule(technique.min_score, technique.min_margin, neighbour_m=0.0),
+            meter=meter,
+            candidates=candidates,
+            search=search_of(length),
+        )
+
+    with TemporaryDirectory() as folder, PlaceMap.create(Path(folder) / "trial.gpkg", spec) as trial_map:
+        peak_is_new = machine.forget_peak()
+        before_mb = machine.rss_mb()
+        # The first time also starts threads and imports what is imported late.
+        first = _stepped(walk(trial_map, empty_index(spec, 0, None), 1), frames[0])
+        encode_mb = machine.peak_mb() - before_mb if peak_is_new else None
+        for _ in range(_PLACES):
+            trial_map.add(frames[0], first.descriptor)
+        index = load_index(trial_map, technique, _PLACES * bytes_per_place(spec))
+        small = walk(trial_map, index, _PLACES)
+        tried = [_stepped(small, frame).steps for frame in frames]
+        process_mb = machine.peak_mb() if peak_is_new else machine.rss_mb()
+        large, fills = walk(trial_map, _many(technique, index), 1), length if length > 1 else 0
+        asked = [replace(frames[i % len(frames)], t_mono_s=0.1 * i) for i in range(fills + len(frames))]
+        steps = [_stepped(large, frame).steps for frame in asked][fills:]  # before, the sequence was not full
+    scan = counted([(each.scan if spec.fine else each.match) * (1 / len(large.index)) for each in steps])
     return TechniqueCosts(
-        encode=counted(encodings),
+        encode=counted([each.encode for each in tried]),
         # Of few places a scan takes as long as of many: what is in RAM is tried with more of them.
-        match_per_place=_times(counted(matchings), 1 / _PLACES) if fine else scan,
-        ram_bytes_per_place=bytes_per_place(technique.spec) + bytes_beside_place(length_of(technique, None)),
-        disk_bytes_per_place=technique.spec.coarse.nbytes + (fine.nbytes if fine else 0),
+        match_per_place=counted([each.match for each in tried]) * (1 / _PLACES) if spec.fine else scan,
+        ram_bytes_per_place=bytes_per_place(spec) + bytes_beside_place(length),
+        disk_bytes_per_place=spec.coarse.nbytes + (spec.fine.nbytes if spec.fine else 0),
         process_mb=process_mb + (0.0 if "pymavlink" in sys.modules else _LINK_MB),
-        candidates=technique.candidates if fine else None,
-        scan_per_place=scan if fine else _NOTHING,
+        candidates=technique.candidates if spec.fine else None,
+        scan_per_place=scan if spec.fine else NO_COST,
         encode_mb=encode_mb,
-        is_network=technique.spec.model_sha256 is not None,
+        is_network=spec.model_sha256 is not None,
     )
-
-
-def _many(technique: Technique, index: PlaceIndex) -> PlaceIndex:
-    """Some thousand places, which are those of the index again and again."""
-    count = max(_PLACES, min(_SCANNED, _SCANNED_BYTES // technique.spec.row.nbytes))
-    unknown = np.full(count, np.nan)
-    rows = np.resize(index.rows, (count, *index.rows.shape[1:]))
-    return PlaceIndex(
-        place_ids=np.arange(count),
-        lat_deg=unknown,
-        lon_deg=unknown,
-        heading_deg=unknown.astype(np.float16),
-        rows=rows,
-        mean=index.mean,
-    )
-
-
-def _scans(
-    technique: Technique, queries: list[Descriptor], index: PlaceIndex, trial_map: PlaceMap
-) -> Iterator[StageCost]:
-    """Cost of one place in the scan of all. A technique that has nothing else to compare is ranked by it, and followed
-    in sequences: both take longer than a scan of bits."""
-    length = length_of(technique, None)
-    sequence = Sequence(length)
-    for number in range(length + len(queries)):
-        query = queries[number % len(queries)]
-        with stage() as scanning:
-            if technique.spec.fine:
-                technique.coarse_scores(query, index.rows, index.mean)
-            else:
-                ranking = rank(technique, query, trial_map, index)
-                ranking = sequence.follow(ranking, index, 0.1 * number) if length > 1 else ranking
-                margin(ranking, index, 0.0)
-        if number >= length:  # before, the sequence was not full
-            yield _times(scanning.cost, 1 / len(index))
 
 
 def probe_each(techniques: Iterable[Technique]) -> Iterator[tuple[str, TechniqueCosts]]:
-    """(name, costs) of each technique in turn, so that the caller can say how far it is."""
+    """Give (name, costs) of each technique in turn, so that the caller can say how far it is."""
     for technique in techniques:
         yield technique.spec.name, probe(technique)
+
+
+def _stepped(walk: Recogniser, frame: Frame) -> Recognition:
+    event = walk.step(frame)
+    if event.failed:
+        raise ModelError(event.reason)
+    return event
+
+
+def _many(technique: Technique, index: PlaceIndex) -> PlaceIndex:
+    """Make an index of some thousand places, which are those of the index again and again."""
+    count = max(_PLACES, min(_SCANNED, _SCANNED_BYTES // technique.spec.row.nbytes))
+    unknown = np.full(count, np.nan)
+    return PlaceIndex(
+        place_ids=np.resize(index.place_ids, count),
+        lat_deg=unknown,
+        lon_deg=unknown,
+        heading_deg=unknown.astype(np.float16),
+        rows=np.resize(index.rows, (count, *index.rows.shape[1:])),
+        mean=index.mean,
+    )
 
 
 def _quickest(costs: list[StageCost]) -> StageCost:
@@ -164,7 +170,3 @@ def _quickest(costs: list[StageCost]) -> StageCost:
 
 def _median(costs: list[StageCost]) -> StageCost:
     return sorted(costs, key=lambda cost: cost.wall_s)[len(costs) // 2]
-
-
-def _times(cost: StageCost, count: float) -> StageCost:
-    return StageCost(cost.wall_s * count, cost.cpu_s * count)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 
-from edgevpr.power.boards import Board, Score
+from edgevpr.power.boards import Board, MachineSpeed
 from edgevpr.runtime.preflight.probe import TechniqueCosts
 from edgevpr.types import StageCost
 
@@ -40,7 +40,7 @@ def ratios(here: Board, board: Board) -> Ratios | None:
     return Ratios(*(there / here_too for there, here_too in pairs))
 
 
-def _products(score: Score) -> float | None:
+def _products(score: MachineSpeed) -> float | None:
     return score.products or (score.single and UNKNOWN_PRODUCTS * score.single)
 
 
@@ -73,7 +73,7 @@ def _scaled(cost: StageCost, ratio: float, board: Board, threads: int | None = N
     return StageCost(wall_s, wall_s * busy_cores)
 
 
-def _kept(score: Score, busy_cores: float) -> float:
+def _kept(score: MachineSpeed, busy_cores: float) -> float:
     """What share of a single core's speed each of so many busy ones keeps: they share memory, heat and current."""
     if score.single is None or score.multi is None:
         return 1.0

@@ -22,7 +22,7 @@ from edgevpr.errors import ConfigError, EdgevprError, UsageError
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.helpers.files import require_folder, write_whole
 from edgevpr.power import machine
-from edgevpr.power.boards import Board, Score
+from edgevpr.power.boards import Board, MachineSpeed
 from edgevpr.resources import own_folder
 from edgevpr.runtime.preflight.offers import Offer
 from edgevpr.runtime.preflight.scale import is_same
@@ -40,7 +40,7 @@ _PACKAGES = {
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Measured:
+class StoredFigures:
     """All techniques on one machine: when (local time), on which `pictures`, with how many `threads` of a network, and
     what the machine is (`identity`) and how fast (`score`, by the micro-benchmark)."""
 
@@ -48,7 +48,7 @@ class Measured:
     identity: dict[str, Any]
     pictures: str
     threads: int
-    score: Score
+    score: MachineSpeed
     trials: tuple[Trial, ...]
 
     def of(self, offer: Offer) -> Trial | None:
@@ -102,20 +102,20 @@ def measure_each(wanted: Iterable[Offer], threads: int, images: Sequence[Path]) 
     return try_each(wanted, threads, images, rounds=_PICTURES)
 
 
-def micro_benchmark() -> Score:
+def micro_benchmark() -> MachineSpeed:
     """How fast this machine is now. Takes some two seconds."""
     from edgevpr.power import speed
 
     found = speed.score()
     figures = {name: float(f"{value:.3g}") for name, value in asdict(found).items()}
     source = "edgevpr's micro-benchmark, run on it; single and multi are means of both kinds"
-    return Score(**figures, verified=True, source=source)
+    return MachineSpeed(**figures, verified=True, source=source)
 
 
-def gathered(trials: Iterable[Trial], pictures: str, threads: int, score: Score) -> Measured:
+def gathered(trials: Iterable[Trial], pictures: str, threads: int, score: MachineSpeed) -> StoredFigures:
     """What was measured just now on this machine."""
     now = datetime.now(timezone.utc).astimezone().isoformat(timespec="minutes")
-    return Measured(
+    return StoredFigures(
         date=now, identity=identity(), pictures=pictures, threads=threads, score=score, trials=tuple(trials)
     )
 
@@ -137,13 +137,13 @@ def require_room(path: Path, make: bool) -> None:
         raise EdgevprError(f"{path} cannot be written: give another --out, or correct the permissions.")
 
 
-def save(found: Measured, path: Path) -> None:
+def save(found: StoredFigures, path: Path) -> None:
     """Write the figures: as a whole, or not at all."""
     text = json.dumps({"format": _FORMAT, **asdict(found)}, indent=1)
     write_whole(path, lambda unfinished: unfinished.write_text(text + "\n", "utf-8"))
 
 
-def load(path: Path) -> tuple[Measured | None, str | None]:
+def load(path: Path) -> tuple[StoredFigures | None, str | None]:
     """The figures of this machine, or None and, where there are some that cannot be used, a sentence that says why."""
     again = "the techniques are tried anew; `edgevpr profile --measure` replaces them."
     try:
@@ -151,7 +151,7 @@ def load(path: Path) -> tuple[Measured | None, str | None]:
         if fields.pop("format") != _FORMAT:
             return None, f"{path} is of another version of edgevpr: {again}"
         trials = tuple(trial_of(each) for each in fields["trials"])
-        found = Measured(**{**fields, "score": Score(**fields["score"]), "trials": trials})
+        found = StoredFigures(**{**fields, "score": MachineSpeed(**fields["score"]), "trials": trials})
         _require_figures(found)
         different = _differences(found.identity, identity())
     except FileNotFoundError:
@@ -163,9 +163,9 @@ def load(path: Path) -> tuple[Measured | None, str | None]:
     return found, None
 
 
-def _require_figures(found: Measured) -> None:
+def _require_figures(found: StoredFigures) -> None:
     """Raise ConfigError, TypeError or ValueError where a file has the form of figures and holds none."""
-    build(Score, asdict(found.score), "score")
+    build(MachineSpeed, asdict(found.score), "score")
     for trial in found.trials:
         if not (isinstance(trial.settings, dict) and isinstance(trial.parameters, dict)):
             raise TypeError(f"the settings of {trial.label} are none")
@@ -190,7 +190,9 @@ def _differences(there: dict[str, Any], here: dict[str, Any]) -> str:
     return ", ".join(found)
 
 
-def known_and_tried(wanted: Iterable[Offer], board: Board, stored: Measured | None) -> Iterator[tuple[Trial, bool]]:
+def known_and_tried(
+    wanted: Iterable[Offer], board: Board, stored: StoredFigures | None
+) -> Iterator[tuple[Trial, bool]]:
     """Each offer's trial, in the order of `wanted`, and whether it was stored: what was not is tried now, quickly."""
     for _, forms in groupby(wanted, key=lambda offer: offer.name):
         known = [(offer, stored.of(offer) if stored else None) for offer in forms]
@@ -202,7 +204,7 @@ def known_and_tried(wanted: Iterable[Offer], board: Board, stored: Measured | No
                 yield now, False
 
 
-def scaled_from(here: Board, board: Board, stored: Measured | None) -> Board:
+def scaled_from(here: Board, board: Board, stored: StoredFigures | None) -> Board:
     """The machine `here` with the score that its figures are scaled from: its own, by the same yardstick as that of
     `board` where there is one. May take two seconds."""
     published = here.benchmark_score.verified and board.benchmark_score.passes is None

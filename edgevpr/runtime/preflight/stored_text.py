@@ -2,7 +2,7 @@
 
 from edgevpr.helpers.tables import aligned
 from edgevpr.runtime.preflight.estimate_text import unusable_lines
-from edgevpr.runtime.preflight.stored import Measured
+from edgevpr.runtime.preflight.stored import StoredFigures
 from edgevpr.runtime.preflight.trial import Trial
 
 _HEADS = (
@@ -10,7 +10,7 @@ _HEADS = (
 )  # fmt: skip
 
 
-def format_measured(found: Measured) -> str:
+def format_stored(found: StoredFigures) -> str:
     """A line for each technique and form. The time of matching is that of one place: compared in full where there is a
     scan of all places before, else with the scan itself."""
     there = found.identity

@@ -18,7 +18,7 @@ from edgevpr.errors import EdgevprError
 from edgevpr.frames.images import read_image
 from edgevpr.runtime.preflight.offers import Offer
 from edgevpr.runtime.preflight.probe import TechniqueCosts, noise, probe
-from edgevpr.runtime.recognise.pipeline import made_with
+from edgevpr.runtime.recognise.opening import made_with
 from edgevpr.techniques.networks.card import load_card, weights_of
 from edgevpr.types import StageCost
 

@@ -4,8 +4,9 @@ A wrong place would be believed by every later flight, so a frame is rather left
 where it may be an echo of our own fixes, where the picture says little, and where the map file has a place already.
 """
 
+import math
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -17,13 +18,11 @@ from edgevpr.frames.exif import read_exif
 from edgevpr.frames.images import list_images
 from edgevpr.frames.positions import find_positions
 from edgevpr.places.growing import GrowingIndex
-from edgevpr.places.index import PlaceIndex
-from edgevpr.places.mapfile import PlaceMap
-from edgevpr.types import Descriptor, Frame, Place, PlaceMatch, Position, Vehicle
+from edgevpr.runtime.recognise.recogniser import Recogniser
+from edgevpr.runtime.recognise.recognition import Recognition
+from edgevpr.types import Frame, Place, Position, Vehicle
 
-POSITION_FRESH_S = 1.0
 _ECHO_S = 10.0  # for so long after a fix of ours, the autopilot's position may be what we told it
-_NEW_FOR_S = 30.0
 _QUALITY_MIN = 0.2
 
 
@@ -35,22 +34,22 @@ class Learner:
     """
 
     def __init__(
-        self, place_map: PlaceMap, growing: GrowingIndex, spacing_m: float, clock: Callable[[], float] = time.monotonic
+        self,
+        recogniser: Recogniser,
+        growing: GrowingIndex,
+        spacing_m: float,
+        utc_clock: Callable[[], float] = time.time,
     ) -> None:
         self.learnt = 0
         self.passed_over: Counter[str] = Counter()
         self.trouble: str | None = None
-        self._map, self._growing, self._spacing_m, self._clock = place_map, growing, spacing_m, clock
-        self._new: deque[tuple[int, float]] = deque()
-
-    @property
-    def index(self) -> PlaceIndex:
-        """What is recognised from now on, until the next `learn`."""
-        return self._growing.index
+        self._recogniser, self._growing, self._spacing_m = recogniser, growing, spacing_m
+        self._map, self._utc_clock = recogniser.place_map, utc_clock
+        self._t_fix_s = -math.inf
 
     @property
     def summary(self) -> str:
-        """How it goes, in a few words."""
+        """Say how it goes, in a few words."""
         if self.trouble:
             return f"{self.learnt} places learnt, then stopped ({self.trouble})"
         left_out = ", ".join(f"{count} {reason}" for reason, count in self.passed_over.most_common())
@@ -58,63 +57,54 @@ class Learner:
 
     @property
     def totals(self) -> dict[str, Any]:
-        """The same for the flight log."""
+        """Say the same for the flight log."""
         return {"places": self.learnt, "left_out": dict(self.passed_over), "stopped": self.trouble}
 
-    def learn(
-        self, frame: Frame, descriptor: Descriptor, vehicle: Vehicle | None, t_fix_s: float | None
-    ) -> Place | None:
-        """Make a place of the frame and give it, or None where it is not worth one; never raises MapError.
+    def learn(self, event: Recognition) -> Place | None:
+        """Make a place of the frame of an event and give it, or None where it is not worth one; never raises MapError.
 
-        `vehicle` is what the autopilot said when the frame was taken, `t_fix_s` when a fix was last sent to it.
+        A fix that the event sent, or that waits to be sent, may come back as the autopilot's position from now on.
         """
-        if self.trouble is not None:
+        if event.fix and event.fix.sent is not False:
+            self._t_fix_s = event.frame.t_mono_s
+        if self.trouble is not None or event.failed:
             return None
         place = None
         try:
-            here, objection = self._placed(frame, vehicle, t_fix_s)
-            objection = objection or self._objection(here.position, descriptor.quality)
+            here, objection = self._placed(event.frame, event.vehicle)
+            objection = objection or self._objection(here.position, event.descriptor.quality)
             if objection:
                 self.passed_over[objection] += 1
                 return None
-            place_id = self._map.add(here, descriptor)
+            place_id = self._map.add(here, event.descriptor)
             self.learnt += 1
-            self._new.append((place_id, self._clock()))
             place = Place(
                 place_id=place_id,
                 source_image=here.name,
                 position=here.position,
                 t_utc_s=here.t_utc_s,
                 heading_deg=here.heading_deg,
-                quality=descriptor.quality,
+                quality=event.descriptor.quality,
             )
-            self._growing.add(place_id, here.position, descriptor.coarse, here.heading_deg)
+            self._growing.add(place_id, here.position, event.descriptor.coarse, here.heading_deg)
         except MapError as error:
             self.trouble = str(error)
+        if place:
+            self._recogniser.extend(self._growing.index, place.place_id, here.t_mono_s)
         return place
 
-    def unless_new(self, event: PlaceMatch) -> PlaceMatch:
-        """The event, not accepted where its place was learnt a moment ago: it says where the autopilot has just said
-        that we are, so a fix would bring it nothing, and make its errors look confirmed."""
-        while self._new and self._clock() - self._new[0][1] > _NEW_FOR_S:
-            self._new.popleft()
-        if not event.accepted or all(place_id != event.candidate.place.place_id for place_id, _ in self._new):
-            return event
-        reason = f"this place was learnt within the last {_NEW_FOR_S:g} s and says nothing new"
-        return replace(event, accepted=False, reason=reason, position=None, accuracy_m=None)
-
-    def _placed(self, frame: Frame, vehicle: Vehicle | None, t_fix_s: float | None) -> tuple[Frame, str | None]:
-        """The frame where it was taken, and what is to be said against learning it there."""
+    def _placed(self, frame: Frame, vehicle: Vehicle | None) -> tuple[Frame, str | None]:
+        """Give the frame where it was taken, and what is to be said against learning it there."""
         if frame.position:  # a recording's own: no echo of anything
             return frame, None
-        if vehicle is None or abs(vehicle.t_heard_s - frame.t_mono_s) > POSITION_FRESH_S:
+        if vehicle is None or not vehicle.is_fresh_at(frame.t_mono_s):
             return frame, "without a fresh position"
         if not vehicle.has_gps:  # it reckons, and goes on saying so
             return frame, "without GPS"
-        if t_fix_s is not None and self._clock() - t_fix_s < _ECHO_S:
+        if frame.t_mono_s - self._t_fix_s < _ECHO_S:
             return frame, "just after a fix"
         position = Position(vehicle.lat_deg, vehicle.lon_deg, vehicle.alt_m)
-        return replace(frame, position=position, heading_deg=vehicle.heading_deg, t_utc_s=time.time()), None
+        return replace(frame, position=position, heading_deg=vehicle.heading_deg, t_utc_s=self._utc_clock()), None
 
     def _objection(self, position: Position, quality: float) -> str | None:
         if not quality >= _QUALITY_MIN:  # so written, NaN is refused as well

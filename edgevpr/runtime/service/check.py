@@ -9,14 +9,18 @@ from pathlib import Path
 
 from edgevpr.config import Config, load_config
 from edgevpr.errors import EdgevprError, LinkError, MapError, UsageError
+from edgevpr.frames.condition import Condition
 from edgevpr.frames.source import open_source
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.transport import open_transport
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import parse_pack
+from edgevpr.runtime.preflight.choose import too_late
+from edgevpr.runtime.preflight.pick import outlook
 from edgevpr.runtime.recognise.learn import check_positions
-from edgevpr.runtime.recognise.pipeline import open_pipeline
+from edgevpr.runtime.recognise.opening import open_recogniser
+from edgevpr.types import FIX_MAX_AGE_S
 
 _LOG_ROOM_MB = 10  # some hours of queries
 
@@ -79,9 +83,15 @@ def _map(config: Config) -> str:
         with PlaceMap.open(path) as place_map:
             if not len(place_map):
                 return f"{path}, empty so far"
-    pipeline = open_pipeline(config)
-    pipeline.place_map.close()
-    return f"{config.map}, {pipeline.reason}"
+    recogniser = open_recogniser(config, load_board(config.board))
+    with recogniser.place_map:
+        found = outlook(recogniser, config)
+    if config.mavlink.link and config.mavlink.send_fixes and (found.t_query_s or 0.0) > FIX_MAX_AGE_S:
+        raise UsageError(
+            f"No fix would ever be sent ({too_late(found.t_query_s)}): use a faster board, fewer places or candidates, "
+            f"or a technique that costs less; {found.reason}."
+        )
+    return f"{config.map}, {found.reason}"
 
 
 def _source(config: Config) -> str:
@@ -91,7 +101,7 @@ def _source(config: Config) -> str:
         check_positions(config, None)
     source = open_source(config.source.uri, live=True)
     # Not closed before FFmpeg has given up (5 s at most): a capture that comes back while Python ends aborts it.
-    while source.state == "opening":
+    while source.condition is Condition.OPENING:
         time.sleep(0.05)
     state = source.state
     source.close()

@@ -3,9 +3,11 @@
 import logging
 import os
 import signal
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
 
 from edgevpr import __version__
 from edgevpr.config import Config
@@ -13,11 +15,24 @@ from edgevpr.errors import MapError, UsageError
 from edgevpr.frames.source import open_source
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.link import Link
+from edgevpr.power.boards import Board, load_board
+from edgevpr.runtime.flight.autopilot import NoAutopilot, ToAutopilot
+from edgevpr.runtime.flight.clock import Clock
+from edgevpr.runtime.flight.flight import fly as fly_with
+from edgevpr.runtime.flight.flight import rate_hz
 from edgevpr.runtime.flight.flightlog import FlightLog, start_fields
-from edgevpr.runtime.flight.loop import Flight, say_learning_stopped
+from edgevpr.runtime.flight.learning import say_learning_stopped
+from edgevpr.runtime.flight.loop import Stop
 from edgevpr.runtime.flight.systemd import notify
+from edgevpr.runtime.preflight.choose import too_late
+from edgevpr.runtime.preflight.pick import outlook, picked_technique
 from edgevpr.runtime.recognise.learn import Learner, check_positions
-from edgevpr.runtime.recognise.pipeline import Pipeline, open_learning, open_pipeline
+from edgevpr.runtime.recognise.opening import has_map, open_learning, open_recogniser
+from edgevpr.runtime.recognise.recogniser import Recogniser
+from edgevpr.types import FIX_MAX_AGE_S
+
+_RELOAD_S = 10.0  # a map that takes longer to load is not loaded again in flight: nothing is recognised meanwhile
+_NEW_MAP_PLACES = 1000  # what a technique must be able to fly with, to be picked for a map that is still empty
 
 _log = logging.getLogger(__name__)
 
@@ -27,94 +42,132 @@ def fly(config: Config, positions: Path | None = None) -> int:
     if config.source.uri is None:
         raise UsageError("There is no source of frames: name one with --source, or `source: {uri: ...}`.")
     address = parse_link(config.mavlink.link) if config.mavlink.link else None
-    learner = cannot_learn = None
     if config.mapping.learn:
         check_positions(config, positions)
+    board = load_board(config.board)
     with ExitStack() as stack:
-        if config.mapping.learn:
-            pipeline, learner, cannot_learn = _open_learner(config)
-        else:
-            pipeline = open_pipeline(config)
-        stack.callback(pipeline.place_map.close)
-        _log.info("version %s on %s", __version__, pipeline.board.title)
-        _log.info("%s", pipeline.reason)
+        begin_s = time.monotonic()
+        recogniser, learner, cannot_learn = _opened(config, board)
+        stack.callback(recogniser.place_map.close)
+        smaller_forms = smaller_forms_of(config, recogniser, learner, time.monotonic() - begin_s)
         flight_log = stack.enter_context(FlightLog(config.log.path, wait="NOTIFY_SOCKET" in os.environ))
-        board = pipeline.board
-        if not board.verified:
-            _log.warning("mAh are estimates: the power of %s is unverified (%s)", board.title, board.source)
-        decided = {
-            "reason": pipeline.reason,
-            "rule": pipeline.rule,
-            "candidates": pipeline.candidates,
-            "sequence": pipeline.sequence.length if pipeline.sequence else 1,
-            "accuracy_m": pipeline.accuracy_m,
-            "rate_hz": pipeline.rate_hz,
-            "idle_w": board.idle_w,
-            "full_w": board.full_w,
-            "power_verified": board.verified,
-        }
-        flight_log.write("start", **start_fields(config, board.name, pipeline.technique.spec), decided=decided)
+        _say_start(config, recogniser, flight_log)
         link = stack.enter_context(Link(address, config.mavlink.component_id)) if address else None
-        if link and (learner or config.match.reach_m_s or pipeline.looks_down):
+        if link and (learner or config.match.reach_m_s or recogniser.technique.spec.heading_within_deg is not None):
             link.want_position()
-        source = open_source(config.source.uri, step_s=1 / pipeline.rate_hz, positions=positions, live=True)
+        step_s = 1 / rate_hz(config, recogniser)
+        source = open_source(config.source.uri, step_s=step_s, positions=positions, live=True)
         stack.callback(source.close)
-        if link and config.mavlink.send_fixes and source.total:
-            _log.warning(
-                "%s is a recording: the fixes sent say where it was made, not where you are", config.source.uri
-            )
+        if link and not source.is_live:
+            _say_recording(config, learner)
+        autopilot = NoAutopilot()
+        if link:
+            send_fixes = config.mavlink.send_fixes
+            autopilot = ToAutopilot(link, send_fixes=send_fixes, cores=board.cores, clock=Clock())
         if cannot_learn:
-            say_learning_stopped(cannot_learn, flight_log, link)
-        if learner and link and source.total:
-            _log.warning("%s is a recording: what it learns is put where the vehicle is now", config.source.uri)
-        flight = Flight(pipeline, source, flight_log, link, config, learner)
-        stack.callback(flight.close)
-        place_map = pipeline.place_map
-        del pipeline  # the flight may have to let go of its index
-        with _signals(flight):
+            say_learning_stopped(cannot_learn, flight_log, autopilot)
+        stop = Stop()
+        with _signals(stop):
             notify(READY=1)
-            flight.run()
+            flown = fly_with(
+                recogniser,
+                source,
+                config,
+                flight_log=flight_log,
+                autopilot=autopilot,
+                stop=stop,
+                learner=learner,
+                smaller_forms=smaller_forms,
+            )
             notify(STOPPING=1)
         if link:
             link.close()  # what waits is sent first, so that the log's last line counts it
-        totals = flight.totals
         flight_log.write(
             "end",
-            accepted=flight.accepted,
-            unusable=flight.unusable,
-            **totals,
+            accepted=flown.accepted,
+            unusable=flown.failed,
+            **flown.totals,
             mavlink=link.stats() if link else None,
             **({"learnt": learner.totals} if learner else {}),
         )
         _log.info(
-            "%d queries, %d accepted, %.3f mAh (%.3f of them for recognising)",
-            flight.queries,
-            flight.accepted,
-            totals["used_mah"],
-            totals["marginal_mah"],
+            "%d queries, %d accepted%s, %.3f mAh (%.3f of them for recognising)",
+            flown.queries,
+            flown.accepted,
+            f", {autopilot.summary}" if autopilot.summary else "",
+            flown.totals["used_mah"],
+            flown.totals["marginal_mah"],
         )
         if learner:
-            _log.info("%s, %d in %s", learner.summary, len(place_map), config.map)
-    return 1 if flight.unusable else 0
+            _log.info("%s, %d in %s", learner.summary, len(recogniser.place_map), config.map)
+    return 1 if flown.failed else 0
 
 
-def _open_learner(config: Config) -> tuple[Pipeline, Learner | None, str | None]:
-    """The pipeline of a flight that learns and its learner or, where the map cannot be written (a card that has become
-    read-only, a full disk), the pipeline alone and why: what the map knows is recognised all the same."""
+def _opened(config: Config, board: Board) -> tuple[Recogniser, Learner | None, str | None]:
+    """Open the recogniser of a flight and its learner, if it is to have one. Where the map cannot be written (a card
+    that has become read-only, a full disk), it is the recogniser alone, and why: what the map knows is recognised all
+    the same."""
+    if not config.mapping.learn:
+        return open_recogniser(config, board, narrowed=True), None, None
+    name = config.technique
+    if name is None and config.map is not None and not has_map(Path(config.map)):
+        name = picked_technique(config.board, _NEW_MAP_PLACES, config.source.camera)
     try:
-        pipeline, growing = open_learning(config)
+        recogniser, growing = open_learning(config, board, name)
     except MapError as error:
         try:
-            return open_pipeline(config), None, str(error)
+            return open_recogniser(config, board, narrowed=True), None, str(error)
         except MapError:
             raise error from None
-    return pipeline, Learner(pipeline.place_map, growing, config.mapping.spacing_m), None
+    return recogniser, Learner(recogniser, growing, config.mapping.spacing_m), None
+
+
+def smaller_forms_of(config: Config, recogniser: Recogniser, learner: Learner | None, load_s: float) -> tuple[str, ...]:
+    """List the forms of the index that the governor may take: of a map that is wholly in memory, does not grow and is
+    quickly loaded. The scores of another form are others, so that where the user has said from which score on a match
+    is accepted, that holds for one form only."""
+    own_limits = config.match.min_score is not None or config.match.min_margin is not None
+    is_whole = len(recogniser.index) == len(recogniser.place_map)  # of a part, a smaller form would hold more places
+    if own_limits or learner or not is_whole or load_s > _RELOAD_S:
+        return ()
+    return recogniser.technique.spec.smaller_forms
+
+
+def _say_start(config: Config, recogniser: Recogniser, flight_log: FlightLog) -> None:
+    """Say with what it is flown, and write the first line of the log."""
+    board, found = recogniser.meter.board, outlook(recogniser, config)
+    _log.info("version %s on %s", __version__, board.title)
+    _log.info("%s", found.reason)
+    if config.mavlink.link and config.mavlink.send_fixes and (found.t_query_s or 0.0) > FIX_MAX_AGE_S:
+        _log.warning("no fix will be sent: %s", too_late(found.t_query_s))
+    if not board.verified:
+        _log.warning("mAh are estimates: the power of %s is unverified (%s)", board.title, board.source)
+    decided: dict[str, Any] = {
+        "reason": found.reason,
+        "rule": recogniser.rule,
+        "candidates": recogniser.candidates,
+        "sequence": recogniser.search.length,
+        "accuracy_m": recogniser.accuracy_m,
+        "rate_hz": rate_hz(config, recogniser),
+        "idle_w": board.idle_w,
+        "full_w": board.full_w,
+        "power_verified": board.verified,
+    }
+    flight_log.write("start", **start_fields(config, board.name, recogniser.technique.spec), decided=decided)
+
+
+def _say_recording(config: Config, learner: Learner | None) -> None:
+    uri = config.source.uri
+    if config.mavlink.send_fixes:
+        _log.warning("%s is a recording: the fixes sent say where it was made, not where you are", uri)
+    if learner:
+        _log.warning("%s is a recording: what it learns is put where the vehicle is now", uri)
 
 
 @contextmanager
-def _signals(flight: Flight) -> Iterator[None]:
-    """SIGTERM and SIGINT end the flight while this lasts."""
-    before = {number: signal.signal(number, flight.stop) for number in (signal.SIGTERM, signal.SIGINT)}
+def _signals(stop: Stop) -> Iterator[None]:
+    """Let SIGTERM and SIGINT end the flight while this lasts."""
+    before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGINT)}
     try:
         yield
     finally:

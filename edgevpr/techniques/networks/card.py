@@ -12,9 +12,9 @@ from functools import cached_property
 from pathlib import Path
 
 from edgevpr.config import bounded, build, read_yaml
+from edgevpr.contract import TechniqueSpec
 from edgevpr.errors import ConfigError, ModelError
 from edgevpr.resources import model_folders
-from edgevpr.types import TechniqueSpec
 
 SIMILARITIES = ("cosine", "l1", "l2")
 _CHOICES = {

@@ -14,9 +14,11 @@ import numpy as np
 import pytest
 
 from edgevpr.config import load_config
+from edgevpr.contract import PartSpec, TechniqueSpec
 from edgevpr.errors import EdgevprError
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log, start_fields
-from edgevpr.types import PartSpec, PlaceMatch, Position, QueryCost, TechniqueSpec
+from edgevpr.runtime.recognise.recognition import Recognition
+from edgevpr.types import Position, QueryCost, Steps
 
 COST = QueryCost(
     t_encode_s=0.01,
@@ -80,9 +82,17 @@ def test_every_line_can_be_read_before_the_log_is_closed(path):
 
 
 def test_a_match_is_written_as_it_is_with_nan_as_null(path):
-    match = PlaceMatch("q.jpg", 12.5, None, True, "score 0.9", Position(50.12345678901, -1.5, None), 20.0, COST)
+    match = Recognition(
+        frame=None,
+        accepted=True,
+        reason="score 0.9",
+        position=Position(50.12345678901, -1.5, None),
+        accuracy_m=20.0,
+        steps=Steps(),
+        cost=COST,
+    )
     with FlightLog(path) as log:
-        log.write("match", t_mono_s=match.t_mono_s, event=match)
+        log.write("match", t_mono_s=12.5, event=match)
     (record,) = read_log(path)
     assert record["t_mono_s"] == 12.5
     assert record["event"]["position"] == {"lat_deg": 50.1234568, "lon_deg": -1.5, "alt_m": None}

@@ -1,137 +1,40 @@
 """What a flight says of its own cost: by the closed form, by the process's own clock, and with the board's heat."""
 
 import random
-import time
 
 import cv2
 import pytest
-from flight_process import start, write_frames
+from fakes import FakeCapture, FakeClock, FakeLink, FakeSource
+from flight_process import start
+from flights import PLACES, Flight, flight_meter, of_kind
 from pictures import textured
 
-from edgevpr.cli import main
-from edgevpr.config import load_config
 from edgevpr.frames.live import LiveSource
-from edgevpr.power import meter
 from edgevpr.power.thermal import ThermalState
-from edgevpr.runtime.flight import loop, metering
-from edgevpr.runtime.flight.flightlog import FlightLog, read_log
-from edgevpr.runtime.flight.loop import Flight
-from edgevpr.runtime.recognise import pipeline
-from edgevpr.runtime.recognise.pipeline import open_pipeline
-from edgevpr.types import Frame
+from edgevpr.runtime.flight.flightlog import read_log
+
+PICTURE = textured(1, 240, 320)
 
 
-class Clocks:
-    """Stands in for the module `time`."""
-
-    def __init__(self):
-        self.now_s, self.cpu_s = 1000.0, 7.0
-
-    def monotonic(self):
-        return self.now_s
-
-    def process_time(self):
-        return self.cpu_s
-
-    thread_time = process_time
-
-    def sleep(self, seconds):
-        self.now_s += seconds
-
-    def work(self, wall_s, cores):
-        self.now_s += wall_s
-        self.cpu_s += wall_s * cores
-
-
-@pytest.fixture
-def clocks(monkeypatch):
-    clocks = Clocks()
-
-    def stage(cpu_clock=clocks.process_time):
-        return meter.stage(clocks.monotonic, cpu_clock)
-
-    for module in (loop, metering):
-        monkeypatch.setattr(module, "time", clocks)
-    for module in (loop, pipeline):
-        monkeypatch.setattr(module, "stage", stage)
-    return clocks
-
-
-@pytest.fixture(scope="module")
-def place_map(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("metering")
-    write_frames(folder / "ref", 60)  # more than are compared in full
-    path = folder / "m.gpkg"
-    assert main(["map", "build", str(path), "--images", str(folder / "ref"), "--technique", "cohog"]) == 0
-    return path
-
-
-class Camera:
-    """A live source of `count` pictures; reading one is work too."""
-
-    total, state = 0, "streaming"
-
-    def __init__(self, count, work=lambda: None):
-        self._left, self._work, self._picture = count, work, textured(1, 240, 320)
-
-    @property
-    def ended(self):
-        return not self._left
-
-    def read(self, timeout_s):
-        self._work()
-        self._left -= 1
-        return Frame(image=self._picture, name="frame", t_mono_s=time.monotonic())
-
-
-class Ground:
-    """A link that keeps what it was given."""
-
-    def __init__(self):
-        self.sent = []
-
-    def send(self, *messages):
-        self.sent += messages
-
-    def vehicle_position(self, max_age_s):
-        return None
-
-    def send_fix(self, fix):
-        pass
-
-    set_health = send_fix
-
-
-def fly(place_map, log, source, link=None, prepare=lambda pipe: None, **settings):
-    """Fly in this process: (lines of the log, the flight)."""
-    config = load_config(None, {"map": str(place_map), **settings})
-    pipe = open_pipeline(config)
-    prepare(pipe)
-    with pipe.place_map, FlightLog(log) as flight_log:
-        flight = Flight(pipe, source, flight_log, link, config)
-        flight.run()
-        flight.close()
-    return list(read_log(log)), flight
-
-
-def test_a_flights_charge_is_the_closed_form(place_map, tmp_path, clocks):
+def test_a_flights_charge_is_the_closed_form(recording, tmp_path):
     """Five minutes on a Pi 4B (2.29 W idle, 4.53 W more at full load, four cores) with stages of all lengths."""
     script = random.Random(5)
-    spent = []
+    spent, clock = [], FakeClock()
 
     def work():
         wall_s, cores = script.uniform(0.001, 0.6), script.uniform(0, 2)
         spent.append(wall_s * cores)
-        clocks.work(wall_s, cores)
-
-    def prepare(pipe):
-        encode, scan = pipe.technique.encode, pipe.technique.coarse_scores
-        pipe.technique.encode = lambda image: (work(), encode(image))[1]
-        pipe.technique.coarse_scores = lambda *asked: (work(), scan(*asked))[1]
+        clock.work(wall_s, cores)
 
     settings = {"board": "rpi-4b", "source.rate_hz": 0.5, "match.candidates": 1}
-    lines, flight = fly(place_map, tmp_path / "log", Camera(150, work), prepare=prepare, **settings)
-    totals, elapsed_s = flight.totals, clocks.now_s - 1000
+    flight = Flight(recording / "cohog.gpkg", tmp_path / "log", clock, **settings)
+    technique = flight.recogniser.technique
+    encode, scan = technique.encode, technique.coarse_scores
+    technique.encode = lambda image: (work(), encode(image))[1]
+    technique.coarse_scores = lambda *asked: (work(), scan(*asked))[1]
+    begin_s = clock.now_s
+    lines = flight.fly(FakeSource([PICTURE] * 150, clock, work=work))
+    totals, elapsed_s = flight.flown.totals, clock.now_s - begin_s
     assert elapsed_s > 290
     mah = 1000 / (14.8 * 0.85 * 3600)  # of a joule, with the pack of the configuration
     busy_j = 4.53 / 4 * sum(spent)
@@ -141,7 +44,7 @@ def test_a_flights_charge_is_the_closed_form(place_map, tmp_path, clocks):
     assert totals["marginal_mah"] == pytest.approx(mah * busy_j, rel=1e-9), "nothing else was done"
     assert totals["stages_cpu_s"] == pytest.approx(sum(spent), rel=1e-9)
     # The queries' own charge is idle power while they last and what they add; reading the picture stands beside it.
-    queries = [line for line in lines if line["kind"] == "query"]
+    queries = of_kind(lines, "query")
     assert len(queries) == 150
     in_queries_mah = sum(line["costs"]["marginal_mah"] for line in queries)
     reading_mah = mah * 4.53 / 4 * sum(line["reading"]["cpu_s"] for line in queries)
@@ -150,98 +53,112 @@ def test_a_flights_charge_is_the_closed_form(place_map, tmp_path, clocks):
     assert queries[-1]["totals"]["used_mah"] == pytest.approx(totals["used_mah"], rel=1e-6)
 
 
-def test_the_stages_account_for_the_cpu_time_of_the_process(place_map, tmp_path):
-    """A real flight: what is no stage of a query (threads, the loop between queries) is less than three percent. Where
-    other programs take the cores and the caches it can be more: such a flight is flown again, twice at most."""
-    write_frames(tmp_path / "query", 40)
-    for attempt in range(3):
-        log = tmp_path / f"log{attempt}"
-        flight = start(place_map, tmp_path / "query", log, "--rate-hz", "15", "--link", "udpout:127.0.0.1:9")
-        assert flight.wait(timeout=60) == 0
-        flight.stderr.close()
-        lines = list(read_log(log))
-        if lines[-1]["stages_cpu_s"] > 0.97 * lines[-1]["process_cpu_s"]:
-            break
-    queries, end = [line for line in lines if line["kind"] == "query"], lines[-1]
+def test_the_stages_account_for_the_cpu_time_of_the_process(recording, tmp_path):
+    """A real flight, by CPU time, which other programs do not take: what is no stage of a query (threads, the loop
+    between queries) is a small part; benchmarks/bench_flight.py says how small."""
+    log = tmp_path / "log"
+    flags = ("--rate-hz", "60", "--link", "udpout:127.0.0.1:9")
+    flight = start(recording / "cohog.gpkg", recording / "blind" / "images", log, *flags)
+    assert flight.wait(timeout=60) == 0
+    flight.stderr.close()
+    lines = list(read_log(log))
+    queries, end = of_kind(lines, "query"), lines[-1]
     in_queries_s = sum(line["costs"]["cpu_s"] + line["reading"]["cpu_s"] for line in queries)
-    assert 0.95 * end["stages_cpu_s"] < in_queries_s < end["stages_cpu_s"], "the rest is the log and the link"
-    assert end["stages_cpu_s"] == pytest.approx(end["process_cpu_s"], rel=0.03)
+    assert 0.8 * end["stages_cpu_s"] < in_queries_s < end["stages_cpu_s"], "the rest is the log and the link"
+    assert 0.8 * end["process_cpu_s"] < end["stages_cpu_s"] < end["process_cpu_s"]
     assert end["elapsed_s"] > end["process_cpu_s"] / 2
     assert all(line["costs"]["rss_mb"] > line["costs"]["pss_mb"] > 10 for line in queries)
     assert queries[0]["totals"]["dropped"] is None, "of a recording every picture is taken"
     assert set(queries[0]["board"]) == {"temperature_c", "frequency_mhz", "throttled", "why"}
 
 
-def test_heat_is_logged_and_told_and_a_throttled_boards_figures_are_marked(place_map, tmp_path, monkeypatch):
-    states = iter(
-        [ThermalState(61.0, 1800.0, False, "")] * 3 + [ThermalState(84.0, 600.0, True, "throttled now")] * 999
-    )
+def test_nearly_all_cpu_time_of_the_loop_is_some_stage_of_a_query(recording, tmp_path):
+    """By a clock that moves where work is done: 1 ms in encoding, as much in reading and logging, nothing between."""
+    clock = FakeClock()
+    flight = Flight(recording / "hog.gpkg", tmp_path / "log", clock, **{"source.rate_hz": 5.0})
+    encode = flight.recogniser.technique.encode
+    flight.recogniser.technique.encode = lambda image: (clock.work(0.001), encode(image))[1]
+    flight.fly(FakeSource([PICTURE] * 20, clock, work=lambda: clock.work(0.001)))
+    totals = flight.flown.totals
+    assert totals["stages_cpu_s"] == pytest.approx(totals["process_cpu_s"], rel=1e-9)
 
-    class Watch:
-        def __init__(self, clock):
-            pass
 
-        def look(self):
-            return next(states)
+class Watch:
+    """A board whose heat is what stands in a script, the last state for ever."""
 
-        def close(self):
-            pass
+    def __init__(self, states):
+        self._states = list(states)
 
-    monkeypatch.setattr(metering, "ThermalWatch", Watch)
-    monkeypatch.setattr(loop, "_HEALTH_S", 0.0)
-    ground = Ground()
-    lines, flight = fly(place_map, tmp_path / "log", Camera(6), ground, **{"source.rate_hz": 60.0})
-    boards = [line["board"] for line in lines if line["kind"] == "query"]
+    def look(self):
+        return self._states.pop(0) if len(self._states) > 1 else self._states[0]
+
+    def close(self):
+        pass
+
+
+def test_heat_is_logged_and_told_and_a_throttled_boards_figures_are_marked(recording, tmp_path):
+    cool, hot = ThermalState(61.0, 1800.0, False, ""), ThermalState(84.0, 600.0, True, "throttled now")
+    clock = FakeClock()
+    flight = Flight(recording / "hog.gpkg", tmp_path / "log", clock, FakeLink(clock), **{"source.rate_hz": 1.0})
+    meter = flight_meter(flight, watch=Watch([cool] * 3 + [hot]))
+    lines = flight.fly(FakeSource([PICTURE] * 6, clock), meter)
+    boards = [line["board"] for line in of_kind(lines, "query")]
     assert boards[0] == {"temperature_c": 61.0, "frequency_mhz": 1800.0, "throttled": False, "why": ""}
     assert boards[-1] == {"temperature_c": 84.0, "frequency_mhz": 600.0, "throttled": True, "why": "throttled now"}
-    told = [each.temperature_core[0] for each in ground.sent if each.get_type() == "ONBOARD_COMPUTER_STATUS"]
+    told = [each.temperature_core[0] for each in flight.link.sent if each.get_type() == "ONBOARD_COMPUTER_STATUS"]
     throttled = [board["throttled"] for board in boards]
-    assert flight.totals["queries_throttled"] == sum(throttled) > 0
+    assert flight.flown.totals["queries_throttled"] == sum(throttled) > 0
     assert told[0] == 61
     assert told[-1] == 84
 
 
-class Capture:
-    """A camera of 200 pictures a second."""
+def test_frames_that_nobody_took_are_counted(recording, tmp_path):
+    """The real capture thread, which takes twelve pictures before the loop asks for each next one."""
+    clock, picture = FakeClock(), cv2.cvtColor(PICTURE, cv2.COLOR_GRAY2BGR)
+    source = LiveSource(lambda: FakeCapture([picture] * 12), clock)
+    flight = Flight(recording / "hog.gpkg", tmp_path / "log", clock, **{"source.rate_hz": 5.0})
 
-    def read(self):
-        time.sleep(0.005)
-        return True, cv2.cvtColor(textured(1, 240, 320), cv2.COLOR_GRAY2BGR)
+    class Patient:
+        """The source, read once all twelve pictures of a capture have come."""
 
-    def release(self):
-        pass
+        is_live, total, ended = True, 0, False
+        condition, state = property(lambda self: source.condition), property(lambda self: source.state)
+        dropped = property(lambda self: source.dropped)
+        reads = 0
 
+        def read(self, timeout_s):
+            while source.dropped < 11 * (self.reads + 1):
+                source._closing.wait(0.005)
+            self.reads += 1
+            self.ended = self.reads == 2
+            return source.read(timeout_s)
 
-def test_frames_that_nobody_took_are_counted(place_map, tmp_path):
-    source = LiveSource(Capture, time.monotonic)
-
-    class Ground3(Ground):
-        """Stops the flight after three queries."""
-
-        def send(self, *messages):
-            source.ended = flight_queries() >= 3
-
-    def flight_queries():
-        return sum(line["kind"] == "query" for line in read_log(tmp_path / "log"))
-
-    lines, flight = fly(place_map, tmp_path / "log", source, Ground3(), **{"source.rate_hz": 5.0})
+    lines = flight.fly(Patient())
     source.close()
-    dropped = [line["totals"]["dropped"] for line in lines if line["kind"] == "query"]
+    dropped = [line["totals"]["dropped"] for line in of_kind(lines, "query")]
     assert dropped == sorted(dropped)
-    assert dropped[-1] >= 10, "at 5 Hz most of its pictures are passed over"
-    assert flight.totals["dropped"] == source.dropped
+    assert dropped[-1] >= 10, "most of its pictures are passed over"
+    assert flight.flown.totals["dropped"] == source.dropped
 
 
-def test_the_log_ends_with_what_the_board_has_drawn(place_map, tmp_path):
+def test_the_log_ends_with_what_the_board_has_drawn(recording, tmp_path):
     """Idle power counts while nothing is recognised: two queries, and two seconds between them."""
-    write_frames(tmp_path / "query", 2)
-    flight = start(place_map, tmp_path / "query", tmp_path / "log", "--rate-hz", "0.5", "--board", "rpi-4b")
-    assert flight.wait(timeout=60) == 0
-    flight.stderr.close()
-    lines = list(read_log(tmp_path / "log"))
-    end = lines[-1]
+    clock = FakeClock()
+    settings = {"board": "rpi-4b", "source.rate_hz": 0.5}
+    flight = Flight(recording / "hog.gpkg", tmp_path / "log", clock, **settings)
+    encode = flight.recogniser.technique.encode
+    flight.recogniser.technique.encode = lambda image: (clock.work(0.05), encode(image))[1]
+    lines, end = flight.fly(FakeSource([PICTURE] * 2, clock)), flight.flown.totals
     idle_mah = 1000 * 2.29 * end["elapsed_s"] / (14.8 * 0.85 * 3600)
     assert end["elapsed_s"] > 2
     assert end["used_mah"] == pytest.approx(idle_mah + end["process_mah"], rel=1e-5)
-    assert sum(line["costs"]["used_mah"] for line in lines if line["kind"] == "query") < end["used_mah"] / 2
+    assert sum(line["costs"]["used_mah"] for line in of_kind(lines, "query")) < end["used_mah"] / 2
     assert 0 < end["marginal_mah"] <= end["process_mah"] < idle_mah
+
+
+def test_a_flight_of_a_recording_takes_every_picture(recording, tmp_path):
+    clock = FakeClock()
+    flight = Flight(recording / "hog.gpkg", tmp_path / "log", clock, **{"source.rate_hz": 60.0})
+    lines = flight.fly(FakeSource([PICTURE] * PLACES, clock, is_live=False))
+    assert len(of_kind(lines, "query")) == PLACES
+    assert flight.flown.totals["dropped"] is None

@@ -8,7 +8,7 @@ import pytest
 from pictures import textured
 from tiny_networks import CARD, write_network
 
-from edgevpr.cli import main
+from edgevpr.cli.main import main
 from edgevpr.config import load_config
 from edgevpr.runtime.flight.flightlog import read_log
 from edgevpr.runtime.service.fly import fly

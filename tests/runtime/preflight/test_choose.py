@@ -1,22 +1,22 @@
 """What a technique costs here, and which one a board can afford."""
 
 import dataclasses
-import functools
+import itertools
 
 import numpy as np
 import pytest
 
 from edgevpr import techniques
+from edgevpr.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
 from edgevpr.errors import ConfigError, ModelError, UsageError
 from edgevpr.power import machine
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.preflight import choose as choosing
-from edgevpr.runtime.preflight import probe as choosing_probe
+from edgevpr.runtime.preflight import pick
 from edgevpr.runtime.preflight.choose import choose, fit, preferred
 from edgevpr.runtime.preflight.probe import TechniqueCosts, noise, probe, probe_each
 from edgevpr.runtime.preflight.scale import on_board
-from edgevpr.runtime.recognise import pipeline
-from edgevpr.types import Descriptor, FineMatch, PartSpec, StageCost, TechniqueSpec
+from edgevpr.types import StageCost
 
 # Round figures of the size that cohog and hog have: exact matching of many regions, or a long vector in RAM.
 REGIONS = TechniqueCosts(
@@ -77,9 +77,9 @@ def test_a_technique_is_tried_on_frames_of_a_camera_and_a_map_on_disk():
     assert min(costs.encode.wall_s, costs.match_per_place.wall_s, costs.match_per_place.cpu_s) > 0
 
 
-def test_given_pictures_are_all_encoded_and_the_median_counts(monkeypatch):
+def test_given_pictures_are_all_encoded_and_the_median_counts():
     technique = TinyTechnique(fine=True)
-    seconds = iter([9.0, 1.0, 3.0, 2.0])
+    seconds = itertools.chain([9.0, 1.0, 3.0, 2.0], itertools.repeat(0.0))
 
     def slow(image, mask=None):
         clock[0] += next(seconds)
@@ -87,9 +87,8 @@ def test_given_pictures_are_all_encoded_and_the_median_counts(monkeypatch):
 
     clock = [0.0]
     technique.encode = slow
-    timed = functools.partial(choosing_probe.stage, wall_clock=lambda: clock[0], cpu_clock=lambda: clock[0] / 2)
-    monkeypatch.setattr(choosing_probe, "stage", timed)
-    costs = probe(technique, [image[:200] for image in noise(3)])
+    clocks = {"wall_clock": lambda: clock[0], "cpu_clock": lambda: clock[0] / 2}
+    costs = probe(technique, [image[:200] for image in noise(3)], **clocks)
     assert costs.encode == StageCost(2.0, 1.0)
     assert technique.shapes == {((200, 640), np.dtype(np.uint8))}
 
@@ -238,20 +237,46 @@ def test_the_technique_that_is_picked_is_the_boards_only_if_it_fits(monkeypatch,
     # The process that runs the tests is large by itself.
     small = board(technique="hog", budget_mb=1.0, memory_max_mb=4000.0)
     for own, places, taken in ((small, 2, "hog"), (small, 100, "cohog")):
-        monkeypatch.setattr(pipeline, "load_board", lambda name, own=own: own)
-        assert pipeline.picked_technique("this", places) == taken
+        monkeypatch.setattr(pick, "load_board", lambda name, own=own: own)
+        assert pick.picked_technique("this", places) == taken
 
 
 def test_a_network_that_the_board_wants_and_that_is_not_there_is_passed_over(monkeypatch, caplog):
-    really = pipeline.made_for
+    really = pick.made_for
 
     def made_for(board, name, settings=None):
         if name == "netvlad":
             raise ModelError("There is no model.")
         return really(board, name, settings)
 
-    monkeypatch.setattr(pipeline, "made_for", made_for)
+    monkeypatch.setattr(pick, "made_for", made_for)
     own = board(technique="netvlad", budget_mb=20.0, memory_max_mb=4000.0)
-    monkeypatch.setattr(pipeline, "load_board", lambda name: own)
-    assert pipeline.picked_technique("this", 10) == "cohog"
+    monkeypatch.setattr(pick, "load_board", lambda name: own)
+    assert pick.picked_technique("this", 10) == "cohog"
     assert any("netvlad is passed over" in message for message in caplog.messages)
+
+
+def test_where_no_fix_could_be_sent_in_time_it_does_not_fit_at_any_rate():
+    found = fit(board(), REGIONS, places=1300, rate_hz=0.1, budget_mb=100)
+    assert found.t_query_s == pytest.approx(5.3)
+    assert found.shortfalls == ("a query takes 5.3 s, and no fix of a frame older than 5 s is ever sent",)
+    assert found.remedies == ("with up to 1225 places",)
+    assert not fit(board(), REGIONS, places=1225, rate_hz=0.1, budget_mb=100).shortfalls
+
+
+def test_for_a_camera_that_looks_down_only_what_can_be_told_so_is_tried():
+    assert preferred(board(technique=None), "nadir") == ("cohog",)
+    assert preferred(board(technique="hog"), "nadir") == ("cohog",)
+    assert preferred(board(technique="hog"), "forward") == ("hog", "cohog")
+
+
+def test_where_nothing_fits_the_best_is_picked_all_the_same_and_the_log_says_what_it_lacks(monkeypatch, caplog):
+    slow = dataclasses.replace(REGIONS, encode=StageCost(30.0, 30.0))
+    monkeypatch.setattr(pick, "probe_each", lambda tried: ((each.spec.name, slow) for each in tried))
+    for camera, knows in (("nadir", {"camera": "nadir"}), ("forward", {"camera": "forward"}), (None, {})):
+        assert pick.picked_technique("this", 10, camera) == "cohog"
+        assert pick.camera_setting("cohog", camera) == knows
+        assert pick.camera_setting("hog", camera) == {}
+    said = [record.message for record in caplog.records if "all the same" in record.message]
+    assert len(said) == 3
+    assert "a query takes 30.0 s" in said[0]

@@ -6,7 +6,7 @@ from dataclasses import asdict, replace
 import pytest
 
 from edgevpr.errors import UsageError
-from edgevpr.power.boards import Score, load_board
+from edgevpr.power.boards import MachineSpeed, load_board
 from edgevpr.power.equations import parse_pack
 from edgevpr.runtime.preflight.estimate import FlightPlan
 from edgevpr.runtime.preflight.estimate import estimate as estimate_of
@@ -34,7 +34,7 @@ PLAN = FlightPlan(
     places=100, rate_hz=1.0, flight_min=20.0, pack=parse_pack("4S5200"), regulator_efficiency=0.85, budget_mb=256
 )
 PI = load_board("rpi-4b")
-NOBODY = Score(single=None, multi=None, products=None, passes=None, verified=False, source="nobody")
+NOBODY = MachineSpeed(single=None, multi=None, products=None, passes=None, verified=False, source="nobody")
 NO_HOVER = "Give the hover power of the aircraft (--hover-w W) to see how many minutes of flight this costs."
 
 
@@ -76,8 +76,9 @@ def test_a_rate_out_of_reach_is_not_charged_for():
 def test_a_technique_that_does_not_fit_says_why_and_what_would():
     rows = estimate(PI, PI, COSTS, replace(PLAN, places=2000)).techniques
     assert [row.fits for row in rows] == [False, False]
-    assert rows[0].shortfalls == ("it reaches 0.12 Hz of 1",)
-    assert rows[0].remedies == ("with up to 225 places", "at up to 0.12 Hz")
+    late = "a query takes 8.1 s, and no fix of a frame older than 5 s is ever sent"
+    assert rows[0].shortfalls == ("it reaches 0.12 Hz of 1", late)
+    assert rows[0].remedies == ("with up to 225 places",), "at 0.12 Hz none of its fixes would be sent"
     assert "its map takes 572.0 MB of RAM and 256.0 are allowed" in rows[1].shortfalls
 
 
@@ -206,8 +207,8 @@ def test_where_nothing_fits_the_reason_says_what_would():
     found = estimate(PI, PI, COSTS, replace(PLAN, places=2000))
     assert found.recommended is None
     assert found.reason == (
-        "None: nothing that was tried fits Raspberry Pi 4B, 64-bit; what would fit is regions with up to 225 places or "
-        "at up to 0.12 Hz, or vector with up to 895 places."
+        "None: nothing that was tried fits Raspberry Pi 4B, 64-bit; what would fit is regions with up to 225 places, "
+        "or vector with up to 895 places."
     )
     tiny = replace(PI, memory_max_mb=64.0)
     assert estimate(tiny, PI, COSTS, PLAN).reason.endswith("; use a larger board.")

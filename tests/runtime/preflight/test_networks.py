@@ -8,7 +8,7 @@ import os
 import pytest
 from tiny_networks import CARD, write_card, write_network
 
-from edgevpr.cli import main
+from edgevpr.cli.main import main
 from edgevpr.errors import EdgevprError, ModelError
 from edgevpr.runtime.preflight.networks import add, list_models, technique_with, verify, verify_here
 from edgevpr.techniques.networks.card import load_card

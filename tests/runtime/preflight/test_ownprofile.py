@@ -6,11 +6,11 @@ import pytest
 
 from edgevpr.errors import EdgevprError, UsageError
 from edgevpr.power import calibrate, sensors
-from edgevpr.power.boards import Score, load_board
+from edgevpr.power.boards import MachineSpeed, load_board
 from edgevpr.power.powermeter import Meter, MeterError
 from edgevpr.runtime.preflight.ownprofile import measured_profile, require_new_profile, write_profile
 
-SCORE = Score(single=0.2, multi=0.7, products=0.1, passes=0.4, verified=True, source="edgevpr's micro-benchmark")
+SCORE = MachineSpeed(single=0.2, multi=0.7, products=0.1, passes=0.4, verified=True, source="edgevpr's micro-benchmark")
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from edgevpr.power.boards import Score, load_board
+from edgevpr.power.boards import MachineSpeed, load_board
 from edgevpr.runtime.preflight.probe import TechniqueCosts
 from edgevpr.runtime.preflight.scale import UNKNOWN_PRODUCTS, Ratios, is_same, on_board, ratios
 from edgevpr.types import StageCost
@@ -31,7 +31,7 @@ HERE, PI = load_board("generic-x86"), load_board("rpi-4b")
 def scored(single=None, multi=None, products=None, passes=None, **changes):
     return replace(
         PI,
-        benchmark_score=Score(
+        benchmark_score=MachineSpeed(
             single=single, multi=multi, products=products, passes=passes, verified=True, source="by hand"
         ),
         **changes,
@@ -58,7 +58,8 @@ def test_what_is_not_known_apart_is_taken_from_the_single_thread_and_products_mo
     assert ratios(HERE, scored(single=0.4)) == Ratios(pytest.approx(0.4 * UNKNOWN_PRODUCTS), 0.4)
     assert ratios(HERE, scored(single=0.4, products=0.1)) == Ratios(0.1, 0.4)
     twice = replace(
-        HERE, benchmark_score=Score(single=2.0, multi=4.0, products=4.0, passes=1.0, verified=True, source="by hand")
+        HERE,
+        benchmark_score=MachineSpeed(single=2.0, multi=4.0, products=4.0, passes=1.0, verified=True, source="by hand"),
     )
     assert ratios(twice, scored(single=0.4, products=0.1)) == Ratios(pytest.approx(0.025), 0.4)
     assert ratios(HERE, scored(products=0.1, passes=0.2)) == Ratios(0.1, 0.2)

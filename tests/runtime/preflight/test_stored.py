@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from edgevpr.errors import EdgevprError, ImageError, SourceError, UsageError
-from edgevpr.power.boards import Score, load_board
+from edgevpr.power.boards import MachineSpeed, load_board
 from edgevpr.runtime.preflight import stored as measured
 from edgevpr.runtime.preflight import trial
 from edgevpr.runtime.preflight.offers import Offer
@@ -22,7 +22,7 @@ from edgevpr.runtime.preflight.stored import (
     require_room,
     save,
 )
-from edgevpr.runtime.preflight.stored_text import format_measured
+from edgevpr.runtime.preflight.stored_text import format_stored
 from edgevpr.runtime.preflight.trial import Trial
 from edgevpr.types import StageCost
 
@@ -36,7 +36,7 @@ COSTS = TechniqueCosts(
     scan_per_place=StageCost(2e-6, 3e-6),
     encode_mb=11.0,
 )
-SCORE = Score(single=0.2, multi=0.7, products=0.1, passes=0.4, verified=True, source="edgevpr's micro-benchmark")
+SCORE = MachineSpeed(single=0.2, multi=0.7, products=0.1, passes=0.4, verified=True, source="edgevpr's micro-benchmark")
 COHOG = Trial(label="cohog", name="cohog", settings={}, costs=COSTS, parameters={"w1": 512, "gt": 0.4})
 HOG = Trial(
     label="hog 1bit", name="hog", settings={"form": "1bit"}, costs=replace(COSTS, candidates=None, encode_mb=None)
@@ -241,7 +241,7 @@ def test_the_score_that_is_scaled_from_is_measured_unless_both_are_published(mon
 
 def test_the_table_names_machine_date_pictures_and_every_technique(kept):
     found, _ = load(kept)
-    first, heads, cohog, hog, calc, what, why, score = format_measured(found).splitlines()
+    first, heads, cohog, hog, calc, what, why, score = format_stored(found).splitlines()
     assert first.startswith(found.identity["machine"])
     assert first.endswith(f"measured on {found.date}, 8 generated pictures")
     assert cohog.split() == [

@@ -3,11 +3,13 @@
 import numpy as np
 import pytest
 
+from edgevpr.contract import FineMatch
 from edgevpr.places.index import PlaceIndex
-from edgevpr.runtime.recognise.hints import Hints, Sighting, agree, allowed, hints_of, reach, turned_deg, use_next
-from edgevpr.types import Candidate, FineMatch, Place, Position
+from edgevpr.runtime.recognise.hints import Hints, Sighting, agree, expected_of, hints_of, reach, use_next
+from edgevpr.types import Candidate, Place, Position, Vehicle
 
 HOME = Position(50.0, 8.0)
+WITHIN_DEG = 22.5
 A_METRE_DEG = 1 / 111_195  # of latitude
 
 
@@ -31,6 +33,17 @@ def index():
     )
 
 
+def vehicle(position, t_heard_s, has_gps=True):
+    return Vehicle(
+        lat_deg=position.lat_deg,
+        lon_deg=position.lon_deg,
+        alt_m=0.0,
+        heading_deg=None,
+        t_heard_s=t_heard_s,
+        has_gps=has_gps,
+    )
+
+
 def found(metres=0.0, heading_deg=None, rotation_deg=None):
     return Candidate(
         Place(place_id=1, source_image="a", position=north(metres), heading_deg=heading_deg),
@@ -44,7 +57,7 @@ def test_reach_grows_with_the_time_since_the_position_was_known():
 
 
 def test_a_fresh_autopilot_goes_before_our_own_fix_and_both_grow_old():
-    autopilot, fix = Sighting(north(500), 9.5), Sighting(HOME, 0.0)
+    autopilot, fix = vehicle(north(500), 9.5), Sighting(HOME, 0.0)
     assert reach(10.0, autopilot, fix, 10.0, 50.0) == (north(500), 55.0)
     assert reach(10.6, autopilot, fix, 10.0, 50.0) == (HOME, pytest.approx(156.0))
     assert reach(60.1, None, fix, 10.0, 50.0) is None
@@ -52,26 +65,26 @@ def test_a_fresh_autopilot_goes_before_our_own_fix_and_both_grow_old():
 
 
 def test_a_position_heard_after_the_frame_was_taken_is_as_far_off_in_time():
-    assert reach(10.0, Sighting(HOME, 10.5), None, 10.0, 50.0) == (HOME, 55.0)
+    assert reach(10.0, vehicle(HOME, 10.5), None, 10.0, 50.0) == (HOME, 55.0)
 
 
 def test_only_places_in_reach_are_allowed_and_none_without_a_position(index):
     hints = hints_of(index, (north(120), 90.0), None)
     assert hints == Hints(north(120), 90.0)
-    assert allowed(hints, index).tolist() == [False, True, True, False, False]
-    assert turned_deg(hints, index) is None
+    assert expected_of(hints, index).in_reach.tolist() == [False, True, True, False, False]
+    assert expected_of(hints, index).turned_deg is None
 
 
 def test_where_no_place_is_in_reach_all_are_searched(index):
     assert hints_of(index, (north(5000), 100.0), None) is None
-    assert allowed(None, index) is None
-    assert turned_deg(None, index) is None
+    assert expected_of(None, index).in_reach is None
+    assert expected_of(None, index).turned_deg is None
 
 
 def test_a_heading_says_how_far_each_place_is_turned(index):
     hints = hints_of(index, None, 5.0)
-    assert allowed(hints, index) is None
-    np.testing.assert_array_equal(turned_deg(hints, index), [5, 355, 345, np.nan, 15])
+    assert expected_of(hints, index).in_reach is None
+    np.testing.assert_array_equal(expected_of(hints, index).turned_deg, [5, 355, 345, np.nan, 15])
 
 
 def test_a_heading_is_no_hint_where_no_place_has_one(index):
@@ -101,7 +114,7 @@ def test_what_the_log_says():
     ],
 )
 def test_a_place_found_agrees_with_hints_that_would_have_led_to_it(hints, candidate, agrees):
-    assert agree(hints, candidate) is agrees
+    assert agree(hints, candidate, WITHIN_DEG) is agrees
 
 
 def test_queries_look_with_and_without_hints_in_turn_until_one_is_accepted():
@@ -109,14 +122,14 @@ def test_queries_look_with_and_without_hints_in_turn_until_one_is_accepted():
     used, seen = True, []
     for _ in range(4):
         seen.append(used)
-        used = use_next(hints, used, nothing, accepted=False)
+        used = use_next(hints, used, nothing, accepted=False, heading_within_deg=WITHIN_DEG)
     assert seen == [True, False, True, False]
 
 
 def test_an_accepted_match_says_whether_the_hints_can_be_believed():
     hints = Hints(HOME, 100.0)
-    assert use_next(hints, False, found(50), accepted=True) is True
-    assert use_next(hints, True, found(50), accepted=True) is True
-    assert use_next(hints, False, found(500), accepted=True) is False
-    assert use_next(hints, False, None, accepted=False) is True
-    assert use_next(None, False, None, accepted=False) is True
+    assert use_next(hints, False, found(50), accepted=True, heading_within_deg=WITHIN_DEG) is True
+    assert use_next(hints, True, found(50), accepted=True, heading_within_deg=WITHIN_DEG) is True
+    assert use_next(hints, False, found(500), accepted=True, heading_within_deg=WITHIN_DEG) is False
+    assert use_next(hints, False, None, accepted=False, heading_within_deg=WITHIN_DEG) is True
+    assert use_next(None, False, None, accepted=False, heading_within_deg=WITHIN_DEG) is True

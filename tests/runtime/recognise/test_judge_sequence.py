@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from edgevpr.config import load_config
+from edgevpr.contract import FineMatch, PartSpec, TechniqueSpec
 from edgevpr.places.index import empty_index
 from edgevpr.places.retrieve import Ranking
-from edgevpr.places.sequence import Sequence
-from edgevpr.runtime.recognise.judge import AcceptRule, accept_rule, accepted
+from edgevpr.places.sequence import SequenceSearch
+from edgevpr.runtime.recognise.judge import AcceptRule, accept_rule, judge
 from edgevpr.techniques import create
-from edgevpr.types import FineMatch, PartSpec, TechniqueSpec
 
 PLACES, LENGTH = 80, 6
 RULE = AcceptRule(min_score=0.1, min_margin=0.05, neighbour_m=50.0)
@@ -23,7 +23,7 @@ def flown(velocity, start, leaves=18, seed=3):
     index = empty_index(TechniqueSpec(name="test", parameters={}, coarse=PartSpec((1,), "<f4")), PLACES, None)
     index.place_ids[:] = np.arange(PLACES)
     noise = np.random.default_rng(seed)
-    sequence, found = Sequence(LENGTH), []
+    sequence, found = SequenceSearch(LENGTH), []
     for query in range(18):
         away = np.abs(np.arange(PLACES) - (start + velocity * query))
         here = np.exp(-away) if query < leaves else 0.0
@@ -31,7 +31,8 @@ def flown(velocity, start, leaves=18, seed=3):
         slots = np.argsort(-scores)
         ranking = Ranking(slots, scores[slots], tuple(FineMatch(float(score)) for score in scores[slots]))
         ranking = sequence.follow(ranking, index, float(query))
-        found.append((*accepted(ranking, index, RULE, sequence), int(ranking.slots[0])))
+        verdict = judge(ranking, index, RULE, sequence, is_new=False)
+        found.append((verdict.accepted, verdict.reason, int(ranking.slots[0])))
     return found
 
 
@@ -59,7 +60,7 @@ def test_an_aircraft_that_leaves_the_mapped_way_is_not_followed_beyond_it(seed):
 
 
 def test_a_score_too_low_for_one_query_is_too_low_for_the_newest():
-    sequence, near = Sequence(3), abs(np.arange(PLACES) - 7) <= 2
+    sequence, near = SequenceSearch(3), abs(np.arange(PLACES) - 7) <= 2
     index = empty_index(TechniqueSpec(name="test", parameters={}, coarse=PartSpec((1,), "<f4")), PLACES, None)
     index.place_ids[:] = np.arange(PLACES)
     for query, score in enumerate((0.5, 0.4, 0.3)):
@@ -70,7 +71,7 @@ def test_a_score_too_low_for_one_query_is_too_low_for_the_newest():
 
 
 def test_a_place_that_the_newest_query_was_not_compared_with_is_not_seen():
-    sequence, near = Sequence(3), abs(np.arange(PLACES) - 7) <= 2
+    sequence, near = SequenceSearch(3), abs(np.arange(PLACES) - 7) <= 2
     index = empty_index(TechniqueSpec(name="test", parameters={}, coarse=PartSpec((1,), "<f4")), PLACES, None)
     index.place_ids[:] = np.arange(PLACES)
     for query, (slot, score) in enumerate([(5, 0.9), (60, 0.1), (20, 0.1)]):

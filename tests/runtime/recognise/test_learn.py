@@ -1,25 +1,38 @@
 """Which frames become places: with a real map file, a real index, and a clock to turn."""
 
 import math
-from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
+from fakes import FakeClock, vehicle_at
 
 from edgevpr.config import load_config
+from edgevpr.contract import Descriptor
 from edgevpr.errors import UsageError
 from edgevpr.places.growing import GrowingIndex
 from edgevpr.places.mapfile import PlaceMap
+from edgevpr.power.boards import load_board
+from edgevpr.runtime.recognise.judge import AcceptRule
 from edgevpr.runtime.recognise.learn import Learner, check_positions
+from edgevpr.runtime.recognise.opening import meter_of
+from edgevpr.runtime.recognise.recogniser import Recogniser
+from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.techniques import create
-from edgevpr.types import Candidate, Descriptor, FineMatch, Frame, Place, PlaceMatch, Position, QueryCost, Vehicle
+from edgevpr.types import FixReport, Frame, Position, QueryCost, Steps
 
 TECHNIQUE = create("hog", {"w1": 32})
 SPACING_M = 10.0
 METRE_DEG = 1 / 111_195  # of latitude
 COST = QueryCost(
-    t_encode_s=0.1, t_match_s=0.1, u_encode=0.5, u_match=0.5, cpu_s=0.1, rss_mb=80.0, used_mah=0.01, marginal_mah=0.01
+    t_encode_s=0.1,
+    t_match_s=0.1,
+    u_encode=0.5,
+    u_match=0.5,
+    cpu_s=0.1,
+    rss_mb=80.0,
+    used_mah=0.01,
+    marginal_mah=0.01,
 )
 
 
@@ -27,27 +40,39 @@ class Bench:
     """A learner over an empty map, and the moment it is."""
 
     def __init__(self, path, places_in_ram=100):
-        self.now_s = 1000.0
+        self.clock = FakeClock()
         self.map = PlaceMap.create(path, TECHNIQUE.spec)
         self.map.index_positions()
-        self.growing = GrowingIndex(place_map=self.map, technique=TECHNIQUE, budget_bytes=10**6, room=places_in_ram)
-        self.learner = Learner(self.map, self.growing, SPACING_M, clock=lambda: self.now_s)
+        self.growing = GrowingIndex(self.map, TECHNIQUE, budget_bytes=10**6, room=places_in_ram)
+        self.recogniser = Recogniser(
+            technique=TECHNIQUE,
+            place_map=self.map,
+            index=self.growing.index,
+            rule=AcceptRule(0.0, 0.0, 50.0),
+            meter=meter_of(load_config(None), load_board("this")),
+        )
+        self.learner = Learner(self.recogniser, self.growing, SPACING_M, self.clock.clock.utc_s)
 
-    def see(self, north_m=0.0, heard_s_ago=0.1, has_gps=True, t_fix_s=None, quality=0.9, position=None):
-        """Show a frame, at a place that the autopilot or the frame itself tells."""
-        frame = Frame(image=np.zeros((8, 8), np.uint8), name=f"{north_m}", t_mono_s=self.now_s, position=position)
+    def see(self, north_m=0.0, heard_s_ago=0.1, has_gps=True, fix=None, quality=0.9, position=None, failed=False):
+        """Show a frame, at a place that the autopilot or the frame itself tells; `fix` is whether its own was sent."""
+        now_s = self.clock.now_s
+        frame = Frame(image=np.zeros((8, 8), np.uint8), name=f"{north_m}", t_mono_s=now_s, position=position)
         vehicle = None
         if heard_s_ago is not None:
-            vehicle = Vehicle(
-                lat_deg=50 + north_m * METRE_DEG,
-                lon_deg=8.0,
-                alt_m=312.0,
-                heading_deg=90.0,
-                t_heard_s=self.now_s - heard_s_ago,
-                has_gps=has_gps,
-            )
+            there = 50 + north_m * METRE_DEG, 8.0, now_s - heard_s_ago
+            vehicle = vehicle_at(*there, alt_m=312.0, heading_deg=90.0, has_gps=has_gps)
         part = np.random.default_rng(int(abs(north_m))).random(TECHNIQUE.spec.coarse.shape).astype("<f2")
-        return self.learner.learn(frame, Descriptor(coarse=part, quality=quality), vehicle, t_fix_s)
+        event = Recognition(
+            frame=frame,
+            vehicle=vehicle,
+            descriptor=Descriptor(coarse=part, quality=quality),
+            reason="",
+            failed=failed,
+            steps=Steps(),
+            cost=COST,
+            fix=None if fix is None else FixReport("0", fix),
+        )
+        return self.learner.learn(event)
 
 
 @pytest.fixture
@@ -61,16 +86,16 @@ def test_a_frame_becomes_a_place_in_file_and_index_where_the_autopilot_is(bench)
     place = bench.see(north_m=40.0)
     assert place.position == Position(50 + 40 * METRE_DEG, 8.0, 312.0)
     (held,) = bench.map.places()
-    assert held.place_id == place.place_id == bench.learner.index.place_ids[0]
+    assert held.place_id == place.place_id == bench.recogniser.index.place_ids[0]
     assert (held.heading_deg, held.quality, held.source_image) == (90.0, 0.9, "40.0")
-    assert held.position.lat_deg == bench.learner.index.lat_deg[0]
+    assert held.position.lat_deg == bench.recogniser.index.lat_deg[0]
     assert held.t_utc_s is not None
     assert bench.learner.learnt == 1
 
 
 def test_a_recordings_own_position_counts_before_the_autopilots_and_is_no_echo(bench):
     own = Position(51.0, 9.0)
-    assert bench.see(position=own, t_fix_s=bench.now_s).position == own
+    assert bench.see(position=own, fix=True).position == own
     assert bench.see(position=Position(52.0, 9.0), heard_s_ago=None) is not None
 
 
@@ -103,7 +128,7 @@ def test_a_place_that_was_given_up_in_ram_is_not_learnt_again(tmp_path):
         for number in range(12):
             assert (bench.see(20.0 * number) is None) == (turn == 1)
     assert len(bench.map) == 12
-    assert len(bench.learner.index) <= 4
+    assert len(bench.recogniser.index) <= 4
     bench.map.close()
 
 
@@ -115,29 +140,38 @@ def test_a_frame_that_says_little_is_left_out(bench, quality):
 
 
 def test_after_a_fix_of_ours_the_autopilot_may_only_repeat_it(bench):
-    sent_s = bench.now_s
-    for seconds, expected in ((0.0, False), (9.9, False), (10.0, True)):
-        bench.now_s = sent_s + seconds
-        assert (bench.see(t_fix_s=sent_s) is not None) == expected
+    sent_s = bench.clock.now_s
+    assert bench.see(fix=True) is None
+    for seconds, expected in ((9.9, False), (10.0, True)):
+        bench.clock.now_s = sent_s + seconds
+        assert (bench.see() is not None) == expected
     assert bench.learner.passed_over == {"just after a fix": 2}
 
 
-def accepted(place_id):
-    candidate = Candidate(Place(place_id=place_id, source_image="a.jpg", position=Position(50.0, 8.0)), FineMatch(0.9))
-    return PlaceMatch("q", 0.0, candidate, True, "score 0.9", Position(50.0, 8.0), 20.0, COST)
+def test_a_fix_that_waits_to_be_sent_may_come_back_and_one_that_was_not_sent_cannot(tmp_path):
+    for fix, learnt in ((None, True), (False, True)):
+        bench = Bench(tmp_path / f"{fix}.gpkg")
+        assert (bench.see(fix=fix) is not None) == learnt
+        bench.map.close()
+    waits = FixReport("0", None)
+    bench = Bench(tmp_path / "waits.gpkg")
+    bench.learner.learn(
+        Recognition(
+            frame=Frame(image=np.zeros((8, 8), np.uint8), name="0", t_mono_s=bench.clock.now_s),
+            reason="",
+            steps=Steps(),
+            cost=COST,
+            descriptor=Descriptor(coarse=np.zeros(1), quality=0.0),
+            fix=waits,
+        )
+    )
+    assert bench.see() is None
+    bench.map.close()
 
 
-def test_a_place_learnt_a_moment_ago_moves_nothing(bench):
-    place = bench.see()
-    bench.now_s += 29.9
-    event = bench.learner.unless_new(accepted(place.place_id))
-    assert (event.accepted, event.position, event.accuracy_m) == (False, None, None)
-    assert "learnt within the last 30 s" in event.reason
-    assert bench.learner.unless_new(accepted(place.place_id + 1)).accepted
-    rejected = replace(accepted(place.place_id), accepted=False, reason="score 0.1")
-    assert bench.learner.unless_new(rejected) is rejected
-    bench.now_s += 0.2
-    assert bench.learner.unless_new(accepted(place.place_id)).accepted
+def test_nothing_is_learnt_from_what_failed(bench):
+    assert bench.see(failed=True) is None
+    assert len(bench.map) == 0
 
 
 def test_trouble_with_the_file_ends_the_learning_and_nothing_else(bench):
@@ -151,7 +185,7 @@ def test_trouble_with_the_file_ends_the_learning_and_nothing_else(bench):
     assert learnt == 1 + len([place for place in places if place]) == len(bench.map)
     bench.map._db.execute("PRAGMA max_page_count = 100000")
     assert bench.see(1000.0) is None, "it has stopped for good"
-    assert len(bench.learner.index) == learnt
+    assert len(bench.recogniser.index) == learnt
     assert "then stopped" in bench.learner.summary
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from edgevpr.errors import UsageError
 from edgevpr.power.boards import board_names, load_board
-from edgevpr.runtime.service.unit import DEFAULT_CONFIG, render_unit
+from edgevpr.runtime.service.unit import render_unit
 
 DEPLOY = Path(__file__).parents[3] / "deploy"
 UNIT = DEPLOY / "edgevpr.service"
@@ -87,7 +87,9 @@ def test_a_configuration_with_an_odd_name_is_handed_over_as_it_is(tmp_path):
 
 @pytest.mark.parametrize("path", ["/home/pi/config.yaml", "/root/c.yaml", "/tmp/c.yaml"])
 def test_a_configuration_that_the_service_cannot_see_is_refused(path):
-    with pytest.raises(UsageError, match=f"^{path} is out of sight of the service.*copy it to {DEFAULT_CONFIG}"):
+    with pytest.raises(
+        UsageError, match=f"^{path} is out of sight of the service.*copy it to /etc/edgevpr/config.yaml"
+    ):
         render_unit(load_board("rpi-zero-2w"), path)
 
 

@@ -1,0 +1,124 @@
+"""What is done with a map: `edgevpr match`, `run`, `check` and `service`."""
+
+import os
+import sys
+import threading
+from argparse import Namespace
+from typing import Any
+
+from edgevpr.cli.shared import (
+    add_json,
+    add_keys,
+    add_parameters,
+    add_positions,
+    add_recording,
+    command,
+    config_of,
+    exit_code,
+    frames_of,
+    leave_out,
+    parameters_of,
+    path_of,
+    print_json,
+)  # fmt: skip
+from edgevpr.errors import ImageError
+
+_MATCHING_KEYS = (
+    "board", "technique", "source.camera", "match.matching", "match.form", "match.candidates", "match.sequence",
+    "match.min_score", "match.min_margin", "memory.budget_mb", "battery.pack",
+)  # fmt: skip
+
+
+def add(commands: Any) -> None:
+    """Add the commands and their flags."""
+    match = command(commands, "match", run_match, "find the places of images in a map, offline")
+    match.add_argument("map", metavar="MAP")
+    add_recording(match)
+    add_parameters(match, "insist on this parameter")
+    add_keys(match, *_MATCHING_KEYS)
+    add_json(match)
+
+    run = command(commands, "run", run_flight, "recognise places in flight and tell the flight controller")
+    run.add_argument("--config", metavar="FILE", help="YAML; flags given here override it")
+    add_keys(run)
+    add_positions(run)
+
+    check = command(commands, "check", run_check, "say whether a configuration would fly")
+    check.add_argument("--config", required=True, metavar="FILE")
+
+    service = command(commands, "service", print_unit, "print the systemd unit for a board")
+    service.add_argument("--board", default="this", metavar="NAME")
+    service.add_argument("--config", metavar="FILE", help="(that of the unit that is shipped)")
+
+
+def run_match(args: Namespace) -> int:
+    """Find the places of a recording in a map."""
+    from edgevpr.frames.source import open_source
+    from edgevpr.geodesy import distance_m
+    from edgevpr.power.boards import load_board
+    from edgevpr.runtime.recognise.opening import open_recogniser
+    from edgevpr.runtime.recognise.recognition import fields_of
+    from edgevpr.techniques.networks.card import weights_of
+
+    config = config_of(args, map=args.map)
+    recogniser = open_recogniser(config, load_board(config.board), settings=parameters_of(args.param))
+    found = []
+    unusable: list[ImageError] = []
+    source = open_source(args.source, positions=path_of(args.positions), live=False)
+    for frame in frames_of(source, "matching", unusable):
+        event = recogniser.step(frame)
+        if event.failed:
+            leave_out(ImageError(f"{frame.name}: {event.reason}"), unusable)
+            continue
+        fields = fields_of(event)
+        here, there = frame.position, fields["position"]
+        if here and there:
+            away_m = distance_m(here.lat_deg, here.lon_deg, there["lat_deg"], there["lon_deg"])
+            fields["error_m"] = round(float(away_m), 2)
+        found.append(fields)
+    if args.json:
+        print_json(found)
+    else:
+        print(f"{'query':<28} {'place':>6} {'reference image':<28} {'score':>6}  accepted  error m")
+        for each in found:
+            error = f"{each['error_m']:8.1f}" if "error_m" in each else "       -"
+            yes = "yes" if each["accepted"] else "no"
+            print(
+                f"{each['query']:<28} {each['place']:>6} {each['reference_image']:<28} {each['score']:6.3f}  {yes:<8}"
+                f" {error}"
+            )
+        print(f"{len(found)} queries, {sum(each['accepted'] for each in found)} accepted")
+        if weights := weights_of(recogniser.technique.spec):
+            print(f"Weights of {weights}.")
+    return exit_code(unusable)
+
+
+def run_flight(args: Namespace) -> int:
+    """Fly."""
+    from edgevpr.runtime.service.fly import fly
+
+    code = fly(config_of(args, args.config), path_of(args.positions))
+    if threading.active_count() > 1:
+        # A capture thread hangs in a stream that does not answer; FFmpeg would abort the end of the interpreter.
+        sys.stderr.flush()
+        os._exit(code)
+    return code
+
+
+def run_check(args: Namespace) -> int:
+    """Say whether a configuration would fly."""
+    from edgevpr.runtime.service.check import check
+
+    findings = check(args.config)
+    for finding in findings:
+        print(f"{'ok   ' if finding.ok else 'WRONG'}  {finding.what:<14} {finding.message}")
+    return 0 if all(finding.ok for finding in findings) else 1
+
+
+def print_unit(args: Namespace) -> int:
+    """Print the systemd unit for a board."""
+    from edgevpr.power.boards import load_board
+    from edgevpr.runtime.service.unit import render_unit
+
+    print(render_unit(load_board(args.board), args.config), end="")
+    return 0

@@ -1,0 +1,59 @@
+"""The command line: what can be asked. Each group of commands stands in a file, its flags beside what it does; what a
+command needs is imported only once it is asked for."""
+
+import argparse
+import logging
+import os
+import sys
+
+from edgevpr import __version__
+from edgevpr.cli import evaluation, flying, maps, networks, profile, simulation
+from edgevpr.errors import EdgevprError
+
+_GROUPS = (maps, flying, profile, evaluation, simulation, networks)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one command; returns the exit code: 0 done, 1 something in the world is wrong, 2 the request is."""
+    args = _parser().parse_args(argv)
+    # Before NumPy is imported: its products here are small, and more threads make them slower and dearer.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    logging.basicConfig(
+        level=logging.DEBUG if args.debug else logging.INFO, format="edgevpr: %(message)s", stream=sys.stderr
+    )
+    try:
+        return args.run(args)
+    except EdgevprError as error:
+        return _failed(args, error, str(error), error.exit_code)
+    except BrokenPipeError:  # the reader of our output has gone (`edgevpr ... | head`)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except OSError as error:
+        what = f"{error.filename}: " if error.filename else ""
+        return _failed(
+            args, error, f"{what}{error.strerror or error}: check the path, its permissions and the disk.", 1
+        )
+    except ImportError as error:
+        return _failed(args, error, f"{error}: a package is missing or broken; install edgevpr again (64-bit OS).", 1)
+    except KeyboardInterrupt:
+        print("edgevpr: stopped; everything confirmed so far is kept.", file=sys.stderr)
+        return 130
+
+
+def _failed(args: argparse.Namespace, error: Exception, sentence: str, exit_code: int) -> int:
+    if args.debug:
+        logging.exception(error)
+    print(f"edgevpr: {sentence}", file=sys.stderr)
+    return exit_code
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="edgevpr", description="Visual place recognition for the companion computer of a small drone."
+    )
+    parser.add_argument("--version", action="version", version=f"edgevpr {__version__}")
+    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    for group in _GROUPS:
+        group.add(commands)
+    return parser

@@ -1,0 +1,173 @@
+"""`edgevpr map`: build, look into, merge and export place maps."""
+
+import sys
+from argparse import Namespace
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from edgevpr.cli.shared import (
+    add_json,
+    add_keys,
+    add_parameters,
+    add_recording,
+    command,
+    exit_code,
+    frames_of,
+    group,
+    leave_out,
+    parameters_of,
+    path_of,
+    print_json,
+    value_of,
+)  # fmt: skip
+from edgevpr.errors import EdgevprError, ImageError, UsageError
+
+
+def add(commands: Any) -> None:
+    """Add the commands and their flags."""
+    maps = group(commands, "map", "build, look into, merge and export place maps")
+    build = command(maps, "build", map_build, "make a map of a flight")
+    build.add_argument("map", metavar="MAP", help="the map file to make, e.g. valley.gpkg")
+    add_recording(build)
+    build.add_argument("--technique", metavar="NAME", help="see `edgevpr profile` (default: by the board)")
+    add_parameters(build, "a parameter of the technique")
+    build.add_argument(
+        "--board", default="this", metavar="NAME", help="the board that will fly (default: this machine)"
+    )
+    add_keys(build, "source.camera")
+    build.add_argument(
+        "--rate-hz", type=_positive, metavar="HZ", help="places a second of a video (default: every frame)"
+    )
+    build.add_argument("--append", action="store_true", help="add to an existing map, going on where it broke off")
+    add_json(build)
+    info = command(maps, "info", map_info, "say what a map holds")
+    info.add_argument("map", metavar="MAP")
+    add_json(info)
+    merge = command(maps, "merge", map_merge, "make one map of several of the same technique")
+    merge.add_argument("out", metavar="OUT", help="the map file to make")
+    merge.add_argument("maps", metavar="MAP", nargs="+")
+    export = command(maps, "export", map_export, "write the places for a map viewer")
+    export.add_argument("map", metavar="MAP")
+    export.add_argument("--geojson", required=True, metavar="FILE", help="GeoJSON file to write, - for standard output")
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not 0 < value < float("inf"):
+        raise ValueError
+    return value
+
+
+def map_build(args: Namespace) -> int:
+    """Make a map of a recording, or go on with one."""
+    from edgevpr.config import load_config
+    from edgevpr.frames.source import open_source
+    from edgevpr.places.mapfile import PlaceMap
+    from edgevpr.power.boards import load_board
+    from edgevpr.runtime.preflight.pick import camera_setting, picked_technique
+    from edgevpr.runtime.recognise.mapping import build_map
+    from edgevpr.runtime.recognise.opening import made_for, meter_of, technique_of
+
+    step_s = 1 / args.rate_hz if args.rate_hz else None
+    source = open_source(args.source, step_s=step_s, positions=path_of(args.positions), live=False)
+    settings, camera, here = parameters_of(args.param), value_of(args, "source.camera"), load_board("this")
+    if args.append and Path(args.map).exists():
+        place_map = PlaceMap.open_for_adding(args.map)
+        asked = settings | ({"camera": camera} if camera else {})
+        technique = technique_of(place_map, args.technique, asked, here)
+    else:
+        if args.technique:
+            name, asked = args.technique, settings | ({"camera": camera} if camera else {})
+        else:
+            name = picked_technique(args.board, source.total or 1, camera)
+            asked = settings | camera_setting(name, camera)
+        technique = made_for(here, name, asked)
+        place_map = PlaceMap.create(args.map, technique.spec)
+    unusable: list[ImageError] = []
+    with place_map:
+        frames = frames_of(source, "mapping", unusable)
+        meter = meter_of(load_config(None), here)
+        result = build_map(frames, technique, place_map, meter, lambda error: leave_out(error, unusable))
+        places = len(place_map)
+    if args.json:
+        print_json({"map": args.map, "technique": technique.spec.name, "places": places, **asdict(result)})
+    else:
+        print(
+            f"{args.map}: {result.added} places added ({result.without_position} without a position), {places} in all"
+        )
+        if result.already_here:
+            print(f"  {result.already_here} images were in the map already")
+    return exit_code(unusable)
+
+
+def map_info(args: Namespace) -> int:
+    """Say what a map holds."""
+    from edgevpr.places.index import bytes_per_place
+    from edgevpr.places.mapfile import PlaceMap
+
+    with PlaceMap.open(args.map) as place_map:
+        info = place_map.info()
+    spec = info.spec
+    ram_mb = info.places * bytes_per_place(spec) / 1e6
+    if args.json:
+        print_json({**asdict(info), "bytes_per_place": bytes_per_place(spec), "ram_mb": ram_mb})
+        return 0
+    settings = ", ".join(f"{key} {value}" for key, value in spec.parameters.items())
+    print(f"{info.path}: {info.places} places, {info.with_position} with a position")
+    print(f"  technique   {spec.name} ({settings})" + (f", model {spec.model_sha256}" if spec.model_sha256 else ""))
+    if info.extent:
+        south, west, north, east = info.extent
+        print(f"  extent      {south:.6f}..{north:.6f} north, {west:.6f}..{east:.6f} east")
+    if info.first_time:
+        print(f"  time        {info.first_time} to {info.last_time}")
+    if info.mean_quality is not None:
+        print(f"  quality     {info.mean_quality:.2f} on average (share of the image that says anything)")
+    print(f"  size        {info.file_bytes / 1e6:.1f} MB on disk, {ram_mb:.2f} MB in RAM ({info.made_by})")
+    return 0
+
+
+def map_merge(args: Namespace) -> int:
+    """Make one map of several, as a whole or not at all."""
+    from edgevpr.places.mapfile import PlaceMap
+    from edgevpr.runtime.recognise.opening import technique_of
+
+    inputs = [PlaceMap.open(path) for path in args.maps]
+    technique_of(inputs[0])
+    for other in inputs[1:]:
+        other.require(inputs[0].spec)
+    with PlaceMap.create(args.out, inputs[0].spec) as merged:
+        try:
+            for path, place_map in zip(args.maps, inputs, strict=True):
+                copied, already_here = merged.absorb(place_map)
+                print(f"{path}: {copied} places copied" + (f", {already_here} there already" if already_here else ""))
+                place_map.close()
+        except EdgevprError:
+            Path(args.out).unlink()  # half a merge would look like a whole one
+            raise
+        print(f"{args.out}: {len(merged)} places")
+    return 0
+
+
+def map_export(args: Namespace) -> int:
+    """Write the places as GeoJSON."""
+    from edgevpr.helpers.files import require_folder, write_whole
+    from edgevpr.places.geojson import write_geojson
+    from edgevpr.places.mapfile import PlaceMap
+
+    with PlaceMap.open(args.map) as place_map:
+        if args.geojson == "-":
+            write_geojson(place_map, sys.stdout)
+            return 0
+        out_path = Path(args.geojson)
+        if out_path.exists() and out_path.samefile(args.map):
+            raise UsageError(f"--geojson {out_path} is the map itself: give another name.")
+        require_folder(out_path)
+
+        def write(unfinished: Path) -> int:
+            with open(unfinished, "w", encoding="utf-8") as out:
+                return write_geojson(place_map, out)
+
+        count = write_whole(out_path, write)
+    print(f"{out_path}: {count} places")
+    return 0

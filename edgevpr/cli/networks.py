@@ -1,0 +1,195 @@
+"""`edgevpr train` and `models`: networks trained on one's own pictures, tried, listed and added."""
+
+import sys
+from argparse import ArgumentParser, Namespace
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from edgevpr.cli.shared import add_json, command, exit_code, group, path_of, print_json
+from edgevpr.errors import EdgevprError, ImageError, ModelError, UsageError
+
+if TYPE_CHECKING:
+    from edgevpr.runtime.preflight.networks import Verified
+
+
+def add(commands: Any) -> None:
+    """Add the commands and their flags."""
+    _add_train(group(commands, "train", "train a network on your own pictures (needs edgevpr[train])"))
+    _add_models(group(commands, "models", "list, try and add the networks that techniques use"))
+
+
+def _add_train(trainings: Any) -> None:
+    calc = command(trainings, "calc", train_calc, "train the CALC autoencoder; no labels are needed")
+    _add_images(calc)
+    calc.add_argument("--out", required=True, metavar="FILE.onnx", help="the model to make; its card lies beside")
+    calc.add_argument("--steps", type=int, default=4000, metavar="N", help="batches of 32 pictures (4000)")
+    calc.add_argument("--seed", type=int, default=1, metavar="N", help="(1)")
+    calc.add_argument("--resume", action="store_true", help="go on with a training that was stopped")
+    add_json(calc)
+    words = command(trainings, "words", train_words, "learn the words that vlad, regions or bow count")
+    _add_images(words)
+    words.add_argument("--model", default="calc", metavar="NAME", help="the card of the backbone (calc)")
+    words.add_argument("--kind", required=True, choices=("vlad", "regions", "bow"), help="what the words are of")
+    words.add_argument("--count", type=int, required=True, metavar="N", help="the number of words")
+    words.add_argument("--whiten", type=int, metavar="D", help="also learn a whitening to D values (vlad)")
+    words.add_argument("--out", metavar="DIR", help="folder to write to (default: your models folder)")
+    words.add_argument("--seed", type=int, default=1, metavar="N", help="(1)")
+    add_json(words)
+
+
+def _add_images(parser: ArgumentParser) -> None:
+    parser.add_argument("--images", required=True, nargs="+", metavar="DIR", help="folders of images")
+
+
+def _add_models(models: Any) -> None:
+    add_json(command(models, "list", models_list, "say which networks there are, whose weights, and what uses them"))
+    verify = command(models, "verify", models_verify, "run networks here: do they work, and what do they take")
+    verify.add_argument("name", metavar="NAME", nargs="?", help="a network (default: all)")
+    add_json(verify)
+    adding = command(models, "add", models_add, "try a network, and copy it and its card to your models folder")
+    adding.add_argument("file", metavar="FILE.onnx")
+    adding.add_argument("--card", required=True, metavar="CARD.yaml", help="its name is that of the network")
+    add_json(adding)
+    quantise = command(models, "quantise", models_quantise, "make NAME_int8 of a network (needs edgevpr[train])")
+    quantise.add_argument("name", metavar="NAME")
+    quantise.add_argument("--calibrate", required=True, metavar="DIR", help="images like those of the flight")
+    quantise.add_argument("--query", metavar="DIR", help="with --ref and --ground-truth: recall before and after")
+    quantise.add_argument("--ref", metavar="DIR")
+    quantise.add_argument("--ground-truth", metavar="CSV")
+    add_json(quantise)
+
+
+def train_calc(args: Namespace) -> int:
+    """Train the CALC autoencoder."""
+    from edgevpr.training import job
+
+    unusable: list[ImageError] = []
+    result = job.train_calc(args.images, Path(args.out), args.steps, args.seed, args.resume, unusable)
+    if args.json:
+        print_json(asdict(result))
+    else:
+        print(
+            f"{result.model} and {result.card}: {result.steps} steps on {result.pictures} images, equal to PyTorch to "
+            f"{result.largest_difference:.1e}"
+        )
+    return exit_code(unusable)
+
+
+def train_words(args: Namespace) -> int:
+    """Learn words."""
+    from edgevpr.training import words
+
+    unusable: list[ImageError] = []
+    result = words.train_words(
+        args.images, args.model, args.kind, args.count, args.whiten, path_of(args.out), args.seed, unusable
+    )
+    if args.json:
+        print_json(asdict(result))
+    else:
+        print(
+            f"{result.file}: {args.count} words of {result.descriptors} descriptors in {result.pictures} images, mean "
+            f"square distance {result.distance:.3f}"
+        )
+    return exit_code(unusable)
+
+
+def models_list(args: Namespace) -> int:
+    """List every card, whether or not it can be used."""
+    from edgevpr.resources import model_folders
+    from edgevpr.runtime.preflight.networks import list_models
+
+    found = list_models()
+    if args.json:
+        print_json([asdict(each) for each in found])
+        return 0
+    for each in found:
+        print(f"{each.name:<20} {'ok   ' if each.ok else 'WRONG'}  {each.title or ''}")
+        if each.title:
+            head = f", head {each.head}" if each.head else ""
+            print(f"{'':<27} {each.licence}; {each.source}")
+            print(f"{'':<27} {each.file}; {' and '.join(each.outputs)}{head}")
+            print(f"{'':<27} used by {', '.join(each.techniques) or 'none, unless told: --param model=' + each.name}")
+        if each.problem:
+            print(f"{'':<27} {each.problem}")
+    print(f"{len(found)} networks in {' and '.join(map(str, model_folders()))}")
+    return 0
+
+
+def models_verify(args: Namespace) -> int:
+    """Run networks, and say what they take."""
+    from edgevpr.power.boards import load_board
+    from edgevpr.runtime.preflight.networks import verify
+    from edgevpr.techniques.networks.card import card_names, load_card
+
+    threads = load_board("this").threads
+    names = [args.name] if args.name else card_names()
+    if not names:
+        raise ModelError("There is no network yet: add one with `edgevpr models add FILE.onnx --card CARD.yaml`.")
+    works, wrong = [], {}
+    for name in names:
+        try:
+            works.append(verify(load_card(name), threads))
+            if not args.json:
+                print(_verified_text(works[-1]))
+        except EdgevprError as error:
+            wrong[name] = str(error)
+    if args.json:
+        print_json({"works": [asdict(each) for each in works], "wrong": wrong})
+    for name, problem in wrong.items():
+        print(f"edgevpr: {name} cannot be used: {problem}", file=sys.stderr)
+    return 1 if wrong else 0
+
+
+def models_add(args: Namespace) -> int:
+    """Try a network and add it."""
+    from edgevpr.power.boards import load_board
+    from edgevpr.runtime.preflight.networks import add
+
+    verified, card = add(Path(args.file), Path(args.card), load_board("this").threads)
+    if args.json:
+        print_json({"card": str(card), **asdict(verified)})
+    else:
+        print(f"{_verified_text(verified)}\nadded as {card}")
+    return 0
+
+
+def models_quantise(args: Namespace) -> int:
+    """Make a network of 8-bit integers, and say what it is worth."""
+    from edgevpr.evaluate.dataset import load_dataset
+    from edgevpr.evaluate.evaluate import evaluate as measured
+    from edgevpr.helpers.progress import progress
+    from edgevpr.power.boards import load_board
+    from edgevpr.runtime.preflight.networks import technique_with
+    from edgevpr.training.quantise import quantise
+
+    data = (args.query, args.ref, args.ground_truth)
+    if any(data) and not all(data):
+        raise UsageError("Recall needs all of --query, --ref and --ground-truth: give those that are missing, or none.")
+    dataset = load_dataset(*data) if all(data) else None
+    result = quantise(args.name, Path(args.calibrate), load_board("this").threads)
+    recall = None
+    if dataset:
+        recall = {
+            each.name: measured(technique, dataset, settings, progress=progress).recall_at_1
+            for each in (result.before, result.after)
+            for technique, settings in [technique_with(each.name)]
+        }
+    if args.json:
+        print_json({**asdict(result), "recall_at_1": recall})
+        return 0
+    for each in (result.before, result.after):
+        print(_verified_text(each) + (f", recall@1 {recall[each.name]:.3f}" if recall else ""))
+    print(f"calibrated with {result.images} images, written as {result.card}")
+    return 0
+
+
+def _verified_text(verified: "Verified") -> str:
+    shapes = ", ".join(f"{output} {'x'.join(map(str, shape))}" for output, shape in verified.shapes.items())
+    vector = f"a descriptor of {verified.vector_length} numbers, " if verified.vector_length else ""
+    return (
+        f"{verified.name}: {verified.title}\n"
+        f"  works: {shapes}; {vector}{verified.image_ms:.1f} ms an image, threads: {verified.threads}, "
+        f"{verified.network_mb:.0f} MB of RAM beside {verified.runtime_mb:.0f} of onnxruntime, "
+        f"{verified.file_mb:.2f} MB on disk"
+    )

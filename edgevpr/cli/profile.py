@@ -1,0 +1,173 @@
+"""`edgevpr profile`: what each technique costs a board in RAM and battery, said before take-off."""
+
+import sys
+from argparse import ArgumentParser, Namespace
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from edgevpr.cli.shared import add_json, add_keys, command, print_json, value_of
+from edgevpr.errors import EdgevprError, UsageError
+
+if TYPE_CHECKING:
+    from edgevpr.power.boards import Board
+    from edgevpr.runtime.preflight.estimate import FlightPlan
+    from edgevpr.runtime.preflight.offers import Offer
+
+
+def add(commands: Any) -> None:
+    """Add the command and its flags."""
+    parser = command(commands, "profile", profile, "say before take-off what each technique costs in RAM and battery")
+    parser.add_argument("--board", default="this", metavar="NAME", help="a board, or `this` (default); see --list")
+    parser.add_argument("--list", action="store_true", help="list the boards")
+    _add_plan(parser)
+    parser.add_argument(
+        "--plot", metavar="FILE", help="draw RAM against charge, and the map's memory (.png, .pdf, .svg)"
+    )
+    own = parser.add_mutually_exclusive_group()
+    own.add_argument("--detect", action="store_true", help="say which board this is, and why; --out writes a profile")
+    own.add_argument(
+        "--measure",
+        action="store_true",
+        help="measure every technique here, and the power if there is a meter; keep it",
+    )
+    parser.add_argument("--images", metavar="DIR", help="pictures to measure on (default: generated ones)")
+    parser.add_argument("--out", metavar="FILE", help="where --detect (.yaml) or --measure (.json) write to")
+    add_json(parser)
+
+
+def _add_plan(parser: ArgumentParser) -> None:
+    places = parser.add_mutually_exclusive_group()
+    places.add_argument("--map", metavar="MAP", help="the map to fly with")
+    places.add_argument("--places", type=int, metavar="N", help="the number of places to fly with")
+    parser.add_argument("--flight-min", type=float, default=20.0, metavar="MIN", help="length of the flight (20)")
+    add_keys(parser, "source.rate_hz", "memory.budget_mb", "battery.pack")
+    parser.add_argument("--hover-w", type=float, metavar="W", help="what the aircraft draws to hover: minutes lost")
+
+
+def profile(args: Namespace) -> int:
+    """Estimate all techniques for a flight, or list, detect or measure boards."""
+    from edgevpr.helpers.figures import require_picture
+    from edgevpr.helpers.progress import progress
+    from edgevpr.power.boards import board_names, load_board
+    from edgevpr.runtime.preflight.choose import require_technique
+    from edgevpr.runtime.preflight.estimate import estimate
+    from edgevpr.runtime.preflight.estimate_text import format_table
+    from edgevpr.runtime.preflight.stored import default_path, known_and_tried, load, scaled_from
+
+    if args.list:
+        for name in board_names():
+            print(f"{name:<20} {load_board(name).title}")
+        return 0
+    if args.out and not (args.detect or args.measure):
+        raise UsageError("--out is for --detect and --measure: name one of them too.")
+    if args.images and not args.measure:
+        raise UsageError("--images is for --measure: give both.")
+    asked = args.map is not None or args.places is not None
+    if args.detect:
+        if asked or args.plot:
+            raise UsageError("--detect says what this machine is: ask what a flight costs without it.")
+        return _detect(args)
+    if not asked and (args.plot or not args.measure):
+        raise UsageError("Say how many places will be flown with: --map MAP, or --places N.")
+    if args.plot:
+        require_picture(Path(args.plot))
+    board = load_board(args.board)
+    require_technique(board)
+    plan, map_technique, wanted = _plan(args, board) if asked else (None, None, ())
+    code = _measure(args, quiet=asked) if args.measure else 0
+    if plan is None:
+        return code
+    stored, refused = load(Path(args.out) if args.measure and args.out else default_path())
+    if refused:
+        print(f"edgevpr: {refused}", file=sys.stderr)
+    trials = progress(known_and_tried(wanted, board, stored), len(wanted), "trying techniques")
+    here = scaled_from(load_board("this"), board, stored)
+    result = estimate(board, here, trials, plan, map_technique, stored.date if stored else None)
+    if args.plot:
+        from edgevpr.runtime.preflight.chart import plot
+
+        plot(result, board, Path(args.plot))
+    if args.json:
+        print_json(asdict(result))
+    else:
+        print(format_table(result))
+    return code
+
+
+def _plan(args: Namespace, board: "Board") -> "tuple[FlightPlan, str | None, tuple[Offer, ...]]":
+    """Read what is asked, the technique of the map if there is one, and what is to be tried."""
+    from edgevpr import techniques
+    from edgevpr.config import load_config
+    from edgevpr.places.mapfile import PlaceMap
+    from edgevpr.power.equations import parse_pack
+    from edgevpr.runtime.preflight.estimate import FlightPlan
+    from edgevpr.runtime.preflight.offers import offers
+
+    settings, places, map_technique = {}, args.places, None
+    if args.map:
+        with PlaceMap.open(args.map) as place_map:
+            places, map_technique = len(place_map), place_map.spec.name
+            settings[map_technique] = place_map.spec.parameters
+    rate_hz, budget_mb = value_of(args, "source.rate_hz"), value_of(args, "memory.budget_mb")
+    battery = load_config(None, {"battery.pack": value_of(args, "battery.pack")}).battery
+    plan = FlightPlan(
+        places=places,
+        rate_hz=board.rate_hz if rate_hz is None else rate_hz,
+        flight_min=args.flight_min,
+        pack=parse_pack(battery.pack),
+        regulator_efficiency=battery.regulator_efficiency,
+        budget_mb=board.budget_mb if budget_mb is None else budget_mb,
+        hover_w=args.hover_w,
+    )
+    return plan, map_technique, offers(techniques.names(), settings=settings)
+
+
+def _detect(args: Namespace) -> int:
+    from edgevpr.power.detect import detect, findings, profile_text
+    from edgevpr.runtime.preflight.ownprofile import require_new_profile, write_profile
+    from edgevpr.runtime.preflight.stored import micro_benchmark
+
+    found = detect()
+    if args.out:
+        require_new_profile(Path(args.out))
+    if args.json:
+        print_json(asdict(found))
+    else:
+        print("\n".join(findings(found)))
+    if args.out:
+        write_profile(Path(args.out), profile_text(found, micro_benchmark()))
+        print(f"edgevpr: {args.out} is written: use it with --board {args.out}.", file=sys.stderr)
+    elif found.board is None and not args.json:
+        print("--out FILE.yaml writes a profile of it.")
+    return 0
+
+
+def _measure(args: Namespace, quiet: bool) -> int:
+    """Measure this machine and keep the figures; `quiet` leaves the table to who asked for more."""
+    from edgevpr import techniques
+    from edgevpr.helpers.progress import progress
+    from edgevpr.power.boards import load_board
+    from edgevpr.runtime.preflight import stored
+    from edgevpr.runtime.preflight.offers import offers
+    from edgevpr.runtime.preflight.ownprofile import measured_profile
+    from edgevpr.runtime.preflight.stored_text import format_stored
+
+    path = Path(args.out) if args.out else stored.default_path()
+    stored.require_room(path, make=not args.out)
+    images, pictures = stored.pictures_of(args.images)
+    threads, wanted = load_board("this").threads, offers(techniques.names())
+    speed = stored.micro_benchmark()
+    trials = progress(stored.measure_each(wanted, threads, images), len(wanted), "measuring techniques")
+    found = stored.gathered(trials, pictures, threads, speed)
+    stored.save(found, path)
+    try:
+        own, said = measured_profile(path, speed)
+    except EdgevprError as error:
+        own, said = None, str(error)
+    if args.json and not quiet:
+        print_json({**asdict(found), "file": str(path), "profile": own and str(own), "power": said})
+    elif not args.json:
+        print(format_stored(found))
+        print(f"Kept in {path}.\n{said}\n" if quiet else f"Kept in {path}.\n{said}")
+    return 0

@@ -1,0 +1,136 @@
+"""What the commands share: flags, the configuration that they make, and how results and troubles are said."""
+
+import json
+import sys
+from argparse import SUPPRESS, ArgumentParser, Namespace
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from edgevpr.config import Config, flagged_keys, load_config
+from edgevpr.errors import ImageError, UsageError
+
+if TYPE_CHECKING:
+    from edgevpr.frames.source import Source
+    from edgevpr.types import Frame
+
+_KEY = "key "  # begins the name under which argparse keeps the value of a flag that is a key of the configuration
+_READ_TIMEOUT_S = 1.0
+_RECORDING = "a folder of images or a video file"
+
+
+def command(commands: Any, name: str, run: Callable[[Namespace], int], text: str) -> ArgumentParser:
+    """Add a command that calls `run` with the parsed arguments, and give its parser."""
+    parser = _parser(commands, name, text)
+    parser.set_defaults(run=run)
+    return parser
+
+
+def group(commands: Any, name: str, text: str) -> Any:
+    """Add a command that has commands of its own, and give what those are added to."""
+    return _parser(commands, name, text).add_subparsers(title="commands", required=True, metavar="COMMAND")
+
+
+def _parser(commands: Any, name: str, text: str) -> ArgumentParser:
+    parser = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+    # Also after the command, where everybody types it.
+    parser.add_argument("--debug", action="store_true", default=SUPPRESS, help=SUPPRESS)
+    return parser
+
+
+def add_json(parser: ArgumentParser) -> None:
+    """Add --json."""
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def add_recording(parser: ArgumentParser) -> None:
+    """Add the recording that frames come from."""
+    parser.add_argument("--images", "--source", dest="source", required=True, metavar="SOURCE", help=_RECORDING)
+    add_positions(parser)
+
+
+def add_positions(parser: ArgumentParser) -> None:
+    """Add the positions that go with a folder of images."""
+    parser.add_argument(
+        "--positions", metavar="CSV", help="file,lat,lon[,alt,yaw_deg,time] (default: beside the images)"
+    )
+
+
+def add_parameters(parser: ArgumentParser, text: str, form: str = "KEY=VALUE") -> None:
+    """Add --param, for parameters of a technique; it may be given several times."""
+    parser.add_argument("--param", action="append", default=[], metavar=form, help=text)
+
+
+def add_keys(parser: ArgumentParser, *names: str, **texts: str) -> None:
+    """Add the flags of the named keys of the configuration, of all of them where none is named. `texts`, by the last
+    part of a name, replace the help of some."""
+    for key in flagged_keys():
+        if names and key.name not in names:
+            continue
+        flag = key.flag
+        text = texts.get(key.name.rpartition(".")[2], flag.text)
+        if key.kind is bool:
+            parser.add_argument(*flag.names, dest=_KEY + key.name, action="store_true", default=None, help=text)
+        elif flag.choices:
+            parser.add_argument(*flag.names, dest=_KEY + key.name, choices=flag.choices, help=text)
+        else:
+            parser.add_argument(*flag.names, dest=_KEY + key.name, type=key.kind, metavar=flag.metavar, help=text)
+
+
+def value_of(args: Namespace, name: str) -> Any:
+    """Give what was said of a key of the configuration, None where nothing was."""
+    return getattr(args, _KEY + name)
+
+
+def config_of(args: Namespace, path: str | None = None, **others: Any) -> Config:
+    """Make the configuration: the file `path`, if there is one, under the flags and `others`."""
+    said = {name.removeprefix(_KEY): value for name, value in vars(args).items() if name.startswith(_KEY)}
+    return load_config(path, said | others)
+
+
+def parameters_of(pairs: list[str]) -> dict[str, str]:
+    """Read ["gt=0.4"] as {"gt": "0.4"}. Raises UsageError for another form."""
+    for pair in pairs:
+        if "=" not in pair:
+            raise UsageError(f"--param {pair}: write KEY=VALUE, e.g. gt=0.4.")
+    return dict(pair.split("=", 1) for pair in pairs)
+
+
+def path_of(text: str | None) -> Path | None:
+    """Read a path that need not be given."""
+    return Path(text) if text else None
+
+
+def frames_of(source: "Source", label: str, unusable: list[ImageError]) -> "Iterator[Frame]":
+    """Read every frame of a source that ends, with progress; an image that cannot be used is said, kept in `unusable`,
+    and left out."""
+    from edgevpr.helpers.progress import progress
+
+    def until_it_ends() -> "Iterator[Frame | None]":
+        while not source.ended:
+            try:
+                yield source.read(_READ_TIMEOUT_S)
+            except ImageError as error:
+                leave_out(error, unusable)
+                yield None
+        source.close()
+
+    return (frame for frame in progress(until_it_ends(), source.total, label) if frame is not None)
+
+
+def leave_out(error: ImageError, unusable: list[ImageError]) -> None:
+    """Say that an image cannot be used, and keep that in `unusable`."""
+    print(f"edgevpr: {error}", file=sys.stderr)
+    unusable.append(error)
+
+
+def exit_code(unusable: list[ImageError]) -> int:
+    """Sum up what could not be used: 1, and a sentence, where there is anything."""
+    if unusable:
+        print(f"edgevpr: {len(unusable)} images could not be used (named above).", file=sys.stderr)
+    return 1 if unusable else 0
+
+
+def print_json(value: Any) -> None:
+    """Print a result for programs."""
+    print(json.dumps(value, indent=2, default=str))

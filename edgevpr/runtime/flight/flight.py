@@ -1,0 +1,104 @@
+"""A flight with everything that has been opened for it: the listeners are wired to the loop, and it turns."""
+
+from dataclasses import dataclass
+
+from edgevpr.config import Config
+from edgevpr.frames.source import Source
+from edgevpr.power.equations import parse_pack
+from edgevpr.runtime.flight.autopilot import Autopilot
+from edgevpr.runtime.flight.clock import Clock
+from edgevpr.runtime.flight.flightlog import FlightLog
+from edgevpr.runtime.flight.governing import Governing
+from edgevpr.runtime.flight.learning import Learning
+from edgevpr.runtime.flight.loop import Observer, Stop, loop
+from edgevpr.runtime.flight.metering import FlightMeter
+from edgevpr.runtime.flight.pace import Pace
+from edgevpr.runtime.flight.querylog import QueryLog
+from edgevpr.runtime.flight.tally import Tally
+from edgevpr.runtime.flight.vitals import Vitals
+from edgevpr.runtime.recognise.learn import Learner
+from edgevpr.runtime.recognise.recogniser import Recogniser
+
+
+@dataclass(frozen=True, slots=True)
+class Flown:
+    """What a flight came to: counts of its events, and `totals` of what it took (see `FlightMeter.totals`)."""
+
+    queries: int
+    accepted: int
+    failed: int
+    totals: dict[str, float | int | None]
+
+
+def rate_hz(config: Config, recogniser: Recogniser) -> float:
+    """Say how often a place is asked for: as often as the configuration says, else as the board's profile does."""
+    return config.source.rate_hz or recogniser.meter.board.rate_hz
+
+
+def fly(
+    recogniser: Recogniser,
+    source: Source,
+    config: Config,
+    *,
+    flight_log: FlightLog,
+    autopilot: Autopilot,
+    stop: Stop,
+    learner: Learner | None = None,
+    smaller_forms: tuple[str, ...] = (),
+    clock: Clock | None = None,
+    meter: FlightMeter | None = None,
+) -> Flown:
+    """Fly until the source has ended or `stop` is asked.
+
+    `learner` makes places (None: nothing is learnt); `smaller_forms` of the index are what the governor may take.
+    `clock` and `meter` are the real ones unless given.
+    """
+    clock = clock or Clock()
+    if meter is None:
+        battery = config.battery
+        pack, efficiency = parse_pack(battery.pack), battery.regulator_efficiency
+        meter = FlightMeter(recogniser.meter.board, pack, efficiency, clock=clock)
+    tally, pace = Tally(), Pace(rate_hz(config, recogniser), clock)
+    governing = Governing(
+        recogniser,
+        pace,
+        config,
+        meter=meter,
+        flight_log=flight_log,
+        autopilot=autopilot,
+        clock=clock,
+        smaller_forms=smaller_forms,
+    )
+    vitals = Vitals(
+        source=source,
+        flight_log=flight_log,
+        autopilot=autopilot,
+        meter=meter,
+        tally=tally,
+        clock=clock,
+        remarks=(
+            lambda: autopilot.summary,
+            lambda: governing.held,
+            lambda: learner and learner.summary,
+        ),
+    )
+    observers: list[Observer] = [tally, QueryLog(flight_log, source, meter, tally)]
+    if learner:
+        observers.append(Learning(learner, flight_log, autopilot))
+    try:
+        loop(
+            source,
+            recogniser,
+            autopilot,
+            observers,
+            governing=governing,
+            vitals=vitals,
+            meter=meter,
+            pace=pace,
+            clock=clock,
+            stop=stop,
+        )
+    finally:
+        meter.close()
+    totals = {"queries": tally.queries, **meter.totals(), "dropped": source.dropped}
+    return Flown(tally.queries, tally.accepted, tally.unusable + tally.failed, totals)

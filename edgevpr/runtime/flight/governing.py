@@ -1,0 +1,109 @@
+"""Doing what the governor says: another rate, fewer candidates, another form of the index."""
+
+import logging
+from dataclasses import asdict
+
+from edgevpr.config import Config
+from edgevpr.power.thermal import limit_c
+from edgevpr.runtime.flight.autopilot import Autopilot, Mood
+from edgevpr.runtime.flight.clock import Clock
+from edgevpr.runtime.flight.flightlog import FlightLog
+from edgevpr.runtime.flight.governor import Change, Governor, Limits, Setting, lowered, steps
+from edgevpr.runtime.flight.metering import FlightMeter
+from edgevpr.runtime.flight.pace import Pace
+from edgevpr.runtime.recognise.opening import take_form
+from edgevpr.runtime.recognise.recogniser import Recogniser
+
+GOVERN_S = 1.0
+_RELOAD_S = 10.0  # between two tries to load an index that could not be loaded
+
+_log = logging.getLogger(__name__)
+
+
+class Governing:
+    """Keeps a recogniser and its pace within the limits of the board. What is lowered, or is back, is logged and said
+    once. `smaller_forms` of the index may be taken (see `TechniqueSpec`)."""
+
+    def __init__(
+        self,
+        recogniser: Recogniser,
+        pace: Pace,
+        config: Config,
+        *,
+        meter: FlightMeter,
+        flight_log: FlightLog,
+        autopilot: Autopilot,
+        clock: Clock,
+        smaller_forms: tuple[str, ...] = (),
+    ) -> None:
+        self._recogniser, self._pace, self._config = recogniser, pace, config
+        self._meter, self._flight_log, self._autopilot, self._clock = meter, flight_log, autopilot, clock
+        self._index_mb = {recogniser.technique.spec.form: recogniser.index.nbytes / 1e6}
+        self._governor = _governor(recogniser, pace, smaller_forms, self._index_mb)
+        self._wanted_form: str | None = None  # one that could not be loaded
+        self._reload_due_s = 0.0
+
+    @property
+    def held(self) -> str | None:
+        """Say what is lowered to keep to the board's limits."""
+        what = lowered(self._governor.setting, self._governor.asked)
+        return f"held to {what}" if what else None
+
+    def look(self) -> None:
+        """Look at what the flight takes, once a second, and change what must be changed."""
+        if self._wanted_form:  # what a flight takes that recognises nothing says nothing
+            if self._clock.mono_s() >= self._reload_due_s:
+                self._load(self._wanted_form)
+            return
+        if self._meter.age_s < GOVERN_S:
+            return
+        change = self._governor.look(self._clock.mono_s(), self._meter.reading())
+        if change is None:
+            return
+        self._say(change)
+        self._pace.set_rate(change.after.rate_hz)
+        self._recogniser.candidates = change.after.candidates
+        if change.after.form != change.before.form:
+            self._load(change.after.form)
+
+    def _load(self, form: str) -> None:
+        """Load the index in another form. Where the map cannot be read any more, nothing is recognised, which is said,
+        and it is tried again and again: it may come back."""
+        first = self._wanted_form is None
+        try:
+            take_form(self._recogniser, self._config, form)
+        except Exception as error:
+            self._wanted_form, self._reload_due_s = form, self._clock.mono_s() + _RELOAD_S
+            self._recogniser.lose_index(error)
+            if first:
+                _log.warning("the index cannot be loaded as %s: %s", form, error)
+                self._flight_log.write("index lost", form=form, problem=str(error))
+                self._autopilot.announce(Mood.WARNING, "its map cannot be read, see its log")
+            return
+        self._wanted_form = None
+        self._index_mb[form] = self._recogniser.index.nbytes / 1e6
+        self._meter.reading()  # what loading took says nothing of flying
+
+    def _say(self, change: Change) -> None:
+        said = self.held or "back to what was asked"
+        text = said
+        if change.before == change.after:
+            said, text = "over a limit of the board", "over a limit of its board, see its log"
+        _log.log(logging.INFO if change.back else logging.WARNING, "%s: %s", said, change.why)
+        fields = {"from": asdict(change.before), "to": asdict(change.after), "why": change.why}
+        self._flight_log.write("governor", **fields)
+        self._autopilot.announce(Mood.NOTE if change.back else Mood.WARNING, text)
+
+
+def _governor(
+    recogniser: Recogniser, pace: Pace, smaller_forms: tuple[str, ...], index_mb: dict[str | None, float]
+) -> Governor:
+    """Make what keeps a recogniser within its board's profile. Candidates of a scan alone are none, and a sequence
+    needs queries as often as the map was made."""
+    board, spec = recogniser.meter.board, recogniser.technique.spec
+    hottest_c = limit_c() if board.thermal_limit_c is None else board.thermal_limit_c
+    in_sequence = recogniser.search.length > 1
+    asked = Setting(pace.rate_hz, recogniser.candidates, spec.form)
+    compares = spec.fine is not None and not in_sequence  # a sequence wants rivals compared
+    settings = steps(asked, in_sequence, compares, smaller_forms)
+    return Governor(Limits(board.cpu_share, board.memory_max_mb, hottest_c), settings, index_mb)

@@ -1,0 +1,36 @@
+"""Counting the events of a flight."""
+
+import logging
+
+from edgevpr.runtime.recognise.recognition import Recognition
+
+FAILURES_IN_A_ROW = 10  # one may be a bad frame; so many are a fault of the camera, the map or the technique
+
+
+_log = logging.getLogger(__name__)
+
+
+class Tally:
+    """Counts of a flight, told of every event: `queries` and how many of them were `accepted`; `unusable` frames that
+    never became a query; `failed` queries; and how many events have `failed_in_a_row` up to the last."""
+
+    def __init__(self) -> None:
+        self._trouble: str | None = None
+        self.queries = self.accepted = self.unusable = self.failed = self.failed_in_a_row = 0
+
+    def tell(self, event: Recognition) -> None:
+        """Count an event; what fails is said, once for all in a row that fail alike."""
+        trouble = event.reason if event.failed else None
+        if trouble and trouble != self._trouble:
+            _log.warning("%s", trouble)
+        self._trouble = trouble
+        self.queries += event.is_query
+        self.accepted += event.accepted
+        self.unusable += not event.is_query
+        self.failed += event.is_query and event.failed
+        self.failed_in_a_row = self.failed_in_a_row + 1 if event.failed else 0
+
+    @property
+    def is_failing(self) -> bool:
+        """Say whether nothing has worked for too long."""
+        return self.failed_in_a_row >= FAILURES_IN_A_ROW

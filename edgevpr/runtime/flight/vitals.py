@@ -1,0 +1,78 @@
+"""How a flight is, told once a second, and the watchdog's beat."""
+
+import logging
+from collections.abc import Callable, Sequence
+
+from edgevpr.frames.condition import Condition
+from edgevpr.frames.source import Source
+from edgevpr.power.load import machine_load
+from edgevpr.runtime.flight.autopilot import Autopilot, Mood
+from edgevpr.runtime.flight.clock import Clock
+from edgevpr.runtime.flight.flightlog import FlightLog
+from edgevpr.runtime.flight.metering import FlightMeter
+from edgevpr.runtime.flight.systemd import notify, watchdog_interval_s
+from edgevpr.runtime.flight.tally import FAILURES_IN_A_ROW, Tally
+
+_HEALTH_S = 1.0
+
+_log = logging.getLogger(__name__)
+
+
+class Vitals:
+    """Tells systemd that the loop turns and how it goes, the autopilot how this companion is, and everybody, once, when
+    the camera is lost or nothing can be recognised any more, and when that is over. `remarks` add to the status."""
+
+    def __init__(
+        self,
+        *,
+        source: Source,
+        flight_log: FlightLog,
+        autopilot: Autopilot,
+        meter: FlightMeter,
+        tally: Tally,
+        clock: Clock,
+        remarks: Sequence[Callable[[], str | None]] = (),
+    ) -> None:
+        self._source, self._flight_log, self._autopilot = source, flight_log, autopilot
+        self._meter, self._tally, self._clock, self._remarks = meter, tally, clock, remarks
+        self._watchdog_s = watchdog_interval_s()
+        self._watchdog_due_s = self._health_due_s = clock.mono_s()
+        self._is_lost = self._is_failing = False
+
+    def beat(self) -> None:
+        """Do what is due."""
+        now_s = self._clock.mono_s()
+        if self._watchdog_s and now_s >= self._watchdog_due_s:
+            notify(WATCHDOG=1)
+            self._watchdog_due_s = now_s + self._watchdog_s
+        if now_s >= self._health_due_s:
+            self._health_due_s = now_s + _HEALTH_S
+            self._tell()
+
+    def _tell(self) -> None:
+        self._meter.look_at_heat()
+        self._say_source()
+        self._say_failures()
+        counts = f"{self._tally.queries} queries, {self._tally.accepted} accepted, {self._meter.used_mah:.2f} mAh"
+        remarks = (remark() for remark in self._remarks)
+        notify(STATUS="; ".join(filter(None, (self._source.state, counts, *remarks, self._flight_log.state))))
+        healthy = not (self._is_lost or self._is_failing)
+        self._autopilot.report(healthy, machine_load(), self._meter.thermal.temperature_c)
+
+    def _say_source(self) -> None:
+        is_lost = self._source.condition is Condition.LOST
+        if is_lost != self._is_lost:
+            self._is_lost = is_lost
+            _log.warning("source: %s", self._source.state)
+            self._flight_log.write("source", state=self._source.state)
+            text = f"camera {'lost' if is_lost else 'is back'}"
+            self._autopilot.announce(Mood.WARNING if is_lost else Mood.NOTE, text)
+
+    def _say_failures(self) -> None:
+        is_failing = self._tally.is_failing
+        if is_failing != self._is_failing:
+            self._is_failing = is_failing
+            said = f"{FAILURES_IN_A_ROW} frames in a row have failed" if is_failing else "frames are recognised again"
+            _log.warning("%s", said)
+            self._flight_log.write("failing", said=said)
+            self._autopilot.announce(Mood.WARNING if is_failing else Mood.NOTE, said)

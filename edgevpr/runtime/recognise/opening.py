@@ -1,0 +1,164 @@
+"""Opening: a map, the technique that it was made with, and its index in RAM make a recogniser."""
+
+from pathlib import Path
+
+from edgevpr import techniques
+from edgevpr.config import Config
+from edgevpr.contract import Technique
+from edgevpr.errors import MapError, UsageError
+from edgevpr.frames.source import is_live
+from edgevpr.places.growing import GrowingIndex
+from edgevpr.places.index import PlaceIndex, empty_index, load_index
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.sequence import bytes_beside_place, length_of, search_of
+from edgevpr.power.boards import Board
+from edgevpr.power.equations import parse_pack
+from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.recognise.hints import Prior
+from edgevpr.runtime.recognise.judge import accept_rule
+from edgevpr.runtime.recognise.recogniser import Recogniser
+
+_ROOM = 20_000  # places to learn in a flight: two hundred kilometres at the usual spacing; beyond, RAM keeps the best
+
+
+def open_recogniser(
+    config: Config, board: Board, *, settings: dict[str, str] | None = None, narrowed: bool = False
+) -> Recogniser:
+    """Open the map, make its technique for the board, load the index. `narrowed` is for a flight: what is known
+    beforehand narrows each query (see `hints`); else every query is asked everywhere.
+
+    Raises a sentence for anything that does not go together, and for `settings` of the technique that the map was not
+    built with.
+    """
+    if config.map is None:
+        raise UsageError("There is no map to recognise places in: name one with --map, or `map:` in the configuration.")
+    place_map = PlaceMap.open(Path(config.map))
+    technique = technique_of(place_map, config.technique, _wanted(config) | (settings or {}), board)
+    index = _loaded(config, board, technique, place_map)
+    return _recogniser(config, board, technique, place_map, index, narrowed)
+
+
+def open_learning(config: Config, board: Board, new_technique: str | None) -> tuple[Recogniser, GrowingIndex]:
+    """Do as `open_recogniser` for a flight, with a map that places can be added to, made new for `new_technique` where
+    there is none, and the index that takes them: what the budget leaves is their room."""
+    if config.map is None:
+        raise UsageError("There is no map to learn places into: name one with --map, or `map:` in the configuration.")
+    path = Path(config.map)
+    if has_map(path):
+        place_map = PlaceMap.open_for_adding(path)
+        technique = technique_of(place_map, config.technique, _wanted(config), board)
+    else:
+        technique = made_for(board, new_technique, _wanted(config))
+        place_map = _new_map(path, technique)
+    place_map.index_positions()
+    growing = GrowingIndex(
+        place_map,
+        technique,
+        budget_bytes=int(budget_mb(config, board) * 1e6),
+        room=_ROOM,
+        beside_bytes=bytes_beside_place(length_of(technique.spec, config.match.sequence)),
+    )
+    return _recogniser(config, board, technique, place_map, growing.index, narrowed=True), growing
+
+
+def has_map(path: Path) -> bool:
+    """Say whether there is a map file at `path`, or anything else that has a content."""
+    return path.exists() and path.stat().st_size > 0
+
+
+def take_form(recogniser: Recogniser, config: Config, form: str) -> None:
+    """Let a recogniser load its index anew in another form, with the limits of that form. The index that it has goes
+    first, so that the two are not in memory together. Raises MapError where the map cannot be read any more; then
+    nothing is recognised until a form has been taken."""
+    board, place_map = recogniser.meter.board, recogniser.place_map
+    nothing = empty_index(recogniser.technique.spec, 0, None)
+    recogniser.take(recogniser.technique, nothing, recogniser.rule, recogniser.search)
+    technique = technique_of(place_map, config.technique, _wanted(config) | {"form": form}, board)
+    length = length_of(technique.spec, config.match.sequence)
+    index = _loaded(config, board, technique, place_map)
+    recogniser.take(technique, index, accept_rule(technique, config.match, length), search_of(length))
+
+
+def budget_mb(config: Config, board: Board) -> float:
+    """Say how much RAM the index may take: what is asked for, else the board's."""
+    return config.memory.budget_mb or board.budget_mb
+
+
+def meter_of(config: Config, board: Board) -> QueryMeter:
+    """Make the meter of queries on a board that is fed by the configured pack."""
+    return QueryMeter(board, parse_pack(config.battery.pack), config.battery.regulator_efficiency)
+
+
+def made_for(board: Board | None, name: str, settings: dict[str, str] | None = None) -> Technique:
+    """Make the technique `name`; a network with as many threads as the board spares for it (None: one)."""
+    return made_with(board.threads if board else None, name, settings)
+
+
+def made_with(threads: int | None, name: str, settings: dict[str, str] | None = None) -> Technique:
+    """Make the technique `name`; a network with `threads` (None: one), where `settings` do not say how many."""
+    own = {"threads": threads} if threads and "threads" in techniques.parameters(name) else {}
+    return techniques.create(name, {**own, **(settings or {})})
+
+
+def technique_of(
+    place_map: PlaceMap, name: str | None = None, settings: dict[str, str] | None = None, board: Board | None = None
+) -> Technique:
+    """Make the technique that a map was built with, for `board`. Raises MapError where `name` or `settings` ask for
+    another, UsageError for a setting that it does not have, and ModelError for a network that cannot be used."""
+    built_with = place_map.spec
+    if not techniques.is_known(built_with.name):
+        raise MapError(
+            f"{place_map.path} was built with `{built_with.name}`, which this edgevpr does not have: update edgevpr, "
+            "add its network with `edgevpr models add`, or build the map with one of "
+            f"{', '.join(techniques.names())}."
+        )
+    if name in (None, built_with.name):
+        technique = made_for(board, built_with.name, {**built_with.parameters, **(settings or {})})
+    else:
+        technique = made_for(board, name, settings)
+    place_map.require(technique.spec)
+    return technique
+
+
+def _recogniser(
+    config: Config, board: Board, technique: Technique, place_map: PlaceMap, index: PlaceIndex, narrowed: bool
+) -> Recogniser:
+    length = length_of(technique.spec, config.match.sequence)
+    return Recogniser(
+        technique=technique,
+        place_map=place_map,
+        index=index,
+        rule=accept_rule(technique, config.match, length),
+        meter=meter_of(config, board),
+        candidates=config.match.candidates or technique.candidates,
+        search=search_of(length),
+        # In a sequence a place that a wrong hint kept out of one query would count as seen and unlike.
+        prior=_prior(config, technique) if narrowed and length == 1 else None,
+        min_accuracy_m=config.mavlink.min_accuracy_m,
+    )
+
+
+def _prior(config: Config, technique: Technique) -> Prior:
+    is_now = config.source.uri is not None and is_live(config.source.uri)
+    return Prior(config.match.reach_m_s, technique.spec.heading_within_deg, is_now)
+
+
+def _new_map(path: Path, technique: Technique) -> PlaceMap:
+    """Make an empty map that is there as a whole or not at all: a service that is killed at power-on must start
+    again."""
+    unfinished = path.with_name(path.name + ".new")
+    for left in ("", "-wal", "-shm", "-journal"):
+        unfinished.with_name(unfinished.name + left).unlink(missing_ok=True)
+    PlaceMap.create(unfinished, technique.spec).close()
+    unfinished.replace(path)
+    return PlaceMap.open_for_adding(path)
+
+
+def _wanted(config: Config) -> dict[str, str]:
+    wanted = {"camera": config.source.camera, "matching": config.match.matching, "form": config.match.form}
+    return {key: value for key, value in wanted.items() if value}
+
+
+def _loaded(config: Config, board: Board, technique: Technique, place_map: PlaceMap) -> PlaceIndex:
+    beside_bytes = bytes_beside_place(length_of(technique.spec, config.match.sequence))
+    return load_index(place_map, technique, int(budget_mb(config, board) * 1e6), beside_bytes=beside_bytes)

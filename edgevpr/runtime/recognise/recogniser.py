@@ -1,0 +1,142 @@
+"""The walk of one frame, written once: in flight, in `match`, in `eval`, in the probe, and while a map is made.
+
+No link, log, thread or clock is inside: what comes in with a frame is all that decides what comes out.
+"""
+
+import logging
+from collections import deque
+
+from edgevpr.contract import Technique
+from edgevpr.errors import EdgevprError, MapError
+from edgevpr.places.index import PlaceIndex
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.retrieve import compare, named, scan
+from edgevpr.places.sequence import Alone, Search
+from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.recognise.hints import NoPrior, Prior, expected_of
+from edgevpr.runtime.recognise.judge import NEW_FOR_S, AcceptRule, Verdict, judge
+from edgevpr.runtime.recognise.recognition import Recognition
+from edgevpr.types import Frame, Vehicle
+
+_log = logging.getLogger(__name__)
+
+
+class Recogniser:
+    """Recognises places of an open map, frame after frame.
+
+    `candidates` places are compared in full (None: all, see `places.retrieve.compare`). `search` goes over several
+    queries, `prior` narrows each; without them each is asked alone, and everywhere. The governor changes `candidates`,
+    the learner and the governor the index (`take`, `extend`).
+    """
+
+    def __init__(
+        self,
+        *,
+        technique: Technique,
+        place_map: PlaceMap,
+        index: PlaceIndex,
+        rule: AcceptRule,
+        meter: QueryMeter,
+        candidates: int | None = None,
+        search: Search | None = None,
+        prior: Prior | NoPrior | None = None,
+        min_accuracy_m: float = 1.0,
+    ) -> None:
+        self.place_map, self.meter, self.candidates = place_map, meter, candidates
+        self._prior, self._min_accuracy_m = prior or NoPrior(), min_accuracy_m
+        self._new: deque[tuple[int, float]] = deque()  # place, and when it was learnt
+        self.take(technique, index, rule, search or Alone())
+
+    def take(self, technique: Technique, index: PlaceIndex, rule: AcceptRule, search: Search) -> None:
+        """Recognise with these from now on: another form of the same vectors has other scores, and other limits."""
+        self.technique, self.rule, self.search = technique, rule, search
+        self._take_index(index)
+
+    def extend(self, index: PlaceIndex, place_id: int, t_mono_s: float) -> None:
+        """Recognise in an index that has grown by a place, learnt from the frame taken at `t_mono_s`."""
+        self._new.append((place_id, t_mono_s))
+        self._take_index(index)
+
+    def lose_index(self, error: Exception) -> None:
+        """Fail every frame for this reason until there is an index again (see `take`)."""
+        self._lost = _sentence(error)
+
+    def _take_index(self, index: PlaceIndex) -> None:
+        self.index, self._lost = index, None
+        # The 1-sigma accuracy of a fix: between two places nobody knows better.
+        self.accuracy_m = max(self._min_accuracy_m, index.spacing_m() or 0.0)
+
+    def step(self, frame: Frame, vehicle: Vehicle | None = None) -> Recognition:
+        """Recognise one frame; `vehicle` is what the autopilot says at that moment. Never raises an Exception: what
+        goes wrong with a frame, a place or the technique is a refusal with its reason."""
+        meter, technique, index = self.meter, self.technique, self.index
+        descriptor = hints = ranking = best = None
+        meter.begin()
+        try:
+            with meter.step("encode"):
+                descriptor = technique.encode(frame.image)
+            if self._lost:
+                raise MapError(self._lost)
+            if not len(index):
+                verdict = Verdict(False, "the map has no place yet")
+            else:
+                with meter.step("scan"):
+                    margin_m = max(self.accuracy_m, self.rule.neighbour_m)
+                    hints = self._prior.hints(frame, vehicle, index, margin_m)
+                    expected = expected_of(hints, index)
+                    scanned = scan(technique, descriptor, index, expected)
+                with meter.step("compare"):
+                    ranking = compare(
+                        technique,
+                        descriptor,
+                        scanned,
+                        self.place_map,
+                        index,
+                        candidates=self.candidates,
+                        neighbour_m=self.rule.neighbour_m,
+                        expected=expected,
+                    )
+                    ranking = self.search.follow(ranking, index, frame.t_mono_s)
+                    (best,) = named(ranking, index, self.place_map, first=1)
+                    is_new = self._is_new(best.place.place_id, frame.t_mono_s)
+                    verdict = judge(ranking, index, self.rule, self.search, is_new)
+                self._prior.learn(best, verdict.accepted, frame.t_mono_s)
+            failed = False
+        except Exception as error:
+            _log.debug("%s failed", frame.name, exc_info=True)
+            verdict, failed = Verdict(False, _sentence(error)), True
+        position = best.place.position if verdict.accepted else None
+        return Recognition(
+            frame=frame,
+            vehicle=vehicle,
+            descriptor=descriptor,
+            hints=hints,
+            ranking=ranking,
+            best=best,
+            accepted=verdict.accepted,
+            reason=verdict.reason,
+            failed=failed,
+            position=position,
+            accuracy_m=self.accuracy_m if position else None,
+            steps=meter.steps(),
+            cost=meter.cost(),
+        )
+
+    def unread(self, error: Exception) -> Recognition:
+        """Give the event of a frame that could not even be read."""
+        self.meter.begin()
+        return Recognition(
+            frame=None, reason=_sentence(error), failed=True, steps=self.meter.steps(), cost=self.meter.cost()
+        )
+
+    def _is_new(self, place_id: int, t_mono_s: float) -> bool:
+        while self._new and t_mono_s - self._new[0][1] > NEW_FOR_S:
+            self._new.popleft()
+        return any(place_id == new for new, _ in self._new)
+
+
+def _sentence(error: Exception) -> str:
+    """Say what went wrong. What is no error of edgevpr's own is a fault of a technique, or of a library."""
+    if isinstance(error, EdgevprError):
+        return str(error)
+    return f"an unforeseen {type(error).__name__} ({error}): report it, with the output of --debug"

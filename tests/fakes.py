@@ -1,0 +1,198 @@
+"""Stand-ins for time, a camera, a source of frames and a flight controller's link, for tests of what lies above them.
+
+Each keeps the promises of the real thing, and `test_fakes.py` holds both to them.
+"""
+
+from collections import Counter, deque
+from collections.abc import Callable, Iterable
+
+import numpy as np
+
+from edgevpr.frames.condition import Condition
+from edgevpr.mavlink.link import LinkStats
+from edgevpr.mavlink.messages import Fix, Health
+from edgevpr.mavlink.outbox import Outbox, Sending
+from edgevpr.runtime.flight.clock import Clock
+from edgevpr.types import Frame, Vehicle
+
+
+class FakeClock:
+    """A clock that moves when told to, and when somebody sleeps by it. Called, it is the monotonic clock."""
+
+    def __init__(self, now_s: float = 1000.0) -> None:
+        self.now_s, self.cpu_s, self.thread_cpu_s = now_s, 7.0, 3.0
+        self.clock = Clock(
+            mono_s=self,
+            utc_s=lambda: 1.7e9 + self.now_s,
+            process_cpu_s=lambda: self.cpu_s,
+            thread_cpu_s=lambda: self.thread_cpu_s,
+            sleep=self.sleep,
+        )
+
+    def __call__(self) -> float:
+        return self.now_s
+
+    def sleep(self, seconds: float) -> None:
+        self.now_s += max(0.0, seconds)
+
+    def work(self, wall_s: float, cores: float = 1.0, kept_waiting: float = 0.0) -> None:
+        """Let so many cores be busy for a while, the asking thread among them but for the share it is kept waiting."""
+        self.now_s += wall_s
+        self.cpu_s += wall_s * cores
+        self.thread_cpu_s += wall_s * min(cores, 1.0) * (1 - kept_waiting)
+
+
+class FakeSource:
+    """A camera or stream (`is_live`), or a recording, of the pictures given, as many frames as there are. Reading one
+    is `work`. A picture may be a Frame, of which all is kept but the time."""
+
+    def __init__(
+        self,
+        pictures: Iterable[np.ndarray | Frame | Exception],
+        clock: Callable[[], float],
+        *,
+        is_live: bool = True,
+        work: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._left, self._clock, self._work = deque(pictures), clock, work
+        self.is_live = is_live
+        self.total = 0 if is_live else len(self._left)
+        self.dropped = 0 if is_live else None
+        self.is_lost = False
+        self._read = 0
+
+    @property
+    def ended(self) -> bool:
+        return not self._left
+
+    @property
+    def condition(self) -> Condition:
+        if self.is_lost:
+            return Condition.LOST
+        return Condition.ENDED if self.ended else Condition.RUNNING
+
+    @property
+    def state(self) -> str:
+        words = {
+            Condition.LOST: "lost, reopening in 0.5 s",
+            Condition.ENDED: "ended",
+            Condition.RUNNING: "streaming" if self.is_live else "reading",
+        }
+        return words[self.condition]
+
+    def read(self, timeout_s: float) -> Frame | None:
+        if not self._left:
+            return None
+        self._work()
+        picture = self._left.popleft()
+        if isinstance(picture, Exception):
+            raise picture
+        given = picture if isinstance(picture, Frame) else None
+        frame = Frame(
+            image=given.image if given else picture,
+            name=given.name if given else f"frame {self._read:06d}",
+            t_mono_s=self._clock(),
+            t_utc_s=given and given.t_utc_s,
+            position=given and given.position,
+            heading_deg=given and given.heading_deg,
+        )
+        self._read += 1
+        return frame
+
+    def close(self) -> None:
+        self._left.clear()
+
+
+class FakeLink:
+    """A link of which nothing gets lost, to an autopilot that listens from when it has an `answer` to fixes (None: it
+    is not there) and says what `vehicle` gives. `sent` is what has left, in order."""
+
+    def __init__(
+        self,
+        clock: Callable[[], float],
+        *,
+        answer: str | None = "ACCEPTED",
+        vehicle: Callable[[], Vehicle | None] = lambda: None,
+    ) -> None:
+        self.answer, self.sent = answer, []
+        self.health = Health.BOOT
+        self._clock, self._vehicle = clock, vehicle
+        self._outbox = Outbox()
+        self._fixes: list[Fix] = []
+        self._acks: Counter[str] = Counter()
+
+    def send(self, *outgoing) -> None:
+        self.sent += outgoing
+
+    def send_fix(self, fix: Fix) -> Sending:
+        sending = self._outbox.put_fix(fix, self._clock())
+        self._turn()
+        return sending
+
+    def set_health(self, health: Health) -> None:
+        self.health = health
+
+    def want_position(self) -> None:
+        pass
+
+    def vehicle(self) -> Vehicle | None:
+        return self._vehicle()
+
+    def listens(self) -> bool:
+        return self.answer is not None
+
+    def stats(self) -> LinkStats:
+        self._turn()
+        sent = Counter(message.get_type() for message in self.sent) | Counter(COMMAND_INT=len(self._fixes))
+        return LinkStats(
+            connected=True,
+            trouble=None,
+            autopilot_heard=self.listens(),
+            autopilot_system_id=1 if self.listens() else None,
+            sent=dict(sent),
+            received={},
+            acks=dict(self._acks),
+            dropped_stale_fixes=self._outbox.dropped_stale_fixes,
+            dropped_queue_full=0,
+            bad_bytes=0,
+            reopened=0,
+        )
+
+    def texts(self) -> list[tuple[int, str]]:
+        """Severity and text of every announcement."""
+        return [(each.severity, each.text) for each in self.sent if each.get_type() == "STATUSTEXT"]
+
+    def close(self) -> None:
+        pass
+
+    def _turn(self) -> None:
+        if not self.listens():
+            self._outbox.drop_stale_fixes(self._clock())
+            return
+        while (sending := self._outbox.next_fix(self._clock())) is not None:
+            self._fixes.append(sending.fix)
+            sending.settle(True)
+            sending.answer = self.answer
+            self._acks[self.answer] += 1
+
+
+class FakeCapture:
+    """What OpenCV gives for a camera: pictures one after another, each `work`, and then no more."""
+
+    def __init__(self, pictures: Iterable[np.ndarray], work: Callable[[], None] = lambda: None) -> None:
+        self._left, self._work = iter(pictures), work
+        self.is_released = False
+
+    def read(self) -> tuple[bool, np.ndarray | None]:
+        self._work()
+        picture = next(self._left, None)
+        return picture is not None, picture
+
+    def release(self) -> None:
+        self.is_released = True
+
+
+def vehicle_at(lat_deg: float, lon_deg: float, t_heard_s: float, **other) -> Vehicle:
+    """What an autopilot says that is there."""
+    known = {"alt_m": 300.0, "heading_deg": None, "has_gps": True} | other
+    return Vehicle(lat_deg=lat_deg, lon_deg=lon_deg, t_heard_s=t_heard_s, **known)

@@ -1,0 +1,138 @@
+"""What is told to the autopilot, and that an event says what became of its fix: accepted, sent, taken are three
+things."""
+
+import pytest
+from fakes import FakeClock, FakeLink, FakeSource
+from flights import Flight, of_kind
+from pictures import textured
+
+from edgevpr.runtime.flight import vitals
+
+
+def flight(recording, tmp_path, link, clock, technique="cohog", **settings):
+    settings = {"source.rate_hz": 1.0} | settings
+    return Flight(recording / f"{technique}.gpkg", tmp_path / "log", clock, link, **settings)
+
+
+def pictures(count, first=0):
+    return [textured(first + number, 240, 320) for number in range(count)]
+
+
+def fixes(lines):
+    return [line["fix"] and (line["fix"]["sent"], line["fix"]["why"]) for line in of_kind(lines, "query")]
+
+
+def test_a_query_says_whether_its_fix_was_sent_and_what_was_answered_to_the_last(recording, tmp_path):
+    clock = FakeClock()
+    link = FakeLink(clock)
+    flown = flight(recording, tmp_path, link, clock)
+    lines = flown.fly(FakeSource(pictures(3), clock))
+    queries = of_kind(lines, "query")
+    assert fixes(lines) == [(True, None)] * 3
+    assert queries[0]["last_fix"] is None
+    assert queries[1]["last_fix"] == {"query": "frame 000000", "sent": True, "why": None, "answer": "ACCEPTED"}
+    assert queries[2]["last_fix"]["query"] == "frame 000001"
+    assert link.stats().fixes_sent == 3
+
+
+def test_an_answer_that_says_no_is_in_the_next_line(recording, tmp_path):
+    clock = FakeClock()
+    lines = flight(recording, tmp_path, FakeLink(clock, answer="FAILED"), clock).fly(FakeSource(pictures(2), clock))
+    assert of_kind(lines, "query")[1]["last_fix"]["answer"] == "FAILED"
+
+
+def test_without_an_autopilot_a_fix_waits_and_is_dropped_and_the_next_line_says_so(recording, tmp_path):
+    clock = FakeClock()
+    link = FakeLink(clock, answer=None)
+    flown = flight(recording, tmp_path, link, clock, **{"source.rate_hz": 0.5})
+    lines = flown.fly(FakeSource(pictures(2), clock))
+    assert fixes(lines) == [(None, None), (None, None)]
+    # After the first query's second of waiting.
+    link.stats()
+    last = of_kind(lines, "query")[1]["last_fix"]
+    assert last["sent"] in (None, False)
+    assert link.stats().fixes_sent == 0
+
+
+def test_a_match_that_takes_longer_than_a_fix_may_be_old_says_so_in_its_line_and_the_status(
+    recording, tmp_path, monkeypatch
+):
+    clock, statuses = FakeClock(), []
+    monkeypatch.setattr(vitals, "notify", lambda **said: statuses.append(said.get("STATUS", "")))
+    link = FakeLink(clock)
+    flown = flight(recording, tmp_path, link, clock)
+    encode = flown.recogniser.technique.encode
+    flown.recogniser.technique.encode = lambda image: (clock.work(6.2), encode(image))[1]
+    lines = flown.fly(FakeSource(pictures(3), clock))
+    assert all(line["accepted"] for line in of_kind(lines, "query")), "accepted never means sent"
+    assert fixes(lines) == [(False, "its frame is 6.2 s old, and 5 s are the limit")] * 3
+    assert link.stats().fixes_sent == 0
+    assert "0 fixes sent, 0 taken, 2 too late to be sent" in statuses[-1]
+
+
+@pytest.mark.parametrize(
+    ("settings", "why"),
+    [({"mavlink.send_fixes": False}, "send_fixes is off"), ({}, "the place has no position")],
+)
+def test_why_a_fix_is_withheld_is_said(recording, tmp_path, settings, why):
+    clock = FakeClock()
+    link = FakeLink(clock)
+    flown = flight(recording, tmp_path, link, clock, **settings)
+    if not settings:
+        flown.recogniser.index.lat_deg[:] = float("nan")
+        flown.recogniser.index.lon_deg[:] = float("nan")
+        flown.recogniser.place_map._point = lambda place_id, geom: None
+    lines = flown.fly(FakeSource(pictures(1), clock))
+    assert fixes(lines) == [(False, why)]
+    assert link.stats().fixes_sent == 0
+    names = [each.name for each in link.sent if each.get_type() == "NAMED_VALUE_INT"]
+    assert names == ["vpr_place"], "the event goes out either way"
+
+
+def test_without_a_link_the_line_says_so(recording, tmp_path):
+    clock = FakeClock()
+    lines = flight(recording, tmp_path, None, clock).fly(FakeSource(pictures(1), clock))
+    assert fixes(lines) == [(False, "there is no link")]
+
+
+def test_what_is_not_accepted_has_no_fix_to_speak_of(recording, tmp_path):
+    clock = FakeClock()
+    link = FakeLink(clock)
+    lines = flight(recording, tmp_path, link, clock).fly(FakeSource(pictures(2, first=100), clock))
+    assert fixes(lines) == [None, None]
+    assert link.stats().fixes_sent == 0
+
+
+def test_the_cost_of_every_query_is_told(recording, tmp_path):
+    clock = FakeClock()
+    link = FakeLink(clock)
+    flown = flight(recording, tmp_path, link, clock, board="rpi-4b")
+    encode = flown.recogniser.technique.encode
+    flown.recogniser.technique.encode = lambda image: (clock.work(0.1, 2.0), encode(image))[1]
+    flown.fly(FakeSource(pictures(1, first=100), clock))
+    told = {each.name: each.value for each in link.sent if each.get_type() == "NAMED_VALUE_FLOAT"}
+    assert told["vpr_cpu"] == pytest.approx(0.5), "two of four cores while the query lasted"
+    assert told["vpr_mah"] == pytest.approx(flown.flown.totals["used_mah"], rel=0.01)
+
+
+def test_a_camera_that_is_lost_is_told_and_is_critical_until_it_is_back(recording, tmp_path):
+    clock = FakeClock()
+    link, health = FakeLink(clock), []
+    source = FakeSource(pictures(5), clock, work=lambda: (health.append(link.health.name), turn())[0])
+
+    def turn():
+        source.is_lost = len(health) in (2, 3)
+
+    lines = flight(recording, tmp_path, link, clock).fly(source)
+    assert health == ["ACTIVE", "ACTIVE", "CRITICAL", "CRITICAL", "ACTIVE"]
+    assert link.texts() == [(4, "edgevpr: camera lost"), (6, "edgevpr: camera is back")]
+    assert [line["state"] for line in of_kind(lines, "source")] == ["lost, reopening in 0.5 s", "streaming"]
+
+
+def test_a_listener_that_fails_does_not_end_the_flight(recording, tmp_path, caplog):
+    clock = FakeClock()
+    link = FakeLink(clock)
+    link.send_fix = lambda fix: 1 / 0
+    lines = flight(recording, tmp_path, link, clock).fly(FakeSource(pictures(2), clock))
+    assert len(of_kind(lines, "query")) == 2
+    assert sum("could not be told" in record.message for record in caplog.records) == 2

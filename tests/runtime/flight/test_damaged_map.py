@@ -1,0 +1,174 @@
+"""A map that is damaged in flight: every BLOB and every column of it, one after another, and the flight goes on.
+
+What is damaged may be compared or not; what must not be is an end of the flight, and a position that the map does not
+have.
+"""
+
+import shutil
+import sqlite3
+
+import numpy as np
+import pytest
+from fakes import FakeClock, FakeLink, FakeSource
+from flights import PLACES, STEP_DEG, Flight, of_kind
+from pictures import textured
+
+from edgevpr.mavlink.messages import Health
+from edgevpr.runtime.flight import vitals
+from edgevpr.runtime.flight.tally import FAILURES_IN_A_ROW
+
+DAMAGE = (None, b"", b"\xff", b"\x00" * 7, "text", 10**18, -1.5, float("inf"), b"\xa5" * 40_000)
+COLUMNS = ("geom", "time", "alt_m", "heading_deg", "source_image", "quality", "coarse", "fine")
+
+
+@pytest.fixture
+def place_map(recording, tmp_path):
+    shutil.copy(recording / "cohog.gpkg", tmp_path / "m.gpkg")
+    return tmp_path / "m.gpkg"
+
+
+def damaged(path, statement, *values):
+    """Another program writes to the map while it is flown with, and minds no rule of it."""
+    with sqlite3.connect(path) as db:
+        for kind in ("geom", "time"):
+            db.create_function(f"ST_{kind}", 1, lambda each: each)
+        db.execute("PRAGMA ignore_check_constraints = ON")
+        db.execute(statement, values)
+    db.close()
+
+
+def fly(place_map, log, damages, pictures=None):
+    """A flight over places 0, 1, 2 ..., before each of which a call of `damages` is made."""
+    clock = FakeClock()
+    link = FakeLink(clock)
+    flight = Flight(place_map, log, clock, link, **{"source.rate_hz": 1.0})
+    calls = iter(damages)
+    pictures = [textured(n % PLACES, 240, 320) for n in range(len(damages))] if pictures is None else pictures
+    lines = flight.fly(FakeSource(pictures, clock, work=lambda: next(calls)()))
+    return of_kind(lines, "query"), lines, flight
+
+
+def nothing():
+    pass
+
+
+def mapped(line):
+    """Whether a line's position is that of its place, as the map has it."""
+    position = line["position"]
+    return position is None or round((position["lat_deg"] - 50) / STEP_DEG) + 1 == line["place"]
+
+
+@pytest.mark.parametrize("place", range(1, PLACES + 1))
+def test_a_damaged_fine_part_of_any_place_costs_queries_and_not_the_flight(place_map, tmp_path, place):
+    damage = lambda: damaged(place_map, "UPDATE places SET fine = x'00' WHERE place_id = ?", place)  # noqa: E731
+    queries, _, flight = fly(place_map, tmp_path / "log", [nothing, damage, nothing])
+    assert len(queries) == 3
+    assert queries[0]["accepted"]
+    for line in queries[1:]:
+        assert (line["accepted"], line["fix"]) == (False, None)
+        assert f"place {place} is damaged" in line["reason"]
+    assert flight.flown.failed == 2
+    assert flight.link.stats().fixes_sent == 1
+
+
+@pytest.mark.parametrize("column", COLUMNS)
+def test_whatever_stands_in_a_column_the_flight_goes_on_and_sends_nothing_that_is_not_in_the_map(
+    place_map, tmp_path, column
+):
+    """Each kind of damage at every place at once, so that candidates and the best place have it."""
+
+    def damage(value):
+        def write():
+            # The schema refuses some of it, which is as well.
+            try:
+                damaged(place_map, f"UPDATE places SET {column} = ?", value)
+            except sqlite3.Error:
+                return
+
+        return write
+
+    damages = [damage(value) for value in DAMAGE]
+    queries, _, flight = fly(place_map, tmp_path / "log", damages)
+    assert len(queries) == len(DAMAGE)
+    assert flight.flown.queries == len(DAMAGE)
+    sent = flight.link.stats().fixes_sent
+    assert sent == sum(line["accepted"] and bool(line["fix"]["sent"]) for line in queries)
+    for line in queries:
+        if line["fix"] and line["fix"]["sent"]:
+            assert mapped(line)
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "DELETE FROM places",
+        "DELETE FROM places WHERE place_id % 2",
+        "DROP TABLE places",
+        "ALTER TABLE places RENAME TO gone",
+        "DELETE FROM edgevpr_map",
+        "UPDATE places SET place_id = place_id + 1000",
+    ],
+)
+def test_a_map_whose_rows_go_in_flight_costs_queries_and_not_the_flight(place_map, tmp_path, statement):
+    queries, _, flight = fly(place_map, tmp_path / "log", [nothing, lambda: damaged(place_map, statement), nothing])
+    assert len(queries) == 3
+    assert all(mapped(line) for line in queries)
+    assert flight.flown.queries == 3
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
+def test_a_map_that_is_cut_or_overwritten_in_flight_costs_queries_and_not_the_flight(place_map, tmp_path, share):
+    whole = place_map.read_bytes()
+    noise = np.random.default_rng(1).bytes(len(whole))
+
+    def cut():
+        place_map.write_bytes(whole[: int(share * len(whole))])
+
+    def overwritten():
+        at = int(share * len(whole))
+        with open(place_map, "r+b") as handle:
+            handle.seek(at)
+            handle.write(noise[: len(whole) - at])
+
+    def restored():
+        place_map.write_bytes(whole)
+
+    queries, _, _ = fly(place_map, tmp_path / "log", [nothing, cut, overwritten, restored])
+    assert len(queries) == 4
+    assert all(mapped(line) for line in queries)
+
+
+def test_ten_failures_in_a_row_are_critical_and_said_once_until_it_works_again(
+    place_map, tmp_path, monkeypatch, caplog
+):
+    health, statuses = [], []
+    monkeypatch.setattr(vitals, "notify", lambda **said: statuses.append(said.get("STATUS", "")))
+    whole = place_map.read_bytes()
+
+    def damage():
+        damaged(place_map, "UPDATE places SET fine = x'00'")
+
+    def look():
+        health.append(flight_link.health)
+
+    clock = FakeClock()
+    flight_link = FakeLink(clock)
+    flight = Flight(place_map, tmp_path / "log", clock, flight_link, **{"source.rate_hz": 1.0})
+    calls = iter([nothing, damage, *[look] * FAILURES_IN_A_ROW, lambda: place_map.write_bytes(whole), look, look, look])
+    count = FAILURES_IN_A_ROW + 6
+    lines = flight.fly(FakeSource([textured(1, 240, 320)] * count, clock, work=lambda: next(calls)()))
+    queries = of_kind(lines, "query")
+    assert [line["accepted"] for line in queries] == [True, *[False] * (FAILURES_IN_A_ROW + 1), *[True] * 4]
+    assert health[-4] is Health.CRITICAL
+    assert health[0] is health[-1] is Health.ACTIVE
+    assert [line["said"] for line in of_kind(lines, "failing")] == [
+        "10 frames in a row have failed",
+        "frames are recognised again",
+    ]
+    assert flight_link.texts() == [
+        (4, "edgevpr: 10 frames in a row have failed"),
+        (6, "edgevpr: frames are recognised again"),
+    ]
+    assert flight.flown.failed == FAILURES_IN_A_ROW + 1
+    told = [record.message for record in caplog.records if "is damaged" in record.message]
+    assert len(told) == 1, "the same trouble is said once"

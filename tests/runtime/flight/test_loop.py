@@ -1,0 +1,108 @@
+"""The loop: it ends when told to, at once where it must, keeps its pace, and goes on whatever a frame brings."""
+
+import pytest
+from fakes import FakeClock, FakeLink, FakeSource
+from flights import Flight, of_kind
+from pictures import textured
+
+from edgevpr.errors import ImageError
+from edgevpr.runtime.flight.loop import Stop
+from edgevpr.runtime.flight.pace import Pace
+
+PICTURE = textured(1, 240, 320)
+
+
+@pytest.fixture
+def clock():
+    return FakeClock()
+
+
+def flight(recording, tmp_path, clock, **settings):
+    return Flight(
+        recording / "hog.gpkg", tmp_path / "log", clock, FakeLink(clock), **{"source.rate_hz": 0.5} | settings
+    )
+
+
+def test_a_stop_between_frames_ends_the_flight_within_a_turn(recording, tmp_path, clock):
+    flown = flight(recording, tmp_path, clock)
+    slept = []
+
+    def sleep(seconds):
+        slept.append(seconds)
+        clock.now_s += seconds
+        flown.stop()
+
+    object.__setattr__(clock.clock, "sleep", sleep)
+    lines = flown.fly(FakeSource([PICTURE] * 9, clock))
+    assert len(of_kind(lines, "query")) == 1
+    assert slept == [pytest.approx(0.2)]
+
+
+def test_a_stop_while_a_frame_is_recognised_breaks_it_off(recording, tmp_path, clock):
+    flown = flight(recording, tmp_path, clock)
+
+    def long(image):
+        flown.stop()  # a signal comes
+        raise AssertionError("the signal breaks this off")
+
+    flown.recogniser.technique.encode = long
+    lines = flown.fly(FakeSource([PICTURE] * 9, clock))
+    assert lines == [], "what was broken off is no query"
+    flown.stop()  # and a second signal finds nothing to break off
+
+
+def test_a_stop_while_others_are_told_lets_them_finish(recording, tmp_path, clock):
+    flown = flight(recording, tmp_path, clock)
+    send = flown.link.send
+    flown.link.send = lambda *messages: (flown.stop(), send(*messages))
+    lines = flown.fly(FakeSource([PICTURE] * 9, clock))
+    assert len(of_kind(lines, "query")) <= 1
+    stop = Stop()
+    with pytest.raises(Stop.Now), stop.breaks_off():
+        stop()
+    assert stop.asked
+
+
+def test_a_frame_that_cannot_be_read_is_logged_and_the_next_is_recognised(recording, tmp_path, clock):
+    flown = flight(recording, tmp_path, clock)
+    pictures = [PICTURE, ImageError("1.png is cut short: copy it again."), PICTURE]
+    lines = flown.fly(FakeSource(pictures, clock, is_live=False))
+    assert [line["problem"] for line in of_kind(lines, "unusable")] == ["1.png is cut short: copy it again."]
+    assert len(of_kind(lines, "query")) == 2
+    assert (flown.flown.queries, flown.flown.failed) == (2, 1)
+
+
+def test_frames_are_taken_evenly_and_a_late_one_does_not_hurry_the_next(clock):
+    pace = Pace(2.0, clock.clock)
+    assert pace.wait_s() == 0
+    pace.taken()
+    assert pace.wait_s() == pytest.approx(0.5)
+    clock.now_s += 1.7
+    assert pace.wait_s() == pytest.approx(-1.2)
+    pace.taken()
+    assert pace.wait_s() == 0, "what was missed is not made up for"
+    pace.taken()
+    assert pace.wait_s() == pytest.approx(0.5)
+    pace.set_rate(1.0)
+    clock.now_s += 0.5
+    pace.taken()
+    assert pace.wait_s() == pytest.approx(1.0)
+
+
+def test_a_source_without_a_frame_leaves_the_loop_turning(recording, tmp_path, clock):
+    flown = flight(recording, tmp_path, clock)
+
+    class Slow(FakeSource):
+        turns = 0
+
+        def read(self, timeout_s):
+            self.turns += 1
+            clock.now_s += timeout_s
+            return None if self.turns < 20 else super().read(timeout_s)
+
+    source = Slow([PICTURE], clock)
+    lines = flown.fly(source)
+    assert len(of_kind(lines, "query")) == 1
+    assert source.turns == 20
+    beats = [each for each in flown.link.sent if each.get_type() == "ONBOARD_COMPUTER_STATUS"]
+    assert len(beats) == pytest.approx(4, abs=1), "once a second of the four"

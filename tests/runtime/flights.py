@@ -1,0 +1,89 @@
+"""Flights in this process, by a clock to turn: the real recogniser, loop and log, and who listens."""
+
+from pathlib import Path
+
+from fakes import FakeClock, FakeLink, FakeSource
+
+from edgevpr.config import Config, load_config
+from edgevpr.power.boards import load_board
+from edgevpr.power.equations import parse_pack
+from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.flight.autopilot import NoAutopilot, ToAutopilot
+from edgevpr.runtime.flight.flight import Flown, fly
+from edgevpr.runtime.flight.flightlog import FlightLog, read_log
+from edgevpr.runtime.flight.loop import Stop
+from edgevpr.runtime.flight.metering import FlightMeter
+from edgevpr.runtime.recognise.learn import Learner
+from edgevpr.runtime.recognise.opening import open_learning, open_recogniser
+from edgevpr.runtime.recognise.recogniser import Recogniser
+
+PLACES = 30
+STEP_DEG = 0.001  # of latitude: 111 m
+
+
+class Flight:
+    """A flight with a map, ready to be flown: `fly` does so and gives the lines of its log; `flown` is what it came to.
+
+    `settings` are keys of the configuration; with `learns` the flight makes places.
+    """
+
+    def __init__(
+        self,
+        place_map: Path,
+        log: Path,
+        clock: FakeClock,
+        link: FakeLink | None = None,
+        learns: bool = False,
+        **settings,
+    ) -> None:
+        self.config = load_config(None, {"map": str(place_map), "source.uri": "/dev/video0"} | settings)
+        self.board = load_board(self.config.board)
+        self.log, self.clock, self.link = log, clock, link
+        growing = None
+        if learns:
+            self.recogniser, growing = open_learning(self.config, self.board, self.config.technique)
+        else:
+            self.recogniser = open_recogniser(self.config, self.board, narrowed=True)
+        self.recogniser.meter = metered(self.config, self.recogniser, clock)
+        spacing_m = self.config.mapping.spacing_m
+        self.learner = Learner(self.recogniser, growing, spacing_m, clock.clock.utc_s) if learns else None
+        self.stop = Stop()
+        self.flown: Flown | None = None
+
+    def fly(
+        self, source: FakeSource, meter: FlightMeter | None = None, smaller_forms: tuple[str, ...] = ()
+    ) -> list[dict]:
+        autopilot = NoAutopilot()
+        if self.link:
+            send_fixes = self.config.mavlink.send_fixes
+            autopilot = ToAutopilot(self.link, send_fixes=send_fixes, cores=self.board.cores, clock=self.clock.clock)
+        with self.recogniser.place_map, FlightLog(self.log, clock=self.clock) as flight_log:
+            self.flown = fly(
+                self.recogniser,
+                source,
+                self.config,
+                flight_log=flight_log,
+                autopilot=autopilot,
+                stop=self.stop,
+                learner=self.learner,
+                smaller_forms=smaller_forms,
+                clock=self.clock.clock,
+                meter=meter,
+            )
+        return list(read_log(self.log))
+
+
+def metered(config: Config, recogniser: Recogniser, clock: FakeClock) -> QueryMeter:
+    """The meter of queries by the flight's own clock."""
+    pack, efficiency = parse_pack(config.battery.pack), config.battery.regulator_efficiency
+    return QueryMeter(recogniser.meter.board, pack, efficiency, wall_clock=clock, cpu_clock=clock.clock.process_cpu_s)
+
+
+def flight_meter(flight: Flight, kind: type[FlightMeter] = FlightMeter, **more) -> FlightMeter:
+    """A meter of the flight as a whole, for a test that looks into it."""
+    battery = flight.config.battery
+    return kind(flight.board, parse_pack(battery.pack), battery.regulator_efficiency, clock=flight.clock.clock, **more)
+
+
+def of_kind(lines: list[dict], kind: str) -> list[dict]:
+    return [line for line in lines if line["kind"] == kind]

@@ -1,0 +1,198 @@
+"""The walk of a frame: what it gives, and that nothing which goes wrong with a frame, a place or a technique leaves
+it."""
+
+import inspect
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fakes import FakeClock
+from pictures import textured
+
+from edgevpr.config import load_config
+from edgevpr.errors import MapError, ModelError
+from edgevpr.places.index import load_index
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.power.boards import load_board
+from edgevpr.power.equations import Pack
+from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.recognise import hints, judge, learn, mapping, opening, recogniser, recognition
+from edgevpr.runtime.recognise.judge import AcceptRule
+from edgevpr.runtime.recognise.mapping import build_map
+from edgevpr.runtime.recognise.recogniser import Recogniser
+from edgevpr.techniques import create
+from edgevpr.types import Frame, Position
+
+PLACES = 6
+RULE = AcceptRule(min_score=0.07, min_margin=0.03, neighbour_m=50.0)
+
+
+def frame(number, t_mono_s=0.0):
+    position = Position(50 + number * 0.001, 8.0)
+    return Frame(image=textured(number), name=f"{number}.png", t_mono_s=t_mono_s, position=position)
+
+
+@pytest.fixture
+def clock():
+    return FakeClock()
+
+
+@pytest.fixture
+def walk(tmp_path, clock):
+    """A recogniser over six places, whose meter has a clock to turn."""
+    technique = create("cohog", {"w1": 208})
+    meter = QueryMeter(load_board("rpi-4b"), Pack(4, 5200), 0.85, wall_clock=clock, cpu_clock=clock.clock.process_cpu_s)
+    with PlaceMap.create(tmp_path / "m.gpkg", technique.spec) as place_map:
+        build_map(map(frame, range(PLACES)), technique, place_map, meter)
+    with PlaceMap.open(tmp_path / "m.gpkg") as place_map:
+        index = load_index(place_map, technique, 10**6)
+        yield Recogniser(
+            technique=technique,
+            place_map=place_map,
+            index=index,
+            rule=RULE,
+            meter=meter,
+            candidates=42,
+            min_accuracy_m=20.0,
+        )
+
+
+def test_the_event_of_a_place_that_is_recognised_says_everything(walk):
+    event = walk.step(frame(3, 12.5))
+    assert event.accepted
+    assert not event.failed
+    assert event.reason.startswith("score 0.9")
+    assert (event.best.place.place_id, event.best.place.source_image) == (4, "3.png")
+    assert event.position == Position(50.003, 8.0)
+    assert event.accuracy_m == pytest.approx(111.2, abs=0.5), "half of the way to the next place nobody knows better"
+    assert event.ranking.slots[0] == 3
+    assert (event.hints, event.fix, event.last_fix) == (None, None, None)
+    assert event.frame.t_mono_s == 12.5
+    assert event.descriptor.fine is not None
+
+
+def test_what_is_not_accepted_carries_no_position(walk):
+    event = walk.step(Frame(image=textured(99), name="elsewhere", t_mono_s=0.0))
+    assert (event.accepted, event.failed, event.position, event.accuracy_m) == (False, False, None, None)
+    assert event.best is not None
+
+
+def test_every_step_is_metered(walk, clock):
+    encode, scan, match = walk.technique.encode, walk.technique.coarse_scores, walk.technique.match
+    walk.technique.encode = lambda image: (clock.work(0.010), encode(image))[1]
+    walk.technique.coarse_scores = lambda *asked: (clock.work(0.020, 2.0), scan(*asked))[1]
+    walk.technique.match = lambda *asked: (clock.work(0.001), match(*asked))[1]
+    event = walk.step(frame(3))
+    steps = event.steps
+    assert [steps.encode.wall_s, steps.scan.wall_s, steps.compare.wall_s] == pytest.approx([0.010, 0.020, 0.006])
+    assert [steps.encode.cpu_s, steps.scan.cpu_s, steps.compare.cpu_s] == pytest.approx([0.010, 0.040, 0.006])
+    assert (event.cost.t_encode_s, event.cost.t_match_s) == pytest.approx((0.010, 0.026))
+    assert event.cost.cpu_s == pytest.approx(0.056)
+
+
+def test_the_same_frames_give_the_same_events_whatever_the_time_is(walk):
+    first = [walk.step(frame(number)) for number in range(PLACES)]
+    second = [walk.step(frame(number)) for number in range(PLACES)]
+    for one, two in zip(first, second, strict=True):
+        assert (one.accepted, one.reason, one.best, one.position) == (two.accepted, two.reason, two.best, two.position)
+
+
+@pytest.mark.parametrize("module", [recogniser, recognition, judge, hints, opening, mapping, learn])
+def test_nothing_of_the_walk_has_a_clock_a_link_or_a_log_of_its_own(module):
+    """The learner writes the time of the day into the map: it is given that clock, and has the real one by default."""
+    text = inspect.getsource(module)
+    if module is learn:
+        text = text.replace("utc_clock: Callable[[], float] = time.time", "").replace("import time\n", "")
+    for word in ("import time", "monotonic", "threading", "import Link", "flightlog"):
+        assert word not in text
+
+
+class Wrong(Exception):
+    """What a library may raise."""
+
+
+@pytest.mark.parametrize(
+    "error", [ModelError("no."), MapError("gone."), Wrong("x"), MemoryError(), ZeroDivisionError()]
+)
+@pytest.mark.parametrize("where", ["encode", "coarse_scores", "match"])
+def test_whatever_a_technique_raises_is_a_refusal_with_its_reason(walk, error, where):
+    def broken(*asked, **more):
+        raise error
+
+    whole = getattr(walk.technique, where)
+    setattr(walk.technique, where, broken)
+    event = walk.step(frame(1))
+    assert (event.failed, event.accepted, event.position) == (True, False, None)
+    assert event.is_query == (where != "encode")
+    expected = str(error) if isinstance(error, (ModelError, MapError)) else type(error).__name__
+    assert expected in event.reason
+    setattr(walk.technique, where, whole)
+    assert walk.step(frame(1)).accepted, "the next frame is recognised"
+
+
+@pytest.mark.parametrize("image", [np.zeros((0, 0), np.uint8), np.zeros((5,), np.uint8), np.zeros((40, 40, 2)), None])
+def test_what_is_no_picture_is_a_refusal(walk, image):
+    event = walk.step(Frame(image=image, name="no picture", t_mono_s=0.0))
+    assert (event.failed, event.is_query, event.position) == (True, False, None)
+
+
+def test_a_stop_is_no_exception_of_a_frame(walk):
+    class Stop(BaseException):
+        pass
+
+    def stopped(image):
+        raise Stop
+
+    walk.technique.encode = stopped
+    with pytest.raises(Stop):
+        walk.step(frame(1))
+
+
+def test_a_place_learnt_a_moment_ago_moves_nothing(walk):
+    assert walk.step(frame(3, 100.0)).accepted
+    walk.extend(walk.index, 4, 100.0)
+    event = walk.step(frame(3, 129.9))
+    assert (event.accepted, event.position, event.accuracy_m) == (False, None, None)
+    assert "learnt within the last 30 s" in event.reason
+    assert walk.step(frame(2, 129.9)).accepted, "another place"
+    far = walk.step(Frame(image=textured(99), name="elsewhere", t_mono_s=129.9))
+    assert "learnt" not in far.reason, "what is not like it has its own reason"
+    assert walk.step(frame(3, 130.1)).accepted
+
+
+def test_an_index_that_is_lost_fails_every_frame_until_there_is_one_again(walk):
+    index = walk.index
+    walk.lose_index(MapError("the map is gone."))
+    event = walk.step(frame(3))
+    assert (event.failed, event.reason) == (True, "the map is gone.")
+    walk.take(walk.technique, index, walk.rule, walk.search)
+    assert walk.step(frame(3)).accepted
+
+
+def test_a_map_without_a_place_refuses_and_does_not_fail(walk):
+    nothing = type(walk.index)(**{name: array[:0] for name, array in walk.index.arrays.items()}, mean=walk.index.mean)
+    walk.take(walk.technique, nothing, walk.rule, walk.search)
+    event = walk.step(frame(3))
+    assert (event.failed, event.accepted, event.reason, event.best) == (False, False, "the map has no place yet", None)
+
+
+def test_a_frame_that_could_not_be_read_is_an_event_too(walk):
+    event = walk.unread(ValueError("cut"))
+    assert (event.frame, event.failed, event.is_query) == (None, True, False)
+    assert "cut" in event.reason
+
+
+def test_the_walk_takes_no_more_than_it_is_given(walk):
+    """What a recogniser holds of a frame is gone with the next: no list grows from frame to frame."""
+    for number in range(3 * PLACES):
+        walk.step(frame(number % PLACES, float(number)))
+    assert len(walk._new) == 0
+    event = walk.step(replace(frame(1), t_mono_s=99.0))
+    assert event.accepted
+
+
+def test_the_accuracy_of_a_map_is_never_below_what_is_claimed_at_least(walk):
+    walk.index.lat_deg[:] = np.linspace(50.0, 50.00001, PLACES)
+    walk.take(walk.technique, walk.index, walk.rule, walk.search)
+    assert walk.accuracy_m == 20.0
+    assert load_config(None).mavlink.min_accuracy_m == 20.0

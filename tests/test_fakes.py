@@ -1,0 +1,173 @@
+"""The stand-ins of `fakes.py` and the real things keep the same promises."""
+
+import time
+from dataclasses import fields
+
+import cv2
+import pytest
+from fakes import FakeCapture, FakeClock, FakeLink, FakeSource, vehicle_at
+from mavlink_peers import AutopilotThread, UdpPort, wait_until
+from pictures import textured
+
+from edgevpr.errors import ImageError
+from edgevpr.frames.condition import Condition
+from edgevpr.frames.live import LiveSource
+from edgevpr.frames.source import open_source
+from edgevpr.mavlink.address import parse_link
+from edgevpr.mavlink.link import Link, LinkStats
+from edgevpr.mavlink.messages import Fix, Health, Severity, status_text
+from edgevpr.runtime.flight.clock import Clock
+from edgevpr.simulate.autopilot import Track
+
+COUNT = 3
+
+
+@pytest.mark.parametrize("clock", [Clock(), FakeClock().clock], ids=["real", "fake"])
+def test_a_clock_goes_on_and_sleeps(clock):
+    before = {each.name: getattr(clock, each.name)() for each in fields(Clock) if each.name != "sleep"}
+    clock.sleep(0.01)
+    assert clock.mono_s() >= before["mono_s"] + 0.01
+    assert clock.utc_s() > before["utc_s"] > 1e9
+    assert clock.process_cpu_s() >= before["process_cpu_s"]
+    assert clock.thread_cpu_s() >= before["thread_cpu_s"]
+
+
+@pytest.fixture(params=["real", "fake"])
+def recording(request, tmp_path):
+    """Three pictures, of which the second cannot be used."""
+    if request.param == "fake":
+        pictures = [textured(0), ImageError("1.png is cut short"), textured(2)]
+        return FakeSource(pictures, FakeClock(), is_live=False)
+    for number in range(COUNT):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), textured(number))
+    whole = (tmp_path / "1.png").read_bytes()
+    (tmp_path / "1.png").write_bytes(whole[:200])
+    return open_source(str(tmp_path), live=True)
+
+
+def test_a_recording_is_read_to_its_end(recording):
+    assert (recording.is_live, recording.total, recording.dropped) == (False, COUNT, None)
+    assert (recording.condition, recording.state, recording.ended) == (Condition.RUNNING, "reading", False)
+    first = recording.read(0.0)
+    assert (first.image == textured(0)).all()
+    with pytest.raises(ImageError, match="cut short"):
+        recording.read(0.0)
+    last = recording.read(0.0)
+    assert (last.image == textured(2)).all()
+    assert last.t_mono_s >= first.t_mono_s
+    assert last.name != first.name
+    assert (recording.condition, recording.state, recording.ended) == (Condition.ENDED, "ended", True)
+    assert recording.read(0.0) is None
+    recording.close()
+
+
+@pytest.fixture(params=["real", "fake"])
+def camera(request):
+    pictures = [cv2.cvtColor(textured(number), cv2.COLOR_GRAY2BGR) for number in range(2)]
+    if request.param == "fake":
+        source = FakeSource(pictures, FakeClock())
+        yield source, lambda: setattr(source, "is_lost", True)
+        return
+    asked = []
+
+    def opened():
+        asked.append(1)
+        return FakeCapture(pictures if len(asked) == 1 else [])
+
+    source = LiveSource(opened, time.monotonic)
+    yield source, lambda: None  # it is lost by itself, when its pictures are at an end
+    source.close()
+
+
+def test_a_camera_is_live_and_can_be_lost(camera):
+    source, lose = camera
+    assert (source.is_live, source.total, source.ended) == (True, 0, False)
+    frame = wait_until(lambda: source.read(0.05))
+    assert frame.image.shape == (120, 160, 3)
+    assert (frame.position, frame.heading_deg) == (None, None)
+    assert source.dropped >= 0
+    lose()
+    wait_until(lambda: source.condition is Condition.LOST)
+    assert source.state.startswith("lost, reopening in ")
+    source.close()
+    wait_until(lambda: source.ended)
+    assert source.read(0.0) is None
+
+
+@pytest.fixture(params=["real", "fake"])
+def link(request):
+    """A link with an autopilot that takes fixes and says where it is; gives it with its clock."""
+    clock = FakeClock()
+    if request.param == "fake":
+        yield FakeLink(clock, vehicle=lambda: vehicle_at(50.0, 8.0, clock.now_s, has_gps=True)), clock
+        return
+    port = UdpPort()
+    number = port.number
+    port.close()
+    track = Track(t_s=[0.0], lat_deg=[50.0], lon_deg=[8.0], alt_m=[300.0], heading_deg=[float("nan")])
+    autopilot = AutopilotThread(f"udpin:127.0.0.1:{number}", track=track)
+    with Link(parse_link(f"udpout:127.0.0.1:{number}"), clock=clock) as real:
+        real.want_position()
+        wait_until(lambda: real.listens() and real.vehicle() and real.vehicle().has_gps)
+        yield real, clock
+    autopilot.finish()
+
+
+def fix(clock, age_s=0.0):
+    return Fix(50.0, 8.0, 20.0, clock.now_s - age_s)
+
+
+def test_a_fix_is_sent_and_answered(link):
+    link, clock = link
+    sending = link.send_fix(fix(clock))
+    sending.wait(10.0)
+    assert (sending.sent, sending.why) == (True, None)
+    assert wait_until(lambda: sending.answer) == "ACCEPTED"
+    assert link.stats().fixes_sent == 1
+    assert wait_until(lambda: link.stats().acks) == {"ACCEPTED": 1}
+
+
+def test_a_fix_of_an_old_frame_never_leaves(link):
+    link, clock = link
+    sending = link.send_fix(fix(clock, age_s=6.2))
+    sending.wait(10.0)
+    assert (sending.sent, sending.why) == (False, "its frame is 6.2 s old, and 5 s are the limit")
+    assert (link.stats().fixes_sent, link.stats().dropped_stale_fixes) == (0, 1)
+
+
+def test_where_the_vehicle_is_and_whether_it_listens(link):
+    link, clock = link
+    assert link.listens()
+    vehicle = link.vehicle()
+    assert (vehicle.lat_deg, vehicle.lon_deg, vehicle.alt_m) == (50.0, 8.0, 300.0)
+    assert (vehicle.heading_deg, vehicle.has_gps) == (None, True)
+    assert vehicle.is_fresh_at(clock.now_s)
+
+
+def test_messages_and_health_are_taken(link):
+    link, _ = link
+    link.send(status_text(Severity.INFO, "one"), status_text(Severity.INFO, "two"))
+    link.set_health(Health.ACTIVE)
+    wait_until(lambda: link.stats().sent.get("STATUSTEXT") == 2)
+    stats = link.stats()
+    assert isinstance(stats, LinkStats)
+    assert (stats.connected, stats.autopilot_heard, stats.autopilot_system_id) == (True, True, 1)
+
+
+@pytest.mark.parametrize("kind", ["real", "fake"])
+def test_without_an_autopilot_a_fix_waits_for_a_second_and_is_dropped(kind):
+    clock = FakeClock()
+    port = UdpPort()
+    link = FakeLink(clock, answer=None)
+    if kind == "real":
+        link = Link(parse_link(f"udpout:127.0.0.1:{port.number}"), clock=clock)
+        link.start()
+    assert not link.listens()
+    assert link.vehicle() is None
+    sending = link.send_fix(fix(clock))
+    assert sending.sent is None
+    clock.now_s += 1.1
+    wait_until(lambda: link.stats().dropped_stale_fixes == 1)
+    assert (sending.sent, sending.why) == (False, "no autopilot was there to take it within 1 s")
+    link.close()
+    port.close()

@@ -1,0 +1,53 @@
+"""The whole walk in under a second: pictures become a map, a frame is recognised, a fix is sent. The first gate."""
+
+from fakes import FakeClock, FakeLink, FakeSource
+from pictures import textured
+
+from edgevpr.config import load_config
+from edgevpr.places.index import load_index
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.power.boards import load_board
+from edgevpr.runtime.flight.autopilot import ToAutopilot
+from edgevpr.runtime.flight.flight import fly
+from edgevpr.runtime.flight.flightlog import FlightLog, read_log
+from edgevpr.runtime.flight.loop import Stop
+from edgevpr.runtime.recognise.judge import accept_rule
+from edgevpr.runtime.recognise.mapping import build_map
+from edgevpr.runtime.recognise.opening import meter_of
+from edgevpr.runtime.recognise.recogniser import Recogniser
+from edgevpr.techniques import create
+from edgevpr.types import Frame, Position
+
+
+def test_the_whole_walk(tmp_path):
+    config, board, clock = load_config(None), load_board("rpi-4b"), FakeClock()
+    technique, meter = create("cohog", {"w1": 208}), meter_of(config, board)
+    frames = [
+        Frame(image=textured(n), name=f"{n}", t_mono_s=0.0, position=Position(50 + n / 1000, 8.0)) for n in range(5)
+    ]
+    with PlaceMap.create(tmp_path / "m.gpkg", technique.spec) as place_map:
+        assert build_map(frames, technique, place_map, meter).added == 5
+    with PlaceMap.open(tmp_path / "m.gpkg") as place_map, FlightLog(tmp_path / "log", clock=clock) as flight_log:
+        recogniser = Recogniser(
+            technique=technique,
+            place_map=place_map,
+            index=load_index(place_map, technique, 10**6),
+            rule=accept_rule(technique, config.match),
+            meter=meter,
+            candidates=technique.candidates,
+        )
+        link = FakeLink(clock)
+        flown = fly(
+            recogniser,
+            FakeSource([textured(3), textured(9)], clock),
+            config,
+            flight_log=flight_log,
+            autopilot=ToAutopilot(link, send_fixes=True, cores=board.cores, clock=clock.clock),
+            stop=Stop(),
+            clock=clock.clock,
+        )
+    assert (flown.queries, flown.accepted, flown.failed) == (2, 1, 0)
+    assert link.stats().fixes_sent == 1
+    known, unknown = read_log(tmp_path / "log")
+    assert (known["place"], known["accepted"], known["fix"]["sent"]) == (4, True, True)
+    assert (unknown["accepted"], unknown["fix"], unknown["last_fix"]["answer"]) == (False, None, "ACCEPTED")
