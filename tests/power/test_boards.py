@@ -39,7 +39,8 @@ def this_root(tmp_path, model=None, ram_kb=4_000_000, **limits):
 def test_every_board_of_the_thesis_and_of_small_drones_is_there():
     assert board_names() == (
         "generic-x86", "jetson-nano", "jetson-orin-nano", "odroid-xu4",
-        "rpi-3b-plus", "rpi-4b", "rpi-5", "rpi-zero-2w", "thesis-xeon",
+        "rpi-3a-plus", "rpi-3b", "rpi-3b-plus", "rpi-400", "rpi-4b", "rpi-5", "rpi-cm4", "rpi-cm5",
+        "rpi-zero-2w", "thesis-xeon",
     )  # fmt: skip
 
 
@@ -57,9 +58,14 @@ def test_a_profile_that_travels_is_whole_and_says_where_its_figures_are_from(nam
     ("name", "idle_w", "full_w", "verified"),
     [
         ("rpi-zero-2w", 0.6, 3.0, False),
+        ("rpi-3a-plus", 2.0, 5.3, False),
+        ("rpi-3b", 1.08, 4.56, True),
         ("rpi-3b-plus", 2.0, 5.3, True),
+        ("rpi-400", 1.82, 6.85, True),
         ("rpi-4b", 2.29, 6.82, True),
         ("rpi-5", 4.4, 7.86, True),
+        ("rpi-cm4", 2.29, 6.82, False),
+        ("rpi-cm5", 4.4, 9.2, False),
         ("odroid-xu4", 3.0, 8.5, False),
         ("jetson-orin-nano", 2.6, 25.0, False),
         ("thesis-xeon", 0.0, 1.0, False),
@@ -131,8 +137,14 @@ def test_this_machine_is_recognised_by_its_device_tree(tmp_path):
     ("model", "name"),
     [
         ("Raspberry Pi Zero 2 W Rev 1.0", "rpi-zero-2w"),
+        ("Raspberry Pi 3 Model A Plus Rev 1.0", "rpi-3a-plus"),
+        ("Raspberry Pi 3 Model B Rev 1.2", "rpi-3b"),
         ("Raspberry Pi 3 Model B Plus Rev 1.3", "rpi-3b-plus"),
+        ("Raspberry Pi 400 Rev 1.0", "rpi-400"),
+        ("Raspberry Pi 4 Model B Rev 1.4", "rpi-4b"),
+        ("Raspberry Pi Compute Module 4 Rev 1.1", "rpi-cm4"),
         ("Raspberry Pi 5 Model B Rev 1.0", "rpi-5"),
+        ("Raspberry Pi Compute Module 5 Rev 1.0", "rpi-cm5"),
         ("Hardkernel Odroid XU4", "odroid-xu4"),
         ("NVIDIA Jetson Nano Developer Kit", "jetson-nano"),
         ("NVIDIA Jetson Orin Nano Developer Kit", "jetson-orin-nano"),
@@ -197,9 +209,14 @@ def test_the_real_machine_loads():
     ("name", "single", "multi", "products", "thermal_limit_c"),
     [
         ("rpi-zero-2w", 838, 3030, None, 80),
+        ("rpi-3a-plus", 856, 3040, None, 60),
+        ("rpi-3b", 977, 2970, None, 80),
         ("rpi-3b-plus", 856, 3040, None, 60),
+        ("rpi-400", 1741, 5760, 11.077, 80),
         ("rpi-4b", 1741, 5760, 11.889, 80),
         ("rpi-5", 3160, None, 30.249, 80),
+        ("rpi-cm4", 1741 * 1.5 / 1.8, 5760 * 1.5 / 1.8, 11.433, 80),
+        ("rpi-cm5", 3306, 11830, 32.152, 80),
         ("odroid-xu4", 1604, 8980, None, None),
         ("jetson-nano", 1578, 5250, None, None),
         ("jetson-orin-nano", 2153, None, None, None),

@@ -49,7 +49,7 @@ def test_techniques_limits_and_boards_are_on_the_picture(tmp_path):
     )
     chart.plot(result, PI, path)
     drawn = path.read_text()
-    names = ("hog", "calc 1bit", "rpi-zero-2w", "rpi-3b-plus, rpi-4b", "thesis-xeon")
+    names = ("hog", "calc 1bit", "rpi-3a-plus, rpi-zero-2w", "rpi-3b, rpi-3b-plus, rpi-4b", "thesis-xeon")
     limits = ("allowed: 512 MB", "RAM of the board: 1024 MB", "pack, less idle: 5139 mAh")
     for words in (*names, *limits, "Raspberry Pi 4B, 64-bit: 1000 places"):
         assert f"<!-- {words}" in drawn, words
