@@ -108,7 +108,7 @@ def _class(name: str) -> Any:
             f"The network `{name}` gives feature maps only: use it as the `model` of a technique, or name a head on "
             "its card."
         )
-    from edgevpr.techniques.networks.network import CardNetwork
+    from edgevpr.techniques.network import CardNetwork
 
     return partial(CardNetwork, card)
 

@@ -198,6 +198,6 @@ def _vector_length(card: Card, backbones: dict[str, Backbone], learned: bool) ->
         return None
     if card.head and card.head["name"] == "vlad" and not learned:
         return card.head["words"] * backbones["features"].shape[0]
-    from edgevpr.techniques.networks.network import CardNetwork
+    from edgevpr.techniques.network import CardNetwork
 
     return CardNetwork(card).spec.coarse.shape[0]
