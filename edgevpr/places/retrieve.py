@@ -42,11 +42,12 @@ class Scan:
 
 @dataclass(frozen=True, slots=True)
 class Ranking:
-    """Places best first: `slots` int (K,) of the index, `scores` float32 (K,), and what is known of each match."""
+    """Places best first: `slots` int (K,) of the index, `scores` float32 (K,), and by its slot the match of each place
+    that was compared in full, with that score."""
 
     slots: np.ndarray
     scores: np.ndarray
-    matches: tuple[FineMatch, ...]
+    compared: dict[int, FineMatch]
 
 
 def scan(technique: Technique, query: Descriptor, index: PlaceIndex, expected: Expected = NOTHING) -> Scan:
@@ -81,15 +82,18 @@ def compare(
     are left would say little, so five places elsewhere are compared at least. Raises MapError for a place that cannot
     be read.
     """
+    matches: dict[int, FineMatch] = {}
     one_stage = technique.spec.fine is None
 
-    def compared(slot: int, hypotheses: list[int] | None) -> FineMatch:
+    def scored(chosen: list[_Chosen]) -> list[float]:
         if one_stage:
-            return FineMatch(float(scanned.scores[slot]))
-        match = technique.match(query, place_map.fine_part(index.place_ids[slot]), hypotheses)
-        if technique.spec.scan_counts:
-            match = replace(match, score=match.score * (1 + float(scanned.scores[slot])) / 2)
-        return match
+            return scanned.scores[[slot for slot, _ in chosen]].tolist()
+        for slot, hypotheses in chosen:
+            match = technique.match(query, place_map.fine_part(index.place_ids[slot]), hypotheses)
+            if technique.spec.scan_counts:
+                match = replace(match, score=match.score * (1 + float(scanned.scores[slot])) / 2)
+            matches[slot] = match
+        return [matches[slot].score for slot, _ in chosen]
 
     scores, by_hypothesis, in_reach = scanned.scores, scanned.by_hypothesis, expected.in_reach
     exact = candidates is None or technique.candidates < candidates >= len(index)
@@ -100,20 +104,20 @@ def compare(
     there = np.ones(len(index), bool) if in_reach is None else in_reach
     chosen = best_scanned(scores, by_hypothesis, there, candidates)
     chosen += best_scanned(scores, by_hypothesis, ~there, _COMPARED_ELSEWHERE)
-    matches = [compared(*each) for each in chosen]
+    found = scored(chosen)
     slots = np.array([slot for slot, _ in chosen])
     if len(slots) < len(index):
-        best = slots[max(range(len(slots)), key=lambda at: matches[at].score)]
+        best = slots[np.argmax(found)]
         rivals = np.count_nonzero(elsewhere(index, best, slots, neighbour_m))
         if rivals < (1 if in_reach is None else _COMPARED_ELSEWHERE):
             others = elsewhere(index, best, np.arange(len(index)), neighbour_m)
             others[slots] = False
             more = best_scanned(scores, by_hypothesis, others, _COMPARED_ELSEWHERE - rivals)
-            matches += [compared(*each) for each in more]
+            found += scored(more)
             slots = np.append(slots, [slot for slot, _ in more]).astype(np.intp)
-    found = np.array([match.score for match in matches], np.float32)
-    order = np.argsort(-found, kind="stable")
-    return Ranking(slots[order], found[order], tuple(matches[i] for i in order))
+    best_first = np.array(found, np.float32)
+    order = np.argsort(-best_first, kind="stable")
+    return Ranking(slots[order], best_first[order], matches)
 
 
 def best_scanned(scanned: np.ndarray, by_hypothesis: np.ndarray | None, among: np.ndarray, count: int) -> list[_Chosen]:
@@ -161,9 +165,9 @@ def margin(ranking: Ranking, index: PlaceIndex, neighbour_m: float) -> float | N
 def named(ranking: Ranking, index: PlaceIndex, place_map: PlaceMap, first: int | None = None) -> list[Candidate]:
     """Name the `first` places of a ranking (None: all) with what the map file says of them, best first. Raises MapError
     for a place that cannot be read, or is not where it was when the index was loaded: nobody knows what is right."""
-    slots, matches = ranking.slots[:first], ranking.matches[:first]
+    slots, scores = ranking.slots[:first].tolist(), ranking.scores[:first].tolist()
     found = []
-    for slot, place, match in zip(slots, place_map.places(index.place_ids[slots]), matches, strict=True):
+    for slot, score, place in zip(slots, scores, place_map.places(index.place_ids[slots]), strict=True):
         position = place.position
         here = (position.lat_deg, position.lon_deg) if position else (np.nan, np.nan)
         if not np.array_equal(here, (index.lat_deg[slot], index.lon_deg[slot]), equal_nan=True):
@@ -171,5 +175,5 @@ def named(ranking: Ranking, index: PlaceIndex, place_map: PlaceMap, first: int |
                 f"{place_map.path}: place {place.place_id} is not where it was; another program changed the map: load "
                 "it again."
             )
-        found.append(Candidate(place, match))
+        found.append(Candidate(place, ranking.compared.get(slot) or FineMatch(score)))
     return found

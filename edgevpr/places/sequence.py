@@ -8,11 +8,12 @@ found would lag behind. So that none of them is accepted, all other speeds are t
 
 import zlib
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from edgevpr.contract import FineMatch, TechniqueSpec
+from edgevpr.contract import TechniqueSpec
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.retrieve import Ranking
 
@@ -100,12 +101,12 @@ class SequenceSearch:
 
         means = best_means(self._rows, self._trajectories)
         self.rivals = best_means(self._rows, self._other_trajectories)
-        compared = np.full(len(index), -1)
-        compared[ranking.slots] = np.arange(len(ranking.slots))
-        slots = np.flatnonzero((means > 0) | (compared >= 0))
+        worth_naming = means > 0
+        worth_naming[ranking.slots] = True
+        slots = np.flatnonzero(worth_naming)
         slots = slots[np.argsort(-means[slots], kind="stable")]
-        matches = (ranking.matches[at] if at >= 0 else None for at in compared[slots].tolist())
-        return Ranking(slots, means[slots], tuple(_scored(means[slots], matches)))
+        matches = {slot: replace(match, score=float(means[slot])) for slot, match in ranking.compared.items()}
+        return Ranking(slots, means[slots], matches)
 
     def goes_on(self, near: np.ndarray, min_score: float) -> bool:
         """Whether the newest queries alone still see what the sequence sees: `near` bool (N,) is the neighbourhood of
@@ -180,14 +181,6 @@ def offline(scores: np.ndarray, length: int, v_min: float = V_MIN, v_max: float 
         np.maximum(best, total, out=best)
     frames = np.minimum(np.arange(queries) + 1, length).astype(np.float32)
     return best / frames[:, None]
-
-
-def _scored(scores: np.ndarray, matches: Iterator[FineMatch | None]) -> Iterator[FineMatch]:
-    for score, match in zip(scores.tolist(), matches, strict=True):
-        if match is None:
-            yield FineMatch(score)
-        else:
-            yield FineMatch(score, match.shift_cells, match.covariance_cells2, match.rotation_deg)
 
 
 Search = Alone | SequenceSearch

@@ -297,7 +297,7 @@ def test_where_the_scan_counts_it_is_part_of_the_score(ruler_map, candidates):
     expected = [compared[slot] * (1 + scanned[slot]) / 2 for slot in ranking.slots.tolist()]
     np.testing.assert_allclose(ranking.scores, expected, rtol=1e-6)
     assert (np.diff(ranking.scores) <= 0).all()
-    assert [match.score for match in ranking.matches] == pytest.approx(expected)
+    assert [ranking.compared[slot].score for slot in ranking.slots.tolist()] == pytest.approx(expected)
 
 
 def tried(by_hypothesis, count, among=None):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from edgevpr.config import load_config
-from edgevpr.contract import FineMatch, PartSpec, TechniqueSpec
+from edgevpr.contract import PartSpec, TechniqueSpec
 from edgevpr.places.index import empty_index
 from edgevpr.places.retrieve import Ranking
 from edgevpr.places.sequence import SequenceSearch
@@ -29,7 +29,7 @@ def flown(velocity, start, leaves=18, seed=3):
         here = np.exp(-away) if query < leaves else 0.0
         scores = (0.3 + 0.4 * here + 0.02 * noise.random(PLACES)).astype(np.float32)
         slots = np.argsort(-scores)
-        ranking = Ranking(slots, scores[slots], tuple(FineMatch(float(score)) for score in scores[slots]))
+        ranking = Ranking(slots, scores[slots], {})
         ranking = sequence.follow(ranking, index, float(query))
         verdict = judge(ranking, index, RULE, sequence, is_new=False)
         found.append((verdict.accepted, verdict.reason, int(ranking.slots[0])))
@@ -65,7 +65,7 @@ def test_a_score_too_low_for_one_query_is_too_low_for_the_newest():
     index.place_ids[:] = np.arange(PLACES)
     for query, score in enumerate((0.5, 0.4, 0.3)):
         slots, scores = np.array([5 + query, 50, 60]), np.array([score, 0.1, 0.1], np.float32)
-        sequence.follow(Ranking(slots, scores, tuple(map(FineMatch, scores))), index, float(query))
+        sequence.follow(Ranking(slots, scores, {}), index, float(query))
     assert sequence.goes_on(near, min_score=0.3 - 1e-6)
     assert not sequence.goes_on(near, min_score=0.31)
 
@@ -75,7 +75,7 @@ def test_a_place_that_the_newest_query_was_not_compared_with_is_not_seen():
     index = empty_index(TechniqueSpec(name="test", parameters={}, coarse=PartSpec((1,), "<f4")), PLACES, None)
     index.place_ids[:] = np.arange(PLACES)
     for query, (slot, score) in enumerate([(5, 0.9), (60, 0.1), (20, 0.1)]):
-        ranking = Ranking(np.array([slot]), np.array([score], np.float32), (FineMatch(score),))
+        ranking = Ranking(np.array([slot]), np.array([score], np.float32), {})
         sequence.follow(ranking, index, float(query))
     assert not sequence.goes_on(near, min_score=0.0)
 
