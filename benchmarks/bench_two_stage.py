@@ -23,7 +23,7 @@ from big_map import make_big_map
 from edgevpr.contract import Technique
 from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import rank
+from edgevpr.places.retrieve import NOTHING, Expected, compare, scan
 from edgevpr.techniques import create
 from edgevpr.types import Position
 
@@ -70,26 +70,27 @@ def rows(places: int = PLACES) -> list[QueryRow]:
 def looking_down(technique: Technique, place_map: PlaceMap, index: PlaceIndex) -> list[QueryRow]:
     # A map as it is flown, on parallel legs to and fro, with some sway.
     rng = np.random.default_rng(0)
-    turned = {"turned_deg": (rng.choice([0, 180], len(index)) + rng.normal(0, 5, len(index))) % 360}
-    middle = Position(float(index.lat_deg.mean()), float(index.lon_deg.mean()))
-    near = {"allowed": index.within(middle, REACH_M)}
-    in_reach = f"{np.count_nonzero(near['allowed'])} places within {REACH_M:.0f} m"
+    turned_deg = (rng.choice([0, 180], len(index)) + rng.normal(0, 5, len(index))) % 360
+    near = index.within(Position(float(index.lat_deg.mean()), float(index.lon_deg.mean())), REACH_M)
+    in_reach = f"{np.count_nonzero(near)} places within {REACH_M:.0f} m"
     cases = (
-        ("nadir", "24 rotations", {}),
-        ("nadir, heading known", "3 rotations", turned),
-        ("nadir, in reach", in_reach, near),
-        ("nadir, both", f"{in_reach}, 3 rotations", turned | near),
+        ("nadir", "24 rotations", NOTHING),
+        ("nadir, heading known", "3 rotations", Expected(turned_deg=turned_deg)),
+        ("nadir, in reach", in_reach, Expected(in_reach=near)),
+        ("nadir, both", f"{in_reach}, 3 rotations", Expected(near, turned_deg)),
     )
-    return [measure(name, beside, technique, place_map, index, **hints) for name, beside, hints in cases]
+    return [measure(name, beside, technique, place_map, index, expected) for name, beside, expected in cases]
 
 
 def measure(
-    camera: str, beside: str, technique: Technique, place_map: PlaceMap, index: PlaceIndex, **hints: np.ndarray
+    camera: str, beside: str, technique: Technique, place_map: PlaceMap, index: PlaceIndex, expected: Expected = NOTHING
 ) -> QueryRow:
     picture = frames()[0]
 
     def query(candidates: int | None) -> None:
-        rank(technique, technique.encode(picture), place_map, index, candidates, **hints)
+        asked = technique.encode(picture)
+        scanned = scan(technique, asked, index, expected)
+        compare(technique, asked, scanned, place_map, index, candidates=candidates, expected=expected)
 
     query(technique.candidates)
     encode_s = statistics.median(timed_s(technique.encode, picture) for _ in range(TURNS))

@@ -17,10 +17,12 @@ from edgevpr.types import Frame, Vehicle
 
 
 class FakeClock:
-    """A clock that moves when told to, and when somebody sleeps by it. Called, it is the monotonic clock."""
+    """A clock that moves when told to, and when somebody sleeps by it. Called, it is the monotonic clock; `at` lets
+    things happen while somebody sleeps."""
 
     def __init__(self, now_s: float = 1000.0) -> None:
         self.now_s, self.cpu_s, self.thread_cpu_s = now_s, 7.0, 3.0
+        self._events: list[tuple[float, Callable[[], object]]] = []
         self.clock = Clock(
             mono_s=self,
             utc_s=lambda: 1.7e9 + self.now_s,
@@ -32,8 +34,14 @@ class FakeClock:
     def __call__(self) -> float:
         return self.now_s
 
+    def at(self, t_s: float, act: Callable[[], object]) -> None:
+        """Let `act` happen `t_s` seconds from now."""
+        self._events = sorted([*self._events, (self.now_s + t_s, act)], key=lambda event: event[0])
+
     def sleep(self, seconds: float) -> None:
         self.now_s += max(0.0, seconds)
+        while self._events and self._events[0][0] <= self.now_s + 1e-9:
+            self._events.pop(0)[1]()
 
     def work(self, wall_s: float, cores: float = 1.0, kept_waiting: float = 0.0) -> None:
         """Let so many cores be busy for a while, the asking thread among them but for the share it is kept waiting."""

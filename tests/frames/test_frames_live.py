@@ -14,7 +14,7 @@ from edgevpr.frames import live
 from edgevpr.frames.live import LiveSource, wait_before_reopening_s
 from edgevpr.frames.source import open_source
 
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 
 
 @pytest.fixture

@@ -9,7 +9,8 @@ import threading
 from contextlib import closing
 
 import pytest
-from mavlink_peers import Peer, TcpServer, TurnedClock, UdpPort, free_port, wait_until
+from fakes import FakeClock
+from mavlink_peers import Peer, TcpServer, UdpPort, free_port, wait_until
 
 from edgevpr.errors import LinkError
 from edgevpr.mavlink.address import parse_link
@@ -21,7 +22,7 @@ from edgevpr.mavlink.wire import mavlink
 
 @pytest.fixture
 def clock():
-    return TurnedClock()
+    return FakeClock()
 
 
 @pytest.fixture
@@ -392,16 +393,16 @@ def test_pymavlinks_own_connection_decodes_all_that_is_sent(monkeypatch, clock):
     number = free_port()
     other = mavutil.mavlink_connection(f"udpin:127.0.0.1:{number}", dialect="all", source_system=5, source_component=1)
     with Link(parse_link(f"udpout:127.0.0.1:{number}"), clock=clock) as link:
-        first = other.recv_match(blocking=True, timeout=10)
+        first = other.recv_match(blocking=True, timeout=60)
         assert first.get_type() == "HEARTBEAT"
         other.mav.heartbeat_send(
             mavutil.mavlink.MAV_TYPE_QUADROTOR, mavutil.mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 0, 0, 4
         )
         wait_until(lambda: link.stats().autopilot_heard)
         link.send_fix(fix_at(clock.now_s))
-        assert other.recv_match(type="COMMAND_INT", blocking=True, timeout=10).command == 43003
+        assert other.recv_match(type="COMMAND_INT", blocking=True, timeout=60).command == 43003
         link.send(*place_match(1.0, 2, 0.5), *query_figures(1.0, 0.5, 2.0), text("end"))
-        names = [other.recv_match(blocking=True, timeout=10).get_type() for _ in range(5)]
+        names = [other.recv_match(blocking=True, timeout=60).get_type() for _ in range(5)]
         assert names == ["NAMED_VALUE_INT", *["NAMED_VALUE_FLOAT"] * 3, "STATUSTEXT"]
         assert other.mav.total_receive_errors == 0
         assert link.stats().bad_bytes == 0

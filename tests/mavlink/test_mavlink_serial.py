@@ -7,7 +7,8 @@ import threading
 import time
 
 import pytest
-from mavlink_peers import AutopilotThread, SerialCable, TurnedClock, wait_until
+from fakes import FakeClock
+from mavlink_peers import AutopilotThread, SerialCable, wait_until
 
 from edgevpr.errors import LinkError
 from edgevpr.mavlink.address import parse_link
@@ -68,7 +69,7 @@ def test_a_line_that_takes_no_bytes_never_blocks_the_sender(terminal):
 
 def test_closing_sends_what_waits(line):
     master, terminal = line
-    link = Link(parse_link(f"serial:{terminal}:57600"), clock=TurnedClock())
+    link = Link(parse_link(f"serial:{terminal}:57600"), clock=FakeClock())
     link.start()
 
     def full() -> bool:

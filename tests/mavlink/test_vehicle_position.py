@@ -1,7 +1,8 @@
 """Where the autopilot says it is: from the pinned autopilot only, only while fresh, and never at 0, 0."""
 
 import pytest
-from mavlink_peers import Peer, TurnedClock, UdpPort, wait_until
+from fakes import FakeClock
+from mavlink_peers import Peer, UdpPort, wait_until
 
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.link import Link
@@ -11,7 +12,7 @@ from edgevpr.types import Vehicle
 
 @pytest.fixture
 def clock():
-    return TurnedClock()
+    return FakeClock()
 
 
 @pytest.fixture

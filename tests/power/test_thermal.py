@@ -128,7 +128,7 @@ def vcgencmd(tree, script):
 
 
 def until(condition):
-    give_up_s = time.monotonic() + 10
+    give_up_s = time.monotonic() + 60
     while not condition():
         assert time.monotonic() < give_up_s
         time.sleep(0.01)

@@ -97,7 +97,7 @@ def test_it_is_a_process_that_ends_well_on_sigterm_and_says_what_it_saw():
         wait_until(lambda: link.stats().acks == {"ACCEPTED": 1})
         wait_until(lambda: link.stats().sent.get("NAMED_VALUE_FLOAT") == 1)
     process.send_signal(signal.SIGTERM)
-    said, _ = process.communicate(timeout=10)
+    said, _ = process.communicate(timeout=60)
     assert process.returncode == 0
     summary = json.loads(said)
     assert summary["fixes_accepted"] == 1

@@ -108,7 +108,7 @@ def test_a_signal_ends_the_flight_with_everything_flushed(fly, tmp_path, number)
     run = fly("--rate-hz", "0.5", "--link", "udpout:127.0.0.1:9")
     wait_for_queries(tmp_path / "flight.jsonl", 1, run)
     run.send_signal(number)
-    assert run.wait(timeout=20) == 0
+    assert run.wait(timeout=60) == 0
     run.stderr.close()
     lines = list(read_log(tmp_path / "flight.jsonl"))
     assert lines[-1]["kind"] == "end"
@@ -169,6 +169,6 @@ def test_a_source_that_is_not_there_yet_leaves_the_loop_turning(recording, tmp_p
         while said.count("WATCHDOG=1") < 8 or not any("reopening" in line for line in said):
             said += listening.recv(4096).decode().splitlines()
         run.terminate()
-        assert run.wait(timeout=20) == 0
+        assert run.wait(timeout=60) == 0
         run.stderr.close()
     assert os.path.exists(log)
