@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -9,6 +10,9 @@ import pytest
 from pictures import textured
 
 from edgevpr.cli.main import main
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.runtime.preflight import pick
+from edgevpr.types import StageCost
 
 
 @pytest.fixture(scope="module")
@@ -106,6 +110,22 @@ def test_the_technique_is_picked_and_the_reason_logged(capsys, caplog, flight, t
         built = run_json(capsys, "map", "build", tmp_path / "m.gpkg", "--images", flight / "ref", "--json")
     assert built["technique"] == "cohog"
     assert any("technique cohog: 6 places take" in message for message in caplog.messages)
+
+
+def test_a_machine_too_slow_for_the_best_technique_makes_the_map_of_the_readme_all_the_same(
+    capsys, caplog, flight, tmp_path, monkeypatch
+):
+    def slow(tried):
+        return ((name, replace(costs, encode=StageCost(9.0, 9.0))) for name, costs in probe_each(tried))
+
+    probe_each = pick.probe_each
+    monkeypatch.setattr(pick, "probe_each", slow)
+    path = tmp_path / "m.gpkg"
+    built = run_json(capsys, "map", "build", path, "--images", flight / "ref", "--camera", "nadir", "--json")
+    assert (built["technique"], built["added"]) == ("cohog", 6)
+    assert any("technique cohog is taken all the same" in message for message in caplog.messages)
+    with PlaceMap.open(path) as place_map:
+        assert place_map.spec.parameters["camera"] == "nadir"
 
 
 def test_a_broken_off_map_is_continued(capsys, flight, tmp_path):

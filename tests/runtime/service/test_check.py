@@ -5,6 +5,7 @@ import shutil
 import socket
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,8 +15,9 @@ from pictures import textured
 
 from edgevpr import techniques
 from edgevpr.places.mapfile import PlaceMap
+from edgevpr.runtime.preflight import pick
 from edgevpr.runtime.service.check import Finding, check
-from edgevpr.types import Frame
+from edgevpr.types import Frame, StageCost
 
 ITEMS = ["configuration", "board", "battery", "map", "source", "link", "log"]
 
@@ -63,6 +65,18 @@ def wrong(config_file: Path, settings: dict) -> list[Finding]:
     findings = check(config_file)
     assert [finding.what for finding in findings] == ITEMS
     return [finding for finding in findings if not finding.ok]
+
+
+def test_a_query_that_is_too_slow_for_any_fix_is_wrong_unless_no_fixes_are_wanted(settings, config_file, monkeypatch):
+    probe = pick.probe
+    monkeypatch.setattr(pick, "probe", lambda technique: replace(probe(technique), encode=StageCost(6.0, 6.0)))
+    (finding,) = wrong(config_file, settings | {"board": "this"})
+    assert finding.what == "map"
+    assert finding.message.startswith(
+        "No fix would ever be sent (a query takes 6.0 s, and no fix of a frame older than 5 s is ever sent): use a "
+    )
+    without_fixes = {"mavlink": {"link": settings["mavlink"]["link"], "send_fixes": False}}
+    assert wrong(config_file, settings | {"board": "this"} | without_fixes) == []
 
 
 def test_all_is_well_and_nothing_is_left_behind(settings, config_file, tmp_path, flight_folder):
