@@ -18,10 +18,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "runtime"))
-
 from big_map import file_bytes, make_big_map
 from flight_process import cpu_s, start, wait_for, watch_memory, write_frames
 

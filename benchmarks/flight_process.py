@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-from pictures import textured
+import numpy as np
 
 from edgevpr.runtime.flight.flightlog import read_log
 
@@ -18,11 +18,16 @@ _TICK_S = 1 / os.sysconf("SC_CLK_TCK")
 
 
 def write_frames(folder: Path, count: int) -> None:
-    """Pictures as a camera gives them, 640x480 in colour, as JPEG files."""
+    """Write pictures as a camera gives them, 640x480 in colour, as JPEG files: noise of several sizes, and a flat
+    corner, whose regions say nothing."""
     folder.mkdir()
     for number in range(count):
-        picture = cv2.cvtColor(textured(number, 480, 640), cv2.COLOR_GRAY2BGR)
-        cv2.imwrite(str(folder / f"{number:04d}.jpg"), picture)
+        rng = np.random.default_rng(number)
+        layers = [rng.random((2**size, 2**size), np.float32) / size for size in range(2, 6)]
+        picture = sum(cv2.resize(layer, (640, 480), interpolation=cv2.INTER_CUBIC) for layer in layers)
+        grey = cv2.normalize(picture, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+        grey[:160, :213] = 90
+        cv2.imwrite(str(folder / f"{number:04d}.jpg"), cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR))
 
 
 def start(
