@@ -1,4 +1,7 @@
-"""Strict YAML to frozen dataclasses: an unknown key, a wrong type or a value out of range is one clear sentence."""
+"""Strict reading of YAML into frozen dataclasses.
+
+An unknown key, a wrong type or a value out of range raises ConfigError with one clear sentence.
+"""
 
 import difflib
 import types
@@ -31,8 +34,8 @@ _WORDS = {
 
 @dataclass(frozen=True, slots=True)
 class Flag:
-    """A key as a flag of the command line: its names, what stands for its value in the help, the text of the help, and
-    the values that it may have (none: any). Everything else about it is in the key."""
+    """A key of the configuration as a command-line flag: its names, the placeholder of its value in the help, the help
+    text, and the allowed values (empty: any). The type and the range of the value belong to the key."""
 
     names: tuple[str, ...]
     metavar: str | None
@@ -46,7 +49,7 @@ def keyed(flag: Flag | None = None) -> Any:
 
 
 def bounded(low: float, high: float, flag: Flag | None = None) -> Any:
-    """Make a dataclass field whose value, where it is not None, must lie in low..high, and that may be a flag."""
+    """Make a dataclass field whose value, unless it is None, must lie in low..high, and that may be a flag."""
     return field(metadata={"range": (low, high), "flag": flag})
 
 
@@ -151,7 +154,7 @@ class Config:
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """A key of the configuration by its dotted name, the type of its value (None apart), and its flag."""
+    """A key of the configuration that is also a flag: its dotted name, the type of its value (None apart), its flag."""
 
     name: str
     kind: type
@@ -159,20 +162,20 @@ class Key:
 
 
 def flagged_keys(cls: type = Config, prefix: str = "") -> Iterator[Key]:
-    """Give every key of the configuration that is a flag too, in the order in which they stand."""
+    """Yield every key of the configuration that is also a flag, in the order of the fields."""
     hints = typing.get_type_hints(cls)
     for each in fields(cls):
         kind = _kind(hints[each.name])
         if is_dataclass(kind):
-            yield from flagged_keys(kind, f"{each.name}.")
+            yield from flagged_keys(kind, f"{prefix}{each.name}.")
         elif each.metadata.get("flag"):
             yield Key(prefix + each.name, kind, each.metadata["flag"])
 
 
 def load_config(path: str | Path | None, overrides: dict[str, Any] | None = None) -> Config:
-    """Defaults, then the user's file, then `overrides` ({"source.rate_hz": 2.0}; None values are left out).
+    """Load the defaults, then the user's file, then `overrides` ({"source.rate_hz": 2.0}; None values are left out).
 
-    Raises ConfigError with the file, the key and what to do.
+    Each of these replaces values of the ones before. Raises ConfigError with the file, the key and what to do.
     """
     defaults_path = shipped("deploy") / "config.yaml"
     merged = read_yaml(defaults_path)
@@ -190,14 +193,14 @@ def load_config(path: str | Path | None, overrides: dict[str, Any] | None = None
 
 def read_yaml(path: str | Path) -> dict[str, Any]:
     """Read a YAML mapping; raises ConfigError for a file that is missing, unreadable or not a mapping."""
-    import yaml  # the command line knows its flags without
+    import yaml  # not at the top: the command line lists its flags without it
 
     try:
         with open(path, encoding="utf-8") as handle:
             content = yaml.safe_load(handle)
     except OSError as error:
         raise ConfigError(f"{path} cannot be read ({error.strerror}): give the path of a YAML file.") from error
-    except (yaml.YAMLError, ValueError) as error:  # a date that is none is a ValueError
+    except (yaml.YAMLError, ValueError) as error:  # an impossible date is a ValueError
         mark = getattr(error, "problem_mark", None)
         where = f", line {mark.line + 1}" if mark else ""
         problem = getattr(error, "problem", None) or str(error)
@@ -210,7 +213,10 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
 
 
 def build(cls: type[T], mapping: dict[str, Any], where: str, prefix: str = "") -> T:
-    """Build the frozen dataclass `cls` from a mapping, strictly; `where` names the file in messages."""
+    """Build the frozen dataclass `cls` from a mapping, strictly. `where` names the file in messages.
+
+    Raises ConfigError for a key that is unknown or missing, and for a value of a wrong type or out of range.
+    """
     hints = typing.get_type_hints(cls)
     known = {f.name: f for f in fields(cls)}  # type: ignore[arg-type]
     for key in mapping:
@@ -264,6 +270,6 @@ def _converted(value: Any, hint: Any, limits: tuple[float, float] | None, where:
 
 
 def _kind(hint: Any) -> Any:
-    """Give the type of a value that may also be None, or is never."""
+    """Return the type of a value without its None: float for `float | None`, and for float."""
     options = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
     return next(option for option in options if option is not type(None))

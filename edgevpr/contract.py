@@ -1,4 +1,4 @@
-"""The contract of a technique: what it is, what it makes of a picture, and how it compares."""
+"""The contract of a technique: its specification, its descriptor of an image, and its comparison of query and place."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -24,15 +24,17 @@ class PartSpec:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TechniqueSpec:
-    """What a technique is. Down to `packed`, what a map must agree with before it is used: name, every parameter,
-    model, and the form of both parts. `packed` is the form of a place in RAM where it is not the coarse part as it is:
-    `Technique.pack` makes it.
+    """The specification of a technique.
 
-    The rest is what a technique can do beyond the contract; a map does not keep it. Its vectors are held in RAM in
-    `form`, one of `forms`, which cost less from one to the next (None and none: it has one form only). It is meant for
-    `sequence` queries matched together. With `scan_counts` the score of the scan counts in that of the comparison (see
-    `places.retrieve`). A technique that tries a query in several rotations takes a known heading for right within
-    `heading_within_deg` (None: headings say nothing to it).
+    A map file stores the fields from `name` to `packed`. The map is used only by a technique of the same name, the same
+    value of every parameter, the same model, and the same form of both parts. `packed` is the form of a place in RAM,
+    made by `Technique.pack`. None: a place in RAM is its coarse part, unchanged.
+
+    The other fields describe abilities beyond the contract; a map does not store them. `form` is the form of the
+    vectors in RAM. It is one of `forms`, each smaller than the one before (None and empty: there is one form only).
+    `sequence` is the usual number of queries matched together. With `scan_counts` the score of the scan is part of the
+    final score (see `places.retrieve`). A technique that tries a query in several rotations tries only those within
+    `heading_within_deg` of the rotation that known headings give (None: it does not use headings).
     """
 
     name: str
@@ -49,21 +51,24 @@ class TechniqueSpec:
 
     @property
     def row(self) -> PartSpec:
-        """Give the form of one place of the index in RAM."""
+        """The form of one place in the index in RAM."""
         return self.packed or self.coarse
 
     @property
     def smaller_forms(self) -> tuple[str, ...]:
-        """Give the forms that cost less than the one it has."""
+        """The forms that take less RAM than `form`."""
         return self.forms[self.forms.index(self.form) + 1 :] if self.form else ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Descriptor:
-    """One encoded image. `coarse` makes one row of the index in RAM (see `Technique.pack`); `fine` lives in the map
-    file and is read for candidates only; `regions` are what a query asks with, and `good` (bool, one a region) says
-    which of them speak; `quality` (0..1) is the share of the image that says anything. `picture` is kept for a query
-    that may have to be turned."""
+    """The descriptor of one image.
+
+    `coarse` becomes one row of the index in RAM (see `Technique.pack`). `fine` stays in the map file and is read for
+    candidates only. `regions` are the region descriptors of a query. `good` (bool, one a region) tells which of them
+    are compared. `quality` (0..1) is the share of the image that holds information. `picture` is kept for a query that
+    may have to be turned.
+    """
 
     coarse: np.ndarray
     fine: np.ndarray | None = None
@@ -75,8 +80,9 @@ class Descriptor:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """What an image was encoded from: `grey` float32 (side, side) where it may have to be turned (None: it need not),
-    `allowed` bool of the same shape (None: all of it), and `seen` bool, the blocks that are wholly allowed."""
+    """The prepared picture that a descriptor was made from. `grey` is float32 (side, side), None where the picture is
+    never turned. `allowed` is a bool mask of the same shape (None: all pixels). `seen` is bool, True for each block
+    that is wholly allowed."""
 
     grey: np.ndarray | None
     allowed: np.ndarray | None
@@ -85,9 +91,9 @@ class Picture:
 
 @dataclass(frozen=True, slots=True)
 class FineMatch:
-    """One place compared with the query: `score` in 0..1 and, where the technique knows them, the step from the query
-    to the place (dx, dy in cells) with its covariance (var x, cov xy, var y), and how far the camera has turned since
-    the map was made (clockwise, 0..360)."""
+    """The result of comparing one place with the query: `score` in 0..1, and values that only some techniques give
+    (else None). `shift_cells` is the step from the query to the place (dx, dy in cells), with its covariance (var x,
+    cov xy, var y). `rotation_deg` is the rotation of the camera since the map was made (clockwise, 0..360)."""
 
     score: float
     shift_cells: tuple[float, float] | None = None
@@ -96,33 +102,34 @@ class FineMatch:
 
 
 class Technique(Protocol):
-    """The contract of `edgevpr/techniques/*.py`. A technique without a fine part needs no `match`, one whose spec has
-    no `packed` no `pack`."""
+    """The contract of `edgevpr/techniques/*.py`. A technique without a fine part needs no `match`. A technique whose
+    spec has no `packed` needs no `pack`."""
 
     spec: TechniqueSpec
-    candidates: int  # places compared in full after the scan, unless the configuration says otherwise
-    min_score: float  # a match is accepted from this score on, unless the configuration says otherwise ...
-    min_margin: float  # ... and when it beats the best place elsewhere by this
+    candidates: int  # places compared in full after the scan, unless the configuration sets another number
+    min_score: float  # least score of an accepted match, unless the configuration sets another
+    min_margin: float  # least margin of an accepted match over the best place elsewhere, likewise
 
     def encode(self, image: np.ndarray, mask: np.ndarray | None = None) -> Descriptor:
-        """Encode a uint8 image; `mask` (H, W) bool is False where the picture must not be used."""
+        """Encode a uint8 image; `mask` (H, W) bool is False where the image must not be used."""
         ...
 
     def pack(self, coarse: np.ndarray, mean: np.ndarray) -> np.ndarray:
-        """Rows of the index (N, *row.shape) from coarse parts (N, *coarse.shape) and their mean over the map."""
+        """Pack coarse parts (N, *coarse.shape) into rows of the index (N, *row.shape); `mean` is that of the map."""
         ...
 
     def coarse_scores(
         self, query: Descriptor, rows: np.ndarray, mean: np.ndarray | None, turned_deg: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """MachineSpeed all places at once: `rows` (N, *row.shape) -> scores (N,) float32 and, where `match` has several
-        hypotheses to try, those of each, float32 (N, H), -inf where it is out of the question; else None.
+        """Score all places at once: `rows` (N, *row.shape) -> scores (N,) float32 and the scores by hypothesis.
 
-        `mean` is that of the map for a technique that packs, else None. `turned_deg` float (N,) is how far the camera
-        should have turned since each place was mapped, as `FineMatch.rotation_deg` (NaN: nobody knows); it is given
-        only to a technique with `spec.heading_within_deg`, which then allows only such rotations."""
+        Where `match` has several hypotheses to try, the second value is the score of each, float32 (N, H), -inf for
+        one that is ruled out; else None. `mean` is the mean coarse part of the map for a technique that packs, else
+        None. `turned_deg` float (N,) is the expected rotation of the camera since each place was mapped, in the sense
+        of `FineMatch.rotation_deg` (NaN: unknown). Only a technique with `spec.heading_within_deg` is given
+        `turned_deg`; it then allows only rotations near the expected one."""
         ...
 
     def match(self, query: Descriptor, fine: np.ndarray, hypotheses: Sequence[int] | None) -> FineMatch:
-        """Compare the query with the fine part of one place, under some of its hypotheses or all (None)."""
+        """Compare the query with the fine part of one place, under the given hypotheses (None: under all)."""
         ...

@@ -1,8 +1,8 @@
-"""The errors a user can meet. Every message is one sentence that names the thing and says what to do."""
+"""The errors that a user can meet. Every message is one sentence that names the cause and says what to do."""
 
 
 class EdgevprError(Exception):
-    """Something in the user's world is wrong (a file, a link, a map): exit code 1."""
+    """Something that the program works with is wrong (a file, a link, a map): exit code 1."""
 
     exit_code = 1
 
@@ -14,11 +14,11 @@ class UsageError(EdgevprError):
 
 
 class ConfigError(UsageError):
-    """A configuration, board or model file does not say what it must."""
+    """A configuration, board or model file is missing, or its content is wrong."""
 
 
 class ImageError(EdgevprError):
-    """One image cannot be used; others may be."""
+    """One image cannot be used; other images may be usable."""
 
 
 class SourceError(EdgevprError):
@@ -34,4 +34,4 @@ class LinkError(EdgevprError):
 
 
 class ModelError(EdgevprError):
-    """A network cannot be used: its card, its file, what it puts out, the words learned on it, or onnxruntime."""
+    """A network cannot be used because of its card, its file, its output, the words learned on it, or onnxruntime."""

@@ -1,4 +1,4 @@
-"""Where the files that travel with the package are: board profiles, model cards, deployment files."""
+"""Folders of the shipped files (board profiles, model cards, deployment files) and of the user's own files."""
 
 import os
 from pathlib import Path
@@ -12,13 +12,13 @@ def shipped(kind: str) -> Path:
 
 
 def own_folder() -> Path:
-    """Return the user's own folder, which need not be there: edgevpr below XDG_DATA_HOME or ~/.local/share."""
-    # Without a home (a service may have none) "~" stays as it is, and no such folder is found.
+    """Return the user's own folder, which may not exist: edgevpr below XDG_DATA_HOME or ~/.local/share."""
+    # Without a home folder (a service may have none) "~" is not expanded, and no such folder is found.
     return Path(os.environ.get("XDG_DATA_HOME") or os.path.expanduser("~/.local/share")) / "edgevpr"
 
 
 def own_models() -> Path:
-    """Return the folder of the user's own models, which need not be there: the environment's EDGEVPR_MODELS, else
+    """Return the folder of the user's own models, which may not exist: the environment variable EDGEVPR_MODELS, else
     models in the user's own folder."""
     if os.environ.get("EDGEVPR_MODELS"):
         return Path(os.environ["EDGEVPR_MODELS"])
@@ -26,5 +26,5 @@ def own_models() -> Path:
 
 
 def model_folders() -> tuple[Path, ...]:
-    """Return where models are looked for: the user's own folder, then the shipped one. The first of a name wins."""
+    """Return the folders that are searched for a model: the user's own, then the shipped one. The first match wins."""
     return own_models(), shipped("models")

@@ -1,4 +1,4 @@
-"""The values that cross rooms: frozen dataclasses."""
+"""The values that packages pass to each other: frozen dataclasses."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from edgevpr.contract import FineMatch
 
-# ArduPilot takes an older frame for one of 5 s ago, and would set the vehicle back too little: no such fix is sent.
+# ArduPilot treats an older frame as 5 s old, and would then correct the position by too little: no such fix is sent.
 FIX_MAX_AGE_S = 5.0
 _FRESH_S = 1.0
 
@@ -22,10 +22,11 @@ class Position:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Vehicle:
-    """What the autopilot says of the aircraft: where it believes to be (degrees, metres above sea level), where its
-    nose points (0..360 clockwise from north, None where it does not know), and when it said so (`t_heard_s`, on the
-    clock of the frames). `has_gps`: a receiver had a 3D fix then, and there. An autopilot goes on saying where it
-    believes to be long after it has lost that, and does not follow a receiver it does not trust."""
+    """The state of the aircraft as the autopilot reports it: estimated position (degrees, metres above sea level),
+    heading of the nose (0..360 clockwise from north, None: unknown), and `t_heard_s`, the time of the report on the
+    clock of the frames. `has_gps`: at that time a receiver had a 3D fix near that position. Without `has_gps` the
+    position may be wrong: an autopilot goes on reporting its estimate long after it has lost GPS, and it does not
+    follow a receiver that it does not trust."""
 
     lat_deg: float
     lon_deg: float
@@ -35,13 +36,14 @@ class Vehicle:
     has_gps: bool
 
     def is_fresh_at(self, t_mono_s: float) -> bool:
-        """Say whether this was said within a second of a moment, such as that at which a frame was taken."""
+        """Tell whether the report came within one second of `t_mono_s`, such as the time of a frame."""
         return abs(t_mono_s - self.t_heard_s) <= _FRESH_S
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Frame:
-    """One picture and what is known of it. `image` is uint8, (H, W) grey or (H, W, 3) BGR."""
+    """One picture and its known data (None: unknown). `image` is uint8, (H, W) grey or (H, W, 3) BGR. `t_mono_s` is
+    seconds of the monotonic clock, `t_utc_s` seconds since 1970, `heading_deg` 0..360 clockwise from true north."""
 
     image: np.ndarray
     name: str
@@ -53,7 +55,7 @@ class Frame:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Place:
-    """A place of the map as a person knows it (its descriptors are fetched apart)."""
+    """A place of the map without its descriptors, which are read separately. Units are those of `Frame`."""
 
     place_id: int
     source_image: str
@@ -65,7 +67,7 @@ class Place:
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A place that may be the one in the query, and how it matches; retrieval returns these best first."""
+    """A place that may be the one in the query, and its match. Retrieval returns candidates best first."""
 
     place: Place
     match: FineMatch
@@ -73,7 +75,7 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True)
 class StageCost:
-    """What one stage cost: wall seconds, and CPU-seconds of all threads of the process."""
+    """Cost of one stage: wall seconds, and CPU-seconds of all threads of the process."""
 
     wall_s: float
     cpu_s: float
@@ -85,7 +87,7 @@ class StageCost:
         return StageCost(self.wall_s * times, self.cpu_s * times)
 
     def utilisation(self, cores: int) -> float:
-        """Reckon U of equation 5.1: the share of the whole machine that was busy, 0..1."""
+        """Compute U of equation 5.1: the share of the whole machine that was busy, 0..1."""
         return min(1.0, self.cpu_s / (self.wall_s * cores)) if self.wall_s > 0 else 0.0
 
 
@@ -94,8 +96,8 @@ NO_COST = StageCost(0.0, 0.0)
 
 @dataclass(frozen=True, slots=True)
 class Steps:
-    """What the steps of one query cost: its picture read (in a flight) and encoded, all places scanned, candidates
-    compared and judged; none where the query did not come to it."""
+    """Costs of the steps of one query: `read` the picture (in a flight only), `encode` it, `scan` all places, and
+    `compare` and judge the candidates. A step that the query did not reach has no cost."""
 
     read: StageCost = NO_COST
     encode: StageCost = NO_COST
@@ -104,7 +106,7 @@ class Steps:
 
     @property
     def match(self) -> StageCost:
-        """Give the thesis's matching: everything after encoding."""
+        """Cost of matching as the thesis defines it: everything after encoding."""
         return self.scan + self.compare
 
 
@@ -112,7 +114,8 @@ class Steps:
 class QueryCost:
     """Cost of one query by equations 5.1-5.7: times, utilisations of all cores, memory, charge drawn from the pack.
 
-    `rss_mb` is now; `pss_mb`, with shared pages in proportion, may be some seconds old (None: the kernel does not say).
+    `rss_mb` is read at the query. `pss_mb`, with shared pages in proportion, may be some seconds old (None: the kernel
+    does not report it).
     """
 
     t_encode_s: float
@@ -127,14 +130,14 @@ class QueryCost:
 
     @property
     def whole(self) -> StageCost:
-        """Give both stages as one."""
+        """Cost of both stages together."""
         return StageCost(self.t_encode_s + self.t_match_s, self.cpu_s)
 
 
 @dataclass(frozen=True, slots=True)
 class FixReport:
-    """What became of the position fix of a `query`: `sent` is True, False (and `why`), or None while it waits for its
-    turn; `answer` is the autopilot's, the name of a MAV_RESULT, None where there is none (yet)."""
+    """The outcome of the position fix of a `query`. `sent` is True, False (`why` gives the reason), or None while the
+    fix waits to be sent. `answer` is the answer of the autopilot, the name of a MAV_RESULT; None: no answer (yet)."""
 
     query: str
     sent: bool | None

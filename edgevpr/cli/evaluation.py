@@ -54,7 +54,7 @@ def evaluate(args: Namespace) -> int:
     if args.plot:
         require_picture(Path(args.plot))
     forms = [form.strip() for form in args.form.split(",")]
-    # A wrong setting is said before the first hour of work, and a network that cannot be used stops no other.
+    # A wrong setting is reported before the first hour of work; a network that cannot be used stops no other.
     tried = list(usable(offers(wanted, forms, _settings(args, wanted))))
     errors = {offer.label: each for offer, each in tried if isinstance(each, ModelError)}
     if len(errors) == len(tried):
@@ -78,7 +78,7 @@ def evaluate(args: Namespace) -> int:
 
 
 def _settings(args: Namespace, wanted: list[str]) -> dict[str, dict[str, str]]:
-    """Read the settings of each technique."""
+    """Read the settings of each technique. Raises UsageError for one of a technique that is not measured."""
     from edgevpr.runtime.preflight.pick import camera_setting
 
     settings = {name: camera_setting(name, value_of(args, "source.camera")) for name in wanted}

@@ -1,4 +1,4 @@
-"""What is done with a map: `edgevpr match`, `run`, `check` and `service`."""
+"""Commands that use a map: `edgevpr match`, `run`, `check` and `service`."""
 
 import os
 import sys
@@ -52,7 +52,7 @@ def add(commands: Any) -> None:
 
 
 def run_match(args: Namespace) -> int:
-    """Find the places of a recording in a map."""
+    """Find the places of a recording in a map, and print a line for each image."""
     from edgevpr.frames.source import open_source
     from edgevpr.geodesy import distance_m
     from edgevpr.power.boards import load_board
@@ -94,12 +94,12 @@ def run_match(args: Namespace) -> int:
 
 
 def run_flight(args: Namespace) -> int:
-    """Fly."""
+    """Fly with a configuration."""
     from edgevpr.runtime.service.fly import fly
 
     code = fly(config_of(args, args.config), path_of(args.positions))
     if threading.active_count() > 1:
-        # A capture thread hangs in a stream that does not answer; FFmpeg would abort the end of the interpreter.
+        # A capture thread hangs in a stream that does not answer: FFmpeg would abort Python while it ends.
         sys.stderr.flush()
         os._exit(code)
     return code

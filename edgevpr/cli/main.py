@@ -1,5 +1,5 @@
-"""The command line: what can be asked. Each group of commands stands in a file, its flags beside what it does; what a
-command needs is imported only once it is asked for."""
+"""The command line. Each group of commands is a file, with its flags beside its code; a command imports what it needs
+only when it runs."""
 
 import argparse
 import logging
@@ -14,9 +14,10 @@ _GROUPS = (maps, flying, profile, evaluation, simulation, networks)
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run one command; returns the exit code: 0 done, 1 something in the world is wrong, 2 the request is."""
+    """Run one command and return the exit code: 0 done, 1 something outside the program is wrong, 2 the request is
+    wrong, 130 stopped by Ctrl-C."""
     args = _parser().parse_args(argv)
-    # Before NumPy is imported: its products here are small, and more threads make them slower and dearer.
+    # Set before NumPy is imported: its products are small here, and more threads make them slower and cost more.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     logging.basicConfig(
         level=logging.DEBUG if args.debug else logging.INFO, format="edgevpr: %(message)s", stream=sys.stderr
@@ -25,7 +26,7 @@ def main(argv: list[str] | None = None) -> int:
         return args.run(args)
     except EdgevprError as error:
         return _failed(args, error, str(error), error.exit_code)
-    except BrokenPipeError:  # the reader of our output has gone (`edgevpr ... | head`)
+    except BrokenPipeError:  # the reader of the output has gone (`edgevpr ... | head`)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:

@@ -60,7 +60,7 @@ def _positive(text: str) -> float:
 
 
 def map_build(args: Namespace) -> int:
-    """Make a map of a recording, or go on with one."""
+    """Make a map of a recording, or continue one."""
     from edgevpr.config import load_config
     from edgevpr.frames.source import open_source
     from edgevpr.places.mapfile import PlaceMap
@@ -128,7 +128,7 @@ def map_info(args: Namespace) -> int:
 
 
 def map_merge(args: Namespace) -> int:
-    """Make one map of several, as a whole or not at all."""
+    """Make one map of several, completely or not at all."""
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.runtime.recognise.opening import technique_of
 

@@ -1,4 +1,4 @@
-"""`edgevpr train` and `models`: networks trained on one's own pictures, tried, listed and added."""
+"""`edgevpr train` and `models`: train networks on your own pictures; list, try, add and quantise networks."""
 
 import sys
 from argparse import ArgumentParser, Namespace
@@ -61,7 +61,7 @@ def _add_models(models: Any) -> None:
 
 
 def train_calc(args: Namespace) -> int:
-    """Train the CALC autoencoder."""
+    """Train the CALC autoencoder, and print the result."""
     from edgevpr.training import job
 
     unusable: list[ImageError] = []
@@ -77,7 +77,7 @@ def train_calc(args: Namespace) -> int:
 
 
 def train_words(args: Namespace) -> int:
-    """Learn words."""
+    """Learn the words that vlad, regions or bow count, and print the result."""
     from edgevpr.training import words
 
     unusable: list[ImageError] = []
@@ -142,7 +142,7 @@ def models_verify(args: Namespace) -> int:
 
 
 def models_add(args: Namespace) -> int:
-    """Try a network and add it."""
+    """Try a network, and add it with its card to the user's models folder."""
     from edgevpr.power.boards import load_board
     from edgevpr.runtime.preflight.networks import add
 
@@ -155,7 +155,7 @@ def models_add(args: Namespace) -> int:
 
 
 def models_quantise(args: Namespace) -> int:
-    """Make a network of 8-bit integers, and say what it is worth."""
+    """Make a network of 8-bit integers, and print its costs and, with a data set, its recall, before and after."""
     from edgevpr.evaluate.dataset import load_dataset
     from edgevpr.evaluate.evaluate import evaluate as measured
     from edgevpr.helpers.progress import progress

@@ -1,4 +1,4 @@
-"""`edgevpr profile`: what each technique costs a board in RAM and battery, said before take-off."""
+"""`edgevpr profile`: what each technique costs a board in RAM and battery, estimated before take-off."""
 
 import sys
 from argparse import ArgumentParser, Namespace
@@ -96,7 +96,7 @@ def profile(args: Namespace) -> int:
 
 
 def _plan(args: Namespace, board: "Board") -> "tuple[FlightPlan, str | None, tuple[Offer, ...]]":
-    """Read what is asked, the technique of the map if there is one, and what is to be tried."""
+    """Return the plan that is asked for, the technique of the map (None: no map), and the techniques to try."""
     from edgevpr import techniques
     from edgevpr.config import load_config
     from edgevpr.places.mapfile import PlaceMap
@@ -144,7 +144,8 @@ def _detect(args: Namespace) -> int:
 
 
 def _measure(args: Namespace, quiet: bool) -> int:
-    """Measure this machine and keep the figures; `quiet` leaves the table to who asked for more."""
+    """Measure this machine and keep the figures; with `quiet` an estimate follows, and the figures are not printed as
+    JSON."""
     from edgevpr import techniques
     from edgevpr.helpers.progress import progress
     from edgevpr.power.boards import load_board

@@ -1,4 +1,4 @@
-"""What the commands share: flags, the configuration that they make, and how results and troubles are said."""
+"""Parts that the commands share: flags, the configuration made from them, and the printing of results and errors."""
 
 import json
 import sys
@@ -20,37 +20,37 @@ _RECORDING = "a folder of images or a video file"
 
 
 def command(commands: Any, name: str, run: Callable[[Namespace], int], text: str) -> ArgumentParser:
-    """Add a command that calls `run` with the parsed arguments, and give its parser."""
+    """Add a command that calls `run` with the parsed arguments, and return its parser."""
     parser = _parser(commands, name, text)
     parser.set_defaults(run=run)
     return parser
 
 
 def group(commands: Any, name: str, text: str) -> Any:
-    """Add a command that has commands of its own, and give what those are added to."""
+    """Add a command that has commands of its own, and return the object that those are added to."""
     return _parser(commands, name, text).add_subparsers(title="commands", required=True, metavar="COMMAND")
 
 
 def _parser(commands: Any, name: str, text: str) -> ArgumentParser:
     parser = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
-    # Also after the command, where everybody types it.
+    # Accepted after the command too, where users type it.
     parser.add_argument("--debug", action="store_true", default=SUPPRESS, help=SUPPRESS)
     return parser
 
 
 def add_json(parser: ArgumentParser) -> None:
-    """Add --json."""
+    """Add the flag --json."""
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 def add_recording(parser: ArgumentParser) -> None:
-    """Add the recording that frames come from."""
+    """Add the flags for the recording that frames come from."""
     parser.add_argument("--images", "--source", dest="source", required=True, metavar="SOURCE", help=_RECORDING)
     add_positions(parser)
 
 
 def add_positions(parser: ArgumentParser) -> None:
-    """Add the positions that go with a folder of images."""
+    """Add the flag for the positions that go with a folder of images."""
     parser.add_argument(
         "--positions", metavar="CSV", help="file,lat,lon[,alt,yaw_deg,time] (default: beside the images)"
     )
@@ -62,8 +62,8 @@ def add_parameters(parser: ArgumentParser, text: str, form: str = "KEY=VALUE") -
 
 
 def add_keys(parser: ArgumentParser, *names: str, **texts: str) -> None:
-    """Add the flags of the named keys of the configuration, of all of them where none is named. `texts`, by the last
-    part of a name, replace the help of some."""
+    """Add the flags of the named keys of the configuration, or of all keys where none is named. `texts`, by the last
+    part of a key's name, replace the help of some."""
     for key in flagged_keys():
         if names and key.name not in names:
             continue
@@ -78,12 +78,12 @@ def add_keys(parser: ArgumentParser, *names: str, **texts: str) -> None:
 
 
 def value_of(args: Namespace, name: str) -> Any:
-    """Give what was said of a key of the configuration, None where nothing was."""
+    """Return the value given for a key of the configuration, None where none was given."""
     return getattr(args, _KEY + name)
 
 
 def config_of(args: Namespace, path: str | None = None, **others: Any) -> Config:
-    """Make the configuration: the file `path`, if there is one, under the flags and `others`."""
+    """Make the configuration from the file `path`, if there is one; the flags and `others` override it."""
     said = {name.removeprefix(_KEY): value for name, value in vars(args).items() if name.startswith(_KEY)}
     return load_config(path, said | others)
 
@@ -97,13 +97,13 @@ def parameters_of(pairs: list[str]) -> dict[str, str]:
 
 
 def path_of(text: str | None) -> Path | None:
-    """Read a path that need not be given."""
+    """Return a path that need not be given; None where it is not."""
     return Path(text) if text else None
 
 
 def frames_of(source: "Source", label: str, unusable: list[ImageError]) -> "Iterator[Frame]":
-    """Read every frame of a source that ends, with progress; an image that cannot be used is said, kept in `unusable`,
-    and left out."""
+    """Read every frame of a source that ends, and show progress. An image that cannot be used is reported, added to
+    `unusable`, and left out."""
     from edgevpr.helpers.progress import progress
 
     def until_it_ends() -> "Iterator[Frame | None]":
@@ -119,18 +119,18 @@ def frames_of(source: "Source", label: str, unusable: list[ImageError]) -> "Iter
 
 
 def leave_out(error: ImageError, unusable: list[ImageError]) -> None:
-    """Say that an image cannot be used, and keep that in `unusable`."""
+    """Report that an image cannot be used, and add the error to `unusable`."""
     print(f"edgevpr: {error}", file=sys.stderr)
     unusable.append(error)
 
 
 def exit_code(unusable: list[ImageError]) -> int:
-    """Sum up what could not be used: 1, and a sentence, where there is anything."""
+    """Return the exit code: 1, with a printed sentence, where any image could not be used, else 0."""
     if unusable:
         print(f"edgevpr: {len(unusable)} images could not be used (named above).", file=sys.stderr)
     return 1 if unusable else 0
 
 
 def print_json(value: Any) -> None:
-    """Print a result for programs."""
+    """Print a result as JSON, for programs."""
     print(json.dumps(value, indent=2, default=str))

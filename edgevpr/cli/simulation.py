@@ -1,4 +1,5 @@
-"""`edgevpr simulate` and `demo`: a generated flight, a flight controller to talk to, and the whole job in one go."""
+"""`edgevpr simulate` and `demo`: a generated flight, a simulated flight controller, and a demonstration of the whole
+job."""
 
 from argparse import Namespace
 from dataclasses import asdict
@@ -28,7 +29,7 @@ def add(commands: Any) -> None:
 
 
 def simulate_autopilot(args: Namespace) -> int:
-    """Be a flight controller."""
+    """Run a simulated flight controller, and print what it has received."""
     from edgevpr.simulate.autopilot import read_track, run_autopilot
 
     summary = run_autopilot(args.link, args.duration_s, track=read_track(args.track) if args.track else None)
@@ -40,7 +41,7 @@ def simulate_autopilot(args: Namespace) -> int:
 
 
 def simulate_flight(args: Namespace) -> int:
-    """Write a generated flight."""
+    """Write a generated flight: images and positions.csv."""
     from edgevpr.simulate.flight import fly_and_write
 
     if args.seed < 0:
@@ -50,7 +51,7 @@ def simulate_flight(args: Namespace) -> int:
 
 
 def run_demo(args: Namespace) -> int:
-    """Run the demonstration."""
+    """Run the demonstration, and print its summary."""
     from edgevpr.simulate import demo
 
     print(demo.run_demo(Path(args.out)))

@@ -7,19 +7,19 @@ from edgevpr.evaluate.evaluate import TechniqueResult
 from edgevpr.helpers.figures import figure
 
 _PANELS_A_ROW = 3
-# Of ten or more curves no ten colours are told apart: after them the lines change.
+# More than ten colours cannot be told apart: after ten curves the line style changes.
 _LINES = ("-", "--", ":", "-.")
 
 
 def plot(results: Mapping[str, Sequence[TechniqueResult]], path: Path) -> None:
-    """Draw one panel a data set, one curve a technique, best AUC first in the key.
+    """Draw one panel per data set with one curve per technique, best AUC first in the legend, and write it to `path`.
 
-    A technique that is right (or wrong) with all of one score gives a curve of one point: it is drawn as a mark.
+    If all scores of a technique are the same, its curve is one point: it is drawn as a mark.
     """
     columns = min(len(results), _PANELS_A_ROW)
     rows = -(-len(results) // columns)
     drawn = figure(5.2 * columns, 4.6 * rows)
-    # A technique looks the same in every panel, whatever is beside it and in whatever order the key is.
+    # A technique looks the same in every panel, whatever is beside it and whatever the order of the legend.
     names = dict.fromkeys(result.technique for compared in results.values() for result in compared)
     looks = {name: look for look, name in enumerate(names)}
     for at, (title, compared) in enumerate(results.items(), start=1):

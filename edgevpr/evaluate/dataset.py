@@ -11,7 +11,7 @@ from edgevpr.frames.images import list_images
 
 @dataclass(frozen=True, slots=True)
 class Query:
-    """A query that is scored: `right` are file names of references that count as correct; a hit in `ignored` is
+    """A query that is scored: `right` are file names of references that count as correct; a match in `ignored` is
     neither right nor wrong."""
 
     path: Path
@@ -21,7 +21,8 @@ class Query:
 
 @dataclass(frozen=True, slots=True)
 class Dataset:
-    """`references` are the names of all images of `ref_dir`, in the order in which it is mapped."""
+    """A data set: its scored queries and the folder of its references. `references` are the names of all images of
+    `ref_dir`, in the order in which they are mapped."""
 
     queries: tuple[Query, ...]
     ref_dir: Path
@@ -31,10 +32,10 @@ class Dataset:
 def load_dataset(query_dir: str | Path, ref_dir: str | Path, ground_truth: str | Path) -> Dataset:
     """Read a data set and check it against its folders.
 
-    Columns of the CSV: query_file, ref_files (names separated by spaces); where present ref_files_loose (ignored
-    unless they are in ref_files too) and status (only `ok` is scored). Other columns, and queries that the CSV does
-    not name, are left alone. Raises UsageError with file, line, value and what to do, and SourceError for a folder
-    without images.
+    Columns of the CSV are query_file and ref_files (names separated by spaces). Optional are ref_files_loose (ignored
+    unless they are in ref_files too) and status (only `ok` is scored). Other columns, and queries that the CSV does not
+    name, are left alone. Raises UsageError with file, line, value and what to do, and SourceError for a folder without
+    images.
     """
     query_paths = {path.name: path for path in list_images(query_dir)}
     references = tuple(path.name for path in list_images(ref_dir))
@@ -62,7 +63,7 @@ def load_dataset(query_dir: str | Path, ref_dir: str | Path, ground_truth: str |
 
 
 def _rows(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
-    """Each row of the CSV, stripped, with its place in the file for messages."""
+    """Yield each row of the CSV, stripped, with its place in the file for messages."""
     try:
         with open(path, encoding="utf-8-sig", newline="") as handle:
             reader = csv.DictReader(handle)

@@ -1,4 +1,4 @@
-"""Measure a technique on a data set through the code that flies: map file, index, retrieval, stage meter."""
+"""Measurement of a technique on a data set by the code that flies: map file, index, retrieval, stage meter."""
 
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
@@ -35,15 +35,16 @@ Progress = Callable[[Iterable[T], int, str], Iterable[T]]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TechniqueResult:
-    """What a technique (and its form) reached on a data set, with which weights, and what it cost.
+    """Result of a technique (in one form) on a data set: its quality, its weights and its cost.
 
     Times are means over the queries: `t_match_s` is for all references, `t_match_per_ref_s` for one. `u_encode` and
-    `u_match` are shares of all cores over those times (5.1). `descriptor_bytes` a place are in RAM, `fine_bytes` on
-    disk. `ah_total` (5.7) is drawn from the pack, `ah_total_cpu_rail` from the thesis's rail of 2.5 V; `ah_assumes`
-    says by what. `precision_recall` are the points of the curve, from the highest threshold down. `accepted` queries
-    would have moved the aircraft by the technique's own rule, `accepted_wrong` of them to a wrong place. `roc_auc` is
-    None where all best matches are right, or none is. `pcu` needs all techniques that are compared: `compare` fills it
-    in, with the `t_encode_max_s` it used. So many queries as `sequence` says were matched together.
+    `u_match` are shares of all cores over those times (5.1). A place takes `descriptor_bytes` in RAM, and its fine part
+    `fine_bytes` on disk. `ah_total` (5.7) is drawn from the pack, `ah_total_cpu_rail` from the thesis's rail of 2.5 V,
+    both for all queries; `ah_assumes` names board, pack and efficiency. `precision_recall` are the points of the curve,
+    from the highest threshold down. `accepted` queries would have moved the aircraft by the technique's own rule,
+    `accepted_wrong` of them to a wrong place. `roc_auc` is None if all best matches are right, or none is. `pcu`
+    depends on all techniques that are compared: `compare` fills it in, with the `t_encode_max_s` it used. `sequence` is
+    the number of queries that were matched together.
     """
 
     technique: str
@@ -79,8 +80,9 @@ class TechniqueResult:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Answer:
-    """One query: the score of its best match and the rank of the first right one among the references that count;
-    whether the flight would have accepted its match, and wrongly so; the cost of both stages."""
+    """The answer to one query. `score` is that of its best match, `first_right` the rank of the first right one, both
+    among the references that count. `accepted`: the flight would have accepted the match; `accepted_wrong`: it would
+    have, and the match is wrong. `encoding` and `matching` are the costs of the two stages."""
 
     score: float
     first_right: float
@@ -98,11 +100,11 @@ def evaluate(
     progress: Progress = lambda items, total, label: items,
     sequence: int | None = None,
 ) -> TechniqueResult:
-    """Map the references, ask every query, and score the answers; `candidates` places are compared in full (None: all),
-    and `sequence` queries are matched together, in the order of their names (None: the technique's own number).
+    """Map the references, ask every query, and score the answers. `candidates` places are compared in full (None: all).
+    `sequence` queries are matched together, in the order of their names (None: the technique's own number).
 
-    Raises UsageError for an unknown technique or parameter, ImageError for an image that cannot be used, and MapError
-    where the temporary map cannot be written.
+    Raises UsageError for an unknown technique or parameter, ImageError for an image that cannot be used, MapError if
+    the temporary map cannot be written, and ModelError for a network that cannot be used or a query that fails.
     """
     technique = create(technique_name, parameters)
     config = load_config(None)
@@ -129,7 +131,7 @@ def evaluate(
                     search=search_of(length),
                 )
 
-            # The first query pays for lazy imports, lookup tables and a cold disk: one that is not counted goes before.
+            # The first query pays for lazy imports, tables and a cold disk, so one that is not counted goes first.
             _asked(walk(1), dataset.queries[0].path)
             answers = list(_answers(walk(length), dataset, progress))
     return replace(_summary(technique, len(dataset.references), answers), sequence=length)
@@ -150,18 +152,19 @@ def compare(results: Iterable[TechniqueResult]) -> list[TechniqueResult]:
 
 
 def as_json(results: Iterable[TechniqueResult]) -> dict[str, Any]:
-    """{"techniques": {name: every field of its result}}, for `json.dump`."""
+    """Return {"techniques": {name: every field of its result}}, for `json.dump`."""
     return {"techniques": {result.technique: asdict(result) for result in results}}
 
 
 def _frames(source: Source) -> Iterator[Frame]:
-    """All frames of a folder; the first that cannot be used ends it all: a set with holes measures nothing."""
+    """Yield all frames of a folder. The first that cannot be used ends the evaluation: a set with holes measures
+    nothing."""
     while not source.ended:
         yield source.read(timeout_s=0)
 
 
 def _answers(recogniser: Recogniser, dataset: Dataset, progress: Progress) -> Iterator[_Answer]:
-    # Of a sequence, those that are not scored are a part as well.
+    # Queries that are not scored are part of a sequence as well.
     scored = {query.path.name: query for query in dataset.queries}
     in_sequence = recogniser.search.length > 1
     folder = dataset.queries[0].path.parent
@@ -186,7 +189,7 @@ def _answers(recogniser: Recogniser, dataset: Dataset, progress: Progress) -> It
 
 
 def _asked(recogniser: Recogniser, path: Path) -> Recognition:
-    """Ask about one image; a set with holes measures nothing, so what fails ends it all."""
+    """Recognise one image. A failure ends the evaluation (ModelError): a set with holes measures nothing."""
     event = recogniser.step(Frame(image=read_image(path), name=path.name, t_mono_s=0.0))  # a folder has no gaps
     if event.failed:
         raise ModelError(event.reason)

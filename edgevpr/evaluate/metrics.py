@@ -1,7 +1,7 @@
-"""The figures of thesis 2.7 and 6.3.1, as pure functions on the best match of every query.
+"""The figures of thesis 2.7 and 6.3.1, as pure functions of the best match of every query.
 
 `scores` is float (N,): the score of each query's best match. `correct` is bool (N,): whether that match is right. A
-match is accepted when its score is at least the threshold; false negatives are right matches below it.
+match is accepted when its score is at least the threshold; false negatives are right matches below the threshold.
 """
 
 import math
@@ -10,7 +10,7 @@ import numpy as np
 
 
 def counting(ranked: np.ndarray, ignored: np.ndarray) -> np.ndarray:
-    """Where in a ranking the references stand that count: those that are neither right nor wrong are passed over.
+    """Return the positions in a ranking of the references that count, skipping those neither right nor wrong.
 
     `ranked` is int (K,), numbers of references, best first; `ignored` is bool (references,).
     """
@@ -18,21 +18,22 @@ def counting(ranked: np.ndarray, ignored: np.ndarray) -> np.ndarray:
 
 
 def first_right(ranked: np.ndarray, right: np.ndarray) -> float:
-    """Rank, from 0, of the first right reference of a ranking; infinite where it holds none. `right` is bool."""
+    """Return the rank, from 0, of the first right reference of a ranking; infinite if there is none. `ranked` is int
+    (K,), `right` is bool (references,)."""
     hits = np.flatnonzero(right[ranked])
     return float(hits[0]) if len(hits) else math.inf
 
 
 def recall_at(k: int, ranks: np.ndarray) -> float:
-    """Share of the queries that have a right reference among their first `k`; `ranks` (N,) by `first_right`."""
+    """Return the share of the queries with a right reference among their first `k`; `ranks` (N,) by `first_right`."""
     return float(np.mean(np.asarray(ranks) < k))
 
 
 def precision_recall(scores: np.ndarray, correct: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Precision and recall (2.1, 2.2) with the threshold at every score that occurs, from the highest down.
+    """Compute precision and recall (2.1, 2.2) with the threshold at every score that occurs, from the highest down.
 
-    Queries of one score are accepted together, so there is one point a distinct score. Where no match at all is right,
-    recall is taken to be 0.
+    Queries with the same score are accepted together, so there is one point per distinct score. If no match at all is
+    right, recall is taken to be 0.
     """
     scores, correct = np.asarray(scores), np.asarray(correct, bool)
     order = np.argsort(-scores, kind="stable")
@@ -43,32 +44,32 @@ def precision_recall(scores: np.ndarray, correct: np.ndarray) -> tuple[np.ndarra
 
 
 def auc(precision: np.ndarray, recall: np.ndarray) -> float:
-    """Area under the precision-recall curve by 2.3: the points that occur, without an extra one at recall 0.
+    """Compute the area under the precision-recall curve by 2.3: only the points that occur, no extra one at recall 0.
 
-    It tops out at (N-1)/N, and is 0 where all scores are the same: one point spans no area.
+    It is at most (N-1)/N. It is 0 if all scores are the same: one point spans no area.
     """
     return float(np.sum((precision[:-1] + precision[1:]) / 2 * np.diff(recall)))
 
 
 def recall_at_100_precision(precision: np.ndarray, recall: np.ndarray) -> float:
-    """The largest recall at which every accepted match is right; 0 where the best-scoring match is wrong."""
+    """Return the largest recall at which every accepted match is right; 0 if the best-scoring match is wrong."""
     return float(recall[precision == 1].max(initial=0))
 
 
 def precision_at_100_recall(precision: np.ndarray, recall: np.ndarray) -> float:
-    """Precision with the threshold at the lowest-scoring right match: never below recall@1."""
+    """Return the precision with the threshold at the lowest-scoring right match: never below recall@1."""
     return float(precision[np.argmax(recall)])
 
 
 def extended_precision(precision: np.ndarray, recall: np.ndarray) -> float:
-    """EP (2.4): the mean of the precision at the smallest recall and the recall at 100 % precision."""
+    """Compute EP (2.4): the mean of the precision at the smallest recall and the recall at 100 % precision."""
     return float(precision[0] + recall_at_100_precision(precision, recall)) / 2
 
 
 def roc_auc(scores: np.ndarray, correct: np.ndarray) -> float | None:
-    """How well the score tells right from wrong: the chance that a right match scores higher than a wrong one.
+    """Compute the area under the ROC curve: the chance that a right match scores higher than a wrong one.
 
-    This is the area under the ROC curve; ties count half. None where all matches are right, or none is.
+    It says how well the score separates right from wrong. Ties count half. None if all matches are right, or none is.
     """
     scores, correct = np.asarray(scores), np.asarray(correct, bool)
     right, wrong = scores[correct], np.sort(scores[~correct])
@@ -80,8 +81,8 @@ def roc_auc(scores: np.ndarray, correct: np.ndarray) -> float | None:
 
 
 def pcu(precision: float, t_encode_s: float, t_encode_max_s: float) -> float:
-    """Performance per compute unit (6.3.1): precision at 100 % recall times log10(t_e,max / t_e + 9).
+    """Compute the performance per compute unit (6.3.1): precision at 100 % recall times log10(t_e,max / t_e + 9).
 
-    `t_encode_max_s` is the encoding time of the slowest technique compared, whose PCU is its precision.
+    `t_encode_max_s` is the encoding time of the slowest technique compared. The PCU of that technique is its precision.
     """
     return precision * math.log10(t_encode_max_s / t_encode_s + 9)

@@ -10,7 +10,7 @@ COSTS = ("t_e ms", "t_m ms", "t_m/ref ms", "RAM B/place", "disk B/place", "U_e",
 
 
 def quality(result: TechniqueResult) -> list[str]:
-    """What a technique reached, as texts in the order of `QUALITY`."""
+    """Return the quality figures of a technique as texts, in the order of `QUALITY`."""
     shares = [
         result.recall_at_1, result.recall_at_5, result.recall_at_10, result.precision_at_100_recall,
         result.recall_at_100_precision, result.auc, result.ep, result.roc_auc, result.pcu,
@@ -22,7 +22,7 @@ def quality(result: TechniqueResult) -> list[str]:
 
 
 def costs(result: TechniqueResult) -> list[str]:
-    """What it cost, as texts in the order of `COSTS`."""
+    """Return the costs of a technique as texts, in the order of `COSTS`."""
     return [
         f"{result.t_encode_s * 1000:.1f}",
         f"{result.t_match_s * 1000:.1f}",
@@ -36,7 +36,7 @@ def costs(result: TechniqueResult) -> list[str]:
 
 
 def results_text(results: Sequence[TechniqueResult]) -> str:
-    """What `edgevpr eval` prints, with what the figures rest on. `results` come from `compare`."""
+    """Make the text that `edgevpr eval` prints: tables, and what their figures rest on; `results` by `compare`."""
     first = results[0]
     reached = aligned([("technique", *QUALITY), *([result.technique, *quality(result)] for result in results)])
     paid = aligned([("technique", *COSTS), *([result.technique, *costs(result)] for result in results)])

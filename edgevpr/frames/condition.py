@@ -1,11 +1,11 @@
-"""How a source of frames is, for programs; its `state` says the same in words, for people."""
+"""The condition of a source of frames, for programs; its `state` gives the same in words, for people."""
 
 from enum import Enum, auto
 
 
 class Condition(Enum):
-    """OPENING until a first picture comes or nothing is found there, RUNNING while pictures come, LOST while none do
-    and the source is opened again and again, ENDED where none will come any more."""
+    """The condition of a source: OPENING until the first picture comes or the opening fails, RUNNING while pictures
+    come, LOST while none come and the source is reopened again and again, ENDED when no more will come."""
 
     OPENING = auto()
     RUNNING = auto()

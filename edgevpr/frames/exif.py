@@ -1,4 +1,4 @@
-"""What the camera wrote into the image file (EXIF): position, heading, time."""
+"""EXIF data that the camera wrote into an image file: position, heading, time."""
 
 import logging
 from collections.abc import Callable
@@ -12,13 +12,14 @@ T = TypeVar("T")
 
 
 def read_exif(path: str | Path) -> GeoTag:
-    """The tag of a JPEG, TIFF, PNG or WebP file. Never raises: what is absent, broken or senseless is not known.
+    """Read the tag of a JPEG, TIFF, PNG or WebP file. Never raises: a value that is absent, broken or senseless is
+    None.
 
-    The time is the receiver's, else the camera clock's, which is taken as UTC where it names no zone.
+    The time is that of the GPS receiver, else that of the camera clock, taken as UTC where it has no time zone.
     """
-    import exifread  # most sources never need it
+    import exifread  # not at the top: most sources never need it
 
-    logging.getLogger("exifread").setLevel(logging.CRITICAL)  # it reports every file without EXIF
+    logging.getLogger("exifread").setLevel(logging.CRITICAL)  # it would report every file without EXIF
 
     def tags() -> dict[str, Any]:
         with open(path, "rb") as handle:
@@ -35,7 +36,7 @@ def read_exif(path: str | Path) -> GeoTag:
 def _known(read: Callable[[], T]) -> T | None:
     try:
         return read()
-    except Exception:  # other people's bytes: a tag may be absent, of another type or length, or divide by zero
+    except Exception:  # files of any origin: a tag may be absent, of another type or length, or divide by zero
         return None
 
 
@@ -56,14 +57,14 @@ def _degrees(tags: dict[str, Any], name: str, signs: dict[str, int], limit: floa
 
 
 def _alt_m(tags: dict[str, Any]) -> float:
-    # 0 is above and 1 below sea level; 2 and 3 (EXIF 3.0) are above the ellipsoid, which is not what we want.
+    # 0 is above and 1 below sea level; 2 and 3 (EXIF 3.0) are relative to the ellipsoid: not usable here.
     reference = tags["GPS GPSAltitudeRef"].values[0] if "GPS GPSAltitudeRef" in tags else 0
     return {0: 1, 1: -1}[reference] * float(tags["GPS GPSAltitude"].values[0])
 
 
 def _heading_deg(tags: dict[str, Any]) -> float | None:
     if "GPS GPSImgDirectionRef" in tags and tags["GPS GPSImgDirectionRef"].values != "T":
-        return None  # magnetic: off by the declination, which we do not know
+        return None  # magnetic: off by the declination, which is unknown
     heading_deg = float(tags["GPS GPSImgDirection"].values[0])
     return heading_deg % 360 if 0 <= heading_deg <= 360 else None
 

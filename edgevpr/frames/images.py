@@ -1,4 +1,4 @@
-"""Image files: which of a folder, and the pixels of one. A file that is not whole is refused, never half decoded."""
+"""Image files: the list of a folder, and the pixels of one file. An incomplete file is refused, never half decoded."""
 
 import re
 import zlib
@@ -14,13 +14,13 @@ MIN_SIDE_PX = 16
 
 _JPEG_START = b"\xff\xd8\xff"
 _PNG_START = b"\x89PNG\r\n\x1a\n"
-# In the scan data of a JPEG, 0xFF followed by 00 (stuffing) or D0..D7 (restart) is no marker that ends it.
+# In the scan data of a JPEG, 0xFF followed by 00 (stuffing) or D0..D7 (restart) does not end the data.
 _MARKER = re.compile(rb"\xff+[^\x00\xd0-\xd7\xff]")
 _END_OF_IMAGE = 0xD9
 
 
 def list_images(folder: str | Path) -> list[Path]:
-    """The images that lie in `folder`, in the order a person counts (2 before 10).
+    """List the images that lie in `folder`, sorted by name, with numbers in counting order (2 before 10).
 
     Raises SourceError for a folder that is missing, cannot be read or holds no images.
     """
@@ -31,7 +31,7 @@ def list_images(folder: str | Path) -> list[Path]:
         raise SourceError(f"The folder {folder} does not exist: give the folder that holds the images.") from None
     except OSError as error:
         raise SourceError(f"{folder} cannot be listed ({error.strerror}): give a folder of images.") from error
-    # Names that begin with a dot are other systems' notes (._IMG_1.jpg), not photographs.
+    # Files that begin with a dot are metadata of other systems (._IMG_1.jpg), not photographs.
     images = [name for name in names if name.lower().endswith(EXTENSIONS) and not name.startswith(".")]
     if not images:
         raise SourceError(f"The folder {folder} holds no images ({' '.join(EXTENSIONS)}): give the one that does.")
@@ -80,10 +80,10 @@ def _decoded(data: bytes) -> np.ndarray | None:
 
 
 def _is_incomplete(data: bytes) -> bool:
-    """Whether a JPEG ends before its end mark (OpenCV 4 fills the missing part with grey and says nothing), or a PNG
-    does not have all its chunks intact (OpenCV does not look at their checksums).
+    """Tell whether a JPEG ends before its end mark, or a PNG does not have all its chunks intact.
 
-    The decoders of the other formats notice by themselves. Bytes after the end mark are harmless.
+    OpenCV 4 fills the missing part of a JPEG with grey without an error, and does not check the checksums of a PNG. The
+    decoders of the other formats detect damage themselves. Bytes after the end mark are harmless.
     """
     if data.startswith(_JPEG_START):
         return not _jpeg_is_whole(data)
@@ -93,9 +93,9 @@ def _is_incomplete(data: bytes) -> bool:
 
 
 def _jpeg_is_whole(data: bytes) -> bool:
-    """Walk from marker to marker (ITU-T T.81, annex B) to the end of the image.
+    """Walk from marker to marker (ITU-T T.81, annex B); return True where the end mark of the image is reached.
 
-    Segments are skipped by their length, so that the end mark of an EXIF thumbnail is not taken for the picture's.
+    Segments are skipped by their length, so that the end mark of an EXIF thumbnail is not taken for the image's.
     """
     position = 2
     while marker := _MARKER.search(data, position):
@@ -107,7 +107,7 @@ def _jpeg_is_whole(data: bytes) -> bool:
 
 
 def _png_is_whole(data: bytes) -> bool:
-    """Walk from chunk to chunk (length, kind, content, checksum) to the end of the image."""
+    """Walk from chunk to chunk (length, kind, content, checksum); return True where the end chunk is reached."""
     position = len(_PNG_START)
     while position + 12 <= len(data):
         end = position + 8 + int.from_bytes(data[position : position + 4], "big")

@@ -1,4 +1,4 @@
-"""Live pictures: a thread that holds the newest frame of a camera or network stream, and reopens what is lost."""
+"""Live pictures: a thread that holds the newest frame of a camera or network stream, and reopens a lost source."""
 
 import contextlib
 import threading
@@ -17,7 +17,7 @@ _CLOSE_TIMEOUT_S = 1.0
 
 
 def open_stream(uri: str) -> cv2.VideoCapture:
-    """Open a network stream, with time-outs: FFmpeg's own patience has no end."""
+    """Open a network stream with time-outs: without them FFmpeg would wait for ever."""
     timeouts = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _OPEN_TIMEOUT_MS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _READ_TIMEOUT_MS]
     return cv2.VideoCapture(uri, cv2.CAP_FFMPEG, timeouts)
 
@@ -28,15 +28,15 @@ def open_camera(device: str) -> cv2.VideoCapture:
 
 
 def wait_before_reopening_s(failures: int) -> float:
-    """0.5 s after the first failure in a row, twice as long after each further one, 10 s at most."""
+    """Return 0.5 s after the first failure in a row, twice as long after each further one, 10 s at most."""
     return min(_FIRST_WAIT_S * 2.0 ** min(failures - 1, 10), _LONGEST_WAIT_S)
 
 
 class LiveSource:
-    """The newest frame of what `open_capture` opens; frames that nobody took in time are counted in `dropped`.
+    """The newest frame of the capture that `open_capture` opens. Frames not read in time are counted in `dropped`.
 
-    Only the capture thread touches the capture, from opening to release: a call into a stream that hangs can be
-    waited for, not interrupted. `close` waits a second, then leaves the thread to its time-out.
+    Only the capture thread touches the capture, from opening to release: a call into a stream that hangs cannot be
+    interrupted. `close` waits one second, then leaves the thread to its time-out.
     """
 
     is_live = True
@@ -61,14 +61,14 @@ class LiveSource:
         return Condition.ENDED if self.ended else self._condition
 
     def read(self, timeout_s: float) -> Frame | None:
-        """The newest frame, where it was not read before; None where none comes within `timeout_s`."""
+        """Return the newest frame, if it was not read before; None where none comes within `timeout_s`."""
         with self._arrived:
             self._arrived.wait_for(lambda: self._newest is not None, timeout_s)
             frame, self._newest = self._newest, None
             return frame
 
     def close(self) -> None:
-        """End the capture, within a second or so."""
+        """End the capture, within about a second."""
         self.ended = True
         self._closing.set()
         self._thread.join(_CLOSE_TIMEOUT_S)
@@ -78,7 +78,7 @@ class LiveSource:
         while not self._closing.is_set():
             before = self._captured
             capture = self._open_capture()
-            with contextlib.suppress(cv2.error):  # a picture that cannot be converted: as good as lost
+            with contextlib.suppress(cv2.error):  # a picture that cannot be converted counts as a loss
                 self._take_frames(capture)
             capture.release()
             failures = 1 if self._captured > before else failures + 1
@@ -90,7 +90,7 @@ class LiveSource:
     def _take_frames(self, capture: cv2.VideoCapture) -> None:
         while not self._closing.is_set():
             there, image = capture.read()
-            if not there:  # the only sign of a loss: `isOpened` stays true
+            if not there:  # the only sign of a lost source: `isOpened` stays true
                 return
             self._condition, self.state = Condition.RUNNING, "streaming"
             self._put(image)

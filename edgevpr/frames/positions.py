@@ -1,4 +1,4 @@
-"""positions.csv: where the images of a folder were taken."""
+"""The file positions.csv: position, heading and time of the images of a folder."""
 
 import csv
 import math
@@ -16,7 +16,7 @@ _NEEDED_COLUMNS = ("file", "lat", "lon")
 
 @dataclass(frozen=True, slots=True)
 class GeoTag:
-    """Where, which way (0..360 clockwise from true north) and when an image was taken; None is what nobody knows."""
+    """Position, heading (0..360 clockwise from true north) and time (seconds since 1970) of an image; None: unknown."""
 
     position: Position | None = None
     heading_deg: float | None = None
@@ -24,7 +24,7 @@ class GeoTag:
 
 
 def find_positions(folder: str | Path) -> Path | None:
-    """The positions.csv that belongs to a folder of images: in it, else beside it."""
+    """Return the positions.csv of a folder of images: the one in it, else the one beside it, else None."""
     folder = Path(folder).absolute()
     candidates = (folder / "positions.csv", folder.parent / "positions.csv")
     return next((path for path in candidates if path.is_file()), None)
@@ -33,8 +33,8 @@ def find_positions(folder: str | Path) -> Path | None:
 def read_positions(csv_path: str | Path) -> dict[str, GeoTag]:
     """Read the columns file, lat, lon (degrees) and, where present, alt (m), heading_deg or yaw_deg, and time.
 
-    Returns one tag a file name. A row may leave all but the name empty; other columns are ignored.
-    Raises UsageError with the line and the value of whatever is not as it should be.
+    Returns one tag for each file name. A row may leave all but the name empty; other columns are ignored.
+    Raises UsageError for a file that cannot be read, and for a wrong value, with its line.
     """
     try:
         with open(csv_path, encoding="utf-8-sig", newline="") as handle:
@@ -46,14 +46,14 @@ def read_positions(csv_path: str | Path) -> dict[str, GeoTag]:
 
 
 def position_or_none(lat_deg: float, lon_deg: float, alt_m: float | None) -> Position | None:
-    """The position, or None for exactly (0, 0): that is what a receiver without a fix writes."""
+    """Make a position, or None of exactly (0, 0), which a receiver without a fix writes."""
     return None if lat_deg == lon_deg == 0 else Position(lat_deg, lon_deg, alt_m)
 
 
 def parse_time(text: str) -> float:
-    """Seconds since 1970 (UTC) of `2016:06:23 16:31:59` (EXIF), ISO 8601, or seconds; without a zone it is UTC.
+    """Convert a time to seconds since 1970 (UTC): `2016:06:23 16:31:59` (EXIF), ISO 8601, or seconds.
 
-    Raises ValueError for any other text.
+    A time without a zone is UTC. Raises ValueError for any other text.
     """
     try:
         seconds = float(text)

@@ -17,7 +17,7 @@ _USUAL_RATE_HZ = 25.0
 
 
 class _Recording:
-    """What every recording has in common: a subclass says whether it has `ended`."""
+    """The common part of all recordings; a subclass sets `ended`."""
 
     is_live = False
     dropped = None
@@ -33,7 +33,7 @@ class _Recording:
 
 
 class FolderSource(_Recording):
-    """Each image of a folder once, placed by positions.csv where it has a line there, else by its EXIF."""
+    """Each image of a folder once, with the position of its line in positions.csv, else that of its EXIF data."""
 
     def __init__(self, folder: Path, positions: Path | None, clock: Callable[[], float]):
         self._paths = list_images(folder)
@@ -50,7 +50,8 @@ class FolderSource(_Recording):
         return self._read == self.total
 
     def read(self, timeout_s: float) -> Frame | None:
-        """The next image. Raises ImageError for one that cannot be used; the call after it goes on."""
+        """Return the next image, None after the last. Raises ImageError for an image that cannot be used; the next call
+        goes on with the image after it."""
         if self.ended:
             return None
         path = self._paths[self._read]
@@ -67,11 +68,11 @@ class FolderSource(_Recording):
         )
 
     def close(self) -> None:
-        """Nothing is held open between images."""
+        """Do nothing: no file is held open between images."""
 
 
 class VideoSource(_Recording):
-    """The frames of a video file, at least `step_s` of video time apart: the same ones each time."""
+    """The frames of a video file, at least `step_s` seconds of video time apart: the same frames in every run."""
 
     def __init__(self, path: Path, step_s: float, clock: Callable[[], float]):
         self.ended = False
@@ -88,7 +89,7 @@ class VideoSource(_Recording):
         self._t_due_s = 0.0
 
     def read(self, timeout_s: float) -> Frame | None:
-        """The next frame that is due; None where it takes longer to get there, or the video has ended."""
+        """Return the next frame that is due; None at the end, or where decoding takes longer than `timeout_s`."""
         deadline_s = self._clock() + timeout_s
         while self._advance():
             if self._t_s >= self._t_due_s - _TIMESTAMP_ROUNDING_S:
@@ -107,12 +108,12 @@ class VideoSource(_Recording):
         self._capture.release()
 
     def _advance(self) -> bool:
-        """Decode one frame; False at the end."""
+        """Advance by one frame; return False at the end."""
         if not self._capture.grab():
             self.ended = True
             return False
         self._index += 1
         stamp_s = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
-        # A bare H.264 or MJPEG file has no time stamps (they come as zero, or worse): then the frame rate counts.
+        # A bare H.264 or MJPEG file has no time stamps (they read as zero or are wrong): the frame rate is used.
         self._t_s = stamp_s if stamp_s > self._t_s else self._t_s + self._frame_s
         return True

@@ -1,4 +1,4 @@
-"""Where frames come from: a folder of images, a video file, a camera or a network stream, all read alike."""
+"""Sources of frames: a folder of images, a video file, a camera or a network stream, all read in the same way."""
 
 import os
 import time
@@ -22,10 +22,10 @@ _SCHEMES_THAT_NEED_A_PORT = ("udp", "tcp")
 class Source(Protocol):
     """A source of frames.
 
-    `is_live`: its pictures are of now, and the newest counts; a recording is read in order to its end. `ended`: no
-    frame will come any more. `total`: about how many there will be, 0 where nobody can know. `dropped`: how many
-    pictures nobody took in time, None of a recording, which drops none. `condition`, and as `state` in a few words for
-    people ("reading", "streaming", "lost, reopening in 2 s")."""
+    `is_live`: pictures are taken while they are read, and the newest counts; a recording is read in order to its end.
+    `ended`: no more frames will come. `total`: approximate number of frames, 0 where unknown. `dropped`: number of
+    pictures not read in time, None for a recording, which drops none. `condition`: the condition for programs. `state`:
+    the same in a few words for people ("reading", "streaming", "lost, reopening in 2 s")."""
 
     is_live: bool
 
@@ -45,14 +45,14 @@ class Source(Protocol):
     def state(self) -> str: ...
 
     def read(self, timeout_s: float) -> Frame | None:
-        """The next frame (of a live source the newest), or None where there is none within `timeout_s`.
+        """Return the next frame (of a live source the newest), or None where there is none within `timeout_s` seconds.
 
-        Raises ImageError for an image that cannot be used; the call after it goes on with the next one.
+        Raises ImageError for an image that cannot be used; the next call goes on with the image after it.
         """
         ...
 
     def close(self) -> None:
-        """Let go of the file, the device or the connection."""
+        """Release the file, the device or the connection."""
         ...
 
 
@@ -64,11 +64,12 @@ def open_source(
     live: bool,
     clock: Callable[[], float] = time.monotonic,
 ) -> Source:
-    """Open what `uri` names; `live` says whether cameras and streams, which never end, are welcome.
+    """Open the source that `uri` names. `live` allows cameras and streams, which never end.
 
-    `step_s` is the least video time between two frames of a video file. `positions` is the positions.csv of a folder
-    of images; without it, the one that lies there counts, else EXIF. A stream that is not there yet is waited for.
-    Raises SourceError for what is not understood or not there, UsageError for positions that make no sense.
+    `step_s` is the least video time in seconds between two frames of a video file. `positions` is the positions.csv of
+    a folder of images; without it, the one in or beside the folder is used, else EXIF. A stream that is not there yet
+    is waited for. Raises SourceError for a source that is unknown, missing or not allowed, and UsageError for positions
+    that make no sense.
     """
     path = Path(uri)
     if positions and not path.is_dir():
@@ -87,13 +88,13 @@ def open_source(
 
 
 def is_live(uri: str) -> bool:
-    """Say whether `uri` names a camera or a stream; all else is a recording."""
+    """Tell whether `uri` names a camera or a stream; anything else is a recording."""
     is_device = uri.startswith("/dev/") and not Path(uri).is_file()  # /dev/shm holds plain files
     return "://" in uri or is_device or uri.lower().endswith(".sdp")
 
 
 def _capture_of(uri: str) -> Callable[[], Any]:
-    """What opens the camera or stream; raises SourceError for one that can never be opened."""
+    """Return the function that opens the camera or stream; raises SourceError for one that can never be opened."""
     if "://" in uri:
         _check_address(uri)
     elif not Path(uri).exists():
@@ -105,8 +106,8 @@ def _capture_of(uri: str) -> Callable[[], Any]:
     elif uri.startswith("/dev/"):
         return lambda: open_camera(uri)
     else:
-        # FFmpeg connects to what an .sdp file names only when told that it may, and OpenCV hands on what it is told
-        # in the environment only.
+        # FFmpeg connects to the addresses in an .sdp file only if these protocols are allowed, and OpenCV passes on
+        # such options from the environment only.
         os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", "protocol_whitelist;file,rtp,udp")
     return lambda: open_stream(uri)
 

@@ -1,4 +1,4 @@
-"""What every command that draws asks first: may the picture be written, and is there something to draw with."""
+"""Checks before a picture is drawn: that its file can be written, and that matplotlib is installed."""
 
 import logging
 from pathlib import Path
@@ -14,7 +14,10 @@ _ENDINGS = (".png", ".pdf", ".svg")
 
 
 def require_picture(path: Path) -> None:
-    """Raise UsageError or EdgevprError where no picture could be written to `path`: before the work, not after it."""
+    """Check that a picture can be written to `path`, before the work and not after it.
+
+    Raises UsageError for a wrong file name or a missing folder, EdgevprError where matplotlib is missing.
+    """
     if path.suffix.lower() not in _ENDINGS:
         raise UsageError(f"{path}: a picture's name ends in {', '.join(_ENDINGS)}: choose one of these.")
     require_folder(path)
@@ -26,7 +29,7 @@ def require_picture(path: Path) -> None:
 
 
 def figure(width_in: float, height_in: float) -> "Figure":
-    """An empty matplotlib figure, in inches."""
+    """Make an empty matplotlib figure; sizes in inches."""
     _hush()
     from matplotlib.figure import Figure
 
@@ -34,4 +37,4 @@ def figure(width_in: float, height_in: float) -> "Figure":
 
 
 def _hush() -> None:
-    logging.getLogger("matplotlib").setLevel(logging.WARNING)  # its fonts are nobody's business
+    logging.getLogger("matplotlib").setLevel(logging.WARNING)  # its messages about fonts are of no use to the user

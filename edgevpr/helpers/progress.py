@@ -1,4 +1,4 @@
-"""Progress of a long loop: one line that is redrawn on a terminal, a line for every tenth elsewhere."""
+"""Progress of a long loop: one line that is redrawn on a terminal, elsewhere a line for every tenth of the work."""
 
 import sys
 from collections.abc import Iterable, Iterator
@@ -8,7 +8,7 @@ T = TypeVar("T")
 
 
 def progress(iterable: Iterable[T], total: int, label: str, stream: TextIO | None = None) -> Iterator[T]:
-    """Yield what `iterable` yields; say on `stream` (None: stderr) how many of `total` (0: nobody knows) are done."""
+    """Yield the items of `iterable`; write to `stream` (None: stderr) how many of `total` (0: unknown) are done."""
     stream = stream or sys.stderr
     terminal = stream.isatty()
     shown = None

@@ -1,4 +1,4 @@
-"""Tables as plain text for a terminal and as Markdown for a page, and text wrapped to the terminal's width."""
+"""Tables as plain text for a terminal and as Markdown for a page, and text wrapped to 120 columns."""
 
 import textwrap
 from collections.abc import Sequence
@@ -7,8 +7,8 @@ _WIDTH = 120
 
 
 def aligned(rows: Sequence[Sequence[str]], left: int = 1) -> list[str]:
-    """Lay rows out in columns, a line a row: the first `left` columns flush left, the others flush right; a short row
-    ends early."""
+    """Lay out rows in columns, one line for each row. The first `left` columns are flush left, the others flush right.
+    A short row ends early."""
     columns = range(max(len(row) for row in rows))
     widths = [max(len(row[column]) for row in rows if column < len(row)) for column in columns]
     return [
@@ -21,7 +21,7 @@ def aligned(rows: Sequence[Sequence[str]], left: int = 1) -> list[str]:
 
 
 def markdown(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Write a Markdown table, numbers to the right."""
+    """Return a Markdown table: the first column flush left, the others flush right."""
     ruler = ["---"] + ["---:"] * (len(headings) - 1)
     return "\n".join("| " + " | ".join(line) + " |" for line in (headings, ruler, *rows))
 

@@ -10,7 +10,7 @@ BAUD_MIN, BAUD_MAX = 1200, 12_000_000
 
 @dataclass(frozen=True, slots=True)
 class LinkAddress:
-    """Where the other end is: `where` is a host or a serial device, `number` a port or a baud rate."""
+    """The address of the other end: `where` is a host or a serial device, `number` a port or a baud rate."""
 
     kind: str  # "udpout", "udpin", "tcp" or "serial"
     where: str

@@ -22,11 +22,11 @@ from edgevpr.mavlink.wire import Message, Receiver, mavlink
 from edgevpr.types import Vehicle
 
 HEARTBEAT_S = 1.0
-TURN_S = 0.25  # how long the thread sleeps where nothing wakes it
+TURN_S = 0.25  # longest sleep of the thread when nothing wakes it
 RETRY_FIRST_S, RETRY_MAX_S = 0.2, 2.0
-HEALTH_GOOD_FOR_S = 10.0  # a main loop that hangs must not look healthy because this thread does not
+HEALTH_GOOD_FOR_S = 10.0  # a hung main loop must not look healthy because this thread still runs
 ASK_AGAIN_S = 5.0
-STUCK_S = 0.5  # a port that has taken no byte for so long is opened anew: what waits in it would come out late
+STUCK_S = 0.5  # a port that has taken no byte for this time is reopened: bytes that wait in it would leave late
 FLUSH_S = 0.5
 
 log = logging.getLogger(__name__)
@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkStats:
-    """What a link has done so far. `trouble` is why it is, or last was, not open: None once something arrives."""
+    """Counts and state of a link. `trouble` is the reason why it is or last was not open, None once data arrives."""
 
     connected: bool
     trouble: str | None
@@ -50,15 +50,16 @@ class LinkStats:
 
     @property
     def fixes_sent(self) -> int:
-        """Count the position fixes among what was sent."""
+        """Number of position fixes sent."""
         return self.sent.get("COMMAND_INT", 0)
 
 
 class Link:
-    """Sends what it is given and a heartbeat a second, listens, and outlives every loss of the other end.
+    """The link to one flight controller. It sends the queued messages and one heartbeat a second, listens, and reopens
+    the port after every loss of the other end.
 
-    `send`, `send_fix`, `set_health`, `want_position`, `vehicle`, `listens` and `stats` may be called from any thread,
-    never block and never raise.
+    `send`, `send_fix`, `set_health`, `want_position`, `vehicle`, `listens` and `stats` may be called from any thread;
+    they never block and never raise.
     """
 
     def __init__(self, address: LinkAddress, component_id: int = 197, clock: Callable[[], float] = time.monotonic):
@@ -70,12 +71,12 @@ class Link:
         self._receiver = Receiver()
         self._packer = mavlink.MAVLink(None, srcSystem=1, srcComponent=component_id)
         self._transport: Transport | None = None
-        self._unsent = b""  # the rest of a message of which the port took only a part
-        self._sending: Sending | None = None  # the fix that this rest is of, if it is one
+        self._unsent = b""  # the rest of a message that the port has taken only in part
+        self._sending: Sending | None = None  # the fix in `_unsent`, if it holds one
         self._last_sent: Sending | None = None
         self._blocked_since_s: float | None = None
         self._heartbeat_due_s = clock()
-        self._ask_position_s: float | None = None  # when to ask for it next; None: nobody wants it
+        self._ask_position_s: float | None = None  # when to ask next; None: not wanted
         self._sent: Counter[str] = Counter()
         self._reopened = 0
         self._retry_s = RETRY_FIRST_S
@@ -88,8 +89,8 @@ class Link:
     def start(self) -> None:
         """Open the port and start the thread.
 
-        Raises LinkError for what the user must put right. A device or server that is absent is no error: it is
-        tried again and again, and `stats` says so.
+        Raises LinkError for a fault that the user must correct. A missing device or server is no error: the link tries
+        to open it again and again, and `stats` gives the reason.
         """
         try:
             self._transport = open_transport(self._address)
@@ -101,32 +102,32 @@ class Link:
         self._thread.start()
 
     def send(self, *outgoing: Message) -> None:
-        """Queue messages; where the queue is full, the oldest are dropped and counted."""
+        """Queue messages. If the queue is full, the oldest messages are dropped and counted."""
         for message in outgoing:
             self._outbox.put(message)
         self._ring()
 
     def send_fix(self, fix: Fix) -> Sending:
-        """Queue a position fix. It leaves within a second and to an autopilot that is there, or never: what it gives
-        says so as soon as it is known."""
+        """Queue a position fix, to be sent within one second and only to an autopilot that is there, or never. The
+        returned `Sending` gives the outcome as soon as it is known."""
         sending = self._outbox.put_fix(fix, self._clock())
         self._ring()
         return sending
 
     def set_health(self, health: Health) -> None:
-        """Set what the heartbeats of the next ten seconds say; a caller that falls silent is reported as critical."""
+        """Set the health in the heartbeats of the next ten seconds. After that, without a new call, it is CRITICAL."""
         self._health, self._health_set_s = health, self._clock()
 
     def want_position(self) -> None:
-        """Ask the autopilot to say where it is, now and whenever it has fallen silent about it."""
+        """Ask the autopilot for its position, at once and again whenever it has stopped reporting it."""
         self._ask_position_s = self._clock()
 
     def vehicle(self) -> Vehicle | None:
-        """Give what the autopilot last said of its vehicle; None where it does not know where it is."""
+        """Return the last report of the autopilot on its vehicle; None where there is none, or it had no position."""
         return self._autopilot.vehicle
 
     def listens(self) -> bool:
-        """Say whether there is an autopilot that a fix can be sent to now."""
+        """Tell whether there is an autopilot that a fix can be sent to at this moment."""
         transport = self._transport
         return transport is not None and transport.connected and self._autopilot.listens(self._clock())
 
@@ -147,7 +148,8 @@ class Link:
         )
 
     def close(self) -> None:
-        """Send what waits, hear the answers to the fixes sent, for half a second at most, and close the port."""
+        """Send the queued messages, receive the answers to the fixes sent, both for half a second at most, and close
+        the port."""
         self._closing.set()
         self._ring()
         if self._thread.ident is None:  # never started
@@ -162,7 +164,7 @@ class Link:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    # All below runs in the link's own thread.
+    # The methods below run in the link's own thread.
 
     def _run(self) -> None:
         while not self._closing.is_set():
@@ -185,7 +187,7 @@ class Link:
         self._reopened += 1
 
     def _turn(self, transport: Transport, timeout_s: float) -> None:
-        """Write what can be written, wait until there is something to do or the time is up, and read."""
+        """Write what the port takes, wait until there is something to do or the time is up, and read."""
         if transport.connected:
             self._transmit(transport)
         writing = [transport] if self._unsent else []
@@ -208,7 +210,7 @@ class Link:
                 self._packer.srcSystem = self._autopilot.system_id
                 transport.answer_sender()
             if self._last_sent and (answer := self._autopilot.take_answer()):
-                self._last_sent.answer = answer  # an answer does not say to which fix: the newest has waited for it
+                self._last_sent.answer = answer  # an answer names no fix: it is taken for the last one sent
 
     def _transmit(self, transport: Transport) -> None:
         while self._unsent or self._pack_next():
@@ -227,7 +229,7 @@ class Link:
                 return
 
     def _pack_next(self) -> bool:
-        """Choose the next message and pack it; False where there is none."""
+        """Choose the next message and pack it; return False where there is none."""
         while (message := self._next_message(self._clock())) is not None:
             try:
                 self._unsent = message.pack(self._packer)
@@ -245,7 +247,7 @@ class Link:
     def _next_message(self, now_s: float) -> Message | None:
         late_s = now_s - self._heartbeat_due_s
         if late_s >= 0:
-            self._heartbeat_due_s = now_s + HEARTBEAT_S - late_s % HEARTBEAT_S  # in step, whatever was missed
+            self._heartbeat_due_s = now_s + HEARTBEAT_S - late_s % HEARTBEAT_S  # keeps the rhythm after missed beats
             stuck = now_s - self._health_set_s > HEALTH_GOOD_FOR_S
             return messages.heartbeat(Health.CRITICAL if stuck else self._health)
         if self._autopilot.listens(now_s):
@@ -258,7 +260,7 @@ class Link:
         return self._outbox.next_message()
 
     def _ask_for_position(self, now_s: float) -> None:
-        """An autopilot that has started anew has forgotten what it was asked for."""
+        """Ask for positions again where none came: an autopilot that has restarted has forgotten the request."""
         if self._ask_position_s is None or now_s < self._ask_position_s:
             return
         self._ask_position_s = now_s + ASK_AGAIN_S
@@ -294,7 +296,7 @@ class Link:
                     break
 
     def _all_answered(self) -> bool:
-        """Say whether as many answers came as fixes went, so that what is counted at the end is what was taken."""
+        """Tell whether as many answers came as fixes were sent, so that the final counts include all answers."""
         return self._autopilot.acks.total() >= self.stats().fixes_sent
 
     def _close_all(self) -> None:

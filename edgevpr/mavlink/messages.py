@@ -1,7 +1,7 @@
-"""One pure function a message: values in, a pymavlink message out. No I/O, no clock.
+"""One pure function for each message: values in, a pymavlink message out. No I/O, no clock.
 
-`t_mono_s` is the system's monotonic clock, the only clock of a link: an autopilot keeps one correction of time for
-all that comes over it.
+`t_mono_s` is seconds of the system's monotonic clock, the only clock of a link: an autopilot keeps one time correction
+for all messages of a link.
 """
 
 import math
@@ -17,15 +17,15 @@ TEXT_BYTES = 50
 
 
 class Health(IntEnum):
-    """What the heartbeat says of this companion (MAV_STATE)."""
+    """The state of this companion in its heartbeat (MAV_STATE)."""
 
     BOOT = mavlink.MAV_STATE_BOOT
     ACTIVE = mavlink.MAV_STATE_ACTIVE
-    CRITICAL = mavlink.MAV_STATE_CRITICAL  # it runs, but cannot do its job: no frames come, or its main loop hangs
+    CRITICAL = mavlink.MAV_STATE_CRITICAL  # it runs, but does not work: no frames come, or its main loop hangs
 
 
 class Severity(IntEnum):
-    """How much a text matters (MAV_SEVERITY)."""
+    """Severity of a status text (MAV_SEVERITY)."""
 
     WARNING = mavlink.MAV_SEVERITY_WARNING
     INFO = mavlink.MAV_SEVERITY_INFO
@@ -33,9 +33,10 @@ class Severity(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Fix:
-    """A position fit to be sent: where the vehicle was when the frame was taken, at `t_frame_s` monotonic.
+    """A position fix: position of the vehicle when the frame was taken, at `t_frame_s` of the monotonic clock.
 
-    Raises ValueError for a position off the Earth and for an accuracy (1 sigma) that is not finite and above zero.
+    Raises ValueError for a position off the Earth, for an accuracy (1 sigma) that is not finite and above zero, and
+    for a time that is not finite.
     """
 
     lat_deg: float
@@ -44,7 +45,7 @@ class Fix:
     t_frame_s: float
 
     def __post_init__(self) -> None:
-        if not (abs(self.lat_deg) <= 90 and abs(self.lon_deg) <= 180):  # so written, NaN is refused as well
+        if not (abs(self.lat_deg) <= 90 and abs(self.lon_deg) <= 180):  # in this form NaN is refused too
             raise ValueError(f"latitude {self.lat_deg}, longitude {self.lon_deg} is no place on the Earth")
         if not 0 < self.accuracy_m < math.inf:
             raise ValueError(f"an accuracy of {self.accuracy_m} m says nothing: it must be finite and above zero")
@@ -53,7 +54,7 @@ class Fix:
 
 
 def heartbeat(health: Health) -> Message:
-    """HEARTBEAT (0) of an onboard computer."""
+    """Make the HEARTBEAT (0) of an onboard computer."""
     return mavlink.MAVLink_heartbeat_message(
         type=mavlink.MAV_TYPE_ONBOARD_CONTROLLER,
         autopilot=mavlink.MAV_AUTOPILOT_INVALID,
@@ -65,10 +66,10 @@ def heartbeat(health: Health) -> Message:
 
 
 def position_fix(fix: Fix, t_sent_s: float, target_system: int) -> Message:
-    """COMMAND_INT (75) with command 43003, in the form that ArduPilot accepts: global frame, no altitude (NaN).
+    """Make a COMMAND_INT (75) with command 43003, in the form that ArduPilot accepts: global frame, no altitude (NaN).
 
-    The time between `fix.t_frame_s` and `t_sent_s` goes along as the processing time, so that the autopilot knows
-    when the vehicle was there. As a float32, `t_sent_s` is good to 8 ms after a day, to 60 ms after ten.
+    The time from `fix.t_frame_s` to `t_sent_s` is sent as the processing time, so that the autopilot knows when the
+    vehicle was there. As a float32, `t_sent_s` is accurate to 8 ms after one day, to 60 ms after ten days.
     """
     return mavlink.MAVLink_command_int_message(
         target_system=target_system,
@@ -88,8 +89,8 @@ def position_fix(fix: Fix, t_sent_s: float, target_system: int) -> Message:
 
 
 def position_requests(target_system: int) -> tuple[Message, Message]:
-    """Two COMMAND_LONG (76) with SET_MESSAGE_INTERVAL (511): GLOBAL_POSITION_INT (33) five times a second, GPS_RAW_INT
-    (24) twice. Many a companion's port is set to stream neither."""
+    """Make two COMMAND_LONG (76) with SET_MESSAGE_INTERVAL (511): GLOBAL_POSITION_INT (33) five times a second,
+    GPS_RAW_INT (24) twice a second. On many autopilots the companion's port streams neither unless asked."""
     wanted_us = {
         mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 200_000,
         mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 500_000,
@@ -103,7 +104,7 @@ def position_requests(target_system: int) -> tuple[Message, Message]:
 
 
 def place_match(t_mono_s: float, place_id: int, score: float) -> tuple[Message, Message]:
-    """The event of an accepted match: NAMED_VALUE_INT (252) `vpr_place` and NAMED_VALUE_FLOAT (251) `vpr_score`."""
+    """Make the event of an accepted match: NAMED_VALUE_INT (252) `vpr_place`, NAMED_VALUE_FLOAT (251) `vpr_score`."""
     return (
         mavlink.MAVLink_named_value_int_message(_boot_ms(t_mono_s), b"vpr_place", place_id),
         _named_float(t_mono_s, b"vpr_score", score),
@@ -111,7 +112,8 @@ def place_match(t_mono_s: float, place_id: int, score: float) -> tuple[Message, 
 
 
 def query_figures(t_mono_s: float, cpu_share: float, used_mah: float) -> tuple[Message, Message]:
-    """The cost of a query: `vpr_cpu`, the share of the whole machine (0..1), and `vpr_mah`, the charge used so far."""
+    """Make the cost of a query, two NAMED_VALUE_FLOAT (251): `vpr_cpu`, the share of the whole machine (0..1), and
+    `vpr_mah`, the charge used so far (mAh)."""
     return (_named_float(t_mono_s, b"vpr_cpu", cpu_share), _named_float(t_mono_s, b"vpr_mah", used_mah))
 
 
@@ -122,7 +124,8 @@ def computer_status(
     ram_total_bytes: int,
     temperature_c: float | None = None,
 ) -> Message:
-    """ONBOARD_COMPUTER_STATUS (390): the load of each core (0..1; the first eight are told), RAM, and temperature."""
+    """Make an ONBOARD_COMPUTER_STATUS (390): the load of each core (0..1; the first eight are sent), RAM (sent in MiB),
+    and temperature (None: unknown)."""
     percents = [min(100, max(0, round(100 * share))) for share in core_shares[:8]]
     temperature = 127 if temperature_c is None else min(126, max(-128, round(temperature_c)))
     return mavlink.MAVLink_onboard_computer_status_message(
@@ -133,7 +136,7 @@ def computer_status(
         ram_total=ram_total_bytes >> 20,
         cpu_cores=percents + [255] * (8 - len(percents)),
         temperature_core=[temperature] + [127] * 7,
-        # The rest is not measured; the largest value of its type says so.
+        # The other fields are not measured; MAVLink marks that by the largest value of their type.
         cpu_combined=[255] * 10,
         gpu_cores=[255] * 4,
         gpu_combined=[255] * 10,
@@ -151,9 +154,9 @@ def computer_status(
 
 
 def status_text(severity: Severity, text: str) -> Message:
-    """STATUSTEXT (253), cut to 50 bytes.
+    """Make a STATUSTEXT (253), cut to 50 bytes.
 
-    Cut, not sent in chunks: where one chunk is lost, or the ground station knows none, a chunked text is a riddle.
+    The text is not sent in chunks: if one chunk is lost, or the ground station knows no chunks, it cannot be read.
     """
     data = text.encode()
     if len(data) > TEXT_BYTES:
@@ -169,4 +172,4 @@ def _named_float(t_mono_s: float, name: bytes, value: float) -> Message:
 
 
 def _boot_ms(t_mono_s: float) -> int:
-    return round(t_mono_s * 1000) % 2**32  # wraps after 49 days, as the field does everywhere
+    return round(t_mono_s * 1000) % 2**32  # uint32: wraps after 49 days, as in every MAVLink system

@@ -1,4 +1,4 @@
-"""What waits to be sent: messages, of which the newest matter, and fixes, which are never sent late."""
+"""The queues of the link: messages, of which the newest matter most, and fixes, which are never sent late."""
 
 from collections import deque
 from threading import Event, Lock
@@ -13,8 +13,9 @@ FIX_MAX_WAIT_S = 1.0
 
 
 class Sending:
-    """A fix on its way. `sent` is None while it waits, then True, or False and `why`; `answer` is the autopilot's, the
-    name of a MAV_RESULT, None while there is none. Only the link's thread changes it once it is queued."""
+    """A fix to be sent, and its outcome. `sent` is None while the fix waits, then True, or False (`why` gives the
+    reason). `answer` is the answer of the autopilot, the name of a MAV_RESULT, None while there is none. Once the fix
+    is queued, only the link's thread changes these."""
 
     def __init__(self, fix: Fix) -> None:
         self.fix = fix
@@ -24,17 +25,17 @@ class Sending:
         self._settled = Event()
 
     def settle(self, sent: bool, why: str | None = None) -> None:
-        """Say what became of it."""
+        """Set the outcome: sent, or not sent and why."""
         self.sent, self.why = sent, why
         self._settled.set()
 
     def wait(self, timeout_s: float) -> None:
-        """Wait until it has left or never will, for so long at most."""
+        """Wait until the fix is sent or given up, `timeout_s` seconds at most."""
         self._settled.wait(timeout_s)
 
 
 class Outbox:
-    """Two bounded queues between any number of threads that send and the one that owns the link."""
+    """Two bounded queues from any number of threads to the thread of the link."""
 
     def __init__(self) -> None:
         self._lock = Lock()
@@ -44,13 +45,13 @@ class Outbox:
         self.dropped_stale_fixes = 0
 
     def put(self, message: Message) -> None:
-        """Queue a message; where the queue is full, the oldest goes."""
+        """Queue a message; if the queue is full, the oldest message is dropped."""
         with self._lock:
             self.dropped_queue_full += len(self._messages) == MESSAGES_MAX
             self._messages.append(message)
 
     def put_fix(self, fix: Fix, now_s: float) -> Sending:
-        """Queue a fix, to be sent soon or not at all."""
+        """Queue a fix, to be sent within one second and before its frame is 5 s old, or not at all."""
         sending = Sending(fix)
         age_s = now_s - fix.t_frame_s
         with self._lock:
@@ -67,13 +68,13 @@ class Outbox:
             return self._messages.popleft() if self._messages else None
 
     def next_fix(self, now_s: float) -> Sending | None:
-        """Give the oldest fix that is still true, and drop those before it."""
+        """Return the oldest fix that may still be sent (None: no fix), and drop those that have waited too long."""
         self.drop_stale_fixes(now_s)
         with self._lock:
             return self._fixes.popleft()[1] if self._fixes else None
 
     def drop_stale_fixes(self, now_s: float) -> None:
-        """Drop what has waited too long."""
+        """Drop the fixes that have waited too long."""
         with self._lock:
             for due_s, sending in self._fixes:
                 if now_s > due_s:
@@ -85,5 +86,5 @@ class Outbox:
         sending.settle(False, why)
 
     def __len__(self) -> int:
-        """Count the messages that wait."""
+        """Return the number of waiting messages, without fixes."""
         return len(self._messages)

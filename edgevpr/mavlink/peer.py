@@ -1,4 +1,4 @@
-"""The autopilot at the other end: who it is, whether it is there, and what it says to our fixes."""
+"""The autopilot at the other end of the link: its system id, its presence, its position, and its answers to fixes."""
 
 import logging
 import math
@@ -9,9 +9,9 @@ from edgevpr.mavlink.messages import AUTOPILOT, POSITION_FIX
 from edgevpr.mavlink.wire import Message, mavlink
 from edgevpr.types import Vehicle
 
-GPS_GONE_AFTER_S = 2.5  # of its reports, which come at least once a second, one may be lost
-GPS_AGREES_WITHIN_M = 50.0  # a vehicle at 25 m/s, and its reports a second or two apart
-SILENT_AFTER_S = 5.0  # of the heartbeats, which come once a second, this many may be lost
+GPS_GONE_AFTER_S = 2.5  # GPS reports come at least once a second, and one may be lost
+GPS_AGREES_WITHIN_M = 50.0  # at 25 m/s, with one or two seconds between the two reports
+SILENT_AFTER_S = 5.0  # heartbeats come once a second, and this many may be lost
 
 _GPS_REPORTS = ("GPS_RAW_INT", "GPS2_RAW")
 
@@ -26,30 +26,31 @@ _EXPLANATIONS = {
 
 
 class Autopilot:
-    """Fed with all that arrives; pinned to the first autopilot heard, so that no other vehicle is ever addressed."""
+    """The state of the autopilot, from all messages that arrive. It is fixed to the first autopilot heard, so that
+    nothing is ever sent to another vehicle."""
 
     def __init__(self, own_component: int) -> None:
         self.system_id: int | None = None
         self.acks: Counter[str] = Counter()  # answers to our fixes, by name of the result
-        self.vehicle: Vehicle | None = None  # what was last heard of it, however old
-        self._answer: str | None = None  # one that nobody has taken
+        self.vehicle: Vehicle | None = None  # the last report, of any age
+        self._answer: str | None = None  # the newest answer, until `take_answer`
         self._own_component = own_component
         self._heard_s = -math.inf
-        self._gps: dict[str, tuple[float, float, float]] = {}  # of each receiver with a fix: lat_deg, lon_deg, when
+        self._gps: dict[str, tuple[float, float, float]] = {}  # each receiver with a fix: lat_deg, lon_deg, time
         self._last_result: int | None = None
         self._warned = False
 
     def listens(self, now_s: float) -> bool:
-        """Say whether its heartbeat was heard in the last five seconds."""
+        """Tell whether a heartbeat of the autopilot was heard in the last five seconds."""
         return now_s - self._heard_s <= SILENT_AFTER_S
 
     def take_answer(self) -> str | None:
-        """Give the newest answer to a fix, once."""
+        """Return the newest answer to a fix (name of a MAV_RESULT) once, then None until the next answer."""
         answer, self._answer = self._answer, None
         return answer
 
     def hear(self, message: Message, now_s: float) -> bool:
-        """Take note of a message; True for the autopilot's heartbeat."""
+        """Take in a message heard at `now_s`; return True for the autopilot's heartbeat."""
         system_id = message.get_srcSystem()
         self._warn_of_another(message)
         if message.get_srcComponent() != AUTOPILOT or system_id == 0 or self.system_id not in (None, system_id):
@@ -87,11 +88,11 @@ class Autopilot:
         return (
             message.get_type() == "COMMAND_ACK"
             and message.command == POSITION_FIX
-            and message.target_component in (0, self._own_component)  # 0: to whom it may concern
+            and message.target_component in (0, self._own_component)  # 0: broadcast
         )
 
     def _warn_of_another(self, message: Message) -> None:
-        """Once: two vehicles on one link are an accident waiting to happen."""
+        """Warn once of a second autopilot: two vehicles on one link are dangerous."""
         if (
             not self._warned
             and message.get_type() == "HEARTBEAT"
@@ -119,7 +120,8 @@ class Autopilot:
 
 
 def _vehicle(message: Message, now_s: float, has_gps: bool) -> Vehicle | None:
-    """None for 0, 0, which is what an autopilot without a position says, and for what is not on Earth."""
+    """Read a GLOBAL_POSITION_INT; return None for 0, 0, which an autopilot without a position sends, and for a position
+    off the Earth."""
     if (message.lat == 0 and message.lon == 0) or abs(message.lat) > 90e7 or abs(message.lon) > 180e7:
         return None
     heading_deg = message.hdg / 100 if message.hdg <= 36_000 else None  # 65535: unknown

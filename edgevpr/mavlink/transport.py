@@ -1,7 +1,7 @@
-"""Four ways to carry bytes, none of which ever blocks: UDP out and in, TCP, serial.
+"""Four transports of bytes, none of which ever blocks once it is open: UDP out and in, TCP, serial.
 
-A transport that is lost raises OSError from `read` or `write`; its owner closes it and opens another. These few lines
-over `socket` and pyserial behave alike in every fault; pymavlink's own connections spin, hang or raise.
+A lost transport raises OSError from `read` or `write`; its owner closes it and opens another. This thin layer over
+`socket` and pyserial behaves the same in every fault. pymavlink's own connections may spin, hang or raise.
 """
 
 import errno
@@ -16,44 +16,44 @@ from edgevpr.errors import LinkError
 from edgevpr.mavlink.address import LinkAddress
 
 CONNECT_TIMEOUT_S = 1.0
-TCP_GIVE_UP_MS = 1000  # bytes that the other end has not confirmed by then die with the connection
+TCP_GIVE_UP_MS = 1000  # if the other end has not confirmed bytes by then, the connection is closed and they are lost
 READ_BYTES = 65_536
 
 
 class Transport(Protocol):
-    """What a link needs of a transport."""
+    """The interface that a link needs of a transport."""
 
     @property
     def connected(self) -> bool:
-        """Say whether there is anybody to send to."""
+        """True where there is a receiver to send to."""
         ...
 
     def fileno(self) -> int: ...
 
     def read(self) -> bytes:
-        """Give what has arrived, b"" where nothing has."""
+        """Return the bytes that have arrived, b"" for none; raises OSError where the connection is lost."""
         ...
 
     def write(self, data: bytes) -> int:
-        """Take as many bytes as fit now and say how many."""
+        """Take as many bytes as fit at once and return their number; raises OSError where the connection is lost."""
         ...
 
     def answer_sender(self) -> None:
-        """From now on send to whom the last bytes came from (where there can be several)."""
+        """Send from this call on to the sender of the last bytes (where there can be several senders)."""
         ...
 
     def idle(self) -> bool:
-        """Say whether all bytes taken have gone out, or will without us."""
+        """Tell whether all bytes taken have left, or will be sent by the system."""
         ...
 
     def close(self) -> None: ...
 
 
 def open_transport(address: LinkAddress) -> Transport:
-    """Open a link's transport.
+    """Open the transport of a link.
 
-    Raises LinkError for what the user must put right (an unknown host, a port in use, no permission), and OSError
-    for what time may put right (a device that is not plugged in, a server that is not up).
+    Raises LinkError for a fault that the user must correct (an unknown host, a port in use, no permission), and OSError
+    for a fault that may end by itself (a device that is not plugged in, a server that is not running).
     """
     try:
         return _OPENERS[address.kind](address.where, address.number)
@@ -102,7 +102,8 @@ class _Socket:
 
 
 class _Udp(_Socket):
-    """Sends to the peer it was given; without one, to the first who speaks until told to answer another."""
+    """A UDP socket that sends to the given peer. Without one, it sends to the first sender heard, until `answer_sender`
+    selects another."""
 
     def __init__(self, own: tuple[str, int], peer: tuple[str, int] | None) -> None:
         super().__init__(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
@@ -144,7 +145,8 @@ class _Tcp(_Socket):
         self._sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, TCP_GIVE_UP_MS)
         if self._sock.getsockname() == self._sock.getpeername():
-            # A knock on a local port that nobody listens on can, by chance, come from that very port and be answered.
+            # A connection to a local port without a listener can, by chance, start from this same port: a socket that
+            # is connected to itself.
             self.close()
             raise ConnectionRefusedError(errno.ECONNREFUSED, os.strerror(errno.ECONNREFUSED))
 
@@ -166,19 +168,19 @@ class _Serial:
     connected = True
 
     def __init__(self, device: str, baud: int) -> None:
-        import serial  # here, because no other kind of link needs it
+        import serial  # not at the top: no other kind of link needs it
 
         if not stat.S_ISCHR(os.stat(device).st_mode):
             raise ValueError("it is no serial device")
         try:
             self._port = serial.Serial(device, baud, timeout=0, exclusive=True)
-        except termios.error as error:  # no OSError, though it is one
+        except termios.error as error:  # not a subclass of OSError
             raise OSError(*error.args) from error
 
     def fileno(self) -> int:
         return self._port.fileno()
 
-    # Not the port's own `read` and `write`: when its buffer is full, pyserial's non-blocking write spins.
+    # Not pyserial's own `read` and `write`: when the buffer is full, its non-blocking write spins.
 
     def read(self) -> bytes:
         with suppress(BlockingIOError):
@@ -202,7 +204,7 @@ class _Serial:
     def close(self) -> None:
         with suppress(OSError, termios.error):
             if not self.idle():
-                # What the line has not taken must neither come out later nor hold up the close (for up to 30 s).
+                # Bytes that the line has not taken must neither leave later nor delay the close (for up to 30 s).
                 self._port.reset_output_buffer()
         self._port.close()
 

@@ -1,7 +1,7 @@
-"""The one import of pymavlink's dialect, and bytes from the wire made into messages.
+"""The one import of pymavlink's dialect, and the parser from bytes to messages.
 
-The dialect alone, without `mavutil`: that would cost another 20 MB of RAM and bring connections that hang, spin or
-raise where ours must not.
+`mavutil` is not imported: it would take another 20 MB of RAM, and its connections hang, spin or raise where a link of
+this package must not.
 """
 
 from collections import Counter
@@ -13,7 +13,7 @@ Message = mavlink.MAVLink_message
 
 
 class Receiver:
-    """Takes the bytes of one stream and gives its messages; what is no message is dropped and counted."""
+    """The parser of one byte stream. It yields the messages; bytes that are no message are dropped and counted."""
 
     def __init__(self) -> None:
         self.received: Counter[str] = Counter()  # messages by name
@@ -21,14 +21,14 @@ class Receiver:
         self.forget_partial_message()
 
     def forget_partial_message(self) -> None:
-        """Start anew, as after a link was lost in the middle of a message."""
+        """Start again with an empty buffer, as after a link was lost in the middle of a message."""
         self._parser = mavlink.MAVLink(None)
-        self._parser.robust_parsing = True  # bad data is handed out as such instead of raised
+        self._parser.robust_parsing = True  # bad data comes as BAD_DATA messages instead of an exception
 
     def feed(self, data: bytes) -> Iterator[Message]:
-        """Give the messages that `data` completes."""
+        """Yield the messages that `data` completes."""
         while data:
-            # In portions that end where a message ends, the parser's buffer is emptied with each and never grows.
+            # The portions end where a message ends, so the parser's buffer is emptied each time and never grows.
             portion = self._parser.bytes_needed()
             message = self._parser.parse_char(data[:portion])
             data = data[portion:]
@@ -37,7 +37,7 @@ class Receiver:
             if message.get_type() == "BAD_DATA":
                 self.bad_bytes += len(message.data)
             elif isinstance(message, mavlink.MAVLink_unknown):
-                self.received["UNKNOWN"] += 1  # under one name: there are 16 million numbers
+                self.received["UNKNOWN"] += 1  # one name for all: there are 16 million message numbers
             else:
                 self.received[message.get_type()] += 1
                 yield message

@@ -9,7 +9,7 @@ from edgevpr.types import Place
 
 
 def write_geojson(place_map: PlaceMap, out: TextIO) -> int:
-    """Write all places as one FeatureCollection, a feature a line; returns how many."""
+    """Write all places as one FeatureCollection, one feature a line, and return their number."""
     count = 0
     out.write('{"type": "FeatureCollection", "features": [')
     for place in place_map.places():

@@ -1,4 +1,4 @@
-"""The GeoPackage side of a map file: tables that QGIS, GDAL and `sqlite3` know (OGC 12-128r18, version 1.3)."""
+"""The GeoPackage side of a map file: tables that QGIS, GDAL and `sqlite3` can read (OGC 12-128r18, version 1.3)."""
 
 import struct
 from datetime import datetime, timezone
@@ -52,8 +52,8 @@ UPDATE gpkg_contents SET last_change = strftime('%Y-%m-%dT%H:%M:%fZ','now'),
 WHERE table_name = 'places'
 """
 
-# The standard's spatial index (OGC 12-128r18, annex F.3), which other programs use and keep as well: an R-tree, and
-# triggers that follow every change of the places.
+# The spatial index of the standard (OGC 12-128r18, annex F.3): an R-tree, and triggers that follow every change of the
+# places. Other programs use it and keep it up to date as well.
 SPATIAL_INDEX = """
 CREATE TABLE IF NOT EXISTS gpkg_extensions (
     table_name TEXT, column_name TEXT, extension_name TEXT NOT NULL, definition TEXT NOT NULL, scope TEXT NOT NULL,
@@ -111,18 +111,18 @@ END;
 
 # "GP", version 0, flags: little-endian, no envelope; srs_id; then well-known binary: little-endian, Point, x, y.
 _POINT = struct.Struct("<2sBBiBIdd")
-_KINDS_OF_POINT = (1, 1001, 2001, 3001)  # x and y; and z, and m, and both, which are not looked at
+_KINDS_OF_POINT = (1, 1001, 2001, 3001)  # xy, xyz, xym, xyzm; z and m are ignored
 
 
 def point_blob(lat_deg: float, lon_deg: float) -> bytes:
-    """GeoPackage geometry of a WGS-84 point."""
+    """Encode a WGS-84 point (degrees) as a GeoPackage geometry."""
     return _POINT.pack(b"GP", 0, 1, WGS84, 1, 1, lon_deg, lat_deg)
 
 
 def read_point(blob: bytes) -> tuple[float, float]:
-    """(lat_deg, lon_deg) of a point written by `point_blob`, or by another tool with or without an envelope.
+    """Return (lat_deg, lon_deg) of a point written by `point_blob`, or by another tool with or without an envelope.
 
-    Raises ValueError for what is no point on the Earth.
+    Raises ValueError for a geometry that is not a point on the Earth.
     """
     try:
         if blob[:2] != b"GP":
@@ -140,14 +140,14 @@ def read_point(blob: bytes) -> tuple[float, float]:
 
 
 def utc_text(t_utc_s: float | None) -> str | None:
-    """Seconds since 1970 as the GeoPackage's DATETIME, UTC with milliseconds."""
+    """Return seconds since 1970 as a GeoPackage DATETIME, UTC with milliseconds; None for None."""
     if t_utc_s is None:
         return None
     return datetime.fromtimestamp(t_utc_s, timezone.utc).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
 def utc_seconds(text: str | None) -> float | None:
-    """The reverse of `utc_text`; None for a text of another form, as other tools may write."""
+    """Reverse `utc_text`; return None for a text of another form, as other tools may write."""
     try:
         return datetime.fromisoformat(text.replace("Z", "+00:00")).timestamp() if text else None
     except ValueError:

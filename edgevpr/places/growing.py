@@ -1,4 +1,5 @@
-"""An index that takes new places while it is in use: it never outgrows its arrays, and gives up its worst places."""
+"""An index that takes new places while it is in use. Its arrays never grow: when they are full, it drops its worst
+places."""
 
 from collections.abc import Iterator
 
@@ -15,18 +16,19 @@ _MOVED_AT_ONCE = 256
 
 
 class GrowingIndex:
-    """The places of an open map, with room for more. `index` is what retrieval takes: views, valid until the next add.
+    """The index of an open map, with free slots for more places.
 
-    When all slots are taken, the best three quarters stay (see `thin`); the map file keeps every place.
+    Retrieval takes `index`, which holds views that are valid until the next `add`. When all slots are taken, the best
+    three quarters of the places stay (see `thin`). The map file keeps every place.
     """
 
     def __init__(
         self, place_map: PlaceMap, technique: Technique, *, budget_bytes: int, room: int, beside_bytes: int = 0
     ) -> None:
-        """Read the map, which may be empty, and leave room for `room` more places as far as the budget allows.
+        """Read the map, which may be empty, and leave slots for `room` more places as far as the budget allows.
 
-        `beside_bytes` of it a place are left to what grows with the index. Raises MapError for a budget that holds no
-        place.
+        For each place, `beside_bytes` of the budget are left to other arrays that grow with the index (see
+        `sequence`). Raises MapError for a budget that holds no place.
         """
         each = bytes_per_place(technique.spec) + beside_bytes
         self._in_file = len(place_map)
@@ -39,7 +41,7 @@ class GrowingIndex:
         self._map, self._technique = place_map, technique
         self._packs = technique.spec.packed is not None
         self._mean = place_map.mean_coarse() if self._packs else None
-        self._mean_of = self._in_file  # places
+        self._mean_of = self._in_file  # number of places in this mean
         self._slots = empty_index(technique.spec, capacity, self._mean)
         self._taken = 0
         if self._in_file:
@@ -52,16 +54,16 @@ class GrowingIndex:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all slots, taken or not: what the index will ever take."""
+        """Bytes of all slots, taken or free: the index never takes more."""
         return self._slots.nbytes
 
     def add(
         self, place_id: int, position: Position | None, coarse: np.ndarray, heading_deg: float | None = None
     ) -> None:
-        """Take a place that `PlaceMap.add` has confirmed; ids grow.
+        """Add a place that `PlaceMap.add` has confirmed. Its id must be larger than all ids in the index.
 
-        Raises MapError where the file cannot be read. The index may be used as before even then: it holds the places
-        that it has read, all packed alike.
+        Raises MapError where the file cannot be read. The index can still be used after that: it holds the places
+        that it could read, all packed with the same mean.
         """
         if self._taken == len(self._slots):
             self._thin()
@@ -72,16 +74,16 @@ class GrowingIndex:
         slots.rows[at] = self._technique.pack(coarse[None], self._mean)[0] if self._packs else coarse
         self._taken += 1
         self._in_file += 1
-        # Rows are packed by their difference from the mean, which a few first places do not tell.
+        # Rows are packed as differences from the mean, and the first few places are a poor estimate of the mean.
         if self._packs and self._in_file >= 2 * self._mean_of:
             self._repack()
 
     def _thin(self) -> None:
         index = self.index
-        # Quality is in the file alone: this happens too seldom for four bytes a place in RAM.
+        # Quality is read from the file: thinning is too rare to justify four more bytes a place in RAM.
         quality = np.fromiter((place.quality for place in self._map.places(index.place_ids)), float, len(index))
         kept = best_places(index.lat_deg, index.lon_deg, quality, 3 * len(index) // 4, index.place_ids)
-        # A slot moves down or stays, so what is overwritten has been moved already or is given up.
+        # A place moves to a lower slot or stays, so an overwritten place has already been moved or is dropped.
         for start in range(0, len(kept), _MOVED_AT_ONCE):
             block = kept[start : start + _MOVED_AT_ONCE]
             for array in index.arrays.values():
@@ -97,7 +99,7 @@ class GrowingIndex:
                 fill(block, parts, self._technique)
                 packed += len(block)
         finally:
-            if packed:  # rows packed by the old mean must not stand beside those packed by the new one
+            if packed:  # rows packed with the old mean and with the new one must not be mixed
                 self._mean, self._mean_of, self._taken = mean, self._in_file, packed
 
     def _view(self, start: int, end: int, mean: np.ndarray | None) -> PlaceIndex:

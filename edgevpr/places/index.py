@@ -1,4 +1,4 @@
-"""The part of a map that is in RAM: one row a place, in arrays made once, never larger than the budget."""
+"""The part of a map that is in RAM: one row a place, in arrays that are made once and never exceed the budget."""
 
 import logging
 from collections.abc import Iterator
@@ -21,10 +21,13 @@ _PACKED_AT_ONCE = 32
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlaceIndex:
-    """`place_ids` int64 (N,), `lat_deg` and `lon_deg` float64 (N,) with NaN where a place has no position,
-    `heading_deg` float16 (N,), to a quarter of a degree and NaN where unknown, and `rows` (N, *row shape): all
-    contiguous. A place's number in these arrays is its *slot*; slots follow the order of mapping. `mean` is that of the
-    coarse parts, None for a technique that does not pack them."""
+    """The arrays of N places, all contiguous. The number of a place in them is its *slot*; slots follow the order of
+    mapping.
+
+    `place_ids` is int64 (N,). `lat_deg` and `lon_deg` are float64 (N,), NaN where a place has no position.
+    `heading_deg` is float16 (N,), accurate to a quarter of a degree, NaN where unknown. `rows` is (N, *row shape).
+    `mean` is the mean of the coarse parts, None for a technique that does not pack them.
+    """
 
     place_ids: np.ndarray
     lat_deg: np.ndarray
@@ -38,7 +41,7 @@ class PlaceIndex:
 
     @property
     def arrays(self) -> dict[str, np.ndarray]:
-        """Those with one entry a place, by name."""
+        """The arrays with one entry a place, by name."""
         return {
             "place_ids": self.place_ids,
             "lat_deg": self.lat_deg,
@@ -53,26 +56,27 @@ class PlaceIndex:
 
     @property
     def knows_headings(self) -> bool:
-        """Say whether any place has a heading."""
+        """True where at least one place has a heading."""
         return not np.isnan(self.heading_deg).all()
 
     def spacing_m(self) -> float | None:
-        """Median distance from a place to the next one mapped, metres; None where no two have a position."""
+        """Return the median distance in metres between places mapped one after the other; None where no such pair has
+        positions."""
         away_m = distance_m(self.lat_deg[:-1], self.lon_deg[:-1], self.lat_deg[1:], self.lon_deg[1:])
         known = away_m[~np.isnan(away_m)]
         return float(np.median(known)) if len(known) else None
 
     def within(self, position: Position, radius_m: float) -> np.ndarray:
-        """Which places are within `radius_m` metres of a position, bool (N,); never one without a position.
+        """Tell which places are within `radius_m` metres of `position`, bool (N,); False for one without a position.
 
-        The map file could be asked by area too, but all 10 000 distances from these arrays take less than half a
-        millisecond of a query of tens, need no file, and speak of slots.
+        The map file can be searched by area too. But 10 000 distances from these arrays take less than half a
+        millisecond, of a query of tens of milliseconds. They need no file, and they are ordered by slot.
         """
         return distance_m(position.lat_deg, position.lon_deg, self.lat_deg, self.lon_deg) <= radius_m
 
 
 def bytes_per_place(spec: TechniqueSpec) -> int:
-    """Resident bytes of one place of the index."""
+    """Return the resident bytes of one place of the index."""
     return spec.row.nbytes + _BYTES_BESIDE_ROW
 
 
@@ -83,11 +87,11 @@ def load_index(
     into: PlaceIndex | None = None,
     beside_bytes: int = 0,
 ) -> PlaceIndex:
-    """Read the coarse parts of a map, packed as the technique wants them, into new arrays or those of `into`.
+    """Load the coarse parts of a map, packed by the technique, into new arrays or those of `into`.
 
-    Where the budget does not hold them all, the best places are loaded (see `thin`) and the map file keeps the rest;
-    `beside_bytes` of it a place are left to what grows with the index (see `sequence`).
-    Raises MapError for a map without places, and for a budget that holds none.
+    Where the budget does not hold all places, the best ones are loaded (see `thin`); the map file keeps all. For each
+    place, `beside_bytes` of the budget are left to other arrays that grow with the index (see `sequence`).
+    Raises MapError for a map without places, and for a budget that holds no place.
     """
     spec = technique.spec
     places, each = len(place_map), bytes_per_place(spec) + beside_bytes
@@ -100,7 +104,7 @@ def load_index(
         )
     if into is None:
         into = empty_index(spec, capacity, place_map.mean_coarse() if spec.packed else None)
-    # A map that another program is adding to may have grown since it was counted: the new places wait for next time.
+    # Another program may have added places since they were counted: those are left out until the next load.
     parts, headings_deg = islice(place_map.coarse_parts(), places), islice(place_map.headings_deg(), places)
     if capacity < places:
         _log.warning(
@@ -118,7 +122,7 @@ def load_index(
 
 
 def empty_index(spec: TechniqueSpec, capacity: int, mean: np.ndarray | None) -> PlaceIndex:
-    """Arrays for `capacity` places: the system gives the memory of ids and rows only as they are written."""
+    """Make arrays for `capacity` places. The system provides the memory of ids and rows only as they are written."""
     return PlaceIndex(
         place_ids=np.empty(capacity, np.int64),
         lat_deg=np.full(capacity, np.nan),
@@ -132,7 +136,10 @@ def empty_index(spec: TechniqueSpec, capacity: int, mean: np.ndarray | None) -> 
 def fill(
     index: PlaceIndex, parts: Iterator[tuple[int, tuple[float, float] | None, np.ndarray]], technique: Technique
 ) -> None:
-    """Write as many `parts` (of `PlaceMap.coarse_parts`) as the index has slots, a block at a time."""
+    """Write as many `parts` (of `PlaceMap.coarse_parts`) as the index has slots, a block at a time.
+
+    Raises MapError where there are fewer parts than slots.
+    """
     spec = technique.spec
     waiting = np.empty((_PACKED_AT_ONCE, *spec.coarse.shape), spec.coarse.dtype)
     for start in range(0, len(index), _PACKED_AT_ONCE):

@@ -9,20 +9,19 @@ import math
 import sqlite3
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from edgevpr import __version__
 from edgevpr.contract import Descriptor, PartSpec, TechniqueSpec
 from edgevpr.errors import MapError
 from edgevpr.geodesy import EARTH_RADIUS_M, distance_m
 from edgevpr.places import geopackage
+from edgevpr.places.mapspec import differences, read_spec, write_spec
 from edgevpr.places.sqlite import connect, sentences, settle, settle_left_log, start_log
 from edgevpr.types import Frame, Place, Position
 
-FORMAT_VERSION = 1
 _PLACE_COLUMNS = "place_id, geom, time, alt_m, heading_deg, source_image, quality"
 _IN_BOX = """
 SELECT place_id, geom FROM rtree_places_geom JOIN places ON place_id = id
@@ -32,7 +31,7 @@ WHERE maxy >= ? AND miny <= ? AND maxx >= ? AND minx <= ?
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapInfo:
-    """What a map holds; `extent` is (lat_min, lon_min, lat_max, lon_max) in degrees, None without positions."""
+    """Summary of a map; `extent` is (lat_min, lon_min, lat_max, lon_max) in degrees, None without positions."""
 
     path: str
     spec: TechniqueSpec
@@ -56,7 +55,7 @@ class PlaceMap:
 
     @classmethod
     def create(cls, path: str | Path, spec: TechniqueSpec) -> "PlaceMap":
-        """Make an empty map for descriptors of `spec`. Raises MapError if the file is there or cannot be written."""
+        """Make an empty map for descriptors of `spec`. Raises MapError if the file has content or cannot be written."""
         path = Path(path)
         if path.exists() and path.stat().st_size:
             raise MapError(f"{path} is there already: choose another name, or add to it with --append.")
@@ -66,31 +65,19 @@ class PlaceMap:
             db.execute(f"PRAGMA user_version = {geopackage.USER_VERSION}")
             start_log(db)
             db.executescript("BEGIN;" + geopackage.SCHEMA)
-            described = {
-                "format_version": FORMAT_VERSION,
-                "made_by": f"edgevpr {__version__}",
-                "technique": spec.name,
-                "parameters": spec.parameters,
-                "model_sha256": spec.model_sha256,
-                "coarse": asdict(spec.coarse),
-                "fine": asdict(spec.fine) if spec.fine else None,
-                "packed": asdict(spec.packed) if spec.packed else None,
-            }
-            db.executemany(
-                "INSERT INTO edgevpr_map (key, value) VALUES (?, ?)",
-                [(key, json.dumps(value)) for key, value in described.items()],
-            )
+            write_spec(db, spec)
             db.execute("COMMIT")
         return cls(path, db, spec, writable=True)
 
     @classmethod
     def open(cls, path: str | Path) -> "PlaceMap":
-        """Open for reading. Raises MapError for a file that is missing, no place map, damaged, or from the future."""
+        """Open a map for reading. Raises MapError for a file that is missing, damaged, no place map, or of a newer
+        format."""
         path = _existing(path)
         settle_left_log(path)
         with sentences(path):
             db = connect(path, "ro")
-            return cls(path, db, _read_spec(path, db), writable=False)
+            return cls(path, db, read_spec(path, db), writable=False)
 
     @classmethod
     def open_for_adding(cls, path: str | Path) -> "PlaceMap":
@@ -98,7 +85,7 @@ class PlaceMap:
         path = _existing(path)
         with sentences(path):
             db = connect(path, "rw")
-            spec = _read_spec(path, db)
+            spec = read_spec(path, db)
             start_log(db)
             return cls(path, db, spec, writable=True)
 
@@ -109,19 +96,16 @@ class PlaceMap:
         self.close()
 
     def close(self) -> None:
-        """Close; a map that was written becomes one plain file again, readable from a read-only card."""
+        """Close the file. A map that was written becomes one plain file again, readable from a read-only card."""
         if self._writable:
             settle(self._db)
         self._db.close()
 
     def require(self, spec: TechniqueSpec) -> None:
         """Raise MapError, naming what differs, unless the map's descriptors were made by exactly `spec`."""
-        differences = [
-            f"{what} is {theirs}, not {ours}" for what, theirs, ours in _compared(self.spec, spec) if theirs != ours
-        ]
-        if differences:
+        if different := differences(self.spec, spec):
             raise MapError(
-                f"{self.path} was made differently ({'; '.join(differences)}): use it with its own technique and "
+                f"{self.path} was made differently ({'; '.join(different)}): use it with its own technique and "
                 "parameters, or build a map with these."
             )
 
@@ -149,7 +133,7 @@ class PlaceMap:
         return cursor.lastrowid
 
     def index_positions(self) -> None:
-        """Make `nearest_m` quick whatever the map's size: with the standard's R-tree, unless the map has it already."""
+        """Add the R-tree of the standard, unless the map has it. `nearest_m` needs it, and is fast for any map size."""
         with sentences(self.path):
             if not self._db.execute("SELECT 1 FROM sqlite_master WHERE name = 'rtree_places_geom'").fetchone():
                 try:
@@ -160,7 +144,10 @@ class PlaceMap:
                     raise
 
     def nearest_m(self, position: Position, within_m: float) -> float | None:
-        """Metres to the nearest place of the file; None where none lies within `within_m`. See `index_positions`."""
+        """Return the metres to the nearest place of the file; None where none lies within `within_m` metres.
+
+        Call `index_positions` before. Raises MapError where the file cannot be read.
+        """
         lat_deg, lon_deg = position.lat_deg, position.lon_deg
         north_deg = math.degrees(within_m / EARTH_RADIUS_M)
         east_deg = min(180.0, north_deg / max(math.cos(math.radians(min(abs(lat_deg) + north_deg, 90.0))), 1e-9))
@@ -174,9 +161,10 @@ class PlaceMap:
         return nearest_m if nearest_m <= within_m else None
 
     def absorb(self, other: "PlaceMap") -> tuple[int, int]:
-        """Copy every place of another map of the same technique, all or none; returns (copied, already here).
+        """Copy every place of another map of the same technique, all or none; return (copied, already here).
 
-        A place is already here when image name, time and coarse part are the same. Raises MapError as `require`.
+        A place is already here when image name, time and coarse part are the same. Raises MapError as `require` does,
+        and where a file cannot be read or written.
         """
         self.require(other.spec)
         columns = "geom, time, alt_m, heading_deg, source_image, quality, coarse, fine"
@@ -196,7 +184,7 @@ class PlaceMap:
         return copied, len(other) - copied
 
     def info(self) -> MapInfo:
-        """Count and summarise."""
+        """Summarise the map."""
         with sentences(self.path):
             places, with_position, first, last, quality = self._db.execute(
                 "SELECT count(*), count(geom), min(time), max(time), avg(quality) FROM places"
@@ -219,7 +207,10 @@ class PlaceMap:
         )
 
     def places(self, place_ids: Iterable[int] | None = None) -> Iterator[Place]:
-        """The named places in the order given, or all of them in the order they were added."""
+        """Yield the places of `place_ids` in the order given, or (None) all places in the order they were added.
+
+        Raises MapError for an id that is not in the map, and for a damaged position.
+        """
         with sentences(self.path):
             if place_ids is None:
                 for row in self._db.execute(f"SELECT {_PLACE_COLUMNS} FROM places ORDER BY place_id"):
@@ -233,7 +224,10 @@ class PlaceMap:
                 )
 
     def coarse_parts(self) -> Iterator[tuple[int, tuple[float, float] | None, np.ndarray]]:
-        """(place_id, (lat_deg, lon_deg) or None, coarse part) of every place, in the order they were added."""
+        """Yield (place_id, (lat_deg, lon_deg) or None, coarse part) of every place, in the order they were added.
+
+        Raises MapError for a damaged place.
+        """
         with sentences(self.path):
             for place_id, geom, coarse in self._db.execute(
                 "SELECT place_id, geom, coarse FROM places ORDER BY place_id"
@@ -244,24 +238,24 @@ class PlaceMap:
                 yield place_id, self._point(place_id, geom), part
 
     def headings_deg(self) -> Iterator[float]:
-        """Heading of every place, 0 up to 360 or NaN where unknown, in the order they were added."""
+        """Yield the heading of every place, 0 up to 360 or NaN where unknown, in the order they were added."""
         with sentences(self.path):
             for (heading_deg,) in self._db.execute("SELECT CAST(heading_deg AS REAL) FROM places ORDER BY place_id"):
                 yield math.nan if heading_deg is None else heading_deg % 360
 
     def fingerprint(self, source_image: str, descriptor: Descriptor) -> tuple[str, int]:
-        """What tells one frame from another: its name, and a hash of its coarse part."""
+        """Return the values that identify a frame: its name, and a hash of its coarse part."""
         return source_image, hash(_blob(descriptor.coarse, self.spec.coarse))
 
     def fingerprints(self) -> set[tuple[str, int]]:
-        """Those of all places of the map."""
+        """Return the `fingerprint` of every place of the map."""
         with sentences(self.path):
             return {
                 (name, hash(coarse)) for name, coarse in self._db.execute("SELECT source_image, coarse FROM places")
             }
 
     def positions_and_quality(self, places: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """lat_deg, lon_deg (NaN where unknown) and quality of the first `places` places, float64 each."""
+        """Return lat_deg, lon_deg (NaN where unknown) and quality of the first `places` places, float64 (N,) each."""
         columns = np.full((3, places), np.nan)
         for at, place in zip(range(places), self.places(), strict=False):
             if place.position:
@@ -270,14 +264,17 @@ class PlaceMap:
         return columns[0], columns[1], columns[2]
 
     def mean_coarse(self) -> np.ndarray:
-        """Mean of the coarse parts over the map, float32 of the shape of one."""
+        """Return the mean of all coarse parts of the map, float32 with the shape of one part."""
         mean = np.zeros(self.spec.coarse.shape)
         for count, (_, _, part) in enumerate(self.coarse_parts(), start=1):
             mean += (part - mean) / count
         return mean.astype(np.float32)
 
     def fine_part(self, place_id: int) -> np.ndarray:
-        """The fine part of one place, read from the file (read-only array of `spec.fine`)."""
+        """Read the fine part of one place from the file (read-only array of `spec.fine`).
+
+        Raises MapError for a place that is missing or damaged.
+        """
         with sentences(self.path):
             row = self._db.execute("SELECT fine FROM places WHERE place_id = ?", (int(place_id),)).fetchone()
         if row is None:
@@ -340,47 +337,7 @@ def _existing(path: str | Path) -> Path:
     return path
 
 
-def _read_spec(path: Path, db: sqlite3.Connection) -> TechniqueSpec:
-    (application_id,) = db.execute("PRAGMA application_id").fetchone()
-    tables = {name for (name,) in db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
-    if application_id != geopackage.APPLICATION_ID or "edgevpr_map" not in tables:
-        raise MapError(f"{path}: this is not a place map: give a .gpkg file made by `edgevpr map build`.")
-    try:
-        stored = {key: json.loads(value) for key, value in db.execute("SELECT key, value FROM edgevpr_map")}
-        if stored["format_version"] > FORMAT_VERSION:
-            raise MapError(
-                f"{path} comes from a newer edgevpr (map format {stored['format_version']}, this one reads up to "
-                f"{FORMAT_VERSION}): update edgevpr."
-            )
-        return TechniqueSpec(
-            name=stored["technique"],
-            parameters=stored["parameters"],
-            coarse=_part_spec(stored["coarse"]),
-            fine=_part_spec(stored["fine"]),
-            model_sha256=stored["model_sha256"],
-            packed=_part_spec(stored["packed"]),
-        )
-    except (ValueError, KeyError, TypeError) as error:
-        raise MapError(
-            f"{path}: its table edgevpr_map is damaged ({error!r}): restore a copy or build the map again."
-        ) from error
-
-
-def _part_spec(stored: dict | None) -> PartSpec | None:
-    return PartSpec(tuple(stored["shape"]), stored["dtype"]) if stored else None
-
-
 def _blob(part: np.ndarray | None, spec: PartSpec | None) -> bytes | None:
     if spec is None:
         return None
     return np.ascontiguousarray(part, spec.dtype).reshape(spec.shape).tobytes()
-
-
-def _compared(theirs: TechniqueSpec, ours: TechniqueSpec) -> Iterator[tuple[str, object, object]]:
-    yield "technique", theirs.name, ours.name
-    if theirs.name == ours.name:
-        for key in sorted(theirs.parameters.keys() | ours.parameters.keys()):
-            yield key, theirs.parameters.get(key), ours.parameters.get(key)
-        yield "model sha256", theirs.model_sha256, ours.model_sha256
-        yield "form of the coarse part", theirs.coarse, ours.coarse
-        yield "form of the fine part", theirs.fine, ours.fine

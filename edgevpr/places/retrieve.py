@@ -1,4 +1,4 @@
-"""From a query to the places that it may be: one scan of the index, then the best candidates compared in full."""
+"""Retrieval of the places that a query may show: one scan of the index, then a full comparison of the best ones."""
 
 from dataclasses import dataclass, replace
 
@@ -15,13 +15,13 @@ _NEIGHBOURS_WITHOUT_POSITION = 2
 _COMPARED_ELSEWHERE = 5
 _TRIED_EACH = 6  # hypotheses of a place
 
-_Chosen = tuple[int, list[int] | None]  # a slot, and the hypotheses to try (None: all there are)
+_Chosen = tuple[int, list[int] | None]  # a slot, and the hypotheses to try (None: all)
 
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """What is known of the place of a query before it is asked, None where nothing is: `in_reach` bool (N,), at least
-    one True, says which places the aircraft can be at; `turned_deg` float (N,) how far the camera should have turned
+    """Knowledge about the place of a query before the search (None: nothing known). `in_reach` bool (N,), at least one
+    True, tells which places the aircraft can be at. `turned_deg` float (N,) is the expected rotation of the camera
     since each place was mapped (see `Technique.coarse_scores`)."""
 
     in_reach: np.ndarray | None = None
@@ -33,8 +33,8 @@ NOTHING = Expected()
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """All places by their rows of the index: `scores` float32 (N,) and, where a comparison has several hypotheses to
-    try, the scores of each, `by_hypothesis` float32 (N, H), -inf for one that is out of the question."""
+    """The result of scanning all rows of the index: `scores` float32 (N,). Where a comparison has several hypotheses
+    to try, `by_hypothesis` float32 (N, H) has the score of each, -inf for one that is ruled out; else None."""
 
     scores: np.ndarray
     by_hypothesis: np.ndarray | None
@@ -42,8 +42,8 @@ class Scan:
 
 @dataclass(frozen=True, slots=True)
 class Ranking:
-    """Places best first: `slots` int (K,) of the index, `scores` float32 (K,), and by its slot the match of each place
-    that was compared in full, with that score."""
+    """Places best first: `slots` int (K,) of the index and `scores` float32 (K,). `compared` maps the slot of each
+    place that was compared in full to its match, which has the same score."""
 
     slots: np.ndarray
     scores: np.ndarray
@@ -67,20 +67,21 @@ def compare(
     neighbour_m: float = 0.0,
     expected: Expected = NOTHING,
 ) -> Ranking:
-    """Compare the best-scanned `candidates` places in full, and rank them.
+    """Compare the `candidates` places with the best scan scores in full, and rank them.
 
-    None, or as many as there are and more than the technique's own number: all places in full under every hypothesis,
-    whatever the scan says (exact, and slow). Where all candidates turn out to be neighbours of the best one (nearer
-    than `neighbour_m`), the best-scanned places elsewhere are compared as well: without them nobody could say how far
-    ahead it is. A technique without a fine part is ranked by the scan.
+    Where `candidates` is None, or is at least the number of places and more than the technique's own number, all
+    places are compared under every hypothesis, unless `expected` narrows them: exact, but slow. Neighbours of the best
+    place are the places within `neighbour_m` metres of it. Where all candidates are its neighbours, the best-scanned
+    places elsewhere are compared as well, because the margin needs one of them. A technique without a fine part is
+    ranked by the scan.
 
-    Of a technique whose scan counts (see `TechniqueSpec`) the score is that of the comparison times the mean of that of
-    the scan and 1: what the two say of a wrong place has little to do with each other.
+    Where the scan counts (see `TechniqueSpec.scan_counts`), the score is that of the comparison times the mean of the
+    scan score and 1: for a wrong place the two scores have little to do with each other.
 
-    Of places in reach the candidates are taken, and five candidates of all others are compared as well. Where what is
-    expected is false, it would hide the right place behind the best of the wrong ones; and to be ahead of the few that
-    are left would say little, so five places elsewhere are compared at least. Raises MapError for a place that cannot
-    be read.
+    Where `expected.in_reach` is known, the candidates are places in reach, and five places out of reach are compared
+    as well: a false expectation would otherwise hide the right place behind the best of the wrong ones. At least five
+    places elsewhere are then compared, because a margin over fewer says little. Raises MapError for a place that
+    cannot be read.
     """
     matches: dict[int, FineMatch] = {}
     one_stage = technique.spec.fine is None
@@ -121,12 +122,13 @@ def compare(
 
 
 def best_scanned(scanned: np.ndarray, by_hypothesis: np.ndarray | None, among: np.ndarray, count: int) -> list[_Chosen]:
-    """Choose the `count` best-scanned slots of those `among` (N,) bool is True of, and which hypotheses to try of each
-    (None: all).
+    """Choose the `count` best-scanned slots where `among` bool (N,) is True, and the hypotheses to try of each (None:
+    all).
 
-    Where there are several (`by_hypothesis` float32 (N, H), see `Technique.coarse_scores`), it is the best hypotheses
-    of all places, `count` times six or, where fewer are possible, so many: a place of which only two look likely leaves
-    room for others. Of one place they are six at most, or more where there are not enough places.
+    With `by_hypothesis` float32 (N, H) (see `Technique.coarse_scores`), the best hypotheses of all places together are
+    chosen instead: `count` times six, or `count` times the mean number possible for a place where that is less. So a
+    place with only two likely hypotheses leaves room for other places. One place gets six hypotheses at most, or more
+    where there are too few places.
     """
     slots = np.flatnonzero(among)
     if by_hypothesis is None or not len(slots):
@@ -144,27 +146,30 @@ def best_scanned(scanned: np.ndarray, by_hypothesis: np.ndarray | None, among: n
 
 
 def _largest(scores: np.ndarray, count: int) -> np.ndarray:
-    """Find where the `count` largest of scores (N,) are, in no order."""
+    """Return the indices of the `count` largest of scores (N,), in no order."""
     return np.argpartition(-scores, count)[:count] if count < len(scores) else np.arange(len(scores))
 
 
 def elsewhere(index: PlaceIndex, best: int, slots: np.ndarray, neighbour_m: float) -> np.ndarray:
-    """Tell which of `slots` are not in the neighbourhood of `best`, bool: more than `neighbour_m` metres away or, where
-    either has no position, more than two places before or after it in the map."""
+    """Tell which of `slots` (K,) are outside the neighbourhood of the slot `best`, bool (K,): more than `neighbour_m`
+    metres away or, where either has no position, more than two places before or after it in the index."""
     away_m = distance_m(index.lat_deg[best], index.lon_deg[best], index.lat_deg[slots], index.lon_deg[slots])
     return np.where(np.isnan(away_m), abs(slots - best) > _NEIGHBOURS_WITHOUT_POSITION, away_m > neighbour_m)
 
 
 def margin(ranking: Ranking, index: PlaceIndex, neighbour_m: float) -> float | None:
-    """Say by how much the best place beats the best one elsewhere; None where no place elsewhere was compared."""
+    """Return the margin: the best score less the best score elsewhere. None where no place elsewhere is ranked."""
     others = ranking.slots[1:]
     runners_up = ranking.scores[1:][elsewhere(index, ranking.slots[0], others, neighbour_m)]
     return float(ranking.scores[0] - runners_up[0]) if len(runners_up) else None
 
 
 def named(ranking: Ranking, index: PlaceIndex, place_map: PlaceMap, first: int | None = None) -> list[Candidate]:
-    """Name the `first` places of a ranking (None: all) with what the map file says of them, best first. Raises MapError
-    for a place that cannot be read, or is not where it was when the index was loaded: nobody knows what is right."""
+    """Return the `first` places of a ranking (None: all) as candidates, with their data in the map file, best first.
+
+    Raises MapError for a place that cannot be read, or whose position has changed since the index was loaded: it is
+    then unknown which position is right.
+    """
     slots, scores = ranking.slots[:first].tolist(), ranking.scores[:first].tolist()
     found = []
     for slot, score, place in zip(slots, scores, place_map.places(index.place_ids[slots]), strict=True):

@@ -1,9 +1,10 @@
-"""Matching in sequences: a place counts as recognised when the queries before it fit the places before it.
+"""Matching in sequences: a place is recognised when the queries before the newest one fit the places before it.
 
-The trajectory search of Milford and Wyeth 2012 (SeqSLAM, equations 4 to 6) over the scores of any technique. The map
-is taken to have been flown in its order, and the queries to be made in the same direction, at 0.8 to 1.2 places a
-query. What flies the other way, or asks much more or less often than the map was made, is not followed: the places
-found would lag behind. So that none of them is accepted, all other speeds are tried too, as rivals.
+The trajectory search of Milford and Wyeth 2012 (SeqSLAM, equations 4 to 6) over the scores of any technique. It
+assumes that the places of the map are in the order of the flight, and that the queries pass them in the same direction,
+at 0.8 to 1.2 places a query. An aircraft that flies the other way, or at a very different number of places a query, is
+not followed: the places found would lag behind. To keep such places from being accepted, other speeds are tried too,
+as rivals.
 """
 
 import zlib
@@ -18,44 +19,44 @@ from edgevpr.places.index import PlaceIndex
 from edgevpr.places.retrieve import Ranking
 
 V_MIN, V_MAX, _V_STEP = 0.8, 1.2, 0.1  # places a query, as in the paper
-_OTHER_SPEEDS = np.arange(-2.5, 3.01, 0.25)  # places a query; ten queries tell them from those between
-# At 10 m/s the vehicle has then left the neighbourhood of 50 m, and no velocity makes up for the places in between.
+_OTHER_SPEEDS = np.arange(-2.5, 3.01, 0.25)  # places a query; a step that a sequence of ten queries can tell apart
+# After this time at 10 m/s the vehicle has left the neighbourhood of 50 m, and no velocity covers the places between.
 _GAP_S = 5.0
 _NEWEST, _NEWEST_ALONE, _BEST_SHARE = 3, 2, 0.1
-_USUAL_INTERVALS = 3  # a technique that takes 6 s a query leaves gaps of 6 s, and they are none
+_USUAL_INTERVALS = 3  # a technique that takes 6 s a query always pauses for 6 s: that is no gap
 
 
 def length_of(spec: TechniqueSpec, asked: int | None) -> int:
-    """Say how many queries are matched together: what is asked for, else the technique's own number."""
+    """Return how many queries are matched together: the number asked for, else the technique's own."""
     return asked or spec.sequence
 
 
 def search_of(length: int) -> "Search":
-    """Make the search over sequences of `length` queries; of one query, none."""
+    """Make the search over sequences of `length` queries; for a length of one, `Alone`."""
     return SequenceSearch(length) if length > 1 else Alone()
 
 
 def bytes_beside_place(length: int) -> int:
-    """What a sequence adds to the resident bytes of a place: a score a query, and that of its rivals."""
+    """Return the resident bytes that a sequence adds to each place: a score for each query, and one for the rivals."""
     return 4 * (length + 1) if length > 1 else 0
 
 
 class Alone:
-    """Each query by itself: what a `SequenceSearch` is where nothing is searched."""
+    """Matching of each query by itself: it stands in for `SequenceSearch` where no sequences are searched."""
 
     length = frames = 1
 
     def follow(self, ranking: Ranking, index: PlaceIndex, t_mono_s: float) -> Ranking:
-        """Give the ranking of the newest query as it is."""
+        """Return the ranking of the newest query unchanged."""
         return ranking
 
 
 class SequenceSearch:
-    """The last `length` queries' scores of all places, followed from query to query.
+    """The scores of all places for the last `length` queries, followed from query to query.
 
-    `frames` of them are there: until there are `length`, nothing may be accepted. `rivals`, float32 (N,), are the best
-    mean scores at speeds that are not followed: no place may be accepted that is not ahead of those elsewhere. `gap_s`
-    seconds without a query begin a new sequence, unless the queries before came almost as seldom.
+    `frames` is the number of queries so far: until it is `length`, no place may be accepted. `rivals`, float32 (N,),
+    are the best mean scores at speeds that are not followed: an accepted place must be ahead of the rivals elsewhere. A
+    pause longer than `gap_s` seconds, and than three times the interval before it, begins a new sequence.
     """
 
     def __init__(self, length: int, v_min: float = V_MIN, v_max: float = V_MAX, gap_s: float = _GAP_S) -> None:
@@ -66,14 +67,14 @@ class SequenceSearch:
         self.rivals = np.empty(0, np.float32)
         self._gap_s = gap_s
         self._rows: deque[np.ndarray] = deque(maxlen=length)  # newest first
-        self._usual: deque[float] = deque(maxlen=_NEWEST_ALONE)  # score of the places that were not compared
-        self._known = (0, 0)  # places of the index, and the checksum of their ids
+        self._usual: deque[float] = deque(maxlen=_NEWEST_ALONE)  # score of the places not compared, by query
+        self._known = (0, 0)  # number of places of the index, and the checksum of their ids
         self._t_last_s: float | None = None
         self._interval_s = 0.0
 
     @property
     def frames(self) -> int:
-        """Queries in the sequence so far, at most `length`."""
+        """Number of queries in the sequence so far, at most `length`."""
         return len(self._rows)
 
     @property
@@ -83,10 +84,10 @@ class SequenceSearch:
     def follow(self, ranking: Ranking, index: PlaceIndex, t_mono_s: float) -> Ranking:
         """Take the ranking of the newest query, made at `t_mono_s`, and rank the places by their best trajectory.
 
-        A place that a query was not compared with has the usual score there, the median of those that were: with 0,
-        rivals would sink, and any place that is always compared would seem ahead. What lies before the first place of
-        the map has score 0. Matches keep what the newest query says of the place (step, rotation), where it was
-        compared.
+        A place that a query was not compared with gets the usual score, the median score of the compared places. With
+        0 instead, rivals would sink, and any place that is always compared would seem ahead. A trajectory has score 0
+        before the first place of the map. Matches exist for the places compared with the newest query: they keep its
+        step and rotation, and have the score of the sequence.
         """
         if self._broken(index, t_mono_s):
             self._rows.clear()
@@ -109,23 +110,26 @@ class SequenceSearch:
         return Ranking(slots, means[slots], matches)
 
     def goes_on(self, near: np.ndarray, min_score: float) -> bool:
-        """Whether the newest queries alone still see what the sequence sees: `near` bool (N,) is the neighbourhood of
-        its best place. The mean of a sequence follows a vehicle that has left the mapped way, or the map, for as long
-        as the queries before bear it. So the last three together must see that neighbourhood too, and each of the last
-        two must find it, with `min_score`, where one neighbourhood in ten would be found by chance."""
+        """Tell whether the newest queries alone still agree with the sequence.
+
+        `near` bool (N,) is the neighbourhood of the sequence's best place. After a vehicle has left the mapped track,
+        or the map, the mean of the sequence stays high until enough old queries are gone. So the best place of the
+        last three queries together must be in `near`. And each of the last two must score in `near` at least
+        `min_score`, and so high that at most one neighbourhood in ten would reach it by chance.
+        """
         newest = list(self._rows)[:_NEWEST]
         together = best_means(newest, [trajectory[:_NEWEST] for trajectory in self._trajectories])
         if not near[together.argmax()]:
             return False
         for row, usual in zip(newest[:_NEWEST_ALONE], self._usual, strict=False):
             seen = float(row[near[: len(row)]].max(initial=0))
-            # The usual score is that of a place not compared, which a technique without a limit would let pass.
+            # Places that were not compared have the usual score, which would pass a `min_score` of 0.
             if seen <= usual or seen < min_score or np.count_nonzero(row > seen) * near.sum() > _BEST_SHARE * len(row):
                 return False
         return True
 
     def _broken(self, index: PlaceIndex, t_mono_s: float) -> bool:
-        """Whether this query does not go on where the last one was: too much time between, or another index."""
+        """Tell whether this query cannot continue the sequence: too long since the last query, or another index."""
         before_s, usual_s = self._t_last_s, self._interval_s
         self._t_last_s = t_mono_s
         if before_s is None:
@@ -140,21 +144,23 @@ class SequenceSearch:
 
 
 def trajectories(length: int, velocities: np.ndarray) -> list[list[int]]:
-    """How many slots before the newest each query of a trajectory was, newest first; one list a velocity."""
-    # Halves go up, whatever the last bit of the product.
+    """Return how many slots before the newest query each query of a trajectory was, newest first.
+
+    Gives one list for each velocity (places a query); velocities with equal lists share one.
+    """
+    # Halves go up, also where the product has a rounding error in its last bit.
     back = np.floor(velocities[:, None] * np.arange(length) + 0.5 + 1e-9).astype(int)
     return np.unique(back, axis=0).tolist()
 
 
 def _followed(v_min: float, v_max: float) -> np.ndarray:
-    """The speeds of the search."""
+    """Return the velocities of the search, places a query."""
     return np.linspace(v_min, v_max, round((v_max - v_min) / _V_STEP) + 1)
 
 
 def best_means(rows: Sequence[np.ndarray], trajectories: Sequence[Sequence[int]]) -> np.ndarray:
-    """The best mean score of the trajectories that end at each slot: rows float32 (up to N,), newest first -> (N,).
-
-    Older rows may be shorter, where the index has grown since.
+    """Return the best mean score of the trajectories that end at each slot: rows float32 (up to N,), newest first ->
+    (N,). Older rows may be shorter, where the index has grown since.
     """
     best, total = np.zeros_like(rows[0]), np.empty_like(rows[0])
     for trajectory in trajectories:
@@ -169,8 +175,7 @@ def best_means(rows: Sequence[np.ndarray], trajectories: Sequence[Sequence[int]]
 
 
 def offline(scores: np.ndarray, length: int, v_min: float = V_MIN, v_max: float = V_MAX) -> np.ndarray:
-    """Give what `SequenceSearch` makes of all queries of a flight at once, the same numbers: float32 (Q, N) -> (Q,
-    N)."""
+    """Compute the same scores as `SequenceSearch` for all queries of a flight at once: float32 (Q, N) -> (Q, N)."""
     queries, places = scores.shape
     best = np.zeros((queries, places), np.float32)
     for trajectory in trajectories(length, _followed(v_min, v_max)):

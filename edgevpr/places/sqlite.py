@@ -1,4 +1,4 @@
-"""How a map file is opened and closed, and how SQLite's errors become sentences."""
+"""Opening and closing of a map file, and SQLite's errors turned into sentences for the user."""
 
 import sqlite3
 from collections.abc import Iterator
@@ -10,12 +10,13 @@ from edgevpr.places.geopackage import read_point
 
 
 def connect(path: Path, mode: str) -> sqlite3.Connection:
-    """Open a map file; `mode` is SQLite's: ro, rw or rwc."""
+    """Open a map file; `mode` is SQLite's: ro, rw or rwc. Raises sqlite3.Error."""
     # Autocommit: transactions are begun by hand, so that nothing is ever half committed.
     db = sqlite3.connect(
         f"{path.absolute().as_uri()}?mode={mode}", uri=True, isolation_level=None, timeout=5, check_same_thread=False
     )
-    # What the triggers of a spatial index call that QGIS or GDAL has added to the map (OGC 12-128r18, annex F.3).
+    # The triggers of the spatial index (OGC 12-128r18, annex F.3) call these functions, which SQLite itself lacks. QGIS
+    # or GDAL may have added such an index.
     db.create_function("ST_IsEmpty", 1, lambda geom: geom is None)
     for name, axis in {"ST_MinX": 1, "ST_MaxX": 1, "ST_MinY": 0, "ST_MaxY": 0}.items():
         db.create_function(name, 1, lambda geom, axis=axis: read_point(geom)[axis] if geom else None)
@@ -23,13 +24,13 @@ def connect(path: Path, mode: str) -> sqlite3.Connection:
 
 
 def start_log(db: sqlite3.Connection) -> None:
-    # A write-ahead log, synced at every commit: what was confirmed survives a pulled battery.
+    # A write-ahead log, synced at every commit: a confirmed place survives a power loss.
     db.execute("PRAGMA journal_mode = WAL")
     db.execute("PRAGMA synchronous = FULL")
 
 
 def settle(db: sqlite3.Connection) -> None:
-    """Fold the write-ahead log into the file. Another program that has the map open keeps the log: no harm."""
+    """Fold the write-ahead log into the file. The log stays where another program has the map open: no harm."""
     try:
         db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         db.execute("PRAGMA journal_mode = DELETE")
@@ -38,7 +39,7 @@ def settle(db: sqlite3.Connection) -> None:
 
 
 def settle_left_log(path: Path) -> None:
-    """Recover a map that was not closed (its log is beside it), where the place may be written."""
+    """Recover a map that was not closed (its log is beside it), where the file and its folder may be written."""
     if path.with_name(path.name + "-wal").exists():
         try:
             db = connect(path, "rw")
@@ -50,7 +51,7 @@ def settle_left_log(path: Path) -> None:
 
 @contextmanager
 def sentences(path: Path) -> Iterator[None]:
-    """Turn what SQLite says into what the user can do."""
+    """Turn an error of SQLite into a MapError that says what the user can do."""
     try:
         yield
     except sqlite3.Error as error:

@@ -1,4 +1,4 @@
-"""Which places stay in RAM when not all of a map fits: the map keeps its best ones, and the file keeps all."""
+"""The choice of the places that stay in RAM when not all of a map fits: the best ones. The file keeps all places."""
 
 import math
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from edgevpr.geodesy import metres
 
-_BLOCK = 256  # places of which the least worth is known, so that the least of all is found quickly
+_BLOCK = 256  # places in a block; the least worth of each block is kept, so that the least of all is found quickly
 
 
 def best_places(
@@ -16,20 +16,20 @@ def best_places(
     capacity: int,
     numbers: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Choose `capacity` of the places (N,), given in the order they were mapped; returns their slots, in that order.
+    """Choose `capacity` of the places (N,), given in the order they were mapped; return their slots, in that order.
 
-    `numbers` (N,) int, ascending, say how many places were mapped between these where some were given up before
-    (None: none were): of two places without a position nothing else says how far apart they are.
+    `numbers` (N,) int, ascending, number all places that were ever mapped, also those dropped before (None: none were
+    dropped). For two places without a position, the numbers alone tell how far apart they are.
 
-    One place after another is given up: the one that is worth least beside its neighbours along the track that are
-    still there. A place is worth its quality times the distance to the nearer of the two, so that gaps stay small
-    and places that say much stay; age does not matter. The first and the last place are kept.
+    Places are dropped one at a time, always the one of least worth. The worth of a place is its quality times the
+    distance to the nearer of its two remaining neighbours along the track. So gaps stay small, and places of high
+    quality stay; age does not matter. The first and the last place are kept.
     """
     count = len(quality)
     if count <= capacity:
         return np.arange(count)
     east_m, north_m = metres(lat_deg, lon_deg)
-    # Where a position is unknown, places are taken to be as far apart as they usually are.
+    # Where a position is unknown, the median distance of successive places is taken.
     number = np.arange(count) if numbers is None else numbers
     steps_m = np.hypot(np.diff(east_m), np.diff(north_m)) / np.diff(number)
     usual_m = (float(np.nanmedian(steps_m)) if np.isfinite(steps_m).any() else 0.0) or 1.0
@@ -41,13 +41,13 @@ def best_places(
     def worth(before: int, at: int, after: int) -> float:
         if before < 0 or after >= count:
             return math.inf
-        # A tiny share of the way between its neighbours decides among places that lie on each other.
+        # A tiny share of the distance between its neighbours decides among places at the same position.
         nearer_m = min(apart_m(before, at), apart_m(at, after))
         return (nearer_m + 1e-6 * apart_m(before, after)) * max(float(quality[at]), 1e-3)
 
-    # No lists, and few arrays: in flight this happens beside an index that may take no more memory than it has.
+    # No lists, and few arrays: in flight this runs beside an index that has already taken its memory budget.
     before, after = np.arange(-1, count - 1, dtype=np.int32), np.arange(1, count + 1, dtype=np.int32)
-    worths = np.full(-(-count // _BLOCK) * _BLOCK, np.inf)  # of what has been given up, too
+    worths = np.full(-(-count // _BLOCK) * _BLOCK, np.inf)  # infinite also for dropped places
     for at in range(count):
         worths[at] = worth(at - 1, at, at + 1)
     blocks = worths.reshape(-1, _BLOCK)

@@ -11,15 +11,16 @@ from edgevpr.power import machine, thermal
 from edgevpr.resources import shipped
 
 _ANY_MACHINE = "generic-x86"
-_SAME_RAM = 1.02  # a kernel keeps some for itself, another amount with every version
+_SAME_RAM = 1.02  # kernels keep some RAM for themselves, every version another amount
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MachineSpeed:
-    """How fast a machine is beside one core of the reference, which `profiles/generic-x86.yaml` names (None: unknown).
+    """Speed of a machine relative to one core of the reference, which `profiles/generic-x86.yaml` names (None:
+    unknown).
 
     `single` is one thread at integer code and bytes, `multi` all cores together at the same; `products` and `passes`
-    are one thread at matrix products and at passes over bytes, where they are known apart. `verified` is whether
+    are one thread at matrix products and at passes over bytes, where they are known apart. `verified` tells whether
     `source` measured it on this very board.
     """
 
@@ -35,13 +36,13 @@ class MachineSpeed:
 class Board:
     """A board's profile.
 
-    `idle_w` and `full_w` are the thesis's a and a + s in watts at the board's input; `verified` is whether `source`
+    `idle_w` and `full_w` are the thesis's a and a + s in watts at the board's input; `verified` tells whether `source`
     measured them on this very board. `cpu_share` (of all cores), `budget_mb` (index of the map) and `memory_max_mb`
-    (whole process) are what edgevpr may take; `rate_hz` is how often it is asked, unless the user says otherwise.
-    `technique` is flown where none is named, if it fits (None: the best that fits). `threads` is how many a network may
-    use. From `thermal_limit_c` on the board slows itself down (None: its kernel says where). A machine whose device
-    tree's model contains `recognised_by` is this board, and so is the one that calls itself `machine`: a profile that
-    was written on it says so.
+    (whole process) are what edgevpr may take. `rate_hz` is the number of queries a second, unless the user says
+    otherwise. `technique` is flown where none is named, if it fits (None: the best that fits). `threads` is how many a
+    network may use. From `thermal_limit_c` on the board slows itself down (None: its kernel says where). A machine is
+    this board if the model in its device tree contains `recognised_by`, or if its own title is `machine`: a profile
+    that was written on a machine contains its title.
     """
 
     name: str
@@ -65,15 +66,15 @@ class Board:
 
 
 def board_names() -> tuple[str, ...]:
-    """Names of the boards that travel with edgevpr."""
+    """Return the names of the boards that come with edgevpr."""
     return tuple(sorted(path.stem for path in shipped("profiles").glob("*.yaml")))
 
 
 def load_board(name: str, root: Path = Path("/")) -> Board:
-    """The board called `name`: "this" (the machine itself), one of `board_names()`, or the path of a YAML file.
+    """Load the board called `name`: "this" (the machine itself), one of `board_names()`, or the path of a YAML file.
 
-    Raises ConfigError for a board that is not there, for a file that does not say what it must, and for one of this
-    very machine that promises more memory than there is. `root` is where the machine's /proc and /sys are.
+    Raises ConfigError for a board that does not exist, for an incomplete or invalid file, and for a file of this very
+    machine that promises more memory than there is. `root` is where the machine's /proc and /sys are.
     """
     if name == "this":
         return _this_machine(root)
@@ -95,7 +96,7 @@ def load_board(name: str, root: Path = Path("/")) -> Board:
 
 
 def is_this_machine(board: Board, root: Path = Path("/")) -> bool:
-    """Whether a profile is of the machine that this runs on."""
+    """Tell whether a profile is of the machine that this runs on."""
     model = machine.model(root)
     recognised = board.recognised_by and model and board.recognised_by.lower() in model.lower()
     return bool(recognised) or (board.machine is not None and board.machine == machine.title(root))
@@ -116,7 +117,8 @@ def _read(path: Path) -> Board:
 
 
 def _this_machine(root: Path) -> Board:
-    """The profile of the board that this is, or of any machine, with the cores and the memory that are really there."""
+    """Return the profile of this machine's board, or of any machine, with the cores and the memory that are really
+    there."""
     model = machine.model(root)
     profile = _read(shipped("profiles") / f"{_ANY_MACHINE}.yaml")
     if model is None:
@@ -139,7 +141,7 @@ def _this_machine(root: Path) -> Board:
             title = f"this machine ({model}, which has no profile: the figures of {_ANY_MACHINE})"
 
     ram_mb = machine.ram_mb(root)
-    # The shares of the profile, of the memory that is there; a control group may allow less than that.
+    # The profile's shares of the memory that is really there; a control group may allow less.
     memory_max_mb = min(profile.memory_max_mb / profile.ram_mb * ram_mb, machine.ram_limit_mb(root))
     # The power model speaks of all cores of the machine, so a quota lowers the share and not their number.
     cores = os.cpu_count() or 1

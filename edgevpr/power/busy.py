@@ -1,4 +1,4 @@
-"""Keep the machine busy to a given share, and see how busy it is: what a calibration of its power needs."""
+"""Keeping the machine busy to a given share, and measuring how busy it is: the tools to calibrate its power."""
 
 import os
 import threading
@@ -17,8 +17,8 @@ def load(share: float, threads: int | None = None) -> Iterator[None]:
     """Hold all usable cores at `share` (0..1) while the block runs, with one thread a core.
 
     Each thread multiplies small float32 matrices, as cohog's matching does; NumPy lets the other threads run meanwhile.
-    Threads start their periods apart, so that the sum is level. Give NumPy's library one thread (OPENBLAS_NUM_THREADS,
-    which edgevpr's command line sets); what was really reached is `utilisation`'s to say.
+    Threads start their periods at different times, so that the sum is level. Give NumPy's library one thread
+    (OPENBLAS_NUM_THREADS, which edgevpr's command line sets); `utilisation` tells which share was really reached.
     """
     stop = threading.Event()
     count = threads or len(os.sched_getaffinity(0))
@@ -43,8 +43,8 @@ def load(share: float, threads: int | None = None) -> Iterator[None]:
 
 
 def duty(share: float, work: Callable[[], object], clock: Callable[[], float] = time.perf_counter) -> float:
-    """Work for `share` of one period, in whole calls of `work`, and return the seconds to rest (0 when full) so that
-    work : rest is as asked, however long the last call took."""
+    """Work for `share` of one period, in whole calls of `work`, and return the seconds to rest (0 at full load). The
+    ratio of work to rest is as asked, however long the last call took."""
     start_s = clock()
     if share <= 0:
         return PERIOD_S
@@ -60,7 +60,8 @@ def _product() -> Callable[[], object]:
 
 
 def cpu_times(root: Path = Path("/")) -> tuple[float, float]:
-    """(busy, all) ticks of all cores since start, every process counted. A tick is some 10 ms: look seconds apart.
+    """Return (busy, all) ticks of all cores since start, every process counted. A tick is some 10 ms: look seconds
+    apart.
 
     Guest time is left out: it is part of user time already.
     """
@@ -71,6 +72,6 @@ def cpu_times(root: Path = Path("/")) -> tuple[float, float]:
 
 
 def utilisation(before: tuple[float, float], after: tuple[float, float]) -> float:
-    """U of equation 5.1 between two looks at `cpu_times`: the busy share of all cores, 0..1."""
+    """Return U of equation 5.1 between two results of `cpu_times`: the busy share of all cores, 0..1."""
     busy, passed = after[0] - before[0], after[1] - before[1]
     return min(1.0, max(0.0, busy / passed)) if passed > 0 else 0.0

@@ -12,18 +12,19 @@ from pathlib import Path
 import numpy as np
 
 from edgevpr.power import busy
-from edgevpr.power.measure import measure
+from edgevpr.power.mean_power import mean_power
 from edgevpr.power.powermeter import Meter, MeterError
 
 LOADS = (0.0, 0.25, 0.5, 0.75, 1.0)
-_LEAST_LOADS = 3  # a line goes through any two: the third says whether it is one
+_LEAST_LOADS = 3  # any two loads lie on a line: the third shows whether power follows one
 _APART = 0.05  # utilisations nearer than this are one load
-_LEAST_R2 = 0.5  # less than half of the power's changes follow the load: by chance, or another program's
+_LEAST_R2 = 0.5  # below it, most changes of the power do not follow the load
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PowerFit:
-    """P = `idle_w` + `span_w` U (a and s), with the root mean square of what the line leaves over, in watts, and R2."""
+    """Straight line P = `idle_w` + `span_w` U (a and s), with the root mean square of its residuals in watts, and R2;
+    `samples` are its points (U, W)."""
 
     idle_w: float
     span_w: float
@@ -39,7 +40,7 @@ class PowerFit:
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """A fit and the meter it came from; `skipped` readings failed."""
+    """A fit and the meter it came from; `skipped` counts the readings that failed."""
 
     fit: PowerFit
     meter: Meter
@@ -47,13 +48,13 @@ class Calibration:
 
     @property
     def verified(self) -> bool:
-        """Whether these are watts at the board's input: the CPU package alone is less than the board draws, and how a
-        meter is wired may only be taken to be so."""
+        """True for watts at the board's input from a meter whose wiring is known. The CPU package alone is less than
+        the board draws, and the wiring of some meters can only be assumed."""
         return self.meter.covers == "board" and self.meter.certain
 
     @property
     def source(self) -> str:
-        """What a profile says of its figures."""
+        """Text of `source` in a profile with these figures."""
         doubt = "" if self.meter.covers == "board" else "CPU only, the rest of the board draws more; "
         return (
             f"{doubt}straight line through {len(self.fit.samples)} loads measured on this machine with its "
@@ -75,8 +76,8 @@ def calibrate(
     """Hold each load for `settle_s` + `window_s` seconds and fit a line. Raises MeterError for a meter that fails and
     for figures that no board can have.
 
-    U is what the whole machine did, other programs included, since the meter sees them too. `progress` is called with
-    each load before it is held.
+    U is the utilisation of the whole machine, other programs included, since the meter measures them too. `progress` is
+    called with each load before it is held.
     """
     samples, skipped = [], 0
     for share in loads:
@@ -84,7 +85,7 @@ def calibrate(
         with load(share):
             sleep(settle_s)
             before = busy.cpu_times(root)
-            measured = measure(meter, window_s, clock, sleep)
+            measured = mean_power(meter, window_s, clock, sleep)
             after = busy.cpu_times(root)
         samples.append((busy.utilisation(before, after), measured.mean_w))
         skipped += measured.skipped
@@ -92,7 +93,8 @@ def calibrate(
 
 
 def fit_power(samples: Sequence[tuple[float, float]]) -> PowerFit:
-    """Least squares of W = a + s U over (U, W), U in 0..1. Raises MeterError where it gives no board's figures."""
+    """Fit W = a + s U by least squares to samples (U, W), U in 0..1. Raises MeterError where the result cannot be a
+    board's."""
     u, watts = np.array(samples, np.float64).reshape(-1, 2).T
     if not (np.isfinite(u).all() and np.isfinite(watts).all()):
         raise MeterError("A power measurement is not a number: measure again.")

@@ -1,4 +1,4 @@
-"""What this machine is, and a profile for one that has none.
+"""Detection of this machine, and a profile for a machine that has none.
 
 Looks at the device tree (ARM boards), DMI (x86), the processor, and the limits of this process's control groups and
 affinity. `root` is the root of the file system: another tree can stand in its place.
@@ -25,9 +25,9 @@ _ANY_MACHINE = "generic-x86"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Detected:
-    """What this machine is. `board` is the name of its profile, None where it has none; `model` is what its device tree
-    or DMI calls it; `usable_cores` and `ram_limit_mb` are what affinity and control groups leave of `cores` and
-    `ram_mb`; it begins to slow down at `thermal_limit_c`."""
+    """Description of this machine. `board` is the name of its profile, None where it has none. `model` is its name in
+    the device tree or DMI. `usable_cores` and `ram_limit_mb` are what affinity and control groups leave of `cores` and
+    `ram_mb`. It begins to slow down at `thermal_limit_c`."""
 
     board: str | None
     model: str | None
@@ -42,7 +42,7 @@ class Detected:
 
 
 def detect(root: Path = Path("/")) -> Detected:
-    """Look at this machine. Never guesses: what nobody wrote down is None or says "unknown"."""
+    """Look at this machine. Never guesses: a value that is found nowhere is None or says "unknown"."""
     tree_model = machine.model(root)
     cores = _cores(root)
     return Detected(
@@ -60,7 +60,7 @@ def detect(root: Path = Path("/")) -> Detected:
 
 
 def findings(found: Detected) -> tuple[str, ...]:
-    """What this machine is, and how that was seen, a sentence each."""
+    """Say what this machine is, and how that was found, a sentence each."""
     if found.from_device_tree:
         said = f"The device tree calls it `{found.model}`"
     elif found.model:
@@ -87,10 +87,10 @@ def findings(found: Detected) -> tuple[str, ...]:
 
 
 def profile_text(found: Detected, score: MachineSpeed | None = None, calibration: Calibration | None = None) -> str:
-    """A whole profile for `found` as YAML, which `load_board` accepts.
+    """Write a whole profile for `found` as YAML, which `load_board` accepts.
 
-    Its watts are the calibration's; without one those of the known board; else relative figures that say nobody has
-    measured them. Its speed is the score's, without one the known board's, else unknown. Memory and shares are what the
+    Its watts are the calibration's; without one those of the known board; else relative figures, marked as not
+    measured. Its speed is the score's; without one the known board's; else unknown. Memory and shares are what the
     known board (or any machine) may take, within the limits of the control groups.
     """
     base = load_board(found.board or _ANY_MACHINE)
@@ -160,18 +160,18 @@ def _profile_of(model: str | None) -> str | None:
 
 
 def _cores(root: Path) -> int:
-    """Cores of the machine that are switched on, whatever this process may use of them."""
+    """Count the cores of the machine that are switched on, whatever this process may use of them."""
     spans = re.findall(r"(\d+)(?:-(\d+))?", machine.text(root / "sys/devices/system/cpu/online") or "")
     return sum(int(last or first) - int(first) + 1 for first, last in spans) or os.cpu_count() or 1
 
 
 def _quoted(text: str) -> str:
-    """A text that YAML reads back as it is, whatever a board calls itself: JSON's quotes are YAML's too."""
+    """Quote a text so that YAML reads it back as it is, whatever a board is called: JSON's quotes are YAML's too."""
     return json.dumps("".join(c if c.isprintable() else " " for c in text), ensure_ascii=False)
 
 
 def _floor(megabytes: float) -> str:
-    """Rounded down, so that what has to fit still fits."""
+    """Round megabytes down and format them, so that what has to fit still fits."""
     return f"{int(megabytes * 10) / 10:g}" if megabytes < 1000 else f"{int(megabytes)}"
 
 

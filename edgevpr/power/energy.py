@@ -1,7 +1,7 @@
 """Running totals of what a flight has cost: idle power all the time, marginal power while a stage runs.
 
-Energies add up, powers do not (see `equations`): the sum of a T and of s U t over all stages is exactly what 5.1 gives
-when integrated over the flight, in whatever order the stages come.
+Energies add up, powers do not (see `equations`). The sum of a T and of s U t over all stages is exactly the integral of
+5.1 over the flight, in whatever order the stages come.
 """
 
 import time
@@ -15,7 +15,8 @@ from edgevpr.types import StageCost
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EnergySoFar:
-    """Since the start: seconds, joules at the board's input, CPU-seconds of the stages and of the whole process."""
+    """Totals since the start: seconds, joules at the board's input, CPU-seconds of the stages and of the whole
+    process."""
 
     elapsed_s: float
     idle_j: float
@@ -49,7 +50,7 @@ class RunningEnergy:
             self._stages_cpu_s += stage.cpu_s
 
     def so_far(self) -> EnergySoFar:
-        """The totals until now."""
+        """Return the totals until now."""
         elapsed_s = self._clock() - self._start_s
         return EnergySoFar(
             elapsed_s=elapsed_s,

@@ -1,4 +1,4 @@
-"""How busy and full the machine is, for its flight controller and ground station; and what this process has of it."""
+"""Load and memory of the machine, for its flight controller and ground station; and the share of this process."""
 
 import time
 from collections.abc import Callable
@@ -8,12 +8,12 @@ import psutil
 
 from edgevpr.types import StageCost
 
-_KEPT_WAITING = 0.15  # of its time a busy thread did not run: what it waits for by itself is less
+_KEPT_WAITING = 0.15  # of busy time: a thread that did not run for longer was kept waiting (its own waits are shorter)
 
 
 @dataclass(frozen=True, slots=True)
 class MachineLoad:
-    """`core_shares` (0..1, one a core) since the last look."""
+    """`core_shares` (0..1, one a core) since the last look, and RAM in bytes."""
 
     core_shares: tuple[float, ...]
     ram_used_bytes: int
@@ -21,7 +21,7 @@ class MachineLoad:
 
 
 def machine_load() -> MachineLoad:
-    """Look at the machine; the first look has nothing to compare with and sees idle cores."""
+    """Look at the machine; the first look has nothing to compare with and reports idle cores."""
     memory = psutil.virtual_memory()
     return MachineLoad(
         tuple(percent / 100 for percent in psutil.cpu_percent(percpu=True)),
@@ -31,9 +31,9 @@ def machine_load() -> MachineLoad:
 
 
 class OwnLoad:
-    """The share of all cores that this process takes, and whether others keep it from them, from look to look.
+    """Share of all cores that this process takes, and whether other programs keep it waiting, from look to look.
 
-    `clock` and `cpu_clock` (all threads) are wall and CPU-seconds.
+    `clock` and `cpu_clock` (all threads) give wall and CPU-seconds.
     """
 
     def __init__(
@@ -52,13 +52,13 @@ class OwnLoad:
         return self._clock() - self._looked_s
 
     def busy(self, work: StageCost) -> None:
-        """Count work; `work.cpu_s` is that of the thread that did it or waited for it (`time.thread_time`)."""
+        """Count work; `work.cpu_s` is the CPU time of the thread that did it or waited for it (`time.thread_time`)."""
         self._busy_s += work.wall_s
         self._ran_s += work.cpu_s
 
     def look(self) -> tuple[float, float]:
-        """Since the last look: this process's share of all cores, 0..1; and the share of the time that its work took,
-        0 where the thread could run when it wanted to."""
+        """Return, since the last look, this process's share of all cores, 0..1, and the share of the time that its work
+        took, 0 where the thread could run when it wanted to."""
         now_s, cpu_s = self._clock(), self._cpu_clock()
         span = StageCost(now_s - self._looked_s, cpu_s - self._cpu_s)
         waited = self._ran_s < (1 - _KEPT_WAITING) * self._busy_s

@@ -1,4 +1,4 @@
-"""What this machine has and what this process takes of it, as the kernel says in /proc and /sys.
+"""Hardware of this machine and memory that this process takes, as the kernel reports them in /proc and /sys.
 
 `root` is the root of the file system: another tree can stand in its place. A megabyte is 10^6 bytes.
 """
@@ -12,7 +12,7 @@ from pathlib import Path, PurePosixPath
 
 _ROOT = Path("/")
 _PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
-# What boards say where their maker has written nothing.
+# Texts that stand in the firmware where the maker has filled in nothing.
 _FILLERS = re.compile(
     r"to be filled|default string|system (product|manufacturer|version)|not (applicable|specified)|o\.?e\.?m\.?$|none$|"
     r"unknown|invalid|type\d|x\.x",
@@ -27,7 +27,8 @@ _ARM_PARTS = {
 
 
 def model(root: Path = _ROOT) -> str | None:
-    """The board's name in the device tree, e.g. "Raspberry Pi 4 Model B Rev 1.4"; None where there is none (x86)."""
+    """Return the board's name in the device tree, e.g. "Raspberry Pi 4 Model B Rev 1.4"; None where there is none
+    (x86)."""
     try:
         return (root / "proc/device-tree/model").read_text().strip("\0\n ")
     except OSError:
@@ -35,7 +36,8 @@ def model(root: Path = _ROOT) -> str | None:
 
 
 def dmi_model(root: Path = _ROOT) -> str | None:
-    """Maker and product by the firmware of an x86 machine; its mainboard where the product is not filled in."""
+    """Return maker and product by the firmware of an x86 machine; its mainboard where the product is not filled in,
+    else None."""
     said = {
         name: words
         for name in ("sys_vendor", "product_name", "board_vendor", "board_name")
@@ -49,7 +51,8 @@ def dmi_model(root: Path = _ROOT) -> str | None:
 
 
 def cpu(root: Path = _ROOT) -> str:
-    """The processor by /proc/cpuinfo: its name (x86, 32-bit ARM), or its kinds of cores by Arm's part numbers."""
+    """Return the processor by /proc/cpuinfo: its name (x86, 32-bit ARM), or its kinds of cores by Arm's part
+    numbers."""
     info = text(root / "proc/cpuinfo") or ""
     if name := re.search(r"^model name\s*:\s*(.+)$", info, re.MULTILINE):
         return " ".join(name[1].split())
@@ -59,13 +62,14 @@ def cpu(root: Path = _ROOT) -> str:
 
 
 def title(root: Path = _ROOT) -> str:
-    """What this machine calls itself, with its processor: the same words every time, so that it is known again."""
+    """Return a name of this machine, with its processor: the same text every time, so that the machine is recognised
+    again."""
     words = f"{model(root) or dmi_model(root) or 'a machine without a name'} ({cpu(root)})"
     return "".join(c if c.isprintable() else " " for c in words)
 
 
 def cores(root: Path = _ROOT) -> float:
-    """Cores that this process may use: its CPU affinity, and the quota (cpu.max) of its control groups."""
+    """Return the cores that this process may use: its CPU affinity, and the quota (cpu.max) of its control groups."""
     usable = float(len(os.sched_getaffinity(0)))
     for quota_us, period_us in _cgroup_limits("cpu.max", root):
         usable = min(usable, int(quota_us) / int(period_us))
@@ -73,17 +77,18 @@ def cores(root: Path = _ROOT) -> float:
 
 
 def ram_mb(root: Path = _ROOT) -> float:
-    """Memory of the machine."""
+    """Return the memory of the machine, MB."""
     return _kib_line(root / "proc/meminfo", "MemTotal:")
 
 
 def ram_limit_mb(root: Path = _ROOT) -> float:
-    """Memory that this process may use: the machine's, and the limit (memory.max) of its control groups."""
+    """Return the memory that this process may use, MB: the machine's, and the limit (memory.max) of its control
+    groups."""
     return min([ram_mb(root), *(int(limit) / 1e6 for (limit,) in _cgroup_limits("memory.max", root))])
 
 
 def rss_mb(root: Path = _ROOT) -> float:
-    """Resident memory of this process, pages that it shares with others included."""
+    """Return the resident memory of this process, MB, pages that it shares with others included."""
     # Every query asks twice: `read_text` would take three times as long.
     with open(f"{root}/proc/self/statm", "rb", buffering=0) as statm:
         resident_pages = int(statm.read(256).split()[1])
@@ -91,7 +96,8 @@ def rss_mb(root: Path = _ROOT) -> float:
 
 
 def forget_peak(root: Path = _ROOT) -> bool:
-    """Let `peak_mb` begin anew with what is resident now; whether the kernel does that."""
+    """Let `peak_mb` begin anew with the memory that is resident now; return False where the kernel does not allow
+    it."""
     try:
         (root / "proc/self/clear_refs").write_text("5")
     except OSError:
@@ -100,12 +106,13 @@ def forget_peak(root: Path = _ROOT) -> bool:
 
 
 def peak_mb(root: Path = _ROOT) -> float:
-    """The most that this process had resident at once."""
+    """Return the most memory that this process had resident at once, MB."""
     return _kib_line(root / "proc/self/status", "VmHWM:")
 
 
 def pss_mb(root: Path = _ROOT) -> float | None:
-    """Memory of this process with shared pages counted in proportion; None where the kernel does not say."""
+    """Return the memory of this process, MB, with shared pages counted in proportion; None where the kernel does not
+    say."""
     try:
         return _kib_line(root / "proc/self/smaps_rollup", "Pss:")
     except OSError:
@@ -113,7 +120,7 @@ def pss_mb(root: Path = _ROOT) -> float | None:
 
 
 def text(path: Path) -> str | None:
-    """What a small file says, without what ends it; None where it cannot be read."""
+    """Read a small file and strip zero bytes, line ends and blanks from both ends; None where it cannot be read."""
     try:
         return path.read_text(errors="replace").strip("\0\n ")
     except OSError:
@@ -121,13 +128,14 @@ def text(path: Path) -> str | None:
 
 
 def _kib_line(path: Path, label: str) -> float:
-    """The figure of a line "label  1234 kB", in MB."""
+    """Read the figure of a line "label 1234 kB", in MB."""
     line = next(line for line in path.read_text().splitlines() if line.startswith(label))
     return int(line.split()[1]) * 1024 / 1e6
 
 
 def _cgroup_limits(name: str, root: Path) -> Iterator[list[str]]:
-    """The words of a limit file (cgroup v2) of this process's group and of every group above it: each one binds."""
+    """Yield the words of a limit file (cgroup v2) of this process's group and of every group above it: each limit
+    binds."""
     try:
         memberships = (root / "proc/self/cgroup").read_text().splitlines()
     except OSError:

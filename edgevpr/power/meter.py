@@ -1,4 +1,4 @@
-"""Metering of what a step of a query costs, and a query: seconds, CPU-seconds, utilisation, charge."""
+"""Metering of the cost of a query and of its steps: seconds, CPU-seconds, utilisation, charge."""
 
 import math
 import time
@@ -17,7 +17,7 @@ _PSS_EVERY_S = 20.0
 
 @dataclass(slots=True)
 class Stage:
-    """A stage that is being metered; `cost` is there once it is over, however it ends."""
+    """A stage that is being metered; `cost` is set once the stage is over, however it ends."""
 
     cost: StageCost | None = None
 
@@ -34,15 +34,15 @@ def stage(wall_clock: Clock = time.perf_counter, cpu_clock: Clock = time.process
 
 
 class PssMeter:
-    """PSS of this process, read at most once in twenty seconds: the kernel walks through all pages for it, which takes
-    some hundredths of a query."""
+    """PSS (memory with shared pages in proportion) of this process, read at most once in twenty seconds: the kernel
+    walks through all pages for it, which takes some hundredths of a query's time."""
 
     def __init__(self, clock: Clock = time.monotonic, read: Callable[[], float | None] = pss_mb) -> None:
         self._clock, self._read = clock, read
         self._read_s, self._pss_mb = -math.inf, None
 
     def look(self) -> float | None:
-        """Give what was read last, MB; None where the kernel does not say."""
+        """Return the value read last, MB; None where the kernel does not say."""
         now_s = self._clock()
         if now_s - self._read_s >= _PSS_EVERY_S:
             self._read_s, self._pss_mb = now_s, self._read()
@@ -50,8 +50,8 @@ class PssMeter:
 
 
 class QueryMeter:
-    """Meters the steps of query after query, and reckons what each query draws from the pack of a board. `wall_clock`
-    and `cpu_clock` (all threads) give seconds."""
+    """Meters the steps of query after query, and computes the charge that each query draws from the pack of a board.
+    `wall_clock` and `cpu_clock` (all threads) give seconds."""
 
     def __init__(
         self,
@@ -69,7 +69,7 @@ class QueryMeter:
         self._taken: dict[str, StageCost] = {}
 
     def begin(self) -> None:
-        """Begin with a new query."""
+        """Begin a new query."""
         self._taken = {}
 
     @contextmanager
@@ -83,11 +83,11 @@ class QueryMeter:
             self._taken[name] = metered.cost
 
     def steps(self) -> Steps:
-        """Give the cost of every step that the query has come to."""
+        """Return the cost of every step that the query has reached."""
         return Steps(**self._taken)
 
     def cost(self) -> QueryCost:
-        """Give the cost of the query so far."""
+        """Return the cost of the query so far."""
         steps = self.steps()
         return query_cost(
             steps.encode, steps.match, self.board, self._pack, self._regulator_efficiency, pss_mb=self._pss.look()
@@ -103,10 +103,10 @@ def query_cost(
     *,
     pss_mb: float | None = None,
 ) -> QueryCost:
-    """Reckon the cost of one query by 5.1-5.6, as the pack sees it: the energies of both stages are added, not their
+    """Compute the cost of one query by 5.1-5.6, as the pack sees it: the energies of both stages are added, not their
     powers.
 
-    `used_mah` is (a + s U) t, `marginal_mah` s U t: what the query adds to a board that is powered anyway.
+    `used_mah` is (a + s U) t, `marginal_mah` s U t: the charge that the query adds to a board that is powered anyway.
     """
     stages = [(each.utilisation(board.cores), each.wall_s) for each in (encode, match)]
     used_j = sum(stage_energy_j(board.idle_w, board.full_w, u, t_s) for u, t_s in stages)

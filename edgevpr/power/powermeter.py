@@ -1,7 +1,7 @@
-"""A power meter: what one reading of it is, and when a reading is none.
+"""A power meter: one reading of it, and the readings that are refused.
 
-A `Meter` reads one number, or raises MeterError with a sentence: a file that has gone, a text, a negative or an absurd
-value is never passed on as a figure. `measure.py` decides how many failures in a row end a measurement.
+A `Meter` reads one number, or raises MeterError with a sentence: a missing file, a text, a negative or an absurd value
+is never passed on as a figure. `measure.py` decides how many failures in a row end a measurement.
 """
 
 import time
@@ -16,12 +16,12 @@ ABSURD_W = 1000.0  # no companion computer draws this: the reading is wrong (the
 
 
 class MeterError(EdgevprError):
-    """A power meter cannot be read, or says what cannot be."""
+    """A power meter cannot be read, or gives an impossible value."""
 
 
 @dataclass(frozen=True, slots=True)
 class PowerSample:
-    """One reading: `power_w`, or for a meter that counts energy `energies_j`, one a counter (a CPU package)."""
+    """One reading: `power_w`, or `energies_j` of a meter that counts energy, one value a counter (a CPU package)."""
 
     t_mono_s: float
     power_w: float | None = None
@@ -33,9 +33,9 @@ class Meter:
     """A power meter. `covers` is "board" (its input: what a profile's watts mean), "cpu" (the CPU package alone, the
     rest of the machine draws more) or "rail" (some other part).
 
-    `kind` is "ina", "rapl" or "pmic"; `period_s` is how often reading it makes sense; the counters of a meter with
-    `wraps_j` start again from 0 after so many joules, one number a counter. A meter is not `certain` where its title
-    says what is only taken to be so.
+    `kind` is "ina", "rapl" or "pmic"; reading more often than every `period_s` seconds makes no sense. The counters of
+    a meter with `wraps_j` start again from 0 after so many joules, one number a counter. `certain` is False where the
+    title contains an assumption.
     """
 
     kind: Literal["ina", "rapl", "pmic"]
@@ -61,7 +61,7 @@ class Meter:
 
 
 def number(path: Path) -> float:
-    """The number in a file of /sys. Raises MeterError, with what to do."""
+    """Read the number in a file of /sys. Raises MeterError, which says what to do."""
     try:
         text = path.read_text(errors="replace")
     except PermissionError:

@@ -25,14 +25,16 @@ _NO_METER = (
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """The meters of this machine, those of the board's input first; `notes` are sentences on what could not be used."""
+    """The meters of this machine, those of the board's input first; `notes` are sentences on meters that could not be
+    used."""
 
     meters: tuple[Meter, ...]
     notes: tuple[str, ...]
 
 
 def find_meters(root: Path = _ROOT) -> Found:
-    """Look for power meters. Never raises: what is there but cannot be read is a note, and so is no meter at all."""
+    """Look for power meters. Never raises: a meter that is there but cannot be read becomes a note, and so does no
+    meter at all."""
     notes: list[str] = []
     meters = [*_ina_meters(root), *_pmic_meters(root), *_rapl_meters(root, notes)]
     if not meters and not notes:
@@ -69,7 +71,7 @@ def _ina_channel(
     def look() -> tuple[float, ...]:
         if power.exists():
             return (number(power) / 1e6,)
-        # An INA3221 knows no power of its own. A current of -1 mA at no load is its offset and counts as none.
+        # An INA3221 gives no power. A small negative current (-1 mA at no load) is its offset and counts as none.
         current_ma = number(folder / f"curr{channel}_input")
         return (number(folder / f"in{channel}_input") * (0.0 if -5 < current_ma < 0 else current_ma) / 1e6,)
 
@@ -77,8 +79,8 @@ def _ina_channel(
 
 
 def _rapl_meters(root: Path, notes: list[str]) -> Iterator[Meter]:
-    """One meter for all packages. Cores, memory and graphics (intel-rapl:0:0 ...) are parts of a package, and psys is
-    the platform that contains them: adding those would count energy twice."""
+    """Make one meter for all packages. Cores, memory and graphics (intel-rapl:0:0 ...) are parts of a package, and psys
+    is the platform that contains the packages: adding those would count energy twice."""
     counters, wraps_j = [], []
     for folder in sorted((root / "sys/class/powercap").glob("intel-rapl:*")):
         if not (machine.text(folder / "name") or "").startswith("package"):
@@ -100,7 +102,7 @@ def _rapl_meters(root: Path, notes: list[str]) -> Iterator[Meter]:
             kind="rapl",
             title=f"RAPL ({packages}, without memory, disks and converters)",
             covers="cpu",
-            period_s=1.0,  # a counter wraps once in many minutes at most, and moves on every millisecond
+            period_s=1.0,  # a counter advances every millisecond, and wraps after many minutes at the earliest
             look=lambda: tuple(number(path) / 1e6 for path in counters),
             wraps_j=tuple(wraps_j),
         )
@@ -120,10 +122,10 @@ def _pmic_meters(root: Path) -> Iterator[Meter]:
 
 
 def _pmic_w(program: Path) -> float:
-    """Watts at the board's input from volts and amperes of all rails that have both.
+    """Return the watts at the board's input from volts and amperes of all rails that have both.
 
-    The rails leave out what converters lose; 1.1451 x + 0.5879 W is the public fit to a meter in the supply (project
-    jfikar/RPi5-power).
+    The rails leave out the losses of converters; 1.1451 x + 0.5879 W is the public fit to a meter in the supply
+    (project jfikar/RPi5-power).
     """
     try:
         answer = vcgencmd.ask(program, "pmic_read_adc")

@@ -1,7 +1,7 @@
-"""How fast this machine is at what edgevpr does, beside the machine that `profiles/generic-x86.yaml` names.
+"""Speed of this machine at edgevpr's work, relative to the machine that `profiles/generic-x86.yaml` names.
 
-Two figures apart, because they do not scale alike: matrix products (cohog's matching) live from wide vector units,
-passes over bytes (encoding an image, scanning a map) do not, and a small ARM core loses far more at the first.
+Two figures are kept apart, because they do not scale alike: matrix products (cohog's matching) depend on wide vector
+units, passes over bytes (encoding an image, scanning a map) do not. A small ARM core loses far more at the first.
 """
 
 import math
@@ -25,7 +25,7 @@ _LEAST_ROUNDS = 5
 @dataclass(frozen=True, slots=True)
 class Speed:
     """Relative speed, 1 for one core of the reference. One thread: `products`, `passes`, and `single`, their geometric
-    mean; `multi` is what all usable cores together do of the same mix."""
+    mean; `multi` is that mean for all usable cores together."""
 
     single: float
     multi: float
@@ -34,10 +34,10 @@ class Speed:
 
 
 def score() -> Speed:
-    """Measure, in about two seconds (a slow board: some more). The machine should have nothing else to do.
+    """Measure the speed, in about two seconds (a slow board: some more). The machine should have nothing else to do.
 
     NumPy's library must have one thread (OPENBLAS_NUM_THREADS=1, which edgevpr's command line sets before NumPy is
-    imported): then one thread is one core, and all cores are as many threads of ours.
+    imported). Then one thread is one core, and all cores are loaded by as many threads of our own.
     """
     cores = len(os.sched_getaffinity(0))
     products = _rate(_product_round()) / _REFERENCE_PRODUCTS_HZ
@@ -48,7 +48,8 @@ def score() -> Speed:
 
 
 def _product_round() -> Callable[[], object]:
-    """One float32 product of 961 x 32 by 32 x 961: the regions of a query with those of a place."""
+    """Return a function that makes one float32 product of 961 x 32 by 32 x 961: the regions of a query with those of a
+    place."""
     random = np.random.default_rng(1)
     query = random.random((961, 32), np.float32)
     place = random.random((961, 32), np.float32)
@@ -57,7 +58,8 @@ def _product_round() -> Callable[[], object]:
 
 
 def _pass_round() -> Callable[[], object]:
-    """Gradient magnitudes of a 512 x 512 picture, and a scan of 4096 codes of 512 bits with two queries."""
+    """Return a function that makes gradient magnitudes of a 512 x 512 picture, and a scan of 4096 codes of 512 bits
+    with two queries."""
     random = np.random.default_rng(2)
     grey = random.integers(0, 256, (512, 512), np.uint8)
     codes = random.integers(0, 2**63, (4096, 8), np.uint64)
@@ -75,7 +77,8 @@ def _pass_round() -> Callable[[], object]:
 
 
 def _rate(work: Callable[[], object]) -> float:
-    """Rounds a second of one thread, by its quickest round: what disturbs the others is not the machine's speed."""
+    """Return the rounds a second of one thread, by its quickest round: disturbances of other rounds are not the
+    machine's speed."""
     work()
     quickest_s, rounds, start_s = math.inf, 0, time.perf_counter()
     while rounds < _LEAST_ROUNDS or time.perf_counter() - start_s < _LEAST_S:
@@ -87,7 +90,7 @@ def _rate(work: Callable[[], object]) -> float:
 
 
 def _rate_together(make: Callable[[], Callable[[], object]], threads: int) -> float:
-    """Rounds a second of so many threads at once, in all; NumPy lets them run beside each other."""
+    """Return the rounds a second of `threads` threads at once, in all; NumPy lets them run in parallel."""
     start, rates = threading.Barrier(threads), [0.0] * threads
 
     def run(thread: int) -> None:

@@ -1,8 +1,8 @@
-"""How hot the machine is, how fast it runs, and whether it slows itself down: one cheap look.
+"""Temperature and frequency of the machine, and whether it slows itself down, in one cheap look.
 
-A look opens two or three files of /sys: microseconds. What costs more (the Raspberry Pi's firmware, the heat counters
-of x86) is asked once in `SLOW_S` seconds, and `vcgencmd` in a process of its own that a later look collects, so no
-look ever waits for it.
+A look opens two or three files of /sys: microseconds. Slower sources (the Raspberry Pi's firmware, the heat counters of
+x86) are asked once in `SLOW_S` seconds. `vcgencmd` runs in a process of its own whose answer a later look collects, so
+no look ever waits for it.
 """
 
 import contextlib
@@ -17,18 +17,18 @@ from pathlib import Path
 from edgevpr.power import vcgencmd
 
 SLOW_S = 5.0
-_UNKNOWN_LIMIT_C = 80.0  # where the firmware of a Raspberry Pi begins to slow down, and modest for anything else
+_UNKNOWN_LIMIT_C = 80.0  # here a Raspberry Pi's firmware begins to slow down; cautious for other boards
 _CPU_ZONE = re.compile(r"cpu|soc|pkg|tj|acpitz|bigcore|littlecore", re.IGNORECASE)
 _CPU_CHIPS = ("coretemp", "k10temp", "zenpower", "cpu_thermal")
-# Bits of the firmware's answer that say what is so now; the same 16 bits higher: has been so since start.
+# Bits of the firmware's answer: the present state. The same bits, 16 places higher: any time since start.
 _BITS = ((1, "under-voltage"), (2, "frequency capped"), (4, "throttled"), (8, "soft temperature limit"))
 _SLOWS = 2 | 4 | 8
 
 
 @dataclass(frozen=True, slots=True)
 class ThermalState:
-    """`temperature_c` of the hottest CPU sensor and `frequency_mhz` of the fastest cluster, None where nothing says;
-    `throttled` None where the machine cannot tell; `why` says what was seen, "" for nothing."""
+    """Result of a look: `temperature_c` of the hottest CPU sensor and `frequency_mhz` of the fastest cluster, None
+    where unknown. `throttled` is None where the machine cannot tell; `why` says what was seen, "" for nothing."""
 
     temperature_c: float | None
     frequency_mhz: float | None
@@ -37,7 +37,7 @@ class ThermalState:
 
 
 class ThermalWatch:
-    """Looks at the sensors found when it is made. `close` it when done."""
+    """Watch over the sensors that are found when it is made. `close` it when done."""
 
     def __init__(self, root: Path = Path("/"), clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -58,7 +58,7 @@ class ThermalWatch:
         self._slow_at_s = float("-inf")
 
     def look(self) -> ThermalState:
-        """Look once; never raises: a sensor that has gone, or says what cannot be, is None."""
+        """Look once; never raises: a sensor that has gone, or gives an impossible value, is None."""
         now_s = self._clock()
         if now_s - self._slow_at_s >= SLOW_S:
             self._slow_at_s = now_s
@@ -74,14 +74,14 @@ class ThermalWatch:
         return ThermalState(temperature_c, frequency_mhz, throttled, "; ".join(why for _, why in reasons))
 
     def close(self) -> None:
-        """Leave no process behind."""
+        """End the process of `vcgencmd`, if one runs."""
         if self._asking:
             self._asking.kill()
             self._asking.communicate()
             self._asking = None
 
     def _reasons(self, temperature_c: float | None, khz: float | None) -> Iterator[tuple[bool, str]]:
-        """(whether it slows the machine down, what it is)."""
+        """Yield (True if it slows the machine down, what it is) for everything seen."""
         bits = self._bits or 0
         if now := [word for bit, word in _BITS if bits & bit]:
             yield bool(bits & _SLOWS), f"{', '.join(now)} now"
@@ -90,7 +90,7 @@ class ThermalWatch:
         if self._heat_events > 0:
             yield True, f"the processor has slowed down {self._heat_events:g} times in {SLOW_S:g} s for heat"
         if self._policy:
-            # What cools a board lowers this limit. A power mode may hold it low for good: the highest seen is normal.
+            # Cooling lowers this limit. A power mode may hold it low for good, so the highest one seen is normal.
             allowed_khz = _number(self._policy / "scaling_max_freq") or 0.0
             self._allowed_khz = max(self._allowed_khz, allowed_khz)
             normal_khz = self._allowed_khz or self._top_khz
@@ -106,14 +106,15 @@ class ThermalWatch:
         if self._firmware:
             self._bits = _hexadecimal(_content(self._firmware))
         elif self._program:
-            self.close()  # one that has not answered by now hangs: ask again
+            self.close()  # a process that has not answered by then hangs: ask again
             with contextlib.suppress(OSError):
                 self._asking = subprocess.Popen(
                     [self._program, "get_throttled"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
                 )
 
     def _count_heat_events(self) -> float:
-        """Since the last count. A core that is switched off takes its counters with it, and brings them back as new."""
+        """Count the heat events since the last count. The counters of a core that is switched off vanish, and start
+        anew when it comes back."""
         counted = {path: count for path in self._counters if (count := _number(path)) is not None}
         before, self._counted = self._counted, self._counted | counted
         return sum(max(0.0, count - before.get(path, count)) for path, count in counted.items())
@@ -126,7 +127,8 @@ class ThermalWatch:
 
 
 def limit_c(root: Path = Path("/")) -> float:
-    """Where this machine begins to slow down: the lowest passive trip point of its CPU's zones.
+    """Return the degrees Celsius at which this machine begins to slow down: the lowest passive trip point of its CPU's
+    zones.
 
     A board whose kernel has none (Raspberry Pi: its firmware does it) is held at 80 degrees, or 10 below the point
     where it switches off if that is lower.
@@ -154,7 +156,8 @@ def _chip_files(root: Path) -> Iterator[Path]:
 
 
 def _content(path: Path) -> str | None:
-    """What a small file says. Opened by hand: a third of the time that `read_text` takes."""
+    """Read the first 64 bytes of a small file, None where that fails. Opened by hand: a third of the time of
+    `read_text`."""
     try:
         handle = os.open(path, os.O_RDONLY)
         try:

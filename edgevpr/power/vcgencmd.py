@@ -5,13 +5,14 @@ from pathlib import Path
 
 
 def find(root: Path) -> Path | None:
-    """The program, None on another board. Older systems keep it in /opt/vc."""
+    """Find the program; None on another board. Older systems keep it in /opt/vc."""
     places = (root / "usr/bin/vcgencmd", root / "opt/vc/bin/vcgencmd")
     return next((place for place in places if place.exists()), None)
 
 
 def ask(program: Path, question: str) -> str:
-    """What the firmware answers. Raises OSError where the program fails or says nothing for two seconds."""
+    """Ask the firmware and return its answer. Raises OSError where the program fails or does not answer for two
+    seconds."""
     try:
         answer = subprocess.run([program, question], capture_output=True, timeout=2, check=True)
     except subprocess.CalledProcessError as error:

@@ -42,8 +42,8 @@ class ReceivedFix:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Track:
-    """Where the simulated vehicle flies: seconds from its start on, degrees, metres above sea level, each (N,) float64;
-    `heading_deg` is NaN where nobody knows."""
+    """Path of the simulated vehicle: seconds from its start on, degrees, metres above sea level, each (N,) float64;
+    `heading_deg` is NaN where unknown."""
 
     t_s: np.ndarray
     lat_deg: np.ndarray
@@ -53,8 +53,8 @@ class Track:
 
 
 def read_track(csv_path: str | Path) -> Track:
-    """The rows of a positions.csv that have a position and a time, in the order of time. Raises UsageError where there
-    are none."""
+    """Read the rows of a positions.csv that have a position and a time, in the order of time. Raises UsageError where
+    there are none."""
     tags = [tag for tag in read_positions(csv_path).values() if tag.position and tag.t_utc_s is not None]
     if not tags:
         raise UsageError(f"{csv_path} has no row with lat, lon and time: a track needs them.")
@@ -70,7 +70,7 @@ def read_track(csv_path: str | Path) -> Track:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AutopilotSummary:
-    """What the simulated flight controller saw. Senders are written "system/component"."""
+    """Everything that the simulated flight controller received. Senders are written "system/component"."""
 
     messages: dict[str, int]
     messages_by_sender: dict[str, dict[str, int]]
@@ -101,12 +101,10 @@ def run_autopilot(
     system_id: int = 1,
     track: Track | None = None,
 ) -> AutopilotSummary:
-    """Be an ArduPilot copter at `link_url` until the time is up, `stop` is set, a signal comes or the line is cut.
+    """Act as an ArduPilot copter at `link_url` until the time is up, `stop` is set, a signal comes or the line is cut.
 
-    With a `track` it flies along it from when a companion is first heard, tells five times a second where it is, and
-    stays where the track ends.
-
-    Raises LinkError where the link cannot be opened.
+    With a `track` it flies along the track from the moment a companion is first heard, reports its position five times
+    a second, and stays where the track ends. Raises LinkError where the link cannot be opened.
     """
     stop = stop or threading.Event()
     address = parse_link(link_url)
@@ -126,7 +124,7 @@ def run_autopilot(
 
 
 def judge(command: Message) -> int:
-    """Give the MAV_RESULT for a COMMAND_INT, by the rules of ArduPilot 4.7 for 43003."""
+    """Return the MAV_RESULT for a COMMAND_INT, by the rules of ArduPilot 4.7 for 43003."""
     if command.command != POSITION_FIX:
         return mavlink.MAV_RESULT_UNSUPPORTED
     global_frame = command.frame in (mavlink.MAV_FRAME_GLOBAL, mavlink.MAV_FRAME_GLOBAL_INT)
@@ -140,7 +138,7 @@ class _Autopilot:
     def __init__(self, transport: Transport, system_id: int, track: Track | None) -> None:
         self._transport = transport
         self._track = track
-        self._start_s: float | None = None  # of the track
+        self._start_s: float | None = None  # of the flight along the track
         self._system_id = system_id
         self._packer = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=AUTOPILOT)
         self._receiver = Receiver()
@@ -250,7 +248,7 @@ def _position(track: Track, t_s: float) -> Message:
 
 
 def _gps(position: Message) -> Message:
-    """A receiver that sees what is so."""
+    """Make the message of a GPS receiver that sees the true position."""
     unknown = 65_535
     return mavlink.MAVLink_gps_raw_int_message(
         0,

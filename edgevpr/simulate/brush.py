@@ -1,4 +1,4 @@
-"""How things are painted on the ground of a scene: noise, ribbons, rows, roofs and crowns of trees."""
+"""Brushes that paint things on the ground of a scene: noise, ribbons, rows, roofs and crowns of trees."""
 
 from dataclasses import dataclass
 
@@ -23,38 +23,38 @@ class Canvas:
         return self.height_cm.shape
 
     def pixels(self, points_m: np.ndarray) -> np.ndarray:
-        """(N, 2) east, north in metres -> float32 (N, 2) column, row."""
+        """Convert (N, 2) east, north in metres to float32 (N, 2) column, row."""
         east_m, north_m = np.asarray(points_m, np.float32).T
         return np.column_stack((east_m, self.shape[0] * self.metres_per_pixel - north_m)) / self.metres_per_pixel
 
     def box(self, points_m: np.ndarray, margin_m: float = 0.0) -> Box:
-        """The pixels around some points, cut off at the edge of the scene (empty outside of it)."""
+        """Return the box of pixels around some points, cut off at the edge of the scene (empty outside of it)."""
         margin = margin_m / self.metres_per_pixel
         low, high = self.pixels(points_m).min(axis=0) - margin, self.pixels(points_m).max(axis=0) + margin
         (left, top), (right, bottom) = np.maximum(low, 0).astype(int), np.maximum(np.ceil(high), 0).astype(int)
         return slice(top, max(top, min(bottom, self.shape[0]))), slice(left, max(left, min(right, self.shape[1])))
 
     def grid_m(self, box: Box) -> tuple[np.ndarray, np.ndarray]:
-        """East (1, W) and north (H, 1) in metres of the pixels of a box, float32."""
+        """Return east (1, W) and north (H, 1) in metres of the pixels of a box, float32."""
         rows, columns = (np.arange(part.start, part.stop, dtype=np.float32) + 0.5 for part in box)
         return columns[None] * self.metres_per_pixel, ((self.shape[0] - rows) * self.metres_per_pixel)[:, None]
 
     def polygon(self, box: Box, points_m: np.ndarray) -> np.ndarray:
-        """The cover, float32 0..1, of a polygon over the pixels of a box, with smooth edges."""
+        """Return the cover, float32 0..1, of a polygon over the pixels of a box, with smooth edges."""
         cover = np.zeros((box[0].stop - box[0].start, box[1].stop - box[1].start), np.uint8)
         corners = (self.pixels(points_m) - (box[1].start, box[0].start)) * 16
         cv2.fillPoly(cover, [corners.round().astype(np.int32)], 255, cv2.LINE_AA, 4)
         return cover.astype(np.float32) / 255
 
     def distance_m(self, box: Box, line_m: np.ndarray) -> np.ndarray:
-        """Metres from a polyline, float32, for every pixel of a box."""
+        """Return the metres from a polyline, float32, for every pixel of a box."""
         away = np.full((box[0].stop - box[0].start, box[1].stop - box[1].start), 255, np.uint8)
         points = self.pixels(line_m) - (box[1].start, box[0].start)
         cv2.polylines(away, [points.round().astype(np.int32)], False, 0)
         return cv2.distanceTransform(away, cv2.DIST_L2, 5) * self.metres_per_pixel
 
     def paint(self, box: Box, cover: np.ndarray, colour) -> None:
-        """Lay a colour, (3,) or (H, W, 3) BGR, over a box, as thick as `cover` 0..1 says."""
+        """Paint a colour, (3,) or (H, W, 3) BGR, over a box, with the opacity `cover` 0..1."""
         touched = cover > 0
         below = self.albedo[box][touched].astype(np.float32)
         above = np.asarray(colour, np.float32)
@@ -63,7 +63,7 @@ class Canvas:
 
 
 def noise(rng: np.random.Generator, shape: tuple[int, int], first_px: float, octaves: int = 3) -> np.ndarray:
-    """Smooth noise, float32, mean 0 and standard deviation 1; its largest bumps are `first_px` wide."""
+    """Make smooth noise, float32, mean 0 and standard deviation 1; its largest bumps are `first_px` wide."""
     total = np.zeros(shape, np.float32)
     for octave in range(octaves):
         step = max(first_px / 2**octave, 1.0)
@@ -77,18 +77,18 @@ def noise(rng: np.random.Generator, shape: tuple[int, int], first_px: float, oct
 
 
 def bgr_mix(low: tuple[int, int, int], high: tuple[int, int, int], share: np.ndarray) -> np.ndarray:
-    """From colour `low` (share 0) to colour `high` (share 1): (H, W) -> float32 (H, W, 3)."""
+    """Mix colour `low` (share 0) and colour `high` (share 1): (H, W) -> float32 (H, W, 3)."""
     low, high = np.float32(low), np.float32(high)
     return low + share[..., None] * (high - low)
 
 
 def smooth_step(values: np.ndarray, low: float, high: float) -> np.ndarray:
-    """0 below `low`, 1 above `high`, a straight ramp between; the other way round where low > high."""
+    """Return 0 below `low`, 1 above `high`, a straight ramp between; the other way round where low > high."""
     return np.clip((values - low) / (high - low), 0, 1)
 
 
 def roof(canvas: Canvas, centre_m, length_m: float, width_m: float, turn_rad: float, wall_m: float, colour) -> None:
-    """A building with a gable roof, its ridge along `turn_rad` (anticlockwise from east)."""
+    """Paint a building with a gable roof, its ridge along `turn_rad` (anticlockwise from east)."""
     along, across = np.array([np.cos(turn_rad), np.sin(turn_rad)]), np.array([-np.sin(turn_rad), np.cos(turn_rad)])
     corners = [
         np.asarray(centre_m) + a * along * length_m / 2 + b * across * width_m / 2
@@ -106,7 +106,7 @@ def roof(canvas: Canvas, centre_m, length_m: float, width_m: float, turn_rad: fl
 
 
 def crown(rng: np.random.Generator, radius_px: int) -> np.ndarray:
-    """The dome of one tree, float32 (2 r + 1, 2 r + 1) in 0..1, 0 outside of its ragged outline."""
+    """Make the dome of one tree, float32 (2 r + 1, 2 r + 1) in 0..1.2, 0 outside of its ragged outline."""
     axis = np.arange(-radius_px, radius_px + 1, dtype=np.float32) / radius_px
     lumps = noise(rng, (len(axis), len(axis)), max(radius_px * 0.7, 2.0), 2)
     leaves = noise(rng, (len(axis), len(axis)), 2.5, 2)

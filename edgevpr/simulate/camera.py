@@ -1,4 +1,5 @@
-"""What a camera under a drone sees of a scene: light on the ground, a pinhole camera, and what its sensor adds."""
+"""Pictures of a scene by a camera under a drone: light on the ground, a pinhole camera, and the faults of its
+sensor."""
 
 from dataclasses import dataclass
 
@@ -14,8 +15,9 @@ _STRIP = 256  # rows lit at a time: the working memory stays small
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Light:
-    """The hour and the weather. `warmth` shifts sunlight from blue (-1) to orange (+1); `cloud_frac` of the ground lies
-    in the shadow of clouds; `haze_frac` of the picture is grey veil; `exposure` multiplies, `gamma` bends."""
+    """Light of the hour and the weather. `warmth` shifts sunlight from blue (-1) to orange (+1). `cloud_frac` of the
+    ground lies in the shadow of clouds, and `haze_frac` of the picture is grey veil. `exposure` is a factor of
+    brightness, `gamma` an exponent."""
 
     sun_azimuth_deg: float
     sun_elevation_deg: float
@@ -40,8 +42,8 @@ class Camera:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pose:
-    """Where the camera is: metres from the scene's south-west corner and over its ground, degrees of the airframe
-    (heading clockwise from north, roll right wing down, pitch nose up)."""
+    """Position and attitude of the camera: metres from the scene's south-west corner and over its ground, degrees of
+    the airframe (heading clockwise from north, roll right wing down, pitch nose up)."""
 
     east_m: float
     north_m: float
@@ -52,7 +54,7 @@ class Pose:
 
 
 def ground_to_pixel(pose: Pose, camera: Camera) -> np.ndarray:
-    """The homography (3, 3) from the ground plane (east, north in metres, 1) to the picture (column, row, 1)."""
+    """Return the homography (3, 3) from the ground plane (east, north in metres, 1) to the picture (column, row, 1)."""
     yaw, pitch, roll = np.radians((pose.heading_deg, pose.pitch_deg, pose.roll_deg))
     about_down = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
     about_right = np.array([[np.cos(pitch), 0, np.sin(pitch)], [0, 1, 0], [-np.sin(pitch), 0, np.cos(pitch)]])
@@ -67,7 +69,7 @@ def ground_to_pixel(pose: Pose, camera: Camera) -> np.ndarray:
 
 
 def lit(scene: Scene, light: Light, seed: int) -> np.ndarray:
-    """The scene under a light, uint8 (H, W, 3) BGR: slopes shaded, shadows cast, clouds (from `seed`) drifting over."""
+    """Light the scene: uint8 (H, W, 3) BGR with shaded slopes, cast shadows, and clouds (from `seed`) drifting over."""
     azimuth, elevation = np.radians((light.sun_azimuth_deg, light.sun_elevation_deg))
     towards_sun = float(np.sin(azimuth)), float(-np.cos(azimuth))  # in columns and rows
     shadow = _cast_shadows(scene, towards_sun, float(np.tan(elevation)))
@@ -89,7 +91,7 @@ def lit(scene: Scene, light: Light, seed: int) -> np.ndarray:
 
 
 def _cast_shadows(scene: Scene, towards_sun: tuple[float, float], steepness: float) -> np.ndarray:
-    """uint8 (H, W), 255 where something towards the sun stands in its way.
+    """Compute the shadows, uint8 (H, W), 255 where something stands between the ground and the sun.
 
     A ray from (x, y) is blocked where max over k of height(k steps on) - k * drop exceeds height(x, y). That maximum
     over 2k steps is the larger of itself over k steps here, and k steps on: eight passes look 256 pixels far.
@@ -112,7 +114,7 @@ def _cast_shadows(scene: Scene, towards_sun: tuple[float, float], steepness: flo
 
 
 def _clouds(scene: Scene, cloud_frac: float, seed: int) -> np.ndarray:
-    """The share of sunlight that clouds hold back, uint8 (H, W) of 255."""
+    """Return the share of sunlight that clouds hold back, uint8 (H, W) of 255."""
     coarse = noise(np.random.default_rng(seed), (64, 64), 16, 3)
     edge = float(np.quantile(coarse, 1 - cloud_frac)) + (0.25 if cloud_frac == 0 else 0)
     cover = (150 * smooth_step(coarse, edge - 0.25, edge + 0.25)).astype(np.uint8)
@@ -122,7 +124,7 @@ def _clouds(scene: Scene, cloud_frac: float, seed: int) -> np.ndarray:
 def photograph(
     ground: np.ndarray, metres_per_pixel: float, pose: Pose, camera: Camera, light: Light, rng: np.random.Generator
 ) -> np.ndarray:
-    """One frame, uint8 (camera.height, camera.width, 3) BGR, of a `lit` ground; `rng` makes the sensor's noise."""
+    """Take one frame, uint8 (camera.height, camera.width, 3) BGR, of a `lit` ground; `rng` makes the sensor's noise."""
     # The centre of the north-west pixel is half a pixel inside of the scene.
     half, depth_m = metres_per_pixel / 2, len(ground) * metres_per_pixel
     metres_from_pixel = np.array([[metres_per_pixel, 0, half], [0, -metres_per_pixel, depth_m - half], [0, 0, 1]])

@@ -1,4 +1,4 @@
-"""The demonstration: two generated flights, and between them the real commands, each a process of its own."""
+"""The demonstration: two generated flights, and the real commands between them, each in a process of its own."""
 
 import json
 import logging
@@ -33,7 +33,7 @@ _END_TIMEOUT_S = 10.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DemoSummary:
-    """What the demonstration showed. `costs` are means of a query under the names of the flight log; `messages` is
+    """Results of the demonstration. `costs` are means of a query under the names of the flight log; `messages` counts
     what the simulated flight controller decoded, by name."""
 
     places: int
@@ -79,7 +79,7 @@ def run_demo(folder: str | Path) -> DemoSummary:
     Leaves in `folder`: flight-1/ and flight-2/ (images, positions.csv), map.gpkg, flight.jsonl and demo.png.
     Raises EdgevprError where a part of it fails or matplotlib is not installed.
     """
-    logging.getLogger("matplotlib").setLevel(logging.WARNING)  # its fonts are nobody's business
+    logging.getLogger("matplotlib").setLevel(logging.WARNING)  # its messages about fonts are of no use here
     try:
         from edgevpr.simulate.picture import draw
     except ModuleNotFoundError as error:
@@ -152,7 +152,7 @@ def _free_udp_port() -> int:
 
 @contextmanager
 def _edgevpr(*arguments: object) -> Iterator[subprocess.Popen]:
-    """The real program as a process of its own, ended at the latest with the block."""
+    """Run the real program in a process of its own, which ends with the block at the latest."""
     command = [sys.executable, "-m", "edgevpr", *map(str, arguments)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
@@ -169,7 +169,7 @@ def _edgevpr(*arguments: object) -> Iterator[subprocess.Popen]:
 
 
 def _output(process: subprocess.Popen) -> str:
-    """What a process writes until its end. Raises EdgevprError where it fails."""
+    """Return everything that a process writes until its end. Raises EdgevprError where it fails."""
     output, _ = process.communicate()
     if process.returncode:
         command = " ".join(process.args[2:])
@@ -178,7 +178,7 @@ def _output(process: subprocess.Popen) -> str:
 
 
 def _queries(log_path: Path, flying: subprocess.Popen) -> Iterator[int]:
-    """Count the queries in the growing flight log until the flight ends."""
+    """Count the queries in the growing flight log, yielding each number, until the flight ends."""
     seen, ended = 0, False
     while not ended:
         ended = flying.poll() is not None

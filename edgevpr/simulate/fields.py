@@ -1,4 +1,4 @@
-"""What grows on a field: one function a kind, from noise over the field to its colour and its relief."""
+"""Fields: one function for each kind of field, from noise over the field to its colour and its relief."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,8 +15,8 @@ SOIL, MUD = (78, 100, 126), (92, 130, 156)
 
 @dataclass(frozen=True, slots=True)
 class Plot:
-    """The pixels of one field, float32 (H, W): noise with bumps of 22 m (`patches`) and of 2.4 m (`tufts`), and metres
-    across its rows."""
+    """The pixels of one field, float32 (H, W): noise with bumps of 22 m (`patches`) and of 2.4 m (`tufts`), and the
+    metres across its rows."""
 
     patches: np.ndarray
     tufts: np.ndarray
@@ -70,7 +70,8 @@ def _forest_floor(plot: Plot) -> Look:
 
 @dataclass(frozen=True, slots=True)
 class _Kind:
-    """How often a kind of field is found, how it looks, and the trees in it: distance, scatter and radius in metres."""
+    """A kind of field: how often it is found, how it looks, and the trees in it (distance, scatter and radius in
+    metres)."""
 
     weight: float
     look: Callable[[Plot], Look]
@@ -89,7 +90,7 @@ _KINDS = (
 
 
 def paint_field(rng: np.random.Generator, canvas: Canvas, outline_m: np.ndarray) -> np.ndarray:
-    """Paint a field of some kind; returns the trees that stand in it, (N, 4) metres: east, north, radius, top."""
+    """Paint a field of some kind; return the trees that stand in it, (N, 4) metres: east, north, radius, top."""
     weights = np.array([kind.weight for kind in _KINDS])
     kind = _KINDS[rng.choice(len(_KINDS), p=weights / weights.sum())]
     side = longest_side(outline_m[:: max(1, len(outline_m) // 10)])

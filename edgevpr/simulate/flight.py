@@ -1,4 +1,5 @@
-"""Two flights over one generated landscape: the first one makes a map, the second one comes back later, and strays."""
+"""Two flights over one generated landscape: the first makes a map; the second comes back later, and leaves the mapped
+land."""
 
 import csv
 from collections.abc import Iterator
@@ -25,7 +26,8 @@ _HEIGHT_M = 80.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Flight:
-    """One picture a pose, every `interval_s` from `start_utc` on; `seed` makes its clouds and its sensor's noise."""
+    """A flight with one picture at each pose, every `interval_s` from `start_utc` on; `seed` makes its clouds and its
+    sensor's noise."""
 
     poses: tuple[Pose, ...]
     light: Light
@@ -36,7 +38,8 @@ class Flight:
 
 
 def mapping_flight(seed: int) -> Flight:
-    """70 places on five parallel legs, flown to and fro on a clear morning, the nose in the direction of flight."""
+    """Plan 70 places on five parallel legs, flown to and fro on a clear morning, the nose in the direction of
+    flight."""
     rng = np.random.default_rng((seed, 1))
     poses = []
     for leg, north_m in enumerate(_LEGS_NORTH_M):
@@ -60,8 +63,9 @@ def mapping_flight(seed: int) -> Flight:
 
 
 def later_flight(seed: int) -> Flight:
-    """40 pictures of an afternoon with clouds and haze: back along the fourth leg, out along the third one and on over
-    land that is in no map. It drifts up to 8 m beside the legs, 10 % in height, 10 degrees in heading, and tilts."""
+    """Plan 40 pictures on an afternoon with clouds and haze: back along the fourth leg, out along the third one and on
+    over land that is in no map. The flight drifts up to 8 m beside the legs, 10 % in height, 10 degrees in heading, and
+    tilts up to 3 degrees."""
     rng = np.random.default_rng((seed, 2))
     back_m = np.arange(_LEG_END_M - 6, _LEG_START_M, -21.0)
     out_m = np.arange(_LEG_START_M + 8, SCENE_WIDTH_M - 62, 19.0)
@@ -87,7 +91,7 @@ def later_flight(seed: int) -> Flight:
 
 
 def write_flight(folder: str | Path, scene: Scene, flight: Flight) -> Iterator[str]:
-    """Fly: `folder`/images/*.jpg, and `folder`/positions.csv with the true position of every one of them.
+    """Write `folder`/images/*.jpg, and `folder`/positions.csv with the true position of every image.
 
     Yields the name of every image once it is written. Raises OSError where the folder cannot be written.
     """
@@ -111,21 +115,21 @@ def write_flight(folder: str | Path, scene: Scene, flight: Flight) -> Iterator[s
 
 
 def fly_and_write(folder: Path, which: str, seed: int) -> str:
-    """Write the "map" or the "query" flight over the landscape of a seed; returns a sentence about it."""
+    """Write the "map" or the "query" flight over the landscape of a seed; return a sentence about it."""
     flight = mapping_flight(seed) if which == "map" else later_flight(seed)
     written = list(write_flight(folder, make_scene(seed, SCENE_WIDTH_M, SCENE_DEPTH_M), flight))
     return f"{folder}: {len(written)} images in images/, where they were taken in positions.csv"
 
 
 def to_position(pose: Pose) -> Position:
-    """Where a pose is on the globe: the scene is a plane that touches it at ORIGIN."""
+    """Return the position of a pose on the globe: the scene is a plane that touches it at ORIGIN."""
     lat_deg = ORIGIN.lat_deg + np.degrees(pose.north_m / EARTH_RADIUS_M)
     lon_deg = ORIGIN.lon_deg + np.degrees(pose.east_m / _radius_of_latitude_m())
     return Position(float(lat_deg), float(lon_deg), ORIGIN.alt_m + pose.height_m)
 
 
 def to_metres(lat_deg: float, lon_deg: float) -> tuple[float, float]:
-    """The other way round: metres (east, north) of a position."""
+    """Return the metres (east, north) of a position in the scene, the inverse of `to_position`."""
     north_m = np.radians(lat_deg - ORIGIN.lat_deg) * EARTH_RADIUS_M
     return float(np.radians(lon_deg - ORIGIN.lon_deg) * _radius_of_latitude_m()), float(north_m)
 
@@ -135,7 +139,7 @@ def _radius_of_latitude_m() -> float:
 
 
 def _wander(rng: np.random.Generator, count: int) -> np.ndarray:
-    """A slow random swing between -1 and 1."""
+    """Make a slow random swing between -1 and 1, float64 (count,)."""
     t = np.arange(count)[:, None] / 9
     waves = np.sin(2 * np.pi * (t * (1, 2.3) + rng.random(2)))
     return waves @ (0.75, 0.25)

@@ -1,4 +1,4 @@
-"""Where the things of a scene lie: winding lines, and land cut into fields. Points are (N, 2) east, north in metres."""
+"""Layout of a scene: winding lines, and land cut into fields. Points are (N, 2) east, north in metres."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ _GRID_M = 8.0
 
 
 def winding(rng: np.random.Generator, start_m, end_m, swing_m: float) -> np.ndarray:
-    """A winding line of 200 points from near `start_m` to near `end_m`."""
+    """Make a winding line of 200 points from near `start_m` to near `end_m`."""
     start_m, end_m = np.asarray(start_m), np.asarray(end_m)
     along = (end_m - start_m) / np.linalg.norm(end_m - start_m)
     t = np.linspace(0, 1, 200)[:, None]
@@ -40,20 +40,20 @@ def parcels(
 
 
 def longest_side(polygon: np.ndarray) -> np.ndarray:
-    """The longest side of a polygon as a vector."""
+    """Return the longest side of a polygon as a vector."""
     sides = np.roll(polygon, -1, axis=0) - polygon
     return sides[np.argmax(np.hypot(*sides.T))]
 
 
 class Bend:
-    """Bends straight lines a little, everywhere the same way, so that what touched still touches."""
+    """Bends straight lines a little, everywhere in the same way, so that lines that touched still touch."""
 
     def __init__(self, rng: np.random.Generator, width_m: float, depth_m: float, by_m: float) -> None:
         shape = int(depth_m / _GRID_M) + 8, int(width_m / _GRID_M) + 8
         self._shift_m = by_m * np.stack([noise(rng, shape, 7, 1), noise(rng, shape, 7, 1)], axis=-1)
 
     def __call__(self, points_m: np.ndarray, closed: bool) -> np.ndarray:
-        """The line through the points as a chain of short pieces, bent; `closed` joins its ends."""
+        """Return the line through the points as a chain of short pieces, bent; `closed` joins its ends."""
         ends_m = np.roll(points_m, -1, axis=0) if closed else points_m[1:]
         chain = [
             np.linspace(a, b, max(2, int(np.hypot(*(b - a)) / 5)), endpoint=False)
@@ -74,7 +74,7 @@ def _area_m2(polygon: np.ndarray) -> float:
 
 
 def _cut(piece: np.ndarray, through: np.ndarray, along: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
-    """Both halves of a convex polygon, and the cut between them."""
+    """Return both halves of a convex polygon, and the cut between them."""
     side = (piece - through) @ np.array([-along[1], along[0]])
     halves: tuple[list, list] = ([], [])
     line = []

@@ -1,4 +1,4 @@
-"""What the runtime answered in a generated flight, beside the truth."""
+"""Answers of the runtime in a generated flight, compared with the truth."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,8 +17,8 @@ RIGHT_M = 55.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Answer:
-    """One query: where it was taken, the place that was named and whether the runtime believed it; `nearest_m` is the
-    way to the nearest place of the map."""
+    """One query: where it was taken, the place that was named, and whether the runtime accepted it. `error_m` is the
+    distance between the two, `nearest_m` that to the nearest place of the map."""
 
     query: str
     reference_image: str
@@ -35,14 +35,14 @@ class Answer:
 
     @property
     def on_map(self) -> bool:
-        """Whether there was a right place to name."""
+        """True where the map has a right place for the query."""
         return self.nearest_m <= RIGHT_M
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Outcome:
-    """Shares and errors of a flight. `recall_at_1` is of the queries on the map; the errors, in metres from where a
-    picture was taken to the place that was named, are of the accepted ones (NaN without any)."""
+    """Counts, shares and errors of a flight. `recall_at_1` is of the queries on the map. The errors are metres from the
+    point where a picture was taken to the place that was named, of the accepted queries (NaN without any)."""
 
     queries: int
     on_map: int
@@ -56,7 +56,7 @@ class Outcome:
 
 
 def read_answers(log_path: Path, map_images: Path, query_images: Path) -> list[Answer]:
-    """The queries of a flight log, judged by the positions.csv of the two flights."""
+    """Read the queries of a flight log, and judge them by the positions.csv of the two flights."""
     places = {name: tag.position for name, tag in read_positions(find_positions(map_images)).items()}
     taken = {name: tag.position for name, tag in read_positions(find_positions(query_images)).items()}
     lat_deg, lon_deg = np.array([(place.lat_deg, place.lon_deg) for place in places.values()]).T
@@ -82,7 +82,7 @@ def read_answers(log_path: Path, map_images: Path, query_images: Path) -> list[A
 
 
 def outcome(answers: Sequence[Answer]) -> Outcome:
-    """Sum up."""
+    """Sum up the answers of a flight."""
     on_map = [answer for answer in answers if answer.on_map]
     accepted = [answer for answer in answers if answer.accepted]
     errors_m = [answer.error_m for answer in accepted] or [np.nan]

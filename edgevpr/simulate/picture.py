@@ -103,7 +103,7 @@ def _draw_legend(axes: Axes, width_m: float, depth_m: float, unmapped_m: float) 
 
 
 def _seen_by(flight: Flight, shape: tuple[int, int], metres_per_pixel: float) -> np.ndarray:
-    """bool (H, W): the ground that is in any picture of a flight."""
+    """Return the ground that is in any picture of a flight, bool (H, W)."""
     camera = flight.camera
     corners = np.array([(0, 0), (camera.width, 0), (camera.width, camera.height), (0, camera.height)], np.float64)
     seen = np.zeros(shape, np.uint8)
@@ -155,7 +155,7 @@ def _draw_pairs(figure: SubFigure, answers: Sequence[Answer], map_images: Path, 
 
 
 def _chosen(answers: Sequence[Answer], count: int) -> list[Answer]:
-    """Some of each kind, in the order they were flown: everything that went wrong first of all."""
+    """Choose at most `count` answers, some of each kind, wrong ones first; return them in the order they were flown."""
     wrong = [answer for answer in answers if answer.accepted and not answer.right]
     rejected = _spread([answer for answer in answers if not answer.accepted], count // 4)
     right = [answer for answer in answers if answer.accepted and answer.right]
@@ -165,7 +165,7 @@ def _chosen(answers: Sequence[Answer], count: int) -> list[Answer]:
 
 
 def _spread(items: list[Answer], count: int) -> list[Answer]:
-    """`count` items (all, where there are fewer) at even distances."""
+    """Choose `count` items (all, where there are fewer) at even distances."""
     if len(items) <= count:
         return items
     return [items[round(at)] for at in np.linspace(0, len(items) - 1, count)]

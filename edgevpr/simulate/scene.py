@@ -1,4 +1,4 @@
-"""A piece of farmland seen from above, generated from a seed: it stands in for a site that nobody has to fly over."""
+"""A piece of farmland seen from above, generated from a seed, in place of a real site to fly over."""
 
 from dataclasses import dataclass
 
@@ -59,7 +59,8 @@ def make_scene(seed: int, width_m: float, depth_m: float, metres_per_pixel: floa
 
 
 def _border(rng: np.random.Generator, canvas: Canvas, line_m: np.ndarray, level: int) -> np.ndarray:
-    """What parts two fields: a lane between large pieces of land, else a hedge, a wall or a grass strip."""
+    """Paint the border of two fields: a lane between large pieces of land, else a hedge, a wall or a grass strip.
+    Returns its trees."""
     box = canvas.box(line_m, 5.0)
     if canvas.height_cm[box].size == 0:
         return np.empty((0, 4))
@@ -85,7 +86,7 @@ def _border(rng: np.random.Generator, canvas: Canvas, line_m: np.ndarray, level:
 
 
 def _along(rng: np.random.Generator, line_m: np.ndarray, step_m: float, spread_m: float, radius_m: float) -> np.ndarray:
-    """Trees along a line."""
+    """Place trees along a line, (N, 4) metres: east, north, radius, top."""
     run_m = np.concatenate(([0], np.cumsum(np.hypot(*np.diff(line_m, axis=0).T))))
     at_m = np.arange(rng.uniform(0, step_m), run_m[-1], step_m)
     at_m += rng.normal(0, step_m * 0.25, len(at_m))
@@ -126,7 +127,7 @@ def _road(rng: np.random.Generator, canvas: Canvas, line_m: np.ndarray) -> None:
 
 
 def _farms(rng: np.random.Generator, canvas: Canvas, road_m: np.ndarray, river_m: np.ndarray) -> np.ndarray:
-    """Farms beside the road, away from the river; returns the middles of their yards, (N, 2) metres."""
+    """Paint farms beside the road, away from the river; return the middles of their yards, (N, 2) metres."""
     yards = []
     for at in range(18, len(road_m) - 18, 13):
         ahead = road_m[at + 1] - road_m[at]
@@ -140,7 +141,7 @@ def _farms(rng: np.random.Generator, canvas: Canvas, road_m: np.ndarray, river_m
 
 
 def _farm(rng: np.random.Generator, canvas: Canvas, middle, turn_rad: float, along, beside) -> None:
-    """A yard with ragged edges, buildings around it and vehicles on it."""
+    """Paint a yard with ragged edges, buildings around it and vehicles on it."""
     yard = np.array([middle + a * along * 19 + b * beside * 17 for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))])
     box = canvas.box(yard, 4.0)
     cover = canvas.polygon(box, yard)
@@ -160,7 +161,8 @@ def _farm(rng: np.random.Generator, canvas: Canvas, middle, turn_rad: float, alo
 
 
 def _mottle(rng: np.random.Generator, canvas: Canvas) -> None:
-    """Ground is never of one colour: brightness varies at 60 m, at a few metres, and from pixel to pixel."""
+    """Vary the brightness of the ground at 60 m, at a few metres, and from pixel to pixel: ground is never of one
+    colour."""
     for share, bump_m in ((0.06, 60.0), (0.07, 5.0), (0.08, 1.0)):
         bump_px = max(bump_m / canvas.metres_per_pixel, 2.0)
         coarse = max(2, int(bump_px / 8))

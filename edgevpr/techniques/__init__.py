@@ -1,4 +1,4 @@
-"""The techniques, by name. Nothing of a technique is imported before it is asked for."""
+"""The techniques, by name. The module of a technique is imported only when the technique is asked for."""
 
 import difflib
 import importlib
@@ -13,13 +13,14 @@ from edgevpr.errors import EdgevprError, UsageError
 
 @dataclass(frozen=True, slots=True)
 class _Own:
-    """Where the class of a technique is, and which output of its `model` it uses (None: it has no model)."""
+    """A technique of edgevpr itself: the location of its class (`where`), and the output of its `model` that it uses
+    (None: it has no model)."""
 
     where: str
     network_output: str | None = None
 
 
-# The first are what a board is offered by itself, best first: see AUTOMATIC.
+# The first ones are offered to a board automatically, best first: see AUTOMATIC.
 _REGISTRY = {
     "cohog": _Own("edgevpr.techniques.cohog:CoHog"),
     "hog": _Own("edgevpr.techniques.hog:Hog"),
@@ -33,48 +34,53 @@ _REGISTRY = {
     "region_vlad": _Own("edgevpr.techniques.region_vlad:RegionVlad", "features"),
     "cross_region_bow": _Own("edgevpr.techniques.cross_region_bow:CrossRegionBow", "features"),
 }
-# Where several fit a board, the first is taken. Networks are used when they are asked for: they want onnxruntime in
-# RAM, and weights that somebody has chosen. A sequence wants a flight along the way that was mapped.
+# If several fit a board, the first is taken. Networks must be asked for: they need onnxruntime in RAM, and weights that
+# a person has chosen. So must `seqslam`: a sequence needs a flight along the mapped route.
 AUTOMATIC = ("cohog", "hog")
 
 
 def names() -> tuple[str, ...]:
-    """Names of all techniques: those of edgevpr, then the networks whose cards make a descriptor by themselves.
+    """Return the names of all techniques: those of edgevpr, then the networks whose cards make a descriptor by
+    themselves.
 
-    A card that cannot be read is left out here, and says what is wrong with it when it is asked for by name.
+    A card that cannot be read is left out here. Asking for it by name raises an error that says what is wrong.
     """
     return (*_REGISTRY, *(name for name in _cards() if not is_own(name)))
 
 
 def is_own(name: str) -> bool:
-    """Whether edgevpr itself has a technique of this name: a card that is called the same is only its `model`."""
+    """Tell whether edgevpr itself has a technique of this name. A card of the same name is then only its `model`."""
     return name in _REGISTRY
 
 
 def is_known(name: str) -> bool:
-    """Whether there is a technique, or the card of a network, of this name."""
+    """Tell whether there is a technique, or the card of a network, of this name."""
     from edgevpr.techniques.networks.card import card_names
 
     return name in _REGISTRY or name in card_names()
 
 
 def parameters(name: str) -> dict[str, Any]:
-    """The parameters of the technique `name` and their defaults. Raises UsageError for an unknown technique."""
+    """Return the parameters of the technique `name` and their defaults. Raises UsageError for an unknown technique or a
+    network that gives feature maps only, ModelError for a card that cannot be read."""
     return {key: p.default for key, p in inspect.signature(_class(name)).parameters.items()}
 
 
 def labelled(name: str, form: str | None) -> str:
-    """A technique and its form as one name; that of `float` (None: it has no forms) is left out."""
+    """Return a technique and its form as one name. The form `float`, and None (the technique has no forms), are left
+    out."""
     return name if form in (None, "float") else f"{name} {form}"
 
 
 def network_output(name: str) -> str | None:
-    """Which output of its `model`, "features" or "descriptor", the technique `name` uses; None: it has no model."""
+    """Return the output of its `model` that the technique `name` uses, "features" or "descriptor"; None: it has no
+    model."""
     return _REGISTRY[name].network_output if is_own(name) else None
 
 
 def create(name: str, settings: dict[str, Any] | None = None) -> Technique:
-    """Make the technique `name` with `settings` (texts are read as the parameter's type; the rest is default).
+    """Make the technique `name` with `settings`. A text is converted to the type of its parameter; parameters that are
+    not in `settings` keep their defaults.
 
     Raises UsageError for an unknown technique or parameter, a value that cannot be read, or one out of range, and
     ModelError for a network that cannot be used.

@@ -1,11 +1,11 @@
 """`amosnet`: the largest activations over a pyramid of grids, compared by L1 difference.
 
 Chen et al., "Deep Learning Features at Scale for Visual Place Recognition", ICRA 2017, in the form of thesis 4.2.1:
-`conv5` of a network trained on the places of SPED, spatial pyramid pooling (see `heads.pooling`). What makes it
-AMOSNet is the weights, trained from scratch: give their card as `model`.
+`conv5` of a network trained on the places of SPED, with spatial pyramid pooling (see `heads.pooling`). Only its
+weights, trained from scratch, make a network AMOSNet: give their card as `model`.
 
-The vector is divided by its sum: L1 then compares how the activations are shared out, not how many there are, and lies
-in 0..2. On corridor and aerial_caliterra, the sets tuned on, that finds more places.
+The vector is divided by its sum. The L1 difference then compares the distribution of the activations, not their total,
+and lies in 0..2. On corridor and aerial_caliterra, the data sets used for tuning, this finds more places.
 """
 
 from typing import ClassVar
@@ -19,12 +19,13 @@ from edgevpr.techniques.vectors import VectorTechnique
 
 
 class AmosNet(VectorTechnique):
-    """Grids of 1x1 to `levels` x `levels` cells over the feature map of the card `model`."""
+    """Maxima over grids of 1x1 to `levels` x `levels` cells of the feature map of the card `model`."""
 
     name = "amosnet"
 
-    # With the weights that edgevpr ships no wrong match of corridor or aerial_caliterra (the sets tuned on), nor any
-    # query of the one in the map of the other, was ahead by 0.033, 0.032, 0.123. Other weights want other figures.
+    # With the shipped weights every wrong match had a margin below 0.033 (float), 0.032 (8bit), 0.123 (1bit): on
+    # corridor and aerial_caliterra (the data sets used for tuning), and with the queries of one of them in the map of
+    # the other. Other weights need other values.
     accept: ClassVar = {"float": (0.0, 0.04), "8bit": (0.0, 0.04), "1bit": (0.0, 0.155)}
 
     def __init__(self, model: str = "calc", form: str = "float", threads: int = 1, levels: int = 4) -> None:
@@ -34,11 +35,11 @@ class AmosNet(VectorTechnique):
         self._levels = tuple(range(1, levels + 1))
         length = len(
             pyramid(np.zeros(self._backbone.shape, np.float32), self._levels)
-        )  # says it where this is too small
+        )  # raises ModelError if the feature map is too small
         parameters = {"model": model, "levels": levels}
         super().__init__(self.name, parameters, length, form=form, similarity="l1", model_sha256=self._backbone.sha256)
 
     def vector(self, image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
-        """uint8 (H, W[, 3]) -> float32 (cells C,), the sum of its magnitudes 1."""
+        """Encode uint8 (H, W[, 3]) to float32 (cells * C,); its magnitudes sum to 1."""
         pooled = pyramid(self._backbone.run(image, mask), self._levels)
         return pooled / max(float(np.abs(pooled).sum()), 1e-6)

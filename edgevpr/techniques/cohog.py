@@ -1,13 +1,13 @@
-"""`cohog`: regional HOG descriptors of the regions that say something, matched by one product (thesis, chapter 6).
+"""`cohog`: HOG descriptors of the informative regions of a picture, matched by one product (thesis, chapter 6).
 
-Every place is 31x31 overlapping blocks, each described by the histograms of its 2x2 cells. A query asks only with its
-*good* blocks, those of high entropy, and each finds its best block in the reference. In the thesis the mean of those
-cosines is the score (`matching: thesis`); here, by default, each also votes for how far the picture has moved, and the
-share that agrees is the score (`matching: displacement`, see `displacement`). Looking ahead, what the scan says of the
-place counts too.
+A place is 31x31 overlapping blocks, each described by the histograms of its 2x2 cells. A query uses only its *good*
+blocks, those of high entropy. Each of them finds its most similar block in the reference. In the thesis the score is
+the mean of these cosines (`matching: thesis`). Here, by default, each good block also votes for the displacement of the
+picture, and the score is the share of votes that agree (`matching: displacement`, see `displacement`). With a forward
+camera the score of the scan counts too.
 
-The blocks are the fine part, 8 bits a value (31 KB a place, on disk). The coarse part is the same blocks averaged over
-a grid, of which 144 bytes a place stay in RAM (see `placecode`): they pick which places are compared in full.
+The blocks are the fine part: 8 bits per value, 31 KB per place, on disk. The coarse part is the same blocks averaged
+over a grid. Its 144 bytes per place stay in RAM (see `placecode`) and select the places that are compared in full.
 """
 
 from collections.abc import Sequence
@@ -26,26 +26,26 @@ from edgevpr.techniques.patterns import slow_patterns
 
 # The goodness threshold GT of the thesis (6.3.2) and of the authors' public code, each for its own entropy.
 _DEFAULT_GT = {"filled_bins": 0.5, "shannon": 0.4}
-# What a vote counts that is 0, 1, 2 ... cells off the peak. Looking ahead, near and far ground move differently; a step
-# is known better when the camera looks straight down.
+# Weight of a vote that is 0, 1, 2 ... cells off the peak. With a forward camera, near and far ground move by different
+# steps; with a nadir camera (one that looks straight down) the step is known more exactly.
 _VOTES_COUNT = {"forward": (1.0, 1.0, 0.75, 0.5), "nadir": (1.0, 1.0)}
-# (min_score, min_margin). The vote's: no wrong match of corridor (forward; alone, or ten in a sequence) or of
-# aerial_caliterra (nadir) reached both, nor did any query of two other sites in the map of aerial_caliterra. The
-# thesis's score has no safe threshold: its margin keeps out those queries of other sites, and most right matches with
-# them.
+# (min_score, min_margin). Displacement vote: no wrong match on corridor (forward; single queries, or sequences of ten)
+# or on aerial_caliterra (nadir) reached both values, nor did any query of two other sites in the map of
+# aerial_caliterra. The thesis's score has no safe threshold: its margin rejects those queries of other sites, and most
+# right matches too.
 _ACCEPT = {"forward": (0.07, 0.035), "nadir": (0.08, 0.03), "thesis": (0.0, 0.02)}
 _CANDIDATES = {"forward": 42, "nadir": 50}
-_ROTATIONS = 24  # of a query that looks straight down and does not know its heading: 15 degrees apart
-_HEADING_WITHIN_DEG = 1.5 * 360 / _ROTATIONS  # the expected rotation, and the two beside it
+_ROTATIONS = 24  # of a nadir query whose heading is unknown: 15 degrees apart
+_HEADING_WITHIN_DEG = 1.5 * 360 / _ROTATIONS  # the expected rotation, and one on either side
 
 
 class CoHog:
-    """CoHOG. The thesis's W1 = H1 is `w1`, W2 = H2 is `w2`, L is `bins`, GT is `gt` (below 0: the default that goes
-    with the entropy); `entropy` is "shannon" or "filled_bins".
+    """CoHOG. Parameters of the thesis: W1 = H1 is `w1` (pixels), W2 = H2 is `w2` (pixels), L is `bins`, GT is `gt`
+    (below 0: the default for the entropy). `entropy` is "shannon" or "filled_bins".
 
-    `camera` "nadir" keeps the shape of the picture, which is laid into a square, so that a turned one shows the same
-    ground, and tries a query in 24 rotations. It is recorded in the map; `matching`, "displacement" or "thesis", is
-    not: both read the same map.
+    With `camera` "nadir" the picture is laid into a square with its shape kept, so that a rotated picture shows the
+    same ground, and a query is tried in 24 rotations. The map records `camera`. It does not record `matching`,
+    "displacement" or "thesis": both read the same map.
     """
 
     def __init__(
@@ -84,22 +84,22 @@ class CoHog:
             coarse=PartSpec((placecode.SIDE, placecode.SIDE, bins), "|u1"),
             fine=PartSpec((self._side**2, 4 * bins), "|u1"),
             packed=PartSpec((placecode.SIDE**2 * bins // 8,), "|u1"),
-            scan_counts=matching == "displacement" and camera == "forward",  # looking down it would say no more
+            scan_counts=matching == "displacement" and camera == "forward",  # with a nadir camera it adds nothing
             heading_within_deg=_HEADING_WITHIN_DEG if camera == "nadir" else None,
         )
 
     def encode(self, image: np.ndarray, mask: np.ndarray | None = None) -> Descriptor:
-        """Encode uint8 (H, W[, 3]); a block that touches a pixel where `mask` is False is never good.
+        """Encode uint8 (H, W[, 3]); a block that touches a pixel where `mask` bool (H, W) is False is never good.
 
-        Returns coarse uint8 (12, 12, bins), fine uint8 (blocks, 4 bins), and for asking: regions float32 (blocks,
-        4 bins) (matrix B of 6.2.3) and good bool (blocks,).
+        Returns coarse uint8 (12, 12, bins), fine uint8 (blocks, 4 bins) and, for a query, regions float32
+        (blocks, 4 bins) and good bool (blocks,): the good ones are the rows of matrix A of 6.2.3.
         """
         if self._camera == "nadir":
             image, mask = _in_square(image, mask)
         grey, allowed = grey_square(image, self._w1), mask_square(mask, self._w1)
         blocks, seen, good = self._regions(grey, allowed)
         regions = blocks.reshape(self.spec.fine.shape)
-        # The root of each value in 8 bits: the small values, of which there are most, keep their digits.
+        # The square root of each value in 8 bits: most values are small, and the root keeps more of their digits.
         stored = np.rint(255 * np.sqrt(regions)).astype(np.uint8)
         coarse = np.rint(255 * placecode.grid(_middle(blocks, seen))).astype(np.uint8)
         quality = float(good.sum() / max(seen.sum(), 1))
@@ -109,8 +109,8 @@ class CoHog:
         )
 
     def _regions(self, grey: np.ndarray, allowed: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Blocks float32 (side, side, 4 bins); which of them are wholly allowed, and of these which are good, both bool
-        (side, side)."""
+        """Compute the blocks float32 (side, side, 4 bins). Also return, as bool (side, side), which of them are wholly
+        allowed, and which of these are good."""
         blocks = normalised_blocks(oriented_cells(grey, self._w2, self._bins, signed=True, allowed=allowed))
         good = good_blocks(levels(grey), self._entropy, self._w2, self._gt)
         if allowed is None:
@@ -119,15 +119,16 @@ class CoHog:
         return blocks, seen, good & seen
 
     def pack(self, coarse: np.ndarray, mean: np.ndarray) -> np.ndarray:
-        """Rows of the index: coarse uint8 (N, 12, 12, bins), the map's mean -> uint8 (N, B)."""
+        """Make the rows of the index, uint8 (N, B), of coarse uint8 (N, 12, 12, bins) and the map's mean
+        (12, 12, bins)."""
         return placecode.pack(coarse.astype(np.float32) / 255, mean / 255, locally=self._camera == "nadir")
 
     def coarse_scores(
         self, query: Descriptor, rows: np.ndarray, mean: np.ndarray, turned_deg: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Compare the place codes, `rows` uint8 (N, B), under shifts and, looking down, rotations, all or those within
-        `spec.heading_within_deg` of `turned_deg` (N,). Returns scores float32 (N,) and, looking down, those of each
-        rotation, float32 (N, 24)."""
+        """Compare the query with the place codes `rows`, uint8 (N, B), under shifts and, with a nadir camera,
+        rotations: all, or those within `spec.heading_within_deg` of `turned_deg` (N,). Returns scores float32 (N,) in
+        0..1 and, as float32 (N, 24), those of each rotation (None with a forward camera)."""
         seen = query.picture.seen
         blocks = _middle(query.regions.reshape(self._side, self._side, -1), seen)
         turns = np.arange(_ROTATIONS if self._camera == "nadir" else 1)
@@ -143,10 +144,11 @@ class CoHog:
         return np.clip(scores.max(axis=1), 0, 1), scores
 
     def match(self, query: Descriptor, fine: np.ndarray, hypotheses: Sequence[int] | None = None) -> FineMatch:
-        """C = A B^T (thesis 6.2.3) with A the good regions of the query, B those of the place; then the score by
-        `matching`. A query without a good region scores 0: it has nothing to say."""
+        """Compute C = A B^T (thesis 6.2.3), with A the good regions of the query and B those of the place, then the
+        score by `matching`. A query without a good region scores 0. A nadir query is tried in the rotations
+        `hypotheses` (None: all), and the best one counts."""
         blocks = fine.astype(np.float32)
-        blocks *= blocks  # what is stored is the root
+        blocks *= blocks  # the stored values are square roots
         reference = self._comparable(blocks)
         if self._camera == "forward":
             return self._matched(self._asking(query, 0), reference)
@@ -156,8 +158,8 @@ class CoHog:
         return replace(matches[best], rotation_deg=360 * best / _ROTATIONS)
 
     def _asking(self, query: Descriptor, turn: int) -> tuple[np.ndarray, np.ndarray]:
-        """Numbers and descriptors of the good regions of a query turned back by `turn` steps; those of the newest query
-        are kept, since many places are asked."""
+        """Return the numbers and descriptors of the good regions of a query that is turned back by `turn` steps. Those
+        of the newest query are kept, since it is compared with many places."""
         if query is not self._asked:
             self._asked, self._by_turn = query, {}
         if turn not in self._by_turn:
@@ -169,14 +171,15 @@ class CoHog:
         return self._by_turn[turn]
 
     def _comparable(self, blocks: np.ndarray) -> np.ndarray:
-        """Blocks float32 (N, 4 bins), or what the vote compares of them, (N, patterns), each of length 1."""
+        """Return blocks float32 (N, 4 bins), or for the displacement vote their slow patterns (N, patterns), each of
+        length 1."""
         if self._compared is not None:
             blocks = blocks @ self._compared
         blocks /= np.maximum(np.sqrt(np.einsum("ij,ij->i", blocks, blocks)), 1e-6)[:, None]
         return blocks
 
     def _turned_back(self, picture: Picture, turn: int) -> tuple[np.ndarray, np.ndarray]:
-        """A picture and where it is allowed, turned back by `turn` steps about its middle; its corners are cut off."""
+        """Turn a picture and its allowed pixels back by `turn` steps about the middle; the corners are cut off."""
         middle = (self._w1 - 1) / 2
         matrix = cv2.getRotationMatrix2D((middle, middle), -360 * turn / _ROTATIONS, 1)
         size = self._w1, self._w1
@@ -205,15 +208,16 @@ def _require(what: str, value: str, allowed) -> None:
 
 
 def _middle(per_block: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """The largest square in the middle that a picture fills that was laid into a larger one: (side, side, ...) ->
-    (n, n, ...)."""
+    """Cut out the largest square in the middle that the picture fills, if it was laid into a larger one:
+    (side, side, ...) to (n, n, ...)."""
     n = max(min(int(seen.any(axis=0).sum()), int(seen.any(axis=1).sum())), placecode.SIDE)
     start = (len(seen) - n) // 2
     return per_block[start : start + n, start : start + n]
 
 
 def _in_square(image: np.ndarray, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """Lay a picture into the middle of a square; returns it, and bool where it is the picture and allowed."""
+    """Lay a picture into the middle of a square. Returns the square, and bool (side, side): part of the picture and
+    allowed."""
     height, width = image.shape[:2]
     side = max(height, width)
     top, left = (side - height) // 2, (side - width) // 2

@@ -1,10 +1,11 @@
-"""`cross_region_bow`: regions that the network marks; a place is found by the words they fall to, and settled by
-matching region with region.
+"""`cross_region_bow`: regions that the network marks. The scan compares their visual words, the full comparison matches
+region with region.
 
 Chen, Maffra, Sa and Chli, "Only Look Once, Mining Distinctive Landmarks from ConvNet for Visual Place Recognition",
 IROS 2017, in the form of thesis 4.2.1: 200 regions and 10 000 words. The paper finds regions in `conv5_3` of VGG-16 and
-describes them from `conv5_2`; a card names one feature map, which is used for both. The bag of words is the coarse
-part, the regions are the fine one, 8 bits a number, and the score of a place is the sum over the mutually best regions.
+describes them from `conv5_2`; a card names one feature map, which is used for both. The coarse part is the bag of
+words. The fine part is the regions, 8 bits per number. The score of a place sums over the mutually best pairs of
+regions.
 """
 
 from dataclasses import replace
@@ -19,11 +20,13 @@ from edgevpr.techniques.vectors import VectorTechnique
 
 
 class CrossRegionBow(VectorTechnique):
-    """The `regions` most energetic regions of the feature map of the card `model`, and the `words` they fall to."""
+    """The `regions` most energetic regions of the feature map of the card `model`, and a bag of `words` visual
+    words."""
 
     candidates = 40
-    # With the weights that edgevpr ships no wrong match of corridor or aerial_caliterra (the sets tuned on), nor any
-    # query of the one in the map of the other, was ahead by 0.056, in any form. Other weights want other figures.
+    # With the shipped weights every wrong match had a margin below 0.056 in every form: on corridor and
+    # aerial_caliterra (the data sets used for tuning), and with the queries of one of them in the map of the other.
+    # Other weights need other values.
     min_margin = 0.07
 
     def __init__(
@@ -44,8 +47,8 @@ class CrossRegionBow(VectorTechnique):
         self.spec = replace(self.spec, fine=PartSpec((regions, channels), "|i1"))
 
     def encode(self, image: np.ndarray, mask: np.ndarray | None = None) -> Descriptor:
-        """Encode uint8 (H, W[, 3]) -> coarse float16 (words,), fine int8 (regions, C), zeros where there are fewer, and
-        for asking the regions as float32 of length 1; `good` are those that were found."""
+        """Encode uint8 (H, W[, 3]) to coarse float16 (words,) and fine int8 (regions, C), zeros where fewer regions are
+        found. For a query there are also the regions as float32 of length 1; `good` marks those that were found."""
         features = self._backbone.run(image, mask)
         boxes, _ = find_regions(features, self._regions)
         found = describe(features, boxes)
@@ -58,5 +61,5 @@ class CrossRegionBow(VectorTechnique):
         )
 
     def match(self, query: Descriptor, fine: np.ndarray, hypotheses: None = None) -> FineMatch:
-        """MachineSpeed the mutually best pairs of regions, 0 to 1 (see `mutual_score`)."""
+        """Score the mutually best pairs of regions, 0 to 1 (see `mutual_score`)."""
         return FineMatch(mutual_score(query.regions, from_bytes(fine)))

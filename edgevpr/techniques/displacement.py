@@ -1,8 +1,8 @@
-"""The displacement vote: regions that belong to the same place have all moved the same way.
+"""The displacement vote: regions that belong to the same place have all moved by the same step.
 
-Every asking region finds its best region in the reference; the step between the two, in cells, is one vote. Where the
-place is the same the votes pile up on one step, where it is another they scatter. The share of the votes at the peak
-says how well: a share of agreeing regions, which a mean of cosines is not.
+Every good region of the query finds its most similar region in the reference. The step between the two, in cells, is
+one vote. If the place is the same, the votes pile up on one step; if it is another place, they scatter. The score is
+the share of the votes at the peak: it says how many regions agree, which a mean of cosines does not.
 """
 
 from dataclasses import dataclass
@@ -14,8 +14,8 @@ import numpy as np
 
 @dataclass(frozen=True, slots=True)
 class Displacement:
-    """`share` (0..1) of the regions agrees on the step `shift_cells` (dx, dy), from the query to the reference;
-    `covariance_cells2` (var x, cov xy, var y) is that of the votes around the peak."""
+    """Result of a vote. `share` (0..1) of the regions agrees on the step `shift_cells` (dx, dy), from the query to the
+    reference; `covariance_cells2` (var x, cov xy, var y) is the covariance of the votes around the peak."""
 
     share: float
     shift_cells: tuple[float, float]
@@ -28,14 +28,15 @@ _NOTHING = Displacement(0.0, (0.0, 0.0), (0.0, 0.0, 0.0))
 def displacement(asking: np.ndarray, best: np.ndarray, side: int, counts: tuple[float, ...]) -> Displacement:
     """Count the votes of regions on a grid of `side` x `side`.
 
-    `asking` and `best` are int (G,): each asking region, and the region of the reference that is most like it, both
-    numbered row by row. The peak is the step with the most votes about it, where a vote that is n cells off, along the
-    rows or along the columns, counts `counts[n]`, and further off nothing.
+    `asking` and `best` are int (G,): each good region of the query, and the region of the reference most similar to it.
+    Both are numbered row by row. A vote that is n cells off a step, along the rows or along the columns, has the weight
+    `counts[n]`; one further off has none. The peak is the step with the largest sum of weighted votes. Without any
+    region the share is 0.
     """
     if not len(asking):
         return _NOTHING
-    # Both numbers in rows as wide as the steps are many: the difference is the number of the step. Around the steps
-    # that there are, room for the square about the peak.
+    # Both numbers are those of a grid as wide as there are steps, so that their difference is the number of the step. A
+    # border around the possible steps leaves room for the square around the peak.
     room = len(counts) - 1
     wide = 2 * (side - 1 + room) + 1
     number = _numbers(side, wide)
@@ -49,7 +50,7 @@ def displacement(asking: np.ndarray, best: np.ndarray, side: int, counts: tuple[
     shares_x, shares_y = agreeing.sum(axis=0) / count, agreeing.sum(axis=1) / count
     off = np.arange(-room, room + 1)
     mean_x, mean_y = float(shares_x @ off), float(shares_y @ off)
-    # A step is known to a cell at best: 1/12 is the variance within one.
+    # A step is known to one cell at best: 1/12 is the variance of a uniform distribution over one cell.
     covariance = (
         float(shares_x @ (off - mean_x) ** 2) + 1 / 12,
         float((off - mean_y) @ agreeing @ (off - mean_x)) / count,
@@ -61,12 +62,12 @@ def displacement(asking: np.ndarray, best: np.ndarray, side: int, counts: tuple[
 
 @lru_cache
 def _numbers(side: int, wide: int) -> np.ndarray:
-    """The numbers of `side` x `side` regions in a grid that is `wide` wide."""
+    """Return the numbers of `side` x `side` regions in a grid of width `wide`: int (side * side,)."""
     return np.add.outer(np.arange(side) * wide, np.arange(side)).ravel()
 
 
 @lru_cache
 def _weights(counts: tuple[float, ...]) -> np.ndarray:
-    """What a vote counts, by how far it is off: float32 (2 n - 1, 2 n - 1) for n counts."""
+    """Return the weight of a vote by its distance from the peak: float32 (2 n - 1, 2 n - 1) for n counts."""
     off = np.abs(np.arange(1 - len(counts), len(counts)))
     return np.array(counts, np.float32)[np.maximum.outer(off, off)]

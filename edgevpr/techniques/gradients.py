@@ -1,11 +1,11 @@
-"""Oriented gradient histograms over cells and blocks: the common ground of `hog` and `cohog`."""
+"""Oriented gradient histograms over cells and blocks, shared by `hog` and `cohog`."""
 
 import cv2
 import numpy as np
 
-_STRIP_ROWS = 64  # rows done at once, so that the planes of a strip stay in cache
+_STRIP_ROWS = 64  # rows computed at once, so that the planes of a strip stay in cache
 _SIGN_BIT = np.uint32(1 << 31)
-# Fitted to the largest error over -45..45 degrees (it is 2e-6 of the magnitude): see _vote_by_octant.
+# Fitted for the smallest maximum error over -45..45 degrees (2e-6 of the magnitude): see _vote_by_octant.
 _P, _Q, _R = 2.904936713, 2.067222680, 0.162280117
 # Rows: the sums of _vote_by_octant. Columns: 0, 45, ... 315 degrees (x to the right, y down).
 _ORIENTATIONS = np.array(
@@ -26,8 +26,8 @@ _ORIENTATIONS = np.array(
 def grey_square(image: np.ndarray, side_px: int) -> np.ndarray:
     """Return a uint8 image, (H, W) grey or (H, W, 3) BGR, as float32 grey of (side_px, side_px), 0 to 255.
 
-    Not rounded to grey levels: between the pixels of a small picture steps are fractions of one, and how they are
-    rounded differs from processor to processor, while a map must fly on any of them.
+    The values are not rounded to grey levels. A small picture that is enlarged has steps of fractions of a level, which
+    processors round differently, and a map must work on any of them.
     """
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     return cv2.resize(grey.astype(np.float32), (side_px, side_px), interpolation=cv2.INTER_LINEAR)
@@ -48,12 +48,12 @@ def mask_square(mask: np.ndarray | None, side_px: int) -> np.ndarray | None:
 def oriented_cells(
     grey: np.ndarray, cell_px: int, bins: int, signed: bool, allowed: np.ndarray | None = None
 ) -> np.ndarray:
-    """Histograms of gradient orientation, one a cell (Dalal and Triggs 2005; thesis 6.2.2, steps 1 and 2).
+    """Compute histograms of gradient orientation, one per cell (Dalal and Triggs 2005; thesis 6.2.2, steps 1 and 2).
 
-    The square root of the image over its maximum, central differences, gradient magnitude, and a linear vote into
-    the two nearest of `bins` orientations over 360 degrees (`signed`) or 180. `grey` is float32 or uint8 (H, W), 0 to
-    255, with sides that are multiples of `cell_px`; pixels where the bool (H, W) `allowed` is False do not vote.
-    Returns float32 (H/cell_px, W/cell_px, bins), sums of magnitude, all >= 0.
+    The steps are: the square root of the image over its maximum, central differences, the gradient magnitude, and a
+    linear vote into the two nearest of `bins` orientations over 360 degrees (`signed`) or 180. `grey` is float32 or
+    uint8 (H, W), 0 to 255, with sides that are multiples of `cell_px`; pixels where the bool (H, W) `allowed` is False
+    do not vote. Returns float32 (H/cell_px, W/cell_px, bins), sums of magnitude, all >= 0.
     """
     rows, cols = grey.shape[0] // cell_px, grey.shape[1] // cell_px
     vote = _vote_by_octant if signed and bins == 8 else _vote_by_angle
@@ -74,7 +74,7 @@ def oriented_cells(
 
 
 def _vote_by_angle(dx: np.ndarray, dy: np.ndarray, cell_px: int, bins: int, signed: bool) -> np.ndarray:
-    """The vote for any number of orientations: float32 (H, W) twice -> (H/cell_px, W/cell_px, bins)."""
+    """Vote for any number of orientations: `dx` and `dy` float32 (H, W) to (H/cell_px, W/cell_px, bins)."""
     magnitude = cv2.magnitude(dx, dy)
     at = np.arctan2(dy, dx)
     at *= np.float32(bins / (2 * np.pi if signed else np.pi))  # in bins; whole numbers are the centres of orientations
@@ -92,14 +92,14 @@ def _vote_by_angle(dx: np.ndarray, dy: np.ndarray, cell_px: int, bins: int, sign
 
 
 def _vote_by_octant(dx: np.ndarray, dy: np.ndarray, cell_px: int, *_: object) -> np.ndarray:
-    """The same vote for 8 orientations over 360 degrees, without angles, branches or scattered sums.
+    """Cast the same vote for 8 orientations over 360 degrees, without angles, branches or scattered sums.
 
-    A gradient of magnitude m lies in a quadrant, at phi = -45..45 degrees from its diagonal. The orientation of the
-    diagonal gets m - |g|, where g = m phi / 45 degrees; the rest is the y axis's where g > 0, the x axis's where
-    g < 0. With v = sqrt(2) m sin(phi) and u = sqrt(2) m cos(phi), which need no angle,
-    g = v (_P m + _R u) / (_Q m + u) to 2e-6 m. Which of the four diagonals, and which way along an axis, is told by
-    the signs of dx and dy: each plane is summed over the cells once as it is and once with its sign bits flipped by
-    theirs; sums and differences of those are the orientations.
+    A gradient of magnitude m lies in a quadrant, at phi = -45..45 degrees from the diagonal of the quadrant. The
+    orientation of the diagonal gets m - |g|, where g = m phi / 45 degrees. The rest goes to the y axis if g > 0, to the
+    x axis if g < 0. v = sqrt(2) m sin(phi) and u = sqrt(2) m cos(phi) need no angle, and g = v (_P m + _R u) / (_Q m +
+    u) to 2e-6 m. The signs of dx and dy say which of the four diagonals it is, and which direction of an axis. So each
+    plane is summed over the cells once as it is, and once with its sign bits flipped by those of dx, dy or both. Sums
+    and differences of these sums are the orientations.
     """
     across, along = np.abs(dx), np.abs(dy)
     u = across + along
@@ -138,7 +138,7 @@ def _vote_by_octant(dx: np.ndarray, dy: np.ndarray, cell_px: int, *_: object) ->
 
 
 def normalised_blocks(cells: np.ndarray) -> np.ndarray:
-    """Blocks of 2x2 cells, stride one cell, each of Euclidean length 1 (thesis 6.2.2, step 3).
+    """Return the blocks of 2x2 cells, stride one cell, each of Euclidean length 1 (thesis 6.2.2, step 3).
 
     `cells` is float32 (rows, cols, L); returns float32 (rows-1, cols-1, 4L) in the order top left, top right, bottom
     left, bottom right. A block without any gradient is all zeros.

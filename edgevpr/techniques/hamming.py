@@ -1,4 +1,4 @@
-"""Exact scan of binary vectors: in how many bits does the query differ from every place of the map?
+"""Exact scan of binary vectors: the number of bits in which the query differs from each place of the map.
 
 With the optional library `simsimd` the scan takes about half the time; both ways give the same numbers.
 """
@@ -10,20 +10,20 @@ try:
 except ImportError:
     simsimd = None
 
-_BYTES_AT_ONCE = 1 << 20  # about a second-level cache: smaller blocks cost more calls than they save memory traffic
+_BYTES_AT_ONCE = 1 << 20  # about a second-level cache: with smaller blocks the calls cost more than the cache saves
 _GROUP = 64  # places
-_PLACES_AT_ONCE = 1 << 13  # simsimd answers in float64: few at once leave little to convert
+_PLACES_AT_ONCE = 1 << 13  # simsimd returns float64: with few places at once there is little to convert
 _EVEN_BYTES = np.uint64(0x00FF00FF00FF00FF)
 _ADD_LANES = np.uint64(0x0001000100010001)
 
 
 def hamming(query: np.ndarray, codes: np.ndarray) -> np.ndarray:
-    """Differing bits: uint8 (B,), uint8 (N, B) -> uint16 (N,), uint32 for more than 8191 bytes."""
+    """Count differing bits: uint8 (B,), uint8 (N, B) to uint16 (N,), or uint32 for more than 8191 bytes."""
     return hamming_numpy(query, codes) if simsimd is None else hamming_simd(query, codes)
 
 
 def hamming_simd(query: np.ndarray, codes: np.ndarray) -> np.ndarray:
-    """`hamming` by simsimd, which must be importable."""
+    """Compute `hamming` by simsimd, which must be importable."""
     asked, places = query[None], np.ascontiguousarray(codes)
     distances = np.empty(len(codes), _counts_of(codes))
     for start in range(0, len(codes), _PLACES_AT_ONCE):
@@ -33,10 +33,10 @@ def hamming_simd(query: np.ndarray, codes: np.ndarray) -> np.ndarray:
 
 
 def hamming_numpy(query: np.ndarray, codes: np.ndarray) -> np.ndarray:
-    """`hamming` in NumPy: XOR and count, in the widest words that fit, block by block.
+    """Compute `hamming` in NumPy: XOR and count, in the widest words that fit, block by block.
 
-    NumPy is slow along short axes. So groups of places meet as many copies of the query at once, and the counts of
-    eight words, bytes of one 64-bit number, are added inside it.
+    NumPy is slow along short axes. So a group of places is compared with as many copies of the query at once. The
+    counts of eight words are the bytes of one 64-bit number, and are added inside it.
     """
     length = codes.shape[1]
     word = np.dtype(next(form for form in ("u8", "u4", "u2", "u1") if length % np.dtype(form).itemsize == 0))
@@ -63,7 +63,7 @@ def _counts_of(codes: np.ndarray) -> type:
 
 
 def _sums_of_bytes(numbers: np.ndarray) -> np.ndarray:
-    """The sum of all bytes of each row: uint64 (n, k) -> (n,); a byte is at most 64."""
+    """Sum all bytes of each row: uint64 (n, k) to (n,); a byte is at most 64."""
     sums = numbers >> 8
     sums &= _EVEN_BYTES
     sums += numbers & _EVEN_BYTES

@@ -1,9 +1,10 @@
-"""`netvlad`: how the activations at each position lie about learned words, whitened, compared by cosine.
+"""`netvlad`: VLAD of the activations at each position about learned visual words, whitened, compared by cosine.
 
 Arandjelović et al., "NetVLAD: CNN architecture for weakly supervised place recognition", CVPR 2016, in the form of
-thesis 4.2.1: 64 words. The paper trains words and network together, for VGG-16; here the words are learned afterwards
-(`edgevpr train words`), as the paper starts out (its section 3.1), and the whitening only where that file holds one. A
-network that has the layer inside gives a vector by itself: make a card of it, and it is a technique of its own.
+thesis 4.2.1: 64 words. The paper trains words and network together, for VGG-16. Here the words are learned afterwards
+(`edgevpr train words`), which is how the paper starts (its section 3.1). The vector is whitened only if the file of the
+words holds a whitening. A network that has the layer inside gives a vector by itself: make a card of it, and it is a
+technique of its own.
 """
 
 from typing import ClassVar
@@ -18,11 +19,12 @@ from edgevpr.techniques.vectors import VectorTechnique
 
 
 class NetVlad(VectorTechnique):
-    """VLAD of the feature map of the card `model` about `words` words; `assignment` of a position to them is "soft" or
-    "hard"."""
+    """VLAD of the feature map of the card `model` about `words` words. The `assignment` of a position to the words is
+    "soft" or "hard"."""
 
-    # With the weights that edgevpr ships no wrong match of corridor or aerial_caliterra (the sets tuned on), nor any
-    # query of the one in the map of the other, was ahead by 0.104, 0.081, 0.067. Other weights want other figures.
+    # With the shipped weights every wrong match had a margin below 0.104 (float), 0.081 (8bit), 0.067 (1bit): on
+    # corridor and aerial_caliterra (the data sets used for tuning), and with the queries of one of them in the map of
+    # the other. Other weights need other values.
     accept: ClassVar = {"float": (0.0, 0.13), "8bit": (0.0, 0.105), "1bit": (0.0, 0.085)}
 
     def __init__(
@@ -43,7 +45,7 @@ class NetVlad(VectorTechnique):
         super().__init__("netvlad", parameters, self._words.length, form=form, model_sha256=self._words.sha256)
 
     def vector(self, image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
-        """uint8 (H, W[, 3]) -> float32 (words C,), or as long as the whitening makes it."""
+        """Encode uint8 (H, W[, 3]) to float32 (words * C,), or to the length that the whitening gives."""
         local, words = vlad.local_descriptors(self._backbone.run(image, mask)), self._words.words
         if self._sharpness is None:
             weights = vlad.hard_weights(local, words)

@@ -1,4 +1,5 @@
-"""A card that makes a vector by itself is a technique by the card's own name: a network is added without any code."""
+"""A network as a technique: a card that makes a vector by itself is a technique of the card's name, without any
+code."""
 
 import hashlib
 import json
@@ -16,10 +17,10 @@ Head = Callable[[np.ndarray], np.ndarray]
 
 
 class CardNetwork(VectorTechnique):
-    """The network of a card: the vector that it puts out or, where the card names a head, what that makes of the
-    feature map. All of it is in the model hash of a map, so there are no parameters.
+    """The network of a card. Its vector is the output of the network or, if the card names a head, the result of the
+    head on the feature map. The model hash of a map covers all of this, so there are no parameters.
 
-    Nobody has measured how far ahead its wrong matches are: none is accepted until the configuration says from when on.
+    The margins of its wrong matches are unknown: no match is accepted until the configuration sets a minimum margin.
     """
 
     min_margin = NEVER
@@ -30,17 +31,18 @@ class CardNetwork(VectorTechnique):
         said = json.dumps([self._backbone.sha256, card.head, card.similarity, words_sha256], sort_keys=True)
         sha256 = hashlib.sha256(said.encode()).hexdigest()
         noise = np.random.default_rng(0).integers(0, 256, (card.input.height, card.input.width), np.uint8)
-        length = len(self.vector(noise, None))  # a feature map too small for the head is said here
+        length = len(self.vector(noise, None))  # raises ModelError for a feature map too small for the head
         super().__init__(card.name, {}, length, form=form, similarity=card.similarity, model_sha256=sha256)
-        self.encode(noise)  # and so are numbers that half precision does not hold
+        self.encode(noise)  # raises ModelError for numbers that half precision cannot hold
 
     def vector(self, image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
-        """uint8 (H, W[, 3]) -> float32 (D,)."""
+        """Encode uint8 (H, W[, 3]) to float32 (D,)."""
         return self._head(self._backbone.run(image, mask))
 
 
 def _head(card: Card, backbone: Backbone) -> tuple[Head, str | None]:
-    """What the card's head makes of a feature map, float32 (C, H, W) -> (D,), and the hash of learned words."""
+    """Make the function of the card's head, from a feature map float32 (C, H, W) to (D,), and the hash of its learned
+    words (None: it has none)."""
     if card.head is None:
         return lambda vector: vector, None
     asked = head_parameters(card)

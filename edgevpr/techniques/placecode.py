@@ -1,11 +1,11 @@
 """A place in 144 bytes that is still found when the camera has moved or turned: the coarse stage of `cohog`.
 
-The block-normalised HOG is averaged over 12x12 cells (its *grid*); the map's mean is taken away, the L orientations of
-each cell are written as a Fourier series, and only the signs stay, one bit for each of its L numbers: neighbouring
-orientations rise and fall together, and their signs would say half of it twice. A query is compared under every shift
-of the grid, for a camera of unknown heading under every rotation too: each such *hypothesis* is one row of a matrix,
-the map is the other, and one product answers for all places. Neither shifting nor turning touches the picture: both
-move the numbers of the grid.
+The block-normalised HOG is averaged over 12x12 cells (its *grid*), and the map's mean is subtracted. The L orientations
+of each cell are written as a Fourier series, and only the signs stay, one bit for each of its L numbers. Without the
+series the signs would repeat half of their information, since neighbouring orientations rise and fall together. A query
+is compared under every shift of the grid and, for a camera of unknown heading, under every rotation. Each such
+*hypothesis* is one row of a matrix, the places of the map are another matrix, and one product compares them all. Shifts
+and rotations move the numbers of the grid, not the picture.
 """
 
 from functools import lru_cache
@@ -15,13 +15,13 @@ import numpy as np
 from edgevpr.techniques.patterns import waves
 
 SIDE = 12  # cells along one side
-_SAMPLES = 3  # along one side of a cell: with 31 blocks about one a block
-_MIN_OVERLAP = 0.5  # with less, more is compared, and on no set was a place more found
-_AROUND_CELLS = 3.0  # standard deviation
-_LOOKED_CLOSER = 500  # places; they take a tenth of the time of a scan of 10 000
+_SAMPLES = 3  # along one side of a cell: about one per block, for 31 blocks
+_MIN_OVERLAP = 0.5  # a smaller overlap costs more shifts, and found no further place on any data set
+_AROUND_CELLS = 3.0  # standard deviation of the weights around a cell
+_LOOKED_CLOSER = 500  # places; comparing them takes a tenth of the time of a scan of 10 000
 _BITS_AT_ONCE = 1 << 19  # of places: 2 MB as float32
 
-# Byte -> its eight bits, first bit first, as +1 and -1: `unpackbits`, conversion and offset in one look-up.
+# Each byte as its eight bits, first bit first, +1 or -1: one look-up instead of `unpackbits`, conversion and offset.
 _SIGNS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).astype(np.float32) * 2 - 1
 
 
@@ -32,28 +32,29 @@ def _shifts() -> np.ndarray:
     return np.stack([dx[enough], dy[enough]], axis=1).astype(np.int8)
 
 
-# int8 (S, 2): every (dx, dy) in cells under which enough of two grids lies on the other.
+# int8 (S, 2): every shift (dx, dy) in cells under which two grids overlap by at least half.
 SHIFTS = _shifts()
 
 
 def grid(blocks: np.ndarray) -> np.ndarray:
-    """Mean orientations of the cells of a picture: blocks float32 (n, n, 4L) -> float32 (12, 12, L), each cell of
-    length 1 (so that contrast and haze do not count)."""
+    """Average the orientations over the cells of a picture: blocks float32 (n, n, 4L) to float32 (12, 12, L), each cell
+    of length 1 (so that contrast and haze do not count)."""
     return turned_grids(blocks, np.zeros(1))[0][0]
 
 
 def turned_grids(
     blocks: np.ndarray, rotations_deg: np.ndarray, seen: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The grids of a picture turned counter-clockwise: blocks float32 (n, n, 4L), angles (R,) -> float32 (R, 12, 12,
-    L), and bool (R, 12, 12), whether at least half of the cell lies in the picture (where bool (n, n) `seen` allows).
+    """Make the grids of a picture turned counter-clockwise: blocks float32 (n, n, 4L) and angles (R,) in degrees to
+    float32 (R, 12, 12, L). Also returns bool (R, 12, 12): at least half of the cell lies in the picture, in blocks that
+    bool (n, n) `seen` allows (None: all).
 
-    Every cell averages samples at the places they came from; the orientations turn with them, shared linearly between
-    the two nearest bins.
+    Each cell averages samples of the blocks from which its points came. The orientations turn with the picture, shared
+    linearly between the two nearest bins.
     """
     n, bins = blocks.shape[0], blocks.shape[2] // 4
     seen = np.ones((n, n), bool) if seen is None else seen
-    # One row more, for samples from outside the picture: nothing is seen there.
+    # One extra row, for samples from outside the picture, where nothing is seen.
     known = np.append(seen.ravel(), False)
     source = np.zeros((n * n + 1, bins), np.float32)
     source[:-1] = blocks.reshape(n * n, 4, bins).mean(axis=1) * seen.reshape(-1, 1)
@@ -68,11 +69,12 @@ def turned_grids(
 
 
 def special(grids: np.ndarray, mean: np.ndarray, seen: np.ndarray | None = None, locally: bool = False) -> np.ndarray:
-    """What sets a picture apart: grids (N, 12, 12, L) less the map's mean (12, 12, L), the orientations of each cell as
-    a Fourier series. Returns float32 of the shape of `grids`.
+    """Return the part of a picture that sets it apart: grids (N, 12, 12, L) less the map's mean (12, 12, L), the
+    orientations of each cell as a Fourier series. The result is float32 of the shape of `grids`.
 
-    `locally`, also less what the (`seen`) cells around have in common: where any rotation may meet any place, the mean
-    of a cell over the map leaves in what comes from the light and from fields that all run one way.
+    With `locally`, the mean of the (`seen`) cells around each cell is subtracted too. This is for maps in which any
+    rotation may meet any place: there the mean over the map does not remove the effect of the light, nor that of fields
+    that all run one way.
     """
     left = (np.asarray(grids, np.float32) - mean) @ waves(grids.shape[-1]).T
     if not locally:
@@ -85,13 +87,15 @@ def special(grids: np.ndarray, mean: np.ndarray, seen: np.ndarray | None = None,
 
 
 def pack(grids: np.ndarray, mean: np.ndarray, locally: bool = False) -> np.ndarray:
-    """Rows of the index: grids (N, 12, 12, L), the map's mean (12, 12, L) -> uint8 (N, 18 L), the signs bit by bit."""
+    """Make the rows of the index: grids (N, 12, 12, L) and the map's mean (12, 12, L) to uint8 (N, 18 L), bit by
+    bit."""
     return np.packbits((special(grids, mean, locally=locally) >= 0).reshape(len(grids), -1), axis=1)
 
 
 def hypotheses(grids: np.ndarray, seen: np.ndarray, mean: np.ndarray, locally: bool = False) -> np.ndarray:
-    """A query as it would look from elsewhere: grids and `seen` of its R rotations by `turned_grids`, the map's mean ->
-    float32 (R, S, 144 L), its signs (0 where it sees nothing), moved by the S `SHIFTS`."""
+    """Make a query's views from elsewhere: grids and `seen` of its R rotations (by `turned_grids`) and the map's mean
+    to float32 (R, S, 144 L). Each is the signs of the query (0 where nothing is seen), moved by one of the S
+    `SHIFTS`."""
     signs = np.where(special(grids, mean, seen, locally) >= 0, np.float32(1), np.float32(-1)) * seen[..., None]
     asked = np.zeros((len(signs), len(SHIFTS), *signs.shape[1:]), np.float32)
     for at, (dx, dy) in enumerate(SHIFTS.tolist()):
@@ -100,8 +104,8 @@ def hypotheses(grids: np.ndarray, seen: np.ndarray, mean: np.ndarray, locally: b
 
 
 def scan(asked: np.ndarray, codes: np.ndarray) -> np.ndarray:
-    """Compare every hypothesis, float32 (R, S, 8 B), with every place, uint8 (N, B): the best score of each rotation,
-    float32 (N, R).
+    """Compare every hypothesis, float32 (R, S, 8 B), with every place, uint8 (N, B). Returns the best score of each
+    rotation, float32 (N, R).
 
     A score is the bits that agree less those that do not, over all bits: 1 is the same picture, 0 is chance.
     """
@@ -122,8 +126,9 @@ def scan(asked: np.ndarray, codes: np.ndarray) -> np.ndarray:
 
 
 def scan_ahead(asked: np.ndarray, codes: np.ndarray) -> np.ndarray:
-    """`scan` for a camera that looks ahead: all places under a quarter of the shifts, each blurred with those around
-    it so that none is overlooked, and the best of those under all."""
+    """Scan for a forward camera: all places under a quarter of the shifts, then the best 500 places under all. Each
+    shift of the quarter is blurred with those around it, so that none is missed. Takes and returns the same as
+    `scan`."""
     if len(codes) <= _LOOKED_CLOSER:
         return scan(asked, codes)
     scores = scan(_blurred() @ asked, codes)
@@ -133,8 +138,8 @@ def scan_ahead(asked: np.ndarray, codes: np.ndarray) -> np.ndarray:
 
 
 def scan_near(asked: np.ndarray, codes: np.ndarray, expected: np.ndarray) -> np.ndarray:
-    """`scan` where the heading is known: place n only under rotation `expected` [n] and the two beside it, -inf for the
-    others. int (N,), below 0 where nobody knows: such a place under all of them.
+    """Scan where the heading is known: place n only under rotation `expected[n]` and the two beside it, with -inf for
+    the others. `expected` is int (N,), below 0 where the heading is unknown: such a place is compared under all.
 
     Places that expect the same rotation are one product, so the work is that of three rotations.
     """
@@ -148,7 +153,7 @@ def scan_near(asked: np.ndarray, codes: np.ndarray, expected: np.ndarray) -> np.
 
 @lru_cache
 def _blurred() -> np.ndarray:
-    """float32 (shifts even both ways, S): the weights of the shifts in the mean about each, by how far they are off."""
+    """Return float32 (even shifts, S): the weights of all shifts in the mean around each even one, by distance."""
     kept = SHIFTS[(SHIFTS % 2 == 0).all(axis=1)]
     weight = np.maximum(1 - abs(kept[:, None] - SHIFTS) / 2, 0).prod(axis=2)
     return (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
@@ -156,7 +161,7 @@ def _blurred() -> np.ndarray:
 
 @lru_cache
 def _around() -> np.ndarray:
-    """float32 (144, 144): how much each cell counts for what the cells around another have in common."""
+    """Return float32 (144, 144): the weight of each cell in the mean of the cells around another."""
     away = np.subtract.outer(np.arange(SIDE), np.arange(SIDE))
     near = np.exp(-(away**2) / (2 * _AROUND_CELLS**2))
     return np.kron(near, near).astype(np.float32)
@@ -164,7 +169,7 @@ def _around() -> np.ndarray:
 
 @lru_cache(maxsize=8)
 def _sources(n: int, rotations_deg: tuple[float, ...]) -> np.ndarray:
-    """int (R, 144, 9): for every sample of every cell the block it comes from, `n` n where that is outside."""
+    """Return int (R, 144, 9): the block that each sample of each cell comes from, `n * n` for samples from outside."""
     middle = (np.arange(SIDE * _SAMPLES) + 0.5) / (SIDE * _SAMPLES) - 0.5
     y, x = (part.reshape(SIDE, _SAMPLES, SIDE, _SAMPLES) for part in np.meshgrid(middle, middle, indexing="ij"))
     x, y = (part.swapaxes(1, 2).reshape(SIDE**2, _SAMPLES**2) for part in (x, y))
@@ -176,12 +181,12 @@ def _sources(n: int, rotations_deg: tuple[float, ...]) -> np.ndarray:
 
 
 def _turned_bins(cells: np.ndarray, rotation_deg: float) -> np.ndarray:
-    """Orientations (..., L) of a picture turned counter-clockwise. They are measured towards y, which points down, so
-    that turning lowers them."""
+    """Turn the orientations (..., L) of a picture that is turned counter-clockwise. Orientations are measured towards
+    y, which points down, so that turning lowers them."""
     whole, part = divmod(rotation_deg / 360 * cells.shape[-1], 1)
     return (1 - part) * np.roll(cells, -int(whole), axis=-1) + part * np.roll(cells, -int(whole) - 1, axis=-1)
 
 
 def _to(step: int) -> slice:
-    """The cells of one side that something moved by `step` cells comes to lie on."""
+    """Return the slice of one side that its own cells cover after a move by `step` cells."""
     return slice(max(0, step), SIDE + min(0, step))

@@ -1,9 +1,9 @@
-"""`region_vlad`: how the regions that the network marks lie about learned words, compared by cosine.
+"""`region_vlad`: VLAD of the regions that the network marks, about learned visual words, compared by cosine.
 
 Khaliq et al., "A Holistic Visual Place Recognition Approach Using Lightweight CNNs for Significant ViewPoint and
 Appearance Changes", T-RO 2019, in the form of thesis 4.2.1: 400 regions of `conv4`, 256 words. Regions have length 1
-(see `heads.regions`), and each word's part of the vector as well; the authors' code takes the signed square root there.
-On corridor and aerial_caliterra, the sets tuned on, that finds fewer places.
+(see `heads.regions`), and so has each word's part of the vector. The authors' code takes the signed square root of
+these parts instead; on corridor and aerial_caliterra, the data sets used for tuning, that finds fewer places.
 """
 
 from typing import ClassVar
@@ -21,8 +21,9 @@ from edgevpr.techniques.vectors import VectorTechnique
 class RegionVlad(VectorTechnique):
     """VLAD of the `regions` most energetic regions of the feature map of the card `model` about `words` words."""
 
-    # With the weights that edgevpr ships no wrong match of corridor or aerial_caliterra (the sets tuned on), nor any
-    # query of the one in the map of the other, was ahead by 0.060, 0.042, 0.021. Other weights want other figures.
+    # With the shipped weights every wrong match had a margin below 0.060 (float), 0.042 (8bit), 0.021 (1bit): on
+    # corridor and aerial_caliterra (the data sets used for tuning), and with the queries of one of them in the map of
+    # the other. Other weights need other values.
     accept: ClassVar = {"float": (0.0, 0.075), "8bit": (0.0, 0.055), "1bit": (0.0, 0.03)}
 
     def __init__(
@@ -41,7 +42,7 @@ class RegionVlad(VectorTechnique):
         super().__init__("region_vlad", parameters, self._words.words.size, form=form, model_sha256=self._words.sha256)
 
     def vector(self, image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
-        """uint8 (H, W[, 3]) -> float32 (words C,); zeros for a picture without any region."""
+        """Encode uint8 (H, W[, 3]) to float32 (words * C,); zeros for a picture without any region."""
         features, words = self._backbone.run(image, mask), self._words.words
         boxes, _ = find_regions(features, self._regions)
         local = describe(features, boxes)
@@ -49,8 +50,9 @@ class RegionVlad(VectorTechnique):
 
 
 def region_backbone(technique: str, model: str, threads: int, regions: int) -> Backbone:
-    """The network of the card `model`, of which regions can be found: raises ModelError for a feature map too small for
-    them, or without an activation above zero, and UsageError for a number of regions that makes no sense."""
+    """Open the network of the card `model`, to find regions in its feature map. Raises ModelError for a feature map
+    that is too small for regions or has no activation above zero, and UsageError for a number of regions outside 1 to
+    10 000."""
     if not 1 <= regions <= 10_000:
         raise UsageError(f"{technique}: regions is {regions}; it must be 1 to 10000.")
     backbone = open_backbone(model, "features", threads)

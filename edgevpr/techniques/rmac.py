@@ -1,10 +1,10 @@
-"""`rmac`: the largest activations of squares of the feature map; a place is found by their sum, and settled by
-matching square with square.
+"""`rmac`: the largest activations in squares of the feature map. The scan compares their sum, the full comparison
+matches square with square.
 
 Tolias, Sicre and Jégou, "Particular object retrieval with integral max-pooling of CNN activations", ICLR 2016, in the
-form of thesis 4.2.1: `conv5_2` of VGG-16, power- and L2-normalised, the squares of two pictures mutually matched and
-the cosines of the mutual pairs summed, no check of geometry. The sum of the squares is the coarse part, which the paper
-compares by cosine; the squares are the fine part, 8 bits a number.
+form of thesis 4.2.1: `conv5_2` of VGG-16, power- and L2-normalised. The squares of two pictures are matched mutually,
+and the cosines of the mutual pairs are summed, without a check of geometry. The coarse part is the sum of the squares,
+which the paper compares by cosine. The fine part is the squares, 8 bits per number.
 """
 
 from dataclasses import replace
@@ -22,8 +22,9 @@ class RMac(VectorTechnique):
     """R-MAC of the feature map of the card `model`, at three scales."""
 
     candidates = 40
-    # With the weights that edgevpr ships no wrong match of corridor or aerial_caliterra (the sets tuned on), nor any
-    # query of the one in the map of the other, was ahead by 0.147. Other weights want other figures.
+    # With the shipped weights every wrong match had a margin below 0.147: on corridor and aerial_caliterra (the data
+    # sets used for tuning), and with the queries of one of them in the map of the other. Other weights need other
+    # values.
     min_margin = 0.185
 
     def __init__(self, model: str = "calc", form: str = "float", threads: int = 1) -> None:
@@ -34,13 +35,13 @@ class RMac(VectorTechnique):
         self.spec = replace(self.spec, fine=PartSpec((len(self._squares), channels), "|i1"))
 
     def encode(self, image: np.ndarray, mask: np.ndarray | None = None) -> Descriptor:
-        """Encode uint8 (H, W[, 3]) -> coarse float16 (C,), fine int8 (squares, C), and for asking the squares as
-        float32 of length 1; `good` are those where anything was active."""
+        """Encode uint8 (H, W[, 3]) to coarse float16 (C,) and fine int8 (squares, C). For a query there are also the
+        squares as float32 of length 1; `good` marks those with any activation."""
         squares = regional_vectors(self._backbone.run(image, mask), self._squares)
         good = squares.any(axis=1)
         coarse = aggregate(squares).astype("<f2")
         return Descriptor(coarse=coarse, fine=to_bytes(squares), regions=squares, good=good, quality=float(good.mean()))
 
     def match(self, query: Descriptor, fine: np.ndarray, hypotheses: None = None) -> FineMatch:
-        """MachineSpeed the mutually best pairs of squares, 0 to 1 (see `mutual_score`)."""
+        """Score the mutually best pairs of squares, 0 to 1 (see `mutual_score`)."""
         return FineMatch(mutual_score(query.regions, from_bytes(fine)))

@@ -1,7 +1,7 @@
 """`seqslam`: small patch-normalised pictures, compared by their absolute differences, in sequences.
 
 Milford and Wyeth 2012, "SeqSLAM: Visual route-based navigation for sunny summer days and stormy winter nights". This
-file makes the difference of one picture from every place and enhances its local contrast; `places.sequence` searches
+file computes the difference of one picture from every place and enhances its local contrast. `places.sequence` searches
 the trajectories, for this technique by default.
 """
 
@@ -14,20 +14,21 @@ from edgevpr.contract import Descriptor, PartSpec, TechniqueSpec
 from edgevpr.errors import UsageError
 
 _WINDOW = 10  # R_window of the paper: five places before and five after
-_GREYEST = 128  # a pixel that is as bright as its patch is on average
-_STEPS = 28  # to a standard deviation: eight bits reach four and a half of them either way
-_LEAST_SPREAD = 1.0  # grey levels: a patch of less says nothing of the place
+_GREYEST = 128  # a pixel as bright as the mean of its patch
+_STEPS = 28  # levels per standard deviation: eight bits reach 4.5 of them either way
+_LEAST_SPREAD = 1.0  # grey levels: a patch with a smaller standard deviation does not describe the place
 
 
 class SeqSlam:
-    """Down-sampled pictures of `width` x `height` pixels, a byte each (2 KB a place by default).
+    """Down-sampled pictures of `width` x `height` pixels, a byte each (2 KB per place by default).
 
-    `sequence` is how many queries are matched together; it belongs to the query, so one map serves all lengths.
+    `sequence` is the number of queries that are matched together. It belongs to the query, so one map serves all
+    lengths.
     """
 
     candidates = 1  # it has no fine part to compare
     min_score = 0.0
-    min_margin = 0.25  # of one query; no wrong match of corridor or aerial_caliterra (tuned on) was ahead by 0.16
+    min_margin = 0.25  # of one query; wrong matches on corridor and aerial_caliterra (tuning) had less than 0.16
 
     def __init__(self, width: int = 64, height: int = 32, patch: int = 8, sequence: int = 10) -> None:
         if not (2 <= patch <= width <= 512 and patch <= height <= 512 and width % patch == height % patch == 0):
@@ -46,7 +47,8 @@ class SeqSlam:
         )
 
     def encode(self, image: np.ndarray, mask: np.ndarray | None = None) -> Descriptor:
-        """Encode uint8 (H, W[, 3]) -> coarse uint8 (height * width,): 128 + 28 standard deviations of its patch.
+        """Encode uint8 (H, W[, 3]) to coarse uint8 (height * width,): 128 + 28 times the deviation of a pixel from its
+        patch's mean, in standard deviations of the patch.
 
         Pixels where `mask` is False count as their patch's mean. The quality is the share of patches that vary.
         """
@@ -64,26 +66,29 @@ class SeqSlam:
         return Descriptor(coarse=coarse, quality=float(np.mean(spread >= _LEAST_SPREAD)))
 
     def _patches(self, picture: np.ndarray) -> np.ndarray:
-        """(height, width) -> (patches, patch * patch)."""
+        """Cut a picture into patches: (height, width) to (patches, patch * patch)."""
         rows, columns = self._height // self._patch, self._width // self._patch
         blocks = picture.reshape(rows, self._patch, columns, self._patch).swapaxes(1, 2)
         return blocks.reshape(rows * columns, self._patch * self._patch)
 
     def coarse_scores(self, query: Descriptor, rows: np.ndarray, mean: None = None) -> tuple[np.ndarray, None]:
-        """How much better the query fits each row than the rows around it: uint8 (N, length) -> float32 (N,) in 0..1.
+        """Score how much better the query fits each row than the rows around it: uint8 (N, length) to float32 (N,) in
+        0..1.
 
-        A half is as well as they do. The score is linear in the enhanced difference, so that the best mean score of a
+        0.5 means as well as they do. The score is linear in the enhanced difference, so that the best mean score of a
         trajectory is its least summed difference.
         """
-        # Each row's nearest of one is the one, which is the quickest way to all sums of absolute differences.
+        # With one query, the nearest neighbour of each row is that query: K=1 is the fastest way to all sums of
+        # absolute differences.
         differences = cv2.batchDistance(rows, query.coarse[None], cv2.CV_32S, normType=cv2.NORM_L1, K=1)[0][:, 0]
-        most = _WINDOW / math.sqrt(_WINDOW + 1)  # (n - 1) / sqrt(n): no value of n is farther from their mean
+        most = _WINDOW / math.sqrt(_WINDOW + 1)  # (n - 1) / sqrt(n): none of n values is farther from their mean
         return (0.5 - enhanced(differences) / (2 * most)).astype(np.float32), None
 
 
 def normalised(pixels: np.ndarray, allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Each patch less its mean, over its standard deviation: float32 (patches, pixels) and weights 0 or 1 of the same
-    shape -> float32 (patches, pixels), 0 where the weight is or the patch is flat, and the deviations (patches,)."""
+    """Subtract each patch's mean and divide by its standard deviation: float32 (patches, pixels) and weights 0 or 1 of
+    the same shape to float32 (patches, pixels), 0 where the weight is 0 or the patch is flat. Also returns the
+    deviations (patches,)."""
     count = np.maximum(allowed.sum(axis=1, keepdims=True), 1)
     centred = (pixels - (pixels * allowed).sum(axis=1, keepdims=True) / count) * allowed
     spread = np.sqrt((centred**2).sum(axis=1, keepdims=True) / count)
@@ -91,10 +96,12 @@ def normalised(pixels: np.ndarray, allowed: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def enhanced(differences: np.ndarray) -> np.ndarray:
-    """Local contrast enhancement along the map: int32 (N,) -> float64 (N,), in standard deviations of the window.
+    """Enhance the local contrast of the differences along the map: int32 (N,) to float64 (N,), in standard deviations
+    of the window.
 
-    Each difference less the mean of those up to five places away, over their (sample) standard deviation; 0 where they
-    are all the same. In whole numbers, so that a long map costs no precision.
+    The mean of the differences up to five places away is subtracted from each difference, and the rest is divided by
+    their (sample) standard deviation; 0 where they are all the same. The sums are whole numbers, so that a long map
+    costs no precision.
     """
     whole = differences.astype(np.int64)
     first = np.maximum(np.arange(len(whole)) - _WINDOW // 2, 0)

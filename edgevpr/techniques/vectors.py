@@ -1,8 +1,9 @@
-"""Techniques that make one vector of a picture: three forms of it in RAM, and how two are compared.
+"""Techniques that make one vector of a picture: the three forms of a vector in RAM, and the comparison of two vectors.
 
-The map file keeps each vector in half precision. In RAM it is that (`float`), or, less the mean of the map, one byte
-(`8bit`) or one bit (`1bit`) a number: what all places have in common says nothing of where one is, and takes most of
-the range that a byte has. The mean changes while a map grows, which is why the file knows no form: one map serves all.
+The map file keeps each vector in half precision. In RAM it is kept so (`float`) or, less the mean of the map, as one
+byte (`8bit`) or one bit (`1bit`) a number. The mean is common to all places: it does not help to tell them apart, and
+takes most of the range of a byte. It changes while a map grows. So the file is independent of the form, and one map
+serves all forms.
 """
 
 from typing import ClassVar
@@ -14,24 +15,25 @@ from edgevpr.contract import Descriptor, PartSpec, TechniqueSpec
 from edgevpr.errors import ModelError, UsageError
 from edgevpr.techniques.hamming import hamming
 
-# Ahead by more than any match can be: how far ahead the wrong matches of a network are is known for the weights that
-# edgevpr ships. With others none is accepted until the configuration says from when on.
+# A margin that no match can reach. The margins of wrong matches are known for the weights that edgevpr ships. With
+# other weights no match is accepted until the configuration sets a minimum margin.
 NEVER = 2.0
 _SHIPPED = "calc"
 _TINY = 1e-6
-_BYTES_AT_ONCE = 4 << 20  # of places turned to float32 together
+_BYTES_AT_ONCE = 4 << 20  # of places converted to float32 together
 _FEWEST_AT_ONCE = 16
-_BESIDE_BYTES = 8  # of a row in 8 bits: its step and its length, both float32
-_WORD_BITS = 64  # a row in 1 bit is filled up to whole words, which count faster
+_BESIDE_BYTES = 8  # at the end of a row in 8 bits: its step and its length, both float32
+_WORD_BITS = 64  # a row in 1 bit is padded to whole words, whose bits are counted faster
 
 
 class VectorTechnique:
-    """What a technique of one vector does beside making it: a subclass gives `vector`.
+    """Base class of the techniques that make one vector; a subclass gives `vector`.
 
-    `similarity` is "cosine", "l1" or "l2"; in 1 bit it is always Hamming's. All scores are 0 to 1: the cosine itself,
-    below 0 as 0 (unrelated), for `float`; (1 + cosine) / 2 of what is left without the mean for `8bit`; 1 / (1 +
-    distance) for both others; the share of equal bits for `1bit`. `accept` gives (min_score, min_margin) of a form
-    where it is not that of the class; with another `model` than the one shipped, nothing is accepted.
+    `similarity` is "cosine", "l1" or "l2"; the form `1bit` always compares by Hamming distance. All scores are 0 to 1.
+    For "cosine" the score in `float` is the cosine (0 where it is negative: unrelated), in `8bit` (1 + cosine) / 2 of
+    the vectors less the mean. For "l1" and "l2" it is 1 / (1 + distance). In `1bit` it is the share of equal bits.
+    `accept` gives (min_score, min_margin) of a form, if they are not those of the class. With another `model` than the
+    shipped one, no match is accepted until the configuration sets a minimum margin.
     """
 
     candidates = 1  # there is no fine part to compare
@@ -72,13 +74,13 @@ class VectorTechnique:
         )
 
     def vector(self, image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
-        """The vector of a uint8 image, float32 (D,); what lies where `mask` (H, W) is False must not count."""
+        """Make the vector of a uint8 image (H, W[, 3]): float32 (D,). Pixels where `mask` bool (H, W) is False must not
+        count."""
         raise NotImplementedError
 
     def encode(self, image: np.ndarray, mask: np.ndarray | None = None) -> Descriptor:
-        """Encode uint8 (H, W[, 3]) -> coarse float16 (D,), of length 1 where the similarity is the cosine. A vector of
-        zeros, or of what half precision takes for such, has quality 0. Raises ModelError for numbers beyond half
-        precision."""
+        """Encode uint8 (H, W[, 3]) to coarse float16 (D,), of length 1 if the similarity is the cosine. A vector that
+        is all zeros in half precision has quality 0. Raises ModelError for numbers beyond half precision."""
         vector = self.vector(image, mask)
         length = float(np.linalg.norm(vector))
         if self._similarity == "cosine":
@@ -92,7 +94,7 @@ class VectorTechnique:
         return Descriptor(coarse=coarse, quality=float(coarse.any()))
 
     def pack(self, coarse: np.ndarray, mean: np.ndarray) -> np.ndarray:
-        """Rows of the index in 8 or 1 bit: coarse float16 (N, D), the map's mean (D,) -> (N, *row shape)."""
+        """Make the rows of the index in 8 or 1 bit: coarse float16 (N, D), the map's mean (D,) to (N, *row shape)."""
         rows = np.zeros((len(coarse), *self.spec.row.shape), self.spec.row.dtype)
         for block in _blocks(len(coarse), self._length):
             left = coarse[block].astype(np.float32)
@@ -114,10 +116,10 @@ class VectorTechnique:
         mean: np.ndarray | None = None,
         turned_deg: np.ndarray | None = None,
     ) -> tuple[np.ndarray, None]:
-        """Compare a query with all places: `rows` (N, *row shape), the map's mean (D,) unless the form is `float` ->
-        scores float32 (N,), all 0 for a query of zeros. Nothing is known of rotations: `turned_deg` changes nothing."""
+        """Compare a query with all places: `rows` (N, *row shape) and the map's mean (D,), unless the form is `float`,
+        to scores float32 (N,), all 0 for a query of zeros. `turned_deg` is ignored: these vectors know no rotations."""
         asked = query.coarse.astype(np.float32)
-        if not asked.any():  # less the mean it would be like some place, and another picture of nothing the very same
+        if not asked.any():  # less the mean, zeros would resemble some place, and equal another picture of zeros
             return np.zeros(len(rows), np.float32), None
         if self.spec.form == "1bit":
             code = np.zeros(self.spec.row.shape, np.uint8)
@@ -140,8 +142,8 @@ class VectorTechnique:
     def _compared(
         self, asked: np.ndarray, values: np.ndarray, step: np.ndarray | None, length: np.ndarray | None
     ) -> np.ndarray:
-        """Scores of some places. In 8 bits the place is `values` times `step`, less the mean as `asked` is, and
-        `length` long. `values` is overwritten."""
+        """Score some places. In 8 bits a place is `values` times `step`, less the mean as `asked` is, and its length is
+        `length`. `values` is overwritten."""
         if self._similarity == "cosine":
             cosines = values @ asked
             if step is None:

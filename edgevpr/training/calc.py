@@ -1,8 +1,8 @@
-"""`edgevpr train calc`: the encoder learns to see through a change of view and light (Merrill and Huang 2018).
+"""`edgevpr train calc`: the encoder learns to ignore a change of view and light (Merrill and Huang 2018).
 
-The target is the HOG of a picture, the input the same ground from elsewhere in other light; no labels. The paper's
-encoder and L2 loss; ours: the target (see `pictures`), the decoder (see `network`), Adam and a rate that falls like a
-cosine instead of plain momentum.
+The target is the HOG of a picture. The input is the same ground from elsewhere in other light. There are no labels. The
+encoder and the L2 loss are the paper's. Different are the target (see `pictures`), the decoder (see `network`), and
+Adam with a rate that falls like a cosine instead of plain momentum.
 """
 
 import hashlib
@@ -28,19 +28,20 @@ _STEPS_BETWEEN_CHECKPOINTS = 250
 
 
 class Training:
-    """One training, step by step; `step` steps are done, `losses` are those of this run.
+    """One training, step by step. `step` is the number of steps done, `losses` are those of this run.
 
-    Pictures of a step follow from the seed and its number alone, so that a training that was stopped and goes on from
-    its checkpoint ends as one that was not (but for the last bit: OpenCV's sums depend on where an array lies).
+    The pictures of a step follow from the seed and the number of the step alone. So a training that was stopped and
+    goes on from its checkpoint ends as one that was not (but for the last bit: OpenCV's sums depend on where an array
+    lies).
     """
 
     def __init__(self, pictures: Sequence[np.ndarray], steps: int, seed: int) -> None:
-        """`pictures` uint8 grey. Raises UsageError for too few pictures."""
+        """Prepare the training; `pictures` are uint8 grey. Raises UsageError for too few of them."""
         require_enough(pictures)
         self.pictures, self.steps, self.seed, self.step = pictures, steps, seed, 0
         self.losses: list[float] = []
         self._device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-        # Half precision doubles the speed where the processor has it, and is as good: the weights stay float32.
+        # bfloat16 doubles the speed where the processor has it, and is as good: the weights stay float32.
         self._halves = _has_halves(self._device)
         torch.manual_seed(seed)
         network = Autoencoder(torch.from_numpy(_mean_target(pictures, seed)))
@@ -48,11 +49,11 @@ class Training:
         self._optimiser = torch.optim.Adam(self._network.parameters(), _RATE)
 
     def encoder(self) -> Encoder:
-        """The encoder as it is now, ready to be written."""
+        """Return the encoder after the steps done so far, ready to be written."""
         return self._network.encoder.folded()
 
     def run(self, checkpoint: Path) -> Iterator[int]:
-        """Do the steps that are left, yielding the number of those done; saves `checkpoint` from time to time."""
+        """Do the steps that are left, yielding the number of those done; save `checkpoint` every 250 steps."""
         while self.step < self.steps:
             self._one_step()
             if self.step % _STEPS_BETWEEN_CHECKPOINTS == 0:
@@ -74,7 +75,7 @@ class Training:
         self.losses.append(loss.item())
 
     def save(self, path: Path) -> None:
-        """Write all that is needed to go on; the file is whole or the one before."""
+        """Write everything that is needed to go on. A failure leaves the file as it was before."""
         state = {
             "key": self._key(),
             "step": self.step,
@@ -86,7 +87,7 @@ class Training:
         write_whole(path, lambda unfinished: unfinished.write_bytes(content.getbuffer()))
 
     def load(self, path: Path) -> None:
-        """Go on from a checkpoint. Raises UsageError for one of another training."""
+        """Go on from a checkpoint. Raises UsageError for a file that cannot be read or is of another training."""
         try:
             state: dict[str, Any] = torch.load(path, map_location=self._device, weights_only=True)
             same = state["key"] == self._key()
@@ -113,7 +114,7 @@ class Training:
 
 
 def _has_halves(device: torch.device) -> bool:
-    """Whether bfloat16 is quick here, and not only possible."""
+    """Tell whether bfloat16 is fast on this device, and not only possible."""
     if device.type == "cuda":
         return torch.cuda.get_device_capability(device)[0] >= 8
     try:
@@ -129,5 +130,5 @@ def _mean_target(pictures: Sequence[np.ndarray], seed: int) -> np.ndarray:
 
 
 def _rate(step: int, steps: int) -> float:
-    """Rises over the first steps, then falls like half a cosine to nothing."""
+    """Return the learning rate of a step: it rises over the first steps, then falls like half a cosine to zero."""
     return _RATE * min(1, (step + 1) / _WARM_UP_STEPS) * (0.5 + 0.5 * math.cos(math.pi * step / steps))

@@ -1,4 +1,4 @@
-"""A trained encoder as an ONNX file and its card. The file is written node by node: the same for every PyTorch."""
+"""Export of a trained encoder as ONNX file and card. The file is written node by node: the same for every PyTorch."""
 
 import json
 import math
@@ -64,15 +64,16 @@ def write_onnx(encoder: Encoder, path: Path) -> None:
         weights,
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", _OPSET)], producer_name="edgevpr")
-    model.ir_version = 8  # what onnxruntime 1.17 reads
+    model.ir_version = 8  # a version that onnxruntime 1.17 reads
     onnx.checker.check_model(model, full_check=True)
     path.write_bytes(model.SerializeToString())
 
 
 def require_equal(encoder: Encoder, path: Path, inputs: np.ndarray) -> float:
-    """Run `inputs`, float32 (N, 1, 120, 160), through the file and through PyTorch; return the largest difference.
+    """Run `inputs`, float32 (N, 1, 120, 160), through the file and through PyTorch; return the largest difference, as a
+    share of the largest value (of 1, if that is larger).
 
-    Raises EdgevprError where it is more than 1e-4 of the largest value.
+    Raises EdgevprError if the difference is more than 1e-4.
     """
     import onnxruntime
 
@@ -92,7 +93,7 @@ def require_equal(encoder: Encoder, path: Path, inputs: np.ndarray) -> float:
 
 
 def write_card(path: Path, model: Path, title: str, source: str) -> None:
-    """Write the card of a CALC model that lies beside it."""
+    """Write the card of a CALC model, `model`, to `path` beside it."""
     sha256 = file_sha256(model)
     path.write_text(
         f"title: {json.dumps(title)}\n"

@@ -14,13 +14,13 @@ from edgevpr.helpers.progress import progress
 from edgevpr.training.pictures import batch, read_pictures, require_enough, small_grey
 
 _CHECKED_INPUTS = 16
-_LOSSES_SAID = 50  # the mean of as many steps is what is said: one batch says little
+_LOSSES_SAID = 50  # the reported loss is the mean of as many steps: one batch says little
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrainingResult:
-    """What a training came to: pictures learnt from, steps, the mean loss of its first and last 50 steps of this run
-    (None where a checkpoint was of the last step), and how far the file is from PyTorch."""
+    """Result of a training: the pictures learned from, the steps, the mean loss of the first and last 50 steps of this
+    run (None if the checkpoint was of the last step), and the largest difference between the file and PyTorch."""
 
     model: str
     card: str
@@ -32,7 +32,7 @@ class TrainingResult:
 
 
 def require_packages() -> None:
-    """Raises EdgevprError where the extra `train` is not installed."""
+    """Raise EdgevprError if the packages of the extra `train` (torch, onnx) cannot be imported."""
     for package in ("torch", "onnx"):
         try:
             importlib.import_module(package)
@@ -47,8 +47,9 @@ def train_calc(
 ) -> TrainingResult:
     """Train on the images of `folders` and write `out` (ONNX) and its card beside it; see `calc.Training`.
 
-    A checkpoint beside `out` is kept until both are written. Images that cannot be used are added to `unusable`.
-    Raises UsageError for settings that make no sense, and what `read_pictures`, `Training` and `export` raise.
+    A checkpoint beside `out` is kept until both are written. Images that cannot be used are added to `unusable`. Raises
+    UsageError for settings that make no sense or files that exist already, and what `read_pictures`,
+    `require_packages`, `Training` and `export` raise.
     """
     if steps < 1 or seed < 0:
         raise UsageError(f"--steps {steps} --seed {seed}: give at least 1 step and a seed of 0 or more.")
@@ -85,7 +86,7 @@ def train_calc(
     try:
         largest = export.require_equal(encoder, out, inputs)
     except EdgevprError:
-        out.unlink()  # what is wrong must not be taken for a model, nor be in the way of another try
+        out.unlink()  # a wrong file must not be taken for a model, nor be in the way of another try
         raise
     names = ", ".join(Path(folder).as_posix() for folder in folders)
     source = f"edgevpr train calc --steps {steps} --seed {seed}; {len(pictures)} images of {names}"

@@ -1,4 +1,4 @@
-"""k-means in NumPy: ten thousand words of a hundred thousand descriptors, block by block."""
+"""k-means in NumPy, block by block: for ten thousand words from a hundred thousand descriptors."""
 
 from collections.abc import Iterator
 
@@ -10,8 +10,8 @@ _BLOCK_VALUES = 8_000_000  # distances held at once: 32 MB
 def kmeans(points: np.ndarray, count: int, rounds: int, rng: np.random.Generator) -> Iterator[np.ndarray]:
     """Yield `count` centres, float32 (count, D), of `points` float32 (N, D), after each of `rounds` (Lloyd 1982).
 
-    They start as points drawn at random; a centre to which no point belongs goes to one of the points that lie
-    furthest from theirs. N must be at least `count`.
+    The centres start as points drawn at random. A centre to which no point belongs moves to one of the points that lie
+    furthest from their centres. N must be at least `count`.
     """
     centres = points[np.sort(rng.choice(len(points), count, replace=False))].copy()
     for _ in range(rounds):
@@ -20,7 +20,7 @@ def kmeans(points: np.ndarray, count: int, rounds: int, rng: np.random.Generator
         sizes = np.bincount(nearest, minlength=count)
         used = np.flatnonzero(sizes)
         starts = np.concatenate([[0], np.cumsum(sizes[used])[:-1]])
-        # The sums of a centre's points: they are neighbours once sorted.
+        # Sorted by centre, the points of one centre are neighbours, and `reduceat` can sum them.
         centres[used] = np.add.reduceat(points[order], starts, axis=0) / sizes[used, None]
         empty = np.flatnonzero(sizes == 0)
         centres[empty] = points[np.argsort(-distance, kind="stable")[: len(empty)]]
@@ -28,7 +28,7 @@ def kmeans(points: np.ndarray, count: int, rounds: int, rng: np.random.Generator
 
 
 def _assigned(points: np.ndarray, centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The nearest centre of each point, int (N,), and the square of its distance, float32 (N,)."""
+    """Find the nearest centre of each point, int (N,), and the square of its distance, float32 (N,)."""
     nearest = np.empty(len(points), np.intp)
     distance = np.empty(len(points), np.float32)
     half_squares = 0.5 * np.einsum("kd,kd->k", centres, centres)

@@ -1,11 +1,12 @@
 """The CALC autoencoder in PyTorch (Merrill and Huang 2018, section III, and their public network definition).
 
-The encoder is theirs, layer by layer. Ours, because theirs saw 2.5 million pictures 42 times: batch normalisation after
-each convolution, without which one or more of the four channels of the code fall silent for good (it is folded into the
-weights when training is done: what flies has the paper's layers and no others), and a decoder of three small
-convolutions where theirs is fully connected (1064, 1064, 2048, 3648): a change of view moves things near where they
-were, and 130 000 numbers learn that from fewer pictures than 11 million. The second layer speaks only where it has
-something to say: regions are made of activations that touch, and where most are above zero all is one region.
+The encoder is the paper's, layer by layer. Two things differ, because the paper's network saw 2.5 million pictures 42
+times. First, batch normalisation follows each convolution: without it one or more of the four channels of the code
+become zero for good. It is folded into the weights after training, so the network that flies has the paper's layers and
+no others. Second, the decoder is three small convolutions, where the paper's is fully connected
+(1064, 1064, 2048, 3648). A change of view moves things near where they were, and 130 000 numbers learn that from fewer
+pictures than 11 million. The second layer of the encoder also has a threshold, so that fewer of its activations are
+above zero: regions are made of activations that touch, and where most are above zero, everything is one region.
 """
 
 import copy
@@ -22,19 +23,20 @@ _THRESHOLD = 1.25  # standard deviations that an activation of the second layer 
 
 
 class Encoder(nn.Module):
-    """Image float32 (N, 1, 120, 160) in 0..1 -> descriptor (N, 1064) of length 1 and features (N, 128, 16, 21).
+    """The encoder: image float32 (N, 1, 120, 160) in 0..1 to descriptor (N, 1064) of length 1 and features
+    (N, 128, 16, 21).
 
-    Pooling rounds up, as Caffe does: that is where 1064 values come from.
+    Pooling rounds up, as Caffe does: this gives the 1064 values.
     """
 
     def __init__(self, normalised: bool = False) -> None:
-        """`normalised`: with batch normalisation, for training."""
+        """Make the layers; `normalised` adds batch normalisation, for training."""
         super().__init__()
         self.conv1 = nn.Conv2d(1, 64, 5, stride=2, padding=4)
         self.conv2 = nn.Conv2d(64, 128, 4, padding=2)
         self.conv3 = nn.Conv2d(128, CODE[0], 3)
         self.norm1 = nn.BatchNorm2d(64) if normalised else nn.Identity()
-        # Without a scale and shift of its own no channel can fall silent, nor speak everywhere.
+        # Without a learned scale and shift no channel can become zero everywhere, nor active everywhere.
         self.norm2 = nn.BatchNorm2d(FEATURES[0], affine=False) if normalised else nn.Identity()
         self.threshold = _THRESHOLD if normalised else 0.0
         self.norm3 = nn.BatchNorm2d(CODE[0], affine=False) if normalised else nn.Identity()
@@ -45,7 +47,7 @@ class Encoder(nn.Module):
         return _response_normalised(functional.max_pool2d(x, 3, 2, ceil_mode=True))
 
     def code(self, features: torch.Tensor) -> torch.Tensor:
-        """What the decoder sees, (N, 4, 14, 19): the descriptor, not yet flat and of length 1."""
+        """Compute the input of the decoder, (N, 4, 14, 19): the descriptor before it is flat and of length 1."""
         return functional.relu(self.norm3(self.conv3(features)))
 
     def forward(self, image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -53,7 +55,7 @@ class Encoder(nn.Module):
         return functional.normalize(self.code(features).flatten(1)), features
 
     def folded(self) -> "Encoder":
-        """The same on the CPU, with what batch normalisation has learnt in the weights of the convolutions."""
+        """Return the same encoder on the CPU, with batch normalisation and threshold folded into the convolutions."""
         learnt = copy.deepcopy(self).cpu().eval()
         plain = Encoder()
         for number in (1, 2, 3):
@@ -64,13 +66,13 @@ class Encoder(nn.Module):
 
 
 class Autoencoder(nn.Module):
-    """Image -> the HOG of what was seen before it was changed, (N, 14 * 19 * M) in 0..1, M values a block.
+    """The autoencoder: changed image to the HOG of the unchanged one, (N, 14 * 19 * M) in 0..1, M values per block.
 
-    The last bias starts where the mean target comes out: the first steps need not learn what all pictures share.
+    The last bias starts at the mean target, so that the first steps need not learn what all pictures share.
     """
 
     def __init__(self, mean_target: torch.Tensor) -> None:
-        """`mean_target` float32 (14 * 19 * M,)."""
+        """Make the layers; `mean_target` is float32 (14 * 19 * M,)."""
         super().__init__()
         blocks = mean_target.reshape(CODE[1], CODE[2], -1).permute(2, 0, 1)
         self.encoder = Encoder(normalised=True)
@@ -94,10 +96,10 @@ class Autoencoder(nn.Module):
 
 
 def _response_normalised(x: torch.Tensor) -> torch.Tensor:
-    """Local response normalisation over channels (Krizhevsky et al. 2012), as ONNX and Caffe define it.
+    """Apply local response normalisation over channels (Krizhevsky et al. 2012), as ONNX and Caffe define it.
 
-    The sums over neighbouring channels are one product with a band matrix: PyTorch's own pooling over channels is
-    slow on a CPU.
+    The sums over neighbouring channels are one product with a band matrix: PyTorch's own pooling over channels is slow
+    on a CPU.
     """
     channels = torch.arange(x.shape[1], device=x.device)
     band = ((channels[:, None] - channels).abs() <= LRN_SIZE // 2).to(x.dtype)

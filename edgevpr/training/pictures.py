@@ -1,9 +1,9 @@
-"""What CALC learns from: a picture seen twice, and the gradients that the network shall read off the changed sight.
+"""Training pairs of CALC: a changed view of a picture as input, the gradients of the unchanged view as target.
 
-Merrill and Huang 2018, section III. Theirs: the corners of one sight are moved at random. Ours, because a flight has
-thousands of pictures and not millions: the sight itself is a random part of the picture, mirrored half of the time;
-corners move outwards as well as inwards, so that nothing is always zoomed; and light falls unevenly, which
-histogram equalisation (part of the network's input here as in flight) cannot undo.
+Merrill and Huang 2018, section III. In the paper the corners of a view are moved at random. Here more is random,
+because a flight has thousands of pictures and not millions. The view itself is a random part of the picture, mirrored
+half of the time. Corners move outwards as well as inwards, so that the changed view is not always zoomed. Light falls
+unevenly, which histogram equalisation (part of the network's input here as in flight) cannot undo.
 """
 
 import sys
@@ -23,21 +23,22 @@ MIN_PICTURES = 16
 _CELL_PX = 8
 _ORIENTATIONS = 9
 # 14 x 19 blocks of 2x2 cells. The paper's 3648 values are OpenCV's HOG of 2 orientations in windows of two blocks that
-# overlap, so that most blocks are in it twice; ours has every block once and the 9 orientations of Dalal and Triggs.
+# overlap, so that most blocks are in it twice. Here each block is in once, with the 9 orientations of Dalal and Triggs.
 TARGET_LENGTH = (HEIGHT // _CELL_PX - 1) * (WIDTH // _CELL_PX - 1) * 4 * _ORIENTATIONS
-_LONGEST_READ_PX = 640  # larger ones would only fill memory: no network here looks at more
+_LONGEST_READ_PX = 640  # larger pictures only fill memory: no network here uses more
 _LONGEST_LEARNT_PX = 320  # twice the network's input: enough for a part of a picture
 _SMALLEST_PART = 0.85
-_CORNER_MOVES = 0.1  # of the sides of the sight
-_LIGHT_VARIES = 0.5  # standard deviation of the logarithm of the light over the sight
-_NOISE = 2.0  # largest standard deviation, of 255
+_CORNER_MOVES = 0.1  # of the sides of the view
+_LIGHT_VARIES = 0.5  # standard deviation of the logarithm of the light over the view
+_NOISE = 2.0  # largest standard deviation, in grey levels
 
 
 def read_pictures(
     folders: Sequence[str | Path], label: str, unusable: list[ImageError] | None = None
 ) -> Iterator[np.ndarray]:
-    """Yield each image of `folders`, uint8 grey or BGR, the longer side at most 640 pixels, saying under `label` how
-    far it is. Those that cannot be used are said and added to `unusable` (None: that was done before).
+    """Yield each image of `folders`, uint8 grey or BGR, the longer side at most 640 pixels, and print the progress
+    under `label`. Images that cannot be used are printed to stderr and added to `unusable` (None: that was done
+    before).
 
     Raises SourceError for a folder that is missing or holds no images.
     """
@@ -52,7 +53,7 @@ def read_pictures(
 
 
 def small_grey(image: np.ndarray) -> np.ndarray:
-    """What `batch` takes: uint8 grey, the longer side at most 320 pixels."""
+    """Convert a uint8 image to the form that `batch` takes: uint8 grey, the longer side at most 320 pixels."""
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     return _at_most(grey, _LONGEST_LEARNT_PX)
 
@@ -63,7 +64,7 @@ def _at_most(image: np.ndarray, longest_px: int) -> np.ndarray:
 
 
 def require_enough(pictures: Sequence[np.ndarray]) -> None:
-    """Raises UsageError for too few pictures to learn from."""
+    """Raise UsageError for too few pictures to learn from."""
     if len(pictures) < MIN_PICTURES:
         raise UsageError(
             f"{len(pictures)} usable images are too few to learn from: give folders with {MIN_PICTURES} at the very "
@@ -84,13 +85,13 @@ def batch(pictures: Sequence[np.ndarray], size: int, rng: np.random.Generator) -
 
 
 def gradients_of(sight: np.ndarray) -> np.ndarray:
-    """The target: HOG of uint8 (120, 160), float32 (TARGET_LENGTH,) in 0..1; cells of 8x8, blocks of 2x2 cells with a
-    stride of one cell, 9 orientations over 180 degrees."""
+    """Compute the target, the HOG of a view: uint8 (120, 160) to float32 (TARGET_LENGTH,) in 0..1. Cells are 8x8
+    pixels, blocks 2x2 cells with a stride of one cell, orientations 9 over 180 degrees."""
     return normalised_blocks(oriented_cells(sight, _CELL_PX, _ORIENTATIONS, signed=False)).ravel()
 
 
 def two_sights(picture: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return a random part of a picture as uint8 (120, 160), and the same ground from elsewhere in other light."""
+    """Return a random part of a grey picture as uint8 (120, 160), and the same ground from elsewhere in other light."""
     height, width = picture.shape
     largest = min(width / WIDTH, height / HEIGHT)
     scale = largest * rng.uniform(_SMALLEST_PART, 1)
@@ -112,7 +113,8 @@ def _seen(picture: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
 
 def _relit(sight: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Other gamma, mostly darker, light that varies over the sight (shadows of clouds), and noise of the sensor."""
+    """Change the light of a view: another gamma, mostly darker, light that varies over the view (shadows of clouds),
+    and noise of the sensor."""
     light = rng.normal(0, _LIGHT_VARIES * rng.random(), (3, 4)).astype(np.float32)
     light = np.exp(cv2.resize(light, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC))
     changed = (sight / np.float32(255)) ** np.float32(rng.uniform(0.6, 1.6))

@@ -1,4 +1,4 @@
-"""A network in 8-bit integers: a quarter of the file, and quicker where the processor multiplies bytes quickly."""
+"""A network in 8-bit integers: a quarter of the file, and faster where the processor multiplies bytes fast."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +19,8 @@ _MOST_IMAGES = 200
 
 @dataclass(frozen=True, slots=True)
 class Quantised:
-    """What became of a network: the new card, the images it was calibrated with, and both networks tried here."""
+    """Result of quantising a network: the new card, the number of images it was calibrated with, and the trials of both
+    networks on this machine."""
 
     card: str
     images: int
@@ -30,7 +31,7 @@ class Quantised:
 def quantise(name: str, calibration: Path, threads: int = 1) -> Quantised:
     """Write the network of the card `name` in static INT8, as NAME_int8, to the user's models folder.
 
-    The ranges of its activations are those met in (at most 200 of) the images of `calibration`. Raises ModelError where
+    The ranges of its activations are those met in (at most 200 of) the images of `calibration`. Raises ModelError if
     the package `onnx` is missing or the network cannot be quantised, SourceError for a folder without images.
     """
     card = load_card(name)
@@ -58,7 +59,7 @@ def quantise(name: str, calibration: Path, threads: int = 1) -> Quantised:
 
 def _quantised(source: Path, target: Path, feeds: Any) -> None:
     try:
-        import onnx  # noqa: F401 (onnxruntime.quantization fails without it, in many words)
+        import onnx  # noqa: F401 (onnxruntime.quantization fails without it, with a long message)
         from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
         from onnxruntime.quantization.shape_inference import quant_pre_process
     except ImportError as error:
@@ -83,6 +84,6 @@ def _quantised(source: Path, target: Path, feeds: Any) -> None:
             activation_type=QuantType.QUInt8,
             weight_type=QuantType.QInt8,
         )
-    except Exception as error:  # of onnx, protobuf and onnxruntime, in no order
+    except Exception as error:  # errors of onnx, protobuf and onnxruntime have no common class
         said = (str(error).strip() or type(error).__name__).splitlines()[0][:200]
         raise ModelError(f"{source} cannot be quantised ({said}): use it as it is.") from error

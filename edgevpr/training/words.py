@@ -1,8 +1,8 @@
-"""`edgevpr train words`: the words that VLAD and bag-of-words speak, learnt by k-means from one's own pictures.
+"""`edgevpr train words`: the visual words of VLAD and bag-of-words, learned by k-means from one's own pictures.
 
-The file is what `techniques.heads.words.load_words` reads: `words` float16 (K, D), rounded to steps of 1/256 so that
-ten thousand of them take little room; `model_sha256`, the fingerprint of the card whose feature map they describe; and,
-where asked for, the whitening of the VLAD vectors made of them (Jégou and Chum, ECCV 2012).
+`techniques.heads.words.load_words` reads the file. It holds `words` float16 (K, D), rounded to steps of 1/256 so that
+ten thousand of them take little room, and `model_sha256`, the fingerprint of the card whose feature map they describe.
+If asked for, it also holds the whitening of the VLAD vectors made of the words (Jégou and Chum, ECCV 2012).
 """
 
 import io
@@ -23,19 +23,19 @@ from edgevpr.techniques.networks.session import Backbone, open_backbone
 from edgevpr.training.kmeans import kmeans
 from edgevpr.training.pictures import read_pictures
 
-REGIONS = {"regions": 400, "bow": 200}  # of a picture, as in `region_vlad` and `cross_region_bow`
-_POINTS = 60_000  # local descriptors that words are learnt from at least, where there are as many ...
-_POINTS_PER_WORD = 12  # ... and as many a word
+REGIONS = {"regions": 400, "bow": 200}  # regions per picture, as in `region_vlad` and `cross_region_bow`
+_POINTS = 60_000  # the fewest local descriptors to learn words from, if there are as many ...
+_POINTS_PER_WORD = 12  # ... and the fewest per word
 _ROUNDS = 10
 _STEP = 256
 _ALIKE = 1e-9  # variance of vectors of length 1 that are the same but for rounding
-_LEAST_VARIANCE = 1e-3  # of the largest: what varies less is mostly noise, and whitening must not blow it up
+_LEAST_VARIANCE = 1e-3  # of the largest: a smaller variance is mostly noise, which whitening must not amplify
 
 
 @dataclass(frozen=True, slots=True)
 class WordsResult:
-    """The file, of how many pictures and local descriptors it was learnt, and the mean square distance of a descriptor
-    to its word (2: nothing in common)."""
+    """Result of a training of words: the file, the numbers of pictures and local descriptors it was learned from, and
+    the mean square distance of a descriptor to its word (2: nothing in common)."""
 
     file: str
     pictures: int
@@ -56,8 +56,9 @@ def train_words(
     """Learn `count` words of `kind` ("vlad", "regions", "bow") and write <model>_<kind><count>.npz to `folder` (None:
     the user's own models folder).
 
-    Raises UsageError for settings that make no sense or too few descriptors, ModelError for a network that cannot be
-    used, SourceError for a folder without images.
+    `whiten` is the length of the whitened VLAD vectors (None: no whitening). Raises UsageError for settings that make
+    no sense, a file that exists already or too few descriptors, ModelError for a network that cannot be used,
+    SourceError for a folder without images.
     """
     if count < 2 or seed < 0 or (whiten is not None and whiten < 1):
         raise UsageError(f"--count {count} --seed {seed}: give at least 2 words, a seed of 0 or more, --whiten from 1.")
@@ -100,7 +101,7 @@ def train_words(
 
 
 def _locals(backbone: Backbone, kind: str) -> Callable[[np.ndarray], np.ndarray]:
-    """Picture -> local descriptors, float32 (N, C), each of length 1."""
+    """Make the function from a picture to its local descriptors, float32 (N, C), each of length 1."""
     if kind == "vlad":
         return lambda picture: vlad.local_descriptors(backbone.run(picture))
 
@@ -118,8 +119,8 @@ def _some(points: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarra
 def _whitening(
     backbone: Backbone, folders: Sequence[str], pictures: int, words: np.ndarray, length: int
 ) -> dict[str, np.ndarray]:
-    """Mean float32 (K D,), matrix int8 (length, K D) and the scale of its rows float32 (length,): principal components
-    of the pictures' VLAD vectors over the root of their variance."""
+    """Learn the whitening: the principal components of the pictures' VLAD vectors over the root of their variance.
+    Returns the mean float32 (K D,), the matrix int8 (length, K D) and the scale of its rows float32 (length,)."""
     sharpness = vlad.sharpness(words)
     vectors = np.empty((pictures, words.size), np.float32)
     for row, picture in enumerate(read_pictures(folders, "whitening")):
@@ -128,7 +129,7 @@ def _whitening(
         vectors[row] = vlad.intra_normalised(vlad.residuals(local, words, weights))
     mean = vectors.mean(axis=0)
     vectors -= mean
-    # Fewer pictures than values: the components come from the small product of pictures with pictures.
+    # There are fewer pictures than values, so the components come from the small product of pictures with pictures.
     variance, mixing = np.linalg.eigh((vectors @ vectors.T).astype(np.float64) / len(vectors))
     variance, mixing = variance[::-1][:length], mixing[:, ::-1][:, :length]
     if not variance[0] > _ALIKE:

@@ -1,4 +1,4 @@
-"""The channel to the autopilot: what is told to it of every event, and what it tells us."""
+"""The channel to the autopilot: tells it of every event, and gives what it says of its vehicle."""
 
 import logging
 from dataclasses import replace
@@ -12,15 +12,15 @@ from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.types import FixReport, Vehicle
 
-# A fix has left a fraction of a millisecond after it was handed over, if anybody is there to take it: so long the loop
-# waits for it, so that what the log says of the fix is so.
+# Where an autopilot listens, a fix leaves within a fraction of a millisecond. The loop waits for that, at most so long,
+# so that the log can tell what became of the fix.
 _SETTLED_WITHIN_S = 0.02
 
 _log = logging.getLogger(__name__)
 
 
 class Mood(Enum):
-    """How much an announcement matters to people on the ground."""
+    """Importance of an announcement to people on the ground."""
 
     NOTE = auto()
     WARNING = auto()
@@ -30,15 +30,15 @@ _SEVERITY = {Mood.NOTE: messages.Severity.INFO, Mood.WARNING: messages.Severity.
 
 
 class NoAutopilot:
-    """Nobody to tell: what a `ToAutopilot` is where there is no link."""
+    """Stands in for a `ToAutopilot` where there is no link."""
 
     summary = None
 
     def vehicle(self) -> Vehicle | None:
-        """Know nothing."""
+        """Return None: nothing is known."""
 
     def told(self, event: Recognition, used_mah: float) -> Recognition:
-        """Say of an accepted match that its fix has nowhere to go."""
+        """Return the event, with a report that the fix of an accepted match was not sent."""
         return replace(event, fix=FixReport(_name(event), False, "there is no link")) if event.accepted else event
 
     def announce(self, mood: Mood, text: str) -> None:
@@ -49,8 +49,8 @@ class NoAutopilot:
 
 
 class ToAutopilot:
-    """Tells an autopilot over an open link. With `send_fixes` an accepted match with a position is a fix; `cores` are
-    those of the board."""
+    """Tells an autopilot of events over an open link. With `send_fixes` an accepted match with a position is sent as a
+    fix; `cores` is the number of the board's cores."""
 
     def __init__(self, link: Link, *, send_fixes: bool, cores: int, clock: Clock) -> None:
         self._link, self._send_fixes, self._cores, self._clock = link, send_fixes, cores, clock
@@ -58,7 +58,7 @@ class ToAutopilot:
 
     @property
     def summary(self) -> str:
-        """Say what became of the fixes so far, in a few words."""
+        """Counts of the fixes so far, in a few words: sent, taken, too late."""
         stats = self._link.stats()
         sent = f"{stats.fixes_sent} fixes sent"
         taken = f"{stats.acks.get('ACCEPTED', 0)} taken"
@@ -66,12 +66,14 @@ class ToAutopilot:
         return ", ".join(filter(None, (sent, taken, late)))
 
     def vehicle(self) -> Vehicle | None:
-        """Give what the autopilot last said of its vehicle."""
+        """Return the autopilot's last report of its vehicle, None where it has given no position."""
         return self._link.vehicle()
 
     def told(self, event: Recognition, used_mah: float) -> Recognition:
-        """Tell the autopilot of an event; gives the event with what became of its fix, and of the one before it.
-        `used_mah` is what the board has drawn so far."""
+        """Tell the autopilot of an event; return the event with reports of its fix and of the fix before it.
+
+        `used_mah` is the charge that the board has drawn so far.
+        """
         last = _reported(*self._last) if self._last else None
         fix = self._fixed(event) if event.accepted else None
         now_s = self._clock.mono_s()
@@ -84,11 +86,11 @@ class ToAutopilot:
         return replace(event, fix=fix, last_fix=last)
 
     def announce(self, mood: Mood, text: str) -> None:
-        """Say something to people on the ground."""
+        """Send a text to people on the ground."""
         self._link.send(messages.status_text(_SEVERITY[mood], f"edgevpr: {text}"))
 
     def report(self, healthy: bool, load: MachineLoad, temperature_c: float | None) -> None:
-        """Report how this companion is, once a second."""
+        """Report the state of this companion computer, once a second."""
         self._link.set_health(messages.Health.ACTIVE if healthy else messages.Health.CRITICAL)
         self._link.send(
             messages.computer_status(
@@ -97,7 +99,7 @@ class ToAutopilot:
         )
 
     def _fixed(self, event: Recognition) -> FixReport:
-        """Send the fix of an accepted match, where there is one."""
+        """Send the fix of an accepted match, if it has one, and report what became of it."""
         if event.position is None:
             return FixReport(_name(event), False, "the place has no position")
         if not self._send_fixes:
@@ -105,7 +107,7 @@ class ToAutopilot:
         here = event.position
         try:
             fix = messages.Fix(here.lat_deg, here.lon_deg, event.accuracy_m, event.frame.t_mono_s)
-        except ValueError as error:  # another program wrote nonsense into the map
+        except ValueError as error:  # another program wrote an invalid position
             _log.warning("place %d: %s; no fix is sent", event.best.place.place_id, error)
             return FixReport(_name(event), False, str(error))
         sending = self._link.send_fix(fix)

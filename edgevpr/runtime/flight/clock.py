@@ -1,4 +1,4 @@
-"""The times that a flight lives by, in one value: a test, or a replay, hands in its own."""
+"""The clocks of a flight in one value: a test, or a replay, hands in its own."""
 
 import time
 from collections.abc import Callable
@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Clock:
-    """Give seconds: `mono_s` since the start of the machine (which every frame and message of a flight is stamped by),
-    `utc_s` since 1970, `process_cpu_s` of all threads and `thread_cpu_s` of the one that asks. `sleep` waits."""
+    """Clocks in seconds: `mono_s` since the start of the machine, which stamps every frame and message of a flight;
+    `utc_s` since 1970; `process_cpu_s` CPU time of all threads; `thread_cpu_s` that of the calling thread. `sleep`
+    waits."""
 
     mono_s: Callable[[], float] = time.monotonic
     utc_s: Callable[[], float] = time.time

@@ -1,4 +1,4 @@
-"""A flight with everything that has been opened for it: the listeners are wired to the loop, and it turns."""
+"""A flight: wires the listeners to the loop, with everything that has been opened for it, and runs the loop."""
 
 from dataclasses import dataclass
 
@@ -22,7 +22,7 @@ from edgevpr.runtime.recognise.recogniser import Recogniser
 
 @dataclass(frozen=True, slots=True)
 class Flown:
-    """What a flight came to: counts of its events, and `totals` of what it took (see `FlightMeter.totals`)."""
+    """Result of a flight: counts of its events, and `totals` of what it took (see `FlightMeter.totals`)."""
 
     queries: int
     accepted: int
@@ -31,7 +31,7 @@ class Flown:
 
 
 def rate_hz(config: Config, recogniser: Recogniser) -> float:
-    """Say how often a place is asked for: as often as the configuration says, else as the board's profile does."""
+    """Return the queries a second: the configuration's figure, else that of the board's profile."""
     return config.source.rate_hz or recogniser.meter.board.rate_hz
 
 
@@ -48,10 +48,10 @@ def fly(
     clock: Clock | None = None,
     meter: FlightMeter | None = None,
 ) -> Flown:
-    """Fly until the source has ended or `stop` is asked.
+    """Fly until the source has ended or `stop` is asked for.
 
-    `learner` makes places (None: nothing is learnt); `smaller_forms` of the index are what the governor may take.
-    `clock` and `meter` are the real ones unless given.
+    `learner` makes places (None: nothing is learnt); `smaller_forms` are the forms of the index that the governor may
+    change to. `clock` and `meter` are the real ones unless given.
     """
     clock = clock or Clock()
     if meter is None:

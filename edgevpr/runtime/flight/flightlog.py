@@ -1,4 +1,5 @@
-"""The flight log: one JSON object a line, appended. A full disk or a pulled card costs lines, never the flight."""
+"""The flight log: one JSON object a line, appended. A full disk or a pulled card loses lines, but never ends the
+flight."""
 
 import json
 import logging
@@ -25,15 +26,15 @@ _SYNC_EVERY_S = 1.0
 class FlightLog:
     """An open flight log; `path=None` writes nothing. Close it (it is a context manager).
 
-    `state` is None while lines arrive, else a sentence that says why they do not; `lost_lines` counts those that are
-    missing. Every write tries again, and the first one that succeeds is preceded by a line of kind "gap".
+    `state` is None while lines are written, else a sentence that says why they are not. `lost_lines` counts the missing
+    lines. Every write tries again, and the first one that succeeds is preceded by a line of kind "gap".
     """
 
     def __init__(
         self, path: str | Path | None, clock: Callable[[], float] = time.monotonic, wait: bool = False
     ) -> None:
-        """Open for appending. Raises EdgevprError where the file cannot be opened; with `wait`, for a service that may
-        be started again in the air, it is tried again with every line instead."""
+        """Open for appending. Raises EdgevprError where the file cannot be opened. With `wait`, for a service that may
+        restart in the air, every line tries to open the file again instead."""
         self.path = path
         self.state: str | None = None
         self.lost_lines = 0
@@ -81,7 +82,7 @@ class FlightLog:
             self._say_recovered()
 
     def close(self) -> None:
-        """Bring everything to the disk. A failure is said, not raised."""
+        """Bring everything to the disk. A failure is logged, not raised."""
         if self._file is None:
             return
         try:
@@ -99,7 +100,7 @@ class FlightLog:
     def _lost_one(self, error: OSError) -> None:
         self.lost_lines += 1
         self._note_trouble(error)
-        # The medium may be another one when it comes back: it is opened anew.
+        # The medium may be another one when it comes back, so the file is opened anew.
         if self._file is not None:
             with suppress(OSError):
                 self._file.close()
@@ -120,7 +121,7 @@ class FlightLog:
 
 
 def start_fields(config: Config, board_name: str, spec: TechniqueSpec) -> dict[str, Any]:
-    """What the first line of a flight says, of kind "start": who flies with what, and how it was set."""
+    """Return the fields of a flight's first line, of kind "start": version, technique, board, map and configuration."""
     return {
         "version": __version__,
         "technique": spec.name,
@@ -132,7 +133,7 @@ def start_fields(config: Config, board_name: str, spec: TechniqueSpec) -> dict[s
 
 
 def read_log(path: str | Path) -> Iterator[dict[str, Any]]:
-    """The lines of a flight log as dicts, in order. A line that was cut (battery pulled) is left out."""
+    """Yield the lines of a flight log as dicts, in order. A line that was cut (battery pulled) is left out."""
     with open(path, "rb") as handle:
         for line in handle:
             try:
@@ -144,7 +145,7 @@ def read_log(path: str | Path) -> Iterator[dict[str, Any]]:
 
 
 def _open(path: str | Path) -> BinaryIO:
-    # Unbuffered: a line that has been written is out of this process, whatever happens to it next.
+    # Unbuffered: a line that has been written is safe even if this process is killed next.
     return open(path, "a+b", buffering=0)
 
 
@@ -157,7 +158,7 @@ def _append(file: BinaryIO, lines: bytes) -> None:
             lines = b"\n" + lines
     try:
         rest = memoryview(lines)
-        while rest:  # a disk with a little room left takes a part, and says only at the next part that it is full
+        while rest:  # a nearly full disk takes a part, and reports only at the next part that it is full
             rest = rest[file.write(rest) :]
     except OSError:
         with suppress(OSError):
@@ -168,12 +169,12 @@ def _append(file: BinaryIO, lines: bytes) -> None:
 def _line(kind: str, fields: dict[str, Any]) -> bytes:
     now = datetime.now(timezone.utc).isoformat(timespec="milliseconds").replace("+00:00", "Z")
     text = json.dumps(_plain({"kind": kind, "time": now, **fields}), ensure_ascii=False, allow_nan=False)
-    # What is no UTF-8 (a file name from elsewhere) becomes a \u escape, which JSON reads back as it was.
+    # Text that is not UTF-8 (a foreign file name) becomes a \u escape, which JSON reads back unchanged.
     return text.encode("utf-8", "backslashreplace") + b"\n"
 
 
 def _plain(value: Any) -> Any:
-    """`value` in JSON's types."""
+    """Return `value` in JSON's types."""
     if value is None or isinstance(value, (bool, int, str)):
         return value
     if isinstance(value, float):
@@ -190,7 +191,8 @@ def _plain(value: Any) -> Any:
 
 
 def _readable(value: float) -> float | None:
-    """Seven decimals (a centimetre of latitude, and what MAVLink carries) or seven digits, whichever is more."""
+    """Round to seven decimals (a centimetre of latitude, and what MAVLink carries) or seven digits, whichever is
+    more."""
     if not math.isfinite(value):
         return None
     return round(value, 7) if abs(value) >= 1 else float(f"{value:.7g}")

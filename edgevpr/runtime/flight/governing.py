@@ -1,4 +1,4 @@
-"""Doing what the governor says: another rate, fewer candidates, another form of the index."""
+"""Applying the governor's changes: another rate, fewer candidates, another form of the index."""
 
 import logging
 from dataclasses import asdict
@@ -15,14 +15,14 @@ from edgevpr.runtime.recognise.opening import take_form
 from edgevpr.runtime.recognise.recogniser import Recogniser
 
 GOVERN_S = 1.0
-_RELOAD_S = 10.0  # between two tries to load an index that could not be loaded
+_RELOAD_S = 10.0  # between two tries to load a lost index
 
 _log = logging.getLogger(__name__)
 
 
 class Governing:
-    """Keeps a recogniser and its pace within the limits of the board. What is lowered, or is back, is logged and said
-    once. `smaller_forms` of the index may be taken (see `TechniqueSpec`)."""
+    """Keeps a recogniser and its pace within the limits of the board. Every change, down or back, is logged and
+    announced once. `smaller_forms` are the forms of the index that may be taken (see `TechniqueSpec`)."""
 
     def __init__(
         self,
@@ -40,18 +40,18 @@ class Governing:
         self._meter, self._flight_log, self._autopilot, self._clock = meter, flight_log, autopilot, clock
         self._index_mb = {recogniser.technique.spec.form: recogniser.index.nbytes / 1e6}
         self._governor = _governor(recogniser, pace, smaller_forms, self._index_mb)
-        self._wanted_form: str | None = None  # one that could not be loaded
+        self._wanted_form: str | None = None  # a form that could not be loaded
         self._reload_due_s = 0.0
 
     @property
     def held(self) -> str | None:
-        """Say what is lowered to keep to the board's limits."""
+        """Settings that are lowered to keep to the board's limits, in a few words; None where none is."""
         what = lowered(self._governor.setting, self._governor.asked)
         return f"held to {what}" if what else None
 
     def look(self) -> None:
-        """Look at what the flight takes, once a second, and change what must be changed."""
-        if self._wanted_form:  # what a flight takes that recognises nothing says nothing
+        """Look at the load of the flight, once a second, and change the settings if needed."""
+        if self._wanted_form:  # without an index nothing is recognised, and the load tells nothing
             if self._clock.mono_s() >= self._reload_due_s:
                 self._load(self._wanted_form)
             return
@@ -67,8 +67,8 @@ class Governing:
             self._load(change.after.form)
 
     def _load(self, form: str) -> None:
-        """Load the index in another form. Where the map cannot be read any more, nothing is recognised, which is said,
-        and it is tried again and again: it may come back."""
+        """Load the index in another form. Where the map cannot be read any more, nothing is recognised; this is
+        announced, and loading is tried again and again, since the map may come back."""
         first = self._wanted_form is None
         try:
             take_form(self._recogniser, self._config, form)
@@ -82,7 +82,7 @@ class Governing:
             return
         self._wanted_form = None
         self._index_mb[form] = self._recogniser.index.nbytes / 1e6
-        self._meter.reading()  # what loading took says nothing of flying
+        self._meter.reading()  # drop this reading: the load of loading says nothing of flying
 
     def _say(self, change: Change) -> None:
         said = self.held or "back to what was asked"
@@ -98,12 +98,12 @@ class Governing:
 def _governor(
     recogniser: Recogniser, pace: Pace, smaller_forms: tuple[str, ...], index_mb: dict[str | None, float]
 ) -> Governor:
-    """Make what keeps a recogniser within its board's profile. Candidates of a scan alone are none, and a sequence
-    needs queries as often as the map was made."""
+    """Make the governor that keeps a recogniser within its board's profile. A scan alone has no candidates to lower,
+    and a sequence needs queries as often as the map was made."""
     board, spec = recogniser.meter.board, recogniser.technique.spec
     hottest_c = limit_c() if board.thermal_limit_c is None else board.thermal_limit_c
     in_sequence = recogniser.search.length > 1
     asked = Setting(pace.rate_hz, recogniser.candidates, spec.form)
-    compares = spec.fine is not None and not in_sequence  # a sequence wants rivals compared
+    compares = spec.fine is not None and not in_sequence  # a sequence needs rivals compared
     settings = steps(asked, in_sequence, compares, smaller_forms)
     return Governor(Limits(board.cpu_share, board.memory_max_mb, hottest_c), settings, index_mb)

@@ -1,35 +1,36 @@
-"""Keeps CPU share, memory and temperature within the board's profile: asks less often, then compares fewer candidates,
-then takes a form of the index that costs less; and goes back the same way when there is room again.
+"""The governor keeps CPU share, memory and temperature within the board's profile. It first asks less often, then
+compares fewer candidates, then takes a form of the index that costs less. It goes back the same way when there is room
+again.
 
-Pure: readings and their times go in, changes come out. Two things keep it from swinging to and fro. It goes back only
-where what it measures, scaled to what would be asked, leaves a clear distance from every limit. And what it had to
-take back soon is tried again after a wait that doubles each time.
+Pure: readings and their times go in, changes come out. Two rules keep it from swinging to and fro. It goes back only if
+the reading, scaled to the higher setting, leaves a clear distance to every limit. A step back that soon had to be
+undone is tried again after a wait that doubles each time.
 """
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-_PATIENCE_S = 3.0  # a limit must be passed for so long
-_HEAT_PATIENCE_S = 20.0  # after a change: what has been heated cools slowly, and shows only then what it has helped
-_FIRST_WAIT_S, _LONGEST_WAIT_S = 6.0, 600.0  # of room on all sides, before it goes back
+_PATIENCE_S = 3.0  # a limit must be passed for so long before anything changes
+_HEAT_PATIENCE_S = 20.0  # after a change: a hot board cools slowly, so its effect shows late
+_FIRST_WAIT_S, _LONGEST_WAIT_S = 6.0, 600.0  # with room below all limits, before it goes back
 _TRIAL_S = 300.0  # going back was right if it lasts so long
-_ROOM = 0.85  # of a limit, for what would be asked
+_ROOM = 0.85  # of a limit, for the load expected at the higher setting
 _LATE = 0.95
 _COOLER_C = 5.0
 _NEAR_MEMORY, _MEMORY_ROOM = 0.95, 0.9
-_SLOWEST = 8  # times less often than asked
-# With fewer places to beat, a wrong one is more easily ahead, and the right one more often is not among them. With half
-# as many as usual (21, or 25 looking down) no wrong match of corridor or aerial_caliterra was accepted. A scan alone
-# says only which places are worth a comparison.
+_SLOWEST = 8  # times less often than asked, at most
+# With fewer candidates a wrong place is more easily ahead, and the right one is more often missing. With half the usual
+# number (21, or 25 looking down) no wrong match of the sets corridor and aerial_caliterra was accepted. Without any, a
+# scan alone says only which places are worth a comparison.
 _FEWEST_CANDIDATES = 20
-_OTHER_FORM = 2.0  # times the work, about, in the larger form
+_OTHER_FORM = 2.0  # the larger form takes about this many times the work
 
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """How places are recognised: so many times a second, so many places compared in full, in this form of the index
-    (None: the technique has none)."""
+    """Settings of recognition: queries a second, places compared in full, and the form of the index (None: the
+    technique has no forms)."""
 
     rate_hz: float
     candidates: int
@@ -38,7 +39,8 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What the process may take of all cores (0..1) and of memory, and the temperature of the board."""
+    """Limits: the process's share of all cores (0..1) and its memory, and the temperature of the board in degrees
+    Celsius."""
 
     cpu_share: float
     memory_max_mb: float
@@ -47,8 +49,9 @@ class Limits:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reading:
-    """What was measured since the last reading: the process's share of all cores (0..1), and the share of the time that
-    queries took, 0 where nothing kept them waiting; and what is so now, None where nothing says."""
+    """One measurement. `cpu_share`, of all cores (0..1), and `late_share` are since the last reading. `late_share` is
+    the share of the time that queries took, 0 where nothing kept them waiting. The rest is the present state, None
+    where unknown."""
 
     cpu_share: float
     late_share: float
@@ -59,7 +62,8 @@ class Reading:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """From one setting to another and why, `back` to more or not; both are the same where nothing is left to lower."""
+    """Change from one setting to another, with the reason. `back` is True towards what was asked; both settings are the
+    same where nothing is left to lower."""
 
     before: Setting
     after: Setting
@@ -68,9 +72,13 @@ class Change:
 
 
 def steps(asked: Setting, keeps_rate: bool, compares: bool, forms: Sequence[str] = ()) -> tuple[Setting, ...]:
-    """The settings from what is asked down to the least. `keeps_rate` where places are matched in sequences, which ask
-    as often as the map was made; `compares` where candidates are compared in full; `forms` are those that cost less
-    than the one asked for and that the map can serve, in the order in which they are to be taken."""
+    """Return the settings from what is asked down to the least.
+
+    The rate is halved down to an eighth, then the candidates as long as 20 are left, then the forms are taken.
+    `keeps_rate` is for sequences, which need queries as often as the map was made; `compares` tells that candidates are
+    compared in full. `forms` are those that the map can serve and that cost less than the one asked for, in the order
+    to take them.
+    """
     found = [asked]
     if not keeps_rate:
         while found[-1].rate_hz > asked.rate_hz / _SLOWEST:
@@ -83,7 +91,7 @@ def steps(asked: Setting, keeps_rate: bool, compares: bool, forms: Sequence[str]
 
 
 def lowered(setting: Setting, asked: Setting) -> str:
-    """What of a setting is not as asked, in a few words; "" where all of it is."""
+    """Name what a setting has other than asked, in a few words; "" where it is all as asked."""
     parts = (
         f"{setting.rate_hz:g} of {asked.rate_hz:g} Hz" if setting.rate_hz != asked.rate_hz else "",
         f"{setting.candidates} of {asked.candidates} candidates" if setting.candidates != asked.candidates else "",
@@ -93,8 +101,9 @@ def lowered(setting: Setting, asked: Setting) -> str:
 
 
 class Governor:
-    """Goes down and up `settings` (of `steps`). `index_mb` says what the index takes in each form that has been in
-    force so far: whoever loads it adds to it. Memory is saved by the form alone, whatever the load allows."""
+    """Goes down and up `settings` (of `steps`). `index_mb` is the size of the index in each form that has been in force
+    so far; the caller that loads a form adds its size. Only the form saves memory, so memory lowers the form whatever
+    the load allows."""
 
     def __init__(self, limits: Limits, settings: Sequence[Setting], index_mb: Mapping[str | None, float]) -> None:
         self._limits, self._settings, self._index_mb = limits, settings, index_mb
@@ -107,19 +116,20 @@ class Governor:
 
     @property
     def setting(self) -> Setting:
-        """What is in force."""
+        """Setting in force."""
         return self._setting(self._at, self._form_at)
 
     @property
     def asked(self) -> Setting:
-        """What is in force while nothing is short."""
+        """Setting in force while no limit is passed."""
         return self._settings[0]
 
     def look(self, now_s: float, reading: Reading) -> Change | None:
-        """Judge a reading; None: all stays as it is. Give it one a second or so, each of a whole number of queries."""
+        """Judge a reading; None: all stays as it is. Call it about once a second, each time with a reading over a whole
+        number of queries."""
         hot, over = self._load(reading)
         full = reading.rss_mb >= _NEAR_MEMORY * self._limits.memory_max_mb
-        less, more = self._next(1, 0), self._next(-1, 0) or self._next(-1, -1)  # the last: both hold the same form
+        less, more = self._next(1, 0), self._next(-1, 0) or self._next(-1, -1)  # load and memory may hold the same form
         smaller, larger = self._next(0, 1), self._next(0, -1)
         room = self._has_room(reading, self._setting(*more or (self._at, self._form_at)))
         memory_room = self._has_memory(reading, self._setting(*larger or (self._at, self._form_at)))
@@ -146,8 +156,10 @@ class Governor:
         return replace(chosen, form=self._forms[max(form_at, self._forms.index(chosen.form))])
 
     def _next(self, by: int, form_by: int) -> tuple[int, int] | None:
-        """The nearest step in this direction that changes anything: the form may be in force already for memory's
-        sake, or for the load's."""
+        """Return the nearest step in this direction that changes the setting, None where there is none.
+
+        A step may change nothing, where the memory or the load has put the form in force already.
+        """
         at, form_at = self._at + by, self._form_at + form_by
         while 0 <= at < len(self._settings) and 0 <= form_at < len(self._forms):
             if self._setting(at, form_at) != self.setting:
@@ -156,7 +168,7 @@ class Governor:
         return None
 
     def _load(self, reading: Reading) -> tuple[bool, str | None]:
-        """Whether it is too hot, and what is over its limit (None: nothing, memory apart)."""
+        """Tell whether it is too hot, and say which limit is passed (None: none, memory apart)."""
         limits, temperature_c = self._limits, reading.temperature_c
         if temperature_c is not None and temperature_c >= limits.temperature_c:
             return True, f"{temperature_c:.0f} degrees, and {limits.temperature_c:.0f} are the limit"
@@ -169,7 +181,7 @@ class Governor:
         return False, None
 
     def _has_room(self, reading: Reading, then: Setting) -> bool:
-        """Whether all limits would be left by a clear distance with this setting."""
+        """Tell whether all limits would be kept by a clear distance with this setting."""
         now, limits = self.setting, self._limits
         more = then.rate_hz / now.rate_hz * then.candidates / now.candidates
         more *= 1.0 if then.form == now.form else _OTHER_FORM
@@ -194,7 +206,7 @@ class Governor:
             return Change(before, before, f"{why}, and nothing is left to lower")
         if now_s - self._raised_s < _TRIAL_S:
             self._wait_s = min(2 * self._wait_s, _LONGEST_WAIT_S)
-            self._raised_s = -math.inf  # what else follows from the same trouble is no new failure
+            self._raised_s = -math.inf  # further steps down for the same reason are no new failure
         elif now_s - self._changed_s >= max(_TRIAL_S, 2 * self._wait_s):
             self._wait_s = _FIRST_WAIT_S
         return self._changed(now_s, step, why, back=False)
@@ -208,18 +220,19 @@ class Governor:
         self._at, self._form_at = step
         self._changed_s = now_s
         for held in (self._over, self._full, self._room, self._memory_room):
-            held.forget()  # what was measured before a change says nothing of what comes after it
+            held.forget()  # readings before a change say nothing of the time after it
         return Change(before, self.setting, why, back)
 
 
 class _Held:
-    """For how long something has been so."""
+    """Timer of a condition: for how long it has held."""
 
     def __init__(self) -> None:
         self._since_s: float | None = None
 
     def since(self, now_s: float, holds: bool) -> float:
-        """Seconds since the first reading of which it holds, 0 where it does not."""
+        """Return the seconds since the first reading at which the condition held without a break, 0 where it does
+        not."""
         if not holds:
             self._since_s = None
             return 0.0

@@ -1,4 +1,4 @@
-"""Telling the learner of every event, and everybody of what it has learnt."""
+"""The learner as a listener of the flight: it gets every event, and what it has learnt is logged."""
 
 import logging
 from dataclasses import asdict
@@ -18,7 +18,7 @@ class Learning:
         self._learner, self._flight_log, self._autopilot = learner, flight_log, autopilot
 
     def tell(self, event: Recognition) -> None:
-        """Make a place of the frame, where it is worth one; what is recognised from now on may be that place."""
+        """Make a place of the frame, where it is worth one; later frames may be recognised as that place."""
         well = self._learner.trouble is None
         place = self._learner.learn(event)
         if place:
@@ -34,7 +34,7 @@ class Learning:
 
 
 def say_learning_stopped(problem: str, flight_log: FlightLog, autopilot: Autopilot) -> None:
-    """Tell everybody that nothing more is learnt, and the log why."""
+    """Announce that nothing more is learnt, and write the reason to the log."""
     _log.warning("nothing more is learnt: %s", problem)
     flight_log.write("learning stopped", problem=problem)
     autopilot.announce(Mood.WARNING, "nothing more is learnt, see its log")

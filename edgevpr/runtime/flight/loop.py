@@ -1,4 +1,4 @@
-"""The loop of a flight: it takes the newest frame, recognises it, and tells those who listen."""
+"""The loop of a flight: it takes the newest frame, recognises it, and tells the listeners."""
 
 import logging
 from collections.abc import Iterator, Sequence
@@ -18,7 +18,7 @@ from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.types import StageCost
 
-_TURN_S = 0.2  # the loop turns at least this often, frames or none
+_TURN_S = 0.2  # the loop turns at least this often, with or without frames
 
 _log = logging.getLogger(__name__)
 
@@ -32,11 +32,11 @@ class Observer(Protocol):
 
 
 class Stop:
-    """Says when a flight is to end: a signal handler. While a frame is recognised it ends at once, so that a long
-    comparison does not delay the end; else after the turn."""
+    """Signal handler that ends a flight. While a frame is recognised the flight ends at once, so that a long comparison
+    does not delay the end; otherwise it ends after the present turn of the loop."""
 
     class Now(BaseException):
-        """Raised where the flight is to end at once."""
+        """Raised to end the flight at once."""
 
     def __init__(self) -> None:
         self.asked = False
@@ -50,7 +50,7 @@ class Stop:
 
     @contextmanager
     def breaks_off(self) -> Iterator[None]:
-        """Let a signal break off what is done here."""
+        """Let a signal interrupt the work inside this context."""
         self._breakable = True
         try:
             yield
@@ -71,7 +71,7 @@ def loop(
     clock: Clock,
     stop: Stop,
 ) -> None:
-    """Turn until the source has ended or `stop` is asked."""
+    """Turn until the source has ended or `stop` is asked for."""
     try:
         while not (stop.asked or source.ended):
             vitals.beat()
@@ -91,7 +91,7 @@ def loop(
                 with stop.breaks_off():
                     event = recogniser.unread(problem) if problem else recogniser.step(frame, autopilot.vehicle())
                 _tell(_with_reading(event, reading.cost), autopilot, observers, meter)
-            governing.look()  # here, where each reading is of a whole number of queries
+            governing.look()  # here, so that each reading covers a whole number of queries
     except Stop.Now:
         pass
 
@@ -101,8 +101,8 @@ def _with_reading(event: Recognition, reading: StageCost) -> Recognition:
 
 
 def _tell(event: Recognition, autopilot: Autopilot, observers: Sequence[Observer], meter: FlightMeter) -> None:
-    """Tell the autopilot of an event, and with what became of its fix everybody else. A listener that fails is logged:
-    it must not end the flight."""
+    """Tell the autopilot of an event, then all observers, who also learn what became of its fix. A listener that fails
+    is logged: it must not end the flight."""
     meter.count(event)
     with meter.telling():
         try:

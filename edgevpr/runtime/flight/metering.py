@@ -1,4 +1,4 @@
-"""Metering of what a flight takes of its board while it flies: charge, cores, memory, heat."""
+"""Metering of what a flight takes of its board: charge, cores, memory, heat."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,8 +19,8 @@ from edgevpr.types import StageCost
 
 
 class FlightMeter:
-    """Counts from when it is made. `thermal` is what was last seen of the board's heat, and `queries_throttled` how
-    many queries were made while the board slowed itself down. `close` it when done."""
+    """Meter of a flight, from the moment it is made. `thermal` is the last look at the board's heat;
+    `queries_throttled` counts the queries made while the board slowed itself down. `close` it when done."""
 
     def __init__(
         self,
@@ -41,17 +41,18 @@ class FlightMeter:
 
     @property
     def age_s(self) -> float:
-        """Give the seconds since the last `reading`."""
+        """Seconds since the last `reading`."""
         return self._load.age_s
 
     @property
     def used_mah(self) -> float:
-        """Give what the board has drawn so far."""
+        """Charge that the board has drawn from the pack so far, mAh."""
         return self.totals()["used_mah"]
 
     @contextmanager
     def reading_frame(self, is_live: bool) -> Iterator[Stage]:
-        """Meter the reading of a frame. Of a live source it is mostly waiting for the next one: that is no work."""
+        """Meter the reading of a frame. Reading from a live source is mostly waiting for the next frame, and is no
+        work."""
         with stage(self._clock.mono_s, self._clock.process_cpu_s) as reading:
             yield reading
         if not is_live:
@@ -59,27 +60,31 @@ class FlightMeter:
 
     @contextmanager
     def working(self) -> Iterator[None]:
-        """Meter what the loop does with a frame, by its own thread's CPU time."""
+        """Meter the loop's work on a frame, by the CPU time of its own thread."""
         with stage(self._clock.mono_s, self._clock.thread_cpu_s) as work:
             yield
         self._load.busy(work.cost)
 
     @contextmanager
     def telling(self) -> Iterator[None]:
-        """Meter telling others what was found."""
+        """Meter the telling of others of an event."""
         with stage(self._clock.mono_s, self._clock.process_cpu_s) as told:
             yield
         self._energy.add(told.cost)
 
     def count(self, event: Recognition) -> None:
-        """Count what a frame took: reading it, and its walk."""
+        """Count what a frame took: reading, encoding and matching."""
         self._energy.add(event.steps.read, event.cost.whole)
         self.queries_throttled += event.is_query and bool(self.thermal.throttled)
 
     def totals(self) -> dict[str, float]:
-        """Sum up until now: `queries_throttled`; `used_mah`, what the board has drawn from the pack, idle all the time
-        and busy with this process (of other programs nothing is known); `process_mah`, the part that the process added;
-        `marginal_mah`, the part of it that the stages of its queries added. And the CPU-seconds of both."""
+        """Return the totals until now.
+
+        `used_mah` is the charge that the board has drawn from the pack, idle all the time and busy with this process
+        (other programs are not counted). `process_mah` is the part that the process added, and `marginal_mah` the part
+        of it that the stages of its queries added; `process_cpu_s` and `stages_cpu_s` are the CPU-seconds of both.
+        `elapsed_s` is the time, and `queries_throttled` a count.
+        """
         so_far, board = self._energy.so_far(), self._board
         process = StageCost(so_far.elapsed_s, so_far.process_cpu_s)
         process_j = marginal_energy_j(board.idle_w, board.full_w, process.utilisation(board.cores), so_far.elapsed_s)
@@ -98,11 +103,11 @@ class FlightMeter:
         self.thermal = self._watch.look()
 
     def heat_fields(self) -> dict[str, Any]:
-        """Give for the log: temperature, frequency, whether the board slows itself down, and why."""
+        """Return the fields of the log: temperature, frequency, whether the board slows itself down, and why."""
         return asdict(self.thermal)
 
     def reading(self) -> Reading:
-        """Give for the governor what was so since the last reading."""
+        """Return the governor's reading: the load since the last one, and the present memory and heat."""
         cpu_share, late_share = self._load.look()
         return Reading(
             cpu_share=cpu_share,
@@ -113,7 +118,7 @@ class FlightMeter:
         )
 
     def close(self) -> None:
-        """Let go of the sensors."""
+        """Release the sensors."""
         self._watch.close()
 
     def _mah(self, energy_j: float) -> float:

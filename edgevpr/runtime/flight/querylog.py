@@ -1,4 +1,4 @@
-"""What the flight log says of every event."""
+"""The lines of the flight log for events."""
 
 from edgevpr.frames.source import Source
 from edgevpr.runtime.flight.flightlog import FlightLog
@@ -8,7 +8,7 @@ from edgevpr.runtime.recognise.recognition import Recognition, fields_of
 
 
 class QueryLog:
-    """Writes a line for every event: of kind "query", or "unusable" for a frame that never became one."""
+    """Writes a line for every event: of kind "query", or "unusable" for a frame that never became a query."""
 
     def __init__(self, flight_log: FlightLog, source: Source, meter: FlightMeter, tally: Tally) -> None:
         self._flight_log, self._source, self._meter, self._tally = flight_log, source, meter, tally

@@ -1,4 +1,4 @@
-"""What systemd is told: ready, alive, stopping, and a line of status. Without systemd nothing is said.
+"""Messages to systemd: ready, alive, stopping, and a line of status. Without systemd nothing is sent.
 
 The protocol is sd_notify(3): `KEY=value` lines in one datagram to the socket that $NOTIFY_SOCKET names.
 """
@@ -32,9 +32,9 @@ def notify(**assignments: object) -> bool:
 
 
 def watchdog_interval_s() -> float | None:
-    """How often `notify(WATCHDOG=1)` is due: half the unit's WatchdogSec, as sd_watchdog_enabled(3) advises.
+    """Return the seconds after which `notify(WATCHDOG=1)` is due again, None where no watchdog waits for this process.
 
-    None where no watchdog waits for this process.
+    It is half the unit's WatchdogSec, as sd_watchdog_enabled(3) advises.
     """
     try:
         watched = int(os.environ.get("WATCHDOG_PID", os.getpid())) == os.getpid()

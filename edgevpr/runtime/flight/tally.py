@@ -11,15 +11,15 @@ _log = logging.getLogger(__name__)
 
 
 class Tally:
-    """Counts of a flight, told of every event: `queries` and how many of them were `accepted`; `unusable` frames that
-    never became a query; `failed` queries; and how many events have `failed_in_a_row` up to the last."""
+    """Counts the events of a flight: `queries` and how many of them were `accepted`; `unusable` frames, which never
+    became a query; `failed` queries; and `failed_in_a_row`, the latest events that all failed."""
 
     def __init__(self) -> None:
         self._trouble: str | None = None
         self.queries = self.accepted = self.unusable = self.failed = self.failed_in_a_row = 0
 
     def tell(self, event: Recognition) -> None:
-        """Count an event; what fails is said, once for all in a row that fail alike."""
+        """Count an event. A failure is logged, but only once for failures in a row with the same reason."""
         trouble = event.reason if event.failed else None
         if trouble and trouble != self._trouble:
             _log.warning("%s", trouble)
@@ -32,5 +32,5 @@ class Tally:
 
     @property
     def is_failing(self) -> bool:
-        """Say whether nothing has worked for too long."""
+        """True where the last `FAILURES_IN_A_ROW` events, or more, have all failed."""
         return self.failed_in_a_row >= FAILURES_IN_A_ROW

@@ -1,4 +1,4 @@
-"""How a flight is, told once a second, and the watchdog's beat."""
+"""The state of a flight, reported once a second, and the watchdog's beat."""
 
 import logging
 from collections.abc import Callable, Sequence
@@ -19,8 +19,9 @@ _log = logging.getLogger(__name__)
 
 
 class Vitals:
-    """Tells systemd that the loop turns and how it goes, the autopilot how this companion is, and everybody, once, when
-    the camera is lost or nothing can be recognised any more, and when that is over. `remarks` add to the status."""
+    """Tells systemd that the loop turns and how the flight goes, and the autopilot how this companion computer is. It
+    tells everybody, once, when the camera is lost or nothing can be recognised any more, and when that is over.
+    `remarks` are added to systemd's status."""
 
     def __init__(
         self,
@@ -40,7 +41,7 @@ class Vitals:
         self._is_lost = self._is_failing = False
 
     def beat(self) -> None:
-        """Do what is due."""
+        """Send the watchdog's beat and the report, where they are due."""
         now_s = self._clock.mono_s()
         if self._watchdog_s and now_s >= self._watchdog_due_s:
             notify(WATCHDOG=1)

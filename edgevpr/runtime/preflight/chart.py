@@ -27,7 +27,7 @@ def plot(estimate: Estimate, board: Board, path: Path) -> None:
     needs, projected = drawn.subplots(1, 2)
     _needs(needs, estimate, board)
     _projected(projected, estimate)
-    # Labels are placed by what is really drawn, so the layout must stand first.
+    # Labels are placed around what is really drawn, so the layout must be final first.
     drawn.draw_without_rendering()
     _label(needs, [(row.technique, row.flight_marginal_mah, row.process_ram_mb) for row in estimate.techniques])
     drawn.savefig(path, dpi=100)
@@ -100,7 +100,8 @@ def _projected(axes: "Axes", estimate: Estimate) -> None:
 
 
 def _label(axes: "Axes", points: Sequence[tuple[str, float, float]]) -> None:
-    """Write each name as near to its point as it covers no other name, no point and no edge; from afar with a line."""
+    """Write each name as near to its point as it covers no other name, point or edge; a name far away gets a line to
+    its point."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.transforms import Bbox
 
@@ -108,7 +109,7 @@ def _label(axes: "Axes", points: Sequence[tuple[str, float, float]]) -> None:
     frame = axes.get_window_extent(renderer)
     px = axes.figure.dpi / 72
     centres = axes.transData.transform([(x, y) for _, x, y in points])
-    axes.set(xlim=axes.get_xlim(), ylim=axes.get_ylim())  # lines to points move no limit
+    axes.set(xlim=axes.get_xlim(), ylim=axes.get_ylim())  # the lines to points must not change the limits
     taken = [Bbox.from_bounds(x - 3 * px, y - 3 * px, 6 * px, 6 * px) for x, y in centres]
     taken += [text.get_window_extent(renderer) for text in axes.texts]
     for (name, x, y), (at_x, at_y) in zip(points, centres, strict=True):
@@ -133,8 +134,8 @@ def _label(axes: "Axes", points: Sequence[tuple[str, float, float]]) -> None:
 
 
 def _places(width_pt: float, height_pt: float) -> Iterator[tuple[float, float, bool]]:
-    """Lower left corners of a label, in points from what it names, and whether that is near: to the right first, then
-    round and further away."""
+    """Yield lower left corners of a label, in points (1/72 inch) from the point that it names, and whether that is
+    near: first to the right, then around and farther away."""
     for far in _FAR_PT:
         for way in range(_WAYS):
             turn = 2 * math.pi * way / _WAYS

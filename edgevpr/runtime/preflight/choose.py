@@ -1,5 +1,4 @@
-"""Which technique a board can afford: what was tried for a moment is held against the board, and the best that fits is
-taken."""
+"""Choice of a technique: the costs of a short trial are compared with the board, and the best that fits is taken."""
 
 import math
 from collections.abc import Mapping
@@ -15,7 +14,7 @@ from edgevpr.types import FIX_MAX_AGE_S
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fit:
-    """How a technique would sit on a board: `t_query_s` is what a query takes. It fits where there are no `shortfalls`;
+    """Fit of a technique on a board; `t_query_s` is the time of one query. It fits where there are no `shortfalls`;
     `remedies` would make it fit."""
 
     t_query_s: float
@@ -28,17 +27,18 @@ class Fit:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """The technique taken, and why, in one line."""
+    """The technique taken, and the reason in one line."""
 
     technique: str
     reason: str
 
 
 def fit(board: Board, costs: TechniqueCosts, places: int, rate_hz: float, budget_mb: float) -> Fit:
-    """Say whether a technique fits: the map in `budget_mb`, the process in its memory, the queries in the CPU's time.
+    """Check whether a technique fits: its map in `budget_mb`, its process in the board's memory, its queries in the
+    CPU's time.
 
-    A query is over before the next one begins and before its fix is too old to be sent, and all of them together take
-    `cpu_share` of the cores at most.
+    A query must be over before the next one begins and before its fix is too old to be sent. All queries together may
+    take `cpu_share` of the cores at most.
     """
     encode, match = costs.encode, costs.match(places)
     usable_cores = board.cores * board.cpu_share
@@ -79,12 +79,12 @@ def fit(board: Board, costs: TechniqueCosts, places: int, rate_hz: float, budget
 
 
 def too_late(t_query_s: float) -> str:
-    """Say that none of the fixes of such slow queries would be sent."""
+    """Say that no fix of such slow queries would be sent."""
     return f"a query takes {t_query_s:.1f} s, and no fix of a frame older than {FIX_MAX_AGE_S:g} s is ever sent"
 
 
 def require_technique(board: Board) -> None:
-    """Raise ConfigError for a board whose profile names a technique that is not there."""
+    """Raise ConfigError for a board whose profile names a technique that does not exist."""
     if board.technique is not None and not techniques.is_known(board.technique):
         raise ConfigError(
             f"The profile of {board.title} names the technique `{board.technique}`, which is not there: use one of "
@@ -93,9 +93,11 @@ def require_technique(board: Board) -> None:
 
 
 def preferred(board: Board, camera: str | None = None) -> tuple[str, ...]:
-    """List what is tried for a board where no technique is named, best first: its own, then those offered to any board.
-    For a `camera` that looks down ("nadir") they are those that can be told so. Raises ConfigError for a technique of
-    the board that is not there."""
+    """List the techniques to try for a board where none is named, best first: its own, then those offered to any board.
+
+    For a `camera` that looks down ("nadir") only techniques with a camera setting are listed. Raises ConfigError where
+    the board's own technique does not exist.
+    """
     require_technique(board)
     own = () if board.technique is None else (board.technique,)
     names = (*own, *(name for name in techniques.AUTOMATIC if name not in own))
@@ -103,9 +105,9 @@ def preferred(board: Board, camera: str | None = None) -> tuple[str, ...]:
 
 
 def choose(board: Board, costs: Mapping[str, TechniqueCosts], places: int, rate_hz: float, budget_mb: float) -> Choice:
-    """Take the first technique that fits: `costs`, as they are on `board`, come best technique first.
+    """Take the first technique that fits. `costs` are those on `board`, best technique first.
 
-    Raises UsageError, saying what would make one fit, where none does.
+    Raises UsageError where none fits; it says what would make one fit.
     """
     passed_over, remedies = [], []
     for name, each in costs.items():
@@ -122,7 +124,7 @@ def choose(board: Board, costs: Mapping[str, TechniqueCosts], places: int, rate_
 
 
 def described(board: Board, found: Fit, places: int, rate_hz: float, budget_mb: float) -> str:
-    """A fit in one line of figures, with what is wrong and what would mend it where it does not fit."""
+    """Describe a fit in one line of figures; where the technique does not fit, add why and what would make it fit."""
     figures = (
         f"{places} places take {found.map_ram_mb:.1f} of {budget_mb:.1f} MB, the process {found.process_ram_mb:.0f} of "
         f"{board.memory_max_mb:.0f} MB, and {_rounded_down(found.reachable_hz):g} Hz of {rate_hz:g} are reached with "
@@ -135,6 +137,6 @@ def described(board: Board, found: Fit, places: int, rate_hz: float, budget_mb: 
 
 
 def _rounded_down(value: float) -> float:
-    """To two digits, and never up: what is said to be reached is reached."""
+    """Round down to two digits, so that a rate said to be reached is really reached."""
     step = 10.0 ** (math.floor(math.log10(value)) - 1)
     return math.floor(value / step) * step

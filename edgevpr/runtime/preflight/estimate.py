@@ -1,4 +1,4 @@
-"""What each technique will cost a board in a flight, said before take-off, from what was measured on some machine.
+"""Estimate of a flight: what each technique will cost a board, before take-off, from costs measured on some machine.
 
 `dataclasses.asdict` of an Estimate is ready for JSON.
 """
@@ -18,9 +18,9 @@ from edgevpr.runtime.preflight.trial import Trial
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightPlan:
-    """What is asked of the board: places in the map, queries a second, minutes in the air, from which pack, how much
-    memory the map's index may take, and what the aircraft draws to hover (None: not said). Raises UsageError for a
-    number that is none."""
+    """Plan of a flight: places in the map, queries a second, minutes in the air, the pack, the memory that the map's
+    index may take, and the watts that the aircraft draws to hover (None: not given). Raises UsageError for a number
+    that is not finite and above 0."""
 
     places: int
     rate_hz: float
@@ -47,12 +47,13 @@ class FlightPlan:
 class TechniqueEstimate:
     """One technique, in one form, on the board.
 
-    `process_ram_mb` is the peak, with the map; `encode_ram_mb` what encoding takes of it for a moment. `query_mah` is
-    (a + s U) t over encoding and matching, `query_marginal_mah` is s U t (5.6); `flight_mah` is what the board draws
-    from start to end, `flight_marginal_mah` what the queries add to it (5.7); all of it from the pack. `lost_min` are
-    the minutes that a full pack hovers less with the board on board, `lost_marginal_min` those of them that recognising
-    costs (None: the hover power is not known). `shortfalls` say why it does not fit, `remedies` what would make it fit.
-    `measured` is whether its costs were stored, not tried just now.
+    `process_ram_mb` is the peak with the map, and `encode_ram_mb` the part of it that encoding takes for a moment.
+    `query_mah` is (a + s U) t over encoding and matching, and `query_marginal_mah` is s U t (5.6). `flight_mah` is what
+    the board draws from start to end, and `flight_marginal_mah` what the queries add to it (5.7). All charges are drawn
+    from the pack. `lost_min` is how many minutes less a full pack hovers with the board on the aircraft, and
+    `lost_marginal_min` the part of them that recognising costs (None: the hover power is unknown). `shortfalls` say why
+    the technique does not fit, `remedies` what would make it fit. `measured` is True for stored costs, False for costs
+    tried just now.
     """
 
     technique: str
@@ -83,11 +84,14 @@ class TechniqueEstimate:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Estimate:
-    """All techniques on one board. `times` is "measured" (on this machine, for this machine), "scaled" (from this
-    machine to the board, by `ratios`) or "unscaled" (this machine's, for want of a figure); `measured_on` is the date
-    of stored figures. `recommended` is the best that fits (None: none does), and `reason` says why in a sentence;
-    `notes` say what to know about it; `unusable` are techniques that cannot be used here, and why; `weights` say which
-    a network has."""
+    """All techniques on one board.
+
+    `times` is "measured" (on this machine, for this machine), "scaled" (from this machine to the board, by `ratios`) or
+    "unscaled" (this machine's, since a figure is missing). `measured_on` is the date of stored figures. `recommended`
+    is the best technique that fits (None: none does), and `reason` says why in a sentence. `notes` are remarks on the
+    estimate; `unusable` are techniques that cannot be used here, each with the reason; `weights` name the weights of
+    networks.
+    """
 
     board: str
     title: str
@@ -112,9 +116,11 @@ def estimate(
     map_technique: str | None = None,
     measured_on: str | None = None,
 ) -> Estimate:
-    """Estimate every technique of `trials`, best first, for a flight of `board`. They were made on the machine `here`,
-    and are paired with whether they were stored, on `measured_on`; a map that is there was built with
-    `map_technique`."""
+    """Estimate every technique of `trials`, best first, for a flight of `board`.
+
+    The trials were made on the machine `here`; each is paired with True if it was stored, on `measured_on`.
+    `map_technique` is the technique that an existing map was built with (None: there is no map).
+    """
     trials = list(trials)
     rows = tuple(
         _technique(trial, on_board(trial.costs, here, board), board, plan, stored)
@@ -147,7 +153,7 @@ def _technique(trial: Trial, costs: TechniqueCosts, board: Board, plan: FlightPl
     query = query_cost(costs.encode, costs.match(plan.places), board, plan.pack, plan.regulator_efficiency)
     flight_s = 60 * plan.flight_min
     marginal_mah = queries_ah(min(plan.rate_hz, found.reachable_hz) * flight_s, query.marginal_mah)
-    # 5.7 leaves out the idle power between two queries; the pack does not.
+    # Equation 5.7 leaves out the idle power between two queries; the pack supplies it all the same.
     idle_mah = 1000 * pack_ah(board.idle_w * flight_s, plan.pack, plan.regulator_efficiency)
     lost_min, lost_marginal_min = _lost_min(plan, idle_mah, marginal_mah)
     return TechniqueEstimate(
@@ -179,7 +185,7 @@ def _technique(trial: Trial, costs: TechniqueCosts, board: Board, plan: FlightPl
 
 
 def _lost_min(plan: FlightPlan, idle_mah: float, marginal_mah: float) -> tuple[float | None, float | None]:
-    """Minutes of hovering on a full pack that the board costs, and those of them that recognising does."""
+    """Return the minutes of hovering on a full pack that the board costs, and those of them that recognising costs."""
     if plan.hover_w is None:
         return None, None
     w_per_mah = plan.pack.nominal_v / 1000 * 60 / plan.flight_min
@@ -193,7 +199,7 @@ def _lost_min(plan: FlightPlan, idle_mah: float, marginal_mah: float) -> tuple[f
 def _recommended(
     rows: tuple[TechniqueEstimate, ...], board: Board, plan: FlightPlan, map_technique: str | None
 ) -> tuple[str | None, str]:
-    """The best that fits, of those that the map can serve, and why. `rows` come best first."""
+    """Return the best technique that fits, of those that the map can serve, and the reason. `rows` come best first."""
     usable = [row for row in rows if map_technique in (None, row.name)]
     fitting = [row for row in usable if row.fits]
     served = f"the map was built with {map_technique}, and " if map_technique else ""
@@ -203,7 +209,7 @@ def _recommended(
         remedies = [f"{row.technique} {' or '.join(row.remedies)}" for row in usable if row.remedies]
         hint = f"what would fit is {', or '.join(remedies[:3])}" if remedies else "use a larger board"
         return None, f"None: {served}nothing that was tried fits {board.title}; {hint}."
-    # `rows` are in the order of the registry; the board's own technique goes before it.
+    # `rows` are in the order of the registry; the board's own technique goes first.
     best = min(fitting, key=lambda row: row.name != board.technique)
     if map_technique or best.name != board.technique:
         why = f"it is the first, in order of preference, of the {len(fitting)} that fit"

@@ -1,4 +1,4 @@
-"""An estimate as plain text of at most 120 columns: two tables, a line for each technique, and what to know."""
+"""An estimate as plain text of at most 120 columns: two tables, a line for each technique, and notes."""
 
 from edgevpr.helpers.tables import aligned, wrapped
 from edgevpr.runtime.preflight.estimate import Estimate, TechniqueEstimate
@@ -9,7 +9,8 @@ _LOSES = ("min lost", "marginal")
 
 
 def format_table(estimate: Estimate) -> str:
-    """The estimate as text: what each technique needs, what it draws, why (not), what is recommended, and the notes."""
+    """Format the estimate as text: what each technique needs and draws, why any does not fit, notes, and what is
+    recommended."""
     plan = estimate.plan
     since = f" on {estimate.measured_on}" if estimate.measured_on else ""
     hovers = f", hovering at {plan.hover_w:g} W" if plan.hover_w else ""
@@ -38,7 +39,7 @@ def format_table(estimate: Estimate) -> str:
 
 
 def unusable_lines(unusable: dict[str, str]) -> list[str]:
-    """Why techniques cannot be used, once for all of the same reason."""
+    """Say why techniques cannot be used, once for all with the same reason."""
     lines = []
     for why in dict.fromkeys(unusable.values()):
         names = ", ".join(name for name, each in unusable.items() if each == why)

@@ -1,4 +1,4 @@
-"""What `edgevpr models` does with networks: list them, try one, add one.
+"""Networks, as `edgevpr models` handles them: list them, try one, add one.
 
 `dataclasses.asdict` of every result is ready for JSON.
 """
@@ -29,8 +29,8 @@ _FRAME = (480, 640)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Listed:
-    """One card. `ok` is whether card and file agree, `problem` in one sentence why not; `techniques` use it unless told
-    otherwise. Of a card that cannot be read nothing else is known."""
+    """One card. `ok` tells whether card and file agree, and `problem` why not, in one sentence. `techniques` use it
+    unless told otherwise. For a card that cannot be read, nothing else is known."""
 
     name: str
     ok: bool
@@ -46,9 +46,9 @@ class Listed:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Verified:
-    """A network that works here. `shapes` of its outputs; `vector_length` of the technique of its own (None: it has
-    none); milliseconds for an image of 640x480, the quickest of ten; megabytes that onnxruntime took by being imported,
-    and that the network took beside it."""
+    """A network that works here. `shapes` are those of its outputs, and `vector_length` that of its own technique
+    (None: it has none). `image_ms` is the quickest of ten images of 640x480. `runtime_mb` is the memory that importing
+    onnxruntime took, and `network_mb` what the network took beside it, in MB."""
 
     name: str
     title: str
@@ -62,13 +62,16 @@ class Verified:
 
 
 def list_models() -> tuple[Listed, ...]:
-    """Every card, whether or not it can be read; nothing is run."""
+    """List every card, whether or not it can be read; nothing is run."""
     return tuple(_listed(name) for name in card_names())
 
 
 def verify(card: Card, threads: int = 1, learned: bool = True) -> Verified:
-    """`verify_here` in a process of its own, since what another network has loaded is not counted again, and a network
-    too large for the board ends that process and not ours. Raises ModelError where it does."""
+    """Run `verify_here` in a process of its own.
+
+    There no other network has loaded anything that would be missing from the figures, and a network too large for the
+    board ends that process and not ours. Raises ModelError where it does.
+    """
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
         try:
             return pool.submit(verify_here, card, threads, learned).result()
@@ -80,9 +83,11 @@ def verify(card: Card, threads: int = 1, learned: bool = True) -> Verified:
 
 
 def verify_here(card: Card, threads: int = 1, learned: bool = True) -> Verified:
-    """Open the network of a card, run it, and say what it takes. Raises ModelError, one sentence, for anything that
-    would keep it on the ground; with `learned` False not for the words of a VLAD head, which are learned on the network
-    once it has its place."""
+    """Open the network of a card, run it, and return what it takes.
+
+    Raises ModelError, one sentence, for anything that would keep it from flying. With `learned` False the words of a
+    VLAD head may be missing, since they are learned on the network after it has been added.
+    """
     rng = np.random.default_rng(0)
     before_mb = rss_mb()
     import_onnxruntime()
@@ -110,7 +115,8 @@ def verify_here(card: Card, threads: int = 1, learned: bool = True) -> Verified:
 
 
 def add(file: Path, card_path: Path, threads: int = 1) -> tuple[Verified, Path]:
-    """Copy a network and its card to the user's models folder, if it works; returns what was found, and the card there.
+    """Copy a network and its card to the user's models folder, if it works; return its figures and the path of the new
+    card.
 
     The hash of the card must be that of the file; a card without one gets it. Raises ModelError or ConfigError.
     """
@@ -122,7 +128,7 @@ def add(file: Path, card_path: Path, threads: int = 1) -> tuple[Verified, Path]:
             "right file, or correct the card."
         )
     target = own_models() / f"{card.name}.yaml"
-    # Tried where it is: the card's name for the file counts only in the folder that both are copied to.
+    # Try the file where it is: its name on the card counts only in the folder that both are copied to.
     tried = replace(card, sha256=found, path=file.absolute().with_name(target.name), file=file.name)
     verified = verify(tried, threads, learned=False)
     text = card_path.read_text("utf-8") if card.sha256 else card_text({**read_yaml(card_path), "sha256": found})
@@ -131,8 +137,11 @@ def add(file: Path, card_path: Path, threads: int = 1) -> tuple[Verified, Path]:
 
 
 def technique_with(name: str) -> tuple[str, dict[str, str]]:
-    """A technique, and its settings, that shows what the network of a card is worth: its own or, of one that gives
-    feature maps only, `rmac`, which needs nothing learned."""
+    """Return a technique and its settings that show the quality of a card's network.
+
+    It is the network's own technique, else `calc` for a network that makes descriptors, else `rmac`, which needs only
+    feature maps and nothing learned.
+    """
     card = load_card(name)
     if card.is_technique and not techniques.is_own(name):
         return name, {}
@@ -140,7 +149,7 @@ def technique_with(name: str) -> tuple[str, dict[str, str]]:
 
 
 def install(file: Path, sha256: str, card_path: Path, file_name: str, text: str) -> None:
-    """Put a file, by `file_name`, and then its card into a folder, each as a whole or not at all. Raises ModelError
+    """Put a file, under `file_name`, and then its card into a folder, each completely or not at all. Raises ModelError
     where another network has either name."""
     folder, target = card_path.parent, card_path.parent / file_name
     if card_path.exists() and card_path.read_text("utf-8") != text:
@@ -156,7 +165,7 @@ def install(file: Path, sha256: str, card_path: Path, file_name: str, text: str)
 
 
 def card_text(values: dict) -> str:
-    """A card as YAML, a line a key: what is JSON is YAML too."""
+    """Write a card as YAML, one line a key: JSON values are valid YAML."""
     return "".join(f"{key}: {json.dumps(value, ensure_ascii=False)}\n" for key, value in values.items())
 
 

@@ -1,4 +1,4 @@
-"""Every technique in every form that it has, for the commands that list them, and what cannot be used here and why."""
+"""Every technique in each of its forms, for the commands that list them, and why some cannot be used here."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from edgevpr.techniques import labelled
 
 @dataclass(frozen=True, slots=True)
 class Offer:
-    """A technique with its settings, one of which may be its form; `label` tells it from the others."""
+    """A technique with its settings, one of which may be its form; `label` tells it from other offers."""
 
     label: str
     name: str
@@ -25,8 +25,10 @@ class Offer:
 def offers(
     names: Iterable[str], forms: Iterable[str] = FORMS, settings: Mapping[str, Mapping[str, Any]] | None = None
 ) -> tuple[Offer, ...]:
-    """Each technique in each of `forms`, or once where it has none; `settings` by name. Raises UsageError for an
-    unknown name, and ModelError for a card that does not say what it must."""
+    """List each technique in each of `forms`, or once where it has none; `settings` are by technique name.
+
+    Raises UsageError for an unknown name, and ModelError for a card that is incomplete.
+    """
     found = []
     for name in names:
         own = dict((settings or {}).get(name, {}))
@@ -38,7 +40,10 @@ def offers(
 
 
 def usable(wanted: Iterable[Offer], board: Board | None = None) -> Iterator[tuple[Offer, Technique | ModelError]]:
-    """Make each technique, for `board`, or say why it cannot be used: that of all its forms once, with its name."""
+    """Make each technique for `board`, or give the error that says why it cannot be used.
+
+    An error is given once for all forms of a technique, under its name.
+    """
     refused = set()
     for offer in wanted:
         if offer.name in refused:

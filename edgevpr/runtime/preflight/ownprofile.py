@@ -1,4 +1,4 @@
-"""Writing a profile of this machine: what `edgevpr profile --detect` and `--measure` leave behind."""
+"""Writing a profile of this machine, for `edgevpr profile --detect` and `--measure`."""
 
 import sys
 from datetime import datetime
@@ -12,7 +12,7 @@ _ENDINGS = (".yaml", ".yml")
 
 
 def require_new_profile(path: Path) -> None:
-    """Raise UsageError where `write_profile` would not write."""
+    """Raise UsageError where `write_profile` could not write."""
     if path.suffix not in _ENDINGS:
         raise UsageError(f"{path}: a profile's name ends in .yaml: choose such a name.")
     require_folder(path)
@@ -21,7 +21,8 @@ def require_new_profile(path: Path) -> None:
 
 
 def write_profile(path: Path, text: str) -> None:
-    """Write a profile that is not there yet, as a whole. Raises EdgevprError where one has come meanwhile."""
+    """Write a profile that does not exist yet, completely or not at all. Raises EdgevprError where the file has
+    appeared meanwhile."""
     try:
         write_whole(path, lambda unfinished: unfinished.write_text(text, "utf-8"), instead=False)
     except FileExistsError:
@@ -29,8 +30,8 @@ def write_profile(path: Path, text: str) -> None:
 
 
 def measured_profile(figures: Path, score: MachineSpeed) -> tuple[Path | None, str]:
-    """Where this machine has a power meter: measure idle and load (minutes), and write a profile beside the file
-    `figures`. Returns where it is (None: no meter can be read), and a sentence. Raises MeterError."""
+    """Measure idle and load power (minutes), where this machine has a power meter, and write a profile beside the file
+    `figures`. Returns the path of the profile (None: no meter can be read) and a sentence. Raises MeterError."""
     from edgevpr.power.calibrate import LOADS, calibrate
     from edgevpr.power.detect import detect, profile_text
     from edgevpr.power.sensors import find_meters

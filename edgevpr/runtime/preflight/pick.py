@@ -1,4 +1,4 @@
-"""Picking a technique where none is named, and saying whether the board can afford the one that flies."""
+"""Picking a technique where none is named, and telling whether the board can afford the one that flies."""
 
 import logging
 from collections.abc import Iterator
@@ -23,16 +23,20 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Outlook:
-    """What is flown with and why, in one line, and how long a query will take (None: it could not be tried)."""
+    """The technique that flies and why, in one line, and the seconds that a query will take (None: it could not be
+    tried)."""
 
     reason: str
     t_query_s: float | None
 
 
 def picked_technique(board_name: str, places: int, camera: str | None = None) -> str:
-    """Pick the best technique that the board can afford, for a `camera` that looks down or ahead; the reason is logged
-    in one line. Where it can afford none, the best is picked all the same, and the log says what it lacks: a map is
-    made once, and may be flown on a larger board. Raises ModelError where no technique can be used at all."""
+    """Pick the best technique that the board can afford, for a `camera` that looks down or ahead; log the reason in one
+    line.
+
+    Where the board can afford none, the best is picked all the same, and the log says what is lacking: a map is made
+    once, and may be flown on a larger board. Raises ModelError where no technique can be used at all.
+    """
     board, here = load_board(board_name), load_board("this")
     tried = _usable(board, preferred(board, camera), camera)
     costs = {name: on_board(cost, here, board) for name, cost in probe_each(tried)}
@@ -49,7 +53,7 @@ def picked_technique(board_name: str, places: int, camera: str | None = None) ->
 
 
 def outlook(recogniser: Recogniser, config: Config) -> Outlook:
-    """Say with what a configuration flies and why, and hold it against its board, tried here and now: no reason not to
+    """Say which technique flies and why, and try here and now whether its board can afford it. Never a reason not to
     fly."""
     spec, board = recogniser.technique.spec, recogniser.meter.board
     weights = weights_of(spec)
@@ -81,12 +85,13 @@ def _afforded(recogniser: Recogniser, config: Config, board: Board) -> tuple[str
 
 
 def camera_setting(name: str, camera: str | None) -> dict[str, str]:
-    """Tell a technique which way the camera looks, where it is known and the technique has a use for it."""
+    """Return the setting that tells a technique which way the camera looks, if that is known and the technique has such
+    a setting."""
     return {"camera": camera} if camera and "camera" in techniques.parameters(name) else {}
 
 
 def _usable(board: Board, names: tuple[str, ...], camera: str | None) -> Iterator[Technique]:
-    """Make each; a network that cannot be used here is passed over, and said."""
+    """Make each technique; one whose network cannot be used here is passed over and logged."""
     for name in names:
         try:
             yield made_for(board, name, camera_setting(name, camera))

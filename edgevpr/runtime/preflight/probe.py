@@ -1,4 +1,4 @@
-"""What a technique costs on this machine: it is tried for a moment, on generated or on real pictures."""
+"""Costs of a technique on this machine: it is tried for a moment, on generated or on real pictures."""
 
 import math
 import sys
@@ -27,20 +27,20 @@ from edgevpr.types import NO_COST, Frame, StageCost
 _ROUNDS = 3
 _PLACES = 6
 _SCANNED = 4096
-_SCANNED_BYTES = 8 << 20  # at most: on a small board this much is to spare before the map is loaded, and no more
-_ANY_PACK = Pack(cells=1, capacity_mah=1)  # seconds are wanted, not charge
+_SCANNED_BYTES = 8 << 20  # at most: a small board has no more to spare before the map is loaded
+_ANY_PACK = Pack(cells=1, capacity_mah=1)  # only seconds count here, not charge
 _LINK_MB = 13.0  # what importing pymavlink adds to the resident memory (measured on x86-64)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TechniqueCosts:
-    """What a technique costs on one machine: to encode a frame, to compare it in full with one place (read from the map
-    file), bytes of a place in RAM and on disk, and the most memory that the process has resident, without a map
-    (`process_mb`); `encode_mb` of that is what encoding a frame takes for a moment (None: the kernel does not say).
-    `is_network` is whether its pictures go through a network.
+    """Costs of a technique on one machine: to encode a frame, to compare it in full with one place (read from the map
+    file), bytes of a place in RAM and on disk, and the peak resident memory of the process without a map
+    (`process_mb`). `encode_mb` is the part of that peak that encoding a frame takes for a moment (None: the kernel does
+    not say). `is_network` tells whether its pictures go through a network.
 
-    Where there are more than `candidates` places, all are scanned in RAM and only so many compared in full (None: the
-    technique has one stage, and compares all of them).
+    In a map of more than `candidates` places, all are scanned in RAM and only `candidates` are compared in full (None:
+    the technique has one stage, and compares all of them).
     """
 
     encode: StageCost
@@ -54,13 +54,13 @@ class TechniqueCosts:
     is_network: bool = False
 
     def match(self, places: int) -> StageCost:
-        """Cost of finding one query in a map of `places` places."""
+        """Return the cost of finding one query in a map of `places` places."""
         if self.candidates is None or places <= self.candidates:
             return self.match_per_place * places
         return self.match_per_place * self.candidates + self.scan_per_place * places
 
     def places_within(self, wall_s: float, cpu_s: float) -> float:
-        """How many places a map may have for a query to be found in it within both times."""
+        """Return how many places a map may have for a query to be found in it within both times, in seconds."""
         full = self.match_per_place
         in_full = min(wall_s / full.wall_s, cpu_s / full.cpu_s)
         if self.candidates is None or in_full < self.candidates:
@@ -71,7 +71,8 @@ class TechniqueCosts:
 
 
 def noise(count: int) -> list[np.ndarray]:
-    """Pictures of 640x480 in which every region says something, so that matching costs the most it can."""
+    """Make `count` pictures, uint8 (480, 640), in which every region has structure, so that matching costs the most it
+    can."""
     rng = np.random.default_rng(0)
     return [rng.integers(0, 256, (480, 640), np.uint8) for _ in range(count)]
 
@@ -83,12 +84,12 @@ def probe(
     wall_clock: Callable[[], float] = time.perf_counter,
     cpu_clock: Callable[[], float] = time.process_time,
 ) -> TechniqueCosts:
-    """Try a technique here and now: some pictures take the walk of a query, first with nothing to find, then in a small
-    map on disk, then in a large index.
+    """Try a technique here and now: some pictures go through the steps of a query, first with nothing to find, then in
+    a small map on disk, then in a large index.
 
     `images` (uint8, (H, W[, 3])) are all encoded, and the median counts, since a real picture may be quick or slow.
-    Without them there are a few of `noise`, all alike, and the quickest counts: what other programs take away at the
-    moment is no cost of the technique. Raises ModelError for a technique that makes nothing of a picture.
+    Without them a few pictures of `noise` are encoded, all alike, and the quickest counts: time that other programs
+    take is no cost of the technique. Raises ModelError for a technique that fails on a picture.
     """
     counted = _quickest if images is None else _median
     pictures = noise(_ROUNDS) if images is None else images
@@ -110,7 +111,7 @@ def probe(
     with TemporaryDirectory() as folder, PlaceMap.create(Path(folder) / "trial.gpkg", spec) as trial_map:
         peak_is_new = machine.forget_peak()
         before_mb = machine.rss_mb()
-        # The first time also starts threads and imports what is imported late.
+        # The first frame also starts threads and causes late imports.
         first = _stepped(walk(trial_map, empty_index(spec, 0, None), 1), frames[0])
         encode_mb = machine.peak_mb() - before_mb if peak_is_new else None
         for _ in range(_PLACES):
@@ -121,11 +122,11 @@ def probe(
         process_mb = machine.peak_mb() if peak_is_new else machine.rss_mb()
         large, fills = walk(trial_map, _many(technique, index), 1), length if length > 1 else 0
         asked = [replace(frames[i % len(frames)], t_mono_s=0.1 * i) for i in range(fills + len(frames))]
-        steps = [_stepped(large, frame).steps for frame in asked][fills:]  # before, the sequence was not full
+        steps = [_stepped(large, frame).steps for frame in asked][fills:]  # the frames before these fill the sequence
     scan = counted([(each.scan if spec.fine else each.match) * (1 / len(large.index)) for each in steps])
     return TechniqueCosts(
         encode=counted([each.encode for each in tried]),
-        # Of few places a scan takes as long as of many: what is in RAM is tried with more of them.
+        # A scan of few places takes as long as one of many, so it is timed in the large index.
         match_per_place=counted([each.match for each in tried]) * (1 / _PLACES) if spec.fine else scan,
         ram_bytes_per_place=bytes_per_place(spec) + bytes_beside_place(length),
         disk_bytes_per_place=spec.coarse.nbytes + (spec.fine.nbytes if spec.fine else 0),
@@ -138,7 +139,7 @@ def probe(
 
 
 def probe_each(techniques: Iterable[Technique]) -> Iterator[tuple[str, TechniqueCosts]]:
-    """Give (name, costs) of each technique in turn, so that the caller can say how far it is."""
+    """Yield (name, costs) of each technique in turn, so that the caller can show progress."""
     for technique in techniques:
         yield technique.spec.name, probe(technique)
 
@@ -151,7 +152,7 @@ def _stepped(walk: Recogniser, frame: Frame) -> Recognition:
 
 
 def _many(technique: Technique, index: PlaceIndex) -> PlaceIndex:
-    """Make an index of some thousand places, which are those of the index again and again."""
+    """Make an index of some thousand places by repeating the places of `index`."""
     count = max(_PLACES, min(_SCANNED, _SCANNED_BYTES // technique.spec.row.nbytes))
     unknown = np.full(count, np.nan)
     return PlaceIndex(

@@ -1,4 +1,4 @@
-"""Costs measured on one machine as they would be on another: times by the ratio of two scores, memory as it is."""
+"""Costs measured on one machine, converted to another: times by the ratio of two scores, memory unchanged."""
 
 from dataclasses import dataclass, replace
 
@@ -6,28 +6,31 @@ from edgevpr.power.boards import Board, MachineSpeed
 from edgevpr.runtime.preflight.probe import TechniqueCosts
 from edgevpr.types import StageCost
 
-# Of a single thread's score, where nobody has measured products: the Raspberry Pi 4's share, the lowest that is known
-# (Pi 5: 0.21). What is not known is not promised.
+# Share of a single thread's score, for boards whose products have not been measured: that of the Raspberry Pi 4, the
+# lowest that is known (Pi 5: 0.21), so that the estimate does not promise too much.
 UNKNOWN_PRODUCTS = 0.15
 
 
 @dataclass(frozen=True, slots=True)
 class Ratios:
-    """How fast one thread of a board is beside one of the machine that measured: at matrix `products` (pictures through
-    a network, and full comparisons of candidates) and at `passes` over bytes (everything else)."""
+    """Speed of one thread of a board relative to one of the machine that measured: at matrix `products` (pictures
+    through a network, and full comparisons of candidates) and at `passes` over bytes (everything else)."""
 
     products: float
     passes: float
 
 
 def is_same(here: Board, board: Board) -> bool:
-    """Whether `board` is the machine `here`, so that nothing has to be scaled."""
+    """Tell whether `board` is the machine `here`, so that nothing has to be scaled."""
     return here.name == board.name or (board.machine is not None and board.machine == here.machine)
 
 
 def ratios(here: Board, board: Board) -> Ratios | None:
-    """The ratios of `board` to `here`, the machine that measured; None where nobody knows. Passes that are not known
-    apart are taken from the single thread's score, and products as a modest share of it."""
+    """Return the ratios of `board` to `here`, the machine that measured; None where a score is unknown.
+
+    Where passes have no figure, the single thread's score stands in for it, and where products have none, a modest
+    share of it.
+    """
     if is_same(here, board):
         return Ratios(1.0, 1.0)
     mine, other = here.benchmark_score, board.benchmark_score
@@ -45,12 +48,12 @@ def _products(score: MachineSpeed) -> float | None:
 
 
 def on_board(costs: TechniqueCosts, here: Board, board: Board) -> TechniqueCosts:
-    """The costs measured `here` as they would be on `board`; its times stay as they are where no ratio is known."""
+    """Convert costs measured `here` to `board`; the times stay as they are where no ratio is known."""
     found = ratios(here, board)
     if found is None or is_same(here, board):
         return costs
-    # A network's layers are products, and so is the comparison of all regions with all regions; what reads and makes
-    # rows of the index, or pictures, is passes.
+    # A network's layers are products, and so is the comparison of all regions with all regions. Work on pictures and on
+    # rows of the index is passes.
     return replace(
         costs,
         encode=_scaled(costs.encode, found.products, board, board.threads)
@@ -64,7 +67,7 @@ def on_board(costs: TechniqueCosts, here: Board, board: Board) -> TechniqueCosts
 
 
 def _scaled(cost: StageCost, ratio: float, board: Board, threads: int | None = None) -> StageCost:
-    """A stage on `board`, where it may use `threads` (None: as many as it did)."""
+    """Scale a stage to `board`, where it may use `threads` (None: as many as it did)."""
     busy_cores = cost.cpu_s / cost.wall_s if cost.wall_s else 0.0
     if busy_cores <= 1:
         return StageCost(cost.wall_s / ratio, cost.cpu_s / ratio)
@@ -74,7 +77,8 @@ def _scaled(cost: StageCost, ratio: float, board: Board, threads: int | None = N
 
 
 def _kept(score: MachineSpeed, busy_cores: float) -> float:
-    """What share of a single core's speed each of so many busy ones keeps: they share memory, heat and current."""
+    """Return the share of a single core's speed that each of `busy_cores` keeps: they share memory, heat and
+    current."""
     if score.single is None or score.multi is None:
         return 1.0
     return min(1.0, score.multi / (busy_cores * score.single))

@@ -1,6 +1,7 @@
-"""What `edgevpr profile --measure` has found on this machine, kept in a file with what the machine is.
+"""Figures that `edgevpr profile --measure` has found on this machine, kept in a file with a description of the machine.
 
-Figures of another machine, or of another version of what was measured, are never used: it is said, and tried anew.
+Figures of another machine, or of other versions of the measured software, are never used: the user is told, and the
+techniques are tried anew.
 """
 
 import contextlib
@@ -30,7 +31,7 @@ from edgevpr.runtime.preflight.trial import Trial, model_of, trial_of, try_each
 
 _FORMAT = 1
 _PICTURES = 8
-_SAME_RAM = 0.02  # a kernel keeps some for itself, another amount with every version
+_SAME_RAM = 0.02  # kernels keep some RAM for themselves, every version another amount
 _PACKAGES = {
     "edgevpr": ("edgevpr",),
     "numpy": ("numpy",),
@@ -41,7 +42,7 @@ _PACKAGES = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredFigures:
-    """All techniques on one machine: when (local time), on which `pictures`, with how many `threads` of a network, and
+    """Figures of all techniques on one machine: the `date` (local time), the `pictures`, the `threads` of a network,
     what the machine is (`identity`) and how fast (`score`, by the micro-benchmark)."""
 
     date: str
@@ -52,7 +53,8 @@ class StoredFigures:
     trials: tuple[Trial, ...]
 
     def of(self, offer: Offer) -> Trial | None:
-        """What was measured of an offer; None where it was not, could not be used then, or has another network now."""
+        """Return the stored trial of an offer; None where it was not measured, could not be used then, or has another
+        network now."""
         for trial in self.trials:
             if trial.costs and trial.label == offer.label and _same_settings(trial, offer):
                 try:
@@ -63,18 +65,18 @@ class StoredFigures:
 
 
 def _same_settings(trial: Trial, offer: Offer) -> bool:
-    """Whether an offer asks for what was tried: a setting that is named may be the default."""
+    """Tell whether an offer asks for the settings that were tried: a setting that is named may be the default."""
     had = {**techniques.parameters(offer.name), **trial.parameters}
     return {**had, **offer.settings} == {**had, **trial.settings}
 
 
 def default_path() -> Path:
-    """Where figures are kept unless the user says otherwise."""
+    """Return the file in which figures are kept unless the user says otherwise."""
     return own_folder() / "measured.json"
 
 
 def identity(root: Path = Path("/")) -> dict[str, Any]:
-    """What the figures of a machine depend on."""
+    """Return everything that the figures of a machine depend on."""
     return {
         "machine": machine.title(root),
         "cores": os.cpu_count(),
@@ -86,8 +88,11 @@ def identity(root: Path = Path("/")) -> dict[str, Any]:
 
 
 def pictures_of(folder: str | None) -> tuple[list[Path], str]:
-    """Up to eight images of a folder, spread over it, and what to call them; without a folder generated ones. Raises
-    SourceError for a folder without images, ImageError for one that cannot be used."""
+    """Choose up to eight images of a folder, spread over it, and a text that names them; without a folder, none, for
+    generated ones.
+
+    Raises SourceError for a folder without images, ImageError for one that cannot be used.
+    """
     if folder is None:
         return [], f"{_PICTURES} generated pictures"
     images = list_images(folder)
@@ -98,12 +103,12 @@ def pictures_of(folder: str | None) -> tuple[list[Path], str]:
 
 
 def measure_each(wanted: Iterable[Offer], threads: int, images: Sequence[Path]) -> Iterator[Trial]:
-    """Try each offer thoroughly: on the pictures `images`, or on as many generated ones."""
+    """Try each offer thoroughly: on the pictures `images`, or on eight generated ones."""
     return try_each(wanted, threads, images, rounds=_PICTURES)
 
 
 def micro_benchmark() -> MachineSpeed:
-    """How fast this machine is now. Takes some two seconds."""
+    """Measure how fast this machine is. Takes about two seconds."""
     from edgevpr.power import speed
 
     found = speed.score()
@@ -113,7 +118,7 @@ def micro_benchmark() -> MachineSpeed:
 
 
 def gathered(trials: Iterable[Trial], pictures: str, threads: int, score: MachineSpeed) -> StoredFigures:
-    """What was measured just now on this machine."""
+    """Put together the figures of trials made just now on this machine."""
     now = datetime.now(timezone.utc).astimezone().isoformat(timespec="minutes")
     return StoredFigures(
         date=now, identity=identity(), pictures=pictures, threads=threads, score=score, trials=tuple(trials)
@@ -121,8 +126,8 @@ def gathered(trials: Iterable[Trial], pictures: str, threads: int, score: Machin
 
 
 def require_room(path: Path, make: bool) -> None:
-    """Raise a sentence where `save` could not write to `path`: before the measuring, not after it. `make`: the folder
-    may be made."""
+    """Raise UsageError or EdgevprError where `save` could not write to `path`: before the measuring, not after it. With
+    `make` the folder may be made."""
     if path.suffix != ".json":
         raise UsageError(f"{path}: the name of a file of figures ends in .json: choose such a name.")
     folder = path.resolve().parent
@@ -138,13 +143,16 @@ def require_room(path: Path, make: bool) -> None:
 
 
 def save(found: StoredFigures, path: Path) -> None:
-    """Write the figures: as a whole, or not at all."""
+    """Write the figures, completely or not at all."""
     text = json.dumps({"format": _FORMAT, **asdict(found)}, indent=1)
     write_whole(path, lambda unfinished: unfinished.write_text(text + "\n", "utf-8"))
 
 
 def load(path: Path) -> tuple[StoredFigures | None, str | None]:
-    """The figures of this machine, or None and, where there are some that cannot be used, a sentence that says why."""
+    """Read the figures of this machine; return None for figures that cannot be used, with a sentence that says why.
+
+    Both are None where there is no file.
+    """
     again = "the techniques are tried anew; `edgevpr profile --measure` replaces them."
     try:
         fields = json.loads(path.read_text("utf-8"))
@@ -164,7 +172,7 @@ def load(path: Path) -> tuple[StoredFigures | None, str | None]:
 
 
 def _require_figures(found: StoredFigures) -> None:
-    """Raise ConfigError, TypeError or ValueError where a file has the form of figures and holds none."""
+    """Raise ConfigError, TypeError or ValueError for a file that has the form of figures but no valid numbers."""
     build(MachineSpeed, asdict(found.score), "score")
     for trial in found.trials:
         if not (isinstance(trial.settings, dict) and isinstance(trial.parameters, dict)):
@@ -193,20 +201,24 @@ def _differences(there: dict[str, Any], here: dict[str, Any]) -> str:
 def known_and_tried(
     wanted: Iterable[Offer], board: Board, stored: StoredFigures | None
 ) -> Iterator[tuple[Trial, bool]]:
-    """Each offer's trial, in the order of `wanted`, and whether it was stored: what was not is tried now, quickly."""
+    """Yield each offer's trial, in the order of `wanted`, and True if it was stored; any other is tried now,
+    quickly."""
     for _, forms in groupby(wanted, key=lambda offer: offer.name):
         known = [(offer, stored.of(offer) if stored else None) for offer in forms]
         tried = try_each([offer for offer, trial in known if trial is None], board.threads)
         for _, trial in known:
             if trial:
                 yield trial, True
-            elif now := next(tried, None):  # none more where the technique cannot be used
+            elif now := next(tried, None):  # there is no further trial of a technique that cannot be used
                 yield now, False
 
 
 def scaled_from(here: Board, board: Board, stored: StoredFigures | None) -> Board:
-    """The machine `here` with the score that its figures are scaled from: its own, by the same yardstick as that of
-    `board` where there is one. May take two seconds."""
+    """Return the machine `here` with the score that its figures are scaled from, of the same kind as that of `board`.
+
+    If `board` has a published score only (no `passes`) and that of `here` is verified, it is the profile's. Otherwise
+    it is the micro-benchmark's, stored or run (two seconds).
+    """
     published = here.benchmark_score.verified and board.benchmark_score.passes is None
     if is_same(here, board) or published:
         return here

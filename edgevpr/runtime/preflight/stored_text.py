@@ -1,4 +1,4 @@
-"""What was measured on this machine, as plain text."""
+"""The figures measured on this machine, as plain text."""
 
 from edgevpr.helpers.tables import aligned
 from edgevpr.runtime.preflight.estimate_text import unusable_lines
@@ -11,8 +11,8 @@ _HEADS = (
 
 
 def format_stored(found: StoredFigures) -> str:
-    """A line for each technique and form. The time of matching is that of one place: compared in full where there is a
-    scan of all places before, else with the scan itself."""
+    """Format a line for each technique and form. The time of matching is that of one place: of its full comparison
+    where all places are scanned before, else of the scan itself."""
     there = found.identity
     unusable = {trial.label: trial.problem for trial in found.trials if trial.problem}
     rows = [_HEADS, *(_cells(trial) for trial in found.trials if trial.costs), *([name, "n/a"] for name in unusable)]

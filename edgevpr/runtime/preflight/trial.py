@@ -1,7 +1,7 @@
-"""Trying techniques in processes of their own: what one has loaded is not counted as another's memory, and a library
-that dies on this processor takes nothing with it but its own row.
+"""Trials of techniques, each in a process of its own: what one has loaded is not counted as another's memory, and a
+library that crashes on this processor loses only its own row.
 
-`python -m edgevpr.runtime.preflight.trial` is such a process: a job as JSON comes in, a Trial as JSON goes out.
+`python -m edgevpr.runtime.preflight.trial` is such a process: it reads a job as JSON and prints a Trial as JSON.
 """
 
 import json
@@ -25,8 +25,8 @@ from edgevpr.types import StageCost
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trial:
-    """What became of an offer: its costs, or in one sentence why it cannot be used here. `model` is the fingerprint of
-    its network, `weights` whose they are; `parameters` are all that the technique then had."""
+    """Result of trying an offer: its costs, or in one sentence why it cannot be used here. `model` is the fingerprint
+    of its network, `weights` names the network's weights; `parameters` are all that the technique then had."""
 
     label: str
     name: str
@@ -39,10 +39,10 @@ class Trial:
 
 
 def try_each(wanted: Iterable[Offer], threads: int, images: Sequence[Path] = (), rounds: int = 0) -> Iterator[Trial]:
-    """Try each offer, each in a process; a technique that cannot be used is one row, of its name.
+    """Try each offer in a process of its own; a technique that cannot be used is one row, under its name.
 
-    Pictures are those of `images`; without them as many of noise as `rounds` (0: a quick look). `threads` are those of
-    a network.
+    The pictures are `images`; without them `rounds` pictures of noise are made (0: a quick look). `threads` are those
+    of a network.
     """
     refused = set()
     for offer in wanted:
@@ -56,15 +56,15 @@ def try_each(wanted: Iterable[Offer], threads: int, images: Sequence[Path] = (),
 
 
 def model_of(name: str, settings: dict[str, Any]) -> str | None:
-    """The fingerprint of the network that a technique would use now; None for one without. Raises ModelError."""
+    """Return the fingerprint of the network that a technique would use now; None for one without. Raises ModelError."""
     parameters = techniques.parameters(name)
-    if "threads" not in parameters:  # which every network has, and nothing else
+    if "threads" not in parameters:  # every network has this parameter, and nothing else has
         return None
     return load_card(settings.get("model") or parameters.get("model", name)).fingerprint
 
 
 def _missing(offer: Offer) -> str | None:
-    """Why a technique cannot be used, if its card says so already: that needs no process."""
+    """Return why a technique cannot be used, if its card shows that already (no process is needed then), else None."""
     try:
         model_of(offer.name, offer.settings)
     except EdgevprError as error:
@@ -78,7 +78,7 @@ def _refused(offer: Offer, problem: str) -> Trial:
 
 def _in_a_process(offer: Offer, threads: int, images: Sequence[Path], rounds: int) -> Trial:
     job = {**asdict(offer), "threads": threads, "images": [str(path) for path in images], "rounds": rounds}
-    # A session of its own: Ctrl-C is for us to act on.
+    # A session of its own: only the parent process is to act on Ctrl-C.
     process = subprocess.Popen(
         [sys.executable, "-m", "edgevpr.runtime.preflight.trial"],
         stdin=subprocess.PIPE,
@@ -109,7 +109,7 @@ def _end(label: str, code: int, said: str) -> str:
 
 
 def trial_of(fields: dict[str, Any]) -> Trial:
-    """A Trial from what `asdict` made of it. Raises TypeError, KeyError or ValueError for anything else."""
+    """Make a Trial from the output of `asdict`. Raises TypeError, KeyError or ValueError for anything else."""
     costs = fields["costs"]
     if costs is not None:
         stages = {key: StageCost(**costs[key]) for key in ("encode", "match_per_place", "scan_per_place")}

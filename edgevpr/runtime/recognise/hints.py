@@ -1,7 +1,7 @@
-"""What else is known when a query is asked: about where the aircraft is, and which way its nose points.
+"""Hints for a query beside its picture: where the aircraft can be, and which way its nose points.
 
-Both narrow the search, and neither is ever the only way: a compass may be wrong and a satellite position false, so a
-query that is not accepted with hints is followed by one without.
+Both narrow the search, and neither is ever the only way to find a place: a compass may be wrong and a satellite
+position false. A query that is not accepted with hints is therefore followed by one without.
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ _FIX_GOOD_FOR_S = 60.0
 
 @dataclass(frozen=True, slots=True)
 class Sighting:
-    """A position, and when it was so on the clock of the frames."""
+    """A position, and the time at which the aircraft was there, on the clock of the frames."""
 
     position: Position
     t_mono_s: float
@@ -24,34 +24,35 @@ class Sighting:
 
 @dataclass(frozen=True, slots=True)
 class Hints:
-    """The aircraft is within `radius_m` metres of `position`, and its nose points to `heading_deg`; None: not known."""
+    """Hints for one query: the aircraft is within `radius_m` metres of `position`, and its nose points to
+    `heading_deg`. None: unknown."""
 
     position: Position | None = None
     radius_m: float | None = None
     heading_deg: float | None = None
 
     def fields(self) -> dict[str, float | bool | None]:
-        """Say what the flight log says of hints that were used."""
+        """Return the fields that the flight log has for hints that were used."""
         radius_m = None if self.radius_m is None else round(self.radius_m, 1)
         return {"reach_m": radius_m, "heading": self.heading_deg is not None}
 
 
 class NoPrior:
-    """Nothing is known beforehand: what a `Prior` is where no query is to be narrowed."""
+    """Stands in for a `Prior` where no query is to be narrowed: it has no hints."""
 
     def hints(self, frame: Frame, vehicle: Vehicle | None, index: PlaceIndex, margin_m: float) -> Hints | None:
-        """Give nothing."""
+        """Return None: there are no hints."""
 
     def learn(self, found: Candidate, accepted: bool, t_mono_s: float) -> None:
         """Learn nothing."""
 
 
 class Prior:
-    """What narrows the search for the next query, and whether it can be believed.
+    """Hints for the next query, and a memory of whether hints can be believed.
 
-    `reach_m_s` is the speed that the aircraft can have (None: its position narrows nothing), `heading_within_deg` how
-    far off a known heading may be (None: no heading narrows anything; see `TechniqueSpec`). `is_live` is whether the
-    frames are of now: the autopilot knows nothing of frames that are a recording.
+    `reach_m_s` is the highest speed of the aircraft, m/s (None: its position narrows nothing). `heading_within_deg` is
+    the largest error of a known heading, degrees (None: no heading narrows anything; see `TechniqueSpec`). `is_live` is
+    False for frames of a recording, of which the autopilot knows nothing.
     """
 
     def __init__(self, reach_m_s: float | None, heading_within_deg: float | None, is_live: bool) -> None:
@@ -61,9 +62,10 @@ class Prior:
         self._believed = True
 
     def hints(self, frame: Frame, vehicle: Vehicle | None, index: PlaceIndex, margin_m: float) -> Hints | None:
-        """Give what narrows the search for a frame, None where nothing does or it is not believed at present.
+        """Return the hints for a frame, None where there are none or they are not believed at present.
 
-        `vehicle` is what the autopilot says; `margin_m` is added to how far the aircraft can have flown.
+        `vehicle` is the autopilot's last report; `margin_m` metres are added to the distance that the aircraft can have
+        flown.
         """
         if not self._is_live or (vehicle and not vehicle.is_fresh_at(frame.t_mono_s)):
             vehicle = None
@@ -76,15 +78,16 @@ class Prior:
         return self._known if self._believed else None
 
     def learn(self, found: Candidate, accepted: bool, t_mono_s: float) -> None:
-        """Learn from what the query found, whether hints are to be used for the next."""
+        """Learn from what a query found whether the next one is to use hints, and keep the position of an accepted
+        match."""
         self._believed = use_next(self._known, self._believed, found, accepted, self._heading_within_deg)
         if accepted and found.place.position:
             self._last_fix = Sighting(found.place.position, t_mono_s)
 
 
 def hints_of(index: PlaceIndex, around: tuple[Position, float] | None, heading_deg: float | None) -> Hints | None:
-    """Give those of a position with its `reach`, and of a heading, that leave something out of the search; None:
-    neither.
+    """Return the hints of a position with its `reach`, and of a heading, as far as they leave any place out of the
+    search; None where neither does.
 
     Where no place is in reach, all are searched.
     """
@@ -101,19 +104,21 @@ def hints_of(index: PlaceIndex, around: tuple[Position, float] | None, heading_d
 def reach(
     now_s: float, vehicle: Vehicle | None, own_fix: Sighting | None, reach_m_s: float, margin_m: float
 ) -> tuple[Position, float] | None:
-    """Say where the aircraft must be at `now_s`: a position, and the metres around it that it may have flown since, by
-    an autopilot that has GPS and has just said so, else by our own last fix of the last minute; None where neither is
-    there."""
+    """Return where the aircraft must be at `now_s`: a position, and the radius in metres that it may have flown since.
+
+    The position is that of an autopilot that has GPS and has reported within a second, else our own last fix if it is
+    at most a minute old. None where there is neither.
+    """
     seen = None
     if own_fix and now_s - own_fix.t_mono_s <= _FIX_GOOD_FOR_S:
         seen = own_fix
-    if vehicle and vehicle.has_gps and vehicle.is_fresh_at(now_s):  # without GPS it drifts, and our own fix says more
+    if vehicle and vehicle.has_gps and vehicle.is_fresh_at(now_s):  # without GPS its position drifts: our fix is better
         seen = Sighting(Position(vehicle.lat_deg, vehicle.lon_deg), vehicle.t_heard_s)
     return seen and (seen.position, margin_m + reach_m_s * abs(now_s - seen.t_mono_s))
 
 
 def expected_of(hints: Hints | None, index: PlaceIndex) -> Expected:
-    """Say what hints mean for every place of the index."""
+    """Return the hints as expectations for every place of the index."""
     if hints is None:
         return Expected()
     in_reach = index.within(hints.position, hints.radius_m) if hints.position else None
@@ -124,7 +129,7 @@ def expected_of(hints: Hints | None, index: PlaceIndex) -> Expected:
 
 
 def agree(hints: Hints, found: Candidate, heading_within_deg: float | None) -> bool:
-    """Say whether a place found is one that these hints would have led to."""
+    """Tell whether a place found agrees with these hints; a position or heading that is unknown agrees with any."""
     place = found.place
     if hints.position and place.position:
         here, there = hints.position, place.position
@@ -139,9 +144,10 @@ def agree(hints: Hints, found: Candidate, heading_within_deg: float | None) -> b
 def use_next(
     hints: Hints | None, used: bool, found: Candidate | None, accepted: bool, heading_within_deg: float | None
 ) -> bool:
-    """Say whether the next query is to use what hints there are, after one that had `hints` and `used` them or not.
+    """Tell whether the next query is to use hints, after a query that had `hints` and `used` them or not.
 
-    With and without in turn until a match is accepted; then it says whether they can be believed.
+    Queries with hints and without take turns until a match is accepted. That match then tells whether the hints can be
+    believed.
     """
     if hints is None:
         return True

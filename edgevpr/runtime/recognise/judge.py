@@ -1,4 +1,4 @@
-"""The one judge: when a match is accepted as the place. A match that is not accepted moves nothing."""
+"""The one judge: decides when a match is accepted as the place. A match that is not accepted carries no position."""
 
 import math
 from dataclasses import dataclass
@@ -11,18 +11,18 @@ from edgevpr.places.index import PlaceIndex
 from edgevpr.places.retrieve import Ranking, elsewhere, margin
 from edgevpr.places.sequence import Search, SequenceSearch
 
-NEW_FOR_S = 30.0  # a place learnt so recently says only what the autopilot has just said
+NEW_FOR_S = 30.0  # seconds; a place learnt so recently only repeats what the autopilot has just said
 
-# They are many, so one of them is good by chance. With half the margin no wrong sequence of corridor was accepted from
-# hog, seqslam or cohog, flown as it was mapped, twice as fast, or the other way. At half the speed cohog accepted
-# places three away from the right one.
+# Trajectories at other speeds are many, so one of them scores well by chance: half the margin over them is enough. With
+# it, no wrong sequence of the corridor set was accepted from hog, seqslam or cohog, flown as it was mapped, twice as
+# fast, or the other way. At half the speed cohog accepted places three away from the right one.
 _OF_MARGIN_AT_OTHER_SPEEDS = 0.5
 _LONGEST = 10
 
 
 @dataclass(frozen=True, slots=True)
 class AcceptRule:
-    """Accept from `min_score` on, if the best place beats the best one farther than `neighbour_m` by `min_margin`."""
+    """Least score, and least lead over the best place farther away than `neighbour_m` metres, of an accepted match."""
 
     min_score: float
     min_margin: float
@@ -31,20 +31,21 @@ class AcceptRule:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Whether the best place is accepted as the place, and why (not), in a few words for the log."""
+    """Decision on the best place: accepted as the place or not, and the reason in a few words for the log."""
 
     accepted: bool
     reason: str
 
 
 def accept_rule(technique: Technique, config: MatchConfig, length: int = 1) -> AcceptRule:
-    """Take the configuration's figures, and the technique's own where it leaves them open.
+    """Return the configuration's limits, and the technique's own where the configuration leaves them open.
 
-    A technique's margin is that of one query. The mean score of a sequence of `length` varies less, as a mean does; of
-    a long one not so much less, since queries that show the same ground are not independent.
+    A technique's margin is that of one query. The mean score of `length` queries varies less, so the margin of a
+    sequence is divided by the root of its length. Lengths above ten count as ten: queries that show the same ground are
+    not independent.
     """
     own_margin = technique.min_margin
-    if own_margin < 1:  # from 1 on nothing is to be accepted, in sequences neither
+    if own_margin < 1:  # a margin of 1 or more accepts nothing, not in sequences either
         own_margin /= math.sqrt(min(length, _LONGEST))
     return AcceptRule(
         technique.min_score if config.min_score is None else config.min_score,
@@ -54,12 +55,15 @@ def accept_rule(technique: Technique, config: MatchConfig, length: int = 1) -> A
 
 
 def judge(ranking: Ranking, index: PlaceIndex, rule: AcceptRule, search: Search, is_new: bool) -> Verdict:
-    """Decide whether the best place of a ranking is accepted. `search` is what the ranking comes from; `is_new` is
-    whether the best place was learnt within the last `NEW_FOR_S`."""
+    """Decide whether the best place of a ranking is accepted.
+
+    `search` is the search that made the ranking; `is_new` tells whether the best place was learnt within the last
+    `NEW_FOR_S` seconds.
+    """
     if search.frames < search.length:
         return Verdict(False, f"the sequence has {search.frames} queries of {search.length} yet")
     score = float(ranking.scores[0])
-    if not score >= rule.min_score:  # so written, a score that is no number is refused as well
+    if not score >= rule.min_score:  # `not >=` refuses NaN as well
         return Verdict(False, f"score {score:.3f} is below {rule.min_score:.3f}")
     if isinstance(search, SequenceSearch) and (objection := _lost_track(ranking, index, rule, search)):
         return Verdict(False, objection)
@@ -68,7 +72,7 @@ def judge(ranking: Ranking, index: PlaceIndex, rule: AcceptRule, search: Search,
         return Verdict(False, "there is no place elsewhere to compare with, and this score alone says nothing")
     if ahead is not None and not ahead >= rule.min_margin:
         return Verdict(False, f"only {ahead:.3f} ahead of a place elsewhere, {rule.min_margin:.3f} needed")
-    if is_new:  # a fix would bring the autopilot nothing, and make its errors look confirmed
+    if is_new:  # a fix would only repeat the autopilot's position, and make its errors look confirmed
         return Verdict(False, f"this place was learnt within the last {NEW_FOR_S:g} s and says nothing new")
     if ahead is None:
         return Verdict(True, f"score {score:.3f}; there is no place elsewhere to compare with")
@@ -76,7 +80,7 @@ def judge(ranking: Ranking, index: PlaceIndex, rule: AcceptRule, search: Search,
 
 
 def _lost_track(ranking: Ranking, index: PlaceIndex, rule: AcceptRule, search: SequenceSearch) -> str | None:
-    """Say why the mean of a sequence is not to be believed, None where it is."""
+    """Return the reason why the mean of a sequence is not to be believed, None where there is none."""
     away = elsewhere(index, ranking.slots[0], np.arange(len(index)), rule.neighbour_m)
     if not search.goes_on(~away, rule.min_score):
         return "the newest queries no longer see what those before them saw"

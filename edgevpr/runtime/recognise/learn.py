@@ -1,7 +1,7 @@
-"""Learning in flight: a frame of what the map does not know becomes a place of it, where the autopilot says we are.
+"""Learning in flight: a frame of ground that the map does not have becomes a place, at the autopilot's position.
 
-A wrong place would be believed by every later flight, so a frame is rather left out: where the position is not fresh,
-where it may be an echo of our own fixes, where the picture says little, and where the map file has a place already.
+Every later flight would believe a wrong place, so a doubtful frame is left out: its position is not fresh, or may be an
+echo of our own fixes, its picture is of low quality, or the map file has a place near it already.
 """
 
 import math
@@ -22,15 +22,15 @@ from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.types import Frame, Place, Position, Vehicle
 
-_ECHO_S = 10.0  # for so long after a fix of ours, the autopilot's position may be what we told it
+_ECHO_S = 10.0  # after a fix of ours: so long the autopilot's position may be only that fix
 _QUALITY_MIN = 0.2
 
 
 class Learner:
-    """Adds places to an open map and to the index in RAM, in this order: what the index knows is safe on the disk.
+    """Adds places to an open map, then to the index in RAM: every place in the index is already safe on disk.
 
-    `learnt` counts them and `passed_over` the frames that were left out, by reason. At the first trouble with the file
-    it stops for good, and `trouble` says why: the flight goes on with what is there.
+    `learnt` counts the places, and `passed_over` the frames that were left out, by reason. At the first error of the
+    file learning stops for good, and `trouble` says why: the flight goes on with the places that are there.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class Learner:
 
     @property
     def summary(self) -> str:
-        """Say how it goes, in a few words."""
+        """Progress of learning, in a few words."""
         if self.trouble:
             return f"{self.learnt} places learnt, then stopped ({self.trouble})"
         left_out = ", ".join(f"{count} {reason}" for reason, count in self.passed_over.most_common())
@@ -57,13 +57,13 @@ class Learner:
 
     @property
     def totals(self) -> dict[str, Any]:
-        """Say the same for the flight log."""
+        """The same figures for the flight log."""
         return {"places": self.learnt, "left_out": dict(self.passed_over), "stopped": self.trouble}
 
     def learn(self, event: Recognition) -> Place | None:
-        """Make a place of the frame of an event and give it, or None where it is not worth one; never raises MapError.
+        """Make a place of an event's frame and return it, or None where the frame is left out. Never raises MapError.
 
-        A fix that the event sent, or that waits to be sent, may come back as the autopilot's position from now on.
+        If the event has sent or queued a fix, the autopilot's position may be an echo of that fix for the next 10 s.
         """
         if event.fix and event.fix.sent is not False:
             self._t_fix_s = event.frame.t_mono_s
@@ -94,12 +94,13 @@ class Learner:
         return place
 
     def _placed(self, frame: Frame, vehicle: Vehicle | None) -> tuple[Frame, str | None]:
-        """Give the frame where it was taken, and what is to be said against learning it there."""
-        if frame.position:  # a recording's own: no echo of anything
+        """Return the frame with the position to learn it at, and the objection to learning it there (None: no
+        objection)."""
+        if frame.position:  # it comes from the recording: no echo of our fixes
             return frame, None
         if vehicle is None or not vehicle.is_fresh_at(frame.t_mono_s):
             return frame, "without a fresh position"
-        if not vehicle.has_gps:  # it reckons, and goes on saying so
+        if not vehicle.has_gps:  # without GPS the position it goes on reporting is only estimated
             return frame, "without GPS"
         if frame.t_mono_s - self._t_fix_s < _ECHO_S:
             return frame, "just after a fix"
@@ -107,16 +108,17 @@ class Learner:
         return replace(frame, position=position, heading_deg=vehicle.heading_deg, t_utc_s=self._utc_clock()), None
 
     def _objection(self, position: Position, quality: float) -> str | None:
-        if not quality >= _QUALITY_MIN:  # so written, NaN is refused as well
+        if not quality >= _QUALITY_MIN:  # `not >=` refuses NaN as well
             return "of low quality"
-        # The file is asked, not the index: a place that was given up in RAM is not to be learnt again.
+        # Ask the file, not the index: a place that was dropped from RAM must not be learnt again.
         if self._map.nearest_m(position, self._spacing_m) is not None:
             return "near a place"
         return None
 
 
 def check_positions(config: Config, positions: Path | None) -> None:
-    """Raise UsageError where nothing could ever say where a frame was taken: no link, and no recording that knows."""
+    """Raise UsageError where no frame can ever have a position: there is neither a link nor a recording with
+    positions."""
     folder = Path(config.source.uri)
     if config.mavlink.link is None and not (folder.is_dir() and (positions or _has_positions(folder))):
         raise UsageError(

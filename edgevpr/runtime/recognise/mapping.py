@@ -1,4 +1,4 @@
-"""Making places: every frame encoded, and on the disk before the next one is taken."""
+"""Making places: every frame is encoded, and is on the disk before the next one is taken."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -12,12 +12,12 @@ from edgevpr.runtime.recognise.judge import AcceptRule
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.types import Frame
 
-_NO_RULE = AcceptRule(min_score=1.0, min_margin=1.0, neighbour_m=0.0)  # nothing is looked for while a map is made
+_NO_RULE = AcceptRule(min_score=1.0, min_margin=1.0, neighbour_m=0.0)  # no place is searched for while a map is made
 
 
 @dataclass(frozen=True, slots=True)
 class MappingResult:
-    """What became of the frames: places added, how many of those without a position, and frames mapped before."""
+    """Counts of frames: places added, how many of those have no position, and frames that were in the map already."""
 
     added: int
     without_position: int
@@ -31,11 +31,11 @@ def build_map(
     meter: QueryMeter,
     unusable: Callable[[ImageError], None] | None = None,
 ) -> MappingResult:
-    """Add a place for every frame that is not in the map yet, so that a map that was broken off is continued.
+    """Add a place for every frame that is not in the map yet, so that an interrupted map can be continued.
 
-    A frame takes the walk of a query, with no place to find. It is there already when one of its name looks exactly the
-    same: cameras start their numbers anew. A frame that cannot be encoded is handed to `unusable` and left out; None:
-    it is raised, as ModelError.
+    A frame goes through the steps of a query, with no place to find. It is in the map already if a place has the same
+    name and the same coarse descriptor; the name alone does not tell, since cameras restart their numbering. A frame
+    that cannot be encoded is handed to `unusable` and left out; with `unusable` None it raises ModelError.
     """
     place_map.require(technique.spec)
     nothing = empty_index(technique.spec, 0, None)

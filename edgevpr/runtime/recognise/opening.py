@@ -1,4 +1,4 @@
-"""Opening: a map, the technique that it was made with, and its index in RAM make a recogniser."""
+"""Opening: makes a recogniser of a map, the technique that it was made with, and its index in RAM."""
 
 from pathlib import Path
 
@@ -18,16 +18,16 @@ from edgevpr.runtime.recognise.hints import Prior
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.recogniser import Recogniser
 
-_ROOM = 20_000  # places to learn in a flight: two hundred kilometres at the usual spacing; beyond, RAM keeps the best
+_ROOM = 20_000  # places to learn in a flight: 200 km at the usual spacing; beyond that, RAM keeps the best places
 
 
 def open_recogniser(
     config: Config, board: Board, *, settings: dict[str, str] | None = None, narrowed: bool = False
 ) -> Recogniser:
-    """Open the map, make its technique for the board, load the index. `narrowed` is for a flight: what is known
-    beforehand narrows each query (see `hints`); else every query is asked everywhere.
+    """Open the map, make its technique for the board, and load the index.
 
-    Raises a sentence for anything that does not go together, and for `settings` of the technique that the map was not
+    With `narrowed`, for a flight, hints narrow each query (see `hints`); otherwise every query searches the whole map.
+    Raises an EdgevprError that says what does not go together, such as `settings` of the technique that the map was not
     built with.
     """
     if config.map is None:
@@ -39,8 +39,12 @@ def open_recogniser(
 
 
 def open_learning(config: Config, board: Board, new_technique: str | None) -> tuple[Recogniser, GrowingIndex]:
-    """Do as `open_recogniser` for a flight, with a map that places can be added to, made new for `new_technique` where
-    there is none, and the index that takes them: what the budget leaves is their room."""
+    """Open a map that places can be added to; return a flight's recogniser, as `open_recogniser`, and the index that
+    takes the new places.
+
+    Where there is no map, an empty one is made for `new_technique`. The memory that the budget leaves is the room for
+    new places.
+    """
     if config.map is None:
         raise UsageError("There is no map to learn places into: name one with --map, or `map:` in the configuration.")
     path = Path(config.map)
@@ -62,14 +66,16 @@ def open_learning(config: Config, board: Board, new_technique: str | None) -> tu
 
 
 def has_map(path: Path) -> bool:
-    """Say whether there is a map file at `path`, or anything else that has a content."""
+    """Tell whether there is a map file at `path`, or anything else that is not empty."""
     return path.exists() and path.stat().st_size > 0
 
 
 def take_form(recogniser: Recogniser, config: Config, form: str) -> None:
-    """Let a recogniser load its index anew in another form, with the limits of that form. The index that it has goes
-    first, so that the two are not in memory together. Raises MapError where the map cannot be read any more; then
-    nothing is recognised until a form has been taken."""
+    """Let a recogniser load its index anew in another form, with the limits of that form.
+
+    Its present index is released first, so that the two are not in memory together. Raises MapError where the map
+    cannot be read any more; nothing is recognised then until a form has been loaded.
+    """
     board, place_map = recogniser.meter.board, recogniser.place_map
     nothing = empty_index(recogniser.technique.spec, 0, None)
     recogniser.take(recogniser.technique, nothing, recogniser.rule, recogniser.search)
@@ -80,7 +86,7 @@ def take_form(recogniser: Recogniser, config: Config, form: str) -> None:
 
 
 def budget_mb(config: Config, board: Board) -> float:
-    """Say how much RAM the index may take: what is asked for, else the board's."""
+    """Return how much RAM the index may take, MB: the configuration's figure, else the board's."""
     return config.memory.budget_mb or board.budget_mb
 
 
@@ -90,12 +96,12 @@ def meter_of(config: Config, board: Board) -> QueryMeter:
 
 
 def made_for(board: Board | None, name: str, settings: dict[str, str] | None = None) -> Technique:
-    """Make the technique `name`; a network with as many threads as the board spares for it (None: one)."""
+    """Make the technique `name`; a network gets as many threads as the board spares for it (None: one)."""
     return made_with(board.threads if board else None, name, settings)
 
 
 def made_with(threads: int | None, name: str, settings: dict[str, str] | None = None) -> Technique:
-    """Make the technique `name`; a network with `threads` (None: one), where `settings` do not say how many."""
+    """Make the technique `name`; a network gets `threads` (None: one), unless `settings` say how many."""
     own = {"threads": threads} if threads and "threads" in techniques.parameters(name) else {}
     return techniques.create(name, {**own, **(settings or {})})
 
@@ -103,8 +109,11 @@ def made_with(threads: int | None, name: str, settings: dict[str, str] | None = 
 def technique_of(
     place_map: PlaceMap, name: str | None = None, settings: dict[str, str] | None = None, board: Board | None = None
 ) -> Technique:
-    """Make the technique that a map was built with, for `board`. Raises MapError where `name` or `settings` ask for
-    another, UsageError for a setting that it does not have, and ModelError for a network that cannot be used."""
+    """Make the technique that a map was built with, for `board`.
+
+    Raises MapError where `name` or `settings` ask for another technique, UsageError for a setting that it does not
+    have, and ModelError for a network that cannot be used.
+    """
     built_with = place_map.spec
     if not techniques.is_known(built_with.name):
         raise MapError(
@@ -132,7 +141,7 @@ def _recogniser(
         meter=meter_of(config, board),
         candidates=config.match.candidates or technique.candidates,
         search=search_of(length),
-        # In a sequence a place that a wrong hint kept out of one query would count as seen and unlike.
+        # In a sequence, a place that a wrong hint kept out of one query would count as compared and unlike it.
         prior=_prior(config, technique) if narrowed and length == 1 else None,
         min_accuracy_m=config.mavlink.min_accuracy_m,
     )
@@ -144,7 +153,7 @@ def _prior(config: Config, technique: Technique) -> Prior:
 
 
 def _new_map(path: Path, technique: Technique) -> PlaceMap:
-    """Make an empty map that is there as a whole or not at all: a service that is killed at power-on must start
+    """Make an empty map that is there completely or not at all: a service killed at power-on must be able to start
     again."""
     unfinished = path.with_name(path.name + ".new")
     for left in ("", "-wal", "-shm", "-journal"):

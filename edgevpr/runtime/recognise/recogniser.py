@@ -1,6 +1,6 @@
-"""The walk of one frame, written once: in flight, in `match`, in `eval`, in the probe, and while a map is made.
+"""The steps of one frame, written once: for a flight, `match`, `eval`, the probe, and while a map is made.
 
-No link, log, thread or clock is inside: what comes in with a frame is all that decides what comes out.
+No link, flight log, thread or clock is inside: what is handed in with a frame decides the result.
 """
 
 import logging
@@ -24,9 +24,9 @@ _log = logging.getLogger(__name__)
 class Recogniser:
     """Recognises places of an open map, frame after frame.
 
-    `candidates` places are compared in full (None: all, see `places.retrieve.compare`). `search` goes over several
-    queries, `prior` narrows each; without them each is asked alone, and everywhere. The governor changes `candidates`,
-    the learner and the governor the index (`take`, `extend`).
+    `candidates` places are compared in full (None: all, see `places.retrieve.compare`). `search` joins several queries,
+    and `prior` narrows each; without them each query is ranked alone, over the whole map. The governor changes
+    `candidates`; the learner and the governor change the index (`take`, `extend`).
     """
 
     def __init__(
@@ -44,31 +44,34 @@ class Recogniser:
     ) -> None:
         self.place_map, self.meter, self.candidates = place_map, meter, candidates
         self._prior, self._min_accuracy_m = prior or NoPrior(), min_accuracy_m
-        self._new: deque[tuple[int, float]] = deque()  # place, and when it was learnt
+        self._new: deque[tuple[int, float]] = deque()  # place id, and the time it was learnt at
         self.take(technique, index, rule, search or Alone())
 
     def take(self, technique: Technique, index: PlaceIndex, rule: AcceptRule, search: Search) -> None:
-        """Recognise with these from now on: another form of the same vectors has other scores, and other limits."""
+        """Recognise with these from the next frame on. Another form of the same vectors has other scores, and so other
+        limits."""
         self.technique, self.rule, self.search = technique, rule, search
         self._take_index(index)
 
     def extend(self, index: PlaceIndex, place_id: int, t_mono_s: float) -> None:
-        """Recognise in an index that has grown by a place, learnt from the frame taken at `t_mono_s`."""
+        """Recognise in an index that has one place more, learnt from the frame taken at `t_mono_s`."""
         self._new.append((place_id, t_mono_s))
         self._take_index(index)
 
     def lose_index(self, error: Exception) -> None:
-        """Fail every frame for this reason until there is an index again (see `take`)."""
+        """Fail every frame with this error until there is an index again (see `take`)."""
         self._lost = _sentence(error)
 
     def _take_index(self, index: PlaceIndex) -> None:
         self.index, self._lost = index, None
-        # The 1-sigma accuracy of a fix: between two places nobody knows better.
+        # 1-sigma accuracy of a fix: a match cannot tell where between two places the aircraft is.
         self.accuracy_m = max(self._min_accuracy_m, index.spacing_m() or 0.0)
 
     def step(self, frame: Frame, vehicle: Vehicle | None = None) -> Recognition:
-        """Recognise one frame; `vehicle` is what the autopilot says at that moment. Never raises an Exception: what
-        goes wrong with a frame, a place or the technique is a refusal with its reason."""
+        """Recognise one frame; `vehicle` is the autopilot's report at that moment.
+
+        Never raises an Exception: an error of a frame, a place or the technique becomes a refusal with its reason.
+        """
         meter, technique, index = self.meter, self.technique, self.index
         descriptor = hints = ranking = best = None
         meter.begin()
@@ -123,7 +126,7 @@ class Recogniser:
         )
 
     def unread(self, error: Exception) -> Recognition:
-        """Give the event of a frame that could not even be read."""
+        """Return the event of a frame that could not even be read."""
         self.meter.begin()
         return Recognition(
             frame=None, reason=_sentence(error), failed=True, steps=self.meter.steps(), cost=self.meter.cost()
@@ -136,7 +139,7 @@ class Recogniser:
 
 
 def _sentence(error: Exception) -> str:
-    """Say what went wrong. What is no error of edgevpr's own is a fault of a technique, or of a library."""
+    """Return the error as a sentence. An error that is not edgevpr's own is a fault of a technique or of a library."""
     if isinstance(error, EdgevprError):
         return str(error)
     return f"an unforeseen {type(error).__name__} ({error}): report it, with the output of --debug"

@@ -13,17 +13,17 @@ _OF_THE_BEST = ("place", "reference_image", "score", "position", "shift_cells", 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recognition:
-    """What became of a frame.
+    """Result of one frame.
 
-    `frame` and what the autopilot said of the `vehicle` when it was taken (None: nothing) went in; `descriptor` is what
-    the frame was encoded as, `hints` what narrowed the search, `ranking` the places that were found and `best` the
-    first of them, each None where it did not come to that. `accepted` is whether `best` is taken for the place,
-    `reason` why (not), in a few words; `failed` whether the frame, a place or the technique could not be used.
-    `position` is the place's and `accuracy_m` its 1-sigma, both only there when the match is accepted: what is not
-    accepted moves nothing.
+    The inputs are `frame` and `vehicle`, the autopilot's report when the frame was taken (None: no report).
+    `descriptor` is the encoded frame, `hints` what narrowed the search, `ranking` the places found and `best` the first
+    of them; each is None where its step was not reached. `accepted` tells whether `best` is taken for the place, and
+    `reason` why (not), in a few words. `failed` tells whether the frame, a place or the technique could not be used.
+    `position` is the place's, and `accuracy_m` its 1-sigma; both are set for an accepted match only: any other carries
+    no position.
 
-    `steps` and `cost` are what it took. `fix` says what became of the position, and `last_fix` of the one sent before
-    it; the channel to the autopilot fills them in, and they are None where there was nothing to send.
+    `steps` and `cost` are what the frame took. `fix` tells what became of the position, and `last_fix` the same of the
+    one sent before it. The channel to the autopilot fills them in; they are None where there was nothing to send.
     """
 
     frame: Frame | None
@@ -44,14 +44,16 @@ class Recognition:
 
     @property
     def is_query(self) -> bool:
-        """Say whether the frame became a query: it could be read and encoded."""
+        """True where the frame became a query: it could be read and encoded."""
         return self.descriptor is not None
 
 
 def fields_of(event: Recognition) -> dict[str, Any]:
-    """Give the event as the flight log (kind "query") and `edgevpr match --json` have it: query, place (id),
-    reference_image, score, position (of the place), the match's step, its covariance and the rotation (all null where
-    no place was found), accepted, reason, accuracy_m, costs."""
+    """Return the event as the flight log (kind "query") and `edgevpr match --json` have it.
+
+    The fields are: query, place (id), reference_image, score, position (of the place), the match's step, its covariance
+    and the rotation (all null where no place was found), accepted, reason, accuracy_m, costs.
+    """
     return {
         "query": event.frame.name,
         **_best(event.best),

@@ -1,4 +1,4 @@
-"""`edgevpr check`: would this configuration fly? All is opened the way `edgevpr run` opens it, and closed again."""
+"""`edgevpr check`: would this configuration fly? Everything is opened as `edgevpr run` opens it, and closed again."""
 
 import os
 import shutil
@@ -27,7 +27,7 @@ _LOG_ROOM_MB = 10  # some hours of queries
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that was looked at; `message` says what it is or, in one sentence, what is wrong with it."""
+    """One thing that was checked; `message` says what it is or, in one sentence, what is wrong with it."""
 
     what: str
     ok: bool
@@ -35,7 +35,7 @@ class Finding:
 
 
 def check(config_path: str | Path) -> list[Finding]:
-    """Look at everything that a flight needs; never raises for what the user can put right."""
+    """Check everything that a flight needs; never raises for an error that the user can correct."""
     try:
         config = load_config(config_path)
     except EdgevprError as error:
@@ -75,7 +75,7 @@ def _battery(config: Config) -> str:
 def _map(config: Config) -> str:
     if config.mapping.learn and config.map is not None:
         path = Path(config.map).absolute()
-        # Neither made nor opened for writing, as with the log.
+        # The map is neither made nor opened for writing, for the same reason as the log in `_log`.
         if not os.access(path.parent, os.W_OK) or (path.exists() and not os.access(path, os.W_OK)):
             raise MapError(f"{path} or its folder may not be written by this user: learning needs both.")
         if not path.exists():
@@ -100,7 +100,7 @@ def _source(config: Config) -> str:
     if config.mapping.learn:
         check_positions(config, None)
     source = open_source(config.source.uri, live=True)
-    # Not closed before FFmpeg has given up (5 s at most): a capture that comes back while Python ends aborts it.
+    # Wait until FFmpeg has given up (5 s at most): a capture that returns while Python ends aborts the process.
     while source.condition is Condition.OPENING:
         time.sleep(0.05)
     state = source.state
@@ -124,7 +124,7 @@ def _link(config: Config) -> str:
 def _log(config: Config) -> str:
     if config.log.path is None:
         return "none, so nothing of the flight is kept"
-    # Not opened, unlike all else: whoever checks as root would leave a file that the service may not write.
+    # Unlike all else, the log is not opened: a check as root would leave a file that the service may not write.
     path = Path(config.log.path).absolute()
     if path.is_dir() or not path.parent.is_dir():
         raise UsageError(f"{path} is no file in a folder that is there: correct `log: {{path: ...}}`.")

@@ -32,13 +32,14 @@ from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.types import FIX_MAX_AGE_S
 
 _RELOAD_S = 10.0  # a map that takes longer to load is not loaded again in flight: nothing is recognised meanwhile
-_NEW_MAP_PLACES = 1000  # what a technique must be able to fly with, to be picked for a map that is still empty
+_NEW_MAP_PLACES = 1000  # a technique picked for an empty map must be able to fly with so many
 
 _log = logging.getLogger(__name__)
 
 
 def fly(config: Config, positions: Path | None = None) -> int:
-    """Open everything, fly, close everything; returns the exit code. Raises a sentence where it cannot start."""
+    """Open everything, fly, close everything; return the exit code, 1 if any frame failed, else 0. Raises an
+    EdgevprError, one sentence, where the flight cannot start."""
     if config.source.uri is None:
         raise UsageError("There is no source of frames: name one with --source, or `source: {uri: ...}`.")
     address = parse_link(config.mavlink.link) if config.mavlink.link else None
@@ -81,7 +82,7 @@ def fly(config: Config, positions: Path | None = None) -> int:
             )
             notify(STOPPING=1)
         if link:
-            link.close()  # what waits is sent first, so that the log's last line counts it
+            link.close()  # sends waiting messages first, so that the log's last line counts them
         flight_log.write(
             "end",
             accepted=flown.accepted,
@@ -104,9 +105,11 @@ def fly(config: Config, positions: Path | None = None) -> int:
 
 
 def _opened(config: Config, board: Board) -> tuple[Recogniser, Learner | None, str | None]:
-    """Open the recogniser of a flight and its learner, if it is to have one. Where the map cannot be written (a card
-    that has become read-only, a full disk), it is the recogniser alone, and why: what the map knows is recognised all
-    the same."""
+    """Open the recogniser of a flight and its learner, if it is to have one.
+
+    Where the map cannot be written (a card that has become read-only, a full disk), return the recogniser alone, and
+    the reason: the places of the map are recognised all the same.
+    """
     if not config.mapping.learn:
         return open_recogniser(config, board, narrowed=True), None, None
     name = config.technique
@@ -123,18 +126,18 @@ def _opened(config: Config, board: Board) -> tuple[Recogniser, Learner | None, s
 
 
 def smaller_forms_of(config: Config, recogniser: Recogniser, learner: Learner | None, load_s: float) -> tuple[str, ...]:
-    """List the forms of the index that the governor may take: of a map that is wholly in memory, does not grow and is
-    quickly loaded. The scores of another form are others, so that where the user has said from which score on a match
-    is accepted, that holds for one form only."""
+    """List the forms of the index that the governor may take: only for a map that is wholly in memory, does not grow
+    and loads quickly. Another form has other scores, so a limit of acceptance set by the user holds for one form only,
+    and no other is taken."""
     own_limits = config.match.min_score is not None or config.match.min_margin is not None
-    is_whole = len(recogniser.index) == len(recogniser.place_map)  # of a part, a smaller form would hold more places
+    is_whole = len(recogniser.index) == len(recogniser.place_map)  # else a smaller form would hold more places
     if own_limits or learner or not is_whole or load_s > _RELOAD_S:
         return ()
     return recogniser.technique.spec.smaller_forms
 
 
 def _say_start(config: Config, recogniser: Recogniser, flight_log: FlightLog) -> None:
-    """Say with what it is flown, and write the first line of the log."""
+    """Say which technique flies, and write the first line of the log."""
     board, found = recogniser.meter.board, outlook(recogniser, config)
     _log.info("version %s on %s", __version__, board.title)
     _log.info("%s", found.reason)
@@ -166,7 +169,7 @@ def _say_recording(config: Config, learner: Learner | None) -> None:
 
 @contextmanager
 def _signals(stop: Stop) -> Iterator[None]:
-    """Let SIGTERM and SIGINT end the flight while this lasts."""
+    """Let SIGTERM and SIGINT end the flight inside this context."""
     before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGINT)}
     try:
         yield

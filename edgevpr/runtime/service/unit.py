@@ -13,8 +13,8 @@ _RUNS = re.compile(r"(?m)^(ExecStart=.* --config )(\S+)$")
 
 
 def render_unit(board: Board, config_path: str | Path | None = None) -> str:
-    """Write the text of edgevpr.service (None: with the configuration file that it names). Raises UsageError for a
-    configuration file that the service would not see."""
+    """Write the text of edgevpr.service for a board and a configuration file (None: the one that the shipped unit
+    names). Raises UsageError for a configuration file that the service would not see."""
     text = (shipped("deploy") / "edgevpr.service").read_text(encoding="utf-8")
     usual = _RUNS.search(text)[2]
     config_path = Path(config_path or usual).absolute()

@@ -1,4 +1,4 @@
-"""Learned words: what `edgevpr train words` wrote, and the bag of words over regions."""
+"""Learned visual words: the file that `edgevpr train words` writes, and the bag of words over regions."""
 
 import hashlib
 import io
@@ -12,13 +12,14 @@ from edgevpr.resources import model_folders
 from edgevpr.techniques.heads.vlad import nearest, unit
 from edgevpr.techniques.networks.card import load_card
 
-_ROWS_AT_ONCE = 64  # of an 8-bit matrix turned to float32 together
+_ROWS_AT_ONCE = 64  # of an 8-bit matrix converted to float32 together
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Words:
-    """`words` float32 (K, D); `sha256` of model and words together, for the map. Where the descriptor made of them is
-    to be whitened: `mean` float32 (K D,) and `whitening` int8 (P, K D), to be multiplied by `scale` float32 (P,)."""
+    """Learned words: `words` float32 (K, D), and the `sha256` of model and words together, for the map. If the
+    descriptor made of them is to be whitened, there are `mean` float32 (K D,) and `whitening` int8 (P, K D), to be
+    multiplied by `scale` float32 (P,)."""
 
     words: np.ndarray
     sha256: str
@@ -28,15 +29,15 @@ class Words:
 
     @property
     def length(self) -> int:
-        """Values of a VLAD descriptor, whitened where that was learned."""
+        """Number of values of a VLAD descriptor, after the whitening if there is one."""
         return self.words.size if self.whitening is None else len(self.whitening)
 
 
 def load_words(model: str, kind: str, count: int) -> Words:
-    """The `count` words of `kind` ("vlad", "regions", "bow") learned on the feature map of the card `model`.
+    """Load the `count` words of `kind` ("vlad", "regions", "bow") learned on the feature map of the card `model`.
 
-    Raises ModelError for a file that is missing, damaged or learned on another network (weights, how a picture is laid
-    before them, or output: the card's fingerprint), naming the command that makes it.
+    Raises ModelError for a file that is missing, damaged or learned on another network, and names the command that
+    makes it. The fingerprint of the card tells networks apart: weights, preparation of the picture, and outputs.
     """
     name = f"{model}_{kind}{count}.npz"
     command = f"make them with `edgevpr train words --images DIR --model {model} --kind {kind} --count {count}`"
@@ -75,11 +76,11 @@ def load_words(model: str, kind: str, count: int) -> Words:
 
 
 def bag_of_words(local: np.ndarray, words: np.ndarray) -> np.ndarray:
-    """Which of the words (K, D) any of the descriptors (N, D) falls to, L2-normalised: float32 (K,).
+    """Mark the words (K, D) that are nearest to any of the descriptors (N, D), and L2-normalise: float32 (K,).
 
-    Whether, not how often: many channels mark the same part of a picture, so that counts say little; on corridor and
-    aerial_caliterra, the sets tuned on, they find fewer places. Nor with the inverse document frequency, which
-    would weigh words by a map that is still being made.
+    A word counts once, however often it occurs. Many channels mark the same part of a picture, so that counts say
+    little; on corridor and aerial_caliterra, the data sets used for tuning, they find fewer places. The inverse
+    document frequency is left out too, since it would weigh words by a map that is still being made.
     """
     present = np.zeros(len(words), np.float32)
     present[nearest(local, words)] = 1
@@ -87,8 +88,8 @@ def bag_of_words(local: np.ndarray, words: np.ndarray) -> np.ndarray:
 
 
 def whitened(vector: np.ndarray, words: Words) -> np.ndarray:
-    """W (v - mean), L2-normalised, where a whitening was learned (Jégou and Chum, ECCV 2012): (K D,) -> float32
-    (length,)."""
+    """Whiten a VLAD vector by W (v - mean), L2-normalised (Jégou and Chum, ECCV 2012): (K D,) to float32 (length,).
+    Without a learned whitening the vector is returned as it is."""
     if words.whitening is None:
         return vector
     centred = vector - words.mean

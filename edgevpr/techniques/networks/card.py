@@ -1,6 +1,6 @@
-"""A network is a card: a YAML file that says which weights, how a picture is laid before them, and what comes out.
+"""The card of a network: a YAML file that names the weights, the preparation of a picture, and the outputs.
 
-Everything that could be wrong with a card is said when it is read, and not in the air.
+Every error in a card is reported when the card is read, not in flight.
 """
 
 import difflib
@@ -27,9 +27,9 @@ _CHOICES = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InputRule:
-    """How a picture becomes the network's input: (pixel * `scale` - `mean`) / `std`, the last two one number or one a
-    channel. `equalise` equalises the histogram of its brightness first; `resize` stretches it to the size. With
-    `layout` NHWC feature maps are (1, H, W, C) as well."""
+    """Preparation of a picture for the network: (pixel * `scale` - `mean`) / `std`. `mean` and `std` are one number, or
+    one per channel. With `equalise` the histogram of the brightness is equalised first. `resize` is the interpolation
+    by which the picture is stretched to the size. With `layout` NHWC feature maps are (1, H, W, C) as well."""
 
     layout: str
     height: int = bounded(8, 4096)
@@ -44,7 +44,7 @@ class InputRule:
 
 @dataclass(frozen=True, slots=True)
 class Outputs:
-    """Names in the ONNX file of a vector (1, D) and of a feature map (1, C, H, W)."""
+    """Names in the ONNX file of a vector (1, D) and of a feature map (1, C, H, W); None: the card names none."""
 
     descriptor: str | None = None
     features: str | None = None
@@ -52,7 +52,7 @@ class Outputs:
 
 @dataclass(frozen=True, slots=True)
 class NoParameters:
-    """Of the heads `flatten`, `max` and `rmac`."""
+    """Parameters of the heads `flatten`, `max` and `rmac`: there are none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +97,7 @@ HEADS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Card:
-    """One network. `path` is the card's own; `head` a name of `HEADS` and its parameters, or None."""
+    """One network. `path` is that of the card itself; `head` is a name of `HEADS` with its parameters, or None."""
 
     path: Path
     title: str
@@ -120,30 +120,31 @@ class Card:
 
     @property
     def is_technique(self) -> bool:
-        """Whether it makes a descriptor by itself, and not only for the techniques that take a `model`."""
+        """Tell whether the card makes a descriptor by itself, and does not only serve techniques that take a
+        `model`."""
         return self.head is not None or self.outputs.descriptor is not None
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 of all that a feature map or vector depends on: the weights, how the picture is prepared for them,
-        and which outputs are read."""
+        """SHA-256 of everything that a feature map or vector depends on: the weights, the preparation of the picture,
+        and the names of the outputs."""
         said = json.dumps([self.sha256, asdict(self.input), asdict(self.outputs)], sort_keys=True)
         return hashlib.sha256(said.encode()).hexdigest()
 
 
 def card_names() -> tuple[str, ...]:
-    """Names of all cards, in the user's folder and the shipped one, whether or not they can be read."""
+    """Return the names of all cards in the user's folder and the shipped one, also of cards that cannot be read."""
     return tuple(sorted({path.stem for folder in model_folders() for path in folder.glob("*.yaml")}))
 
 
 def load_card(name: str) -> Card:
-    """The card called `name`. Raises ModelError where there is none, and for one that does not say what it must."""
+    """Load the card called `name`. Raises ModelError if there is none, or if it is not valid."""
     for folder in model_folders():
         path = folder / f"{name}.yaml"
         if "/" not in name and path.is_file():
             try:
                 return read_card(path)
-            except ConfigError as error:  # it keeps one network on the ground, and is no wrong request of the user's
+            except ConfigError as error:  # one network cannot be used; the user's request is not wrong
                 raise ModelError(str(error)) from error
     near = difflib.get_close_matches(name, card_names(), n=1)
     known = ", ".join(card_names()) or "there are none yet"
@@ -154,7 +155,7 @@ def load_card(name: str) -> Card:
 
 
 def weights_of(spec: TechniqueSpec) -> str | None:
-    """Which weights a technique uses, in the words of its card; None for one without a network."""
+    """Return the weights that a technique uses, in the words of its card; None for a technique without a network."""
     if spec.model_sha256 is None:
         return None
     card = load_card(str(spec.parameters.get("model", spec.name)))
@@ -162,7 +163,8 @@ def weights_of(spec: TechniqueSpec) -> str | None:
 
 
 def read_card(path: Path, needs_hash: bool = True) -> Card:
-    """Read one card; `needs_hash` False lets `sha256` be missing or empty, for a card that is not filled in yet."""
+    """Read one card. With `needs_hash` False, `sha256` may be missing or empty, for a card that is not filled in yet.
+    Raises ConfigError or ModelError for a card that is not valid."""
     values = read_yaml(path)
     if not needs_hash:
         values = {**values, "sha256": values.get("sha256") or ""}
@@ -191,8 +193,9 @@ def read_card(path: Path, needs_hash: bool = True) -> Card:
 
 
 def head_parameters(card: Card) -> object | None:
-    """The parameters of the card's head as the dataclass of `HEADS`; None for a card without. Raises ModelError for a
-    head that does not exist or lacks a feature map, ConfigError for a parameter."""
+    """Return the parameters of the card's head as the dataclass of `HEADS`; None for a card without a head. Raises
+    ModelError for a head that does not exist, lacks a feature map or has wrong `levels` or `how`, ConfigError for other
+    parameters."""
     if card.head is None:
         return None
     name = card.head.get("name")

@@ -1,4 +1,4 @@
-"""From a picture to the input of a network, by the `input` of its card."""
+"""Preparation of a picture as the input of a network, by the `input` of its card."""
 
 import cv2
 import numpy as np
@@ -10,7 +10,7 @@ _NOTHING_ALLOWED = 128
 
 
 def prepare(image: np.ndarray, rule: InputRule) -> np.ndarray:
-    """uint8 (H, W) grey or (H, W, 3) BGR -> float32 (1, C, height, width), or (1, height, width, C) for NHWC.
+    """Prepare uint8 (H, W) grey or (H, W, 3) BGR as float32 (1, C, height, width), or (1, height, width, C) for NHWC.
 
     Equalising is that of CALC: BGR to YUV, the histogram of Y equalised, back to BGR, all before the picture is made
     grey and smaller. A grey picture has no U and V: its own histogram is equalised.
@@ -32,8 +32,8 @@ def prepare(image: np.ndarray, rule: InputRule) -> np.ndarray:
 
 
 def without_masked(image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
-    """The picture with every pixel where the bool (H, W) `mask` is False set to the mean of the others: a network needs
-    a whole picture, and an even patch says the least."""
+    """Set every pixel where the bool (H, W) `mask` is False to the mean of the others (128 if there are none). A
+    network needs a whole picture, and a uniform patch adds the least to it."""
     if mask is None or mask.all():
         return image
     filled = image.copy()

@@ -1,10 +1,9 @@
-"""Running a network: the only place that knows onnxruntime, imported when the first network is opened.
+"""Running a network: the only module that uses onnxruntime in flight, and imports it only with the first network.
 
-What a file promises is not believed: it is run once before it may fly, and each result is looked at.
+A model file is not trusted: it is run once before it may fly, and every result is checked.
 """
 
 import hashlib
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -19,38 +18,35 @@ _RANKS = {"descriptor": 2, "features": 4}
 _FORMS = {"descriptor": "(1, D)", "features": "(1, C, H, W)"}
 _SEED = 7
 _MOST_THREADS = 256
-_LARGEST = 1e12  # in float32 the length of a vector of much larger numbers is infinite, and the vector nothing
+_LARGEST = 1e12  # with much larger numbers the length of a vector overflows float32, and the unit vector is zero
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Backbone:
-    """One output of a network that has been seen to work. `shape` is (C, H, W) of features, (D,) of a descriptor;
-    `sha256` is the card's fingerprint: weights, preparation and outputs (that of the file alone is `card.sha256`)."""
+    """One output of a network that has run successfully. `shape` is (C, H, W) of features, (D,) of a descriptor.
+    `sha256` is the card's fingerprint: weights, preparation and outputs (`card.sha256` is that of the file alone)."""
 
-    card: Card
-    output: str
-    shape: tuple[int, ...]
-    sha256: str
-    session: Any
+    def __init__(self, *, card: Card, output: str, shape: tuple[int, ...], sha256: str, session: Any) -> None:
+        self.card, self.output, self.shape, self.sha256, self.session = card, output, shape, sha256, session
 
     def run(self, image: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
-        """uint8 (H, W[, 3]) -> float32 of `shape`; pixels where bool (H, W) `mask` is False are filled with the mean of
-        the others. Raises ModelError for a result with NaN or numbers without measure, and for one of zeros only."""
+        """Run the network on uint8 (H, W[, 3]); returns float32 of `shape`. Pixels where bool (H, W) `mask` is False
+        are filled with the mean of the others. Raises ModelError for a result with NaN or numbers beyond 1e12, and for
+        one of zeros only."""
         return _run(self.card, self.output, self.session, without_masked(image, mask))
 
 
 def open_backbone(model: str, output: str, threads: int = 1) -> Backbone:
-    """The network of the card `model`, for its output "features" or "descriptor".
+    """Open the network of the card `model`, for its output "features" or "descriptor".
 
-    Raises ModelError, one sentence: no onnxruntime, no card, no file or another one than the card's, no ONNX, inputs or
-    outputs of another form, axes without a size, a result that is not finite or says nothing. UsageError for a number
-    of threads that makes no sense.
+    Raises ModelError, one sentence, for any of: no onnxruntime, no card, no file or another one than the card's, no
+    ONNX, inputs or outputs of another form, axes without a size, a result that is not finite or all zeros. Raises
+    UsageError for a number of threads outside 1 to 256.
     """
     return backbone_of(load_card(model), output, threads)
 
 
 def backbone_of(card: Card, output: str, threads: int = 1) -> Backbone:
-    """`open_backbone` of a card that is at hand."""
+    """Open the network of a card that is already loaded, as `open_backbone` does."""
     if not 1 <= threads <= _MOST_THREADS:
         raise UsageError(f"{card.name} cannot run with threads={threads}: give 1 to {_MOST_THREADS}.")
     if getattr(card.outputs, output) is None:
@@ -61,14 +57,14 @@ def backbone_of(card: Card, output: str, threads: int = 1) -> Backbone:
     session = _session(card.file_path, card.sha256, threads)
     _require_input(card, session)
     _require_output(card, output, session)
-    # A picture with something in it: an even one is all zeros after many a network that is whole.
+    # Noise, not a uniform picture: many a correct network gives only zeros for that.
     noise = np.random.default_rng(_SEED).integers(0, 256, (card.input.height, card.input.width), np.uint8)
     result = _run(card, output, session, noise)
     return Backbone(card=card, output=output, shape=result.shape, sha256=card.fingerprint, session=session)
 
 
 def file_sha256(path: Path) -> str:
-    """SHA-256 of a model file. Raises ModelError where it cannot be read."""
+    """Compute the SHA-256 of a model file, 64 hexadecimal digits. Raises ModelError if it cannot be read."""
     try:
         with open(path, "rb") as handle:
             digest = hashlib.sha256()
@@ -83,7 +79,7 @@ def file_sha256(path: Path) -> str:
 
 @cache
 def _session(path: Path, sha256: str, threads: int) -> Any:
-    """One session a file and process, however many techniques use it."""
+    """Open the session of a file: one in the process, however many techniques use it."""
     found = file_sha256(path)
     if found != sha256:
         raise ModelError(
@@ -93,13 +89,13 @@ def _session(path: Path, sha256: str, threads: int) -> Any:
     runtime = import_onnxruntime()
     options = runtime.SessionOptions()
     options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
-    # The arena stays on: without it the memory of the same network went from 20 to 60 MB, as malloc had it, and was
-    # less in few of six tried.
-    options.log_severity_level = 4  # what goes wrong is said by us
+    # The arena stays on: without it the memory of the same network varied from 20 to 60 MB, depending on malloc, and
+    # was lower for few of six networks tried.
+    options.log_severity_level = 4  # fatal messages only: edgevpr reports errors itself
     # Threads that wait for work by spinning draw power and do nothing.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    # Weights in a second file, which the hash would not cover, are refused: of bytes they would be looked for where the
-    # program was started, so a place is named where there is none.
+    # Weights in a second file are refused, since the hash would not cover them. For a model given as bytes onnxruntime
+    # would look for them in the working directory, so a folder is named that does not exist.
     options.add_session_config_entry("session.model_external_initializers_file_folder_path", str(path))
     try:
         return runtime.InferenceSession(path.read_bytes(), options, providers=["CPUExecutionProvider"])
@@ -110,10 +106,10 @@ def _session(path: Path, sha256: str, threads: int) -> Any:
 
 
 def import_onnxruntime() -> Any:
-    """The library, imported now. Raises ModelError where it cannot be."""
+    """Import onnxruntime and return it. Raises ModelError if it cannot be imported."""
     try:
         import onnxruntime
-    except Exception as error:  # also a broken library of it: OSError, and NumPy's complaints
+    except Exception as error:  # a broken installation raises OSError, or an error of NumPy
         raise ModelError(
             f"onnxruntime cannot be imported ({_first_line(error)}): install it again (`pip install onnxruntime`) for "
             "the techniques with networks; hog, cohog and seqslam fly without it."
@@ -170,7 +166,7 @@ def _run(card: Card, output: str, session: Any, image: np.ndarray) -> np.ndarray
             "correct `outputs` of the card."
         )
     values = result[0].astype(np.float32, copy=False)
-    if not np.abs(values).max() <= _LARGEST:  # so written, NaN is refused as well
+    if not np.abs(values).max() <= _LARGEST:  # written with `not`, so that NaN is refused as well
         raise ModelError(
             f"{card.file_path} gives numbers that are not finite, or beyond {_LARGEST:g}, for `{name}`: its weights or "
             "`input` of its card are wrong."

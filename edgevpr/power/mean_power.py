@@ -1,4 +1,4 @@
-"""Mean power over a time, from a meter: trapezoids between readings of watts, differences of counters of joules."""
+"""Mean power over a time, from a meter: trapezoids between readings of watts, or differences of counters of joules."""
 
 import time
 from collections.abc import Callable
@@ -11,7 +11,7 @@ _GONE_AFTER = 3  # failures in a row: the meter is gone, and a mean from before 
 
 
 @dataclass(frozen=True, slots=True)
-class MeasuredPower:
+class MeanPower:
     """Mean power over `window_s`, the time between the first and the last good reading; `skipped` readings failed."""
 
     mean_w: float
@@ -20,17 +20,18 @@ class MeasuredPower:
     skipped: int
 
 
-def measure(
+def mean_power(
     meter: Meter,
     window_s: float,
     clock: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], None] = time.sleep,
-) -> MeasuredPower:
-    """Read `meter` every `meter.period_s` for `window_s` seconds and give the mean power.
+) -> MeanPower:
+    """Read `meter` every `meter.period_s` for `window_s` seconds and return the mean power.
 
-    A reading that fails (gone, a text, negative, absurd) is left out and counted; the neighbours bridge it. Raises
-    MeterError when three fail in a row, when fewer than two are good, or when more than half have failed. Short windows
-    say little: one study had to read at 350 Hz to trust them, so let the same work run for many seconds.
+    A reading that fails (file gone, no number, negative, absurd) is left out and counted; its neighbours bridge the
+    gap. Raises MeterError when three fail in a row, when fewer than two are good, or when more than half have failed,
+    and UsageError for a time that is not above 0. Short windows say little: one study had to read at 350 Hz to trust
+    them, so let the same work run for many seconds.
     """
     if not 0 < window_s < float("inf"):
         raise UsageError(f"Power cannot be measured for {window_s:g} s: give a time above 0.")
@@ -58,12 +59,12 @@ def measure(
             "longer, or check its wiring."
         )
     covered_s = last.t_mono_s - first.t_mono_s
-    return MeasuredPower(energy_j / covered_s, covered_s, readings, skipped)
+    return MeanPower(energy_j / covered_s, covered_s, readings, skipped)
 
 
 def _energy_between(meter: Meter, earlier: PowerSample, later: PowerSample) -> float:
-    """Joules between two readings. Raises MeterError for counters that have moved by more than any machine draws: one
-    that was reset looks like one that has wrapped."""
+    """Return the joules between two readings. Raises MeterError for counters that have moved by more than any machine
+    draws: a counter that was reset looks like one that has wrapped."""
     step_s = later.t_mono_s - earlier.t_mono_s
     if not meter.wraps_j:
         return (earlier.power_w + later.power_w) / 2 * step_s
