@@ -1,13 +1,14 @@
 """The one import of pymavlink's dialect, and the parser from bytes to messages.
 
-`mavutil` is not imported: it would take another 20 MB of RAM, and its connections hang, spin or raise where a link of
+`ardupilotmega` holds all that ArduPilot and PX4 say to a companion computer; the dialect `all` would take another 1 MB
+of RAM. `mavutil` is not imported: it would take another 20 MB, and its connections hang, spin or raise where a link of
 this package must not.
 """
 
 from collections import Counter
 from collections.abc import Iterator
 
-from pymavlink.dialects.v20 import all as mavlink
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 Message = mavlink.MAVLink_message
 
