@@ -5,6 +5,7 @@ import itertools
 
 import numpy as np
 import pytest
+from example_costs import REGIONS, VECTOR
 
 from edgevpr import techniques
 from edgevpr.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
@@ -18,21 +19,6 @@ from edgevpr.runtime.preflight.probe import TechniqueCosts, noise, probe, probe_
 from edgevpr.runtime.preflight.scale import on_board
 from edgevpr.types import StageCost
 
-# Round figures of the size that cohog and hog have: exact matching of many regions, or a long vector in RAM.
-REGIONS = TechniqueCosts(
-    encode=StageCost(0.1, 0.1),
-    match_per_place=StageCost(0.004, 0.004),
-    ram_bytes_per_place=1_000,
-    disk_bytes_per_place=124_000,
-    process_mb=90.0,
-)
-VECTOR = TechniqueCosts(
-    encode=StageCost(0.05, 0.05),
-    match_per_place=StageCost(0.001, 0.001),
-    ram_bytes_per_place=286_000,
-    disk_bytes_per_place=286_000,
-    process_mb=90.0,
-)
 COSTS = {"regions": REGIONS, "vector": VECTOR}
 
 

@@ -3,13 +3,14 @@
 from dataclasses import replace
 
 import pytest
+from example_costs import REGIONS
+from example_costs import VECTOR as ONE_CORE_VECTOR
 
 from edgevpr import techniques
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import parse_pack
 from edgevpr.runtime.preflight.estimate import FlightPlan, estimate
 from edgevpr.runtime.preflight.estimate_text import format_table
-from edgevpr.runtime.preflight.probe import TechniqueCosts
 from edgevpr.runtime.preflight.trial import Trial
 from edgevpr.types import StageCost
 
@@ -17,20 +18,7 @@ ZERO, HERE = load_board("rpi-zero-2w"), load_board("generic-x86")
 PLAN = FlightPlan(
     places=1000, rate_hz=1.0, flight_min=20.0, pack=parse_pack("4S5200"), regulator_efficiency=0.85, budget_mb=256
 )
-REGIONS = TechniqueCosts(
-    encode=StageCost(0.1, 0.1),
-    match_per_place=StageCost(0.004, 0.004),
-    ram_bytes_per_place=1_000,
-    disk_bytes_per_place=124_000,
-    process_mb=90.0,
-)
-VECTOR = TechniqueCosts(
-    encode=StageCost(0.05, 0.1),
-    match_per_place=StageCost(0.001, 0.002),
-    ram_bytes_per_place=286_000,
-    disk_bytes_per_place=286_000,
-    process_mb=90.0,
-)
+VECTOR = replace(ONE_CORE_VECTOR, encode=StageCost(0.05, 0.1), match_per_place=StageCost(0.001, 0.002))
 
 
 def text(trials, plan=PLAN, board=ZERO, **more):

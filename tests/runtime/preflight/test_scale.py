@@ -2,29 +2,15 @@
 
 from dataclasses import replace
 
+import example_costs
 import pytest
+from example_costs import VECTOR
 
 from edgevpr.power.boards import MachineSpeed, load_board
-from edgevpr.runtime.preflight.probe import TechniqueCosts
 from edgevpr.runtime.preflight.scale import UNKNOWN_PRODUCTS, Ratios, is_same, on_board, ratios
 from edgevpr.types import StageCost
 
-REGIONS = TechniqueCosts(
-    encode=StageCost(0.1, 0.1),
-    match_per_place=StageCost(0.004, 0.004),
-    ram_bytes_per_place=1_000,
-    disk_bytes_per_place=124_000,
-    process_mb=90.0,
-    candidates=40,
-    scan_per_place=StageCost(1e-6, 1e-6),
-)
-VECTOR = TechniqueCosts(
-    encode=StageCost(0.05, 0.05),
-    match_per_place=StageCost(0.001, 0.001),
-    ram_bytes_per_place=286_000,
-    disk_bytes_per_place=286_000,
-    process_mb=90.0,
-)
+REGIONS = replace(example_costs.REGIONS, candidates=40, scan_per_place=StageCost(1e-6, 1e-6))
 HERE, PI = load_board("generic-x86"), load_board("rpi-4b")
 
 

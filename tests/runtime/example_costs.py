@@ -1,0 +1,19 @@
+"""Costs in round figures of the size of cohog (exact matching of many regions) and of hog (a long vector in RAM)."""
+
+from edgevpr.runtime.preflight.probe import TechniqueCosts
+from edgevpr.types import StageCost
+
+REGIONS = TechniqueCosts(
+    encode=StageCost(0.1, 0.1),
+    match_per_place=StageCost(0.004, 0.004),
+    ram_bytes_per_place=1_000,
+    disk_bytes_per_place=124_000,
+    process_mb=90.0,
+)
+VECTOR = TechniqueCosts(
+    encode=StageCost(0.05, 0.05),
+    match_per_place=StageCost(0.001, 0.001),
+    ram_bytes_per_place=286_000,
+    disk_bytes_per_place=286_000,
+    process_mb=90.0,
+)
