@@ -25,7 +25,6 @@ class FakeClock:
         self._events: list[tuple[float, Callable[[], object]]] = []
         self.clock = Clock(
             mono_s=self,
-            utc_s=lambda: 1.7e9 + self.now_s,
             process_cpu_s=lambda: self.cpu_s,
             thread_cpu_s=lambda: self.thread_cpu_s,
             sleep=self.sleep,

@@ -27,7 +27,6 @@ def test_a_clock_goes_on_and_sleeps(clock):
     before = {each.name: getattr(clock, each.name)() for each in fields(Clock) if each.name != "sleep"}
     clock.sleep(0.01)
     assert clock.mono_s() >= before["mono_s"] + 0.01
-    assert clock.utc_s() > before["utc_s"] > 1e9
     assert clock.process_cpu_s() >= before["process_cpu_s"]
     assert clock.thread_cpu_s() >= before["thread_cpu_s"]
 

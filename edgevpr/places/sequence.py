@@ -18,8 +18,9 @@ from edgevpr.contract import TechniqueSpec
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.retrieve import Ranking
 
-V_MIN, V_MAX, _V_STEP = 0.8, 1.2, 0.1  # places a query, as in the paper
-_OTHER_SPEEDS = np.arange(-2.5, 3.01, 0.25)  # places a query; a step that a sequence of ten queries can tell apart
+FOLLOWED_SPEEDS = np.linspace(0.8, 1.2, 5)  # places a query, as in the paper
+_SPEEDS = np.arange(-2.5, 3.01, 0.25)  # places a query; a step that a sequence of ten queries can tell apart
+_OTHER_SPEEDS = _SPEEDS[(_SPEEDS < FOLLOWED_SPEEDS[0]) | (_SPEEDS > FOLLOWED_SPEEDS[-1])]
 # After this time at 10 m/s the vehicle has left the neighbourhood of 50 m, and no velocity covers the places between.
 _GAP_S = 5.0
 _NEWEST, _NEWEST_ALONE, _BEST_SHARE = 3, 2, 0.1
@@ -56,16 +57,14 @@ class SequenceSearch:
 
     `frames` is the number of queries so far: until it is `length`, no place may be accepted. `rivals`, float32 (N,),
     are the best mean scores at speeds that are not followed: an accepted place must be ahead of the rivals elsewhere. A
-    pause longer than `gap_s` seconds, and than three times the interval before it, begins a new sequence.
+    pause longer than five seconds, and than three times the interval before it, begins a new sequence.
     """
 
-    def __init__(self, length: int, v_min: float = V_MIN, v_max: float = V_MAX, gap_s: float = _GAP_S) -> None:
+    def __init__(self, length: int) -> None:
         self.length = length
-        self._trajectories = trajectories(length, _followed(v_min, v_max))
-        others = [velocity for velocity in _OTHER_SPEEDS if not v_min <= velocity <= v_max]
-        self._other_trajectories = trajectories(length, np.array(others))
+        self._trajectories = trajectories(length, FOLLOWED_SPEEDS)
+        self._other_trajectories = trajectories(length, _OTHER_SPEEDS)
         self.rivals = np.empty(0, np.float32)
-        self._gap_s = gap_s
         self._rows: deque[np.ndarray] = deque(maxlen=length)  # newest first
         self._usual: deque[float] = deque(maxlen=_NEWEST_ALONE)  # score of the places not compared, by query
         self._known = (0, 0)  # number of places of the index, and the checksum of their ids
@@ -137,7 +136,7 @@ class SequenceSearch:
         self._interval_s = t_mono_s - before_s
         places, checksum = self._known
         return (
-            self._interval_s > max(self._gap_s, _USUAL_INTERVALS * usual_s)
+            self._interval_s > max(_GAP_S, _USUAL_INTERVALS * usual_s)
             or len(index) < places
             or zlib.crc32(index.place_ids[:places]) != checksum
         )
@@ -151,11 +150,6 @@ def trajectories(length: int, velocities: np.ndarray) -> list[list[int]]:
     # Halves go up, also where the product has a rounding error in its last bit.
     back = np.floor(velocities[:, None] * np.arange(length) + 0.5 + 1e-9).astype(int)
     return np.unique(back, axis=0).tolist()
-
-
-def _followed(v_min: float, v_max: float) -> np.ndarray:
-    """Return the velocities of the search, places a query."""
-    return np.linspace(v_min, v_max, round((v_max - v_min) / _V_STEP) + 1)
 
 
 def best_means(rows: Sequence[np.ndarray], trajectories: Sequence[Sequence[int]]) -> np.ndarray:
@@ -172,20 +166,6 @@ def best_means(rows: Sequence[np.ndarray], trajectories: Sequence[Sequence[int]]
         np.maximum(best, total, out=best)
     best /= len(rows)
     return best
-
-
-def offline(scores: np.ndarray, length: int, v_min: float = V_MIN, v_max: float = V_MAX) -> np.ndarray:
-    """Compute the same scores as `SequenceSearch` for all queries of a flight at once: float32 (Q, N) -> (Q, N)."""
-    queries, places = scores.shape
-    best = np.zeros((queries, places), np.float32)
-    for trajectory in trajectories(length, _followed(v_min, v_max)):
-        total = np.zeros_like(best)
-        for age, back in enumerate(trajectory):
-            if age < queries and back < places:
-                total[age:, back:] += scores[: queries - age, : places - back]
-        np.maximum(best, total, out=best)
-    frames = np.minimum(np.arange(queries) + 1, length).astype(np.float32)
-    return best / frames[:, None]
 
 
 Search = Alone | SequenceSearch

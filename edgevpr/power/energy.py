@@ -24,10 +24,6 @@ class EnergySoFar:
     stages_cpu_s: float
     process_cpu_s: float
 
-    @property
-    def total_j(self) -> float:
-        return self.idle_j + self.marginal_j
-
 
 class RunningEnergy:
     """Adds up stages as they end. `clock` and `cpu_clock` give wall and CPU-seconds (all threads) in flight."""

@@ -10,7 +10,7 @@ from map_writer import SPEC
 from edgevpr.contract import FineMatch
 from edgevpr.places.index import PlaceIndex, empty_index
 from edgevpr.places.retrieve import Ranking
-from edgevpr.places.sequence import SequenceSearch, bytes_beside_place, length_of, offline
+from edgevpr.places.sequence import FOLLOWED_SPEEDS, SequenceSearch, bytes_beside_place, length_of, trajectories
 from edgevpr.techniques import create
 
 FOLLOWED = (0.8, 0.9, 1.0, 1.1, 1.2)
@@ -32,6 +32,20 @@ def literal(scores, length, velocities=FOLLOWED):
                         total += float(scores[newest - age][place])
                 found[newest, end] = max(found[newest, end], total / frames)
     return found
+
+
+def offline(scores, length):
+    """The scores of all queries of a flight at once, added up in the order of `SequenceSearch`: exactly the same."""
+    queries, places = scores.shape
+    best = np.zeros((queries, places), np.float32)
+    for trajectory in trajectories(length, FOLLOWED_SPEEDS):
+        total = np.zeros_like(best)
+        for age, back in enumerate(trajectory):
+            if age < queries and back < places:
+                total[age:, back:] += scores[: queries - age, : places - back]
+        np.maximum(best, total, out=best)
+    frames = np.minimum(np.arange(queries) + 1, length).astype(np.float32)
+    return best / frames[:, None]
 
 
 def index_of(place_ids):

@@ -8,11 +8,9 @@ from dataclasses import dataclass
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Clock:
     """Clocks in seconds: `mono_s` since the start of the machine, which stamps every frame and message of a flight;
-    `utc_s` since 1970; `process_cpu_s` CPU time of all threads; `thread_cpu_s` that of the calling thread. `sleep`
-    waits."""
+    `process_cpu_s` CPU time of all threads; `thread_cpu_s` that of the calling thread. `sleep` waits."""
 
     mono_s: Callable[[], float] = time.monotonic
-    utc_s: Callable[[], float] = time.time
     process_cpu_s: Callable[[], float] = time.process_time
     thread_cpu_s: Callable[[], float] = time.thread_time
     sleep: Callable[[float], None] = time.sleep
