@@ -1,3 +1,3 @@
-from edgevpr.cli.main import main
+from edgevpr.cli.main import program
 
-raise SystemExit(main())
+program()

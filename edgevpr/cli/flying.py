@@ -1,8 +1,5 @@
 """Commands that use a map: `edgevpr match`, `run`, `check` and `service`."""
 
-import os
-import sys
-import threading
 from argparse import Namespace
 from typing import Any
 
@@ -97,12 +94,7 @@ def run_flight(args: Namespace) -> int:
     """Fly with a configuration."""
     from edgevpr.runtime.service.fly import fly
 
-    code = fly(config_of(args, args.config), path_of(args.positions))
-    if threading.active_count() > 1:
-        # A capture thread hangs in a stream that does not answer: FFmpeg would abort Python while it ends.
-        sys.stderr.flush()
-        os._exit(code)
-    return code
+    return fly(config_of(args, args.config), path_of(args.positions))
 
 
 def run_check(args: Namespace) -> int:

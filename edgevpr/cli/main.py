@@ -5,12 +5,24 @@ import argparse
 import logging
 import os
 import sys
+import threading
 
 from edgevpr import __version__
 from edgevpr.cli import evaluation, flying, maps, networks, profile, simulation
 from edgevpr.errors import EdgevprError
 
 _GROUPS = (maps, flying, profile, evaluation, simulation, networks)
+
+
+def program() -> None:
+    """Run one command as a program of its own, and end with its exit code."""
+    code = main()
+    if threading.active_count() > 1:
+        # A capture thread hangs in a stream that does not answer: FFmpeg would abort Python while it ends.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    sys.exit(code)
 
 
 def main(argv: list[str] | None = None) -> int:

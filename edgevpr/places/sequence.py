@@ -20,7 +20,7 @@ from edgevpr.places.retrieve import Ranking
 
 FOLLOWED_SPEEDS = np.linspace(0.8, 1.2, 5)  # places a query, as in the paper
 _SPEEDS = np.arange(-2.5, 3.01, 0.25)  # places a query; a step that a sequence of ten queries can tell apart
-_OTHER_SPEEDS = _SPEEDS[(_SPEEDS < FOLLOWED_SPEEDS[0]) | (_SPEEDS > FOLLOWED_SPEEDS[-1])]
+_OTHER_SPEEDS = _SPEEDS[(FOLLOWED_SPEEDS[0] > _SPEEDS) | (FOLLOWED_SPEEDS[-1] < _SPEEDS)]
 # After this time at 10 m/s the vehicle has left the neighbourhood of 50 m, and no velocity covers the places between.
 _GAP_S = 5.0
 _NEWEST, _NEWEST_ALONE, _BEST_SHARE = 3, 2, 0.1

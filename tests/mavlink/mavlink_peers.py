@@ -164,7 +164,7 @@ class AutopilotThread:
         self._stop = threading.Event()
         self._summaries: list[AutopilotSummary] = []
         self._thread = threading.Thread(
-            target=lambda: self._summaries.append(run_autopilot(link_url, stop=self._stop, **options))
+            target=lambda: self._summaries.append(run_autopilot(link_url, stop=self._stop, **options)), daemon=True
         )
         self._thread.start()
 

@@ -44,13 +44,14 @@ def test_waiting_costs_idle_power_only():
     energy = RunningEnergy(PI4, lambda: now_s[0], lambda: 0.0)
     now_s[0] = 150.0
     so_far = energy.so_far()
-    assert (so_far.elapsed_s, so_far.total_j, so_far.marginal_j) == (100.0, pytest.approx(229.0), 0.0)
+    assert (so_far.elapsed_s, so_far.idle_j, so_far.marginal_j) == (100.0, pytest.approx(229.0), 0.0)
 
 
 def test_a_stage_of_no_length_costs_nothing():
     energy = RunningEnergy(PI4, lambda: 0.0, lambda: 0.0)
     energy.add(StageCost(0.0, 0.0))
-    assert energy.so_far().total_j == 0
+    so_far = energy.so_far()
+    assert so_far.idle_j + so_far.marginal_j == 0
 
 
 def test_stages_of_the_real_process_add_up_to_its_own_cpu_time():
