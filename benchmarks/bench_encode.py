@@ -73,7 +73,8 @@ def measure(entropy: str, pictures: list[np.ndarray], turns: int) -> EncodeRow:
 
 
 def published(picture: np.ndarray, entropy: str) -> tuple[np.ndarray, np.ndarray]:
-    return competitor.encode(cv2.resize(picture, (SIDE_PX, SIDE_PX), interpolation=cv2.INTER_LINEAR), entropy)
+    scaled = cv2.resize(picture.astype(np.float32), (SIDE_PX, SIDE_PX), interpolation=cv2.INTER_LINEAR)
+    return competitor.encode(scaled, entropy)
 
 
 def floor(picture: np.ndarray) -> None:

@@ -16,15 +16,16 @@ _DISC = disk(5).astype(np.uint8)
 
 
 def encode(grey: np.ndarray, entropy: str) -> tuple[np.ndarray, np.ndarray]:
-    """Regions float64 (blocks, 32) and which of them are good, bool (blocks,), of uint8 grey (H, W)."""
-    entropy_map = shannon(grey) if entropy == "shannon" else filled_bins(grey)
+    """Regions float64 (blocks, 32) and which of them are good, bool (blocks,), of float32 grey (H, W), 0 to 255."""
+    levels = np.floor(grey + 0.5).astype(np.uint8)
+    entropy_map = shannon(levels) if entropy == "shannon" else filled_bins(levels)
     regions = hog_blocks(grey)
     return regions.reshape(-1, regions.shape[2]), (block_means(entropy_map) >= GT[entropy]).ravel()
 
 
 def shannon(grey: np.ndarray) -> np.ndarray:
     """Shannon entropy in a disc of 5, over 8, of a 100x100 copy scaled back: float64 (H, W)."""
-    small = cv2.resize(grey, (100, 100), interpolation=cv2.INTER_LINEAR)
+    small = cv2.resize(grey, (100, 100), interpolation=cv2.INTER_LINEAR_EXACT)
     return cv2.resize(rank.entropy(small, _DISC), grey.shape[::-1], interpolation=cv2.INTER_LINEAR) / 8
 
 
