@@ -15,13 +15,13 @@ from pathlib import Path
 import numpy as np
 
 from edgevpr import techniques
-from edgevpr.config import read_yaml
 from edgevpr.errors import EdgevprError, ModelError
 from edgevpr.helpers.files import write_whole
 from edgevpr.power.machine import rss_mb
 from edgevpr.resources import own_models
 from edgevpr.techniques.networks.card import Card, card_names, load_card, read_card
 from edgevpr.techniques.networks.session import Backbone, backbone_of, file_sha256, import_onnxruntime
+from edgevpr.yamlfile import read_yaml
 
 _ROUNDS = 10
 _FRAME = (480, 640)
