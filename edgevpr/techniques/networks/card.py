@@ -188,7 +188,7 @@ def read_card(path: Path, needs_hash: bool = True) -> Card:
         numbers = getattr(card.input, key)
         if numbers is not None and not _are_numbers(numbers, (1, channels), positive=key == "std"):
             raise ModelError(
-                f"{path}: `input.{key}` is {str(numbers):.80}: write one number or {channels}, one a channel"
+                f"{path}: `input.{key}` is {numbers!s:.80}: write one number or {channels}, one a channel"
                 + (", all above 0." if key == "std" else ".")
             )
     head_parameters(card)
@@ -219,7 +219,7 @@ def head_parameters(card: Card) -> object | None:
         levels = parameters.levels
         if not levels or not all(type(level) is int and 1 <= level <= 64 for level in levels):
             raise ModelError(
-                f"{card.path}: `head.levels` is {str(levels):.80}: write whole numbers from 1 to 64, e.g. [1, 2, 3]."
+                f"{card.path}: `head.levels` is {levels!s:.80}: write whole numbers from 1 to 64, e.g. [1, 2, 3]."
             )
     if name == "grid" and parameters.how not in ("mean", "max"):
         raise ModelError(f"{card.path}: `head.how` is `{parameters.how}`: write mean or max.")
