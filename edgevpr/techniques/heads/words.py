@@ -8,10 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgevpr.errors import ModelError
+from edgevpr.helpers.files import read_file
 from edgevpr.resources import model_folders
 from edgevpr.techniques.heads.vlad import nearest, unit
 from edgevpr.techniques.networks.card import load_card
 
+_MAX_FILE_BYTES = 500_000_000  # 65,536 words of 2,048 numbers
 _ROWS_AT_ONCE = 64  # of an 8-bit matrix converted to float32 together
 
 
@@ -46,7 +48,7 @@ def load_words(model: str, kind: str, count: int) -> Words:
         raise ModelError(f"There are no words {name} for the model `{model}`: {command}.")
     wanted = load_card(model).fingerprint
     try:
-        content = path.read_bytes()
+        content = read_file(path, _MAX_FILE_BYTES)
         with np.load(io.BytesIO(content), allow_pickle=False) as file:
             arrays = {key: file[key] for key in file.files}
         learned_on = str(arrays["model_sha256"])
