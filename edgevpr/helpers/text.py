@@ -4,7 +4,8 @@ import os
 import re
 
 # user:password@ of an address. A password may hold `@` and, wrongly, `/`: all up to the last @ of the word is left out.
-_PASSWORD = re.compile(r"(://[^\s/:@]*):\S*@")
+# An address that was taken for a path has one `/` only.
+_PASSWORD = re.compile(r"(\w:/{1,2}[^\s/:@]*):\S*@")
 # Cameras take their secrets in the query of an address, too.
 _SECRET = re.compile(r"(?i)([?&](?:password|passwd|passwort|pass|pwd|token|secret|api_?key|key|auth)=)[^&\s#]*")
 
@@ -19,7 +20,7 @@ def printable(text: str, keep: str = "") -> str:
 
 def without_passwords(text: str) -> str:
     """Replace the passwords of the addresses in a text: rtsp://user:***@host/path."""
-    if "://" not in text:
+    if ":/" not in text:
         return text
     return _SECRET.sub(r"\1***", _PASSWORD.sub(r"\1:***@", text))
 

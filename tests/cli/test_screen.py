@@ -47,6 +47,7 @@ def test_a_name_that_is_not_utf_8_becomes_one():
         ("rtsp://:secret@10.0.0.2/cam", "rtsp://:***@10.0.0.2/cam"),
         ("rtsp://pilot:s/e:c@r@et@10.0.0.2/cam", "rtsp://pilot:***@10.0.0.2/cam"),
         ("http://10.0.0.2/cam?user=pilot&pwd=secret&x=1", "http://10.0.0.2/cam?user=pilot&pwd=***&x=1"),
+        ("There is no map rtsp:/pilot:secret@cam.", "There is no map rtsp:/pilot:***@cam."),
         ("rtsp://10.0.0.2:554/cam", "rtsp://10.0.0.2:554/cam"),
         ("rtsp://pilot@10.0.0.2:554/cam", "rtsp://pilot@10.0.0.2:554/cam"),
         ("serial:/dev/ttyAMA0:921600", "serial:/dev/ttyAMA0:921600"),
