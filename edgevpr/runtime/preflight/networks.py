@@ -14,7 +14,7 @@ import numpy as np
 from edgevpr import techniques
 from edgevpr.config import build
 from edgevpr.errors import EdgevprError, ModelError
-from edgevpr.helpers.child import ask_child, job_of_parent, last_line
+from edgevpr.helpers.child import ask_child, last_line, serve_parent
 from edgevpr.helpers.files import read_file, write_whole
 from edgevpr.power.machine import rss_mb
 from edgevpr.resources import own_models
@@ -85,7 +85,7 @@ def verify(card: Card, threads: int = 1, learned: bool = True, limit_s: float = 
         )
     if ended.code:
         raise ModelError(f"{card.file_path} could not be tried ({last_line(ended)}): install edgevpr again.")
-    answer = json.loads(ended.answer)
+    answer = ended.answer
     if "problem" in answer:
         raise ModelError(answer["problem"])
     return Verified(**answer | {"shapes": {output: tuple(shape) for output, shape in answer["shapes"].items()}})
@@ -234,4 +234,4 @@ def _answer(job: dict) -> dict:
 
 
 if __name__ == "__main__":
-    print(json.dumps(_answer(job_of_parent())))
+    serve_parent(_answer)

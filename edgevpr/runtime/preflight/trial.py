@@ -4,7 +4,6 @@ library that crashes on this processor loses only its own row.
 `python -m edgevpr.runtime.preflight.trial` is such a process: it reads a job as JSON and prints a Trial as JSON.
 """
 
-import json
 import signal
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
@@ -14,7 +13,7 @@ from typing import Any
 from edgevpr import techniques
 from edgevpr.errors import EdgevprError
 from edgevpr.frames.images import read_image
-from edgevpr.helpers.child import Ended, ask_child, job_of_parent, last_line
+from edgevpr.helpers.child import Ended, ask_child, last_line, serve_parent
 from edgevpr.runtime.preflight.offers import Offer
 from edgevpr.runtime.preflight.probe import TechniqueCosts, noise, probe
 from edgevpr.runtime.recognise.opening import made_with
@@ -82,7 +81,7 @@ def _in_a_process(offer: Offer, threads: int, images: Sequence[Path], rounds: in
     ended = ask_child("edgevpr.runtime.preflight.trial", job, _LIMIT_S)
     if ended.code != 0:
         return _refused(offer, _end(offer.label, ended))
-    return trial_of(json.loads(ended.answer))
+    return trial_of(ended.answer)
 
 
 def _end(label: str, ended: Ended) -> str:
@@ -131,4 +130,4 @@ def _tried(job: dict[str, Any]) -> Trial:
 
 
 if __name__ == "__main__":
-    print(json.dumps(asdict(_tried(job_of_parent()))))
+    serve_parent(lambda job: asdict(_tried(job)))
