@@ -83,6 +83,15 @@ def test_the_name_of_an_image_is_escaped_in_errors_and_tables(tmp_path):
     assert b"\x1b" not in built.stdout + built.stderr + matched.stdout + matched.stderr
 
 
+def test_the_password_of_a_camera_is_not_printed(tmp_path):
+    (tmp_path / "c.yaml").write_text("source: {uri: 'http://pilot:secret@127.0.0.1:9/cam'}\n")
+    checked = said(["check", "--config", tmp_path / "c.yaml"])
+    assert b"http://pilot:***@127.0.0.1:9/cam" in checked.stdout
+    refused = said(["map", "build", tmp_path / "m.gpkg", "--images", "rtsp://pilot:secret@127.0.0.1/cam"])
+    assert (refused.returncode, b"rtsp://pilot:***@127.0.0.1/cam is live" in refused.stderr) == (1, True)
+    assert b"secret" not in checked.stdout + checked.stderr + refused.stdout + refused.stderr
+
+
 def test_a_wrong_flag_is_repeated_without_its_escapes():
     refused = said(["match", "m.gpkg", "--images", "x", "\x1b[31m"])
     assert refused.returncode == 2

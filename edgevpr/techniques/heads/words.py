@@ -49,11 +49,12 @@ def load_words(model: str, kind: str, count: int) -> Words:
     wanted = load_card(model).fingerprint
     try:
         content = read_file(path, _MAX_FILE_BYTES)
+        _require_room(content)
         with np.load(io.BytesIO(content), allow_pickle=False) as file:
             arrays = {key: file[key] for key in file.files}
         learned_on = str(arrays["model_sha256"])
         words = arrays["words"].astype(np.float32)
-    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
+    except (OSError, EOFError, ValueError, KeyError, MemoryError, NotImplementedError, zipfile.BadZipFile) as error:
         raise ModelError(f"{path} cannot be read as words ({error}): {command}.") from error
     if learned_on != wanted:
         raise ModelError(
@@ -75,6 +76,13 @@ def load_words(model: str, kind: str, count: int) -> Words:
         whitening=whitening,
         scale=scale.astype(np.float32).ravel(),
     )
+
+
+def _require_room(content: bytes) -> None:
+    """Raise ValueError for an archive that would take more memory unpacked than any words do."""
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        if sum(part.file_size for part in archive.infolist()) > _MAX_FILE_BYTES:
+            raise ValueError(f"it takes more than {_MAX_FILE_BYTES / 1e6:.0f} MB unpacked")
 
 
 def bag_of_words(local: np.ndarray, words: np.ndarray) -> np.ndarray:
