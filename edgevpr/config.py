@@ -1,9 +1,10 @@
-"""Strict reading of YAML into frozen dataclasses.
+"""The configuration, and the strict making of frozen dataclasses from the mappings of a YAML file.
 
 An unknown key, a wrong type or a value out of range raises ConfigError with one clear sentence.
 """
 
 import difflib
+import os
 import types
 import typing
 from collections.abc import Iterator
@@ -13,6 +14,7 @@ from typing import Any, TypeVar
 
 from edgevpr.errors import ConfigError
 from edgevpr.resources import shipped
+from edgevpr.yamlfile import read_yaml
 
 FORMS = ("float", "8bit", "1bit")  # of a vector in RAM, each smaller than the one before: see techniques.vectors
 LOWEST_RATE_HZ, HIGHEST_RATE_HZ = 0.01, 60.0  # of queries
@@ -20,6 +22,8 @@ BUDGET_MB = (1, 65_536)  # of the index in RAM
 SOURCES = (
     "a folder of images, a video file, a camera (/dev/video0) or a stream (rtsp://, udp://, tcp://, http://, FILE.sdp)"
 )
+
+_SHOWN = 80  # characters of a wrong value in a message
 
 T = TypeVar("T")
 _WORDS = {
@@ -191,27 +195,6 @@ def load_config(path: str | Path | None, overrides: dict[str, Any] | None = None
     return build(Config, merged, str(path or "the command line"))
 
 
-def read_yaml(path: str | Path) -> dict[str, Any]:
-    """Read a YAML mapping; raises ConfigError for a file that is missing, unreadable or not a mapping."""
-    import yaml  # not at the top: the command line lists its flags without it
-
-    try:
-        with open(path, encoding="utf-8") as handle:
-            content = yaml.safe_load(handle)
-    except OSError as error:
-        raise ConfigError(f"{path} cannot be read ({error.strerror}): give the path of a YAML file.") from error
-    except (yaml.YAMLError, ValueError) as error:  # an impossible date is a ValueError
-        mark = getattr(error, "problem_mark", None)
-        where = f", line {mark.line + 1}" if mark else ""
-        problem = getattr(error, "problem", None) or str(error)
-        raise ConfigError(f"{path}{where} is not valid YAML ({problem}): correct it there.") from error
-    if content is None:
-        return {}
-    if not isinstance(content, dict):
-        raise ConfigError(f"{path} must hold `key: value` lines, not {type(content).__name__}.")
-    return content
-
-
 def build(cls: type[T], mapping: dict[str, Any], where: str, prefix: str = "") -> T:
     """Build the frozen dataclass `cls` from a mapping, strictly. `where` names the file in messages.
 
@@ -221,7 +204,7 @@ def build(cls: type[T], mapping: dict[str, Any], where: str, prefix: str = "") -
     known = {f.name: f for f in fields(cls)}  # type: ignore[arg-type]
     for key in mapping:
         if key not in known:
-            raise ConfigError(f"{where}: unknown key `{prefix}{key}`{_suggestion(str(key), known)}.")
+            raise _unknown(key, known, where, prefix)
     values = {}
     for name, spec in known.items():
         if name in mapping:
@@ -235,7 +218,7 @@ def _overlaid(base: dict[str, Any], over: dict[str, Any], where: str, prefix: st
     merged = dict(base)
     for key, value in over.items():
         if key not in base:
-            raise ConfigError(f"{where}: unknown key `{prefix}{key}`{_suggestion(str(key), base)}.")
+            raise _unknown(key, base, where, prefix)
         if isinstance(base[key], dict):
             if not isinstance(value, dict):
                 raise ConfigError(f"{where}: `{prefix}{key}` is a section: write its keys below it, indented.")
@@ -244,9 +227,11 @@ def _overlaid(base: dict[str, Any], over: dict[str, Any], where: str, prefix: st
     return merged
 
 
-def _suggestion(key: str, known: typing.Iterable[str]) -> str:
-    near = difflib.get_close_matches(key, list(known), n=1)
-    return f" (did you mean `{near[0]}`?)" if near else f" (known: {', '.join(sorted(known))})"
+def _unknown(key: object, known: typing.Iterable[str], where: str, prefix: str) -> ConfigError:
+    name = str(key)[:_SHOWN]
+    near = difflib.get_close_matches(name, list(known), n=1)
+    hint = f"did you mean `{near[0]}`?" if near else f"known: {', '.join(sorted(known))}"
+    return ConfigError(f"{where}: unknown key `{prefix}{name}` ({hint}).")
 
 
 def _converted(value: Any, hint: Any, limits: tuple[float, float] | None, where: str, key: str) -> Any:
@@ -261,12 +246,30 @@ def _converted(value: Any, hint: Any, limits: tuple[float, float] | None, where:
         return build(wanted, value, where, f"{key}.")  # type: ignore[arg-type]
     if wanted is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
+    if isinstance(value, str):
+        require_sayable(value, f"{where}: `{key}`")
     if not isinstance(value, wanted) or (isinstance(value, bool) and wanted is not bool):
         word = _WORDS.get(wanted, str(wanted))
-        raise ConfigError(f"{where}: `{key}` must be {word}, not {value!r}.")
+        raise ConfigError(f"{where}: `{key}` must be {word}, not {_shortened(value)}.")
     if limits and not limits[0] <= value <= limits[1]:
         raise ConfigError(f"{where}: `{key}` is {value:g}; it must be between {limits[0]:g} and {limits[1]:g}.")
     return value
+
+
+def require_sayable(text: str, what: str) -> None:
+    """Check that a text can be the name of a file; raises ConfigError for one with NUL or half a character (a lone
+    surrogate), which no file has and no output takes. `what` begins the sentence."""
+    try:
+        os.fsencode(text)
+    except UnicodeEncodeError:
+        raise ConfigError(f"{what} holds half a character ({text!a:.60}): write it anew.") from None
+    if "\0" in text:
+        raise ConfigError(f"{what} holds a NUL character ({text!a:.60}): write it anew.")
+
+
+def _shortened(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= _SHOWN else text[:_SHOWN] + "..."
 
 
 def _kind(hint: Any) -> Any:

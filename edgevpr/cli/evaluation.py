@@ -17,6 +17,7 @@ from edgevpr.cli.shared import (
 )
 from edgevpr.config import FORMS
 from edgevpr.errors import ModelError, UsageError
+from edgevpr.helpers.text import shown
 
 
 def add(commands: Any) -> None:
@@ -54,6 +55,8 @@ def evaluate(args: Namespace) -> int:
     if args.plot:
         require_picture(Path(args.plot))
     forms = [form.strip() for form in args.form.split(",")]
+    if unknown := [form for form in forms if form not in FORMS]:
+        raise UsageError(f"--form names `{unknown[0]}`: use some of {', '.join(FORMS)}.")
     # A wrong setting is reported before the first hour of work; a network that cannot be used stops no other.
     tried = list(usable(offers(wanted, forms, _settings(args, wanted))))
     errors = {offer.label: each for offer, each in tried if isinstance(each, ModelError)}
@@ -73,7 +76,7 @@ def evaluate(args: Namespace) -> int:
     else:
         print(results_text(results))
     for label, error in errors.items():
-        print(f"edgevpr: {label} was not measured: {error}", file=sys.stderr)
+        print(f"edgevpr: {label} was not measured: {shown(str(error))}", file=sys.stderr)
     return 1 if errors else 0
 
 

@@ -19,6 +19,7 @@ from edgevpr.cli.shared import (
     print_json,
 )  # fmt: skip
 from edgevpr.errors import ImageError
+from edgevpr.helpers.text import shown
 
 _MATCHING_KEYS = (
     "board", "technique", "source.camera", "match.matching", "match.form", "match.candidates", "match.sequence",
@@ -80,10 +81,8 @@ def run_match(args: Namespace) -> int:
         for each in found:
             error = f"{each['error_m']:8.1f}" if "error_m" in each else "       -"
             yes = "yes" if each["accepted"] else "no"
-            print(
-                f"{each['query']:<28} {each['place']:>6} {each['reference_image']:<28} {each['score']:6.3f}  {yes:<8}"
-                f" {error}"
-            )
+            query, found_image = shown(each["query"]), shown(each["reference_image"])
+            print(f"{query:<28} {each['place']:>6} {found_image:<28} {each['score']:6.3f}  {yes:<8} {error}")
         print(f"{len(found)} queries, {sum(each['accepted'] for each in found)} accepted")
         if weights := weights_of(recogniser.technique.spec):
             print(f"Weights of {weights}.")
@@ -103,7 +102,7 @@ def run_check(args: Namespace) -> int:
 
     findings = check(args.config)
     for finding in findings:
-        print(f"{'ok   ' if finding.ok else 'WRONG'}  {finding.what:<14} {finding.message}")
+        print(f"{'ok   ' if finding.ok else 'WRONG'}  {finding.what:<14} {shown(finding.message)}")
     return 0 if all(finding.ok for finding in findings) else 1
 
 

@@ -9,7 +9,10 @@ import threading
 
 from edgevpr import __version__
 from edgevpr.cli import evaluation, flying, maps, networks, profile, simulation
+from edgevpr.cli.screen import LineFormatter, guarded_output
+from edgevpr.config import require_sayable
 from edgevpr.errors import EdgevprError
+from edgevpr.helpers.text import shown
 
 _GROUPS = (maps, flying, profile, evaluation, simulation, networks)
 
@@ -28,13 +31,20 @@ def program() -> None:
 def main(argv: list[str] | None = None) -> int:
     """Run one command and return the exit code: 0 done, 1 something outside the program is wrong, 2 the request is
     wrong, 130 stopped by Ctrl-C."""
+    with guarded_output():
+        return _run(sys.argv[1:] if argv is None else argv)
+
+
+def _run(argv: list[str]) -> int:
     args = _parser().parse_args(argv)
     # Set before NumPy is imported: its products are small here, and more threads make them slower and cost more.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    logging.basicConfig(
-        level=logging.DEBUG if args.debug else logging.INFO, format="edgevpr: %(message)s", stream=sys.stderr
-    )
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(LineFormatter("edgevpr: %(message)s"))
+    logging.basicConfig(level=logging.DEBUG if args.debug else logging.INFO, handlers=[handler])
     try:
+        for word in argv:
+            require_sayable(word, "The command line")
         return args.run(args)
     except EdgevprError as error:
         return _failed(args, error, str(error), error.exit_code)
@@ -56,7 +66,7 @@ def main(argv: list[str] | None = None) -> int:
 def _failed(args: argparse.Namespace, error: Exception, sentence: str, exit_code: int) -> int:
     if args.debug:
         logging.exception(error)
-    print(f"edgevpr: {sentence}", file=sys.stderr)
+    print(f"edgevpr: {shown(sentence)}", file=sys.stderr)
     return exit_code
 
 

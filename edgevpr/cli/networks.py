@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from edgevpr.cli.shared import add_json, command, exit_code, group, path_of, print_json
 from edgevpr.errors import EdgevprError, ImageError, ModelError, UsageError
+from edgevpr.helpers.text import shown
 
 if TYPE_CHECKING:
     from edgevpr.runtime.preflight.networks import Verified
@@ -137,7 +138,7 @@ def models_verify(args: Namespace) -> int:
     if args.json:
         print_json({"works": [asdict(each) for each in works], "wrong": wrong})
     for name, problem in wrong.items():
-        print(f"edgevpr: {name} cannot be used: {problem}", file=sys.stderr)
+        print(f"edgevpr: {shown(name)} cannot be used: {shown(problem)}", file=sys.stderr)
     return 1 if wrong else 0
 
 

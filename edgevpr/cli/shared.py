@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from edgevpr.config import Config, flagged_keys, load_config
 from edgevpr.errors import ImageError, UsageError
+from edgevpr.helpers.text import shown
 
 if TYPE_CHECKING:
     from edgevpr.frames.source import Source
@@ -120,7 +121,7 @@ def frames_of(source: "Source", label: str, unusable: list[ImageError]) -> "Iter
 
 def leave_out(error: ImageError, unusable: list[ImageError]) -> None:
     """Report that an image cannot be used, and add the error to `unusable`."""
-    print(f"edgevpr: {error}", file=sys.stderr)
+    print(f"edgevpr: {shown(str(error))}", file=sys.stderr)
     unusable.append(error)
 
 

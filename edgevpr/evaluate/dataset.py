@@ -1,12 +1,18 @@
 """A data set: a folder of queries, a folder of references, and a CSV that says which references are right."""
 
 import csv
+import io
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from edgevpr.errors import UsageError
 from edgevpr.frames.images import list_images
+from edgevpr.helpers.files import read_file
+from edgevpr.helpers.text import decoded_name
+
+_COLUMNS = ("query_file", "ref_files", "ref_files_loose", "status")
+_MAX_FILE_BYTES = 100_000_000  # a million queries
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,8 +43,8 @@ def load_dataset(query_dir: str | Path, ref_dir: str | Path, ground_truth: str |
     name, are left alone. Raises UsageError with file, line, value and what to do, and SourceError for a folder without
     images.
     """
-    query_paths = {path.name: path for path in list_images(query_dir)}
-    references = tuple(path.name for path in list_images(ref_dir))
+    query_paths = {decoded_name(path.name): path for path in list_images(query_dir)}
+    references = tuple(decoded_name(path.name) for path in list_images(ref_dir))
     known = frozenset(references)
     queries: dict[str, Query | None] = {}
     for where, row in _rows(Path(ground_truth)):
@@ -65,19 +71,21 @@ def load_dataset(query_dir: str | Path, ref_dir: str | Path, ground_truth: str |
 def _rows(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
     """Yield each row of the CSV, stripped, with its place in the file for messages."""
     try:
-        with open(path, encoding="utf-8-sig", newline="") as handle:
-            reader = csv.DictReader(handle)
-            for column in ("query_file", "ref_files"):
-                if column not in (reader.fieldnames or ()):
-                    raise UsageError(f"{path}: the column `{column}` is missing from its first line: add it.")
-            for row in reader:
-                where = f"{path}, line {reader.line_num}"
-                if None in row or None in row.values():
-                    raise UsageError(
-                        f"{where}: the row has not as many fields as the first line: separate columns by commas, and "
-                        "file names inside a column by spaces."
-                    )
-                yield where, {column: value.strip() for column, value in row.items()}
+        reader = csv.DictReader(io.StringIO(read_file(path, _MAX_FILE_BYTES).decode("utf-8-sig"), newline=""))
+        columns = list(reader.fieldnames or ())
+        for column in _COLUMNS:
+            if column in _COLUMNS[:2] and column not in columns:
+                raise UsageError(f"{path}: the column `{column}` is missing from its first line: add it.")
+            if columns.count(column) > 1:
+                raise UsageError(f"{path}: its first line has two columns `{column}`: keep one of them.")
+        for row in reader:
+            where = f"{path}, line {reader.line_num}"
+            if None in row or None in row.values():
+                raise UsageError(
+                    f"{where}: the row has not as many fields as the first line: separate columns by commas, and file "
+                    "names inside a column by spaces."
+                )
+            yield where, {column: value.strip() for column, value in row.items()}
     except OSError as error:
         raise UsageError(f"{path} cannot be read ({error.strerror}): give the path of a CSV file.") from error
     except (UnicodeDecodeError, csv.Error) as error:

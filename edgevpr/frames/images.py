@@ -7,16 +7,23 @@ from pathlib import Path
 import numpy as np
 
 from edgevpr.errors import ImageError, SourceError
+from edgevpr.frames.header import Header, read_header
 from edgevpr.frames.opencv import cv2
+from edgevpr.helpers.files import read_file
 
 EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm")
 MIN_SIDE_PX = 16
+# The largest survey cameras that are flown have 100 megapixels (11664 x 8750); decoded that is 300 MB. Without a limit
+# a file of 1 MB, which compresses well, takes gigabytes.
+MAX_PIXELS = 102_100_000
+_MAX_FILE_BYTES = 4 * MAX_PIXELS  # such a picture with transparency, not compressed at all
 
 _JPEG_START = b"\xff\xd8\xff"
 _PNG_START = b"\x89PNG\r\n\x1a\n"
 # In the scan data of a JPEG, 0xFF followed by 00 (stuffing) or D0..D7 (restart) does not end the data.
 _MARKER = re.compile(rb"\xff+[^\x00\xd0-\xd7\xff]")
-_END_OF_IMAGE = 0xD9
+_START_OF_SCAN, _END_OF_IMAGE = 0xDA, 0xD9
+_MOST_SCANS = 100  # of a progressive JPEG, which has about ten; each costs the decoder a pass over the whole picture
 
 
 def list_images(folder: str | Path) -> list[Path]:
@@ -41,10 +48,11 @@ def list_images(folder: str | Path) -> list[Path]:
 def read_image(path: str | Path) -> np.ndarray:
     """Decode an image file to uint8, (H, W, 3) BGR or (H, W) grey; turned as its EXIF says, without transparency.
 
-    Raises ImageError for a file that is missing, cut short, no image, not 8 bit, or smaller than 16x16 pixels.
+    Raises ImageError for a file that is missing, no regular file, cut short, no image, not 8 bit, smaller than 16x16
+    pixels, or larger than `MAX_PIXELS`. Size and depth are those of the header: nothing is decoded in vain.
     """
     try:
-        data = Path(path).read_bytes()
+        data = read_file(path, _MAX_FILE_BYTES)
     except FileNotFoundError:
         raise ImageError(f"The image {path} does not exist: check the name.") from None
     except OSError as error:
@@ -53,18 +61,34 @@ def read_image(path: str | Path) -> np.ndarray:
         raise ImageError(f"{path} is empty: copy it again from the camera.")
     if _is_incomplete(data):
         raise ImageError(f"{path} is cut short or damaged: copy it again from the camera.")
-    image = _decoded(data)
+    header = read_header(data)
+    if header:
+        _require_usual(path, header)
+    image = _decoded(data) if header else None
     if image is None:
         raise ImageError(f"{path} is not an image edgevpr can decode: give a JPEG, PNG, TIFF, BMP or WebP file.")
     if image.dtype != np.uint8:
-        bits = 8 * image.dtype.itemsize
-        raise ImageError(f"{path} has {bits} bits a channel; edgevpr reads 8-bit images: convert it first.")
+        raise _other_depth(path, 8 * image.dtype.itemsize)
     height, width = image.shape[:2]
     if min(height, width) < MIN_SIDE_PX:
         raise ImageError(
             f"{path} is {width}x{height} pixels; at least {MIN_SIDE_PX}x{MIN_SIDE_PX} are needed: give a larger image."
         )
     return image
+
+
+def _require_usual(path: str | Path, header: Header) -> None:
+    if header.width * header.height > MAX_PIXELS:
+        raise ImageError(
+            f"{path} is {header.width}x{header.height} pixels; edgevpr reads up to {MAX_PIXELS / 1e6:.0f} megapixels: "
+            "give a smaller image."
+        )
+    if header.bits > 8:
+        raise _other_depth(path, header.bits)
+
+
+def _other_depth(path: str | Path, bits: int) -> ImageError:
+    return ImageError(f"{path} has {bits} bits a channel; edgevpr reads 8-bit images: convert it first.")
 
 
 def _counting_order(name: str) -> tuple[list[str | int], str]:
@@ -97,11 +121,14 @@ def _jpeg_is_whole(data: bytes) -> bool:
 
     Segments are skipped by their length, so that the end mark of an EXIF thumbnail is not taken for the image's.
     """
-    position = 2
+    position, scans = 2, 0
     while marker := _MARKER.search(data, position):
         code = data[marker.end() - 1]
         if code == _END_OF_IMAGE:
             return True
+        scans += code == _START_OF_SCAN
+        if scans > _MOST_SCANS:
+            return False
         position = marker.end() + int.from_bytes(data[marker.end() : marker.end() + 2], "big")
     return False
 

@@ -1,6 +1,7 @@
 """The file positions.csv: position, heading and time of the images of a folder."""
 
 import csv
+import io
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,9 +10,15 @@ from pathlib import Path
 from typing import Any
 
 from edgevpr.errors import UsageError
+from edgevpr.helpers.files import read_file
 from edgevpr.types import Position
 
 _NEEDED_COLUMNS = ("file", "lat", "lon")
+_COLUMNS = (*_NEEDED_COLUMNS, "alt", "heading_deg", "yaw_deg", "time")
+ALT_M = (-1000.0, 100_000.0)  # of anything that flies
+_MAX_FILE_BYTES = 100_000_000  # a million images
+# 1900 to 2200. Beyond lie times in milliseconds, which are a thousand times too large.
+_FIRST_S, _LAST_S = -2_208_988_800, 7_258_118_400
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,8 +44,8 @@ def read_positions(csv_path: str | Path) -> dict[str, GeoTag]:
     Raises UsageError for a file that cannot be read, and for a wrong value, with its line.
     """
     try:
-        with open(csv_path, encoding="utf-8-sig", newline="") as handle:
-            return _read_rows(csv.reader(handle, skipinitialspace=True), csv_path)
+        text = io.StringIO(read_file(csv_path, _MAX_FILE_BYTES).decode("utf-8-sig"), newline="")
+        return _read_rows(csv.reader(text, skipinitialspace=True), csv_path)
     except OSError as error:
         raise UsageError(f"{csv_path} cannot be read ({error.strerror}): give the path of a CSV file.") from error
     except (UnicodeDecodeError, csv.Error) as error:
@@ -53,7 +60,8 @@ def position_or_none(lat_deg: float, lon_deg: float, alt_m: float | None) -> Pos
 def parse_time(text: str) -> float:
     """Convert a time to seconds since 1970 (UTC): `2016:06:23 16:31:59` (EXIF), ISO 8601, or seconds.
 
-    A time without a zone is UTC. Raises ValueError for any other text.
+    A time without a zone is UTC. Raises ValueError for any other text, and for a time outside 1900 to 2200, as one in
+    milliseconds is.
     """
     try:
         seconds = float(text)
@@ -61,9 +69,9 @@ def parse_time(text: str) -> float:
         if text[4:5] == text[7:8] == ":":
             text = text.replace(":", "-", 2)
         moment = datetime.fromisoformat(text.replace("Z", "+00:00"))  # Python 3.10 does not know Z
-        return (moment if moment.tzinfo else moment.replace(tzinfo=timezone.utc)).timestamp()
-    if not math.isfinite(seconds):
-        raise ValueError(f"{text} is no time")
+        seconds = (moment if moment.tzinfo else moment.replace(tzinfo=timezone.utc)).timestamp()
+    if not _FIRST_S <= seconds < _LAST_S:  # false for NaN too
+        raise ValueError(f"{text} is no time between 1900 and 2200")
     return seconds
 
 
@@ -75,6 +83,8 @@ def _read_rows(reader: Any, csv_path: str | Path) -> dict[str, GeoTag]:
             f"{csv_path}, line 1 has no column `{missing[0]}`: it must name {', '.join(_NEEDED_COLUMNS)}, "
             "with commas between them."
         )
+    if twice := [name for name in _COLUMNS if header.count(name) > 1]:
+        raise UsageError(f"{csv_path}, line 1 has two columns `{twice[0]}`: keep one of them.")
     tags: dict[str, GeoTag] = {}
     lines: dict[str, int] = {}
     for values in reader:
@@ -97,7 +107,7 @@ def _read_rows(reader: Any, csv_path: str | Path) -> dict[str, GeoTag]:
 def _tag(row: Mapping[str, str], where: str) -> GeoTag:
     lat_deg = _number(row, "lat", -90, 90, where)
     lon_deg = _number(row, "lon", -180, 180, where)
-    alt_m = _number(row, "alt", -1000, 100_000, where)
+    alt_m = _number(row, "alt", *ALT_M, where)
     if (lat_deg is None) != (lon_deg is None):
         raise UsageError(f"{where} has only one of lat and lon: write both, or leave both empty.")
     heading_deg = _number(row, "heading_deg" if row.get("heading_deg") else "yaw_deg", -360, 360, where)
@@ -127,7 +137,8 @@ def _time(row: Mapping[str, str], where: str) -> float | None:
         return None
     try:
         return parse_time(text)
-    except ValueError:
+    except (ValueError, OverflowError):
         raise UsageError(
-            f"{where}: time is `{text}`: write 2016-06-23T16:31:59Z, 2016:06:23 16:31:59 or seconds since 1970."
+            f"{where}: time is `{text}`: write 2016-06-23T16:31:59Z, 2016:06:23 16:31:59 or seconds since 1970, "
+            "between 1900 and 2200."
         ) from None

@@ -10,6 +10,7 @@ from edgevpr.frames.exif import read_exif
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.opencv import cv2
 from edgevpr.frames.positions import find_positions, read_positions
+from edgevpr.helpers.text import decoded_name
 from edgevpr.types import Frame
 
 _TIMESTAMP_ROUNDING_S = 0.001  # Matroska counts in milliseconds
@@ -42,7 +43,7 @@ class FolderSource(_Recording):
         self._clock = clock
         csv_path = positions or find_positions(folder)
         self._tags = read_positions(csv_path) if csv_path else {}
-        if positions and not any(path.name in self._tags for path in self._paths):
+        if positions and not any(decoded_name(path.name) in self._tags for path in self._paths):
             raise UsageError(f"{positions} names none of the images in {folder}: its column `file` must.")
 
     @property
@@ -57,10 +58,11 @@ class FolderSource(_Recording):
         path = self._paths[self._read]
         self._read += 1
         image = read_image(path)
-        tag = self._tags.get(path.name) or read_exif(path)
+        name = decoded_name(path.name)  # a map and a positions.csv hold UTF-8 only
+        tag = self._tags.get(name) or read_exif(path)
         return Frame(
             image=image,
-            name=path.name,
+            name=name,
             t_mono_s=self._clock(),
             t_utc_s=tag.t_utc_s,
             position=tag.position,

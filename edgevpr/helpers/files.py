@@ -1,13 +1,42 @@
-"""Files that are written as a whole or not at all, and the check of their folders."""
+"""Files that are written as a whole or not at all, and the check of their folders; files of foreign origin, opened
+only where they are files, and no larger than expected."""
 
+import errno
 import os
+import stat
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import BinaryIO, TypeVar
 
 from edgevpr.errors import UsageError
 
 T = TypeVar("T")
+
+
+def open_file(path: str | Path, most_bytes: int) -> BinaryIO:
+    """Open a regular file of at most `most_bytes` for reading, without waiting for anybody.
+
+    Raises OSError with a `strerror` fit for a sentence: also for a pipe, which would wait for a writer, for a device,
+    which may never end, and for a larger file.
+    """
+    handle = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
+    try:
+        said = os.fstat(handle.fileno())
+        if not stat.S_ISREG(said.st_mode):
+            raise OSError(errno.EINVAL, "it is a pipe or a device and not a regular file", str(path))
+        if said.st_size > most_bytes:
+            size = f"it has {said.st_size / 1e6:,.1f} MB, and at most {most_bytes / 1e6:,.1f} are read"
+            raise OSError(errno.EFBIG, size, str(path))
+    except BaseException:
+        handle.close()
+        raise
+    return handle
+
+
+def read_file(path: str | Path, most_bytes: int) -> bytes:
+    """Read a regular file of at most `most_bytes`; raises OSError as `open_file` does."""
+    with open_file(path, most_bytes) as handle:
+        return handle.read(most_bytes)
 
 
 def require_folder(path: Path) -> None:

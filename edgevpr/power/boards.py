@@ -5,10 +5,11 @@ import os
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from edgevpr.config import BUDGET_MB, HIGHEST_RATE_HZ, LOWEST_RATE_HZ, bounded, build, read_yaml
+from edgevpr.config import BUDGET_MB, HIGHEST_RATE_HZ, LOWEST_RATE_HZ, bounded, build
 from edgevpr.errors import ConfigError
 from edgevpr.power import machine, thermal
 from edgevpr.resources import shipped
+from edgevpr.yamlfile import read_yaml
 
 _ANY_MACHINE = "generic-x86"
 _SAME_RAM = 1.02  # kernels keep some RAM for themselves, every version another amount

@@ -16,6 +16,7 @@ from edgevpr.errors import ImageError, UsageError
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.opencv import cv2
 from edgevpr.helpers.progress import progress
+from edgevpr.helpers.text import shown
 from edgevpr.techniques.gradients import normalised_blocks, oriented_cells
 
 HEIGHT, WIDTH = 120, 160  # of the network's input
@@ -48,7 +49,7 @@ def read_pictures(
             yield _at_most(read_image(path), _LONGEST_READ_PX)
         except ImageError as error:
             if unusable is not None:
-                print(f"edgevpr: {error}", file=sys.stderr)
+                print(f"edgevpr: {shown(str(error))}", file=sys.stderr)
                 unusable.append(error)
 
 

@@ -5,7 +5,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from edgevpr.config import read_yaml
 from edgevpr.errors import ModelError, SourceError
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.resources import own_models
@@ -13,6 +12,7 @@ from edgevpr.runtime.preflight.networks import Verified, card_text, install, ver
 from edgevpr.techniques.networks.card import load_card, read_card
 from edgevpr.techniques.networks.prepare import prepare
 from edgevpr.techniques.networks.session import backbone_of, file_sha256
+from edgevpr.yamlfile import read_yaml
 
 _MOST_IMAGES = 200
 

@@ -147,7 +147,7 @@ def test_eval_goes_on_without_a_network_whose_card_is_wrong(models, capsys, flig
 def test_eval_of_an_unknown_form_is_a_wrong_request(capsys, flight):
     code, _, said = evaluated(capsys, flight, "--techniques", "hog", "--form", "4bit")
     assert code == 2
-    assert "hog has no form `4bit`" in said
+    assert "--form names `4bit`: use some of float, 8bit, 1bit" in said
 
 
 def test_profile_lists_every_form_and_says_in_a_sentence_what_cannot_be_used(models, capsys, monkeypatch):

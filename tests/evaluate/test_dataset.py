@@ -57,6 +57,7 @@ HEAD = "query_file,ref_files,status\n"
     [
         ("query_file,refs\na.png,a.png\n", ["truth.csv", "`ref_files` is missing"]),
         ("", ["truth.csv", "`query_file` is missing"]),
+        ("query_file,ref_files,ref_files\na.png,a.png,b.png\n", ["truth.csv", "two columns `ref_files`"]),
         (HEAD + "a.png,a.png,ok\nz.png,a.png,ok\n", ["truth.csv, line 3", "`z.png`", "correct its name"]),
         (HEAD + "z.png,,novel\n", ["truth.csv, line 2", "`z.png`"]),
         (HEAD + ",a.png,ok\n", ["truth.csv, line 2", "``"]),

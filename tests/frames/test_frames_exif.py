@@ -1,6 +1,7 @@
 """Positions, headings and times from EXIF; the tags are numbered as in the EXIF standard (JEITA CP-3451)."""
 
 import random
+import re
 
 import photographs
 import pytest
@@ -119,3 +120,29 @@ def test_exif_with_bytes_gone_wrong_never_raises_and_never_leaves_the_earth(tmp_
         tag = read_exif(tmp_path / "broken.jpg")
         assert tag.position is None or (abs(tag.position.lat_deg) <= 90 and abs(tag.position.lon_deg) <= 180)
         assert tag.heading_deg is None or 0 <= tag.heading_deg < 360
+
+
+@pytest.mark.parametrize(
+    ("gps", "camera", "says"),
+    [
+        (GPS | {LAT: (46.0, 99.0, 33.0)}, None, "GPSLatitude 46 99 33"),
+        (GPS | {LON: (91.0, 59.0, 4200.0)}, None, "GPSLongitude 91 59 4200"),
+        (GPS | {ALT_REF: b"\x00", ALT: 4e9}, None, r"GPSAltitude 4e\+09"),
+        ({TIME: (4294967295.0, 31.0, 59.5), DATE: "2016:06:23"}, None, r"GPSTimeStamp 4.29497e\+09 31 59.5"),
+        ({TIME: (16.0, 31.0, 59.5), DATE: "1e308"}, None, "GPSDate '1e308 00:00:00'"),
+        (None, {TAKEN: "1e308"}, "DateTimeOriginal '1e308'"),
+        (None, {TAKEN: "9999:12:31 23:59:59"}, "DateTimeOriginal '9999:12:31 23:59:59'"),
+        (None, {TAKEN: "0001:01:01 00:00:00", ZONE: "+14:00"}, "DateTimeOriginal"),
+    ],
+)
+def test_what_cannot_be_true_is_unknown_and_said(gps, camera, says, tmp_path, caplog):
+    tag = tag_of(tmp_path, gps, camera=camera)
+    assert tag.t_utc_s is None
+    assert (tag.position is None) == ("GPSAltitude" not in says)  # a position without its height is still one
+    assert re.search(rf"photo\.jpg: its EXIF says {says}.*which cannot be: it is taken as unknown", caplog.text)
+
+
+def test_a_clock_that_was_never_set_is_unknown_and_nothing_is_said(tmp_path, caplog):
+    for never in ("0000:00:00 00:00:00", "    :  :     :  :  "):
+        assert tag_of(tmp_path, camera={TAKEN: never}).t_utc_s is None
+    assert caplog.text == ""

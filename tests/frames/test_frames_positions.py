@@ -1,5 +1,7 @@
 """positions.csv, right and wrong."""
 
+import os
+
 import pytest
 
 from edgevpr.errors import UsageError
@@ -64,7 +66,10 @@ def test_a_time_is_understood_in_each_of_its_forms(text):
     assert parse_time(text) == 1466699519
 
 
-@pytest.mark.parametrize("text", ["", "yesterday", "nan", "-inf", "2016:13:23 16:31:59", "2016:06:23 25:00:00"])
+@pytest.mark.parametrize(
+    "text",
+    ["", "yesterday", "nan", "-inf", "2016:13:23 16:31:59", "2016:06:23 25:00:00", "1466699519000", "1e308", "-1e10"],
+)
 def test_what_is_no_time_is_refused(text):
     with pytest.raises(ValueError):
         parse_time(text)
@@ -80,6 +85,8 @@ def test_what_is_no_time_is_refused(text):
         ("b.jpg,ref,46,2,high,,,", "line 3: alt is `high`"),
         ("b.jpg,ref,46,2,,,NE,", "line 3: yaw_deg is `NE`"),
         ("b.jpg,ref,46,2,,,,noon", "line 3: time is `noon`"),
+        ("b.jpg,ref,46,2,,,,1466699519000", "line 3: time is `1466699519000`: write 2016-06-23T16:31:59Z"),  # ms
+        ("b.jpg,ref,46,2,,,,0001-01-01T00:00:00+14:00", "line 3: time is"),
         ("b.jpg,ref,46,,,,,", "line 3 has only one of lat and lon"),
         ("b.jpg,ref,,2,,,,", "line 3 has only one of lat and lon"),
         ("b.jpg,46,2", "line 3 has 3 values; line 1 names 8 columns"),
@@ -127,3 +134,16 @@ def test_positions_beside_a_relative_folder_are_found(tmp_path, monkeypatch):
     (tmp_path / "ref").mkdir()
     monkeypatch.chdir(tmp_path / "ref")
     assert find_positions(".") == tmp_path / "positions.csv"
+
+
+@pytest.mark.parametrize("column", ["file", "lat", "yaw_deg", "time"])
+def test_a_column_that_stands_there_twice_is_refused(column, written):
+    with pytest.raises(UsageError, match=f"line 1 has two columns `{column}`: keep one of them"):
+        read_positions(written(HEADER.replace("\n", f", {column.upper()}\n")))
+    assert read_positions(written("file,lat,lon,note,note\na.jpg,,,,\n")) == {"a.jpg": GeoTag()}
+
+
+def test_a_pipe_in_place_of_the_file_is_refused_and_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "positions.csv")
+    with pytest.raises(UsageError, match=r"cannot be read \(it is a pipe or a device"):
+        read_positions(tmp_path / "positions.csv")

@@ -1,5 +1,6 @@
 """Folders of images and video files, read through open_source."""
 
+import os
 import subprocess
 
 import cv2
@@ -52,6 +53,17 @@ def all_frames(source):
 def shades_of(frames):
     """Which frames of the test video these are."""
     return [round(frame.image.mean() / 10) for frame in frames]
+
+
+def test_an_image_whose_name_is_not_utf_8_has_a_name_that_a_map_can_hold(folder):
+    path = os.path.join(os.fsencode(folder), b"caf\xe9.png")
+    with open(path, "wb") as file:
+        file.write(photographs.encoded(".png", photographs.picture()))
+    (frame,) = all_frames(open_source(str(folder), live=False))
+    assert frame.name == "caf\\xe9.png"
+    (folder / "positions.csv").write_text("file,lat,lon\ncaf\\xe9.png,50,8\n")
+    (frame,) = all_frames(open_source(str(folder), live=False))
+    assert frame.position == Position(50, 8)
 
 
 def test_a_folder_gives_each_image_once_in_order(folder):

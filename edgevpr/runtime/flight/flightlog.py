@@ -1,6 +1,7 @@
 """The flight log: one JSON object a line, appended. A full disk or a pulled card loses lines, but never ends the
 flight."""
 
+import errno
 import json
 import logging
 import math
@@ -18,16 +19,19 @@ from edgevpr import __version__
 from edgevpr.config import Config
 from edgevpr.contract import TechniqueSpec
 from edgevpr.errors import EdgevprError
+from edgevpr.helpers.text import without_passwords
 
 _log = logging.getLogger(__name__)
 _SYNC_EVERY_S = 1.0
+_MODE = 0o640  # positions are nobody else's, and a log is for the group that reads logs, whatever the umask
 
 
 class FlightLog:
     """An open flight log; `path=None` writes nothing. Close it (it is a context manager).
 
     `state` is None while lines are written, else a sentence that says why they are not. `lost_lines` counts the missing
-    lines. Every write tries again, and the first one that succeeds is preceded by a line of kind "gap".
+    lines. Every write tries again, and the first one that succeeds is preceded by a line of kind "gap". A log that was
+    deleted or moved in flight is noticed within a second or so, and goes on in a new file of that name.
     """
 
     def __init__(
@@ -41,6 +45,7 @@ class FlightLog:
         self._clock = clock
         self._synced_s = -math.inf
         self._file: BinaryIO | None = None
+        self._written = 0  # lines in the file that is open
         if path is not None:
             try:
                 self._file = _open(path)
@@ -67,18 +72,22 @@ class FlightLog:
         """
         if self.path is None:
             return
+        is_sync_due = self._clock() - self._synced_s >= _SYNC_EVERY_S
+        if is_sync_due and self._file is not None and not _is_at(self._file, self.path):
+            self._note_taken_away()
         lines = _line(kind, {"t_mono_s": self._clock(), **fields})
         if self.state is not None:
             lines = _line("gap", {"t_mono_s": self._clock(), "lost_lines": self.lost_lines}) + lines
         try:
             if self._file is None:
-                self._file = _open(self.path)
+                self._file, self._written = _open(self.path), 0
             _append(self._file, lines)
-            if self._clock() - self._synced_s >= _SYNC_EVERY_S:
+            if is_sync_due:
                 self._sync()
         except OSError as error:
             self._lost_one(error)
         else:
+            self._written += 1
             self._say_recovered()
 
     def close(self) -> None:
@@ -100,7 +109,20 @@ class FlightLog:
     def _lost_one(self, error: OSError) -> None:
         self.lost_lines += 1
         self._note_trouble(error)
-        # The medium may be another one when it comes back, so the file is opened anew.
+        self._let_go()  # the medium may be another one when it comes back, so the file is opened anew
+
+    def _note_taken_away(self) -> None:
+        is_deleted = os.fstat(self._file.fileno()).st_nlink == 0
+        lost = self._written if is_deleted else 0
+        self.lost_lines += lost
+        self.state = (
+            f"The flight log {self.path} was {'deleted' if is_deleted else 'moved or replaced'} in flight, and {lost} "
+            "lines of it are lost: it goes on in a new file as soon as there can be one."
+        )
+        _log.warning("%s", self.state)
+        self._let_go()
+
+    def _let_go(self) -> None:
         if self._file is not None:
             with suppress(OSError):
                 self._file.close()
@@ -145,8 +167,31 @@ def read_log(path: str | Path) -> Iterator[dict[str, Any]]:
 
 
 def _open(path: str | Path) -> BinaryIO:
-    # Unbuffered: a line that has been written is safe even if this process is killed next.
-    return open(path, "a+b", buffering=0)
+    flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY
+    try:
+        descriptor, is_new = os.open(path, flags | os.O_EXCL, _MODE), True
+    except FileExistsError:  # or a link to a file, which may not be there yet
+        descriptor, is_new = os.open(path, flags, _MODE), False
+    try:
+        kind = os.fstat(descriptor).st_mode
+        if not (stat.S_ISREG(kind) or stat.S_ISCHR(kind)):
+            raise OSError(errno.EINVAL, "it is a pipe or a disk and not a file", str(path))
+        if is_new:
+            with suppress(OSError):  # FAT has no permissions
+                os.fchmod(descriptor, _MODE)
+        # Unbuffered: a line that has been written is safe even if this process is killed next.
+        return os.fdopen(descriptor, "r+b", buffering=0)
+    except BaseException:
+        os.close(descriptor)
+        raise
+
+
+def _is_at(file: BinaryIO, path: str | Path) -> bool:
+    """Tell whether an open file is still the one that is found under `path`."""
+    try:
+        return os.path.samestat(os.fstat(file.fileno()), os.stat(path))
+    except OSError:
+        return False
 
 
 def _append(file: BinaryIO, lines: bytes) -> None:
@@ -159,7 +204,10 @@ def _append(file: BinaryIO, lines: bytes) -> None:
     try:
         rest = memoryview(lines)
         while rest:  # a nearly full disk takes a part, and reports only at the next part that it is full
-            rest = rest[file.write(rest) :]
+            taken = file.write(rest)
+            if not taken:  # a terminal that is stopped
+                raise OSError(errno.EAGAIN, "it takes nothing more at the moment")
+            rest = rest[taken:]
     except OSError:
         with suppress(OSError):
             file.truncate(end)
@@ -175,7 +223,9 @@ def _line(kind: str, fields: dict[str, Any]) -> bytes:
 
 def _plain(value: Any) -> Any:
     """Return `value` in JSON's types."""
-    if value is None or isinstance(value, (bool, int, str)):
+    if isinstance(value, str):
+        return without_passwords(value)
+    if value is None or isinstance(value, (bool, int)):
         return value
     if isinstance(value, float):
         return _readable(value)
@@ -187,7 +237,7 @@ def _plain(value: Any) -> Any:
         return _plain(asdict(value))
     if hasattr(value, "tolist"):  # NumPy's scalars and arrays
         return _plain(value.tolist())
-    return str(value)
+    return without_passwords(str(value))
 
 
 def _readable(value: float) -> float | None:

@@ -6,6 +6,8 @@ The protocol is sd_notify(3): `KEY=value` lines in one datagram to the socket th
 import os
 import socket
 
+from edgevpr.helpers.text import shown
+
 _SEND_TIMEOUT_S = 0.5
 
 
@@ -20,8 +22,8 @@ def notify(**assignments: object) -> bool:
     if address[0] == "@":  # a name in the abstract namespace, which begins with a zero byte
         address = "\0" + address[1:]
     # A line break in a value would begin an assignment of its own.
-    lines = (f"{key}={' '.join(str(value).splitlines())}" for key, value in assignments.items())
-    message = "\n".join(lines).encode("utf-8", "replace")
+    lines = (f"{key}={shown(' '.join(str(value).splitlines()))}" for key, value in assignments.items())
+    message = "\n".join(lines).encode("utf-8")
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as sender:
             sender.settimeout(_SEND_TIMEOUT_S)  # the receiver's queue may be full; the main loop must not hang on it

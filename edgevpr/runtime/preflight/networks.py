@@ -4,27 +4,27 @@
 """
 
 import json
-import multiprocessing
 import shutil
 import time
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from edgevpr import techniques
-from edgevpr.config import read_yaml
+from edgevpr.config import build
 from edgevpr.errors import EdgevprError, ModelError
-from edgevpr.helpers.files import write_whole
+from edgevpr.helpers.child import ask_child, last_line, serve_parent
+from edgevpr.helpers.files import read_file, write_whole
 from edgevpr.power.machine import rss_mb
 from edgevpr.resources import own_models
 from edgevpr.techniques.networks.card import Card, card_names, load_card, read_card
 from edgevpr.techniques.networks.session import Backbone, backbone_of, file_sha256, import_onnxruntime
+from edgevpr.yamlfile import MAX_FILE_BYTES, read_yaml
 
 _ROUNDS = 10
 _FRAME = (480, 640)
+_LIMIT_S = 120.0  # of a trial: its ten pictures would come every twelve seconds
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,20 +66,29 @@ def list_models() -> tuple[Listed, ...]:
     return tuple(_listed(name) for name in card_names())
 
 
-def verify(card: Card, threads: int = 1, learned: bool = True) -> Verified:
-    """Run `verify_here` in a process of its own.
+def verify(card: Card, threads: int = 1, learned: bool = True, limit_s: float = _LIMIT_S) -> Verified:
+    """Run `verify_here` in a process of its own, for at most `limit_s` seconds.
 
     There no other network has loaded anything that would be missing from the figures, and a network too large for the
-    board ends that process and not ours. Raises ModelError where it does.
+    board, or one that never ends, ends that process and not ours. Raises ModelError where it does.
     """
-    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-        try:
-            return pool.submit(verify_here, card, threads, learned).result()
-        except BrokenProcessPool as error:
-            raise ModelError(
-                f"{card.file_path} ended the process that tried it, most likely for want of memory: use a smaller "
-                "network, or a board with more RAM."
-            ) from error
+    job = {"card": asdict(card) | {"path": str(card.path)}, "threads": threads, "learned": learned}
+    ended = ask_child("edgevpr.runtime.preflight.networks", job, limit_s)
+    if ended.code is None:
+        raise ModelError(
+            f"{card.file_path} was tried for {limit_s:g} s and had no end: it loops, or is too slow for this board."
+        )
+    if ended.code < 0:
+        raise ModelError(
+            f"{card.file_path} ended the process that tried it, most likely for want of memory: use a smaller "
+            "network, or a board with more RAM."
+        )
+    if ended.code:
+        raise ModelError(f"{card.file_path} could not be tried ({last_line(ended)}): install edgevpr again.")
+    answer = ended.answer
+    if "problem" in answer:
+        raise ModelError(answer["problem"])
+    return Verified(**answer | {"shapes": {output: tuple(shape) for output, shape in answer["shapes"].items()}})
 
 
 def verify_here(card: Card, threads: int = 1, learned: bool = True) -> Verified:
@@ -131,7 +140,7 @@ def add(file: Path, card_path: Path, threads: int = 1) -> tuple[Verified, Path]:
     # Try the file where it is: its name on the card counts only in the folder that both are copied to.
     tried = replace(card, sha256=found, path=file.absolute().with_name(target.name), file=file.name)
     verified = verify(tried, threads, learned=False)
-    text = card_path.read_text("utf-8") if card.sha256 else card_text({**read_yaml(card_path), "sha256": found})
+    text = _text_of(card_path) if card.sha256 else card_text({**read_yaml(card_path), "sha256": found})
     install(file, found, target, card.file, text)
     return verified, target
 
@@ -152,7 +161,7 @@ def install(file: Path, sha256: str, card_path: Path, file_name: str, text: str)
     """Put a file, under `file_name`, and then its card into a folder, each completely or not at all. Raises ModelError
     where another network has either name."""
     folder, target = card_path.parent, card_path.parent / file_name
-    if card_path.exists() and card_path.read_text("utf-8") != text:
+    if card_path.exists() and _text_of(card_path) != text:
         raise ModelError(
             f"{card_path} is there already and says something else: take it away, or name yours otherwise."
         )
@@ -162,6 +171,10 @@ def install(file: Path, sha256: str, card_path: Path, file_name: str, text: str)
     if not target.exists():
         write_whole(target, lambda unfinished: shutil.copyfile(file, unfinished))
     write_whole(card_path, lambda unfinished: unfinished.write_text(text, "utf-8"))
+
+
+def _text_of(card_path: Path) -> str:
+    return read_file(card_path, MAX_FILE_BYTES).decode("utf-8")
 
 
 def card_text(values: dict) -> str:
@@ -210,3 +223,15 @@ def _vector_length(card: Card, backbones: dict[str, Backbone], learned: bool) ->
     from edgevpr.techniques.network import CardNetwork
 
     return CardNetwork(card).spec.coarse.shape[0]
+
+
+def _answer(job: dict) -> dict:
+    card = build(Card, {**job["card"], "path": Path(job["card"]["path"])}, job["card"]["path"])
+    try:
+        return asdict(verify_here(card, job["threads"], job["learned"]))
+    except EdgevprError as error:
+        return {"problem": str(error)}
+
+
+if __name__ == "__main__":
+    serve_parent(_answer)

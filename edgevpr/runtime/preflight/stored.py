@@ -21,7 +21,7 @@ from edgevpr import techniques
 from edgevpr.config import build
 from edgevpr.errors import ConfigError, EdgevprError, UsageError
 from edgevpr.frames.images import list_images, read_image
-from edgevpr.helpers.files import require_folder, write_whole
+from edgevpr.helpers.files import read_file, require_folder, write_whole
 from edgevpr.power import machine
 from edgevpr.power.boards import Board, MachineSpeed
 from edgevpr.resources import own_folder
@@ -30,6 +30,7 @@ from edgevpr.runtime.preflight.scale import is_same
 from edgevpr.runtime.preflight.trial import Trial, model_of, trial_of, try_each
 
 _FORMAT = 1
+_MAX_FILE_BYTES = 10_000_000
 _PICTURES = 8
 _SAME_RAM = 0.02  # kernels keep some RAM for themselves, every version another amount
 _PACKAGES = {
@@ -155,7 +156,7 @@ def load(path: Path) -> tuple[StoredFigures | None, str | None]:
     """
     again = "the techniques are tried anew; `edgevpr profile --measure` replaces them."
     try:
-        fields = json.loads(path.read_text("utf-8"))
+        fields = json.loads(read_file(path, _MAX_FILE_BYTES))
         if fields.pop("format") != _FORMAT:
             return None, f"{path} is of another version of edgevpr: {again}"
         trials = tuple(trial_of(each) for each in fields["trials"])
@@ -164,7 +165,7 @@ def load(path: Path) -> tuple[StoredFigures | None, str | None]:
         different = _differences(found.identity, identity())
     except FileNotFoundError:
         return None, None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, ConfigError):
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, ConfigError):
         return None, f"{path} holds no figures that can be read: {again}"
     if different:
         return None, f"The figures in {path} are of another machine or installation ({different}): {again}"

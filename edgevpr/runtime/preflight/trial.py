@@ -4,10 +4,7 @@ library that crashes on this processor loses only its own row.
 `python -m edgevpr.runtime.preflight.trial` is such a process: it reads a job as JSON and prints a Trial as JSON.
 """
 
-import json
 import signal
-import subprocess
-import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -16,11 +13,14 @@ from typing import Any
 from edgevpr import techniques
 from edgevpr.errors import EdgevprError
 from edgevpr.frames.images import read_image
+from edgevpr.helpers.child import Ended, ask_child, last_line, serve_parent
 from edgevpr.runtime.preflight.offers import Offer
 from edgevpr.runtime.preflight.probe import TechniqueCosts, noise, probe
 from edgevpr.runtime.recognise.opening import made_with
 from edgevpr.techniques.networks.card import load_card, weights_of
 from edgevpr.types import StageCost
+
+_LIMIT_S = 900.0  # ten times what the slowest technique takes on the slowest board
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,34 +78,24 @@ def _refused(offer: Offer, problem: str) -> Trial:
 
 def _in_a_process(offer: Offer, threads: int, images: Sequence[Path], rounds: int) -> Trial:
     job = {**asdict(offer), "threads": threads, "images": [str(path) for path in images], "rounds": rounds}
-    # A session of its own: only the parent process is to act on Ctrl-C.
-    process = subprocess.Popen(
-        [sys.executable, "-m", "edgevpr.runtime.preflight.trial"],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
-    try:
-        answer, said = process.communicate(json.dumps(job))
-    finally:
-        process.kill()
-        process.wait()
-    if process.returncode:
-        return _refused(offer, _end(offer.label, process.returncode, said))
-    return trial_of(json.loads(answer))
+    ended = ask_child("edgevpr.runtime.preflight.trial", job, _LIMIT_S)
+    if ended.code != 0:
+        return _refused(offer, _end(offer.label, ended))
+    return trial_of(ended.answer)
 
 
-def _end(label: str, code: int, said: str) -> str:
-    if code < 0:
-        how = f"ended by {signal.Signals(-code).name}"
+def _end(label: str, ended: Ended) -> str:
+    if ended.code is None:
+        return f"Trying {label} took longer than {_LIMIT_S / 60:.0f} minutes: it is too slow for this machine."
+    if ended.code < 0:
+        how = f"ended by {signal.Signals(-ended.code).name}"
         hint = (
-            "memory ran out" if code == -signal.SIGKILL else "a library does not suit this processor: install another"
+            "memory ran out"
+            if ended.code == -signal.SIGKILL
+            else "a library does not suit this processor: install another"
         )
         return f"Trying {label} was {how}: {hint}."
-    last = (said.strip().splitlines() or [f"exit code {code}"])[-1][:200]
-    return f"Trying {label} failed ({last}): install edgevpr and its packages again."
+    return f"Trying {label} failed ({last_line(ended)}): install edgevpr and its packages again."
 
 
 def trial_of(fields: dict[str, Any]) -> Trial:
@@ -140,4 +130,4 @@ def _tried(job: dict[str, Any]) -> Trial:
 
 
 if __name__ == "__main__":
-    print(json.dumps(asdict(_tried(json.load(sys.stdin)))))
+    serve_parent(lambda job: asdict(_tried(job)))

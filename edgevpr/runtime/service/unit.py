@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 from edgevpr.errors import UsageError
+from edgevpr.helpers.text import printable
 from edgevpr.power.boards import Board
 from edgevpr.resources import shipped
 
@@ -14,23 +15,37 @@ _RUNS = re.compile(r"(?m)^(ExecStart=.* --config )(\S+)$")
 
 def render_unit(board: Board, config_path: str | Path | None = None) -> str:
     """Write the text of edgevpr.service for a board and a configuration file (None: the one that the shipped unit
-    names). Raises UsageError for a configuration file that the service would not see."""
+    names). Raises UsageError for a configuration file that the service would not see, or whose name would be more than
+    a word of its command line."""
     text = (shipped("deploy") / "edgevpr.service").read_text(encoding="utf-8")
     usual = _RUNS.search(text)[2]
-    config_path = Path(config_path or usual).absolute()
-    for folder in _HIDDEN_FROM_THE_SERVICE:
-        if config_path.is_relative_to(folder):
-            raise UsageError(
-                f"{config_path} is out of sight of the service, which has no access to {folder}: copy it to {usual}."
-            )
+    config_path = _visible(Path(config_path or usual), usual)
     text = _RUNS.sub(lambda line: line[1] + _quoted(str(config_path)), text)
     for key, value in {
-        "# Board: ": board.name,
+        "# Board: ": printable(board.name),
         "MemoryMax=": f"{board.memory_max_mb * 1e6:.0f}",
         "CPUQuota=": f"{100 * board.cpu_share * board.cores:.0f}%",
     }.items():
         text = re.sub(f"(?m)^{re.escape(key)}.*$", lambda _, line=key + value: line, text)
     return text
+
+
+def _visible(path: Path, usual: str) -> Path:
+    """Return the absolute path of a configuration file that the service sees and that a unit can name, else raise
+    UsageError. Links and `..` are followed to tell; where there is a `..`, the path that they lead to is written."""
+    if not str(path).isprintable():  # a line break would begin a line of its own in the unit
+        raise UsageError(f"{path} holds a character that a unit cannot hold: give it another name, e.g. {usual}.")
+    try:
+        leads_to = path.resolve()
+    except (OSError, RuntimeError) as error:  # links in a circle; RuntimeError before Python 3.13
+        raise UsageError(f"{path} leads nowhere ({error}): give the path of a file, e.g. {usual}.") from error
+    written = leads_to if ".." in path.parts else path.absolute()
+    for folder in _HIDDEN_FROM_THE_SERVICE:
+        if hidden := next((each for each in (written, leads_to) if each.is_relative_to(folder)), None):
+            raise UsageError(
+                f"{hidden} is out of sight of the service, which has no access to {folder}: copy it to {usual}."
+            )
+    return written
 
 
 def _quoted(argument: str) -> str:

@@ -8,10 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgevpr.errors import ModelError
+from edgevpr.helpers.files import read_file
 from edgevpr.resources import model_folders
 from edgevpr.techniques.heads.vlad import nearest, unit
 from edgevpr.techniques.networks.card import load_card
 
+_MAX_FILE_BYTES = 500_000_000  # 65,536 words of 2,048 numbers
 _ROWS_AT_ONCE = 64  # of an 8-bit matrix converted to float32 together
 
 
@@ -46,12 +48,13 @@ def load_words(model: str, kind: str, count: int) -> Words:
         raise ModelError(f"There are no words {name} for the model `{model}`: {command}.")
     wanted = load_card(model).fingerprint
     try:
-        content = path.read_bytes()
+        content = read_file(path, _MAX_FILE_BYTES)
+        _require_room(content)
         with np.load(io.BytesIO(content), allow_pickle=False) as file:
             arrays = {key: file[key] for key in file.files}
         learned_on = str(arrays["model_sha256"])
         words = arrays["words"].astype(np.float32)
-    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
+    except (OSError, EOFError, ValueError, KeyError, MemoryError, NotImplementedError, zipfile.BadZipFile) as error:
         raise ModelError(f"{path} cannot be read as words ({error}): {command}.") from error
     if learned_on != wanted:
         raise ModelError(
@@ -73,6 +76,13 @@ def load_words(model: str, kind: str, count: int) -> Words:
         whitening=whitening,
         scale=scale.astype(np.float32).ravel(),
     )
+
+
+def _require_room(content: bytes) -> None:
+    """Raise ValueError for an archive that would take more memory unpacked than any words do."""
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        if sum(part.file_size for part in archive.infolist()) > _MAX_FILE_BYTES:
+            raise ValueError(f"it takes more than {_MAX_FILE_BYTES / 1e6:.0f} MB unpacked")
 
 
 def bag_of_words(local: np.ndarray, words: np.ndarray) -> np.ndarray:

@@ -11,10 +11,11 @@ from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 
-from edgevpr.config import bounded, build, read_yaml
+from edgevpr.config import bounded, build
 from edgevpr.contract import TechniqueSpec
 from edgevpr.errors import ConfigError, ModelError
 from edgevpr.resources import model_folders
+from edgevpr.yamlfile import read_yaml
 
 SIMILARITIES = ("cosine", "l1", "l2")
 _CHOICES = {
@@ -178,6 +179,8 @@ def read_card(path: Path, needs_hash: bool = True) -> Card:
         raise ModelError(f"{path}: `sha256` must be the 64 hexadecimal digits that `sha256sum {card.file}` prints.")
     if card.file in ("", ".", "..") or "/" in card.file:
         raise ModelError(f"{path}: `file` is `{card.file}`: write the name of a file that lies beside the card.")
+    if card.file.lower().endswith((".yaml", ".yml")):
+        raise ModelError(f"{path}: `file` is `{card.file}`, which is the name of a card: write that of the ONNX file.")
     if not (card.outputs.descriptor or card.outputs.features):
         raise ModelError(f"{path}: `outputs` names none: write the ONNX output of a descriptor or of features.")
     channels = 1 if card.input.colour == "grey" else 3
@@ -185,7 +188,7 @@ def read_card(path: Path, needs_hash: bool = True) -> Card:
         numbers = getattr(card.input, key)
         if numbers is not None and not _are_numbers(numbers, (1, channels), positive=key == "std"):
             raise ModelError(
-                f"{path}: `input.{key}` is {numbers}: write one number or {channels}, one a channel"
+                f"{path}: `input.{key}` is {numbers!s:.80}: write one number or {channels}, one a channel"
                 + (", all above 0." if key == "std" else ".")
             )
     head_parameters(card)
@@ -199,8 +202,9 @@ def head_parameters(card: Card) -> object | None:
     if card.head is None:
         return None
     name = card.head.get("name")
-    if name not in HEADS:
-        near = difflib.get_close_matches(str(name), HEADS, n=1)
+    if not isinstance(name, str) or name not in HEADS:
+        name = str(name)[:80]
+        near = difflib.get_close_matches(name, HEADS, n=1)
         raise ModelError(
             f"{card.path}: there is no head `{name}`: "
             + (f"did you mean `{near[0]}`?" if near else f"use {', '.join(HEADS)}, or null.")
@@ -215,7 +219,7 @@ def head_parameters(card: Card) -> object | None:
         levels = parameters.levels
         if not levels or not all(type(level) is int and 1 <= level <= 64 for level in levels):
             raise ModelError(
-                f"{card.path}: `head.levels` is {levels}: write whole numbers from 1 to 64, e.g. [1, 2, 3]."
+                f"{card.path}: `head.levels` is {levels!s:.80}: write whole numbers from 1 to 64, e.g. [1, 2, 3]."
             )
     if name == "grid" and parameters.how not in ("mean", "max"):
         raise ModelError(f"{card.path}: `head.how` is `{parameters.how}`: write mean or max.")

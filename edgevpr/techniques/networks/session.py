@@ -4,6 +4,7 @@ A model file is not trusted: it is run once before it may fly, and every result 
 """
 
 import hashlib
+import threading
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -11,12 +12,15 @@ from typing import Any
 import numpy as np
 
 from edgevpr.errors import ModelError, UsageError
+from edgevpr.helpers.files import open_file, read_file
 from edgevpr.techniques.networks.card import Card, load_card
 from edgevpr.techniques.networks.prepare import prepare, without_masked
 
 _RANKS = {"descriptor": 2, "features": 4}
 _FORMS = {"descriptor": "(1, D)", "features": "(1, C, H, W)"}
 _SEED = 7
+MAX_FILE_BYTES = 2**31  # protobuf, in which ONNX files are written, allows no more
+_RUN_LIMIT_S = 30.0  # of one picture: half of what the watchdog of systemd allows a flight to be silent
 _MOST_THREADS = 256
 _LARGEST = 1e12  # with much larger numbers the length of a vector overflows float32, and the unit vector is zero
 
@@ -66,7 +70,7 @@ def backbone_of(card: Card, output: str, threads: int = 1) -> Backbone:
 def file_sha256(path: Path) -> str:
     """Compute the SHA-256 of a model file, 64 hexadecimal digits. Raises ModelError if it cannot be read."""
     try:
-        with open(path, "rb") as handle:
+        with open_file(path, MAX_FILE_BYTES) as handle:
             digest = hashlib.sha256()
             while block := handle.read(1 << 20):
                 digest.update(block)
@@ -98,7 +102,7 @@ def _session(path: Path, sha256: str, threads: int) -> Any:
     # would look for them in the working directory, so a folder is named that does not exist.
     options.add_session_config_entry("session.model_external_initializers_file_folder_path", str(path))
     try:
-        return runtime.InferenceSession(path.read_bytes(), options, providers=["CPUExecutionProvider"])
+        return runtime.InferenceSession(read_file(path, MAX_FILE_BYTES), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's own classes, and RuntimeError
         raise ModelError(
             f"{path} cannot be opened as an ONNX model with its weights inside ({_first_line(error)}): export it again."
@@ -156,10 +160,21 @@ def _require_output(card: Card, output: str, session: Any) -> None:
 def _run(card: Card, output: str, session: Any, image: np.ndarray) -> np.ndarray:
     name = getattr(card.outputs, output)
     feed = {session.get_inputs()[0].name: prepare(image, card.input)}
+    options = import_onnxruntime().RunOptions()
+    limit = threading.Timer(_RUN_LIMIT_S, _terminate, (options,))
+    limit.daemon = True
+    limit.start()
     try:
-        (result,) = session.run([name], feed)
+        (result,) = session.run([name], feed, options)
     except Exception as error:
+        if options.terminate:
+            raise ModelError(
+                f"{card.file_path} had no result for a picture within {_RUN_LIMIT_S:g} s: it loops, or is too slow for "
+                "this board."
+            ) from error
         raise ModelError(f"{card.file_path} cannot be run ({_first_line(error)}): export it again.") from error
+    finally:
+        limit.cancel()
     if result.ndim != _RANKS[output] or len(result) != 1 or not result.size:
         raise ModelError(
             f"{card.file_path}: its output `{name}` is {_axes(result.shape)} and `{output}` must be {_FORMS[output]}: "
@@ -179,6 +194,10 @@ def _run(card: Card, output: str, session: Any, image: np.ndarray) -> np.ndarray
     if output == "features" and card.input.layout == "NHWC":
         values = np.ascontiguousarray(values.transpose(2, 0, 1))
     return values
+
+
+def _terminate(options: Any) -> None:
+    options.terminate = True  # onnxruntime looks at it before each operator, in loops too
 
 
 def _axes(shape) -> str:

@@ -3,6 +3,7 @@
 import json
 import logging
 import os
+import re
 import resource
 import shutil
 import subprocess
@@ -215,6 +216,86 @@ def test_a_sync_that_fails_is_a_failure_too(path, monkeypatch):
         assert "Input/output error" in log.state
         log.write("match")
         assert log.state is None
+
+
+@pytest.mark.parametrize("umask", [0, 0o022, 0o077])
+def test_a_log_is_for_its_owner_and_group_whatever_the_umask(umask, path):
+    before = os.umask(umask)
+    try:
+        FlightLog(path).close()
+    finally:
+        os.umask(before)
+    assert path.stat().st_mode & 0o777 == 0o640
+    path.chmod(0o600)  # by somebody who had a reason
+    FlightLog(path).close()
+    assert path.stat().st_mode & 0o777 == 0o600
+
+
+def flown(log, clock, *names):
+    for name in names:
+        log.write(name)
+        clock.now_s += 0.5
+
+
+def test_a_log_that_is_deleted_in_flight_goes_on_and_says_how_much_is_lost(path, caplog):
+    clock = FakeClock()
+    with FlightLog(path, clock) as log:
+        flown(log, clock, "start", "a", "b")
+        path.unlink()
+        flown(log, clock, "c", "d", "e")
+    assert kinds(path)[:1] == ["gap"]
+    assert kinds(path)[-1] == "e"
+    (gap,) = [record for record in read_log(path) if record["kind"] == "gap"]
+    assert gap["lost_lines"] == log.lost_lines == 6 - (len(kinds(path)) - 1)  # a second's lines may go into the old one
+    assert log.lost_lines <= 4
+    said = [record.getMessage() for record in caplog.records]
+    assert re.match(rf"The flight log {path} was deleted in flight, and {log.lost_lines} lines of it are lost", said[0])
+    assert said[1] == f"The flight log {path} is written again; {log.lost_lines} lines are missing."
+    assert len(said) == 2
+    assert log.state is None
+
+
+def test_a_log_that_is_moved_in_flight_loses_nothing(path, caplog):
+    clock = FakeClock()
+    with FlightLog(path, clock) as log:
+        flown(log, clock, "start", "a", "b")
+        path.rename(path.with_suffix(".1"))
+        flown(log, clock, "c", "d", "e")
+    both = kinds(path.with_suffix(".1")) + kinds(path)
+    assert [kind for kind in both if kind != "gap"] == ["start", "a", "b", "c", "d", "e"]
+    assert log.lost_lines == 0
+    assert "was moved or replaced in flight, and 0 lines" in caplog.text
+
+
+def test_a_log_whose_folder_is_deleted_is_tried_again(path, caplog):
+    path = path.parent / "logs" / "flight.jsonl"
+    path.parent.mkdir()
+    clock = FakeClock()
+    with FlightLog(path, clock) as log:
+        flown(log, clock, "start", "a", "b")
+        shutil.rmtree(path.parent)
+        flown(log, clock, "c", "d", "e")
+        assert log.state
+        path.parent.mkdir()
+        flown(log, clock, "f")
+    assert kinds(path) == ["gap", "f"]
+    assert log.lost_lines == 6
+
+
+def test_the_password_of_a_camera_stands_in_no_line(path):
+    config = load_config(None, {"source.uri": "rtsp://pilot:secret@10.0.0.2/cam", "log.path": str(path)})
+    spec = TechniqueSpec(name="cohog", parameters={}, coarse=PartSpec((4,), "<f4"))
+    with FlightLog(path) as log:
+        log.write("start", **start_fields(config, "rpi-5", spec), source=Path("rtsp://pilot:secret@10.0.0.2"))
+        log.write("source", state="rtsp://pilot:secret@10.0.0.2/cam lost")
+    assert "secret" not in path.read_text()
+    assert next(read_log(path))["config"]["source"]["uri"] == "rtsp://pilot:***@10.0.0.2/cam"
+
+
+def test_a_pipe_is_no_log_and_is_not_waited_for(path):
+    os.mkfifo(path)
+    with pytest.raises(EdgevprError, match=r"cannot be opened \(it is a pipe or a disk and not a file\)"):
+        FlightLog(path)
 
 
 _ON_A_SMALL_FILE_SYSTEM = """

@@ -40,7 +40,12 @@ def test_a_line_break_in_a_value_cannot_become_an_assignment(manager):
 
 def test_a_file_name_that_is_not_utf8_still_makes_a_status(manager):
     notify(STATUS="flight \udcff.mp4")
-    assert manager.recv(4096).decode() == "STATUS=flight ?.mp4"
+    assert manager.recv(4096).decode() == "STATUS=flight \\xff.mp4"
+
+
+def test_neither_a_password_nor_an_escape_gets_into_the_status(manager):
+    notify(STATUS="rtsp://pilot:secret@cam \x1b[31m lost")
+    assert manager.recv(4096) == b"STATUS=rtsp://pilot:***@cam \\x1b[31m lost"
 
 
 def test_without_systemd_nothing_is_sent(monkeypatch):

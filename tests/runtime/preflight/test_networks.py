@@ -1,16 +1,24 @@
 """`edgevpr models`: what is listed, tried, added and refused."""
 
+import contextlib
 import errno
 import hashlib
 import json
 import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import pytest
 from tiny_networks import CARD, write_card, write_network
 
 from edgevpr.cli.main import main
 from edgevpr.errors import EdgevprError, ModelError
+from edgevpr.helpers import child
 from edgevpr.runtime.preflight.networks import add, list_models, technique_with, verify, verify_here
+from edgevpr.techniques.networks import session
 from edgevpr.techniques.networks.card import load_card
 
 
@@ -187,18 +195,95 @@ def test_a_card_called_like_a_technique_is_not_said_to_be_it(models):
     assert technique_with("hog") == ("calc", {"model": "hog"})
 
 
-class TooLarge:
-    """Ends the process that it is sent to, as the kernel does where memory runs out."""
-
-    file_path = "large.onnx"
-
-    def __reduce__(self):
-        return os._exit, (9,)
-
-
-def test_a_network_that_ends_the_process_that_tries_it_is_one_sentence():
+def test_a_network_that_ends_the_process_that_tries_it_is_one_sentence(models, monkeypatch):
+    write_network(models, "large")
+    really = subprocess.Popen
+    argv = [sys.executable, "-c", "import os; input(); os.kill(os.getpid(), 9)"]  # as the kernel does
+    monkeypatch.setattr(child.subprocess, "Popen", lambda _, **more: really(argv, **more))
     with pytest.raises(ModelError, match=r"large\.onnx ended the process that tried it"):
-        verify(TooLarge())
+        verify(load_card("large"))
+
+
+def test_a_network_without_an_end_is_given_up_in_the_process_that_tries_it(models):
+    write_network(models, "endless", fault="endless")
+    with pytest.raises(ModelError, match=r"endless\.onnx was tried for 3 s and had no end: it loops"):
+        verify(load_card("endless"), limit_s=3)
+
+
+def test_a_network_without_an_end_is_given_up_in_our_own_process_too(models, monkeypatch):
+    monkeypatch.setattr(session, "_RUN_LIMIT_S", 0.2)
+    write_network(models, "endless", fault="endless")
+    with pytest.raises(ModelError, match=r"endless\.onnx had no result for a picture within 0\.2 s: it loops"):
+        verify_here(load_card("endless"))
+
+
+def processes_that_try() -> dict[int, str]:
+    found = {}
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        with contextlib.suppress(OSError):
+            words = path.read_bytes().split(b"\0")
+            if b"edgevpr.runtime.preflight.networks" in words:
+                found[int(path.parent.name)] = path.parent.joinpath("stat").read_text().split()[3]
+    return found
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, -15), (signal.SIGKILL, -9)])
+def test_a_signal_ends_the_trial_and_its_process(models, tmp_path, number, code):
+    folder = tmp_path / "download"
+    write_network(folder, "endless", fault="endless")
+    argv = [
+        sys.executable,
+        "-m",
+        "edgevpr",
+        "models",
+        "add",
+        folder / "endless.onnx",
+        "--card",
+        folder / "endless.yaml",
+    ]
+    adding = subprocess.Popen(argv, stderr=subprocess.DEVNULL)
+    try:
+        mine = wait_for(lambda: [pid for pid, parent in processes_that_try().items() if int(parent) == adding.pid])
+        wait_for(lambda: b"onnxruntime" in Path(f"/proc/{mine[0]}/maps").read_bytes())
+        adding.send_signal(number)
+        assert adding.wait(30) == code
+        wait_for(lambda: mine[0] not in processes_that_try(), limit_s=15)  # it would give up after 30
+    finally:
+        adding.kill()
+    assert not list(models.iterdir())
+
+
+def wait_for(there, limit_s=60.0):
+    end_s = time.monotonic() + limit_s
+    while not (found := there()):
+        assert time.monotonic() < end_s
+        time.sleep(0.05)
+    return found
+
+
+def test_devices_and_pipes_are_no_networks(models, tmp_path):
+    os.mkfifo(tmp_path / "pipe.onnx")
+    write_network(tmp_path / "download", "mine", card={"sha256": ""})
+    for file in (Path("/dev/zero"), tmp_path / "pipe.onnx"):
+        with pytest.raises(ModelError, match=r"cannot be read \(it is a pipe or a device and not a regular file\)"):
+            add(file, tmp_path / "download" / "mine.yaml")
+    (tmp_path / "vast.onnx").touch()
+    os.truncate(tmp_path / "vast.onnx", 2**31 + 1)
+    with pytest.raises(ModelError, match=r"cannot be read \(it has 2,147.5 MB, and at most 2,147.5 are read\)"):
+        add(tmp_path / "vast.onnx", tmp_path / "download" / "mine.yaml")
+
+
+def test_a_card_that_names_itself_is_not_added(models, download):
+    write_card(download / "same.yaml", {"file": "same.yaml", "sha256": ""})
+    with pytest.raises(ModelError, match=r"same\.yaml, which is the name of a card|`same\.yaml`, which is the name"):
+        add(download / "mine.onnx", download / "same.yaml")
+    assert not list(models.iterdir())
+
+
+def test_a_card_whose_head_has_a_list_for_a_name_stops_no_command(models, capsys):
+    write_network(models, "odd", card={"head": {"name": [1]}})
+    assert main(["models", "list"]) == 0
+    assert "there is no head `[1]`" in capsys.readouterr().out
 
 
 @pytest.mark.usefixtures("tried_here")

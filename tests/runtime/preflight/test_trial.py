@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from edgevpr.helpers import child
 from edgevpr.runtime.preflight import trial as trying
 from edgevpr.runtime.preflight.offers import Offer, offers
 from edgevpr.runtime.preflight.trial import Trial, model_of, trial_of, try_each
@@ -40,7 +41,7 @@ def test_it_is_tried_on_pictures_of_a_folder(tmp_path):
 
 
 def test_a_network_that_is_not_there_is_one_row_and_needs_no_process(monkeypatch):
-    monkeypatch.setattr(trying.subprocess, "Popen", None)
+    monkeypatch.setattr(child.subprocess, "Popen", None)
     named = {"calc": {"model": "nowhere"}, "netvlad": {"model": "nowhere"}}
     found = list(try_each(offers(["calc", "netvlad"], settings=named), threads=1))
     assert [each.label for each in found] == ["calc", "netvlad"]
@@ -51,7 +52,7 @@ def program(monkeypatch, *lines):
     """Let another program stand in for the process."""
     really = subprocess.Popen
     code = "; ".join(["import sys, os", "sys.stdin.read()", *lines])
-    monkeypatch.setattr(trying.subprocess, "Popen", lambda argv, **more: really([sys.executable, "-c", code], **more))
+    monkeypatch.setattr(child.subprocess, "Popen", lambda argv, **more: really([sys.executable, "-c", code], **more))
 
 
 @pytest.mark.parametrize(
@@ -81,10 +82,10 @@ def test_ctrl_c_leaves_no_process_behind(monkeypatch):
             assert more["start_new_session"], "or it would be interrupted itself, with a traceback"
             started.append(self)
 
-        def communicate(self, *args):
+        def communicate(self, *args, **more):
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(trying.subprocess, "Popen", Interrupted)
+    monkeypatch.setattr(child.subprocess, "Popen", Interrupted)
     with pytest.raises(KeyboardInterrupt):
         list(try_each(offers(["hog"]), threads=1))
     assert started[0].poll() == -signal.SIGKILL

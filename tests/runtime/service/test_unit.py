@@ -10,6 +10,7 @@ import pytest
 
 from edgevpr.errors import UsageError
 from edgevpr.power.boards import board_names, load_board
+from edgevpr.runtime.service import unit as unit_text
 from edgevpr.runtime.service.unit import render_unit
 
 DEPLOY = Path(__file__).parents[3] / "deploy"
@@ -91,6 +92,48 @@ def test_a_configuration_that_the_service_cannot_see_is_refused(path):
         UsageError, match=f"^{path} is out of sight of the service.*copy it to /etc/edgevpr/config.yaml"
     ):
         render_unit(load_board("rpi-zero-2w"), path)
+
+
+@pytest.mark.parametrize(
+    "path", ["/var/../home/pi/c.yaml", "/etc/edgevpr/../../root/c.yaml", "/proc/self/root/home/pi/c.yaml"]
+)
+def test_no_way_round_leads_to_what_the_service_cannot_see(path):
+    with pytest.raises(UsageError, match="is out of sight of the service"):
+        render_unit(load_board("rpi-zero-2w"), path)
+
+
+def test_a_link_to_what_the_service_cannot_see_is_followed(tmp_path, monkeypatch):
+    monkeypatch.setattr(unit_text, "_HIDDEN_FROM_THE_SERVICE", (str(tmp_path / "home"),))
+    (tmp_path / "home").mkdir()
+    (tmp_path / "c.yaml").symlink_to(tmp_path / "home" / "c.yaml")
+    with pytest.raises(UsageError, match=r"home/c\.yaml is out of sight of the service"):
+        render_unit(load_board("rpi-zero-2w"), tmp_path / "c.yaml")
+    (tmp_path / "night.yaml").touch()
+    (tmp_path / "config.yaml").symlink_to("night.yaml")  # the link is what the user wants to turn, so it is written
+    assert f"--config {tmp_path}/config.yaml\n" in render_unit(load_board("rpi-zero-2w"), tmp_path / "config.yaml")
+    assert f"--config {tmp_path}/night.yaml\n" in render_unit(
+        load_board("rpi-zero-2w"), tmp_path / "home" / ".." / "night.yaml"
+    )
+
+
+@pytest.mark.parametrize("odd", ["\n", "\r", "\x1b", "\u2028", "\x85", "\udcff", "\t"])
+def test_a_name_that_would_write_lines_into_the_unit_is_refused(odd):
+    with pytest.raises(UsageError, match="holds a character that a unit cannot hold"):
+        render_unit(load_board("rpi-zero-2w"), f"/etc/edgevpr/c.yaml{odd}ExecStartPre=/bin/sh")
+
+
+@needs_systemd
+@pytest.mark.parametrize("name", ["%n%h", "a b", "a'b", 'a"b', "$HOME ${HOME}", "a\\", "a\\nb", ";", "ü", "#x", "%"])
+def test_every_other_name_is_one_word_for_systemd(name, tmp_path):
+    unit = render_unit(load_board("rpi-zero-2w"), f"/etc/edgevpr/{name}")
+    assert len(unit.splitlines()) == len(UNIT.read_text().splitlines())
+    assert verify(unit, tmp_path) == ""
+
+
+def test_a_board_of_ones_own_writes_no_line_of_its_own():
+    unit = render_unit(replace(load_board("rpi-zero-2w"), name="x\nExecStartPre=/bin/sh"))
+    assert "\n# Board: x\\nExecStartPre=/bin/sh\n" in unit
+    assert "ExecStartPre" not in directives(unit)
 
 
 def test_the_unit_keeps_trying_in_flight_but_not_after_a_usage_error():

@@ -1,5 +1,7 @@
 """Learned words: the file that is read, and what is made of them."""
 
+import zipfile
+
 import literal_heads as literal
 import numpy as np
 import pytest
@@ -98,3 +100,13 @@ def test_bag_of_words():
     local, known = rng.normal(size=(30, 4)).astype(np.float32), rng.normal(size=(20, 4)).astype(np.float32)
     np.testing.assert_allclose(words.bag_of_words(local, known), literal.bag_of_words(local, known), rtol=1e-6)
     assert not words.bag_of_words(np.zeros((0, 4), np.float32), known).any()
+
+
+def test_a_small_archive_that_unpacks_to_gigabytes_is_refused(folder):
+    path = folder / "tiny_vlad3.npz"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("words.npy", "w") as part:
+        for _ in range(52):
+            part.write(bytes(10_000_000))
+    assert (folder / "tiny_vlad3.npz").stat().st_size < 1_000_000
+    with pytest.raises(ModelError, match=r"cannot be read as words \(it takes more than 500 MB unpacked\)"):
+        words.load_words("tiny", "vlad", 3)

@@ -1,0 +1,129 @@
+"""Names, passwords and halves of characters on their way to the terminal."""
+
+import logging
+import os
+import subprocess
+import sys
+
+import cv2
+import pytest
+from pictures import textured
+
+from edgevpr.cli.main import main
+from edgevpr.cli.screen import LineFormatter
+from edgevpr.helpers.text import decoded_name, printable, shown, without_passwords
+
+REDDENING = "\x1b[31m.jpg"  # a name that would make all that follows red
+
+
+def said(argv, **more):
+    return subprocess.run([sys.executable, "-m", "edgevpr", *argv], capture_output=True, timeout=60, **more)
+
+
+@pytest.mark.parametrize(
+    ("text", "printed"),
+    [
+        ("Straße 東京.jpg", "Straße 東京.jpg"),
+        ("a\x1b[31m\n\r\x07\x7f\x9b", r"a\x1b[31m\n\r\x07\x7f\x9b"),
+        ("gpj.\u202e\u2028", r"gpj.\u202e\u2028"),
+        ("caf\udce9", r"caf\xe9"),
+        ("\ud800\0", r"\ud800\x00"),
+    ],
+)
+def test_what_a_terminal_would_act_on_is_escaped(text, printed):
+    assert printable(text) == printed
+    printed.encode("utf-8")
+
+
+def test_a_name_that_is_not_utf_8_becomes_one():
+    assert decoded_name(os.fsdecode(b"caf\xe9.jpg")) == "caf\\xe9.jpg"
+    assert decoded_name("café.jpg") == "café.jpg"
+
+
+@pytest.mark.parametrize(
+    ("address", "without"),
+    [
+        ("rtsp://pilot:secret@10.0.0.2:554/cam", "rtsp://pilot:***@10.0.0.2:554/cam"),
+        ("rtsp://:secret@10.0.0.2/cam", "rtsp://:***@10.0.0.2/cam"),
+        ("rtsp://pilot:s/e:c@r@et@10.0.0.2/cam", "rtsp://pilot:***@10.0.0.2/cam"),
+        ("http://10.0.0.2/cam?user=pilot&pwd=secret&x=1", "http://10.0.0.2/cam?user=pilot&pwd=***&x=1"),
+        ("There is no map rtsp:/pilot:secret@cam.", "There is no map rtsp:/pilot:***@cam."),
+        ("rtsp://10.0.0.2:554/cam", "rtsp://10.0.0.2:554/cam"),
+        ("rtsp://pilot@10.0.0.2:554/cam", "rtsp://pilot@10.0.0.2:554/cam"),
+        ("serial:/dev/ttyAMA0:921600", "serial:/dev/ttyAMA0:921600"),
+    ],
+)
+def test_passwords_are_left_out(address, without):
+    assert without_passwords(address) == without
+    assert shown(f"{address} is lost, {address} is back") == f"{without} is lost, {without} is back"
+
+
+def test_a_message_is_one_line_and_a_traceback_keeps_its_own():
+    try:
+        raise ValueError("rtsp://pilot:secret@cam\nINFO all is well")
+    except ValueError:
+        record = logging.LogRecord("x", 20, "x.py", 1, "bad\nINFO %s", ("\x1b[31m",), sys.exc_info())
+    text = LineFormatter("edgevpr: %(message)s").format(record)
+    assert text.startswith("edgevpr: bad\\nINFO \\x1b[31m\nTraceback")
+    assert "secret" not in text
+    assert len(text.splitlines()) > 3
+
+
+def test_the_name_of_an_image_is_escaped_in_errors_and_tables(tmp_path):
+    for number, folder in enumerate(("ref", "query")):
+        (tmp_path / folder).mkdir()
+        picture = cv2.imencode(".jpg", textured(1, 120, 160))[1].tobytes()
+        (tmp_path / folder / REDDENING).write_bytes(picture)
+        (tmp_path / folder / f"{number}\x1b[0m.jpg").write_bytes(b"no image")
+    built = said(["map", "build", tmp_path / "m.gpkg", "--images", tmp_path / "ref", "--technique", "cohog"])
+    assert built.returncode == 1
+    matched = said(["match", tmp_path / "m.gpkg", "--images", tmp_path / "query"])
+    assert b"1\\x1b[0m.jpg is not an image" in matched.stderr
+    assert matched.stdout.count(b"\\x1b[31m.jpg") == 2
+    assert b"\x1b" not in built.stdout + built.stderr + matched.stdout + matched.stderr
+
+
+def test_the_password_of_a_camera_is_not_printed(tmp_path):
+    (tmp_path / "c.yaml").write_text("source: {uri: 'http://pilot:secret@127.0.0.1:9/cam'}\n")
+    checked = said(["check", "--config", tmp_path / "c.yaml"])
+    assert b"http://pilot:***@127.0.0.1:9/cam" in checked.stdout
+    refused = said(["map", "build", tmp_path / "m.gpkg", "--images", "rtsp://pilot:secret@127.0.0.1/cam"])
+    assert (refused.returncode, b"rtsp://pilot:***@127.0.0.1/cam is live" in refused.stderr) == (1, True)
+    assert b"secret" not in checked.stdout + checked.stderr + refused.stdout + refused.stderr
+
+
+def test_a_wrong_flag_is_repeated_without_its_escapes():
+    refused = said(["match", "m.gpkg", "--images", "x", "\x1b[31m"])
+    assert refused.returncode == 2
+    assert b"\\x1b[31m" in refused.stderr
+    assert b"\x1b" not in refused.stderr
+
+
+def test_names_that_are_not_utf_8_are_mapped_and_matched(tmp_path):
+    (tmp_path / "ref").mkdir()
+    path = os.path.join(os.fsencode(tmp_path / "ref"), b"caf\xe9.jpg")
+    with open(path, "wb") as file:
+        file.write(cv2.imencode(".jpg", textured(1, 120, 160))[1].tobytes())
+    assert said(["map", "build", tmp_path / "m.gpkg", "--images", tmp_path / "ref"]).returncode == 0
+    for flags in ([], ["--json"]):
+        matched = said(["match", tmp_path / "m.gpkg", "--images", tmp_path / "ref", *flags])
+        assert matched.returncode == 0
+        assert b"caf\\" in matched.stdout
+    in_ascii = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    missing = said(["match", os.path.join(os.fsencode(tmp_path), b"\xc3\xa9\xff.gpkg"), "--images", "x"], env=in_ascii)
+    assert (missing.returncode, b"Traceback" in missing.stderr) == (1, False)
+    assert b"\\xe9\\xff.gpkg" in missing.stderr
+
+
+@pytest.mark.parametrize("word", ["a\0b.gpkg", "\ud800.gpkg"])
+def test_a_path_that_no_file_can_have_is_refused(word, tmp_path, capsys):
+    for argv in (["match", word, "--images", "x"], ["map", "info", word], ["check", "--config", word]):
+        assert main(argv) == 2
+        assert "edgevpr: The command line holds" in capsys.readouterr().err
+
+
+def test_a_form_that_does_not_exist_is_refused(capsys):
+    data = ["--query", "q", "--ref", "r", "--ground-truth", "t.csv"]
+    for form in ("x", "float,", "8bit,9bit"):
+        assert main(["eval", *data, "--form", form]) == 2
+        assert "use some of float, 8bit, 1bit" in capsys.readouterr().err
