@@ -7,6 +7,8 @@ from edgevpr.errors import LinkAddressError
 FORMS = "udpout:HOST:PORT, udpin:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD"
 BAUD_MIN, BAUD_MAX = 1200, 12_000_000
 
+Sender = tuple[str, int]  # host and port
+
 
 @dataclass(frozen=True, slots=True)
 class LinkAddress:
@@ -21,8 +23,8 @@ class LinkAddress:
 
 
 def parse_link(url: str) -> LinkAddress:
-    """Read a link such as `udpout:127.0.0.1:14550`; raises LinkAddressError with one sentence
-    for anything else."""
+    """Read a link such as `udpout:127.0.0.1:14550`; raises LinkAddressError, one sentence, for
+    anything else."""
     kind, _, rest = url.partition(":")
     where, _, number = rest.rpartition(":")  # from the right: names in /dev/serial/by-path hold colons
     if kind not in ("udpout", "udpin", "tcp", "serial") or not where.strip() or not number:

@@ -36,12 +36,14 @@ class Answers:
         self._sent_s = now_s
 
     def note_lost(self, fixes: int) -> None:
-        """Note that so many fixes were thrown away with the port: nobody could answer them."""
-        self.unanswered = max(0, self.unanswered - fixes)
+        """Note that so many fixes were thrown away with the port: nobody could answer them. Once the sending is
+        stopped, only an answer changes that."""
+        if not self.is_stopped:
+            self.unanswered -= fixes
 
     def note_answer(self, now_s: float) -> None:
         """Note an answer."""
-        if self.unanswered >= UNANSWERED_MAX:
+        if self.is_stopped:
             # All those fixes may be answered now, and these answers must not pass for one to a new fix.
             self._resumes_s = now_s + ANSWERED_WITHIN_S
         self.unanswered = 0

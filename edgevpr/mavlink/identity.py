@@ -4,7 +4,7 @@ import logging
 import math
 from dataclasses import dataclass
 
-from edgevpr.mavlink.transport import Sender
+from edgevpr.mavlink.address import Sender
 
 # A flight controller that restarts is back within 20 s; what speaks meanwhile is not it.
 RETAKEN_AFTER_S = 30.0

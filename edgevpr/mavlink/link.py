@@ -9,7 +9,6 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 
 from edgevpr.errors import LinkError
 from edgevpr.mavlink import messages
@@ -19,6 +18,7 @@ from edgevpr.mavlink.line import Line
 from edgevpr.mavlink.messages import Fix, Health, Severity
 from edgevpr.mavlink.outbox import MAX_FIX_WAIT_S, Outbox, Sending
 from edgevpr.mavlink.peer import Autopilot
+from edgevpr.mavlink.stats import LinkStats
 from edgevpr.mavlink.transport import open_transport
 from edgevpr.mavlink.wire import Message, Receiver, mavlink
 from edgevpr.types import Vehicle
@@ -32,34 +32,6 @@ WATCH_S = 0.01  # between two looks whether a fix has left
 FLUSH_S = 0.5
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LinkStats:
-    """Counts and state of a link. `trouble` is the reason why it is or last was not open, None once data arrives.
-
-    `foreign_messages` came from another autopilot or another address than ours and were refused. `withheld_fixes` were
-    not sent because those before had no answer.
-    """
-
-    connected: bool
-    trouble: str | None
-    autopilot_heard: bool
-    autopilot_system_id: int | None
-    sent: dict[str, int]
-    received: dict[str, int]
-    acks: dict[str, int]
-    dropped_stale_fixes: int
-    withheld_fixes: int
-    foreign_messages: int
-    dropped_queue_full: int
-    bad_bytes: int
-    reopened: int
-
-    @property
-    def fixes_sent(self) -> int:
-        """Number of position fixes sent."""
-        return self.sent.get("COMMAND_INT", 0)
 
 
 class Link:

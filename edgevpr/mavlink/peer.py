@@ -5,9 +5,9 @@ import math
 from collections import Counter
 
 from edgevpr.geodesy import distance_m
+from edgevpr.mavlink.address import Sender
 from edgevpr.mavlink.identity import Identity, Speaker
 from edgevpr.mavlink.messages import AUTOPILOT, POSITION_FIX
-from edgevpr.mavlink.transport import Sender
 from edgevpr.mavlink.wire import Message, mavlink
 from edgevpr.types import Vehicle
 
