@@ -151,6 +151,34 @@ def test_another_autopilot_starts_with_a_clean_slate(link_and_peer, clock):
         peer.heartbeat(system_id=9)
         wait_until(lambda before=before: link.stats().received["HEARTBEAT"] > before)
     assert link.stats().autopilot_system_id == 9
-    sending = link.send_fix(Fix(50.0, 8.0, 20.0, clock.now_s))
-    sending.wait(60)
-    assert sending.sent
+    for _ in range(5):
+        sending = link.send_fix(Fix(50.0, 8.0, 20.0, clock.now_s))
+        sending.wait(60)
+        assert sending.sent
+
+
+def test_fixes_thrown_away_with_the_port_wait_for_no_answer_but_do_not_end_a_stop():
+    answers = Answers()
+    for t_s in range(5):
+        answers.note_sent(t_s)
+    answers.note_lost(3)
+    assert (answers.unanswered, answers.why_not(5.0)) == (2, None)
+    for t_s in range(5, 8):
+        answers.note_sent(t_s)
+    assert answers.news(8.5)
+    answers.note_sent(17.5)
+    answers.note_lost(2)
+    assert (answers.why_not(20.0), answers.news(20.0)) == (UNANSWERED, None)
+
+
+def test_over_tcp_every_answer_is_that_of_its_fix(clock):
+    number = free_port(socket.SOCK_STREAM)
+    with closing(TcpServer(number)) as server, Link(parse_link(f"tcp:127.0.0.1:{number}"), clock=clock) as link:
+        peer = Peer(server.accept(), 7)
+        beat(link, peer)
+        for turn in range(20):
+            sending = link.send_fix(Fix(50.0, 8.0, 20.0, clock.now_s))
+            peer.expect("COMMAND_INT")
+            answer(link, peer, result=turn % 2)
+            wait_until(lambda sending=sending: sending.answer, "the answer")
+            assert sending.answer == ("ACCEPTED", "TEMPORARILY_REJECTED")[turn % 2]
