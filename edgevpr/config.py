@@ -119,13 +119,15 @@ class MappingConfig:
     spacing_m: float = bounded(1, 1000)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class MavlinkConfig:
     link: str | None = keyed(
         Flag(("--link",), "URL", "udpout:HOST:PORT, udpin:HOST:PORT, tcp:HOST:PORT, serial:DEV:BAUD")
     )
     component_id: int = bounded(1, 255)
+    system_id: int | None = bounded(1, 255)
     send_fixes: bool = field()
+    max_fix_age_s: float = bounded(0.1, 5)
     min_accuracy_m: float = bounded(1, 10_000)
 
 

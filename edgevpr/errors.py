@@ -33,5 +33,11 @@ class LinkError(EdgevprError):
     """A MAVLink link cannot be opened."""
 
 
+class LinkAddressError(LinkError):
+    """The address of a MAVLink link is wrong, and no waiting will change that: a wrong request, exit code 2."""
+
+    exit_code = 2
+
+
 class ModelError(EdgevprError):
     """A network cannot be used because of its card, its file, its output, the words learned on it, or onnxruntime."""

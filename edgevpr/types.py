@@ -137,7 +137,8 @@ class QueryCost:
 @dataclass(frozen=True, slots=True)
 class FixReport:
     """The outcome of the position fix of a `query`. `sent` is True, False (`why` gives the reason), or None while the
-    fix waits to be sent. `answer` is the answer of the autopilot, the name of a MAV_RESULT; None: no answer (yet)."""
+    fix waits to be sent or, over TCP, to be confirmed by the other end. `answer` is the answer of the autopilot, the
+    name of a MAV_RESULT; None: no answer (yet)."""
 
     query: str
     sent: bool | None

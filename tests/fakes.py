@@ -160,6 +160,8 @@ class FakeLink:
             received={},
             acks=dict(self._acks),
             dropped_stale_fixes=self._outbox.dropped_stale_fixes,
+            withheld_fixes=self._outbox.withheld_fixes,
+            foreign_messages=0,
             dropped_queue_full=0,
             bad_bytes=0,
             reopened=0,

@@ -2,10 +2,12 @@
 
 from dataclasses import dataclass
 
-from edgevpr.errors import LinkError
+from edgevpr.errors import LinkAddressError
 
 FORMS = "udpout:HOST:PORT, udpin:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD"
 BAUD_MIN, BAUD_MAX = 1200, 12_000_000
+
+Sender = tuple[str, int]  # host and port
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,18 +23,19 @@ class LinkAddress:
 
 
 def parse_link(url: str) -> LinkAddress:
-    """Read a link such as `udpout:127.0.0.1:14550`; raises LinkError with one sentence for anything else."""
+    """Read a link such as `udpout:127.0.0.1:14550`; raises LinkAddressError, one sentence, for
+    anything else."""
     kind, _, rest = url.partition(":")
     where, _, number = rest.rpartition(":")  # from the right: names in /dev/serial/by-path hold colons
     if kind not in ("udpout", "udpin", "tcp", "serial") or not where.strip() or not number:
-        raise LinkError(f"{url!r} is no MAVLink link: write {FORMS}.")
+        raise LinkAddressError(f"{url!r} is no MAVLink link: write {FORMS}.")
     if kind == "serial":
         if not _is_whole_number(number, BAUD_MIN, BAUD_MAX):
-            raise LinkError(f"{url}: the baud rate must be a number such as 57600 or 921600, not {number!r}.")
+            raise LinkAddressError(f"{url}: the baud rate must be a number such as 57600 or 921600, not {number!r}.")
     elif ":" in where:
-        raise LinkError(f"{url}: {where!r} is no host: give a name or an IPv4 address.")
+        raise LinkAddressError(f"{url}: {where!r} is no host: give a name or an IPv4 address.")
     elif not _is_whole_number(number, 1, 65_535):
-        raise LinkError(f"{url}: the port must be a whole number from 1 to 65535, not {number!r}.")
+        raise LinkAddressError(f"{url}: the port must be a whole number from 1 to 65535, not {number!r}.")
     return LinkAddress(kind, where, int(number))
 
 

@@ -9,16 +9,20 @@ from edgevpr.types import FIX_MAX_AGE_S
 
 MESSAGES_MAX = 64
 FIXES_MAX = 8
-FIX_MAX_WAIT_S = 1.0
+# The longest that a fix may wait, from `put_fix` on and in all buffers together, unless the configuration says another.
+# This limits what the link adds to the age of a frame; types.FIX_MAX_AGE_S limits the age itself, which is mostly the
+# time that matching took and which the autopilot is told. A fix must keep both limits.
+MAX_FIX_WAIT_S = 1.0
 
 
 class Sending:
-    """A fix to be sent, and its outcome. `sent` is None while the fix waits, then True, or False (`why` gives the
-    reason). `answer` is the answer of the autopilot, the name of a MAV_RESULT, None while there is none. Once the fix
-    is queued, only the link's thread changes these."""
+    """A fix to be sent by `due_s`, and its outcome. `sent` is None while the fix waits, then True, or False (`why`
+    gives the reason). `answer` is the answer of the autopilot, the name of a MAV_RESULT, None while there is none. Once
+    the fix is queued, only the link's thread changes these."""
 
-    def __init__(self, fix: Fix) -> None:
+    def __init__(self, fix: Fix, due_s: float) -> None:
         self.fix = fix
+        self.due_s = due_s
         self.sent: bool | None = None
         self.why: str | None = None
         self.answer: str | None = None
@@ -37,12 +41,14 @@ class Sending:
 class Outbox:
     """Two bounded queues from any number of threads to the thread of the link."""
 
-    def __init__(self) -> None:
+    def __init__(self, max_fix_wait_s: float = MAX_FIX_WAIT_S) -> None:
         self._lock = Lock()
         self._messages: deque[Message] = deque(maxlen=MESSAGES_MAX)
-        self._fixes: deque[tuple[float, Sending]] = deque()
+        self._fixes: deque[Sending] = deque()
+        self._max_fix_wait_s = max_fix_wait_s
         self.dropped_queue_full = 0
         self.dropped_stale_fixes = 0
+        self.withheld_fixes = 0
 
     def put(self, message: Message) -> None:
         """Queue a message; if the queue is full, the oldest message is dropped."""
@@ -51,16 +57,16 @@ class Outbox:
             self._messages.append(message)
 
     def put_fix(self, fix: Fix, now_s: float) -> Sending:
-        """Queue a fix, to be sent within one second and before its frame is 5 s old, or not at all."""
-        sending = Sending(fix)
+        """Queue a fix, to be sent within the longest wait and before its frame is 5 s old, or not at all."""
+        sending = Sending(fix, min(now_s + self._max_fix_wait_s, fix.t_frame_s + FIX_MAX_AGE_S))
         age_s = now_s - fix.t_frame_s
         with self._lock:
             if age_s > FIX_MAX_AGE_S:
                 self._drop(sending, f"its frame is {age_s:.1f} s old, and {FIX_MAX_AGE_S:g} s are the limit")
                 return sending
             if len(self._fixes) == FIXES_MAX:
-                self._drop(self._fixes.popleft()[1], "newer ones came before its turn")
-            self._fixes.append((min(now_s + FIX_MAX_WAIT_S, fix.t_frame_s + FIX_MAX_AGE_S), sending))
+                self._drop(self._fixes.popleft(), "newer ones came before its turn")
+            self._fixes.append(sending)
         return sending
 
     def next_message(self) -> Message | None:
@@ -71,15 +77,23 @@ class Outbox:
         """Return the oldest fix that may still be sent (None: no fix), and drop those that have waited too long."""
         self.drop_stale_fixes(now_s)
         with self._lock:
-            return self._fixes.popleft()[1] if self._fixes else None
+            return self._fixes.popleft() if self._fixes else None
 
     def drop_stale_fixes(self, now_s: float) -> None:
         """Drop the fixes that have waited too long."""
         with self._lock:
-            for due_s, sending in self._fixes:
-                if now_s > due_s:
-                    self._drop(sending, f"no autopilot was there to take it within {FIX_MAX_WAIT_S:g} s")
-            self._fixes = deque(entry for entry in self._fixes if entry[1].sent is None)
+            for sending in self._fixes:
+                if now_s > sending.due_s:
+                    self._drop(sending, f"no autopilot was there to take it within {self._max_fix_wait_s:g} s")
+            self._fixes = deque(sending for sending in self._fixes if sending.sent is None)
+
+    def withhold_fixes(self, why: str) -> None:
+        """Drop all fixes, for a reason that is the autopilot's."""
+        with self._lock:
+            self.withheld_fixes += len(self._fixes)
+            for sending in self._fixes:
+                sending.settle(False, why)
+            self._fixes.clear()
 
     def _drop(self, sending: Sending, why: str) -> None:
         self.dropped_stale_fixes += 1

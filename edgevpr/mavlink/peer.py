@@ -5,6 +5,8 @@ import math
 from collections import Counter
 
 from edgevpr.geodesy import distance_m
+from edgevpr.mavlink.address import Sender
+from edgevpr.mavlink.identity import Identity, Speaker
 from edgevpr.mavlink.messages import AUTOPILOT, POSITION_FIX
 from edgevpr.mavlink.wire import Message, mavlink
 from edgevpr.types import Vehicle
@@ -26,11 +28,10 @@ _EXPLANATIONS = {
 
 
 class Autopilot:
-    """The state of the autopilot, from all messages that arrive. It is fixed to the first autopilot heard, so that
-    nothing is ever sent to another vehicle."""
+    """The state of the autopilot, from all messages that arrive. `Identity` says which of them are its own."""
 
-    def __init__(self, own_component: int) -> None:
-        self.system_id: int | None = None
+    def __init__(self, own_component: int, system_id: int | None = None) -> None:
+        self.identity = Identity(system_id)
         self.acks: Counter[str] = Counter()  # answers to our fixes, by name of the result
         self.vehicle: Vehicle | None = None  # the last report, of any age
         self._answer: str | None = None  # the newest answer, until `take_answer`
@@ -38,31 +39,42 @@ class Autopilot:
         self._heard_s = -math.inf
         self._gps: dict[str, tuple[float, float, float]] = {}  # each receiver with a fix: lat_deg, lon_deg, time
         self._last_result: int | None = None
-        self._warned = False
+
+    @property
+    def system_id(self) -> int | None:
+        """System id of the autopilot, None until it is heard."""
+        return self.identity.kept and self.identity.kept.system_id
 
     def listens(self, now_s: float) -> bool:
-        """Tell whether a heartbeat of the autopilot was heard in the last five seconds."""
+        """Tell whether a heartbeat of the autopilot was heard in the last five seconds, over the port as it is open."""
         return now_s - self._heard_s <= SILENT_AFTER_S
+
+    def forget_presence(self) -> None:
+        """Regard the autopilot as absent until its next heartbeat, as after a reconnection to who knows whom."""
+        self._heard_s = -math.inf
 
     def take_answer(self) -> str | None:
         """Return the newest answer to a fix (name of a MAV_RESULT) once, then None until the next answer."""
         answer, self._answer = self._answer, None
         return answer
 
-    def hear(self, message: Message, now_s: float) -> bool:
-        """Take in a message heard at `now_s`; return True for the autopilot's heartbeat."""
-        system_id = message.get_srcSystem()
-        self._warn_of_another(message)
-        if message.get_srcComponent() != AUTOPILOT or system_id == 0 or self.system_id not in (None, system_id):
+    def hear(self, message: Message, now_s: float, address: Sender | None = None) -> bool:
+        """Take in a message heard at `now_s` from `address` (None: there is only one sender); return True for the
+        autopilot's heartbeat."""
+        if message.get_srcComponent() != AUTOPILOT or message.get_srcSystem() == 0:
+            if self.identity.is_elsewhere(address):
+                self.identity.refuse()
             return False
-        if message.get_type() == "HEARTBEAT" and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID:
-            if self.system_id is None:
-                self.system_id = system_id
-                log.info("autopilot heard: system %d", system_id)
+        beats = message.get_type() == "HEARTBEAT" and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID
+        before = self.identity.kept
+        if not self.identity.admits(Speaker(message.get_srcSystem(), address), beats, now_s):
+            return False
+        if self.identity.kept != before:
+            self.vehicle, self._last_result = None, None
+            self._gps.clear()
+        if beats:
             self._heard_s = now_s
             return True
-        if self.system_id is None:
-            return False
         if self._answers_our_fix(message):
             self._hear_result(message.result)
         elif message.get_type() == "GLOBAL_POSITION_INT":
@@ -90,23 +102,6 @@ class Autopilot:
             and message.command == POSITION_FIX
             and message.target_component in (0, self._own_component)  # 0: broadcast
         )
-
-    def _warn_of_another(self, message: Message) -> None:
-        """Warn once of a second autopilot: two vehicles on one link are dangerous."""
-        if (
-            not self._warned
-            and message.get_type() == "HEARTBEAT"
-            and message.get_srcComponent() == AUTOPILOT
-            and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID
-            and self.system_id not in (None, message.get_srcSystem())
-        ):
-            self._warned = True
-            log.warning(
-                "a second autopilot, system %d, is on this link; fixes go to system %d only: give each vehicle a link "
-                "of its own",
-                message.get_srcSystem(),
-                self.system_id,
-            )
 
     def _hear_result(self, result: int) -> None:
         known = mavlink.enums["MAV_RESULT"].get(result)

@@ -6,15 +6,19 @@ this package must not.
 """
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 Message = mavlink.MAVLink_message
 
 
+_SENDERS_MAX = 8  # whose unfinished messages are kept; a flood from invented addresses must not fill the memory
+
+
 class Receiver:
-    """The parser of one byte stream. It yields the messages; bytes that are no message are dropped and counted."""
+    """The parser of what arrives, apart for each sender: a message that one begins swallows nothing of another's. It
+    yields the messages; bytes that are no message are dropped and counted."""
 
     def __init__(self) -> None:
         self.received: Counter[str] = Counter()  # messages by name
@@ -23,15 +27,15 @@ class Receiver:
 
     def forget_partial_message(self) -> None:
         """Start again with an empty buffer, as after a link was lost in the middle of a message."""
-        self._parser = mavlink.MAVLink(None)
-        self._parser.robust_parsing = True  # bad data comes as BAD_DATA messages instead of an exception
+        self._parsers: dict[Hashable, mavlink.MAVLink] = {}  # by sender, the one heard last at the end
 
-    def feed(self, data: bytes) -> Iterator[Message]:
-        """Yield the messages that `data` completes."""
+    def feed(self, data: bytes, sender: Hashable = None) -> Iterator[Message]:
+        """Yield the messages that `data` completes. `sender`: where it comes from, where there can be several."""
+        parser = self._parser_of(sender)
         while data:
             # The portions end where a message ends, so the parser's buffer is emptied each time and never grows.
-            portion = self._parser.bytes_needed()
-            message = self._parser.parse_char(data[:portion])
+            portion = parser.bytes_needed()
+            message = parser.parse_char(data[:portion])
             data = data[portion:]
             if message is None:
                 continue
@@ -42,3 +46,13 @@ class Receiver:
             else:
                 self.received[message.get_type()] += 1
                 yield message
+
+    def _parser_of(self, sender: Hashable) -> mavlink.MAVLink:
+        parser = self._parsers.pop(sender, None)
+        if parser is None:
+            parser = mavlink.MAVLink(None)
+            parser.robust_parsing = True  # bad data comes as BAD_DATA messages instead of an exception
+            if len(self._parsers) == _SENDERS_MAX:
+                self._parsers.pop(next(iter(self._parsers)))
+        self._parsers[sender] = parser
+        return parser

@@ -1,7 +1,11 @@
+import socket
+
 import pytest
 
-from edgevpr.errors import LinkError
+from edgevpr.cli.main import main
+from edgevpr.errors import LinkAddressError, LinkError
 from edgevpr.mavlink.address import LinkAddress, parse_link
+from edgevpr.mavlink.transport import open_transport
 
 
 @pytest.mark.parametrize(
@@ -47,3 +51,40 @@ def test_a_malformed_link_gets_one_sentence(url, says):
         parse_link(url)
     assert says in str(caught.value)
     assert str(caught.value).endswith(".")
+
+
+@pytest.mark.parametrize(
+    "link",
+    [
+        "",
+        " ",
+        "udp:127.0.0.1:14550",
+        "udpout:127.0.0.1",
+        "udpout:127.0.0.l:14550",
+        "udpout:255.255.255.255:14550",
+        "tcp:a..b:5760",
+        "serial:/etc/hostname:57600",
+        "serial:/dev/null:57600",
+        "serial:/dev/ttyACM0:fast",
+    ],
+)
+def test_a_wrong_link_is_a_wrong_request_which_a_service_must_not_repeat(link):
+    with pytest.raises(LinkAddressError) as caught:
+        open_transport(parse_link(link))
+    assert caught.value.exit_code == 2
+
+
+def test_an_empty_link_is_refused_and_not_taken_for_none(tmp_path, capsys):
+    assert main(["run", "--source", str(tmp_path), "--map", "no.gpkg", "--link", ""]) == 2
+    assert "'' is no MAVLink link" in capsys.readouterr().err
+
+
+def test_what_may_end_by_itself_is_no_wrong_request():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        with pytest.raises(LinkError) as caught:
+            open_transport(parse_link(f"udpin:127.0.0.1:{other.getsockname()[1]}"))
+        assert caught.value.exit_code == 1
+    with pytest.raises(LinkError) as caught:
+        open_transport(parse_link("tcp:no-such-drone.local:5760"))
+    assert caught.value.exit_code == 1, "a host that announces itself may not be up yet"

@@ -213,8 +213,11 @@ def test_a_listening_link_speaks_when_spoken_to_and_follows_the_autopilot_to_a_n
         port.close()
         port = UdpPort(to=number)
         peer = Peer(port)
-        peer.heartbeat()
-        wait_until(lambda: link.stats().received["HEARTBEAT"] == 2)
+        clock.now_s += 25.0
+        for beats in range(2, 8):
+            clock.now_s += 1.0
+            peer.heartbeat()
+            wait_until(lambda beats=beats: link.stats().received["HEARTBEAT"] == beats)
         link.send(text("at the new port"))
         peer.expect_text("at the new port")
         port.close()

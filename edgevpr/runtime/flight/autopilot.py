@@ -58,12 +58,14 @@ class ToAutopilot:
 
     @property
     def summary(self) -> str:
-        """Counts of the fixes so far, in a few words: sent, taken, too late."""
+        """Counts so far, in a few words: fixes sent, taken, too late, withheld; messages of others refused."""
         stats = self._link.stats()
         sent = f"{stats.fixes_sent} fixes sent"
         taken = f"{stats.acks.get('ACCEPTED', 0)} taken"
         late = f"{stats.dropped_stale_fixes} too late to be sent" if stats.dropped_stale_fixes else ""
-        return ", ".join(filter(None, (sent, taken, late)))
+        withheld = f"{stats.withheld_fixes} withheld for want of answers" if stats.withheld_fixes else ""
+        foreign = f"{stats.foreign_messages} foreign messages refused" if stats.foreign_messages else ""
+        return ", ".join(filter(None, (sent, taken, late, withheld, foreign)))
 
     def vehicle(self) -> Vehicle | None:
         """Return the autopilot's last report of its vehicle, None where it has given no position."""

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from edgevpr import __version__
-from edgevpr.config import Config
+from edgevpr.config import Config, MavlinkConfig
 from edgevpr.errors import MapError, UsageError
 from edgevpr.frames.source import open_source
-from edgevpr.mavlink.address import parse_link
+from edgevpr.mavlink.address import LinkAddress, parse_link
 from edgevpr.mavlink.link import Link
 from edgevpr.power.boards import Board, load_board
 from edgevpr.runtime.flight.autopilot import NoAutopilot, ToAutopilot
@@ -42,7 +42,7 @@ def fly(config: Config, positions: Path | None = None) -> int:
     EdgevprError, one sentence, where the flight cannot start."""
     if config.source.uri is None:
         raise UsageError("There is no source of frames: name one with --source, or `source: {uri: ...}`.")
-    address = parse_link(config.mavlink.link) if config.mavlink.link else None
+    address = parse_link(config.mavlink.link) if config.mavlink.link is not None else None
     if config.mapping.learn:
         check_positions(config, positions)
     board = load_board(config.board)
@@ -53,7 +53,7 @@ def fly(config: Config, positions: Path | None = None) -> int:
         smaller_forms = smaller_forms_of(config, recogniser, learner, time.monotonic() - begin_s)
         flight_log = stack.enter_context(FlightLog(config.log.path, wait="NOTIFY_SOCKET" in os.environ))
         _say_start(config, recogniser, flight_log)
-        link = stack.enter_context(Link(address, config.mavlink.component_id)) if address else None
+        link = stack.enter_context(_link(address, config.mavlink)) if address else None
         if link and (learner or config.match.reach_m_s or recogniser.technique.spec.heading_within_deg is not None):
             link.want_position()
         step_s = 1 / rate_hz(config, recogniser)
@@ -102,6 +102,10 @@ def fly(config: Config, positions: Path | None = None) -> int:
         if learner:
             _log.info("%s, %d in %s", learner.summary, len(recogniser.place_map), config.map)
     return 1 if flown.failed else 0
+
+
+def _link(address: LinkAddress, settings: MavlinkConfig) -> Link:
+    return Link(address, settings.component_id, system_id=settings.system_id, max_fix_age_s=settings.max_fix_age_s)
 
 
 def _opened(config: Config, board: Board) -> tuple[Recogniser, Learner | None, str | None]:

@@ -4,9 +4,12 @@ things."""
 import pytest
 from fakes import FakeClock, FakeLink, FakeSource
 from flights import Flight, of_kind
+from mavlink_peers import Peer, UdpPort, wait_until
 from pictures import textured
 
-from edgevpr.runtime.flight import vitals
+from edgevpr.mavlink.address import parse_link
+from edgevpr.mavlink.link import Link
+from edgevpr.runtime.flight import autopilot, vitals
 
 
 def flight(recording, tmp_path, link, clock, technique="cohog", **settings):
@@ -39,6 +42,25 @@ def test_an_answer_that_says_no_is_in_the_next_line(recording, tmp_path):
     clock = FakeClock()
     lines = flight(recording, tmp_path, FakeLink(clock, answer="FAILED"), clock).fly(FakeSource(pictures(2), clock))
     assert of_kind(lines, "query")[1]["last_fix"]["answer"] == "FAILED"
+
+
+def test_five_fixes_that_nobody_answers_stop_the_sending_and_the_lines_say_so(recording, tmp_path, monkeypatch):
+    monkeypatch.setattr(autopilot, "_SETTLED_WITHIN_S", 60.0)
+    clock, port = FakeClock(), UdpPort()
+    with Link(parse_link(f"udpout:127.0.0.1:{port.number}"), clock=clock) as link:
+        peer = Peer(port)
+        peer.expect("HEARTBEAT")
+
+        def beat():
+            before = link.stats().received.get("HEARTBEAT", 0)
+            peer.heartbeat()
+            wait_until(lambda: link.stats().received.get("HEARTBEAT", 0) > before and link.listens())
+
+        flown = flight(recording, tmp_path, link, clock)
+        lines = flown.fly(FakeSource(pictures(3) + pictures(3) + pictures(1), clock, work=beat))
+    port.close()
+    assert fixes(lines) == [(True, None)] * 5 + [(False, "not sent: five fixes in a row had no answer")] * 2
+    assert link.stats().withheld_fixes == 2
 
 
 def test_without_an_autopilot_a_fix_waits_and_is_dropped_and_the_next_line_says_so(recording, tmp_path):

@@ -1,0 +1,31 @@
+"""Counts and state of a link."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkStats:
+    """Counts and state of a link. `trouble` is the reason why it is or last was not open, None once data arrives.
+
+    `foreign_messages` came from another autopilot or another address than ours and were refused. `withheld_fixes` were
+    not sent because those before had no answer.
+    """
+
+    connected: bool
+    trouble: str | None
+    autopilot_heard: bool
+    autopilot_system_id: int | None
+    sent: dict[str, int]
+    received: dict[str, int]
+    acks: dict[str, int]
+    dropped_stale_fixes: int
+    withheld_fixes: int
+    foreign_messages: int
+    dropped_queue_full: int
+    bad_bytes: int
+    reopened: int
+
+    @property
+    def fixes_sent(self) -> int:
+        """Number of position fixes sent."""
+        return self.sent.get("COMMAND_INT", 0)

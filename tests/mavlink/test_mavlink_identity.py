@@ -1,0 +1,301 @@
+"""Which autopilot is ours: the one kept, others refused, and the rule by which one takes the place of another."""
+
+import logging
+import socket
+
+import pytest
+from fakes import FakeClock
+from mavlink_peers import Peer, TcpServer, UdpPort, free_port, wait_until
+
+from edgevpr.mavlink.address import parse_link
+from edgevpr.mavlink.identity import Identity, Speaker
+from edgevpr.mavlink.link import Link
+from edgevpr.mavlink.messages import Fix
+from edgevpr.mavlink.wire import mavlink
+
+OURS, FOREIGN = Speaker(1, None), Speaker(2, None)
+HERE, THERE = ("127.0.0.1", 1000), ("127.0.0.1", 2000)
+
+
+def beat(identity: Identity, speaker: Speaker, *times_s: float) -> list[bool]:
+    return [identity.admits(speaker, True, t_s) for t_s in times_s]
+
+
+def seconds(first: float, last: float) -> list[float]:
+    """Every second from `first` to `last`."""
+    return [first + count for count in range(round(last - first) + 1)]
+
+
+def test_the_first_autopilot_heard_is_kept_while_it_speaks(caplog):
+    identity = Identity()
+    assert not identity.admits(OURS, False, 0.0), "what is no heartbeat makes nobody ours"
+    for t_s in seconds(0, 100):
+        assert identity.admits(OURS, True, t_s)
+        assert not identity.admits(FOREIGN, True, t_s + 0.5)
+        assert not identity.admits(FOREIGN, False, t_s + 0.6)
+    assert identity.kept == OURS
+    assert identity.foreign_messages == 202
+    assert caplog.text.count("a second autopilot, system 2") == 1
+
+
+def test_messages_that_are_no_heartbeat_keep_our_place_too():
+    identity = Identity()
+    beat(identity, OURS, 0.0)
+    for t_s in seconds(1, 60):
+        identity.admits(OURS, False, t_s)
+        beat(identity, FOREIGN, t_s + 0.5)
+    assert identity.kept == OURS
+
+
+def test_an_autopilot_that_changed_its_number_is_taken_after_thirty_seconds_of_silence(caplog):
+    identity = Identity()
+    beat(identity, OURS, 0.0)
+    assert not any(beat(identity, Speaker(7, None), *seconds(20, 29)))
+    assert beat(identity, Speaker(7, None), 30.0, 31.0) == [True, True]
+    assert identity.take_news() == "autopilot is now system 7"
+    assert identity.take_news() is None
+    assert "the autopilot is system 7 now: system 1 has been silent for 30 s" in caplog.text
+    assert beat(identity, OURS, 32.0) == [False]
+
+
+def test_one_stray_heartbeat_after_the_silence_takes_nothing_over():
+    identity = Identity()
+    beat(identity, OURS, 0.0)
+    assert not any(beat(identity, Speaker(7, None), 40.0, 43.0, 46.0, 49.0, 52.0, 53.0)), "gaps of 3 s are not steady"
+    assert beat(identity, Speaker(7, None), *seconds(54, 57)) == [False] * 3 + [True]
+
+
+def test_a_system_heard_between_two_heartbeats_of_ours_is_another_vehicle_and_never_taken():
+    identity = Identity()
+    beat(identity, OURS, 0.0)
+    beat(identity, FOREIGN, 0.5)
+    beat(identity, OURS, 1.0)
+    assert not any(beat(identity, FOREIGN, *seconds(2, 400)))
+    assert beat(identity, OURS, 401.0) == [True]
+
+
+def test_the_same_system_from_elsewhere_comes_before_another_system():
+    identity = Identity()
+    beat(identity, Speaker(1, HERE), 0.0)
+    for t_s in seconds(20, 40):
+        assert beat(identity, Speaker(7, THERE), t_s) == [False]
+        taken = beat(identity, Speaker(1, THERE), t_s + 0.5)
+        assert taken == [t_s >= 30]
+    assert identity.take_news() == "autopilot now at 127.0.0.1:2000"
+
+
+def test_between_two_unknown_systems_nobody_chooses():
+    identity = Identity()
+    beat(identity, OURS, 0.0)
+    for t_s in seconds(20, 100):
+        assert beat(identity, Speaker(7, None), t_s) + beat(identity, Speaker(8, None), t_s + 0.5) == [False, False]
+    assert beat(identity, Speaker(7, None), *seconds(101, 104))[-1], "when one of them has gone"
+
+
+def test_a_configured_system_is_never_given_up_but_may_come_from_elsewhere(caplog):
+    identity = Identity(system_id=1)
+    assert not any(beat(identity, Speaker(2, HERE), *seconds(0, 99)))
+    assert identity.foreign_messages == 100
+    assert caplog.text.count("is not system 1, which is configured") == 1
+    assert beat(identity, Speaker(1, HERE), 100.0) == [True]
+    assert not any(beat(identity, Speaker(2, HERE), *seconds(101, 200)))
+    assert beat(identity, Speaker(1, THERE), *seconds(201, 206)) == [False] * 5 + [True]
+    assert identity.kept == Speaker(1, THERE)
+
+
+def test_a_flood_of_invented_speakers_fills_no_memory_and_takes_nothing_over():
+    identity = Identity()
+    beat(identity, Speaker(1, HERE), 0.0)
+    for number in range(5000):
+        assert not identity.admits(Speaker(1, ("127.0.0.1", 10_000 + number)), True, 30.0 + number / 100)
+    assert identity.kept == Speaker(1, HERE)
+    assert len(identity._others) <= 32
+
+
+@pytest.fixture
+def clock():
+    return FakeClock()
+
+
+@pytest.fixture
+def listening(clock):
+    """A link that listens, and a call that makes an autopilot at a port of its own."""
+    number, ports = free_port(), []
+
+    def autopilot(system_id: int) -> Peer:
+        ports.append(UdpPort(to=number))
+        return Peer(ports[-1], system_id)
+
+    with Link(parse_link(f"udpin:127.0.0.1:{number}"), clock=clock) as link:
+        yield link, autopilot
+    for port in ports:
+        port.close()
+
+
+def speak(link: Link, peer: Peer, clock: FakeClock, beats: int, **sender: int) -> None:
+    """Let an autopilot send a heartbeat a second."""
+    for _ in range(beats):
+        clock.now_s += 1.0
+        before = link.stats().received.get("HEARTBEAT", 0)
+        peer.heartbeat(**sender)
+        wait_until(lambda before=before: link.stats().received.get("HEARTBEAT", 0) > before, "the heartbeat")
+
+
+def became_of_a_fix(link: Link, clock: FakeClock) -> bool:
+    """Send a fix; tell whether it left."""
+    sending = link.send_fix(Fix(50.0, 8.0, 20.0, clock.now_s))
+    if not link.listens():
+        clock.now_s += 1.1
+        wait_until(lambda: sending.sent is not None, "giving up the fix")
+    sending.wait(60)
+    return bool(sending.sent)
+
+
+def names(peer: Peer) -> list[str]:
+    """Names of all messages that have come by now."""
+    peer.port._sock.setblocking(False)
+    try:
+        while True:
+            peer.read()
+    except BlockingIOError:
+        return [message.get_type() for message in peer.seen]
+
+
+def test_a_second_socket_with_our_autopilots_number_gets_no_fix_while_ours_speaks(listening, clock, caplog):
+    link, autopilot = listening
+    ours, thief = autopilot(1), autopilot(1)
+    speak(link, ours, clock, 1)
+    for _ in range(40):
+        speak(link, thief, clock, 1)
+        thief.answer_fix(mavlink.MAV_RESULT_ACCEPTED)
+        speak(link, ours, clock, 1)
+        assert became_of_a_fix(link, clock)
+        assert ours.expect("COMMAND_INT").target_system == 1
+        ours.answer_fix(mavlink.MAV_RESULT_FAILED)
+    wait_until(lambda: link.stats().acks.get("FAILED") == 40)
+    assert names(thief) == []
+    assert link.stats().acks == {"FAILED": 40}, "nor is it believed"
+    assert link.stats().foreign_messages == 80
+    assert caplog.text.count("a second autopilot of that number") == 1
+
+
+def test_an_autopilot_that_comes_back_from_elsewhere_is_taken_and_the_ground_is_told(listening, clock):
+    link, autopilot = listening
+    before = autopilot(1)
+    speak(link, before, clock, 2)
+    assert became_of_a_fix(link, clock)
+    clock.now_s += 20.0
+    after = autopilot(1)
+    speak(link, after, clock, 7)
+    assert not became_of_a_fix(link, clock)
+    speak(link, after, clock, 7)
+    assert became_of_a_fix(link, clock)
+    after.expect_text(f"edgevpr: autopilot now at 127.0.0.1:{after.port.number}")
+    assert after.expect("COMMAND_INT").target_system == 1
+    assert names(before).count("COMMAND_INT") == 1
+
+
+def test_our_autopilot_with_a_new_number_is_taken_and_addressed_by_it(listening, clock):
+    link, autopilot = listening
+    peer = autopilot(1)
+    speak(link, peer, clock, 3)
+    speak(link, peer, clock, 29, system_id=7)
+    assert not became_of_a_fix(link, clock)
+    speak(link, peer, clock, 2, system_id=7)
+    assert link.stats().autopilot_system_id == 7
+    assert became_of_a_fix(link, clock)
+    peer.expect_text("edgevpr: autopilot is now system 7")
+    fix = peer.expect("COMMAND_INT")
+    assert (fix.target_system, fix.get_srcSystem()) == (7, 7)
+
+
+def test_a_foreign_autopilot_heard_first_gives_way_to_ours_when_only_ours_is_heard(listening, clock):
+    link, autopilot = listening
+    foreign, ours = autopilot(2), autopilot(1)
+    speak(link, foreign, clock, 10)
+    speak(link, ours, clock, 45)
+    assert became_of_a_fix(link, clock)
+    assert ours.expect("COMMAND_INT").target_system == 1
+    assert "COMMAND_INT" not in names(foreign)
+
+
+def test_where_ours_falls_silent_the_other_vehicle_on_the_bus_gets_no_fix(listening, clock):
+    link, autopilot = listening
+    ours, foreign = autopilot(1), autopilot(2)
+    for _ in range(5):
+        speak(link, ours, clock, 1)
+        speak(link, foreign, clock, 1)
+    speak(link, ours, clock, 1)
+    speak(link, foreign, clock, 60)
+    assert not became_of_a_fix(link, clock)
+    assert names(foreign) == []
+    speak(link, ours, clock, 1)
+    assert became_of_a_fix(link, clock)
+
+
+def test_the_vehicle_of_the_autopilot_before_is_forgotten(listening, clock):
+    link, autopilot = listening
+    peer = autopilot(1)
+    speak(link, peer, clock, 1)
+    peer.send(mavlink.MAVLink_global_position_int_message(0, 10**7, 10**7, 0, 0, 0, 0, 0, 0))
+    wait_until(link.vehicle)
+    speak(link, peer, clock, 31, system_id=7)
+    wait_until(lambda: link.stats().autopilot_system_id == 7)
+    assert link.vehicle() is None
+
+
+def test_the_configured_system_is_our_own_number_from_the_start_and_the_only_one_sent_to(clock):
+    number = free_port()
+    with Link(parse_link(f"udpin:127.0.0.1:{number}"), clock=clock, system_id=5) as link:
+        port = UdpPort(to=number)
+        peer = Peer(port, system_id=9)
+        speak(link, peer, clock, 40)
+        assert peer.expect("HEARTBEAT").get_srcSystem() == 5
+        assert not became_of_a_fix(link, clock)
+        assert link.stats().autopilot_system_id is None
+        speak(link, peer, clock, 1, system_id=5)
+        assert became_of_a_fix(link, clock)
+        assert peer.expect("COMMAND_INT").target_system == 5
+        port.close()
+
+
+def test_after_a_reconnection_no_fix_leaves_before_ours_has_spoken(clock, caplog):
+    caplog.set_level(logging.INFO, "edgevpr.mavlink")
+    number = free_port(socket.SOCK_STREAM)
+    server = TcpServer(number)
+    with Link(parse_link(f"tcp:127.0.0.1:{number}"), clock=clock) as link:
+        speak(link, Peer(server.accept(), 1), clock, 1)
+        server.close()
+        wait_until(lambda: not link.stats().connected, "noticing the loss")
+        server = TcpServer(number)
+        stranger = Peer(server.accept(), 2)
+        speak(link, stranger, clock, 3)
+        assert not became_of_a_fix(link, clock), "ours was heard 4 s ago, but over another connection"
+        speak(link, stranger, clock, 1, system_id=1)
+        assert became_of_a_fix(link, clock)
+    server.close()
+
+
+def test_a_sending_link_hears_no_other_port_of_its_peers_host(clock):
+    port, thief = UdpPort(), UdpPort()
+    with Link(parse_link(f"udpout:127.0.0.1:{port.number}"), clock=clock) as link:
+        peer = Peer(port)
+        peer.expect("HEARTBEAT")
+        thief.to = port.to
+        Peer(thief).heartbeat()
+        thief.send(b"hello")
+        speak(link, peer, clock, 1)
+        stats = link.stats()
+        assert (stats.received, stats.bad_bytes, stats.foreign_messages) == ({"HEARTBEAT": 1}, 0, 0)
+    port.close()
+    thief.close()
+
+
+def test_a_message_that_a_stranger_begins_swallows_nothing_of_ours(listening, clock):
+    link, autopilot = listening
+    ours, stranger = autopilot(1), autopilot(1)
+    speak(link, ours, clock, 1)
+    for beats in range(2, 20):
+        stranger.port.send(b"\xfd\xff\x00")
+        ours.heartbeat()
+        wait_until(lambda beats=beats: link.stats().received["HEARTBEAT"] == beats)

@@ -1,0 +1,31 @@
+"""The link of a flight is opened as the configuration says."""
+
+from contextlib import closing
+
+import pytest
+from mavlink_peers import Peer, UdpPort, wait_until
+
+from edgevpr.config import load_config
+from edgevpr.errors import ConfigError
+from edgevpr.mavlink.address import parse_link
+from edgevpr.mavlink.messages import Fix
+from edgevpr.runtime.service import fly
+
+
+def test_the_keys_of_the_configuration_reach_the_link():
+    keys = {"mavlink.system_id": 5, "mavlink.component_id": 191, "mavlink.max_fix_age_s": 0.2}
+    config = load_config(None, keys)
+    with closing(UdpPort()) as port, fly._link(parse_link(f"udpout:127.0.0.1:{port.number}"), config.mavlink) as link:
+        heartbeat = Peer(port).expect("HEARTBEAT")
+        assert (heartbeat.get_srcSystem(), heartbeat.get_srcComponent()) == (5, 191)
+        sending = link.send_fix(Fix(50.0, 8.0, 20.0, link._clock()))
+        wait_until(lambda: sending.sent is not None)
+        assert sending.why == "no autopilot was there to take it within 0.2 s"
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("system_id", 0), ("system_id", 256), ("max_fix_age_s", 0.05), ("max_fix_age_s", 5.1)]
+)
+def test_a_value_out_of_range_is_refused(key, value):
+    with pytest.raises(ConfigError, match=key):
+        load_config(None, {f"mavlink.{key}": value})
