@@ -18,6 +18,7 @@ from edgevpr.places import geopackage, rows
 
 FORMAT_VERSION = 2  # 1 had no checksums and no map_id
 _WITH_CHECKSUMS = 2
+_DTYPES = [order + kind for order in ("<", "|", "") for kind in ("i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f2", "f4", "f8")]
 _MOST_PART_BYTES = 64_000_000
 _MOST_STORED = 1000  # rows of the table, and characters that a message shows of a damaged one
 
@@ -157,7 +158,7 @@ def _part_spec(value: object) -> PartSpec | None:
     shape, dtype = value["shape"], value["dtype"]
     if not isinstance(shape, list) or not all(isinstance(each, int) and each > 0 for each in shape):
         raise ValueError(f"the shape {shape!r}")
-    if not isinstance(dtype, str) or np.dtype(dtype).kind not in "iuf":
+    if dtype not in _DTYPES:
         raise ValueError(f"the dtype {dtype!r}")
     if math.prod(shape) * np.dtype(dtype).itemsize > _MOST_PART_BYTES:
         raise ValueError(f"a part of {shape} {dtype}")

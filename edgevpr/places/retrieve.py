@@ -4,8 +4,8 @@ A place that cannot be read is left out from then on, and the others are used. T
 an accepted wrong one, by taking the right place, or the rival that kept the margin small, out of the way. So:
 
 * The query in which a place turns out to be unreadable is refused.
-* A place that was left out keeps its row in the index, and so its score in the scan. It is a rival in every later query
-  that may show it (see `Ranking.unread`): a match is refused where such a place lies elsewhere.
+* A place that was left out keeps its row in the index, and so its score in the scan. A later query that may show it
+  (see `Ranking.unread`) is refused, whichever place it matches.
 * A technique without a fine part needs nothing but the row. A place that was left out then keeps its rank and its
   score, and is refused when it is the best.
 * Where most of the places compared with one query cannot be read, the file is at fault, not the places: the query is
@@ -27,9 +27,9 @@ from edgevpr.types import Candidate
 _NEIGHBOURS_WITHOUT_POSITION = 2
 _COMPARED_ELSEWHERE = 5
 _TRIED_EACH = 6  # hypotheses of a place
-# Without the right places, every wrong match on corridor (tune) that had the margin to be accepted was kept from it by
-# one of them among the best two of the scan.
-_LIKELY = 5
+# On corridor (tune), wherever the right places were left out and a wrong one had the margin to be accepted, one of the
+# right ones was as good in the scan as the wrong one, or among the best two.
+_LIKELY = 3
 _MANY = 3  # unreadable places of one query, that may be the file's fault
 
 _Chosen = tuple[int, list[int] | None]  # a slot, and the hypotheses to try (None: all)
@@ -61,7 +61,7 @@ class Scan:
 class Ranking:
     """Places best first: `slots` int (K,) of the index and `scores` float32 (K,). `compared` maps the slot of each
     place that was compared in full to its match, which has the same score. `unread` int (U,) are slots of places that
-    cannot be read but may be in the picture: their scan is at least as good as that of the best place, or as the fifth
+    cannot be read but may be in the picture: their scan is at least as good as that of the best place, or as the third
     best of all."""
 
     slots: np.ndarray
@@ -187,8 +187,8 @@ def _unread(scanned: np.ndarray, readable: np.ndarray, best: int) -> np.ndarray:
     slots = np.flatnonzero(~readable)
     if not len(slots):
         return slots
-    fifth = min(_LIKELY, len(scanned))
-    least = min(scanned[best], np.partition(scanned, -fifth)[-fifth])
+    likely = min(_LIKELY, len(scanned))
+    least = min(scanned[best], np.partition(scanned, -likely)[-likely])
     return slots[scanned[slots] >= least]
 
 

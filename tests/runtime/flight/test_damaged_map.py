@@ -73,8 +73,8 @@ def test_a_damaged_fine_part_of_any_place_costs_one_query_and_then_only_where_it
             assert line["place"] == shown
             assert mapped(line)
         else:
-            assert place == shown or "cannot be read, elsewhere" in line["reason"]
-    assert sum(line["accepted"] for line in queries[2:]) >= 3, "the flight goes on with the rest"
+            assert place == shown or "may be the right one" in line["reason"]
+    assert sum(line["accepted"] for line in queries[2:]) >= 4, "the flight goes on with the rest"
     assert flight.flown.failed == 1
     assert [(line["place"], line["problem"]) for line in of_kind(lines, "left out")] == [
         (place, "its fine part has a wrong size")
