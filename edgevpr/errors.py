@@ -29,6 +29,18 @@ class MapError(EdgevprError):
     """A place map cannot be opened, written or used with this technique."""
 
 
+class MapBusyError(MapError):
+    """Another program is writing to a place map at this moment."""
+
+
+class PlaceError(MapError):
+    """One place of a map cannot be used; others may be usable. `place_id` is its number, `problem` a few words."""
+
+    def __init__(self, path: object, place_id: int, problem: str) -> None:
+        super().__init__(f"{path}: place {place_id} is damaged ({problem}): `edgevpr map check` says what else is.")
+        self.place_id, self.problem = place_id, problem
+
+
 class LinkError(EdgevprError):
     """A MAVLink link cannot be opened."""
 

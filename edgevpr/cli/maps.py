@@ -1,10 +1,12 @@
-"""`edgevpr map`: build, look into, merge and export place maps."""
+"""`edgevpr map`: build, look into, check, repair, merge and export place maps."""
 
+import os
 import sys
 from argparse import Namespace
+from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from edgevpr.cli.shared import (
     add_json,
@@ -21,12 +23,15 @@ from edgevpr.cli.shared import (
     print_json,
     value_of,
 )  # fmt: skip
-from edgevpr.errors import EdgevprError, ImageError, UsageError
+from edgevpr.errors import EdgevprError, ImageError, MapError, UsageError
+
+if TYPE_CHECKING:
+    from edgevpr.places.repair import MapCheck, Watch
 
 
 def add(commands: Any) -> None:
     """Add the commands and their flags."""
-    maps = group(commands, "map", "build, look into, merge and export place maps")
+    maps = group(commands, "map", "build, look into, check, repair, merge and export place maps")
     build = command(maps, "build", map_build, "make a map of a flight")
     build.add_argument("map", metavar="MAP", help="the map file to make, e.g. valley.gpkg")
     add_recording(build)
@@ -44,6 +49,11 @@ def add(commands: Any) -> None:
     info = command(maps, "info", map_info, "say what a map holds")
     info.add_argument("map", metavar="MAP")
     add_json(info)
+    check = command(maps, "check", map_check, "read everything in a map, and say what is damaged")
+    check.add_argument("map", metavar="MAP")
+    add_json(check)
+    repair = command(maps, "repair", map_repair, "drop what is damaged; the original is kept as MAP.damaged")
+    repair.add_argument("map", metavar="MAP")
     merge = command(maps, "merge", map_merge, "make one map of several of the same technique")
     merge.add_argument("out", metavar="OUT", help="the map file to make")
     merge.add_argument("maps", metavar="MAP", nargs="+")
@@ -64,16 +74,19 @@ def map_build(args: Namespace) -> int:
     from edgevpr.config import load_config
     from edgevpr.frames.source import open_source
     from edgevpr.places.mapfile import PlaceMap
+    from edgevpr.places.mapfiles import map_path, remove
     from edgevpr.power.boards import load_board
     from edgevpr.runtime.preflight.pick import camera_setting, picked_technique
     from edgevpr.runtime.recognise.mapping import build_map
     from edgevpr.runtime.recognise.opening import made_for, meter_of, technique_of
 
+    path = map_path(args.map)
     step_s = 1 / args.rate_hz if args.rate_hz else None
     source = open_source(args.source, step_s=step_s, positions=path_of(args.positions), live=False)
     settings, camera, here = parameters_of(args.param), value_of(args, "source.camera"), load_board("this")
-    if args.append and Path(args.map).exists():
-        place_map = PlaceMap.open_for_adding(args.map)
+    is_new = not (args.append and path.exists())
+    if not is_new:
+        place_map = PlaceMap.open_for_adding(path)
         asked = settings | ({"camera": camera} if camera else {})
         technique = technique_of(place_map, args.technique, asked, here)
     else:
@@ -83,12 +96,17 @@ def map_build(args: Namespace) -> int:
             name = picked_technique(args.board, source.total or 1, camera)
             asked = settings | camera_setting(name, camera)
         technique = made_for(here, name, asked)
-        place_map = PlaceMap.create(args.map, technique.spec)
+        place_map = PlaceMap.create(path, technique.spec)
     unusable: list[ImageError] = []
     with place_map:
         frames = frames_of(source, "mapping", unusable)
         meter = meter_of(load_config(None), here)
-        result = build_map(frames, technique, place_map, meter, lambda error: leave_out(error, unusable))
+        try:
+            result = build_map(frames, technique, place_map, meter, lambda error: leave_out(error, unusable))
+        except EdgevprError:
+            if is_new and not len(place_map):  # a full disk: an empty map would only stand in the way of the next try
+                remove(path)
+            raise
         places = len(place_map)
     if args.json:
         print_json({"map": args.map, "technique": technique.spec.name, "places": places, **asdict(result)})
@@ -98,6 +116,8 @@ def map_build(args: Namespace) -> int:
         )
         if result.already_here:
             print(f"  {result.already_here} images were in the map already")
+        if result.odd_times:
+            print(f"  {result.odd_times} images have a time that is no date: their places have none")
     return exit_code(unusable)
 
 
@@ -105,9 +125,10 @@ def map_info(args: Namespace) -> int:
     """Say what a map holds."""
     from edgevpr.places.index import bytes_per_place
     from edgevpr.places.mapfile import PlaceMap
+    from edgevpr.places.mapinfo import info_of
 
     with PlaceMap.open(args.map) as place_map:
-        info = place_map.info()
+        info = info_of(place_map)
     spec = info.spec
     ram_mb = info.places * bytes_per_place(spec) / 1e6
     if args.json:
@@ -127,25 +148,75 @@ def map_info(args: Namespace) -> int:
     return 0
 
 
+def map_check(args: Namespace) -> int:
+    """Read everything in a map and say what is damaged; the exit code is 1 where anything is."""
+    from edgevpr.places.repair import check
+
+    found = check(args.map, _watched("checking"))
+    if args.json:
+        print_json({**asdict(found), "is_whole": found.is_whole})
+    else:
+        _print_check(found)
+    return 0 if found.is_whole else 1
+
+
+def map_repair(args: Namespace) -> int:
+    """Drop what is damaged in a map, and keep the original."""
+    from edgevpr.places.repair import check, repair
+
+    found = check(args.map, _watched("checking"))
+    _print_check(found)
+    if found.is_whole:
+        print("nothing is damaged: the map is as it was")
+        return 0
+    original = repair(args.map, _watched("copying"))
+    print(f"{args.map}: repaired, {found.places} places kept, {len(found.damaged)} dropped; the original is {original}")
+    return 0
+
+
+def _watched(label: str) -> "Watch":
+    from edgevpr.helpers.progress import progress
+
+    return lambda places, total: progress(places, total, label)
+
+
+def _print_check(found: "MapCheck") -> None:
+    print(f"{found.path}: {found.places} of {found.places + len(found.damaged)} places can be read")
+    for place_id, problem in found.damaged:
+        print(f"  damaged     place {place_id}: {problem}")
+    for fault in found.faults:
+        print(f"  SQLite      {fault}")
+    if not found.faults:
+        print("  SQLite      the file is sound")
+    lacking = f"{found.without_checksums} places lack some: damage of those cannot be seen"
+    print(f"  checksums   {lacking if found.without_checksums else 'all match'}")
+
+
 def map_merge(args: Namespace) -> int:
     """Make one map of several, completely or not at all."""
+    from edgevpr.places.examine import absorb
     from edgevpr.places.mapfile import PlaceMap
+    from edgevpr.places.mapfiles import map_path, remove, require_regular
     from edgevpr.runtime.recognise.opening import technique_of
 
-    inputs = [PlaceMap.open(path) for path in args.maps]
-    technique_of(inputs[0])
-    for other in inputs[1:]:
-        other.require(inputs[0].spec)
-    with PlaceMap.create(args.out, inputs[0].spec) as merged:
-        try:
+    out = map_path(args.out)
+    require_regular(out)
+    if out.exists() and out.stat().st_size:
+        raise MapError(f"{out} is there already: choose another name.")
+    unfinished = out.with_name(f".{out.name}.{os.getpid()}")
+    with ExitStack() as stack:
+        inputs = [stack.enter_context(PlaceMap.open(path)) for path in args.maps]
+        technique_of(inputs[0])
+        for other in inputs[1:]:
+            other.require(inputs[0].spec)
+        stack.callback(remove, unfinished)  # half a merge would look like a whole one
+        with PlaceMap.create(unfinished, inputs[0].spec) as merged:
             for path, place_map in zip(args.maps, inputs, strict=True):
-                copied, already_here = merged.absorb(place_map)
+                copied, already_here = absorb(merged, place_map)
                 print(f"{path}: {copied} places copied" + (f", {already_here} there already" if already_here else ""))
-                place_map.close()
-        except EdgevprError:
-            Path(args.out).unlink()  # half a merge would look like a whole one
-            raise
-        print(f"{args.out}: {len(merged)} places")
+            places = len(merged)
+        unfinished.replace(out)
+    print(f"{out}: {places} places")
     return 0
 
 

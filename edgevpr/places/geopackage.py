@@ -13,6 +13,8 @@ _WGS84_WKT = (
     'AUTHORITY["EPSG","9122"]],AUTHORITY["EPSG","4326"]]'
 )
 
+# The checksums (CRC-32 of zlib) stand before the BLOBs: what comes after a large BLOB is found only by reading all of
+# that. A program that moves a place (QGIS) knows nothing of checksums: the trigger takes that of the position away.
 SCHEMA = f"""
 CREATE TABLE gpkg_spatial_ref_sys (
     srs_name TEXT NOT NULL, srs_id INTEGER PRIMARY KEY, organization TEXT NOT NULL,
@@ -35,7 +37,12 @@ CREATE TABLE gpkg_geometry_columns (
 
 CREATE TABLE places (
     place_id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, geom POINT, time DATETIME, alt_m DOUBLE, heading_deg DOUBLE,
-    source_image TEXT NOT NULL, quality DOUBLE NOT NULL, coarse BLOB NOT NULL, fine BLOB);
+    source_image TEXT NOT NULL, quality DOUBLE NOT NULL, geom_crc32 INTEGER, coarse_crc32 INTEGER,
+    fine_crc32 INTEGER, coarse BLOB NOT NULL, fine BLOB);
+CREATE TRIGGER places_moved AFTER UPDATE OF geom ON places
+BEGIN
+    UPDATE places SET geom_crc32 = NULL WHERE place_id = NEW.place_id;
+END;
 CREATE TABLE edgevpr_map (
     id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, key TEXT NOT NULL UNIQUE, value TEXT NOT NULL);
 INSERT INTO gpkg_contents (table_name, data_type, identifier, description, srs_id) VALUES
@@ -111,6 +118,7 @@ END;
 
 # "GP", version 0, flags: little-endian, no envelope; srs_id; then well-known binary: little-endian, Point, x, y.
 _POINT = struct.Struct("<2sBBiBIdd")
+_MOST_POINT_BYTES = 8 + 64 + 1 + 4 + 4 * 8  # header, the largest envelope, and four coordinates
 _KINDS_OF_POINT = (1, 1001, 2001, 3001)  # xy, xyz, xym, xyzm; z and m are ignored
 
 
@@ -119,36 +127,45 @@ def point_blob(lat_deg: float, lon_deg: float) -> bytes:
     return _POINT.pack(b"GP", 0, 1, WGS84, 1, 1, lon_deg, lat_deg)
 
 
-def read_point(blob: bytes) -> tuple[float, float]:
+def read_point(blob: object) -> tuple[float, float]:
     """Return (lat_deg, lon_deg) of a point written by `point_blob`, or by another tool with or without an envelope.
 
-    Raises ValueError for a geometry that is not a point on the Earth.
+    Raises ValueError, in a few words, for anything that is not a WGS-84 point on the Earth.
     """
     try:
-        if blob[:2] != b"GP":
+        if not isinstance(blob, bytes) or blob[:2] != b"GP" or len(blob) > _MOST_POINT_BYTES:
             raise ValueError("its geometry is no point")
+        order = "<" if blob[3] & 1 else ">"
+        (srs_id,) = struct.unpack_from(f"{order}i", blob, 4)
         wkb = 8 + (0, 32, 48, 48, 64)[(blob[3] >> 1) & 7]  # the header, and the envelope that its flags announce
         order = {0: ">", 1: "<"}[blob[wkb]]
         kind, lon_deg, lat_deg = struct.unpack_from(f"{order}Idd", blob, wkb + 1)
-    except (IndexError, KeyError, TypeError, struct.error) as error:
+    except (IndexError, KeyError, struct.error) as error:
         raise ValueError("its geometry is no point") from error
     if kind not in _KINDS_OF_POINT:
         raise ValueError("its geometry is no point")
+    if srs_id != WGS84:
+        raise ValueError(f"its position is in the reference system {srs_id}, not in WGS 84")
     if not (abs(lat_deg) <= 90 and abs(lon_deg) <= 180):
         raise ValueError(f"latitude {lat_deg:g}, longitude {lon_deg:g} is not on the Earth")
     return lat_deg, lon_deg
 
 
 def utc_text(t_utc_s: float | None) -> str | None:
-    """Return seconds since 1970 as a GeoPackage DATETIME, UTC with milliseconds; None for None."""
+    """Return seconds since 1970 as a GeoPackage DATETIME, UTC with milliseconds; None for None, and for a number that
+    is no date of the years 1 to 9999."""
     if t_utc_s is None:
         return None
-    return datetime.fromtimestamp(t_utc_s, timezone.utc).isoformat(timespec="milliseconds").replace("+00:00", "Z")
-
-
-def utc_seconds(text: str | None) -> float | None:
-    """Reverse `utc_text`; return None for a text of another form, as other tools may write."""
     try:
-        return datetime.fromisoformat(text.replace("Z", "+00:00")).timestamp() if text else None
-    except ValueError:
+        moment = datetime.fromtimestamp(t_utc_s, timezone.utc)
+    except (ValueError, OverflowError, OSError):
+        return None
+    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def utc_seconds(text: object) -> float | None:
+    """Reverse `utc_text`; return None for a value of another form, as other tools may write."""
+    try:
+        return datetime.fromisoformat(text.replace("Z", "+00:00")).timestamp() if isinstance(text, str) else None
+    except (ValueError, OverflowError):
         return None

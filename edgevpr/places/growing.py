@@ -7,7 +7,7 @@ import numpy as np
 
 from edgevpr.contract import Technique
 from edgevpr.errors import MapError
-from edgevpr.places.index import PlaceIndex, bytes_per_place, empty_index, fill, load_index
+from edgevpr.places.index import CoarsePart, PlaceIndex, bytes_per_place, empty_index, fill, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.thin import best_places
 from edgevpr.types import Position
@@ -45,12 +45,13 @@ class GrowingIndex:
         self._slots = empty_index(technique.spec, capacity, self._mean)
         self._taken = 0
         if self._in_file:
-            self._taken = min(self._in_file, capacity)
-            load_index(place_map, technique, self._taken * each, into=self.index, beside_bytes=beside_bytes)
+            free = self._slots.part(0, min(self._in_file, capacity), self._mean)
+            loaded = load_index(place_map, technique, len(free) * each, into=free, beside_bytes=beside_bytes)
+            self._taken = len(loaded)
 
     @property
     def index(self) -> PlaceIndex:
-        return self._view(0, self._taken, self._mean)
+        return self._slots.part(0, self._taken, self._mean)
 
     @property
     def nbytes(self) -> int:
@@ -63,7 +64,7 @@ class GrowingIndex:
         """Add a place that `PlaceMap.add` has confirmed. Its id must be larger than all ids in the index.
 
         Raises MapError where the file cannot be read. The index can still be used after that: it holds the places
-        that it could read, all packed with the same mean.
+        that it could read, all packed with the same mean. A place that is damaged is left out, and raises nothing.
         """
         if self._taken == len(self._slots):
             self._thin()
@@ -81,7 +82,7 @@ class GrowingIndex:
     def _thin(self) -> None:
         index = self.index
         # Quality is read from the file: thinning is too rare to justify four more bytes a place in RAM.
-        quality = np.fromiter((place.quality for place in self._map.places(index.place_ids)), float, len(index))
+        quality = np.fromiter(self._map.qualities(index.place_ids), float, len(index))
         kept = best_places(index.lat_deg, index.lon_deg, quality, 3 * len(index) // 4, index.place_ids)
         # A place moves to a lower slot or stays, so an overwritten place has already been moved or is dropped.
         for start in range(0, len(kept), _MOVED_AT_ONCE):
@@ -91,24 +92,23 @@ class GrowingIndex:
         self._taken = len(kept)
 
     def _repack(self) -> None:
-        mean, parts = self._map.mean_coarse(), self._held_parts()
+        """Pack all places anew. One that can no longer be read is dropped: its row is packed with the old mean."""
+        mean = self._map.mean_coarse()
         packed = 0
         try:
-            while packed < self._taken:
-                block = self._view(packed, min(packed + _MOVED_AT_ONCE, self._taken), mean)
-                fill(block, parts, self._technique)
-                packed += len(block)
+            for written in fill(self._slots.part(0, self._taken, mean), self._held_parts(), self._technique):
+                packed = written
         finally:
             if packed:  # rows packed with the old mean and with the new one must not be mixed
                 self._mean, self._mean_of, self._taken = mean, self._in_file, packed
 
-    def _view(self, start: int, end: int, mean: np.ndarray | None) -> PlaceIndex:
-        return PlaceIndex(**{name: array[start:end] for name, array in self._slots.arrays.items()}, mean=mean)
-
-    def _held_parts(self) -> Iterator[tuple[int, tuple[float, float] | None, np.ndarray]]:
-        held = map(int, self.index.place_ids)
-        wanted = next(held, None)
+    def _held_parts(self) -> Iterator[CoarsePart]:
+        """Yield the parts of the places in the index that can be read. What is written into the index meanwhile is what
+        has been yielded, so it never overtakes the ids that are still to be found."""
+        held = 0
         for part in self._map.coarse_parts():
-            if part[0] == wanted:
+            while held < self._taken and self._slots.place_ids[held] < part[0]:
+                held += 1
+            if held < self._taken and self._slots.place_ids[held] == part[0]:
+                held += 1
                 yield part
-                wanted = next(held, None)

@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import compress, islice
+from itertools import islice
 
 import numpy as np
 
@@ -17,6 +17,8 @@ from edgevpr.types import Position
 _log = logging.getLogger(__name__)
 _BYTES_BESIDE_ROW = 8 + 8 + 8 + 2  # id, latitude, longitude, heading
 _PACKED_AT_ONCE = 32
+
+CoarsePart = tuple[int, tuple[float, float] | None, float | None, np.ndarray]  # of `PlaceMap.coarse_parts`
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,6 +61,14 @@ class PlaceIndex:
         """True where at least one place has a heading."""
         return not np.isnan(self.heading_deg).all()
 
+    def first(self, count: int) -> "PlaceIndex":
+        """Return the index of the first `count` places: the same arrays, seen in part."""
+        return self.part(0, count, self.mean)
+
+    def part(self, start: int, end: int, mean: np.ndarray | None) -> "PlaceIndex":
+        """Return the slots from `start` to `end` as an index with another mean: the same arrays, seen in part."""
+        return PlaceIndex(**{name: array[start:end] for name, array in self.arrays.items()}, mean=mean)
+
     def spacing_m(self) -> float | None:
         """Return the median distance in metres between places mapped one after the other; None where no such pair has
         positions."""
@@ -87,11 +97,13 @@ def load_index(
     into: PlaceIndex | None = None,
     beside_bytes: int = 0,
 ) -> PlaceIndex:
-    """Load the coarse parts of a map, packed by the technique, into new arrays or those of `into`.
+    """Load the coarse parts of a map, packed by the technique, into new arrays or those of `into`; return the index of
+    the places that were loaded.
 
     Where the budget does not hold all places, the best ones are loaded (see `thin`); the map file keeps all. For each
-    place, `beside_bytes` of the budget are left to other arrays that grow with the index (see `sequence`).
-    Raises MapError for a map without places, and for a budget that holds no place.
+    place, `beside_bytes` of the budget are left to other arrays that grow with the index (see `sequence`). Places that
+    cannot be read are left out (see `PlaceMap.left_out`). Raises MapError for a map without places, for one of which no
+    place can be read, and for a budget that holds no place.
     """
     spec = technique.spec
     places, each = len(place_map), bytes_per_place(spec) + beside_bytes
@@ -105,20 +117,28 @@ def load_index(
     if into is None:
         into = empty_index(spec, capacity, place_map.mean_coarse() if spec.packed else None)
     # Another program may have added places since they were counted: those are left out until the next load.
-    parts, headings_deg = islice(place_map.coarse_parts(), places), islice(place_map.headings_deg(), places)
+    parts = islice(place_map.coarse_parts(), places)
     if capacity < places:
         _log.warning(
             f"{place_map.path} needs {places * each / 1e6:.1f} MB in RAM for its {places} places and the budget is "
             f"{budget_bytes / 1e6:g} MB: the {capacity} best are used; raise --budget-mb to "
             f"{np.ceil(places * each / 1e5) / 10:g} for all."
         )
-        kept = np.zeros(places, bool)
-        kept[best_places(*place_map.positions_and_quality(places), capacity)] = True
-        parts, headings_deg = compress(parts, kept), compress(headings_deg, kept)
-    fill(into, parts, technique)
-    for slot, heading_deg in enumerate(headings_deg):
-        into.heading_deg[slot] = heading_deg
-    return into
+        place_ids, lat_deg, lon_deg, quality = _outlines(place_map, places)
+        kept = place_ids[best_places(lat_deg, lon_deg, quality, capacity)]
+        parts = (part for part in parts if _holds(kept, part[0]))
+    loaded = 0
+    for written in fill(into, parts, technique):
+        loaded = written
+    if not loaded:
+        raise MapError(f"{place_map.path}: none of its {places} places can be read: restore a copy, or build it again.")
+    if place_map.left_out:
+        _log.warning(
+            "%s: %d places are damaged and left out: `edgevpr map check` names them, `edgevpr map repair` drops them.",
+            place_map.path,
+            len(place_map.left_out),
+        )
+    return into.first(loaded)
 
 
 def empty_index(spec: TechniqueSpec, capacity: int, mean: np.ndarray | None) -> PlaceIndex:
@@ -133,25 +153,34 @@ def empty_index(spec: TechniqueSpec, capacity: int, mean: np.ndarray | None) -> 
     )
 
 
-def fill(
-    index: PlaceIndex, parts: Iterator[tuple[int, tuple[float, float] | None, np.ndarray]], technique: Technique
-) -> None:
-    """Write as many `parts` (of `PlaceMap.coarse_parts`) as the index has slots, a block at a time.
-
-    Raises MapError where there are fewer parts than slots.
-    """
+def fill(index: PlaceIndex, parts: Iterator[CoarsePart], technique: Technique) -> Iterator[int]:
+    """Write as many `parts` as the index has slots, a block at a time, and yield how many are written after each block:
+    in the end fewer than there are slots, where there are fewer parts. A slot is written completely or not at all."""
     spec = technique.spec
     waiting = np.empty((_PACKED_AT_ONCE, *spec.coarse.shape), spec.coarse.dtype)
-    for start in range(0, len(index), _PACKED_AT_ONCE):
-        count = min(_PACKED_AT_ONCE, len(index) - start)
-        read = 0
-        for at, (place_id, position, coarse) in enumerate(islice(parts, count)):
-            read += 1
-            index.place_ids[start + at] = place_id
-            if position:
-                index.lat_deg[start + at], index.lon_deg[start + at] = position
+    filled = 0
+    while block := list(islice(parts, min(_PACKED_AT_ONCE, len(index) - filled))):
+        for at, (*_, coarse) in enumerate(block):
             waiting[at] = coarse
-        if read < count:
-            raise MapError("The map has lost places while it was read, another program changes it: load it again.")
-        rows = technique.pack(waiting[:count], index.mean) if spec.packed else waiting[:count]
-        index.rows[start : start + count] = rows
+        rows = technique.pack(waiting[: len(block)], index.mean) if spec.packed else waiting[: len(block)]
+        index.rows[filled : filled + len(block)] = rows
+        for at, (place_id, point, heading_deg, _) in enumerate(block, start=filled):
+            index.place_ids[at] = place_id
+            index.lat_deg[at], index.lon_deg[at] = point or (np.nan, np.nan)
+            index.heading_deg[at] = np.nan if heading_deg is None else heading_deg
+        filled += len(block)
+        yield filled
+
+
+def _outlines(place_map: PlaceMap, places: int) -> np.ndarray:
+    """Return id, lat_deg, lon_deg and quality of the first `places` places that can be read, float64 (4, N)."""
+    columns = np.empty((4, places))
+    count = 0
+    for count, outline in enumerate(islice(place_map.outlines(), places), start=1):
+        columns[:, count - 1] = outline
+    return columns[:, :count]
+
+
+def _holds(ascending: np.ndarray, number: int) -> bool:
+    at = int(np.searchsorted(ascending, number))
+    return at < len(ascending) and ascending[at] == number

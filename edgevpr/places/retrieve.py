@@ -1,11 +1,24 @@
-"""Retrieval of the places that a query may show: one scan of the index, then a full comparison of the best ones."""
+"""Retrieval of the places that a query may show: one scan of the index, then a full comparison of the best ones.
 
-from dataclasses import dataclass, replace
+A place that cannot be read is left out from then on, and the others are used. This must never turn a refused match into
+an accepted wrong one, by taking the right place, or the rival that kept the margin small, out of the way. So:
+
+* The query in which a place turns out to be unreadable is refused.
+* A place that was left out keeps its row in the index, and so its score in the scan. A later query that may show it
+  (see `Ranking.unread`) is refused, whichever place it matches.
+* A technique without a fine part needs nothing but the row. A place that was left out then keeps its rank and its
+  score, and is refused when it is the best.
+* Where most of the places compared with one query cannot be read, the file is at fault, not the places: the query is
+  refused, and none is left out. So all are used again as soon as the file can be read again.
+"""
+
+import math
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from edgevpr.contract import Descriptor, FineMatch, Technique
-from edgevpr.errors import MapError
+from edgevpr.errors import MapError, PlaceError
 from edgevpr.geodesy import distance_m
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
@@ -14,6 +27,10 @@ from edgevpr.types import Candidate
 _NEIGHBOURS_WITHOUT_POSITION = 2
 _COMPARED_ELSEWHERE = 5
 _TRIED_EACH = 6  # hypotheses of a place
+# On corridor (tune), wherever the right places were left out and a wrong one had the margin to be accepted, one of the
+# right ones was as good in the scan as the wrong one, or among the best two.
+_LIKELY = 3
+_MANY = 3  # unreadable places of one query, that may be the file's fault
 
 _Chosen = tuple[int, list[int] | None]  # a slot, and the hypotheses to try (None: all)
 
@@ -43,11 +60,14 @@ class Scan:
 @dataclass(frozen=True, slots=True)
 class Ranking:
     """Places best first: `slots` int (K,) of the index and `scores` float32 (K,). `compared` maps the slot of each
-    place that was compared in full to its match, which has the same score."""
+    place that was compared in full to its match, which has the same score. `unread` int (U,) are slots of places that
+    cannot be read but may be in the picture: their scan is at least as good as that of the best place, or as the third
+    best of all."""
 
     slots: np.ndarray
     scores: np.ndarray
     compared: dict[int, FineMatch]
+    unread: np.ndarray = field(default_factory=lambda: np.empty(0, np.intp))
 
 
 def scan(technique: Technique, query: Descriptor, index: PlaceIndex, expected: Expected = NOTHING) -> Scan:
@@ -80,20 +100,32 @@ def compare(
 
     Where `expected.in_reach` is known, the candidates are places in reach, and five places out of reach are compared
     as well: a false expectation would otherwise hide the right place behind the best of the wrong ones. At least five
-    places elsewhere are then compared, because a margin over fewer says little. Raises MapError for a place that
-    cannot be read.
+    places elsewhere are then compared, because a margin over fewer says little.
+
+    Raises PlaceError where a place cannot be read, after all candidates have been tried. It is then left out (see the
+    top of this file). Raises MapError where the file cannot be read.
     """
     matches: dict[int, FineMatch] = {}
     one_stage = technique.spec.fine is None
+    readable = np.ones(len(index), bool) if one_stage else ~left_out(place_map, index)
 
     def scored(chosen: list[_Chosen]) -> list[float]:
         if one_stage:
             return scanned.scores[[slot for slot, _ in chosen]].tolist()
+        unreadable = []
         for slot, hypotheses in chosen:
-            match = technique.match(query, place_map.fine_part(index.place_ids[slot]), hypotheses)
+            try:
+                fine, point = place_map.fine_part(index.place_ids[slot])
+                _require_there(place_map, index, slot, point)
+            except PlaceError as error:
+                unreadable.append(error)
+                continue
+            match = technique.match(query, fine, hypotheses)
             if technique.spec.scan_counts:
                 match = replace(match, score=match.score * (1 + float(scanned.scores[slot])) / 2)
             matches[slot] = match
+        if unreadable:
+            raise _left_out_now(place_map, unreadable, len(chosen))
         return [matches[slot].score for slot, _ in chosen]
 
     scores, by_hypothesis, in_reach = scanned.scores, scanned.by_hypothesis, expected.in_reach
@@ -102,23 +134,62 @@ def compare(
         candidates = len(index)
     if exact and in_reach is None and expected.turned_deg is None:
         by_hypothesis = None  # all are tried
-    there = np.ones(len(index), bool) if in_reach is None else in_reach
+    there = readable if in_reach is None else in_reach & readable
     chosen = best_scanned(scores, by_hypothesis, there, candidates)
-    chosen += best_scanned(scores, by_hypothesis, ~there, _COMPARED_ELSEWHERE)
+    chosen += best_scanned(scores, by_hypothesis, readable & ~there, _COMPARED_ELSEWHERE)
+    if not chosen:
+        raise MapError(f"{place_map.path}: no place of it can be read any more: restore a copy, or build it again.")
     found = scored(chosen)
     slots = np.array([slot for slot, _ in chosen])
-    if len(slots) < len(index):
+    if len(slots) < np.count_nonzero(readable):
         best = slots[np.argmax(found)]
         rivals = np.count_nonzero(elsewhere(index, best, slots, neighbour_m))
         if rivals < (1 if in_reach is None else _COMPARED_ELSEWHERE):
             others = elsewhere(index, best, np.arange(len(index)), neighbour_m)
             others[slots] = False
+            others &= readable
             more = best_scanned(scores, by_hypothesis, others, _COMPARED_ELSEWHERE - rivals)
             found += scored(more)
             slots = np.append(slots, [slot for slot, _ in more]).astype(np.intp)
     best_first = np.array(found, np.float32)
     order = np.argsort(-best_first, kind="stable")
-    return Ranking(slots[order], best_first[order], matches)
+    return Ranking(slots[order], best_first[order], matches, _unread(scores, readable, slots[order[0]]))
+
+
+def left_out(place_map: PlaceMap, index: PlaceIndex) -> np.ndarray:
+    """Tell which places of the index could not be read so far, bool (N,)."""
+    return np.isin(index.place_ids, list(place_map.left_out)) if place_map.left_out else np.zeros(len(index), bool)
+
+
+def _require_there(place_map: PlaceMap, index: PlaceIndex, slot: int, point: tuple[float, float] | None) -> None:
+    """Raise PlaceError unless a place is exactly where it was when the index was loaded."""
+    lat_deg = float(index.lat_deg[slot])
+    if (None if math.isnan(lat_deg) else (lat_deg, float(index.lon_deg[slot]))) != point:
+        raise PlaceError(place_map.path, int(index.place_ids[slot]), "its position has changed")
+
+
+def _left_out_now(place_map: PlaceMap, unreadable: list[PlaceError], tried: int) -> MapError:
+    """Leave places out that could not be read, and return the error of this query. Where they are most of the `tried`,
+    return one of the file, and leave none out."""
+    first = unreadable[0]
+    if len(unreadable) >= _MANY and 2 * len(unreadable) > tried:
+        return MapError(
+            f"{place_map.path}: {len(unreadable)} of the {tried} places compared cannot be read (place "
+            f"{first.place_id}: {first.problem}): the file is damaged or another map; restore a copy."
+        )
+    for error in unreadable:
+        place_map.left_out.setdefault(error.place_id, error.problem)
+    return first
+
+
+def _unread(scanned: np.ndarray, readable: np.ndarray, best: int) -> np.ndarray:
+    """Return the slots of the places left out that a query may show (see `Ranking`)."""
+    slots = np.flatnonzero(~readable)
+    if not len(slots):
+        return slots
+    likely = min(_LIKELY, len(scanned))
+    least = min(scanned[best], np.partition(scanned, -likely)[-likely])
+    return slots[scanned[slots] >= least]
 
 
 def best_scanned(scanned: np.ndarray, by_hypothesis: np.ndarray | None, among: np.ndarray, count: int) -> list[_Chosen]:
@@ -167,18 +238,21 @@ def margin(ranking: Ranking, index: PlaceIndex, neighbour_m: float) -> float | N
 def named(ranking: Ranking, index: PlaceIndex, place_map: PlaceMap, first: int | None = None) -> list[Candidate]:
     """Return the `first` places of a ranking (None: all) as candidates, with their data in the map file, best first.
 
-    Raises MapError for a place that cannot be read, or whose position has changed since the index was loaded: it is
-    then unknown which position is right.
+    Raises PlaceError for a place that cannot be read, that was left out, or whose position has changed since the index
+    was loaded: it is then unknown which position is right. It is left out from then on.
     """
     slots, scores = ranking.slots[:first].tolist(), ranking.scores[:first].tolist()
     found = []
-    for slot, score, place in zip(slots, scores, place_map.places(index.place_ids[slots]), strict=True):
-        position = place.position
-        here = (position.lat_deg, position.lon_deg) if position else (np.nan, np.nan)
-        if not np.array_equal(here, (index.lat_deg[slot], index.lon_deg[slot]), equal_nan=True):
-            raise MapError(
-                f"{place_map.path}: place {place.place_id} is not where it was; another program changed the map: load "
-                "it again."
-            )
+    for slot, score in zip(slots, scores, strict=True):
+        place_id = int(index.place_ids[slot])
+        try:
+            if place_id in place_map.left_out:
+                raise PlaceError(place_map.path, place_id, place_map.left_out[place_id])
+            (place,) = place_map.places([place_id])
+            position = place.position
+            _require_there(place_map, index, slot, (position.lat_deg, position.lon_deg) if position else None)
+        except PlaceError as error:
+            place_map.left_out.setdefault(place_id, error.problem)
+            raise
         found.append(Candidate(place, ranking.compared.get(slot) or FineMatch(score)))
     return found

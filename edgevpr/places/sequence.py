@@ -106,7 +106,7 @@ class SequenceSearch:
         slots = np.flatnonzero(worth_naming)
         slots = slots[np.argsort(-means[slots], kind="stable")]
         matches = {slot: replace(match, score=float(means[slot])) for slot, match in ranking.compared.items()}
-        return Ranking(slots, means[slots], matches)
+        return replace(ranking, slots=slots, scores=means[slots], compared=matches)
 
     def goes_on(self, near: np.ndarray, min_score: float) -> bool:
         """Tell whether the newest queries alone still agree with the sequence.

@@ -1,26 +1,49 @@
 """Opening and closing of a map file, and SQLite's errors turned into sentences for the user."""
 
 import sqlite3
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from edgevpr.errors import MapError
+from edgevpr.errors import MapBusyError, MapError
 from edgevpr.places.geopackage import read_point
 
+WAIT_S = 5.0  # for another program that is writing
+# A statement on a table of a million places takes a tenth of this. A view, or a table that refers to itself, may never
+# end.
+_MOST_STEPS = 500_000_000
 
-def connect(path: Path, mode: str) -> sqlite3.Connection:
-    """Open a map file; `mode` is SQLite's: ro, rw or rwc. Raises sqlite3.Error."""
+
+def connect(path: Path, mode: str, options: str = "", wait_s: float = WAIT_S) -> sqlite3.Connection:
+    """Open a map file; `mode` is SQLite's: ro or rw, and `options` begin with "&". Raises sqlite3.Error."""
     # Autocommit: transactions are begun by hand, so that nothing is ever half committed.
     db = sqlite3.connect(
-        f"{path.absolute().as_uri()}?mode={mode}", uri=True, isolation_level=None, timeout=5, check_same_thread=False
+        f"{path.absolute().as_uri()}?mode={mode}{options}",
+        uri=True,
+        isolation_level=None,
+        timeout=wait_s,
+        check_same_thread=False,
     )
+    db.text_factory = _text
+    db.set_progress_handler(lambda: 1, _MOST_STEPS)
     # The triggers of the spatial index (OGC 12-128r18, annex F.3) call these functions, which SQLite itself lacks. QGIS
-    # or GDAL may have added such an index.
-    db.create_function("ST_IsEmpty", 1, lambda geom: geom is None)
+    # or GDAL may have added such an index. A damaged geometry is like an empty one: it is nowhere.
+    db.create_function("ST_IsEmpty", 1, lambda geom: _point(geom) is None)
     for name, axis in {"ST_MinX": 1, "ST_MaxX": 1, "ST_MinY": 0, "ST_MaxY": 0}.items():
-        db.create_function(name, 1, lambda geom, axis=axis: read_point(geom)[axis] if geom else None)
+        db.create_function(name, 1, lambda geom, axis=axis: (_point(geom) or (None, None))[axis])
     return db
+
+
+def wait_at_most(db: sqlite3.Connection, wait_s: float) -> None:
+    """Wait at most so long for another program that is writing."""
+    db.execute(f"PRAGMA busy_timeout = {round(1000 * wait_s)}")
+
+
+def most_bytes(db: sqlite3.Connection, row_bytes: int) -> None:
+    """Refuse to read any row that is larger, before it is in memory. Python 3.10 cannot ask SQLite for this."""
+    if sys.version_info >= (3, 11):
+        db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, row_bytes)
 
 
 def start_log(db: sqlite3.Connection) -> None:
@@ -46,30 +69,75 @@ def settle_left_log(path: Path) -> None:
             settle(db)
             db.close()
         except sqlite3.Error:
-            pass  # a read-only medium: SQLite reads map and log as they are, or says what is wrong
+            pass  # a read-only medium: `connect_to_read` reads map and log as they are, or says what is wrong
+
+
+def connect_to_read(path: Path, wait_s: float = WAIT_S) -> sqlite3.Connection:
+    """Open a map file for reading, also with a left-over log in a folder that may not be written.
+
+    SQLite keeps the index of a log in a file beside it. Where it cannot make that file, the index is kept in memory
+    instead. This needs the file for itself alone, and so locks that are not there: nobody writes to a read-only medium.
+    Raises sqlite3.Error.
+    """
+    db = connect(path, "ro", wait_s=wait_s)
+    try:
+        db.execute("PRAGMA application_id").fetchone()
+    except sqlite3.OperationalError as error:
+        db.close()
+        log, index = (path.with_name(path.name + end) for end in ("-wal", "-shm"))
+        if "locked" in str(error) or not log.exists() or index.exists():
+            raise
+        db = connect(path, "ro", "&vfs=unix-none")
+        db.execute("PRAGMA locking_mode = EXCLUSIVE")
+    return db
+
+
+def is_of_one_row(error: sqlite3.Error) -> bool:
+    """Tell whether an error may be that of one row, so that other rows can still be read: a damaged page, an unreadable
+    sector, or a value that is too large."""
+    return any(words in str(error) for words in ("malformed", "disk I/O", "too big"))
 
 
 @contextmanager
 def sentences(path: Path) -> Iterator[None]:
-    """Turn an error of SQLite into a MapError that says what the user can do."""
+    """Turn an error of SQLite into a MapError that says what the user can do, a MapBusyError where waiting helps."""
     try:
         yield
     except sqlite3.Error as error:
         said = str(error)
+        if "locked" in said:
+            raise MapBusyError(
+                f"{path}: another program is writing to it: close that program and try again."
+            ) from error
         if "full" in said:
             advice = "the disk is full: make room; every place confirmed so far is kept"
         elif "not a database" in said:
             advice = "this is not a place map: give a .gpkg file made by `edgevpr map build`"
         elif "no such module" in said:
             advice = f"the SQLite of this Python lacks what learning needs ({said}): use the system's own Python"
-        elif "malformed" in said or "no such" in said:
+        elif "malformed" in said or "no such" in said or "unsupported file format" in said:
             advice = f"the file is damaged or no place map ({said}): restore a copy or build it again"
         elif "readonly" in said:
             advice = "it may not be written: check its permissions and those of its folder"
         elif "unable to open" in said:
             advice = "it cannot be opened: check the path, and the permissions of the file and its folder"
-        elif "locked" in said:
-            advice = "another program is writing to it: close that program and try again"
+        elif "interrupted" in said:
+            advice = "reading its table of places does not end, so this is no place map: restore a copy"
         else:
             advice = f"SQLite says: {said}: check the disk and its free space"
         raise MapError(f"{path}: {advice}.") from error
+
+
+def _text(raw: bytes) -> str | bytes:
+    """Return a text of the file. One that is not UTF-8 stays bytes, which no column of a place may hold."""
+    try:
+        return raw.decode()
+    except UnicodeDecodeError:
+        return raw
+
+
+def _point(geom: object) -> tuple[float, float] | None:
+    try:
+        return read_point(geom)
+    except ValueError:
+        return None

@@ -135,9 +135,10 @@ def test_a_descriptor_of_the_wrong_size_is_named(tmp_path):
     spec = dataclasses.replace(Ruler.spec, fine=None)
     with PlaceMap.create(tmp_path / "bad.gpkg", spec) as place_map:
         place_map.add(Frame(image=np.zeros((1, 1)), name="a", t_mono_s=0.0), Descriptor(coarse=np.zeros(1, "<f4")))
-        place_map._db.execute("UPDATE places SET coarse = x'00'")
-        with pytest.raises(MapError, match="place 1 is damaged"):
+        place_map.db.execute("UPDATE places SET coarse = x'00'")
+        with pytest.raises(MapError, match="none of its 1 places can be read"):
             load_index(place_map, Ruler(), 1000)
+        assert place_map.left_out == {1: "its coarse part has a wrong size"}
 
 
 def within(index, *numbers):
@@ -234,7 +235,7 @@ def test_the_index_knows_distances_and_headings(tmp_path):
 def test_a_thinned_index_keeps_each_place_its_heading(ruler_map):
     technique, place_map = ruler_map
     with PlaceMap.open_for_adding(place_map.path) as adding:
-        adding._db.execute("UPDATE places SET heading_deg = 10 * place_id")
+        adding.db.execute("UPDATE places SET heading_deg = 10 * place_id")
     index = load_index(place_map, technique, 10 * bytes_per_place(technique.spec))
     assert len(index) == 10
     np.testing.assert_array_equal(index.heading_deg, index.place_ids * 10)

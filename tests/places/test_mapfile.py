@@ -17,10 +17,13 @@ import pytest
 from map_writer import SPEC, descriptor, frame
 
 from edgevpr.contract import PartSpec
-from edgevpr.errors import MapError
+from edgevpr.errors import MapError, PlaceError
+from edgevpr.places.examine import absorb
 from edgevpr.places.geojson import write_geojson
 from edgevpr.places.geopackage import point_blob
 from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.mapinfo import info_of
+from edgevpr.places.near import index_positions, nearest_m
 from edgevpr.types import Position
 
 
@@ -43,11 +46,11 @@ def test_what_is_added_comes_back(map_path):
             assert place.t_utc_s == pytest.approx(added.t_utc_s, abs=1e-3)
             assert place.heading_deg == added.heading_deg
             assert place.position == added.position
-            np.testing.assert_array_equal(place_map.fine_part(place.place_id), descriptor(number).fine)
-        for number, (_, position, coarse) in enumerate(place_map.coarse_parts()):
+            np.testing.assert_array_equal(place_map.fine_part(place.place_id)[0], descriptor(number).fine)
+        for number, (_, position, _, coarse) in enumerate(place_map.coarse_parts()):
             np.testing.assert_array_equal(coarse, descriptor(number).coarse)
             assert (position is None) == (frame(number).position is None)
-        info = place_map.info()
+        info = info_of(place_map)
     assert (info.places, info.with_position) == (10, 8)
     np.testing.assert_allclose(info.extent, (50.0001, 8.0, 50.0009, 8.0))
 
@@ -144,11 +147,11 @@ def test_a_full_disk_is_a_sentence_and_keeps_every_confirmed_place(tmp_path):
 
 def test_sqlite_full_says_make_room(map_path):
     place_map = PlaceMap.open_for_adding(map_path)
-    (pages,) = place_map._db.execute("PRAGMA page_count").fetchone()
-    place_map._db.execute(f"PRAGMA max_page_count = {pages + 1}")
+    (pages,) = place_map.db.execute("PRAGMA page_count").fetchone()
+    place_map.db.execute(f"PRAGMA max_page_count = {pages + 1}")
     with pytest.raises(MapError, match="the disk is full: make room"):
         [place_map.add(frame(number), descriptor(number)) for number in range(10, 20)]
-    place_map._db.execute("PRAGMA max_page_count = 100000")
+    place_map.db.execute("PRAGMA max_page_count = 100000")
     place_map.add(frame(20), descriptor(20))  # room again: it goes on
     place_map.close()
     with PlaceMap.open(map_path) as again:
@@ -170,7 +173,7 @@ def test_another_technique_or_parameter_is_refused_by_name(map_path):
 
 def test_a_map_from_a_newer_version_is_refused(map_path):
     db = sqlite3.connect(map_path)
-    db.execute("UPDATE edgevpr_map SET value = '2' WHERE key = 'format_version'")
+    db.execute("UPDATE edgevpr_map SET value = '3' WHERE key = 'format_version'")
     db.commit()
     db.close()
     with pytest.raises(MapError, match=r"newer edgevpr .*update edgevpr"):
@@ -216,14 +219,14 @@ def test_merging_copies_what_is_new_and_refuses_what_differs(map_path, tmp_path)
         for number in (8, 9, 10, 11):
             other.add(frame(number), descriptor(number))
     with PlaceMap.open_for_adding(map_path) as place_map, PlaceMap.open(tmp_path / "other.gpkg") as other:
-        assert place_map.absorb(other) == (2, 2)
+        assert absorb(place_map, other) == (2, 2)
         assert len(place_map) == 12
-        assert place_map.info().extent[2] == pytest.approx(50.0011)
-        np.testing.assert_array_equal(place_map.fine_part(12), descriptor(11).fine)
+        assert info_of(place_map).extent[2] == pytest.approx(50.0011)
+        np.testing.assert_array_equal(place_map.fine_part(12)[0], descriptor(11).fine)
     different = dataclasses.replace(SPEC, parameters={"seed": 3})
     with PlaceMap.create(tmp_path / "third.gpkg", different) as third, PlaceMap.open(map_path) as place_map:
         with pytest.raises(MapError, match="seed"):
-            third.absorb(place_map)
+            absorb(third, place_map)
         assert len(third) == 0
 
 
@@ -272,31 +275,31 @@ def at(lat_deg, lon_deg):
 
 def test_the_nearest_place_is_found_whenever_it_was_added(map_path):
     with PlaceMap.open_for_adding(map_path) as place_map:
-        place_map.index_positions()
-        place_map.index_positions()  # once is enough, twice does no harm
+        index_positions(place_map)
+        index_positions(place_map)  # once is enough, twice does no harm
         place_map.add(at(50.01, 8.0), descriptor(11))
         for lat_deg in (50.0003, 50.01):
-            assert place_map.nearest_m(Position(lat_deg, 8.0), 1.0) == 0
-        assert place_map.nearest_m(Position(50.0003, 8.0001), 5.0) is None
-        assert place_map.nearest_m(Position(50.0003, 8.0001), 50.0) == pytest.approx(7.147, abs=0.01)
-        assert place_map.nearest_m(Position(50.0096, 8.0), 1000.0) == pytest.approx(44.48, abs=0.05)
-        assert place_map.nearest_m(Position(0.0, 0.0), 1000.0) is None
+            assert nearest_m(place_map, Position(lat_deg, 8.0), 1.0) == 0
+        assert nearest_m(place_map, Position(50.0003, 8.0001), 5.0) is None
+        assert nearest_m(place_map, Position(50.0003, 8.0001), 50.0) == pytest.approx(7.147, abs=0.01)
+        assert nearest_m(place_map, Position(50.0096, 8.0), 1000.0) == pytest.approx(44.48, abs=0.05)
+        assert nearest_m(place_map, Position(0.0, 0.0), 1000.0) is None
 
 
 def test_near_knows_neither_the_date_line_nor_the_poles(tmp_path):
     with PlaceMap.create(tmp_path / "m.gpkg", SPEC) as place_map:
-        place_map.index_positions()
+        index_positions(place_map)
         for number, where in enumerate([(0.0, 179.99999), (10.0, -179.99999), (89.99999, 10.0)]):
             place_map.add(at(*where), descriptor(number))
-        assert place_map.nearest_m(Position(0.0, -179.99999), 10.0) == pytest.approx(2.22, abs=0.01)
-        assert place_map.nearest_m(Position(10.0, 179.99999), 10.0) == pytest.approx(2.19, abs=0.01)
-        assert place_map.nearest_m(Position(89.99999, -150.0), 10.0) is not None
+        assert nearest_m(place_map, Position(0.0, -179.99999), 10.0) == pytest.approx(2.22, abs=0.01)
+        assert nearest_m(place_map, Position(10.0, 179.99999), 10.0) == pytest.approx(2.19, abs=0.01)
+        assert nearest_m(place_map, Position(89.99999, -150.0), 10.0) is not None
 
 
 def test_gdal_uses_the_spatial_index_and_keeps_it(map_path):
     pyogrio = pytest.importorskip("pyogrio", reason="pyogrio (GDAL) is not installed")
     with PlaceMap.open_for_adding(map_path) as place_map:
-        place_map.index_positions()
+        index_positions(place_map)
         place_map.add(frame(11), descriptor(11))
     box = (7.99, 50.00055, 8.01, 50.01)
     _, fids, _, _ = pyogrio.raw.read(map_path, layer="places", bbox=box, return_fids=True)
@@ -306,7 +309,7 @@ def test_gdal_uses_the_spatial_index_and_keeps_it(map_path):
 
 def test_the_spatial_index_follows_what_other_programs_change(map_path):
     with PlaceMap.open_for_adding(map_path) as place_map:
-        place_map.index_positions()
+        index_positions(place_map)
         changes = {
             "moved": f"UPDATE places SET geom = x'{point_blob(60.0, 8.0).hex()}' WHERE place_id = 4",
             "placed": f"UPDATE places SET geom = x'{point_blob(61.0, 8.0).hex()}' WHERE place_id = 1",
@@ -315,8 +318,8 @@ def test_the_spatial_index_follows_what_other_programs_change(map_path):
             "renumbered": "UPDATE places SET place_id = 100 WHERE place_id = 8",
         }
         for change in changes.values():
-            place_map._db.execute(change)
-        boxes = dict(place_map._db.execute("SELECT id, miny FROM rtree_places_geom"))
+            place_map.db.execute(change)
+        boxes = dict(place_map.db.execute("SELECT id, miny FROM rtree_places_geom"))
         points = {place.place_id: place.position.lat_deg for place in place_map.places() if place.position}
         assert boxes == pytest.approx(points, abs=1e-4)
         assert {1, 4, 100} <= boxes.keys()
@@ -325,9 +328,17 @@ def test_the_spatial_index_follows_what_other_programs_change(map_path):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ("geom = x'4750000100'", "place 3: its geometry is no point"),
-        (f"coarse = x'{'00' * 126}007c'", "place 3 is damaged"),  # an infinity, in half precision
-        ("coarse = x'00'", "place 3 is damaged"),
+        ("geom = x'4750000100'", "its geometry is no point"),
+        (f"geom = x'{point_blob(50.0, 8.0).hex().replace('e6100000', '110f0000')}'", "in the reference system 3857"),
+        (f"coarse = x'{'00' * 126}007c', coarse_crc32 = NULL", "its coarse part is not finite"),
+        (f"coarse = x'{'00' * 128}'", "its coarse part does not match its checksum"),
+        ("coarse = x'00'", "its coarse part has a wrong size"),
+        ("coarse = 1e18", "its coarse part has a wrong size"),
+        ("heading_deg = 'north'", "its heading_deg is no number"),
+        ("alt_m = 9e999", "its alt_m is no number"),
+        ("quality = 1.5", "its quality is not from 0 to 1"),
+        ("source_image = CAST('a.jpg' AS BLOB)", "its source_image is no text"),
+        ("source_image = CAST(x'ff41' AS TEXT)", "its source_image is no text"),
     ],
 )
 def test_what_another_program_has_spoilt_is_named(map_path, change, says):
@@ -335,8 +346,13 @@ def test_what_another_program_has_spoilt_is_named(map_path, change, says):
     db.execute(f"UPDATE places SET {change} WHERE place_id = 3")
     db.commit()
     db.close()
-    with PlaceMap.open(map_path) as place_map, pytest.raises(MapError, match=says):
-        list(place_map.coarse_parts())
+    with PlaceMap.open(map_path) as place_map:
+        assert [place_id for place_id, *_ in place_map.coarse_parts()] == [1, 2, *range(4, 11)]
+        assert list(place_map.left_out) == [3]
+        assert says in place_map.left_out[3]
+        if "coarse" not in change:
+            with pytest.raises(PlaceError, match=f"place 3 is damaged .*{says}"):
+                list(place_map.places())
 
 
 def test_a_time_of_another_form_is_no_time(map_path):

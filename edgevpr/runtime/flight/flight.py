@@ -11,6 +11,7 @@ from edgevpr.runtime.flight.flightlog import FlightLog
 from edgevpr.runtime.flight.governing import Governing
 from edgevpr.runtime.flight.learning import Learning
 from edgevpr.runtime.flight.loop import Observer, Stop, loop
+from edgevpr.runtime.flight.mapstate import MapState
 from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.flight.pace import Pace
 from edgevpr.runtime.flight.querylog import QueryLog
@@ -58,6 +59,7 @@ def fly(
         battery = config.battery
         pack, efficiency = parse_pack(battery.pack), battery.regulator_efficiency
         meter = FlightMeter(recogniser.meter.board, pack, efficiency, clock=clock)
+    map_state = MapState(flight_log, autopilot)
     tally, pace = Tally(), Pace(rate_hz(config, recogniser), clock)
     governing = Governing(
         recogniser,
@@ -80,9 +82,10 @@ def fly(
             lambda: autopilot.summary,
             lambda: governing.held,
             lambda: learner and learner.summary,
+            lambda: map_state.summary,
         ),
     )
-    observers: list[Observer] = [tally, QueryLog(flight_log, source, meter, tally)]
+    observers: list[Observer] = [tally, map_state, QueryLog(flight_log, source, meter, tally, map_state=map_state)]
     if learner:
         observers.append(Learning(learner, flight_log, autopilot))
     try:
@@ -100,5 +103,5 @@ def fly(
         )
     finally:
         meter.close()
-    totals = {"queries": tally.queries, **meter.totals(), "dropped": source.dropped}
+    totals = {"queries": tally.queries, **meter.totals(), "dropped": source.dropped, "left_out": map_state.left_out}
     return Flown(tally.queries, tally.accepted, tally.unusable + tally.failed, totals)

@@ -67,6 +67,8 @@ def judge(ranking: Ranking, index: PlaceIndex, rule: AcceptRule, search: Search,
         return Verdict(False, f"score {score:.3f} is below {rule.min_score:.3f}")
     if isinstance(search, SequenceSearch) and (objection := _lost_track(ranking, index, rule, search)):
         return Verdict(False, objection)
+    if len(ranking.unread):
+        return Verdict(False, "a place that cannot be read may be the right one")
     ahead = margin(ranking, index, rule.neighbour_m)
     if ahead is None and rule.min_score == 0:
         return Verdict(False, "there is no place elsewhere to compare with, and this score alone says nothing")

@@ -13,11 +13,12 @@ from pathlib import Path
 from typing import Any
 
 from edgevpr.config import Config
-from edgevpr.errors import MapError, UsageError
+from edgevpr.errors import MapBusyError, MapError, UsageError
 from edgevpr.frames.exif import read_exif
 from edgevpr.frames.images import list_images
 from edgevpr.frames.positions import find_positions
 from edgevpr.places.growing import GrowingIndex
+from edgevpr.places.near import nearest_m
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.types import Frame, Place, Position, Vehicle
@@ -29,8 +30,9 @@ _QUALITY_MIN = 0.2
 class Learner:
     """Adds places to an open map, then to the index in RAM: every place in the index is already safe on disk.
 
-    `learnt` counts the places, and `passed_over` the frames that were left out, by reason. At the first error of the
-    file learning stops for good, and `trouble` says why: the flight goes on with the places that are there.
+    `learnt` counts the places, and `passed_over` the frames that were left out, by reason. A frame is passed over while
+    another program is writing to the file. At any other error of the file learning stops for good, and `trouble` says
+    why: the flight goes on with the places that are there.
     """
 
     def __init__(
@@ -76,6 +78,7 @@ class Learner:
             if objection:
                 self.passed_over[objection] += 1
                 return None
+            self._map.require_unchanged()  # a place in a file that was deleted would be lost
             place_id = self._map.add(here, event.descriptor)
             self.learnt += 1
             place = Place(
@@ -87,6 +90,9 @@ class Learner:
                 quality=event.descriptor.quality,
             )
             self._growing.add(place_id, here.position, event.descriptor.coarse, here.heading_deg)
+        except MapBusyError:
+            if place is None:
+                self.passed_over["while another program was writing"] += 1
         except MapError as error:
             self.trouble = str(error)
         if place:
@@ -111,7 +117,7 @@ class Learner:
         if not quality >= _QUALITY_MIN:  # `not >=` refuses NaN as well
             return "of low quality"
         # Ask the file, not the index: a place that was dropped from RAM must not be learnt again.
-        if self._map.nearest_m(position, self._spacing_m) is not None:
+        if nearest_m(self._map, position, self._spacing_m) is not None:
             return "near a place"
         return None
 

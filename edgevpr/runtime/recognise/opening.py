@@ -1,5 +1,7 @@
 """Opening: makes a recogniser of a map, the technique that it was made with, and its index in RAM."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from edgevpr import techniques
@@ -10,6 +12,8 @@ from edgevpr.frames.source import is_live
 from edgevpr.places.growing import GrowingIndex
 from edgevpr.places.index import PlaceIndex, empty_index, load_index
 from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.mapfiles import map_path, remove, require_regular
+from edgevpr.places.near import index_positions
 from edgevpr.places.sequence import bytes_beside_place, length_of, search_of
 from edgevpr.power.boards import Board
 from edgevpr.power.equations import parse_pack
@@ -18,6 +22,7 @@ from edgevpr.runtime.recognise.hints import Prior
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.recogniser import Recogniser
 
+_WAIT_S = 0.05  # in flight, for another program that writes to the map: the next query is better than a late one
 _ROOM = 20_000  # places to learn in a flight: 200 km at the usual spacing; beyond that, RAM keeps the best places
 
 
@@ -32,9 +37,10 @@ def open_recogniser(
     """
     if config.map is None:
         raise UsageError("There is no map to recognise places in: name one with --map, or `map:` in the configuration.")
-    place_map = PlaceMap.open(Path(config.map))
-    technique = technique_of(place_map, config.technique, _wanted(config) | (settings or {}), board)
-    index = _loaded(config, board, technique, place_map)
+    place_map = PlaceMap.open(config.map)
+    with _closed_on_error(place_map):
+        technique = technique_of(place_map, config.technique, _wanted(config) | (settings or {}), board)
+        index = _loaded(config, board, technique, place_map)
     return _recogniser(config, board, technique, place_map, index, narrowed)
 
 
@@ -47,21 +53,23 @@ def open_learning(config: Config, board: Board, new_technique: str | None) -> tu
     """
     if config.map is None:
         raise UsageError("There is no map to learn places into: name one with --map, or `map:` in the configuration.")
-    path = Path(config.map)
+    path = map_path(config.map)
+    require_regular(path)
     if has_map(path):
-        place_map = PlaceMap.open_for_adding(path)
-        technique = technique_of(place_map, config.technique, _wanted(config), board)
+        place_map, technique = PlaceMap.open_for_adding(path), None
     else:
         technique = made_for(board, new_technique, _wanted(config))
         place_map = _new_map(path, technique)
-    place_map.index_positions()
-    growing = GrowingIndex(
-        place_map,
-        technique,
-        budget_bytes=int(budget_mb(config, board) * 1e6),
-        room=_ROOM,
-        beside_bytes=bytes_beside_place(length_of(technique.spec, config.match.sequence)),
-    )
+    with _closed_on_error(place_map):
+        technique = technique or technique_of(place_map, config.technique, _wanted(config), board)
+        index_positions(place_map)
+        growing = GrowingIndex(
+            place_map,
+            technique,
+            budget_bytes=int(budget_mb(config, board) * 1e6),
+            room=_ROOM,
+            beside_bytes=bytes_beside_place(length_of(technique.spec, config.match.sequence)),
+        )
     return _recogniser(config, board, technique, place_map, growing.index, narrowed=True), growing
 
 
@@ -122,7 +130,14 @@ def technique_of(
             f"{', '.join(techniques.names())}."
         )
     if name in (None, built_with.name):
-        technique = made_for(board, built_with.name, {**built_with.parameters, **(settings or {})})
+        try:
+            technique = made_for(board, built_with.name, {**built_with.parameters, **(settings or {})})
+        except (UsageError, TypeError, OverflowError) as error:
+            if settings and isinstance(error, UsageError):
+                raise
+            raise MapError(
+                f"{place_map.path}: its parameters cannot be used ({error}): restore a copy or build the map again."
+            ) from error
     else:
         technique = made_for(board, name, settings)
     place_map.require(technique.spec)
@@ -133,6 +148,8 @@ def _recogniser(
     config: Config, board: Board, technique: Technique, place_map: PlaceMap, index: PlaceIndex, narrowed: bool
 ) -> Recogniser:
     length = length_of(technique.spec, config.match.sequence)
+    if narrowed:
+        place_map.wait_at_most(_WAIT_S)
     return Recogniser(
         technique=technique,
         place_map=place_map,
@@ -152,12 +169,20 @@ def _prior(config: Config, technique: Technique) -> Prior:
     return Prior(config.match.reach_m_s, technique.spec.heading_within_deg, is_now)
 
 
+@contextmanager
+def _closed_on_error(place_map: PlaceMap) -> Iterator[None]:
+    try:
+        yield
+    except BaseException:
+        place_map.close()
+        raise
+
+
 def _new_map(path: Path, technique: Technique) -> PlaceMap:
     """Make an empty map that is there completely or not at all: a service killed at power-on must be able to start
     again."""
     unfinished = path.with_name(path.name + ".new")
-    for left in ("", "-wal", "-shm", "-journal"):
-        unfinished.with_name(unfinished.name + left).unlink(missing_ok=True)
+    remove(unfinished)
     PlaceMap.create(unfinished, technique.spec).close()
     unfinished.replace(path)
     return PlaceMap.open_for_adding(path)

@@ -5,9 +5,10 @@ No link, flight log, thread or clock is inside: what is handed in with a frame d
 
 import logging
 from collections import deque
+from itertools import islice
 
 from edgevpr.contract import Technique
-from edgevpr.errors import EdgevprError, MapError
+from edgevpr.errors import EdgevprError, MapError, PlaceError
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import compare, named, scan
@@ -44,6 +45,7 @@ class Recogniser:
     ) -> None:
         self.place_map, self.meter, self.candidates = place_map, meter, candidates
         self._prior, self._min_accuracy_m = prior or NoPrior(), min_accuracy_m
+        self._told = 0  # number of places left out that an event has told of
         self._new: deque[tuple[int, float]] = deque()  # place id, and the time it was learnt at
         self.take(technique, index, rule, search or Alone())
 
@@ -74,6 +76,7 @@ class Recogniser:
         """
         meter, technique, index = self.meter, self.technique, self.index
         descriptor = hints = ranking = best = None
+        map_lost = False
         meter.begin()
         try:
             with meter.step("encode"):
@@ -84,6 +87,7 @@ class Recogniser:
                 verdict = Verdict(False, "the map has no place yet")
             else:
                 with meter.step("scan"):
+                    self.place_map.require_unchanged()
                     margin_m = max(self.accuracy_m, self.rule.neighbour_m)
                     hints = self._prior.hints(frame, vehicle, index, margin_m)
                     expected = expected_of(hints, index)
@@ -108,6 +112,7 @@ class Recogniser:
         except Exception as error:
             _log.debug("%s failed", frame.name, exc_info=True)
             verdict, failed = Verdict(False, _sentence(error)), True
+            map_lost = isinstance(error, MapError) and not isinstance(error, PlaceError)
         position = best.place.position if verdict.accepted else None
         return Recognition(
             frame=frame,
@@ -119,6 +124,8 @@ class Recogniser:
             accepted=verdict.accepted,
             reason=verdict.reason,
             failed=failed,
+            map_lost=map_lost,
+            left_out=self._newly_left_out(),
             position=position,
             accuracy_m=self.accuracy_m if position else None,
             steps=meter.steps(),
@@ -131,6 +138,12 @@ class Recogniser:
         return Recognition(
             frame=None, reason=_sentence(error), failed=True, steps=self.meter.steps(), cost=self.meter.cost()
         )
+
+    def _newly_left_out(self) -> tuple[tuple[int, str], ...]:
+        found = self.place_map.left_out
+        newly = tuple(islice(found.items(), self._told, None))
+        self._told = len(found)
+        return newly
 
     def _is_new(self, place_id: int, t_mono_s: float) -> bool:
         while self._new and t_mono_s - self._new[0][1] > NEW_FOR_S:

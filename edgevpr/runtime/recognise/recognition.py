@@ -18,9 +18,12 @@ class Recognition:
     The inputs are `frame` and `vehicle`, the autopilot's report when the frame was taken (None: no report).
     `descriptor` is the encoded frame, `hints` what narrowed the search, `ranking` the places found and `best` the first
     of them; each is None where its step was not reached. `accepted` tells whether `best` is taken for the place, and
-    `reason` why (not), in a few words. `failed` tells whether the frame, a place or the technique could not be used.
-    `position` is the place's, and `accuracy_m` its 1-sigma; both are set for an accepted match only: any other carries
-    no position.
+    `reason` why (not), in a few words. `position` is the place's, and `accuracy_m` its 1-sigma; both are set for an
+    accepted match only: any other carries no position.
+
+    `failed` tells whether the frame, a place or the technique could not be used, and `map_lost` whether that is because
+    the map as a whole cannot be read. `left_out` are the places that have been left out since the last event because
+    they cannot be read: the number of each, and what is wrong with it.
 
     `steps` and `cost` are what the frame took. `fix` tells what became of the position, and `last_fix` the same of the
     one sent before it. The channel to the autopilot fills them in; they are None where there was nothing to send.
@@ -35,6 +38,8 @@ class Recognition:
     accepted: bool = False
     reason: str
     failed: bool = False
+    map_lost: bool = False
+    left_out: tuple[tuple[int, str], ...] = ()
     position: Position | None = None
     accuracy_m: float | None = None
     steps: Steps

@@ -14,6 +14,7 @@ from edgevpr.frames.source import open_source
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.transport import open_transport
 from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.mapfiles import map_path
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import parse_pack
 from edgevpr.runtime.preflight.choose import too_late
@@ -74,7 +75,7 @@ def _battery(config: Config) -> str:
 
 def _map(config: Config) -> str:
     if config.mapping.learn and config.map is not None:
-        path = Path(config.map).absolute()
+        path = map_path(config.map).absolute()
         # The map is neither made nor opened for writing, for the same reason as the log in `_log`.
         if not os.access(path.parent, os.W_OK) or (path.exists() and not os.access(path, os.W_OK)):
             raise MapError(f"{path} or its folder may not be written by this user: learning needs both.")

@@ -1,6 +1,9 @@
 """What is told to the autopilot, and that an event says what became of its fix: accepted, sent, taken are three
 things."""
 
+import shutil
+import sqlite3
+
 import pytest
 from fakes import FakeClock, FakeLink, FakeSource
 from flights import Flight, of_kind
@@ -12,9 +15,9 @@ from edgevpr.mavlink.link import Link
 from edgevpr.runtime.flight import autopilot, vitals
 
 
-def flight(recording, tmp_path, link, clock, technique="cohog", **settings):
+def flight(folder, tmp_path, link, clock, technique="cohog", **settings):
     settings = {"source.rate_hz": 1.0} | settings
-    return Flight(recording / f"{technique}.gpkg", tmp_path / "log", clock, link, **settings)
+    return Flight(folder / f"{technique}.gpkg", tmp_path / "log", clock, link, **settings)
 
 
 def pictures(count, first=0):
@@ -99,11 +102,12 @@ def test_a_match_that_takes_longer_than_a_fix_may_be_old_says_so_in_its_line_and
 def test_why_a_fix_is_withheld_is_said(recording, tmp_path, settings, why):
     clock = FakeClock()
     link = FakeLink(clock)
-    flown = flight(recording, tmp_path, link, clock, **settings)
+    shutil.copy(recording / "cohog.gpkg", tmp_path / "cohog.gpkg")
     if not settings:
-        flown.recogniser.index.lat_deg[:] = float("nan")
-        flown.recogniser.index.lon_deg[:] = float("nan")
-        flown.recogniser.place_map._point = lambda place_id, geom: None
+        with sqlite3.connect(tmp_path / "cohog.gpkg") as db:
+            db.execute("UPDATE places SET geom = NULL")
+        db.close()
+    flown = flight(tmp_path, tmp_path, link, clock, **settings)
     lines = flown.fly(FakeSource(pictures(1), clock))
     assert fixes(lines) == [(False, why)]
     assert link.stats().fixes_sent == 0

@@ -59,16 +59,38 @@ def mapped(line):
 
 
 @pytest.mark.parametrize("place", range(1, PLACES + 1))
-def test_a_damaged_fine_part_of_any_place_costs_queries_and_not_the_flight(place_map, tmp_path, place):
+def test_a_damaged_fine_part_of_any_place_costs_one_query_and_then_only_where_it_may_be_seen(
+    place_map, tmp_path, place
+):
     damage = lambda: damaged(place_map, "UPDATE places SET fine = x'00' WHERE place_id = ?", place)  # noqa: E731
-    queries, _, flight = fly(place_map, tmp_path / "log", [nothing, damage, nothing])
-    assert len(queries) == 3
+    queries, lines, flight = fly(place_map, tmp_path / "log", [nothing, damage, *[nothing] * 10])
+    assert len(queries) == 12
     assert queries[0]["accepted"]
-    for line in queries[1:]:
-        assert (line["accepted"], line["fix"]) == (False, None)
-        assert f"place {place} is damaged" in line["reason"]
+    assert (queries[1]["accepted"], queries[1]["fix"]) == (False, None)
+    assert f"place {place} is damaged" in queries[1]["reason"]
+    for shown, line in enumerate(queries[2:], start=3):
+        if line["accepted"]:
+            assert line["place"] == shown
+            assert mapped(line)
+        else:
+            assert place == shown or "may be the right one" in line["reason"]
+    assert sum(line["accepted"] for line in queries[2:]) >= 4, "the flight goes on with the rest"
+    assert flight.flown.failed == 1
+    assert [(line["place"], line["problem"]) for line in of_kind(lines, "left out")] == [
+        (place, "its fine part has a wrong size")
+    ]
+    assert flight.link.texts() == [(4, "edgevpr: map damaged, 1 place left out")]
+    assert flight.flown.totals["left_out"] == queries[-1]["totals"]["left_out"] == 1
+
+
+def test_each_damaged_place_is_counted_once_however_often_it_is_met(place_map, tmp_path):
+    damages = [lambda n=n: damaged(place_map, "UPDATE places SET fine = x'00' WHERE place_id = ?", n) for n in (4, 9)]
+    queries, lines, flight = fly(place_map, tmp_path / "log", [*damages, *[nothing] * 20])
+    assert [line["place"] for line in of_kind(lines, "left out")] == [4, 9]
+    assert flight.flown.totals["left_out"] == 2
     assert flight.flown.failed == 2
-    assert flight.link.stats().fixes_sent == 1
+    assert [text for _, text in flight.link.texts()] == ["edgevpr: map damaged, 1 place left out"], "said once"
+    assert sum(line["accepted"] for line in queries) >= 8
 
 
 @pytest.mark.parametrize("column", COLUMNS)
@@ -166,9 +188,12 @@ def test_ten_failures_in_a_row_are_critical_and_said_once_until_it_works_again(
         "frames are recognised again",
     ]
     assert flight_link.texts() == [
+        (4, "edgevpr: its map cannot be read, see its log"),
         (4, "edgevpr: 10 frames in a row have failed"),
+        (6, "edgevpr: its map is read again"),
         (6, "edgevpr: frames are recognised again"),
     ]
     assert flight.flown.failed == FAILURES_IN_A_ROW + 1
+    assert flight.flown.totals["left_out"] == 0, "where all are damaged the file is at fault, and may come back"
     told = [record.message for record in caplog.records if "is damaged" in record.message]
     assert len(told) == 1, "the same trouble is said once"

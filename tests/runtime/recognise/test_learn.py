@@ -9,9 +9,10 @@ from fakes import FakeClock, vehicle_at
 
 from edgevpr.config import load_config
 from edgevpr.contract import Descriptor
-from edgevpr.errors import UsageError
+from edgevpr.errors import MapError, UsageError
 from edgevpr.places.growing import GrowingIndex
 from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.near import index_positions
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.judge import AcceptRule
 from edgevpr.runtime.recognise.learn import Learner, check_positions
@@ -42,7 +43,7 @@ class Bench:
     def __init__(self, path, places_in_ram=100):
         self.clock = FakeClock()
         self.map = PlaceMap.create(path, TECHNIQUE.spec)
-        self.map.index_positions()
+        index_positions(self.map)
         self.growing = GrowingIndex(self.map, TECHNIQUE, budget_bytes=10**6, room=places_in_ram)
         self.recogniser = Recogniser(
             technique=TECHNIQUE,
@@ -176,21 +177,21 @@ def test_nothing_is_learnt_from_what_failed(bench):
 
 def test_trouble_with_the_file_ends_the_learning_and_nothing_else(bench):
     assert bench.see(0.0)
-    (pages,) = bench.map._db.execute("PRAGMA page_count").fetchone()
-    bench.map._db.execute(f"PRAGMA max_page_count = {pages}")
+    (pages,) = bench.map.db.execute("PRAGMA page_count").fetchone()
+    bench.map.db.execute(f"PRAGMA max_page_count = {pages}")
     places = [bench.see(20.0 * number) for number in range(1, 30)]
     assert None in places
     assert "make room" in bench.learner.trouble
     learnt = bench.learner.learnt
     assert learnt == 1 + len([place for place in places if place]) == len(bench.map)
-    bench.map._db.execute("PRAGMA max_page_count = 100000")
+    bench.map.db.execute("PRAGMA max_page_count = 100000")
     assert bench.see(1000.0) is None, "it has stopped for good"
     assert len(bench.recogniser.index) == learnt
     assert "then stopped" in bench.learner.summary
 
 
 def test_a_place_that_is_in_the_file_is_told_though_the_index_cannot_follow(bench):
-    bench.growing.add = lambda *_: (_ for _ in ()).throw(bench.map._damaged(1))
+    bench.growing.add = lambda *_: (_ for _ in ()).throw(MapError("m.gpkg: the file is damaged."))
     assert bench.see(0.0).place_id == 1
     assert "damaged" in bench.learner.trouble
     assert len(bench.map) == 1

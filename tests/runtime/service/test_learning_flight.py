@@ -160,8 +160,8 @@ def test_the_end_of_learning_is_told_to_the_ground_once(recording, tmp_path):
         technique="hog",
         **{"source.rate_hz": 1.0},
     )
-    (pages,) = flight.recogniser.place_map._db.execute("PRAGMA page_count").fetchone()
-    flight.recogniser.place_map._db.execute(f"PRAGMA max_page_count = {pages + 200}")
+    (pages,) = flight.recogniser.place_map.db.execute("PRAGMA page_count").fetchone()
+    flight.recogniser.place_map.db.execute(f"PRAGMA max_page_count = {pages + 200}")
     source = open_source(str(recording / "seen" / "images"), live=True, clock=clock)
     lines = flight.fly(source)
     assert flight.link.texts() == [(4, "edgevpr: nothing more is learnt, see its log")]

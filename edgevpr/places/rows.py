@@ -1,0 +1,163 @@
+"""The rows of the table of places: what may stand in one, and the reading of all that can be read.
+
+A row is believed only where each value has its type and range, and each BLOB its size and, where the map has one, its
+checksum. The exception is the time, of which other programs write many forms: what is no time is an unknown time.
+"""
+
+import math
+import sqlite3
+import zlib
+from collections.abc import Iterator
+
+import numpy as np
+
+from edgevpr.contract import PartSpec
+from edgevpr.places import geopackage
+from edgevpr.places.sqlite import is_of_one_row
+from edgevpr.types import Place, Position
+
+CHECKSUMS = "geom_crc32, coarse_crc32, fine_crc32"
+VALUES = "geom, time, alt_m, heading_deg, source_image, quality"
+BLOBS = "coarse, fine"
+COLUMNS = {"place_id", *f"{VALUES}, {BLOBS}".split(", ")}
+
+_LEAST_ROW_BYTES = 16  # no row of a map is smaller, so a file has no more rows than its size allows
+_MOST_MISSING = 100_000  # ids one after another of which there is no place
+
+Point = tuple[float, float]
+
+
+class Unreadable(ValueError):
+    """A value of a row that is not to be believed, in a few words."""
+
+
+def crc32(blob: bytes | None) -> int | None:
+    """Return the checksum of a BLOB, None for one that is NULL."""
+    return None if blob is None else zlib.crc32(blob)
+
+
+def point_of(geom: object, checksum: object) -> Point | None:
+    """Return (lat_deg, lon_deg), None for a place without a position. Raises Unreadable."""
+    if geom is None:
+        if checksum is not None:
+            raise Unreadable("its position is gone")
+        return None
+    try:
+        point = geopackage.read_point(geom)
+    except ValueError as error:
+        raise Unreadable(str(error)) from error
+    _hold(geom, checksum, "position")
+    return point
+
+
+def part_of(blob: object, spec: PartSpec, checksum: object, name: str) -> np.ndarray:
+    """Return a part of a descriptor (read-only array of `spec`); `name` it is called by. Raises Unreadable."""
+    if not isinstance(blob, bytes) or len(blob) != spec.nbytes:
+        raise Unreadable(f"its {name} has a wrong size")
+    _hold(blob, checksum, name)
+    part = np.frombuffer(blob, spec.dtype).reshape(spec.shape)
+    if part.dtype.kind == "f" and not np.isfinite(part).all():
+        raise Unreadable(f"its {name} is not finite")
+    return part
+
+
+def heading_of(value: object) -> float | None:
+    """Return a heading as 0 up to 360 degrees, None where unknown. Raises Unreadable."""
+    heading_deg = _number(value, "heading_deg")
+    return None if heading_deg is None else heading_deg % 360
+
+
+def quality_of(value: object) -> float:
+    """Return a quality, 0 to 1. Raises Unreadable."""
+    quality = _number(value, "quality")
+    if quality is None or not 0 <= quality <= 1:
+        raise Unreadable("its quality is not from 0 to 1")
+    return quality
+
+
+def place_of(place_id: int, values: tuple, geom_checksum: object) -> Place:
+    """Make a place of its row's `VALUES`. Raises Unreadable."""
+    geom, time, alt_m, heading_deg, source_image, quality = values
+    point = point_of(geom, geom_checksum)
+    alt_m = _number(alt_m, "alt_m")
+    heading_of(heading_deg)
+    if not isinstance(source_image, str):
+        raise Unreadable("its source_image is no text")
+    return Place(
+        place_id=place_id,
+        source_image=source_image,
+        position=Position(*point, alt_m) if point else None,
+        t_utc_s=geopackage.utc_seconds(time),
+        heading_deg=heading_deg,
+        quality=quality_of(quality),
+    )
+
+
+def most_rows(file_bytes: int) -> int:
+    """Return how many rows a file of this size can hold at most."""
+    return file_bytes // _LEAST_ROW_BYTES
+
+
+def scan(db: sqlite3.Connection, columns: str, file_bytes: int) -> Iterator[tuple[int, tuple | None]]:
+    """Yield (place id, row) of every place in the order they were added; the row is None where SQLite cannot read it.
+
+    A damaged page hides the rows on it, and those after it from a walk through the table. They are then asked for one
+    by one. Raises sqlite3.Error where the file cannot be read at all, or has more rows than its size allows.
+    """
+    left = most_rows(file_bytes)
+    last, highest = -(2**63), None
+    while True:
+        try:
+            walk = db.execute(f"SELECT place_id, {columns} FROM places WHERE place_id > ? ORDER BY place_id", (last,))
+            for place_id, *row in walk:
+                left -= 1
+                if not isinstance(place_id, int) or place_id <= last or left < 0:
+                    raise sqlite3.DatabaseError("malformed: the table of places does not end")
+                last = place_id
+                yield place_id, tuple(row)
+            return
+        except sqlite3.Error as error:
+            if left < 0 or not is_of_one_row(error):
+                raise
+            highest = _highest_id(db, error) if highest is None else highest
+        last, missing, row = max(last, 0), 0, None
+        while row is None and last < highest and missing < _MOST_MISSING and left > 0:
+            last += 1
+            try:
+                row = db.execute(f"SELECT {columns} FROM places WHERE place_id = ?", (last,)).fetchone()
+                missing += 1
+            except sqlite3.Error as error:
+                if not is_of_one_row(error):
+                    raise
+                missing, left = 0, left - 1
+                yield last, None
+        if row is None:
+            return
+        left -= 1
+        yield last, row
+
+
+def _highest_id(db: sqlite3.Connection, error: sqlite3.Error) -> int:
+    """Return the highest id that a place may have. Raises `error`, because of which it is asked, where none can be
+    read."""
+    for asked in ("SELECT max(place_id) FROM places", "SELECT seq FROM sqlite_sequence WHERE name = 'places'"):
+        try:
+            (highest,) = db.execute(asked).fetchone() or (None,)
+        except sqlite3.Error:
+            continue
+        if isinstance(highest, int):
+            return highest
+    raise error
+
+
+def _hold(blob: bytes, checksum: object, name: str) -> None:
+    if checksum is not None and checksum != zlib.crc32(blob):
+        raise Unreadable(f"its {name} does not match its checksum")
+
+
+def _number(value: object, name: str) -> float | None:
+    if value is None:
+        return None
+    if not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise Unreadable(f"its {name} is no number")
+    return value
