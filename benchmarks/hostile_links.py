@@ -22,7 +22,7 @@ from edgevpr.mavlink.wire import Message, Receiver, mavlink
 
 OURS, FOREIGN = 1, 2
 BURST, FLOOD = 40, 400  # hostile packets in a second
-PATIENCE_S = 0.3  # a fix that leaves at all leaves at once
+PATIENCE_S = 1.0  # a fix that leaves at all leaves at once
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""What a link needs of a port of any kind, and how one is opened.
+"""The interface that a link needs of a port of any kind, and the function that opens one.
 
 A lost transport raises OSError from `read` or `write`; its owner closes it and opens another.
 """

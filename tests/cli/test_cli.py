@@ -199,7 +199,6 @@ def test_what_the_world_gets_wrong_is_a_sentence_and_exit_code_1(capsys, flight,
         (["map", "build", valley, "--images", query, "--technique", "cohog"], "is there already"),
         (["map", "build", tmp_path / "no" / "m.gpkg", "--images", query, "--technique", "cohog"], "check the path"),
         (["run", "--map", valley, "--source", query, "--log", tmp_path / "no" / "x.jsonl"], "flight log"),
-        (["run", "--map", valley, "--source", query, "--log", tmp_path / "x", "--link", "udp:1"], "no MAVLink link"),
     ]:
         code, sentence = refused(capsys, *argv)
         assert (code, says in sentence) == (1, True), sentence
@@ -214,6 +213,8 @@ def test_what_the_user_gets_wrong_is_a_sentence_and_exit_code_2(capsys, flight, 
     wrong_row = tmp_path / "positions.csv"
     wrong_row.write_text("file,lat,lon\n0.png,91,8\n")
     for argv, says in [
+        (["run", "--map", valley, "--source", query, "--log", tmp_path / "x", "--link", "udp:1"], "no MAVLink link"),
+        (["run", "--map", valley, "--source", query, "--log", tmp_path / "x", "--link", ""], "no MAVLink link"),
         (["match", valley, "--images", query, "--min-score", "3"], "between 0 and 1"),
         (["map", "export", valley, "--geojson", tmp_path / "no" / "x.json"], "no such folder: make it first"),
         (["match", valley, "--images", query, "--board", "rpi5"], "did you mean `rpi-5`"),
