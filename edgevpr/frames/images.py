@@ -57,6 +57,8 @@ def read_image(path: str | Path) -> np.ndarray:
         raise ImageError(f"The image {path} does not exist: check the name.") from None
     except OSError as error:
         raise ImageError(f"The image {path} cannot be read ({error.strerror}): give a readable file.") from error
+    except MemoryError:
+        raise ImageError(f"{path} does not fit in the memory that is left: give a smaller image.") from None
     if not data:
         raise ImageError(f"{path} is empty: copy it again from the camera.")
     if _is_incomplete(data):

@@ -11,6 +11,7 @@ from typing import BinaryIO, TypeVar
 from edgevpr.errors import UsageError
 
 T = TypeVar("T")
+_KERNEL_FILE_BYTES = 1_000_000  # those of /proc and /sys say that they have none
 
 
 def open_file(path: str | Path, most_bytes: int) -> BinaryIO:
@@ -36,7 +37,9 @@ def open_file(path: str | Path, most_bytes: int) -> BinaryIO:
 def read_file(path: str | Path, most_bytes: int) -> bytes:
     """Read a regular file of at most `most_bytes`; raises OSError as `open_file` does."""
     with open_file(path, most_bytes) as handle:
-        return handle.read(most_bytes)
+        # Never more at once than the file has: Python makes room first for all that is asked for.
+        size = os.fstat(handle.fileno()).st_size or min(most_bytes, _KERNEL_FILE_BYTES)
+        return handle.read(size) or b""  # None: a file of the kernel that would have to be waited for
 
 
 def require_folder(path: Path) -> None:

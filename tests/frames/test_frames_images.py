@@ -123,6 +123,14 @@ def test_an_image_that_promises_more_pixels_than_can_be_held_is_refused(tmp_path
     assert capfd.readouterr().err == ""
 
 
+def test_an_image_that_does_not_fit_in_memory_is_refused_like_any_other(tmp_path, monkeypatch):
+    def full(*_):
+        raise MemoryError
+
+    monkeypatch.setattr("edgevpr.frames.images.read_file", full)
+    assert "does not fit in the memory that is left" in complaint(tmp_path / "large.tif")
+
+
 def test_a_missing_image_and_a_folder_are_refused(tmp_path):
     assert "does not exist" in complaint(tmp_path / "nothing.jpg")
     (tmp_path / "folder.jpg").mkdir()
