@@ -47,10 +47,8 @@ class Short(Ruler):
     spec = dataclasses.replace(Ruler.spec, fine=None)
 
 
-@pytest.fixture(params=[Ruler, Short])
-def either(request, tmp_path):
+def opened(technique, tmp_path):
     """A technique, its map of the places 0, 10, ... 290, 111 m apart, and the index. Their ids are 1 to 30."""
-    technique = request.param()
     with PlaceMap.create(tmp_path / "m.gpkg", technique.spec) as place_map:
         for number in range(0, 300, 10):
             position = Position(number * 1e-4, 0.0)
@@ -60,10 +58,13 @@ def either(request, tmp_path):
 
 
 @pytest.fixture
-def ruler(either):
-    if isinstance(either[0], Short):
-        pytest.skip("a technique of two stages")
-    return either
+def ruler(tmp_path):
+    yield from opened(Ruler(), tmp_path)
+
+
+@pytest.fixture
+def short(tmp_path):
+    yield from opened(Short(), tmp_path)
 
 
 def damage(place_map, change, *numbers):
@@ -156,10 +157,8 @@ def test_rivals_elsewhere_are_found_among_the_places_that_can_be_read(ruler):
     assert margin(ranking, index, 200.0) is not None
 
 
-def test_of_one_stage_a_place_left_out_is_still_a_rival_and_never_named(either):
-    technique, place_map, index = either
-    if not isinstance(technique, Short):
-        pytest.skip("a technique of one stage")
+def test_of_one_stage_a_place_left_out_is_still_a_rival_and_never_named(short):
+    technique, place_map, index = short
     damage(place_map, f"geom = x'{point_blob(1.0, 1.0).hex()}'", 140)
     ranking = rank(technique, technique.encode(142), place_map, index)
     with pytest.raises(PlaceError, match="its position has changed"):
