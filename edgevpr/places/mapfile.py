@@ -8,7 +8,7 @@ the others are used.
 import os
 import sqlite3
 from collections.abc import Iterable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -43,16 +43,15 @@ class PlaceMap:
     """
 
     def __init__(self, path: Path, connection: sqlite3.Connection, found: Stored, lock: int | None = None) -> None:
-        self.path, self.spec, self.db = path, spec_of(path, found), connection
+        self.path, self.spec = path, spec_of(path, found)
         self.has_checksums = has_checksums(found)
         self.left_out: dict[int, str] = {}
         self.made_by = found["made_by"] if isinstance(found.get("made_by"), str) else None
         self._found, self._lock = found, lock  # the lock of the program that adds places; None: only read
         self.checksums = rows.CHECKSUMS if self.has_checksums else "NULL, NULL, NULL"
         self._geom_checksum, self._coarse_checksum, self._fine_checksum = self.checksums.split(", ")
-        fine_bytes = self.spec.fine.nbytes if self.spec.fine else 0
-        most_bytes(connection, self.spec.coarse.nbytes + fine_bytes + _BESIDE_BLOBS_BYTES)
         self._wait_s = WAIT_S
+        self._take(connection)
         self._seen = self._state()
 
     @classmethod
@@ -138,18 +137,28 @@ class PlaceMap:
     def require_unchanged(self) -> None:
         """Raise MapError where the file is gone, cannot be read, or is another map than the one that was opened.
 
-        This is cheap: only when another program has touched the file is it opened once more, and its map_id compared.
+        This is cheap: only when another program has touched the file is it opened anew, and its map_id compared. The
+        new connection is then used, since the old one may have kept pages of another file.
         """
         with sentences(self.path):
             state = self._state()
             if state == self._seen:
                 return
             mapfiles.existing(self.path)
-            with closing(connect_to_read(self.path, self._wait_s)) as fresh:
-                found = stored(self.path, fresh)
-        if found != self._found:
-            raise MapError(f"{self.path} is another map than the one that was opened: put that one back.")
-        self._seen = state
+            fresh = connect_to_read(self.path, self._wait_s)
+            try:
+                if _checked(self.path, fresh) != self._found:
+                    raise MapError(f"{self.path} is another map than the one that was opened: put that one back.")
+                if self._lock is not None:
+                    fresh.close()
+                    fresh = connect(self.path, "rw", wait_s=self._wait_s)
+                    start_log(fresh)
+            except BaseException:
+                fresh.close()
+                raise
+            self.db.close()
+            self._take(fresh)
+            self._seen = self._version(), *state[1:]
 
     def wait_at_most(self, wait_s: float) -> None:
         """From now on, wait at most so long for another program that is writing; then MapBusyError is raised."""
@@ -319,14 +328,28 @@ class PlaceMap:
         (pages,), (page_bytes,) = (self.db.execute(f"PRAGMA page_{name}").fetchone() for name in ("count", "size"))
         return pages * page_bytes
 
-    def _state(self) -> tuple[int, ...]:
+    def _take(self, connection: sqlite3.Connection) -> None:
+        self.db = connection
+        fine_bytes = self.spec.fine.nbytes if self.spec.fine else 0
+        most_bytes(connection, self.spec.coarse.nbytes + fine_bytes + _BESIDE_BLOBS_BYTES)
+
+    def _version(self) -> int | None:
+        """Return a number that changes when another program has written to the file; None where this connection cannot
+        read it any more."""
+        try:
+            return self.db.execute("PRAGMA data_version").fetchone()[0]
+        except sqlite3.Error as error:
+            if "locked" in str(error):
+                raise
+            return None
+
+    def _state(self) -> tuple[int | None, ...]:
         """Return numbers that change when another program writes to the file, or puts another one in its place."""
-        (version,) = self.db.execute("PRAGMA data_version").fetchone()
         try:
             file = self.path.stat()
         except OSError as error:
             raise MapError(f"{self.path} is gone ({error.strerror}): put it back.") from error
-        return version, file.st_dev, file.st_ino, file.st_size, file.st_mtime_ns
+        return self._version(), file.st_dev, file.st_ino, file.st_size, file.st_mtime_ns
 
 
 def _checked(path: Path, db: sqlite3.Connection) -> Stored:

@@ -18,7 +18,7 @@ from edgevpr.places import geopackage, rows
 
 FORMAT_VERSION = 2  # 1 had no checksums and no map_id
 _WITH_CHECKSUMS = 2
-_DTYPES = [order + kind for order in ("<", "|", "") for kind in ("i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f2", "f4", "f8")]
+_DTYPES = ("|i1", "|u1", "<i1", "<u1", *(f"<{kind}{size}" for kind in "iu" for size in "248"), "<f2", "<f4", "<f8")
 _MOST_PART_BYTES = 64_000_000
 _MOST_STORED = 1000  # rows of the table, and characters that a message shows of a damaged one
 

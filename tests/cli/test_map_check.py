@@ -1,0 +1,258 @@
+"""`edgevpr map check` and `map repair`, and what `map build` and `map merge` leave behind when they fail."""
+
+import contextlib
+import json
+import os
+import shutil
+import signal
+import sqlite3
+import subprocess
+import sys
+
+import cv2
+import pytest
+from pictures import textured
+
+from edgevpr.cli.main import main
+from edgevpr.places.mapfile import PlaceMap
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory):
+    """Six pictures with positions and, the last three, odd times; the last has a name that is not UTF-8."""
+    folder = tmp_path_factory.mktemp("flight")
+    (folder / "images").mkdir()
+    rows = ["file,lat,lon,time"]
+    for number in range(6):
+        name = f"{number}.png"
+        cv2.imwrite(str(folder / "images" / name), textured(number, 240, 320))
+        rows.append(f"{name},{50 + number * 0.001:.6f},8.0,{1.7e9 * (1000 if number > 2 else 1) + number}")
+    (folder / "positions.csv").write_text("\n".join(rows) + "\n")
+    os.rename(folder / "images" / "5.png", os.fsencode(folder / "images") + b"/\xff.png")
+    return folder
+
+
+@pytest.fixture
+def valley(flight, tmp_path, capsys):
+    path = tmp_path / "valley.gpkg"
+    assert main(built(path, flight)) == 0
+    capsys.readouterr()
+    return path
+
+
+def built(path, flight, *flags):
+    technique = () if "--append" in flags else ("--technique", "cohog", "--param", "w1=208")
+    return ["map", "build", str(path), "--images", str(flight / "images"), *technique, *flags]
+
+
+def damage(path, *statements):
+    with contextlib.closing(sqlite3.connect(path)) as db, db:
+        for statement in statements:
+            db.execute(statement)
+
+
+DAMAGE = (
+    "UPDATE places SET fine = zeroblob(length(fine)) WHERE place_id = 2",
+    "UPDATE places SET heading_deg = 'north' WHERE place_id = 4",
+)
+
+
+def test_odd_times_and_names_are_mapped_and_the_times_counted(flight, tmp_path, capsys):
+    path = tmp_path / "m.gpkg"
+    assert main(built(path, flight)) == 0
+    assert "2 images have a time that is no date" in capsys.readouterr().out
+    assert main([*built(path, flight, "--append"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["already_here"] == 6
+    with PlaceMap.open(path) as place_map:
+        assert [place.t_utc_s is None for place in place_map.places()] == [False] * 3 + [True] * 3
+        assert list(place_map.places())[-1].source_image == "\\udcff.png"
+
+
+def test_a_whole_map_is_said_to_be_whole_and_a_repair_leaves_it_alone(valley, capsys):
+    before = valley.read_bytes()
+    assert main(["map", "check", str(valley)]) == 0
+    said = capsys.readouterr()
+    assert said.out.splitlines() == [
+        f"{valley}: 6 of 6 places can be read",
+        "  SQLite      the file is sound",
+        "  checksums   all match",
+    ]
+    assert "checking  6/6  100 %" in said.err
+    assert main(["map", "repair", str(valley)]) == 0
+    assert "nothing is damaged" in capsys.readouterr().out
+    assert valley.read_bytes() == before
+    assert [entry.name for entry in valley.parent.iterdir()] == [valley.name]
+
+
+def test_what_is_damaged_is_named_and_dropped_and_the_original_kept(valley, capsys):
+    damage(valley, *DAMAGE)
+    before = valley.read_bytes()
+    assert main(["map", "check", str(valley)]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[:3] == [
+        f"{valley}: 4 of 6 places can be read",
+        "  damaged     place 2: its fine part does not match its checksum",
+        "  damaged     place 4: its heading_deg is no number",
+    ]
+    assert main(["map", "check", str(valley), "--json"]) == 1
+    found = json.loads(capsys.readouterr().out)
+    assert (found["places"], found["is_whole"]) == (4, False)
+    assert [number for number, _ in found["damaged"]] == [2, 4]
+
+    assert main(["map", "repair", str(valley)]) == 0
+    original = valley.with_name("valley.gpkg.damaged")
+    assert f"repaired, 4 places kept, 2 dropped; the original is {original}" in capsys.readouterr().out
+    assert original.read_bytes() == before
+    with PlaceMap.open(original) as damaged, PlaceMap.open(valley) as repaired:
+        kept = list(repaired.places())
+        assert [place.place_id for place in kept] == [1, 3, 5, 6], "the numbers stay"
+        assert kept == list(damaged.places([1, 3, 5, 6]))
+        for place in kept:
+            assert (repaired.fine_part(place.place_id)[0] == damaged.fine_part(place.place_id)[0]).all()
+        repaired.require(damaged.spec)
+    assert main(["map", "check", str(valley)]) == 0
+    assert sorted(entry.name for entry in valley.parent.iterdir()) == [valley.name, original.name]
+
+
+def test_a_map_repaired_once_is_not_repaired_over_its_original(valley, capsys):
+    damage(valley, *DAMAGE)
+    assert main(["map", "repair", str(valley)]) == 0
+    first = valley.with_name("valley.gpkg.damaged").read_bytes()
+    damage(valley, "UPDATE places SET fine = x'00' WHERE place_id = 1")
+    assert main(["map", "repair", str(valley)]) == 1
+    assert "is there already, from an earlier repair" in capsys.readouterr().err
+    assert valley.with_name("valley.gpkg.damaged").read_bytes() == first
+
+
+def test_a_map_of_which_nothing_can_be_read_is_left_as_it_is(valley, capsys):
+    damage(valley, "UPDATE places SET coarse = x'00'")
+    before = valley.read_bytes()
+    assert main(["map", "repair", str(valley)]) == 1
+    assert "no place of it can be read: restore a copy" in capsys.readouterr().err
+    assert valley.read_bytes() == before
+    assert [entry.name for entry in valley.parent.iterdir()] == [valley.name]
+
+
+def test_a_file_whose_pages_are_damaged_is_repaired_too(valley, capsys):
+    data = bytearray(valley.read_bytes())
+    with contextlib.closing(sqlite3.connect(valley)) as db:
+        (fine,) = db.execute("SELECT fine FROM places WHERE place_id = 3").fetchone()
+    at = data.find(fine[-64:]) // 4096 * 4096
+    data[at : at + 4096] = b"\xff" * 4096
+    valley.write_bytes(data)
+    assert main(["map", "check", str(valley)]) == 1
+    capsys.readouterr()
+    assert main(["map", "repair", str(valley)]) == 0
+    assert "repaired, 5 places kept, 1 dropped" in capsys.readouterr().out
+    assert main(["map", "check", str(valley)]) == 0
+
+
+def test_a_map_without_checksums_is_whole_and_says_so(valley, capsys):
+    damage(valley, "UPDATE places SET geom_crc32 = NULL, coarse_crc32 = NULL, fine_crc32 = NULL")
+    assert main(["map", "check", str(valley)]) == 0
+    assert "6 places lack some: damage of those cannot be seen" in capsys.readouterr().out
+
+
+def test_a_damaged_map_is_matched_in_with_the_rest(valley, flight, capsys):
+    damage(valley, "UPDATE places SET geom = 'text' WHERE place_id = 2")
+    assert main(["match", str(valley), "--images", str(flight / "images"), "--json"]) == 0
+    accepted = [row["place"] for row in json.loads(capsys.readouterr().out)["queries"] if row["accepted"]]
+    assert len(accepted) >= 4
+    assert 2 not in accepted
+
+
+@pytest.mark.parametrize("name", ["", "a\0b.gpkg"])
+@pytest.mark.parametrize("command", [["info"], ["check"], ["repair"], ["export", "--geojson", "-"]])
+def test_a_name_that_no_file_can_have_is_exit_code_2(command, name, capsys):
+    assert main(["map", command[0], name, *command[1:]]) == 2
+    assert "cannot be the name of a map" in capsys.readouterr().err
+
+
+def run_full(arguments, bytes_at_most):
+    """Run a command on a disk that takes files of so many bytes at most."""
+    code = f"""
+import resource, signal, sys
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, ({bytes_at_most}, {bytes_at_most}))
+from edgevpr.cli.main import main
+sys.exit(main({arguments!r}))
+"""
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+
+
+@pytest.mark.parametrize("bytes_at_most", [1, 5_000, 45_000])
+def test_a_full_disk_leaves_no_map_of_nothing(flight, tmp_path, bytes_at_most):
+    result = run_full(built(tmp_path / "m.gpkg", flight), bytes_at_most)
+    assert result.returncode == 1
+    assert "Traceback" not in result.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_full_disk_leaves_no_half_of_a_merge_or_repair(valley, tmp_path):
+    out = tmp_path / "out" / "m.gpkg"
+    out.parent.mkdir()
+    for bytes_at_most in (1, 5_000, 60_000):
+        result = run_full(["map", "merge", str(out), str(valley)], bytes_at_most)
+        assert result.returncode == 1
+        assert not list(out.parent.iterdir())
+    damage(valley, *DAMAGE)
+    before = valley.read_bytes()
+    for bytes_at_most in (1, 5_000, 45_000):
+        result = run_full(["map", "repair", str(valley)], bytes_at_most)
+        assert result.returncode == 1
+        assert "Traceback" not in result.stderr
+        assert valley.read_bytes() == before
+        assert [entry.name for entry in tmp_path.glob("valley*")] == [valley.name]
+    assert main(["map", "merge", str(out), str(valley)]) == 1, "it is damaged"
+    assert not list(out.parent.iterdir())
+
+
+def test_of_two_builders_on_the_same_images_one_is_refused(flight, tmp_path):
+    """Both are started while a third program holds the map; then they race for it."""
+    path = tmp_path / "m.gpkg"
+    shutil.copytree(flight, tmp_path / "many")
+    for number in range(6, 30):
+        cv2.imwrite(str(tmp_path / "many" / "images" / f"{number}.png"), textured(number, 240, 320))
+    code = "import sys; from edgevpr.cli.main import main; sys.exit(main(sys.argv[1:]))"
+    assert main(built(path, flight)) == 0
+    both = [
+        subprocess.Popen(
+            [sys.executable, "-c", code, *built(path, tmp_path / "many", "--append")], stderr=subprocess.PIPE
+        )
+        for _ in range(2)
+    ]
+    said = [each.communicate(timeout=120)[1].decode() for each in both]
+    codes = sorted(each.returncode for each in both)
+    with PlaceMap.open(path) as place_map:
+        names = [place.source_image for place in place_map.places()]
+    assert len(names) == len(set(names)) == 30, "no place twice"
+    # On a machine so busy that one has ended before the other begins, both are right.
+    assert codes in ([0, 0], [0, 1])
+    if codes == [0, 1]:
+        assert any("another program is adding places to this map" in each for each in said)
+
+
+def test_a_second_builder_is_refused_while_the_first_one_works(flight, tmp_path, capsys):
+    path = tmp_path / "m.gpkg"
+    assert main(built(path, flight)) == 0
+    with PlaceMap.open_for_adding(path):
+        assert main(built(path, flight, "--append")) == 1
+        assert "another program is adding places to this map" in capsys.readouterr().err
+    assert main(built(path, flight, "--append")) == 0
+
+
+def test_a_builder_that_is_killed_leaves_no_lock(flight, tmp_path):
+    path = tmp_path / "m.gpkg"
+    code = f"""
+import time
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.techniques import create
+PlaceMap.create({str(path)!r}, create("cohog", {{"w1": 208}}).spec)
+print("made", flush=True)
+time.sleep(600)
+"""
+    builder = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert builder.stdout.readline() == "made\n"
+    builder.send_signal(signal.SIGKILL)
+    builder.communicate()
+    assert main(built(path, flight, "--append")) == 0

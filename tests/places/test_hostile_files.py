@@ -1,0 +1,333 @@
+"""Files that are no map, or a map that somebody has tampered with: one sentence, no traceback, and no reading that does
+not end."""
+
+import contextlib
+import dataclasses
+import os
+import sqlite3
+import stat
+import subprocess
+import sys
+
+import map_writer
+import numpy as np
+import pytest
+from map_writer import SPEC, descriptor, frame
+
+from edgevpr.errors import MapBusyError, MapError, UsageError
+from edgevpr.places.examine import absorb, examine
+from edgevpr.places.geopackage import point_blob
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.mapinfo import info_of
+from edgevpr.places.near import index_positions, nearest_m
+from edgevpr.types import Position
+
+PLACES = 40
+
+
+@pytest.fixture
+def map_path(tmp_path):
+    path = tmp_path / "valley.gpkg"
+    with PlaceMap.create(path, SPEC) as place_map:
+        for number in range(PLACES):
+            place_map.add(frame(number), descriptor(number))
+    return path
+
+
+def written(path, *statements):
+    """Another program writes to the map."""
+    with sqlite3.connect(path) as db:
+        for statement in statements:
+            db.executescript(statement)
+    db.close()
+
+
+@pytest.mark.parametrize("name", ["", "a\0b.gpkg", "\ud800.gpkg", "/"])
+@pytest.mark.parametrize("use", [PlaceMap.open, PlaceMap.open_for_adding, lambda path: PlaceMap.create(path, SPEC)])
+def test_a_name_that_no_file_can_have_is_a_wrong_request(use, name):
+    with pytest.raises(UsageError, match="cannot be the name of a map"):
+        use(name)
+
+
+def test_a_name_that_is_not_utf_8_is_a_name(tmp_path):
+    path = os.fsdecode(os.fsencode(tmp_path) + b"/\xff.gpkg")
+    PlaceMap.create(path, SPEC).close()
+    with PlaceMap.open(path) as place_map:
+        assert len(place_map) == 0
+
+
+@pytest.mark.parametrize("end", ["", "-wal", "-journal"])
+@pytest.mark.parametrize("use", [PlaceMap.open, PlaceMap.open_for_adding])
+def test_a_pipe_is_refused_and_not_waited_for(map_path, use, end):
+    path = map_path.with_name(map_path.name + end)
+    path.unlink(missing_ok=True)
+    os.mkfifo(path)
+    with pytest.raises(MapError, match=f"{path.name} is no regular file but a folder, pipe or device"):
+        use(map_path)
+
+
+def test_no_map_is_made_in_a_pipe(tmp_path):
+    os.mkfifo(tmp_path / "m.gpkg")
+    with pytest.raises(MapError, match="no regular file"):
+        PlaceMap.create(tmp_path / "m.gpkg", SPEC)
+    assert stat.S_ISFIFO((tmp_path / "m.gpkg").stat().st_mode)
+
+
+ENDLESS = "WITH RECURSIVE n(place_id) AS (SELECT 1 UNION ALL SELECT place_id + 1 FROM n)"
+COLUMNS = "geom, time, alt_m, heading_deg, source_image, quality, geom_crc32, coarse_crc32, fine_crc32, coarse, fine"
+TAMPERED = {
+    f"ALTER TABLE places RENAME TO old; CREATE VIEW places AS {ENDLESS} SELECT n.place_id, {COLUMNS} FROM n, old": (
+        "not a place map"
+    ),
+    "DROP TABLE places; CREATE VIRTUAL TABLE places USING rtree(id, a, b)": "not a place map",
+    "DROP TABLE places": "not a place map",
+    "ALTER TABLE places RENAME COLUMN fine TO fein": "has not the columns of a map .fine.",
+    "ALTER TABLE places DROP COLUMN fine; ALTER TABLE places ADD COLUMN fine AS (zeroblob(1000000000))": (
+        "has not the columns of a map .fine."
+    ),
+    "ALTER TABLE places RENAME COLUMN geom_crc32 TO other": "has not the columns of a map .geom_crc32.",
+    "UPDATE gpkg_geometry_columns SET srs_id = 3857": "not points in WGS 84",
+    "UPDATE gpkg_geometry_columns SET geometry_type_name = 'POLYGON'": "not points in WGS 84",
+    "DELETE FROM gpkg_geometry_columns": "not points in WGS 84",
+    "DELETE FROM edgevpr_map": "edgevpr_map is damaged",
+    "UPDATE edgevpr_map SET value = '\"2\"' WHERE key = 'format_version'": "edgevpr_map is damaged",
+    "UPDATE edgevpr_map SET value = '[1]' WHERE key = 'technique'": "edgevpr_map is damaged",
+    "UPDATE edgevpr_map SET value = '7' WHERE key = 'parameters'": "edgevpr_map is damaged",
+    "UPDATE edgevpr_map SET value = '{\"seed\": [1]}' WHERE key = 'parameters'": "edgevpr_map is damaged",
+    "UPDATE edgevpr_map SET value = '{\"seed\": 1e999}' WHERE key = 'parameters'": "edgevpr_map is damaged",
+    "UPDATE edgevpr_map SET value = 'null' WHERE key = 'coarse'": "edgevpr_map is damaged",
+    "UPDATE edgevpr_map SET value = '[]' WHERE key = 'fine'": "edgevpr_map is damaged",
+    'UPDATE edgevpr_map SET value = \'{"shape": [9], "dtype": "O"}\' WHERE key = \'fine\'': "edgevpr_map is damaged",
+    'UPDATE edgevpr_map SET value = \'{"shape": [9], "dtype": "(2,"}\' WHERE key = \'fine\'': "edgevpr_map is damaged",
+    'UPDATE edgevpr_map SET value = \'{"shape": [-9], "dtype": "<f4"}\' WHERE key = \'fine\'': "edgevpr_map is damaged",
+    'UPDATE edgevpr_map SET value = \'{"shape": [1000000, 1000000], "dtype": "<f4"}\' WHERE key = \'fine\'': (
+        "edgevpr_map is damaged"
+    ),
+    f"UPDATE edgevpr_map SET value = '{'[' * 100_000}' WHERE key = 'fine'": "edgevpr_map is damaged",
+    "UPDATE edgevpr_map SET value = CAST(x'ff' AS TEXT) WHERE key = 'fine'": "edgevpr_map is damaged",
+}
+
+
+@pytest.mark.parametrize(("change", "says"), TAMPERED.items(), ids=range(len(TAMPERED)))
+def test_a_map_that_was_tampered_with_is_refused_in_a_sentence(map_path, change, says):
+    written(map_path, change)
+    for use in (PlaceMap.open, PlaceMap.open_for_adding):
+        with pytest.raises(MapError, match=says) as caught:
+            use(map_path)
+        assert len(str(caught.value)) < 1500
+
+
+def test_a_summary_says_what_it_can(map_path):
+    written(
+        map_path,
+        "UPDATE gpkg_contents SET min_x = NULL, max_y = 'north'",
+        "UPDATE places SET time = 1, quality = 'good' WHERE place_id < 9",
+        "DELETE FROM edgevpr_map WHERE key = 'made_by'",
+    )
+    with PlaceMap.open(map_path) as place_map:
+        info = info_of(place_map)
+    assert (info.places, info.extent, info.first_time, info.made_by) == (PLACES, None, None, None)
+    assert info.last_time.startswith("2023-11-14")
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_bits_flipped_in_the_header_are_a_sentence(map_path, seed):
+    rng = np.random.default_rng(seed)
+    data = bytearray(map_path.read_bytes())
+    for at in rng.integers(0, 100, rng.integers(1, 4)):
+        data[at] ^= 1 << int(rng.integers(8))
+    map_path.write_bytes(data)
+    # A file that is still a map is read; any other is a MapError, and nothing else.
+    with contextlib.suppress(MapError), PlaceMap.open(map_path) as place_map:
+        info_of(place_map)
+        for place_id, *_ in list(place_map.coarse_parts()):
+            place_map.fine_part(place_id)
+
+
+def test_a_damaged_page_hides_only_the_places_on_it(map_path):
+    page_bytes, data, lost = 4096, map_path.read_bytes(), []
+    for page in range(1, len(data) // page_bytes):
+        damaged = bytearray(data)
+        damaged[page * page_bytes : (page + 1) * page_bytes] = b"\xa5" * page_bytes
+        map_path.write_bytes(damaged)
+        try:
+            with PlaceMap.open(map_path) as place_map:
+                found = list(examine(place_map))
+        except MapError:
+            continue  # a page that every map needs
+        whole = [each for each in found if not each.problem]
+        for each in whole:
+            assert each.row[-1] == descriptor(each.place_id - 1).fine.tobytes()
+        lost.append(PLACES - len(whole))
+        assert len(whole) + len([each for each in found if each.problem]) >= PLACES - 8 or not whole
+    assert lost.count(1) > PLACES, "most pages hold a part of one place"
+    assert sorted(lost)[len(lost) * 9 // 10] <= 8
+
+
+def test_a_large_value_is_not_read(map_path):
+    if sys.version_info < (3, 11):
+        pytest.skip("this Python cannot ask SQLite for it")
+    written(map_path, "UPDATE places SET source_image = CAST(zeroblob(300000) AS TEXT) WHERE place_id = 3")
+    with PlaceMap.open(map_path) as place_map:
+        assert [place_id for place_id, *_ in place_map.coarse_parts()] == [1, 2, *range(4, PLACES + 1)]
+        assert list(place_map.left_out) == [3]
+
+
+def test_a_statement_that_does_not_end_is_broken_off(map_path):
+    """A trigger may hold a query of any length; it fires where a place is added."""
+    endless = "SELECT count(*) FROM (WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n) SELECT x FROM n)"
+    written(map_path, f"CREATE TRIGGER endless AFTER INSERT ON places BEGIN {endless}; END")
+    with PlaceMap.open_for_adding(map_path) as place_map:
+        place_map.db.set_progress_handler(lambda: 1, 1_000_000)  # the real one takes some seconds
+        with pytest.raises(MapError, match="does not end"):
+            place_map.add(frame(50), descriptor(50))
+        assert len(place_map) == PLACES
+
+
+def test_a_name_and_a_time_that_cannot_be_written_cost_no_place(map_path):
+    odd = dataclasses.replace(frame(41), name=os.fsdecode(b"\xff\xfe.jpg"), t_utc_s=1.7e12)
+    later = dataclasses.replace(frame(42), name="\ud800.jpg", t_utc_s=1e308)
+    with PlaceMap.open_for_adding(map_path) as place_map:
+        for number, each in ((41, odd), (42, later)):
+            place_map.add(each, descriptor(number))
+            assert place_map.fingerprint(each.name, descriptor(number)) in place_map.fingerprints()
+        *_, first, second = place_map.places()
+    assert (first.source_image, first.t_utc_s) == ("\\udcff\\udcfe.jpg", None)
+    assert (second.source_image, second.t_utc_s) == ("\\ud800.jpg", None)
+
+
+def test_two_programs_never_add_to_one_map_at_once(map_path):
+    with PlaceMap.open_for_adding(map_path) as place_map:
+        second = subprocess.run(
+            [sys.executable, map_writer.__file__, str(map_path), "1"], capture_output=True, text=True, timeout=60
+        )
+        assert "MapBusyError" in second.stderr
+        assert "another program is adding places to this map" in second.stderr
+        with PlaceMap.open(map_path) as reader:  # to look is allowed
+            assert len(reader) == len(place_map) == PLACES
+    with PlaceMap.open_for_adding(map_path) as again:
+        again.add(frame(41), descriptor(41))
+
+
+def test_two_programs_that_make_one_map_at_once_make_one(tmp_path):
+    path = tmp_path / "new.gpkg"
+    with PlaceMap.create(path, SPEC), pytest.raises(MapBusyError, match="another program is adding"):
+        PlaceMap.create(path, SPEC)
+    with pytest.raises(MapError, match="is there already"):
+        PlaceMap.create(path, SPEC)
+    assert path.stat().st_size
+
+
+def test_a_map_that_could_not_be_made_leaves_no_file(tmp_path):
+    code = f"""
+import resource, signal, sys
+sys.path[:0] = {sys.path!r}
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, 10_000))
+from map_writer import SPEC
+from edgevpr.places.mapfile import PlaceMap
+PlaceMap.create({str(tmp_path / "m.gpkg")!r}, SPEC)
+"""
+    made = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert "MapError" in made.stderr.splitlines()[-1]
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("left", ["-wal", "-wal and -shm"])
+def test_a_left_over_log_in_a_folder_that_may_not_be_written_is_read(tmp_path, left):
+    folder = tmp_path / "card"
+    folder.mkdir()
+    writer = subprocess.Popen(
+        [sys.executable, map_writer.__file__, str(folder / "m.gpkg"), "0"], stdout=subprocess.PIPE, text=True
+    )
+    for _ in range(5):
+        writer.stdout.readline()
+    writer.kill()
+    writer.communicate()
+    if left == "-wal":
+        (folder / "m.gpkg-shm").unlink()
+    before = sorted(entry.name for entry in folder.iterdir())
+    for entry in folder.iterdir():
+        entry.chmod(0o444)
+    folder.chmod(0o555)
+    code = f"""
+import os, sys
+sys.path[:0] = {sys.path!r}
+from edgevpr.places.mapfile import PlaceMap
+os.getuid() or os.setuid(65534)  # whom permissions hold for
+with PlaceMap.open({str(folder / "m.gpkg")!r}) as place_map:
+    print(len(place_map), len(list(place_map.coarse_parts())))
+    place_map.require_unchanged()
+"""
+    for parent in (tmp_path, *tmp_path.parents[:2]):
+        parent.chmod(parent.stat().st_mode | 0o055)
+    read = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    folder.chmod(0o755)
+    assert read.returncode == 0, read.stderr
+    counted, parts = map(int, read.stdout.split())
+    assert counted == parts >= 5
+    assert sorted(entry.name for entry in folder.iterdir()) == before
+
+
+def first_format(path):
+    """Make a map of the first format of one of today: without checksums, and without an id."""
+    columns = "place_id, geom, time, alt_m, heading_deg, source_image, quality, coarse, fine"
+    written(
+        path,
+        "DROP TRIGGER places_moved",
+        *(f"ALTER TABLE places DROP COLUMN {part}_crc32" for part in ("geom", "coarse", "fine")),
+        "UPDATE edgevpr_map SET value = '1' WHERE key = 'format_version'",
+        "DELETE FROM edgevpr_map WHERE key = 'map_id'",
+    )
+    with sqlite3.connect(path) as db:
+        assert ", ".join(row[1] for row in db.execute("PRAGMA table_info(places)")) == columns
+    db.close()
+
+
+def test_a_map_of_the_first_format_is_read_added_to_and_merged(map_path, tmp_path):
+    first_format(map_path)
+    with PlaceMap.open_for_adding(map_path) as place_map:
+        assert not place_map.has_checksums
+        place_map.add(frame(41), descriptor(41))
+        index_positions(place_map)
+        assert nearest_m(place_map, Position(50.0041, 8.0), 1.0) == 0
+        place_map.require_unchanged()
+    with PlaceMap.open(map_path) as place_map, PlaceMap.create(tmp_path / "new.gpkg", SPEC) as new:
+        assert len(list(place_map.coarse_parts())) == PLACES + 1
+        np.testing.assert_array_equal(place_map.fine_part(41)[0], descriptor(41).fine)
+        assert {(each.problem, each.has_checksums) for each in examine(place_map)} == {(None, False)}
+        assert absorb(new, place_map) == (PLACES + 1, 0)
+        assert {(each.problem, each.has_checksums) for each in examine(new)} == {(None, True)}
+
+
+@pytest.mark.parametrize("part", ["geom", "coarse", "fine"])
+def test_one_bit_flipped_in_the_file_is_damage(map_path, part):
+    with sqlite3.connect(map_path) as db:
+        (blob,) = db.execute(f"SELECT {part} FROM places WHERE place_id = 7").fetchone()
+    db.close()
+    data = bytearray(map_path.read_bytes())
+    # Of a BLOB that stands on several pages, a stretch that is on one of them.
+    stretches = (blob[start : start + 24] for start in range(0, len(blob), 24))
+    at = next(data.find(stretch) for stretch in stretches if stretch in data)
+    data[at + 15] ^= 1
+    map_path.write_bytes(data)
+    with PlaceMap.open(map_path) as place_map:
+        (broken,) = [each for each in examine(place_map) if each.problem]
+    assert broken.place_id == 7
+    assert "does not match its checksum" in broken.problem
+
+
+def test_a_place_that_was_moved_on_purpose_is_believed(map_path):
+    written(map_path, f"UPDATE places SET geom = x'{point_blob(51.0, 9.0).hex()}' WHERE place_id = 7")
+    with PlaceMap.open(map_path) as place_map:
+        assert {(each.problem, each.has_checksums) for each in examine(place_map)} == {(None, True), (None, False)}
+        (place,) = place_map.places([7])
+        assert place.position == Position(51.0, 9.0, 106.0)
+
+
+def test_a_merge_with_a_damaged_map_says_how_to_repair_it(map_path, tmp_path):
+    written(map_path, "UPDATE places SET fine = x'00' WHERE place_id = 7")
+    with PlaceMap.create(tmp_path / "new.gpkg", SPEC) as new, PlaceMap.open(map_path) as place_map:
+        with pytest.raises(MapError, match="place 7 is damaged"):
+            absorb(new, place_map)
+        assert len(new) == 0
