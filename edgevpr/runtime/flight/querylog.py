@@ -1,10 +1,25 @@
 """The lines of the flight log for events."""
 
+from typing import Any
+
 from edgevpr.frames.source import Source
 from edgevpr.runtime.flight.flightlog import FlightLog
 from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.flight.tally import Tally
 from edgevpr.runtime.recognise.recognition import Recognition, fields_of
+
+
+def totals_of(tally: Tally, meter: FlightMeter, source: Source) -> dict[str, Any]:
+    """Return the counts and costs of the flight so far: queries, those of `FlightMeter.totals`, the pictures that were
+    not read in time (`dropped`) or not new and whole (`refused`, by reason), and the seconds that the newest was old
+    when it could be read (`latency_s`)."""
+    return {
+        "queries": tally.queries,
+        **meter.totals(),
+        "dropped": source.dropped,
+        "refused": dict(source.refused),
+        "latency_s": source.latency_s,
+    }
 
 
 class QueryLog:
@@ -27,5 +42,5 @@ class QueryLog:
             reading=event.steps.read,
             board=self._meter.heat_fields(),
             hints=event.hints.fields() if event.hints else None,
-            totals={"queries": self._tally.queries, **self._meter.totals(), "dropped": self._source.dropped},
+            totals=totals_of(self._tally, self._meter, self._source),
         )
