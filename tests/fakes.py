@@ -65,7 +65,9 @@ class FakeSource:
         self.is_live = is_live
         self.total = 0 if is_live else len(self._left)
         self.dropped = 0 if is_live else None
-        self.is_lost = False
+        self.refused = {"damaged": 0, "patched": 0, "frozen": 0, "late": 0} if is_live else {"damaged": 0}
+        self.latency_s = 0.0 if is_live else None
+        self.is_lost = self.is_frozen = False
         self._read = 0
 
     @property
@@ -76,12 +78,15 @@ class FakeSource:
     def condition(self) -> Condition:
         if self.is_lost:
             return Condition.LOST
+        if self.is_frozen:
+            return Condition.FROZEN
         return Condition.ENDED if self.ended else Condition.RUNNING
 
     @property
     def state(self) -> str:
         words = {
             Condition.LOST: "lost, reopening in 0.5 s",
+            Condition.FROZEN: "frozen: the same picture over and over",
             Condition.ENDED: "ended",
             Condition.RUNNING: "streaming" if self.is_live else "reading",
         }

@@ -11,7 +11,7 @@ from pictures import textured
 
 from edgevpr.errors import ImageError
 from edgevpr.frames.condition import Condition
-from edgevpr.frames.live import LiveSource
+from edgevpr.frames.live import Camera, LiveSource
 from edgevpr.frames.source import open_source
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.link import Link, LinkStats
@@ -71,7 +71,7 @@ def camera(request):
 
     def opened():
         asked.append(1)
-        return FakeCapture(pictures if len(asked) == 1 else [])
+        return Camera(FakeCapture(pictures if len(asked) == 1 else []), time.monotonic)
 
     source = LiveSource(opened, time.monotonic)
     yield source, lambda: None  # it is lost by itself, when its pictures are at an end

@@ -112,13 +112,13 @@ def _is_incomplete(data: bytes) -> bool:
     decoders of the other formats detect damage themselves. Bytes after the end mark are harmless.
     """
     if data.startswith(_JPEG_START):
-        return not _jpeg_is_whole(data)
+        return not jpeg_is_whole(data)
     if data.startswith(_PNG_START):
         return not _png_is_whole(data)
     return False
 
 
-def _jpeg_is_whole(data: bytes) -> bool:
+def jpeg_is_whole(data: bytes) -> bool:
     """Walk from marker to marker (ITU-T T.81, annex B); return True where the end mark of the image is reached.
 
     Segments are skipped by their length, so that the end mark of an EXIF thumbnail is not taken for the image's.

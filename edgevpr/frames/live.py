@@ -4,27 +4,41 @@ import contextlib
 import threading
 from collections.abc import Callable
 
-import numpy as np
-
 from edgevpr.frames.condition import Condition
+from edgevpr.frames.newness import Newness, coarse
 from edgevpr.frames.opencv import cv2
+from edgevpr.frames.shot import Capture, Refusal, Shot
 from edgevpr.types import Frame
 
-_OPEN_TIMEOUT_MS = 5000
-_READ_TIMEOUT_MS = 3000
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.5, 10.0
 _CLOSE_TIMEOUT_S = 1.0
+_FROZEN_S, _FROZEN_PICTURES = 1.0, 3  # the second for a camera that takes less than three pictures a second
+_DAMAGED_S = 5.0  # longer than streams need to recover from a lost packet
 
 
-def open_stream(uri: str) -> cv2.VideoCapture:
-    """Open a network stream with time-outs: without them FFmpeg would wait for ever."""
-    timeouts = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _OPEN_TIMEOUT_MS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _READ_TIMEOUT_MS]
-    return cv2.VideoCapture(uri, cv2.CAP_FFMPEG, timeouts)
-
-
-def open_camera(device: str) -> cv2.VideoCapture:
+def open_camera(device: str, clock: Callable[[], float]) -> "Camera":
     """Open a V4L2 device (/dev/video0, /dev/v4l/by-id/...)."""
-    return cv2.VideoCapture(device, cv2.CAP_V4L2)
+    return Camera(cv2.VideoCapture(device, cv2.CAP_V4L2), clock)
+
+
+class Camera:
+    """A camera that OpenCV has opened, which decodes its pictures itself and says of none that it is damaged."""
+
+    def __init__(self, capture: cv2.VideoCapture, clock: Callable[[], float]) -> None:
+        self._capture, self._clock = capture, clock
+
+    def read(self) -> Shot | None:
+        """Wait for the next picture and return it; None where the camera is lost: `isOpened` stays true."""
+        with contextlib.suppress(cv2.error):  # a picture that cannot be converted counts as a loss
+            there, image = self._capture.read()
+            if there:
+                plane = image if image.ndim == 2 else image[:, :, 1]
+                return Shot(t_mono_s=self._clock(), look=coarse(plane), pixels=lambda: image)
+        return None
+
+    def release(self) -> None:
+        """Close the device."""
+        self._capture.release()
 
 
 def wait_before_reopening_s(failures: int) -> float:
@@ -33,7 +47,8 @@ def wait_before_reopening_s(failures: int) -> float:
 
 
 class LiveSource:
-    """The newest frame of the capture that `open_capture` opens. Frames not read in time are counted in `dropped`.
+    """The newest frame of the capture that `open_capture` opens (it gives None where nothing is there). Frames not read
+    in time are counted in `dropped`, those that are not new and whole in `refused`, by their reason.
 
     Only the capture thread touches the capture, from opening to release: a call into a stream that hangs cannot be
     interrupted. `close` waits one second, then leaves the thread to its time-out.
@@ -42,15 +57,19 @@ class LiveSource:
     is_live = True
     total = 0
 
-    def __init__(self, open_capture: Callable[[], cv2.VideoCapture], clock: Callable[[], float]):
+    def __init__(self, open_capture: Callable[[], Capture | None], clock: Callable[[], float]):
         self._condition, self.state = Condition.OPENING, "opening"
         self.ended = False
         self.dropped = 0
+        self.refused = {reason.value: 0 for reason in Refusal}
+        self.latency_s: float | None = None
         self._open_capture = open_capture
         self._clock = clock
         self._t_start_s = clock()
-        self._captured = 0
-        self._newest: Frame | None = None
+        self._captured = self._same = 0
+        self._last_new_s = self._t_start_s
+        self._last_taken_s = float("-inf")
+        self._newest: tuple[int, Shot] | None = None
         self._arrived = threading.Condition()
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._capture, name="capture", daemon=True)
@@ -64,8 +83,12 @@ class LiveSource:
         """Return the newest frame, if it was not read before; None where none comes within `timeout_s`."""
         with self._arrived:
             self._arrived.wait_for(lambda: self._newest is not None, timeout_s)
-            frame, self._newest = self._newest, None
-            return frame
+            newest, self._newest = self._newest, None
+        if newest is None:
+            return None
+        number, shot = newest
+        name = f"frame {number:06d} t={shot.t_mono_s - self._t_start_s:.3f} s"
+        return Frame(image=shot.pixels(), name=name, t_mono_s=shot.t_mono_s)
 
     def close(self) -> None:
         """End the capture, within about a second."""
@@ -78,30 +101,45 @@ class LiveSource:
         while not self._closing.is_set():
             before = self._captured
             capture = self._open_capture()
-            with contextlib.suppress(cv2.error):  # a picture that cannot be converted counts as a loss
-                self._take_frames(capture)
-            capture.release()
+            if capture is not None:
+                self._take_pictures(capture)
+                capture.release()
             failures = 1 if self._captured > before else failures + 1
             wait_s = wait_before_reopening_s(failures)
             self._condition = Condition.LOST
             self.state = f"{'lost' if self._captured else 'nothing there'}, reopening in {wait_s:g} s"
             self._closing.wait(wait_s)
 
-    def _take_frames(self, capture: cv2.VideoCapture) -> None:
+    def _take_pictures(self, capture: Capture) -> None:
+        newness, self._same, self._last_new_s = Newness(), 0, self._clock()
         while not self._closing.is_set():
-            there, image = capture.read()
-            if not there:  # the only sign of a lost source: `isOpened` stays true
+            shot = capture.read()
+            if shot is None:
                 return
-            self._condition, self.state = Condition.RUNNING, "streaming"
-            self._put(image)
+            refusal = shot if isinstance(shot, Refusal) else newness.refusal(shot.look)
+            if refusal is None and shot.t_mono_s < self._last_taken_s:
+                refusal = Refusal.LATE
+            if refusal is None:
+                self._put(shot)
+            else:
+                self._refuse(refusal)
 
-    def _put(self, image: np.ndarray) -> None:
-        t_mono_s = self._clock()
-        frame = Frame(
-            image=image, name=f"frame {self._captured:06d} t={t_mono_s - self._t_start_s:.3f} s", t_mono_s=t_mono_s
-        )
-        self._captured += 1
+    def _put(self, shot: Shot) -> None:
+        now_s = self._clock()
+        self._condition, self.state = Condition.RUNNING, "streaming"
+        self.latency_s = now_s - shot.t_mono_s
+        self._same, self._last_new_s, self._last_taken_s = 0, now_s, shot.t_mono_s
         with self._arrived:
             self.dropped += self._newest is not None
-            self._newest = frame
+            self._newest = self._captured, shot
+            self._captured += 1
             self._arrived.notify()
+
+    def _refuse(self, refusal: Refusal) -> None:
+        self.refused[refusal.value] += 1
+        self._same = self._same + 1 if refusal is Refusal.FROZEN else 0
+        silent_s = self._clock() - self._last_new_s
+        if self._same >= _FROZEN_PICTURES and silent_s > _FROZEN_S:
+            self._condition, self.state = Condition.FROZEN, "frozen: the same picture over and over"
+        elif not self._same and silent_s > _DAMAGED_S:
+            self._condition, self.state = Condition.DAMAGED, "damaged: no picture is whole"

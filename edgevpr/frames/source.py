@@ -4,15 +4,16 @@ import os
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 from urllib.parse import urlsplit
 
 from edgevpr.config import SOURCES
 from edgevpr.errors import SourceError, UsageError
 from edgevpr.frames.condition import Condition
 from edgevpr.frames.images import EXTENSIONS
-from edgevpr.frames.live import LiveSource, open_camera, open_stream
-from edgevpr.frames.recordings import FolderSource, VideoSource
+from edgevpr.frames.live import LiveSource, open_camera
+from edgevpr.frames.recordings import FolderSource
+from edgevpr.frames.shot import Capture
 from edgevpr.types import Frame
 
 _SCHEMES = ("rtsp", "rtsps", "udp", "tcp", "http", "https")
@@ -24,8 +25,10 @@ class Source(Protocol):
 
     `is_live`: pictures are taken while they are read, and the newest counts; a recording is read in order to its end.
     `ended`: no more frames will come. `total`: approximate number of frames, 0 where unknown. `dropped`: number of
-    pictures not read in time, None for a recording, which drops none. `condition`: the condition for programs. `state`:
-    the same in a few words for people ("reading", "streaming", "lost, reopening in 2 s")."""
+    pictures not read in time, None for a recording, which drops none. `refused`: numbers of pictures that were not new
+    and whole, by the reason. `latency_s`: seconds from the taking of the newest picture until it could be read, None
+    where unknown. `condition`: the condition for programs. `state`: the same in a few words for people ("reading",
+    "streaming", "lost, reopening in 2 s")."""
 
     is_live: bool
 
@@ -37,6 +40,12 @@ class Source(Protocol):
 
     @property
     def dropped(self) -> int | None: ...
+
+    @property
+    def refused(self) -> dict[str, int]: ...
+
+    @property
+    def latency_s(self) -> float | None: ...
 
     @property
     def condition(self) -> Condition: ...
@@ -79,11 +88,13 @@ def open_source(
     if is_live(uri):
         if not live:
             raise SourceError(f"{uri} is live and never ends: give a folder of images or a video file here.")
-        return LiveSource(_capture_of(uri), clock)
+        return LiveSource(_capture_of(uri, clock), clock)
     if not path.is_file():
         raise SourceError(f"There is nothing at `{uri}`: give {SOURCES}.")
     if path.name.lower().endswith(EXTENSIONS):
         raise SourceError(f"{uri} is a single image: give the folder that holds it.")
+    from edgevpr.frames.video import VideoSource  # loads FFmpeg
+
     return VideoSource(path, step_s or 0.0, clock)
 
 
@@ -93,7 +104,7 @@ def is_live(uri: str) -> bool:
     return "://" in uri or is_device or uri.lower().endswith(".sdp")
 
 
-def _capture_of(uri: str) -> Callable[[], Any]:
+def _capture_of(uri: str, clock: Callable[[], float]) -> Callable[[], Capture | None]:
     """Return the function that opens the camera or stream; raises SourceError for one that can never be opened."""
     if "://" in uri:
         _check_address(uri)
@@ -104,12 +115,10 @@ def _capture_of(uri: str) -> Callable[[], Any]:
             f"{uri} may not be read by this user: add the user to the group that owns it (often `video`)."
         )
     elif uri.startswith("/dev/"):
-        return lambda: open_camera(uri)
-    else:
-        # FFmpeg connects to the addresses in an .sdp file only if these protocols are allowed, and OpenCV passes on
-        # such options from the environment only.
-        os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", "protocol_whitelist;file,rtp,udp")
-    return lambda: open_stream(uri)
+        return lambda: open_camera(uri, clock)
+    from edgevpr.frames.streams import open_stream  # loads FFmpeg
+
+    return lambda: open_stream(uri, clock)
 
 
 def _check_address(uri: str) -> None:

@@ -1,6 +1,5 @@
 """Live sources on real streams. What is asserted is what happens and in which order, never how fast."""
 
-import os
 import queue
 import socket
 import threading
@@ -10,8 +9,8 @@ import numpy as np
 import pytest
 
 from edgevpr.errors import SourceError
-from edgevpr.frames import live
-from edgevpr.frames.live import LiveSource, wait_before_reopening_s
+from edgevpr.frames import streams
+from edgevpr.frames.live import Camera, LiveSource, wait_before_reopening_s
 from edgevpr.frames.source import open_source
 
 PATIENCE_S = 60.0
@@ -28,7 +27,7 @@ def cameras():
 @pytest.fixture
 def opened(monkeypatch):
     """open_source for live sources, with a short read time-out; closed at the end."""
-    monkeypatch.setattr(live, "_READ_TIMEOUT_MS", 700)
+    monkeypatch.setattr(streams, "READ_TIMEOUT_S", 0.7)
     sources = []
 
     def open_live(uri):
@@ -98,16 +97,12 @@ def test_a_slow_reader_gets_the_newest_frame_of_a_stream(cameras, opened):
 
 
 def test_rtp_described_by_an_sdp_file_is_shown(cameras, opened, tmp_path):
-    options_before = os.environ.pop("OPENCV_FFMPEG_CAPTURE_OPTIONS", None)
     camera = cameras.RtpCamera(tmp_path)
     camera.switch_on()
     try:
         assert next_frame(opened(camera.uri)).image.shape == (cameras.HEIGHT, cameras.WIDTH, 3)
     finally:
         camera.switch_off()
-        os.environ.pop("OPENCV_FFMPEG_CAPTURE_OPTIONS")
-        if options_before is not None:
-            os.environ["OPENCV_FFMPEG_CAPTURE_OPTIONS"] = options_before
 
 
 def test_a_stream_that_is_not_there_at_the_start_is_waited_for_in_silence(opened, capfd):
@@ -161,16 +156,16 @@ class SteppedCamera:
 
 
 def test_the_newest_frame_wins_and_the_others_are_counted():
-    camera = SteppedCamera()
-    source = LiveSource(lambda: camera, clock=iter(range(100)).__next__)
+    camera, clock = SteppedCamera(), iter(range(100)).__next__
+    source = LiveSource(lambda: Camera(camera, clock), clock)
     for value in range(5):
-        camera.pictures.put(np.full((20, 20, 3), value, np.uint8))
+        camera.pictures.put(np.full((20, 20, 3), 9 * value, np.uint8))
     for _ in range(6):  # the sixth call means that the fifth picture has been put away
         camera.taken.acquire()
     frame = source.read(0)
-    assert frame.image[0, 0, 0] == 4
-    assert frame.name == "frame 000004 t=5.000 s"
-    assert frame.t_mono_s == 5
+    assert frame.image[0, 0, 0] == 36
+    assert frame.name == "frame 000004 t=10.000 s"
+    assert frame.t_mono_s == 10
     assert source.dropped == 4
     assert source.read(0) is None
     camera.pictures.put(None)
@@ -180,7 +175,7 @@ def test_the_newest_frame_wins_and_the_others_are_counted():
 def test_the_capture_is_released_by_the_thread_that_reads_it_and_opened_anew():
     cameras = [SteppedCamera(), SteppedCamera()]
     waiting = iter(cameras)
-    source = LiveSource(lambda: next(waiting), clock=time.monotonic)
+    source = LiveSource(lambda: Camera(next(waiting), time.monotonic), time.monotonic)
     cameras[0].pictures.put(np.zeros((20, 20, 3), np.uint8))
     cameras[0].pictures.put(None)
     assert cameras[0].released.wait(PATIENCE_S)

@@ -1,6 +1,7 @@
 """A flight: wires the listeners to the loop, with everything that has been opened for it, and runs the loop."""
 
 from dataclasses import dataclass
+from typing import Any
 
 from edgevpr.config import Config
 from edgevpr.frames.source import Source
@@ -14,7 +15,7 @@ from edgevpr.runtime.flight.loop import Observer, Stop, loop
 from edgevpr.runtime.flight.mapstate import MapState
 from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.flight.pace import Pace
-from edgevpr.runtime.flight.querylog import QueryLog
+from edgevpr.runtime.flight.querylog import QueryLog, totals_of
 from edgevpr.runtime.flight.tally import Tally
 from edgevpr.runtime.flight.vitals import Vitals
 from edgevpr.runtime.recognise.learn import Learner
@@ -23,12 +24,12 @@ from edgevpr.runtime.recognise.recogniser import Recogniser
 
 @dataclass(frozen=True, slots=True)
 class Flown:
-    """Result of a flight: counts of its events, and `totals` of what it took (see `FlightMeter.totals`)."""
+    """Result of a flight: counts of its events, and `totals` of what it took (see `querylog.totals_of`)."""
 
     queries: int
     accepted: int
     failed: int
-    totals: dict[str, float | int | None]
+    totals: dict[str, Any]
 
 
 def rate_hz(config: Config, recogniser: Recogniser) -> float:
@@ -85,7 +86,11 @@ def fly(
             lambda: map_state.summary,
         ),
     )
-    observers: list[Observer] = [tally, map_state, QueryLog(flight_log, source, meter, tally, map_state=map_state)]
+
+    def totals() -> dict[str, Any]:
+        return totals_of(tally, meter, source, map_state)
+
+    observers: list[Observer] = [tally, map_state, QueryLog(flight_log, meter, totals)]
     if learner:
         observers.append(Learning(learner, flight_log, autopilot))
     try:
@@ -103,5 +108,4 @@ def fly(
         )
     finally:
         meter.close()
-    totals = {"queries": tally.queries, **meter.totals(), "dropped": source.dropped, "left_out": map_state.left_out}
-    return Flown(tally.queries, tally.accepted, tally.unusable + tally.failed, totals)
+    return Flown(tally.queries, tally.accepted, tally.unusable + tally.failed, totals())

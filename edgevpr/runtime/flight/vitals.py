@@ -14,13 +14,15 @@ from edgevpr.runtime.flight.systemd import notify, watchdog_interval_s
 from edgevpr.runtime.flight.tally import FAILURES_IN_A_ROW, Tally
 
 _HEALTH_S = 1.0
+_TROUBLES = {Condition.LOST: "lost", Condition.FROZEN: "frozen", Condition.DAMAGED: "damaged"}
 
 _log = logging.getLogger(__name__)
 
 
 class Vitals:
     """Tells systemd that the loop turns and how the flight goes, and the autopilot how this companion computer is. It
-    tells everybody, once, when the camera is lost or nothing can be recognised any more, and when that is over.
+    tells everybody, once, when the camera is lost, frozen or damaged, or nothing can be recognised any more, and when
+    that is over.
     `remarks` are added to systemd's status."""
 
     def __init__(
@@ -38,7 +40,8 @@ class Vitals:
         self._meter, self._tally, self._clock, self._remarks = meter, tally, clock, remarks
         self._watchdog_s = watchdog_interval_s()
         self._watchdog_due_s = self._health_due_s = clock.mono_s()
-        self._is_lost = self._is_failing = False
+        self._trouble: str | None = None
+        self._is_failing = False
 
     def beat(self) -> None:
         """Send the watchdog's beat and the report, where they are due."""
@@ -57,17 +60,16 @@ class Vitals:
         counts = f"{self._tally.queries} queries, {self._tally.accepted} accepted, {self._meter.used_mah:.2f} mAh"
         remarks = (remark() for remark in self._remarks)
         notify(STATUS="; ".join(filter(None, (self._source.state, counts, *remarks, self._flight_log.state))))
-        healthy = not (self._is_lost or self._is_failing)
+        healthy = not (self._trouble or self._is_failing)
         self._autopilot.report(healthy, machine_load(), self._meter.thermal.temperature_c)
 
     def _say_source(self) -> None:
-        is_lost = self._source.condition is Condition.LOST
-        if is_lost != self._is_lost:
-            self._is_lost = is_lost
+        trouble = _TROUBLES.get(self._source.condition)
+        if trouble != self._trouble:
+            self._trouble = trouble
             _log.warning("source: %s", self._source.state)
-            self._flight_log.write("source", state=self._source.state)
-            text = f"camera {'lost' if is_lost else 'is back'}"
-            self._autopilot.announce(Mood.WARNING if is_lost else Mood.NOTE, text)
+            self._flight_log.write("source", state=self._source.state, refused=self._source.refused)
+            self._autopilot.announce(Mood.WARNING if trouble else Mood.NOTE, f"camera {trouble or 'is back'}")
 
     def _say_failures(self) -> None:
         is_failing = self._tally.is_failing

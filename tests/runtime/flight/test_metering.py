@@ -3,13 +3,14 @@
 import random
 
 import cv2
+import numpy as np
 import pytest
 from fakes import FakeCapture, FakeClock, FakeLink, FakeSource
 from flight_process import start
 from flights import PLACES, Flight, flight_meter, of_kind
 from pictures import textured
 
-from edgevpr.frames.live import LiveSource
+from edgevpr.frames.live import Camera, LiveSource
 from edgevpr.power.thermal import ThermalState
 from edgevpr.runtime.flight.flightlog import read_log
 
@@ -115,7 +116,8 @@ def test_heat_is_logged_and_told_and_a_throttled_boards_figures_are_marked(recor
 def test_frames_that_nobody_took_are_counted(recording, tmp_path):
     """The real capture thread, which takes twelve pictures before the loop asks for each next one."""
     clock, picture = FakeClock(), cv2.cvtColor(PICTURE, cv2.COLOR_GRAY2BGR)
-    source = LiveSource(lambda: FakeCapture([picture] * 12), clock)
+    pictures = [np.roll(picture, 9 * number, axis=1) for number in range(12)]
+    source = LiveSource(lambda: Camera(FakeCapture(pictures), clock), clock)
     flight = Flight(recording / "hog.gpkg", tmp_path / "log", clock, **{"source.rate_hz": 5.0})
 
     class Patient:
@@ -123,7 +125,8 @@ def test_frames_that_nobody_took_are_counted(recording, tmp_path):
 
         is_live, total, ended = True, 0, False
         condition, state = property(lambda self: source.condition), property(lambda self: source.state)
-        dropped = property(lambda self: source.dropped)
+        dropped, refused = property(lambda self: source.dropped), property(lambda self: source.refused)
+        latency_s = property(lambda self: source.latency_s)
         reads = 0
 
         def read(self, timeout_s):

@@ -1,0 +1,114 @@
+"""Decoding with FFmpeg (PyAV), which tells what OpenCV hides: packets that were lost, pictures that are not whole.
+
+Only what opens a stream or a video file imports this: the library takes room.
+"""
+
+import logging
+from typing import TYPE_CHECKING
+
+import av
+import av.logging
+import numpy as np
+from av.video.reformatter import VideoReformatter
+
+from edgevpr.frames.images import jpeg_is_whole
+from edgevpr.frames.shot import Refusal
+
+if TYPE_CHECKING:
+    from av.container import InputContainer
+    from av.packet import Packet
+    from av.video.frame import VideoFrame
+
+# FFmpeg's messages are listened to for packets that went missing; what else it says is said in edgevpr's own words.
+av.logging.set_level(av.logging.WARNING)
+av.logging.set_skip_repeated(False)
+logging.getLogger("libav").setLevel(logging.CRITICAL + 1)
+_MISSED = "missed"  # "RTP: missed 3 packets", the only sign of it
+
+_PACKETS_IN_DOUBT = 2
+_UNSTAMPED = 0x80  # AVFMT_NOTIMESTAMPS of FFmpeg: what looks like a time stamp has been made up from a frame rate
+
+
+def open_container(
+    uri: str, options: dict[str, str], timeouts_s: tuple[float, float] | None = None
+) -> "InputContainer | None":
+    """Open a stream or file with FFmpeg's options, and the time-outs for opening and for every reading; None where
+    nothing is there that holds pictures."""
+    try:
+        container = av.open(uri, options=options, timeout=timeouts_s)
+    except (av.FFmpegError, OSError, ValueError):
+        return None
+    if container.streams.video:
+        return container
+    container.close()
+    return None
+
+
+def is_stamped(container: "InputContainer") -> bool:
+    """Tell whether the pictures have time stamps of their own."""
+    return not container.format.flags & _UNSTAMPED
+
+
+class WholePictures:
+    """The pictures of one container that are whole: `fetch` a packet, then `decode` it. A picture that is damaged, and
+    all that are predicted from it until the next one that stands alone, are refused before they cost anything."""
+
+    def __init__(self, container: "InputContainer") -> None:
+        self._container, self.stream = container, container.streams.video[0]
+        self._codec = self.stream.codec_context
+        self._codec.thread_count = 1  # pictures decoded side by side come late, and each takes memory
+        self._codec.options = {"err_detect": "explode"}  # what cannot be decoded is not filled in
+        self._packets = container.demux(self.stream)
+        self._reformatter = VideoReformatter()
+        self._doubtful = 0  # so many packets from now on are not to be trusted
+        self._has_begun = self._is_sound = False
+
+    def fetch(self) -> "Packet | None":
+        """Wait for the next packet and return it; None at the end, and where the stream is lost."""
+        with av.logging.Capture() as said:
+            try:
+                packet = next(self._packets, None)
+            except (av.FFmpegError, OSError):
+                return None
+        if packet is not None and (packet.is_corrupt or any(_MISSED in message for _, _, message in said)):
+            # FFmpeg notices a gap while it puts together the picture after the one that it hands out.
+            self._doubtful = _PACKETS_IN_DOUBT
+        return packet
+
+    def decode(self, packet: "Packet") -> "list[VideoFrame] | Refusal":
+        """Return the pictures that are ready after this packet: none, one, or at the end several."""
+        if not packet.size:
+            return self._decoded(packet) if self._is_sound else []
+        if self._doubtful:
+            self._doubtful -= 1
+            return self._refuse()
+        if not self._is_sound:
+            if not packet.is_keyframe:
+                return self._refuse()
+            if self._has_begun:
+                self._codec.flush_buffers()
+            self._has_begun = self._is_sound = True
+        if self._codec.name == "mjpeg" and not jpeg_is_whole(bytes(packet)):
+            return self._refuse()
+        return self._decoded(packet)
+
+    def pixels(self, picture: "VideoFrame", form: str = "bgr24") -> np.ndarray:
+        """Return the pixels of a picture, uint8: (H, W, 3) BGR, or (H, W) for the form "gray". Maps and queries go
+        through this alike, so that the same picture gives the same pixels."""
+        return self._reformatter.reformat(picture, format=form, interpolation="BICUBIC").to_ndarray()
+
+    def close(self) -> None:
+        """Close the file or the connection."""
+        self._container.close()
+
+    def _decoded(self, packet: "Packet") -> "list[VideoFrame] | Refusal":
+        with av.logging.Capture():
+            try:
+                pictures = self._codec.decode(packet)
+            except av.FFmpegError:
+                return self._refuse()
+        return self._refuse() if any(picture.is_corrupt for picture in pictures) else pictures
+
+    def _refuse(self) -> Refusal:
+        self._is_sound = False
+        return Refusal.DAMAGED if self._has_begun else Refusal.LATE  # joined in its midst, a stream is not damaged

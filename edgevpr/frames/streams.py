@@ -1,0 +1,79 @@
+"""Network streams, decoded by FFmpeg: every picture is whole, and is as old as its time stamp says."""
+
+from collections import deque
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from edgevpr.frames.age import StampedTime, UnstampedTime
+from edgevpr.frames.decoding import WholePictures, is_stamped, open_container
+from edgevpr.frames.newness import coarse
+from edgevpr.frames.shot import Refusal, Shot
+
+if TYPE_CHECKING:
+    from av.container import InputContainer
+    from av.video.frame import VideoFrame
+
+OPEN_TIMEOUT_S = 5.0
+READ_TIMEOUT_S = 3.0
+# RTSP over its own connection loses nothing; FFmpeg connects to the addresses in an .sdp file only where it is allowed.
+_OPTIONS = {"rtsp_transport": "tcp"}
+_BYTES_OF_LUMA = ("yuv", "nv12", "nv21", "gray")  # pixel formats that begin with a plane of brightness
+_SDP_OPTIONS = {"protocol_whitelist": "file,rtp,udp"}
+
+
+def open_stream(uri: str, clock: Callable[[], float]) -> "StreamCapture | None":
+    """Open a network stream or an .sdp file with time-outs; None where nothing is there."""
+    opened_s = clock()
+    options = _OPTIONS if "://" in uri else _SDP_OPTIONS
+    container = open_container(uri, options, (OPEN_TIMEOUT_S, READ_TIMEOUT_S))
+    return StreamCapture(container, clock, opened_s) if container else None
+
+
+class StreamCapture:
+    """The pictures of an open stream."""
+
+    def __init__(self, container: "InputContainer", clock: Callable[[], float], opened_s: float) -> None:
+        self._whole, self._clock = WholePictures(container), clock
+        self._unit_s = float(self._whole.stream.time_base)
+        self._stamped = StampedTime() if is_stamped(container) else None
+        self._unstamped = UnstampedTime(opened_s)
+        self._ready: deque[Shot | Refusal] = deque()
+
+    def read(self) -> Shot | Refusal | None:
+        """Wait for the next picture and return it, or the reason why it is refused; None where the stream is lost."""
+        while not self._ready:
+            asked_s = self._clock()
+            packet = self._whole.fetch()
+            arrived_s = self._clock()
+            if packet is None:
+                return None
+            came_s = self._unstamped.taken_s(asked_s, arrived_s)
+            if self._stamped and packet.pts is not None:
+                order = packet.pts if packet.dts is None else packet.dts
+                self._stamped.arrived(packet.pts * self._unit_s, order * self._unit_s, arrived_s)
+            pictures = self._whole.decode(packet)
+            if isinstance(pictures, Refusal):
+                return pictures
+            self._ready.extend(self._shot(picture, came_s, arrived_s) for picture in pictures)
+        return self._ready.popleft()
+
+    def release(self) -> None:
+        """Close the connection."""
+        self._whole.close()
+
+    def _shot(self, picture: "VideoFrame", came_s: float, arrived_s: float) -> Shot | Refusal:
+        if self._stamped and picture.pts is not None:
+            taken_s = self._stamped.taken_s(picture.pts * self._unit_s, arrived_s)
+            if taken_s is None:
+                return Refusal.LATE
+        else:
+            taken_s = came_s
+        return Shot(t_mono_s=taken_s, look=self._look(picture), pixels=lambda: self._whole.pixels(picture))
+
+    def _look(self, picture: "VideoFrame") -> np.ndarray:
+        if not picture.format.name.startswith(_BYTES_OF_LUMA) or picture.format.components[0].bits != 8:
+            return coarse(self._whole.pixels(picture, "gray"))
+        plane = picture.planes[0]
+        return coarse(np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: picture.height, : picture.width])

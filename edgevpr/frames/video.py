@@ -1,0 +1,120 @@
+"""A video file, read in order to its end; what is damaged or missing in it is said."""
+
+import math
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from edgevpr.errors import ImageError, SourceError
+from edgevpr.frames.decoding import WholePictures, is_stamped, open_container
+from edgevpr.frames.recordings import Recording
+from edgevpr.frames.shot import Refusal
+from edgevpr.types import Frame
+
+if TYPE_CHECKING:
+    from av.container import InputContainer
+    from av.video.frame import VideoFrame
+
+_TIMESTAMP_ROUNDING_S = 0.001  # Matroska counts in milliseconds
+_USUAL_RATE_HZ = 25.0
+_CUT_S = 1.0  # so much may be missing at the end: other streams in the file last a little longer
+
+
+class VideoSource(Recording):
+    """The frames of a video file, at least `step_s` seconds of video time apart: the same frames in every run.
+
+    Damaged frames, and those predicted from them, are left out. `read` raises ImageError once for every stretch of
+    them, and once for an end that is missing."""
+
+    def __init__(self, path: Path, step_s: float, clock: Callable[[], float]):
+        super().__init__()
+        self.ended = False
+        self._path, self._step_s, self._clock = path, step_s, clock
+        container = open_container(str(path), {})
+        if container is None:
+            raise SourceError(f"{path} is not a video that can be decoded: give a video file or a folder of images.")
+        self._whole, stream = WholePictures(container), container.streams.video[0]
+        self._unit_s, self._first_stamp = float(stream.time_base), stream.start_time or 0
+        self._frame_s = 1 / float(stream.average_rate or _USUAL_RATE_HZ)
+        self._promised_s, self._is_stamped = _promised_s(container), is_stamped(container)
+        frames = stream.frames or self._promised_s / self._frame_s
+        self._promised_s = max(self._promised_s, stream.frames * self._frame_s)  # an AVI file says only this when cut
+        self.total = math.ceil(frames * self._frame_s / max(step_s, self._frame_s))
+        self._ready: deque[VideoFrame] = deque()
+        self._index, self._damaged = -1, 0
+        self._t_s = -self._frame_s
+        self._t_due_s = self._heard_s = 0.0
+
+    def read(self, timeout_s: float) -> Frame | None:
+        """Return the next frame that is due; None at the end, or where decoding takes longer than `timeout_s`."""
+        deadline_s = self._clock() + timeout_s
+        while not self.ended:
+            if not self._ready:
+                self._decode_more()
+            elif self._damaged:
+                self._tell_damaged()
+            elif self._advance(picture := self._ready.popleft()):
+                self._t_due_s = self._t_s + self._step_s
+                name = f"frame {self._index:06d} t={self._t_s:.3f} s"
+                return Frame(image=self._whole.pixels(picture), name=name, t_mono_s=self._clock())
+            if self._clock() >= deadline_s:
+                break
+        return None
+
+    def close(self) -> None:
+        self.ended = True
+        self._whole.close()
+
+    def _decode_more(self) -> None:
+        packet = self._whole.fetch()
+        if packet is None:
+            self._end()
+            return
+        if packet.pts is not None:
+            self._heard_s = max(self._heard_s, (packet.pts - self._first_stamp) * self._unit_s)
+        pictures = self._whole.decode(packet)
+        if isinstance(pictures, Refusal):
+            self._damaged += 1
+        else:
+            self._ready.extend(pictures)
+
+    def _advance(self, picture: "VideoFrame") -> bool:
+        """Advance to this picture, and tell whether it is due."""
+        self._index += 1
+        stamp = picture.pts or 0
+        if not self._index:
+            self._first_stamp = stamp
+        stamp_s = (stamp - self._first_stamp) * self._unit_s
+        # A bare H.264 or MJPEG file has no time stamps (they read as zero or are wrong): the frame rate is used.
+        self._t_s = stamp_s if stamp_s > self._t_s else self._t_s + self._frame_s
+        return self._t_s >= self._t_due_s - _TIMESTAMP_ROUNDING_S
+
+    def _tell_damaged(self, until: str = "") -> None:
+        count, first, t_s = self._damaged, self._index + 1, self._t_s + self._frame_s
+        self.refused[Refusal.DAMAGED.value] += count
+        self._damaged, self._index = 0, self._index + count
+        self._t_s += 0.0 if self._is_stamped else count * self._frame_s
+        which = f"frame {first:06d} (t={t_s:.1f} s)" + (f" and {count - 1} after it" if count > 1 else "")
+        raise ImageError(
+            f"{self._path}: {which} cannot be used, being damaged or built on damage{until}: copy the video again."
+        )
+
+    def _end(self) -> None:
+        if self._damaged:
+            self._tell_damaged(until=", to the end of the file, which may be cut short")
+        self.ended = True
+        seen_s = self._heard_s + self._frame_s
+        if self._promised_s - seen_s > _CUT_S:
+            raise ImageError(
+                f"{self._path} ends after {seen_s:.1f} s of {self._promised_s:.1f} s: it is cut short: copy the "
+                "video again."
+            )
+
+
+def _promised_s(container: "InputContainer") -> float:
+    """Return the seconds that the file says it lasts; 0 where it does not say."""
+    if not is_stamped(container):
+        return 0.0
+    stream = container.streams.video[0]
+    return float(stream.duration * stream.time_base) if stream.duration else (container.duration or 0) / 1e6
