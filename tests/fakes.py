@@ -33,6 +33,9 @@ class FakeClock:
     def __call__(self) -> float:
         return self.now_s
 
+    def utc_s(self) -> float:
+        return 1.7e9 + self.now_s
+
     def at(self, t_s: float, act: Callable[[], object]) -> None:
         """Let `act` happen `t_s` seconds from now."""
         self._events = sorted([*self._events, (self.now_s + t_s, act)], key=lambda event: event[0])

@@ -52,7 +52,7 @@ class Bench:
             rule=AcceptRule(0.0, 0.0, 50.0),
             meter=meter_of(load_config(None), load_board("this")),
         )
-        self.learner = Learner(self.recogniser, self.growing, SPACING_M, self.clock.clock.utc_s)
+        self.learner = Learner(self.recogniser, self.growing, SPACING_M, self.clock.utc_s)
 
     def see(self, north_m=0.0, heard_s_ago=0.1, has_gps=True, fix=None, quality=0.9, position=None, failed=False):
         """Show a frame, at a place that the autopilot or the frame itself tells; `fix` is whether its own was sent."""
