@@ -83,10 +83,10 @@ def run_match(args: Namespace) -> int:
         for each in found:
             error = f"{each['error_m']:8.1f}" if "error_m" in each else "       -"
             yes = "yes" if each["accepted"] else "no"
-            print(
-                f"{each['query']:<28} {each['place']:>6} {each['reference_image']:<28} {each['score']:6.3f}  {yes:<8}"
-                f" {error}"
-            )
+            found_place = f"{'-':>6} {'(' + each['reason'].partition(':')[0] + ')':<28} {'-':>6}"
+            if each["place"] is not None:
+                found_place = f"{each['place']:>6} {each['reference_image']:<28} {each['score']:6.3f}"
+            print(f"{each['query']:<28} {found_place}  {yes:<8} {error}")
         print(f"{len(found)} queries, {sum(each['accepted'] for each in found)} accepted")
         if weights := weights_of(recogniser.technique.spec):
             print(f"Weights of {weights}.")

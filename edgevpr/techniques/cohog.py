@@ -199,7 +199,12 @@ class CoHog:
         numbers, regions = asking
         best = (regions @ reference.T).argmax(axis=1)
         found = displacement(numbers, best, self._side, _VOTES_COUNT[self._camera])
-        return FineMatch(found.share, found.shift_cells, found.covariance_cells2)
+        return FineMatch(
+            found.share,
+            shift_cells=found.shift_cells,
+            covariance_cells2=found.covariance_cells2,
+            coverage=found.agreeing / len(reference),
+        )
 
 
 def _require(what: str, value: str, allowed) -> None:

@@ -18,12 +18,12 @@ from edgevpr.frames.exif import read_exif
 from edgevpr.frames.images import list_images
 from edgevpr.frames.positions import find_positions
 from edgevpr.places.growing import GrowingIndex
+from edgevpr.runtime.recognise.gate import MIN_QUALITY
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.types import Frame, Place, Position, Vehicle
 
 _ECHO_S = 10.0  # after a fix of ours: so long the autopilot's position may be only that fix
-_QUALITY_MIN = 0.2
 
 
 class Learner:
@@ -108,7 +108,7 @@ class Learner:
         return replace(frame, position=position, heading_deg=vehicle.heading_deg, t_utc_s=self._utc_clock()), None
 
     def _objection(self, position: Position, quality: float) -> str | None:
-        if not quality >= _QUALITY_MIN:  # `not >=` refuses NaN as well
+        if not quality >= MIN_QUALITY:  # `not >=` refuses NaN as well
             return "of low quality"
         # Ask the file, not the index: a place that was dropped from RAM must not be learnt again.
         if self._map.nearest_m(position, self._spacing_m) is not None:

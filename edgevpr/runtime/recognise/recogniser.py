@@ -13,6 +13,7 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import compare, named, scan
 from edgevpr.places.sequence import Alone, Search
 from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.recognise.gate import says_nothing
 from edgevpr.runtime.recognise.hints import NoPrior, Prior, expected_of
 from edgevpr.runtime.recognise.judge import NEW_FOR_S, AcceptRule, Verdict, judge
 from edgevpr.runtime.recognise.recognition import Recognition
@@ -73,14 +74,17 @@ class Recogniser:
         Never raises an Exception: an error of a frame, a place or the technique becomes a refusal with its reason.
         """
         meter, technique, index = self.meter, self.technique, self.index
-        descriptor = hints = ranking = best = None
+        descriptor = hints = ranking = best = nothing = None
         meter.begin()
         try:
             with meter.step("encode"):
                 descriptor = technique.encode(frame.image)
             if self._lost:
                 raise MapError(self._lost)
-            if not len(index):
+            nothing = says_nothing(descriptor)
+            if nothing:
+                verdict = Verdict(False, nothing)
+            elif not len(index):
                 verdict = Verdict(False, "the map has no place yet")
             else:
                 with meter.step("scan"):
@@ -118,6 +122,7 @@ class Recogniser:
             best=best,
             accepted=verdict.accepted,
             reason=verdict.reason,
+            says_nothing=nothing is not None,
             failed=failed,
             position=position,
             accuracy_m=self.accuracy_m if position else None,

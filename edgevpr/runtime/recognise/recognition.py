@@ -18,7 +18,8 @@ class Recognition:
     The inputs are `frame` and `vehicle`, the autopilot's report when the frame was taken (None: no report).
     `descriptor` is the encoded frame, `hints` what narrowed the search, `ranking` the places found and `best` the first
     of them; each is None where its step was not reached. `accepted` tells whether `best` is taken for the place, and
-    `reason` why (not), in a few words. `failed` tells whether the frame, a place or the technique could not be used.
+    `reason` why (not), in a few words. `says_nothing` tells whether the picture holds too little to be recognised: no
+    place was then searched for. `failed` tells whether the frame, a place or the technique could not be used.
     `position` is the place's, and `accuracy_m` its 1-sigma; both are set for an accepted match only: any other carries
     no position.
 
@@ -34,6 +35,7 @@ class Recognition:
     best: Candidate | None = None
     accepted: bool = False
     reason: str
+    says_nothing: bool = False
     failed: bool = False
     position: Position | None = None
     accuracy_m: float | None = None
