@@ -66,7 +66,9 @@ def _colour(rng: np.random.Generator, low: int = 0, high: int = 256) -> tuple[in
     return tuple(int(value) for value in rng.integers(low, high, 3))
 
 
-def _write(picture: np.ndarray, rng: np.random.Generator, text: str, at: tuple[float, float], size: float = 1.0) -> None:
+def _write(
+    picture: np.ndarray, rng: np.random.Generator, text: str, at: tuple[float, float], size: float = 1.0
+) -> None:
     """Write a text that begins at shares of the width and the height, in white or a light colour."""
     height, width = picture.shape[:2]
     scale = size * height / 480 * rng.uniform(0.8, 1.2)

@@ -4,6 +4,7 @@ import os
 import sys
 import threading
 from argparse import Namespace
+from pathlib import Path
 from typing import Any
 
 from edgevpr.cli.shared import (
@@ -21,11 +22,11 @@ from edgevpr.cli.shared import (
     path_of,
     print_json,
 )  # fmt: skip
-from edgevpr.errors import ImageError
+from edgevpr.errors import ImageError, UsageError
 
 _MATCHING_KEYS = (
-    "board", "technique", "source.camera", "match.matching", "match.form", "match.candidates", "match.sequence",
-    "match.min_score", "match.min_margin", "memory.budget_mb", "battery.pack",
+    "board", "technique", "source.camera", "source.mask", "match.matching", "match.form", "match.candidates",
+    "match.sequence", "match.min_score", "match.min_margin", "memory.budget_mb", "battery.pack",
 )  # fmt: skip
 
 
@@ -45,6 +46,10 @@ def add(commands: Any) -> None:
 
     check = command(commands, "check", run_check, "say whether a configuration would fly")
     check.add_argument("--config", required=True, metavar="FILE")
+    check.add_argument(
+        "--learn-mask", metavar="PNG", help="instead, learn from the source which part of its frames shows no ground"
+    )
+    check.add_argument("--images", "--source", dest="source", metavar="SOURCE", help="learn it from this recording")
 
     service = command(commands, "service", print_unit, "print the systemd unit for a board")
     service.add_argument("--board", default="this", metavar="NAME")
@@ -107,8 +112,13 @@ def run_flight(args: Namespace) -> int:
 
 def run_check(args: Namespace) -> int:
     """Say whether a configuration would fly."""
-    from edgevpr.runtime.service.check import check
+    from edgevpr.runtime.service.check import check, learn_mask
 
+    if args.learn_mask:
+        print(learn_mask(args.config, Path(args.learn_mask), args.source))
+        return 0
+    if args.source:
+        raise UsageError("--source goes with --learn-mask: a check looks at the source of the configuration.")
     findings = check(args.config)
     for finding in findings:
         print(f"{'ok   ' if finding.ok else 'WRONG'}  {finding.what:<14} {finding.message}")

@@ -35,7 +35,7 @@ def add(commands: Any) -> None:
     build.add_argument(
         "--board", default="this", metavar="NAME", help="the board that will fly (default: this machine)"
     )
-    add_keys(build, "source.camera")
+    add_keys(build, "source.camera", "source.mask")
     build.add_argument(
         "--rate-hz", type=_positive, metavar="HZ", help="places a second of a video (default: every frame)"
     )
@@ -62,20 +62,23 @@ def _positive(text: str) -> float:
 def map_build(args: Namespace) -> int:
     """Make a map of a recording, or continue one."""
     from edgevpr.config import load_config
+    from edgevpr.frames.mask import mask_of
     from edgevpr.frames.source import open_source
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.power.boards import load_board
     from edgevpr.runtime.preflight.pick import camera_setting, picked_technique
     from edgevpr.runtime.recognise.mapping import build_map
-    from edgevpr.runtime.recognise.opening import made_for, meter_of, technique_of
+    from edgevpr.runtime.recognise.opening import made_for, meter_of, say_other_mask, technique_of
 
     step_s = 1 / args.rate_hz if args.rate_hz else None
     source = open_source(args.source, step_s=step_s, positions=path_of(args.positions), live=False)
+    mask = mask_of(value_of(args, "source.mask"))
     settings, camera, here = parameters_of(args.param), value_of(args, "source.camera"), load_board("this")
     if args.append and Path(args.map).exists():
         place_map = PlaceMap.open_for_adding(args.map)
         asked = settings | ({"camera": camera} if camera else {})
         technique = technique_of(place_map, args.technique, asked, here)
+        say_other_mask(place_map, mask)
     else:
         if args.technique:
             name, asked = args.technique, settings | ({"camera": camera} if camera else {})
@@ -84,11 +87,12 @@ def map_build(args: Namespace) -> int:
             asked = settings | camera_setting(name, camera)
         technique = made_for(here, name, asked)
         place_map = PlaceMap.create(args.map, technique.spec)
+        place_map.record_mask(mask.sha256)
     unusable: list[ImageError] = []
     with place_map:
         frames = frames_of(source, "mapping", unusable)
         meter = meter_of(load_config(None), here)
-        result = build_map(frames, technique, place_map, meter, lambda error: leave_out(error, unusable))
+        result = build_map(frames, technique, place_map, meter, lambda error: leave_out(error, unusable), mask)
         places = len(place_map)
     if args.json:
         print_json({"map": args.map, "technique": technique.spec.name, "places": places, **asdict(result)})
@@ -136,6 +140,7 @@ def map_merge(args: Namespace) -> int:
     technique_of(inputs[0])
     for other in inputs[1:]:
         other.require(inputs[0].spec)
+    masks = {each.mask_sha256 for each in inputs}
     with PlaceMap.create(args.out, inputs[0].spec) as merged:
         try:
             for path, place_map in zip(args.maps, inputs, strict=True):
@@ -145,6 +150,8 @@ def map_merge(args: Namespace) -> int:
         except EdgevprError:
             Path(args.out).unlink()  # half a merge would look like a whole one
             raise
+        if len(masks) == 1:
+            merged.record_mask(*masks)
         print(f"{args.out}: {len(merged)} places")
     return 0
 

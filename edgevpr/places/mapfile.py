@@ -18,7 +18,7 @@ from edgevpr.contract import Descriptor, PartSpec, TechniqueSpec
 from edgevpr.errors import MapError
 from edgevpr.geodesy import EARTH_RADIUS_M, distance_m
 from edgevpr.places import geopackage
-from edgevpr.places.mapspec import differences, read_spec, write_spec
+from edgevpr.places.mapspec import differences, read_mask, read_spec, write_mask, write_spec
 from edgevpr.places.sqlite import connect, sentences, settle, settle_left_log, start_log
 from edgevpr.types import Frame, Place, Position
 
@@ -131,6 +131,17 @@ class PlaceMap:
             if position:
                 self._db.execute(geopackage.GROW_EXTENT, {"lat": position.lat_deg, "lon": position.lon_deg})
         return cursor.lastrowid
+
+    @property
+    def mask_sha256(self) -> str | None:
+        """The overlay mask that the places were made with; None: none, or unknown."""
+        with sentences(self.path):
+            return read_mask(self._db)
+
+    def record_mask(self, sha256: str | None) -> None:
+        """Record the overlay mask that the places are made with (None: none). Raises MapError."""
+        with sentences(self.path), self._transaction():
+            write_mask(self._db, sha256)
 
     def index_positions(self) -> None:
         """Add the R-tree of the standard, unless the map has it. `nearest_m` needs it, and is fast for any map size."""

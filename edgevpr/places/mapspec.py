@@ -62,6 +62,17 @@ def read_spec(path: Path, db: sqlite3.Connection) -> TechniqueSpec:
         ) from error
 
 
+def write_mask(db: sqlite3.Connection, sha256: str | None) -> None:
+    """Record which overlay mask (None: none) the places of a map are made with. Raises sqlite3.Error."""
+    db.execute("INSERT OR REPLACE INTO edgevpr_map (key, value) VALUES ('mask_sha256', ?)", (json.dumps(sha256),))
+
+
+def read_mask(db: sqlite3.Connection) -> str | None:
+    """Read which overlay mask the places of a map were made with; None for none, or a map that does not say."""
+    row = db.execute("SELECT value FROM edgevpr_map WHERE key = 'mask_sha256'").fetchone()
+    return json.loads(row[0]) if row else None
+
+
 def differences(theirs: TechniqueSpec, ours: TechniqueSpec) -> list[str]:
     """List, in words, in what the technique of a map differs from ours."""
     return [f"{what} is {there}, not {here}" for what, there, here in _compared(theirs, ours) if there != here]

@@ -4,9 +4,9 @@ Every good region of the query finds its most similar region in the reference. T
 one vote. If the place is the same, the votes pile up on one step; if it is another place, they scatter. The score is
 the share of the votes at the peak: it says how many regions agree, which a mean of cosines does not.
 
-A picture of another kind (a screen, a test card, a view ahead in a map made looking down) has many regions that resemble
-the same few regions of the place: a line here and a line there. Their votes can pile up as well. So the regions of the
-place that agree are counted too, each of them once.
+A picture of another kind (a screen, a test card, a view ahead in a map made looking down) has many regions that
+resemble the same few regions of the place: a line here and a line there. Their votes can pile up as well. So the
+regions of the place that agree are counted too, each of them once.
 """
 
 from dataclasses import dataclass
@@ -19,8 +19,8 @@ import numpy as np
 @dataclass(frozen=True, slots=True)
 class Displacement:
     """Result of a vote. `share` (0..1) of the regions agrees on the step `shift_cells` (dx, dy), from the query to the
-    reference; `covariance_cells2` (var x, cov xy, var y) is the covariance of the votes around the peak. `agreeing` is the
-    number of different regions of the reference that the agreeing votes lead to."""
+    reference; `covariance_cells2` (var x, cov xy, var y) is the covariance of the votes around the peak. `agreeing` is
+    the number of different regions of the reference that the agreeing votes lead to."""
 
     share: float
     shift_cells: tuple[float, float]

@@ -44,7 +44,10 @@ def ranked(scores, slots=None):
     """The ranking of one query: all slots, or those that were compared in full."""
     slots = np.arange(len(scores)) if slots is None else np.array(slots)
     slots = slots[np.argsort(-scores[slots], kind="stable")]
-    matches = {slot: FineMatch(float(scores[slot]), shift_cells=(float(slot), 1.0), rotation_deg=30.0) for slot in slots.tolist()}
+    matches = {
+        slot: FineMatch(float(scores[slot]), shift_cells=(float(slot), 1.0), rotation_deg=30.0)
+        for slot in slots.tolist()
+    }
     return Ranking(slots, scores[slots].astype(np.float32), matches)
 
 

@@ -12,8 +12,8 @@ _log = logging.getLogger(__name__)
 
 class Tally:
     """Counts the events of a flight: `queries` and how many of them were `accepted`; `unusable` frames, which never
-    became a query; `failed` queries; and `failed_in_a_row` and `nothing_in_a_row`, the latest events that all failed, or
-    whose pictures all said nothing."""
+    became a query; `failed` queries; `failed_in_a_row`, the latest events that all failed; and `nothing_in_a_row`, the
+    latest pictures that all said nothing."""
 
     def __init__(self) -> None:
         self._trouble: str | None = None

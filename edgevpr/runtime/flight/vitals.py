@@ -20,9 +20,8 @@ _log = logging.getLogger(__name__)
 
 class Vitals:
     """Tells systemd that the loop turns and how the flight goes, and the autopilot how this companion computer is. It
-    tells everybody, once, when the camera is lost or shows nothing, or nothing can be recognised any more, and when that
-    is over.
-    `remarks` are added to systemd's status."""
+    tells everybody, once, when the camera is lost or shows nothing, when nothing can be recognised any more, and when
+    it is over. `remarks` are added to systemd's status."""
 
     def __init__(
         self,

@@ -1,11 +1,13 @@
 """Opening: makes a recogniser of a map, the technique that it was made with, and its index in RAM."""
 
+import logging
 from pathlib import Path
 
 from edgevpr import techniques
 from edgevpr.config import Config
 from edgevpr.contract import Technique
 from edgevpr.errors import MapError, UsageError
+from edgevpr.frames.mask import AnyMask, mask_of
 from edgevpr.frames.source import is_live
 from edgevpr.places.growing import GrowingIndex
 from edgevpr.places.index import PlaceIndex, empty_index, load_index
@@ -18,6 +20,7 @@ from edgevpr.runtime.recognise.hints import Prior
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.recogniser import Recogniser
 
+_log = logging.getLogger(__name__)
 _ROOM = 20_000  # places to learn in a flight: 200 km at the usual spacing; beyond that, RAM keeps the best places
 
 
@@ -53,7 +56,7 @@ def open_learning(config: Config, board: Board, new_technique: str | None) -> tu
         technique = technique_of(place_map, config.technique, _wanted(config), board)
     else:
         technique = made_for(board, new_technique, _wanted(config))
-        place_map = _new_map(path, technique)
+        place_map = _new_map(path, technique, mask_of(config.source.mask))
     place_map.index_positions()
     growing = GrowingIndex(
         place_map,
@@ -133,6 +136,8 @@ def _recogniser(
     config: Config, board: Board, technique: Technique, place_map: PlaceMap, index: PlaceIndex, narrowed: bool
 ) -> Recogniser:
     length = length_of(technique.spec, config.match.sequence)
+    mask = mask_of(config.source.mask)
+    say_other_mask(place_map, mask)
     return Recogniser(
         technique=technique,
         place_map=place_map,
@@ -144,7 +149,17 @@ def _recogniser(
         # In a sequence, a place that a wrong hint kept out of one query would count as compared and unlike it.
         prior=_prior(config, technique) if narrowed and length == 1 else None,
         min_accuracy_m=config.mavlink.min_accuracy_m,
+        mask=mask,
     )
+
+
+def say_other_mask(place_map: PlaceMap, mask: AnyMask) -> None:
+    """Warn where the places of a map were made with another mask than `mask`. They can be used all the same: a display
+    in them is ground that nobody sees."""
+    built_with = place_map.mask_sha256
+    if len(place_map) and built_with != mask.sha256:
+        how = "without a mask" if built_with is None else "with another mask"
+        _log.warning("%s was built %s; more is recognised where map and frames have the same", place_map.path, how)
 
 
 def _prior(config: Config, technique: Technique) -> Prior:
@@ -152,13 +167,14 @@ def _prior(config: Config, technique: Technique) -> Prior:
     return Prior(config.match.reach_m_s, technique.spec.heading_within_deg, is_now)
 
 
-def _new_map(path: Path, technique: Technique) -> PlaceMap:
+def _new_map(path: Path, technique: Technique, mask: AnyMask) -> PlaceMap:
     """Make an empty map that is there completely or not at all: a service killed at power-on must be able to start
     again."""
     unfinished = path.with_name(path.name + ".new")
     for left in ("", "-wal", "-shm", "-journal"):
         unfinished.with_name(unfinished.name + left).unlink(missing_ok=True)
-    PlaceMap.create(unfinished, technique.spec).close()
+    with PlaceMap.create(unfinished, technique.spec) as place_map:
+        place_map.record_mask(mask.sha256)
     unfinished.replace(path)
     return PlaceMap.open_for_adding(path)
 

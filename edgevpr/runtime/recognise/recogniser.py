@@ -8,6 +8,7 @@ from collections import deque
 
 from edgevpr.contract import Technique
 from edgevpr.errors import EdgevprError, MapError
+from edgevpr.frames.mask import AnyMask, NoMask
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import compare, named, scan
@@ -25,7 +26,8 @@ _log = logging.getLogger(__name__)
 class Recogniser:
     """Recognises places of an open map, frame after frame.
 
-    `candidates` places are compared in full (None: all, see `places.retrieve.compare`). `search` joins several queries,
+    `candidates` places are compared in full (None: all, see `places.retrieve.compare`). `mask` leaves parts of every
+    frame out. `search` joins several queries,
     and `prior` narrows each; without them each query is ranked alone, over the whole map. The governor changes
     `candidates`; the learner and the governor change the index (`take`, `extend`).
     """
@@ -42,9 +44,10 @@ class Recogniser:
         search: Search | None = None,
         prior: Prior | NoPrior | None = None,
         min_accuracy_m: float = 1.0,
+        mask: AnyMask | None = None,
     ) -> None:
         self.place_map, self.meter, self.candidates = place_map, meter, candidates
-        self._prior, self._min_accuracy_m = prior or NoPrior(), min_accuracy_m
+        self._prior, self._min_accuracy_m, self._mask = prior or NoPrior(), min_accuracy_m, mask or NoMask()
         self._new: deque[tuple[int, float]] = deque()  # place id, and the time it was learnt at
         self.take(technique, index, rule, search or Alone())
 
@@ -78,7 +81,7 @@ class Recogniser:
         meter.begin()
         try:
             with meter.step("encode"):
-                descriptor = technique.encode(frame.image)
+                descriptor = self._mask.encode(technique, frame.image)
             if self._lost:
                 raise MapError(self._lost)
             nothing = says_nothing(descriptor)
