@@ -76,14 +76,22 @@ def judge(ranking: Ranking, index: PlaceIndex, rule: AcceptRule, search: Search,
         return Verdict(False, "there is no place elsewhere to compare with, and this score alone says nothing")
     if ahead is not None and not ahead >= rule.min_margin:
         return Verdict(False, f"only {ahead:.3f} ahead of a place elsewhere, {rule.min_margin:.3f} needed")
-    match = ranking.compared.get(int(ranking.slots[0]))
-    if match and match.coverage is not None and not match.coverage >= _MIN_COVERAGE:
-        return Verdict(False, f"only {match.coverage:.1%} of the place agrees, {_MIN_COVERAGE:.0%} needed")
+    if search.length == 1 and (objection := _covers_little(ranking)):
+        return Verdict(False, objection)
     if is_new:  # a fix would only repeat the autopilot's position, and make its errors look confirmed
         return Verdict(False, f"this place was learnt within the last {NEW_FOR_S:g} s and says nothing new")
     if ahead is None:
         return Verdict(True, f"score {score:.3f}; there is no place elsewhere to compare with")
     return Verdict(True, f"score {score:.3f}, {ahead:.3f} ahead of any place elsewhere")
+
+
+def _covers_little(ranking: Ranking) -> str | None:
+    """Return the reason why too little of the best place agrees, None where enough does. It is not asked in a sequence,
+    where the newest query need not be sure by itself."""
+    match = ranking.compared.get(int(ranking.slots[0]))
+    if match is None or match.coverage is None or match.coverage >= _MIN_COVERAGE:
+        return None
+    return f"only {match.coverage:.1%} of the place agrees, {_MIN_COVERAGE:.0%} needed"
 
 
 def _lost_track(ranking: Ranking, index: PlaceIndex, rule: AcceptRule, search: SequenceSearch) -> str | None:
