@@ -112,6 +112,7 @@ class Technique(Protocol):
     candidates: int  # places compared in full after the scan, unless the configuration sets another number
     min_score: float  # least score of an accepted match, unless the configuration sets another
     min_margin: float  # least margin of an accepted match over the best place elsewhere, likewise
+    min_quality: float  # least `Descriptor.quality` of a query that says enough to be recognised
 
     def encode(self, image: np.ndarray, mask: np.ndarray | None = None) -> Descriptor:
         """Encode a uint8 image; `mask` (H, W) bool is False where the image must not be used."""

@@ -65,8 +65,9 @@ def displacement(asking: np.ndarray, best: np.ndarray, side: int, counts: tuple[
     shift = (peak_x - (side - 1) + mean_x, peak_y - (side - 1) + mean_y)
     near = np.zeros((wide, wide), bool)
     near[peak_y : peak_y + len(weights), peak_x : peak_x + len(weights)] = True
-    agreeing = len(set(best[near.ravel()[step]].tolist()))
-    return Displacement(count / len(asking), shift, covariance, agreeing)
+    agreed = np.zeros(side * side, bool)
+    agreed[best[near.ravel().take(step)]] = True
+    return Displacement(count / len(asking), shift, covariance, int(np.count_nonzero(agreed)))
 
 
 @lru_cache

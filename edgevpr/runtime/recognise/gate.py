@@ -6,14 +6,10 @@ information. The share of regions that agree on a place is then the share of a f
 
 from edgevpr.contract import Descriptor
 
-# Least share of a picture that holds information. Without the gate, the pictures of nothing that were accepted on the
-# tuning sets had .39 or less, and washed-out or covered pictures that were taken for a wrong place .43 or less; right
-# matches had .91 or more (on the other sets .72, and .47 where pictures have 64 x 32 pixels).
-MIN_QUALITY = 0.4
 
-
-def says_nothing(query: Descriptor) -> str | None:
-    """Return the reason why a picture says too little to be recognised, None where it says enough."""
-    if query.quality >= MIN_QUALITY:
+def says_nothing(query: Descriptor, min_quality: float) -> str | None:
+    """Return the reason why a picture says too little to be recognised, None where it says enough: its quality is at
+    least `min_quality`."""
+    if query.quality >= min_quality:  # False for NaN
         return None
-    return f"the picture says nothing: {query.quality:.0%} of it holds information, {MIN_QUALITY:.0%} are needed"
+    return f"the picture says nothing: {query.quality:.0%} of it holds information, {min_quality:.0%} are needed"

@@ -26,11 +26,13 @@ _MIN_COVERAGE = 0.04
 
 @dataclass(frozen=True, slots=True)
 class AcceptRule:
-    """Least score, and least lead over the best place farther away than `neighbour_m` metres, of an accepted match."""
+    """Least score, and least lead over the best place farther away than `neighbour_m` metres, of an accepted match; and
+    least quality of its picture."""
 
     min_score: float
     min_margin: float
     neighbour_m: float
+    min_quality: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +57,7 @@ def accept_rule(technique: Technique, config: MatchConfig, length: int = 1) -> A
         technique.min_score if config.min_score is None else config.min_score,
         own_margin if config.min_margin is None else config.min_margin,
         config.neighbour_m,
+        technique.min_quality,
     )
 
 

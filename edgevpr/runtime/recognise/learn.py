@@ -18,12 +18,12 @@ from edgevpr.frames.exif import read_exif
 from edgevpr.frames.images import list_images
 from edgevpr.frames.positions import find_positions
 from edgevpr.places.growing import GrowingIndex
-from edgevpr.runtime.recognise.gate import MIN_QUALITY
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.types import Frame, Place, Position, Vehicle
 
 _ECHO_S = 10.0  # after a fix of ours: so long the autopilot's position may be only that fix
+_QUALITY_MIN = 0.2
 
 
 class Learner:
@@ -72,7 +72,7 @@ class Learner:
         place = None
         try:
             here, objection = self._placed(event.frame, event.vehicle)
-            objection = objection or self._objection(here.position, event.descriptor.quality)
+            objection = objection or self._objection(here.position, event)
             if objection:
                 self.passed_over[objection] += 1
                 return None
@@ -107,8 +107,8 @@ class Learner:
         position = Position(vehicle.lat_deg, vehicle.lon_deg, vehicle.alt_m)
         return replace(frame, position=position, heading_deg=vehicle.heading_deg, t_utc_s=self._utc_clock()), None
 
-    def _objection(self, position: Position, quality: float) -> str | None:
-        if not quality >= MIN_QUALITY:  # `not >=` refuses NaN as well
+    def _objection(self, position: Position, event: Recognition) -> str | None:
+        if event.says_nothing or not event.descriptor.quality >= _QUALITY_MIN:  # `not >=` refuses NaN as well
             return "of low quality"
         # Ask the file, not the index: a place that was dropped from RAM must not be learnt again.
         if self._map.nearest_m(position, self._spacing_m) is not None:

@@ -84,11 +84,11 @@ class Recogniser:
                 descriptor = self._mask.encode(technique, frame.image)
             if self._lost:
                 raise MapError(self._lost)
-            nothing = says_nothing(descriptor)
-            if nothing:
-                verdict = Verdict(False, nothing)
-            elif not len(index):
+            nothing = says_nothing(descriptor, self.rule.min_quality)
+            if not len(index):
                 verdict = Verdict(False, "the map has no place yet")
+            elif nothing and self.search.length == 1:  # in a sequence it is searched for, to keep the others in step
+                verdict = Verdict(False, nothing)
             else:
                 with meter.step("scan"):
                     margin_m = max(self.accuracy_m, self.rule.neighbour_m)
@@ -110,6 +110,7 @@ class Recogniser:
                     (best,) = named(ranking, index, self.place_map, first=1)
                     is_new = self._is_new(best.place.place_id, frame.t_mono_s)
                     verdict = judge(ranking, index, self.rule, self.search, is_new)
+                    verdict = Verdict(False, nothing) if nothing else verdict
                 self._prior.learn(best, verdict.accepted, frame.t_mono_s)
             failed = False
         except Exception as error:

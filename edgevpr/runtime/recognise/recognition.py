@@ -18,10 +18,10 @@ class Recognition:
     The inputs are `frame` and `vehicle`, the autopilot's report when the frame was taken (None: no report).
     `descriptor` is the encoded frame, `hints` what narrowed the search, `ranking` the places found and `best` the first
     of them; each is None where its step was not reached. `accepted` tells whether `best` is taken for the place, and
-    `reason` why (not), in a few words. `says_nothing` tells whether the picture holds too little to be recognised: no
-    place was then searched for. `failed` tells whether the frame, a place or the technique could not be used.
-    `position` is the place's, and `accuracy_m` its 1-sigma; both are set for an accepted match only: any other carries
-    no position.
+    `reason` why (not), in a few words. `says_nothing` tells whether the picture holds too little to be recognised; a
+    place was then searched for only to go on with a sequence. `failed` tells whether the frame, a place or the
+    technique could not be used. `position` is the place's, and `accuracy_m` its 1-sigma; both are set for an accepted
+    match only: any other carries no position.
 
     `steps` and `cost` are what the frame took. `fix` tells what became of the position, and `last_fix` the same of the
     one sent before it. The channel to the autopilot fills them in; they are None where there was nothing to send.

@@ -12,7 +12,7 @@ from edgevpr.config import load_config
 from edgevpr.contract import Descriptor
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.recognise.gate import MIN_QUALITY, says_nothing
+from edgevpr.runtime.recognise.gate import says_nothing
 from edgevpr.runtime.recognise.mapping import build_map
 from edgevpr.runtime.recognise.opening import meter_of, open_recogniser
 from edgevpr.techniques import create
@@ -43,11 +43,10 @@ def walk(request, tmp_path_factory):
     ("quality", "refused"), [(0.0, True), (0.399, True), (math.nan, True), (0.4, False), (1, False)]
 )
 def test_a_picture_says_enough_from_two_fifths_on(quality, refused):
-    reason = says_nothing(Descriptor(coarse=np.zeros(1), quality=quality))
+    reason = says_nothing(Descriptor(coarse=np.zeros(1), quality=quality), create("cohog").min_quality)
     assert (reason is not None) == refused
     if reason and quality > 0:
         assert "the picture says nothing: " in reason
-    assert MIN_QUALITY == 0.4
 
 
 def test_what_says_nothing_is_not_searched_for(walk):

@@ -132,11 +132,11 @@ def test_a_place_that_was_given_up_in_ram_is_not_learnt_again(tmp_path):
     bench.map.close()
 
 
-@pytest.mark.parametrize("quality", [0.39, math.nan])
+@pytest.mark.parametrize("quality", [0.19, math.nan])
 def test_a_frame_that_says_little_is_left_out(bench, quality):
     assert bench.see(quality=quality) is None
     assert bench.learner.passed_over == {"of low quality": 1}
-    assert bench.see(quality=0.4)
+    assert bench.see(quality=0.2)
 
 
 def test_after_a_fix_of_ours_the_autopilot_may_only_repeat_it(bench):
