@@ -71,6 +71,7 @@ class SourceConfig:
     rate_hz: float | None = bounded(
         LOWEST_RATE_HZ, HIGHEST_RATE_HZ, Flag(("--rate-hz",), "HZ", "queries a second (default: the board's)")
     )
+    mask: str | None = keyed(Flag(("--mask",), "PNG", "black where frames show a display and no ground"))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -89,16 +89,19 @@ class Picture:
     seen: np.ndarray
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FineMatch:
     """The result of comparing one place with the query: `score` in 0..1, and values that only some techniques give
     (else None). `shift_cells` is the step from the query to the place (dx, dy in cells), with its covariance (var x,
-    cov xy, var y). `rotation_deg` is the rotation of the camera since the map was made (clockwise, 0..360)."""
+    cov xy, var y). `rotation_deg` is the rotation of the camera since the map was made (clockwise, 0..360). `coverage`
+    (0..1) is the share of the place's regions that agree with this step, each counted once, however many regions of the
+    query resemble it."""
 
-    score: float
+    score: float = field(kw_only=False)
     shift_cells: tuple[float, float] | None = None
     covariance_cells2: tuple[float, float, float] | None = None
     rotation_deg: float | None = None
+    coverage: float | None = None
 
 
 class Technique(Protocol):
@@ -109,6 +112,7 @@ class Technique(Protocol):
     candidates: int  # places compared in full after the scan, unless the configuration sets another number
     min_score: float  # least score of an accepted match, unless the configuration sets another
     min_margin: float  # least margin of an accepted match over the best place elsewhere, likewise
+    min_quality: float  # least `Descriptor.quality` of a query that says enough to be recognised
 
     def encode(self, image: np.ndarray, mask: np.ndarray | None = None) -> Descriptor:
         """Encode a uint8 image; `mask` (H, W) bool is False where the image must not be used."""

@@ -1,6 +1,7 @@
 """Commands that use a map: `edgevpr match`, `run`, `check` and `service`."""
 
 from argparse import Namespace
+from pathlib import Path
 from typing import Any
 
 from edgevpr.cli.shared import (
@@ -18,12 +19,12 @@ from edgevpr.cli.shared import (
     path_of,
     print_json,
 )  # fmt: skip
-from edgevpr.errors import ImageError
+from edgevpr.errors import ImageError, UsageError
 from edgevpr.helpers.text import shown
 
 _MATCHING_KEYS = (
-    "board", "technique", "source.camera", "match.matching", "match.form", "match.candidates", "match.sequence",
-    "match.min_score", "match.min_margin", "memory.budget_mb", "battery.pack",
+    "board", "technique", "source.camera", "source.mask", "match.matching", "match.form", "match.candidates",
+    "match.sequence", "match.min_score", "match.min_margin", "memory.budget_mb", "battery.pack",
 )  # fmt: skip
 
 
@@ -43,6 +44,10 @@ def add(commands: Any) -> None:
 
     check = command(commands, "check", run_check, "say whether a configuration would fly")
     check.add_argument("--config", required=True, metavar="FILE")
+    check.add_argument(
+        "--learn-mask", metavar="PNG", help="instead, learn from the source which part of its frames shows no ground"
+    )
+    check.add_argument("--images", "--source", dest="source", metavar="SOURCE", help="learn it from this recording")
 
     service = command(commands, "service", print_unit, "print the systemd unit for a board")
     service.add_argument("--board", default="this", metavar="NAME")
@@ -81,8 +86,10 @@ def run_match(args: Namespace) -> int:
         for each in found:
             error = f"{each['error_m']:8.1f}" if "error_m" in each else "       -"
             yes = "yes" if each["accepted"] else "no"
-            query, found_image = shown(each["query"]), shown(each["reference_image"])
-            print(f"{query:<28} {each['place']:>6} {found_image:<28} {each['score']:6.3f}  {yes:<8} {error}")
+            found_place = f"{'-':>6} {'(' + each['reason'].partition(':')[0] + ')':<28} {'-':>6}"
+            if each["place"] is not None:
+                found_place = f"{each['place']:>6} {shown(each['reference_image']):<28} {each['score']:6.3f}"
+            print(f"{shown(each['query']):<28} {found_place}  {yes:<8} {error}")
         print(f"{len(found)} queries, {sum(each['accepted'] for each in found)} accepted")
         if weights := weights_of(recogniser.technique.spec):
             print(f"Weights of {weights}.")
@@ -98,8 +105,13 @@ def run_flight(args: Namespace) -> int:
 
 def run_check(args: Namespace) -> int:
     """Say whether a configuration would fly."""
-    from edgevpr.runtime.service.check import check
+    from edgevpr.runtime.service.check import check, learn_mask
 
+    if args.learn_mask:
+        print(learn_mask(args.config, Path(args.learn_mask), args.source))
+        return 0
+    if args.source:
+        raise UsageError("--source goes with --learn-mask: a check looks at the source of the configuration.")
     findings = check(args.config)
     for finding in findings:
         print(f"{'ok   ' if finding.ok else 'WRONG'}  {finding.what:<14} {shown(finding.message)}")

@@ -40,7 +40,7 @@ def add(commands: Any) -> None:
     build.add_argument(
         "--board", default="this", metavar="NAME", help="the board that will fly (default: this machine)"
     )
-    add_keys(build, "source.camera")
+    add_keys(build, "source.camera", "source.mask")
     build.add_argument(
         "--rate-hz", type=_positive, metavar="HZ", help="places a second of a video (default: every frame)"
     )
@@ -72,23 +72,26 @@ def _positive(text: str) -> float:
 def map_build(args: Namespace) -> int:
     """Make a map of a recording, or continue one."""
     from edgevpr.config import load_config
+    from edgevpr.frames.mask import mask_of
     from edgevpr.frames.source import open_source
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.places.mapfiles import map_path, remove
     from edgevpr.power.boards import load_board
     from edgevpr.runtime.preflight.pick import camera_setting, picked_technique
     from edgevpr.runtime.recognise.mapping import build_map
-    from edgevpr.runtime.recognise.opening import made_for, meter_of, technique_of
+    from edgevpr.runtime.recognise.opening import made_for, meter_of, say_other_mask, technique_of
 
     path = map_path(args.map)
     step_s = 1 / args.rate_hz if args.rate_hz else None
     source = open_source(args.source, step_s=step_s, positions=path_of(args.positions), live=False)
+    mask = mask_of(value_of(args, "source.mask"))
     settings, camera, here = parameters_of(args.param), value_of(args, "source.camera"), load_board("this")
     is_new = not (args.append and path.exists())
     if not is_new:
         place_map = PlaceMap.open_for_adding(path)
         asked = settings | ({"camera": camera} if camera else {})
         technique = technique_of(place_map, args.technique, asked, here)
+        say_other_mask(place_map, mask)
     else:
         if args.technique:
             name, asked = args.technique, settings | ({"camera": camera} if camera else {})
@@ -97,12 +100,13 @@ def map_build(args: Namespace) -> int:
             asked = settings | camera_setting(name, camera)
         technique = made_for(here, name, asked)
         place_map = PlaceMap.create(path, technique.spec)
+        place_map.record_mask(mask.sha256)
     unusable: list[ImageError] = []
     with place_map:
         frames = frames_of(source, "mapping", unusable)
         meter = meter_of(load_config(None), here)
         try:
-            result = build_map(frames, technique, place_map, meter, lambda error: leave_out(error, unusable))
+            result = build_map(frames, technique, place_map, meter, lambda error: leave_out(error, unusable), mask)
         except EdgevprError:
             if is_new and not len(place_map):  # a full disk: an empty map would only stand in the way of the next try
                 remove(path)
@@ -209,8 +213,11 @@ def map_merge(args: Namespace) -> int:
         technique_of(inputs[0])
         for other in inputs[1:]:
             other.require(inputs[0].spec)
+        masks = {each.mask_sha256 for each in inputs}
         stack.callback(remove, unfinished)  # half a merge would look like a whole one
         with PlaceMap.create(unfinished, inputs[0].spec) as merged:
+            if len(masks) == 1:
+                merged.record_mask(*masks)
             for path, place_map in zip(args.maps, inputs, strict=True):
                 copied, already_here = absorb(merged, place_map)
                 print(f"{path}: {copied} places copied" + (f", {already_here} there already" if already_here else ""))

@@ -17,6 +17,7 @@ from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.source import Source, open_source
 from edgevpr.places.index import bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.retrieve import Ranking
 from edgevpr.places.sequence import length_of, search_of
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import pack_ah, parse_pack, queries_ah, rail_ah, stage_energy_j
@@ -31,6 +32,7 @@ from edgevpr.types import NO_COST, Frame, StageCost
 
 T = TypeVar("T")
 Progress = Callable[[Iterable[T], int, str], Iterable[T]]
+_NOTHING_FOUND = Ranking(np.empty(0, np.intp), np.empty(0, np.float32), {})  # a picture that says nothing
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -173,7 +175,7 @@ def _answers(recogniser: Recogniser, dataset: Dataset, progress: Progress) -> It
         event = _asked(recogniser, path)
         if path.name not in scored:
             continue
-        query, ranking = scored[path.name], event.ranking
+        query, ranking = scored[path.name], event.ranking or _NOTHING_FOUND
         # Slots of the index follow the order of mapping, which is that of the references' names.
         right = np.array([name in query.right for name in dataset.references])
         ignored = np.array([name in query.ignored for name in dataset.references])

@@ -16,7 +16,17 @@ import numpy as np
 from edgevpr.contract import Descriptor, PartSpec, TechniqueSpec
 from edgevpr.errors import MapError, PlaceError
 from edgevpr.places import geopackage, mapfiles, rows
-from edgevpr.places.mapspec import Stored, differences, has_checksums, require_layer, spec_of, stored, write_spec
+from edgevpr.places.mapspec import (
+    Stored,
+    differences,
+    has_checksums,
+    read_mask,
+    require_layer,
+    spec_of,
+    stored,
+    write_mask,
+    write_spec,
+)  # fmt: skip
 from edgevpr.places.rows import Point, Unreadable
 from edgevpr.places.sqlite import (
     WAIT_S,
@@ -197,6 +207,17 @@ class PlaceMap:
             lat_deg, lon_deg = geopackage.read_point(values[0])
             self.db.execute(geopackage.GROW_EXTENT, {"lat": lat_deg, "lon": lon_deg})
         return cursor.lastrowid
+
+    @property
+    def mask_sha256(self) -> str | None:
+        """The overlay mask that the places were made with; None: none, or unknown."""
+        with sentences(self.path):
+            return read_mask(self.db)
+
+    def record_mask(self, sha256: str | None) -> None:
+        """Record the overlay mask that the places are made with (None: none). Raises MapError."""
+        with sentences(self.path), self.transaction():
+            write_mask(self.db, sha256)
 
     def places(self, place_ids: Iterable[int] | None = None) -> Iterator[Place]:
         """Yield the places of `place_ids` in the order given, or (None) all places in the order they were added.

@@ -117,6 +117,21 @@ def require_layer(path: Path, db: sqlite3.Connection, checksums: bool) -> None:
         )
 
 
+def write_mask(db: sqlite3.Connection, sha256: str | None) -> None:
+    """Record which overlay mask (None: none) the places of a map are made with. Raises sqlite3.Error."""
+    db.execute("INSERT OR REPLACE INTO edgevpr_map (key, value) VALUES ('mask_sha256', ?)", (json.dumps(sha256),))
+
+
+def read_mask(db: sqlite3.Connection) -> str | None:
+    """Read which overlay mask the places of a map were made with; None for none, or a map that does not say."""
+    row = db.execute("SELECT value FROM edgevpr_map WHERE key = 'mask_sha256'").fetchone()
+    try:
+        sha256 = json.loads(row[0]) if row else None
+    except (ValueError, TypeError):
+        return None
+    return sha256 if isinstance(sha256, str) else None
+
+
 def differences(theirs: TechniqueSpec, ours: TechniqueSpec) -> list[str]:
     """List, in words, in what the technique of a map differs from ours."""
     return [f"{what} is {there}, not {here}" for what, there, here in _compared(theirs, ours) if there != here]

@@ -34,6 +34,10 @@ _VOTES_COUNT = {"forward": (1.0, 1.0, 0.75, 0.5), "nadir": (1.0, 1.0)}
 # aerial_caliterra. The thesis's score has no safe threshold: its margin rejects those queries of other sites, and most
 # right matches too.
 _ACCEPT = {"forward": (0.07, 0.035), "nadir": (0.08, 0.03), "thesis": (0.0, 0.02)}
+# Least quality. Without it, the pictures of nothing that were accepted on the tuning sets had .39 or less, and real
+# ones, washed out or covered, that were taken for a wrong place .43 or less; right matches had .91 or more (on the other sets
+# .72, and .47 where pictures have 64 x 32 pixels). With `filled_bins` it was .14, .18 and .30.
+_MIN_QUALITY = {"shannon": 0.4, "filled_bins": 0.2}
 _CANDIDATES = {"forward": 42, "nadir": 50}
 _ROTATIONS = 24  # of a nadir query whose heading is unknown: 15 degrees apart
 _HEADING_WITHIN_DEG = 1.5 * 360 / _ROTATIONS  # the expected rotation, and one on either side
@@ -76,6 +80,7 @@ class CoHog:
         self._matched = self._displacement if matching == "displacement" else self._thesis
         self._compared = slow_patterns(bins) if matching == "displacement" else None
         self.min_score, self.min_margin = _ACCEPT[camera if matching == "displacement" else matching]
+        self.min_quality = _MIN_QUALITY[entropy]
         self.candidates = _CANDIDATES[camera]
         self._asked, self._by_turn = None, {}
         self.spec = TechniqueSpec(
@@ -199,7 +204,12 @@ class CoHog:
         numbers, regions = asking
         best = (regions @ reference.T).argmax(axis=1)
         found = displacement(numbers, best, self._side, _VOTES_COUNT[self._camera])
-        return FineMatch(found.share, found.shift_cells, found.covariance_cells2)
+        return FineMatch(
+            found.share,
+            shift_cells=found.shift_cells,
+            covariance_cells2=found.covariance_cells2,
+            coverage=found.agreeing / len(reference),
+        )
 
 
 def _require(what: str, value: str, allowed) -> None:

@@ -3,6 +3,10 @@
 Every good region of the query finds its most similar region in the reference. The step between the two, in cells, is
 one vote. If the place is the same, the votes pile up on one step; if it is another place, they scatter. The score is
 the share of the votes at the peak: it says how many regions agree, which a mean of cosines does not.
+
+A picture of another kind (a screen, a test card, a view ahead in a map made looking down) has many regions that
+resemble the same few regions of the place: a line here and a line there. Their votes can pile up as well. So the
+regions of the place that agree are counted too, each of them once.
 """
 
 from dataclasses import dataclass
@@ -15,14 +19,16 @@ import numpy as np
 @dataclass(frozen=True, slots=True)
 class Displacement:
     """Result of a vote. `share` (0..1) of the regions agrees on the step `shift_cells` (dx, dy), from the query to the
-    reference; `covariance_cells2` (var x, cov xy, var y) is the covariance of the votes around the peak."""
+    reference; `covariance_cells2` (var x, cov xy, var y) is the covariance of the votes around the peak. `agreeing` is
+    the number of different regions of the reference that the agreeing votes lead to."""
 
     share: float
     shift_cells: tuple[float, float]
     covariance_cells2: tuple[float, float, float]
+    agreeing: int
 
 
-_NOTHING = Displacement(0.0, (0.0, 0.0), (0.0, 0.0, 0.0))
+_NOTHING = Displacement(0.0, (0.0, 0.0), (0.0, 0.0, 0.0), 0)
 
 
 def displacement(asking: np.ndarray, best: np.ndarray, side: int, counts: tuple[float, ...]) -> Displacement:
@@ -57,7 +63,11 @@ def displacement(asking: np.ndarray, best: np.ndarray, side: int, counts: tuple[
         float(shares_y @ (off - mean_y) ** 2) + 1 / 12,
     )
     shift = (peak_x - (side - 1) + mean_x, peak_y - (side - 1) + mean_y)
-    return Displacement(count / len(asking), shift, covariance)
+    near = np.zeros((wide, wide), bool)
+    near[peak_y : peak_y + len(weights), peak_x : peak_x + len(weights)] = True
+    agreed = np.zeros(side * side, bool)
+    agreed[best[near.ravel().take(step)]] = True
+    return Displacement(count / len(asking), shift, covariance, int(np.count_nonzero(agreed)))
 
 
 @lru_cache

@@ -29,6 +29,7 @@ class SeqSlam:
     candidates = 1  # it has no fine part to compare
     min_score = 0.0
     min_margin = 0.25  # of one query; wrong matches on corridor and aerial_caliterra (tuning) had less than 0.16
+    min_quality = 0.4  # real pictures have 0.8 or more
 
     def __init__(self, width: int = 64, height: int = 32, patch: int = 8, sequence: int = 10) -> None:
         if not (2 <= patch <= width <= 512 and patch <= height <= 512 and width % patch == height % patch == 0):

@@ -39,6 +39,7 @@ class VectorTechnique:
     candidates = 1  # there is no fine part to compare
     min_score = 0.0
     min_margin = 0.0
+    min_quality = 0.5  # the quality is 0 or 1
     accept: ClassVar[dict[str, tuple[float, float]]] = {}
 
     def __init__(

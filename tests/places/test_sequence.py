@@ -58,7 +58,10 @@ def ranked(scores, slots=None):
     """The ranking of one query: all slots, or those that were compared in full."""
     slots = np.arange(len(scores)) if slots is None else np.array(slots)
     slots = slots[np.argsort(-scores[slots], kind="stable")]
-    matches = {slot: FineMatch(float(scores[slot]), (float(slot), 1.0), None, 30.0) for slot in slots.tolist()}
+    matches = {
+        slot: FineMatch(float(scores[slot]), shift_cells=(float(slot), 1.0), rotation_deg=30.0)
+        for slot in slots.tolist()
+    }
     return Ranking(slots, scores[slots].astype(np.float32), matches)
 
 
@@ -117,7 +120,7 @@ def test_matches_keep_the_step_of_the_newest_query_and_have_the_score_of_the_seq
     assert set(ranking.compared) == set(range(10, 30))
     scored = dict(zip(ranking.slots.tolist(), ranking.scores.tolist(), strict=True))
     for slot, match in ranking.compared.items():
-        assert match == FineMatch(scored[slot], (float(slot), 1.0), None, 30.0)
+        assert match == FineMatch(scored[slot], shift_cells=(float(slot), 1.0), rotation_deg=30.0)
 
 
 def test_a_gap_in_time_begins_a_new_sequence(scores):

@@ -82,3 +82,26 @@ def test_a_camera_that_looks_down_finds_how_far_it_has_turned(turned_deg):
     assert match.score > 0.5
     assert match.shift_cells == pytest.approx((0, 0), abs=0.3)
     assert technique.match(technique.encode(textured(4, 512, 512)), reference.fine).score < 0.1
+
+
+def test_a_region_that_many_resemble_agrees_once():
+    asking, best = np.arange(20, 27), np.array([120, 121, 121, 121, 121, 121, 150])
+    found = displacement(asking, best, 31, (1.0, 1.0, 1.0, 1.0))
+    assert found.agreeing == 2, "120 and 121; 150 has moved by another step"
+    assert found.share == pytest.approx(6 / 7)
+
+
+def test_regions_that_all_moved_alike_are_all_counted():
+    asking = np.arange(300)
+    assert displacement(asking, asking + 31, 31, (1.0, 1.0)).agreeing == 300
+    assert displacement(asking[:0], asking[:0], 31, (1.0, 1.0)).agreeing == 0
+
+
+@pytest.mark.parametrize("camera", ["forward", "nadir"])
+def test_a_match_says_how_much_of_the_place_agrees(camera):
+    technique = create("cohog", {"camera": camera})
+    here, there = (technique.encode(textured(seed, 240, 320)) for seed in (1, 2))
+    own, other = technique.match(here, here.fine), technique.match(here, there.fine)
+    assert own.coverage > 0.4
+    assert other.coverage < 0.06
+    assert create("cohog", {"matching": "thesis"}).match(here, here.fine).coverage is None

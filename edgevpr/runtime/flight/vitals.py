@@ -21,9 +21,8 @@ _log = logging.getLogger(__name__)
 
 class Vitals:
     """Tells systemd that the loop turns and how the flight goes, and the autopilot how this companion computer is. It
-    tells everybody, once, when the camera is lost, frozen or damaged, or nothing can be recognised any more, and when
-    that is over.
-    `remarks` are added to systemd's status."""
+    tells everybody, once, when the camera is lost, frozen or damaged or shows nothing, when nothing can be recognised
+    any more, and when that is over. `remarks` are added to systemd's status."""
 
     def __init__(
         self,
@@ -41,7 +40,7 @@ class Vitals:
         self._watchdog_s = watchdog_interval_s()
         self._watchdog_due_s = self._health_due_s = clock.mono_s()
         self._trouble: str | None = None
-        self._is_failing = False
+        self._is_failing = self._sees_nothing = False
 
     def beat(self) -> None:
         """Send the watchdog's beat and the report, where they are due."""
@@ -57,10 +56,11 @@ class Vitals:
         self._meter.look_at_heat()
         self._say_source()
         self._say_failures()
+        self._say_nothing_seen()
         counts = f"{self._tally.queries} queries, {self._tally.accepted} accepted, {self._meter.used_mah:.2f} mAh"
         remarks = (remark() for remark in self._remarks)
         notify(STATUS="; ".join(filter(None, (self._source.state, counts, *remarks, self._flight_log.state))))
-        healthy = not (self._trouble or self._is_failing)
+        healthy = not (self._trouble or self._is_failing or self._sees_nothing)
         self._autopilot.report(healthy, machine_load(), self._meter.thermal.temperature_c)
 
     def _say_source(self) -> None:
@@ -79,3 +79,12 @@ class Vitals:
             _log.warning("%s", said)
             self._flight_log.write("failing", said=said)
             self._autopilot.announce(Mood.WARNING if is_failing else Mood.NOTE, said)
+
+    def _say_nothing_seen(self) -> None:
+        sees_nothing = self._tally.sees_nothing
+        if sees_nothing != self._sees_nothing:
+            self._sees_nothing = sees_nothing
+            said = "camera shows nothing" if sees_nothing else "camera shows ground again"
+            _log.warning("%s", said)
+            self._flight_log.write("camera", said=said)
+            self._autopilot.announce(Mood.WARNING if sees_nothing else Mood.NOTE, said)

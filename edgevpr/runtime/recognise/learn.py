@@ -74,7 +74,7 @@ class Learner:
         place = None
         try:
             here, objection = self._placed(event.frame, event.vehicle)
-            objection = objection or self._objection(here.position, event.descriptor.quality)
+            objection = objection or self._objection(here.position, event)
             if objection:
                 self.passed_over[objection] += 1
                 return None
@@ -113,8 +113,8 @@ class Learner:
         position = Position(vehicle.lat_deg, vehicle.lon_deg, vehicle.alt_m)
         return replace(frame, position=position, heading_deg=vehicle.heading_deg, t_utc_s=self._utc_clock()), None
 
-    def _objection(self, position: Position, quality: float) -> str | None:
-        if not quality >= _QUALITY_MIN:  # `not >=` refuses NaN as well
+    def _objection(self, position: Position, event: Recognition) -> str | None:
+        if event.says_nothing or not event.descriptor.quality >= _QUALITY_MIN:  # `not >=` refuses NaN as well
             return "of low quality"
         # Ask the file, not the index: a place that was dropped from RAM must not be learnt again.
         if nearest_m(self._map, position, self._spacing_m) is not None:

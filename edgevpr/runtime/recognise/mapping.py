@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from edgevpr.contract import Technique
 from edgevpr.errors import ImageError, ModelError
+from edgevpr.frames.mask import AnyMask
 from edgevpr.places.geopackage import utc_text
 from edgevpr.places.index import empty_index
 from edgevpr.places.mapfile import PlaceMap
@@ -33,16 +34,18 @@ def build_map(
     place_map: PlaceMap,
     meter: QueryMeter,
     unusable: Callable[[ImageError], None] | None = None,
+    mask: AnyMask | None = None,
 ) -> MappingResult:
     """Add a place for every frame that is not in the map yet, so that an interrupted map can be continued.
 
     A frame goes through the steps of a query, with no place to find. It is in the map already if a place has the same
     name and the same coarse descriptor; the name alone does not tell, since cameras restart their numbering. A frame
-    that cannot be encoded is handed to `unusable` and left out; with `unusable` None it raises ModelError.
+    that cannot be encoded is handed to `unusable` and left out; with `unusable` None it raises ModelError. `mask`
+    leaves parts of every frame out.
     """
     place_map.require(technique.spec)
     nothing = empty_index(technique.spec, 0, None)
-    walk = Recogniser(technique=technique, place_map=place_map, index=nothing, rule=_NO_RULE, meter=meter)
+    walk = Recogniser(technique=technique, place_map=place_map, index=nothing, rule=_NO_RULE, meter=meter, mask=mask)
     here = place_map.fingerprints()
     added = without_position = already_here = odd_times = 0
     for frame in frames:

@@ -1,5 +1,6 @@
 """Opening: makes a recogniser of a map, the technique that it was made with, and its index in RAM."""
 
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -8,6 +9,7 @@ from edgevpr import techniques
 from edgevpr.config import Config
 from edgevpr.contract import Technique
 from edgevpr.errors import MapError, UsageError
+from edgevpr.frames.mask import AnyMask, mask_of
 from edgevpr.frames.source import is_live
 from edgevpr.places.growing import GrowingIndex
 from edgevpr.places.index import PlaceIndex, empty_index, load_index
@@ -23,6 +25,7 @@ from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.recogniser import Recogniser
 
 _WAIT_S = 0.05  # in flight, for another program that writes to the map: the next query is better than a late one
+_log = logging.getLogger(__name__)
 _ROOM = 20_000  # places to learn in a flight: 200 km at the usual spacing; beyond that, RAM keeps the best places
 
 
@@ -59,7 +62,7 @@ def open_learning(config: Config, board: Board, new_technique: str | None) -> tu
         place_map, technique = PlaceMap.open_for_adding(path), None
     else:
         technique = made_for(board, new_technique, _wanted(config))
-        place_map = _new_map(path, technique)
+        place_map = _new_map(path, technique, mask_of(config.source.mask))
     with _closed_on_error(place_map):
         technique = technique or technique_of(place_map, config.technique, _wanted(config), board)
         index_positions(place_map)
@@ -150,6 +153,8 @@ def _recogniser(
     length = length_of(technique.spec, config.match.sequence)
     if narrowed:
         place_map.wait_at_most(_WAIT_S)
+    mask = mask_of(config.source.mask)
+    say_other_mask(place_map, mask)
     return Recogniser(
         technique=technique,
         place_map=place_map,
@@ -161,7 +166,17 @@ def _recogniser(
         # In a sequence, a place that a wrong hint kept out of one query would count as compared and unlike it.
         prior=_prior(config, technique) if narrowed and length == 1 else None,
         min_accuracy_m=config.mavlink.min_accuracy_m,
+        mask=mask,
     )
+
+
+def say_other_mask(place_map: PlaceMap, mask: AnyMask) -> None:
+    """Warn where the places of a map were made with another mask than `mask`. They can be used all the same: a display
+    in them is ground that nobody sees."""
+    built_with = place_map.mask_sha256
+    if len(place_map) and built_with != mask.sha256:
+        how = "without a mask" if built_with is None else "with another mask"
+        _log.warning("%s was built %s; more is recognised where map and frames have the same", place_map.path, how)
 
 
 def _prior(config: Config, technique: Technique) -> Prior:
@@ -178,12 +193,13 @@ def _closed_on_error(place_map: PlaceMap) -> Iterator[None]:
         raise
 
 
-def _new_map(path: Path, technique: Technique) -> PlaceMap:
+def _new_map(path: Path, technique: Technique, mask: AnyMask) -> PlaceMap:
     """Make an empty map that is there completely or not at all: a service killed at power-on must be able to start
     again."""
     unfinished = path.with_name(path.name + ".new")
     remove(unfinished)
-    PlaceMap.create(unfinished, technique.spec).close()
+    with PlaceMap.create(unfinished, technique.spec) as place_map:
+        place_map.record_mask(mask.sha256)
     unfinished.replace(path)
     return PlaceMap.open_for_adding(path)
 

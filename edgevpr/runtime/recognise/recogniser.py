@@ -9,11 +9,13 @@ from itertools import islice
 
 from edgevpr.contract import Technique
 from edgevpr.errors import EdgevprError, MapError, PlaceError
+from edgevpr.frames.mask import AnyMask, NoMask
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import compare, named, scan
 from edgevpr.places.sequence import Alone, Search
 from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.recognise.gate import says_nothing
 from edgevpr.runtime.recognise.hints import NoPrior, Prior, expected_of
 from edgevpr.runtime.recognise.judge import NEW_FOR_S, AcceptRule, Verdict, judge
 from edgevpr.runtime.recognise.recognition import Recognition
@@ -25,7 +27,8 @@ _log = logging.getLogger(__name__)
 class Recogniser:
     """Recognises places of an open map, frame after frame.
 
-    `candidates` places are compared in full (None: all, see `places.retrieve.compare`). `search` joins several queries,
+    `candidates` places are compared in full (None: all, see `places.retrieve.compare`). `mask` leaves parts of every
+    frame out. `search` joins several queries,
     and `prior` narrows each; without them each query is ranked alone, over the whole map. The governor changes
     `candidates`; the learner and the governor change the index (`take`, `extend`).
     """
@@ -42,9 +45,10 @@ class Recogniser:
         search: Search | None = None,
         prior: Prior | NoPrior | None = None,
         min_accuracy_m: float = 1.0,
+        mask: AnyMask | None = None,
     ) -> None:
         self.place_map, self.meter, self.candidates = place_map, meter, candidates
-        self._prior, self._min_accuracy_m = prior or NoPrior(), min_accuracy_m
+        self._prior, self._min_accuracy_m, self._mask = prior or NoPrior(), min_accuracy_m, mask or NoMask()
         self._told = 0  # number of places left out that an event has told of
         self._new: deque[tuple[int, float]] = deque()  # place id, and the time it was learnt at
         self.take(technique, index, rule, search or Alone())
@@ -75,16 +79,19 @@ class Recogniser:
         Never raises an Exception: an error of a frame, a place or the technique becomes a refusal with its reason.
         """
         meter, technique, index = self.meter, self.technique, self.index
-        descriptor = hints = ranking = best = None
+        descriptor = hints = ranking = best = nothing = None
         map_lost = False
         meter.begin()
         try:
             with meter.step("encode"):
-                descriptor = technique.encode(frame.image)
+                descriptor = self._mask.encode(technique, frame.image)
             if self._lost:
                 raise MapError(self._lost)
+            nothing = says_nothing(descriptor, self.rule.min_quality)
             if not len(index):
                 verdict = Verdict(False, "the map has no place yet")
+            elif nothing and self.search.length == 1:  # in a sequence it is searched for, to keep the others in step
+                verdict = Verdict(False, nothing)
             else:
                 with meter.step("scan"):
                     self.place_map.require_unchanged()
@@ -107,6 +114,7 @@ class Recogniser:
                     (best,) = named(ranking, index, self.place_map, first=1)
                     is_new = self._is_new(best.place.place_id, frame.t_mono_s)
                     verdict = judge(ranking, index, self.rule, self.search, is_new)
+                    verdict = Verdict(False, nothing) if nothing else verdict
                 self._prior.learn(best, verdict.accepted, frame.t_mono_s)
             failed = False
         except Exception as error:
@@ -123,6 +131,7 @@ class Recogniser:
             best=best,
             accepted=verdict.accepted,
             reason=verdict.reason,
+            says_nothing=nothing is not None,
             failed=failed,
             map_lost=map_lost,
             left_out=self._newly_left_out(),

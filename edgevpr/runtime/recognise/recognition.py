@@ -19,7 +19,8 @@ class Recognition:
     `descriptor` is the encoded frame, `hints` what narrowed the search, `ranking` the places found and `best` the first
     of them; each is None where its step was not reached. `accepted` tells whether `best` is taken for the place, and
     `reason` why (not), in a few words. `position` is the place's, and `accuracy_m` its 1-sigma; both are set for an
-    accepted match only: any other carries no position.
+    accepted match only: any other carries no position. `says_nothing` tells whether the picture holds too little to be
+    recognised; a place was then searched for only to go on with a sequence.
 
     `failed` tells whether the frame, a place or the technique could not be used, and `map_lost` whether that is because
     the map as a whole cannot be read. `left_out` are the places that have been left out since the last event because
@@ -37,6 +38,7 @@ class Recognition:
     best: Candidate | None = None
     accepted: bool = False
     reason: str
+    says_nothing: bool = False
     failed: bool = False
     map_lost: bool = False
     left_out: tuple[tuple[int, str], ...] = ()

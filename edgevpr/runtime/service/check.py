@@ -3,14 +3,18 @@
 import os
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from edgevpr.config import Config, load_config
-from edgevpr.errors import EdgevprError, LinkError, MapError, UsageError
+from edgevpr.errors import EdgevprError, ImageError, LinkError, MapError, UsageError
 from edgevpr.frames.condition import Condition
-from edgevpr.frames.source import open_source
+from edgevpr.frames.overlay import FEWEST_FRAMES, learn_overlay, require_png, write_mask
+from edgevpr.frames.source import Source, open_source
+from edgevpr.helpers.files import require_folder
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.transport import open_transport
 from edgevpr.places.mapfile import PlaceMap
@@ -24,6 +28,8 @@ from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.types import FIX_MAX_AGE_S
 
 _LOG_ROOM_MB = 10  # some hours of queries
+# Pictures that a mask is learnt from: so far apart that the ground has moved, and of a minute of flight at most.
+_LEARNT_FROM, _APART_S = 3 * FEWEST_FRAMES, 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +58,46 @@ def check(config_path: str | Path) -> list[Finding]:
         findings.append(Finding("map", False, "Not looked at: correct the board or the battery first."))
     findings += [_looked_at("source", _source, config), _looked_at("link", _link, config)]
     return [*findings, _looked_at("log", _log, config)]
+
+
+def learn_mask(config_path: str | Path, out: Path, recording: str | None = None) -> str:
+    """Learn which part of the frames shows no ground, from the configured source or a `recording`, and write the mask
+    to `out`. Return a sentence about it. Raises an EdgevprError where there is nothing to learn from."""
+    require_png(out)
+    require_folder(out)
+    uri = recording or load_config(config_path).source.uri
+    if uri is None:
+        raise UsageError("There is no source to learn a mask from: name a recording with --source.")
+    source = open_source(uri, step_s=_APART_S, live=recording is None)
+    try:
+        allowed = learn_overlay(_pictures(source), uri)
+    finally:
+        source.close()
+    if allowed.all():
+        return f"{uri} shows no display over the ground: no mask is needed, and none was written."
+    write_mask(out, allowed)
+    return (
+        f"{out}: {1 - allowed.mean():.1%} of the frame is masked. Look at it, use it as `source: {{mask: {out}}}`, and "
+        f"build the map with --mask {out}."
+    )
+
+
+def _pictures(source: Source) -> Iterator[np.ndarray]:
+    """Yield pictures of a source, `_APART_S` seconds apart where it is live, as long as any come and enough were
+    yielded."""
+    end_s = time.monotonic() + 2 * _LEARNT_FROM * _APART_S
+    count = 0
+    while count < _LEARNT_FROM and not source.ended and time.monotonic() < end_s:
+        try:
+            frame = source.read(1.0)
+        except ImageError:
+            continue
+        if frame is None:
+            continue
+        count += 1
+        yield frame.image
+        if source.is_live:
+            time.sleep(_APART_S)
 
 
 def _looked_at(what: str, look: Callable[[Config], str], config: Config) -> Finding:

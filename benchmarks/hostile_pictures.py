@@ -1,0 +1,172 @@
+"""Pictures that say nothing, and flights of such pictures over every map: nothing of them may be accepted.
+
+`pictures` makes pictures of nothing real: screens without a signal, displays on a blank ground, noise, sky, and others.
+`spoilt` makes pictures that hide a real one: covered, out of focus, smeared. `run` asks in the map of every image set:
+pictures of nothing, the set's own queries spoilt, and pictures by a camera that looks the other way. It counts what is
+accepted. A spoilt picture that is recognised as its own place is no fault. Everything follows from a seed.
+"""
+
+import argparse
+import os
+import tempfile
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from hostile_nothing import NOTHING, SIZES
+from hostile_spoilt import SPOILT
+
+from edgevpr.config import load_config
+from edgevpr.evaluate.dataset import Dataset, load_dataset
+from edgevpr.frames.images import list_images, read_image
+from edgevpr.frames.source import open_source
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.power.boards import load_board
+from edgevpr.runtime.recognise.mapping import build_map
+from edgevpr.runtime.recognise.opening import meter_of, open_recogniser
+from edgevpr.runtime.recognise.recogniser import Recogniser
+from edgevpr.techniques import create
+from edgevpr.types import Frame
+
+DATA = Path(os.environ.get("EDGEVPR_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data")
+NADIR = ("aerial_", "kite_")  # how the names of sets from the air begin
+OF_NOTHING, OTHER_CAMERA = "nothing: ", "other camera: "  # how kinds begin
+
+
+def pictures(seed: int, count: int | None = None) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield `count` pictures of nothing real (None: endlessly): the kind, and uint8 (H, W, 3) BGR. All kinds take
+    turns."""
+    number = 0
+    while count is None or number < count:
+        kind = list(NOTHING)[number % len(NOTHING)]
+        rng = np.random.default_rng((seed, number))
+        height, width = SIZES[rng.integers(len(SIZES))]
+        yield kind, NOTHING[kind](rng, height, width)
+        number += 1
+
+
+def spoilt(seed: int, picture: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield a real picture once in every way that hides most of it: the kind, and a uint8 picture."""
+    for number, (kind, spoil) in enumerate(SPOILT.items()):
+        yield kind, spoil(np.random.default_rng((seed, number)), picture)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Row:
+    """Count of pictures of one kind that were asked in the map of one set, and of those accepted, right or wrong."""
+
+    kind: str
+    set: str
+    camera: str
+    tried: int
+    accepted: int
+    accepted_wrong: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Asked:
+    """A picture to ask: its kind, and the references that it may be taken for (empty: none)."""
+
+    kind: str
+    image: np.ndarray
+    may_be: frozenset[str] = frozenset()
+
+
+def run(count: int, seed: int, data: Path = DATA, names: Iterable[str] | None = None) -> list[Row]:
+    """Ask `count` pictures of nothing, about `count` spoilt ones and `count` by the other camera in the map of every
+    set of `data` (or of those named), and count by kind and set."""
+    folders = [path.parent for path in sorted(data.glob("*/ground_truth.csv"))]
+    rows = []
+    for number, folder in enumerate(folders):
+        if names is None or folder.name in names:
+            others = [each for each in folders if camera_of(each.name) != camera_of(folder.name)]
+            rows += _counted(folder, others, count, seed + number)
+    return rows
+
+
+def camera_of(name: str) -> str:
+    return "nadir" if name.startswith(NADIR) else "forward"
+
+
+def _counted(folder: Path, others: list[Path], count: int, seed: int) -> list[Row]:
+    dataset = load_dataset(folder / "query", folder / "ref", folder / "ground_truth.csv")
+    tried: Counter[str] = Counter()
+    accepted: Counter[str] = Counter()
+    wrong: Counter[str] = Counter()
+    with tempfile.TemporaryDirectory(prefix="edgevpr-hostile-") as temporary:
+        recogniser = mapped(folder, Path(temporary))
+        with recogniser.place_map:
+            for asked in _asked(dataset, others, count, seed):
+                event = recogniser.step(Frame(image=asked.image, name=asked.kind, t_mono_s=0.0))
+                tried[asked.kind] += 1
+                if event.accepted:
+                    accepted[asked.kind] += 1
+                    wrong[asked.kind] += event.best.place.source_image not in asked.may_be
+    return [
+        Row(
+            kind=kind,
+            set=folder.name,
+            camera=camera_of(folder.name),
+            tried=tried[kind],
+            accepted=accepted[kind],
+            accepted_wrong=wrong[kind],
+        )
+        for kind in tried
+    ]
+
+
+def mapped(folder: Path, temporary: Path) -> Recogniser:
+    """Map the references of a set with `cohog`, and open the map as a flight does."""
+    config = load_config(None, {"map": str(temporary / "m.gpkg"), "source.camera": camera_of(folder.name)})
+    board = load_board("this")
+    technique = create("cohog", {"camera": camera_of(folder.name)})
+    source = open_source(str(folder / "ref"), live=False)
+    with PlaceMap.create(config.map, technique.spec) as place_map:
+        build_map((source.read(0) for _ in range(source.total)), technique, place_map, meter_of(config, board))
+    return open_recogniser(config, board)
+
+
+def _asked(dataset: Dataset, others: list[Path], count: int, seed: int) -> Iterator[_Asked]:
+    for kind, image in pictures(seed, count):
+        yield _Asked(OF_NOTHING + kind, image)
+    rng = np.random.default_rng((seed, 1))
+    queries = -(-count // len(SPOILT))
+    for number in rng.choice(len(dataset.queries), queries, replace=queries > len(dataset.queries)):
+        query = dataset.queries[number]
+        for kind, image in spoilt(seed + int(number), read_image(query.path)):
+            yield _Asked(kind, image, query.right | query.ignored)
+    paths = [path for other in others for part in ("query", "ref") for path in list_images(other / part)]
+    order = rng.permutation(len(paths))
+    for number in range(count):
+        path, turns = paths[order[number % len(paths)]], number // len(paths)  # a picture asked again is turned
+        yield _Asked(OTHER_CAMERA + path.parents[1].name, np.ascontiguousarray(np.rot90(read_image(path), turns)))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--count", type=int, default=46, help="pictures of nothing a map (46)")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--sets", metavar="A,B", help="names of sets (default: all)")
+    parser.add_argument("--data", type=Path, default=DATA)
+    args = parser.parse_args()
+    rows = run(args.count, args.seed, args.data, args.sets.split(",") if args.sets else None)
+    for row in rows:
+        if row.accepted:
+            print(f"{row.set:26} {row.camera:8} {row.kind:32} {row.tried:5} {row.accepted:5} {row.accepted_wrong:5}")
+    for kind in (OF_NOTHING, OTHER_CAMERA, ""):
+        for camera in ("forward", "nadir"):
+            these = [row for row in rows if row.camera == camera and _group(row) == kind]
+            tried, accepted, wrong = (
+                sum(getattr(row, what) for row in these) for what in ("tried", "accepted", "accepted_wrong")
+            )
+            print(f"{kind or 'spoilt: ':14} {camera:8} {tried} tried, {accepted} accepted, {wrong} of them wrong")
+
+
+def _group(row: Row) -> str:
+    return next((kind for kind in (OF_NOTHING, OTHER_CAMERA) if row.kind.startswith(kind)), "")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,62 @@
+"""The overlay mask: which part of every frame shows ground, and which a display or the aircraft itself."""
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from edgevpr.contract import Descriptor, Technique
+from edgevpr.errors import UsageError
+from edgevpr.frames.images import read_image
+from edgevpr.frames.opencv import cv2
+
+MOST_MASKED = 0.6  # share of the frame; too little ground is left beside more
+_WHITE = 128
+
+
+class NoMask:
+    """Stands in for a `Mask` where the whole frame shows ground."""
+
+    sha256 = None
+
+    def encode(self, technique: Technique, image: np.ndarray) -> Descriptor:
+        """Encode the whole image."""
+        return technique.encode(image)
+
+
+@dataclass(frozen=True, slots=True)
+class Mask:
+    """A mask: `allowed` bool (H, W) is True where frames show ground. It is scaled to each frame. `sha256` is that of
+    the pixels, not of the file."""
+
+    allowed: np.ndarray
+    sha256: str
+
+    def encode(self, technique: Technique, image: np.ndarray) -> Descriptor:
+        """Encode the part of an image that shows ground."""
+        height, width = image.shape[:2]
+        fitted = cv2.resize(self.allowed.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
+        return technique.encode(image, fitted.astype(bool))
+
+
+AnyMask = NoMask | Mask
+
+
+def mask_of(path: str | None) -> AnyMask:
+    """Read the mask of a configuration (`source.mask`); None gives `NoMask`."""
+    return NoMask() if path is None else read_mask(path)
+
+
+def read_mask(path: str | Path) -> Mask:
+    """Read an image as a mask: bright pixels show ground, dark ones are ignored.
+
+    Raises ImageError for a file that is no image, and UsageError for a mask that leaves too little of the frame.
+    """
+    image = read_image(path)
+    allowed = (image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)) >= _WHITE
+    if (masked := 1 - allowed.mean()) > MOST_MASKED:
+        raise UsageError(
+            f"{path} masks {masked:.0%} of the frame, and {MOST_MASKED:.0%} is the most: leave more of it white."
+        )
+    return Mask(allowed, hashlib.sha256(repr(allowed.shape).encode() + np.packbits(allowed).tobytes()).hexdigest())

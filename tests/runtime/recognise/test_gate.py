@@ -1,0 +1,86 @@
+"""A picture that says nothing is refused before anything is searched for, and nothing made of nothing is accepted."""
+
+import math
+
+import cv2
+import hostile_pictures
+import numpy as np
+import pytest
+from pictures import textured
+
+from edgevpr.config import load_config
+from edgevpr.contract import Descriptor
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.power.boards import load_board
+from edgevpr.runtime.recognise.gate import says_nothing
+from edgevpr.runtime.recognise.mapping import build_map
+from edgevpr.runtime.recognise.opening import meter_of, open_recogniser
+from edgevpr.techniques import create
+from edgevpr.types import NO_COST, Frame
+
+PLACES = 6
+
+
+def frame(image, name="x"):
+    return Frame(image=image, name=name, t_mono_s=0.0)
+
+
+@pytest.fixture(scope="module", params=["forward", "nadir"])
+def walk(request, tmp_path_factory):
+    """A recogniser of six places, as a flight opens it."""
+    path = tmp_path_factory.mktemp("map") / "m.gpkg"
+    config, board = load_config(None, {"map": str(path), "source.camera": request.param}), load_board("this")
+    technique = create("cohog", {"camera": request.param})
+    with PlaceMap.create(path, technique.spec) as place_map:
+        frames = (frame(textured(number, 240, 320), f"{number}.png") for number in range(PLACES))
+        build_map(frames, technique, place_map, meter_of(config, board))
+    recogniser = open_recogniser(config, board)
+    with recogniser.place_map:
+        yield recogniser
+
+
+@pytest.mark.parametrize(
+    ("quality", "refused"), [(0.0, True), (0.399, True), (math.nan, True), (0.4, False), (1, False)]
+)
+def test_a_picture_says_enough_from_two_fifths_on(quality, refused):
+    reason = says_nothing(Descriptor(coarse=np.zeros(1), quality=quality), create("cohog").min_quality)
+    assert (reason is not None) == refused
+    if reason and quality > 0:
+        assert "the picture says nothing: " in reason
+
+
+def test_what_says_nothing_is_not_searched_for(walk):
+    picture = np.full((480, 640, 3), (180, 0, 0), np.uint8)
+    cv2.putText(picture, "NO SIGNAL", (150, 260), cv2.FONT_HERSHEY_SIMPLEX, 2, (255, 255, 255), 3)
+    event = walk.step(frame(picture))
+    assert (event.says_nothing, event.accepted, event.failed, event.is_query) == (True, False, False, True)
+    assert (event.position, event.best, event.ranking) == (None, None, None)
+    assert event.reason.startswith("the picture says nothing: ")
+    assert event.reason.endswith("% of it holds information, 40% are needed")
+    assert event.steps.scan == event.steps.compare == NO_COST, "the search is saved"
+    after = walk.step(frame(textured(3, 240, 320)))
+    assert (after.accepted, after.says_nothing, after.best.place.source_image) == (True, False, "3.png")
+
+
+def test_no_picture_of_nothing_real_is_accepted(walk):
+    for kind, picture in hostile_pictures.pictures(seed=9000, count=23):
+        event = walk.step(frame(picture, kind))
+        assert not event.accepted, f"{kind}: {event.reason}"
+
+
+def test_a_picture_that_hides_most_of_a_place_is_that_place_or_none(walk):
+    recognised = 0
+    for number in (2, 5):
+        for kind, picture in hostile_pictures.spoilt(9000 + number, textured(number, 240, 320)):
+            event = walk.step(frame(picture, kind))
+            assert not event.accepted or event.best.place.source_image == f"{number}.png", kind
+            recognised += event.accepted
+    assert recognised > 0, "what is left is often enough"
+
+
+def test_the_same_seed_makes_the_same_pictures():
+    one, other = (list(hostile_pictures.pictures(seed=5, count=23)) for _ in range(2))
+    assert [kind for kind, _ in one] == [kind for kind, _ in other]
+    assert all(np.array_equal(a, b) for (_, a), (_, b) in zip(one, other, strict=True))
+    assert len({kind for kind, _ in one}) == 23
+    assert all(picture.dtype == np.uint8 and picture.shape[2:] == (3,) for _, picture in one)

@@ -1,0 +1,148 @@
+"""The mask from the camera to the match: learnt by `check`, used by map and query, and said where they differ."""
+
+import cv2
+import numpy as np
+import pytest
+from pictures import textured
+
+from edgevpr.cli.main import main
+from edgevpr.config import load_config
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.power.boards import load_board
+from edgevpr.runtime.recognise.opening import open_recogniser
+from edgevpr.types import Frame
+
+PLACES = 24
+
+
+def shown(picture):
+    """The picture with a display over it: two panels of figures, the same in every frame."""
+    shown = picture.copy()
+    shown[:60], shown[190:] = 0, 0
+    for line, row in enumerate((25, 50, 215, 235)):
+        cv2.putText(shown, f"{line} BAT 16.2V RSSI 87 HOME 412m ALT", (3, row), cv2.FONT_HERSHEY_PLAIN, 1.1, 255, 1)
+    return shown
+
+
+def view(number):
+    return textured(number, 240, 320)
+
+
+def dusk(number):
+    """The same place with less light and more noise."""
+    noise = np.random.default_rng(number).normal(0, 20, (240, 320))
+    return np.clip(0.6 * view(number) + noise, 0, 255).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("masked")
+    (folder / "ref").mkdir()
+    for number in range(PLACES):
+        cv2.imwrite(str(folder / "ref" / f"{number:02d}.png"), shown(view(number)))
+    (folder / "c.yaml").write_text(f"source: {{uri: {folder / 'ref'}}}\nlog: {{path: null}}\n")
+    assert main(["check", "--config", str(folder / "c.yaml"), "--learn-mask", str(folder / "mask.png")]) == 0
+    built = ["map", "build", "--images", str(folder / "ref"), "--technique", "cohog", "--param", "w1=208"]
+    assert main([*built, str(folder / "plain.gpkg")]) == 0
+    assert main([*built, str(folder / "masked.gpkg"), "--mask", str(folder / "mask.png")]) == 0
+    return folder
+
+
+def opened(folder, name, mask):
+    settings = {"map": str(folder / name), "source.mask": str(folder / "mask.png") if mask else None}
+    return open_recogniser(load_config(None, settings), load_board("this"))
+
+
+def test_the_mask_that_check_learns_covers_the_display(folder, capsys):
+    mask = cv2.imread(str(folder / "mask.png"), cv2.IMREAD_GRAYSCALE)
+    assert mask.shape == (240, 320)
+    assert (mask[15:50, 10:250] == 0).mean() > 0.8
+    assert (mask[90:175] == 255).all(), "nothing but ground"
+    assert main(["check", "--config", str(folder / "c.yaml"), "--learn-mask", str(folder / "again.png")]) == 0
+    said = capsys.readouterr().out
+    assert "% of the frame is masked" in said
+    assert f"--mask {folder / 'again.png'}" in said
+
+
+def test_with_the_mask_more_is_recognised_behind_a_display(folder):
+    found = {}
+    for name, mask in (("plain.gpkg", False), ("masked.gpkg", True)):
+        walk = opened(folder, name, mask)
+        with walk.place_map:
+            events = [walk.step(Frame(image=shown(dusk(n)), name=str(n), t_mono_s=0.0)) for n in range(PLACES)]
+        assert all(e.best.place.source_image == f"{n:02d}.png" for n, e in enumerate(events) if e.accepted)
+        found[name] = sum(event.accepted for event in events)
+    assert found["masked.gpkg"] >= found["plain.gpkg"] + 4, "what all places share says nothing of any"
+
+
+def test_a_display_on_nothing_is_nothing(folder):
+    walk = opened(folder, "masked.gpkg", True)
+    with walk.place_map:
+        event = walk.step(Frame(image=shown(np.full((240, 320), 70, np.uint8)), name="x", t_mono_s=0.0))
+    assert (event.accepted, event.says_nothing) == (False, True)
+
+
+def test_map_and_frames_with_different_masks_are_used_with_a_warning(folder, caplog):
+    for name, mask, said in (
+        ("plain.gpkg", True, "was built without a mask"),
+        ("masked.gpkg", False, "was built with another mask"),
+        ("masked.gpkg", True, None),
+        ("plain.gpkg", False, None),
+    ):
+        caplog.clear()
+        walk = opened(folder, name, mask)
+        with walk.place_map:
+            assert walk.step(Frame(image=view(3), name="x", t_mono_s=0.0)).best.place.source_image == "03.png"
+        assert [said in record.message for record in caplog.records if "was built" in record.message] == [True] * bool(
+            said
+        )
+
+
+def test_a_map_knows_its_mask_and_a_merged_one_where_it_is_the_same(folder, tmp_path):
+    def mask_of(path):
+        with PlaceMap.open(path) as place_map:
+            return place_map.mask_sha256
+
+    own = mask_of(folder / "masked.gpkg")
+    assert len(own) == 64
+    assert mask_of(folder / "plain.gpkg") is None
+    masked, plain = str(folder / "masked.gpkg"), str(folder / "plain.gpkg")
+    assert main(["map", "merge", str(tmp_path / "same.gpkg"), masked, masked]) == 0
+    assert main(["map", "merge", str(tmp_path / "both.gpkg"), masked, plain]) == 0
+    assert mask_of(tmp_path / "same.gpkg") == own
+    assert mask_of(tmp_path / "both.gpkg") is None
+
+
+def test_check_learns_from_a_recording_and_says_what_it_needs(folder, tmp_path, capsys):
+    config, out = ["check", "--config", str(folder / "c.yaml")], str(tmp_path / "m.png")
+    still = tmp_path / "still"
+    still.mkdir()
+    for number in range(PLACES):
+        cv2.imwrite(str(still / f"{number}.png"), shown(view(1)))
+    for arguments, code, said in (
+        (["--learn-mask", out, "--source", str(still)], 1, "stands still"),
+        (["--learn-mask", str(tmp_path / "m.jpg")], 2, "ends in .png"),
+        (["--learn-mask", str(tmp_path / "absent" / "m.png")], 2, "there is no such folder"),
+        (["--source", str(still)], 2, "--source goes with --learn-mask"),
+        (["--learn-mask", out, "--source", "/dev/video99"], 1, "is live and never ends"),
+    ):
+        assert main([*config, *arguments]) == code
+        err = capsys.readouterr().err
+        assert said in err
+        assert "Traceback" not in err
+    assert not (tmp_path / "m.png").exists()
+    assert main([*config, "--learn-mask", out, "--source", str(folder / "ref")]) == 0
+    (tmp_path / "no-source.yaml").write_text("log: {path: null}\n")
+    assert main(["check", "--config", str(tmp_path / "no-source.yaml"), "--learn-mask", out]) == 2
+
+
+@pytest.mark.parametrize("command", ["build", "match"])
+def test_a_mask_that_cannot_be_used_is_said_before_anything_is_made(folder, tmp_path, capsys, command):
+    black = tmp_path / "black.png"
+    cv2.imwrite(str(black), np.zeros((240, 320), np.uint8))
+    asked = ["map", "build", str(tmp_path / "m.gpkg"), "--technique", "cohog"]
+    if command == "match":
+        asked = ["match", str(folder / "plain.gpkg")]
+    assert main([*asked, "--images", str(folder / "ref"), "--mask", str(black)]) == 2
+    assert "masks 100% of the frame" in capsys.readouterr().err
+    assert not (tmp_path / "m.gpkg").exists()
