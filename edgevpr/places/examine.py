@@ -52,7 +52,7 @@ def faults(place_map: PlaceMap) -> list[str]:
     """Return what SQLite finds wrong with the file as a whole, a sentence each; empty for a sound one."""
     try:
         said = [str(text) for (text,) in place_map.db.execute(f"PRAGMA integrity_check({_MOST_SAID})")]
-    except sqlite3.Error as error:
+    except (sqlite3.Error, UnicodeDecodeError) as error:
         said = [str(error)]
     return [] if said == ["ok"] else said
 

@@ -359,7 +359,7 @@ class PlaceMap:
         read it any more."""
         try:
             return self.db.execute("PRAGMA data_version").fetchone()[0]
-        except sqlite3.Error as error:
+        except (sqlite3.Error, UnicodeDecodeError) as error:
             if "locked" in str(error):
                 raise
             return None

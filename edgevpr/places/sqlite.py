@@ -103,6 +103,10 @@ def sentences(path: Path) -> Iterator[None]:
     """Turn an error of SQLite into a MapError that says what the user can do, a MapBusyError where waiting helps."""
     try:
         yield
+    except UnicodeDecodeError as error:  # Python's, of a message of SQLite that quotes a damaged schema
+        raise MapError(
+            f"{path}: the file is damaged or no place map (its schema is no text): restore a copy or build it again."
+        ) from error
     except sqlite3.Error as error:
         said = str(error)
         if "locked" in said:

@@ -3,6 +3,7 @@
 import sqlite3
 from contextlib import closing
 
+import hostile_maps
 import pytest
 from hostile_maps import KINDS, damaged_maps, make_whole_map, run
 
@@ -33,7 +34,8 @@ def test_the_same_seed_damages_in_the_same_way_and_another_in_another(tmp_path):
 def test_a_map_that_says_a_wrong_position_is_seen(tmp_path, monkeypatch):
     """The generator itself must be able to find something: without checksums it does."""
     monkeypatch.setattr("edgevpr.places.rows._hold", lambda blob, checksum, name: None)
-    (found,) = [row for row in run(12 * len(KINDS), seed=3) if row.kind == "bits of a position flipped"]
+    monkeypatch.setattr(hostile_maps, "KINDS", {"bits of a position flipped": KINDS["bits of a position flipped"]})
+    (found,) = run(12, seed=3)
     assert found.wrong_positions > 0
 
 
