@@ -82,10 +82,7 @@ class VideoSource(Recording):
     def _advance(self, picture: "VideoFrame") -> bool:
         """Advance to this picture, and tell whether it is due."""
         self._index += 1
-        stamp = picture.pts or 0
-        if not self._index:
-            self._first_stamp = stamp
-        stamp_s = (stamp - self._first_stamp) * self._unit_s
+        stamp_s = ((picture.pts or 0) - self._first_stamp) * self._unit_s
         # A bare H.264 or MJPEG file has no time stamps (they read as zero or are wrong): the frame rate is used.
         self._t_s = stamp_s if stamp_s > self._t_s else self._t_s + self._frame_s
         return self._t_s >= self._t_due_s - _TIMESTAMP_ROUNDING_S

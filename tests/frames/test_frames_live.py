@@ -7,10 +7,13 @@ import time
 
 import numpy as np
 import pytest
+from fakes import FakeClock
 
 from edgevpr.errors import SourceError
 from edgevpr.frames import streams
+from edgevpr.frames.condition import Condition
 from edgevpr.frames.live import Camera, LiveSource, wait_before_reopening_s
+from edgevpr.frames.shot import Refusal, Shot
 from edgevpr.frames.source import open_source
 
 PATIENCE_S = 60.0
@@ -187,6 +190,87 @@ def test_the_capture_is_released_by_the_thread_that_reads_it_and_opened_anew():
     cameras[1].pictures.put(None)
     source.close()
     assert cameras[1].released.is_set()
+
+
+class ScriptedCapture:
+    """A capture that gives shots and refusals; `clock` steps before each, and when all are given it waits."""
+
+    def __init__(self, given, clock, step_s):
+        self._given, self._clock, self._step_s = iter(given), clock, step_s
+        self.is_done, self.may_end = threading.Event(), threading.Event()
+
+    def read(self):
+        self._clock.now_s += self._step_s
+        shot = next(self._given, None)
+        if shot is None:
+            self.is_done.set()
+            self.may_end.wait(PATIENCE_S)
+        return shot
+
+    def release(self):
+        pass
+
+
+def shot(number, t_mono_s=0.0):
+    picture = np.random.default_rng(number).integers(0, 255, (48, 64), np.uint8)
+    return Shot(t_mono_s=t_mono_s, look=picture, pixels=lambda: picture)
+
+
+def condition_after(given, step_s=0.1):
+    """The source after it was given these, one every `step_s`, and was lost; what is read of it, and its condition."""
+    clock = FakeClock()
+    capture = ScriptedCapture(given, clock, step_s)
+    source = LiveSource(lambda: capture, clock)
+    assert capture.is_done.wait(PATIENCE_S)
+    condition, state, frame = source.condition, source.state, source.read(0)
+    capture.may_end.set()
+    source.close()
+    return source, condition, state, frame
+
+
+@pytest.mark.parametrize(
+    ("repeats", "step_s", "condition"),
+    [
+        (5, 0.1, Condition.RUNNING),
+        (11, 0.1, Condition.FROZEN),
+        (2, 0.9, Condition.RUNNING),
+        (3, 0.9, Condition.FROZEN),
+        (3, 0.2, Condition.RUNNING),
+    ],
+)
+def test_a_picture_that_repeats_for_a_second_and_three_times_is_frozen(repeats, step_s, condition):
+    source, found, state, frame = condition_after([shot(1), shot(2), *[shot(2)] * repeats], step_s)
+    assert found is condition
+    assert (
+        state == {Condition.RUNNING: "streaming", Condition.FROZEN: "frozen: the same picture over and over"}[condition]
+    )
+    assert frame.name.startswith("frame 000001 "), "only the first of them is a frame"
+    assert source.refused == {"damaged": 0, "patched": 0, "frozen": repeats, "late": 0}
+
+
+def test_a_frozen_source_is_back_with_its_next_new_picture():
+    _, condition, state, frame = condition_after([*[shot(1)] * 30, shot(2)])
+    assert (condition, state) == (Condition.RUNNING, "streaming")
+    assert frame.name.startswith("frame 000001 ")
+
+
+def test_a_stream_of_which_nothing_is_whole_is_damaged_after_five_seconds():
+    refusals = [Refusal.DAMAGED] * 51
+    assert condition_after([shot(1), *refusals[:-2]])[1] is Condition.RUNNING
+    source, condition, state, frame = condition_after(refusals)
+    assert (condition, state, frame) == (Condition.DAMAGED, "damaged: no picture is whole", None)
+    assert source.refused["damaged"] == 51
+
+
+def test_a_picture_that_is_older_than_the_one_before_is_refused():
+    source, _, _, frame = condition_after([shot(1, 5.0), shot(2, 4.9)])
+    assert frame.t_mono_s == 5.0
+    assert source.refused["late"] == 1
+
+
+def test_the_age_of_the_newest_picture_is_known():
+    source, *_ = condition_after([shot(1, 998.1)])
+    assert source.latency_s == pytest.approx(2.0)
 
 
 def test_the_wait_before_reopening_doubles_up_to_ten_seconds():

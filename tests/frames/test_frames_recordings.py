@@ -1,6 +1,7 @@
 """Folders of images and video files, read through open_source."""
 
 import os
+import re
 import subprocess
 
 import cv2
@@ -181,6 +182,69 @@ def test_a_bare_h264_stream_is_timed_by_its_frame_rate(tmp_path):
     times_s = [float(frame.name.split("=")[1].split()[0]) for frame in all_frames(open_source(str(path), live=False))]
     assert len(times_s) == 50
     assert times_s == sorted(set(times_s))
+
+
+def frames_and_complaints(path):
+    source, frames, complaints = open_source(str(path), live=False), [], []
+    while not source.ended:
+        try:
+            frames.append(source.read(9.0))
+        except ImageError as error:
+            complaints.append(str(error))
+    source.close()
+    return [frame for frame in frames if frame], complaints, source.refused["damaged"]
+
+
+def time_of(frame):
+    return frame.name.split("t=")[1]
+
+
+@pytest.fixture
+def films(tmp_path):
+    """A function that films three seconds of a test picture at 25 Hz, with a key frame every second."""
+    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="the video is made with ffmpeg (pip install imageio-ffmpeg)")
+
+    def film(name, *coding):
+        picture = ["-f", "lavfi", "-i", "testsrc2=size=160x120:rate=25:duration=3"]
+        path = tmp_path / name
+        command = [ffmpeg.get_ffmpeg_exe(), "-v", "quiet", *picture, "-g", "25", *coding, str(path)]
+        subprocess.run(command, check=True)
+        return path
+
+    return film
+
+
+def test_damaged_frames_of_a_video_and_those_built_on_them_are_left_out_counted_and_said_once(films):
+    path = films("flight.mkv", "-c:v", "libx264", "-bf", "0", "-sc_threshold", "0")
+    whole, complaints, _ = frames_and_complaints(path)
+    assert (len(whole), complaints) == (75, [])
+    data = bytearray(path.read_bytes())
+    middle = len(data) // 2
+    data[middle : middle + 300] = bytes(300)
+    path.write_bytes(data)
+    frames, complaints, damaged = frames_and_complaints(path)
+    images = {time_of(frame): frame.image for frame in whole}
+    assert all((images[time_of(frame)] == frame.image).all() for frame in frames)
+    assert 50 <= len(frames) < 75
+    assert time_of(frames[-1]) == time_of(whole[-1]), "it goes on with the next key frame"
+    assert damaged > 0
+    (complaint,) = complaints
+    assert f"{path}: frame 0000" in complaint
+    assert "being damaged or built on damage: copy the video again." in complaint
+
+
+@pytest.mark.parametrize("name", ["flight.mkv", "flight.avi", "flight.mp4"])
+def test_a_video_that_is_cut_short_is_said(name, films):
+    path = films(
+        name, "-c:v", "mpeg4", "-qscale:v", "3", *(["-movflags", "+faststart"] if name.endswith("mp4") else [])
+    )
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    frames, complaints, _ = frames_and_complaints(path)
+    assert 10 < len(frames) < 60
+    assert re.search(
+        rf"{name} ends after 1\.[0-9] s of 3\.0 s: it is cut short: copy the video again\.", complaints[-1]
+    )
 
 
 @pytest.mark.parametrize(

@@ -155,6 +155,23 @@ def test_a_camera_that_is_lost_is_told_and_is_critical_until_it_is_back(recordin
     assert [line["state"] for line in of_kind(lines, "source")] == ["lost, reopening in 0.5 s", "streaming"]
 
 
+def test_a_camera_that_is_frozen_is_told_once_and_is_critical_until_it_is_back(recording, tmp_path):
+    clock = FakeClock()
+    link, health = FakeLink(clock), []
+    source = FakeSource(pictures(6), clock, work=lambda: (health.append(link.health.name), turn())[0])
+
+    def turn():
+        source.is_frozen = len(health) in (2, 3, 4)
+
+    lines = flight(recording, tmp_path, link, clock).fly(source)
+    assert health == ["ACTIVE", "ACTIVE", "CRITICAL", "CRITICAL", "CRITICAL", "ACTIVE"]
+    assert link.texts() == [(4, "edgevpr: camera frozen"), (6, "edgevpr: camera is back")]
+    assert [line["state"] for line in of_kind(lines, "source")] == [
+        "frozen: the same picture over and over",
+        "streaming",
+    ]
+
+
 def test_a_listener_that_fails_does_not_end_the_flight(recording, tmp_path, caplog):
     clock = FakeClock()
     link = FakeLink(clock)

@@ -142,6 +142,8 @@ def test_frames_that_nobody_took_are_counted(recording, tmp_path):
     assert dropped == sorted(dropped)
     assert dropped[-1] >= 10, "most of its pictures are passed over"
     assert flight.flown.totals["dropped"] == source.dropped
+    assert flight.flown.totals["refused"] == source.refused
+    assert of_kind(lines, "query")[-1]["totals"].keys() >= {"refused", "latency_s"}
 
 
 def test_the_log_ends_with_what_the_board_has_drawn(recording, tmp_path):

@@ -1,0 +1,73 @@
+"""The time at which pictures of a stream were taken, by their time stamps and by when they arrived."""
+
+import pytest
+
+from edgevpr.frames.age import StampedTime, UnstampedTime
+
+STEP_S = 0.05
+
+
+def feed(time, pictures, *, stamp_s=100.0, t_mono_s=1000.0, delay_s=lambda number: 0.0, drift=0.0):
+    """Let so many pictures arrive, one every 50 ms; returns how old each is said to be on arrival."""
+    ages_s = []
+    for number in range(pictures):
+        stamp = stamp_s + number * STEP_S * (1 + drift)
+        now = t_mono_s + number * STEP_S + delay_s(number)
+        time.arrived(stamp, stamp, now)
+        taken = time.taken_s(stamp, now)
+        ages_s.append(None if taken is None else now - taken)
+    return ages_s
+
+
+def test_a_stream_without_delays_is_new_on_arrival():
+    assert feed(StampedTime(), 200)[3:] == [pytest.approx(0, abs=1e-9)] * 197
+
+
+def test_what_a_picture_took_longer_than_the_quickest_is_its_age():
+    ages_s = feed(StampedTime(), 100, delay_s=lambda number: 0.8 if 60 <= number < 70 else 0.0)
+    assert ages_s[60:70] == [pytest.approx(0.8)] * 10
+    assert ages_s[70:] == [pytest.approx(0)] * 30
+
+
+def test_pictures_that_have_waited_for_the_opening_have_no_time():
+    """Forty pictures are there at once, the last of them new; then one comes every 50 ms."""
+    ages_s = feed(StampedTime(), 80, delay_s=lambda number: max(0.0, 2.0 - number * STEP_S))
+    assert ages_s[:40] == [None] * 40
+    assert ages_s[50:] == [pytest.approx(0, abs=1e-9)] * 30
+
+
+def test_no_picture_is_taken_after_it_has_arrived():
+    time = StampedTime()
+    feed(time, 20)
+    assert time.taken_s(500.0, 1001.0) == 1001.0
+
+
+@pytest.mark.parametrize("drift", [1e-4, -1e-4])
+def test_clocks_that_drift_make_no_picture_old(drift):
+    """An hour at 0.01 %: 0.36 s that are nobody's age."""
+    ages_s = feed(StampedTime(), 72_000, drift=drift)
+    assert max(ages_s[3:]) < 0.01
+
+
+@pytest.mark.parametrize("stamp_s", [0.0, 5000.0])
+def test_a_sender_that_begins_anew_is_followed(stamp_s):
+    time = StampedTime()
+    feed(time, 40)
+    ages_s = feed(time, 40, stamp_s=stamp_s, t_mono_s=1010.0)
+    assert ages_s[0] is None
+    assert ages_s[5:] == [pytest.approx(0, abs=1e-9)] * 35
+
+
+def test_pictures_that_are_sent_out_of_turn_are_no_new_beginning():
+    time, order = StampedTime(), [0, 3, 1, 2, 6, 4, 5, 9, 7, 8, 12, 10, 11]
+    for turn, number in enumerate(order):
+        now = 1000.0 + turn * STEP_S
+        time.arrived(number * STEP_S, (turn - 1) * STEP_S, now)
+    assert time.taken_s(11 * STEP_S, now) is not None
+
+
+def test_without_stamps_a_picture_that_was_there_already_is_as_old_as_the_last_wait():
+    time = UnstampedTime(opened_s=10.0)
+    assert time.taken_s(asked_s=10.5, t_mono_s=10.5001) == 10.0
+    assert time.taken_s(asked_s=10.5, t_mono_s=10.6) == 10.6, "it was waited for"
+    assert time.taken_s(asked_s=13.0, t_mono_s=13.0005) == 10.6, "it may have come at any moment since"

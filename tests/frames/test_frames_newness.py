@@ -1,0 +1,78 @@
+"""Pictures that are not new: the one before again, and those patched from older ones."""
+
+import cv2
+import numpy as np
+import pytest
+
+from edgevpr.frames.newness import Newness, coarse
+from edgevpr.frames.shot import Refusal
+
+HEIGHT, WIDTH = 240, 320
+_NOISE = np.random.default_rng(3).normal(128, 400, (900, 1200))
+GROUND = np.clip(128 + cv2.GaussianBlur(_NOISE - 128, (0, 0), 3), 0, 255).astype(np.uint8)
+
+
+def view(number):
+    """What a camera sees that flies on."""
+    return GROUND[2 * number : 2 * number + HEIGHT, 5 * number : 5 * number + WIDTH].copy()
+
+
+def refusals(pictures):
+    newness = Newness()
+    return [newness.refusal(coarse(picture)) for picture in pictures]
+
+
+def test_pictures_of_a_flight_are_new():
+    assert refusals(view(number) for number in range(100)) == [None] * 100
+
+
+def test_the_same_picture_is_frozen_for_as_long_as_it_lasts():
+    assert refusals([view(0), view(1), *[view(1)] * 20, view(2)]) == [None, None, *[Refusal.FROZEN] * 20, None]
+
+
+def test_a_grey_level_here_and_there_does_not_make_a_picture_new():
+    again = view(1)
+    again[::40, ::40] += 1
+    assert refusals([view(0), view(1), again]) == [None, None, Refusal.FROZEN]
+
+
+def test_the_noise_of_a_camera_that_stands_still_makes_every_picture_new():
+    noise = np.random.default_rng(0)
+    standing = [np.clip(view(0) + noise.normal(0, 1.5, (HEIGHT, WIDTH)), 0, 255).astype(np.uint8) for _ in range(20)]
+    assert refusals(standing) == [None] * 20
+
+
+@pytest.mark.parametrize("behind", [1, 2, 4])
+def test_a_picture_of_which_the_lower_part_is_older_is_patched(behind):
+    flown = [view(number) for number in range(40)]
+    patched = view(40)
+    patched[100:] = flown[-behind][100:]
+    assert refusals([*flown, patched, view(41)])[-2:] == [Refusal.PATCHED, None]
+
+
+def test_patched_pictures_are_refused_for_as_long_as_they_come():
+    patched = [view(number) for number in range(40, 90)]
+    for picture in patched:
+        picture[100:] = view(39)[100:]
+    assert set(refusals([*(view(number) for number in range(40)), *patched])[40:]) == {Refusal.PATCHED}
+
+
+def test_what_stands_in_every_picture_is_no_patch():
+    """A black border, a sky without a cloud, and the text of a display."""
+    pictures = [view(number) for number in range(80)]
+    for picture in pictures:
+        picture[:70], picture[220:] = 255, 0
+        cv2.putText(picture, "ALT 120 BAT 14.8 AUTO", (5, 236), cv2.FONT_HERSHEY_SIMPLEX, 0.6, 255, 2)
+    assert refusals(pictures) == [None] * 80
+
+
+def test_a_standing_scene_in_which_something_moves_is_no_patch():
+    """A camera on the ground without any noise, and somebody who walks through the picture."""
+    pictures = [view(0) for _ in range(60)]
+    for number, picture in enumerate(pictures):
+        picture[100:160, 4 * number : 4 * number + 40] = GROUND[500:560, 40:80]
+    assert Refusal.PATCHED not in refusals(pictures)
+
+
+def test_a_picture_of_another_size_begins_anew():
+    assert refusals([view(0), view(0)[:96, :128], view(0)[:96, :128]]) == [None, None, Refusal.FROZEN]
