@@ -120,8 +120,6 @@ def map_build(args: Namespace) -> int:
         )
         if result.already_here:
             print(f"  {result.already_here} images were in the map already")
-        if result.odd_times:
-            print(f"  {result.odd_times} images have a time that is no date: their places have none")
     return exit_code(unusable)
 
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from edgevpr.contract import Technique
 from edgevpr.errors import ImageError, ModelError
 from edgevpr.frames.mask import AnyMask
-from edgevpr.places.geopackage import utc_text
 from edgevpr.places.index import empty_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.meter import QueryMeter
@@ -19,13 +18,11 @@ _NO_RULE = AcceptRule(min_score=1.0, min_margin=1.0, neighbour_m=0.0)  # no plac
 
 @dataclass(frozen=True, slots=True)
 class MappingResult:
-    """Counts of frames: places added, how many of those have no position or a time that is no date, and frames that
-    were in the map already."""
+    """Counts of frames: places added, how many of those have no position, and frames that were in the map already."""
 
     added: int
     without_position: int
     already_here: int
-    odd_times: int = 0
 
 
 def build_map(
@@ -47,7 +44,7 @@ def build_map(
     nothing = empty_index(technique.spec, 0, None)
     walk = Recogniser(technique=technique, place_map=place_map, index=nothing, rule=_NO_RULE, meter=meter, mask=mask)
     here = place_map.fingerprints()
-    added = without_position = already_here = odd_times = 0
+    added = without_position = already_here = 0
     for frame in frames:
         seen = walk.step(frame)
         if seen.failed:
@@ -61,5 +58,4 @@ def build_map(
         place_map.add(frame, seen.descriptor)
         added += 1
         without_position += frame.position is None
-        odd_times += frame.t_utc_s is not None and utc_text(frame.t_utc_s) is None
-    return MappingResult(added, without_position, already_here, odd_times)
+    return MappingResult(added, without_position, already_here)

@@ -42,7 +42,7 @@ def test_a_technique_that_does_not_count_what_agrees_is_judged_by_its_score():
 
 def test_in_a_sequence_the_newest_query_need_not_be_sure_by_itself():
     index = empty_index(TechniqueSpec(name="test", parameters={}, coarse=PartSpec((1,), "<f4")), 10, None)
-    search, verdicts = SequenceSearch(2, gap_s=9.0), []
+    search, verdicts = SequenceSearch(2), []
     for query in range(2):
         scores = np.full(10, 0.02, np.float32)
         scores[4 + query] = 0.3
