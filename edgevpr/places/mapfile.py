@@ -8,7 +8,7 @@ the others are used.
 import os
 import sqlite3
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -232,7 +232,7 @@ class PlaceMap:
         for place_id, row in found:
             with self._named(place_id):
                 *values, checksum = _there(row)
-                place = rows.place_of(place_id, tuple(values), checksum)
+                place = rows.place_of(place_id, values, checksum)
             yield place
 
     def coarse_parts(self) -> Iterator[tuple[int, Point | None, float | None, np.ndarray]]:
@@ -242,20 +242,22 @@ class PlaceMap:
         for place_id, row in self.scan(columns):
             try:
                 *values, geom_checksum, coarse, checksum = _there(row)
-                place = rows.place_of(place_id, tuple(values), geom_checksum)
+                point, heading_deg = rows.where_of(values, geom_checksum)
                 part = rows.part_of(coarse, self.spec.coarse, checksum, "coarse part")
             except Unreadable as error:
                 self.left_out.setdefault(place_id, str(error))
                 continue
-            where = place.position
-            heading_deg = None if place.heading_deg is None else place.heading_deg % 360
-            yield place_id, (where.lat_deg, where.lon_deg) if where else None, heading_deg, part
+            yield place_id, point, heading_deg, part
 
     def mean_coarse(self) -> np.ndarray:
         """Return the mean of all coarse parts that can be read, float32 with the shape of one part."""
-        mean = np.zeros(self.spec.coarse.shape)
-        for count, (*_, part) in enumerate(self.coarse_parts(), start=1):
-            mean += (part - mean) / count
+        mean, count = np.zeros(self.spec.coarse.shape), 0
+        for _, row in self.scan(f"coarse, {self._coarse_checksum}"):
+            with suppress(Unreadable):
+                coarse, checksum = _there(row)
+                part = rows.part_of(coarse, self.spec.coarse, checksum, "coarse part")
+                count += 1
+                mean += (part - mean) / count
         return mean.astype(np.float32)
 
     def fine_part(self, place_id: int) -> tuple[np.ndarray, Point | None]:

@@ -26,9 +26,15 @@ def existing(name: str | Path) -> Path:
     """Return the path of a map that is there. Raises UsageError as `map_path`, and MapError for a map that is missing
     or is no regular file."""
     path = map_path(name)
-    if not path.exists():
-        raise MapError(f"There is no map {path}: make one with `edgevpr map build {path} --images DIR`.")
-    require_regular(path)
+    try:
+        if not path.exists():
+            raise MapError(f"There is no map {path}: make one with `edgevpr map build {path} --images DIR`.")
+        require_regular(path)
+    except OSError as error:
+        raise MapError(
+            f"{path}: it cannot be opened ({error.strerror}): check the path, and the permissions of the file and its "
+            "folder."
+        ) from error
     return path
 
 

@@ -7,7 +7,7 @@ checksum. The exception is the time, of which other programs write many forms: w
 import math
 import sqlite3
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -61,12 +61,6 @@ def part_of(blob: object, spec: PartSpec, checksum: object, name: str) -> np.nda
     return part
 
 
-def heading_of(value: object) -> float | None:
-    """Return a heading as 0 up to 360 degrees, None where unknown. Raises Unreadable."""
-    heading_deg = _number(value, "heading_deg")
-    return None if heading_deg is None else heading_deg % 360
-
-
 def quality_of(value: object) -> float:
     """Return a quality, 0 to 1. Raises Unreadable."""
     quality = _number(value, "quality")
@@ -75,21 +69,29 @@ def quality_of(value: object) -> float:
     return quality
 
 
-def place_of(place_id: int, values: tuple, geom_checksum: object) -> Place:
-    """Make a place of its row's `VALUES`. Raises Unreadable."""
-    geom, time, alt_m, heading_deg, source_image, quality = values
+def where_of(values: Sequence, geom_checksum: object) -> tuple[Point | None, float | None]:
+    """Check all of a row's `VALUES`; return the position, and the heading as 0 up to 360 degrees. Raises Unreadable."""
+    geom, _, alt_m, heading_deg, source_image, quality = values
     point = point_of(geom, geom_checksum)
-    alt_m = _number(alt_m, "alt_m")
-    heading_of(heading_deg)
+    _number(alt_m, "alt_m")
+    heading_deg = _number(heading_deg, "heading_deg")
     if not isinstance(source_image, str):
         raise Unreadable("its source_image is no text")
+    quality_of(quality)
+    return point, None if heading_deg is None else heading_deg % 360
+
+
+def place_of(place_id: int, values: Sequence, geom_checksum: object) -> Place:
+    """Make a place of its row's `VALUES`. Raises Unreadable."""
+    point, _ = where_of(values, geom_checksum)
+    _, time, alt_m, heading_deg, source_image, quality = values
     return Place(
         place_id=place_id,
         source_image=source_image,
         position=Position(*point, alt_m) if point else None,
         t_utc_s=geopackage.utc_seconds(time),
         heading_deg=heading_deg,
-        quality=quality_of(quality),
+        quality=quality,
     )
 
 

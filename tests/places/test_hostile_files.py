@@ -8,6 +8,8 @@ import sqlite3
 import stat
 import subprocess
 import sys
+import tempfile
+from pathlib import Path
 
 import map_writer
 import numpy as np
@@ -234,23 +236,23 @@ PlaceMap.create({str(tmp_path / "m.gpkg")!r}, SPEC)
 
 
 @pytest.mark.parametrize("left", ["-wal", "-wal and -shm"])
-def test_a_left_over_log_in_a_folder_that_may_not_be_written_is_read(tmp_path, left):
-    folder = tmp_path / "card"
-    folder.mkdir()
-    writer = subprocess.Popen(
-        [sys.executable, map_writer.__file__, str(folder / "m.gpkg"), "0"], stdout=subprocess.PIPE, text=True
-    )
-    for _ in range(5):
-        writer.stdout.readline()
-    writer.kill()
-    writer.communicate()
-    if left == "-wal":
-        (folder / "m.gpkg-shm").unlink()
-    before = sorted(entry.name for entry in folder.iterdir())
-    for entry in folder.iterdir():
-        entry.chmod(0o444)
-    folder.chmod(0o555)
-    code = f"""
+def test_a_left_over_log_in_a_folder_that_may_not_be_written_is_read(left):
+    with tempfile.TemporaryDirectory() as name:  # not pytest's own folder: nobody else may look into that
+        folder = Path(name)
+        writer = subprocess.Popen(
+            [sys.executable, map_writer.__file__, str(folder / "m.gpkg"), "0"], stdout=subprocess.PIPE, text=True
+        )
+        for _ in range(5):
+            writer.stdout.readline()
+        writer.kill()
+        writer.communicate()
+        if left == "-wal":
+            (folder / "m.gpkg-shm").unlink()
+        before = sorted(entry.name for entry in folder.iterdir())
+        for entry in folder.iterdir():
+            entry.chmod(0o444)
+        folder.chmod(0o555)
+        code = f"""
 import os, sys
 sys.path[:0] = {sys.path!r}
 from edgevpr.places.mapfile import PlaceMap
@@ -259,14 +261,12 @@ with PlaceMap.open({str(folder / "m.gpkg")!r}) as place_map:
     print(len(place_map), len(list(place_map.coarse_parts())))
     place_map.require_unchanged()
 """
-    for parent in (tmp_path, *tmp_path.parents[:2]):
-        parent.chmod(parent.stat().st_mode | 0o055)
-    read = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
-    folder.chmod(0o755)
-    assert read.returncode == 0, read.stderr
-    counted, parts = map(int, read.stdout.split())
-    assert counted == parts >= 5
-    assert sorted(entry.name for entry in folder.iterdir()) == before
+        read = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+        folder.chmod(0o755)
+        assert read.returncode == 0, read.stderr
+        counted, parts = map(int, read.stdout.split())
+        assert counted == parts >= 5
+        assert sorted(entry.name for entry in folder.iterdir()) == before
 
 
 def first_format(path):
