@@ -13,7 +13,8 @@ class StampedTime:
     """Time by the stream's own time stamps.
 
     They share no zero with this machine's clock: the least delay seen in the last 5 to 10 s is taken for none, and all
-    that a picture took longer is its age. Older delays are forgotten, so that clocks that drift do no harm."""
+    that a picture took longer is its age. Older delays are forgotten, so that clocks that drift do no harm. `is_live`:
+    what waited for the opening has been fetched."""
 
     def __init__(self) -> None:
         self._begin_anew()
@@ -25,7 +26,7 @@ class StampedTime:
         if order_s < self._order_s or abs(order_delay_s - self._order_delay_s) > _RESTART_S:
             self._begin_anew()
         self._in_time = self._in_time + 1 if order_delay_s > self._least_order_delay_s - _BACKLOG_S else 0
-        self._is_live = self._is_live or self._in_time >= _IN_TIME
+        self.is_live = self.is_live or self._in_time >= _IN_TIME
         self._order_s, self._order_delay_s = order_s, order_delay_s
         self._least_order_delay_s = min(self._least_order_delay_s, order_delay_s)
         if self._window_began_s is None:
@@ -37,12 +38,12 @@ class StampedTime:
     def taken_s(self, stamp_s: float, t_mono_s: float) -> float | None:
         """Return the time at which the picture with this stamp was taken, `t_mono_s` at the latest. None while what has
         waited since the opening is still being fetched: how old that is cannot be known."""
-        if not self._is_live:
+        if not self.is_live:
             return None
         return min(t_mono_s, stamp_s + min(self._least_s, self._former_s))
 
     def _begin_anew(self) -> None:
-        self._is_live, self._in_time = False, 0
+        self.is_live, self._in_time = False, 0
         self._order_s, self._order_delay_s = -math.inf, math.nan
         self._least_order_delay_s = self._least_s = self._former_s = math.inf
         self._window_began_s: float | None = None

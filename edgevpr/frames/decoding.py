@@ -29,39 +29,48 @@ _PACKETS_IN_DOUBT = 2
 _UNSTAMPED = 0x80  # AVFMT_NOTIMESTAMPS of FFmpeg: what looks like a time stamp has been made up from a frame rate
 
 
-def open_container(
+def open_pictures(
     uri: str, options: dict[str, str], timeouts_s: tuple[float, float] | None = None
-) -> "InputContainer | None":
+) -> "WholePictures | None":
     """Open a stream or file with FFmpeg's options, and the time-outs for opening and for every reading; None where
     nothing is there that holds pictures."""
-    try:
-        container = av.open(uri, options=options, timeout=timeouts_s)
-    except (av.FFmpegError, OSError, ValueError):
-        return None
+    with av.logging.Capture() as said:
+        try:
+            container = av.open(uri, options=options, timeout=timeouts_s)
+        except (av.FFmpegError, OSError, ValueError):
+            return None
     if container.streams.video:
-        return container
+        return WholePictures(container, _is_missed(said))
     container.close()
     return None
 
 
-def is_stamped(container: "InputContainer") -> bool:
-    """Tell whether the pictures have time stamps of their own."""
-    return not container.format.flags & _UNSTAMPED
+def _is_missed(said: list[tuple[int, str, str]]) -> bool:
+    return any(_MISSED in message for _, _, message in said)
 
 
 class WholePictures:
     """The pictures of one container that are whole: `fetch` a packet, then `decode` it. A picture that is damaged, and
-    all that are predicted from it until the next one that stands alone, are refused before they cost anything."""
+    all that are predicted from it until the next one that stands alone, are refused before they cost anything.
 
-    def __init__(self, container: "InputContainer") -> None:
-        self._container, self.stream = container, container.streams.video[0]
+    FFmpeg reads ahead while it opens a stream. Where packets `are_missed` then, it is not known which, and no packet is
+    trusted until `caught_up` is called."""
+
+    def __init__(self, container: "InputContainer", are_missed: bool) -> None:
+        self.container, self.stream = container, container.streams.video[0]
+        self.is_stamped = not container.format.flags & _UNSTAMPED
         self._codec = self.stream.codec_context
         self._codec.thread_count = 1  # pictures decoded side by side come late, and each takes memory
         self._codec.options = {"err_detect": "explode"}  # what cannot be decoded is not filled in
         self._packets = container.demux(self.stream)
         self._reformatter = VideoReformatter()
+        self._is_backlog_doubtful = are_missed
         self._doubtful = 0  # so many packets from now on are not to be trusted
         self._has_begun = self._is_sound = False
+
+    def caught_up(self) -> None:
+        """Take note that what is fetched from now on came after the opening."""
+        self._is_backlog_doubtful = False
 
     def fetch(self) -> "Packet | None":
         """Wait for the next packet and return it; None at the end, and where the stream is lost."""
@@ -70,7 +79,7 @@ class WholePictures:
                 packet = next(self._packets, None)
             except (av.FFmpegError, OSError):
                 return None
-        if packet is not None and (packet.is_corrupt or any(_MISSED in message for _, _, message in said)):
+        if packet is not None and (packet.is_corrupt or _is_missed(said)):
             # FFmpeg notices a gap while it puts together the picture after the one that it hands out.
             self._doubtful = _PACKETS_IN_DOUBT
         return packet
@@ -79,8 +88,8 @@ class WholePictures:
         """Return the pictures that are ready after this packet: none, one, or at the end several."""
         if not packet.size:
             return self._decoded(packet) if self._is_sound else []
-        if self._doubtful:
-            self._doubtful -= 1
+        if self._doubtful or self._is_backlog_doubtful:
+            self._doubtful = max(0, self._doubtful - 1)
             return self._refuse()
         if not self._is_sound:
             if not packet.is_keyframe:
@@ -99,7 +108,7 @@ class WholePictures:
 
     def close(self) -> None:
         """Close the file or the connection."""
-        self._container.close()
+        self.container.close()
 
     def _decoded(self, packet: "Packet") -> "list[VideoFrame] | Refusal":
         with av.logging.Capture():

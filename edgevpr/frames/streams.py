@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from edgevpr.frames.age import StampedTime, UnstampedTime
-from edgevpr.frames.decoding import WholePictures, is_stamped, open_container
+from edgevpr.frames.decoding import WholePictures, open_pictures
 from edgevpr.frames.newness import coarse
 from edgevpr.frames.shot import Refusal, Shot
 
 if TYPE_CHECKING:
-    from av.container import InputContainer
     from av.video.frame import VideoFrame
 
 OPEN_TIMEOUT_S = 5.0
@@ -27,17 +26,17 @@ def open_stream(uri: str, clock: Callable[[], float]) -> "StreamCapture | None":
     """Open a network stream or an .sdp file with time-outs; None where nothing is there."""
     opened_s = clock()
     options = _OPTIONS if "://" in uri else _SDP_OPTIONS
-    container = open_container(uri, options, (OPEN_TIMEOUT_S, READ_TIMEOUT_S))
-    return StreamCapture(container, clock, opened_s) if container else None
+    whole = open_pictures(uri, options, (OPEN_TIMEOUT_S, READ_TIMEOUT_S))
+    return StreamCapture(whole, clock, opened_s) if whole else None
 
 
 class StreamCapture:
     """The pictures of an open stream."""
 
-    def __init__(self, container: "InputContainer", clock: Callable[[], float], opened_s: float) -> None:
-        self._whole, self._clock = WholePictures(container), clock
+    def __init__(self, whole: WholePictures, clock: Callable[[], float], opened_s: float) -> None:
+        self._whole, self._clock = whole, clock
         self._unit_s = float(self._whole.stream.time_base)
-        self._stamped = StampedTime() if is_stamped(container) else None
+        self._stamped = StampedTime() if whole.is_stamped else None
         self._unstamped = UnstampedTime(opened_s)
         self._ready: deque[Shot | Refusal] = deque()
 
@@ -53,6 +52,8 @@ class StreamCapture:
             if self._stamped and packet.pts is not None:
                 order = packet.pts if packet.dts is None else packet.dts
                 self._stamped.arrived(packet.pts * self._unit_s, order * self._unit_s, arrived_s)
+                if self._stamped.is_live:
+                    self._whole.caught_up()
             pictures = self._whole.decode(packet)
             if isinstance(pictures, Refusal):
                 return pictures

@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from edgevpr.errors import ImageError, SourceError
-from edgevpr.frames.decoding import WholePictures, is_stamped, open_container
+from edgevpr.frames.decoding import WholePictures, open_pictures
 from edgevpr.frames.recordings import Recording
 from edgevpr.frames.shot import Refusal
 from edgevpr.types import Frame
 
 if TYPE_CHECKING:
-    from av.container import InputContainer
     from av.video.frame import VideoFrame
 
 _TIMESTAMP_ROUNDING_S = 0.001  # Matroska counts in milliseconds
@@ -31,13 +30,13 @@ class VideoSource(Recording):
         super().__init__()
         self.ended = False
         self._path, self._step_s, self._clock = path, step_s, clock
-        container = open_container(str(path), {})
-        if container is None:
+        whole = open_pictures(str(path), {})
+        if whole is None:
             raise SourceError(f"{path} is not a video that can be decoded: give a video file or a folder of images.")
-        self._whole, stream = WholePictures(container), container.streams.video[0]
+        self._whole, stream = whole, whole.stream
         self._unit_s, self._first_stamp = float(stream.time_base), stream.start_time or 0
         self._frame_s = 1 / float(stream.average_rate or _USUAL_RATE_HZ)
-        self._promised_s, self._is_stamped = _promised_s(container), is_stamped(container)
+        self._promised_s, self._is_stamped = _promised_s(whole), whole.is_stamped
         frames = stream.frames or self._promised_s / self._frame_s
         self._promised_s = max(self._promised_s, stream.frames * self._frame_s)  # an AVI file says only this when cut
         self.total = math.ceil(frames * self._frame_s / max(step_s, self._frame_s))
@@ -109,9 +108,9 @@ class VideoSource(Recording):
             )
 
 
-def _promised_s(container: "InputContainer") -> float:
+def _promised_s(whole: WholePictures) -> float:
     """Return the seconds that the file says it lasts; 0 where it does not say."""
-    if not is_stamped(container):
+    if not whole.is_stamped:
         return 0.0
-    stream = container.streams.video[0]
-    return float(stream.duration * stream.time_base) if stream.duration else (container.duration or 0) / 1e6
+    stream = whole.stream
+    return float(stream.duration * stream.time_base) if stream.duration else (whole.container.duration or 0) / 1e6

@@ -205,7 +205,7 @@ def films(tmp_path):
     ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="the video is made with ffmpeg (pip install imageio-ffmpeg)")
 
     def film(name, *coding):
-        picture = ["-f", "lavfi", "-i", "testsrc2=size=160x120:rate=25:duration=3"]
+        picture = ["-f", "lavfi", "-i", "testsrc2=size=320x240:rate=25:duration=3"]
         path = tmp_path / name
         command = [ffmpeg.get_ffmpeg_exe(), "-v", "quiet", *picture, "-g", "25", *coding, str(path)]
         subprocess.run(command, check=True)
@@ -220,7 +220,7 @@ def test_damaged_frames_of_a_video_and_those_built_on_them_are_left_out_counted_
     assert (len(whole), complaints) == (75, [])
     data = bytearray(path.read_bytes())
     middle = len(data) // 2
-    data[middle : middle + 300] = bytes(300)
+    data[middle : middle + 300] = np.random.default_rng(1).bytes(300)
     path.write_bytes(data)
     frames, complaints, damaged = frames_and_complaints(path)
     images = {time_of(frame): frame.image for frame in whole}
