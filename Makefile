@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # One thread for the matrix products: what is measured is what one core does, and small products gain nothing from more.
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: demo test lint results bench clean
+.PHONY: demo test lint results bench hostile clean
 
 demo: $(VENV)/installed
 	$(BIN)/edgevpr demo --out demo_out
@@ -28,6 +28,10 @@ bench: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[bench]'
 	$(BIN)/python benchmarks/bench.py
 	$(BIN)/python benchmarks/readme.py
+
+# Everything that a hostile world does, from a seed, into benchmarks/results/.
+hostile: $(VENV)/installed
+	$(BIN)/python benchmarks/hostile.py
 
 clean:
 	rm -rf $(VENV) demo_out dist build

@@ -1,0 +1,77 @@
+"""Everything that a hostile world does, again: `make hostile` writes benchmarks/results/hostile.md and hostile.json.
+
+Streams that break, pictures that say nothing, maps that are damaged, packets of others, programs that are killed and
+files that are wrong are all made from a seed. The table says what was tried, how often, and what left the aircraft.
+"""
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
+
+import argparse
+import json
+from dataclasses import asdict
+from datetime import datetime, timezone
+from pathlib import Path
+
+import bench_streams
+import hostile_inputs
+import hostile_kills
+import hostile_links
+import hostile_maps
+import hostile_pictures
+from run_sets import commit_of, machine
+
+from edgevpr.helpers.tables import markdown
+
+RESULTS = Path(__file__).resolve().parent / "results"
+PARTS = {  # name: (title, how it is run, usual count)
+    "streams": ("Streams: pictures that are cut, corrupted, lost or frozen", bench_streams.run, 200),
+    "pictures": ("Pictures that say nothing, and those of the other camera", hostile_pictures.run, 3000),
+    "maps": ("Maps that are damaged", hostile_maps.run, 200),
+    "links": ("Links: packets and autopilots that are not ours", hostile_links.run, 1000),
+    "kills": ("`kill -9` while mapping and learning", hostile_kills.run, 40),
+    "inputs": ("Files and command lines that are wrong", hostile_inputs.run, 150),
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--parts", metavar="A,B", default=",".join(PARTS), help=f"some of {', '.join(PARTS)}")
+    parser.add_argument("--share", type=float, default=1.0, help="of the usual counts (default: 1)")
+    parser.add_argument("--seed", type=int, default=1)
+    args = parser.parse_args()
+    kept = RESULTS / "hostile.json"
+    measured = json.loads(kept.read_text()) if kept.exists() else {}
+    for name in args.parts.split(","):
+        _, run, count = PARTS[name]
+        print(f"trying: {name}", flush=True)
+        rows = run(max(1, round(args.share * count)), args.seed)
+        measured[name] = {
+            "date": datetime.now(timezone.utc).strftime("%Y-%m-%d"),
+            "commit": commit_of(),
+            "seed": args.seed,
+            "machine": machine(),
+            "rows": [asdict(row) for row in rows],
+        }
+        kept.write_text(json.dumps(measured, indent=2) + "\n")
+    (RESULTS / "hostile.md").write_text(report(measured))
+
+
+def report(measured: dict) -> str:
+    """Return the page for people: a table for each part, with the fields of its rows as columns."""
+    page = ["# Tried as a hostile world would\n\nMade by `make hostile`: all inputs come from a seed."]
+    for name, (title, _, _) in PARTS.items():
+        if name in measured:
+            part = measured[name]
+            rows = part["rows"]
+            columns = [key.replace("_", " ") for key in rows[0]]
+            page.append(
+                f"## {title}\n\n{part['date']}, commit {part['commit']}, seed {part['seed']}, "
+                f"{part['machine']['cpu']}.\n\n{markdown(columns, [list(map(str, row.values())) for row in rows])}"
+            )
+    return "\n\n".join(page) + "\n"
+
+
+if __name__ == "__main__":
+    main()
