@@ -233,6 +233,22 @@ def test_damaged_frames_of_a_video_and_those_built_on_them_are_left_out_counted_
     assert "being damaged or built on damage: copy the video again." in complaint
 
 
+def test_frames_predicted_from_one_that_is_missing_are_left_out(films):
+    """Of an MPEG transport stream, recorded from a radio link that lost the packets of a whole frame: no decoder finds
+    anything wrong with the frames after it."""
+    path = films("flight.ts", "-c:v", "libx264", "-bf", "0", "-sc_threshold", "0")
+    images = {time_of(frame): frame.image for frame in frames_and_complaints(path)[0]}
+    packets = [path.read_bytes()[start : start + 188] for start in range(0, path.stat().st_size, 188)]
+    video = [index for index, packet in enumerate(packets) if packet[1] & 0x1F == 1 and packet[2] == 0]
+    begins = [index for index in video if packets[index][1] & 0x40]
+    lost = [index for index in video if begins[35] <= index < begins[36]]
+    path.write_bytes(b"".join(packet for index, packet in enumerate(packets) if index not in lost))
+    frames, complaints, damaged = frames_and_complaints(path)
+    assert all((images[time_of(frame)] == frame.image).all() for frame in frames)
+    assert 55 <= len(frames) <= 65
+    assert (len(complaints), len(frames) + damaged) == (1, 74)
+
+
 @pytest.mark.parametrize("name", ["flight.mkv", "flight.avi", "flight.mp4"])
 def test_a_video_that_is_cut_short_is_said(name, films):
     path = films(
