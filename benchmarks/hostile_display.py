@@ -59,8 +59,8 @@ def asked(folder: Path, flight: str, *flags: str) -> str:
     accepted_m = [error for error, each in zip(errors_m, found, strict=True) if each["accepted"]]
     near, wrong = sum(error < NEAR_M for error in errors_m), sum(error > WRONG_M for error in accepted_m)
     return (
-        f"{len(found)} queries, {near} best places within {NEAR_M:g} m, {len(accepted_m)} accepted, {wrong} of them more "
-        f"than {WRONG_M:g} m off"
+        f"{len(found)} queries, {near} best places within {NEAR_M:g} m, {len(accepted_m)} accepted, {wrong} of them "
+        f"more than {WRONG_M:g} m off"
     )
 
 
