@@ -178,7 +178,7 @@ class PlaceMap:
     def add(self, frame: Frame, descriptor: Descriptor) -> int:
         """Add one place and return its id once it is safe on the disk. Raises MapError (disk full, ...).
 
-        A time that is no date is unknown. In a name that is not UTF-8, the bytes that are not are written as escapes.
+        A time that is no date is unknown, and so is an altitude at which nothing flies. In a name that is not UTF-8, the bytes that are not are written as escapes.
         """
         position = frame.position
         geom = geopackage.point_blob(position.lat_deg, position.lon_deg) if position else None
@@ -186,7 +186,7 @@ class PlaceMap:
         values = (
             geom,
             geopackage.utc_text(frame.t_utc_s),
-            position.alt_m if position else None,
+            rows.altitude(position.alt_m) if position else None,
             frame.heading_deg,
             _readable(frame.name),
             descriptor.quality,

@@ -22,6 +22,7 @@ BLOBS = "coarse, fine"
 COLUMNS = {"place_id", *f"{VALUES}, {BLOBS}".split(", ")}
 
 _LEAST_ROW_BYTES = 16  # no row of a map is smaller, so a file has no more rows than its size allows
+_LOWEST_M, _HIGHEST_M = -1000, 100_000  # above sea level, as in positions.csv
 _MOST_MISSING = 100_000  # ids one after another of which there is no place
 
 Point = tuple[float, float]
@@ -69,11 +70,18 @@ def quality_of(value: object) -> float:
     return quality
 
 
+def altitude(alt_m: float | None) -> float | None:
+    """Return an altitude above sea level, None for one at which nothing flies."""
+    return alt_m if alt_m is not None and _LOWEST_M <= alt_m <= _HIGHEST_M else None
+
+
 def where_of(values: Sequence, geom_checksum: object) -> tuple[Point | None, float | None]:
     """Check all of a row's `VALUES`; return the position, and the heading as 0 up to 360 degrees. Raises Unreadable."""
     geom, _, alt_m, heading_deg, source_image, quality = values
     point = point_of(geom, geom_checksum)
-    _number(alt_m, "alt_m")
+    alt_m = _number(alt_m, "alt_m")
+    if alt_m != altitude(alt_m):
+        raise Unreadable(f"its alt_m is {alt_m:g}")
     heading_deg = _number(heading_deg, "heading_deg")
     if not isinstance(source_image, str):
         raise Unreadable("its source_image is no text")

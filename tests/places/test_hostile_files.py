@@ -198,6 +198,13 @@ def test_a_name_and_a_time_that_cannot_be_written_cost_no_place(map_path):
     assert (second.source_image, second.t_utc_s) == ("\\ud800.jpg", None)
 
 
+def test_an_altitude_at_which_nothing_flies_is_unknown(map_path):
+    with PlaceMap.open_for_adding(map_path) as place_map:
+        for alt_m in (1e9, float("nan"), float("inf")):
+            place_map.add(dataclasses.replace(frame(41), position=Position(50.0, 8.0, alt_m)), descriptor(41))
+        assert [place.position.alt_m for place in place_map.places([PLACES + 1, PLACES + 2, PLACES + 3])] == [None] * 3
+
+
 def test_two_programs_never_add_to_one_map_at_once(map_path):
     with PlaceMap.open_for_adding(map_path) as place_map:
         second = subprocess.run(

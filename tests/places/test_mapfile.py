@@ -3,6 +3,7 @@
 import dataclasses
 import io
 import json
+import re
 import resource
 import shutil
 import signal
@@ -336,6 +337,7 @@ def test_the_spatial_index_follows_what_other_programs_change(map_path):
         ("coarse = 1e18", "its coarse part has a wrong size"),
         ("heading_deg = 'north'", "its heading_deg is no number"),
         ("alt_m = 9e999", "its alt_m is no number"),
+        ("alt_m = 1e18", "its alt_m is 1e[+]18"),
         ("quality = 1.5", "its quality is not from 0 to 1"),
         ("source_image = CAST('a.jpg' AS BLOB)", "its source_image is no text"),
         ("source_image = CAST(x'ff41' AS TEXT)", "its source_image is no text"),
@@ -349,7 +351,7 @@ def test_what_another_program_has_spoilt_is_named(map_path, change, says):
     with PlaceMap.open(map_path) as place_map:
         assert [place_id for place_id, *_ in place_map.coarse_parts()] == [1, 2, *range(4, 11)]
         assert list(place_map.left_out) == [3]
-        assert says in place_map.left_out[3]
+        assert re.search(says, place_map.left_out[3])
         if "coarse" not in change:
             with pytest.raises(PlaceError, match=f"place 3 is damaged .*{says}"):
                 list(place_map.places())
