@@ -178,7 +178,8 @@ class PlaceMap:
     def add(self, frame: Frame, descriptor: Descriptor) -> int:
         """Add one place and return its id once it is safe on the disk. Raises MapError (disk full, ...).
 
-        A time that is no date is unknown, and so is an altitude at which nothing flies. In a name that is not UTF-8, the bytes that are not are written as escapes.
+        A time that is no date is unknown, and so is an altitude at which nothing flies. In a name that is not UTF-8,
+        the bytes that are not are written as escapes.
         """
         position = frame.position
         geom = geopackage.point_blob(position.lat_deg, position.lon_deg) if position else None
