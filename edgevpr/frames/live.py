@@ -1,5 +1,6 @@
 """Live pictures: a thread that holds the newest frame of a camera or network stream, and reopens a lost source."""
 
+import atexit
 import contextlib
 import threading
 from collections.abc import Callable
@@ -12,6 +13,7 @@ from edgevpr.types import Frame
 
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.5, 10.0
 _CLOSE_TIMEOUT_S = 1.0
+_EXIT_TIMEOUT_S = 10.0  # longer than any time-out of a stream or camera
 _FROZEN_S, _FROZEN_PICTURES = 1.0, 3  # the second for a camera that takes less than three pictures a second
 _DAMAGED_S = 5.0  # longer than streams need to recover from a lost packet
 
@@ -74,6 +76,7 @@ class LiveSource:
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._capture, name="capture", daemon=True)
         self._thread.start()
+        atexit.register(self._end_thread)
 
     @property
     def condition(self) -> Condition:
@@ -95,6 +98,13 @@ class LiveSource:
         self.ended = True
         self._closing.set()
         self._thread.join(_CLOSE_TIMEOUT_S)
+        if not self._thread.is_alive():
+            atexit.unregister(self._end_thread)
+
+    def _end_thread(self) -> None:
+        """Wait for the thread before Python ends: one that comes back from FFmpeg while it ends crashes the process."""
+        self._closing.set()
+        self._thread.join(_EXIT_TIMEOUT_S)
 
     def _capture(self) -> None:
         failures = 0

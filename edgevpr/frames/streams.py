@@ -65,12 +65,13 @@ class StreamCapture:
         self._whole.close()
 
     def _shot(self, picture: "VideoFrame", came_s: float, arrived_s: float) -> Shot | Refusal:
-        if self._stamped and picture.pts is not None:
-            taken_s = self._stamped.taken_s(picture.pts * self._unit_s, arrived_s)
-            if taken_s is None:
-                return Refusal.LATE
+        if self._stamped:
+            stamp_s = None if picture.pts is None else picture.pts * self._unit_s
+            taken_s = None if stamp_s is None else self._stamped.taken_s(stamp_s, arrived_s)
         else:
             taken_s = came_s
+        if taken_s is None:
+            return Refusal.LATE
         return Shot(t_mono_s=taken_s, look=self._look(picture), pixels=lambda: self._whole.pixels(picture))
 
     def _look(self, picture: "VideoFrame") -> np.ndarray:
