@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgevpr.config import MatchConfig
-from edgevpr.contract import Technique
+from edgevpr.contract import FineMatch, Technique
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.retrieve import Ranking, elsewhere, margin
 from edgevpr.places.sequence import Search, SequenceSearch
@@ -22,6 +22,11 @@ _LONGEST = 10
 # Least share of a place's regions that agree, each counted once. Of 961 regions, 48 or more did in every right match of
 # all sets, and 30 at most in the best matches of pictures that are of no place of the map.
 _MIN_COVERAGE = 0.04
+
+# Looking down, a place elsewhere that agrees without any step or rotation, as the best one does, shares with it what is
+# drawn over every frame. Such places scored .14 or more behind a display, and .05 or less in all sets without one.
+_DISPLAY_SCORE = 0.08
+_AT_REST_CELLS = 1.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +86,7 @@ def judge(ranking: Ranking, index: PlaceIndex, rule: AcceptRule, search: Search,
         return Verdict(False, "there is no place elsewhere to compare with, and this score alone says nothing")
     if ahead is not None and not ahead >= rule.min_margin:
         return Verdict(False, f"only {ahead:.3f} ahead of a place elsewhere, {rule.min_margin:.3f} needed")
-    if search.length == 1 and (objection := _covers_little(ranking)):
+    if search.length == 1 and (objection := _covers_little(ranking) or _is_display(ranking, index, rule)):
         return Verdict(False, objection)
     if is_new:  # a fix would only repeat the autopilot's position, and make its errors look confirmed
         return Verdict(False, f"this place was learnt within the last {NEW_FOR_S:g} s and says nothing new")
@@ -97,6 +102,24 @@ def _covers_little(ranking: Ranking) -> str | None:
     if match is None or match.coverage is None or match.coverage >= _MIN_COVERAGE:
         return None
     return f"only {match.coverage:.1%} of the place agrees, {_MIN_COVERAGE:.0%} needed"
+
+
+def _is_display(ranking: Ranking, index: PlaceIndex, rule: AcceptRule) -> str | None:
+    """Return the reason why what agrees may be a display over every frame, None where nothing points to one. Only a
+    camera that looks down can tell: ahead, places one after the other agree without a step."""
+    if not _at_rest(ranking.compared.get(int(ranking.slots[0]))):
+        return None
+    others = ranking.slots[elsewhere(index, ranking.slots[0], ranking.slots, rule.neighbour_m)]
+    matches = (ranking.compared.get(slot) for slot in others.tolist())
+    if not any(_at_rest(match) and match.score >= _DISPLAY_SCORE for match in matches):
+        return None
+    return "a place elsewhere has not moved either, as behind a display: learn a mask with `edgevpr check --learn-mask`"
+
+
+def _at_rest(match: FineMatch | None) -> bool:
+    if match is None or match.rotation_deg != 0 or match.shift_cells is None:
+        return False
+    return max(map(abs, match.shift_cells)) <= _AT_REST_CELLS
 
 
 def _lost_track(ranking: Ranking, index: PlaceIndex, rule: AcceptRule, search: SequenceSearch) -> str | None:

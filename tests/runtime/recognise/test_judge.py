@@ -40,6 +40,41 @@ def test_a_technique_that_does_not_count_what_agrees_is_judged_by_its_score():
     assert "ahead of a place elsewhere" in judged(None, (0.2, 0.19)).reason
 
 
+def behind(*others, best=(0.3, (0.2, -0.1), 0.0)):
+    """The verdict on a best place and two places elsewhere: the score, step and rotation of each."""
+    index = empty_index(TechniqueSpec(name="test", parameters={}, coarse=PartSpec((1,), "<f4")), 30, None)
+    slots = np.array([0, 10, 20])[: 1 + len(others)]
+    matches = {
+        int(slot): FineMatch(score, shift_cells=step, rotation_deg=turn, coverage=0.5)
+        for slot, (score, step, turn) in zip(slots, (best, *others), strict=True)
+    }
+    ranking = Ranking(slots, np.array([match.score for match in matches.values()], np.float32), matches)
+    return judge(ranking, index, RULE, Alone(), is_new=False)
+
+
+@pytest.mark.parametrize("step", [(0.0, 0.0), (-1.4, 1.4)])
+def test_places_far_apart_that_have_not_moved_either_share_a_display(step):
+    verdict = behind((0.2, (9.0, 3.0), 0.0), (0.15, step, 0.0))
+    assert not verdict.accepted
+    assert "--learn-mask" in verdict.reason
+
+
+@pytest.mark.parametrize(
+    "other", [(0.15, (1.6, 0.0), 0.0), (0.15, (0.0, 0.0), 15.0), (0.07, (0.0, 0.0), 0.0), (0.15, (0.0, 0.0), None)]
+)
+def test_places_that_agree_by_another_step_share_none(other):
+    assert behind(other).accepted
+    assert behind(other, (0.1, None, None)).accepted
+
+
+def test_a_picture_that_has_moved_is_no_display():
+    still = (0.15, (0.0, 0.0), 0.0)
+    assert not behind(still).accepted
+    assert behind(still, best=(0.3, (5.0, 0.0), 0.0)).accepted
+    assert behind(still, best=(0.3, (0.0, 0.0), 180.0)).accepted
+    assert behind(still, best=(0.3, (0.0, 0.0), None)).accepted, "looking ahead"
+
+
 def test_in_a_sequence_the_newest_query_need_not_be_sure_by_itself():
     index = empty_index(TechniqueSpec(name="test", parameters={}, coarse=PartSpec((1,), "<f4")), 10, None)
     search, verdicts = SequenceSearch(2), []
