@@ -11,7 +11,7 @@ demo: $(VENV)/installed
 	$(BIN)/edgevpr demo --out demo_out
 
 test: $(VENV)/installed lint
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python -m pytest -n 4 --dist loadfile
 
 lint: $(VENV)/installed
 	$(BIN)/ruff check .
