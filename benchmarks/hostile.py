@@ -1,5 +1,7 @@
 """Everything that a hostile world does, again: `make hostile` writes benchmarks/results/hostile.md and hostile.json.
 
+python benchmarks/hostile.py [--parts A,B] [--share S] [--seed N]
+
 Streams that break, pictures that say nothing, maps that are damaged, packets of others, programs that are killed and
 files that are wrong are all made from a seed. The table says what was tried, how often, and what left the aircraft.
 """
@@ -68,9 +70,18 @@ def report(measured: dict) -> str:
             columns = [key.replace("_", " ") for key in rows[0]]
             page.append(
                 f"## {title}\n\n{part['date']}, commit {part['commit']}, seed {part['seed']}, "
-                f"{part['machine']['cpu']}.\n\n{markdown(columns, [list(map(str, row.values())) for row in rows])}"
+                f"{part['machine']['cpu']}.\n\n{markdown(columns, [list(map(_shown, row.values())) for row in rows])}"
             )
     return "\n\n".join(page) + "\n"
+
+
+def _shown(value: object) -> str:
+    """Return a figure in three digits, and of counts by reason those that are not 0."""
+    if isinstance(value, float):
+        return f"{value:.3g}"
+    if isinstance(value, dict):
+        return ", ".join(f"{count} {reason}" for reason, count in value.items() if count) or "0"
+    return str(value)
 
 
 if __name__ == "__main__":
