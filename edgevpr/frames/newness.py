@@ -22,9 +22,8 @@ _MOVES_ALWAYS = 0.75  # share of pictures: of a scene that stands nothing is ask
 
 
 def coarse(plane: np.ndarray) -> np.ndarray:
-    """Return a copy of every n-th row and column of a picture's plane, (H, W) uint8: 60 x 80 pixels or a few
-    more. Pixels are
-    picked and not averaged, which would hide the noise by which a picture is known as new."""
+    """Return a copy of every n-th row and column of a picture's plane, (H, W) uint8: 60 x 80 pixels or a few more.
+    Pixels are picked and not averaged, which would hide the noise by which a picture is known as new."""
     height, width = plane.shape
     return plane[:: max(1, height // _LOOK_PX[0]), :: max(1, width // _LOOK_PX[1])].copy()
 

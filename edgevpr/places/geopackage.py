@@ -151,6 +151,14 @@ def read_point(blob: object) -> tuple[float, float]:
     return lat_deg, lon_deg
 
 
+def point_or_none(geom: object) -> tuple[float, float] | None:
+    """Read a point as `read_point` does; None for a value that is none."""
+    try:
+        return read_point(geom)
+    except ValueError:
+        return None
+
+
 def utc_text(t_utc_s: float | None) -> str | None:
     """Return seconds since 1970 as a GeoPackage DATETIME, UTC with milliseconds; None for None, and for a number that
     is no date of the years 1 to 9999."""

@@ -7,7 +7,12 @@ from pathlib import Path
 
 from edgevpr.errors import MapBusyError, MapError, UsageError
 
-BESIDE = ("-wal", "-shm", "-journal")
+_BESIDE = ("-wal", "-shm", "-journal")
+
+
+def beside(path: Path) -> list[Path]:
+    """Return the files that SQLite keeps beside a map: its log, the index of the log, and the journal."""
+    return [path.with_name(path.name + end) for end in _BESIDE]
 
 
 def map_path(name: str | Path) -> Path:
@@ -41,7 +46,7 @@ def existing(name: str | Path) -> Path:
 def require_regular(path: Path) -> None:
     """Raise MapError where the map, or a file of SQLite's beside it, is anything but a file: a folder, or a pipe, whose
     reading would never end."""
-    for each in (path, *(path.with_name(path.name + end) for end in BESIDE)):
+    for each in (path, *beside(path)):
         if each.exists() and not stat.S_ISREG(each.stat().st_mode):
             raise MapError(f"{each} is no regular file but a folder, pipe or device: give the path of a map file.")
 
@@ -74,5 +79,5 @@ def lock(path: Path, make: bool = False) -> int:
 
 def remove(path: Path) -> None:
     """Remove a map that was not finished, with the files beside it."""
-    for each in (path, *(path.with_name(path.name + end) for end in BESIDE)):
+    for each in (path, *beside(path)):
         each.unlink(missing_ok=True)

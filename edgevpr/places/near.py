@@ -42,13 +42,6 @@ def nearest_m(place_map: PlaceMap, position: Position, within_m: float) -> float
         for turn_deg in (-360.0, 0.0, 360.0):  # places on the other side of the date line
             box = (lat_deg - north_deg, lat_deg + north_deg, lon_deg + turn_deg - east_deg)
             for place_id, geom in place_map.db.execute(_IN_BOX, (*box, lon_deg + turn_deg + east_deg)):
-                if place_id not in place_map.left_out and (point := _point(geom)):
+                if place_id not in place_map.left_out and (point := geopackage.point_or_none(geom)):
                     nearest = min(nearest, float(distance_m(lat_deg, lon_deg, *point)))
     return nearest if nearest <= within_m else None
-
-
-def _point(geom: object) -> tuple[float, float] | None:
-    try:
-        return geopackage.read_point(geom)
-    except ValueError:
-        return None

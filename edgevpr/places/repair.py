@@ -86,10 +86,9 @@ def repair(path: str | Path, watch: Watch[Examined]) -> Path:
 
 def _exchange(path: Path, copy: Path, original: Path) -> None:
     """Rename the map to `original`, with what SQLite has beside it, and the copy to the map."""
-    for end in mapfiles.BESIDE:
-        left = path.with_name(path.name + end)
+    for left, kept in zip(mapfiles.beside(path), mapfiles.beside(original), strict=True):
         if left.exists():  # the log of the damaged map must not be taken for one of the copy
-            left.rename(original.with_name(original.name + end))
+            left.rename(kept)
     try:
         os.link(path, original)  # so that there is a map under its name at every moment
     except OSError:

@@ -7,7 +7,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from edgevpr.errors import MapBusyError, MapError
-from edgevpr.places.geopackage import read_point
+from edgevpr.places.geopackage import point_or_none
+from edgevpr.places.mapfiles import beside
 
 WAIT_S = 5.0  # for another program that is writing
 # A statement on a table of a million places takes a tenth of this. A view, or a table that refers to itself, may never
@@ -29,9 +30,9 @@ def connect(path: Path, mode: str, options: str = "", wait_s: float = WAIT_S) ->
     db.set_progress_handler(lambda: 1, _MOST_STEPS)
     # The triggers of the spatial index (OGC 12-128r18, annex F.3) call these functions, which SQLite itself lacks. QGIS
     # or GDAL may have added such an index. A damaged geometry is like an empty one: it is nowhere.
-    db.create_function("ST_IsEmpty", 1, lambda geom: _point(geom) is None)
+    db.create_function("ST_IsEmpty", 1, lambda geom: point_or_none(geom) is None)
     for name, axis in {"ST_MinX": 1, "ST_MaxX": 1, "ST_MinY": 0, "ST_MaxY": 0}.items():
-        db.create_function(name, 1, lambda geom, axis=axis: (_point(geom) or (None, None))[axis])
+        db.create_function(name, 1, lambda geom, axis=axis: (point_or_none(geom) or (None, None))[axis])
     return db
 
 
@@ -63,7 +64,7 @@ def settle(db: sqlite3.Connection) -> None:
 
 def settle_left_log(path: Path) -> None:
     """Recover a map that was not closed (its log is beside it), where the file and its folder may be written."""
-    if path.with_name(path.name + "-wal").exists():
+    if beside(path)[0].exists():
         try:
             db = connect(path, "rw")
             settle(db)
@@ -84,7 +85,7 @@ def connect_to_read(path: Path, wait_s: float = WAIT_S) -> sqlite3.Connection:
         db.execute("PRAGMA application_id").fetchone()
     except sqlite3.OperationalError as error:
         db.close()
-        log, index = (path.with_name(path.name + end) for end in ("-wal", "-shm"))
+        log, index, _ = beside(path)
         if "locked" in str(error) or not log.exists() or index.exists():
             raise
         db = connect(path, "ro", "&vfs=unix-none")
@@ -138,10 +139,3 @@ def _text(raw: bytes) -> str | bytes:
         return raw.decode()
     except UnicodeDecodeError:
         return raw
-
-
-def _point(geom: object) -> tuple[float, float] | None:
-    try:
-        return read_point(geom)
-    except ValueError:
-        return None

@@ -72,19 +72,21 @@ class Vitals:
             self._autopilot.announce(Mood.WARNING if trouble else Mood.NOTE, f"camera {trouble or 'is back'}")
 
     def _say_failures(self) -> None:
-        is_failing = self._tally.is_failing
-        if is_failing != self._is_failing:
-            self._is_failing = is_failing
-            said = f"{FAILURES_IN_A_ROW} frames in a row have failed" if is_failing else "frames are recognised again"
-            _log.warning("%s", said)
-            self._flight_log.write("failing", said=said)
-            self._autopilot.announce(Mood.WARNING if is_failing else Mood.NOTE, said)
+        failing = f"{FAILURES_IN_A_ROW} frames in a row have failed"
+        self._is_failing = self._said(
+            "failing", self._is_failing, self._tally.is_failing, failing, "frames are recognised again"
+        )
 
     def _say_nothing_seen(self) -> None:
-        sees_nothing = self._tally.sees_nothing
-        if sees_nothing != self._sees_nothing:
-            self._sees_nothing = sees_nothing
-            said = "camera shows nothing" if sees_nothing else "camera shows ground again"
+        self._sees_nothing = self._said(
+            "camera", self._sees_nothing, self._tally.sees_nothing, "camera shows nothing", "camera shows ground again"
+        )
+
+    def _said(self, kind: str, was_so: bool, is_so: bool, begun: str, over: str) -> bool:
+        """Tell everybody where a trouble has begun or is over, with a line of this kind in the log; return `is_so`."""
+        if is_so != was_so:
+            said = begun if is_so else over
             _log.warning("%s", said)
-            self._flight_log.write("camera", said=said)
-            self._autopilot.announce(Mood.WARNING if sees_nothing else Mood.NOTE, said)
+            self._flight_log.write(kind, said=said)
+            self._autopilot.announce(Mood.WARNING if is_so else Mood.NOTE, said)
+        return is_so
