@@ -10,7 +10,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
 
 import json
 from dataclasses import asdict
-from datetime import datetime, timezone
 from pathlib import Path
 
 import bench_encode
@@ -18,14 +17,14 @@ import bench_flight
 import bench_match
 import bench_scan
 import bench_two_stage
-from run_sets import commit_of, machine
+from run_sets import made_by
 
 RESULTS = Path(__file__).resolve().parent / "results"
 
 
 def main() -> None:
     RESULTS.mkdir(exist_ok=True)
-    made_by = {"date": datetime.now(timezone.utc).strftime("%Y-%m-%d"), "commit": commit_of(), "machine": machine()}
+    made = made_by()
     measured = {}
     for name, measure in {
         "encode": bench_encode.rows,
@@ -38,9 +37,9 @@ def main() -> None:
         print(f"measuring: {name}", flush=True)
         measured[name] = measure()
     plain = {name: [row if isinstance(row, dict) else asdict(row) for row in rows] for name, rows in measured.items()}
-    (RESULTS / "bench.json").write_text(json.dumps({**made_by, **plain}, indent=2) + "\n")
+    (RESULTS / "bench.json").write_text(json.dumps({**made, **plain}, indent=2) + "\n")
     plot_growth(measured["growth"], RESULTS / "growth.png")
-    page = report(measured, made_by)
+    page = report(measured, made)
     (RESULTS / "bench.md").write_text(page)
     print(page)
 
@@ -69,9 +68,9 @@ def plot_growth(rows: list[dict], path: Path) -> None:
     plt.close(figure)
 
 
-def report(measured: dict, made_by: dict) -> str:
+def report(measured: dict, made: dict) -> str:
     """The page for people."""
-    ran_on = made_by["machine"]
+    ran_on = made["machine"]
     binary = "\n".join(
         f"| {row['what']} | {row['t_ms']:.2f} | {row['gb_per_s']:.1f} | {row['of_byte_sum']:.0%} "
         f"| {row['of_word_sum']:.0%} |"
@@ -84,7 +83,7 @@ def report(measured: dict, made_by: dict) -> str:
     )
     return f"""# Speed and memory
 
-Made by `make bench` on {made_by["date"]}, commit {made_by["commit"]}.
+Made by `make bench` on {made["date"]}, commit {made["commit"]}.
 Machine: {ran_on["cpu"]}, {ran_on["cores"]} cores; one thread; Python {ran_on["python"]}, NumPy {ran_on["numpy"]},
 OpenCV {ran_on["opencv"]}. Medians; ratios are taken turn by turn in one interleaved run.
 

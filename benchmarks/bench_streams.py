@@ -1,11 +1,8 @@
 """Old pixels under a new time: streams that are cut, corrupted or lose packets, read as in a flight.
 
-python benchmarks/bench_streams.py [--count N] [--seed N]
-
 Every picture carries its number in every band of its rows, so that what is delivered tells how old each part of it is.
 """
 
-import argparse
 import random
 import time
 from collections.abc import Callable
@@ -14,7 +11,6 @@ from dataclasses import dataclass
 from hostile_streams import LossyCamera, MjpegCamera, numbers_in
 
 from edgevpr.frames.source import open_source
-from edgevpr.helpers.tables import markdown
 
 RATE_HZ = 40.0
 OLD_S = 1.0
@@ -61,11 +57,6 @@ class Row:
     old: int
     broken: int
     latency_s: float
-
-    @property
-    def lost(self) -> float:
-        """Share of the pictures that were sent and not delivered."""
-        return max(0.0, 1 - self.delivered / self.sent) if self.sent else 1.0
 
 
 def run(count: int, seed: int, only: Callable[[str], bool] = lambda stream: True) -> list[Row]:
@@ -133,30 +124,3 @@ def _judged(stream: str, is_whole: bool, camera: MjpegCamera | LossyCamera) -> R
         broken=broken,
         latency_s=max(latencies_s),
     )
-
-
-def table_of(rows: list[Row]) -> str:
-    """Return the rows as a table in Markdown."""
-    head = ["stream", "sent", "delivered", "refused", "older than claimed", "broken", "lost", "latency at most s"]
-    cells = [
-        [
-            row.stream,
-            row.sent,
-            row.delivered,
-            ", ".join(f"{count} {reason}" for reason, count in row.refused.items() if count) or "-",
-            f"{row.old} of {row.looked_at}",
-            row.broken,
-            f"{row.lost:.1%}" if row.is_whole else "-",
-            f"{row.latency_s:.2f}",
-        ]
-        for row in rows
-    ]
-    return markdown(head, [[str(cell) for cell in row] for row in cells])
-
-
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--count", type=int, default=400)
-    parser.add_argument("--seed", type=int, default=1)
-    asked = parser.parse_args()
-    print(table_of(run(asked.count, asked.seed)))

@@ -13,7 +13,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
 import argparse
 import json
 from dataclasses import asdict
-from datetime import datetime, timezone
 from pathlib import Path
 
 import bench_streams
@@ -22,14 +21,16 @@ import hostile_kills
 import hostile_links
 import hostile_maps
 import hostile_pictures
-from run_sets import commit_of, machine
+from run_sets import made_by
 
 from edgevpr.helpers.tables import markdown
 
 RESULTS = Path(__file__).resolve().parent / "results"
-PARTS = {  # name: (title, how it is run, usual count)
+# name: (title, how it is run, usual count: of each stream, set of pictures, kind of packet or input, and in all of maps
+# and of kills of each kind)
+PARTS = {
     "streams": ("Streams: pictures that are cut, corrupted, lost or frozen", bench_streams.run, 200),
-    "pictures": ("Pictures that say nothing, and those of the other camera", hostile_pictures.run, 3000),
+    "pictures": ("Pictures that say nothing, and those of the other camera", hostile_pictures.run_in_groups, 276),
     "maps": ("Maps that are damaged", hostile_maps.run, 200),
     "links": ("Links: packets and autopilots that are not ours", hostile_links.run, 1000),
     "kills": ("`kill -9` while mapping and learning", hostile_kills.run, 40),
@@ -50,10 +51,8 @@ def main() -> None:
         print(f"trying: {name}", flush=True)
         rows = run(max(1, round(args.share * count)), args.seed)
         measured[name] = {
-            "date": datetime.now(timezone.utc).strftime("%Y-%m-%d"),
-            "commit": commit_of(),
+            **made_by(),
             "seed": args.seed,
-            "machine": machine(),
             "rows": [asdict(row) for row in rows],
         }
         kept.write_text(json.dumps(measured, indent=2) + "\n")

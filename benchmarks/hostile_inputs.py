@@ -1,14 +1,11 @@
 """Hostile inputs: generated images, EXIF data, tables, configurations, cards, networks and paths, each given to a real
 command in a process of its own, with limits of time and memory.
 
-    python benchmarks/hostile_inputs.py --count 100 --seed 1
-
 A command may refuse an input, with one sentence and exit code 1 or 2, or use it. Counted is what it may not do: end
 with a traceback, not end, end with another code, a signal or without a sentence, or print a control character or a
 password.
 """
 
-import argparse
 import os
 import random
 import resource
@@ -216,24 +213,3 @@ def _wrongs(attempt: Attempt, here: Path) -> Iterator[tuple[str, str]]:
 def _limited() -> None:
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-
-
-def main() -> None:
-    """Print a table, and what went wrong."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--count", type=int, default=100)
-    parser.add_argument("--seed", type=int, default=1)
-    args = parser.parse_args()
-    rows = run(args.count, args.seed)
-    print(
-        "| input | tried | tracebacks | hangs | wrong exit codes | leaks |\n| --- | ---: | ---: | ---: | ---: | ---: |"
-    )
-    for row in rows:
-        print(f"| {row.kind} | {row.tried} | {row.tracebacks} | {row.hangs} | {row.wrong_exit_codes} | {row.leaks} |")
-    for row in rows:
-        for example in row.examples:
-            print(f"{row.kind}: {example}", file=sys.stderr)
-
-
-if __name__ == "__main__":
-    main()

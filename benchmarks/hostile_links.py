@@ -1,13 +1,9 @@
 """Hostile links: damaged packets, other autopilots, and one that renames itself, reads nothing or answers nothing, each
-against a real `Link` over real sockets. The clock alone is stepped, so that a minute takes a moment.
-
-`python benchmarks/hostile_links.py [COUNT] [SEED]` prints a table: what was tried, and what left.
-"""
+against a real `Link` over real sockets. The clock alone is stepped, so that a minute takes a moment."""
 
 import logging
 import random
 import socket
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -324,18 +320,3 @@ def run(count: int, seed: int) -> list[Row]:
         _reads_nothing(count, narrow=True),
         _answers_nothing(count),
     ]
-
-
-def table(rows: list[Row]) -> str:
-    """Write the rows as a Markdown table."""
-    head = "| tried | times | fixes offered | left | to another | late | oldest when read, s | exceptions |"
-    lines = [
-        f"| {row.kind} | {row.tried} | {row.fixes} | {row.left} | {row.foreign} | {row.late} | {row.oldest_s:g} | "
-        f"{row.exceptions} |"
-        for row in rows
-    ]
-    return "\n".join([head, "|---" * 8 + "|", *lines])
-
-
-if __name__ == "__main__":
-    print(table(run(*(int(each) for each in sys.argv[1:]), *(1000, 1)[len(sys.argv) - 1 :])))

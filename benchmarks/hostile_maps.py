@@ -1,14 +1,10 @@
-"""Maps damaged in every way, and what becomes of a flight, of the commands and of a repair with each.
-
-python benchmarks/hostile_maps.py [COUNT [SEED]]
-"""
+"""Maps damaged in every way, and what becomes of a flight, of the commands and of a repair with each."""
 
 import contextlib
 import io
 import os
 import shutil
 import sqlite3
-import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -20,7 +16,6 @@ import numpy as np
 from edgevpr.cli.main import main
 from edgevpr.config import Config, load_config
 from edgevpr.errors import EdgevprError
-from edgevpr.helpers.tables import markdown
 from edgevpr.places.geopackage import point_blob
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
@@ -295,9 +290,3 @@ def _rows_of(path: Path, whole: Path) -> set[int]:
                 if db.execute(asked).fetchone() == right.execute(asked).fetchone():
                     same.add(place_id)
     return same
-
-
-if __name__ == "__main__":
-    rows = run(*map(int, sys.argv[1:3])) if len(sys.argv) > 2 else run(int((sys.argv[1:] or ["240"])[0]), 1)
-    cells = [(r.kind, *map(str, (r.tried, r.tracebacks, r.wrong_positions, r.places_lost))) for r in rows]
-    print(markdown(("kind", "tried", "tracebacks", "wrong positions", "readable places lost"), cells))

@@ -6,7 +6,6 @@ pictures of nothing, the set's own queries spoilt, and pictures by a camera that
 accepted. A spoilt picture that is recognised as its own place is no fault. Everything follows from a seed.
 """
 
-import argparse
 import os
 import tempfile
 from collections import Counter
@@ -144,29 +143,25 @@ def _asked(dataset: Dataset, others: list[Path], count: int, seed: int) -> Itera
         yield _Asked(OTHER_CAMERA + path.parents[1].name, np.ascontiguousarray(np.rot90(read_image(path), turns)))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--count", type=int, default=46, help="pictures of nothing a map (46)")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--sets", metavar="A,B", help="names of sets (default: all)")
-    parser.add_argument("--data", type=Path, default=DATA)
-    args = parser.parse_args()
-    rows = run(args.count, args.seed, args.data, args.sets.split(",") if args.sets else None)
-    for row in rows:
-        if row.accepted:
-            print(f"{row.set:26} {row.camera:8} {row.kind:32} {row.tried:5} {row.accepted:5} {row.accepted_wrong:5}")
-    for kind in (OF_NOTHING, OTHER_CAMERA, ""):
-        for camera in ("forward", "nadir"):
-            these = [row for row in rows if row.camera == camera and _group(row) == kind]
-            tried, accepted, wrong = (
-                sum(getattr(row, what) for row in these) for what in ("tried", "accepted", "accepted_wrong")
-            )
-            print(f"{kind or 'spoilt: ':14} {camera:8} {tried} tried, {accepted} accepted, {wrong} of them wrong")
+def run_in_groups(count: int, seed: int) -> list[Row]:
+    """Run as `run` does, and add up the kinds of each group: pictures of nothing, of the other camera, and spoilt."""
+    groups: dict[tuple[str, str, str], list[Row]] = {}
+    for row in run(count, seed):
+        groups.setdefault((_group(row), row.set, row.camera), []).append(row)
+    return [
+        Row(
+            kind=kind,
+            set=name,
+            camera=camera,
+            tried=sum(row.tried for row in rows),
+            accepted=sum(row.accepted for row in rows),
+            accepted_wrong=sum(row.accepted_wrong for row in rows),
+        )
+        for (kind, name, camera), rows in groups.items()
+    ]
 
 
 def _group(row: Row) -> str:
-    return next((kind for kind in (OF_NOTHING, OTHER_CAMERA) if row.kind.startswith(kind)), "")
-
-
-if __name__ == "__main__":
-    main()
+    """Return the group of a kind, in words."""
+    groups = {OF_NOTHING: "of nothing", OTHER_CAMERA: "of the other camera"}
+    return next((group for begin, group in groups.items() if row.kind.startswith(begin)), "spoilt")

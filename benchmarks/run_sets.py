@@ -227,6 +227,11 @@ def spread(errors_m: list[float]) -> dict[str, float | int | None]:
     return {"count": len(errors_m), "median_m": median_m, "p90_m": p90_m, "worst_m": worst_m}
 
 
+def made_by() -> dict[str, Any]:
+    """Return the date, the commit and the machine of a measurement."""
+    return {"date": datetime.now(timezone.utc).strftime("%Y-%m-%d"), "commit": commit_of(), "machine": machine()}
+
+
 def commit_of() -> str:
     """The commit that is measured, and whether something has changed since."""
 

@@ -1,5 +1,5 @@
 """Streams that are cut, corrupted and lose packets: what is delivered is whole and no older than it says. The long form
-is `python benchmarks/bench_streams.py`."""
+is `python benchmarks/hostile.py --parts streams`."""
 
 import pytest
 
