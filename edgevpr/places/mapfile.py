@@ -1,125 +1,60 @@
-"""The place map: one GeoPackage file.
+"""The place map: one GeoPackage file, and the places in it.
 
 Every place is committed before it is confirmed, so a battery pulled while mapping loses at most the place that was
 being written, and never the file. What is read is checked (see `rows`): a place that cannot be read is left out, and
-the others are used.
+the others are used. The open file itself is a `MapConnection`.
 """
 
-import os
 import sqlite3
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
 
-from edgevpr.contract import Descriptor, PartSpec, TechniqueSpec
+from edgevpr.contract import Descriptor, TechniqueSpec
 from edgevpr.errors import MapError, PlaceError
-from edgevpr.places import geopackage, mapfiles, rows
-from edgevpr.places.mapspec import (
-    Stored,
-    differences,
-    has_checksums,
-    read_mask,
-    require_layer,
-    spec_of,
-    stored,
-    write_mask,
-    write_spec,
-)  # fmt: skip
+from edgevpr.places import geopackage, rows
+from edgevpr.places.connection import MapConnection
+from edgevpr.places.mapspec import differences, has_checksums, read_mask, write_mask
 from edgevpr.places.rows import Point, Unreadable
-from edgevpr.places.sqlite import (
-    WAIT_S,
-    connect,
-    connect_to_read,
-    is_of_one_row,
-    most_bytes,
-    sentences,
-    settle,
-    settle_left_log,
-    start_log,
-    wait_at_most,
-)  # fmt: skip
+from edgevpr.places.sqlite import sentences
 from edgevpr.types import Frame, Place
-
-_BESIDE_BLOBS_BYTES = 100_000  # what a row may have beside its descriptor: the name of its image
 
 
 class PlaceMap:
-    """An open map file. Use `create`, `open` or `open_for_adding`, and close it (it is a context manager).
+    """An open map. Use `create`, `open` or `open_for_adding`, and close it (it is a context manager).
 
     `left_out` are the places that could not be read so far, with what is wrong with each in a few words, in the order
     in which they were found. `checksums` are the SQL expressions of the checksums of position, coarse and fine part.
     """
 
-    def __init__(self, path: Path, connection: sqlite3.Connection, found: Stored, lock: int | None = None) -> None:
-        self.path, self.spec = path, spec_of(path, found)
-        self.has_checksums = has_checksums(found)
+    def __init__(self, file: MapConnection) -> None:
+        self._file = file
+        self.path, self.spec, self.has_checksums = file.path, file.spec, has_checksums(file.found)
         self.left_out: dict[int, str] = {}
-        self.made_by = found["made_by"] if isinstance(found.get("made_by"), str) else None
-        self._found, self._lock = found, lock  # the lock of the program that adds places; None: only read
+        made_by = file.found.get("made_by")
+        self.made_by = made_by if isinstance(made_by, str) else None
         self.checksums = rows.CHECKSUMS if self.has_checksums else "NULL, NULL, NULL"
         self._geom_checksum, self._coarse_checksum, self._fine_checksum = self.checksums.split(", ")
-        self._wait_s = WAIT_S
-        self._take(connection)
-        self._seen = self._state()
 
     @classmethod
     def create(cls, path: str | Path, spec: TechniqueSpec) -> "PlaceMap":
         """Make an empty map for descriptors of `spec`: all of it, or no file. Raises MapError if the file has content
         or cannot be written, and UsageError for a name that no file can have."""
-        path = mapfiles.map_path(path)
-        mapfiles.require_regular(path)
-        lock = mapfiles.lock(path, make=True)
-        try:
-            if os.fstat(lock).st_size:
-                raise MapError(f"{path} is there already: choose another name, or add to it with --append.")
-            try:
-                with sentences(path):
-                    db = connect(path, "rw")
-                    db.execute(f"PRAGMA application_id = {geopackage.APPLICATION_ID}")
-                    db.execute(f"PRAGMA user_version = {geopackage.USER_VERSION}")
-                    start_log(db)
-                    db.executescript("BEGIN;" + geopackage.SCHEMA)
-                    write_spec(db, spec)
-                    db.execute("COMMIT")
-                    return cls(path, db, stored(path, db), lock)
-            except BaseException:
-                mapfiles.remove(path)
-                raise
-        except BaseException:
-            os.close(lock)
-            raise
+        return cls(MapConnection.create(path, spec))
 
     @classmethod
     def open(cls, path: str | Path) -> "PlaceMap":
         """Open a map for reading. Raises MapError for a file that is missing, damaged, no place map, or of a newer
         format, and UsageError for a name that no file can have."""
-        path = mapfiles.existing(path)
-        settle_left_log(path)
-        with sentences(path):
-            db = connect_to_read(path)
-            try:
-                return cls(path, db, _checked(path, db))
-            except BaseException:
-                db.close()
-                raise
+        return cls(MapConnection.open(path))
 
     @classmethod
     def open_for_adding(cls, path: str | Path) -> "PlaceMap":
         """Open an existing map to add places to it. Raises MapError as `open` does, and MapBusyError where another
         program adds places to it."""
-        path = mapfiles.existing(path)
-        lock = mapfiles.lock(path)
-        try:
-            with sentences(path):
-                db = connect(path, "rw")
-                found = _checked(path, db)
-                start_log(db)
-                return cls(path, db, found, lock)
-        except BaseException:
-            os.close(lock)
-            raise
+        return cls(MapConnection.open_for_adding(path))
 
     def __enter__(self) -> "PlaceMap":
         return self
@@ -129,12 +64,12 @@ class PlaceMap:
 
     def close(self) -> None:
         """Close the file. A map that was written becomes one plain file again, readable from a read-only card."""
-        if self._lock is not None:
-            settle(self.db)
-        self.db.close()
-        if self._lock is not None:
-            os.close(self._lock)
-            self._lock = None
+        self._file.close()
+
+    @property
+    def db(self) -> sqlite3.Connection:
+        """The connection of SQLite, for this moment: `require_unchanged` may put another one in its place."""
+        return self._file.db
 
     def require(self, spec: TechniqueSpec) -> None:
         """Raise MapError, naming what differs, unless the map's descriptors were made by exactly `spec`."""
@@ -145,35 +80,17 @@ class PlaceMap:
             )
 
     def require_unchanged(self) -> None:
-        """Raise MapError where the file is gone, cannot be read, or is another map than the one that was opened.
-
-        This is cheap: only when another program has touched the file is it opened anew, and its map_id compared. The
-        new connection is then used, since the old one may have kept pages of another file.
-        """
-        with sentences(self.path):
-            state = self._state()
-            if state == self._seen:
-                return
-            mapfiles.existing(self.path)
-            fresh = connect_to_read(self.path, self._wait_s)
-            try:
-                if _checked(self.path, fresh) != self._found:
-                    raise MapError(f"{self.path} is another map than the one that was opened: put that one back.")
-                if self._lock is not None:
-                    fresh.close()
-                    fresh = connect(self.path, "rw", wait_s=self._wait_s)
-                    start_log(fresh)
-            except BaseException:
-                fresh.close()
-                raise
-            self.db.close()
-            self._take(fresh)
-            self._seen = self._version(), *state[1:]
+        """Raise MapError where the file is gone, cannot be read, or is another map than the one that was opened. This
+        is cheap."""
+        self._file.require_unchanged()
 
     def wait_at_most(self, wait_s: float) -> None:
         """From now on, wait at most so long for another program that is writing; then MapBusyError is raised."""
-        self._wait_s = wait_s
-        wait_at_most(self.db, wait_s)
+        self._file.wait_at_most(wait_s)
+
+    def transaction(self) -> AbstractContextManager[None]:
+        """Commit what is written inside this context, or nothing of it. Raises sqlite3.Error."""
+        return self._file.transaction()
 
     def add(self, frame: Frame, descriptor: Descriptor) -> int:
         """Add one place and return its id once it is safe on the disk. Raises MapError (disk full, ...).
@@ -181,17 +98,9 @@ class PlaceMap:
         A time that is no date is unknown, and so is an altitude at which nothing flies. In a name that is not UTF-8,
         the bytes that are not are written as escapes.
         """
-        position = frame.position
-        geom = geopackage.point_blob(position.lat_deg, position.lon_deg) if position else None
-        coarse, fine = _blob(descriptor.coarse, self.spec.coarse), _blob(descriptor.fine, self.spec.fine)
-        values = (
-            geom,
-            geopackage.utc_text(frame.t_utc_s),
-            rows.altitude(position.alt_m) if position else None,
-            frame.heading_deg,
-            _readable(frame.name),
-            descriptor.quality,
-        )
+        coarse = rows.blob_of(descriptor.coarse, self.spec.coarse)
+        fine = rows.blob_of(descriptor.fine, self.spec.fine)
+        values = rows.values_of(frame, descriptor.quality)
         with sentences(self.path), self.transaction():
             place_id = self.insert(values, coarse, fine)
         return place_id
@@ -229,10 +138,10 @@ class PlaceMap:
         if place_ids is None:
             found = self.scan(columns)
         else:
-            found = ((int(place_id), self._row(int(place_id), columns)) for place_id in place_ids)
+            found = ((int(place_id), self._file.row(int(place_id), columns)) for place_id in place_ids)
         for place_id, row in found:
             with self._named(place_id):
-                *values, checksum = _there(row)
+                *values, checksum = rows.there(row)
                 place = rows.place_of(place_id, values, checksum)
             yield place
 
@@ -242,7 +151,7 @@ class PlaceMap:
         columns = f"{rows.VALUES}, {self._geom_checksum}, coarse, {self._coarse_checksum}"
         for place_id, row in self.scan(columns):
             try:
-                *values, geom_checksum, coarse, checksum = _there(row)
+                *values, geom_checksum, coarse, checksum = rows.there(row)
                 point, heading_deg = rows.where_of(values, geom_checksum)
                 part = rows.part_of(coarse, self.spec.coarse, checksum, "coarse part")
             except Unreadable as error:
@@ -255,7 +164,7 @@ class PlaceMap:
         mean, count = np.zeros(self.spec.coarse.shape), 0
         for _, row in self.scan(f"coarse, {self._coarse_checksum}"):
             with suppress(Unreadable):
-                coarse, checksum = _there(row)
+                coarse, checksum = rows.there(row)
                 part = rows.part_of(coarse, self.spec.coarse, checksum, "coarse part")
                 count += 1
                 mean += (part - mean) / count
@@ -269,13 +178,13 @@ class PlaceMap:
         place_id = int(place_id)
         columns = f"geom, {self._geom_checksum}, fine, {self._fine_checksum}"
         with self._named(place_id):
-            geom, geom_checksum, fine, checksum = _there(self._row(place_id, columns))
+            geom, geom_checksum, fine, checksum = rows.there(self._file.row(place_id, columns))
             point = rows.point_of(geom, geom_checksum)
             return rows.part_of(fine, self.spec.fine, checksum, "fine part"), point
 
     def fingerprint(self, source_image: str, descriptor: Descriptor) -> tuple[str, int]:
         """Return the values that identify a frame: its name, and a hash of its coarse part."""
-        return _readable(source_image), hash(_blob(descriptor.coarse, self.spec.coarse))
+        return rows.readable(source_image), hash(rows.blob_of(descriptor.coarse, self.spec.coarse))
 
     def fingerprints(self) -> set[tuple[str, int]]:
         """Return the `fingerprint` of every place of the map that can be read."""
@@ -287,7 +196,7 @@ class PlaceMap:
         columns = f"geom, quality, {self._geom_checksum}"
         for place_id, row in self.scan(columns):
             try:
-                geom, quality, checksum = _there(row)
+                geom, quality, checksum = rows.there(row)
                 lat_deg, lon_deg = rows.point_of(geom, checksum) or (np.nan, np.nan)
                 yield place_id, lat_deg, lon_deg, rows.quality_of(quality)
             except Unreadable as error:
@@ -304,41 +213,11 @@ class PlaceMap:
                 yield 0.0
 
     def __len__(self) -> int:
-        with sentences(self.path):
-            try:
-                # Counted row by row: SQLite's own count of a table that refers to itself need not end.
-                asked = "SELECT count(*) FROM (SELECT 1 FROM places LIMIT ?)"
-                return self.db.execute(asked, (rows.most_rows(self._file_bytes()),)).fetchone()[0]
-            except sqlite3.Error as error:
-                if not is_of_one_row(error):
-                    raise
-        return sum(row is not None for _, row in self.scan("1"))
+        return self._file.count()
 
     def scan(self, columns: str) -> Iterator[tuple[int, tuple | None]]:
         """Yield (place id, row) of every place (see `rows.scan`)."""
-        with sentences(self.path):
-            yield from rows.scan(self.db, columns, self._file_bytes())
-
-    @contextmanager
-    def transaction(self) -> Iterator[None]:
-        """Commit what is written inside this context, or nothing of it."""
-        self.db.execute("BEGIN IMMEDIATE")
-        try:
-            yield
-            self.db.execute("COMMIT")
-        except BaseException:
-            if self.db.in_transaction:  # SQLite has already rolled back where the disk is full
-                self.db.execute("ROLLBACK")
-            raise
-
-    def _row(self, place_id: int, columns: str) -> tuple | None:
-        with sentences(self.path):
-            try:
-                return self.db.execute(f"SELECT {columns} FROM places WHERE place_id = ?", (place_id,)).fetchone()
-            except sqlite3.Error as error:
-                if not is_of_one_row(error):
-                    raise
-                raise PlaceError(self.path, place_id, f"SQLite says: {error}") from error
+        return self._file.scan(columns)
 
     @contextmanager
     def _named(self, place_id: int) -> Iterator[None]:
@@ -347,53 +226,3 @@ class PlaceMap:
             yield
         except Unreadable as error:
             raise PlaceError(self.path, place_id, str(error)) from error
-
-    def _file_bytes(self) -> int:
-        (pages,), (page_bytes,) = (self.db.execute(f"PRAGMA page_{name}").fetchone() for name in ("count", "size"))
-        return pages * page_bytes
-
-    def _take(self, connection: sqlite3.Connection) -> None:
-        self.db = connection
-        fine_bytes = self.spec.fine.nbytes if self.spec.fine else 0
-        most_bytes(connection, self.spec.coarse.nbytes + fine_bytes + _BESIDE_BLOBS_BYTES)
-
-    def _version(self) -> int | None:
-        """Return a number that changes when another program has written to the file; None where this connection cannot
-        read it any more."""
-        try:
-            return self.db.execute("PRAGMA data_version").fetchone()[0]
-        except (sqlite3.Error, UnicodeDecodeError) as error:
-            if "locked" in str(error):
-                raise
-            return None
-
-    def _state(self) -> tuple[int | None, ...]:
-        """Return numbers that change when another program writes to the file, or puts another one in its place."""
-        try:
-            file = self.path.stat()
-        except OSError as error:
-            raise MapError(f"{self.path} is gone ({error.strerror}): put it back.") from error
-        return self._version(), file.st_dev, file.st_ino, file.st_size, file.st_mtime_ns
-
-
-def _checked(path: Path, db: sqlite3.Connection) -> Stored:
-    """Return what the file says of the map, after a look at the form of its table of places."""
-    found = stored(path, db)
-    require_layer(path, db, has_checksums(found))
-    return found
-
-
-def _there(row: tuple | None) -> tuple:
-    if row is None:
-        raise Unreadable("its row is gone")
-    return row
-
-
-def _blob(part: np.ndarray | None, spec: PartSpec | None) -> bytes | None:
-    if spec is None:
-        return None
-    return np.ascontiguousarray(part, spec.dtype).reshape(spec.shape).tobytes()
-
-
-def _readable(name: str) -> str:
-    return name.encode("utf-8", "backslashreplace").decode()

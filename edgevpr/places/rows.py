@@ -14,7 +14,7 @@ import numpy as np
 from edgevpr.contract import PartSpec
 from edgevpr.places import geopackage
 from edgevpr.places.sqlite import is_of_one_row
-from edgevpr.types import Place, Position
+from edgevpr.types import Frame, Place, Position
 
 CHECKSUMS = "geom_crc32, coarse_crc32, fine_crc32"
 VALUES = "geom, time, alt_m, heading_deg, source_image, quality"
@@ -30,6 +30,13 @@ Point = tuple[float, float]
 
 class Unreadable(ValueError):
     """A value of a row that is not to be believed, in a few words."""
+
+
+def there(row: tuple | None) -> tuple:
+    """Return a row. Raises Unreadable for None."""
+    if row is None:
+        raise Unreadable("its row is gone")
+    return row
 
 
 def crc32(blob: bytes | None) -> int | None:
@@ -101,6 +108,34 @@ def place_of(place_id: int, values: Sequence, geom_checksum: object) -> Place:
         heading_deg=heading_deg,
         quality=quality,
     )
+
+
+def values_of(frame: Frame, quality: float) -> tuple:
+    """Return the `VALUES` of a frame's row.
+
+    A time that is no date is unknown, and so is an altitude at which nothing flies.
+    """
+    position = frame.position
+    return (
+        geopackage.point_blob(position.lat_deg, position.lon_deg) if position else None,
+        geopackage.utc_text(frame.t_utc_s),
+        altitude(position.alt_m) if position else None,
+        frame.heading_deg,
+        readable(frame.name),
+        quality,
+    )
+
+
+def blob_of(part: np.ndarray | None, spec: PartSpec | None) -> bytes | None:
+    """Return the bytes of a part of a descriptor as the file has them, None for a part that the technique lacks."""
+    if spec is None:
+        return None
+    return np.ascontiguousarray(part, spec.dtype).reshape(spec.shape).tobytes()
+
+
+def readable(name: str) -> str:
+    """Return a name as UTF-8 can have it: bytes that are not UTF-8 are written as escapes."""
+    return name.encode("utf-8", "backslashreplace").decode()
 
 
 def most_rows(file_bytes: int) -> int:
