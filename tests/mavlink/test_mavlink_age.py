@@ -148,7 +148,8 @@ def test_a_tcp_peer_that_reads_late_finds_no_fix_that_was_called_unsent(narrow_s
         assert found <= {each.fix.lat_deg for each in fixes if each.sent}
         assert not all(each.sent for each in fixes)
         assert link.stats().fixes_sent == sum(each.sent for each in fixes)
-        assert link._answers.unanswered == link.stats().fixes_sent, "what was thrown away waits for no answer"
+        unanswered = link._conversation.answers.unanswered
+        assert unanswered == link.stats().fixes_sent, "what was thrown away waits for no answer"
 
 
 def _held(link) -> bool:
