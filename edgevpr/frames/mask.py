@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from edgevpr.contract import Descriptor, Technique
-from edgevpr.errors import UsageError
+from edgevpr.errors import ImageError, UsageError
 from edgevpr.frames.images import read_image
 from edgevpr.frames.opencv import cv2
 
@@ -44,8 +44,13 @@ AnyMask = NoMask | Mask
 
 
 def mask_of(path: str | None) -> AnyMask:
-    """Read the mask of a configuration (`source.mask`); None gives `NoMask`."""
-    return NoMask() if path is None else read_mask(path)
+    """Read the mask of a configuration (`source.mask`); None gives `NoMask`. Raises as `read_mask`."""
+    if path is None:
+        return NoMask()
+    try:
+        return read_mask(path)
+    except ImageError as error:  # it speaks of an image, as of a frame
+        raise ImageError(f"The mask of `source.mask` (--mask) cannot be used: {error}") from error
 
 
 def read_mask(path: str | Path) -> Mask:

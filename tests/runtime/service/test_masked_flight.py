@@ -64,6 +64,20 @@ def test_the_mask_that_check_learns_covers_the_display(folder, capsys):
     assert f"--mask {folder / 'again.png'}" in said
 
 
+def test_a_mask_that_is_missing_is_said_to_be_the_mask(folder, tmp_path, capsys):
+    missing = str(tmp_path / "nope.png")
+    said = f"The mask of `source.mask` (--mask) cannot be used: The image {missing} does not exist: check the name."
+    (tmp_path / "c.yaml").write_text(
+        f"map: {folder / 'masked.gpkg'}\nsource: {{uri: {folder / 'ref'}, mask: {missing}}}\nlog: {{path: null}}\n"
+    )
+    assert main(["run", "--config", str(tmp_path / "c.yaml")]) == 1
+    assert said in capsys.readouterr().err
+    built = ["map", "build", str(tmp_path / "new.gpkg"), "--images", str(folder / "ref"), "--mask", missing]
+    assert main(built) == 1
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "new.gpkg").exists()
+
+
 def test_with_the_mask_more_is_recognised_behind_a_display(folder):
     found = {}
     for name, mask in (("plain.gpkg", False), ("masked.gpkg", True)):
