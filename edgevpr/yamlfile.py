@@ -1,7 +1,8 @@
 """YAML files of foreign origin: the owner of PyYAML. Read without aliases and within limits of size, depth and digits,
 so that no file takes more than its own length in time and memory; a key that stands there twice is an error."""
 
-from functools import cache
+from copy import deepcopy
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     import yaml  # not at the top: the command line lists its flags without it
 
     try:
-        content = yaml.load(read_file(path, MAX_FILE_BYTES).decode("utf-8-sig"), _loader())
+        content = deepcopy(_content(read_file(path, MAX_FILE_BYTES).decode("utf-8-sig")))
     except OSError as error:
         raise ConfigError(f"{path} cannot be read ({error.strerror}): give the path of a YAML file.") from error
     except (yaml.YAMLError, ValueError, OverflowError) as error:  # an impossible date is a ValueError
@@ -33,6 +34,15 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise ConfigError(f"{path} must hold `key: value` lines, not {type(content).__name__}.")
     return content
+
+
+# Commands read some files several times, all boards above all, and PyYAML takes 3 to 8 ms for each on a workstation.
+@lru_cache(maxsize=32)
+def _content(text: str) -> Any:
+    """Return what a YAML text holds, the same object each time. Raises yaml.YAMLError, ValueError, OverflowError."""
+    import yaml
+
+    return yaml.load(text, _loader())
 
 
 @cache

@@ -98,6 +98,15 @@ def test_a_file_too_long_to_be_a_configuration_is_not_read(refused):
     assert "cannot be read (it has 0.1 MB" in refused("# " + "x" * MAX_FILE_BYTES)
 
 
+def test_who_changes_what_was_read_changes_it_for_nobody_else(tmp_path):
+    path = tmp_path / "c.yaml"
+    path.write_text("source: {uri: a}\n")
+    read_yaml(path)["source"]["uri"] = "b"
+    assert read_yaml(path) == {"source": {"uri": "a"}}
+    path.write_text("source: {uri: c}\n")
+    assert read_yaml(path) == {"source": {"uri": "c"}}
+
+
 def test_pipes_and_devices_are_not_read(tmp_path):
     os.mkfifo(tmp_path / "c.yaml")
     for path in (tmp_path / "c.yaml", "/dev/zero"):

@@ -6,6 +6,7 @@ import logging
 import os
 import sys
 import threading
+from functools import cache
 
 from edgevpr import __version__
 from edgevpr.cli import evaluation, flying, maps, networks, profile, simulation
@@ -70,6 +71,7 @@ def _failed(args: argparse.Namespace, error: Exception, sentence: str, exit_code
     return exit_code
 
 
+@cache  # two thirds of a short command, where one process runs many
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="edgevpr", description="Visual place recognition for the companion computer of a small drone."
