@@ -73,8 +73,7 @@ class _Ground:
         for number in range(2):
             (pictures / f"{number}.jpg").write_bytes(files.picture(".jpg", number))
         place_map = folder / "m.gpkg"
-        argv = ["map", "build", str(place_map), "--images", str(pictures), "--technique", "cohog"]
-        subprocess.run([sys.executable, "-m", "edgevpr", *argv], check=True, capture_output=True)
+        subprocess.run([sys.executable, "-m", "edgevpr", *_built(folder, pictures)], check=True, capture_output=True)
         models = Path(__file__).parents[1] / "models"
         lines = (models / "calc.yaml").read_text("utf-8").splitlines(keepends=True)
         card = "".join(line for line in lines if not line.startswith("sha256"))
@@ -89,19 +88,21 @@ def _images(ground: _Ground, here: Path, chance: random.Random, left: int) -> At
     return Attempt(argv=["match", str(ground.map), "--images", str(here)], codes=frozenset((0, 1)), inputs=inputs)
 
 
+def _built(here: Path, pictures: Path) -> list[str]:
+    # Without a technique to insist on, each would first be tried in a process of its own.
+    return ["map", "build", str(here / "m.gpkg"), "--images", str(pictures), "--technique", "cohog"]
+
+
 def _exif(ground: _Ground, here: Path, chance: random.Random, left: int) -> Attempt:
     inputs = min(left, _AT_ONCE)
     for number in range(inputs):
         (here / f"{number}.jpg").write_bytes(files.with_exif(files.picture(".jpg", 1), chance))
-    return Attempt(
-        argv=["map", "build", str(here / "m.gpkg"), "--images", str(here)], codes=frozenset((0,)), inputs=inputs
-    )
+    return Attempt(argv=_built(here, here), codes=frozenset((0,)), inputs=inputs)
 
 
 def _positions(ground: _Ground, here: Path, chance: random.Random, left: int) -> Attempt:
     path = files.write_table(here / "p.csv", files.POSITIONS, chance)
-    argv = ["map", "build", str(here / "m.gpkg"), "--images", str(ground.pictures), "--positions", str(path)]
-    return Attempt(argv=argv, codes=frozenset((0, 2)))
+    return Attempt(argv=[*_built(here, ground.pictures), "--positions", str(path)], codes=frozenset((0, 2)))
 
 
 def _truth(ground: _Ground, here: Path, chance: random.Random, left: int) -> Attempt:

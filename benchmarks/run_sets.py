@@ -73,7 +73,7 @@ FIVE_PLACES = "five places only: made for studies of change, recall on them says
 LEFT_OUT = {"grief_michigan_monthly": FIVE_PLACES, "grief_stromovka_monthly": FIVE_PLACES}
 
 
-def main() -> int:
+def main(argv: list[str] | None = None) -> int:
     beside = REPOSITORY.parent / "shared"
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, default=os.environ.get("EDGEVPR_DATA") or beside / "data")
@@ -83,7 +83,7 @@ def main() -> int:
         "--models", type=Path, default=beside / "models", help="a folder with the original weights: calc/model.onnx"
     )
     parser.add_argument("--out", type=Path, default=REPOSITORY / "benchmarks" / "results")
-    args = parser.parse_args()
+    args = parser.parse_args(argv)
     try:
         with ExitStack() as stack:
             folders = find_sets(args.data, args.sets.split(",") if args.sets else None)

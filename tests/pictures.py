@@ -1,11 +1,18 @@
 """Small pictures for tests, made from a seed."""
 
+from functools import lru_cache
+
 import cv2
 import numpy as np
 
 
 def textured(seed: int, height: int = 120, width: int = 160) -> np.ndarray:
     """A grey picture with texture at several scales and a flat corner (regions that say nothing)."""
+    return _textured(seed, height, width).copy()
+
+
+@lru_cache(maxsize=100)  # flights ask for the same few again and again
+def _textured(seed: int, height: int, width: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     picture = np.zeros((height, width), np.float32)
     for octave in range(2, 6):

@@ -11,6 +11,7 @@ import sys
 
 import cv2
 import pytest
+from full_disk import no_file_larger_than
 from pictures import textured
 
 from edgevpr.cli.main import main
@@ -169,37 +170,28 @@ def test_a_name_that_no_file_can_have_is_exit_code_2(command, name, said, capsys
 
 def run_full(arguments, bytes_at_most):
     """Run a command on a disk that takes files of so many bytes at most."""
-    code = f"""
-import resource, signal, sys
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-resource.setrlimit(resource.RLIMIT_FSIZE, ({bytes_at_most}, {bytes_at_most}))
-from edgevpr.cli.main import main
-sys.exit(main({arguments!r}))
-"""
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    with no_file_larger_than(bytes_at_most):
+        return main(arguments)
 
 
 @pytest.mark.parametrize("bytes_at_most", [1, 5_000, 45_000])
-def test_a_full_disk_leaves_no_map_of_nothing(flight, tmp_path, bytes_at_most):
-    result = run_full(built(tmp_path / "m.gpkg", flight), bytes_at_most)
-    assert result.returncode == 1
-    assert "Traceback" not in result.stderr
+def test_a_full_disk_leaves_no_map_of_nothing(flight, tmp_path, bytes_at_most, capsys):
+    assert run_full(built(tmp_path / "m.gpkg", flight), bytes_at_most) == 1
+    assert "Traceback" not in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 
-def test_a_full_disk_leaves_no_half_of_a_merge_or_repair(valley, tmp_path):
+def test_a_full_disk_leaves_no_half_of_a_merge_or_repair(valley, tmp_path, capsys):
     out = tmp_path / "out" / "m.gpkg"
     out.parent.mkdir()
     for bytes_at_most in (1, 5_000, 60_000):
-        result = run_full(["map", "merge", str(out), str(valley)], bytes_at_most)
-        assert result.returncode == 1
+        assert run_full(["map", "merge", str(out), str(valley)], bytes_at_most) == 1
         assert not list(out.parent.iterdir())
     damage(valley, *DAMAGE)
     before = valley.read_bytes()
     for bytes_at_most in (1, 5_000, 45_000):
-        result = run_full(["map", "repair", str(valley)], bytes_at_most)
-        assert result.returncode == 1
-        assert "Traceback" not in result.stderr
+        assert run_full(["map", "repair", str(valley)], bytes_at_most) == 1
+        assert "Traceback" not in capsys.readouterr().err
         assert valley.read_bytes() == before
         assert [entry.name for entry in tmp_path.glob("valley*")] == [valley.name]
     assert main(["map", "merge", str(out), str(valley)]) == 1, "it is damaged"

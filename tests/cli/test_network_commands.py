@@ -15,6 +15,7 @@ from edgevpr.config import FORMS, load_config
 from edgevpr.errors import ConfigError, ModelError, UsageError
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
+from edgevpr.runtime.preflight import stored
 from edgevpr.runtime.preflight.offers import offers, usable
 from edgevpr.runtime.preflight.pick import outlook
 from edgevpr.runtime.recognise.opening import made_for, open_recogniser, technique_of
@@ -150,10 +151,24 @@ def test_eval_of_an_unknown_form_is_a_wrong_request(capsys, flight):
     assert "--form names `4bit`: use some of float, 8bit, 1bit" in said
 
 
+def tried_once(try_each):
+    """The same trials for every command: each takes a process."""
+    trials = {}
+
+    def known(wanted, threads):
+        labels = tuple(offer.label for offer in wanted)
+        if labels not in trials:
+            trials[labels] = list(try_each(wanted, threads))
+        return iter(trials[labels])
+
+    return known
+
+
 def test_profile_lists_every_form_and_says_in_a_sentence_what_cannot_be_used(models, capsys, monkeypatch):
     wanted = ("cohog", "seqslam", "tiny", "calc", "rmac")
     monkeypatch.setattr("edgevpr.techniques.names", lambda: wanted)
     monkeypatch.setattr("edgevpr.techniques.networks.card.model_folders", lambda: (models,))
+    monkeypatch.setattr(stored, "try_each", tried_once(stored.try_each))
     assert main(["profile", "--places", "100", "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert [row["technique"] for row in said["techniques"]] == ["cohog", "seqslam", "tiny", "tiny 8bit", "tiny 1bit"]

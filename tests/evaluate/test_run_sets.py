@@ -6,13 +6,12 @@ import sys
 from pathlib import Path
 
 import cv2
+import run_sets
 from pictures import textured
 
-SCRIPT = Path(__file__).parents[2] / "benchmarks" / "run_sets.py"
 
-
-def run_sets(*arguments):
-    return subprocess.run([sys.executable, str(SCRIPT), *map(str, arguments)], capture_output=True, text=True)
+def measure(data, out, *arguments):
+    return run_sets.main(["--data", str(data), "--out", str(out), *arguments])
 
 
 def make_set(folder, places=4):
@@ -31,10 +30,8 @@ def make_set(folder, places=4):
 def test_every_set_gets_a_file_and_its_lines_in_the_summary(tmp_path):
     make_set(tmp_path / "data" / "meadow")
     make_set(tmp_path / "data" / "grief_stromovka_monthly", places=1)  # one of those that are left out
-    some = ("--data", tmp_path / "data", "--out", tmp_path / "out", "--variants")
     for variants in ("hog;cohog", "seqslam"):  # the second adds to what the first has written
-        done = run_sets(*some, variants)
-        assert done.returncode == 0, done.stderr
+        assert measure(tmp_path / "data", tmp_path / "out", "--variants", variants) == 0
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["curves.png", "meadow.json", "sets.md"]
 
     content = json.loads((tmp_path / "out" / "meadow.json").read_text())
@@ -52,23 +49,23 @@ def test_every_set_gets_a_file_and_its_lines_in_the_summary(tmp_path):
     assert "* grief_stromovka_monthly: five places only" in page
 
 
-def test_a_row_that_is_not_there_gets_a_sentence(tmp_path):
+def test_a_row_that_is_not_there_gets_a_sentence(tmp_path, capsys):
     make_set(tmp_path / "data" / "meadow")
-    done = run_sets("--data", tmp_path / "data", "--out", tmp_path / "out", "--variants", "cohogg")
-    assert done.returncode == 2
-    assert done.stderr.startswith("run_sets: There is no row `cohogg`: use some of cohog; ")
+    assert measure(tmp_path / "data", tmp_path / "out", "--variants", "cohogg") == 2
+    assert capsys.readouterr().err.startswith("run_sets: There is no row `cohogg`: use some of cohog; ")
 
 
 def test_a_folder_without_sets_gets_a_sentence(tmp_path):
-    done = run_sets("--data", tmp_path, "--out", tmp_path / "out")
+    """As `make results` starts it, in a process of its own."""
+    script = Path(run_sets.__file__)
+    done = subprocess.run([sys.executable, script, "--data", tmp_path], capture_output=True, text=True)
     assert done.returncode == 2
     assert done.stderr.startswith("run_sets: There are no image sets")
     assert "EDGEVPR_DATA" in done.stderr
 
 
-def test_a_broken_image_stops_it(tmp_path):
+def test_a_broken_image_stops_it(tmp_path, capsys):
     make_set(tmp_path / "data" / "meadow")
     (tmp_path / "data" / "meadow" / "ref" / "ref2.png").write_bytes(b"")
-    done = run_sets("--data", tmp_path / "data", "--out", tmp_path / "out", "--variants", "hog")
-    assert done.returncode == 1
-    assert "ref2.png is empty" in done.stderr
+    assert measure(tmp_path / "data", tmp_path / "out", "--variants", "hog") == 1
+    assert "ref2.png is empty" in capsys.readouterr().err

@@ -1,5 +1,7 @@
 """The techniques against the literal transcription of chapter 6."""
 
+from functools import cache
+
 import literal
 import numpy as np
 import pytest
@@ -40,16 +42,28 @@ def test_cell_histograms_and_blocks(bins, signed):
     np.testing.assert_allclose(normalised_blocks(cells).reshape(-1, 4 * bins), literal.blocks(expected), atol=1e-4)
 
 
+@cache  # these loops are slow
+def literal_grey(seed):
+    return literal.grey_square(textured(seed), 208)
+
+
+@cache
+def literal_blocks(seed):
+    return literal.blocks(literal.cell_histograms(literal_grey(seed), 16, 8, True))
+
+
+@cache
+def literal_entropy(seed, which):
+    return getattr(literal, which)(literal.levels(literal_grey(seed)))
+
+
 @pytest.mark.parametrize(("which", "threshold"), [("filled_bins", 0.5), ("shannon", 0.4), ("shannon", 0.55)])
 def test_cohog_descriptor_good_regions_and_score(which, threshold):
     technique = create("cohog", {"w1": 208, "w2": 16, "gt": threshold, "entropy": which, "matching": "thesis"})
-    query_image, reference_image = textured(6), textured(7)
-    query, reference = technique.encode(query_image), technique.encode(reference_image)
+    query, reference = technique.encode(textured(6)), technique.encode(textured(7))
 
-    grey = literal.grey_square(query_image, 208)
-    query_blocks = literal.blocks(literal.cell_histograms(grey, 16, 8, True))
-    good = literal.good_blocks(getattr(literal, which)(literal.levels(grey)), 16, threshold)
-    reference_blocks = literal.blocks(literal.cell_histograms(literal.grey_square(reference_image, 208), 16, 8, True))
+    good = literal.good_blocks(literal_entropy(6, which), 16, threshold)
+    query_blocks, reference_blocks = literal_blocks(6), literal_blocks(7)
     assert 0 < good.sum() < len(good), "the picture must have good and confusing regions"
     np.testing.assert_array_equal(query.good, good)
     np.testing.assert_allclose(query.regions, query_blocks, atol=1e-4)

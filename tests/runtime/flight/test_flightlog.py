@@ -4,16 +4,15 @@ import json
 import logging
 import os
 import re
-import resource
 import shutil
 import subprocess
 import sys
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 from fakes import FakeClock
+from full_disk import no_file_larger_than
 
 from edgevpr.config import load_config
 from edgevpr.contract import PartSpec, TechniqueSpec
@@ -46,17 +45,6 @@ def syncs(monkeypatch) -> list[int]:
     fdatasync = os.fdatasync
     monkeypatch.setattr(os, "fdatasync", lambda fd: (calls.append(fd), fdatasync(fd)))
     return calls
-
-
-@contextmanager
-def no_file_larger_than(limit_bytes: int):
-    """A disk that is full, for this process: writes past the limit fail, and the one that crosses it is cut."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 def kinds(path: Path) -> list[str]:
