@@ -33,12 +33,16 @@ def flight(tmp_path_factory):
     return folder
 
 
-@pytest.fixture
-def valley(flight, tmp_path, capsys):
-    path = tmp_path / "valley.gpkg"
+@pytest.fixture(scope="module")
+def whole_valley(flight, tmp_path_factory):
+    path = tmp_path_factory.mktemp("whole") / "valley.gpkg"
     assert main(built(path, flight)) == 0
-    capsys.readouterr()
     return path
+
+
+@pytest.fixture
+def valley(whole_valley, tmp_path):
+    return shutil.copy(whole_valley, tmp_path / whole_valley.name)
 
 
 def built(path, flight, *flags):

@@ -1,6 +1,7 @@
 """A program of its own that adds places and says which are confirmed; the tests kill it at any moment."""
 
 import sys
+from pathlib import Path
 
 import numpy as np
 
@@ -26,6 +27,14 @@ def frame(number: int) -> Frame:
 def descriptor(number: int) -> Descriptor:
     rng = np.random.default_rng(number)
     return Descriptor(coarse=rng.random(64).astype("<f2"), fine=rng.random((40, 32), dtype=np.float32), quality=0.75)
+
+
+def make_map(path: Path, places: int) -> Path:
+    """Make a map of so many places."""
+    with PlaceMap.create(path, SPEC) as place_map:
+        for number in range(places):
+            place_map.add(frame(number), descriptor(number))
+    return path
 
 
 if __name__ == "__main__":

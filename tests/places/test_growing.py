@@ -117,11 +117,11 @@ def test_a_full_index_keeps_its_best_places_and_the_file_keeps_all(empty_map):
 
 
 def test_the_budget_holds_at_every_moment_of_growing(empty_map):
-    technique, places = Signs(), 4000
+    technique, places = Signs(), 2000
     each = bytes_per_place(technique.spec)
     tracemalloc.start()
     growing = GrowingIndex(place_map=empty_map, technique=technique, budget_bytes=places * each, room=10**6)
-    empty_map.db.execute("PRAGMA synchronous = OFF")  # four thousand syncs would only take time
+    empty_map.db.execute("PRAGMA synchronous = OFF")  # two thousand syncs would only take time
     learn(empty_map, growing, range(places))
     tracemalloc.reset_peak()
     learn(empty_map, growing, range(places, places + 10))  # thins

@@ -4,6 +4,7 @@ not end."""
 import contextlib
 import dataclasses
 import os
+import shutil
 import sqlite3
 import stat
 import subprocess
@@ -15,7 +16,7 @@ import map_writer
 import numpy as np
 import pytest
 from full_disk import no_file_larger_than
-from map_writer import SPEC, descriptor, frame
+from map_writer import SPEC, descriptor, frame, make_map
 
 from edgevpr.errors import MapBusyError, MapError, UsageError
 from edgevpr.places.examine import absorb, examine
@@ -28,13 +29,14 @@ from edgevpr.types import Position
 PLACES = 40
 
 
+@pytest.fixture(scope="module")
+def valley(tmp_path_factory):
+    return make_map(tmp_path_factory.mktemp("valley") / "valley.gpkg", PLACES)
+
+
 @pytest.fixture
-def map_path(tmp_path):
-    path = tmp_path / "valley.gpkg"
-    with PlaceMap.create(path, SPEC) as place_map:
-        for number in range(PLACES):
-            place_map.add(frame(number), descriptor(number))
-    return path
+def map_path(valley, tmp_path):
+    return shutil.copy(valley, tmp_path / valley.name)
 
 
 def written(path, *statements):

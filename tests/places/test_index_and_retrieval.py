@@ -1,6 +1,7 @@
 """The index under its budget, and retrieval over it with techniques that are simple enough to predict."""
 
 import dataclasses
+import shutil
 
 import numpy as np
 import pytest
@@ -34,10 +35,11 @@ class Ruler:
         return FineMatch(1 / (1 + abs(float(fine[0] - query.fine[0]))))
 
 
-@pytest.fixture
-def ruler_map(tmp_path):
+@pytest.fixture(scope="module")
+def whole_map(tmp_path_factory):
     technique = Ruler()
-    with PlaceMap.create(tmp_path / "ruler.gpkg", technique.spec) as place_map:
+    path = tmp_path_factory.mktemp("ruler") / "ruler.gpkg"
+    with PlaceMap.create(path, technique.spec) as place_map:
         for number in range(0, 100, 4):
             image = np.full((1, 1), number)
             position = Position(0.0, number * 1e-4) if number != 60 else None
@@ -45,8 +47,14 @@ def ruler_map(tmp_path):
                 Frame(image=image, name=f"{number}", t_mono_s=0.0, t_utc_s=None, position=position),
                 technique.encode(image),
             )
-    with PlaceMap.open(tmp_path / "ruler.gpkg") as place_map:
-        yield technique, place_map
+    return path
+
+
+@pytest.fixture
+def ruler_map(whole_map, tmp_path):
+    shutil.copy(whole_map, tmp_path)
+    with PlaceMap.open(tmp_path / whole_map.name) as place_map:
+        yield Ruler(), place_map
 
 
 def test_the_index_is_contiguous_and_of_the_size_promised(ruler_map):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -47,24 +48,34 @@ class Short(Ruler):
     spec = dataclasses.replace(Ruler.spec, fine=None)
 
 
-def opened(technique, tmp_path):
-    """A technique, its map of the places 0, 10, ... 290, 111 m apart, and the index. Their ids are 1 to 30."""
-    with PlaceMap.create(tmp_path / "m.gpkg", technique.spec) as place_map:
-        for number in range(0, 300, 10):
-            position = Position(number * 1e-4, 0.0)
-            frame = Frame(image=np.zeros((1, 1)), name=f"{number}", t_mono_s=0.0, position=position)
-            place_map.add(frame, technique.encode(number))
+@pytest.fixture(scope="module")
+def maps(tmp_path_factory):
+    """A map of each technique: the places 0, 10, ... 290, 111 m apart. Their ids are 1 to 30."""
+    folder = tmp_path_factory.mktemp("maps")
+    for technique in (Ruler(), Short()):
+        with PlaceMap.create(folder / type(technique).__name__, technique.spec) as place_map:
+            for number in range(0, 300, 10):
+                position = Position(number * 1e-4, 0.0)
+                frame = Frame(image=np.zeros((1, 1)), name=f"{number}", t_mono_s=0.0, position=position)
+                place_map.add(frame, technique.encode(number))
+    return folder
+
+
+def opened(technique, maps, tmp_path):
+    """A technique, its map, and the index."""
+    path = shutil.copy(maps / type(technique).__name__, tmp_path / "m.gpkg")
+    with PlaceMap.open_for_adding(path) as place_map:
         yield technique, place_map, load_index(place_map, technique, 10_000)
 
 
 @pytest.fixture
-def ruler(tmp_path):
-    yield from opened(Ruler(), tmp_path)
+def ruler(maps, tmp_path):
+    yield from opened(Ruler(), maps, tmp_path)
 
 
 @pytest.fixture
-def short(tmp_path):
-    yield from opened(Short(), tmp_path)
+def short(maps, tmp_path):
+    yield from opened(Short(), maps, tmp_path)
 
 
 def damage(place_map, change, *numbers):

@@ -15,7 +15,7 @@ from pathlib import Path
 import map_writer
 import numpy as np
 import pytest
-from map_writer import SPEC, descriptor, frame
+from map_writer import SPEC, descriptor, frame, make_map
 
 from edgevpr.contract import PartSpec
 from edgevpr.errors import MapError, PlaceError
@@ -28,13 +28,14 @@ from edgevpr.places.near import index_positions, nearest_m
 from edgevpr.types import Position
 
 
+@pytest.fixture(scope="module")
+def valley(tmp_path_factory):
+    return make_map(tmp_path_factory.mktemp("valley") / "valley.gpkg", 10)
+
+
 @pytest.fixture
-def map_path(tmp_path):
-    path = tmp_path / "valley.gpkg"
-    with PlaceMap.create(path, SPEC) as place_map:
-        for number in range(10):
-            place_map.add(frame(number), descriptor(number))
-    return path
+def map_path(valley, tmp_path):
+    return shutil.copy(valley, tmp_path / valley.name)
 
 
 def test_what_is_added_comes_back(map_path):

@@ -58,7 +58,7 @@ def test_places_on_one_spot_do_not_confuse_it():
 
 
 def test_choosing_takes_little_memory():
-    places = 20_000
+    places = 10_000
     lat, lon = track(np.random.default_rng(1).random(places) * 1e5)
     quality = np.ones(places)
     tracemalloc.start()

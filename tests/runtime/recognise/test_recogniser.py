@@ -2,6 +2,7 @@
 it."""
 
 import inspect
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -37,14 +38,25 @@ def clock():
     return FakeClock()
 
 
-@pytest.fixture
-def walk(tmp_path, clock):
-    """A recogniser over six places, whose meter has a clock to turn."""
+def meter_with(clock):
+    return QueryMeter(load_board("rpi-4b"), Pack(4, 5200), 0.85, wall_clock=clock, cpu_clock=clock.clock.process_cpu_s)
+
+
+@pytest.fixture(scope="module")
+def whole_map(tmp_path_factory):
     technique = create("cohog", {"w1": 208})
-    meter = QueryMeter(load_board("rpi-4b"), Pack(4, 5200), 0.85, wall_clock=clock, cpu_clock=clock.clock.process_cpu_s)
-    with PlaceMap.create(tmp_path / "m.gpkg", technique.spec) as place_map:
-        build_map(map(frame, range(PLACES)), technique, place_map, meter)
-    with PlaceMap.open(tmp_path / "m.gpkg") as place_map:
+    path = tmp_path_factory.mktemp("map") / "m.gpkg"
+    with PlaceMap.create(path, technique.spec) as place_map:
+        build_map(map(frame, range(PLACES)), technique, place_map, meter_with(FakeClock()))
+    return path
+
+
+@pytest.fixture
+def walk(whole_map, tmp_path, clock):
+    """A recogniser over six places, whose meter has a clock to turn."""
+    technique, meter = create("cohog", {"w1": 208}), meter_with(clock)
+    shutil.copy(whole_map, tmp_path)
+    with PlaceMap.open(tmp_path / whole_map.name) as place_map:
         index = load_index(place_map, technique, 10**6)
         yield Recogniser(
             technique=technique,
