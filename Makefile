@@ -4,6 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 # One thread for the matrix products: what is measured is what one core does, and small products gain nothing from more.
 export OPENBLAS_NUM_THREADS ?= 1
+# Where this is set, each of the hundreds of processes that the tests start compiles edgevpr anew.
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: demo test lint results bench hostile clean
 
@@ -11,7 +13,7 @@ demo: $(VENV)/installed
 	$(BIN)/edgevpr demo --out demo_out
 
 test: $(VENV)/installed lint
-	$(BIN)/python -m pytest -n 4 --dist loadfile
+	$(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder
 
 lint: $(VENV)/installed
 	$(BIN)/ruff check .

@@ -8,6 +8,33 @@ import pytest
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
+# Files that take longest, most of them for a few tests that wait or start programs. They begin first: a process that
+# ended alone with one of them would leave the others idle.
+LONGEST = (
+    "test_learning_flight",
+    "test_frames_damage",
+    "test_flight_process",
+    "test_hostile_links",
+    "test_gate",
+    "test_frames_live",
+    "test_hostile_inputs",
+    "test_mavlink_answers",
+    "test_memory",
+    "test_hostile_maps",
+    "test_demo",
+    "test_hostile_pictures",
+    "test_run_sets",
+    "test_profile_command",
+    "test_golden",
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Bring the longest files to the front."""
+    rank = {name: number for number, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path.stem, len(LONGEST)))
+
+
 @pytest.fixture
 def models(tmp_path, monkeypatch):
     """A models folder of the user's own, empty."""

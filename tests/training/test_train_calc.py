@@ -2,6 +2,7 @@
 
 import json
 import os
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -9,18 +10,39 @@ from pictures_on_disk import write_pictures
 
 from edgevpr.cli.main import main
 from edgevpr.errors import EdgevprError, UsageError
+from edgevpr.techniques.networks.card import read_card
+from edgevpr.training.pictures import read_pictures, small_grey
 
-torch = pytest.importorskip("torch", reason="PyTorch is not installed (pip install 'edgevpr[train]')")
-onnx = pytest.importorskip("onnx", reason="onnx is not installed (pip install 'edgevpr[train]')")
+# PyTorch is a fixture and no import: of all processes that collect these tests, only the one that runs them loads it.
 
-from edgevpr.techniques.networks.card import read_card  # noqa: E402
-from edgevpr.training import calc, export  # noqa: E402
-from edgevpr.training.network import Autoencoder, Encoder  # noqa: E402
-from edgevpr.training.pictures import read_pictures, small_grey  # noqa: E402
+
+@pytest.fixture(scope="module")
+def torch():
+    return pytest.importorskip("torch", reason="PyTorch is not installed (pip install 'edgevpr[train]')")
+
+
+@pytest.fixture(scope="module")
+def onnx():
+    return pytest.importorskip("onnx", reason="onnx is not installed (pip install 'edgevpr[train]')")
+
+
+@pytest.fixture(scope="module")
+def calc(torch):
+    return import_module("edgevpr.training.calc")
+
+
+@pytest.fixture(scope="module")
+def export(torch, onnx):
+    return import_module("edgevpr.training.export")
+
+
+@pytest.fixture(scope="module")
+def network(torch):
+    return import_module("edgevpr.training.network")
 
 
 @pytest.fixture(autouse=True)
-def small(monkeypatch):
+def small(monkeypatch, torch, onnx, calc):
     monkeypatch.setattr(calc, "BATCH", 4)
     monkeypatch.setattr(calc, "_WARM_UP_STEPS", 4)
     torch.set_num_threads(1)
@@ -46,12 +68,12 @@ def weights(training):
     return {name: value.numpy() for name, value in training.encoder().state_dict().items()}
 
 
-def test_training_lowers_the_loss(pictures, tmp_path):
+def test_training_lowers_the_loss(calc, pictures, tmp_path):
     training = finished(calc.Training(pictures, 24, seed=1), tmp_path / "c")
     assert np.mean(training.losses[-6:]) < 0.97 * np.mean(training.losses[:6])
 
 
-def test_a_stopped_training_ends_as_one_that_was_not(pictures, tmp_path, monkeypatch):
+def test_a_stopped_training_ends_as_one_that_was_not(calc, pictures, tmp_path, monkeypatch):
     whole = finished(calc.Training(pictures, 6, seed=1), tmp_path / "whole")
     monkeypatch.setattr(calc, "_STEPS_BETWEEN_CHECKPOINTS", 3)
     stopped = calc.Training(pictures, 6, seed=1)
@@ -67,12 +89,12 @@ def test_a_stopped_training_ends_as_one_that_was_not(pictures, tmp_path, monkeyp
         np.testing.assert_allclose(weights(resumed)[name], value, atol=1e-4)
 
 
-def test_another_seed_is_another_training(pictures, tmp_path):
+def test_another_seed_is_another_training(calc, pictures, tmp_path):
     first, other = (finished(calc.Training(pictures, 1, seed), tmp_path / "c") for seed in (1, 2))
     assert first.losses != other.losses
 
 
-def test_a_checkpoint_of_other_settings_is_refused(pictures, tmp_path):
+def test_a_checkpoint_of_other_settings_is_refused(calc, pictures, tmp_path):
     training = calc.Training(pictures, 4, seed=1)
     training.save(tmp_path / "c")
     for other in (calc.Training(pictures, 5, 1), calc.Training(pictures, 4, 2), calc.Training(pictures[1:], 4, 1)):
@@ -80,7 +102,7 @@ def test_a_checkpoint_of_other_settings_is_refused(pictures, tmp_path):
             other.load(tmp_path / "c")
 
 
-def test_a_damaged_or_missing_checkpoint_is_refused(pictures, tmp_path):
+def test_a_damaged_or_missing_checkpoint_is_refused(calc, pictures, tmp_path):
     training = calc.Training(pictures, 4, seed=1)
     training.save(tmp_path / "c")
     (tmp_path / "c").write_bytes((tmp_path / "c").read_bytes()[:1000])
@@ -90,33 +112,31 @@ def test_a_damaged_or_missing_checkpoint_is_refused(pictures, tmp_path):
         training.load(tmp_path / "none")
 
 
-def test_folding_changes_nothing(pictures):
+def test_folding_changes_nothing(torch, network):
     """What batch normalisation does in evaluation, in the weights."""
-    network = Autoencoder(torch.full((14 * 19 * 36,), 0.3)).encoder
+    encoder = network.Autoencoder(torch.full((14 * 19 * 36,), 0.3)).encoder
     image = torch.rand(4, 1, 120, 160)
     for _ in range(3):
-        network.features(image)
-        network.code(network.features(image))
-    trained_on = network.training
-    folded = network.folded()
-    assert network.training is trained_on  # the training goes on as before
-    network.eval()
+        encoder.features(image)
+        encoder.code(encoder.features(image))
+    trained_on = encoder.training
+    folded = encoder.folded()
+    assert encoder.training is trained_on  # the training goes on as before
+    encoder.eval()
     with torch.no_grad():
-        for got, wanted in zip(folded(image), network(image), strict=True):
+        for got, wanted in zip(folded(image), encoder(image), strict=True):
             torch.testing.assert_close(got, wanted, atol=1e-5, rtol=1e-4)
 
 
-def test_the_encoder_normalises_responses_as_pytorch_does():
-    from edgevpr.training.network import _response_normalised
-
+def test_the_encoder_normalises_responses_as_pytorch_does(torch, network):
     x = 100 * torch.rand(2, 64, 6, 5)
     wanted = torch.nn.functional.local_response_norm(x, 5, 1e-4, 0.75, 1.0)
-    torch.testing.assert_close(_response_normalised(x), wanted)
+    torch.testing.assert_close(network._response_normalised(x), wanted)
 
 
-def test_the_file_equals_pytorch_and_a_difference_is_found(tmp_path):
+def test_the_file_equals_pytorch_and_a_difference_is_found(torch, network, export, tmp_path):
     torch.manual_seed(0)
-    encoder = Encoder().eval().requires_grad_(False)
+    encoder = network.Encoder().eval().requires_grad_(False)
     export.write_onnx(encoder, tmp_path / "m.onnx")
     inputs = np.random.default_rng(0).random((3, 1, 120, 160), np.float32)
     assert export.require_equal(encoder, tmp_path / "m.onnx", inputs) <= 1e-4
@@ -145,7 +165,7 @@ def test_the_command_makes_a_model_that_edgevpr_opens(folder, tmp_path, capsys, 
     assert open_backbone("mine", "features").shape == (128, 16, 21)
 
 
-def test_a_file_that_differs_is_not_left_and_another_try_goes_on(folder, tmp_path, capsys, monkeypatch):
+def test_a_file_that_differs_is_not_left_and_another_try_goes_on(export, folder, tmp_path, capsys, monkeypatch):
     with monkeypatch.context() as patched:
         patched.setattr(export, "LARGEST_DIFFERENCE", -1.0)
         assert train(folder, tmp_path / "mine.onnx") == 1
@@ -154,7 +174,7 @@ def test_a_file_that_differs_is_not_left_and_another_try_goes_on(folder, tmp_pat
     assert train(folder, tmp_path / "mine.onnx", "--resume") == 0
 
 
-def test_interrupted_the_command_keeps_what_was_done(folder, tmp_path, capsys, monkeypatch):
+def test_interrupted_the_command_keeps_what_was_done(calc, onnx, folder, tmp_path, capsys, monkeypatch):
     one_step = calc.Training._one_step
 
     def interrupted(training):
