@@ -18,7 +18,11 @@ class ConfigError(UsageError):
 
 
 class ImageError(EdgevprError):
-    """One image cannot be used; other images may be usable."""
+    """One image, or `count` images of a video, cannot be used; others may be usable."""
+
+    def __init__(self, message: str, count: int = 1) -> None:
+        super().__init__(message)
+        self.count = count
 
 
 class SourceError(EdgevprError):

@@ -128,7 +128,8 @@ def leave_out(error: ImageError, unusable: list[ImageError]) -> None:
 def exit_code(unusable: list[ImageError]) -> int:
     """Return the exit code: 1, with a printed sentence, where any image could not be used, else 0."""
     if unusable:
-        print(f"edgevpr: {len(unusable)} images could not be used (named above).", file=sys.stderr)
+        count = sum(error.count for error in unusable)
+        print(f"edgevpr: {count} images could not be used (named above).", file=sys.stderr)
     return 1 if unusable else 0
 
 

@@ -93,7 +93,8 @@ class VideoSource(Recording):
         self._t_s += 0.0 if self._is_stamped else count * self._frame_s
         which = f"frame {first:06d} (t={t_s:.1f} s)" + (f" and {count - 1} after it" if count > 1 else "")
         raise ImageError(
-            f"{self._path}: {which} cannot be used, being damaged or built on damage{until}: copy the video again."
+            f"{self._path}: {which} cannot be used, being damaged or built on damage{until}: copy the video again.",
+            count,
         )
 
     def _end(self) -> None:
@@ -104,7 +105,8 @@ class VideoSource(Recording):
         if self._promised_s - seen_s > _CUT_S:
             raise ImageError(
                 f"{self._path} ends after {seen_s:.1f} s of {self._promised_s:.1f} s: it is cut short: copy the "
-                "video again."
+                "video again.",
+                round((self._promised_s - seen_s) / self._frame_s),
             )
 
 

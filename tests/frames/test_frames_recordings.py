@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import photographs
 import pytest
+from films import cut_in_half, film, overwrite_in_the_middle
 
 from edgevpr.errors import ImageError, SourceError, UsageError
 from edgevpr.frames.source import open_source
@@ -201,27 +202,15 @@ def time_of(frame):
 
 @pytest.fixture
 def films(tmp_path):
-    """A function that films three seconds of a test picture at 25 Hz, with a key frame every second."""
-    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="the video is made with ffmpeg (pip install imageio-ffmpeg)")
-
-    def film(name, *coding):
-        picture = ["-f", "lavfi", "-i", "testsrc2=size=320x240:rate=25:duration=3"]
-        path = tmp_path / name
-        command = [ffmpeg.get_ffmpeg_exe(), "-v", "quiet", *picture, "-g", "25", *coding, str(path)]
-        subprocess.run(command, check=True)
-        return path
-
-    return film
+    """A function that makes a film of this name."""
+    return lambda name, *coding: film(tmp_path / name, *coding)
 
 
 def test_damaged_frames_of_a_video_and_those_built_on_them_are_left_out_counted_and_said_once(films):
     path = films("flight.mkv", "-c:v", "libx264", "-bf", "0", "-sc_threshold", "0")
     whole, complaints, _ = frames_and_complaints(path)
     assert (len(whole), complaints) == (75, [])
-    data = bytearray(path.read_bytes())
-    middle = len(data) // 2
-    data[middle : middle + 300] = np.random.default_rng(1).bytes(300)
-    path.write_bytes(data)
+    overwrite_in_the_middle(path)
     frames, complaints, damaged = frames_and_complaints(path)
     images = {time_of(frame): frame.image for frame in whole}
     assert all((images[time_of(frame)] == frame.image).all() for frame in frames)
@@ -254,8 +243,7 @@ def test_a_video_that_is_cut_short_is_said(name, films):
     path = films(
         name, "-c:v", "mpeg4", "-qscale:v", "3", *(["-movflags", "+faststart"] if name.endswith("mp4") else [])
     )
-    data = path.read_bytes()
-    path.write_bytes(data[: len(data) // 2])
+    cut_in_half(path)
     frames, complaints, _ = frames_and_complaints(path)
     assert 10 < len(frames) < 60
     assert re.search(
