@@ -16,8 +16,10 @@ if TYPE_CHECKING:
 
 OPEN_TIMEOUT_S = 5.0
 READ_TIMEOUT_S = 3.0
-# RTSP over its own connection loses nothing; FFmpeg connects to the addresses in an .sdp file only where it is allowed.
-_OPTIONS = {"rtsp_transport": "tcp"}
+# RTSP over its own connection loses nothing, but the camera may lose packets before, in the air or for want of room.
+# FFmpeg says so only where it may hold packets back to see whether the missing one follows: two are the least. It
+# connects to the addresses in an .sdp file only where it is allowed.
+_OPTIONS = {"rtsp_transport": "tcp", "reorder_queue_size": "2"}
 _BYTES_OF_LUMA = ("yuv", "nv12", "nv21", "gray")  # pixel formats that begin with a plane of brightness
 _SDP_OPTIONS = {"protocol_whitelist": "file,rtp,udp"}
 

@@ -1,12 +1,11 @@
 """Test cameras: ffmpeg on loopback, which can be switched off and on again like a plug being pulled."""
 
-import socket
 import subprocess
 import time
 from pathlib import Path
 
 import imageio_ffmpeg
-from rtsp_camera import RtspCamera
+from rtsp_camera import RtspCamera, free_port
 
 KINDS = ("udp", "tcp", "http", "rtsp")
 WIDTH, HEIGHT = 160, 120
@@ -21,13 +20,6 @@ def start_ffmpeg(*output: str) -> subprocess.Popen:
 def stop(process: subprocess.Popen) -> None:
     process.kill()
     process.wait()
-
-
-def free_port() -> int:
-    """A port that was free a moment ago for TCP, UDP and, two further, for RTP with its reports."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 class FfmpegCamera:

@@ -1,52 +1,72 @@
 """Streams that are cut, corrupted and lose packets: what is delivered is whole and no older than it says. The long form
 is `python benchmarks/hostile.py --parts streams`."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import pytest
 
 pytest.importorskip("imageio_ffmpeg", reason="the cameras need ffmpeg (pip install imageio-ffmpeg)")
 
 import bench_streams
-import hostile_streams
+import numbered_pictures
+
+from edgevpr.frames import streams
+
+PICTURES, RATE_HZ = 200, 80.0
+WHOLE = ("MJPEG over HTTP, whole", "H.264 in MPEG-TS, 0% lost", "H.264 in RTSP, 0% lost")
+CUT = ("MJPEG over HTTP, cut to 15 %", "MJPEG over HTTP, truncated")
+CORRUPTED = "MJPEG over HTTP, bytes corrupted"
+LOSSY = (
+    "H.264 in MPEG-TS, 10% lost",
+    "H.264 in RTP, 2% lost",
+    "H.265 in RTP, 10% lost",
+    "H.265 in RTSP, 10% lost",
+    "MPEG-2 in MPEG-TS, 10% lost",
+)
 
 
-def row(stream, count=160):
-    (row,) = bench_streams.run(count, 1, only=stream.__eq__)
-    return row
+@pytest.fixture(scope="module")
+def rows():
+    """What was delivered of each stream, by its name. All are read side by side: it takes seconds, mostly of waiting."""
+    names = (*WHOLE, *CUT, CORRUPTED, *LOSSY)
+    with pytest.MonkeyPatch.context() as patch, ThreadPoolExecutor(6) as pool:
+        patch.setattr(streams, "READ_TIMEOUT_S", 1.5)
+        found = pool.map(lambda name: bench_streams.run(PICTURES, 1, only=name.__eq__, rate_hz=RATE_HZ), names)
+        return {row.stream: row for (row,) in found}
 
 
 def test_the_time_can_be_read_from_every_band_of_a_picture():
-    patched = hostile_streams.picture(700)
-    patched[128:] = hostile_streams.picture(650)[128:]
+    patched = numbered_pictures.picture(700)
+    patched[128:] = numbered_pictures.picture(650)[128:]
     patched[8:16, :160] = 0
-    assert hostile_streams.numbers_in(patched) == [None, *[700] * 7, *[650] * 7]
+    assert numbered_pictures.numbers_in(patched) == [None, *[700] * 7, *[650] * 7]
 
 
-def test_a_whole_stream_loses_nothing():
-    whole = row("MJPEG over HTTP, whole")
+@pytest.mark.parametrize("stream", WHOLE)
+def test_a_whole_stream_loses_nothing(stream, rows):
+    whole = rows[stream]
     assert (whole.old, whole.broken) == (0, 0)
-    assert whole.delivered == whole.sent
-    assert sum(whole.refused.values()) == 0
+    assert whole.sent > PICTURES / 4
+    assert whole.delivered >= 0.99 * whole.sent
 
 
-@pytest.mark.parametrize("damage", ["cut to 15 %", "truncated"])
-def test_pictures_that_are_cut_are_refused_and_counted(damage):
-    damaged = row(f"MJPEG over HTTP, {damage}")
-    assert (damaged.old, damaged.broken) == (0, 0)
-    assert damaged.refused["damaged"] > 20
-    assert damaged.delivered + damaged.refused["damaged"] == 160
+@pytest.mark.parametrize("stream", CUT)
+def test_pictures_that_are_cut_are_refused_and_counted(stream, rows):
+    cut = rows[stream]
+    assert (cut.old, cut.broken) == (0, 0)
+    assert cut.refused["damaged"] > 20
+    assert cut.delivered + cut.refused["damaged"] == cut.sent
 
 
-def test_pictures_whose_bytes_are_corrupted_are_never_old():
-    corrupted = row("MJPEG over HTTP, bytes corrupted")
+def test_pictures_whose_bytes_are_corrupted_are_never_old(rows):
+    corrupted = rows[CORRUPTED]
     assert corrupted.old == 0
     assert corrupted.refused["damaged"] > 0
 
 
-@pytest.mark.parametrize(
-    "stream",
-    ["H.264 in MPEG-TS, 10% lost", "H.264 in RTP, 2% lost", "H.265 in RTP, 10% lost", "MPEG-2 in MPEG-TS, 10% lost"],
-)
-def test_of_a_stream_that_loses_packets_nothing_old_or_broken_is_delivered(stream):
-    lossy = row(stream)
+@pytest.mark.parametrize("stream", LOSSY)
+def test_of_a_stream_that_loses_packets_nothing_old_or_broken_is_delivered(stream, rows):
+    lossy = rows[stream]
     assert (lossy.old, lossy.broken) == (0, 0)
-    assert lossy.delivered < lossy.sent or lossy.delivered == 0
+    assert lossy.delivered < lossy.sent
+    assert sum(lossy.refused.values()) > PICTURES / 10
