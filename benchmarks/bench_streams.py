@@ -3,24 +3,29 @@
 Every picture carries its number in every band of its rows, so that what is delivered tells how old each part of it is.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 
 from hostile_cameras import Camera, Film
 from hostile_streams import streams
 from numbered_pictures import numbers_in, picture
 
 from edgevpr.frames.condition import Condition
+from edgevpr.frames.decoding import Fetched, WholePictures
 from edgevpr.frames.source import open_source
 
 RATE_HZ = 40.0
 OLD_S = 1.0
 _WHOLE_AT_FIRST = 20
+_TOO_SLOW = ("MJPEG over HTTP, whole", "H.264 in MPEG-TS, 0% lost", "H.264 in RTSP, 0% lost")
+_SLOWER, _LONGER = 2.0, 3  # than the stream: the work for a picture; and than the others: how long it is borne
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
-    """Counts of the pictures of one stream. `sent` counts from the first that was delivered; `delivered` to the flight
+    """Counts of the pictures of one stream, of which nothing need be lost where it `is_whole`. `sent` counts from the first that was delivered; `delivered` to the flight
     or superseded by a newer one; `refused` by reason; of those `looked_at`, `old` have a part more than a second older
     than the frame claims, and `broken` a part that cannot be read; `latency_s` is that of the slowest."""
 
@@ -38,11 +43,35 @@ class Row:
 def run(
     count: int, seed: int, only: Callable[[str], bool] = lambda stream: True, rate_hz: float = RATE_HZ
 ) -> list[Row]:
-    """Send `count` pictures over every stream whose name is wanted, and judge what is delivered."""
+    """Send `count` pictures over every stream whose name is wanted, and judge what is delivered; then over some once
+    more, with a decoder that is too slow for them."""
     film = Film(picture=picture, count=count, rate_hz=rate_hz, whole_at_first=_WHOLE_AT_FIRST)
-    return [
+    rows = [
         _judged(stream.name, stream.is_whole, stream.camera(film, seed)) for stream in streams() if only(stream.name)
     ]
+    long = replace(film, count=_LONGER * count)
+    for stream in streams():
+        name = f"{stream.name}, decoded too slowly"
+        if stream.name in _TOO_SLOW and only(name):
+            with _slow_decoder(_SLOWER / rate_hz):
+                rows.append(_judged(name, False, stream.camera(long, seed)))
+    return rows
+
+
+@contextmanager
+def _slow_decoder(work_s: float) -> Iterator[None]:
+    """Let every packet take so much longer to decode."""
+    decode = WholePictures.decode
+
+    def slowly(whole: WholePictures, fetched: Fetched) -> object:
+        time.sleep(work_s)
+        return decode(whole, fetched)
+
+    WholePictures.decode = slowly
+    try:
+        yield
+    finally:
+        WholePictures.decode = decode
 
 
 def _judged(stream: str, is_whole: bool, camera: Camera) -> Row:

@@ -6,15 +6,16 @@ _RESTART_S = 5.0  # a longer jump of the delay: the sender has begun anew, or so
 _BACKLOG_S = 0.005  # a picture that comes sooner than all before it by more has waited to be fetched
 _IN_TIME = 3  # pictures in a row after which none is waiting any more
 _WAITED_S = 0.002  # a picture that took longer to get was not there before
-_WINDOW_S = 5.0  # two of these are looked back on
+_WINDOW_S, _STEADY_S = 5.0, 0.2  # delays that differ by no more for so long are the way, and not a jam
 
 
 class StampedTime:
     """Time by the stream's own time stamps.
 
-    They share no zero with this machine's clock: the least delay seen in the last 5 to 10 s is taken for none, and all
-    that a picture took longer is its age. Older delays are forgotten, so that clocks that drift do no harm. `is_live`:
-    what waited for the opening has been fetched."""
+    They share no zero with this machine's clock: the least delay seen so far is taken for none, and all that a picture
+    took longer is its age. That least delay is forgotten only for another one that has been steady for five seconds, as
+    when clocks drift or the sender has paused: delays in a jam waver, and may last. `is_live`: what waited for the
+    opening has been fetched."""
 
     def __init__(self) -> None:
         self._begin_anew()
@@ -29,10 +30,7 @@ class StampedTime:
         self.is_live = self.is_live or self._in_time >= _IN_TIME
         self._order_s, self._order_delay_s = order_s, order_delay_s
         self._least_order_delay_s = min(self._least_order_delay_s, order_delay_s)
-        if self._window_began_s is None:
-            self._window_began_s = t_mono_s
-        elif t_mono_s - self._window_began_s > _WINDOW_S:
-            self._window_began_s, self._former_s, self._least_s = t_mono_s, self._least_s, math.inf
+        self._look_back(t_mono_s, delay_s, order_delay_s)
         self._least_s = min(self._least_s, delay_s)
 
     def taken_s(self, stamp_s: float, t_mono_s: float) -> float | None:
@@ -40,18 +38,26 @@ class StampedTime:
         waited since the opening is still being fetched: how old that is cannot be known."""
         if not self.is_live:
             return None
-        return min(t_mono_s, stamp_s + min(self._least_s, self._former_s))
+        return min(t_mono_s, stamp_s + self._least_s)
+
+    def _look_back(self, t_mono_s: float, delay_s: float, order_delay_s: float) -> None:
+        if self._window and t_mono_s - self._window[0][0] > _WINDOW_S:
+            _, delays_s, order_delays_s = zip(*self._window, strict=True)
+            if max(order_delays_s) - min(order_delays_s) < _STEADY_S:
+                self._least_s = min(delays_s)
+            self._window.clear()
+        self._window.append((t_mono_s, delay_s, order_delay_s))
 
     def _begin_anew(self) -> None:
         self.is_live, self._in_time = False, 0
         self._order_s, self._order_delay_s = -math.inf, math.nan
-        self._least_order_delay_s = self._least_s = self._former_s = math.inf
-        self._window_began_s: float | None = None
+        self._least_order_delay_s = self._least_s = math.inf
+        self._window: list[tuple[float, float, float]] = []
 
 
 class UnstampedTime:
-    """Time for streams without time stamps (MJPEG over HTTP): a picture that was there when it was asked for may have
-    come at any moment since the last one that was not."""
+    """Time for streams without time stamps (MJPEG over HTTP): a picture that was waited for has come since it was asked
+    for. One that was there already may have come at any moment since the last one that was waited for was."""
 
     def __init__(self, opened_s: float) -> None:
         self._waited_s = opened_s
@@ -59,5 +65,5 @@ class UnstampedTime:
     def taken_s(self, asked_s: float, t_mono_s: float) -> float:
         """Return the earliest time at which the picture asked for at `asked_s` and got at `t_mono_s` can have come."""
         if t_mono_s - asked_s > _WAITED_S:
-            self._waited_s = t_mono_s
+            self._waited_s = asked_s
         return self._waited_s

@@ -4,6 +4,7 @@ Only what opens a stream or a video file imports this: the library takes room.
 """
 
 import logging
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import av
@@ -45,6 +46,14 @@ def open_pictures(
     return None
 
 
+@dataclass(frozen=True, slots=True)
+class Fetched:
+    """A packet; `is_doubtful` where others may be missing before it."""
+
+    packet: "Packet"
+    is_doubtful: bool
+
+
 def _is_missed(said: list[tuple[int, str, str]]) -> bool:
     return any(_MISSED in message for _, _, message in said)
 
@@ -65,38 +74,47 @@ class WholePictures:
         self._packets = container.demux(self.stream)
         self._reformatter = VideoReformatter()
         self._is_backlog_doubtful = are_missed
-        self._doubtful = 0  # so many packets from now on are not to be trusted
-        self._has_begun = self._is_sound = False
+        self._doubtful = 0  # so many packets from now on are not to be trusted, where it is above zero
+        self._refusal: Refusal | None = Refusal.LATE  # of all until the next one that stands alone
+        self._has_begun = False
 
     def caught_up(self) -> None:
         """Take note that what is fetched from now on came after the opening."""
         self._is_backlog_doubtful = False
 
-    def fetch(self) -> "Packet | None":
-        """Wait for the next packet and return it; None at the end, and where the stream is lost."""
+    def fetch(self) -> Fetched | None:
+        """Wait for the next packet and return it; None at the end, and where the stream is lost. A thread of its own may
+        do this while another one decodes."""
         with av.logging.Capture() as said:
             try:
                 packet = next(self._packets, None)
             except (av.FFmpegError, OSError):
                 return None
-        if packet is not None and (packet.is_corrupt or _is_missed(said)):
+        if packet is None:
+            return None
+        if packet.is_corrupt or _is_missed(said):
             # FFmpeg notices a gap while it puts together the picture after the one that it hands out.
             self._doubtful = _PACKETS_IN_DOUBT
-        return packet
+        self._doubtful -= 1
+        return Fetched(packet, self._doubtful >= 0)
 
-    def decode(self, packet: "Packet") -> "list[VideoFrame] | Refusal":
+    def skip(self) -> Refusal:
+        """Leave a packet out, and say why it and those that are built on it are refused."""
+        return self._refuse(Refusal.LATE)
+
+    def decode(self, fetched: Fetched) -> "list[VideoFrame] | Refusal":
         """Return the pictures that are ready after this packet: none, one, or at the end several."""
+        packet = fetched.packet
         if not packet.size:
-            return self._decoded(packet) if self._is_sound else []
-        if self._doubtful or self._is_backlog_doubtful:
-            self._doubtful = max(0, self._doubtful - 1)
+            return [] if self._refusal else self._decoded(packet)
+        if fetched.is_doubtful or self._is_backlog_doubtful:
             return self._refuse()
-        if not self._is_sound:
+        if self._refusal:
             if not packet.is_keyframe:
-                return self._refuse()
+                return self._refusal
             if self._has_begun:
                 self._codec.flush_buffers()
-            self._has_begun = self._is_sound = True
+            self._refusal, self._has_begun = None, True
         if self._codec.name == "mjpeg" and not jpeg_is_whole(bytes(packet)):
             return self._refuse()
         return self._decoded(packet)
@@ -118,6 +136,6 @@ class WholePictures:
                 return self._refuse()
         return self._refuse() if any(picture.is_corrupt for picture in pictures) else pictures
 
-    def _refuse(self) -> Refusal:
-        self._is_sound = False
-        return Refusal.DAMAGED if self._has_begun else Refusal.LATE  # joined in its midst, a stream is not damaged
+    def _refuse(self, why: Refusal = Refusal.DAMAGED) -> Refusal:
+        self._refusal = self._refusal or why
+        return self._refusal

@@ -11,7 +11,7 @@ import numpy as np
 class Refusal(Enum):
     """The reason for which a picture is refused. DAMAGED: it is not whole, or predicted from one that is not. PATCHED:
     parts of it are those of an older one. FROZEN: it is the one before again. LATE: how old it is cannot be told, as it
-    has waited since before the opening, or comes out of turn."""
+    has waited since before the opening, or comes out of turn; or it came sooner than those before could be decoded."""
 
     DAMAGED = "damaged"
     PATCHED = "patched"

@@ -66,13 +66,13 @@ class VideoSource(Recording):
         self._whole.close()
 
     def _decode_more(self) -> None:
-        packet = self._whole.fetch()
-        if packet is None:
+        fetched = self._whole.fetch()
+        if fetched is None:
             self._end()
             return
-        if packet.pts is not None:
-            self._heard_s = max(self._heard_s, (packet.pts - self._first_stamp) * self._unit_s)
-        pictures = self._whole.decode(packet)
+        if fetched.packet.pts is not None:
+            self._heard_s = max(self._heard_s, (fetched.packet.pts - self._first_stamp) * self._unit_s)
+        pictures = self._whole.decode(fetched)
         if isinstance(pictures, Refusal):
             self._damaged += 1
         else:

@@ -1,5 +1,6 @@
 """The time at which pictures of a stream were taken, by their time stamps and by when they arrived."""
 
+import numpy as np
 import pytest
 
 from edgevpr.frames.age import StampedTime, UnstampedTime
@@ -49,6 +50,25 @@ def test_clocks_that_drift_make_no_picture_old(drift):
     assert max(ages_s[3:]) < 0.01
 
 
+def test_a_delay_that_wavers_is_age_for_as_long_as_it_lasts():
+    """A network that is jammed for a minute: two seconds and more, once the first ten pictures had come at once."""
+    wavering = np.random.default_rng(1).uniform(2.0, 2.5, 1200)
+    ages_s = feed(StampedTime(), 1200, delay_s=lambda number: wavering[number] if number >= 10 else 0.0)
+    assert ages_s[10:] == [pytest.approx(delay_s) for delay_s in wavering[10:]]
+
+
+def test_a_delay_that_grows_is_age():
+    """What somebody gets who is too slow for the stream."""
+    ages_s = feed(StampedTime(), 400, delay_s=lambda number: 0.02 * number)
+    assert ages_s[10:] == [pytest.approx(0.02 * number) for number in range(10, 400)]
+
+
+def test_a_sender_that_has_paused_without_counting_is_new_again_after_ten_seconds():
+    ages_s = feed(StampedTime(), 400, delay_s=lambda number: 1.5 if number >= 100 else 0.0)
+    assert ages_s[100] == pytest.approx(1.5)
+    assert ages_s[310:] == [pytest.approx(0)] * 90
+
+
 @pytest.mark.parametrize("stamp_s", [0.0, 5000.0])
 def test_a_sender_that_begins_anew_is_followed(stamp_s):
     time = StampedTime()
@@ -69,5 +89,5 @@ def test_pictures_that_are_sent_out_of_turn_are_no_new_beginning():
 def test_without_stamps_a_picture_that_was_there_already_is_as_old_as_the_last_wait():
     time = UnstampedTime(opened_s=10.0)
     assert time.taken_s(asked_s=10.5, t_mono_s=10.5001) == 10.0
-    assert time.taken_s(asked_s=10.5, t_mono_s=10.6) == 10.6, "it was waited for"
-    assert time.taken_s(asked_s=13.0, t_mono_s=13.0005) == 10.6, "it may have come at any moment since"
+    assert time.taken_s(asked_s=10.5, t_mono_s=10.6) == 10.5, "it was waited for since then"
+    assert time.taken_s(asked_s=13.0, t_mono_s=13.0005) == 10.5, "it may have come at any moment since"

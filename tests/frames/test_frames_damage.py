@@ -12,7 +12,7 @@ import numbered_pictures
 
 from edgevpr.frames import streams
 
-PICTURES, RATE_HZ = 200, 80.0
+PICTURES, RATE_HZ = 160, 80.0
 WHOLE = ("MJPEG over HTTP, whole", "H.264 in MPEG-TS, 0% lost", "H.264 in RTSP, 0% lost")
 CUT = ("MJPEG over HTTP, cut to 15 %", "MJPEG over HTTP, truncated")
 CORRUPTED = "MJPEG over HTTP, bytes corrupted"
@@ -27,9 +27,9 @@ LOSSY = (
 
 @pytest.fixture(scope="module")
 def rows():
-    """What was delivered of each stream, by its name. All are read side by side: it takes seconds, mostly of waiting."""
+    """What was delivered of each stream, by its name; read side by side, as it takes seconds, mostly of waiting."""
     names = (*WHOLE, *CUT, CORRUPTED, *LOSSY)
-    with pytest.MonkeyPatch.context() as patch, ThreadPoolExecutor(6) as pool:
+    with pytest.MonkeyPatch.context() as patch, ThreadPoolExecutor(4) as pool:
         patch.setattr(streams, "READ_TIMEOUT_S", 1.5)
         found = pool.map(lambda name: bench_streams.run(PICTURES, 1, only=name.__eq__, rate_hz=RATE_HZ), names)
         return {row.stream: row for (row,) in found}
@@ -45,9 +45,11 @@ def test_the_time_can_be_read_from_every_band_of_a_picture():
 @pytest.mark.parametrize("stream", WHOLE)
 def test_a_whole_stream_loses_nothing(stream, rows):
     whole = rows[stream]
+    late = whole.refused["late"]  # those that waited for the opening, and what a busy machine is too slow for
     assert (whole.old, whole.broken) == (0, 0)
-    assert whole.sent > PICTURES / 4
-    assert whole.delivered >= 0.99 * whole.sent
+    assert whole.refused == {"damaged": 0, "patched": 0, "frozen": 0, "late": late}
+    assert whole.delivered + late >= 0.95 * PICTURES  # some were sent before the viewer was there
+    assert whole.delivered > PICTURES / 10
 
 
 @pytest.mark.parametrize("stream", CUT)
@@ -55,7 +57,7 @@ def test_pictures_that_are_cut_are_refused_and_counted(stream, rows):
     cut = rows[stream]
     assert (cut.old, cut.broken) == (0, 0)
     assert cut.refused["damaged"] > 20
-    assert cut.delivered + cut.refused["damaged"] == cut.sent
+    assert cut.delivered + sum(cut.refused.values()) == cut.sent
 
 
 def test_pictures_whose_bytes_are_corrupted_are_never_old(rows):
@@ -70,3 +72,11 @@ def test_of_a_stream_that_loses_packets_nothing_old_or_broken_is_delivered(strea
     assert (lossy.old, lossy.broken) == (0, 0)
     assert lossy.delivered < lossy.sent
     assert sum(lossy.refused.values()) > PICTURES / 10
+
+
+def test_where_decoding_is_too_slow_for_a_stream_pictures_are_left_out_and_none_is_old():
+    """Each takes twice as long as the stream has for it: one would be 1.5 s behind after 3 s."""
+    (slow,) = bench_streams.run(80, 1, only="MJPEG over HTTP, whole, decoded too slowly".__eq__, rate_hz=RATE_HZ)
+    assert (slow.old, slow.broken) == (0, 0)
+    assert slow.refused["late"] > 80
+    assert slow.delivered > 40

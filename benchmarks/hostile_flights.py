@@ -1,0 +1,181 @@
+"""Flights behind damaged streams: what leaves the aircraft for pictures that are cut, corrupted, truncated or lost.
+
+The ground passes by under the camera by a whole picture a second, along a line, so that every position of the map
+belongs to one moment: a fix tells when the picture was sent that it was made from.
+"""
+
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from datetime import datetime, timezone
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from flight_process import start, wait_for
+from hostile_cameras import Camera, Film
+from hostile_streams import Stream, streams
+from rtsp_camera import free_port
+
+from edgevpr.cli.main import main
+from edgevpr.runtime.flight.flightlog import read_log
+from edgevpr.simulate import camera as simulated
+from edgevpr.simulate.autopilot import ReceivedFix, run_autopilot
+from edgevpr.simulate.flight import Flight, to_metres, write_flight
+from edgevpr.simulate.scene import make_scene
+
+RATE_HZ = 40.0
+# As often as the machine can; few candidates and a coarse technique, so that it can often.
+_FLAGS = ("--rate-hz", "20", "--candidates", "4")
+_TECHNIQUE = ("--technique", "cohog", "--camera", "nadir", "--param", "w1=320")
+_WHOLE_AT_FIRST = 80
+_HEIGHT_M, _METRES_PER_PIXEL = 80.0, 0.32
+_STEP_M = 6 * _METRES_PER_PIXEL  # a picture of 240 rows passes in a second
+_PICTURES_A_PLACE = 8
+_PLACE_S = _PICTURES_A_PLACE / RATE_HZ
+_LIMIT_S = 1.0 + _PLACE_S / 2
+_LINE_NORTH_M, _BEGIN_EAST_M = 60.0, 60.0
+_DEPTH_M = 320.0  # the road that crosses every scene from west to east passes north of the line
+_LENS = simulated.Camera(width=320, height=240, focal_px=_HEIGHT_M / _METRES_PER_PIXEL)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Row:
+    """What became of one stream: pictures `sent`, `queries` asked with those that were taken, and `fixes` that reached
+    the autopilot; of a damaged stream those for pictures said to be taken since the damage began.
+
+    Of the fixes, `old` say a place that had passed more than a second, and half a place's spacing, before the time that
+    they claim, and `ahead` one that was as far ahead; `oldest_s` is the most that any was behind."""
+
+    stream: str
+    is_whole: bool
+    sent: int
+    queries: int
+    fixes: int
+    old: int
+    ahead: int
+    oldest_s: float
+
+
+def run(count: int, seed: int, only: Callable[[str], bool] = lambda stream: True) -> list[Row]:
+    """Fly `count` pictures far behind every stream whose name is wanted; the last row is the sum of all damaged
+    ones."""
+    with TemporaryDirectory(prefix="edgevpr-flights-") as name:
+        film, place_map = _land(Path(name), count, seed)
+        rows = []
+        for number, stream in enumerate(each for each in streams() if only(each.name)):
+            log = place_map.with_name(f"{number}.jsonl")
+            rows.append(_flown(stream, stream.camera(film, seed), film, place_map, log))
+    return [*rows, total(row for row in rows if not row.is_whole)]
+
+
+def total(rows: Iterable[Row]) -> Row:
+    """Add up the rows of damaged streams."""
+    rows = list(rows)
+    sums = {name: sum(getattr(row, name) for row in rows) for name in ("sent", "queries", "fixes", "old", "ahead")}
+    return Row(
+        stream="all that are damaged",
+        is_whole=False,
+        oldest_s=max((row.oldest_s for row in rows), default=0.0),
+        **sums,
+    )
+
+
+def behind_s(fixes: Sequence[ReceivedFix], sent_s: dict[int, float]) -> np.ndarray:
+    """Return by how many seconds each fix is older than it claims, float64 (N,): from the time at which the picture of
+    its position was sent to the time that it gives for its own."""
+    east_m = [to_metres(fix.lat_deg, fix.lon_deg)[0] for fix in fixes]
+    numbers = (np.array(east_m) - _BEGIN_EAST_M) / _STEP_M
+    return _claimed_s(fixes) - np.interp(numbers, list(sent_s), list(sent_s.values()))
+
+
+def _claimed_s(fixes: Sequence[ReceivedFix]) -> np.ndarray:
+    return np.array([fix.t_sent_s - fix.processing_s for fix in fixes])
+
+
+def _land(folder: Path, count: int, seed: int) -> tuple[Film, Path]:
+    """Make a landscape; return what a later flight over it films, and the map of an earlier one at another hour."""
+    scene = make_scene(seed, 2 * _BEGIN_EAST_M + count * _STEP_M, _DEPTH_M, _METRES_PER_PIXEL)
+    rng = np.random.default_rng((seed, 1))
+    earlier = Flight(
+        poses=tuple(_mapped_from(number, rng) for number in range(0, count, _PICTURES_A_PLACE)),
+        light=simulated.Light(sun_azimuth_deg=48, sun_elevation_deg=52, exposure=1.12),
+        camera=_LENS,
+        start_utc=datetime(2026, 2, 14, 0, 30, tzinfo=timezone.utc),
+        interval_s=_PLACE_S,
+        seed=seed,
+    )
+    list(write_flight(folder, scene, earlier))
+    place_map = folder / "map.gpkg"
+    built = ["map", "build", place_map, "--images", folder / "images", *_TECHNIQUE]
+    if main([*map(str, built)]):
+        raise RuntimeError("the map of the flights could not be made")
+    light = simulated.Light(sun_azimuth_deg=20, sun_elevation_deg=58, warmth=0.4, exposure=1.05)
+    ground = simulated.lit(scene, light, seed + 1)
+
+    def picture(number: int) -> np.ndarray:
+        noise = np.random.default_rng((seed, 2, number))
+        return simulated.photograph(ground, scene.metres_per_pixel, _pose(number), _LENS, light, noise)
+
+    return Film(picture=picture, count=count, rate_hz=RATE_HZ, whole_at_first=_WHOLE_AT_FIRST), place_map
+
+
+def _pose(number: float) -> simulated.Pose:
+    east_m = _BEGIN_EAST_M + number * _STEP_M
+    return simulated.Pose(east_m=east_m, north_m=_LINE_NORTH_M, height_m=_HEIGHT_M, heading_deg=90.0)
+
+
+def _mapped_from(number: int, rng: np.random.Generator) -> simulated.Pose:
+    north_m, height_m, heading_deg = rng.normal(0, (1.0, 1.0, 1.0))
+    exact = _pose(number)
+    return replace(
+        exact,
+        north_m=exact.north_m + north_m,
+        height_m=exact.height_m + height_m,
+        heading_deg=exact.heading_deg + heading_deg,
+    )
+
+
+def _flown(stream: Stream, camera: Camera, film: Film, place_map: Path, log: Path) -> Row:
+    with _autopilot() as (link, received):
+        flight = start(place_map, camera.uri, log, "--link", link, *_FLAGS)
+        wait_for("start", log, flight)
+        camera.roll()
+        camera.done.wait()
+        flight.terminate()
+        flight.communicate(timeout=60)
+        fixes = received()
+    camera.close()
+    begin_s = 0.0 if stream.is_whole else camera.sent_s[film.whole_at_first]
+    fixes = [fix for fix, claimed_s in zip(fixes, _claimed_s(fixes), strict=True) if claimed_s > begin_s]
+    older_s = behind_s(fixes, camera.sent_s)
+    return Row(
+        stream=stream.name,
+        is_whole=stream.is_whole,
+        sent=len(camera.sent_s),
+        queries=sum(line["kind"] == "query" and line["t_frame_s"] > begin_s for line in read_log(log)),
+        fixes=len(fixes),
+        old=int((older_s > _LIMIT_S).sum()),
+        ahead=int((older_s < -_LIMIT_S).sum()),
+        oldest_s=float(older_s.max(initial=0.0)),
+    )
+
+
+@contextmanager
+def _autopilot() -> Iterator[tuple[str, Callable[[], tuple[ReceivedFix, ...]]]]:
+    """A simulated flight controller; gives the link to it, and a call that ends it and returns the fixes received."""
+    address, stop, summaries = f"127.0.0.1:{free_port()}", threading.Event(), []
+    thread = threading.Thread(target=lambda: summaries.append(run_autopilot(f"udpin:{address}", stop=stop)))
+    thread.start()
+
+    def received() -> tuple[ReceivedFix, ...]:
+        stop.set()
+        thread.join()
+        return summaries[0].fixes
+
+    try:
+        yield f"udpout:{address}", received
+    finally:
+        stop.set()
+        thread.join()
