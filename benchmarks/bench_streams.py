@@ -25,9 +25,10 @@ _SLOWER, _LONGER = 2.0, 3  # than the stream: the work for a picture; and than t
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
-    """Counts of the pictures of one stream, of which nothing need be lost where it `is_whole`. `sent` counts from the first that was delivered; `delivered` to the flight
-    or superseded by a newer one; `refused` by reason; of those `looked_at`, `old` have a part more than a second older
-    than the frame claims, and `broken` a part that cannot be read; `latency_s` is that of the slowest."""
+    """Counts of the pictures of one stream, of which nothing need be lost where it `is_whole`. `sent` counts from the
+    first that was delivered; `delivered` to the flight or superseded by a newer one; `refused` by reason; of those
+    `looked_at`, `old` have a part more than a second older than the frame claims, and `broken` a part that cannot be
+    read; `latency_s` is that of the slowest."""
 
     stream: str
     is_whole: bool

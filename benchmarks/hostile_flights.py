@@ -22,8 +22,9 @@ from edgevpr.cli.main import main
 from edgevpr.runtime.flight.flightlog import read_log
 from edgevpr.simulate import camera as simulated
 from edgevpr.simulate.autopilot import ReceivedFix, run_autopilot
-from edgevpr.simulate.flight import Flight, to_metres, write_flight
+from edgevpr.simulate.flight import Flight, to_metres, to_position, write_flight
 from edgevpr.simulate.scene import make_scene
+from edgevpr.types import Position
 
 RATE_HZ = 40.0
 # As often as the machine can; few candidates and a coarse technique, so that it can often.
@@ -119,6 +120,11 @@ def _land(folder: Path, count: int, seed: int) -> tuple[Film, Path]:
         return simulated.photograph(ground, scene.metres_per_pixel, _pose(number), _LENS, light, noise)
 
     return Film(picture=picture, count=count, rate_hz=RATE_HZ, whole_at_first=_WHOLE_AT_FIRST), place_map
+
+
+def place_of(number: float) -> Position:
+    """Return the position of the camera at a picture."""
+    return to_position(_pose(number))
 
 
 def _pose(number: float) -> simulated.Pose:

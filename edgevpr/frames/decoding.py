@@ -83,8 +83,8 @@ class WholePictures:
         self._is_backlog_doubtful = False
 
     def fetch(self) -> Fetched | None:
-        """Wait for the next packet and return it; None at the end, and where the stream is lost. A thread of its own may
-        do this while another one decodes."""
+        """Wait for the next packet and return it; None at the end, and where the stream is lost. One thread may do this
+        while another one decodes."""
         with av.logging.Capture() as said:
             try:
                 packet = next(self._packets, None)
@@ -115,6 +115,8 @@ class WholePictures:
             if self._has_begun:
                 self._codec.flush_buffers()
             self._refusal, self._has_begun = None, True
+        # Bytes that were changed within the data of a JPEG are noticed where they make no sense or data run out. Most
+        # make sense: they give a picture whose rest is shifted or of another brightness, but is no older.
         if self._codec.name == "mjpeg" and not jpeg_is_whole(bytes(packet)):
             return self._refuse()
         return self._decoded(packet)
