@@ -12,7 +12,7 @@ WIDTH, HEIGHT = 160, 120
 
 
 def start_ffmpeg(*output: str) -> subprocess.Popen:
-    picture = ["-re", "-f", "lavfi", "-i", f"testsrc=size={WIDTH}x{HEIGHT}:rate=20"]
+    picture = ["-re", "-f", "lavfi", "-i", f"testsrc=size={WIDTH}x{HEIGHT}:rate=60"]
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "quiet", *picture, "-g", "5", *output]
     return subprocess.Popen(command, stdin=subprocess.DEVNULL)
 
