@@ -30,7 +30,7 @@ RESULTS = Path(__file__).resolve().parent / "results"
 # name: (title, how it is run, usual count: of the pictures of each stream, of each set of pictures, kind of packet or
 # input, and in all of maps and of kills of each kind)
 PARTS = {
-    "streams": ("Streams: pictures that are cut, corrupted, lost or frozen", bench_streams.run, 200),
+    "streams": ("Streams: pictures that are cut, corrupted, lost or frozen", bench_streams.run, 240),
     "flights": ("Flights behind such streams: how much older than claimed a picture was", hostile_flights.run, 800),
     "pictures": ("Pictures that say nothing, and those of the other camera", hostile_pictures.run_in_groups, 276),
     "maps": ("Maps that are damaged", hostile_maps.run, 200),
