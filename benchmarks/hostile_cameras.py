@@ -27,19 +27,18 @@ class Film:
     rate_hz: float
     whole_at_first: int
 
-    def play(self, sent_s: dict[int, float]) -> Iterator[tuple[int, np.ndarray]]:
-        """Yield number and picture when each is due, and note the time of that on the monotonic clock."""
+    def play(self) -> Iterator[tuple[int, np.ndarray]]:
+        """Yield number and picture when each is due."""
         start_s = time.monotonic()
         for number in range(self.count):
             picture = self.picture(number)
             time.sleep(max(0.0, start_s + number / self.rate_hz - time.monotonic()))
-            sent_s[number] = time.monotonic()
             yield number, picture
 
 
 class Camera(Protocol):
-    """A camera at `uri`, which films when told to `roll`. `sent_s` is when each picture was sent, by its number; `done`
-    is set once the last one has left."""
+    """A camera at `uri`, which films when told to `roll`. `sent_s` is when each picture began to leave it, by its
+    number, on the monotonic clock; `done` is set once the last one has left."""
 
     uri: str
     sent_s: dict[int, float]
@@ -77,11 +76,12 @@ class MjpegCamera:
             viewer.recv(4096)
             viewer.sendall(b"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace;boundary=part\r\n\r\n")
             self._rolls.wait()
-            for number, picture in self._film.play(self.sent_s):
+            for number, picture in self._film.play():
                 jpeg = cv2.imencode(".jpg", picture)[1].tobytes()
                 if number >= self._film.whole_at_first:
                     jpeg = self._damage(jpeg)
                 head = f"--part\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n".encode()
+                self.sent_s[number] = time.monotonic()
                 try:
                     viewer.sendall(head + jpeg + b"\r\n")
                 except OSError:  # the viewer has gone
@@ -104,6 +104,7 @@ class LossyCamera:
         self._in.settimeout(0.2)
         inner, outer = self._in.getsockname()[1], free_port()
         self._viewer = "127.0.0.1", outer
+        self._pictures_begun = _PicturesInTs() if transport == "MPEG-TS" else _PicturesInRtp()
         self._folder = tempfile.TemporaryDirectory()
         sdp = Path(self._folder.name) / "camera.sdp"
         target = ["-f", "rtp", "-sdp_file", str(sdp), f"rtp://127.0.0.1:{inner}?pkt_size=1200"]
@@ -140,13 +141,14 @@ class LossyCamera:
             pipe.write(self._film.picture(0).tobytes())  # the encoder says what it sends only when it has seen one
             pipe.flush()
             self._rolls.wait()
-            for _, picture in self._film.play(self.sent_s):
+            for _, picture in self._film.play():
                 pipe.write(picture.tobytes())
                 pipe.flush()
         self._encoder.wait()
         self._filmed.set()
 
     def _hand_on(self) -> None:
+        number = -2  # the first picture is shown twice
         with self._in, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
             while True:
                 try:
@@ -155,9 +157,32 @@ class LossyCamera:
                     if self._filmed.is_set():
                         break
                     continue
+                for _ in range(self._pictures_begun.in_datagram(datagram)):
+                    number += 1
+                    if number >= 0:
+                        self.sent_s[number] = time.monotonic()
                 if len(self.sent_s) <= self._film.whole_at_first or self._random.random() >= self._lost:
                     out.sendto(datagram, self._viewer)
         self.done.set()
+
+
+class _PicturesInTs:
+    """Counts the pictures that begin in a datagram of MPEG-TS packets: the units of FFmpeg's first stream."""
+
+    def in_datagram(self, datagram: bytes) -> int:
+        packets = (datagram[start : start + 188] for start in range(0, len(datagram), 188))
+        return sum(packet[1] == 0x41 and packet[2] == 0 for packet in packets)
+
+
+class _PicturesInRtp:
+    """Counts the pictures that begin in an RTP datagram, one at most: each has a time stamp of its own."""
+
+    def __init__(self) -> None:
+        self._stamp = b""
+
+    def in_datagram(self, datagram: bytes) -> int:
+        before, self._stamp = self._stamp, datagram[4:8]
+        return before != self._stamp
 
 
 def _encoder(film: Film, codec: tuple[str, ...], target: list[str]) -> subprocess.Popen:
