@@ -21,6 +21,8 @@ from edgevpr.places.rows import Point, Unreadable
 from edgevpr.places.sqlite import sentences
 from edgevpr.types import Frame, Place
 
+_SAME_PICTURE = 0.01  # of the length of a coarse part: far more than rounding, far less than another picture
+
 
 class PlaceMap:
     """An open map. Use `create`, `open` or `open_for_adding`, and close it (it is a context manager).
@@ -182,14 +184,27 @@ class PlaceMap:
             point = rows.point_of(geom, geom_checksum)
             return rows.part_of(fine, self.spec.fine, checksum, "fine part"), point
 
-    def fingerprint(self, source_image: str, descriptor: Descriptor) -> tuple[str, int]:
-        """Return the values that identify a frame: its name, and a hash of its coarse part."""
-        return rows.readable(source_image), hash(rows.blob_of(descriptor.coarse, self.spec.coarse))
+    def by_name(self) -> dict[str, list[int]]:
+        """Return the ids of the places of every image name that can be read."""
+        found: dict[str, list[int]] = {}
+        for place_id, row in self.scan("source_image"):
+            if row and isinstance(row[0], str):
+                found.setdefault(row[0], []).append(place_id)
+        return found
 
-    def fingerprints(self) -> set[tuple[str, int]]:
-        """Return the `fingerprint` of every place of the map that can be read."""
-        found = (row for _, row in self.scan("source_image, coarse") if row)
-        return {(name, hash(coarse)) for name, coarse in found if isinstance(name, str)}
+    def is_of(self, place_id: int, descriptor: Descriptor) -> bool:
+        """Tell whether a place was made of the picture of a descriptor; False for a place that cannot be read.
+
+        The last bits of a descriptor may differ from one run of a program to the next: sums depend on where an array
+        lies in memory.
+        """
+        try:
+            (coarse,) = rows.there(self._file.row(place_id, "coarse"))
+            there = rows.part_of(coarse, self.spec.coarse, None, "coarse part").astype(np.float32)
+        except (Unreadable, PlaceError):
+            return False
+        apart = np.linalg.norm(there - np.asarray(descriptor.coarse, np.float32).reshape(there.shape))
+        return bool(apart <= _SAME_PICTURE * np.linalg.norm(there))
 
     def outlines(self) -> Iterator[tuple[int, float, float, float]]:
         """Yield (place_id, lat_deg, lon_deg, quality) of every place that can be read; NaN where it has no position."""

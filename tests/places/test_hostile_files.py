@@ -24,6 +24,7 @@ from edgevpr.places.geopackage import point_blob
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapinfo import info_of
 from edgevpr.places.near import index_positions, nearest_m
+from edgevpr.places.rows import readable
 from edgevpr.types import Position
 
 PLACES = 40
@@ -195,7 +196,8 @@ def test_a_name_and_a_time_that_cannot_be_written_cost_no_place(map_path):
     with PlaceMap.open_for_adding(map_path) as place_map:
         for number, each in ((41, odd), (42, later)):
             place_map.add(each, descriptor(number))
-            assert place_map.fingerprint(each.name, descriptor(number)) in place_map.fingerprints()
+            (place_id,) = place_map.by_name()[readable(each.name)]
+            assert place_map.is_of(place_id, descriptor(number))
         *_, first, second = place_map.places()
     assert (first.source_image, first.t_utc_s) == ("\\udcff\\udcfe.jpg", None)
     assert (second.source_image, second.t_utc_s) == ("\\ud800.jpg", None)

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from map_writer import SPEC, descriptor, frame, make_map
 
-from edgevpr.contract import PartSpec
+from edgevpr.contract import Descriptor, PartSpec
 from edgevpr.errors import MapError, PlaceError
 from edgevpr.places.examine import absorb
 from edgevpr.places.geojson import write_geojson
@@ -365,3 +365,20 @@ def test_a_time_of_another_form_is_no_time(map_path):
     db.close()
     with PlaceMap.open(map_path) as place_map:
         assert {place.t_utc_s for place in place_map.places()} == {None}
+
+
+def test_a_place_is_known_again_where_the_last_bits_differ_and_not_where_the_picture_does(map_path):
+    rng = np.random.default_rng(4)
+    with PlaceMap.open(map_path) as place_map:
+        ids = [place_id for found in place_map.by_name().values() for place_id in found]
+        for place_id in ids:
+            coarse = next(part for number, _, _, part in place_map.coarse_parts() if number == place_id)
+            for off, same in ((0.0, True), (1e-4, True), (0.5, False)):
+                other = coarse + off * np.linalg.norm(coarse) * unit(rng, coarse.shape)
+                assert place_map.is_of(place_id, Descriptor(other)) is same
+        assert not place_map.is_of(10**6, Descriptor(coarse))
+
+
+def unit(rng, shape):
+    values = rng.normal(0, 1, shape)
+    return values / np.linalg.norm(values)

@@ -8,6 +8,7 @@ from edgevpr.errors import ImageError, ModelError
 from edgevpr.frames.mask import AnyMask
 from edgevpr.places.index import empty_index
 from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.rows import readable
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.judge import AcceptRule
 from edgevpr.runtime.recognise.recogniser import Recogniser
@@ -36,14 +37,14 @@ def build_map(
     """Add a place for every frame that is not in the map yet, so that an interrupted map can be continued.
 
     A frame goes through the steps of a query, with no place to find. It is in the map already if a place has the same
-    name and the same coarse descriptor; the name alone does not tell, since cameras restart their numbering. A frame
+    name and nearly the same descriptor; the name alone does not tell, since cameras restart their numbering. A frame
     that cannot be encoded is handed to `unusable` and left out; with `unusable` None it raises ModelError. `mask`
     leaves parts of every frame out.
     """
     place_map.require(technique.spec)
     nothing = empty_index(technique.spec, 0, None)
     walk = Recogniser(technique=technique, place_map=place_map, index=nothing, rule=_NO_RULE, meter=meter, mask=mask)
-    here = place_map.fingerprints()
+    here = place_map.by_name()
     added = without_position = already_here = 0
     for frame in frames:
         seen = walk.step(frame)
@@ -52,7 +53,7 @@ def build_map(
                 raise ModelError(seen.reason)
             unusable(ImageError(f"{frame.name}: {seen.reason}"))
             continue
-        if place_map.fingerprint(frame.name, seen.descriptor) in here:
+        if any(place_map.is_of(place_id, seen.descriptor) for place_id in here.get(readable(frame.name), ())):
             already_here += 1
             continue
         place_map.add(frame, seen.descriptor)
