@@ -375,8 +375,8 @@ def test_a_place_is_known_again_where_the_last_bits_differ_and_not_where_the_pic
             coarse = next(part for number, _, _, part in place_map.coarse_parts() if number == place_id)
             for off, same in ((0.0, True), (1e-4, True), (0.5, False)):
                 other = coarse + off * np.linalg.norm(coarse) * unit(rng, coarse.shape)
-                assert place_map.is_of(place_id, Descriptor(other)) is same
-        assert not place_map.is_of(10**6, Descriptor(coarse))
+                assert place_map.is_of(place_id, Descriptor(coarse=other)) is same
+        assert not place_map.is_of(10**6, Descriptor(coarse=coarse))
 
 
 def unit(rng, shape):
