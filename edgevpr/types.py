@@ -53,9 +53,21 @@ class Frame:
     heading_deg: float | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class Salience:
+    """MS, SS and ES of a frame (thesis 3.2.4), each 0..1: how memorable, static and full of information it is; None for
+    what was not looked at. `is_low`: it passed only because there would have been too wide a gap without it."""
+
+    memorability: float | None
+    staticity: float | None
+    entropy: float | None
+    is_low: bool = False
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Place:
-    """A place of the map without its descriptors, which are read separately. Units are those of `Frame`."""
+    """A place of the map without its descriptors, which are read separately. Units are those of `Frame`. `salience` is
+    None where the map was made without that gate."""
 
     place_id: int
     source_image: str
@@ -63,6 +75,7 @@ class Place:
     t_utc_s: float | None = None
     heading_deg: float | None = None
     quality: float = 1.0
+    salience: Salience | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,15 +107,22 @@ class StageCost:
 NO_COST = StageCost(0.0, 0.0)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Steps:
-    """Costs of the steps of one query: `read` the picture (in a flight only), `encode` it, `scan` all places, and
-    `compare` and judge the candidates. A step that the query did not reach has no cost."""
+    """Costs of the steps of one query: `read` the picture (in a flight only), look whether it passes the `gate`,
+    `encode` it, `scan` all places, and `compare` and judge the candidates. A step that the query did not reach has no
+    cost."""
 
     read: StageCost = NO_COST
+    gate: StageCost = NO_COST
     encode: StageCost = NO_COST
     scan: StageCost = NO_COST
     compare: StageCost = NO_COST
+
+    @property
+    def encoding(self) -> StageCost:
+        """Cost of encoding as the thesis defines it: everything before matching."""
+        return self.gate + self.encode
 
     @property
     def match(self) -> StageCost:

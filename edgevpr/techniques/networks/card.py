@@ -7,7 +7,7 @@ import difflib
 import hashlib
 import json
 import re
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -18,6 +18,8 @@ from edgevpr.resources import model_folders
 from edgevpr.yamlfile import read_yaml
 
 SIMILARITIES = ("cosine", "l1", "l2")
+_ADDED_LATER = ("pad", "boxes", "memorability")
+FAMILIES = ("yolox", "fastestdet", "nanodet")  # of detectors
 _CHOICES = {
     "input.layout": ("NCHW", "NHWC"),
     "input.colour": ("grey", "bgr", "rgb"),
@@ -30,7 +32,8 @@ _CHOICES = {
 class InputRule:
     """Preparation of a picture for the network: (pixel * `scale` - `mean`) / `std`. `mean` and `std` are one number, or
     one per channel. With `equalise` the histogram of the brightness is equalised first. `resize` is the interpolation
-    by which the picture is stretched to the size. With `layout` NHWC feature maps are (1, H, W, C) as well."""
+    by which the picture is stretched to the size; with `pad`, it keeps its shape in the upper left corner, and the rest
+    has that grey level. With `layout` NHWC feature maps are (1, H, W, C) as well."""
 
     layout: str
     height: int = bounded(8, 4096)
@@ -41,14 +44,28 @@ class InputRule:
     scale: float = bounded(1e-9, 1e9)
     mean: list
     std: list | None = None
+    pad: int | None = field(default=None, metadata={"range": (0, 255)})
 
 
 @dataclass(frozen=True, slots=True)
 class Outputs:
-    """Names in the ONNX file of a vector (1, D) and of a feature map (1, C, H, W); None: the card names none."""
+    """Names in the ONNX file of a vector (1, D), of a feature map (1, C, H, W), of all that the family of a detector
+    decodes its boxes from, and of the memorability of a picture (1, 1) in 0..1; None: the card names none."""
 
     descriptor: str | None = None
     features: str | None = None
+    boxes: list | None = None
+    memorability: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class DetectorRule:
+    """Reading of the outputs `boxes`: by the decoder of a `family` of detectors. `dynamic` are the classes of what does
+    not stay where it is, each with its number in the outputs; a box counts from `min_score` on."""
+
+    family: str
+    dynamic: dict
+    min_score: float = bounded(0.01, 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +126,8 @@ class Card:
     input: InputRule
     outputs: Outputs
     head: dict | None
-    similarity: str
+    similarity: str = "cosine"
+    detector: DetectorRule | None = None
 
     @property
     def name(self) -> str:
@@ -129,8 +147,14 @@ class Card:
     def fingerprint(self) -> str:
         """SHA-256 of everything that a feature map or vector depends on: the weights, the preparation of the picture,
         and the names of the outputs."""
-        said = json.dumps([self.sha256, asdict(self.input), asdict(self.outputs)], sort_keys=True)
+        said = json.dumps([self.sha256, _used(self.input), _used(self.outputs)], sort_keys=True)
         return hashlib.sha256(said.encode()).hexdigest()
+
+
+def _used(part: InputRule | Outputs) -> dict:
+    """Return what a card says there, without the keys that were added later and are not used: words and maps made
+    before then have the fingerprint without them."""
+    return {key: value for key, value in asdict(part).items() if value is not None or key not in _ADDED_LATER}
 
 
 def card_names() -> tuple[str, ...]:
@@ -181,8 +205,12 @@ def read_card(path: Path, needs_hash: bool = True) -> Card:
         raise ModelError(f"{path}: `file` is `{card.file}`: write the name of a file that lies beside the card.")
     if card.file.lower().endswith((".yaml", ".yml")):
         raise ModelError(f"{path}: `file` is `{card.file}`, which is the name of a card: write that of the ONNX file.")
-    if not (card.outputs.descriptor or card.outputs.features):
-        raise ModelError(f"{path}: `outputs` names none: write the ONNX output of a descriptor or of features.")
+    if not any(asdict(card.outputs).values()):
+        raise ModelError(
+            f"{path}: `outputs` names none: write the ONNX output of a descriptor, of features, of boxes or of "
+            "memorability."
+        )
+    _require_detector(card)
     channels = 1 if card.input.colour == "grey" else 3
     for key in ("mean", "std"):
         numbers = getattr(card.input, key)
@@ -193,6 +221,23 @@ def read_card(path: Path, needs_hash: bool = True) -> Card:
             )
     head_parameters(card)
     return card
+
+
+def _require_detector(card: Card) -> None:
+    boxes, rule = card.outputs.boxes, card.detector
+    if (boxes is None) != (rule is None):
+        raise ModelError(f"{card.path}: a detector needs both `outputs.boxes` and the section `detector`: write both.")
+    if rule is None:
+        return
+    if not boxes or not all(isinstance(name, str) for name in boxes):
+        raise ModelError(f"{card.path}: `outputs.boxes` is {boxes!s:.80}: write the names of ONNX outputs.")
+    if rule.family not in FAMILIES:
+        raise ModelError(
+            f"{card.path}: `detector.family` is `{rule.family}`: write {', '.join(FAMILIES[:-1])} or {FAMILIES[-1]}."
+        )
+    numbers = rule.dynamic.values()
+    if not numbers or not all(type(number) is int and 0 <= number < 10_000 for number in numbers):
+        raise ModelError(f"{card.path}: `detector.dynamic` needs names of classes with their numbers, {{car: 2}}.")
 
 
 def head_parameters(card: Card) -> object | None:

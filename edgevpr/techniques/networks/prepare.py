@@ -23,12 +23,31 @@ def prepare(image: np.ndarray, rule: InputRule) -> np.ndarray:
         image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     elif rule.colour == "rgb":
         image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-    image = cv2.resize(image, (rule.width, rule.height), interpolation=_RESIZE[rule.resize])
+    image = _sized(image, rule)
     values = np.multiply(image, np.float32(rule.scale), dtype=np.float32).reshape(rule.height, rule.width, -1)
     values -= np.array(rule.mean, np.float32)
     if rule.std is not None:
         values /= np.array(rule.std, np.float32)
     return np.ascontiguousarray(values[None] if rule.layout == "NHWC" else values.transpose(2, 0, 1)[None])
+
+
+def shares(image: np.ndarray, rule: InputRule) -> tuple[float, float]:
+    """Return the shares of the input's width and height that `prepare` fills with the picture; the rest is padding."""
+    if rule.pad is None:
+        return 1.0, 1.0
+    height, width = image.shape[:2]
+    scale = min(rule.width / width, rule.height / height)
+    return max(1, round(width * scale)) / rule.width, max(1, round(height * scale)) / rule.height
+
+
+def _sized(image: np.ndarray, rule: InputRule) -> np.ndarray:
+    across, down = shares(image, rule)
+    width, height = round(across * rule.width), round(down * rule.height)
+    image = cv2.resize(image, (width, height), interpolation=_RESIZE[rule.resize])
+    if (width, height) == (rule.width, rule.height):
+        return image
+    border = (0, rule.height - height, 0, rule.width - width)
+    return cv2.copyMakeBorder(image, *border, cv2.BORDER_CONSTANT, value=(rule.pad,) * 3)
 
 
 def without_masked(image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:

@@ -51,20 +51,28 @@ def open_backbone(model: str, output: str, threads: int = 1) -> Backbone:
 
 def backbone_of(card: Card, output: str, threads: int = 1) -> Backbone:
     """Open the network of a card that is already loaded, as `open_backbone` does."""
-    if not 1 <= threads <= _MOST_THREADS:
-        raise UsageError(f"{card.name} cannot run with threads={threads}: give 1 to {_MOST_THREADS}.")
     if getattr(card.outputs, output) is None:
         raise ModelError(
             f"{card.path} names no output for `{output}`: use another model, or name its ONNX output in "
             f"`outputs: {{{output}: ...}}`."
         )
-    session = _session(card.file_path, card.sha256, threads)
-    _require_input(card, session)
-    _require_output(card, output, session)
+    session = open_session(card, [getattr(card.outputs, output)], threads)
     # Noise, not a uniform picture: many a correct network gives only zeros for that.
     noise = np.random.default_rng(_SEED).integers(0, 256, (card.input.height, card.input.width), np.uint8)
     result = _run(card, output, session, noise)
     return Backbone(card=card, output=output, shape=result.shape, sha256=card.fingerprint, session=session)
+
+
+def open_session(card: Card, outputs: list[str], threads: int = 1) -> Any:
+    """Open the session of a card's file, and check its input and the outputs of these names; see `open_backbone` for
+    what is raised."""
+    if not 1 <= threads <= _MOST_THREADS:
+        raise UsageError(f"{card.name} cannot run with threads={threads}: give 1 to {_MOST_THREADS}.")
+    session = _session(card.file_path, card.sha256, threads)
+    _require_input(card, session)
+    for name in outputs:
+        _require_output(card, name, session)
+    return session
 
 
 def file_sha256(path: Path) -> str:
@@ -146,26 +154,45 @@ def _require_input(card: Card, session: Any) -> None:
         )
 
 
-def _require_output(card: Card, output: str, session: Any) -> None:
-    name = getattr(card.outputs, output)
+def _require_output(card: Card, name: str, session: Any) -> None:
     found = {each.name: each for each in session.get_outputs()}
     if name not in found:
-        raise ModelError(
-            f"{card.file_path} has no output `{name}`, which its card names for `{output}`: it has {', '.join(found)}."
-        )
+        raise ModelError(f"{card.file_path} has no output `{name}`, which its card names: it has {', '.join(found)}.")
     if found[name].type not in ("tensor(float)", "tensor(float16)"):
         raise ModelError(f"{card.file_path}: its output `{name}` is {found[name].type}: it must be float.")
 
 
 def _run(card: Card, output: str, session: Any, image: np.ndarray) -> np.ndarray:
     name = getattr(card.outputs, output)
-    feed = {session.get_inputs()[0].name: prepare(image, card.input)}
+    (result,) = run_outputs(card, session, [name], prepare(image, card.input))
+    if result.ndim != _RANKS[output] or len(result) != 1 or not result.size:
+        raise ModelError(
+            f"{card.file_path}: its output `{name}` is {_axes(result.shape)} and `{output}` must be {_FORMS[output]}: "
+            "correct `outputs` of the card."
+        )
+    values = result[0].astype(np.float32, copy=False)
+    if not values.any():
+        raise ModelError(
+            f"{card.file_path} gives nothing but zeros for `{name}`: its weights or `input` of its card are wrong, or "
+            "the picture shows nothing at all."
+        )
+    if output == "features" and card.input.layout == "NHWC":
+        values = np.ascontiguousarray(values.transpose(2, 0, 1))
+    return values
+
+
+def run_outputs(card: Card, session: Any, names: list[str], pictures: np.ndarray) -> list[np.ndarray]:
+    """Run a session of `open_session` on prepared pictures, float32 (N, ...); return the outputs named.
+
+    Raises ModelError for a run that fails or takes too long, and for numbers that are not finite or beyond 1e12.
+    """
+    feed = {session.get_inputs()[0].name: pictures}
     options = import_onnxruntime().RunOptions()
     limit = threading.Timer(_RUN_LIMIT_S, _terminate, (options,))
     limit.daemon = True
     limit.start()
     try:
-        (result,) = session.run([name], feed, options)
+        results = session.run(names, feed, options)
     except Exception as error:
         if options.terminate:
             raise ModelError(
@@ -175,25 +202,14 @@ def _run(card: Card, output: str, session: Any, image: np.ndarray) -> np.ndarray
         raise ModelError(f"{card.file_path} cannot be run ({_first_line(error)}): export it again.") from error
     finally:
         limit.cancel()
-    if result.ndim != _RANKS[output] or len(result) != 1 or not result.size:
-        raise ModelError(
-            f"{card.file_path}: its output `{name}` is {_axes(result.shape)} and `{output}` must be {_FORMS[output]}: "
-            "correct `outputs` of the card."
-        )
-    values = result[0].astype(np.float32, copy=False)
-    if not np.abs(values).max() <= _LARGEST:  # written with `not`, so that NaN is refused as well
-        raise ModelError(
-            f"{card.file_path} gives numbers that are not finite, or beyond {_LARGEST:g}, for `{name}`: its weights or "
-            "`input` of its card are wrong."
-        )
-    if not values.any():
-        raise ModelError(
-            f"{card.file_path} gives nothing but zeros for `{name}`: its weights or `input` of its card are wrong, or "
-            "the picture shows nothing at all."
-        )
-    if output == "features" and card.input.layout == "NHWC":
-        values = np.ascontiguousarray(values.transpose(2, 0, 1))
-    return values
+    for name, result in zip(names, results, strict=True):
+        # Written with `not`, so that NaN is refused as well.
+        if result.size and not max(result.max(), -result.min()) <= _LARGEST:
+            raise ModelError(
+                f"{card.file_path} gives numbers that are not finite, or beyond {_LARGEST:g}, for `{name}`: its "
+                "weights or `input` of its card are wrong."
+            )
+    return results
 
 
 def _terminate(options: Any) -> None:

@@ -1,0 +1,1 @@
+"""Memorable maps: which frames are worth remembering (thesis, chapter 3)."""
