@@ -121,6 +121,20 @@ class MappingConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class SalienceConfig:
+    use: bool = keyed(Flag(("--salience",), None, "keep, and ask for, only what is worth remembering"))
+    memorability: float = bounded(0, 1)
+    staticity: float = bounded(0, 1)
+    entropy: float = bounded(0, 1)
+    network: str | None = field()
+    detector: str | None = field()
+    detect_every: int = bounded(1, 1000)
+    footprint_m: float | None = bounded(1, 10_000)
+    gap_frames: int = bounded(1, 10_000)
+    gap_m: float = bounded(1, 100_000)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class MavlinkConfig:
     link: str | None = keyed(
         Flag(("--link",), "URL", "udpout:HOST:PORT, udpin:HOST:PORT, tcp:HOST:PORT, serial:DEV:BAUD")
@@ -154,6 +168,7 @@ class Config:
     match: MatchConfig
     memory: MemoryConfig
     mapping: MappingConfig
+    salience: SalienceConfig
     mavlink: MavlinkConfig
     log: LogConfig
     battery: BatteryConfig

@@ -25,6 +25,7 @@ from edgevpr.helpers.text import shown
 _MATCHING_KEYS = (
     "board", "technique", "source.camera", "source.mask", "match.matching", "match.form", "match.candidates",
     "match.sequence", "match.min_score", "match.min_margin", "memory.budget_mb", "battery.pack",
+    "salience.use",
 )  # fmt: skip
 
 
@@ -33,6 +34,7 @@ def add(commands: Any) -> None:
     match = command(commands, "match", run_match, "find the places of images in a map, offline")
     match.add_argument("map", metavar="MAP")
     add_recording(match)
+    match.add_argument("--config", metavar="FILE", help="that of the flight; flags given here override it")
     add_parameters(match, "insist on this parameter")
     add_keys(match, *_MATCHING_KEYS)
     add_json(match)
@@ -63,7 +65,7 @@ def run_match(args: Namespace) -> int:
     from edgevpr.runtime.recognise.recognition import fields_of
     from edgevpr.techniques.networks.card import weights_of
 
-    config = config_of(args, map=args.map)
+    config = config_of(args, args.config, map=args.map)
     recogniser = open_recogniser(config, load_board(config.board), settings=parameters_of(args.param))
     found = []
     unusable: list[ImageError] = []

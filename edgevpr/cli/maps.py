@@ -14,6 +14,7 @@ from edgevpr.cli.shared import (
     add_parameters,
     add_recording,
     command,
+    config_of,
     exit_code,
     frames_of,
     group,
@@ -21,7 +22,6 @@ from edgevpr.cli.shared import (
     parameters_of,
     path_of,
     print_json,
-    value_of,
 )  # fmt: skip
 from edgevpr.errors import EdgevprError, ImageError, MapError, UsageError
 
@@ -40,7 +40,8 @@ def add(commands: Any) -> None:
     build.add_argument(
         "--board", default="this", metavar="NAME", help="the board that will fly (default: this machine)"
     )
-    add_keys(build, "source.camera", "source.mask")
+    build.add_argument("--config", metavar="FILE", help="that of the flight: its camera, mask and salience")
+    add_keys(build, "source.camera", "source.mask", "salience.use")
     build.add_argument(
         "--rate-hz", type=_positive, metavar="HZ", help="places a second of a video (default: every frame)"
     )
@@ -57,6 +58,12 @@ def add(commands: Any) -> None:
     merge = command(maps, "merge", map_merge, "make one map of several of the same technique")
     merge.add_argument("out", metavar="OUT", help="the map file to make")
     merge.add_argument("maps", metavar="MAP", nargs="+")
+    smaller = command(maps, "shrink", map_shrink, "keep only the best places, spread over the map")
+    smaller.add_argument("map", metavar="MAP")
+    smaller.add_argument("out", metavar="OUT", help="the map file to make")
+    size = smaller.add_mutually_exclusive_group(required=True)
+    size.add_argument("--places", type=_count, metavar="N", help="as many places")
+    size.add_argument("--mb", type=_positive, metavar="MB", help="as many as such a file holds, MB of 10^6 bytes")
     export = command(maps, "export", map_export, "write the places for a map viewer")
     export.add_argument("map", metavar="MAP")
     export.add_argument("--geojson", required=True, metavar="FILE", help="GeoJSON file to write, - for standard output")
@@ -69,23 +76,33 @@ def _positive(text: str) -> float:
     return value
 
 
+def _count(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise ValueError
+    return value
+
+
 def map_build(args: Namespace) -> int:
     """Make a map of a recording, or continue one."""
-    from edgevpr.config import load_config
     from edgevpr.frames.mask import mask_of
     from edgevpr.frames.source import open_source
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.places.mapfiles import map_path, remove
     from edgevpr.power.boards import load_board
     from edgevpr.runtime.preflight.pick import camera_setting, picked_technique
+    from edgevpr.runtime.recognise.gaps import Gaps
     from edgevpr.runtime.recognise.mapping import build_map
-    from edgevpr.runtime.recognise.opening import made_for, meter_of, say_other_mask, technique_of
+    from edgevpr.runtime.recognise.opening import gate_of, made_for, meter_of, say_other_mask, technique_of
 
+    config = config_of(args, args.config)
     path = map_path(args.map)
     step_s = 1 / args.rate_hz if args.rate_hz else None
     source = open_source(args.source, step_s=step_s, positions=path_of(args.positions), live=False)
-    mask = mask_of(value_of(args, "source.mask"))
-    settings, camera, here = parameters_of(args.param), value_of(args, "source.camera"), load_board("this")
+    mask = mask_of(config.source.mask)
+    settings, camera, here = parameters_of(args.param), config.source.camera, load_board("this")
+    gate = gate_of(config.salience, here.threads)
+    gaps = Gaps(config.salience.gap_frames, config.salience.gap_m)
     is_new = not (args.append and path.exists())
     if not is_new:
         place_map = PlaceMap.open_for_adding(path)
@@ -104,9 +121,11 @@ def map_build(args: Namespace) -> int:
     unusable: list[ImageError] = []
     with place_map:
         frames = frames_of(source, "mapping", unusable)
-        meter = meter_of(load_config(None), here)
+        meter = meter_of(config, here)
         try:
-            result = build_map(frames, technique, place_map, meter, lambda error: leave_out(error, unusable), mask)
+            result = build_map(
+                frames, technique, place_map, meter, lambda error: leave_out(error, unusable), mask, gate, gaps
+            )
         except EdgevprError:
             if is_new and not len(place_map):  # a full disk: an empty map would only stand in the way of the next try
                 remove(path)
@@ -120,6 +139,11 @@ def map_build(args: Namespace) -> int:
         )
         if result.already_here:
             print(f"  {result.already_here} images were in the map already")
+        if result.not_memorable:
+            lacking = ", ".join(f"{count} for want of {what}" for what, count in result.not_memorable.items())
+            print(f"  left out: {lacking}")
+        if result.of_low_quality:
+            print(f"  {result.of_low_quality} of the places are of low quality, kept to bound the gaps")
     return exit_code(unusable)
 
 
@@ -146,6 +170,8 @@ def map_info(args: Namespace) -> int:
         print(f"  time        {info.first_time} to {info.last_time}")
     if info.mean_quality is not None:
         print(f"  quality     {info.mean_quality:.2f} on average (share of the image that says anything)")
+    if info.of_low_quality:
+        print(f"  salience    {info.of_low_quality} of low quality, kept to bound the gaps")
     print(f"  size        {info.file_bytes / 1e6:.1f} MB on disk, {ram_mb:.2f} MB in RAM ({info.made_by})")
     return 0
 
@@ -222,6 +248,23 @@ def map_merge(args: Namespace) -> int:
             places = len(merged)
         unfinished.replace(out)
     print(f"{out}: {places} places")
+    return 0
+
+
+def map_shrink(args: Namespace) -> int:
+    """Make a smaller map of the places that are worth most."""
+    from edgevpr.places.mapfile import PlaceMap
+    from edgevpr.places.mapfiles import map_path
+    from edgevpr.places.shrink import places_in, shrink
+
+    count = args.places
+    if count is None:
+        with PlaceMap.open(args.map) as place_map:
+            count = places_in(int(args.mb * 1e6), place_map.spec)
+        if count < 1:
+            raise UsageError(f"--mb {args.mb:g}: not one place of {args.map} fits: give more.")
+    places = shrink(args.map, map_path(args.out), count)
+    print(f"{args.out}: {min(count, places)} of {places} places")
     return 0
 
 

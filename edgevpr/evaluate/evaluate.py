@@ -185,7 +185,7 @@ def _answers(recogniser: Recogniser, dataset: Dataset, progress: Progress) -> It
             first_right=metrics.first_right(ranking.slots[at], right),
             accepted=event.accepted,
             accepted_wrong=event.accepted and not (right | ignored)[ranking.slots[0]],
-            encoding=event.steps.encode,
+            encoding=event.steps.encoding,
             matching=event.steps.match,
         )
 

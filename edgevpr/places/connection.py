@@ -13,7 +13,7 @@ from pathlib import Path
 from edgevpr.contract import TechniqueSpec
 from edgevpr.errors import MapError, PlaceError
 from edgevpr.places import geopackage, mapfiles, rows
-from edgevpr.places.mapspec import Stored, has_checksums, require_layer, spec_of, stored, write_spec
+from edgevpr.places.mapspec import Stored, require_layer, spec_of, stored, write_spec
 from edgevpr.places.sqlite import (
     WAIT_S,
     connect,
@@ -211,5 +211,5 @@ class MapConnection:
 def _checked(path: Path, db: sqlite3.Connection) -> Stored:
     """Return what the file says of the map, after a look at the form of its table of places."""
     found = stored(path, db)
-    require_layer(path, db, has_checksums(found))
+    require_layer(path, db, found)
     return found

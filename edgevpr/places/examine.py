@@ -10,14 +10,13 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.rows import Unreadable
 from edgevpr.places.sqlite import sentences
 
-_ALL = f"{rows.VALUES}, {rows.BLOBS}"
 _MOST_SAID = 20  # faults of the file that SQLite lists
 
 
 @dataclass(frozen=True, slots=True)
 class Examined:
-    """One place of a map: `problem` says in a few words what is damaged (None: nothing), and `row` has the values and
-    BLOBs of one that is whole. `has_checksums` tells whether all its BLOBs have one."""
+    """One place of a map: `problem` says in a few words what is damaged (None: nothing), and `row` has the values,
+    salience and BLOBs of one that is whole. `has_checksums` tells whether all its BLOBs have one."""
 
     place_id: int
     problem: str | None
@@ -28,18 +27,19 @@ class Examined:
 def examine(place_map: PlaceMap) -> Iterator[Examined]:
     """Read everything of every place, in the order they were added."""
     checksums = place_map.checksums
-    for place_id, row in place_map.scan(f"{_ALL}, {checksums}"):
+    for place_id, row in place_map.scan(f"{rows.VALUES}, {place_map.salience}, {rows.BLOBS}, {checksums}"):
         if row is None:
             yield Examined(place_id, "SQLite cannot read its row", None, False)
             continue
         *values, coarse, fine, geom_checksum, coarse_checksum, fine_checksum = row
+        values, salience = values[: -rows.SALIENCES], values[-rows.SALIENCES :]
         has_checksums = not any(
             blob is not None and checksum is None
             for blob, checksum in ((row[0], geom_checksum), (coarse, coarse_checksum), (fine, fine_checksum))
         )
         problem, spec = None, place_map.spec
         try:
-            rows.place_of(place_id, tuple(values), geom_checksum)
+            rows.place_of(place_id, values, salience, geom_checksum)
             rows.part_of(coarse, spec.coarse, coarse_checksum, "coarse part")
             if spec.fine:
                 rows.part_of(fine, spec.fine, fine_checksum, "fine part")
@@ -70,7 +70,7 @@ def absorb(place_map: PlaceMap, other: PlaceMap) -> tuple[int, int]:
         for each in examine(other):
             if each.problem:
                 raise PlaceError(other.path, each.place_id, each.problem)
-            _, time, _, _, source_image, _, coarse, _ = each.row
+            _, time, _, _, source_image, *_, coarse, _ = each.row
             if _identity(time, source_image, coarse) in here:
                 already_here += 1
                 continue
@@ -82,7 +82,7 @@ def absorb(place_map: PlaceMap, other: PlaceMap) -> tuple[int, int]:
 def insert(place_map: PlaceMap, row: tuple, place_id: int | None = None) -> None:
     """Insert the row of an `Examined`, inside a transaction of the map. Raises sqlite3.Error."""
     *values, coarse, fine = row
-    place_map.insert(tuple(values), coarse, fine, place_id)
+    place_map.insert(tuple(values[: -rows.SALIENCES]), tuple(values[-rows.SALIENCES :]), coarse, fine, place_id)
 
 
 def _identity(time: object, source_image: object, coarse: object) -> tuple:

@@ -5,7 +5,9 @@ from typing import TextIO
 
 from edgevpr.places import geopackage
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.types import Place
+from edgevpr.types import Place, Salience
+
+_LOW, _USUAL = "#e0b060", "#2060c0"
 
 
 def write_geojson(place_map: PlaceMap, out: TextIO) -> int:
@@ -35,5 +37,20 @@ def _feature(place: Place) -> dict:
             "heading_deg": place.heading_deg,
             "source_image": place.source_image,
             "quality": round(place.quality, 4),
+            **_salience(place.salience),
         },
+    }
+
+
+def _salience(salience: Salience | None) -> dict:
+    """Return what is known of a place's salience. Viewers that know the simplestyle keys (geojson.io, GitHub, QGIS by a
+    rule on `low_quality`) draw a place of low quality small and pale."""
+    if salience is None:
+        return {}
+    scores = {"memorability": salience.memorability, "staticity": salience.staticity, "entropy": salience.entropy}
+    return {
+        **{name: score if score is None else round(score, 4) for name, score in scores.items()},
+        "low_quality": salience.is_low,
+        "marker-color": _LOW if salience.is_low else _USUAL,
+        "marker-size": "small" if salience.is_low else "medium",
     }

@@ -37,7 +37,8 @@ CREATE TABLE gpkg_geometry_columns (
 
 CREATE TABLE places (
     place_id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, geom POINT, time DATETIME, alt_m DOUBLE, heading_deg DOUBLE,
-    source_image TEXT NOT NULL, quality DOUBLE NOT NULL, geom_crc32 INTEGER, coarse_crc32 INTEGER,
+    source_image TEXT NOT NULL, quality DOUBLE NOT NULL, memorability DOUBLE, staticity DOUBLE, entropy DOUBLE,
+    is_low_quality BOOLEAN, geom_crc32 INTEGER, coarse_crc32 INTEGER,
     fine_crc32 INTEGER, coarse BLOB NOT NULL, fine BLOB);
 CREATE TRIGGER places_moved AFTER UPDATE OF geom ON places
 BEGIN

@@ -16,10 +16,10 @@ from edgevpr.contract import Descriptor, TechniqueSpec
 from edgevpr.errors import MapError, PlaceError
 from edgevpr.places import geopackage, rows
 from edgevpr.places.connection import MapConnection
-from edgevpr.places.mapspec import differences, has_checksums, read_mask, write_mask
+from edgevpr.places.mapspec import differences, has_checksums, has_salience, read_mask, write_mask
 from edgevpr.places.rows import Point, Unreadable
 from edgevpr.places.sqlite import sentences
-from edgevpr.types import Frame, Place
+from edgevpr.types import Frame, Place, Salience
 
 _SAME_PICTURE = 0.01  # of the length of a coarse part: far more than rounding, far less than another picture
 
@@ -28,7 +28,8 @@ class PlaceMap:
     """An open map. Use `create`, `open` or `open_for_adding`, and close it (it is a context manager).
 
     `left_out` are the places that could not be read so far, with what is wrong with each in a few words, in the order
-    in which they were found. `checksums` are the SQL expressions of the checksums of position, coarse and fine part.
+    in which they were found. `salience` and `checksums` are the SQL expressions of a place's salience, and of the
+    checksums of position, coarse and fine part.
     """
 
     def __init__(self, file: MapConnection) -> None:
@@ -37,6 +38,8 @@ class PlaceMap:
         self.left_out: dict[int, str] = {}
         made_by = file.found.get("made_by")
         self.made_by = made_by if isinstance(made_by, str) else None
+        self.has_salience = has_salience(file.found)
+        self.salience = rows.SALIENCE if self.has_salience else "NULL, NULL, NULL, NULL"
         self.checksums = rows.CHECKSUMS if self.has_checksums else "NULL, NULL, NULL"
         self._geom_checksum, self._coarse_checksum, self._fine_checksum = self.checksums.split(", ")
 
@@ -94,7 +97,7 @@ class PlaceMap:
         """Commit what is written inside this context, or nothing of it. Raises sqlite3.Error."""
         return self._file.transaction()
 
-    def add(self, frame: Frame, descriptor: Descriptor) -> int:
+    def add(self, frame: Frame, descriptor: Descriptor, salience: Salience | None = None) -> int:
         """Add one place and return its id once it is safe on the disk. Raises MapError (disk full, ...).
 
         A time that is no date is unknown, and so is an altitude at which nothing flies. In a name that is not UTF-8,
@@ -104,12 +107,18 @@ class PlaceMap:
         fine = rows.blob_of(descriptor.fine, self.spec.fine)
         values = rows.values_of(frame, descriptor.quality)
         with sentences(self.path), self.transaction():
-            place_id = self.insert(values, coarse, fine)
+            place_id = self.insert(values, rows.salience_values(salience), coarse, fine)
         return place_id
 
-    def insert(self, values: tuple, coarse: bytes, fine: bytes | None, place_id: int | None = None) -> int:
-        """Insert a row inside a `transaction`; `values` are those of `rows.VALUES`. Raises sqlite3.Error."""
+    def insert(
+        self, values: tuple, salience: tuple, coarse: bytes, fine: bytes | None, place_id: int | None = None
+    ) -> int:
+        """Insert a row inside a `transaction`; `values` are those of `rows.VALUES`, and `salience` of `rows.SALIENCE`
+        (for which a map of an older format has no columns). Raises sqlite3.Error."""
         columns, row = f"place_id, {rows.VALUES}, {rows.BLOBS}", (place_id, *values, coarse, fine)
+        if self.has_salience:
+            columns += f", {rows.SALIENCE}"
+            row += salience
         if self.has_checksums:
             columns += f", {rows.CHECKSUMS}"
             row += tuple(map(rows.crc32, (values[0], coarse, fine)))
@@ -136,15 +145,15 @@ class PlaceMap:
 
         Raises PlaceError for one that is missing or damaged.
         """
-        columns = f"{rows.VALUES}, {self._geom_checksum}"
+        columns = f"{rows.VALUES}, {self._geom_checksum}, {self.salience}"
         if place_ids is None:
             found = self.scan(columns)
         else:
             found = ((int(place_id), self._file.row(int(place_id), columns)) for place_id in place_ids)
         for place_id, row in found:
             with self._named(place_id):
-                *values, checksum = rows.there(row)
-                place = rows.place_of(place_id, values, checksum)
+                *values, checksum = rows.there(row)[: -rows.SALIENCES]
+                place = rows.place_of(place_id, values, row[-rows.SALIENCES :], checksum)
             yield place
 
     def coarse_parts(self) -> Iterator[tuple[int, Point | None, float | None, np.ndarray]]:

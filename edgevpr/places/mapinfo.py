@@ -13,7 +13,8 @@ Extent = tuple[float, float, float, float]
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapInfo:
     """Summary of a map; `extent` is (lat_min, lon_min, lat_max, lon_max) in degrees, None without positions or where
-    the file does not say it. What the file has in another form than edgevpr writes is None too."""
+    the file does not say it. What the file has in another form than edgevpr writes is None too. `of_low_quality` counts
+    the places that were kept only to bound a gap."""
 
     path: str
     spec: TechniqueSpec
@@ -23,6 +24,7 @@ class MapInfo:
     first_time: str | None
     last_time: str | None
     mean_quality: float | None
+    of_low_quality: int
     file_bytes: int
     made_by: str | None
 
@@ -31,8 +33,9 @@ def info_of(place_map: PlaceMap) -> MapInfo:
     """Summarise a map. Raises MapError where it cannot be read."""
     db = place_map.db
     with sentences(place_map.path):
-        places, with_position, quality, *times = db.execute(
-            "SELECT count(*), count(geom), avg(quality), min(time), max(time) FROM places"
+        low = place_map.salience.split(", ")[-1]
+        places, with_position, quality, of_low_quality, *times = db.execute(
+            f"SELECT count(*), count(geom), avg(quality), total({low} = 1), min(time), max(time) FROM places"
         ).fetchone()
         extent = db.execute(
             "SELECT min_y, min_x, max_y, max_x FROM gpkg_contents WHERE table_name = 'places'"
@@ -47,6 +50,7 @@ def info_of(place_map: PlaceMap) -> MapInfo:
         first_time=first,
         last_time=last,
         mean_quality=quality,
+        of_low_quality=int(of_low_quality),
         file_bytes=place_map.path.stat().st_size,
         made_by=place_map.made_by,
     )

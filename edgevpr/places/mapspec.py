@@ -16,8 +16,8 @@ from edgevpr.contract import PartSpec, TechniqueSpec
 from edgevpr.errors import MapError
 from edgevpr.places import geopackage, rows
 
-FORMAT_VERSION = 2  # 1 had no checksums and no map_id
-_WITH_CHECKSUMS = 2
+FORMAT_VERSION = 3  # 1 had no checksums and no map_id, 2 no salience
+_WITH_CHECKSUMS, _WITH_SALIENCE = 2, 3
 _DTYPES = ("|i1", "|u1", "<i1", "<u1", *(f"<{kind}{size}" for kind in "iu" for size in "248"), "<f2", "<f4", "<f8")
 _MOST_PART_BYTES = 64_000_000
 _MOST_STORED = 1000  # rows of the table, and characters that a message shows of a damaged one
@@ -75,6 +75,11 @@ def has_checksums(found: Stored) -> bool:
     return found["format_version"] >= _WITH_CHECKSUMS
 
 
+def has_salience(found: Stored) -> bool:
+    """Tell whether the places of a map have columns of salience."""
+    return found["format_version"] >= _WITH_SALIENCE
+
+
 def spec_of(path: Path, found: Stored) -> TechniqueSpec:
     """Return the specification of the technique that made the map. Raises MapError for one that makes no sense."""
     try:
@@ -93,12 +98,14 @@ def spec_of(path: Path, found: Stored) -> TechniqueSpec:
         raise _damaged(path, error) from error
 
 
-def require_layer(path: Path, db: sqlite3.Connection, checksums: bool) -> None:
+def require_layer(path: Path, db: sqlite3.Connection, found: Stored) -> None:
     """Raise MapError where the table of places has not the columns and the kind of positions that every map has.
 
-    `checksums` tells whether its format has checksums. Raises sqlite3.Error.
+    `found` is what the map says of itself. Raises sqlite3.Error.
     """
-    wanted = rows.COLUMNS | (set(rows.CHECKSUMS.split(", ")) if checksums else set())
+    wanted = set(rows.COLUMNS)
+    wanted.update(rows.CHECKSUMS.split(", ") if has_checksums(found) else ())
+    wanted.update(rows.SALIENCE.split(", ") if has_salience(found) else ())
     # A generated column is hidden: it stands in no row, and may be as large as its expression says.
     there = {name: (hidden, kind, key) for _, name, kind, _, _, key, hidden in db.execute("PRAGMA table_xinfo(places)")}
     wrong = sorted(name for name in wanted if there.get(name, (True,))[0])

@@ -14,10 +14,12 @@ import numpy as np
 from edgevpr.contract import PartSpec
 from edgevpr.places import geopackage
 from edgevpr.places.sqlite import is_of_one_row
-from edgevpr.types import Frame, Place, Position
+from edgevpr.types import Frame, Place, Position, Salience
 
 CHECKSUMS = "geom_crc32, coarse_crc32, fine_crc32"
 VALUES = "geom, time, alt_m, heading_deg, source_image, quality"
+SALIENCE = "memorability, staticity, entropy, is_low_quality"
+SALIENCES = 4  # columns
 BLOBS = "coarse, fine"
 COLUMNS = {"place_id", *f"{VALUES}, {BLOBS}".split(", ")}
 
@@ -96,8 +98,25 @@ def where_of(values: Sequence, geom_checksum: object) -> tuple[Point | None, flo
     return point, None if heading_deg is None else heading_deg % 360
 
 
-def place_of(place_id: int, values: Sequence, geom_checksum: object) -> Place:
-    """Make a place of its row's `VALUES`. Raises Unreadable."""
+def salience_of(values: Sequence) -> Salience | None:
+    """Return what a row's `SALIENCE` says; None where it says nothing. A score that is none is unknown: nothing depends
+    on it in flight."""
+    *scores, is_low = values
+    if is_low is None:
+        return None
+    known = (isinstance(each, float) and 0 <= each <= 1 for each in scores)
+    return Salience(*(each if ok else None for each, ok in zip(scores, known, strict=True)), is_low=is_low == 1)
+
+
+def salience_values(salience: Salience | None) -> tuple:
+    """Return a row's `SALIENCE`."""
+    if salience is None:
+        return None, None, None, None
+    return salience.memorability, salience.staticity, salience.entropy, int(salience.is_low)
+
+
+def place_of(place_id: int, values: Sequence, salience: Sequence, geom_checksum: object) -> Place:
+    """Make a place of its row's `VALUES` and `SALIENCE`. Raises Unreadable."""
     point, _ = where_of(values, geom_checksum)
     _, time, alt_m, heading_deg, source_image, quality = values
     return Place(
@@ -107,6 +126,7 @@ def place_of(place_id: int, values: Sequence, geom_checksum: object) -> Place:
         t_utc_s=geopackage.utc_seconds(time),
         heading_deg=heading_deg,
         quality=quality,
+        salience=salience_of(salience),
     )
 
 

@@ -90,7 +90,7 @@ class QueryMeter:
         """Return the cost of the query so far."""
         steps = self.steps()
         return query_cost(
-            steps.encode, steps.match, self.board, self._pack, self._regulator_efficiency, pss_mb=self._pss.look()
+            steps.encoding, steps.match, self.board, self._pack, self._regulator_efficiency, pss_mb=self._pss.look()
         )
 
 

@@ -24,7 +24,7 @@ from edgevpr.places.geopackage import point_blob
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapinfo import info_of
 from edgevpr.places.near import index_positions, nearest_m
-from edgevpr.places.rows import readable
+from edgevpr.places.rows import SALIENCE, readable
 from edgevpr.types import Position
 
 PLACES = 40
@@ -279,6 +279,7 @@ def first_format(path):
         path,
         "DROP TRIGGER places_moved",
         *(f"ALTER TABLE places DROP COLUMN {part}_crc32" for part in ("geom", "coarse", "fine")),
+        *(f"ALTER TABLE places DROP COLUMN {column}" for column in SALIENCE.split(", ")),
         "UPDATE edgevpr_map SET value = '1' WHERE key = 'format_version'",
         "DELETE FROM edgevpr_map WHERE key = 'map_id'",
     )

@@ -46,7 +46,11 @@ class Flight:
             self.recogniser = open_recogniser(self.config, self.board, narrowed=True)
         self.recogniser.meter = metered(self.config, self.recogniser, clock)
         spacing_m = self.config.mapping.spacing_m
-        self.learner = Learner(self.recogniser, growing, spacing_m, clock.utc_s) if learns else None
+        self.learner = (
+            Learner(self.recogniser, growing, spacing_m=spacing_m, gap_m=100.0, utc_clock=clock.utc_s)
+            if learns
+            else None
+        )
         self.stop = Stop()
         self.flown: Flown | None = None
 

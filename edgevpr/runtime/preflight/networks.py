@@ -18,6 +18,8 @@ from edgevpr.helpers.child import ask_child, last_line, serve_parent
 from edgevpr.helpers.files import read_file, write_whole
 from edgevpr.power.machine import rss_mb
 from edgevpr.resources import own_models
+from edgevpr.salience.detector import detector_of
+from edgevpr.salience.memorability import CROPS, memorability_of
 from edgevpr.techniques.networks.card import Card, card_names, load_card, read_card
 from edgevpr.techniques.networks.session import Backbone, backbone_of, file_sha256, import_onnxruntime
 from edgevpr.yamlfile import MAX_FILE_BYTES, read_yaml
@@ -46,7 +48,8 @@ class Listed:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Verified:
-    """A network that works here. `shapes` are those of its outputs, and `vector_length` that of its own technique
+    """A network that works here. `shapes` are those of its outputs (of a detector's mask, and of the crops of
+    memorability, those of one picture), and `vector_length` that of its own technique
     (None: it has none). `image_ms` is the quickest of ten images of 640x480. `runtime_mb` is the memory that importing
     onnxruntime took, and `network_mb` what the network took beside it, in MB."""
 
@@ -101,21 +104,33 @@ def verify_here(card: Card, threads: int = 1, learned: bool = True) -> Verified:
     before_mb = rss_mb()
     import_onnxruntime()
     imported_mb = rss_mb()
-    outputs = [output for output, name in asdict(card.outputs).items() if name]
+    outputs = [output for output in ("descriptor", "features") if getattr(card.outputs, output)]
     backbones = {output: backbone_of(card, output, threads) for output in outputs}
-    network = backbones.get("descriptor" if card.head is None and card.outputs.descriptor else "features")
+    shapes = {output: backbone.shape for output, backbone in backbones.items()}
+    runs = [backbones[output].run for output in outputs]
+    if card.head is None and card.outputs.descriptor:
+        runs = runs[:1]
+    elif runs:
+        runs = runs[-1:]
+    if card.outputs.boxes:
+        runs.append(detector_of(card, threads).is_static)
+        shapes["boxes"] = _FRAME
+    if card.outputs.memorability:
+        runs.append(memorability_of(card, threads).matrix)
+        shapes["memorability"] = (CROPS, CROPS)
     times_s = []
     for _ in range(_ROUNDS):
         frame = rng.integers(0, 256, _FRAME, np.uint8)
         start_s = time.perf_counter()
-        network.run(frame)
+        for run in runs:
+            run(frame)
         times_s.append(time.perf_counter() - start_s)
     return Verified(
         name=card.name,
         title=card.title,
         threads=threads,
         file_mb=card.file_path.stat().st_size / 1e6,
-        shapes={output: backbone.shape for output, backbone in backbones.items()},
+        shapes=shapes,
         vector_length=_vector_length(card, backbones, learned),
         image_ms=1000 * min(times_s),
         runtime_mb=imported_mb - before_mb,
@@ -201,6 +216,9 @@ def _listed(name: str) -> Listed:
     ]
     if card.is_technique and not techniques.is_own(name):
         users.insert(0, name)
+    users += [
+        f"salience.{key}" for key, said in (("detector", card.detector), ("network", card.outputs.memorability)) if said
+    ]
     return Listed(
         name=name,
         ok=problem is None,

@@ -39,13 +39,15 @@ class Learner:
         self,
         recogniser: Recogniser,
         growing: GrowingIndex,
+        *,
         spacing_m: float,
+        gap_m: float,
         utc_clock: Callable[[], float] = time.time,
     ) -> None:
         self.learnt = 0
         self.passed_over: Counter[str] = Counter()
         self.trouble: str | None = None
-        self._recogniser, self._growing, self._spacing_m = recogniser, growing, spacing_m
+        self._recogniser, self._growing, self._spacing_m, self._gap_m = recogniser, growing, spacing_m, gap_m
         self._map, self._utc_clock = recogniser.place_map, utc_clock
         self._t_fix_s = -math.inf
 
@@ -79,7 +81,8 @@ class Learner:
                 self.passed_over[objection] += 1
                 return None
             self._map.require_unchanged()  # a place in a file that was deleted would be lost
-            place_id = self._map.add(here, event.descriptor)
+            salience = event.worth and replace(event.worth.salience, is_low=event.worth.reason is not None)
+            place_id = self._map.add(here, event.descriptor, salience)
             self.learnt += 1
             place = Place(
                 place_id=place_id,
@@ -88,6 +91,7 @@ class Learner:
                 t_utc_s=here.t_utc_s,
                 heading_deg=here.heading_deg,
                 quality=event.descriptor.quality,
+                salience=salience,
             )
             self._growing.add(place_id, here.position, event.descriptor.coarse, here.heading_deg)
         except MapBusyError:
@@ -119,6 +123,8 @@ class Learner:
         # Ask the file, not the index: a place that was dropped from RAM must not be learnt again.
         if nearest_m(self._map, position, self._spacing_m) is not None:
             return "near a place"
+        if event.worth and event.worth.reason and nearest_m(self._map, position, self._gap_m) is not None:
+            return "not memorable"
         return None
 
 

@@ -1,5 +1,6 @@
 """Making places: every frame is encoded, and is on the disk before the next one is taken."""
 
+from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
@@ -10,20 +11,25 @@ from edgevpr.places.index import empty_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.rows import readable
 from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.recognise.gaps import Gaps, Kept
 from edgevpr.runtime.recognise.judge import AcceptRule
 from edgevpr.runtime.recognise.recogniser import Recogniser
+from edgevpr.salience.gate import Gate, NoGate
 from edgevpr.types import Frame
 
 _NO_RULE = AcceptRule(min_score=1.0, min_margin=1.0, neighbour_m=0.0)  # no place is searched for while a map is made
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class MappingResult:
-    """Counts of frames: places added, how many of those have no position, and frames that were in the map already."""
+    """Counts of frames: places added, how many of those have no position and how many are of low quality, frames that
+    were in the map already, and frames that were not memorable, by what they lacked."""
 
     added: int
     without_position: int
     already_here: int
+    of_low_quality: int
+    not_memorable: dict[str, int]
 
 
 def build_map(
@@ -33,19 +39,36 @@ def build_map(
     meter: QueryMeter,
     unusable: Callable[[ImageError], None] | None = None,
     mask: AnyMask | None = None,
+    gate: Gate | NoGate | None = None,
+    gaps: Gaps | None = None,
 ) -> MappingResult:
     """Add a place for every frame that is not in the map yet, so that an interrupted map can be continued.
 
     A frame goes through the steps of a query, with no place to find. It is in the map already if a place has the same
     name and nearly the same descriptor; the name alone does not tell, since cameras restart their numbering. A frame
     that cannot be encoded is handed to `unusable` and left out; with `unusable` None it raises ModelError. `mask`
-    leaves parts of every frame out.
+    leaves parts of every frame out. Frames that do not pass the `gate` are left out, but for those that `gaps` keeps.
     """
     place_map.require(technique.spec)
     nothing = empty_index(technique.spec, 0, None)
-    walk = Recogniser(technique=technique, place_map=place_map, index=nothing, rule=_NO_RULE, meter=meter, mask=mask)
+    walk = Recogniser(
+        technique=technique, place_map=place_map, index=nothing, rule=_NO_RULE, meter=meter, mask=mask, gate=gate
+    )
+    gaps = gaps or Gaps()
     here = place_map.by_name()
-    added = without_position = already_here = 0
+    added = without_position = already_here = of_low_quality = 0
+    not_memorable: Counter[str] = Counter()
+
+    def keep(kept: Iterable[Kept]) -> None:
+        nonlocal added, without_position, of_low_quality
+        for event, salience in kept:
+            place_map.add(event.frame, event.descriptor, salience)
+            added += 1
+            without_position += event.frame.position is None
+            if salience and salience.is_low:
+                of_low_quality += 1
+                not_memorable[event.worth.lacks] -= 1
+
     for frame in frames:
         seen = walk.step(frame)
         if seen.failed:
@@ -56,7 +79,14 @@ def build_map(
         if any(place_map.is_of(place_id, seen.descriptor) for place_id in here.get(readable(frame.name), ())):
             already_here += 1
             continue
-        place_map.add(frame, seen.descriptor)
-        added += 1
-        without_position += frame.position is None
-    return MappingResult(added, without_position, already_here)
+        if seen.worth and seen.worth.lacks:
+            not_memorable[seen.worth.lacks] += 1
+        keep(gaps.take(seen))
+    keep(gaps.end())
+    return MappingResult(
+        added=added,
+        without_position=without_position,
+        already_here=already_here,
+        of_low_quality=of_low_quality,
+        not_memorable=dict(+not_memorable),
+    )

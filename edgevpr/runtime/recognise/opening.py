@@ -6,9 +6,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from edgevpr import techniques
-from edgevpr.config import Config
+from edgevpr.config import Config, SalienceConfig
 from edgevpr.contract import Technique
-from edgevpr.errors import MapError, UsageError
+from edgevpr.errors import ConfigError, MapError, UsageError
 from edgevpr.frames.mask import AnyMask, mask_of
 from edgevpr.frames.source import is_live
 from edgevpr.places.growing import GrowingIndex
@@ -23,6 +23,9 @@ from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.hints import Prior
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.recogniser import Recogniser
+from edgevpr.salience.detector import open_detector
+from edgevpr.salience.gate import MOST_ENTROPY, Gate, NoGate, Thresholds
+from edgevpr.salience.memorability import open_memorability
 
 _WAIT_S = 0.05  # in flight, for another program that writes to the map: the next query is better than a late one
 _log = logging.getLogger(__name__)
@@ -101,6 +104,40 @@ def budget_mb(config: Config, board: Board) -> float:
     return config.memory.budget_mb or board.budget_mb
 
 
+def gate_of(config: SalienceConfig, threads: int = 1) -> Gate | NoGate:
+    """Make the gate of salience that the configuration asks for, and say which criteria are off for want of a network.
+
+    Raises ConfigError for thresholds that nothing can reach, or of which none is above 0, and ModelError for a network
+    that cannot be used.
+    """
+    if not config.use:
+        return NoGate()
+    if config.entropy > MOST_ENTROPY:
+        raise ConfigError(
+            f"`salience.entropy` is {config.entropy:g}, and no picture has more than {MOST_ENTROPY:.3f}: lower it."
+        )
+    memorability = detector = None
+    if config.memorability > 0:
+        if config.network:
+            memorability = open_memorability(config.network, threads)
+        else:
+            _log.warning("no `salience.network` is named: how memorable a picture is does not count")
+    if config.staticity > 0:
+        if config.detector:
+            detector = open_detector(config.detector, threads)
+        else:
+            _log.warning("no `salience.detector` is named: what moves in a picture does not count")
+    if not (memorability or detector or config.entropy > 0):
+        raise ConfigError("`salience.use` is true, and every criterion is off: raise a threshold, or use no salience.")
+    return Gate(
+        Thresholds(config.memorability, config.staticity, config.entropy),
+        memorability,
+        detector,
+        detect_every=config.detect_every,
+        footprint_m=config.footprint_m,
+    )
+
+
 def meter_of(config: Config, board: Board) -> QueryMeter:
     """Make the meter of queries on a board that is fed by the configured pack."""
     return QueryMeter(board, parse_pack(config.battery.pack), config.battery.regulator_efficiency)
@@ -167,6 +204,7 @@ def _recogniser(
         prior=_prior(config, technique) if narrowed and length == 1 else None,
         min_accuracy_m=config.mavlink.min_accuracy_m,
         mask=mask,
+        gate=gate_of(config.salience, board.threads),
     )
 
 

@@ -19,6 +19,7 @@ from edgevpr.runtime.recognise.gate import says_nothing
 from edgevpr.runtime.recognise.hints import NoPrior, Prior, expected_of
 from edgevpr.runtime.recognise.judge import NEW_FOR_S, AcceptRule, Verdict, judge
 from edgevpr.runtime.recognise.recognition import Recognition
+from edgevpr.salience.gate import Gate, NoGate
 from edgevpr.types import Frame, Vehicle
 
 _log = logging.getLogger(__name__)
@@ -27,10 +28,10 @@ _log = logging.getLogger(__name__)
 class Recogniser:
     """Recognises places of an open map, frame after frame.
 
-    `candidates` places are compared in full (None: all, see `places.retrieve.compare`). `mask` leaves parts of every
-    frame out. `search` joins several queries,
-    and `prior` narrows each; without them each query is ranked alone, over the whole map. The governor changes
-    `candidates`; the learner and the governor change the index (`take`, `extend`).
+    `candidates` places are compared in full (None: all, see `places.retrieve.compare`). `gate` refuses frames that are
+    not memorable, and `mask` leaves parts of every frame out. `search` joins several queries, and `prior` narrows each;
+    without them each query is ranked alone, over the whole map. The governor changes `candidates`; the learner and the
+    governor change the index (`take`, `extend`).
     """
 
     def __init__(
@@ -46,9 +47,11 @@ class Recogniser:
         prior: Prior | NoPrior | None = None,
         min_accuracy_m: float = 1.0,
         mask: AnyMask | None = None,
+        gate: Gate | NoGate | None = None,
     ) -> None:
         self.place_map, self.meter, self.candidates = place_map, meter, candidates
         self._prior, self._min_accuracy_m, self._mask = prior or NoPrior(), min_accuracy_m, mask or NoMask()
+        self._gate = gate or NoGate()
         self._told = 0  # number of places left out that an event has told of
         self._new: deque[tuple[int, float]] = deque()  # place id, and the time it was learnt at
         self.take(technique, index, rule, search or Alone())
@@ -79,19 +82,22 @@ class Recogniser:
         Never raises an Exception: an error of a frame, a place or the technique becomes a refusal with its reason.
         """
         meter, technique, index = self.meter, self.technique, self.index
-        descriptor = hints = ranking = best = nothing = None
+        worth = descriptor = hints = ranking = best = nothing = objection = None
         map_lost = False
         meter.begin()
         try:
+            with meter.step("gate"):
+                worth = self._gate.look(frame.image)
             with meter.step("encode"):
                 descriptor = self._mask.encode(technique, frame.image)
             if self._lost:
                 raise MapError(self._lost)
             nothing = says_nothing(descriptor, self.rule.min_quality)
+            objection = nothing or (worth and worth.reason)
             if not len(index):
                 verdict = Verdict(False, "the map has no place yet")
-            elif nothing and self.search.length == 1:  # in a sequence it is searched for, to keep the others in step
-                verdict = Verdict(False, nothing)
+            elif objection and self.search.length == 1:  # in a sequence it is searched for, to keep the others in step
+                verdict = Verdict(False, objection)
             else:
                 with meter.step("scan"):
                     self.place_map.require_unchanged()
@@ -114,7 +120,7 @@ class Recogniser:
                     (best,) = named(ranking, index, self.place_map, first=1)
                     is_new = self._is_new(best.place.place_id, frame.t_mono_s)
                     verdict = judge(ranking, index, self.rule, self.search, is_new)
-                    verdict = Verdict(False, nothing) if nothing else verdict
+                    verdict = Verdict(False, objection) if objection else verdict
                 self._prior.learn(best, verdict.accepted, frame.t_mono_s)
             failed = False
         except Exception as error:
@@ -125,6 +131,7 @@ class Recogniser:
         return Recognition(
             frame=frame,
             vehicle=vehicle,
+            worth=worth,
             descriptor=descriptor,
             hints=hints,
             ranking=ranking,

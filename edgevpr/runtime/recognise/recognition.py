@@ -6,7 +6,8 @@ from typing import Any
 from edgevpr.contract import Descriptor
 from edgevpr.places.retrieve import Ranking
 from edgevpr.runtime.recognise.hints import Hints
-from edgevpr.types import Candidate, FixReport, Frame, Position, QueryCost, Steps, Vehicle
+from edgevpr.salience.gate import Worth
+from edgevpr.types import Candidate, FixReport, Frame, Position, QueryCost, Salience, Steps, Vehicle
 
 _OF_THE_BEST = ("place", "reference_image", "score", "position", "shift_cells", "covariance_cells2", "rotation_deg")
 
@@ -16,7 +17,8 @@ class Recognition:
     """Result of one frame.
 
     The inputs are `frame` and `vehicle`, the autopilot's report when the frame was taken (None: no report).
-    `descriptor` is the encoded frame, `hints` what narrowed the search, `ranking` the places found and `best` the first
+    `worth` is what the gate says of the frame (None: no gate looks), `descriptor` is the encoded frame, `hints` what
+    narrowed the search, `ranking` the places found and `best` the first
     of them; each is None where its step was not reached. `accepted` tells whether `best` is taken for the place, and
     `reason` why (not), in a few words. `position` is the place's, and `accuracy_m` its 1-sigma; both are set for an
     accepted match only: any other carries no position. `says_nothing` tells whether the picture holds too little to be
@@ -32,6 +34,7 @@ class Recognition:
 
     frame: Frame | None
     vehicle: Vehicle | None = None
+    worth: Worth | None = None
     descriptor: Descriptor | None = None
     hints: Hints | None = None
     ranking: Ranking | None = None
@@ -59,16 +62,23 @@ def fields_of(event: Recognition) -> dict[str, Any]:
     """Return the event as the flight log (kind "query") and `edgevpr match --json` have it.
 
     The fields are: query, place (id), reference_image, score, position (of the place), the match's step, its covariance
-    and the rotation (all null where no place was found), accepted, reason, accuracy_m, costs.
+    and the rotation (all null where no place was found), accepted, reason, accuracy_m, costs; and, where a gate looks,
+    salience.
     """
     return {
         "query": event.frame.name,
         **_best(event.best),
+        **({"salience": _salience(event.worth.salience)} if event.worth else {}),
         "accepted": event.accepted,
         "reason": event.reason,
         "accuracy_m": event.accuracy_m,
         "costs": {key: value and float(f"{value:.6g}") for key, value in asdict(event.cost).items()},
     }
+
+
+def _salience(salience: Salience) -> dict[str, float | None]:
+    scores = {"memorability": salience.memorability, "staticity": salience.staticity, "entropy": salience.entropy}
+    return {name: score if score is None else round(score, 4) for name, score in scores.items()}
 
 
 def _best(candidate: Candidate | None) -> dict[str, Any]:

@@ -126,7 +126,11 @@ def _opened(config: Config, board: Board) -> tuple[Recogniser, Learner | None, s
             return open_recogniser(config, board, narrowed=True), None, str(error)
         except MapError:
             raise error from None
-    return recogniser, Learner(recogniser, growing, config.mapping.spacing_m), None
+    return (
+        recogniser,
+        Learner(recogniser, growing, spacing_m=config.mapping.spacing_m, gap_m=config.salience.gap_m),
+        None,
+    )
 
 
 def smaller_forms_of(config: Config, recogniser: Recogniser, learner: Learner | None, load_s: float) -> tuple[str, ...]:

@@ -24,6 +24,7 @@ from edgevpr.types import FixReport, Frame, Position, QueryCost, Steps
 
 TECHNIQUE = create("hog", {"w1": 32})
 SPACING_M = 10.0
+GAP_M = 100.0
 METRE_DEG = 1 / 111_195  # of latitude
 COST = QueryCost(
     t_encode_s=0.1,
@@ -52,7 +53,9 @@ class Bench:
             rule=AcceptRule(0.0, 0.0, 50.0),
             meter=meter_of(load_config(None), load_board("this")),
         )
-        self.learner = Learner(self.recogniser, self.growing, SPACING_M, self.clock.utc_s)
+        self.learner = Learner(
+            self.recogniser, self.growing, spacing_m=SPACING_M, gap_m=GAP_M, utc_clock=self.clock.utc_s
+        )
 
     def see(self, north_m=0.0, heard_s_ago=0.1, has_gps=True, fix=None, quality=0.9, position=None, failed=False):
         """Show a frame, at a place that the autopilot or the frame itself tells; `fix` is whether its own was sent."""

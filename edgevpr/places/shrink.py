@@ -1,0 +1,78 @@
+"""A smaller map: the places of a map that are worth most, spread so that no wide gap is left (see `thin`)."""
+
+import os
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+
+from edgevpr.contract import TechniqueSpec
+from edgevpr.errors import MapError, PlaceError
+from edgevpr.places import mapfiles
+from edgevpr.places.examine import examine, insert
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.sqlite import sentences
+from edgevpr.places.thin import best_places
+from edgevpr.types import Place
+
+_PAGE_BYTES, _EMPTY_BYTES, _BESIDE_BLOBS_BYTES = 4096, 53_248, 300  # of a file of SQLite, a map without places, a row
+_LOW = 0.5  # of its worth is left to a place that was kept only to bound a gap
+
+
+def places_in(file_bytes: int, spec: TechniqueSpec) -> int:
+    """Return how many places a map file of this size holds."""
+    row_bytes = spec.coarse.nbytes + (spec.fine.nbytes if spec.fine else 0) + _BESIDE_BLOBS_BYTES
+    return max(0, file_bytes - _EMPTY_BYTES) // (-(-row_bytes // _PAGE_BYTES) * _PAGE_BYTES)
+
+
+def worth_of(place: Place) -> float:
+    """Return what a place is worth, 0..1: its quality, times its memorability and staticity where they are known."""
+    salience = place.salience
+    if salience is None:
+        return place.quality
+    scores = [score for score in (salience.memorability, salience.staticity) if score is not None]
+    return place.quality * float(np.prod(scores)) * (_LOW if salience.is_low else 1.0)
+
+
+def shrink(path: str | Path, out: Path, count: int) -> int:
+    """Copy the `count` best places of a map to a new one, all or none; return how many places there were.
+
+    A place that cannot be read is left behind. Raises MapError for a map that cannot be read, or an `out` that is there
+    already or cannot be written.
+    """
+    mapfiles.require_regular(out)
+    if out.exists() and out.stat().st_size:
+        raise MapError(f"{out} is there already: choose another name.")
+    unfinished = out.with_name(f".{out.name}.{os.getpid()}")
+    try:
+        with PlaceMap.open(path) as place_map:
+            there = readable(place_map)
+            kept = {there[number].place_id for number in chosen(there, count)}
+            with PlaceMap.create(unfinished, place_map.spec) as smaller:
+                smaller.record_mask(place_map.mask_sha256)
+                with sentences(unfinished), smaller.transaction():
+                    for each in examine(place_map):
+                        if each.place_id in kept and not each.problem:
+                            insert(smaller, each.row)
+        unfinished.replace(out)
+    finally:
+        mapfiles.remove(unfinished)
+    return len(there)
+
+
+def readable(place_map: PlaceMap) -> list[Place]:
+    """Return all places that can be read, in the order they were mapped."""
+    found = []
+    for place_id, _ in place_map.scan("1"):
+        with suppress(PlaceError):
+            found += place_map.places([place_id])
+    return found
+
+
+def chosen(places: list[Place], count: int) -> np.ndarray:
+    """Choose `count` of the places by worth and coverage; return their numbers in the list, ascending."""
+    points = [
+        (place.position.lat_deg, place.position.lon_deg) if place.position else (np.nan, np.nan) for place in places
+    ]
+    lat_deg, lon_deg = np.array(points, float).reshape(-1, 2).T
+    return best_places(lat_deg, lon_deg, np.array([worth_of(place) for place in places]), count)

@@ -1,0 +1,157 @@
+"""`edgevpr salience`, maps that keep only what is worth remembering, and maps that shrink."""
+
+import json
+
+import numpy as np
+import pytest
+
+pytest.importorskip("onnx", reason="the test networks are written with onnx (pip install onnx)")
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "salience"))
+from tiny_detectors import write_detector, write_memorability
+
+from edgevpr.cli.main import main
+from edgevpr.frames.images import read_image
+from edgevpr.frames.opencv import cv2
+from edgevpr.places.mapfile import PlaceMap
+
+
+@pytest.fixture
+def networks(tmp_path, monkeypatch):
+    folder = tmp_path / "networks"
+    monkeypatch.setenv("EDGEVPR_MODELS", str(folder))
+    write_memorability(folder)
+    write_detector(folder, [(0, 0, 32, 64, 2)])
+    return folder
+
+
+def texture(seed, spread=40.0):
+    fine = cv2.GaussianBlur(np.random.default_rng(seed).normal(0, 1, (120, 160)), (0, 0), 1.5)
+    return np.clip(128 + spread * fine / fine.std(), 0, 255).astype(np.uint8)
+
+
+@pytest.fixture
+def recording(tmp_path):
+    """Sixty frames; of the thirty in the middle, each is of one colour or nearly so."""
+    folder = tmp_path / "recording"
+    folder.mkdir()
+    for number in range(60):
+        cv2.imwrite(str(folder / f"{number:02d}.png"), texture(number, 1.5 if 15 <= number < 45 else 40.0))
+    return folder
+
+
+def config(tmp_path, **keys):
+    path = tmp_path / "config.yaml"
+    path.write_text(json.dumps({"salience": {"network": None, "memorability": 0, "staticity": 0, **keys}}))
+    return str(path)
+
+
+def test_a_picture_is_scored_and_drawn(networks, tmp_path, capsys):
+    picture, out = tmp_path / "p.png", tmp_path / "maps.png"
+    cv2.imwrite(str(picture), texture(1))
+    command = ["salience", str(picture), "--network", "bright", "--detector", "tiny", "--out", str(out)]
+    assert main(command) == 0
+    said = capsys.readouterr().out
+    assert "staticity     0.50" in said
+    assert "not memorable: memorability 0.24, 0.50 needed" in said
+    assert read_image(out).shape == (2 * (360 + 34 + 12), 2 * (480 + 12), 3)
+    assert main([*command[:-2], "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert (said["kept"], said["staticity"]) == (False, pytest.approx(0.5, abs=0.01))
+
+
+def test_frames_of_little_worth_are_left_out_and_a_gap_is_bounded_by_the_best_of_them(recording, tmp_path, capsys):
+    place_map = tmp_path / "m.gpkg"
+    command = ["map", "build", str(place_map), "--images", str(recording), "--technique", "hog", "--salience"]
+    assert main([*command, "--config", config(tmp_path), "--json"]) == 0
+    built = json.loads(capsys.readouterr().out)
+    with PlaceMap.open(place_map) as opened:
+        places = list(opened.places())
+    low = [int(place.source_image[:2]) for place in places if place.salience.is_low]
+    assert [int(place.source_image[:2]) for place in places if not place.salience.is_low] == [
+        *range(15),
+        *range(45, 60),
+    ]
+    assert low
+    assert all(15 <= number < 45 for number in low)
+    assert max(np.diff([14, *low, 45])) <= 21
+    assert built["added"] == len(places)
+    assert built["of_low_quality"] == len(low)
+    assert built["not_memorable"] == {"entropy": 30 - len(low)}
+
+    assert main(["map", "export", str(place_map), "--geojson", str(tmp_path / "m.geojson")]) == 0
+    drawn = json.loads((tmp_path / "m.geojson").read_text())["features"]
+    colours = {each["properties"]["low_quality"]: each["properties"]["marker-color"] for each in drawn}
+    assert len(set(colours.values())) == 2
+    capsys.readouterr()
+    assert main(["map", "info", str(place_map)]) == 0
+    assert f"{len(low)} of low quality" in capsys.readouterr().out
+
+
+def test_a_query_that_is_not_memorable_is_not_asked_for(recording, tmp_path, capsys):
+    place_map = str(tmp_path / "m.gpkg")
+    assert main(["map", "build", place_map, "--images", str(recording), "--technique", "hog"]) == 0
+    capsys.readouterr()
+    said = ["match", place_map, "--images", str(recording), "--salience", "--json"]
+    assert main([*said, "--config", config(tmp_path, entropy=0.5)]) == 0
+    answers = json.loads(capsys.readouterr().out)
+    refused = [each for each in answers if each["reason"].startswith("not memorable: entropy")]
+    assert [int(each["query"][:2]) for each in refused] == [*range(15, 45)]
+    assert all(each["place"] is None and not each["accepted"] for each in refused)
+
+
+@pytest.mark.parametrize(
+    ("keys", "complaint"),
+    [
+        ({"entropy": 0.8}, "no picture has more than 0.792: lower it"),
+        ({"entropy": 0}, "every criterion is off"),
+        ({"entropy": 1.5}, "must be between 0 and 1"),
+        ({"memorability": 0.5, "network": "nobody"}, "There is no model `nobody`"),
+        ({"memorability": 0.5, "network": "tiny"}, "has no `outputs.memorability`"),
+        ({"staticity": 0.5, "detector": "bright"}, "is of no detector"),
+    ],
+)
+def test_settings_that_cannot_be_meant_are_refused_in_one_sentence(networks, keys, complaint, tmp_path, capsys):
+    picture = tmp_path / "p.png"
+    cv2.imwrite(str(picture), texture(1))
+    assert main(["salience", str(picture), "--config", config(tmp_path, **keys)]) != 0
+    said = capsys.readouterr().err.strip().splitlines()
+    assert len(said) == 1
+    assert complaint in said[0]
+
+
+def test_memorability_outside_0_to_1_is_refused(networks, tmp_path, capsys):
+    write_memorability(networks, gain=3.0)
+    picture = tmp_path / "p.png"
+    cv2.imwrite(str(picture), texture(1))
+    assert main(["salience", str(picture), "--network", "bright"]) != 0
+    assert "it must be from 0 to 1" in capsys.readouterr().err
+
+
+def test_a_criterion_without_its_network_is_off_and_says_so(tmp_path, capsys, caplog):
+    picture = tmp_path / "p.png"
+    cv2.imwrite(str(picture), texture(1))
+    assert main(["salience", str(picture), "--config", config(tmp_path, memorability=0.5, staticity=0.6)]) == 0
+    assert "no `salience.network` is named" in caplog.text
+    assert "no `salience.detector` is named" in caplog.text
+
+
+def test_a_map_shrinks_to_its_best_places(recording, tmp_path, capsys):
+    place_map, smaller = tmp_path / "m.gpkg", tmp_path / "s.gpkg"
+    command = ["map", "build", str(place_map), "--images", str(recording), "--technique", "hog", "--salience"]
+    assert main([*command, "--config", config(tmp_path)]) == 0
+    assert main(["map", "shrink", str(place_map), str(smaller), "--places", "12"]) == 0
+    with PlaceMap.open(smaller) as opened:
+        kept = list(opened.places())
+        assert len(kept) == 12
+        assert all(place.salience is not None for place in kept)
+    assert smaller.stat().st_size < place_map.stat().st_size / 2
+    assert main(["map", "shrink", str(place_map), str(smaller), "--places", "12"]) != 0  # it is there already
+    by_size = tmp_path / "b.gpkg"
+    assert main(["map", "shrink", str(place_map), str(by_size), "--mb", "5"]) == 0
+    assert 3e6 < by_size.stat().st_size <= 5e6
+    assert main(["map", "shrink", str(place_map), str(tmp_path / "c.gpkg"), "--mb", "0.1"]) != 0
+    assert "not one place" in capsys.readouterr().err
