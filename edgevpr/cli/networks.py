@@ -37,6 +37,18 @@ def _add_train(trainings: Any) -> None:
     words.add_argument("--out", metavar="DIR", help="folder to write to (default: your models folder)")
     words.add_argument("--seed", type=int, default=1, metavar="N", help="(1)")
     add_json(words)
+    _add_matchability(trainings)
+
+
+def _add_matchability(trainings: Any) -> None:
+    matchability = command(trainings, "matchability", train_matchability, "learn which pictures are found again")
+    matchability.add_argument("--data", nargs="+", default=[], metavar="DIR", help="data sets that look ahead")
+    matchability.add_argument("--nadir", nargs="+", default=[], metavar="DIR", help="data sets that look straight down")
+    matchability.add_argument(
+        "--out", required=True, metavar="FILE.onnx", help="the model to make; its card lies beside"
+    )
+    matchability.add_argument("--seed", type=int, default=1, metavar="N", help="(1)")
+    add_json(matchability)
 
 
 def _add_images(parser: ArgumentParser) -> None:
@@ -93,6 +105,22 @@ def train_words(args: Namespace) -> int:
             f"square distance {result.distance:.3f}"
         )
     return exit_code(unusable)
+
+
+def train_matchability(args: Namespace) -> int:
+    """Learn which pictures are found again, and print how well that is told on a site that was left out."""
+    from edgevpr.training.matchability_job import train_matchability
+
+    result = train_matchability(args.data, args.nadir, Path(args.out), args.seed)
+    if args.json:
+        print_json(asdict(result))
+        return 0
+    for kind, by_site in result.unseen.items():
+        judged = ", ".join(f"{site} {value:.2f}" for site, value in by_site.items() if value is not None)
+        print(f"{kind}, each site left out once (.50 is chance): {judged}")
+    print("; ".join(f"{count} frames {name}" for name, count in result.classes.items()))
+    print(f"{result.model} and {result.card}: {result.kind}, fitted to {result.frames} frames of all sites")
+    return 0
 
 
 def models_list(args: Namespace) -> int:

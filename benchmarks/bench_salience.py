@@ -1,0 +1,377 @@
+"""What memorable maps are worth: every image set with and without the gate, and what is left of a map that shrinks.
+
+python benchmarks/bench_salience.py [--sets A,B]
+
+Needs the extra `train`. For every set the network of matchability is fitted to all other sets, so that no figure comes
+from a network that has seen its site. Writes salience.json, salience.md and salience_budget.png into
+benchmarks/results/.
+"""
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
+
+import argparse
+import json
+import tempfile
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import yaml
+from hostile_pictures import DATA, camera_of
+from run_sets import made_by
+
+from edgevpr.config import load_config
+from edgevpr.evaluate import metrics
+from edgevpr.evaluate.dataset import Dataset, load_dataset
+from edgevpr.frames.images import list_images, read_image
+from edgevpr.frames.opencv import cv2
+from edgevpr.frames.source import open_source
+from edgevpr.helpers.figures import figure
+from edgevpr.helpers.progress import progress
+from edgevpr.helpers.tables import markdown
+from edgevpr.places.index import bytes_per_place, load_index
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.shrink import chosen
+from edgevpr.power.boards import load_board
+from edgevpr.runtime.recognise.judge import AcceptRule
+from edgevpr.runtime.recognise.mapping import build_map
+from edgevpr.runtime.recognise.opening import meter_of
+from edgevpr.runtime.recognise.recogniser import Recogniser
+from edgevpr.salience.detector import Detector, open_detector
+from edgevpr.salience.gate import Gate, Thresholds, worth_of
+from edgevpr.salience.maps import maps_of, scores_of
+from edgevpr.salience.memorability import Memorability, open_memorability
+from edgevpr.techniques import create
+from edgevpr.techniques.networks.session import file_sha256
+from edgevpr.training import export_matchability
+from edgevpr.training.labels import label_site
+from edgevpr.training.matchability import KINDS, Site, crops_of, fit, leave_one_out
+from edgevpr.types import Frame, Place, Salience
+
+RESULTS = Path(__file__).resolve().parent / "results"
+TECHNIQUES = ("hog", "cohog", "calc", "netvlad")
+FULL = Thresholds(0.5, 0.6, 0.4)
+CRITERIA = {
+    "all three": FULL,
+    "memorability": Thresholds(memorability=FULL.memorability),
+    "staticity": Thresholds(staticity=FULL.staticity),
+    "entropy": Thresholds(entropy=FULL.entropy),
+}
+SHARES = (0.5, 0.25, 0.1)
+_SEED = 1
+_NO_RULE = AcceptRule(min_score=1.0, min_margin=1.0, neighbour_m=0.0)
+# Weights that are no part of edgevpr, for the staticity.
+DETECTOR = Path(os.environ.get("EDGEVPR_DETECTOR") or DATA.parent / "models" / "yolox_nano" / "model.onnx")
+_DYNAMIC = {
+    "person": 0, "bicycle": 1, "car": 2, "motorcycle": 3, "aeroplane": 4, "bus": 5, "train": 6, "truck": 7, "boat": 8,
+    "bird": 14, "cat": 15, "dog": 16, "horse": 17, "sheep": 18, "cow": 19, "elephant": 20, "bear": 21, "zebra": 22,
+    "giraffe": 23, "backpack": 24, "umbrella": 25,
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GateRow:
+    """One technique on one set under one gate. `auc` is that of the thesis's count (a query that is discarded is a true
+    negative), `recall_strict` counts it as missed. `true_discarded` of the queries were matched rightly without the
+    gate, `false_discarded` wrongly. `places` is the share of the references that the gate keeps, gaps bounded."""
+
+    set: str
+    technique: str
+    gate: str
+    recall: float
+    auc: float
+    recall_strict: float
+    true_discarded: int
+    false_discarded: int
+    places: float
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """The answers of a technique on a set: for each query the slots of the places, best first, their scores, and which
+    slots are right or to be ignored."""
+
+    slots: list[np.ndarray]
+    scores: list[np.ndarray]
+    right: list[np.ndarray]
+    ignored: list[np.ndarray]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--sets", metavar="A,B", help="(default: all but those of five places, and of 64x32 pixels)")
+    args = parser.parse_args()
+    left_out = ("grief_michigan_monthly", "grief_stromovka_monthly", "nordland_tiny")
+    names = args.sets.split(",") if args.sets else None
+    folders = [path.parent for path in sorted(DATA.glob("*/ground_truth.csv"))]
+    folders = [each for each in folders if (each.name in names if names else each.name not in left_out)]
+    with tempfile.TemporaryDirectory(prefix="edgevpr-salience-") as temporary:
+        os.environ["EDGEVPR_MODELS"] = temporary
+        judged = fit_each(folders, Path(temporary))
+        detector = _detector(Path(temporary))
+        rows, budget, light = [], [], []
+        for folder in folders:
+            memorability = open_memorability(f"without_{folder.name}")
+            dataset = load_dataset(folder / "query", folder / "ref", folder / "ground_truth.csv")
+            queries = [each.path for each in dataset.queries]
+            places = list_images(folder / "ref")
+            seen = {path: _salience(path, memorability, detector) for path in [*queries, *places]}
+            light += [{"set": folder.name, **row} for row in kept_in_bad_light(places)]
+            for technique in TECHNIQUES:
+                asked = ask(technique, dataset)
+                rows += gated(folder.name, technique, asked, [seen[path] for path in queries], _kept(places, seen))
+                budget += shrunk(folder.name, technique, asked, [seen[path] for path in places])
+    measured = {**made_by(), "unseen": judged, "gate": [asdict(row) for row in rows], "light": light, "budget": budget}
+    (RESULTS / "salience.json").write_text(json.dumps(measured, indent=1) + "\n")
+    (RESULTS / "salience.md").write_text(page(measured))
+    plot(budget, RESULTS / "salience_budget.png")
+
+
+def fit_each(folders: list[Path], models: Path) -> dict[str, dict[str, float | None]]:
+    """For every set fit the better kind of network to all others, and write it with its card; return how both kinds do
+    on a set that they have not seen."""
+    sites = []
+    for folder in folders:
+        labelled = label_site(folder, camera_of(folder.name) == "nadir", _SEED, progress)
+        crops = np.stack([crops_of(read_image(each.path)) for each in labelled])
+        sites.append(Site(folder.name, crops, np.array([each.found for each in labelled], np.float32)))
+    unseen = {kind: leave_one_out(kind, sites, _SEED) for kind in progress(KINDS, len(KINDS), "fitting")}
+    kind = max(unseen, key=lambda each: unseen[each].mean)
+    for site in sites:
+        network = fit(kind, [other for other in sites if other is not site], _SEED)
+        file = models / f"without_{site.name}.onnx"
+        export_matchability.write_onnx(network, file)
+        export_matchability.write_card(file.with_suffix(".yaml"), file, f"without {site.name}", "a benchmark")
+    return {each: found.by_site for each, found in unseen.items()}
+
+
+def ask(name: str, dataset: Dataset) -> Asked:
+    """Map the references and ask all queries."""
+    looks_down = camera_of(dataset.ref_dir.parent.name) == "nadir"
+    technique = create(name, {"camera": "nadir"} if name == "cohog" and looks_down else {})
+    meter = meter_of(load_config(None), load_board("this"))
+    slots, scores, right, ignored = [], [], [], []
+    with tempfile.TemporaryDirectory(prefix="edgevpr-salience-") as temporary:
+        path, source = Path(temporary) / "m.gpkg", open_source(str(dataset.ref_dir), live=False)
+        with PlaceMap.create(path, technique.spec) as place_map:
+            build_map((source.read(0) for _ in range(source.total)), technique, place_map, meter)
+        with PlaceMap.open(path) as place_map:
+            index = load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
+            walk = Recogniser(
+                technique=technique,
+                place_map=place_map,
+                index=index,
+                rule=_NO_RULE,
+                meter=meter,
+                candidates=technique.candidates,
+            )
+            for query in progress(dataset.queries, len(dataset.queries), f"{dataset.ref_dir.parent.name}, {name}"):
+                ranking = walk.step(Frame(image=read_image(query.path), name=query.path.name, t_mono_s=0.0)).ranking
+                slots.append(np.empty(0, int) if ranking is None else ranking.slots)
+                scores.append(np.empty(0) if ranking is None else ranking.scores)
+                right.append(np.array([each in query.right for each in dataset.references]))
+                ignored.append(np.array([each in query.ignored for each in dataset.references]))
+    return Asked(slots, scores, right, ignored)
+
+
+def answers(asked: Asked, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Answer every query from the places that are kept, bool (N,): (score of the best, is it right)."""
+    best, found = [], []
+    for slots, scores, right, ignored in zip(asked.slots, asked.scores, asked.right, asked.ignored, strict=True):
+        counts = places[slots] & ~ignored[slots]
+        best.append(float(scores[counts][0]) if counts.any() else 0.0)
+        found.append(bool(right[slots[counts][0]]) if counts.any() else False)
+    return np.array(best), np.array(found)
+
+
+def gated(
+    name: str, technique: str, asked: Asked, seen: list[Salience], kept: dict[str, np.ndarray]
+) -> Iterable[GateRow]:
+    """Yield the rows of a technique on a set: without a gate, with all criteria, and with each alone. All references
+    stay, as in the thesis."""
+    score, found = answers(asked, np.ones(len(asked.right[0]), bool))
+    for gate, thresholds in {"none": Thresholds(), **CRITERIA}.items():
+        passes = np.array([worth_of(each, thresholds).reason is None for each in seen])
+        precision, recall = metrics.precision_recall(score[passes], found[passes])
+        yield GateRow(
+            set=name,
+            technique=technique,
+            gate=gate,
+            recall=float(found[passes].mean()) if passes.any() else 0.0,
+            auc=float(metrics.auc(precision, recall)) if passes.any() else 0.0,
+            recall_strict=float((found & passes).mean()),
+            true_discarded=int((found & ~passes).sum()),
+            false_discarded=int((~found & ~passes).sum()),
+            places=float(kept[gate].mean()),
+        )
+
+
+def shrunk(name: str, technique: str, asked: Asked, seen: list[Salience]) -> Iterable[dict]:
+    """Yield recall and the largest gap, in frames, of maps that were made smaller: by worth and coverage, evenly, and
+    at random (the mean of five)."""
+    total = len(seen)
+    for share in SHARES:
+        count = max(1, round(share * total))
+        rng = np.random.default_rng(_SEED)
+        ways = {
+            "worth and coverage": [chosen([_place(number, each) for number, each in enumerate(seen)], count)],
+            "even": [np.unique(np.linspace(0, total - 1, count).round().astype(int))],
+            "random": [np.sort(rng.choice(total, count, replace=False)) for _ in range(5)],
+        }
+        for way, choices in ways.items():
+            recalls, gaps = [], []
+            for slots in choices:
+                places = np.zeros(total, bool)
+                places[slots] = True
+                recalls.append(float(answers(asked, places)[1].mean()))
+                gaps.append(int(np.diff([-1, *slots, total]).max()) - 1)
+            yield {
+                "set": name,
+                "technique": technique,
+                "share": share,
+                "way": way,
+                "recall": float(np.mean(recalls)),
+                "gap": float(np.mean(gaps)),
+            }
+
+
+def kept_in_bad_light(paths: list[Path]) -> Iterable[dict]:
+    """Yield the share of the pictures that the entropy keeps, as they are, dark and in fog: by the threshold that
+    follows the light, and by the thesis's constant one. By day a tenth of them fail it, or a half."""
+    pictures = [read_image(path) for path in paths]
+    by_day = [_entropy(picture) for picture in pictures]
+    for keeps in (0.9, 0.5):
+        threshold = float(np.quantile(by_day, 1 - keeps))
+        for light, change in {"as it is": None, "dark": _dark, "fog": _fog}.items():
+            changed = [change(picture, number) if change else picture for number, picture in enumerate(pictures)]
+            gate = Gate(Thresholds(entropy=threshold))
+            yield {
+                "threshold": threshold,
+                "light": light,
+                "kept": float(np.mean([gate.look(picture).reason is None for picture in changed])),
+                "kept_constant": float(np.mean([_entropy(picture) >= threshold for picture in changed])),
+            }
+
+
+def _dark(picture: np.ndarray, seed: int) -> np.ndarray:
+    values = (picture / 255.0) ** 2.2 * 255 * 0.35 + np.random.default_rng(seed).normal(0, 1.5, picture.shape)
+    return np.clip(values, 0, 255).astype(np.uint8)
+
+
+def _fog(picture: np.ndarray, seed: int) -> np.ndarray:
+    values = 0.35 * picture + 0.65 * 200 + np.random.default_rng(seed).normal(0, 1, picture.shape)
+    return np.clip(values, 0, 255).astype(np.uint8)
+
+
+def _entropy(picture: np.ndarray) -> float:
+    return scores_of(maps_of(picture, None, None)).entropy
+
+
+def _salience(path: Path, memorability: Memorability, detector: Detector | None) -> Salience:
+    picture = read_image(path)
+    return scores_of(maps_of(picture, memorability, None if detector is None else detector.is_static(picture)))
+
+
+def _kept(places: list[Path], seen: dict[Path, Salience]) -> dict[str, np.ndarray]:
+    """Return which references each gate keeps, with one of every twenty at least."""
+    kept = {"none": np.ones(len(places), bool)}
+    for gate, thresholds in CRITERIA.items():
+        passes = np.array([worth_of(seen[path], thresholds).reason is None for path in places])
+        kept[gate] = passes | (np.arange(len(places)) % 21 == 20)
+    return kept
+
+
+def _place(number: int, salience: Salience) -> Place:
+    return Place(place_id=number + 1, source_image=str(number), salience=salience)
+
+
+def _detector(models: Path) -> Detector | None:
+    if not DETECTOR.is_file():
+        return None
+    (models / "yolox.onnx").symlink_to(DETECTOR.resolve())
+    card = {
+        "title": "YOLOX-nano",
+        "file": "yolox.onnx",
+        "sha256": file_sha256(DETECTOR),
+        "licence": "see the file's own",
+        "source": "Ge et al. 2021, as an ONNX file",
+        "input": {"layout": "NCHW", "height": 416, "width": 416, "colour": "bgr", "equalise": False, "resize": "linear",
+                  "scale": 1.0, "mean": [0.0], "pad": 114},
+        "outputs": {"boxes": ["output"]},
+        "detector": {"family": "yolox", "min_score": 0.3, "dynamic": _DYNAMIC},
+    }  # fmt: skip
+    (models / "yolox.yaml").write_text(yaml.safe_dump(card))
+    return open_detector("yolox")
+
+
+def page(measured: dict) -> str:
+    """Return the page for people."""
+    rows = measured["gate"]
+    unseen = measured["unseen"]
+    sets = list(next(iter(unseen.values())))
+    told = [
+        [kind, *("-" if by_site[name] is None else f"{by_site[name]:.2f}" for name in sets)]
+        for kind, by_site in unseen.items()
+    ]
+    compared = [
+        [
+            row["set"],
+            row["technique"],
+            row["gate"],
+            *(f"{row[key]:.2f}" for key in ("recall", "auc", "recall_strict")),
+            str(row["true_discarded"]),
+            str(row["false_discarded"]),
+            f"{row['places']:.0%}",
+        ]
+        for row in rows
+    ]
+    light = [
+        [row["set"], f"{row['threshold']:.2f}", row["light"], f"{row['kept']:.0%}", f"{row['kept_constant']:.0%}"]
+        for row in measured["light"]
+    ]
+    parts = (
+        "# Memorable maps: what the gate and the choice of places are worth",
+        f"Made by `python benchmarks/bench_salience.py`, {measured['date']}, commit {measured['commit']}, "
+        f"{measured['machine']['cpu']}. Thresholds: memorability {FULL.memorability:g}, staticity {FULL.staticity:g}, "
+        f"entropy {FULL.entropy:g}.",
+        "## Is it told which frames are found again? On sites that were left out; .50 is chance",
+        markdown(["network", *sets], told),
+        "## With and without the gate",
+        "recall@1 and AUC are those of the thesis's count: a query that is discarded is a true negative. *strict*: it "
+        "is a miss.\n*right* and *wrong* count the discarded queries that would have been matched so. *places*: the "
+        "share of the references\nthat the gate keeps.",
+        markdown(["set", "technique", "gate", "recall", "AUC", "strict", "right", "wrong", "places"], compared),
+        "## Entropy in bad light: share of the references kept",
+        markdown(["set", "threshold", "light", "follows the light", "constant"], light),
+        "## A map that shrinks",
+        "![recall and largest gap of maps of 50, 25 and 10 % of the places](salience_budget.png)",
+    )
+    return "\n\n".join(parts) + "\n"
+
+
+def plot(budget: list[dict], path: Path) -> None:
+    """Draw recall of `cohog` and the largest gap against the share of places that is left."""
+    sets = list(dict.fromkeys(row["set"] for row in budget))
+    drawn = figure(3.0 * len(sets), 6.0)
+    axes = drawn.subplots(2, len(sets), sharex=True, sharey="row", squeeze=False)
+    for column, name in enumerate(sets):
+        for way in dict.fromkeys(row["way"] for row in budget):
+            rows = [row for row in budget if (row["set"], row["technique"], row["way"]) == (name, "cohog", way)]
+            share = [100 * row["share"] for row in rows]
+            axes[0][column].plot(share, [row["recall"] for row in rows], "o-", label=way)
+            axes[1][column].plot(share, [row["gap"] for row in rows], "o-", label=way)
+        axes[0][column].set_title(name, fontsize=9)
+        axes[1][column].set_xlabel("% of the places")
+        axes[1][column].set_yscale("symlog")
+    axes[0][0].set_ylabel("recall@1 of cohog")
+    axes[1][0].set_ylabel("largest gap, frames")
+    axes[0][0].legend(fontsize=8)
+    drawn.savefig(path, dpi=100)
+
+
+if __name__ == "__main__":
+    cv2.setNumThreads(1)
+    main()

@@ -1,0 +1,145 @@
+"""`edgevpr train matchability`: a network that says how likely a picture's parts are found again.
+
+It sees one of 5x5 crops at a time, as the network of the thesis does (3.2.1), and a frame's score is the mean over its
+crops; so the labels of frames teach what a crop is worth. Two kinds compete: a logistic regression on eight statistics
+of a crop, and a convolutional network of 6,000 weights. The better one is kept, judged on sites that it has not seen.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import torch
+from torch import nn
+from torch.nn import functional
+
+from edgevpr.evaluate.metrics import roc_auc
+from edgevpr.frames.opencv import cv2
+
+HEIGHT, WIDTH = 48, 64  # of a crop
+CROPS = 5  # a side
+_BATCH = 16
+SCALES, UNEVEN_SCALES = 4, 2
+FLOOR = 1e-4  # of what a logarithm is taken
+
+
+class Statistics(nn.Module):
+    """Mean, contrast, and on four scales the logarithm of the strength of edges after the contrast is taken out, with
+    how unevenly they are spread on two of them; a logistic regression on all of it."""
+
+    RATE, STEPS = 0.03, 400
+    NOISE = 3 / 255  # a weaker contrast than that is the sensor's
+    LENGTH = 2 + SCALES + UNEVEN_SCALES
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.norm = nn.BatchNorm1d(self.LENGTH, affine=False)
+        self.linear = nn.Linear(self.LENGTH, 1)
+
+    def forward(self, crops: torch.Tensor) -> torch.Tensor:
+        mean = crops.mean((2, 3), keepdim=True)
+        contrast = ((crops - mean) ** 2).mean((2, 3), keepdim=True).add(self.NOISE**2).sqrt()
+        even = (crops - mean) / contrast
+        said = [mean, contrast.log()]
+        for scale in range(SCALES):
+            here = even[..., :-1, :-1]
+            strength = (even[..., 1:, :-1] - here) ** 2 + (even[..., :-1, 1:] - here) ** 2
+            usual = strength.mean((2, 3), keepdim=True) + FLOOR
+            said.append(usual.log())
+            if scale < UNEVEN_SCALES:
+                said.append(((strength**2).mean((2, 3), keepdim=True) / usual**2 + FLOOR).log())
+            even = functional.avg_pool2d(even, 2)
+        return torch.sigmoid(self.linear(self.norm(torch.cat(said, 1).flatten(1))))
+
+
+class Small(nn.Module):
+    """Four convolutions and the mean of what they find."""
+
+    RATE, STEPS = 0.003, 600
+
+    def __init__(self) -> None:
+        super().__init__()
+        widths = (1, 8, 16, 24, 24)
+        layers: list[nn.Module] = []
+        for before, after in pairwise(widths):
+            layers += [nn.Conv2d(before, after, 3, 2, 1, bias=False), nn.BatchNorm2d(after), nn.ReLU()]
+        self.layers = nn.Sequential(*layers)
+        self.linear = nn.Linear(widths[-1], 1)
+
+    def forward(self, crops: torch.Tensor) -> torch.Tensor:
+        return torch.sigmoid(self.linear(self.layers(crops).mean((2, 3))))
+
+
+KINDS = {"statistics": Statistics, "convolutions": Small}
+
+
+@dataclass(frozen=True, slots=True)
+class Site:
+    """The frames of one site: `crops` float32 (N, 25, 1, 48, 64) in 0..1, and what share of the questions about each
+    was answered rightly, float32 (N,)."""
+
+    name: str
+    crops: np.ndarray
+    found: np.ndarray
+
+
+def crops_of(picture: np.ndarray) -> np.ndarray:
+    """Cut a uint8 picture into its crops as in flight: float32 (25, 1, 48, 64) in 0..1."""
+    grey = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
+    rows = np.array_split(np.arange(grey.shape[0]), CROPS)
+    columns = np.array_split(np.arange(grey.shape[1]), CROPS)
+    parts = [grey[y[0] : y[-1] + 1, x[0] : x[-1] + 1] for y in rows for x in columns]
+    sized = [cv2.resize(part, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA) for part in parts]
+    return np.stack(sized)[:, None].astype(np.float32) / 255
+
+
+def fit(kind: str, sites: Sequence[Site], seed: int) -> nn.Module:
+    """Fit a network of this kind to the frames of all sites, each site as often as any other."""
+    torch.manual_seed(seed)
+    rng = np.random.default_rng(seed)
+    network = KINDS[kind]().train()
+    optimiser = torch.optim.AdamW(network.parameters(), KINDS[kind].RATE, weight_decay=0.01)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, KINDS[kind].STEPS)
+    for _ in range(KINDS[kind].STEPS):
+        chosen = [sites[number] for number in rng.integers(len(sites), size=_BATCH)]
+        frames = [rng.integers(len(site.found)) for site in chosen]
+        crops = torch.from_numpy(np.stack([site.crops[frame] for site, frame in zip(chosen, frames, strict=True)]))
+        found = torch.tensor([float(site.found[frame]) for site, frame in zip(chosen, frames, strict=True)])
+        said = network(crops.flatten(0, 1)).reshape(_BATCH, -1).mean(1)
+        loss = functional.binary_cross_entropy(said, found)
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        schedule.step()
+    return network.eval()
+
+
+def scores(network: nn.Module, site: Site) -> np.ndarray:
+    """Return the score of every frame of a site, float32 (N,) in 0..1."""
+    with torch.no_grad():
+        said = [network(torch.from_numpy(crops)).mean().item() for crops in site.crops]
+    return np.array(said, np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class Unseen:
+    """Result of a kind on sites that it has not seen: by site, the share of pairs of frames (one found by more than
+    half of the site's frames, one by fewer) that it puts in the right order, .5 being chance (None: all frames alike);
+    and the mean over the sites."""
+
+    by_site: dict[str, float | None]
+
+    @property
+    def mean(self) -> float:
+        known = [value for value in self.by_site.values() if value is not None]
+        return float(np.mean(known)) if known else 0.5
+
+
+def leave_one_out(kind: str, sites: Sequence[Site], seed: int) -> Unseen:
+    """Fit a kind as often as there are sites, each time without one of them, and judge it on that one."""
+    judged = {}
+    for site in sites:
+        network = fit(kind, [other for other in sites if other is not site], seed)
+        judged[site.name] = roc_auc(scores(network, site), site.found > np.median(site.found))
+    return Unseen(judged)
