@@ -2,7 +2,7 @@
 
 import os
 import sys
-from argparse import Namespace
+from argparse import ArgumentTypeError, Namespace
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
@@ -62,7 +62,7 @@ def add(commands: Any) -> None:
     smaller.add_argument("map", metavar="MAP")
     smaller.add_argument("out", metavar="OUT", help="the map file to make")
     size = smaller.add_mutually_exclusive_group(required=True)
-    size.add_argument("--places", type=_count, metavar="N", help="as many places")
+    size.add_argument("--places", type=_number_of_places, metavar="N", help="as many places")
     size.add_argument("--mb", type=_positive, metavar="MB", help="as many as such a file holds, MB of 10^6 bytes")
     export = command(maps, "export", map_export, "write the places for a map viewer")
     export.add_argument("map", metavar="MAP")
@@ -76,11 +76,10 @@ def _positive(text: str) -> float:
     return value
 
 
-def _count(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise ValueError
-    return value
+def _number_of_places(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise ArgumentTypeError(f"`{text}` is no number of places: give 1 or more")
+    return int(text)
 
 
 def map_build(args: Namespace) -> int:
