@@ -83,11 +83,11 @@ class LiveSource:
         return Condition.ENDED if self.ended else self._condition
 
     def read(self, timeout_s: float) -> Frame | None:
-        """Return the newest frame, if it was not read before; None where none comes within `timeout_s`."""
+        """Return the newest frame, if it was not read before; None if none comes in `timeout_s`, or after `close`."""
         with self._arrived:
             self._arrived.wait_for(lambda: self._newest is not None, timeout_s)
             newest, self._newest = self._newest, None
-        if newest is None:
+        if newest is None or self._closing.is_set():
             return None
         number, shot = newest
         name = f"frame {number:06d} t={shot.t_mono_s - self._t_start_s:.3f} s"
