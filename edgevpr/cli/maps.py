@@ -1,6 +1,5 @@
 """`edgevpr map`: build, look into, check, repair, merge and export place maps."""
 
-import os
 import sys
 from argparse import ArgumentTypeError, Namespace
 from contextlib import ExitStack
@@ -23,7 +22,7 @@ from edgevpr.cli.shared import (
     path_of,
     print_json,
 )  # fmt: skip
-from edgevpr.errors import EdgevprError, ImageError, MapError, UsageError
+from edgevpr.errors import EdgevprError, ImageError, UsageError
 
 if TYPE_CHECKING:
     from edgevpr.places.repair import MapCheck, Watch
@@ -223,21 +222,17 @@ def map_merge(args: Namespace) -> int:
     """Make one map of several, completely or not at all."""
     from edgevpr.places.examine import absorb
     from edgevpr.places.mapfile import PlaceMap
-    from edgevpr.places.mapfiles import map_path, remove, require_regular
+    from edgevpr.places.mapfiles import map_path, whole_or_none
     from edgevpr.runtime.recognise.opening import technique_of
 
     out = map_path(args.out)
-    require_regular(out)
-    if out.exists() and out.stat().st_size:
-        raise MapError(f"{out} is there already: choose another name.")
-    unfinished = out.with_name(f".{out.name}.{os.getpid()}")
     with ExitStack() as stack:
+        unfinished = stack.enter_context(whole_or_none(out))
         inputs = [stack.enter_context(PlaceMap.open(path)) for path in args.maps]
         technique_of(inputs[0])
         for other in inputs[1:]:
             other.require(inputs[0].spec)
         masks = {each.mask_sha256 for each in inputs}
-        stack.callback(remove, unfinished)  # half a merge would look like a whole one
         with PlaceMap.create(unfinished, inputs[0].spec) as merged:
             if len(masks) == 1:
                 merged.record_mask(*masks)
@@ -245,7 +240,6 @@ def map_merge(args: Namespace) -> int:
                 copied, already_here = absorb(merged, place_map)
                 print(f"{path}: {copied} places copied" + (f", {already_here} there already" if already_here else ""))
             places = len(merged)
-        unfinished.replace(out)
     print(f"{out}: {places} places")
     return 0
 
@@ -262,8 +256,8 @@ def map_shrink(args: Namespace) -> int:
             count = places_in(int(args.mb * 1e6), place_map.spec)
         if count < 1:
             raise UsageError(f"--mb {args.mb:g}: not one place of {args.map} fits: give more.")
-    places = shrink(args.map, map_path(args.out), count)
-    print(f"{args.out}: {min(count, places)} of {places} places")
+    kept, places = shrink(args.map, map_path(args.out), count)
+    print(f"{args.out}: {kept} of {places} places")
     return 0
 
 

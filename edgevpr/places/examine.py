@@ -60,18 +60,19 @@ def faults(place_map: PlaceMap) -> list[str]:
 def absorb(place_map: PlaceMap, other: PlaceMap) -> tuple[int, int]:
     """Copy every place of another map of the same technique, all or none; return (copied, already here).
 
-    A place is already here when image name, time and coarse part are the same. Raises MapError as `PlaceMap.require`
-    does and where a file cannot be read or written, and PlaceError for a damaged place.
+    A place is already here when image name and time are the same, and the coarse part nearly (`PlaceMap.is_of`). Raises
+    MapError as `PlaceMap.require` does and where a file cannot be read or written, and PlaceError for a damaged place.
     """
     place_map.require(other.spec)
     copied = already_here = 0
     with sentences(place_map.path), place_map.transaction():
-        here = {_identity(*row) for _, row in place_map.scan("time, source_image, coarse") if row}
+        here = place_map.ids_by("source_image, time")
         for each in examine(other):
             if each.problem:
                 raise PlaceError(other.path, each.place_id, each.problem)
             _, time, _, _, source_image, *_, coarse, _ = each.row
-            if _identity(time, source_image, coarse) in here:
+            part = rows.part_of(coarse, other.spec.coarse, None, "coarse part")
+            if any(place_map.is_of(place_id, part) for place_id in here.get((source_image, time), ())):
                 already_here += 1
                 continue
             insert(place_map, each.row)
@@ -83,7 +84,3 @@ def insert(place_map: PlaceMap, row: tuple, place_id: int | None = None) -> None
     """Insert the row of an `Examined`, inside a transaction of the map. Raises sqlite3.Error."""
     *values, coarse, fine = row
     place_map.insert(tuple(values[: -rows.SALIENCES]), tuple(values[-rows.SALIENCES :]), coarse, fine, place_id)
-
-
-def _identity(time: object, source_image: object, coarse: object) -> tuple:
-    return source_image, time, hash(coarse)

@@ -47,9 +47,8 @@ def _salience(salience: Salience | None) -> dict:
     rule on `low_quality`) draw a place of low quality small and pale."""
     if salience is None:
         return {}
-    scores = {"memorability": salience.memorability, "staticity": salience.staticity, "entropy": salience.entropy}
     return {
-        **{name: score if score is None else round(score, 4) for name, score in scores.items()},
+        **salience.rounded(),
         "low_quality": salience.is_low,
         "marker-color": _LOW if salience.is_low else _USUAL,
         "marker-size": "small" if salience.is_low else "medium",

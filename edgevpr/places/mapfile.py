@@ -193,26 +193,26 @@ class PlaceMap:
             point = rows.point_of(geom, geom_checksum)
             return rows.part_of(fine, self.spec.fine, checksum, "fine part"), point
 
-    def by_name(self) -> dict[str, list[int]]:
-        """Return the ids of the places of every image name that can be read."""
-        found: dict[str, list[int]] = {}
-        for place_id, row in self.scan("source_image"):
-            if row and isinstance(row[0], str):
-                found.setdefault(row[0], []).append(place_id)
+    def ids_by(self, columns: str) -> dict[tuple, list[int]]:
+        """Return the ids of the places that can be read, by their values in these columns."""
+        found: dict[tuple, list[int]] = {}
+        for place_id, row in self.scan(columns):
+            if row:
+                found.setdefault(row, []).append(place_id)
         return found
 
-    def is_of(self, place_id: int, descriptor: Descriptor) -> bool:
-        """Tell whether a place was made of the picture of a descriptor; False for a place that cannot be read.
+    def is_of(self, place_id: int, coarse: np.ndarray) -> bool:
+        """Tell whether a place was made of the picture with this coarse part; False for a place that cannot be read.
 
         The last bits of a descriptor may differ from one run of a program to the next: sums depend on where an array
         lies in memory.
         """
         try:
-            (coarse,) = rows.there(self._file.row(place_id, "coarse"))
-            there = rows.part_of(coarse, self.spec.coarse, None, "coarse part").astype(np.float32)
+            (blob,) = rows.there(self._file.row(place_id, "coarse"))
+            there = rows.part_of(blob, self.spec.coarse, None, "coarse part").astype(np.float32)
         except (Unreadable, PlaceError):
             return False
-        apart = np.linalg.norm(there - np.asarray(descriptor.coarse, np.float32).reshape(there.shape))
+        apart = np.linalg.norm(there - np.asarray(coarse, np.float32).reshape(there.shape))
         return bool(apart <= _SAME_PICTURE * np.linalg.norm(there))
 
     def outlines(self) -> Iterator[tuple[int, float, float, float]]:

@@ -3,6 +3,8 @@
 import fcntl
 import os
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from edgevpr.errors import MapBusyError, MapError, UsageError
@@ -75,6 +77,21 @@ def lock(path: Path, make: bool = False) -> int:
     except OSError:
         pass  # a file system without locks
     return descriptor
+
+
+@contextmanager
+def whole_or_none(out: Path) -> Iterator[Path]:
+    """Give the path of a file to write a new map to; at the end it becomes `out`. Where anything fails it is removed:
+    half a map would look like a whole one. Raises MapError where a map is there already."""
+    require_regular(out)
+    if out.exists() and out.stat().st_size:
+        raise MapError(f"{out} is there already: choose another name.")
+    unfinished = out.with_name(f".{out.name}.{os.getpid()}")
+    try:
+        yield unfinished
+        unfinished.replace(out)
+    finally:
+        remove(unfinished)
 
 
 def remove(path: Path) -> None:

@@ -112,7 +112,7 @@ def salience_values(salience: Salience | None) -> tuple:
     """Return a row's `SALIENCE`."""
     if salience is None:
         return None, None, None, None
-    return salience.memorability, salience.staticity, salience.entropy, int(salience.is_low)
+    return *salience.scores.values(), int(salience.is_low)
 
 
 def place_of(place_id: int, values: Sequence, salience: Sequence, geom_checksum: object) -> Place:

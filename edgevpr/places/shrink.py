@@ -1,13 +1,10 @@
 """A smaller map: the places of a map that are worth most, spread so that no wide gap is left (see `thin`)."""
 
-import os
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
 from edgevpr.contract import TechniqueSpec
-from edgevpr.errors import MapError, PlaceError
 from edgevpr.places import mapfiles
 from edgevpr.places.examine import examine, insert
 from edgevpr.places.mapfile import PlaceMap
@@ -34,39 +31,23 @@ def worth_of(place: Place) -> float:
     return place.quality * float(np.prod(scores)) * (_LOW if salience.is_low else 1.0)
 
 
-def shrink(path: str | Path, out: Path, count: int) -> int:
-    """Copy the `count` best places of a map to a new one, all or none; return how many places there were.
+def shrink(path: str | Path, out: Path, count: int) -> tuple[int, int]:
+    """Copy the `count` best places of a map to a new one, all or none; return how many were kept, of how many.
 
     A place that cannot be read is left behind. Raises MapError for a map that cannot be read, or an `out` that is there
     already or cannot be written.
     """
-    mapfiles.require_regular(out)
-    if out.exists() and out.stat().st_size:
-        raise MapError(f"{out} is there already: choose another name.")
-    unfinished = out.with_name(f".{out.name}.{os.getpid()}")
-    try:
-        with PlaceMap.open(path) as place_map:
-            there = readable(place_map)
-            kept = {there[number].place_id for number in chosen(there, count)}
-            with PlaceMap.create(unfinished, place_map.spec) as smaller:
-                smaller.record_mask(place_map.mask_sha256)
-                with sentences(unfinished), smaller.transaction():
-                    for each in examine(place_map):
-                        if each.place_id in kept and not each.problem:
-                            insert(smaller, each.row)
-        unfinished.replace(out)
-    finally:
-        mapfiles.remove(unfinished)
-    return len(there)
-
-
-def readable(place_map: PlaceMap) -> list[Place]:
-    """Return all places that can be read, in the order they were mapped."""
-    found = []
-    for place_id, _ in place_map.scan("1"):
-        with suppress(PlaceError):
-            found += place_map.places([place_id])
-    return found
+    with mapfiles.whole_or_none(out) as unfinished, PlaceMap.open(path) as place_map:
+        whole = [each.place_id for each in examine(place_map) if not each.problem]
+        places = list(place_map.places(whole))
+        kept = {whole[number] for number in chosen(places, count)}
+        with PlaceMap.create(unfinished, place_map.spec) as smaller:
+            smaller.record_mask(place_map.mask_sha256)
+            with sentences(unfinished), smaller.transaction():
+                for each in examine(place_map):
+                    if each.place_id in kept:
+                        insert(smaller, each.row)
+    return len(kept), len(whole)
 
 
 def chosen(places: list[Place], count: int) -> np.ndarray:

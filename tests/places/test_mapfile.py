@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from map_writer import SPEC, descriptor, frame, make_map
 
-from edgevpr.contract import Descriptor, PartSpec
+from edgevpr.contract import PartSpec
 from edgevpr.errors import MapError, PlaceError
 from edgevpr.places.examine import absorb
 from edgevpr.places.geojson import write_geojson
@@ -232,6 +232,14 @@ def test_merging_copies_what_is_new_and_refuses_what_differs(map_path, tmp_path)
         assert len(third) == 0
 
 
+def test_a_place_whose_last_bits_differ_is_not_merged_twice(map_path, tmp_path):
+    rounded = dataclasses.replace(descriptor(3), coarse=np.nextafter(descriptor(3).coarse, np.float32(9)))
+    with PlaceMap.create(tmp_path / "other.gpkg", SPEC) as other:
+        other.add(frame(3), rounded)
+    with PlaceMap.open_for_adding(map_path) as place_map, PlaceMap.open(tmp_path / "other.gpkg") as other:
+        assert absorb(place_map, other) == (0, 1)
+
+
 def test_geojson_has_every_place_and_no_descriptor(map_path):
     out = io.StringIO()
     with PlaceMap.open(map_path) as place_map:
@@ -370,13 +378,13 @@ def test_a_time_of_another_form_is_no_time(map_path):
 def test_a_place_is_known_again_where_the_last_bits_differ_and_not_where_the_picture_does(map_path):
     rng = np.random.default_rng(4)
     with PlaceMap.open(map_path) as place_map:
-        ids = [place_id for found in place_map.by_name().values() for place_id in found]
+        ids = [place_id for found in place_map.ids_by("source_image").values() for place_id in found]
         for place_id in ids:
             coarse = next(part for number, _, _, part in place_map.coarse_parts() if number == place_id)
             for off, same in ((0.0, True), (1e-4, True), (0.5, False)):
                 other = coarse + off * np.linalg.norm(coarse) * unit(rng, coarse.shape)
-                assert place_map.is_of(place_id, Descriptor(coarse=other)) is same
-        assert not place_map.is_of(10**6, Descriptor(coarse=coarse))
+                assert place_map.is_of(place_id, other) is same
+        assert not place_map.is_of(10**6, coarse)
 
 
 def unit(rng, shape):

@@ -40,6 +40,9 @@ class AcceptRule:
     min_quality: float = 0.0
 
 
+ACCEPT_NOTHING = AcceptRule(min_score=1.0, min_margin=1.0, neighbour_m=0.0)
+
+
 @dataclass(frozen=True, slots=True)
 class Verdict:
     """Decision on the best place: accepted as the place or not, and the reason in a few words for the log."""

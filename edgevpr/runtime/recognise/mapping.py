@@ -12,12 +12,10 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.rows import readable
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.gaps import Gaps, Kept
-from edgevpr.runtime.recognise.judge import AcceptRule
+from edgevpr.runtime.recognise.judge import ACCEPT_NOTHING
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.salience.gate import Gate, NoGate
 from edgevpr.types import Frame
-
-_NO_RULE = AcceptRule(min_score=1.0, min_margin=1.0, neighbour_m=0.0)  # no place is searched for while a map is made
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,10 +50,10 @@ def build_map(
     place_map.require(technique.spec)
     nothing = empty_index(technique.spec, 0, None)
     walk = Recogniser(
-        technique=technique, place_map=place_map, index=nothing, rule=_NO_RULE, meter=meter, mask=mask, gate=gate
+        technique=technique, place_map=place_map, index=nothing, rule=ACCEPT_NOTHING, meter=meter, mask=mask, gate=gate
     )
     gaps = gaps or Gaps()
-    here = place_map.by_name()
+    here = place_map.ids_by("source_image")
     added = without_position = already_here = of_low_quality = 0
     not_memorable: Counter[str] = Counter()
 
@@ -76,7 +74,7 @@ def build_map(
                 raise ModelError(seen.reason)
             unusable(ImageError(f"{frame.name}: {seen.reason}"))
             continue
-        if any(place_map.is_of(place_id, seen.descriptor) for place_id in here.get(readable(frame.name), ())):
+        if any(place_map.is_of(place_id, seen.descriptor.coarse) for place_id in here.get((readable(frame.name),), ())):
             already_here += 1
             continue
         if seen.worth and seen.worth.lacks:
