@@ -19,42 +19,33 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-import yaml
 from hostile_pictures import DATA, camera_of
 from run_sets import made_by
 
-from edgevpr.config import load_config
 from edgevpr.evaluate import metrics
 from edgevpr.evaluate.dataset import Dataset, load_dataset
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.opencv import cv2
-from edgevpr.frames.source import open_source
 from edgevpr.helpers.figures import figure
 from edgevpr.helpers.progress import progress
 from edgevpr.helpers.tables import markdown
-from edgevpr.places.index import bytes_per_place, load_index
-from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.shrink import chosen
-from edgevpr.power.boards import load_board
-from edgevpr.runtime.recognise.judge import AcceptRule
-from edgevpr.runtime.recognise.mapping import build_map
-from edgevpr.runtime.recognise.opening import meter_of
-from edgevpr.runtime.recognise.recogniser import Recogniser
+from edgevpr.runtime.preflight.networks import card_text
 from edgevpr.salience.detector import Detector, open_detector
 from edgevpr.salience.gate import Gate, Thresholds, worth_of
 from edgevpr.salience.maps import maps_of, scores_of
 from edgevpr.salience.memorability import Memorability, open_memorability
-from edgevpr.techniques import create
 from edgevpr.techniques.networks.session import file_sha256
 from edgevpr.training import export_matchability
-from edgevpr.training.labels import label_site
-from edgevpr.training.matchability import KINDS, Site, crops_of, fit, leave_one_out
+from edgevpr.training.labels import label_site, walk_over
+from edgevpr.training.matchability import compared, fit, site_of
 from edgevpr.types import Frame, Place, Salience
 
 RESULTS = Path(__file__).resolve().parent / "results"
 TECHNIQUES = ("hog", "cohog", "calc", "netvlad")
 FULL = Thresholds(0.5, 0.6, 0.4)
-CRITERIA = {
+GATES = {
+    "none": Thresholds(),
     "all three": FULL,
     "memorability": Thresholds(memorability=FULL.memorability),
     "staticity": Thresholds(staticity=FULL.staticity),
@@ -62,7 +53,6 @@ CRITERIA = {
 }
 SHARES = (0.5, 0.25, 0.1)
 _SEED = 1
-_NO_RULE = AcceptRule(min_score=1.0, min_margin=1.0, neighbour_m=0.0)
 # Weights that are no part of edgevpr, for the staticity.
 DETECTOR = Path(os.environ.get("EDGEVPR_DETECTOR") or DATA.parent / "models" / "yolox_nano" / "model.onnx")
 _DYNAMIC = {
@@ -76,7 +66,7 @@ _DYNAMIC = {
 class GateRow:
     """One technique on one set under one gate. `auc` is that of the thesis's count (a query that is discarded is a true
     negative), `recall_strict` counts it as missed. `true_discarded` of the queries were matched rightly without the
-    gate, `false_discarded` wrongly. `places` is the share of the references that the gate keeps, gaps bounded."""
+    gate, `false_discarded` wrongly. `places` is the share of the references that pass the gate."""
 
     set: str
     technique: str
@@ -136,10 +126,8 @@ def fit_each(folders: list[Path], models: Path) -> dict[str, dict[str, float | N
     sites = []
     for folder in folders:
         labelled = label_site(folder, camera_of(folder.name) == "nadir", _SEED, progress)
-        crops = np.stack([crops_of(read_image(each.path)) for each in labelled])
-        sites.append(Site(folder.name, crops, np.array([each.found for each in labelled], np.float32)))
-    unseen = {kind: leave_one_out(kind, sites, _SEED) for kind in progress(KINDS, len(KINDS), "fitting")}
-    kind = max(unseen, key=lambda each: unseen[each].mean)
+        sites.append(site_of(folder.name, labelled))
+    kind, unseen = compared(sites, _SEED)
     for site in sites:
         network = fit(kind, [other for other in sites if other is not site], _SEED)
         file = models / f"without_{site.name}.onnx"
@@ -150,30 +138,15 @@ def fit_each(folders: list[Path], models: Path) -> dict[str, dict[str, float | N
 
 def ask(name: str, dataset: Dataset) -> Asked:
     """Map the references and ask all queries."""
-    looks_down = camera_of(dataset.ref_dir.parent.name) == "nadir"
-    technique = create(name, {"camera": "nadir"} if name == "cohog" and looks_down else {})
-    meter = meter_of(load_config(None), load_board("this"))
+    site = dataset.ref_dir.parent.name
     slots, scores, right, ignored = [], [], [], []
-    with tempfile.TemporaryDirectory(prefix="edgevpr-salience-") as temporary:
-        path, source = Path(temporary) / "m.gpkg", open_source(str(dataset.ref_dir), live=False)
-        with PlaceMap.create(path, technique.spec) as place_map:
-            build_map((source.read(0) for _ in range(source.total)), technique, place_map, meter)
-        with PlaceMap.open(path) as place_map:
-            index = load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
-            walk = Recogniser(
-                technique=technique,
-                place_map=place_map,
-                index=index,
-                rule=_NO_RULE,
-                meter=meter,
-                candidates=technique.candidates,
-            )
-            for query in progress(dataset.queries, len(dataset.queries), f"{dataset.ref_dir.parent.name}, {name}"):
-                ranking = walk.step(Frame(image=read_image(query.path), name=query.path.name, t_mono_s=0.0)).ranking
-                slots.append(np.empty(0, int) if ranking is None else ranking.slots)
-                scores.append(np.empty(0) if ranking is None else ranking.scores)
-                right.append(np.array([each in query.right for each in dataset.references]))
-                ignored.append(np.array([each in query.ignored for each in dataset.references]))
+    with walk_over(list_images(dataset.ref_dir), name, camera_of(site) == "nadir") as walk:
+        for query in progress(dataset.queries, len(dataset.queries), f"{site}, {name}"):
+            ranking = walk.step(Frame(image=read_image(query.path), name=query.path.name, t_mono_s=0.0)).ranking
+            slots.append(np.empty(0, int) if ranking is None else ranking.slots)
+            scores.append(np.empty(0) if ranking is None else ranking.scores)
+            right.append(np.array([each in query.right for each in dataset.references]))
+            ignored.append(np.array([each in query.ignored for each in dataset.references]))
     return Asked(slots, scores, right, ignored)
 
 
@@ -193,7 +166,7 @@ def gated(
     """Yield the rows of a technique on a set: without a gate, with all criteria, and with each alone. All references
     stay, as in the thesis."""
     score, found = answers(asked, np.ones(len(asked.right[0]), bool))
-    for gate, thresholds in {"none": Thresholds(), **CRITERIA}.items():
+    for gate, thresholds in GATES.items():
         passes = np.array([worth_of(each, thresholds).reason is None for each in seen])
         precision, recall = metrics.precision_recall(score[passes], found[passes])
         yield GateRow(
@@ -276,12 +249,11 @@ def _salience(path: Path, memorability: Memorability, detector: Detector | None)
 
 
 def _kept(places: list[Path], seen: dict[Path, Salience]) -> dict[str, np.ndarray]:
-    """Return which references each gate keeps, with one of every twenty at least."""
-    kept = {"none": np.ones(len(places), bool)}
-    for gate, thresholds in CRITERIA.items():
-        passes = np.array([worth_of(seen[path], thresholds).reason is None for path in places])
-        kept[gate] = passes | (np.arange(len(places)) % 21 == 20)
-    return kept
+    """Return which references pass each gate."""
+    return {
+        gate: np.array([worth_of(seen[path], thresholds).reason is None for path in places])
+        for gate, thresholds in GATES.items()
+    }
 
 
 def _place(number: int, salience: Salience) -> Place:
@@ -303,7 +275,7 @@ def _detector(models: Path) -> Detector | None:
         "outputs": {"boxes": ["output"]},
         "detector": {"family": "yolox", "min_score": 0.3, "dynamic": _DYNAMIC},
     }  # fmt: skip
-    (models / "yolox.yaml").write_text(yaml.safe_dump(card))
+    (models / "yolox.yaml").write_text(card_text(card))
     return open_detector("yolox")
 
 

@@ -63,6 +63,15 @@ class Salience:
     entropy: float | None
     is_low: bool = False
 
+    @property
+    def scores(self) -> dict[str, float | None]:
+        """Return the three scores by their names."""
+        return {"memorability": self.memorability, "staticity": self.staticity, "entropy": self.entropy}
+
+    def rounded(self) -> dict[str, float | None]:
+        """Return the scores as they are written for people and programs: four digits."""
+        return {name: score if score is None else round(score, 4) for name, score in self.scores.items()}
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Place:

@@ -25,10 +25,10 @@ def salience(args: Namespace) -> int:
     from edgevpr.frames.images import read_image
     from edgevpr.helpers.files import require_folder, write_whole
     from edgevpr.runtime.recognise.opening import gate_of
-    from edgevpr.salience.picture import panels, png
+    from edgevpr.salience.picture import panels, png, said
 
-    said = {"salience.use": True, "salience.network": args.network, "salience.detector": args.detector}
-    gate = gate_of(config_of(args, args.config, **said).salience)
+    asked = {"salience.use": True, "salience.network": args.network, "salience.detector": args.detector}
+    gate = gate_of(config_of(args, args.config, **asked).salience)
     out = Path(args.out) if args.out else None
     if out:
         if out.suffix.lower() != ".png":
@@ -42,9 +42,8 @@ def salience(args: Namespace) -> int:
             {"image": args.image, **asdict(worth.salience), "kept": worth.reason is None, "reason": worth.reason}
         )
     else:
-        for name, score in asdict(worth.salience).items():
-            if name != "is_low":
-                print(f"{name:<13} {'off' if score is None else f'{score:.2f}'}")
+        for name, score in worth.salience.scores.items():
+            print(f"{name:<13} {said(score)}")
         print(worth.reason or "worth remembering")
     if out:
         drawn = png(panels(image, maps, worth.salience))

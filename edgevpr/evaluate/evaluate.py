@@ -2,6 +2,7 @@
 
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,12 +16,13 @@ from edgevpr.evaluate import metrics
 from edgevpr.evaluate.dataset import Dataset
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.source import Source, open_source
-from edgevpr.places.index import bytes_per_place, load_index
+from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Ranking
 from edgevpr.places.sequence import length_of, search_of
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import pack_ah, parse_pack, queries_ah, rail_ah, stage_energy_j
+from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.mapping import build_map
 from edgevpr.runtime.recognise.opening import meter_of
@@ -111,32 +113,38 @@ def evaluate(
     technique = create(technique_name, parameters)
     config = load_config(None)
     meter = meter_of(config, load_board("this"))
-    with tempfile.TemporaryDirectory(prefix="edgevpr-eval-") as folder:
-        map_path = Path(folder) / "references.gpkg"
-        source = open_source(str(dataset.ref_dir), live=False)
-        with PlaceMap.create(map_path, technique.spec) as place_map:
-            frames = progress(_frames(source), source.total, f"{technique_name}: references")
-            build_map(frames, technique, place_map, meter)
-        with PlaceMap.open(map_path) as place_map:
-            length = length_of(technique.spec, sequence)
-            index = load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
-            rule = accept_rule(technique, config.match, length)
+    source = open_source(str(dataset.ref_dir), live=False)
+    frames = progress(_frames(source), source.total, f"{technique_name}: references")
+    with mapped(frames, technique, meter) as (place_map, index):
+        length = length_of(technique.spec, sequence)
+        rule = accept_rule(technique, config.match, length)
 
-            def walk(length: int) -> Recogniser:
-                return Recogniser(
-                    technique=technique,
-                    place_map=place_map,
-                    index=index,
-                    rule=rule,
-                    meter=meter,
-                    candidates=candidates,
-                    search=search_of(length),
-                )
+        def walk(length: int) -> Recogniser:
+            return Recogniser(
+                technique=technique,
+                place_map=place_map,
+                index=index,
+                rule=rule,
+                meter=meter,
+                candidates=candidates,
+                search=search_of(length),
+            )
 
-            # The first query pays for lazy imports, tables and a cold disk, so one that is not counted goes first.
-            _asked(walk(1), dataset.queries[0].path)
-            answers = list(_answers(walk(length), dataset, progress))
+        # The first query pays for lazy imports, tables and a cold disk, so one that is not counted goes first.
+        _asked(walk(1), dataset.queries[0].path)
+        answers = list(_answers(walk(length), dataset, progress))
     return replace(_summary(technique, len(dataset.references), answers), sequence=length)
+
+
+@contextmanager
+def mapped(frames: Iterable[Frame], technique: Technique, meter: QueryMeter) -> Iterator[tuple[PlaceMap, PlaceIndex]]:
+    """Map frames in a temporary folder; give the map, open for reading, and an index with all its places."""
+    with tempfile.TemporaryDirectory(prefix="edgevpr-eval-") as folder:
+        path = Path(folder) / "references.gpkg"
+        with PlaceMap.create(path, technique.spec) as place_map:
+            build_map(frames, technique, place_map, meter)
+        with PlaceMap.open(path) as place_map:
+            yield place_map, load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
 
 
 def compare(results: Iterable[TechniqueResult]) -> list[TechniqueResult]:

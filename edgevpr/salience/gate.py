@@ -120,7 +120,7 @@ def worth_of(salience: Salience, thresholds: Thresholds, usual: float = 1.0) -> 
         "staticity": thresholds.staticity,
         "entropy": min(thresholds.entropy, usual),
     }
-    known = {name: getattr(salience, name) for name in least}
+    known = salience.scores
     short = {name: least[name] - score for name, score in known.items() if least[name] > 0 and score is not None}
     worst = max(short, key=short.get, default=None)
     if worst is None or short[worst] <= 0:

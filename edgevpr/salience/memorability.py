@@ -1,8 +1,8 @@
 """Memorability: how well the parts of a frame can be remembered, by a network with a card (thesis 3.2.1).
 
 The picture is cut into 5x5 crops that do not overlap. The network says of each how memorable it is, 0..1; between the
-middles of the crops the map is interpolated. edgevpr's own network, `matchability`, says how likely such a part is to
-be found again (see `training.matchability`).
+middles of the crops the map is interpolated. `edgevpr train matchability` makes a network that says how likely such a
+part is to be found again.
 """
 
 from typing import Any
@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from edgevpr.errors import ModelError
-from edgevpr.techniques.networks.card import Card, load_card
+from edgevpr.techniques.networks.card import Card, InputRule, load_card
 from edgevpr.techniques.networks.prepare import prepare
 from edgevpr.techniques.networks.session import open_session, run_outputs
 
@@ -32,11 +32,7 @@ class Memorability:
         Raises ModelError for numbers that are not finite, or are outside 0..1.
         """
         rule, name = self.card.input, self.card.outputs.memorability
-        rows = np.array_split(np.arange(image.shape[0]), CROPS)
-        columns = np.array_split(np.arange(image.shape[1]), CROPS)
-        crops = np.concatenate(
-            [prepare(image[y[0] : y[-1] + 1, x[0] : x[-1] + 1], rule) for y in rows for x in columns]
-        )
+        crops = prepared_crops(image, rule)
         batches = [crops] if self._takes_many else np.split(crops, len(crops))
         said = [run_outputs(self.card, self._session, [name], batch)[0] for batch in batches]
         if any(part.size != len(batch) for part, batch in zip(said, batches, strict=True)):
@@ -45,6 +41,13 @@ class Memorability:
         if values.min() < 0 or values.max() > 1:
             raise ModelError(f"{self.card.path}: `{name}` is {values.max():g} for a picture: it must be from 0 to 1.")
         return values.reshape(CROPS, CROPS)
+
+
+def prepared_crops(image: np.ndarray, rule: InputRule) -> np.ndarray:
+    """Cut uint8 (H, W[, 3]), 5 pixels a side at least, into its crops, row by row, each prepared for a network: float32
+    (25, C, height, width), or (25, height, width, C) for NHWC."""
+    rows, columns = (np.array_split(np.arange(side), CROPS) for side in image.shape[:2])
+    return np.concatenate([prepare(image[y[0] : y[-1] + 1, x[0] : x[-1] + 1], rule) for y in rows for x in columns])
 
 
 def as_map(matrix: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:

@@ -21,9 +21,9 @@ def panels(image: np.ndarray, maps: Maps, salience: Salience) -> np.ndarray:
     ground = cv2.resize(colour, (_WIDTH_PX, height), interpolation=cv2.INTER_AREA)
     drawn = [
         _captioned(ground, "picture"),
-        _captioned(_over(ground, maps.memorability, 1.0), f"memorability {_said(salience.memorability)}"),
-        _captioned(_covered(ground, maps.is_static), f"staticity {_said(salience.staticity)}"),
-        _captioned(_over(ground, maps.entropy, _MOST_ENTROPY), f"entropy {_said(salience.entropy)}"),
+        _captioned(_over(ground, maps.memorability, 1.0), f"memorability {said(salience.memorability)}"),
+        _captioned(_covered(ground, maps.is_static), f"staticity {said(salience.staticity)}"),
+        _captioned(_over(ground, maps.entropy, _MOST_ENTROPY), f"entropy {said(salience.entropy)}"),
     ]
     framed = [cv2.copyMakeBorder(each, *(_GAP_PX,) * 4, cv2.BORDER_CONSTANT, value=(255,) * 3) for each in drawn]
     return np.vstack([np.hstack(framed[:2]), np.hstack(framed[2:])])
@@ -57,5 +57,6 @@ def _captioned(panel: np.ndarray, text: str) -> np.ndarray:
     return drawn
 
 
-def _said(score: float | None) -> str:
+def said(score: float | None) -> str:
+    """Return a score in words: two digits, or that it is off."""
     return "off" if score is None else f"{score:.2f}"

@@ -63,6 +63,11 @@ def write_onnx(encoder: Encoder, path: Path) -> None:
         ],
         weights,
     )
+    save(graph, path)
+
+
+def save(graph: onnx.GraphProto, path: Path) -> None:
+    """Check a graph and write it as an ONNX file that every onnxruntime since 1.17 reads."""
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", _OPSET)], producer_name="edgevpr")
     model.ir_version = 8  # a version that onnxruntime 1.17 reads
     onnx.checker.check_model(model, full_check=True)
@@ -84,12 +89,17 @@ def require_equal(encoder: Encoder, path: Path, inputs: np.ndarray) -> float:
             wanted = [value.numpy() for value in encoder(torch.from_numpy(image))]
         for got, want in zip(session.run(["descriptor", "features"], {"image": image}), wanted, strict=True):
             largest = max(largest, float(np.abs(got - want).max() / max(1.0, np.abs(want).max())))
+    require_small(largest, path, "run the command again with --resume")
+    return largest
+
+
+def require_small(largest: float, path: Path, then: str) -> None:
+    """Raise EdgevprError, with what to do `then`, if a file differs from PyTorch by more than 1e-4."""
     if not largest <= LARGEST_DIFFERENCE:
         raise EdgevprError(
             f"{path} gives other values than PyTorch (they differ by {largest:.2g}): install another version of onnx "
-            "or torch and run the command again with --resume."
+            f"or torch and {then}."
         )
-    return largest
 
 
 def write_card(path: Path, model: Path, title: str, source: str) -> None:

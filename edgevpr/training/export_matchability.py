@@ -1,6 +1,6 @@
 """Export of a network of matchability as ONNX, written node by node: the same for every PyTorch."""
 
-import json
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +9,11 @@ import torch
 from onnx import TensorProto, helper, numpy_helper
 from torch import nn
 
-from edgevpr.errors import EdgevprError
+from edgevpr.runtime.preflight.networks import card_text
 from edgevpr.techniques.networks.session import file_sha256
-from edgevpr.training.matchability import FLOOR, HEIGHT, SCALES, UNEVEN_SCALES, WIDTH, Small, Statistics
+from edgevpr.training.export import require_small, save
+from edgevpr.training.matchability import FLOOR, HEIGHT, INPUT, SCALES, UNEVEN_SCALES, WIDTH, Small, Statistics
 
-LARGEST_DIFFERENCE = 1e-4
-_OPSET = 13
 _LAST = 2**31
 
 
@@ -47,20 +46,14 @@ def write_onnx(network: nn.Module, path: Path) -> None:
     graph = _Graph()
     logit = _statistics(graph, network) if isinstance(network, Statistics) else _small(graph, network)
     graph.nodes.append(helper.make_node("Sigmoid", [logit], ["memorability"]))
-    model = helper.make_model(
-        helper.make_graph(
-            graph.nodes,
-            "matchability",
-            [helper.make_tensor_value_info("crops", TensorProto.FLOAT, ["n", 1, HEIGHT, WIDTH])],
-            [helper.make_tensor_value_info("memorability", TensorProto.FLOAT, ["n", 1])],
-            graph.weights,
-        ),
-        opset_imports=[helper.make_opsetid("", _OPSET)],
-        producer_name="edgevpr",
+    whole = helper.make_graph(
+        graph.nodes,
+        "matchability",
+        [helper.make_tensor_value_info("crops", TensorProto.FLOAT, ["n", 1, HEIGHT, WIDTH])],
+        [helper.make_tensor_value_info("memorability", TensorProto.FLOAT, ["n", 1])],
+        graph.weights,
     )
-    model.ir_version = 8  # a version that onnxruntime 1.17 reads
-    onnx.checker.check_model(model, full_check=True)
-    path.write_bytes(model.SerializeToString())
+    save(whole, path)
 
 
 def require_equal(network: nn.Module, path: Path, crops: np.ndarray) -> float:
@@ -72,27 +65,22 @@ def require_equal(network: nn.Module, path: Path, crops: np.ndarray) -> float:
     (got,) = session.run(["memorability"], {"crops": crops})
     with torch.no_grad():
         largest = float(np.abs(got - network(torch.from_numpy(crops)).numpy()).max())
-    if not largest <= LARGEST_DIFFERENCE:
-        raise EdgevprError(
-            f"{path} gives other values than PyTorch (they differ by {largest:.2g}): install another version of onnx "
-            "or torch and run the command again."
-        )
+    require_small(largest, path, "run the command again")
     return largest
 
 
 def write_card(path: Path, model: Path, title: str, source: str) -> None:
     """Write the card of a network of matchability, `model`, to `path` beside it."""
-    path.write_text(
-        f"title: {json.dumps(title)}\n"
-        f"file: {json.dumps(model.name)}\n"
-        f"sha256: {json.dumps(file_sha256(model))}\n"
-        "licence: MIT\n"
-        f"source: {json.dumps(source)}\n"
-        f"input: {{layout: NCHW, height: {HEIGHT}, width: {WIDTH}, colour: grey, equalise: false, resize: area, "
-        f"scale: {1 / 255!r}, mean: [0.0]}}\n"
-        "outputs: {memorability: memorability}\n",
-        encoding="utf-8",
-    )
+    values = {
+        "title": title,
+        "file": model.name,
+        "sha256": file_sha256(model),
+        "licence": "MIT",
+        "source": source,
+        "input": {key: value for key, value in asdict(INPUT).items() if value is not None},
+        "outputs": {"memorability": "memorability"},
+    }
+    path.write_text(card_text(values), encoding="utf-8")
 
 
 def _small(graph: _Graph, network: Small) -> str:

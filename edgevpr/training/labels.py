@@ -5,7 +5,6 @@ the right answer is the place itself. Its neighbours are left out, since they sh
 queries with a ground truth, these are asked as they are.
 """
 
-import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,13 +14,11 @@ import numpy as np
 
 from edgevpr.config import load_config
 from edgevpr.evaluate.dataset import load_dataset
+from edgevpr.evaluate.evaluate import mapped
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.opencv import cv2
-from edgevpr.places.index import bytes_per_place, load_index
-from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.recognise.judge import AcceptRule
-from edgevpr.runtime.recognise.mapping import build_map
+from edgevpr.runtime.recognise.judge import ACCEPT_NOTHING
 from edgevpr.runtime.recognise.opening import meter_of
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.techniques import create
@@ -31,7 +28,6 @@ TECHNIQUES = ("hog", "calc", "cohog")
 TURNS = ("cohog",)  # techniques that know a picture under every heading, where the camera looks down
 CHANGES = 3  # of each place
 _NEIGHBOURS = 3  # before and after a place, in the order of the frames
-_RULE = AcceptRule(min_score=0.0, min_margin=0.0, neighbour_m=0.0)
 Progress = Callable[[Iterable, int, str], Iterable]
 
 
@@ -58,13 +54,13 @@ def label_site(folder: Path, looks_down: bool, seed: int, progress: Progress) ->
     queries = load_dataset(folder / "query", folder / "ref", truth).queries if truth.is_file() else []
     for name in TECHNIQUES:
         turns = looks_down and name in TURNS
-        with _walk(places, name, {"camera": "nadir"} if turns else {}) as walk:
+        with walk_over(places, name, looks_down) as walk:
             for slot, path in progress(list(enumerate(places)), len(places), f"{folder.name}, {name}: places"):
                 near = set(range(slot - _NEIGHBOURS, slot + _NEIGHBOURS + 1)) - {slot}
+                picture = read_image(path)
                 for change in range(CHANGES):
-                    rng = np.random.default_rng((seed, slot, change))
-                    picture = changed(read_image(path), rng, turns)
-                    said.setdefault(path, []).append(_answer(walk, picture, {slot}, near))
+                    later = changed(picture, np.random.default_rng((seed, slot, change)), turns)
+                    said.setdefault(path, []).append(_answer(walk, later, {slot}, near))
             numbers = {path.name: slot for slot, path in enumerate(places)}
             for query in progress(queries, len(queries), f"{folder.name}, {name}: queries"):
                 right, ignored = ({numbers[each] for each in names} for names in (query.right, query.ignored))
@@ -89,24 +85,19 @@ def changed(picture: np.ndarray, rng: np.random.Generator, turns: bool) -> np.nd
 
 
 @contextmanager
-def _walk(places: list[Path], name: str, settings: dict[str, str]) -> Iterator[Recogniser]:
-    """Map the places with a technique, and yield what recognises in that map."""
-    technique, config = create(name, settings), load_config(None)
-    meter = meter_of(config, load_board("this"))
-    with tempfile.TemporaryDirectory(prefix="edgevpr-labels-") as folder:
-        path = Path(folder) / "m.gpkg"
-        with PlaceMap.create(path, technique.spec) as place_map:
-            build_map(map(_frame, places), technique, place_map, meter)
-        with PlaceMap.open(path) as place_map:
-            index = load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
-            yield Recogniser(
-                technique=technique,
-                place_map=place_map,
-                index=index,
-                rule=_RULE,
-                meter=meter,
-                candidates=technique.candidates,
-            )
+def walk_over(places: Iterable[Path], name: str, looks_down: bool) -> Iterator[Recogniser]:
+    """Map images with a technique, and give what recognises in that map, as it flies, and accepts nothing."""
+    technique = create(name, {"camera": "nadir"} if looks_down and name in TURNS else {})
+    meter = meter_of(load_config(None), load_board("this"))
+    with mapped(map(_frame, places), technique, meter) as (place_map, index):
+        yield Recogniser(
+            technique=technique,
+            place_map=place_map,
+            index=index,
+            rule=ACCEPT_NOTHING,
+            meter=meter,
+            candidates=technique.candidates,
+        )
 
 
 def _frame(path: Path) -> Frame:

@@ -15,10 +15,23 @@ from torch import nn
 from torch.nn import functional
 
 from edgevpr.evaluate.metrics import roc_auc
-from edgevpr.frames.opencv import cv2
+from edgevpr.frames.images import read_image
+from edgevpr.helpers.progress import progress
+from edgevpr.salience.memorability import prepared_crops
+from edgevpr.techniques.networks.card import InputRule
+from edgevpr.training.labels import Labelled
 
 HEIGHT, WIDTH = 48, 64  # of a crop
-CROPS = 5  # a side
+INPUT = InputRule(
+    layout="NCHW",
+    height=HEIGHT,
+    width=WIDTH,
+    colour="grey",
+    equalise=False,
+    resize="area",
+    scale=1 / 255,
+    mean=[0.0],
+)
 _BATCH = 16
 SCALES, UNEVEN_SCALES = 4, 2
 FLOOR = 1e-4  # of what a logarithm is taken
@@ -84,14 +97,10 @@ class Site:
     found: np.ndarray
 
 
-def crops_of(picture: np.ndarray) -> np.ndarray:
-    """Cut a uint8 picture into its crops as in flight: float32 (25, 1, 48, 64) in 0..1."""
-    grey = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
-    rows = np.array_split(np.arange(grey.shape[0]), CROPS)
-    columns = np.array_split(np.arange(grey.shape[1]), CROPS)
-    parts = [grey[y[0] : y[-1] + 1, x[0] : x[-1] + 1] for y in rows for x in columns]
-    sized = [cv2.resize(part, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA) for part in parts]
-    return np.stack(sized)[:, None].astype(np.float32) / 255
+def site_of(name: str, labelled: Sequence[Labelled]) -> Site:
+    """Read the labelled frames of a site, and cut them into crops as in flight."""
+    crops = np.stack([prepared_crops(read_image(each.path), INPUT) for each in labelled])
+    return Site(name, crops, np.array([each.found for each in labelled], np.float32))
 
 
 def fit(kind: str, sites: Sequence[Site], seed: int) -> nn.Module:
@@ -143,3 +152,9 @@ def leave_one_out(kind: str, sites: Sequence[Site], seed: int) -> Unseen:
         network = fit(kind, [other for other in sites if other is not site], seed)
         judged[site.name] = roc_auc(scores(network, site), site.found > np.median(site.found))
     return Unseen(judged)
+
+
+def compared(sites: Sequence[Site], seed: int) -> tuple[str, dict[str, Unseen]]:
+    """Judge every kind on sites that it has not seen; return the better one, and what each does."""
+    unseen = {kind: leave_one_out(kind, sites, seed) for kind in progress(KINDS, len(KINDS), "fitting")}
+    return max(unseen, key=lambda kind: unseen[kind].mean), unseen

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from edgevpr.errors import EdgevprError, UsageError
-from edgevpr.frames.images import list_images, read_image
+from edgevpr.frames.images import list_images
 from edgevpr.helpers.files import require_folder
 from edgevpr.helpers.progress import progress
 from edgevpr.training.job import require_packages
@@ -55,19 +55,11 @@ def train_matchability(folders: Sequence[str], looks_down: Sequence[str], out: P
     require_packages()
 
     from edgevpr.training import export_matchability as export
-    from edgevpr.training.matchability import KINDS, Site, crops_of, fit, leave_one_out
+    from edgevpr.training.matchability import compared, fit, site_of
 
     labels = {folder.name: label_site(folder, down, seed, progress) for folder, down in sets}
-    sites = [
-        Site(
-            name,
-            np.stack([crops_of(read_image(each.path)) for each in labelled]),
-            np.array([each.found for each in labelled], np.float32),
-        )
-        for name, labelled in labels.items()
-    ]
-    unseen = {kind: leave_one_out(kind, sites, seed) for kind in progress(KINDS, len(KINDS), "fitting")}
-    kind = max(unseen, key=lambda each: unseen[each].mean)
+    sites = [site_of(name, labelled) for name, labelled in labels.items()]
+    kind, unseen = compared(sites, seed)
     network = fit(kind, sites, seed)
     export.write_onnx(network, out)
     try:

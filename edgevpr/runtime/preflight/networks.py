@@ -107,23 +107,19 @@ def verify_here(card: Card, threads: int = 1, learned: bool = True) -> Verified:
     outputs = [output for output in ("descriptor", "features") if getattr(card.outputs, output)]
     backbones = {output: backbone_of(card, output, threads) for output in outputs}
     shapes = {output: backbone.shape for output, backbone in backbones.items()}
-    runs = [backbones[output].run for output in outputs]
-    if card.head is None and card.outputs.descriptor:
-        runs = runs[:1]
-    elif runs:
-        runs = runs[-1:]
+    runs = {output: backbone.run for output, backbone in backbones.items()}
     if card.outputs.boxes:
-        runs.append(detector_of(card, threads).is_static)
-        shapes["boxes"] = _FRAME
+        runs["boxes"], shapes["boxes"] = detector_of(card, threads).is_static, _FRAME
     if card.outputs.memorability:
-        runs.append(memorability_of(card, threads).matrix)
-        shapes["memorability"] = (CROPS, CROPS)
+        runs["memorability"], shapes["memorability"] = memorability_of(card, threads).matrix, (CROPS, CROPS)
+    if card.head is not None:
+        runs.pop("descriptor", None)  # the head makes its own, of the feature map
+    run = next(iter(runs.values()))
     times_s = []
     for _ in range(_ROUNDS):
         frame = rng.integers(0, 256, _FRAME, np.uint8)
         start_s = time.perf_counter()
-        for run in runs:
-            run(frame)
+        run(frame)
         times_s.append(time.perf_counter() - start_s)
     return Verified(
         name=card.name,

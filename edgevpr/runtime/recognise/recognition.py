@@ -7,7 +7,7 @@ from edgevpr.contract import Descriptor
 from edgevpr.places.retrieve import Ranking
 from edgevpr.runtime.recognise.hints import Hints
 from edgevpr.salience.gate import Worth
-from edgevpr.types import Candidate, FixReport, Frame, Position, QueryCost, Salience, Steps, Vehicle
+from edgevpr.types import Candidate, FixReport, Frame, Position, QueryCost, Steps, Vehicle
 
 _OF_THE_BEST = ("place", "reference_image", "score", "position", "shift_cells", "covariance_cells2", "rotation_deg")
 
@@ -68,17 +68,12 @@ def fields_of(event: Recognition) -> dict[str, Any]:
     return {
         "query": event.frame.name,
         **_best(event.best),
-        **({"salience": _salience(event.worth.salience)} if event.worth else {}),
+        **({"salience": event.worth.salience.rounded()} if event.worth else {}),
         "accepted": event.accepted,
         "reason": event.reason,
         "accuracy_m": event.accuracy_m,
         "costs": {key: value and float(f"{value:.6g}") for key, value in asdict(event.cost).items()},
     }
-
-
-def _salience(salience: Salience) -> dict[str, float | None]:
-    scores = {"memorability": salience.memorability, "staticity": salience.staticity, "entropy": salience.entropy}
-    return {name: score if score is None else round(score, 4) for name, score in scores.items()}
 
 
 def _best(candidate: Candidate | None) -> dict[str, Any]:
