@@ -2,9 +2,9 @@
 
 python benchmarks/bench_salience.py [--sets A,B]
 
-Needs the extra `train`. For every set the network of matchability is fitted to all other sets, so that no figure comes
-from a network that has seen its site. Writes salience.json, salience.md and salience_budget.png into
-benchmarks/results/.
+Needs the extra `train`, and for the staticity a detector (see `detectors`). For every set the network of matchability
+is fitted to all other sites, so that no figure comes from a network that has seen its site. Writes salience.json,
+salience.md and salience_budget.png into benchmarks/results/.
 """
 
 import os
@@ -18,7 +18,9 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import detectors
 import numpy as np
+from bench_scan import medians_s
 from hostile_pictures import DATA, camera_of
 from run_sets import made_by
 
@@ -30,12 +32,10 @@ from edgevpr.helpers.figures import figure
 from edgevpr.helpers.progress import progress
 from edgevpr.helpers.tables import markdown
 from edgevpr.places.shrink import chosen
-from edgevpr.runtime.preflight.networks import card_text
 from edgevpr.salience.detector import Detector, open_detector
 from edgevpr.salience.gate import Gate, Thresholds, worth_of
 from edgevpr.salience.maps import maps_of, scores_of
 from edgevpr.salience.memorability import Memorability, open_memorability
-from edgevpr.techniques.networks.session import file_sha256
 from edgevpr.training import export_matchability
 from edgevpr.training.labels import label_site, walk_over
 from edgevpr.training.matchability import compared, fit, site_of
@@ -52,14 +52,11 @@ GATES = {
     "entropy": Thresholds(entropy=FULL.entropy),
 }
 SHARES = (0.5, 0.25, 0.1)
+# Sets of which no network learns: of five places, and of 64x32 pixels.
+NOT_LEARNT = ("grief_michigan_monthly", "grief_stromovka_monthly", "nordland_tiny")
+SAME_SITE = {"grief_stromovka_monthly": "grief_stromovka_seasons"}
 _SEED = 1
-# Weights that are no part of edgevpr, for the staticity.
-DETECTOR = Path(os.environ.get("EDGEVPR_DETECTOR") or DATA.parent / "models" / "yolox_nano" / "model.onnx")
-_DYNAMIC = {
-    "person": 0, "bicycle": 1, "car": 2, "motorcycle": 3, "aeroplane": 4, "bus": 5, "train": 6, "truck": 7, "boat": 8,
-    "bird": 14, "cat": 15, "dog": 16, "horse": 17, "sheep": 18, "cow": 19, "elephant": 20, "bear": 21, "zebra": 22,
-    "giraffe": 23, "backpack": 24, "umbrella": 25,
-}  # fmt: skip
+DETECTOR = "yolox_nano"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,48 +89,76 @@ class Asked:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--sets", metavar="A,B", help="(default: all but those of five places, and of 64x32 pixels)")
+    parser.add_argument("--sets", metavar="A,B", help="(default: all)")
     args = parser.parse_args()
-    left_out = ("grief_michigan_monthly", "grief_stromovka_monthly", "nordland_tiny")
     names = args.sets.split(",") if args.sets else None
     folders = [path.parent for path in sorted(DATA.glob("*/ground_truth.csv"))]
-    folders = [each for each in folders if (each.name in names if names else each.name not in left_out)]
+    folders = [each for each in folders if not names or each.name in names]
     with tempfile.TemporaryDirectory(prefix="edgevpr-salience-") as temporary:
         os.environ["EDGEVPR_MODELS"] = temporary
-        judged = fit_each(folders, Path(temporary))
-        detector = _detector(Path(temporary))
+        judged = fit_each([each.name for each in folders], Path(temporary))
+        there = [name for name in detectors.NAMES if detectors.is_there(name)]
+        for name in there:
+            detectors.write_card(name, Path(temporary))
+        detector = open_detector(DETECTOR) if DETECTOR in there else None
+        speed = speeds(f"without_{folders[0].name}", there)
         rows, budget, light = [], [], []
         for folder in folders:
             memorability = open_memorability(f"without_{folder.name}")
             dataset = load_dataset(folder / "query", folder / "ref", folder / "ground_truth.csv")
             queries = [each.path for each in dataset.queries]
             places = list_images(folder / "ref")
-            seen = {path: _salience(path, memorability, detector) for path in [*queries, *places]}
+            every = progress([*queries, *places], len(queries) + len(places), f"{folder.name}: salience")
+            seen = {path: _salience(path, memorability, detector) for path in every}
             light += [{"set": folder.name, **row} for row in kept_in_bad_light(places)]
             for technique in TECHNIQUES:
                 asked = ask(technique, dataset)
                 rows += gated(folder.name, technique, asked, [seen[path] for path in queries], _kept(places, seen))
                 budget += shrunk(folder.name, technique, asked, [seen[path] for path in places])
-    measured = {**made_by(), "unseen": judged, "gate": [asdict(row) for row in rows], "light": light, "budget": budget}
+    measured = {
+        **made_by(),
+        "speed": speed,
+        "unseen": judged,
+        "gate": [asdict(row) for row in rows],
+        "light": light,
+        "budget": budget,
+    }
     (RESULTS / "salience.json").write_text(json.dumps(measured, indent=1) + "\n")
     (RESULTS / "salience.md").write_text(page(measured))
     plot(budget, RESULTS / "salience_budget.png")
 
 
-def fit_each(folders: list[Path], models: Path) -> dict[str, dict[str, float | None]]:
-    """For every set fit the better kind of network to all others, and write it with its card; return how both kinds do
-    on a set that they have not seen."""
+def fit_each(names: list[str], models: Path) -> dict[str, dict[str, dict[str, float | None]]]:
+    """For every set fit the better kind of network to all other sites, and write it with its card; return how both
+    kinds do on sites that they have not seen, on generated changes and on real queries."""
     sites = []
-    for folder in folders:
-        labelled = label_site(folder, camera_of(folder.name) == "nadir", _SEED, progress)
-        sites.append(site_of(folder.name, labelled))
+    for folder in sorted(path.parent for path in DATA.glob("*/ground_truth.csv")):
+        if folder.name not in NOT_LEARNT:
+            labelled = label_site(folder, camera_of(folder.name) == "nadir", _SEED, progress)
+            sites.append(site_of(folder.name, labelled))
     kind, unseen = compared(sites, _SEED)
-    for site in sites:
-        network = fit(kind, [other for other in sites if other is not site], _SEED)
-        file = models / f"without_{site.name}.onnx"
+    for name in names:
+        network = fit(kind, [site for site in sites if site.name not in (name, SAME_SITE.get(name))], _SEED)
+        file = models / f"without_{name}.onnx"
         export_matchability.write_onnx(network, file)
-        export_matchability.write_card(file.with_suffix(".yaml"), file, f"without {site.name}", "a benchmark")
-    return {each: found.by_site for each, found in unseen.items()}
+        export_matchability.write_card(file.with_suffix(".yaml"), file, f"without {name}", "a benchmark")
+    return {each: asdict(found) for each, found in unseen.items()}
+
+
+def speeds(network: str, there: list[str]) -> dict[str, float]:
+    """Return the median milliseconds of a frame of 640x480, one thread."""
+    picture = cv2.resize(read_image(list_images(DATA / "aerial_swindale" / "ref")[0]), (640, 480))
+    memorability = open_memorability(network)
+    found = {name: open_detector(name) for name in there}
+    ways = {
+        "entropy": lambda: scores_of(maps_of(picture, None, None)),
+        "entropy and memorability": lambda: scores_of(maps_of(picture, memorability, None)),
+    }
+    for name, each in found.items():
+        ways[f"all three, {name}"] = lambda each=each: scores_of(
+            maps_of(picture, memorability, each.is_static(picture))
+        )
+    return {name: 1e3 * t_s for name, t_s in medians_s(ways, 30).items()}
 
 
 def ask(name: str, dataset: Dataset) -> Asked:
@@ -260,34 +285,15 @@ def _place(number: int, salience: Salience) -> Place:
     return Place(place_id=number + 1, source_image=str(number), salience=salience)
 
 
-def _detector(models: Path) -> Detector | None:
-    if not DETECTOR.is_file():
-        return None
-    (models / "yolox.onnx").symlink_to(DETECTOR.resolve())
-    card = {
-        "title": "YOLOX-nano",
-        "file": "yolox.onnx",
-        "sha256": file_sha256(DETECTOR),
-        "licence": "see the file's own",
-        "source": "Ge et al. 2021, as an ONNX file",
-        "input": {"layout": "NCHW", "height": 416, "width": 416, "colour": "bgr", "equalise": False, "resize": "linear",
-                  "scale": 1.0, "mean": [0.0], "pad": 114},
-        "outputs": {"boxes": ["output"]},
-        "detector": {"family": "yolox", "min_score": 0.3, "dynamic": _DYNAMIC},
-    }  # fmt: skip
-    (models / "yolox.yaml").write_text(card_text(card))
-    return open_detector("yolox")
-
-
 def page(measured: dict) -> str:
     """Return the page for people."""
     rows = measured["gate"]
-    unseen = measured["unseen"]
-    sets = list(next(iter(unseen.values())))
     told = [
-        [kind, *("-" if by_site[name] is None else f"{by_site[name]:.2f}" for name in sets)]
-        for kind, by_site in unseen.items()
+        [kind, of, *("-" if each is None else f"{each:.2f}" for each in by_site.values())]
+        for kind, unseen in measured["unseen"].items()
+        for of, by_site in unseen.items()
     ]
+    sets = list(next(iter(measured["unseen"].values()))["generated"])
     compared = [
         [
             row["set"],
@@ -309,8 +315,10 @@ def page(measured: dict) -> str:
         f"Made by `python benchmarks/bench_salience.py`, {measured['date']}, commit {measured['commit']}, "
         f"{measured['machine']['cpu']}. Thresholds: memorability {FULL.memorability:g}, staticity {FULL.staticity:g}, "
         f"entropy {FULL.entropy:g}.",
+        "## Time of a frame of 640x480, one thread",
+        markdown(["what", "ms"], [[name, f"{t_ms:.1f}"] for name, t_ms in measured["speed"].items()]),
         "## Is it told which frames are found again? On sites that were left out; .50 is chance",
-        markdown(["network", *sets], told),
+        markdown(["network", "pictures", *sets], told),
         "## With and without the gate",
         "recall@1 and AUC are those of the thesis's count: a query that is discarded is a true negative. *strict*: it "
         "is a miss.\n*right* and *wrong* count the discarded queries that would have been matched so. *places*: the "

@@ -30,7 +30,8 @@ def add(commands: Any) -> None:
         "--form", default="float", metavar="A,B", help=f"of vectors, one row each: {', '.join(FORMS)} (float)"
     )
     all_exact = "places compared in full (default: all, exact)"
-    add_keys(parser, "source.camera", "match.candidates", "match.sequence", candidates=all_exact)
+    parser.add_argument("--config", metavar="FILE", help="YAML; its sections `salience` and `match` count")
+    add_keys(parser, "source.camera", "match.candidates", "match.sequence", "salience.use", candidates=all_exact)
     parser.add_argument("--techniques", default="hog,cohog", metavar="A,B", help="names, comma-separated")
     add_parameters(parser, "a parameter of a technique", "TECHNIQUE.KEY=VALUE")
     parser.add_argument("--plot", metavar="FILE", help="draw the precision-recall curves (.png, .pdf, .svg)")
@@ -47,11 +48,13 @@ def evaluate(args: Namespace) -> int:
     from edgevpr.helpers.figures import require_picture
     from edgevpr.helpers.progress import progress
     from edgevpr.runtime.preflight.offers import offers, usable
+    from edgevpr.runtime.recognise.opening import gate_of
 
     wanted = [name.strip() for name in args.techniques.split(",") if name.strip()]
     if not wanted:
         raise UsageError(f"--techniques names none: use some of {', '.join(techniques.names())}.")
-    match = config_of(args).match
+    config = config_of(args, args.config)
+    match, gate = config.match, gate_of(config.salience)
     if args.plot:
         require_picture(Path(args.plot))
     forms = [form.strip() for form in args.form.split(",")]
@@ -64,7 +67,7 @@ def evaluate(args: Namespace) -> int:
         raise next(iter(errors.values()))
     dataset = load_dataset(args.query, args.ref, args.ground_truth)
     results = [
-        evaluation.evaluate(offer.name, dataset, offer.settings, match.candidates, progress, match.sequence)
+        evaluation.evaluate(offer.name, dataset, offer.settings, match.candidates, progress, match.sequence, gate)
         for offer, _ in tried
         if offer.label not in errors
     ]

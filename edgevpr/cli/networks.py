@@ -115,11 +115,12 @@ def train_matchability(args: Namespace) -> int:
     if args.json:
         print_json(asdict(result))
         return 0
-    for kind, by_site in result.unseen.items():
-        judged = ", ".join(f"{site} {value:.2f}" for site, value in by_site.items() if value is not None)
-        print(f"{kind}, each site left out once (.50 is chance): {judged}")
-    print("; ".join(f"{count} frames {name}" for name, count in result.classes.items()))
-    print(f"{result.model} and {result.card}: {result.kind}, fitted to {result.frames} frames of all sites")
+    for kind, unseen in result.unseen.items():
+        for of, by_site in unseen.items():
+            judged = ", ".join(f"{site} {value:.2f}" for site, value in by_site.items() if value is not None)
+            print(f"{kind}, {of} pictures, each site left out once (.50 is chance): {judged or 'none to judge by'}")
+    print("; ".join(f"{count} pictures {name}" for name, count in result.classes.items()))
+    print(f"{result.model} and {result.card}: {result.kind}, fitted to {result.frames} pictures of all sites")
     return 0
 
 

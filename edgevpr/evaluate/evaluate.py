@@ -28,6 +28,7 @@ from edgevpr.runtime.recognise.mapping import build_map
 from edgevpr.runtime.recognise.opening import meter_of
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
+from edgevpr.salience.gate import Gate, NoGate
 from edgevpr.techniques import create, labelled
 from edgevpr.techniques.networks.card import weights_of
 from edgevpr.types import NO_COST, Frame, StageCost
@@ -48,7 +49,7 @@ class TechniqueResult:
     from the highest threshold down. `accepted` queries would have moved the aircraft by the technique's own rule,
     `accepted_wrong` of them to a wrong place. `roc_auc` is None if all best matches are right, or none is. `pcu`
     depends on all techniques that are compared: `compare` fills it in, with the `t_encode_max_s` it used. `sequence` is
-    the number of queries that were matched together.
+    the number of queries that were matched together. `discarded` queries were not memorable, and count as missed.
     """
 
     technique: str
@@ -77,6 +78,7 @@ class TechniqueResult:
     ah_assumes: str
     precision_recall: tuple[tuple[float, float], ...]
     sequence: int = 1
+    discarded: int = 0
     weights: str | None = None
     pcu: float | None = None
     t_encode_max_s: float | None = None
@@ -86,12 +88,14 @@ class TechniqueResult:
 class _Answer:
     """The answer to one query. `score` is that of its best match, `first_right` the rank of the first right one, both
     among the references that count. `accepted`: the flight would have accepted the match; `accepted_wrong`: it would
-    have, and the match is wrong. `encoding` and `matching` are the costs of the two stages."""
+    have, and the match is wrong. `discarded`: the query was not memorable. `encoding` and `matching` are the costs of
+    the two stages."""
 
     score: float
     first_right: float
     accepted: bool
     accepted_wrong: bool
+    discarded: bool
     encoding: StageCost
     matching: StageCost
 
@@ -103,14 +107,16 @@ def evaluate(
     candidates: int | None = None,
     progress: Progress = lambda items, total, label: items,
     sequence: int | None = None,
+    gate: Gate | NoGate | None = None,
 ) -> TechniqueResult:
     """Map the references, ask every query, and score the answers. `candidates` places are compared in full (None: all).
-    `sequence` queries are matched together, in the order of their names (None: the technique's own number).
+    `sequence` queries are matched together, in the order of their names (None: the technique's own number). `gate`
+    discards queries; the map has all references, as in the thesis (3.3).
 
     Raises UsageError for an unknown technique or parameter, ImageError for an image that cannot be used, MapError if
     the temporary map cannot be written, and ModelError for a network that cannot be used or a query that fails.
     """
-    technique = create(technique_name, parameters)
+    technique, gate = create(technique_name, parameters), gate or NoGate()
     config = load_config(None)
     meter = meter_of(config, load_board("this"))
     source = open_source(str(dataset.ref_dir), live=False)
@@ -128,10 +134,12 @@ def evaluate(
                 meter=meter,
                 candidates=candidates,
                 search=search_of(length),
+                gate=gate,
             )
 
         # The first query pays for lazy imports, tables and a cold disk, so one that is not counted goes first.
         _asked(walk(1), dataset.queries[0].path)
+        gate.forget()
         answers = list(_answers(walk(length), dataset, progress))
     return replace(_summary(technique, len(dataset.references), answers), sequence=length)
 
@@ -183,7 +191,8 @@ def _answers(recogniser: Recogniser, dataset: Dataset, progress: Progress) -> It
         event = _asked(recogniser, path)
         if path.name not in scored:
             continue
-        query, ranking = scored[path.name], event.ranking or _NOTHING_FOUND
+        discarded = event.worth is not None and event.worth.reason is not None
+        query, ranking = scored[path.name], (None if discarded else event.ranking) or _NOTHING_FOUND
         # Slots of the index follow the order of mapping, which is that of the references' names.
         right = np.array([name in query.right for name in dataset.references])
         ignored = np.array([name in query.ignored for name in dataset.references])
@@ -193,6 +202,7 @@ def _answers(recogniser: Recogniser, dataset: Dataset, progress: Progress) -> It
             first_right=metrics.first_right(ranking.slots[at], right),
             accepted=event.accepted,
             accepted_wrong=event.accepted and not (right | ignored)[ranking.slots[0]],
+            discarded=discarded,
             encoding=event.steps.encoding,
             matching=event.steps.match,
         )
@@ -236,6 +246,7 @@ def _summary(technique: Technique, references: int, answers: list[_Answer]) -> T
         roc_auc=metrics.roc_auc(scores, ranks == 0),
         accepted=sum(answer.accepted for answer in answers),
         accepted_wrong=sum(answer.accepted_wrong for answer in answers),
+        discarded=sum(answer.discarded for answer in answers),
         t_encode_s=t_encode_s,
         t_match_s=t_match_s,
         t_match_per_ref_s=t_match_s / references,

@@ -47,6 +47,7 @@ def results_text(results: Sequence[TechniqueResult]) -> str:
         "",
         f"{first.queries} queries scored against {first.references} references; times are means over the queries.",
         *_sequences(results),
+        *_discarded(results),
         "accepted: queries that would have moved the aircraft, by the technique's own rule.",
         f"PCU: P@100%R x log10(t_e,max / t_e + 9) with t_e,max = {first.t_encode_max_s * 1000:.1f} ms.",
         f"mAh: {first.ah_assumes}.",
@@ -58,3 +59,15 @@ def results_text(results: Sequence[TechniqueResult]) -> str:
 def _sequences(results: Sequence[TechniqueResult]) -> list[str]:
     lengths = [f"{result.technique} of {result.sequence}" for result in results if result.sequence > 1]
     return [f"Matched in sequences of queries: {', '.join(lengths)}."] if lengths else []
+
+
+def _discarded(results: Sequence[TechniqueResult]) -> list[str]:
+    lines = []
+    for each in results:
+        if each.discarded:
+            of_the_others = each.recall_at_1 * each.queries / max(each.queries - each.discarded, 1)
+            lines.append(
+                f"{each.technique}: {each.discarded} queries were not memorable, and count as missed; recall@1 of the "
+                f"others is {of_the_others:.3f}."
+            )
+    return lines

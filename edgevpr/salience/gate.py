@@ -54,6 +54,9 @@ class NoGate:
     def look(self, image: np.ndarray) -> None:
         """Say nothing of a frame."""
 
+    def forget(self) -> None:
+        """Remember nothing."""
+
 
 class Gate:
     """Looks at one frame of a flight after the other.
@@ -91,6 +94,11 @@ class Gate:
         scores = scores_of(maps)
         self._entropies.append(scores.entropy)
         return worth_of(scores, self._thresholds, usual_entropy(self._entropies))
+
+    def forget(self) -> None:
+        """Begin another flight: nothing is known of its light, nor of what moves there."""
+        self._entropies.clear()
+        self._until_detection, self._static = 0, None
 
     def _is_static(self, image: np.ndarray) -> np.ndarray | None:
         if self._detector is None:

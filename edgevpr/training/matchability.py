@@ -15,11 +15,10 @@ from torch import nn
 from torch.nn import functional
 
 from edgevpr.evaluate.metrics import roc_auc
-from edgevpr.frames.images import read_image
 from edgevpr.helpers.progress import progress
 from edgevpr.salience.memorability import prepared_crops
 from edgevpr.techniques.networks.card import InputRule
-from edgevpr.training.labels import Labelled
+from edgevpr.training.labels import MATCHED, Labelled
 
 HEIGHT, WIDTH = 48, 64  # of a crop
 INPUT = InputRule(
@@ -89,18 +88,25 @@ KINDS = {"statistics": Statistics, "convolutions": Small}
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """The frames of one site: `crops` float32 (N, 25, 1, 48, 64) in 0..1, and what share of the questions about each
-    was answered rightly, float32 (N,)."""
+    """The pictures of one site: `crops` uint8 (N, 25, 1, 48, 64), the share of the techniques that knew each rightly,
+    float32 (N,), and which are real queries, not generated, bool (N,)."""
 
     name: str
     crops: np.ndarray
     found: np.ndarray
+    is_real: np.ndarray
+
+    def inputs(self, frame: int) -> torch.Tensor:
+        """Return a picture's crops as the network takes them, float32 (25, 1, 48, 64) in 0..1."""
+        return torch.from_numpy(self.crops[frame]) / 255
 
 
 def site_of(name: str, labelled: Sequence[Labelled]) -> Site:
-    """Read the labelled frames of a site, and cut them into crops as in flight."""
-    crops = np.stack([prepared_crops(read_image(each.path), INPUT) for each in labelled])
-    return Site(name, crops, np.array([each.found for each in labelled], np.float32))
+    """Read the labelled pictures of a site, and cut them into crops as in flight."""
+    pictures = (each.question.picture() for each in labelled)
+    crops = np.stack([(255 * prepared_crops(picture, INPUT)).round().astype(np.uint8) for picture in pictures])
+    found = np.array([each.found for each in labelled], np.float32)
+    return Site(name, crops, found, np.array([each.question.change is None for each in labelled]))
 
 
 def fit(kind: str, sites: Sequence[Site], seed: int) -> nn.Module:
@@ -113,7 +119,7 @@ def fit(kind: str, sites: Sequence[Site], seed: int) -> nn.Module:
     for _ in range(KINDS[kind].STEPS):
         chosen = [sites[number] for number in rng.integers(len(sites), size=_BATCH)]
         frames = [rng.integers(len(site.found)) for site in chosen]
-        crops = torch.from_numpy(np.stack([site.crops[frame] for site, frame in zip(chosen, frames, strict=True)]))
+        crops = torch.stack([site.inputs(frame) for site, frame in zip(chosen, frames, strict=True)])
         found = torch.tensor([float(site.found[frame]) for site, frame in zip(chosen, frames, strict=True)])
         said = network(crops.flatten(0, 1)).reshape(_BATCH, -1).mean(1)
         loss = functional.binary_cross_entropy(said, found)
@@ -127,31 +133,35 @@ def fit(kind: str, sites: Sequence[Site], seed: int) -> nn.Module:
 def scores(network: nn.Module, site: Site) -> np.ndarray:
     """Return the score of every frame of a site, float32 (N,) in 0..1."""
     with torch.no_grad():
-        said = [network(torch.from_numpy(crops)).mean().item() for crops in site.crops]
+        said = [network(site.inputs(frame)).mean().item() for frame in range(len(site.found))]
     return np.array(said, np.float32)
 
 
 @dataclass(frozen=True, slots=True)
 class Unseen:
-    """Result of a kind on sites that it has not seen: by site, the share of pairs of frames (one found by more than
-    half of the site's frames, one by fewer) that it puts in the right order, .5 being chance (None: all frames alike);
-    and the mean over the sites."""
+    """Result of a kind on sites that it has not seen. By site, the share of pairs of pictures, one known by most
+    techniques and one not, that it puts in the right order: of `generated` changes, and of `real` queries. .5 is
+    chance; None: all pictures are alike, or there are none."""
 
-    by_site: dict[str, float | None]
+    generated: dict[str, float | None]
+    real: dict[str, float | None]
 
     @property
     def mean(self) -> float:
-        known = [value for value in self.by_site.values() if value is not None]
+        """The mean over the sites, of generated changes."""
+        known = [value for value in self.generated.values() if value is not None]
         return float(np.mean(known)) if known else 0.5
 
 
 def leave_one_out(kind: str, sites: Sequence[Site], seed: int) -> Unseen:
     """Fit a kind as often as there are sites, each time without one of them, and judge it on that one."""
-    judged = {}
+    unseen = Unseen({}, {})
     for site in sites:
         network = fit(kind, [other for other in sites if other is not site], seed)
-        judged[site.name] = roc_auc(scores(network, site), site.found > np.median(site.found))
-    return Unseen(judged)
+        said, matched = scores(network, site), site.found >= MATCHED
+        for judged, of in ((unseen.generated, ~site.is_real), (unseen.real, site.is_real)):
+            judged[site.name] = roc_auc(said[of], matched[of])
+    return unseen
 
 
 def compared(sites: Sequence[Site], seed: int) -> tuple[str, dict[str, Unseen]]:

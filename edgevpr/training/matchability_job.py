@@ -1,7 +1,7 @@
 """The whole job of `edgevpr train matchability`: data sets in, labels, a checked ONNX file and its card out."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,23 +11,23 @@ from edgevpr.frames.images import list_images
 from edgevpr.helpers.files import require_folder
 from edgevpr.helpers.progress import progress
 from edgevpr.training.job import require_packages
-from edgevpr.training.labels import Labelled, label_site
+from edgevpr.training.labels import MATCHED, Labelled, label_site
 
 _FEWEST_SITES, _FEWEST_FRAMES = 3, 8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MatchabilityResult:
-    """Result of a training. `unseen` has, by kind of network and site, the area under the ROC curve on a site that was
-    left out (None: all its frames are alike); `kind` is the one that was better, and is written. `classes` counts the
-    frames that are good or confusing (they look like another place more than half of their site does), and matched or
-    mismatched (by most techniques)."""
+    """Result of a training. `unseen` has by kind of network, by sort of picture (`generated` changes and `real`
+    queries) and by site the area under the ROC curve on a site that was left out (None: all its pictures are alike);
+    `kind` is the one that was better, and is written. `classes` counts the pictures that are good or confusing (they
+    look like another place more than half of their site does), and matched or mismatched (by most techniques)."""
 
     model: str
     card: str
     kind: str
     frames: int
-    unseen: dict[str, dict[str, float | None]]
+    unseen: dict[str, dict[str, dict[str, float | None]]]
     classes: dict[str, int]
     largest_difference: float
 
@@ -63,14 +63,14 @@ def train_matchability(folders: Sequence[str], looks_down: Sequence[str], out: P
     network = fit(kind, sites, seed)
     export.write_onnx(network, out)
     try:
-        largest = export.require_equal(network, out, sites[0].crops[0])
+        largest = export.require_equal(network, out, sites[0].inputs(0).numpy())
     except EdgevprError:
         out.unlink()
         raise
     frames = sum(map(len, labels.values()))
     source = (
-        f"edgevpr train matchability --seed {seed}; {kind}; {frames} frames of {', '.join(labels)}; on a site left out "
-        f"{unseen[kind].mean:.2f} of pairs in the right order"
+        f"edgevpr train matchability --seed {seed}; {kind}; {frames} pictures of {', '.join(labels)}; on a site left "
+        f"out {unseen[kind].mean:.2f} of pairs of changed pictures in the right order"
     )
     export.write_card(card, out, "Matchability, trained by edgevpr", source)
     return MatchabilityResult(
@@ -78,7 +78,7 @@ def train_matchability(folders: Sequence[str], looks_down: Sequence[str], out: P
         card=str(card),
         kind=kind,
         frames=frames,
-        unseen={each: found.by_site for each, found in unseen.items()},
+        unseen={each: asdict(found) for each, found in unseen.items()},
         classes=_classes(labels),
         largest_difference=largest,
     )
@@ -91,5 +91,5 @@ def _classes(labels: dict[str, list[Labelled]]) -> dict[str, int]:
         usual = float(np.median([each.alike for each in labelled]))
         for each in labelled:
             like = "confusing" if each.alike > usual else "good"
-            counts[f"{like}, {'matched' if each.found >= 0.5 else 'mismatched'}"] += 1
+            counts[f"{like}, {'matched' if each.found >= MATCHED else 'mismatched'}"] += 1
     return counts

@@ -56,7 +56,7 @@ def test_a_picture_is_scored_and_drawn(networks, tmp_path, capsys):
     assert main(command) == 0
     said = capsys.readouterr().out
     assert "staticity     0.50" in said
-    assert "not memorable: memorability 0.24, 0.50 needed" in said
+    assert "not memorable: memorability 0.24, 0.30 needed" in said
     assert read_image(out).shape == (2 * (360 + 34 + 12), 2 * (480 + 12), 3)
     assert main([*command[:-2], "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
@@ -155,3 +155,19 @@ def test_a_map_shrinks_to_its_best_places(recording, tmp_path, capsys):
     assert 3e6 < by_size.stat().st_size <= 5e6
     assert main(["map", "shrink", str(place_map), str(tmp_path / "c.gpkg"), "--mb", "0.1"]) != 0
     assert "not one place" in capsys.readouterr().err
+
+
+def test_eval_counts_what_the_gate_discards_as_missed(recording, tmp_path, capsys):
+    names = [path.name for path in sorted(recording.iterdir())]
+    truth = tmp_path / "truth.csv"
+    truth.write_text("query_file,ref_files\n" + "".join(f"{name},{name}\n" for name in names[:40]))
+    command = ["eval", "--query", recording, "--ref", recording, "--ground-truth", truth, "--techniques", "hog,calc"]
+    command = [*map(str, command), "--salience", "--config", config(tmp_path)]
+    assert main([*command, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)["techniques"]
+    for each in found.values():
+        assert each["discarded"] == 25  # of forty queries those of one colour, whichever technique was asked before
+        assert each["recall_at_1"] == pytest.approx(15 / 40)
+    assert main(command) == 0
+    said = capsys.readouterr().out
+    assert "hog: 25 queries were not memorable, and count as missed; recall@1 of the others is 1.000." in said

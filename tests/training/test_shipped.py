@@ -8,6 +8,7 @@ import onnxruntime
 import pytest
 
 from edgevpr.resources import shipped
+from edgevpr.salience.memorability import memorability_of
 from edgevpr.techniques.heads.words import load_words
 from edgevpr.techniques.networks.card import load_card
 from edgevpr.techniques.networks.session import open_backbone
@@ -77,3 +78,22 @@ def test_the_words_of_the_defaults_are_there(kind, count):
 def test_all_of_it_fits_the_wheel():
     assert (MODELS / "calc.onnx").stat().st_size < 2_000_000
     assert sum(path.stat().st_size for path in MODELS.rglob("*") if path.is_file()) < 4_200_000
+
+
+def test_matchability_prefers_a_sharp_picture_to_the_same_one_spoilt():
+    card = load_card("matchability")
+    assert "edgevpr train matchability" in card.source
+    assert card.file_path.stat().st_size < 1_000_000
+    network = memorability_of(card)
+    sharp = cv2.GaussianBlur(np.random.default_rng(1).normal(0, 1, (480, 640)), (0, 0), 2)
+    sharp = np.clip(128 + 45 * sharp / sharp.std(), 0, 255).astype(np.uint8)
+    spoilt = {
+        "blur": cv2.GaussianBlur(sharp, (0, 0), 12),
+        "haze": (200 + 0.05 * (sharp.astype(float) - 128)).astype(np.uint8),
+        "dark": (sharp * 0.04).astype(np.uint8),
+        "nothing": np.full_like(sharp, 90),
+    }
+    worth = network.matrix(sharp).mean()
+    assert worth > 0.3
+    for name, picture in spoilt.items():
+        assert network.matrix(picture).mean() < 0.7 * worth, name

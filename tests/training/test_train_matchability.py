@@ -34,12 +34,22 @@ def silent(items, total, label):
 def test_a_place_is_found_again_unless_there_is_nothing_to_see(tmp_path, monkeypatch):
     monkeypatch.setattr(labels, "TECHNIQUES", ("cohog",))
     found = label_site(site(tmp_path / "a", 1, 12, empty=(0, 6)), False, 1, silent)
-    by_number = {int(each.path.stem): each for each in found}
-    assert sorted(by_number) == list(range(12))
-    seen = [each for number, each in by_number.items() if number not in (0, 6)]
-    assert np.mean([each.found for each in seen]) > 0.8
-    assert max(by_number[number].found for number in (0, 6)) < 0.5
-    assert np.mean([each.alike for each in seen]) < min(by_number[number].alike for number in (0, 6))
+    assert len(found) == 12 * labels.CHANGES
+    seen = [each for each in found if each.question.path.stem not in ("0", "6")]
+    empty = [each for each in found if each.question.path.stem in ("0", "6")]
+    assert np.mean([each.found for each in seen]) > 0.5
+    assert not any(each.found for each in empty)
+    assert np.mean([each.alike for each in seen]) < min(each.alike for each in empty)
+
+
+def test_a_label_is_of_the_changed_picture_and_the_network_sees_that_one(tmp_path, monkeypatch):
+    monkeypatch.setattr(labels, "TECHNIQUES", ("cohog",))
+    found = label_site(site(tmp_path / "a", 1), False, 1, silent)
+    pictures = [each.question.picture() for each in found[: labels.CHANGES]]
+    assert {each.question.path for each in found[: labels.CHANGES]} == {tmp_path / "a" / "ref" / "0.png"}
+    assert len({picture.tobytes() for picture in pictures}) == labels.CHANGES
+    known = np.array([each.found for each in found]).reshape(9, labels.CHANGES)
+    assert (known.max(axis=1) > known.min(axis=1)).any()  # one change of a place is recognised, another is not
 
 
 def test_queries_are_labelled_by_their_truth(tmp_path, monkeypatch):
@@ -49,7 +59,8 @@ def test_queries_are_labelled_by_their_truth(tmp_path, monkeypatch):
     cv2.imwrite(str(folder / "query" / "right.png"), ground(104))
     cv2.imwrite(str(folder / "query" / "wrong.png"), ground(107))
     (folder / "ground_truth.csv").write_text("query_file,ref_files\nright.png,4.png\nwrong.png,0.png\n")
-    found = {each.path.name: each.found for each in label_site(folder, False, 1, silent)}
+    asked = label_site(folder, False, 1, silent)
+    found = {each.question.path.name: each.found for each in asked if each.question.change is None}
     assert (found["right.png"], found["wrong.png"]) == (1.0, 0.0)
 
 
@@ -94,9 +105,10 @@ def test_the_command_writes_a_network_that_the_gate_can_use(tmp_path, monkeypatc
     out = tmp_path / "m.onnx"
     assert main(["train", "matchability", "--data", *folders, "--out", str(out), "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
-    assert result["frames"] == sum(result["classes"].values()) == 27
+    assert result["frames"] == sum(result["classes"].values()) == 27 * labels.CHANGES
     assert set(result["unseen"]) == set(matchability.KINDS)
-    assert set(result["unseen"]["statistics"]) == {"a", "b", "c"}
+    assert set(result["unseen"]["statistics"]["generated"]) == {"a", "b", "c"}
+    assert set(result["unseen"]["statistics"]["real"].values()) == {None}  # these sites have no queries
     assert result["largest_difference"] < 1e-4
     network = memorability_of(read_card(Path(result["card"])))
     assert network.matrix(ground(5)).mean() > network.matrix(np.full((96, 128), 90, np.uint8)).mean()

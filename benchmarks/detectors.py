@@ -1,0 +1,60 @@
+"""Cards of three object detectors, for tests and benchmarks. Their files are no part of edgevpr: they are looked for in
+$EDGEVPR_DETECTORS, by default ../shared/models beside the project.
+"""
+
+import os
+from pathlib import Path
+
+from edgevpr.runtime.preflight.networks import card_text
+from edgevpr.techniques.networks.session import file_sha256
+
+FILES = Path(os.environ.get("EDGEVPR_DETECTORS") or Path(__file__).resolve().parents[2] / "shared" / "models")
+NAMES = ("fastestdet", "nanodet_m_320", "yolox_nano")
+# Of the eighty classes of COCO those that move (thesis 3.2.2), with their numbers.
+_DYNAMIC = {
+    "person": 0, "bicycle": 1, "car": 2, "motorcycle": 3, "aeroplane": 4, "bus": 5, "train": 6, "truck": 7, "boat": 8,
+    "bird": 14, "cat": 15, "dog": 16, "horse": 17, "sheep": 18, "cow": 19, "elephant": 20, "bear": 21, "zebra": 22,
+    "giraffe": 23, "backpack": 24, "umbrella": 25,
+}  # fmt: skip
+_INPUT = {"layout": "NCHW", "colour": "bgr", "equalise": False, "resize": "linear", "mean": [0.0]}
+_SAID = {
+    "fastestdet": {
+        "input": {**_INPUT, "height": 352, "width": 352, "scale": 1 / 255},
+        "outputs": {"boxes": ["758"]},
+        # On views from the air it finds much below that which is not there.
+        "detector": {"family": "fastestdet", "min_score": 0.65, "dynamic": _DYNAMIC},
+    },
+    "nanodet_m_320": {
+        "input": {
+            **_INPUT, "height": 320, "width": 320, "scale": 1.0,
+            "mean": [103.53, 116.28, 123.675], "std": [57.375, 57.12, 58.395],
+        },
+        "outputs": {"boxes": [f"{of}_pred_stride_{stride}" for of in ("cls", "dis") for stride in (8, 16, 32)]},
+        "detector": {"family": "nanodet", "min_score": 0.4, "dynamic": _DYNAMIC},
+    },
+    "yolox_nano": {
+        "input": {**_INPUT, "height": 416, "width": 416, "scale": 1.0, "pad": 114},
+        "outputs": {"boxes": ["output"]},
+        "detector": {"family": "yolox", "min_score": 0.3, "dynamic": _DYNAMIC},
+    },
+}  # fmt: skip
+
+
+def is_there(name: str) -> bool:
+    """Tell whether the file of a detector is on this machine."""
+    return (FILES / name / "model.onnx").is_file()
+
+
+def write_card(name: str, folder: Path) -> None:
+    """Put a detector and its card into a folder of models."""
+    file = FILES / name / "model.onnx"
+    (folder / f"{name}.onnx").symlink_to(file.resolve())
+    card = {
+        "title": name,
+        "file": f"{name}.onnx",
+        "sha256": file_sha256(file),
+        "licence": "see the file's own",
+        "source": "an ONNX file beside the project",
+        **_SAID[name],
+    }
+    (folder / f"{name}.yaml").write_text(card_text(card))
