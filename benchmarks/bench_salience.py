@@ -43,7 +43,7 @@ from edgevpr.types import Frame, Place, Salience
 
 RESULTS = Path(__file__).resolve().parent / "results"
 TECHNIQUES = ("hog", "cohog", "calc", "netvlad")
-FULL = Thresholds(0.5, 0.6, 0.4)
+FULL = Thresholds(0.3, 0.6, 0.4)
 GATES = {
     "none": Thresholds(),
     "all three": FULL,

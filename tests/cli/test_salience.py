@@ -56,7 +56,7 @@ def test_a_picture_is_scored_and_drawn(networks, tmp_path, capsys):
     assert main(command) == 0
     said = capsys.readouterr().out
     assert "staticity     0.50" in said
-    assert "not memorable: memorability 0.24, 0.30 needed" in said
+    assert "not memorable: staticity 0.50, 0.60 needed" in said
     assert read_image(out).shape == (2 * (360 + 34 + 12), 2 * (480 + 12), 3)
     assert main([*command[:-2], "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
