@@ -50,7 +50,7 @@ class Question:
 
 @dataclass(frozen=True, slots=True)
 class Labelled:
-    """What became of a question: `found` is the share of the techniques that answered it rightly; `alike` is how much
+    """Answers to a question: `found` is the share of the techniques that answered it rightly; `alike` is how much
     the picture looks like the place elsewhere that it resembles most, as a share of how much it looks like its own, the
     mean over the techniques."""
 
