@@ -53,7 +53,8 @@ GATES = {
 }
 SHARES = (0.5, 0.25, 0.1)
 # Sets of which no network learns: of five places, and of 64x32 pixels.
-NOT_LEARNT = ("grief_michigan_monthly", "grief_stromovka_monthly", "nordland_tiny")
+FIVE_PLACES = ("grief_michigan_monthly", "grief_stromovka_monthly")
+NOT_LEARNT = (*FIVE_PLACES, "nordland_tiny")
 SAME_SITE = {"grief_stromovka_monthly": "grief_stromovka_seasons"}
 _SEED = 1
 DETECTOR = "yolox_nano"
@@ -62,7 +63,7 @@ DETECTOR = "yolox_nano"
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GateRow:
     """One technique on one set under one gate. `auc` is that of the thesis's count (a query that is discarded is a true
-    negative), `recall_strict` counts it as missed. `true_discarded` of the queries were matched rightly without the
+    negative), `recall_strict` counts it as missed. `true_discarded` of the `queries` were matched rightly without the
     gate, `false_discarded` wrongly. `places` is the share of the references that pass the gate."""
 
     set: str
@@ -71,6 +72,7 @@ class GateRow:
     recall: float
     auc: float
     recall_strict: float
+    queries: int
     true_discarded: int
     false_discarded: int
     places: float
@@ -109,12 +111,12 @@ def main() -> None:
             queries = [each.path for each in dataset.queries]
             places = list_images(folder / "ref")
             every = progress([*queries, *places], len(queries) + len(places), f"{folder.name}: salience")
-            seen = {path: _salience(path, memorability, detector) for path in every}
+            seen = {path: scores_by_gate(path, memorability, detector) for path in every}
             light += [{"set": folder.name, **row} for row in kept_in_bad_light(places)]
             for technique in TECHNIQUES:
                 asked = ask(technique, dataset)
                 rows += gated(folder.name, technique, asked, [seen[path] for path in queries], _kept(places, seen))
-                budget += shrunk(folder.name, technique, asked, [seen[path] for path in places])
+                budget += shrunk(folder.name, technique, asked, [seen[path]["all three"] for path in places])
     measured = {
         **made_by(),
         "speed": speed,
@@ -186,13 +188,13 @@ def answers(asked: Asked, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def gated(
-    name: str, technique: str, asked: Asked, seen: list[Salience], kept: dict[str, np.ndarray]
+    name: str, technique: str, asked: Asked, seen: list[dict[str, Salience]], kept: dict[str, np.ndarray]
 ) -> Iterable[GateRow]:
     """Yield the rows of a technique on a set: without a gate, with all criteria, and with each alone. All references
     stay, as in the thesis."""
     score, found = answers(asked, np.ones(len(asked.right[0]), bool))
     for gate, thresholds in GATES.items():
-        passes = np.array([worth_of(each, thresholds).reason is None for each in seen])
+        passes = np.array([worth_of(each[gate], thresholds).reason is None for each in seen])
         precision, recall = metrics.precision_recall(score[passes], found[passes])
         yield GateRow(
             set=name,
@@ -201,6 +203,7 @@ def gated(
             recall=float(found[passes].mean()) if passes.any() else 0.0,
             auc=float(metrics.auc(precision, recall)) if passes.any() else 0.0,
             recall_strict=float((found & passes).mean()),
+            queries=len(passes),
             true_discarded=int((found & ~passes).sum()),
             false_discarded=int((~found & ~passes).sum()),
             places=float(kept[gate].mean()),
@@ -268,15 +271,20 @@ def _entropy(picture: np.ndarray) -> float:
     return scores_of(maps_of(picture, None, None)).entropy
 
 
-def _salience(path: Path, memorability: Memorability, detector: Detector | None) -> Salience:
+def scores_by_gate(path: Path, memorability: Memorability, detector: Detector | None) -> dict[str, Salience]:
+    """Return the scores of a picture under each gate. A criterion alone knows nothing of what moves, but staticity."""
     picture = read_image(path)
-    return scores_of(maps_of(picture, memorability, None if detector is None else detector.is_static(picture)))
+    still = scores_of(maps_of(picture, memorability, None))
+    if detector is None:
+        return dict.fromkeys(GATES, still)
+    moving = scores_of(maps_of(picture, memorability, detector.is_static(picture)))
+    return {gate: moving if gate in ("all three", "staticity") else still for gate in GATES}
 
 
-def _kept(places: list[Path], seen: dict[Path, Salience]) -> dict[str, np.ndarray]:
+def _kept(places: list[Path], seen: dict[Path, dict[str, Salience]]) -> dict[str, np.ndarray]:
     """Return which references pass each gate."""
     return {
-        gate: np.array([worth_of(seen[path], thresholds).reason is None for path in places])
+        gate: np.array([worth_of(seen[path][gate], thresholds).reason is None for path in places])
         for gate, thresholds in GATES.items()
     }
 
@@ -294,7 +302,8 @@ def page(measured: dict) -> str:
         for of, by_site in unseen.items()
     ]
     sets = list(next(iter(measured["unseen"].values()))["generated"])
-    compared = [
+    discards = {(row["set"], row["technique"]) for row in rows if row["true_discarded"] or row["false_discarded"]}
+    found = [
         [
             row["set"],
             row["technique"],
@@ -302,10 +311,14 @@ def page(measured: dict) -> str:
             *(f"{row[key]:.2f}" for key in ("recall", "auc", "recall_strict")),
             str(row["true_discarded"]),
             str(row["false_discarded"]),
-            f"{row['places']:.0%}",
         ]
         for row in rows
+        if (row["set"], row["technique"]) in discards
     ]
+    all_sets = list(dict.fromkeys(row["set"] for row in rows))
+    unchanged = [name for name in all_sets if not any(each == name for each, _ in discards)]
+    shares = {(row["set"], row["gate"]): f"{row['places']:.0%}" for row in rows}
+    sizes = [[gate, *(shares[name, gate] for name in all_sets)] for gate in GATES if gate != "none"]
     light = [
         [row["set"], f"{row['threshold']:.2f}", row["light"], f"{row['kept']:.0%}", f"{row['kept_constant']:.0%}"]
         for row in measured["light"]
@@ -321,9 +334,12 @@ def page(measured: dict) -> str:
         markdown(["network", "pictures", *sets], told),
         "## With and without the gate",
         "recall@1 and AUC are those of the thesis's count: a query that is discarded is a true negative. *strict*: it "
-        "is a miss.\n*right* and *wrong* count the discarded queries that would have been matched so. *places*: the "
-        "share of the references\nthat the gate keeps.",
-        markdown(["set", "technique", "gate", "recall", "AUC", "strict", "right", "wrong", "places"], compared),
+        "is a miss.\n*right* and *wrong* count the discarded queries that would have been matched so. The map has all "
+        f"references. No query is discarded of\n{', '.join(unchanged) or 'any set'}: there all "
+        "figures are those without a gate.",
+        markdown(["set", "technique", "gate", "recall", "AUC", "strict", "right", "wrong"], found),
+        "The size of a map that is built through the gate, before its gaps are filled: share of the references kept",
+        markdown(["gate", *all_sets], sizes),
         "## Entropy in bad light: share of the references kept",
         markdown(["set", "threshold", "light", "follows the light", "constant"], light),
         "## A map that shrinks",
@@ -333,9 +349,9 @@ def page(measured: dict) -> str:
 
 
 def plot(budget: list[dict], path: Path) -> None:
-    """Draw recall of `cohog` and the largest gap against the share of places that is left."""
-    sets = list(dict.fromkeys(row["set"] for row in budget))
-    drawn = figure(3.0 * len(sets), 6.0)
+    """Draw recall of `cohog` and the largest gap against the share of places that is left, of sets of many places."""
+    sets = [name for name in dict.fromkeys(row["set"] for row in budget) if name not in FIVE_PLACES]
+    drawn = figure(2.2 * len(sets), 6.0)
     axes = drawn.subplots(2, len(sets), sharex=True, sharey="row", squeeze=False)
     for column, name in enumerate(sets):
         for way in dict.fromkeys(row["way"] for row in budget):

@@ -25,6 +25,8 @@ def salience(args: Namespace) -> int:
     from edgevpr.frames.images import read_image
     from edgevpr.helpers.files import require_folder, write_whole
     from edgevpr.runtime.recognise.opening import gate_of
+    from edgevpr.salience.gate import worth_of
+    from edgevpr.salience.maps import scores_of
     from edgevpr.salience.picture import panels, png, said
 
     asked = {"salience.use": True, "salience.network": args.network, "salience.detector": args.detector}
@@ -36,7 +38,7 @@ def salience(args: Namespace) -> int:
         require_folder(out)
     image = read_image(Path(args.image))
     maps = gate.maps(image)
-    worth = gate.worth(maps)
+    worth = worth_of(scores_of(maps), gate.thresholds)
     if args.json:
         print_json(
             {"image": args.image, **asdict(worth.salience), "kept": worth.reason is None, "reason": worth.reason}

@@ -3,7 +3,8 @@
 The threshold of entropy is meant for the light of day. In a night or a fog all frames have less, and the best of them
 are as good a choice as ever. So a frame lacks entropy only if it has less than the threshold *and* less than is usual
 in this light (the thesis's threshold is constant). What is usual is told by the upper half of the frames before: a
-long stretch of sky or water changes the other half, and is no change of light.
+long stretch of sky or water changes the other half, and is no change of light. Before so much is known, half of the
+threshold is enough.
 
 Where none of 20 frames passes, all thresholds are lowered (thesis 3.4.8).
 """
@@ -75,7 +76,7 @@ class Gate:
         detect_every: int = 1,
         footprint_m: float | None = None,
     ) -> None:
-        self._thresholds, self._memorability, self._detector = thresholds, memorability, detector
+        self.thresholds, self._memorability, self._detector = thresholds, memorability, detector
         self._detect_every, self._footprint_m = detect_every, footprint_m
         self._entropies: deque[float] = deque(maxlen=_REMEMBERED)
         self._until_detection = 0
@@ -93,7 +94,9 @@ class Gate:
         """Tell what the frame of these maps is worth."""
         scores = scores_of(maps)
         self._entropies.append(scores.entropy)
-        return worth_of(scores, self._thresholds, usual_entropy(self._entropies))
+        usual = usual_entropy(self._entropies)
+        # The first frames of a flight at night: their light is not known yet, and a picture of nothing has none at all.
+        return worth_of(scores, self.thresholds, self.thresholds.entropy / 2 if usual is None else usual)
 
     def forget(self) -> None:
         """Begin another flight: nothing is known of its light, nor of what moves there."""
@@ -110,12 +113,12 @@ class Gate:
         return self._static
 
 
-def usual_entropy(entropies: Iterable[float]) -> float:
-    """Return the least entropy that is usual among these frames: a tenth have less, where they are alike. Of fewer than
-    8 nothing is known, and anything is unusual."""
+def usual_entropy(entropies: Iterable[float]) -> float | None:
+    """Return the least entropy that is usual among these frames: a tenth have less, where they are alike. None: of
+    fewer than 8 nothing is known."""
     entropies = list(entropies)
     if len(entropies) < _TO_KNOW:
-        return 1.0
+        return None
     middle, high = np.percentile(entropies, (75, 90))
     return float(middle - _STEPS_BELOW * max(high - middle, _LEAST_STEP))
 

@@ -101,9 +101,17 @@ def test_in_bad_light_less_entropy_is_asked_for():
     by_day, at_night = Gate(Thresholds(entropy=0.4)), Gate(Thresholds(entropy=0.4))
     assert all(by_day.look(picture).reason is None for picture in day)
     passed = [at_night.look(picture).reason is None for picture in night]
-    assert not any(passed[:7])  # nothing is known of the light yet: the thesis's constant threshold
-    assert sum(passed[7:]) >= 28
+    assert sum(passed) >= 36
     assert at_night.look(np.full((120, 160), 3, np.uint8)).lacks == "entropy"
+
+
+def test_while_nothing_is_known_of_the_light_half_of_the_threshold_is_enough():
+    gate = Gate(Thresholds(entropy=0.4))
+    little = texture()
+    while not 0.2 < scores_of(maps_of(little, None, None)).entropy < 0.4:
+        little = (little * 0.8).astype(np.uint8)
+    assert [gate.look(little).reason for _ in range(4)] == [None] * 4
+    assert all(gate.look(np.full((120, 160), 3, np.uint8)).lacks == "entropy" for _ in range(3))
 
 
 def test_a_long_stretch_without_information_does_not_become_usual():
