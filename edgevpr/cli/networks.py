@@ -37,6 +37,11 @@ def _add_train(trainings: Any) -> None:
     words.add_argument("--out", metavar="DIR", help="folder to write to (default: your models folder)")
     words.add_argument("--seed", type=int, default=1, metavar="N", help="(1)")
     add_json(words)
+    ground = command(trainings, "ground", train_ground, "learn the words by which cohog names places, looking down")
+    _add_images(ground)
+    ground.add_argument("--out", required=True, metavar="FILE.npz", help="the file to make")
+    ground.add_argument("--seed", type=int, default=1, metavar="N", help="(1)")
+    add_json(ground)
     _add_matchability(trainings)
 
 
@@ -103,6 +108,22 @@ def train_words(args: Namespace) -> int:
         print(
             f"{result.file}: {args.count} words of {result.descriptors} descriptors in {result.pictures} images, mean "
             f"square distance {result.distance:.3f}"
+        )
+    return exit_code(unusable)
+
+
+def train_ground(args: Namespace) -> int:
+    """Learn the words of the ground, and print how well they fit."""
+    from edgevpr.training.ground import train_ground
+
+    unusable: list[ImageError] = []
+    result = train_ground(args.images, Path(args.out), args.seed, unusable)
+    if args.json:
+        print_json(asdict(result))
+    else:
+        print(
+            f"{result.file}: words of {result.regions} regions in {result.pictures} images, mean cosine of a region "
+            f"and its word {result.cosine:.3f}"
         )
     return exit_code(unusable)
 

@@ -21,6 +21,7 @@ from edgevpr.places.rows import Point, Unreadable
 from edgevpr.places.sqlite import sentences
 from edgevpr.types import Frame, Place, Salience
 
+_OTHERS = 0.05  # of the numbers of a coarse part
 _SAME_PICTURE = 0.01  # of the length of a coarse part: far more than rounding, far less than another picture
 
 
@@ -205,15 +206,16 @@ class PlaceMap:
         """Tell whether a place was made of the picture with this coarse part; False for a place that cannot be read.
 
         The last bits of a descriptor may differ from one run of a program to the next: sums depend on where an array
-        lies in memory.
+        lies in memory. Of numbers that stand for something, a few are then others.
         """
         try:
             (blob,) = rows.there(self._file.row(place_id, "coarse"))
             there = rows.part_of(blob, self.spec.coarse, None, "coarse part").astype(np.float32)
         except (Unreadable, PlaceError):
             return False
-        apart = np.linalg.norm(there - np.asarray(coarse, np.float32).reshape(there.shape))
-        return bool(apart <= _SAME_PICTURE * np.linalg.norm(there))
+        here = np.asarray(coarse, np.float32).reshape(there.shape)
+        near = np.linalg.norm(there - here) <= _SAME_PICTURE * np.linalg.norm(there)
+        return bool(near or np.mean(there != here) <= _OTHERS)
 
     def outlines(self) -> Iterator[tuple[int, float, float, float]]:
         """Yield (place_id, lat_deg, lon_deg, quality) of every place that can be read; NaN where it has no position."""

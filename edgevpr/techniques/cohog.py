@@ -6,8 +6,9 @@ the mean of these cosines (`matching: thesis`). Here, by default, each good bloc
 picture, and the score is the share of votes that agree (`matching: displacement`, see `displacement`). With a forward
 camera the score of the scan counts too.
 
-The blocks are the fine part: 8 bits per value, 31 KB per place, on disk. The coarse part is the same blocks averaged
-over a grid. Its 144 bytes per place stay in RAM (see `placecode`) and select the places that are compared in full.
+The blocks are the fine part: 8 bits per value, 31 KB per place, on disk. The coarse part stays in RAM and selects the
+places that are compared in full. Ahead it is the same blocks averaged over a grid, in 144 bytes (see `placecode`);
+looking down it is a hundred words, in 200 (see `placewords`).
 """
 
 from collections.abc import Sequence
@@ -18,7 +19,7 @@ import numpy as np
 
 from edgevpr.contract import Descriptor, FineMatch, PartSpec, Picture, TechniqueSpec
 from edgevpr.errors import UsageError
-from edgevpr.techniques import placecode
+from edgevpr.techniques import placecode, placewords
 from edgevpr.techniques.displacement import displacement
 from edgevpr.techniques.entropy import block_means, good_blocks
 from edgevpr.techniques.gradients import grey_square, levels, mask_square, normalised_blocks, oriented_cells
@@ -40,6 +41,8 @@ _ACCEPT = {"forward": (0.07, 0.035), "nadir": (0.08, 0.03), "thesis": (0.0, 0.02
 _MIN_QUALITY = {"shannon": 0.4, "filled_bins": 0.2}
 _CANDIDATES = {"forward": 42, "nadir": 50}
 _ROTATIONS = 24  # of a nadir query whose heading is unknown: 15 degrees apart
+_GLANCE = 4  # of so many regions one
+_WITHIN_QUARTER = _ROTATIONS // placewords.QUARTERS
 _HEADING_WITHIN_DEG = 1.5 * 360 / _ROTATIONS  # the expected rotation, and one on either side
 
 
@@ -71,6 +74,8 @@ class CoHog:
                 f"cohog cannot use w1={w1}, w2={w2}, bins={bins}: w1 must be a multiple of w2 (more than "
                 f"{placecode.SIDE} regions of at least 2 pixels, at most 4096 pixels), bins 2 to 64."
             )
+        if camera == "nadir" and bins != placewords.BINS:
+            raise UsageError(f"cohog looking down uses {placewords.BINS} bins, which its words are of, and not {bins}.")
         if gt > 1:
             raise UsageError(f"cohog: gt is {gt:g}; it is a share of the largest entropy, 0 to 1.")
         self._w1, self._w2, self._bins = w1, w2, bins
@@ -82,13 +87,13 @@ class CoHog:
         self.min_score, self.min_margin = _ACCEPT[camera if matching == "displacement" else matching]
         self.min_quality = _MIN_QUALITY[entropy]
         self.candidates = _CANDIDATES[camera]
-        self._asked, self._by_turn = None, {}
+        self._asked, self._by_turn, self._within = None, {}, {}
         self.spec = TechniqueSpec(
             name="cohog",
             parameters={"w1": w1, "w2": w2, "bins": bins, "gt": self._gt, "entropy": entropy, "camera": camera},
-            coarse=PartSpec((placecode.SIDE, placecode.SIDE, bins), "|u1"),
+            coarse=PartSpec((placewords.SIDE**2,), "<u2") if camera == "nadir" else _grid_spec(bins),
             fine=PartSpec((self._side**2, 4 * bins), "|u1"),
-            packed=PartSpec((placecode.SIDE**2 * bins // 8,), "|u1"),
+            packed=None if camera == "nadir" else PartSpec((placecode.SIDE**2 * bins // 8,), "|u1"),
             scan_counts=matching == "displacement" and camera == "forward",  # with a nadir camera it adds nothing
             heading_within_deg=_HEADING_WITHIN_DEG if camera == "nadir" else None,
         )
@@ -96,8 +101,9 @@ class CoHog:
     def encode(self, image: np.ndarray, mask: np.ndarray | None = None) -> Descriptor:
         """Encode uint8 (H, W[, 3]); a block that touches a pixel where `mask` bool (H, W) is False is never good.
 
-        Returns coarse uint8 (12, 12, bins), fine uint8 (blocks, 4 bins) and, for a query, regions float32
-        (blocks, 4 bins) and good bool (blocks,): the good ones are the rows of matrix A of 6.2.3.
+        Returns coarse uint8 (12, 12, bins), with a nadir camera uint16 (100,), fine uint8 (blocks, 4 bins) and, for a
+        query, regions float32 (blocks, 4 bins) and good bool (blocks,): the good ones are the rows of matrix A of
+        6.2.3.
         """
         if self._camera == "nadir":
             image, mask = _in_square(image, mask)
@@ -106,7 +112,10 @@ class CoHog:
         regions = blocks.reshape(self.spec.fine.shape)
         # The square root of each value in 8 bits: most values are small, and the root keeps more of their digits.
         stored = np.rint(255 * np.sqrt(regions)).astype(np.uint8)
-        coarse = np.rint(255 * placecode.grid(_middle(blocks, seen))).astype(np.uint8)
+        if self._camera == "nadir":
+            coarse = placewords.of_place(_patterns(regions), good.ravel(), self._side)
+        else:
+            coarse = np.rint(255 * placecode.grid(_middle(blocks, seen))).astype(np.uint8)
         quality = float(good.sum() / max(seen.sum(), 1))
         picture = Picture(grey if self._camera == "nadir" else None, allowed, seen)
         return Descriptor(
@@ -126,27 +135,33 @@ class CoHog:
     def pack(self, coarse: np.ndarray, mean: np.ndarray) -> np.ndarray:
         """Make the rows of the index, uint8 (N, B), of coarse uint8 (N, 12, 12, bins) and the map's mean
         (12, 12, bins)."""
-        return placecode.pack(coarse.astype(np.float32) / 255, mean / 255, locally=self._camera == "nadir")
+        return placecode.pack(coarse.astype(np.float32) / 255, mean / 255)
 
     def coarse_scores(
-        self, query: Descriptor, rows: np.ndarray, mean: np.ndarray, turned_deg: np.ndarray | None = None
+        self, query: Descriptor, rows: np.ndarray, mean: np.ndarray | None, turned_deg: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Compare the query with the place codes `rows`, uint8 (N, B), under shifts and, with a nadir camera,
-        rotations: all, or those within `spec.heading_within_deg` of `turned_deg` (N,). Returns scores float32 (N,) in
-        0..1 and, as float32 (N, 24), those of each rotation (None with a forward camera)."""
-        seen = query.picture.seen
-        blocks = _middle(query.regions.reshape(self._side, self._side, -1), seen)
-        turns = np.arange(_ROTATIONS if self._camera == "nadir" else 1)
-        grids, in_view = placecode.turned_grids(blocks, -360 * turns / _ROTATIONS, _middle(seen, seen))
-        asked = placecode.hypotheses(grids, in_view, mean / 255, locally=self._camera == "nadir")
+        """Compare the query with the place codes `rows`, uint8 (N, B), under shifts. With a nadir camera compare its
+        words with those of the places, uint16 (N, 100), under all rotations or those within `spec.heading_within_deg`
+        of `turned_deg` (N,). Returns scores float32 (N,) in 0..1 and, as float32 (N, 24), those of each rotation (None
+        with a forward camera)."""
         if self._camera == "forward":
-            return np.clip(placecode.scan_ahead(asked, rows)[:, 0], 0, 1), None
-        if turned_deg is None:
-            scores = placecode.scan(asked, rows)
-        else:
+            seen = query.picture.seen
+            blocks = _middle(query.regions.reshape(self._side, self._side, -1), seen)
+            asked = placecode.hypotheses(*placecode.seen_grid(blocks, _middle(seen, seen)), mean / 255)
+            return np.clip(placecode.scan_ahead(asked, rows), 0, 1), None
+        expected = None
+        if turned_deg is not None:
             steps = np.rint(turned_deg * (_ROTATIONS / 360)) % _ROTATIONS
-            scores = placecode.scan_near(asked, rows, np.nan_to_num(steps, nan=-1).astype(np.intp))
-        return np.clip(scores.max(axis=1), 0, 1), scores
+            expected = np.nan_to_num(steps, nan=-1).astype(np.intp)
+        asking = [self.good_patterns(query, turn) for turn in range(_WITHIN_QUARTER)]
+        scores = placewords.scan(placewords.of_query(asking, self._side), rows, expected)
+        return scores.max(axis=1), scores
+
+    def good_patterns(self, query: Descriptor, turn: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the slow patterns float32 (G, 20) of the good regions of a query that is turned back by `turn` steps,
+        and their numbers int (G,)."""
+        regions, good = self._turned(query, turn)
+        return _patterns(regions[good]), np.flatnonzero(good)
 
     def match(self, query: Descriptor, fine: np.ndarray, hypotheses: Sequence[int] | None = None) -> FineMatch:
         """Compute C = A B^T (thesis 6.2.3), with A the good regions of the query and B those of the place, then the
@@ -157,31 +172,49 @@ class CoHog:
         reference = self._comparable(blocks)
         if self._camera == "forward":
             return self._matched(self._asking(query, 0), reference)
-        turns = range(_ROTATIONS) if hypotheses is None else hypotheses
-        matches = {turn: self._matched(self._asking(query, turn), reference) for turn in turns}
-        best = max(matches, key=lambda turn: matches[turn].score)
-        return replace(matches[best], rotation_deg=360 * best / _ROTATIONS)
+        if hypotheses is None:
+            matches = {turn: self._matched(self._asking(query, turn), reference) for turn in range(_ROTATIONS)}
+            best = max(matches, key=lambda turn: matches[turn].score)
+            return replace(matches[best], rotation_deg=360 * best / _ROTATIONS)
+        best = hypotheses[0]
+        if len(hypotheses) > 1:  # some of the regions tell which it is
+            glances = [tuple(part[::_GLANCE] for part in self._asking(query, turn)) for turn in hypotheses]
+            shares = [self._matched(glance, reference).score for glance in glances]
+            best = hypotheses[int(np.argmax(shares))]
+        return replace(self._matched(self._asking(query, best), reference), rotation_deg=360 * best / _ROTATIONS)
 
     def _asking(self, query: Descriptor, turn: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the numbers and descriptors of the good regions of a query that is turned back by `turn` steps. Those
         of the newest query are kept, since it is compared with many places."""
-        if query is not self._asked:
-            self._asked, self._by_turn = query, {}
+        self._keep(query)
         if turn not in self._by_turn:
-            regions, good = query.regions, query.good
-            if turn:
-                blocks, _, good = self._regions(*self._turned_back(query.picture, turn))
-                regions, good = blocks.reshape(regions.shape), good.ravel()
+            regions, good = self._turned(query, turn)
             self._by_turn[turn] = np.flatnonzero(good), self._comparable(regions[good])
         return self._by_turn[turn]
+
+    def _turned(self, query: Descriptor, turn: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the regions float32 (blocks, 4 bins) of a query that is turned back by `turn` steps, and which are
+        good, bool (blocks,). Only pictures within a quarter turn are encoded: the others have the same cells."""
+        self._keep(query)
+        quarters, within = divmod(turn, _WITHIN_QUARTER)
+        square = (self._side, self._side)
+        if within not in self._within:
+            blocks, good = query.regions.reshape(*square, -1), query.good.reshape(square)
+            if within:
+                blocks, _, good = self._regions(*self._turned_back(query.picture, within))
+            self._within[within] = blocks, good
+        blocks, good = self._within[within]
+        blocks = placewords.turned_blocks(blocks, -quarters)
+        return blocks.reshape(query.regions.shape), np.rot90(good, -quarters).ravel()
+
+    def _keep(self, query: Descriptor) -> None:
+        if query is not self._asked:
+            self._asked, self._by_turn, self._within = query, {}, {}
 
     def _comparable(self, blocks: np.ndarray) -> np.ndarray:
         """Return blocks float32 (N, 4 bins), or for the displacement vote their slow patterns (N, patterns), each of
         length 1."""
-        if self._compared is not None:
-            blocks = blocks @ self._compared
-        blocks /= np.maximum(np.sqrt(np.einsum("ij,ij->i", blocks, blocks)), 1e-6)[:, None]
-        return blocks
+        return _unit(blocks if self._compared is None else blocks @ self._compared)
 
     def _turned_back(self, picture: Picture, turn: int) -> tuple[np.ndarray, np.ndarray]:
         """Turn a picture and its allowed pixels back by `turn` steps about the middle; the corners are cut off."""
@@ -215,6 +248,19 @@ class CoHog:
 def _require(what: str, value: str, allowed) -> None:
     if value not in allowed:
         raise UsageError(f"cohog has no {what} `{value}`: use {' or '.join(sorted(allowed))}.")
+
+
+def _grid_spec(bins: int) -> PartSpec:
+    return PartSpec((placecode.SIDE, placecode.SIDE, bins), "|u1")
+
+
+def _patterns(regions: np.ndarray) -> np.ndarray:
+    """Return regions float32 (N, 32) as their slow patterns (N, 20), each of length 1."""
+    return _unit(regions @ slow_patterns(placewords.BINS))
+
+
+def _unit(rows: np.ndarray) -> np.ndarray:
+    return rows / np.maximum(np.sqrt(np.einsum("ij,ij->i", rows, rows)), 1e-6)[:, None]
 
 
 def _middle(per_block: np.ndarray, seen: np.ndarray) -> np.ndarray:

@@ -1,0 +1,220 @@
+"""A place in a hundred words: the coarse stage of `cohog` for a camera that looks straight down.
+
+Of 10x10 regions of a place each is named by the most similar of 1024 *words*, which are typical regions of the ground.
+A place is found by the words that it shares with the query, however the camera has moved or turned: ground without
+large structures, such as woods and roofs, has few shapes that a coarse picture of it would keep, and many words.
+
+A query has words under each of 24 rotations. Words come in fours, each the one before turned by a quarter turn, so only
+six of the rotations are looked up, and the others follow. A word that is everywhere says little: of a place it counts
+once, of a query four times.
+
+The scan is two steps. All places are scored by how many words they share with the query under each rotation, wherever
+the words are (a bag of words: Sivic and Zisserman 2003). For the best pairs of a place and a rotation, the shared words
+then vote for the shift of the picture, as all regions do in the full comparison (see `displacement`).
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from edgevpr.resources import shipped
+from edgevpr.techniques.patterns import slow_patterns
+
+SIDE = 10  # regions along one side
+QUARTERS = 4
+BINS = 8  # orientations of the regions that the words are of
+VOCABULARY = "ground_words.npz"
+_AT_MOST = 4  # times that a word of a query counts
+_VOTED = 3000  # pairs of a place and a rotation
+_BIN_REGIONS = 4  # side of a bin of shifts; two by two of them agree
+_VOTE_COUNTS = 5.0  # as many shared words as one that agrees on the shift; about the ratio of how much both scatter
+_ROWS_AT_ONCE = 2048  # 100 KB of counts for 24 rotations
+_VOTING_AT_ONCE = 256
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Asked:
+    """The words of a query under each of R rotations: `word`, `region` (its number, row by row) and `turn` int (E,) of
+    each that counts, and `counts` uint16 (1025, R), how often each word counts. The last row is of no word."""
+
+    word: np.ndarray
+    region: np.ndarray
+    turn: np.ndarray
+    counts: np.ndarray
+    side: int  # regions along one side of the query
+
+
+def of_place(patterns: np.ndarray, good: np.ndarray, side: int) -> np.ndarray:
+    """Return the words of a place: patterns float32 (side * side, 20) and good bool (side * side,) to uint16 (100,).
+    Regions that are not good, and those of a word that was there before, have none (1024)."""
+    at = _places(side)
+    words = np.where(good[at], nearest(patterns[at]), len(vocabulary()))
+    _, first = np.unique(words, return_index=True)
+    once = np.full(len(words), len(vocabulary()), np.uint16)
+    once[first] = words[first]
+    return once
+
+
+def of_query(asking: list[tuple[np.ndarray, np.ndarray]], side: int) -> Asked:
+    """Return the words of a query. `asking` has, of the picture turned clockwise by each of the steps within a quarter
+    turn, the patterns float32 (G, 20) of the good regions and their numbers int (G,); the other quarters follow."""
+    within, total = len(asking), len(asking) * QUARTERS
+    words, regions, turns = [], [], []
+    none = len(vocabulary())
+    for turn, (patterns, numbers) in enumerate(asking):
+        order = np.argsort(_shuffled(side)[numbers])
+        found, here = nearest(patterns[order]), numbers[order]
+        by_word = np.argsort(found, kind="stable")
+        found, here = found[by_word], here[by_word]
+        kept = np.flatnonzero(np.arange(len(found)) - np.searchsorted(found, found) < _AT_MOST)
+        found, here = found[kept], here[kept]
+        for quarter in range(QUARTERS):
+            words.append(found - found % QUARTERS + (found + quarter) % QUARTERS)
+            regions.append(here)
+            turns.append(np.full(len(here), (turn - within * quarter) % total))
+            here = turned_numbers(side)[here]
+    word, region, turn = (np.concatenate(each) for each in (words, regions, turns))
+    counts = np.bincount(word * total + turn, minlength=(none + 1) * total).reshape(none + 1, total)
+    return Asked(word=word, region=region, turn=turn, counts=counts.astype(np.uint16), side=side)
+
+
+def scan(asked: Asked, rows: np.ndarray, expected: np.ndarray | None = None) -> np.ndarray:
+    """Score all places, uint16 (N, 100), under each rotation: float32 (N, R) in 0..1.
+
+    Where the heading is known, place n is scored only under rotation `expected[n]` and the two beside it, with -inf for
+    the others. `expected` is int (N,), below 0 where the heading is unknown: such a place is scored under all.
+    """
+    turns = asked.counts.shape[1]
+    if expected is None:
+        scores = _shared(asked.counts, rows).astype(np.float32)
+    else:
+        scores = np.full((len(rows), turns), -np.inf, np.float32)
+        for turn in np.unique(expected):
+            group = np.flatnonzero(expected == turn)
+            near = np.arange(turns) if turn < 0 else np.arange(turn - 1, turn + 2) % turns
+            scores[group[:, None], near] = _shared(np.ascontiguousarray(asked.counts[:, near]), rows[group])
+    flat = scores.ravel()
+    best = np.argpartition(-flat, _VOTED)[:_VOTED] if len(flat) > _VOTED else np.arange(len(flat))
+    best = best[np.isfinite(flat[best])]
+    slots, turned = np.divmod(best, turns)
+    for turn in np.unique(turned):
+        of_turn = turned == turn
+        flat[best[of_turn]] += _VOTE_COUNTS * _votes(asked, int(turn), rows[slots[of_turn]])
+    scores /= (_AT_MOST + _VOTE_COUNTS * _AT_MOST) * rows.shape[1]
+    return scores
+
+
+def nearest(patterns: np.ndarray) -> np.ndarray:
+    """Return the number of the word most similar to each of patterns float32 (N, 20): int (N,)."""
+    return (patterns @ vocabulary().T).argmax(axis=1)
+
+
+@lru_cache
+def vocabulary() -> np.ndarray:
+    """Return the words, float32 (1024, 20), of length 1: number 4 k + q is number 4 k turned by q quarter turns."""
+    with np.load(shipped("models") / VOCABULARY, allow_pickle=False) as file:
+        return turned_words(file["words"].astype(np.float32))
+
+
+def turned_words(words: np.ndarray) -> np.ndarray:
+    """Return each of words float32 (K, 20) turned counter-clockwise by no, one, two and three quarter turns: float32
+    (4 K, 20)."""
+    quarter = _quarter_turn()
+    turned = [words]
+    for _ in range(1, QUARTERS):
+        turned.append(turned[-1] @ quarter)
+    return np.ascontiguousarray(np.stack(turned, axis=1).reshape(-1, words.shape[1]))
+
+
+def turned_blocks(blocks: np.ndarray, quarters: int = 1) -> np.ndarray:
+    """Turn the blocks of a picture counter-clockwise by quarter turns: (side, side, 4 L) with L a multiple of 4. Equal
+    to the blocks of the turned picture, but for rounding."""
+    for _ in range(quarters % QUARTERS):
+        blocks = np.rot90(_turned_block(blocks))
+    return np.ascontiguousarray(blocks)
+
+
+@lru_cache
+def turned_numbers(side: int) -> np.ndarray:
+    """Return where each region, numbered row by row, is after a quarter turn counter-clockwise: int (side * side,)."""
+    was = np.rot90(np.arange(side * side).reshape(side, side)).ravel()
+    now = np.empty_like(was)
+    now[was] = np.arange(side * side)
+    return now
+
+
+def _turned_block(blocks: np.ndarray) -> np.ndarray:
+    """Turn blocks (..., 4 L) in place: cells top left, top right, bottom left, bottom right, and their orientations,
+    which are measured towards y, which points down."""
+    cells = blocks.reshape(*blocks.shape[:-1], 4, -1)[..., [1, 3, 0, 2], :]
+    return np.roll(cells, -(cells.shape[-1] // QUARTERS), axis=-1).reshape(blocks.shape)
+
+
+@lru_cache
+def _quarter_turn() -> np.ndarray:
+    """Return the matrix that turns patterns counter-clockwise by a quarter turn: float32 (20, 20)."""
+    kept = slow_patterns(BINS)
+    return kept.T @ _turned_block(np.eye(len(kept), dtype=np.float32)) @ kept
+
+
+def _shared(counts: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Count the words that each place, uint16 (N, 100), shares with the query under each rotation: uint16 (N, R)."""
+    shared = np.zeros((len(rows), counts.shape[1]), np.uint16)
+    of_one = np.empty((_ROWS_AT_ONCE, counts.shape[1]), np.uint16)
+    for start in range(0, len(rows), _ROWS_AT_ONCE):
+        # One word of all these places after the other: the sums stay in the cache, and no array of all words is made.
+        sums = shared[start : start + _ROWS_AT_ONCE]
+        for words in np.ascontiguousarray(rows[start : start + len(sums)].T):
+            sums += np.take(counts, words, axis=0, out=of_one[: len(sums)], mode="clip")
+    return shared
+
+
+def _votes(asked: Asked, turn: int, rows: np.ndarray) -> np.ndarray:
+    """Count the shared words that agree on one shift of the picture, for places uint16 (P, 100) under one rotation:
+    float32 (P,)."""
+    mine = asked.turn == turn
+    order = np.argsort(asked.word[mine], kind="stable")
+    region = asked.region[mine][order]
+    often = asked.counts[:, turn].astype(np.intp)
+    first = np.cumsum(often) - often
+    bins, wide = _bins(asked.side)
+    votes = np.empty(len(rows), np.float32)
+    for start in range(0, len(rows), _VOTING_AT_ONCE):
+        part = rows[start : start + _VOTING_AT_ONCE]
+        times = often[part].ravel()
+        # Each word of a place meets each region of the query that has this word.
+        entry = np.repeat(np.arange(len(times)), times)
+        met = region[np.arange(len(entry)) + (first[part].ravel() - np.cumsum(times) + times)[entry]]
+        place, position = np.divmod(entry, part.shape[1])
+        number = place * wide * wide + bins[position, met]
+        counted = np.bincount(number, minlength=len(part) * wide * wide).reshape(-1, wide, wide)
+        counted = counted[:, 1:] + counted[:, :-1]
+        counted = counted[:, :, 1:] + counted[:, :, :-1]
+        votes[start : start + len(part)] = counted.max(axis=(1, 2))
+    return votes
+
+
+@lru_cache
+def _places(side: int) -> np.ndarray:
+    """Return the numbers of the regions of a place that have words: int (100,) of `side` * `side`."""
+    at = np.rint((np.arange(SIDE) + 0.5) * side / SIDE - 0.5).astype(np.intp)
+    return np.add.outer(at * side, at).ravel()
+
+
+@lru_cache
+def _shuffled(side: int) -> np.ndarray:
+    """Return a rank of each region, in no order of space: the first of a word that count are then spread over the
+    picture."""
+    return np.random.default_rng(0).permutation(side * side)
+
+
+@lru_cache
+def _bins(side: int) -> tuple[np.ndarray, int]:
+    """Return the bin of the shift from each region of a query to each of a place that has a word, int
+    (100, side * side), and the number of bins along one side."""
+    y, x = np.divmod(_places(side)[:, None], side)
+    query_y, query_x = np.divmod(np.arange(side * side), side)
+    along = (2 * side - 2) // _BIN_REGIONS + 1
+    rows, columns = ((to - of + side - 1) // _BIN_REGIONS for to, of in ((y, query_y), (x, query_x)))
+    return rows * along + columns, along
