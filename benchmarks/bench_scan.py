@@ -12,7 +12,7 @@ from collections.abc import Callable  # noqa: E402
 
 import numpy as np  # noqa: E402
 
-from edgevpr.techniques import hamming, placecode  # noqa: E402
+from edgevpr.techniques import hamming, placecode, placewords  # noqa: E402
 
 
 def medians_s(ways: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
@@ -53,32 +53,44 @@ def binary_rows(places: int = 100_000, code_bytes: int = 64, rounds: int = 30) -
 
 
 def growth_rows(places: tuple[int, ...] = (1_000, 3_000, 10_000, 30_000, 100_000)) -> list[dict]:
-    """The scan of place codes as the map grows, ahead and looking down (24 rotations): the data of the plot. The
+    """The scan as the map grows: place codes ahead, words looking down (24 rotations); the data of the plot. The
     query's own part does not grow, and stands apart as `t_query_ms`."""
     rng = np.random.default_rng(0)
     blocks = rng.random((31, 31, 32), dtype=np.float32)
     mean = rng.random((placecode.SIDE, placecode.SIDE, 8), dtype=np.float32)
+    patterns = rng.normal(size=(700, 20)).astype(np.float32)
+    numbers = np.sort(rng.permutation(31 * 31)[:700])
+
+    def ask_ahead() -> np.ndarray:
+        return placecode.hypotheses(*placecode.seen_grid(blocks, np.ones((31, 31), bool)), mean)
+
+    def ask_down() -> placewords.Asked:
+        return placewords.of_query([(patterns, numbers)] * 6, 31)
+
+    def codes(count: int) -> np.ndarray:
+        return rng.integers(0, 256, (count, placecode.SIDE**2), dtype=np.uint8)
+
+    def words(count: int) -> np.ndarray:
+        return rng.integers(0, 1024, (count, placewords.SIDE**2), dtype=np.uint16)
+
     rows = []
-    for turns, scan in ((1, placecode.scan_ahead), (24, placecode.scan)):
-        angles_deg = np.arange(turns) * 360 / turns
-
-        def ask(angles_deg: np.ndarray = angles_deg) -> np.ndarray:
-            grids, seen = placecode.turned_grids(blocks, angles_deg)
-            return placecode.hypotheses(grids, seen, mean, locally=len(angles_deg) > 1)
-
+    for turns, ask, scan, made in (
+        (1, ask_ahead, placecode.scan_ahead, codes),
+        (24, ask_down, placewords.scan, words),
+    ):
         asked = ask()
         for count in places:
-            codes = rng.integers(0, 256, (count, placecode.SIDE**2), dtype=np.uint8)
-            ways = {"query": ask, "scan": lambda codes=codes, asked=asked, scan=scan: scan(asked, codes)}
+            there = made(count)
+            ways = {"query": ask, "scan": lambda there=there, asked=asked, scan=scan: scan(asked, there)}
             taken = medians_s(ways, rounds=max(1, min(20, 2_000_000 // (count * turns))))
             rows.append(
                 {
                     "places": count,
                     "rotations": turns,
-                    "code_bytes": codes.shape[1],
+                    "place_bytes": there.nbytes // count,
                     "t_query_ms": 1e3 * taken["query"],
                     "t_scan_ms": 1e3 * taken["scan"],
-                    "index_mb": codes.nbytes / 1e6,
+                    "index_mb": there.nbytes / 1e6,
                 }
             )
     return rows

@@ -6,6 +6,7 @@ where GPS is known, positions.csv.
 """
 
 import argparse
+import csv
 import json
 import os
 import platform
@@ -31,7 +32,7 @@ from edgevpr.helpers.progress import progress
 from edgevpr.techniques.networks.session import file_sha256
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-TUNED_ON = ("corridor", "aerial_caliterra")
+TUNED_ON = ("corridor", "aerial_caliterra", "aerial_garfield28")
 FROM_THE_AIR = ("aerial_", "kite_")  # how the names of such sets begin
 
 
@@ -69,6 +70,8 @@ VARIANTS = (
 )
 
 FIVE_PLACES = "five places only: made for studies of change, recall on them says nothing"
+JOINED = "aerial_joined"  # all sets from the air as one map: the rows that are measured on it
+JOINED_ROWS = ("cohog", "cohog, exact")
 # What is not measured, and why.
 LEFT_OUT = {"grief_michigan_monthly": FIVE_PLACES, "grief_stromovka_monthly": FIVE_PLACES}
 
@@ -87,6 +90,11 @@ def main(argv: list[str] | None = None) -> int:
     try:
         with ExitStack() as stack:
             folders = find_sets(args.data, args.sets.split(",") if args.sets else None)
+            from_the_air = [folder for folder in folders if folder.name.startswith(FROM_THE_AIR)]
+            if len(from_the_air) > 1:
+                joined = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="edgevpr-joined-"))) / JOINED
+                join(from_the_air, joined)
+                folders.append(joined)
             kept = [folder for folder in folders if folder.name not in LEFT_OUT]
             if not kept:
                 raise UsageError(
@@ -102,7 +110,9 @@ def main(argv: list[str] | None = None) -> int:
             args.out.mkdir(parents=True, exist_ok=True)
             commit = commit_of()
             for folder in kept:
-                write_set(args.out / f"{folder.name}.json", folder, wanted, commit)
+                rows = [row for row in wanted if folder.name != JOINED or row.label in JOINED_ROWS]
+                if rows:
+                    write_set(args.out / f"{folder.name}.json", folder, rows, commit)
         sets_page.write(args.out, {folder.name: LEFT_OUT[folder.name] for folder in folders if folder.name in LEFT_OUT})
     except EdgevprError as error:
         print(f"run_sets: {error}", file=sys.stderr)
@@ -118,6 +128,26 @@ def find_sets(data: Path, names: list[str] | None) -> list[Path]:
         what = f"no set `{missing[0]}`" if missing else "no image sets (folders with a ground_truth.csv)"
         raise UsageError(f"There are {what} in {data}: name the right folder with --data or EDGEVPR_DATA.")
     return [folder for name, folder in found.items() if names is None or name in names]
+
+
+def join(folders: list[Path], out: Path) -> None:
+    """Make one set of several: every query asks for its place among the places of all."""
+    rows = []
+    for part in ("query", "ref"):
+        (out / part).mkdir(parents=True)
+        for folder in folders:
+            for path in (folder / part).iterdir():
+                (out / part / f"{folder.name}_{path.name}").symlink_to(path.resolve())
+    for folder in folders:
+        with open(folder / "ground_truth.csv", newline="") as handle:
+            for row in csv.DictReader(handle):
+                names = {key: row.get(key) or "" for key in ("query_file", "ref_files", "ref_files_loose")}
+                named = {key: " ".join(f"{folder.name}_{name}" for name in each.split()) for key, each in names.items()}
+                rows.append({**named, "status": row.get("status") or "ok"})
+    with open(out / "ground_truth.csv", "w", newline="") as handle:
+        table = csv.DictWriter(handle, rows[0])
+        table.writeheader()
+        table.writerows(rows)
 
 
 def find_variants(labels: list[str] | None) -> list[Variant]:

@@ -73,9 +73,10 @@ its camera looks straight down (`--camera nadir`: the picture laid into a square
 exact` votes over all places, under all rotations. `cohog, thesis` scores as published, on the whole picture. A vector
 is kept in half precision; as `8bit` or `1bit` it is less the map's mean, a byte or a bit a number. Parameters and
 limits of acceptance were chosen on the sets marked *tune*. Some figures of cohog were fixed after other sets had been
-seen, and are to be judged with that in mind: of a place code the least overlap (half), its size (12x12 cells), its
-Fourier series and, looking down, the neighbourhood whose common part it leaves out (3 cells); how many places are
-compared in full (42) or, looking down, pairs of place and rotation (300, of one place 6 at most), with aerial_swindale;
+seen, and are to be judged with that in mind: of a place code the least overlap (half), its size (12x12 cells) and
+its Fourier series; how many places are compared in full (42) or, looking down, pairs of place and rotation (300, of one
+place 6 at most), with aerial_swindale; that words take the place of codes, looking down, how many there are (1024, 100
+of a place) and how they are counted, with aerial_swindale, aerial_copr and kite_ochota;
 that the scan counts in the score, ahead, with grief_stromovka_seasons and nordland_tiny; what a vote counts that is off
 the peak (ahead 1, 1, 0.75, 0.5) and how many patterns of a region are compared (20 of 32), both with
 grief_stromovka_seasons; and the margin of `cohog, thesis` (0.02, with pictures of foreign sites). The shipped weights
@@ -164,8 +165,14 @@ def overview(contents: list[dict[str, Any]], wanted: Callable[[str], bool] = lam
     rows = []
     for label in filter(wanted, dict.fromkeys(label for content in contents for label in content["techniques"])):
         found = [content["techniques"].get(label) for content in contents]
-        size = next(row["descriptor_bytes"] for row in found if row)
-        rows.append([label, f"{size}", *("-" if row is None else f"{row['recall_at_1']:.2f}" for row in found)])
+        sizes = sorted({row["descriptor_bytes"] for row in found if row})  # those of cohog differ by camera
+        rows.append(
+            [
+                label,
+                " or ".join(map(str, sizes)),
+                *("-" if row is None else f"{row['recall_at_1']:.2f}" for row in found),
+            ]
+        )
     heads = [f"{content['set']} ({content['use']}, {_rows(content)[0]['queries']})" for content in contents]
     return markdown(("technique", "RAM B/place", *heads), rows)
 
