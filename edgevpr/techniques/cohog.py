@@ -51,8 +51,8 @@ class CoHog:
     (below 0: the default for the entropy). `entropy` is "shannon" or "filled_bins".
 
     With `camera` "nadir" the picture is laid into a square with its shape kept, so that a rotated picture shows the
-    same ground, and a query is tried in 24 rotations. The map records `camera`. It does not record `matching`,
-    "displacement" or "thesis": both read the same map.
+    same ground, and a query is tried in 24 rotations; places are named by `words` (see `placewords.load`). The map
+    records `camera` and `words`. It does not record `matching`, "displacement" or "thesis": both read the same map.
     """
 
     def __init__(
@@ -65,6 +65,7 @@ class CoHog:
         entropy: str = "shannon",
         camera: str = "forward",
         matching: str = "displacement",
+        words: str = "ground_words",
     ) -> None:
         _require("entropy", entropy, _DEFAULT_GT)
         _require("camera", camera, _VOTES_COUNT)
@@ -87,10 +88,14 @@ class CoHog:
         self.min_score, self.min_margin = _ACCEPT[camera if matching == "displacement" else matching]
         self.min_quality = _MIN_QUALITY[entropy]
         self.candidates = _CANDIDATES[camera]
+        self._vocabulary = placewords.load(words) if camera == "nadir" else None
         self._asked, self._by_turn, self._within = None, {}, {}
+        parameters = {"w1": w1, "w2": w2, "bins": bins, "gt": self._gt, "entropy": entropy, "camera": camera}
+        if camera == "nadir":
+            parameters["words"] = words
         self.spec = TechniqueSpec(
             name="cohog",
-            parameters={"w1": w1, "w2": w2, "bins": bins, "gt": self._gt, "entropy": entropy, "camera": camera},
+            parameters=parameters,
             coarse=PartSpec((placewords.SIDE**2,), "<u2") if camera == "nadir" else _grid_spec(bins),
             fine=PartSpec((self._side**2, 4 * bins), "|u1"),
             packed=None if camera == "nadir" else PartSpec((placecode.SIDE**2 * bins // 8,), "|u1"),
@@ -113,7 +118,7 @@ class CoHog:
         # The square root of each value in 8 bits: most values are small, and the root keeps more of their digits.
         stored = np.rint(255 * np.sqrt(regions)).astype(np.uint8)
         if self._camera == "nadir":
-            coarse = placewords.of_place(_patterns(regions), good.ravel(), self._side)
+            coarse = placewords.of_place(self._vocabulary, _patterns(regions), good.ravel(), self._side)
         else:
             coarse = np.rint(255 * placecode.grid(_middle(blocks, seen))).astype(np.uint8)
         quality = float(good.sum() / max(seen.sum(), 1))
@@ -154,7 +159,7 @@ class CoHog:
             steps = np.rint(turned_deg * (_ROTATIONS / 360)) % _ROTATIONS
             expected = np.nan_to_num(steps, nan=-1).astype(np.intp)
         asking = [self.good_patterns(query, turn) for turn in range(_WITHIN_QUARTER)]
-        scores = placewords.scan(placewords.of_query(asking, self._side), rows, expected)
+        scores = placewords.scan(placewords.of_query(self._vocabulary, asking, self._side), rows, expected)
         return scores.max(axis=1), scores
 
     def good_patterns(self, query: Descriptor, turn: int) -> tuple[np.ndarray, np.ndarray]:

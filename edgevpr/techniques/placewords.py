@@ -13,18 +13,25 @@ the words are (a bag of words: Sivic and Zisserman 2003). For the best pairs of 
 then vote for the shift of the picture, as all regions do in the full comparison (see `displacement`).
 """
 
+import io
+import zipfile
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 
-from edgevpr.resources import shipped
+from edgevpr.errors import ModelError
+from edgevpr.helpers.files import read_file
+from edgevpr.resources import model_folders
 from edgevpr.techniques.patterns import slow_patterns
 
 SIDE = 10  # regions along one side
 QUARTERS = 4
 BINS = 8  # orientations of the regions that the words are of
-VOCABULARY = "ground_words.npz"
+COUNT = 256  # words, each of four turns
+NONE = COUNT * QUARTERS  # the number of no word
+_MAX_FILE_BYTES = 1_000_000
+_ROUNDED = 0.01  # of a length of 1
 _AT_MOST = 4  # times that a word of a query counts
 _VOTED = 3000  # pairs of a place and a rotation
 _BIN_REGIONS = 4  # side of a bin of shifts; two by two of them agree
@@ -45,26 +52,25 @@ class Asked:
     side: int  # regions along one side of the query
 
 
-def of_place(patterns: np.ndarray, good: np.ndarray, side: int) -> np.ndarray:
+def of_place(vocabulary: np.ndarray, patterns: np.ndarray, good: np.ndarray, side: int) -> np.ndarray:
     """Return the words of a place: patterns float32 (side * side, 20) and good bool (side * side,) to uint16 (100,).
     Regions that are not good, and those of a word that was there before, have none (1024)."""
     at = _places(side)
-    words = np.where(good[at], nearest(patterns[at]), len(vocabulary()))
+    words = np.where(good[at], nearest(vocabulary, patterns[at]), NONE)
     _, first = np.unique(words, return_index=True)
-    once = np.full(len(words), len(vocabulary()), np.uint16)
+    once = np.full(len(words), NONE, np.uint16)
     once[first] = words[first]
     return once
 
 
-def of_query(asking: list[tuple[np.ndarray, np.ndarray]], side: int) -> Asked:
+def of_query(vocabulary: np.ndarray, asking: list[tuple[np.ndarray, np.ndarray]], side: int) -> Asked:
     """Return the words of a query. `asking` has, of the picture turned clockwise by each of the steps within a quarter
     turn, the patterns float32 (G, 20) of the good regions and their numbers int (G,); the other quarters follow."""
     within, total = len(asking), len(asking) * QUARTERS
     words, regions, turns = [], [], []
-    none = len(vocabulary())
     for turn, (patterns, numbers) in enumerate(asking):
         order = np.argsort(_shuffled(side)[numbers])
-        found, here = nearest(patterns[order]), numbers[order]
+        found, here = nearest(vocabulary, patterns[order]), numbers[order]
         by_word = np.argsort(found, kind="stable")
         found, here = found[by_word], here[by_word]
         kept = np.flatnonzero(np.arange(len(found)) - np.searchsorted(found, found) < _AT_MOST)
@@ -75,7 +81,7 @@ def of_query(asking: list[tuple[np.ndarray, np.ndarray]], side: int) -> Asked:
             turns.append(np.full(len(here), (turn - within * quarter) % total))
             here = turned_numbers(side)[here]
     word, region, turn = (np.concatenate(each) for each in (words, regions, turns))
-    counts = np.bincount(word * total + turn, minlength=(none + 1) * total).reshape(none + 1, total)
+    counts = np.bincount(word * total + turn, minlength=(NONE + 1) * total).reshape(NONE + 1, total)
     return Asked(word=word, region=region, turn=turn, counts=counts.astype(np.uint16), side=side)
 
 
@@ -105,16 +111,31 @@ def scan(asked: Asked, rows: np.ndarray, expected: np.ndarray | None = None) -> 
     return scores
 
 
-def nearest(patterns: np.ndarray) -> np.ndarray:
+def nearest(vocabulary: np.ndarray, patterns: np.ndarray) -> np.ndarray:
     """Return the number of the word most similar to each of patterns float32 (N, 20): int (N,)."""
-    return (patterns @ vocabulary().T).argmax(axis=1)
+    return (patterns @ vocabulary.T).argmax(axis=1)
 
 
-@lru_cache
-def vocabulary() -> np.ndarray:
-    """Return the words, float32 (1024, 20), of length 1: number 4 k + q is number 4 k turned by q quarter turns."""
-    with np.load(shipped("models") / VOCABULARY, allow_pickle=False) as file:
-        return turned_words(file["words"].astype(np.float32))
+@lru_cache(maxsize=1)
+def load(name: str) -> np.ndarray:
+    """Load the words of the file NAME.npz in a folder of models, as `edgevpr train ground` writes it: float32
+    (1024, 20), of length 1, number 4 k + q being number 4 k turned by q quarter turns.
+
+    Raises ModelError for a file that is missing or damaged, and names the command that makes it.
+    """
+    path = next((folder / f"{name}.npz" for folder in model_folders() if (folder / f"{name}.npz").is_file()), None)
+    command = f"make it with `edgevpr train ground --images DIR --out {name}.npz`"
+    if path is None:
+        raise ModelError(f"There are no words {name}.npz in the folders of models: {command}.")
+    try:
+        with np.load(io.BytesIO(read_file(path, _MAX_FILE_BYTES)), allow_pickle=False) as file:
+            words = file["words"].astype(np.float32)
+    except (OSError, EOFError, ValueError, KeyError, TypeError, NotImplementedError, zipfile.BadZipFile) as error:
+        raise ModelError(f"{path} cannot be read as words ({error}): {command}.") from error
+    length = np.linalg.norm(words, axis=-1)
+    if words.shape != (COUNT, slow_patterns(BINS).shape[1]) or not (abs(length - 1) < _ROUNDED).all():
+        raise ModelError(f"{path} holds no {COUNT} words of the ground: {command}.")
+    return turned_words(words)
 
 
 def turned_words(words: np.ndarray) -> np.ndarray:

@@ -20,7 +20,6 @@ from edgevpr.techniques.cohog import CoHog
 from edgevpr.training.kmeans import kmeans
 from edgevpr.training.pictures import read_pictures
 
-COUNT = 256
 _STEPS = (0, 2, 4)  # of 15 degrees
 _POINTS = 90_000
 _ROUNDS = 12
@@ -53,9 +52,9 @@ def train_ground(folders: Sequence[str], out: Path, seed: int, unusable: list[Im
         regions += [part[rng.permutation(len(part))[:each]] for part in _regions(technique, picture)]
         pictures += 1
     points = np.concatenate(regions) if regions else np.empty((0, 1))
-    if len(points) < 2 * COUNT:
+    if len(points) < 2 * placewords.COUNT:
         raise UsageError(f"{pictures} usable images give {len(points)} regions, too few to learn from: give more.")
-    *_, centres = progress(kmeans(aligned(points), COUNT, _ROUNDS, rng), _ROUNDS, "learning")
+    *_, centres = progress(kmeans(aligned(points), placewords.COUNT, _ROUNDS, rng), _ROUNDS, "learning")
     words = (centres / np.linalg.norm(centres, axis=1, keepdims=True)).astype(np.float16)
     content = io.BytesIO()
     np.savez_compressed(content, words=words)

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from edgevpr.errors import ModelError, UsageError
 from edgevpr.techniques import placewords
 from edgevpr.techniques.cohog import CoHog
 from edgevpr.techniques.gradients import normalised_blocks, oriented_cells
@@ -11,6 +12,7 @@ from edgevpr.techniques.patterns import slow_patterns
 
 SIDE = 31
 NONE = 1024
+VOCABULARY = placewords.load("ground_words")
 
 
 def ground(seed, side_px=1024):
@@ -43,12 +45,12 @@ def town():
 
 
 def test_a_word_of_four_is_the_one_before_turned(town):
-    words = placewords.vocabulary()
+    words = VOCABULARY
     assert words.shape == (1024, 20)
     np.testing.assert_allclose(np.linalg.norm(words, axis=1), 1, atol=2e-3)
     image = view(ground(3))
     once, turned = patterns(image), patterns(np.ascontiguousarray(np.rot90(image)))
-    first, then = placewords.nearest(once), placewords.nearest(turned)
+    first, then = placewords.nearest(VOCABULARY, once), placewords.nearest(VOCABULARY, turned)
     now = then[placewords.turned_numbers(SIDE)]
     assert np.mean(first - first % 4 + (first + 1) % 4 == now) > 0.99
 
@@ -66,7 +68,7 @@ def test_turned_blocks_are_those_of_the_turned_picture():
 def test_a_place_has_each_word_once_and_none_where_nothing_is_to_be_seen():
     good = np.zeros(SIDE * SIDE, bool)
     good[: SIDE * SIDE // 2] = True
-    words = placewords.of_place(patterns(view(ground(5))), good, SIDE)
+    words = placewords.of_place(VOCABULARY, patterns(view(ground(5))), good, SIDE)
     assert (words.shape, words.dtype) == ((100,), np.uint16)
     there = words[words < NONE]
     assert len(np.unique(there)) == len(there) > 20
@@ -76,7 +78,7 @@ def test_a_place_has_each_word_once_and_none_where_nothing_is_to_be_seen():
 def test_the_scan_is_the_count_spelt_out(town):
     technique, grounds, rows = town
     query = technique.encode(view(grounds[2], 60, -30, 40.0))
-    asked = placewords.of_query([technique.good_patterns(query, turn) for turn in range(6)], SIDE)
+    asked = placewords.of_query(VOCABULARY, [technique.good_patterns(query, turn) for turn in range(6)], SIDE)
     places = [round((n + 0.5) * 3.1 - 0.5) for n in range(10)]
     expected = np.zeros((len(rows), 24))
     for turn in range(24):
@@ -143,3 +145,31 @@ def test_a_picture_without_a_good_region_is_compared_without_a_warning(town):
     scores, by_rotation = technique.coarse_scores(query, rows, None)
     assert (scores == 0).all()
     assert np.isfinite(by_rotation).all()
+
+
+@pytest.mark.parametrize(
+    ("content", "complaint"),
+    [
+        (None, "There are no words mine.npz"),
+        (b"no archive", "cannot be read as words"),
+        ({"other": np.zeros(3)}, "cannot be read as words"),
+        ({"words": np.ones((256, 20), np.float16)}, "holds no 256 words"),
+        ({"words": np.full((256, 20), np.nan, np.float16)}, "holds no 256 words"),
+        ({"words": np.zeros((3, 20), np.float16)}, "holds no 256 words"),
+    ],
+)
+def test_words_that_are_missing_or_damaged_are_refused_in_one_sentence(content, complaint, tmp_path, monkeypatch):
+    monkeypatch.setenv("EDGEVPR_MODELS", str(tmp_path))
+    if isinstance(content, bytes):
+        (tmp_path / "mine.npz").write_bytes(content)
+    elif content:
+        np.savez(tmp_path / "mine.npz", **content)
+    with pytest.raises(ModelError, match=complaint):
+        CoHog(camera="nadir", words="mine")
+
+
+def test_a_map_records_its_words_and_one_that_looks_ahead_has_none():
+    assert CoHog(camera="nadir").spec.parameters["words"] == "ground_words"
+    assert "words" not in CoHog().spec.parameters
+    with pytest.raises(UsageError, match="uses 8 bins"):
+        CoHog(camera="nadir", bins=12)
