@@ -24,7 +24,6 @@ import numpy as np
 import sets_page
 import yaml
 
-from edgevpr import techniques
 from edgevpr.errors import EdgevprError, UsageError
 from edgevpr.evaluate.dataset import load_dataset
 from edgevpr.evaluate.evaluate import compare, evaluate
@@ -186,8 +185,7 @@ def write_set(path: Path, folder: Path, wanted: list[Variant], commit: str) -> N
             return progress(items, total, f"{folder.name}, {variant.label}, {label.partition(': ')[2]}")
 
         chosen = settings(variant, folder)
-        candidates = None if variant.exact else techniques.create(variant.technique, chosen).candidates
-        result = evaluate(variant.technique, dataset, chosen, candidates, shown, variant.sequence)
+        result = evaluate(variant.technique, dataset, chosen, None, shown, variant.sequence, exact=variant.exact)
         rows[variant.label] = {
             **asdict(replace(result, technique=variant.label)),
             "encode_ram_mb": encode_ram_mb(variant.technique, chosen),

@@ -29,9 +29,9 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--form", default="float", metavar="A,B", help=f"of vectors, one row each: {', '.join(FORMS)} (float)"
     )
-    all_exact = "places compared in full (default: all, exact)"
+    parser.add_argument("--exact", action="store_true", help="compare all places in full, which no flight has time for")
     parser.add_argument("--config", metavar="FILE", help="YAML; its sections `salience` and `match` count")
-    add_keys(parser, "source.camera", "match.candidates", "match.sequence", "salience.use", candidates=all_exact)
+    add_keys(parser, "source.camera", "match.candidates", "match.sequence", "salience.use")
     parser.add_argument("--techniques", default="hog,cohog", metavar="A,B", help="names, comma-separated")
     add_parameters(parser, "a parameter of a technique", "TECHNIQUE.KEY=VALUE")
     parser.add_argument("--plot", metavar="FILE", help="draw the precision-recall curves (.png, .pdf, .svg)")
@@ -67,7 +67,9 @@ def evaluate(args: Namespace) -> int:
         raise next(iter(errors.values()))
     dataset = load_dataset(args.query, args.ref, args.ground_truth)
     results = [
-        evaluation.evaluate(offer.name, dataset, offer.settings, match.candidates, progress, match.sequence, gate)
+        evaluation.evaluate(
+            offer.name, dataset, offer.settings, match.candidates, progress, match.sequence, gate, args.exact
+        )
         for offer, _ in tried
         if offer.label not in errors
     ]

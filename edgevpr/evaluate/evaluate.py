@@ -108,10 +108,12 @@ def evaluate(
     progress: Progress = lambda items, total, label: items,
     sequence: int | None = None,
     gate: Gate | NoGate | None = None,
+    exact: bool = False,
 ) -> TechniqueResult:
-    """Map the references, ask every query, and score the answers. `candidates` places are compared in full (None: all).
-    `sequence` queries are matched together, in the order of their names (None: the technique's own number). `gate`
-    discards queries; the map has all references, as in the thesis (3.3).
+    """Map the references, ask every query, and score the answers. `candidates` places are compared in full (None: the
+    technique's own number, as it flies); with `exact` all are, and the scan chooses none. `sequence` queries are
+    matched together, in the order of their names (None: the technique's own number). `gate` discards queries; the map
+    has all references, as in the thesis (3.3).
 
     Raises UsageError for an unknown technique or parameter, ImageError for an image that cannot be used, MapError if
     the temporary map cannot be written, and ModelError for a network that cannot be used or a query that fails.
@@ -132,7 +134,7 @@ def evaluate(
                 index=index,
                 rule=rule,
                 meter=meter,
-                candidates=candidates,
+                candidates=None if exact else candidates or technique.candidates,
                 search=search_of(length),
                 gate=gate,
             )
