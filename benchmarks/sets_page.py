@@ -68,9 +68,10 @@ Python {machine["python"]}, NumPy {machine["numpy"]}, OpenCV {machine["opencv"]}
 
 {markdown(("set", "use", "date", "commit"), made)}
 
-`cohog` is as it flies: a scan of 144 bytes a place, then the displacement vote over the best places; in the aerial sets
-its camera looks straight down (`--camera nadir`: the picture laid into a square, 24 rotations of the query). `cohog,
-exact` votes over all places, under all rotations. `cohog, thesis` scores as published, on the whole picture. A vector
+`cohog` is as it flies: a scan of 144 bytes a place (looking down 200), then the displacement vote over the best places;
+in the aerial sets its camera looks straight down (`--camera nadir`: the picture laid into a square, 24 rotations of the
+query). *aerial_joined* is all sets from the air as one map, those that were tuned on too. `cohog, exact` votes over all
+places, under all rotations. `cohog, thesis` scores as published, on the whole picture. A vector
 is kept in half precision; as `8bit` or `1bit` it is less the map's mean, a byte or a bit a number. Parameters and
 limits of acceptance were chosen on the sets marked *tune*. Some figures of cohog were fixed after other sets had been
 seen, and are to be judged with that in mind: of a place code the least overlap (half), its size (12x12 cells) and
