@@ -41,7 +41,8 @@ class TechniqueCosts:
     not say). `is_network` tells whether its pictures go through a network.
 
     In a map of more than `candidates` places, all are scanned in RAM and only `candidates` are compared in full (None:
-    the technique has one stage, and compares all of them).
+    the technique has one stage, and compares all of them). `scan_once` is what a scan costs however small the map: what
+    is made of the query for it.
     """
 
     encode: StageCost
@@ -51,22 +52,25 @@ class TechniqueCosts:
     process_mb: float
     candidates: int | None = None
     scan_per_place: StageCost = NO_COST
+    scan_once: StageCost = NO_COST
     encode_mb: float | None = None
     is_network: bool = False
 
     def match(self, places: int) -> StageCost:
         """Return the cost of finding one query in a map of `places` places."""
-        if self.candidates is None or places <= self.candidates:
+        if self.candidates is None:
             return self.match_per_place * places
-        return self.match_per_place * self.candidates + self.scan_per_place * places
+        in_full = min(places, self.candidates)
+        return self.scan_once + self.match_per_place * in_full + self.scan_per_place * places
 
     def places_within(self, wall_s: float, cpu_s: float) -> float:
         """Return how many places a map may have for a query to be found in it within both times, in seconds."""
-        full = self.match_per_place
-        in_full = min(wall_s / full.wall_s, cpu_s / full.cpu_s)
+        wall_s, cpu_s = wall_s - self.scan_once.wall_s, cpu_s - self.scan_once.cpu_s
+        full, scan = self.match_per_place, self.scan_per_place
+        each = full + scan
+        in_full = max(0.0, min(wall_s / each.wall_s, cpu_s / each.cpu_s))
         if self.candidates is None or in_full < self.candidates:
             return in_full
-        scan = self.scan_per_place
         rest_wall_s, rest_cpu_s = wall_s - self.candidates * full.wall_s, cpu_s - self.candidates * full.cpu_s
         return min(rest_wall_s / scan.wall_s, rest_cpu_s / scan.cpu_s) if scan.wall_s else math.inf
 
@@ -124,16 +128,19 @@ def probe(
         large, fills = walk(trial_map, _many(technique, index), 1), length if length > 1 else 0
         asked = [replace(frames[i % len(frames)], t_mono_s=0.1 * i) for i in range(fills + len(frames))]
         steps = [_stepped(large, frame).steps for frame in asked][fills:]  # the frames before these fill the sequence
-    scan = counted([(each.scan if spec.fine else each.match) * (1 / len(large.index)) for each in steps])
+    whole = counted([each.scan if spec.fine else each.match for each in steps])
+    once = counted([each.scan for each in tried]) if spec.fine else NO_COST
+    # What a scan of six places takes is not of these places: it is what is made of the query, and of calling at all.
+    scan = _beyond(whole, once) * (1 / len(large.index))
     return TechniqueCosts(
         encode=counted([each.encode for each in tried]),
-        # A scan of few places takes as long as one of many, so it is timed in the large index.
-        match_per_place=counted([each.match for each in tried]) * (1 / _PLACES) if spec.fine else scan,
+        match_per_place=counted([each.compare for each in tried]) * (1 / _PLACES) if spec.fine else scan,
         ram_bytes_per_place=bytes_per_place(spec) + bytes_beside_place(length),
         disk_bytes_per_place=spec.coarse.nbytes + (spec.fine.nbytes if spec.fine else 0),
         process_mb=process_mb + (0.0 if "pymavlink" in sys.modules else _LINK_MB),
         candidates=technique.candidates if spec.fine else None,
         scan_per_place=scan if spec.fine else NO_COST,
+        scan_once=once,
         encode_mb=encode_mb,
         is_network=spec.model_sha256 is not None,
     )
@@ -164,6 +171,12 @@ def _many(technique: Technique, index: PlaceIndex) -> PlaceIndex:
         rows=np.resize(index.rows, (count, *index.rows.shape[1:])),
         mean=index.mean,
     )
+
+
+def _beyond(cost: StageCost, part: StageCost) -> StageCost:
+    """Return a cost less a part of it; a thousandth of it at least, since clocks jump."""
+    least = cost * 0.001
+    return StageCost(max(cost.wall_s - part.wall_s, least.wall_s), max(cost.cpu_s - part.cpu_s, least.cpu_s))
 
 
 def _quickest(costs: list[StageCost]) -> StageCost:

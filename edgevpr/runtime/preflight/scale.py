@@ -63,6 +63,7 @@ def on_board(costs: TechniqueCosts, here: Board, board: Board) -> TechniqueCosts
             costs.match_per_place, found.passes if costs.candidates is None else found.products, board
         ),
         scan_per_place=_scaled(costs.scan_per_place, found.passes, board),
+        scan_once=_scaled(costs.scan_once, found.passes, board),
     )
 
 

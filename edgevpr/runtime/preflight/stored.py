@@ -181,7 +181,8 @@ def _require_figures(found: StoredFigures) -> None:
         if costs := trial.costs:
             stages = [*astuple(costs.encode), *astuple(costs.match_per_place)]
             above_0 = [*stages, costs.ram_bytes_per_place, costs.disk_bytes_per_place, costs.process_mb]
-            others = [*astuple(costs.scan_per_place), costs.encode_mb or 0.0, costs.candidates or 0]
+            scans = [*astuple(costs.scan_per_place), *astuple(costs.scan_once)]
+            others = [*scans, costs.encode_mb or 0.0, costs.candidates or 0]
             if not (all(0 < each < math.inf for each in above_0) and all(0 <= each < math.inf for each in others)):
                 raise ValueError(f"the costs of {trial.label} are no figures")
 
