@@ -96,7 +96,7 @@ class CoHog:
         self.spec = TechniqueSpec(
             name="cohog",
             parameters=parameters,
-            coarse=PartSpec((placewords.SIDE**2,), "<u2") if camera == "nadir" else _grid_spec(bins),
+            coarse=PartSpec((placewords.SIDE**2,), placewords.DTYPE) if camera == "nadir" else _grid_spec(bins),
             fine=PartSpec((self._side**2, 4 * bins), "|u1"),
             packed=None if camera == "nadir" else PartSpec((placecode.SIDE**2 * bins // 8,), "|u1"),
             scan_counts=matching == "displacement" and camera == "forward",  # with a nadir camera it adds nothing

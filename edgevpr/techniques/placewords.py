@@ -25,6 +25,7 @@ from edgevpr.helpers.files import read_file
 from edgevpr.resources import model_folders
 from edgevpr.techniques.patterns import slow_patterns
 
+DTYPE = "<u2"  # of a word
 SIDE = 10  # regions along one side
 QUARTERS = 4
 BINS = 8  # orientations of the regions that the words are of
@@ -92,6 +93,7 @@ def scan(asked: Asked, rows: np.ndarray, expected: np.ndarray | None = None) -> 
     the others. `expected` is int (N,), below 0 where the heading is unknown: such a place is scored under all.
     """
     turns = asked.counts.shape[1]
+    rows = np.minimum(rows, NONE)  # what no program of ours has written may hold any number
     if expected is None:
         scores = _shared(asked.counts, rows).astype(np.float32)
     else:

@@ -139,6 +139,16 @@ def test_a_known_heading_is_the_full_scan_of_three_rotations(town):
     assert np.isneginf(near[~scanned]).all()
 
 
+def test_numbers_that_are_no_words_count_as_none(town):
+    technique, grounds, rows = town
+    query = technique.encode(view(grounds[4], 16, 0, 30))
+    odd = rows.copy()
+    odd[odd == NONE] = 60_000
+    np.testing.assert_array_equal(
+        technique.coarse_scores(query, odd, None)[1], technique.coarse_scores(query, rows, None)[1]
+    )
+
+
 def test_a_picture_without_a_good_region_is_compared_without_a_warning(town):
     technique, _, rows = town
     query = technique.encode(np.full((512, 512), 90, np.uint8))
