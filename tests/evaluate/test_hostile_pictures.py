@@ -34,7 +34,7 @@ def test_a_map_made_looking_down_knows_that_a_view_ahead_is_none_of_its_places(n
             event = recogniser.step(Frame(image=read_image(DATA / path), name=path, t_mono_s=0.0))
             assert not event.accepted
             assert event.best.match.score >= recogniser.rule.min_score, "score alone would accept it"
-            assert "of the place agrees, 4% needed" in event.reason
+            assert any(each in event.reason for each in ("of the place agrees, 4% needed", "of a place elsewhere"))
         own = next((DATA / name / "query").glob("*.jp*g"), None) or next((DATA / name / "query").glob("*.JP*G"))
         assert recogniser.step(Frame(image=read_image(own), name="own", t_mono_s=0.0)).accepted
 
