@@ -113,9 +113,10 @@ def main() -> None:
             every = progress([*queries, *places], len(queries) + len(places), f"{folder.name}: salience")
             seen = {path: scores_by_gate(path, memorability, detector) for path in every}
             light += [{"set": folder.name, **row} for row in kept_in_bad_light(places)]
+            kept = _kept(places, seen)
             for technique in TECHNIQUES:
                 asked = ask(technique, dataset)
-                rows += gated(folder.name, technique, asked, [seen[path] for path in queries], _kept(places, seen))
+                rows += gated(folder.name, technique, asked, [seen[path] for path in queries], kept)
                 budget += shrunk(folder.name, technique, asked, [seen[path]["all three"] for path in places])
     measured = {
         **made_by(),

@@ -28,3 +28,8 @@ def own_models() -> Path:
 def model_folders() -> tuple[Path, ...]:
     """Return the folders that are searched for a model: the user's own, then the shipped one. The first match wins."""
     return own_models(), shipped("models")
+
+
+def find_model(file: str) -> Path | None:
+    """Return the path of a file in the `model_folders`, None where none has it or the name leads out of them."""
+    return next((folder / file for folder in model_folders() if "/" not in file and (folder / file).is_file()), None)

@@ -84,14 +84,11 @@ def train_calc(args: Namespace) -> int:
 
     unusable: list[ImageError] = []
     result = job.train_calc(args.images, Path(args.out), args.steps, args.seed, args.resume, unusable)
-    if args.json:
-        print_json(asdict(result))
-    else:
-        print(
-            f"{result.model} and {result.card}: {result.steps} steps on {result.pictures} images, equal to PyTorch to "
-            f"{result.largest_difference:.1e}"
-        )
-    return exit_code(unusable)
+    said = (
+        f"{result.model} and {result.card}: {result.steps} steps on {result.pictures} images, equal to PyTorch to "
+        f"{result.largest_difference:.1e}"
+    )
+    return _learnt(args, result, said, unusable)
 
 
 def train_words(args: Namespace) -> int:
@@ -102,14 +99,11 @@ def train_words(args: Namespace) -> int:
     result = words.train_words(
         args.images, args.model, args.kind, args.count, args.whiten, path_of(args.out), args.seed, unusable
     )
-    if args.json:
-        print_json(asdict(result))
-    else:
-        print(
-            f"{result.file}: {args.count} words of {result.descriptors} descriptors in {result.pictures} images, mean "
-            f"square distance {result.distance:.3f}"
-        )
-    return exit_code(unusable)
+    said = (
+        f"{result.file}: {args.count} words of {result.descriptors} descriptors in {result.pictures} images, mean "
+        f"square distance {result.distance:.3f}"
+    )
+    return _learnt(args, result, said, unusable)
 
 
 def train_ground(args: Namespace) -> int:
@@ -118,13 +112,19 @@ def train_ground(args: Namespace) -> int:
 
     unusable: list[ImageError] = []
     result = train_ground(args.images, Path(args.out), args.seed, unusable)
+    said = (
+        f"{result.file}: words of {result.regions} regions in {result.pictures} images, mean cosine of a region and "
+        f"its word {result.cosine:.3f}"
+    )
+    return _learnt(args, result, said, unusable)
+
+
+def _learnt(args: Namespace, result: Any, said: str, unusable: list[ImageError]) -> int:
+    """Print the result of a training, as JSON or as this sentence."""
     if args.json:
         print_json(asdict(result))
     else:
-        print(
-            f"{result.file}: words of {result.regions} regions in {result.pictures} images, mean cosine of a region "
-            f"and its word {result.cosine:.3f}"
-        )
+        print(said)
     return exit_code(unusable)
 
 

@@ -84,7 +84,7 @@ class CoHog:
         self._gt = gt if gt >= 0 else _DEFAULT_GT[entropy]
         self._side = w1 // w2 - 1  # blocks along one side
         self._matched = self._displacement if matching == "displacement" else self._thesis
-        self._compared = slow_patterns(bins) if matching == "displacement" else None
+        self._compares_patterns = matching == "displacement"
         self.min_score, self.min_margin = _ACCEPT[camera if matching == "displacement" else matching]
         self.min_quality = _MIN_QUALITY[entropy]
         self.candidates = _CANDIDATES[camera]
@@ -118,7 +118,8 @@ class CoHog:
         # The square root of each value in 8 bits: most values are small, and the root keeps more of their digits.
         stored = np.rint(255 * np.sqrt(regions)).astype(np.uint8)
         if self._camera == "nadir":
-            coarse = placewords.of_place(self._vocabulary, _patterns(regions), good.ravel(), self._side)
+            at = placewords.named(self._side)
+            coarse = placewords.of_place(self._vocabulary, self._patterns(regions[at]), good.ravel()[at])
         else:
             coarse = np.rint(255 * placecode.grid(_middle(blocks, seen))).astype(np.uint8)
         quality = float(good.sum() / max(seen.sum(), 1))
@@ -166,7 +167,7 @@ class CoHog:
         """Return the slow patterns float32 (G, 20) of the good regions of a query that is turned back by `turn` steps,
         and their numbers int (G,)."""
         regions, good = self._turned(query, turn)
-        return _patterns(regions[good]), np.flatnonzero(good)
+        return self._patterns(regions[good]), np.flatnonzero(good)
 
     def match(self, query: Descriptor, fine: np.ndarray, hypotheses: Sequence[int] | None = None) -> FineMatch:
         """Compute C = A B^T (thesis 6.2.3), with A the good regions of the query and B those of the place, then the
@@ -219,7 +220,11 @@ class CoHog:
     def _comparable(self, blocks: np.ndarray) -> np.ndarray:
         """Return blocks float32 (N, 4 bins), or for the displacement vote their slow patterns (N, patterns), each of
         length 1."""
-        return _unit(blocks if self._compared is None else blocks @ self._compared)
+        return self._patterns(blocks) if self._compares_patterns else _unit(blocks)
+
+    def _patterns(self, regions: np.ndarray) -> np.ndarray:
+        """Return regions float32 (N, 4 bins) as their slow patterns (N, patterns), each of length 1."""
+        return _unit(regions @ slow_patterns(self._bins))
 
     def _turned_back(self, picture: Picture, turn: int) -> tuple[np.ndarray, np.ndarray]:
         """Turn a picture and its allowed pixels back by `turn` steps about the middle; the corners are cut off."""
@@ -257,11 +262,6 @@ def _require(what: str, value: str, allowed) -> None:
 
 def _grid_spec(bins: int) -> PartSpec:
     return PartSpec((placecode.SIDE, placecode.SIDE, bins), "|u1")
-
-
-def _patterns(regions: np.ndarray) -> np.ndarray:
-    """Return regions float32 (N, 32) as their slow patterns (N, 20), each of length 1."""
-    return _unit(regions @ slow_patterns(placewords.BINS))
 
 
 def _unit(rows: np.ndarray) -> np.ndarray:

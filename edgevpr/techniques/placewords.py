@@ -13,8 +13,6 @@ the words are (a bag of words: Sivic and Zisserman 2003). For the best pairs of 
 then vote for the shift of the picture, as all regions do in the full comparison (see `displacement`).
 """
 
-import io
-import zipfile
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -22,7 +20,8 @@ import numpy as np
 
 from edgevpr.errors import ModelError
 from edgevpr.helpers.files import read_file
-from edgevpr.resources import model_folders
+from edgevpr.helpers.npz import arrays_of
+from edgevpr.resources import find_model
 from edgevpr.techniques.patterns import slow_patterns
 
 DTYPE = "<u2"  # of a word
@@ -53,11 +52,10 @@ class Asked:
     side: int  # regions along one side of the query
 
 
-def of_place(vocabulary: np.ndarray, patterns: np.ndarray, good: np.ndarray, side: int) -> np.ndarray:
-    """Return the words of a place: patterns float32 (side * side, 20) and good bool (side * side,) to uint16 (100,).
-    Regions that are not good, and those of a word that was there before, have none (1024)."""
-    at = _places(side)
-    words = np.where(good[at], nearest(vocabulary, patterns[at]), NONE)
+def of_place(vocabulary: np.ndarray, patterns: np.ndarray, good: np.ndarray) -> np.ndarray:
+    """Return the words of a place: patterns float32 (100, 20) of the regions `named`, and which of them are good, bool
+    (100,), to uint16 (100,). Regions that are not good, and those of a word that was there before, have none (1024)."""
+    words = np.where(good, nearest(vocabulary, patterns), NONE)
     _, first = np.unique(words, return_index=True)
     once = np.full(len(words), NONE, np.uint16)
     once[first] = words[first]
@@ -125,14 +123,13 @@ def load(name: str) -> np.ndarray:
 
     Raises ModelError for a file that is missing or damaged, and names the command that makes it.
     """
-    path = next((folder / f"{name}.npz" for folder in model_folders() if (folder / f"{name}.npz").is_file()), None)
+    path = find_model(f"{name}.npz")
     command = f"make it with `edgevpr train ground --images DIR --out {name}.npz`"
     if path is None:
         raise ModelError(f"There are no words {name}.npz in the folders of models: {command}.")
     try:
-        with np.load(io.BytesIO(read_file(path, _MAX_FILE_BYTES)), allow_pickle=False) as file:
-            words = file["words"].astype(np.float32)
-    except (OSError, EOFError, ValueError, KeyError, TypeError, NotImplementedError, zipfile.BadZipFile) as error:
+        words = arrays_of(read_file(path, _MAX_FILE_BYTES), _MAX_FILE_BYTES)["words"].astype(np.float32)
+    except (OSError, ValueError, KeyError, MemoryError) as error:
         raise ModelError(f"{path} cannot be read as words ({error}): {command}.") from error
     length = np.linalg.norm(words, axis=-1)
     if words.shape != (COUNT, slow_patterns(BINS).shape[1]) or not (abs(length - 1) < _ROUNDED).all():
@@ -219,7 +216,7 @@ def _votes(asked: Asked, turn: int, rows: np.ndarray) -> np.ndarray:
 
 
 @lru_cache
-def _places(side: int) -> np.ndarray:
+def named(side: int) -> np.ndarray:
     """Return the numbers of the regions of a place that have words: int (100,) of `side` * `side`."""
     at = np.rint((np.arange(SIDE) + 0.5) * side / SIDE - 0.5).astype(np.intp)
     return np.add.outer(at * side, at).ravel()
@@ -236,7 +233,7 @@ def _shuffled(side: int) -> np.ndarray:
 def _bins(side: int) -> tuple[np.ndarray, int]:
     """Return the bin of the shift from each region of a query to each of a place that has a word, int
     (100, side * side), and the number of bins along one side."""
-    y, x = np.divmod(_places(side)[:, None], side)
+    y, x = np.divmod(named(side)[:, None], side)
     query_y, query_x = np.divmod(np.arange(side * side), side)
     along = (2 * side - 2) // _BIN_REGIONS + 1
     rows, columns = ((to - of + side - 1) // _BIN_REGIONS for to, of in ((y, query_y), (x, query_x)))

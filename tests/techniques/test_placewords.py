@@ -68,7 +68,8 @@ def test_turned_blocks_are_those_of_the_turned_picture():
 def test_a_place_has_each_word_once_and_none_where_nothing_is_to_be_seen():
     good = np.zeros(SIDE * SIDE, bool)
     good[: SIDE * SIDE // 2] = True
-    words = placewords.of_place(VOCABULARY, patterns(view(ground(5))), good, SIDE)
+    at = placewords.named(SIDE)
+    words = placewords.of_place(VOCABULARY, patterns(view(ground(5)))[at], good[at])
     assert (words.shape, words.dtype) == ((100,), np.uint16)
     there = words[words < NONE]
     assert len(np.unique(there)) == len(there) > 20
@@ -166,6 +167,7 @@ def test_a_picture_without_a_good_region_is_compared_without_a_warning(town):
         ({"words": np.ones((256, 20), np.float16)}, "holds no 256 words"),
         ({"words": np.full((256, 20), np.nan, np.float16)}, "holds no 256 words"),
         ({"words": np.zeros((3, 20), np.float16)}, "holds no 256 words"),
+        ({"words": np.zeros(2_000_000, np.uint8)}, "more than 1 MB unpacked"),
     ],
 )
 def test_words_that_are_missing_or_damaged_are_refused_in_one_sentence(content, complaint, tmp_path, monkeypatch):
@@ -173,9 +175,11 @@ def test_words_that_are_missing_or_damaged_are_refused_in_one_sentence(content, 
     if isinstance(content, bytes):
         (tmp_path / "mine.npz").write_bytes(content)
     elif content:
-        np.savez(tmp_path / "mine.npz", **content)
+        np.savez_compressed(tmp_path / "mine.npz", **content)
     with pytest.raises(ModelError, match=complaint):
         CoHog(camera="nadir", words="mine")
+    with pytest.raises(ModelError, match="There are no words"):
+        CoHog(camera="nadir", words="../ground_words")
 
 
 def test_a_map_records_its_words_and_one_that_looks_ahead_has_none():

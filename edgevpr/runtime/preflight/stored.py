@@ -29,7 +29,7 @@ from edgevpr.runtime.preflight.offers import Offer
 from edgevpr.runtime.preflight.scale import is_same
 from edgevpr.runtime.preflight.trial import Trial, model_of, trial_of, try_each
 
-_FORMAT = 1
+_FORMAT = 2  # 1 had no cost of a scan that is paid once
 _MAX_FILE_BYTES = 10_000_000
 _PICTURES = 8
 _SAME_RAM = 0.02  # kernels keep some RAM for themselves, every version another amount

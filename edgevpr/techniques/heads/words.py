@@ -1,15 +1,14 @@
 """Learned visual words: the file that `edgevpr train words` writes, and the bag of words over regions."""
 
 import hashlib
-import io
-import zipfile
 from dataclasses import dataclass
 
 import numpy as np
 
 from edgevpr.errors import ModelError
 from edgevpr.helpers.files import read_file
-from edgevpr.resources import model_folders
+from edgevpr.helpers.npz import arrays_of
+from edgevpr.resources import find_model
 from edgevpr.techniques.heads.vlad import nearest, unit
 from edgevpr.techniques.networks.card import load_card
 
@@ -43,18 +42,16 @@ def load_words(model: str, kind: str, count: int) -> Words:
     """
     name = f"{model}_{kind}{count}.npz"
     command = f"make them with `edgevpr train words --images DIR --model {model} --kind {kind} --count {count}`"
-    path = next((folder / name for folder in model_folders() if (folder / name).is_file()), None)
+    path = find_model(name)
     if path is None:
         raise ModelError(f"There are no words {name} for the model `{model}`: {command}.")
     wanted = load_card(model).fingerprint
     try:
         content = read_file(path, _MAX_FILE_BYTES)
-        _require_room(content)
-        with np.load(io.BytesIO(content), allow_pickle=False) as file:
-            arrays = {key: file[key] for key in file.files}
+        arrays = arrays_of(content, _MAX_FILE_BYTES)
         learned_on = str(arrays["model_sha256"])
         words = arrays["words"].astype(np.float32)
-    except (OSError, EOFError, ValueError, KeyError, MemoryError, NotImplementedError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, KeyError, MemoryError) as error:
         raise ModelError(f"{path} cannot be read as words ({error}): {command}.") from error
     if learned_on != wanted:
         raise ModelError(
@@ -76,13 +73,6 @@ def load_words(model: str, kind: str, count: int) -> Words:
         whitening=whitening,
         scale=scale.astype(np.float32).ravel(),
     )
-
-
-def _require_room(content: bytes) -> None:
-    """Raise ValueError for an archive that would take more memory unpacked than any words do."""
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        if sum(part.file_size for part in archive.infolist()) > _MAX_FILE_BYTES:
-            raise ValueError(f"it takes more than {_MAX_FILE_BYTES / 1e6:.0f} MB unpacked")
 
 
 def bag_of_words(local: np.ndarray, words: np.ndarray) -> np.ndarray:

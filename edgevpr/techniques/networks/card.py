@@ -14,7 +14,7 @@ from pathlib import Path
 from edgevpr.config import bounded, build
 from edgevpr.contract import TechniqueSpec
 from edgevpr.errors import ConfigError, ModelError
-from edgevpr.resources import model_folders
+from edgevpr.resources import find_model, model_folders
 from edgevpr.yamlfile import read_yaml
 
 SIMILARITIES = ("cosine", "l1", "l2")
@@ -164,13 +164,11 @@ def card_names() -> tuple[str, ...]:
 
 def load_card(name: str) -> Card:
     """Load the card called `name`. Raises ModelError if there is none, or if it is not valid."""
-    for folder in model_folders():
-        path = folder / f"{name}.yaml"
-        if "/" not in name and path.is_file():
-            try:
-                return read_card(path)
-            except ConfigError as error:  # one network cannot be used; the user's request is not wrong
-                raise ModelError(str(error)) from error
+    if path := find_model(f"{name}.yaml"):
+        try:
+            return read_card(path)
+        except ConfigError as error:  # one network cannot be used; the user's request is not wrong
+            raise ModelError(str(error)) from error
     near = difflib.get_close_matches(name, card_names(), n=1)
     known = ", ".join(card_names()) or "there are none yet"
     raise ModelError(

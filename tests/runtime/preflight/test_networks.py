@@ -82,7 +82,8 @@ def test_verifying_is_done_apart_so_that_memory_is_that_of_the_network(models):
 
 def test_the_command_verifies_all_and_says_which_cannot_be_used(models, capsys, monkeypatch):
     monkeypatch.setattr("edgevpr.runtime.preflight.networks.verify", verify_here)
-    monkeypatch.setattr("edgevpr.techniques.networks.card.model_folders", lambda: (models,))
+    for room in ("resources", "techniques.networks.card"):
+        monkeypatch.setattr(f"edgevpr.{room}.model_folders", lambda: (models,))
     write_network(models, "mine")
     write_network(models, "wrong", fault="zeros")
     assert main(["models", "verify"]) == 1
