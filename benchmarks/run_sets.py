@@ -190,6 +190,7 @@ def write_set(path: Path, folder: Path, wanted: list[Variant], commit: str) -> N
             **asdict(replace(result, technique=variant.label)),
             "encode_ram_mb": encode_ram_mb(variant.technique, chosen),
             "commit": commit,
+            "cpu": cpu_model(),
         }
     in_order = [rows[variant.label] for variant in VARIANTS if variant.label in rows]
     for row, each in zip(in_order, compare(sets_page.result(row) for row in in_order), strict=True):

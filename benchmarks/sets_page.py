@@ -55,7 +55,7 @@ def _page(contents: list[dict[str, Any]], results: dict[str, list[TechniqueResul
     machine = contents[0]["machine"]
     reached = [[name, each.technique, *tables.quality(each)] for name, rows in results.items() for each in rows]
     paid = [
-        [content["set"], label, *tables.costs(result(row)), f"{row['encode_ram_mb']:.0f}"]
+        [content["set"], label, *tables.costs(result(row)), f"{row['encode_ram_mb']:.0f}", row["cpu"]]
         for content in contents
         for label, row in content["techniques"].items()
     ]
@@ -63,8 +63,8 @@ def _page(contents: list[dict[str, Any]], results: dict[str, list[TechniqueResul
     assumed = next(iter(results.values()))[0].ah_assumes
     page = f"""# Every technique on real images
 
-Made by `make results`. Machine: {machine["cpu"]}, {machine["cores"]} cores, BLAS threads: {machine["blas_threads"]}.
-Python {machine["python"]}, NumPy {machine["numpy"]}, OpenCV {machine["opencv"]}.
+Made by `make results` with {machine["cores"]} cores, BLAS threads: {machine["blas_threads"]}; the table of costs names
+the machine of each row. Python {machine["python"]}, NumPy {machine["numpy"]}, OpenCV {machine["opencv"]}.
 
 {markdown(("set", "use", "date", "commit"), made)}
 
@@ -111,7 +111,7 @@ Weights in use:
 
 ## Costs
 
-{markdown(("set", "technique", *tables.COSTS, "encode RAM MB"), paid)}
+{markdown(("set", "technique", *tables.COSTS, "encode RAM MB", "machine"), paid)}
 
 * Means over the queries; t_m is for all references. U: share of all cores.
 * encode RAM: what the technique adds to a process that has NumPy and OpenCV, until it has encoded one 640x480 picture:
