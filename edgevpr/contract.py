@@ -34,7 +34,8 @@ class TechniqueSpec:
     vectors in RAM. It is one of `forms`, each smaller than the one before (None and empty: there is one form only).
     `sequence` is the usual number of queries matched together. With `scan_counts` the score of the scan is part of the
     final score (see `places.retrieve`). A technique that tries a query in several rotations tries only those within
-    `heading_within_deg` of the rotation that known headings give (None: it does not use headings).
+    `heading_within_deg` of the rotation that known headings give (None: it does not use headings). Of more places than
+    `in_full`, those that look best at a glance are compared in full (None: all are).
     """
 
     name: str
@@ -48,6 +49,7 @@ class TechniqueSpec:
     sequence: int = field(default=1, compare=False)
     scan_counts: bool = field(default=False, compare=False)
     heading_within_deg: float | None = field(default=None, compare=False)
+    in_full: int | None = field(default=None, compare=False)
 
     @property
     def row(self) -> PartSpec:
@@ -106,10 +108,10 @@ class FineMatch:
 
 class Technique(Protocol):
     """The contract of `edgevpr/techniques/*.py`. A technique without a fine part needs no `match`. A technique whose
-    spec has no `packed` needs no `pack`."""
+    spec has no `packed` needs no `pack`, and one whose spec has no `in_full` needs no `glance`."""
 
     spec: TechniqueSpec
-    candidates: int  # places compared in full after the scan, unless the configuration sets another number
+    candidates: int  # places compared after the scan, unless the configuration sets another number
     min_score: float  # least score of an accepted match, unless the configuration sets another
     min_margin: float  # least margin of an accepted match over the best place elsewhere, likewise
     min_quality: float  # least `Descriptor.quality` of a query that says enough to be recognised
@@ -136,4 +138,11 @@ class Technique(Protocol):
 
     def match(self, query: Descriptor, fine: np.ndarray, hypotheses: Sequence[int] | None) -> FineMatch:
         """Compare the query with the fine part of one place, under the given hypotheses (None: under all)."""
+        ...
+
+    def glance(
+        self, query: Descriptor, fine: np.ndarray, hypotheses: Sequence[int] | None
+    ) -> tuple[float, list[int] | None]:
+        """Compare a part of the query with one place: about the score that `match` would give, and which of the
+        hypotheses is best (None where there is none to choose)."""
         ...

@@ -1,38 +1,26 @@
 """Retrieval of the places that a query may show: one scan of the index, then a full comparison of the best ones.
 
-A place that cannot be read is left out from then on, and the others are used. This must never turn a refused match into
-an accepted wrong one, by taking the right place, or the rival that kept the margin small, out of the way. So:
-
-* The query in which a place turns out to be unreadable is refused.
-* A place that was left out keeps its row in the index, and so its score in the scan. A later query that may show it
-  (see `Ranking.unread`) is refused, whichever place it matches.
-* A technique without a fine part needs nothing but the row. A place that was left out then keeps its rank and its
-  score, and is refused when it is the best.
-* Where most of the places compared with one query cannot be read, the file is at fault, not the places: the query is
-  refused, and none is left out. So all are used again as soon as the file can be read again.
+A place that cannot be read must never turn a refused match into an accepted wrong one: see `visit`.
 """
 
-import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from edgevpr.contract import Descriptor, FineMatch, Technique
 from edgevpr.errors import MapError, PlaceError
 from edgevpr.geodesy import distance_m
+from edgevpr.places.candidates import Chosen, best_scanned
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.visit import Seen, Visit, left_out, require_there
 from edgevpr.types import Candidate
 
 _NEIGHBOURS_WITHOUT_POSITION = 2
 _COMPARED_ELSEWHERE = 5
-_TRIED_EACH = 6  # hypotheses of a place
 # On corridor (tune), wherever the right places were left out and a wrong one had the margin to be accepted, one of the
 # right ones was as good in the scan as the wrong one, or among the best two.
 _LIKELY = 3
-_MANY = 3  # unreadable places of one query, that may be the file's fault
-
-_Chosen = tuple[int, list[int] | None]  # a slot, and the hypotheses to try (None: all)
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +48,8 @@ class Scan:
 @dataclass(frozen=True, slots=True)
 class Ranking:
     """Places best first: `slots` int (K,) of the index and `scores` float32 (K,). `compared` maps the slot of each
-    place that was compared in full to its match, which has the same score. `unread` int (U,) are slots of places that
+    place that was compared in full to its match, which has the same score. Places that were looked at for a moment only
+    come after them. `unread` int (U,) are slots of places that
     cannot be read but may be in the picture: their scan is at least as good as that of the best place, or as the third
     best of all."""
 
@@ -87,7 +76,9 @@ def compare(
     neighbour_m: float = 0.0,
     expected: Expected = NOTHING,
 ) -> Ranking:
-    """Compare the `candidates` places with the best scan scores in full, and rank them.
+    """Compare the `candidates` places with the best scan scores, and rank them.
+
+    Of more than the technique's `in_full` of them, those that look best at a glance are compared in full.
 
     Where `candidates` is None, or is at least the number of places and more than the technique's own number, all
     places are compared under every hypothesis, unless `expected` narrows them: exact, but slow. Neighbours of the best
@@ -105,81 +96,59 @@ def compare(
     Raises PlaceError where a place cannot be read, after all candidates have been tried. It is then left out (see the
     top of this file). Raises MapError where the file cannot be read.
     """
-    matches: dict[int, FineMatch] = {}
-    one_stage = technique.spec.fine is None
-    readable = np.ones(len(index), bool) if one_stage else ~left_out(place_map, index)
-
-    def scored(chosen: list[_Chosen]) -> list[float]:
-        if one_stage:
-            return scanned.scores[[slot for slot, _ in chosen]].tolist()
-        unreadable = []
-        for slot, hypotheses in chosen:
-            try:
-                fine, point = place_map.fine_part(index.place_ids[slot])
-                _require_there(place_map, index, slot, point)
-            except PlaceError as error:
-                unreadable.append(error)
-                continue
-            match = technique.match(query, fine, hypotheses)
-            if technique.spec.scan_counts:
-                match = replace(match, score=match.score * (1 + float(scanned.scores[slot])) / 2)
-            matches[slot] = match
-        if unreadable:
-            raise _left_out_now(place_map, unreadable, len(chosen))
-        return [matches[slot].score for slot, _ in chosen]
-
-    scores, by_hypothesis, in_reach = scanned.scores, scanned.by_hypothesis, expected.in_reach
+    spec, scores, in_reach = technique.spec, scanned.scores, expected.in_reach
+    one_stage = spec.fine is None
     exact = candidates is None or technique.candidates < candidates >= len(index)
+    nothing_expected = in_reach is None and expected.turned_deg is None
+    by_hypothesis = None if exact and nothing_expected else scanned.by_hypothesis
     if one_stage or exact:
         candidates = len(index)
-    if exact and in_reach is None and expected.turned_deg is None:
-        by_hypothesis = None  # all are tried
+    readable = np.ones(len(index), bool) if one_stage else ~left_out(place_map, index)
+    visit = Visit(technique, query, scores, place_map, index)
+    matches: dict[int, FineMatch] = {}
+    passed_over: list[Seen] = []
+
+    def best(among: np.ndarray, count: int, in_full: int | None) -> list[Chosen]:
+        chosen = best_scanned(scores, by_hypothesis, among, count)
+        if exact or in_full is None or sum(len(tried or [None]) for _, tried in chosen) <= in_full:
+            return chosen
+        seen = visit.at_a_glance(chosen)
+        passed_over.extend(seen[in_full:])
+        return [found for _, found in seen[:in_full]]
+
+    def scored(chosen: list[Chosen]) -> list[float]:
+        slots = [slot for slot, _ in chosen]
+        if one_stage:
+            return scores[slots].tolist()
+        matches.update(zip(slots, visit.in_full(chosen), strict=True))
+        return [matches[slot].score for slot in slots]
+
     there = readable if in_reach is None else in_reach & readable
-    chosen = best_scanned(scores, by_hypothesis, there, candidates)
-    chosen += best_scanned(scores, by_hypothesis, readable & ~there, _COMPARED_ELSEWHERE)
+    chosen = best(there, candidates, spec.in_full)
+    chosen += best(readable & ~there, _COMPARED_ELSEWHERE, spec.in_full and _COMPARED_ELSEWHERE)
     if not chosen:
         raise MapError(f"{place_map.path}: no place of it can be read any more: restore a copy, or build it again.")
     found = scored(chosen)
     slots = np.array([slot for slot, _ in chosen])
     if len(slots) < np.count_nonzero(readable):
-        best = slots[np.argmax(found)]
-        rivals = np.count_nonzero(elsewhere(index, best, slots, neighbour_m))
-        if rivals < (1 if in_reach is None else _COMPARED_ELSEWHERE):
-            others = elsewhere(index, best, np.arange(len(index)), neighbour_m)
+        others = elsewhere(index, slots[np.argmax(found)], np.arange(len(index)), neighbour_m)
+        rivals, enough = np.count_nonzero(others[slots]), 1 if in_reach is None else _COMPARED_ELSEWHERE
+        if rivals < enough:
             others[slots] = False
             others &= readable
-            more = best_scanned(scores, by_hypothesis, others, _COMPARED_ELSEWHERE - rivals)
+            more = [found for _, found in passed_over if others[found[0]]][: _COMPARED_ELSEWHERE - rivals]
+            more = more or best_scanned(scores, by_hypothesis, others, _COMPARED_ELSEWHERE - rivals)
             found += scored(more)
             slots = np.append(slots, [slot for slot, _ in more]).astype(np.intp)
-    best_first = np.array(found, np.float32)
-    order = np.argsort(-best_first, kind="stable")
-    return Ranking(slots[order], best_first[order], matches, _unread(scores, readable, slots[order[0]]))
-
-
-def left_out(place_map: PlaceMap, index: PlaceIndex) -> np.ndarray:
-    """Tell which places of the index could not be read so far, bool (N,)."""
-    return np.isin(index.place_ids, list(place_map.left_out)) if place_map.left_out else np.zeros(len(index), bool)
-
-
-def _require_there(place_map: PlaceMap, index: PlaceIndex, slot: int, point: tuple[float, float] | None) -> None:
-    """Raise PlaceError unless a place is exactly where it was when the index was loaded."""
-    lat_deg = float(index.lat_deg[slot])
-    if (None if math.isnan(lat_deg) else (lat_deg, float(index.lon_deg[slot]))) != point:
-        raise PlaceError(place_map.path, int(index.place_ids[slot]), "its position has changed")
-
-
-def _left_out_now(place_map: PlaceMap, unreadable: list[PlaceError], tried: int) -> MapError:
-    """Leave places out that could not be read, and return the error of this query. Where they are most of the `tried`,
-    return one of the file, and leave none out."""
-    first = unreadable[0]
-    if len(unreadable) >= _MANY and 2 * len(unreadable) > tried:
-        return MapError(
-            f"{place_map.path}: {len(unreadable)} of the {tried} places compared cannot be read (place "
-            f"{first.place_id}: {first.problem}): the file is damaged or another map; restore a copy."
-        )
-    for error in unreadable:
-        place_map.left_out.setdefault(error.place_id, error.problem)
-    return first
+    order = np.argsort(-np.array(found, np.float32), kind="stable")
+    slots, ranked = slots[order], np.array(found, np.float32)[order]
+    last = sorted((each for each in passed_over if each[1][0] not in matches), key=lambda seen: -seen[0])
+    return Ranking(
+        np.append(slots, [slot for _, (slot, _) in last]).astype(np.intp),
+        np.append(ranked, np.minimum([score for score, _ in last], ranked[-1])).astype(np.float32),
+        matches,
+        _unread(scores, readable, slots[0]),
+    )
 
 
 def _unread(scanned: np.ndarray, readable: np.ndarray, best: int) -> np.ndarray:
@@ -190,35 +159,6 @@ def _unread(scanned: np.ndarray, readable: np.ndarray, best: int) -> np.ndarray:
     likely = min(_LIKELY, len(scanned))
     least = min(scanned[best], np.partition(scanned, -likely)[-likely])
     return slots[scanned[slots] >= least]
-
-
-def best_scanned(scanned: np.ndarray, by_hypothesis: np.ndarray | None, among: np.ndarray, count: int) -> list[_Chosen]:
-    """Choose the `count` best-scanned slots where `among` bool (N,) is True, and the hypotheses to try of each (None:
-    all).
-
-    With `by_hypothesis` float32 (N, H) (see `Technique.coarse_scores`), the best hypotheses of all places together are
-    chosen instead: `count` times six, or `count` times the mean number possible for a place where that is less. So a
-    place with only two likely hypotheses leaves room for other places. One place gets six hypotheses at most, or more
-    where there are too few places.
-    """
-    slots = np.flatnonzero(among)
-    if by_hypothesis is None or not len(slots):
-        return [(slot, None) for slot in slots[_largest(scanned[slots], count)].tolist()]
-    possible = round(np.isfinite(by_hypothesis[slots]).sum(axis=1).mean())
-    tries = count * max(1, min(_TRIED_EACH, possible))
-    slots = slots[_largest(scanned[slots], tries)]
-    scores = by_hypothesis[slots]
-    of_place = np.argsort(np.argsort(-scores, axis=1, kind="stable"), axis=1)
-    scores = np.where(of_place < max(_TRIED_EACH, tries // len(slots)), scores, -np.inf)
-    tried = np.zeros(scores.shape, bool)
-    tried.flat[_largest(scores.ravel(), tries)] = True
-    tried &= np.isfinite(scores)
-    return [(int(slots[at]), np.flatnonzero(tried[at]).tolist()) for at in np.flatnonzero(tried.any(axis=1))]
-
-
-def _largest(scores: np.ndarray, count: int) -> np.ndarray:
-    """Return the indices of the `count` largest of scores (N,), in no order."""
-    return np.argpartition(-scores, count)[:count] if count < len(scores) else np.arange(len(scores))
 
 
 def elsewhere(index: PlaceIndex, best: int, slots: np.ndarray, neighbour_m: float) -> np.ndarray:
@@ -250,7 +190,7 @@ def named(ranking: Ranking, index: PlaceIndex, place_map: PlaceMap, first: int |
                 raise PlaceError(place_map.path, place_id, place_map.left_out[place_id])
             (place,) = place_map.places([place_id])
             position = place.position
-            _require_there(place_map, index, slot, (position.lat_deg, position.lon_deg) if position else None)
+            require_there(place_map, index, slot, (position.lat_deg, position.lon_deg) if position else None)
         except PlaceError as error:
             place_map.left_out.setdefault(place_id, error.problem)
             raise

@@ -41,15 +41,10 @@ def displacement(asking: np.ndarray, best: np.ndarray, side: int, counts: tuple[
     """
     if not len(asking):
         return _NOTHING
-    # Both numbers are those of a grid as wide as there are steps, so that their difference is the number of the step. A
-    # border around the possible steps leaves room for the square around the peak.
     room = len(counts) - 1
-    wide = 2 * (side - 1 + room) + 1
-    number = _numbers(side, wide)
-    step = number[best] - number[asking] + wide // 2 * (wide + 1)
-    votes = np.bincount(step, minlength=wide * wide).reshape(wide, wide).astype(np.float32)
+    step, votes, around = _piled(asking, best, side, counts)
+    wide = len(votes)
     weights = _weights(counts)
-    around = cv2.filter2D(votes, -1, weights, borderType=cv2.BORDER_CONSTANT)[room : wide - room, room : wide - room]
     peak_y, peak_x = divmod(int(around.argmax()), 2 * side - 1)
     agreeing = votes[peak_y : peak_y + len(weights), peak_x : peak_x + len(weights)] * weights
     count = float(agreeing.sum())
@@ -68,6 +63,27 @@ def displacement(asking: np.ndarray, best: np.ndarray, side: int, counts: tuple[
     agreed = np.zeros(side * side, bool)
     agreed[best[near.ravel().take(step)]] = True
     return Displacement(count / len(asking), shift, covariance, int(np.count_nonzero(agreed)))
+
+
+def share(asking: np.ndarray, best: np.ndarray, side: int, counts: tuple[float, ...]) -> float:
+    """Return the `share` of a `displacement` without the rest of it, in half the time."""
+    return float(_piled(asking, best, side, counts)[2].max()) / len(asking) if len(asking) else 0.0
+
+
+def _piled(
+    asking: np.ndarray, best: np.ndarray, side: int, counts: tuple[float, ...]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the number of the step of each vote, int (G,), the votes by step, float32 (W, W), and the weighted sum
+    around each possible step, float32 (2 side - 1, 2 side - 1)."""
+    # Both numbers are those of a grid as wide as there are steps, so that their difference is the number of the step. A
+    # border around the possible steps leaves room for the square around the peak.
+    room = len(counts) - 1
+    wide = 2 * (side - 1 + room) + 1
+    number = _numbers(side, wide)
+    step = number[best] - number[asking] + wide // 2 * (wide + 1)
+    votes = np.bincount(step, minlength=wide * wide).reshape(wide, wide).astype(np.float32)
+    around = cv2.filter2D(votes, -1, _weights(counts), borderType=cv2.BORDER_CONSTANT)
+    return step, votes, around[room : wide - room, room : wide - room]
 
 
 @lru_cache

@@ -55,23 +55,26 @@ def block_means(per_pixel: np.ndarray, cell_px: int) -> np.ndarray:
     return (cell[:-1, :-1] + cell[:-1, 1:] + cell[1:, :-1] + cell[1:, 1:]) / 4
 
 
-def good_blocks(grey: np.ndarray, which: str, cell_px: int, threshold: float) -> np.ndarray:
+def good_blocks(
+    grey: np.ndarray, which: str, cell_px: int, threshold: float, among: np.ndarray | bool = True
+) -> np.ndarray:
     """Tell which blocks are good (thesis 6.2.1): `block_means(filled_bins(grey), cell_px) >= threshold`, or of
     `shannon`.
 
     Nearly every block is decided by bounds of its entropy, which cost a tenth of the map; only the pixels under the
     other blocks are computed exactly. `which` is "filled_bins" or "shannon"; `grey` is uint8 (H, W) with sides that are
-    multiples of `cell_px`. Returns bool (H/cell_px - 1, W/cell_px - 1).
+    multiples of `cell_px`. Returns bool (H/cell_px - 1, W/cell_px - 1), False where `among` of the same shape is False.
     """
     bounds = _BOUNDS[which](grey, cell_px)
     low = bounds.low
     undecided = (bounds.blocks(low) < threshold + _ROUNDING) & (bounds.blocks(bounds.high) >= threshold - _ROUNDING)
+    undecided &= among
     if undecided.any():
         matters = (bounds.down.T @ undecided @ bounds.across > 0) & (low < bounds.high)
         low[matters] = bounds.exact(matters)
         if (np.abs(bounds.blocks(low)[undecided] - threshold) < _ROUNDING).any():
-            return block_means(_MAPS[which](grey), cell_px) >= threshold
-    return bounds.blocks(low) >= threshold
+            return (block_means(_MAPS[which](grey), cell_px) >= threshold) & among
+    return (bounds.blocks(low) >= threshold) & among
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -33,7 +33,7 @@ NONE = COUNT * QUARTERS  # the number of no word
 _MAX_FILE_BYTES = 1_000_000
 _ROUNDED = 0.01  # of a length of 1
 _AT_MOST = 4  # times that a word of a query counts
-_VOTED = 3000  # pairs of a place and a rotation
+_VOTED_EACH = 125  # places of each rotation that is possible: pairs of a place and a rotation
 _BIN_REGIONS = 4  # side of a bin of shifts; two by two of them agree
 _VOTE_COUNTS = 5.0  # as many shared words as one that agrees on the shift; about the ratio of how much both scatter
 _ROWS_AT_ONCE = 2048  # 100 KB of counts for 24 rotations
@@ -62,12 +62,13 @@ def of_place(vocabulary: np.ndarray, patterns: np.ndarray, good: np.ndarray) -> 
     return once
 
 
-def of_query(vocabulary: np.ndarray, asking: list[tuple[np.ndarray, np.ndarray]], side: int) -> Asked:
-    """Return the words of a query. `asking` has, of the picture turned clockwise by each of the steps within a quarter
-    turn, the patterns float32 (G, 20) of the good regions and their numbers int (G,); the other quarters follow."""
-    within, total = len(asking), len(asking) * QUARTERS
+def of_query(vocabulary: np.ndarray, asking: dict[int, tuple[np.ndarray, np.ndarray]], within: int, side: int) -> Asked:
+    """Return the words of a query. `asking` has, of the picture turned clockwise by some of the `within` steps of a
+    quarter turn, the patterns float32 (G, 20) of the good regions and their numbers int (G,); the other quarters
+    follow. Under the steps that it lacks, and those a quarter turn from them, the query has no words."""
+    total = within * QUARTERS
     words, regions, turns = [], [], []
-    for turn, (patterns, numbers) in enumerate(asking):
+    for turn, (patterns, numbers) in asking.items():
         order = np.argsort(_shuffled(side)[numbers])
         found, here = nearest(vocabulary, patterns[order]), numbers[order]
         by_word = np.argsort(found, kind="stable")
@@ -99,9 +100,11 @@ def scan(asked: Asked, rows: np.ndarray, expected: np.ndarray | None = None) -> 
         for turn in np.unique(expected):
             group = np.flatnonzero(expected == turn)
             near = np.arange(turns) if turn < 0 else np.arange(turn - 1, turn + 2) % turns
-            scores[group[:, None], near] = _shared(np.ascontiguousarray(asked.counts[:, near]), rows[group])
+            scores[group[:, None], near] = _shared(asked.counts[:, near], rows[group])
     flat = scores.ravel()
-    best = np.argpartition(-flat, _VOTED)[:_VOTED] if len(flat) > _VOTED else np.arange(len(flat))
+    possible = np.count_nonzero(np.isfinite(flat))
+    voted = _VOTED_EACH * max(1, possible // max(1, len(rows)))
+    best = np.argpartition(-flat, voted)[:voted] if len(flat) > voted else np.arange(len(flat))
     best = best[np.isfinite(flat[best])]
     slots, turned = np.divmod(best, turns)
     for turn in np.unique(turned):
@@ -180,14 +183,19 @@ def _quarter_turn() -> np.ndarray:
 
 def _shared(counts: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Count the words that each place, uint16 (N, 100), shares with the query under each rotation: uint16 (N, R)."""
-    shared = np.zeros((len(rows), counts.shape[1]), np.uint16)
-    of_one = np.empty((_ROWS_AT_ONCE, counts.shape[1]), np.uint16)
+    turns = counts.shape[1]
+    # Four counts are one number of 64 bits: no sum of a hundred of at most four runs over into the next.
+    padded = np.zeros((len(counts), turns + -turns % 4), np.uint16)
+    padded[:, :turns] = counts
+    by_four = padded.view(np.uint64)
+    shared = np.zeros((len(rows), by_four.shape[1]), np.uint64)
+    of_one = np.empty((_ROWS_AT_ONCE, by_four.shape[1]), np.uint64)
     for start in range(0, len(rows), _ROWS_AT_ONCE):
         # One word of all these places after the other: the sums stay in the cache, and no array of all words is made.
         sums = shared[start : start + _ROWS_AT_ONCE]
         for words in np.ascontiguousarray(rows[start : start + len(sums)].T):
-            sums += np.take(counts, words, axis=0, out=of_one[: len(sums)], mode="clip")
-    return shared
+            sums += np.take(by_four, words, axis=0, out=of_one[: len(sums)], mode="clip")
+    return shared.view(np.uint16)[:, :turns]
 
 
 def _votes(asked: Asked, turn: int, rows: np.ndarray) -> np.ndarray:

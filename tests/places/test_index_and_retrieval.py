@@ -270,8 +270,8 @@ def test_a_match_is_asked_for_the_hypotheses_chosen_and_for_all_where_all_is_com
     technique = Turned()
     index = load_index(place_map, technique, 10_000)
     query = technique.encode(np.full((1, 1), 43))
-    few = rank(technique, query, place_map, index, 4)
-    assert sum(len(hypotheses) for hypotheses in technique.tried) == 12
+    few = rank(technique, query, place_map, index, 8)
+    assert sum(len(hypotheses) for hypotheses in technique.tried) == 12  # for each place half of what is possible
     assert len(few.slots) > 4
     assert [2] in technique.tried
     technique.tried.clear()
@@ -279,6 +279,56 @@ def test_a_match_is_asked_for_the_hypotheses_chosen_and_for_all_where_all_is_com
     assert technique.tried == [None] * 25
     assert few.slots[0] == everything.slots[0]
     assert few.scores[0] == everything.scores[0]
+
+
+class Hasty(Ruler):
+    """A ruler with wrong first impressions: at a glance each number is five larger than it is."""
+
+    spec = dataclasses.replace(Ruler.spec, in_full=3)
+
+    def __init__(self):
+        self.glanced = []
+
+    def glance(self, query, fine, hypotheses):
+        self.glanced.append(float(fine[0]))
+        return 1 / (1 + abs(float(fine[0]) + 5 - float(query.fine[0]))), hypotheses
+
+
+def test_of_many_candidates_those_that_look_best_at_a_glance_are_compared_in_full(ruler_map):
+    _, place_map = ruler_map
+    technique = Hasty()
+    index = load_index(place_map, technique, 10_000)
+    ranking = rank(technique, technique.encode(np.full((1, 1), 41)), place_map, index, 8, 5.0)
+    assert len(technique.glanced) == 8
+    assert technique.compared == 3
+    names = [c.place.source_image for c in named(ranking, index, place_map)]
+    assert names[:3] == ["40", "36", "32"]
+    assert len(names) == 8, "the others come last, as they looked"
+    assert set(ranking.compared) == set(ranking.slots[:3].tolist())
+    assert (np.diff(ranking.scores) <= 0).all()
+
+
+def test_a_rival_is_one_that_looked_best_elsewhere(ruler_map):
+    _, place_map = ruler_map
+    technique = Hasty()
+    index = load_index(place_map, technique, 10_000)
+    # All three that are compared are neighbours, within 150 m of 40: so five rivals are compared as well.
+    ranking = rank(technique, technique.encode(np.full((1, 1), 41)), place_map, index, 12, 150.0)
+    assert technique.compared == 8
+    away = elsewhere(index, ranking.slots[0], ranking.slots, 150.0)
+    rivals = [slot for slot in ranking.slots[away].tolist() if slot in ranking.compared]
+    seen = {number: 1 / (1 + abs(number + 5 - 41)) for number in technique.glanced}
+    assert len(rivals) == 5
+    numbers = {4.0 * slot for slot in rivals}
+    others = [score for number, score in seen.items() if number not in numbers and abs(number - 40) * 11.1 > 150]
+    assert min(seen[number] for number in numbers) >= max(others, default=0)
+
+
+def test_an_exact_comparison_is_not_at_a_glance(ruler_map):
+    _, place_map = ruler_map
+    technique = Hasty()
+    rank(technique, technique.encode(np.full((1, 1), 41)), place_map, load_index(place_map, technique, 10_000))
+    assert (len(technique.glanced), technique.compared) == (0, 25)
 
 
 def test_rivals_elsewhere_are_compared_under_their_best_hypotheses_too(ruler_map):
@@ -348,7 +398,7 @@ def test_what_is_out_of_the_question_is_not_tried_and_nor_are_more_places_for_it
     by_hypothesis[:, 3:] = -np.inf
     by_hypothesis[7] = 0.5  # one place of which nothing is known does not change what all take
     found = tried(by_hypothesis, 10)
-    assert sum(len(each) for each in found.values()) == 30
+    assert sum(len(each) for each in found.values()) == 15  # one and a half of three, for each of ten
     assert {number for slot, each in found.items() for number in each if slot != 7} == {0, 1, 2}
     by_hypothesis[:] = -np.inf
     assert not tried(by_hypothesis, 10)

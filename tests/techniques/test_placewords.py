@@ -79,7 +79,8 @@ def test_a_place_has_each_word_once_and_none_where_nothing_is_to_be_seen():
 def test_the_scan_is_the_count_spelt_out(town):
     technique, grounds, rows = town
     query = technique.encode(view(grounds[2], 60, -30, 40.0))
-    asked = placewords.of_query(VOCABULARY, [technique.good_patterns(query, turn) for turn in range(6)], SIDE)
+    asking = {turn: technique.good_patterns(query, turn) for turn in range(6)}
+    asked = placewords.of_query(VOCABULARY, asking, 6, SIDE)
     places = [round((n + 0.5) * 3.1 - 0.5) for n in range(10)]
     expected = np.zeros((len(rows), 24))
     for turn in range(24):
@@ -119,7 +120,7 @@ def test_of_many_pairs_only_the_best_vote_and_they_come_first(town, monkeypatch)
     many = np.concatenate([many, rows])
     query = technique.encode(view(grounds[9], 16, 16, 75))
     full = technique.coarse_scores(query, many, None)[1]
-    monkeypatch.setattr(placewords, "_VOTED", 1000)
+    monkeypatch.setattr(placewords, "_VOTED_EACH", 40)
     some = technique.coarse_scores(query, many, None)[1]
     assert some.argmax() == full.argmax()
     assert np.mean(some < full) > 0.2
