@@ -12,11 +12,13 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
+import bench_card
 import bench_encode
 import bench_flight
 import bench_match
 import bench_scan
 import bench_two_stage
+import beside_before
 from run_sets import made_by
 
 RESULTS = Path(__file__).resolve().parent / "results"
@@ -30,6 +32,8 @@ def main() -> None:
         "encode": bench_encode.rows,
         "match": lambda: [bench_match.row()],
         "two_stage": bench_two_stage.rows,
+        "before": beside_before.rows,
+        "card": bench_card.rows,
         "binary_scan": bench_scan.binary_rows,
         "growth": bench_scan.growth_rows,
         "flight": bench_flight.rows,
@@ -100,6 +104,18 @@ The published way is written plainly in `benchmarks/competitor.py`; the floor is
 ## A query over 10 000 places
 
 {bench_two_stage.table(measured["two_stage"])}
+
+Beside the same queries as edgevpr was before its scan looked for words (commit {beside_before.BEFORE}), turn by turn in
+one run, each version in a process of its own:
+
+{beside_before.table(measured["before"])}
+
+## Reading from a card
+
+What one query reads of a map of 10 000 places that is not in the page cache, and what that takes beside the query
+itself on a card of {bench_card.CARD_MB_PER_S:g} MB/s:
+
+{bench_card.table(measured["card"])}
 
 ## Scan of binary vectors, 100 000 x 512 bits
 

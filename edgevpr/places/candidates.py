@@ -9,7 +9,7 @@ Chosen = tuple[int, list[int] | None]  # a slot, and the hypotheses to try (None
 
 def best_scanned(scanned: np.ndarray, by_hypothesis: np.ndarray | None, among: np.ndarray, count: int) -> list[Chosen]:
     """Choose the `count` best-scanned slots where `among` bool (N,) is True, and the hypotheses to try of each (None:
-    all).
+    all). They come in the order of the map file, in which a card reads them fastest.
 
     With `by_hypothesis` float32 (N, H) (see `Technique.coarse_scores`), the best hypotheses of all places together are
     chosen instead: `count` times six, or `count` times half of the mean number possible for a place where that is less.
@@ -18,10 +18,10 @@ def best_scanned(scanned: np.ndarray, by_hypothesis: np.ndarray | None, among: n
     """
     slots = np.flatnonzero(among)
     if by_hypothesis is None or not len(slots):
-        return [(slot, None) for slot in slots[_largest(scanned[slots], count)].tolist()]
+        return [(slot, None) for slot in slots[np.sort(_largest(scanned[slots], count))].tolist()]
     possible = np.isfinite(by_hypothesis[slots]).sum(axis=1).mean()
     tries = round(count * max(1.0, min(_TRIED_EACH, possible / 2)))
-    slots = slots[_largest(scanned[slots], tries)]
+    slots = slots[np.sort(_largest(scanned[slots], tries))]
     scores = by_hypothesis[slots]
     of_place = np.argsort(np.argsort(-scores, axis=1, kind="stable"), axis=1)
     scores = np.where(of_place < max(_TRIED_EACH, tries // len(slots)), scores, -np.inf)

@@ -104,7 +104,7 @@ def compare(
     if one_stage or exact:
         candidates = len(index)
     readable = np.ones(len(index), bool) if one_stage else ~left_out(place_map, index)
-    visit = Visit(technique, query, scores, place_map, index)
+    visit = Visit(technique=technique, query=query, scores=scores, place_map=place_map, index=index)
     matches: dict[int, FineMatch] = {}
     passed_over: list[Seen] = []
 

@@ -29,7 +29,7 @@ Seen = tuple[float, Chosen]  # about the score of a place, and the best of the h
 _MANY = 3  # unreadable places of one query, that may be the file's fault
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Visit:
     """Comparisons of one query with places of a map; `scores` float32 (N,) are those of the scan.
 
