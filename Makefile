@@ -7,7 +7,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # Where this is set, each of the hundreds of processes that the tests start compiles edgevpr anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test lint results bench hostile clean
+.PHONY: demo test lint results bench bench-arm64 hostile clean
 
 demo: $(VENV)/installed
 	$(BIN)/edgevpr demo --out demo_out
@@ -30,6 +30,11 @@ bench: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[bench]'
 	$(BIN)/python benchmarks/bench.py
 	$(BIN)/python benchmarks/readme.py
+
+# What a query costs an ARM core, counted under emulation (as root; Debian's qemu-user, debootstrap and gcc), into
+# benchmarks/results/.
+bench-arm64: $(VENV)/installed
+	$(BIN)/python benchmarks/bench_arm64.py
 
 # Everything that a hostile world does, from a seed, into benchmarks/results/.
 hostile: $(VENV)/installed

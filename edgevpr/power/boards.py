@@ -21,14 +21,16 @@ class MachineSpeed:
     unknown).
 
     `single` is one thread at integer code and bytes, `multi` all cores together at the same; `products` and `passes`
-    are one thread at matrix products and at passes over bytes, where they are known apart. `verified` tells whether
-    `source` measured it on this very board.
+    are one thread at matrix products and at passes over bytes, where they are known apart. `arm64_mips` is how many
+    million instructions a second one thread of an aarch64 board runs. `verified` tells whether `source` measured it on
+    this very board.
     """
 
     single: float | None = bounded(0.0001, 100)
     multi: float | None = bounded(0.0001, 10_000)
     products: float | None = bounded(0.0001, 100)
     passes: float | None = bounded(0.0001, 100)
+    arm64_mips: float | None = field(default=None, metadata={"range": (1, 1_000_000)})
     verified: bool
     source: str
 

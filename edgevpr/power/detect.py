@@ -146,6 +146,7 @@ benchmark_score:
   multi: {_number(speed.multi)}
   products: {_number(speed.products)}
   passes: {_number(speed.passes)}
+  arm64_mips: {_number(speed.arm64_mips)}
   verified: {_word(speed.verified)}
   source: {_quoted(speed.source)}
 """

@@ -15,8 +15,8 @@ import numpy as np
 
 # Rounds a second of one core of the reference, an AMD EPYC (Zen 4) in a virtual machine, by `_rate` below with
 # OPENBLAS_NUM_THREADS=1, Python 3.11 and NumPy 2.4 (OpenBLAS 0.3.31).
-_REFERENCE_PRODUCTS_HZ = 1585.0
-_REFERENCE_PASSES_HZ = 1960.0
+REFERENCE_PRODUCTS_HZ = 1585.0
+REFERENCE_PASSES_HZ = 1960.0
 
 _LEAST_S = 0.4  # of each of the four measurements
 _LEAST_ROUNDS = 5
@@ -40,14 +40,14 @@ def score() -> Speed:
     imported). Then one thread is one core, and all cores are loaded by as many threads of our own.
     """
     cores = len(os.sched_getaffinity(0))
-    products = _rate(_product_round()) / _REFERENCE_PRODUCTS_HZ
-    passes = _rate(_pass_round()) / _REFERENCE_PASSES_HZ
-    all_products = _rate_together(_product_round, cores) / _REFERENCE_PRODUCTS_HZ
-    all_passes = _rate_together(_pass_round, cores) / _REFERENCE_PASSES_HZ
+    products = _rate(product_round()) / REFERENCE_PRODUCTS_HZ
+    passes = _rate(pass_round()) / REFERENCE_PASSES_HZ
+    all_products = _rate_together(product_round, cores) / REFERENCE_PRODUCTS_HZ
+    all_passes = _rate_together(pass_round, cores) / REFERENCE_PASSES_HZ
     return Speed(math.sqrt(products * passes), math.sqrt(all_products * all_passes), products, passes)
 
 
-def _product_round() -> Callable[[], object]:
+def product_round() -> Callable[[], object]:
     """Return a function that makes one float32 product of 961 x 32 by 32 x 961: the regions of a query with those of a
     place."""
     random = np.random.default_rng(1)
@@ -57,7 +57,7 @@ def _product_round() -> Callable[[], object]:
     return lambda: np.matmul(query, place.T, out=out)
 
 
-def _pass_round() -> Callable[[], object]:
+def pass_round() -> Callable[[], object]:
     """Return a function that makes gradient magnitudes of a 512 x 512 picture, and a scan of 4096 codes of 512 bits
     with two queries."""
     random = np.random.default_rng(2)

@@ -6,9 +6,9 @@ from edgevpr.power import speed
 
 
 def test_the_score_is_relative_to_the_reference_and_keeps_its_two_parts_apart(monkeypatch):
-    monkeypatch.setattr(speed, "_product_round", lambda: "product")
-    monkeypatch.setattr(speed, "_pass_round", lambda: "pass")
-    rates = {"product": speed._REFERENCE_PRODUCTS_HZ / 16, "pass": speed._REFERENCE_PASSES_HZ / 4}
+    monkeypatch.setattr(speed, "product_round", lambda: "product")
+    monkeypatch.setattr(speed, "pass_round", lambda: "pass")
+    rates = {"product": speed.REFERENCE_PRODUCTS_HZ / 16, "pass": speed.REFERENCE_PASSES_HZ / 4}
     monkeypatch.setattr(speed, "_rate", lambda work: rates[work])
     monkeypatch.setattr(speed, "_rate_together", lambda make, threads: 3 * rates[make()])
     found = speed.score()

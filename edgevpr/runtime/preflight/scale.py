@@ -1,8 +1,12 @@
-"""Costs measured on one machine, converted to another: times by the ratio of two scores, memory unchanged."""
+"""Costs measured on one machine, converted to another: times by the ratio of two scores, or by the instructions that
+were counted; memory unchanged."""
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 from edgevpr.power.boards import Board, MachineSpeed
+from edgevpr.power.speed import REFERENCE_PASSES_HZ, REFERENCE_PRODUCTS_HZ
+from edgevpr.runtime.preflight import counted
+from edgevpr.runtime.preflight.counted import Work
 from edgevpr.runtime.preflight.probe import TechniqueCosts
 from edgevpr.types import StageCost
 
@@ -28,15 +32,16 @@ def is_same(here: Board, board: Board) -> bool:
 def ratios(here: Board, board: Board) -> Ratios | None:
     """Return the ratios of `board` to `here`, the machine that measured; None where a score is unknown.
 
-    Where passes have no figure, the single thread's score stands in for it, and where products have none, a modest
-    share of it.
+    Where products or passes have no figure, the counted instructions of such work stand in for it, on a board that says
+    how many a second it runs. On others the single thread's score stands in for passes, and a modest share of it for
+    products.
     """
     if is_same(here, board):
         return Ratios(1.0, 1.0)
     mine, other = here.benchmark_score, board.benchmark_score
     pairs = [
         (_products(other), _products(mine)),
-        (other.passes or other.single, mine.passes or mine.single),
+        (_passes(other), _passes(mine)),
     ]
     if not all(there and here_too for there, here_too in pairs):
         return None
@@ -44,13 +49,28 @@ def ratios(here: Board, board: Board) -> Ratios | None:
 
 
 def _products(score: MachineSpeed) -> float | None:
+    if score.products is None and score.arm64_mips:
+        return counted.rounds_hz("products", score.arm64_mips) / REFERENCE_PRODUCTS_HZ
     return score.products or (score.single and UNKNOWN_PRODUCTS * score.single)
 
 
-def on_board(costs: TechniqueCosts, here: Board, board: Board) -> TechniqueCosts:
-    """Convert costs measured `here` to `board`; the times stay as they are where no ratio is known."""
+def _passes(score: MachineSpeed) -> float | None:
+    if score.passes is None and score.arm64_mips:
+        return counted.rounds_hz("passes", score.arm64_mips) / REFERENCE_PASSES_HZ
+    return score.passes or score.single
+
+
+def on_board(costs: TechniqueCosts, here: Board, board: Board, work: Work | None = None) -> TechniqueCosts:
+    """Convert costs measured `here` to `board`: by the counted `work` of the technique, where it is known and the board
+    says how many instructions a second it runs, else by the ratios. The times stay as they are where no ratio is
+    known."""
+    if is_same(here, board):
+        return costs
+    if work and (mips := board.benchmark_score.arm64_mips):
+        times_s = {stage: instructions / (1e6 * mips) for stage, instructions in asdict(work).items()}
+        return replace(costs, **{stage: StageCost(time_s, time_s) for stage, time_s in times_s.items()})
     found = ratios(here, board)
-    if found is None or is_same(here, board):
+    if found is None:
         return costs
     # A network's layers are products, and so is the comparison of all regions with all regions. Work on pictures and on
     # rows of the index is passes.
@@ -62,6 +82,7 @@ def on_board(costs: TechniqueCosts, here: Board, board: Board) -> TechniqueCosts
         match_per_place=_scaled(
             costs.match_per_place, found.passes if costs.candidates is None else found.products, board
         ),
+        compare_once=_scaled(costs.compare_once, found.products, board),
         scan_per_place=_scaled(costs.scan_per_place, found.passes, board),
         scan_once=_scaled(costs.scan_once, found.passes, board),
     )

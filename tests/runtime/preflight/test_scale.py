@@ -1,12 +1,16 @@
 """Costs of one machine as they would be on another."""
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import example_costs
 import pytest
 from example_costs import VECTOR
 
 from edgevpr.power.boards import MachineSpeed, load_board
+from edgevpr.power.speed import REFERENCE_PASSES_HZ
+from edgevpr.runtime.preflight import counted
 from edgevpr.runtime.preflight.scale import UNKNOWN_PRODUCTS, Ratios, is_same, on_board, ratios
 from edgevpr.types import StageCost
 
@@ -60,8 +64,41 @@ def test_no_board_is_taken_to_be_quicker_at_products_because_nobody_has_measured
     assert products["rpi-zero-2w"] <= products["rpi-3b-plus"] < products["rpi-4b"] < products["rpi-5"]
 
 
-def test_the_pi_4_is_slower_at_products_than_at_anything_else():
-    assert ratios(HERE, PI) == Ratios(0.056, 0.38)
+def test_what_is_not_known_apart_of_an_arm_board_is_by_the_instructions_that_were_counted():
+    assert ratios(HERE, PI).products == PI.benchmark_score.products
+    passes_hz = 1e6 * PI.benchmark_score.arm64_mips / counted_parts()["micro-benchmark: a round of passes"]
+    assert ratios(HERE, PI).passes == pytest.approx(passes_hz / REFERENCE_PASSES_HZ, rel=1e-6)
+    for name in ("rpi-4b", "rpi-5"):  # whose products Linpack tells
+        score = load_board(name).benchmark_score
+        alone = replace(PI, benchmark_score=replace(score, products=None))
+        assert ratios(HERE, alone).products == pytest.approx(score.products, rel=0.4)
+
+
+def test_counted_work_takes_its_instructions_whatever_was_measured_here():
+    work = counted.of("cohog", {"camera": "nadir"})
+    there = on_board(REGIONS, HERE, PI, work)
+    parts, rate_hz = counted_parts(), 1e6 * PI.benchmark_score.arm64_mips
+    assert there.encode.wall_s == pytest.approx(parts["down: encode a frame"] / rate_hz, rel=1e-6)
+    query_s = there.encode.wall_s + replace(there, candidates=50).match(10_000).wall_s
+    assert query_s == pytest.approx(parts["down: a query"] / rate_hz, rel=1e-3)
+    assert on_board(REGIONS, HERE, HERE, work) == REGIONS
+    assert on_board(REGIONS, HERE, scored(single=0.4), work) == on_board(REGIONS, HERE, scored(single=0.4))
+
+
+def test_only_what_was_counted_is_known():
+    assert counted.of("cohog", {}) == counted.of("cohog", {"camera": "forward", "w1": 512, "gt": 0.4})
+    assert counted.of("cohog", {"w1": 256}) is None
+    assert counted.of("cohog", {"matching": "thesis"}) is None
+    assert counted.of("hog", {}) is None
+
+
+def test_the_counts_are_those_of_the_benchmark():
+    assert counted.figures(counted_parts()) == json.loads(counted.PATH.read_text())
+
+
+def counted_parts():
+    results = Path(__file__).parents[3] / "benchmarks" / "results" / "arm64.json"
+    return {row["part"]: row["instructions"] for row in json.loads(results.read_text())["parts"]}
 
 
 def test_more_busy_cores_than_the_board_has_take_longer():

@@ -1,0 +1,105 @@
+"""The parts of a query, once each: what `bench_arm64.py` counts under emulation, and times here.
+
+`python work.py AHEAD.gpkg DOWN.gpkg` marks the beginning and the end of each part by a call of getppid(), which costs
+next to nothing, and prints its name. With `--here` it prints JSON of each part's quickest time in milliseconds, and of
+its calls of compiled functions.
+"""
+
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from edgevpr.places.index import PlaceIndex, load_index
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.retrieve import NOTHING, Expected, compare, scan
+from edgevpr.power.speed import pass_round, product_round
+from edgevpr.techniques import create
+
+SMALL = 1_000  # places of a part of the map
+PER_PLACE = ("place_ids", "lat_deg", "lon_deg", "heading_deg", "rows")
+_TURNS = 7
+
+
+def parts(ahead: str, down: str) -> Iterator[tuple[str, Callable[[], object]]]:
+    """Yield the name of each part, and a function that does it."""
+    yield from of_camera("ahead", "forward", ahead)
+    yield from of_camera("down", "nadir", down)
+    yield "micro-benchmark: a round of products", product_round()
+    yield "micro-benchmark: a round of passes", pass_round()
+
+
+def of_camera(name: str, camera: str, path: str) -> Iterator[tuple[str, Callable[[], object]]]:
+    """Yield the parts of a query of `cohog` in one map."""
+    rng = np.random.default_rng(0)
+    # Noise smoothed and stretched: nearly all regions are good, as over a town.
+    noise = cv2.GaussianBlur(rng.integers(0, 256, (480, 640), np.uint8), (0, 0), 2)
+    picture = cv2.normalize(noise, None, 0, 255, cv2.NORM_MINMAX)
+    technique = create("cohog", {"camera": camera})
+    with PlaceMap.open(path) as place_map:
+        index = load_index(place_map, technique, 100_000_000)
+        small = replace(index, **{each: getattr(index, each)[:SMALL] for each in PER_PLACE})
+        known = Expected(turned_deg=rng.choice([0.0, 180.0], len(index)))
+        fine, _ = place_map.fine_part(index.place_ids[0])
+        asked, one = technique.encode(picture), [0] if camera == "nadir" else None
+
+        def scanned(places: PlaceIndex) -> object:
+            return scan(technique, technique.encode(picture), places)
+
+        def query(expected: Expected) -> object:
+            seen, count = technique.encode(picture), technique.candidates
+            found = scan(technique, seen, index, expected)
+            return compare(technique, seen, found, place_map, index, candidates=count, expected=expected)
+
+        yield f"{name}: encode a frame", lambda: technique.encode(picture)
+        yield f"{name}: read a place", lambda: place_map.fine_part(index.place_ids[1])
+        yield f"{name}: glance at a place", lambda: technique.glance(asked, fine, one)
+        yield f"{name}: compare a place in full", lambda: technique.match(asked, fine, one)
+        yield f"{name}: encode, and scan {len(small)} places", lambda: scanned(small)
+        yield f"{name}: encode, and scan {len(index)} places", lambda: scanned(index)
+        yield f"{name}: a query", lambda: query(NOTHING)
+        if camera == "nadir":
+            yield f"{name}: a query, heading known", lambda: query(known)
+
+
+def mark_each(*maps: str) -> None:
+    for name, work in parts(*maps):
+        work()
+        os.getppid()
+        work()
+        os.getppid()
+        print(name, flush=True)
+
+
+def time_each(*maps: str) -> None:
+    found = {}
+    for name, work in parts(*maps):
+        calls, times_ms = 0, []
+
+        def count(_: object, event: str, called: object) -> None:
+            nonlocal calls
+            calls += event == "c_call"
+
+        work()
+        sys.setprofile(count)
+        work()
+        sys.setprofile(None)
+        for _ in range(_TURNS):
+            start = time.perf_counter()
+            work()
+            times_ms.append(1000 * (time.perf_counter() - start))
+        found[name] = {"here_ms": min(times_ms), "calls": calls}
+    print(json.dumps(found))
+
+
+if __name__ == "__main__":
+    cv2.setNumThreads(1)
+    if sys.argv[1] == "--here":
+        time_each(*sys.argv[2:])
+    else:
+        mark_each(*sys.argv[1:])

@@ -1,0 +1,133 @@
+"""What a query costs an ARM core: instructions, bytes and multiply-adds of its parts, counted while an emulated
+Cortex-A53 runs them, beside their times and calls on this machine. `make bench-arm64` writes
+benchmarks/results/arm64.md and arm64.json, and the counts that `edgevpr profile` estimates ARM boards by.
+
+It needs Debian's packages qemu-user, debootstrap and gcc, and the registries of Debian and PyPI. Counts repeat to some
+thousandths; times do not.
+"""
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
+
+import json
+import shutil
+import subprocess
+import sys
+from importlib import metadata
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from big_map import make_big_map
+from run_sets import made_by
+
+from edgevpr.helpers.tables import markdown
+from edgevpr.power.boards import load_board
+from edgevpr.runtime.preflight import counted
+from edgevpr.techniques import create
+
+HERE = Path(__file__).resolve().parent
+RESULTS = HERE / "results"
+TOOLS = ("qemu-aarch64", "debootstrap", "gcc", "dpkg-deb")
+WHEELS = ("numpy", "opencv-python-headless", "psutil", "pyyaml")  # what the parts import
+PLATFORMS = ("manylinux2014_aarch64", "manylinux_2_17_aarch64", "manylinux_2_27_aarch64", "manylinux_2_28_aarch64")
+
+
+def main() -> None:
+    missing = [tool for tool in TOOLS if not shutil.which(tool)]
+    if missing or os.geteuid():
+        sys.exit(f"bench_arm64: as root, install qemu-user, debootstrap and gcc ({' '.join(missing)} is not there).")
+    with TemporaryDirectory(prefix="edgevpr-arm64-") as folder:
+        work = Path(folder)
+        print("building an aarch64 system", flush=True)
+        build(work)
+        maps = []
+        for camera in ("forward", "nadir"):
+            maps.append(str(work / f"{camera}.gpkg"))
+            make_big_map(Path(maps[-1]), create("cohog", {"camera": camera}).spec, counted.LARGE)
+        print("counting", flush=True)
+        rows = count(work, maps)
+        here = json.loads(run([sys.executable, str(HERE / "arm64" / "work.py"), "--here", *maps]).stdout)
+    for row in rows:
+        row.update(here[row["part"]])
+    made = made_by()
+    (RESULTS / "arm64.json").write_text(json.dumps({**made, "parts": rows}, indent=1) + "\n")
+    figures = counted.figures({row["part"]: row["instructions"] for row in rows})
+    counted.PATH.write_text(json.dumps(figures, indent=1) + "\n")
+    page = report(rows, made)
+    (RESULTS / "arm64.md").write_text(page)
+    print(page)
+
+
+def build(work: Path) -> None:
+    """Make a Debian system for aarch64 with Python, the wheels that edgevpr imports, and the plug-in that counts."""
+    system, site = work / "system", work / "site"
+    packages = "python3,libsqlite3-0,libstdc++6"
+    mirror = ("--variant=minbase", f"--include={packages}", "bookworm", str(system))
+    run(["debootstrap", "--foreign", "--arch=arm64", *mirror])
+    for archive in sorted((system / "var/cache/apt/archives").glob("*.deb")):
+        run(["dpkg-deb", "-x", str(archive), str(system)])
+    versions = [f"{name}=={metadata.version(name)}" for name in WHEELS]
+    platforms = [f"--platform={name}" for name in PLATFORMS]
+    binary = ["--only-binary=:all:", "--no-deps", "--python-version=3.11", *platforms]
+    run([sys.executable, "-m", "pip", "install", "--quiet", f"--target={site}", *binary, *versions])
+    run(["gcc", "-shared", "-fPIC", "-O2", "-o", str(work / "count.so"), str(HERE / "arm64" / "count.c")])
+
+
+def count(work: Path, maps: list[str]) -> list[dict[str, Any]]:
+    """Run the parts under emulation. Returns for each what it took: `part`, `instructions`, `bytes` loaded and stored,
+    and `multiply_adds`."""
+    argv = ["qemu-aarch64", "-cpu", "cortex-a53", "-L", str(work / "system"), "-plugin", str(work / "count.so")]
+    argv += [str(work / "system/usr/bin/python3.11"), str(HERE / "arm64" / "work.py"), *maps]
+    variables = {**os.environ, "PYTHONPATH": f"{work / 'site'}:{HERE.parent}"}
+    done = run(argv, env=variables)
+    marks = [[int(number) for number in line.split()] for line in done.stderr.splitlines() if line[:1].isdigit()]
+    names = done.stdout.splitlines()
+    if len(marks) != 2 * len(names):
+        raise RuntimeError(f"{len(marks)} marks of {len(names)} parts: {done.stderr}")
+    rows = []
+    for name, before, after in zip(names, marks[::2], marks[1::2], strict=True):
+        instructions, moved, multiply_adds = (late - early for early, late in zip(before, after, strict=True))
+        rows.append({"part": name, "instructions": instructions, "bytes": moved, "multiply_adds": multiply_adds})
+    return rows
+
+
+def run(argv: list[str], env: dict[str, str] | None = None) -> subprocess.CompletedProcess:
+    """Run a command; its output ends the program where it fails."""
+    done = subprocess.run(argv, capture_output=True, text=True, env=env)
+    if done.returncode:
+        sys.exit(f"bench_arm64: {' '.join(argv[:4])} ... failed: {done.stdout[-2000:]}{done.stderr[-2000:]}")
+    return done
+
+
+def report(rows: list[dict[str, Any]], made: dict[str, Any]) -> str:
+    """The page for people."""
+    machine, mips = made["machine"], load_board("rpi-zero-2w").benchmark_score.arm64_mips
+    lines = [
+        [
+            row["part"],
+            f"{row['instructions'] / 1e6:.2f}",
+            f"{row['bytes'] / 1e6:.1f}",
+            f"{row['multiply_adds'] / 1e6:.1f}",
+            row["calls"],
+            f"{row['here_ms']:.2f}",
+            f"{row['instructions'] / 1e6 / mips:.3f}",
+        ]
+        for row in rows
+    ]
+    heads = ("part", "million instructions", "MB moved", "million multiply-adds", "calls", "ms here", "s on Zero 2 W")
+    return f"""# What a query costs an ARM core
+
+Made by `make bench-arm64` on {made["date"]}, commit {made["commit"]}: {counted.LARGE} places, and a picture in which
+nearly every region is good. Counted while QEMU ran a Cortex-A53, with NumPy {machine["numpy"]} and OpenCV
+{machine["opencv"]} for aarch64. MB moved are all loads and stores, most of them from caches. Multiply-adds are those of
+vector instructions. Calls are of compiled functions, by Python. Times here are the quickest on an {machine["cpu"]}, one
+thread. The last column divides by the {mips:g} million instructions a second of `profiles/rpi-zero-2w.yaml`.
+
+{markdown(heads, lines)}
+"""
+
+
+if __name__ == "__main__":
+    main()
