@@ -55,7 +55,11 @@ class Flight:
         self.flown: Flown | None = None
 
     def fly(
-        self, source: FakeSource, meter: FlightMeter | None = None, smaller_forms: tuple[str, ...] = ()
+        self,
+        source: FakeSource,
+        meter: FlightMeter | None = None,
+        smaller_forms: tuple[str, ...] = (),
+        fewer_candidates: tuple[int, ...] = (),
     ) -> list[dict]:
         autopilot = NoAutopilot()
         if self.link:
@@ -70,6 +74,7 @@ class Flight:
                 autopilot=autopilot,
                 stop=self.stop,
                 learner=self.learner,
+                fewer_candidates=fewer_candidates,
                 smaller_forms=smaller_forms,
                 clock=self.clock.clock,
                 meter=meter,

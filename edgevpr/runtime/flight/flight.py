@@ -46,14 +46,15 @@ def fly(
     autopilot: Autopilot,
     stop: Stop,
     learner: Learner | None = None,
+    fewer_candidates: tuple[int, ...] = (),
     smaller_forms: tuple[str, ...] = (),
     clock: Clock | None = None,
     meter: FlightMeter | None = None,
 ) -> Flown:
     """Fly until the source has ended or `stop` is asked for.
 
-    `learner` makes places (None: nothing is learnt); `smaller_forms` are the forms of the index that the governor may
-    change to. `clock` and `meter` are the real ones unless given.
+    `learner` makes places (None: nothing is learnt); `fewer_candidates`, and `smaller_forms` of the index, are those
+    that the governor may change to. `clock` and `meter` are the real ones unless given.
     """
     clock = clock or Clock()
     if meter is None:
@@ -70,6 +71,7 @@ def fly(
         flight_log=flight_log,
         autopilot=autopilot,
         clock=clock,
+        fewer_candidates=fewer_candidates,
         smaller_forms=smaller_forms,
     )
     vitals = Vitals(

@@ -22,7 +22,8 @@ _log = logging.getLogger(__name__)
 
 class Governing:
     """Keeps a recogniser and its pace within the limits of the board. Every change, down or back, is logged and
-    announced once. `smaller_forms` are the forms of the index that may be taken (see `TechniqueSpec`)."""
+    announced once. `fewer_candidates` and `smaller_forms` are those that may be taken, in this order (see
+    `governor.steps`)."""
 
     def __init__(
         self,
@@ -34,12 +35,13 @@ class Governing:
         flight_log: FlightLog,
         autopilot: Autopilot,
         clock: Clock,
+        fewer_candidates: tuple[int, ...] = (),
         smaller_forms: tuple[str, ...] = (),
     ) -> None:
         self._recogniser, self._pace, self._config = recogniser, pace, config
         self._meter, self._flight_log, self._autopilot, self._clock = meter, flight_log, autopilot, clock
         self._index_mb = {recogniser.technique.spec.form: recogniser.index.nbytes / 1e6}
-        self._governor = _governor(recogniser, pace, smaller_forms, self._index_mb)
+        self._governor = _governor(recogniser, pace, fewer_candidates, smaller_forms, self._index_mb)
         self._wanted_form: str | None = None  # a form that could not be loaded
         self._reload_due_s = 0.0
 
@@ -96,14 +98,17 @@ class Governing:
 
 
 def _governor(
-    recogniser: Recogniser, pace: Pace, smaller_forms: tuple[str, ...], index_mb: dict[str | None, float]
+    recogniser: Recogniser,
+    pace: Pace,
+    fewer_candidates: tuple[int, ...],
+    smaller_forms: tuple[str, ...],
+    index_mb: dict[str | None, float],
 ) -> Governor:
-    """Make the governor that keeps a recogniser within its board's profile. A scan alone has no candidates to lower,
-    and a sequence needs queries as often as the map was made."""
+    """Make the governor that keeps a recogniser within its board's profile. A sequence needs queries as often as the
+    map was made, and its rivals compared."""
     board, spec = recogniser.meter.board, recogniser.technique.spec
     hottest_c = limit_c() if board.thermal_limit_c is None else board.thermal_limit_c
     in_sequence = recogniser.search.length > 1
     asked = Setting(pace.rate_hz, recogniser.candidates, spec.form)
-    compares = spec.fine is not None and not in_sequence  # a sequence needs rivals compared
-    settings = steps(asked, in_sequence, compares, smaller_forms)
+    settings = steps(asked, in_sequence, () if in_sequence else fewer_candidates, smaller_forms)
     return Governor(Limits(board.cpu_share, board.memory_max_mb, hottest_c), settings, index_mb)

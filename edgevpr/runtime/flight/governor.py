@@ -1,6 +1,6 @@
-"""The governor keeps CPU share, memory and temperature within the board's profile. It first asks less often, then
-compares fewer candidates, then takes a form of the index that costs less. It goes back the same way when there is room
-again.
+"""The governor keeps CPU share, memory and temperature within the board's profile. It first compares fewer candidates,
+which find nearly as much for less, then asks less often, then takes a form of the index that costs less. It goes back
+the same way when there is room again.
 
 Pure: readings and their times go in, changes come out. Two rules keep it from swinging to and fro. It goes back only if
 the reading, scaled to the higher setting, leaves a clear distance to every limit. A step back that soon had to be
@@ -20,10 +20,7 @@ _LATE = 0.95
 _COOLER_C = 5.0
 _NEAR_MEMORY, _MEMORY_ROOM = 0.95, 0.9
 _SLOWEST = 8  # times less often than asked, at most
-# With fewer candidates a wrong place is more easily ahead, and the right one is more often missing. With half the usual
-# number (21, or 25 looking down) no wrong match of the sets corridor and aerial_caliterra was accepted. Without any, a
-# scan alone says only which places are worth a comparison.
-_FEWEST_CANDIDATES = 20
+_OF_CANDIDATES = 0.6  # of a query that is for its candidates, in a large map (benchmarks/results/arm64.md)
 _OTHER_FORM = 2.0  # the larger form takes about this many times the work
 
 
@@ -71,21 +68,21 @@ class Change:
     back: bool = False
 
 
-def steps(asked: Setting, keeps_rate: bool, compares: bool, forms: Sequence[str] = ()) -> tuple[Setting, ...]:
+def steps(
+    asked: Setting, keeps_rate: bool, fewer: Sequence[int] = (), forms: Sequence[str] = ()
+) -> tuple[Setting, ...]:
     """Return the settings from what is asked down to the least.
 
-    The rate is halved down to an eighth, then the candidates as long as 20 are left, then the forms are taken.
-    `keeps_rate` is for sequences, which need queries as often as the map was made; `compares` tells that candidates are
-    compared in full. `forms` are those that the map can serve and that cost less than the one asked for, in the order
-    to take them.
+    The candidates are lowered to each of `fewer`, numbers that are known to accept no wrong place, largest first. Then
+    the rate is halved down to an eighth, then the forms are taken. `keeps_rate` is for sequences, which need queries as
+    often as the map was made. `forms` are those that the map can serve and that cost less than the one asked for, in
+    the order to take them.
     """
     found = [asked]
+    found += [replace(asked, candidates=count) for count in fewer if count < asked.candidates]
     if not keeps_rate:
         while found[-1].rate_hz > asked.rate_hz / _SLOWEST:
             found.append(replace(found[-1], rate_hz=found[-1].rate_hz / 2))
-    if compares:
-        while found[-1].candidates // 2 >= _FEWEST_CANDIDATES:
-            found.append(replace(found[-1], candidates=found[-1].candidates // 2))
     found += [replace(found[-1], form=form) for form in forms]
     return tuple(found)
 
@@ -129,7 +126,7 @@ class Governor:
         number of queries."""
         hot, over = self._load(reading)
         full = reading.rss_mb >= _NEAR_MEMORY * self._limits.memory_max_mb
-        less, more = self._next(1, 0), self._next(-1, 0) or self._next(-1, -1)  # load and memory may hold the same form
+        less, more = self._less(hot), self._next(-1, 0) or self._next(-1, -1)  # load and memory may hold the same form
         smaller, larger = self._next(0, 1), self._next(0, -1)
         room = self._has_room(reading, self._setting(*more or (self._at, self._form_at)))
         memory_room = self._has_memory(reading, self._setting(*larger or (self._at, self._form_at)))
@@ -167,6 +164,13 @@ class Governor:
             at, form_at = at + by, form_at + form_by
         return None
 
+    def _less(self, hot: bool) -> tuple[int, int] | None:
+        """Return the next step down; where the board is hot, the next to a lower rate, since a small one cools it too
+        slowly to tell."""
+        rate_hz, settings = self.setting.rate_hz, enumerate(self._settings)
+        slower = next((at for at, each in settings if at > self._at and each.rate_hz < rate_hz), None)
+        return self._next(1, 0) if slower is None or not hot else (slower, self._form_at)
+
     def _load(self, reading: Reading) -> tuple[bool, str | None]:
         """Tell whether it is too hot, and say which limit is passed (None: none, memory apart)."""
         limits, temperature_c = self._limits, reading.temperature_c
@@ -183,7 +187,8 @@ class Governor:
     def _has_room(self, reading: Reading, then: Setting) -> bool:
         """Tell whether all limits would be kept by a clear distance with this setting."""
         now, limits = self.setting, self._limits
-        more = then.rate_hz / now.rate_hz * then.candidates / now.candidates
+        more = 1 + _OF_CANDIDATES * (then.candidates / now.candidates - 1)
+        more *= then.rate_hz / now.rate_hz
         more *= 1.0 if then.form == now.form else _OTHER_FORM
         return (
             reading.cpu_share * more <= _ROOM * limits.cpu_share

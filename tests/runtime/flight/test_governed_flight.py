@@ -15,6 +15,7 @@ from edgevpr.resources import shipped
 from edgevpr.runtime.flight import vitals
 from edgevpr.runtime.flight.governor import Reading
 from edgevpr.runtime.flight.metering import FlightMeter
+from edgevpr.runtime.preflight import accuracy
 from edgevpr.runtime.recognise.opening import open_learning, open_recogniser
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.service.fly import smaller_forms_of
@@ -38,13 +39,22 @@ class Scripted(FlightMeter):
         return self._readings[turn] if turn < len(self._readings) else CALM
 
 
-def governed(place_map, log, readings, count, **settings):
+@pytest.fixture
+def trusted(monkeypatch):
+    """No form of hog has ever accepted a wrong place, but that of a test's choice."""
+    counts = {"recall_at_1": 0.5, "sets": 2, "queries": 90, "asked": 90, "accepted": 9, "accepted_wrong": 0}
+    table = {label: {**counts, "accepted_elsewhere": 0} for label in ("hog", "hog 8bit", "hog 1bit")}
+    monkeypatch.setattr(accuracy, "_content", lambda: {"forward": table, "nadir": {}})
+    return table
+
+
+def governed(place_map, log, readings, count, fewer_candidates=(), **settings):
     """(changes, all lines, announcements, the flight) of a flight of `count` turns of 4 s."""
     clock = FakeClock()
     flight = Flight(place_map, log, clock, FakeLink(clock), **settings)
     forms = smaller_forms_of(flight.config, flight.recogniser, None, load_s=0.0)
     source = FakeSource([textured(0, 240, 320)] * count, clock, work=lambda: clock.sleep(TURN_S))
-    lines = flight.fly(source, flight_meter(flight, Scripted, readings=readings), forms)
+    lines = flight.fly(source, flight_meter(flight, Scripted, readings=readings), forms, fewer_candidates)
     return of_kind(lines, "governor"), lines, flight.link.texts(), flight
 
 
@@ -79,17 +89,18 @@ def test_a_lower_rate_is_kept(recording, tmp_path):
     assert at_s[-1] - at_s[-2] == pytest.approx(0.4), "an eighth of it"
 
 
-def test_fewer_candidates_are_compared_when_the_rate_is_at_its_least(recording, tmp_path, monkeypatch):
+def test_fewer_candidates_are_compared_before_the_rate_is_lowered(recording, tmp_path, monkeypatch):
     compared = []
     step = Recogniser.step
     monkeypatch.setattr(
         Recogniser, "step", lambda self, *asked: (compared.append(self.candidates), step(self, *asked))[1]
     )
     changes, _, texts, _ = governed(
-        recording / "cohog.gpkg", tmp_path / "log", [BUSY] * 99, 12, **{"source.rate_hz": 60.0}
+        recording / "cohog.gpkg", tmp_path / "log", [BUSY] * 99, 12, (20,), **{"source.rate_hz": 60.0}
     )
-    assert [line["to"]["candidates"] for line in changes] == [42, 42, 42, 21, 21]
-    assert set(compared) == {42, 21}
+    assert [line["to"]["candidates"] for line in changes] == [20] * 5
+    assert [line["to"]["rate_hz"] for line in changes] == [60.0, 30.0, 15.0, 7.5, 7.5]
+    assert set(compared) == {42, 20}
     assert changes[-1]["from"] == changes[-1]["to"]
     assert changes[-1]["why"].endswith("nothing is left to lower")
     assert texts[-1][1] == "edgevpr: over a limit of its board, see its log"
@@ -106,7 +117,7 @@ def full_reading():
 
 
 def test_memory_that_runs_short_loads_the_index_in_a_smaller_form_and_places_are_found_as_before(
-    recording, tmp_path, monkeypatch
+    recording, tmp_path, monkeypatch, trusted
 ):
     held = []
     step = Recogniser.step
@@ -152,7 +163,7 @@ def test_an_index_that_cannot_be_loaded_is_tried_again_and_the_flight_goes_on(re
     assert (4, "edgevpr: its map cannot be read, see its log") in flight.link.texts()
 
 
-def test_what_a_map_cannot_serve_is_not_offered(recording, tmp_path):
+def test_what_a_map_cannot_serve_is_not_offered(recording, tmp_path, trusted):
     def forms(name, learner=None, load_s=0.0, **settings):
         config = load_config(None, {"map": str(recording / f"{name}.gpkg"), **settings})
         recogniser = open_recogniser(config, load_board("this"))
@@ -161,6 +172,10 @@ def test_what_a_map_cannot_serve_is_not_offered(recording, tmp_path):
 
     assert forms("hog") == ("8bit", "1bit")
     assert forms("hog", **{"match.form": "8bit"}) == ("1bit",)
+    trusted["hog 8bit"]["accepted_elsewhere"] = 1
+    assert forms("hog") == ("1bit",), "a form that accepts wrong places is not taken"
+    trusted["hog"]["accepted_elsewhere"] = 1
+    assert forms("hog") == ("8bit", "1bit"), "unless the form asked for does too"
     assert forms("hog", **{"match.min_margin": 0.05}) == (), "a margin of one form says nothing of another"
     assert forms("hog", load_s=11.0) == (), "nothing would be recognised for so long"
     assert forms("cohog") == forms("seqslam") == ()
