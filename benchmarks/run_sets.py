@@ -19,6 +19,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
+import accuracy_table
 import cv2
 import numpy as np
 import sets_page
@@ -37,13 +38,14 @@ FROM_THE_AIR = ("aerial_", "kite_")  # how the names of such sets begin
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """One row of the tables: a technique, how it is set, how many queries are matched together (None: its own number),
-    and whether all places are compared in full."""
+    """One row of the tables: a technique, how it is set, how many queries are matched together and how many places are
+    compared (None: its own numbers), and whether all places are compared in full."""
 
     label: str
     technique: str
     settings: dict[str, str] = field(default_factory=dict)
     sequence: int | None = None
+    candidates: int | None = None
     exact: bool = False
 
 
@@ -59,6 +61,7 @@ VARIANTS = (
     Variant("cohog, exact", "cohog", exact=True),
     Variant("cohog, thesis", "cohog", {"matching": "thesis"}, exact=True),
     Variant("cohog, sequence 10", "cohog", sequence=10),
+    *(Variant(f"cohog, {count} candidates", "cohog", candidates=count) for count in (20, 10)),
     Variant("hog", "hog"),
     Variant("seqslam", "seqslam"),
     Variant("seqslam, one frame", "seqslam", sequence=1),
@@ -112,11 +115,20 @@ def main(argv: list[str] | None = None) -> int:
                 rows = [row for row in wanted if folder.name != JOINED or row.label in JOINED_ROWS]
                 if rows:
                     write_set(args.out / f"{folder.name}.json", folder, rows, commit)
+        write_accuracy(args.out)
         sets_page.write(args.out, {folder.name: LEFT_OUT[folder.name] for folder in folders if folder.name in LEFT_OUT})
     except EdgevprError as error:
         print(f"run_sets: {error}", file=sys.stderr)
         return error.exit_code
     return 0
+
+
+def write_accuracy(out: Path) -> None:
+    """Write the table that travels with the program, of all results that are there."""
+    contents = [json.loads(path.read_text()) for path in sorted(out.glob("*.json"))]
+    contents = [each for each in contents if "techniques" in each]
+    looks_down = {each["set"]: each["set"].startswith(FROM_THE_AIR) for each in contents}
+    accuracy_table.write(contents, looks_down, JOINED)
 
 
 def find_sets(data: Path, names: list[str] | None) -> list[Path]:
@@ -185,7 +197,8 @@ def write_set(path: Path, folder: Path, wanted: list[Variant], commit: str) -> N
             return progress(items, total, f"{folder.name}, {variant.label}, {label.partition(': ')[2]}")
 
         chosen = settings(variant, folder)
-        result = evaluate(variant.technique, dataset, chosen, None, shown, variant.sequence, exact=variant.exact)
+        count = variant.candidates
+        result = evaluate(variant.technique, dataset, chosen, count, shown, variant.sequence, exact=variant.exact)
         rows[variant.label] = {
             **asdict(replace(result, technique=variant.label)),
             "encode_ram_mb": encode_ram_mb(variant.technique, chosen),

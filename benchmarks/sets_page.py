@@ -32,8 +32,9 @@ PUBLISHED = {
 
 
 def result(row: dict[str, Any]) -> TechniqueResult:
-    """A row of a file as what it was."""
+    """A row of a file as what it was. Older rows do not say how far away a wrong place was: it counts as far."""
     known = {each.name for each in fields(TechniqueResult)}
+    row = {"accepted_elsewhere": row["accepted_wrong"], **row}
     return TechniqueResult(**{key: value for key, value in row.items() if key in known})
 
 

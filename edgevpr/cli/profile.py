@@ -22,7 +22,7 @@ def add(commands: Any) -> None:
     parser.add_argument("--list", action="store_true", help="list the boards")
     _add_plan(parser)
     parser.add_argument(
-        "--plot", metavar="FILE", help="draw RAM against charge, and the map's memory (.png, .pdf, .svg)"
+        "--plot", metavar="FILE", help="draw recall against charge, and the map's memory (.png, .pdf, .svg)"
     )
     own = parser.add_mutually_exclusive_group()
     own.add_argument("--detect", action="store_true", help="say which board this is, and why; --out writes a profile")
@@ -41,7 +41,10 @@ def _add_plan(parser: ArgumentParser) -> None:
     places.add_argument("--map", metavar="MAP", help="the map to fly with")
     places.add_argument("--places", type=int, metavar="N", help="the number of places to fly with")
     parser.add_argument("--flight-min", type=float, default=20.0, metavar="MIN", help="length of the flight (20)")
-    add_keys(parser, "source.rate_hz", "memory.budget_mb", "battery.pack")
+    add_keys(parser, "source.camera", "source.rate_hz", "memory.budget_mb", "battery.pack")
+    parser.add_argument(
+        "--min-recall", type=float, metavar="R", help="the cheapest with this recall@1 (default: the best)"
+    )
     parser.add_argument("--hover-w", type=float, metavar="W", help="what the aircraft draws to hover: minutes lost")
 
 
@@ -87,7 +90,7 @@ def profile(args: Namespace) -> int:
     if args.plot:
         from edgevpr.runtime.preflight.chart import plot
 
-        plot(result, board, Path(args.plot))
+        plot(result, Path(args.plot))
     if args.json:
         print_json(asdict(result))
     else:
@@ -103,12 +106,15 @@ def _plan(args: Namespace, board: "Board") -> "tuple[FlightPlan, str | None, tup
     from edgevpr.power.equations import parse_pack
     from edgevpr.runtime.preflight.estimate import FlightPlan
     from edgevpr.runtime.preflight.offers import offers
+    from edgevpr.runtime.preflight.pick import camera_setting
 
-    settings, places, map_technique = {}, args.places, None
+    places, map_technique, camera = args.places, None, value_of(args, "source.camera")
+    settings = {name: camera_setting(name, camera) for name in techniques.names()}
     if args.map:
         with PlaceMap.open(args.map) as place_map:
             places, map_technique = len(place_map), place_map.spec.name
             settings[map_technique] = place_map.spec.parameters
+            camera = place_map.spec.parameters.get("camera", camera)
     rate_hz, budget_mb = value_of(args, "source.rate_hz"), value_of(args, "memory.budget_mb")
     battery = load_config(None, {"battery.pack": value_of(args, "battery.pack")}).battery
     plan = FlightPlan(
@@ -119,6 +125,8 @@ def _plan(args: Namespace, board: "Board") -> "tuple[FlightPlan, str | None, tup
         regulator_efficiency=battery.regulator_efficiency,
         budget_mb=board.budget_mb if budget_mb is None else budget_mb,
         hover_w=args.hover_w,
+        camera=camera,
+        min_recall=args.min_recall,
     )
     return plan, map_technique, offers(techniques.names(), settings=settings)
 

@@ -18,7 +18,7 @@ from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.source import Source, open_source
 from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import Ranking
+from edgevpr.places.retrieve import Ranking, elsewhere
 from edgevpr.places.sequence import length_of, search_of
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import pack_ah, parse_pack, queries_ah, rail_ah, stage_energy_j
@@ -47,9 +47,10 @@ class TechniqueResult:
     `fine_bytes` on disk. `ah_total` (5.7) is drawn from the pack, `ah_total_cpu_rail` from the thesis's rail of 2.5 V,
     both for all queries; `ah_assumes` names board, pack and efficiency. `precision_recall` are the points of the curve,
     from the highest threshold down. `accepted` queries would have moved the aircraft by the technique's own rule,
-    `accepted_wrong` of them to a wrong place. `roc_auc` is None if all best matches are right, or none is. `pcu`
-    depends on all techniques that are compared: `compare` fills it in, with the `t_encode_max_s` it used. `sequence` is
-    the number of queries that were matched together. `discarded` queries were not memorable, and count as missed.
+    `accepted_wrong` of them to a wrong place, `accepted_elsewhere` of these to one that is no neighbour of a right
+    place (see `places.retrieve.elsewhere`). `roc_auc` is None if all best matches are right, or none is. `pcu` depends
+    on all techniques that are compared: `compare` fills it in, with the `t_encode_max_s` it used. `sequence` is the
+    number of queries that were matched together. `discarded` queries were not memorable, and count as missed.
     """
 
     technique: str
@@ -66,6 +67,7 @@ class TechniqueResult:
     roc_auc: float | None
     accepted: int
     accepted_wrong: int
+    accepted_elsewhere: int
     t_encode_s: float
     t_match_s: float
     t_match_per_ref_s: float
@@ -88,13 +90,14 @@ class TechniqueResult:
 class _Answer:
     """The answer to one query. `score` is that of its best match, `first_right` the rank of the first right one, both
     among the references that count. `accepted`: the flight would have accepted the match; `accepted_wrong`: it would
-    have, and the match is wrong. `discarded`: the query was not memorable. `encoding` and `matching` are the costs of
-    the two stages."""
+    have, and the match is wrong; `accepted_elsewhere`: and not beside a right one either. `discarded`: the query was
+    not memorable. `encoding` and `matching` are the costs of the two stages."""
 
     score: float
     first_right: float
     accepted: bool
     accepted_wrong: bool
+    accepted_elsewhere: bool
     discarded: bool
     encoding: StageCost
     matching: StageCost
@@ -199,11 +202,14 @@ def _answers(recogniser: Recogniser, dataset: Dataset, progress: Progress) -> It
         right = np.array([name in query.right for name in dataset.references])
         ignored = np.array([name in query.ignored for name in dataset.references])
         at = metrics.counting(ranking.slots, ignored)
+        wrong = event.accepted and not (right | ignored)[ranking.slots[0]]
+        away = wrong and elsewhere(recogniser.index, ranking.slots[0], np.flatnonzero(right | ignored), 0.0).all()
         yield _Answer(
             score=float(ranking.scores[at[0]]) if len(at) else 0.0,
             first_right=metrics.first_right(ranking.slots[at], right),
             accepted=event.accepted,
-            accepted_wrong=event.accepted and not (right | ignored)[ranking.slots[0]],
+            accepted_wrong=bool(wrong),
+            accepted_elsewhere=bool(away),
             discarded=discarded,
             encoding=event.steps.encoding,
             matching=event.steps.match,
@@ -248,6 +254,7 @@ def _summary(technique: Technique, references: int, answers: list[_Answer]) -> T
         roc_auc=metrics.roc_auc(scores, ranks == 0),
         accepted=sum(answer.accepted for answer in answers),
         accepted_wrong=sum(answer.accepted_wrong for answer in answers),
+        accepted_elsewhere=sum(answer.accepted_elsewhere for answer in answers),
         discarded=sum(answer.discarded for answer in answers),
         t_encode_s=t_encode_s,
         t_match_s=t_match_s,

@@ -109,17 +109,19 @@ def test_the_technique_is_picked_and_the_reason_logged(capsys, caplog, flight, t
     with caplog.at_level("INFO"):
         built = run_json(capsys, "map", "build", tmp_path / "m.gpkg", "--images", flight / "ref", "--json")
     assert built["technique"] == "cohog"
-    assert any("technique cohog: 6 places take" in message for message in caplog.messages)
+    (said,) = (message for message in caplog.messages if message.startswith("technique cohog: recall@1 "))
+    assert "accepted, 0 wrong" in said
+    assert "6 places take" in said
 
 
 def test_a_machine_too_slow_for_the_best_technique_makes_the_map_of_the_readme_all_the_same(
     capsys, caplog, flight, tmp_path, monkeypatch
 ):
-    def slow(tried):
-        return ((name, replace(costs, encode=StageCost(9.0, 9.0))) for name, costs in probe_each(tried))
+    def slow(technique):
+        return replace(probe(technique), encode=StageCost(9.0, 9.0))
 
-    probe_each = pick.probe_each
-    monkeypatch.setattr(pick, "probe_each", slow)
+    probe = pick.probe
+    monkeypatch.setattr(pick, "probe", slow)
     path = tmp_path / "m.gpkg"
     built = run_json(capsys, "map", "build", path, "--images", flight / "ref", "--camera", "nadir", "--json")
     assert (built["technique"], built["added"]) == ("cohog", 6)

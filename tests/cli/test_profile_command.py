@@ -11,6 +11,7 @@ from edgevpr.cli.main import main
 from edgevpr.power import machine, sensors, speed
 from edgevpr.power.boards import board_names, load_board
 from edgevpr.resources import shipped
+from edgevpr.runtime.preflight import accuracy
 from edgevpr.runtime.preflight import stored as measured
 from edgevpr.runtime.preflight.probe import TechniqueCosts
 from edgevpr.runtime.preflight.trial import Trial
@@ -59,6 +60,10 @@ def tried(monkeypatch):
 
     monkeypatch.setattr(measured, "try_each", try_each)
     monkeypatch.setattr(techniques, "names", lambda: ("cohog", "hog", "seqslam", "calc"))
+    counts = {"sets": 2, "queries": 90, "asked": 90, "accepted": 9, "accepted_wrong": 0, "accepted_elsewhere": 0}
+    recalls = {"cohog": 0.9, "hog": 0.4, "hog 8bit": 0.4, "hog 1bit": 0.3, "seqslam": 0.5}
+    table = {label: {"recall_at_1": recall, **counts} for label, recall in recalls.items()}
+    monkeypatch.setattr(accuracy, "_content", lambda: {"forward": table, "nadir": {}})
     return asked
 
 
@@ -105,6 +110,16 @@ def test_progress_is_shown_and_the_text_has_both_tables(capsys, tried):
     assert "\nRecommended: cohog: " in said.out
     assert "calc cannot be used: There is no model `calc`." in said.out
     assert all(len(line) <= 120 for line in said.out.splitlines())
+
+
+def test_the_cheapest_that_finds_enough_is_recommended(capsys, tried):
+    found = json.loads(run(capsys, "--board", "rpi-5", "--places", 20, "--min-recall", 0.35, "--json").out)
+    assert found["recommended"] == "cohog", "ways to use the board's own technique come first"
+    nothing = run(capsys, "--board", "rpi-5", "--places", 20, "--min-recall", 0.95).out
+    assert "Recommended: None: nothing that fits has a recall@1 of 0.95; the most is 0.90." in nothing
+    assert refused(capsys, "--board", "rpi-5", "--places", 20, "--min-recall", 2)[1].startswith(
+        "The least recall is 2:"
+    )
 
 
 def test_with_a_map_its_places_count_and_only_its_forms_are_recommended(capsys, tmp_path, tried):

@@ -27,6 +27,7 @@ _RESULT = TechniqueResult(
     roc_auc=0.9,
     accepted=1,
     accepted_wrong=0,
+    accepted_elsewhere=0,
     t_encode_s=0.01,
     t_match_s=0.01,
     t_match_per_ref_s=0.001,

@@ -49,7 +49,7 @@ def test_recall_costs_and_sizes_of_a_technique(folder, name, parameters):
     assert result.recall_at_10 == 1
     assert result.precision_at_100_recall >= result.recall_at_1
     assert result.pcu == pytest.approx(result.precision_at_100_recall)  # the slowest of one
-    assert (result.accepted, result.accepted_wrong) == (8, 1)
+    assert (result.accepted, result.accepted_wrong, result.accepted_elsewhere) == (8, 1, 1)
     assert result.t_encode_s > 0
     assert result.t_match_per_ref_s == pytest.approx(result.t_match_s / 8)
     assert 0 < result.u_encode <= 1

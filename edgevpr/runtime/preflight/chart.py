@@ -1,4 +1,4 @@
-"""The estimate of a flight as a picture: RAM against charge, and the projected memory of the map (figure 5.7 of the
+"""The estimate of a flight as a picture: recall against charge, and the projected memory of the map (figure 5.7 of the
 thesis) beside the RAM of the boards that edgevpr knows (needs matplotlib, extra `plots`)."""
 
 import math
@@ -8,61 +8,87 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from edgevpr.helpers.figures import figure
-from edgevpr.power.boards import Board, board_names, load_board
+from edgevpr.power.boards import board_names, load_board
 from edgevpr.runtime.preflight.estimate import Estimate
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _FITS, _FITS_NOT = "C0", "C3"
+_SIZE_PT2_PER_MB = 0.3  # of the area of a point
 _LINE = {"color": "0.45", "linewidth": 1, "linestyle": "--"}
 _FAR_PT = (8, 14, 22, 32, 44, 58, 74, 92, 112, 134)  # how far from its point a label may be
 _WAYS = 24
 
 
-def plot(estimate: Estimate, board: Board, path: Path) -> None:
-    """Draw both panels to `path`; techniques that do not fit are red."""
+def plot(estimate: Estimate, path: Path) -> None:
+    """Draw both panels to `path`; techniques that do not fit are red, those that another one beats are pale."""
     rows = 0.24 * max(14, len(estimate.techniques)) + 1.6
     drawn = figure(14.5, rows)
-    needs, projected = drawn.subplots(1, 2)
-    _needs(needs, estimate, board)
+    found, projected = drawn.subplots(1, 2)
+    _found(found, estimate)
     _projected(projected, estimate)
     # Labels are placed around what is really drawn, so the layout must be final first.
     drawn.draw_without_rendering()
-    _label(needs, [(row.technique, row.flight_marginal_mah, row.process_ram_mb) for row in estimate.techniques])
+    measured = [row for row in estimate.techniques if row.accuracy]
+    _label(found, [(row.technique, row.flight_marginal_mah, row.accuracy.recall_at_1) for row in measured])
     drawn.savefig(path, dpi=100)
 
 
-def _needs(axes: "Axes", estimate: Estimate, board: Board) -> None:
-    plan, rows = estimate.plan, estimate.techniques
+def _found(axes: "Axes", estimate: Estimate) -> None:
+    """Draw recall against charge: what is found beside what it costs, the size of a point by its RAM."""
+    from matplotlib.lines import Line2D
+
+    plan, rows = estimate.plan, [row for row in estimate.techniques if row.accuracy]
     for row in rows:
-        axes.plot(
-            row.flight_marginal_mah, row.process_ram_mb, "o", markersize=5, color=_FITS if row.fits else _FITS_NOT
+        trusted = row.accuracy.is_trusted
+        axes.scatter(
+            row.flight_marginal_mah,
+            row.accuracy.recall_at_1,
+            s=_SIZE_PT2_PER_MB * row.process_ram_mb,
+            marker="o" if trusted else "X",
+            color=_FITS if row.fits else _FITS_NOT,
+            alpha=1.0 if row.on_front else 0.3,
+            linewidths=0,
         )
-    idle_mah = rows[0].flight_mah - rows[0].flight_marginal_mah if rows else 0.0
+    front = sorted((row.flight_marginal_mah, row.accuracy.recall_at_1) for row in rows if row.on_front)
+    if front:
+        axes.step(*zip(*front, strict=True), where="post", color=_FITS, linewidth=1, alpha=0.6)
+    for row in rows:
+        if row.technique == estimate.recommended:
+            at = row.flight_marginal_mah, row.accuracy.recall_at_1
+            axes.plot(*at, "o", markersize=17, markerfacecolor="none", markeredgecolor="k")
+    idle_mah = estimate.techniques[0].flight_mah - estimate.techniques[0].flight_marginal_mah if rows else 0.0
+    camera = "looking down" if plan.camera == "nadir" else "looking ahead"
     axes.set(
         xscale="log",
-        yscale="log",
+        ylim=(0, 1.08),
         xlabel=f"mAh that recognising takes in {plan.flight_min:g} min"
         + (f" (the idle board takes {idle_mah:.0f} more)" if idle_mah else ""),
-        ylabel="peak RAM of the process with its map, MB",
+        ylabel=f"recall@1 on image sets, {camera}",
         title=f"{estimate.title}: {plan.places} places at {plan.rate_hz:g} Hz",
     )
-    for ram_mb, what in ((board.memory_max_mb, "allowed"), (board.ram_mb, "RAM of the board")):
-        axes.axhline(ram_mb, **_LINE)
-        axes.annotate(
-            f"{what}: {ram_mb:.0f} MB", (0.01, ram_mb), (0, 2), xycoords=axes.get_yaxis_transform(),
-            textcoords="offset points", fontsize=8, color="0.3",
-        )  # fmt: skip
+    handles = [
+        Line2D([], [], linestyle="", marker=marker, color=colour, alpha=alpha, markersize=6, label=label)
+        for marker, colour, alpha, label in (
+            ("o", _FITS, 1.0, "fits: nothing else finds as much for less"),
+            ("o", _FITS, 0.3, "fits, and another finds more for less"),
+            ("o", _FITS_NOT, 0.3, "does not fit"),
+            ("X", "0.4", 1.0, "has accepted wrong places: never chosen by itself"),
+        )
+    ]
+    if estimate.recommended:
+        ring = {"markerfacecolor": "none", "markeredgecolor": "k", "markersize": 9}
+        handles.append(Line2D([], [], linestyle="", marker="o", label="recommended", **ring))
+    sizes = "area of a point: RAM"
+    axes.legend(handles=handles, fontsize=7, loc="lower right", framealpha=0.9, title=sizes, title_fontsize=7)
     pack_mah = plan.pack.capacity_mah - idle_mah
     if pack_mah > 0:
         axes.axvline(pack_mah, **_LINE)
         axes.annotate(
-            f"pack, less idle: {pack_mah:.0f} mAh", (pack_mah, 0.02), (-10, 0), xycoords=axes.get_xaxis_transform(),
-            textcoords="offset points", fontsize=8, color="0.3", rotation=90, va="bottom",
+            f"pack, less idle: {pack_mah:.0f} mAh", (pack_mah, 0.98), (-10, 0), xycoords=axes.get_xaxis_transform(),
+            textcoords="offset points", fontsize=8, color="0.3", rotation=90, va="top",
         )  # fmt: skip
-    low, high = axes.get_ylim()
-    axes.set_ylim(low / 1.3, high * 1.3)
     low, high = axes.get_xlim()
     axes.set_xlim(low / 2, high * 2)
     axes.grid(alpha=0.3)

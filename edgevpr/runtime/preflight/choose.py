@@ -1,23 +1,31 @@
-"""Choice of a technique: the costs of a short trial are compared with the board, and the best that fits is taken."""
+"""Choice of a technique: what each finds beside what it costs, on the board.
+
+All that fit and can be trusted make a front: none of it is both less accurate and dearer than another. Where no
+accuracy is asked for, the most accurate of the front is taken; else the cheapest that reaches it. A technique that has
+accepted a wrong place on the image sets is never chosen by itself, since its fixes would be sent.
+"""
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 
 from edgevpr import techniques
 from edgevpr.config import LOWEST_RATE_HZ
 from edgevpr.errors import ConfigError, UsageError
 from edgevpr.power.boards import Board
+from edgevpr.runtime.preflight import accuracy
+from edgevpr.runtime.preflight.accuracy import Accuracy
 from edgevpr.runtime.preflight.probe import TechniqueCosts
 from edgevpr.types import FIX_MAX_AGE_S
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fit:
-    """Fit of a technique on a board; `t_query_s` is the time of one query. It fits where there are no `shortfalls`;
-    `remedies` would make it fit."""
+    """Fit of a technique on a board; `t_query_s` is the time of one query, and `cpu_s` that of all cores together. It
+    fits where there are no `shortfalls`; `remedies` would make it fit."""
 
     t_query_s: float
+    cpu_s: float
     map_ram_mb: float
     process_ram_mb: float
     reachable_hz: float
@@ -25,12 +33,100 @@ class Fit:
     remedies: tuple[str, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Choice:
-    """The technique taken, and the reason in one line."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Option:
+    """One way to recognise: a technique in a form, its costs on the board and its `fit`. `label` tells it from others.
+    `candidates` are fewer than the technique's own (None: its own). `accuracy` is None where it was not measured."""
 
-    technique: str
-    reason: str
+    label: str
+    name: str
+    candidates: int | None
+    costs: TechniqueCosts
+    fit: Fit
+    accuracy: Accuracy | None
+
+    @property
+    def is_sound(self) -> bool:
+        """Tell whether it may be chosen by itself: a sequence needs a flight along the mapped way, which nobody has
+        promised, and where accuracy was not measured nothing is known."""
+        return self.accuracy is not None and self.accuracy.is_trusted and self.costs.sequence == 1
+
+    @property
+    def recall(self) -> float:
+        """Recall@1, 0 where it was not measured."""
+        return self.accuracy.recall_at_1 if self.accuracy else 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Demand:
+    """Demands of a flight: places of the map, queries a second, MB for the index, and the way the camera looks
+    ("nadir" or "forward"; None: forward)."""
+
+    places: int
+    rate_hz: float
+    budget_mb: float
+    camera: str | None = None
+
+
+def options(board: Board, label: str, name: str, costs: TechniqueCosts, demand: Demand) -> Iterator[Option]:
+    """Yield a technique of these costs on `board` as it is, then with the fewer candidates that were measured."""
+    for candidates in (None, *accuracy.fewer_candidates(label, demand.camera)):
+        if candidates is not None and (costs.candidates is None or candidates >= costs.candidates):
+            continue
+        fewer = costs if candidates is None else replace(costs, candidates=candidates)
+        yield Option(
+            label=label if candidates is None else f"{label}, {candidates} candidates",
+            name=name,
+            candidates=candidates,
+            costs=fewer,
+            fit=fit(board, fewer, demand.places, demand.rate_hz, demand.budget_mb),
+            accuracy=accuracy.of(label, demand.camera, candidates),
+        )
+
+
+def front(wanted: Iterable[Option]) -> list[Option]:
+    """Return those that fit, can be trusted, and are not both less accurate and dearer than another, cheapest first."""
+    found: list[Option] = []
+    sound = [each for each in wanted if not each.fit.shortfalls and each.is_sound]
+    for each in sorted(sound, key=lambda option: (option.fit.cpu_s, -option.recall)):
+        if not found or each.recall > found[-1].recall:
+            found.append(each)
+    return found
+
+
+def best(wanted: Sequence[Option], board: Board, min_recall: float | None = None) -> Option | None:
+    """Choose from the front: the most accurate, or the cheapest with a recall of at least `min_recall`. Ways to use the
+    board's own technique go before all others. None where nothing on the front reaches it.
+
+    The board's own technique is taken without measured accuracy too: its profile names it.
+    """
+    own = [each for each in wanted if each.name == board.technique]
+    for among in (own, wanted):
+        reaching = [each for each in front(among) if each.recall >= (min_recall or 0.0)]
+        if reaching:
+            return reaching[0] if min_recall is not None else reaching[-1]
+        named = [each for each in among if each.name == board.technique and each.accuracy is None]
+        if min_recall is None and (unmeasured := [each for each in named if not each.fit.shortfalls]):
+            return unmeasured[0]
+    return None
+
+
+def objection(option: Option, min_recall: float | None = None) -> str | None:
+    """Say why an option is not chosen by itself; None where nothing is against it."""
+    if option.fit.shortfalls:
+        return f"{option.label} does not fit, {' and '.join(option.fit.shortfalls)}"
+    if option.accuracy is None:
+        return f"{option.label} was never measured: name it to use it"
+    if not option.accuracy.is_trusted:
+        return (
+            f"{option.label} accepted {option.accuracy.accepted_elsewhere} wrong places in "
+            f"{option.accuracy.asked} queries: name it to use it"
+        )
+    if option.costs.sequence > 1:
+        return f"{option.label} needs a flight along the mapped way: name it to use it"
+    if option.recall < (min_recall or 0.0):
+        return f"{option.label} has a recall@1 of {option.recall:.2f}"
+    return None
 
 
 def fit(board: Board, costs: TechniqueCosts, places: int, rate_hz: float, budget_mb: float) -> Fit:
@@ -70,6 +166,7 @@ def fit(board: Board, costs: TechniqueCosts, places: int, rate_hz: float, budget
                 remedies.append(f"with a budget of {math.ceil(map_ram_mb)} MB")
     return Fit(
         t_query_s=query.wall_s,
+        cpu_s=query.cpu_s,
         map_ram_mb=map_ram_mb,
         process_ram_mb=process_ram_mb,
         reachable_hz=reachable_hz,
@@ -104,21 +201,19 @@ def preferred(board: Board, camera: str | None = None) -> tuple[str, ...]:
     return tuple(name for name in names if camera != "nadir" or "camera" in techniques.parameters(name))
 
 
-def choose(board: Board, costs: Mapping[str, TechniqueCosts], places: int, rate_hz: float, budget_mb: float) -> Choice:
-    """Take the first technique that fits. `costs` are those on `board`, best technique first.
-
-    Raises UsageError where none fits; it says what would make one fit.
-    """
-    passed_over, remedies = [], []
-    for name, each in costs.items():
-        found = fit(board, each, places, rate_hz, budget_mb)
-        if not found.shortfalls:
-            reason = f"{name}: {described(board, found, places, rate_hz, budget_mb)}"
-            return Choice(name, "; ".join([reason, *passed_over]))
-        passed_over.append(f"{name} does not fit, {' and '.join(found.shortfalls)}")
-        remedies += [f"{name} {' or '.join(found.remedies)}"] if found.remedies else []
+def require_best(wanted: Sequence[Option], board: Board, demand: Demand) -> Option:
+    """Choose as `best` does. Raises UsageError where nothing can be chosen; it says what would make something fit."""
+    found = best(wanted, board)
+    if found:
+        return found
+    against = filter(None, map(objection, wanted))
+    remedies = [
+        f"{each.label} {' or '.join(each.fit.remedies)}"
+        for each in wanted
+        if each.fit.remedies and (each.is_sound or each.name == board.technique)
+    ]
     raise UsageError(
-        f"No technique fits {board.title} with {places} places at {rate_hz:g} Hz ({'; '.join(passed_over)}): "
+        f"No technique fits {board.title} with {demand.places} places at {demand.rate_hz:g} Hz ({'; '.join(against)}): "
         + (f"what would fit is {', or '.join(remedies)}." if remedies else "use a larger board.")
     )
 

@@ -10,17 +10,22 @@ from edgevpr.errors import UsageError
 from edgevpr.power.boards import Board
 from edgevpr.power.equations import Pack, endurance_min, pack_ah, queries_ah
 from edgevpr.power.meter import query_cost
-from edgevpr.runtime.preflight.choose import fit
+from edgevpr.runtime.preflight import counted
+from edgevpr.runtime.preflight.accuracy import Accuracy
+from edgevpr.runtime.preflight.choose import Demand, Option, best, front, objection, options
 from edgevpr.runtime.preflight.probe import TechniqueCosts
 from edgevpr.runtime.preflight.scale import UNKNOWN_PRODUCTS, Ratios, is_same, on_board, ratios
 from edgevpr.runtime.preflight.trial import Trial
+
+_BUSY = 0.1  # of the time of a trial, in which other programs had the processor
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightPlan:
     """Plan of a flight: places in the map, queries a second, minutes in the air, the pack, the memory that the map's
-    index may take, and the watts that the aircraft draws to hover (None: not given). Raises UsageError for a number
-    that is not finite and above 0."""
+    index may take, the watts that the aircraft draws to hover (None: not given), the way the camera looks (None:
+    ahead), and the least recall@1 that is asked for (None: the most that fits). Raises UsageError for a number that is
+    not finite and above 0."""
 
     places: int
     rate_hz: float
@@ -29,6 +34,8 @@ class FlightPlan:
     regulator_efficiency: float
     budget_mb: float
     hover_w: float | None = None
+    camera: str | None = None
+    min_recall: float | None = None
 
     def __post_init__(self) -> None:
         asked = {
@@ -37,10 +44,13 @@ class FlightPlan:
             "length of the flight in minutes": self.flight_min,
             "budget in MB": self.budget_mb,
             "hover power in W": self.hover_w,
+            "least recall": self.min_recall,
         }
         for what, value in asked.items():
             if value is not None and not 0 < value < float("inf"):
                 raise UsageError(f"The {what} is {value:g}: give a number above 0.")
+        if self.min_recall is not None and self.min_recall > 1:
+            raise UsageError(f"The least recall is {self.min_recall:g}: give a share of the queries, up to 1.")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,16 +58,22 @@ class TechniqueEstimate:
     """One technique, in one form, on the board.
 
     `process_ram_mb` is the peak with the map, and `encode_ram_mb` the part of it that encoding takes for a moment.
-    `query_mah` is (a + s U) t over encoding and matching, and `query_marginal_mah` is s U t (5.6). `flight_mah` is what
-    the board draws from start to end, and `flight_marginal_mah` what the queries add to it (5.7). All charges are drawn
-    from the pack. `lost_min` is how many minutes less a full pack hovers with the board on the aircraft, and
-    `lost_marginal_min` the part of them that recognising costs (None: the hover power is unknown). `shortfalls` say why
-    the technique does not fit, `remedies` what would make it fit. `measured` is True for stored costs, False for costs
-    tried just now.
+    `query_mah` is (a + s U) t over encoding and matching, and `query_marginal_mah` is s U t (5.6). `u_query` is U over
+    a whole query. `flight_mah` is what the board draws from start to end, and `flight_marginal_mah` what the queries
+    add to it (5.7). All charges are drawn from the pack. `lost_min` is how many minutes less a full pack hovers with
+    the board on the aircraft, and `lost_marginal_min` the part of them that recognising costs (None: the hover power is
+    unknown). `shortfalls` say why the technique does not fit, `remedies` what would make it fit. `measured` is True for
+    stored costs, False for costs tried just now. `accuracy` is that of `make results` (None: it was not measured),
+    `candidates` how many places are compared where they are fewer than usual. A row `on_front` fits, can be trusted,
+    and is not both less accurate and dearer than another.
     """
 
     technique: str
     name: str
+    candidates: int | None
+    accuracy: Accuracy | None
+    on_front: bool
+    objection: str | None
     fits: bool
     ram_bytes_per_place: int
     disk_bytes_per_place: int
@@ -69,6 +85,7 @@ class TechniqueEstimate:
     t_match_s: float
     u_encode: float
     u_match: float
+    u_query: float
     reachable_hz: float
     query_mah: float
     query_marginal_mah: float
@@ -88,9 +105,9 @@ class Estimate:
 
     `times` is "measured" (on this machine, for this machine), "scaled" (from this machine to the board, by `ratios`) or
     "unscaled" (this machine's, since a figure is missing). `measured_on` is the date of stored figures. `recommended`
-    is the best technique that fits (None: none does), and `reason` says why in a sentence. `notes` are remarks on the
-    estimate; `unusable` are techniques that cannot be used here, each with the reason; `weights` name the weights of
-    networks.
+    is the technique to take (None: none can be; see `choose`), and `reason` says why in a sentence. `notes` are remarks
+    on the estimate; `unusable` are techniques that cannot be used here, each with the reason; `weights` name the
+    weights of networks.
     """
 
     board: str
@@ -122,15 +139,20 @@ def estimate(
     `map_technique` is the technique that an existing map was built with (None: there is no map).
     """
     trials = list(trials)
-    rows = tuple(
-        _technique(trial, on_board(trial.costs, here, board), board, plan, stored)
+    demand = Demand(places=plan.places, rate_hz=plan.rate_hz, budget_mb=plan.budget_mb, camera=plan.camera)
+    wanted = [
+        (option, stored)
         for trial, stored in trials
         if trial.costs
-    )
+        for option in options(board, trial.label, trial.name, _costs_on(trial, here, board), demand)
+    ]
+    of_front = [each.label for each in front(option for option, _ in wanted)]
+    rows = tuple(_technique(option, board, plan, stored, option.label in of_front) for option, stored in wanted)
     found = ratios(here, board)
     times = "unscaled" if found is None else "measured" if is_same(here, board) else "scaled"
     used_stored = any(row.measured for row in rows)
-    recommended, reason = _recommended(rows, board, plan, map_technique)
+    waited = max((option.costs.waited for option, _ in wanted), default=0.0)
+    recommended, reason = _recommended([option for option, _ in wanted], rows, board, plan, map_technique)
     return Estimate(
         board=board.name,
         title=board.title,
@@ -142,14 +164,18 @@ def estimate(
         techniques=rows,
         recommended=recommended,
         reason=reason,
-        notes=tuple(_notes(board, here, found, times, plan)),
+        notes=tuple(_notes(board, here, found, times, plan, waited)),
         unusable={trial.label: trial.problem for trial, _ in trials if trial.problem},
         weights=tuple(dict.fromkeys(trial.weights for trial, _ in trials if trial.weights)),
     )
 
 
-def _technique(trial: Trial, costs: TechniqueCosts, board: Board, plan: FlightPlan, stored: bool) -> TechniqueEstimate:
-    found = fit(board, costs, plan.places, plan.rate_hz, plan.budget_mb)
+def _costs_on(trial: Trial, here: Board, board: Board) -> TechniqueCosts:
+    return on_board(trial.costs, here, board, counted.of(trial.name, {**trial.parameters, **trial.settings}))
+
+
+def _technique(option: Option, board: Board, plan: FlightPlan, stored: bool, on_front: bool) -> TechniqueEstimate:
+    costs, found = option.costs, option.fit
     query = query_cost(costs.encode, costs.match(plan.places), board, plan.pack, plan.regulator_efficiency)
     flight_s = 60 * plan.flight_min
     marginal_mah = queries_ah(min(plan.rate_hz, found.reachable_hz) * flight_s, query.marginal_mah)
@@ -157,8 +183,12 @@ def _technique(trial: Trial, costs: TechniqueCosts, board: Board, plan: FlightPl
     idle_mah = 1000 * pack_ah(board.idle_w * flight_s, plan.pack, plan.regulator_efficiency)
     lost_min, lost_marginal_min = _lost_min(plan, idle_mah, marginal_mah)
     return TechniqueEstimate(
-        technique=trial.label,
-        name=trial.name,
+        technique=option.label,
+        name=option.name,
+        candidates=option.candidates,
+        accuracy=option.accuracy,
+        on_front=on_front,
+        objection=None if found.shortfalls else objection(option),
         fits=not found.shortfalls,
         ram_bytes_per_place=costs.ram_bytes_per_place,
         disk_bytes_per_place=costs.disk_bytes_per_place,
@@ -170,6 +200,7 @@ def _technique(trial: Trial, costs: TechniqueCosts, board: Board, plan: FlightPl
         t_match_s=query.t_match_s,
         u_encode=query.u_encode,
         u_match=query.u_match,
+        u_query=found.cpu_s / (found.t_query_s * board.cores),
         reachable_hz=found.reachable_hz,
         query_mah=query.used_mah,
         query_marginal_mah=query.marginal_mah,
@@ -197,32 +228,53 @@ def _lost_min(plan: FlightPlan, idle_mah: float, marginal_mah: float) -> tuple[f
 
 
 def _recommended(
-    rows: tuple[TechniqueEstimate, ...], board: Board, plan: FlightPlan, map_technique: str | None
+    wanted: list[Option],
+    rows: tuple[TechniqueEstimate, ...],
+    board: Board,
+    plan: FlightPlan,
+    map_technique: str | None,
 ) -> tuple[str | None, str]:
-    """Return the best technique that fits, of those that the map can serve, and the reason. `rows` come best first."""
-    usable = [row for row in rows if map_technique in (None, row.name)]
-    fitting = [row for row in usable if row.fits]
+    """Return the technique to take, of those that the map can serve, and the reason."""
+    usable = [each for each in wanted if map_technique in (None, each.name)]
     served = f"the map was built with {map_technique}, and " if map_technique else ""
     if not usable:
         return None, f"None: the map was built with {map_technique}, which cannot be used here."
-    if not fitting:
-        remedies = [f"{row.technique} {' or '.join(row.remedies)}" for row in usable if row.remedies]
-        hint = f"what would fit is {', or '.join(remedies[:3])}" if remedies else "use a larger board"
-        return None, f"None: {served}nothing that was tried fits {board.title}; {hint}."
-    # `rows` are in the order of the registry; the board's own technique goes first.
-    best = min(fitting, key=lambda row: row.name != board.technique)
-    if map_technique or best.name != board.technique:
-        why = f"it is the first, in order of preference, of the {len(fitting)} that fit"
+    taken = best(usable, board, plan.min_recall)
+    if taken is None:
+        return None, f"None: {served}{_nothing(usable, board, plan)}."
+    row = next(row for row in rows if row.technique == taken.label)
+    if taken.accuracy is None:
+        why = "it is what the board's profile names, and it was never measured"
+    elif plan.min_recall is None:
+        why = f"nothing that fits finds more: {taken.accuracy}"
     else:
-        why = "it is what the board's profile prefers, and it fits"
-    return best.technique, (
-        f"{best.technique}: {served}{why}: {best.process_ram_mb:.0f} of {board.memory_max_mb:.0f} MB, "
-        f"{best.reachable_hz:.3g} Hz where {plan.rate_hz:g} are asked, and {best.flight_marginal_mah:.3g} mAh a flight "
-        f"beside the {best.flight_mah - best.flight_marginal_mah:.3g} of the idle board."
+        why = f"it is the cheapest with a recall@1 of at least {plan.min_recall:g}: {taken.accuracy}"
+    return taken.label, (
+        f"{taken.label}: {served}{why}; {row.process_ram_mb:.0f} of {board.memory_max_mb:.0f} MB, "
+        f"{row.reachable_hz:.3g} Hz where {plan.rate_hz:g} are asked, {row.u_query:.0%} of the CPU during a query, and "
+        f"{row.flight_marginal_mah:.3g} mAh a flight beside the {row.flight_mah - row.flight_marginal_mah:.3g} of the "
+        "idle board."
     )
 
 
-def _notes(board: Board, here: Board, found: Ratios | None, times: str, plan: FlightPlan) -> Iterator[str]:
+def _nothing(usable: list[Option], board: Board, plan: FlightPlan) -> str:
+    """Say why nothing can be taken, and what could be."""
+    fitting = [each for each in usable if not each.fit.shortfalls]
+    if not fitting:
+        sound = [each for each in usable if each.fit.remedies and (each.is_sound or each.name == board.technique)]
+        remedies = [f"{each.label} {' or '.join(each.fit.remedies)}" for each in sound]
+        hint = f"what would fit is {', or '.join(remedies[:3])}" if remedies else "use a larger board"
+        return f"nothing that was tried fits {board.title}; {hint}"
+    sound = front(fitting)
+    if sound:
+        best_recall = max(each.recall for each in sound)
+        return f"nothing that fits has a recall@1 of {plan.min_recall:g}; the most is {best_recall:.2f}"
+    return f"of what fits {board.title} nothing is chosen by itself: {'; '.join(filter(None, map(objection, fitting)))}"
+
+
+def _notes(
+    board: Board, here: Board, found: Ratios | None, times: str, plan: FlightPlan, waited: float
+) -> Iterator[str]:
     if found is None:
         unknown = board if board.benchmark_score.single is None else here
         yield (
@@ -232,13 +284,22 @@ def _notes(board: Board, here: Board, found: Ratios | None, times: str, plan: Fl
     if found and times == "scaled":
         score = board.benchmark_score
         doubt = "" if score.verified and here.benchmark_score.verified else "unverified; "
-        apart = (
-            "" if score.products else f"; its products are not known apart: {UNKNOWN_PRODUCTS:g} of its single thread"
-        )
+        apart = f"; its products are not known apart: {UNKNOWN_PRODUCTS:g} of its single thread"
         yield (
             f"The times are scaled from this machine, not measured on this board: networks and full comparisons to "
             f"{found.products:.2g} of its speed, everything else to {found.passes:.2g} ({doubt}the board by "
-            f"{score.source}; this machine by {here.benchmark_score.source}){apart}."
+            f"{score.source}; this machine by {here.benchmark_score.source})"
+            f"{'' if score.products or score.arm64_mips else apart}."
+        )
+        if score.arm64_mips:
+            yield (
+                f"Those of cohog are the instructions that it takes on an ARM core (`make bench-arm64`), at "
+                f"{score.arm64_mips:g} million a second."
+            )
+    if waited > _BUSY:
+        yield (
+            f"This machine was busy: while techniques were tried, other programs had it for {waited:.0%} of the time. "
+            "Times of the processor were measured, which that changes little; to be sure, ask again when it is idle."
         )
     if not board.verified:
         yield f"The power of {board.title} is unverified: {board.source}."

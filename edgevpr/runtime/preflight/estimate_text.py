@@ -1,15 +1,16 @@
-"""An estimate as plain text of at most 120 columns: two tables, a line for each technique, and notes."""
+"""An estimate as plain text of at most 120 columns: three tables, a line for each technique, and notes."""
 
 from edgevpr.helpers.tables import aligned, wrapped
 from edgevpr.runtime.preflight.estimate import Estimate, TechniqueEstimate
 
+_FINDS = ("technique", "fits", "recall@1", "accepted", "wrong", "sets", "queries", "chosen by itself")
 _NEEDS = ("technique", "fits", "B/place", "map MB", "disk MB", "peak MB", "t_e s", "t_m s", "U_e", "U_m", "Hz")
 _DRAWS = ("technique", "mAh/query", "marginal", "mAh/flight", "marginal", "of pack")
 _LOSES = ("min lost", "marginal")
 
 
 def format_table(estimate: Estimate) -> str:
-    """Format the estimate as text: what each technique needs and draws, why any does not fit, notes, and what is
+    """Format the estimate as text: what each technique needs, finds and draws, why any does not fit, notes, and what is
     recommended."""
     plan = estimate.plan
     since = f" on {estimate.measured_on}" if estimate.measured_on else ""
@@ -21,6 +22,7 @@ def format_table(estimate: Estimate) -> str:
     ]
     missing = [[name, "n/a"] for name in estimate.unusable]
     lines += ["", *aligned([_NEEDS, *(_needs(row) for row in estimate.techniques), *missing], left=2)]
+    lines += ["", *aligned([_FINDS, *(_finds(row) for row in estimate.techniques)], left=2)]
     draws = _DRAWS + (_LOSES if plan.hover_w else ())
     lines += ["", *aligned([draws, *(_draws(row) for row in estimate.techniques)]), ""]
     for each in estimate.techniques:
@@ -45,6 +47,34 @@ def unusable_lines(unusable: dict[str, str]) -> list[str]:
         names = ", ".join(name for name, each in unusable.items() if each == why)
         lines += wrapped(f"{names} cannot be used: {why}")
     return lines
+
+
+def _finds(row: TechniqueEstimate) -> tuple[str, ...]:
+    found, fits = row.accuracy, "yes" if row.fits else "no"
+    if found is None:
+        return (row.technique, fits, "?", "?", "?", "", "", "never measured")
+    wrong = f"{found.accepted_elsewhere}"
+    if beside := found.accepted_wrong - found.accepted_elsewhere:
+        wrong += f" (+{beside} beside)"
+    if not row.fits:
+        chosen = ""
+    elif row.on_front:
+        chosen = "yes"
+    elif not found.is_trusted:
+        chosen = "wrong places"
+    else:
+        chosen = "needs a sequence" if row.objection else "another is better"
+    accepted = f"{found.accepted} of {found.asked}"
+    return (
+        row.technique,
+        fits,
+        f"{found.recall_at_1:.2f}",
+        accepted,
+        wrong,
+        f"{found.sets}",
+        f"{found.queries}",
+        chosen,
+    )
 
 
 def _needs(row: TechniqueEstimate) -> tuple[str, ...]:

@@ -11,8 +11,17 @@ from edgevpr.errors import MapError, ModelError, UsageError
 from edgevpr.places.index import bytes_per_place
 from edgevpr.places.sequence import bytes_beside_place
 from edgevpr.power.boards import Board, load_board
-from edgevpr.runtime.preflight.choose import choose, described, fit, preferred
-from edgevpr.runtime.preflight.probe import probe, probe_each
+from edgevpr.runtime.preflight import accuracy, counted
+from edgevpr.runtime.preflight.choose import (
+    Demand,
+    Option,
+    described,
+    objection,
+    options,
+    preferred,
+    require_best,
+)
+from edgevpr.runtime.preflight.probe import TechniqueCosts, probe
 from edgevpr.runtime.preflight.scale import on_board
 from edgevpr.runtime.recognise.opening import budget_mb, made_for
 from edgevpr.runtime.recognise.recogniser import Recogniser
@@ -23,65 +32,122 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Outlook:
-    """The technique that flies and why, in one line, and the seconds that a query will take (None: it could not be
-    tried)."""
+    """The technique that flies and why, in one line, the places to compare a query with, and the seconds that it will
+    take (None: it could not be tried)."""
 
     reason: str
+    candidates: int
     t_query_s: float | None
 
 
 def picked_technique(board_name: str, places: int, camera: str | None = None) -> str:
-    """Pick the best technique that the board can afford, for a `camera` that looks down or ahead; log the reason in one
-    line.
+    """Pick the technique by what it finds and what the board can afford, for a `camera` that looks down or ahead; log
+    the reason in one line (see `choose`).
 
     Where the board can afford none, the best is picked all the same, and the log says what is lacking: a map is made
     once, and may be flown on a larger board. Raises ModelError where no technique can be used at all.
     """
-    board, here = load_board(board_name), load_board("this")
-    tried = _usable(board, preferred(board, camera), camera)
-    costs = {name: on_board(cost, here, board) for name, cost in probe_each(tried)}
-    if not costs:
+    board = load_board(board_name)
+    demand = Demand(places=places, rate_hz=board.rate_hz, budget_mb=board.budget_mb, camera=camera)
+    wanted = [
+        option
+        for technique in _usable(board, preferred(board, camera), camera)
+        for option in options(
+            board,
+            _label(technique),
+            technique.spec.name,
+            _costs_on(technique, board),
+            demand,
+        )
+    ]
+    if not wanted:
         raise ModelError("No technique can be used here (see above): correct what it names, or name another one.")
     try:
-        choice = choose(board, costs, places, board.rate_hz, board.budget_mb)
+        taken = require_best(wanted, board, demand)
     except UsageError as error:
-        best = next(iter(costs))
-        _log.warning("technique %s is taken all the same: %s", best, error)
-        return best
-    _log.info("technique %s", choice.reason)
-    return choice.technique
+        _log.warning("technique %s is taken all the same: %s", wanted[0].name, error)
+        return wanted[0].name
+    figures = described(board, taken.fit, places, demand.rate_hz, demand.budget_mb)
+    against = filter(None, (objection(each) for each in wanted if each.name != taken.name))
+    _log.info("technique %s", "; ".join([f"{taken.label}: {taken.accuracy or 'never measured'}; {figures}", *against]))
+    return taken.name
 
 
 def outlook(recogniser: Recogniser, config: Config) -> Outlook:
-    """Say which technique flies and why, and try here and now whether its board can afford it. Never a reason not to
-    fly."""
-    spec, board = recogniser.technique.spec, recogniser.meter.board
+    """Say which technique flies and why, and try here and now whether its board can afford it. Where it cannot, and the
+    configuration does not say how many candidates are compared, fewer are taken that fit (see `choose`). Never a reason
+    not to fly."""
+    technique, board = recogniser.technique, recogniser.meter.board
+    spec, candidates = technique.spec, recogniser.candidates
     weights = weights_of(spec)
     left_out = len(recogniser.place_map) - len(recogniser.index)
-    afforded, t_query_s = _afforded(recogniser, config, board)
+    t_query_s = None
+    try:
+        taken, afforded = _afforded(recogniser, config, board)
+        t_query_s, candidates = taken.fit.t_query_s, taken.candidates or candidates
+    except (MapError, ModelError, OSError) as error:  # the trial map needs a little room for temporary files
+        afforded = f"what it takes could not be tried ({error})"
     parts = (
         "the map was built with it" if config.technique is None else "it was named",
         weights and f"weights of {weights}",
         left_out and f"{left_out} places are left to the map file",
+        candidates != recogniser.candidates and f"{candidates} candidates instead of {recogniser.candidates}",
         afforded,
     )
-    name = techniques.labelled(spec.name, spec.form)
-    return Outlook(f"technique {name}: {'; '.join(filter(None, parts))}", t_query_s)
+    return Outlook(f"technique {_label(technique)}: {'; '.join(filter(None, parts))}", candidates, t_query_s)
 
 
-def _afforded(recogniser: Recogniser, config: Config, board: Board) -> tuple[str, float | None]:
+def _afforded(recogniser: Recogniser, config: Config, board: Board) -> tuple[Option, str]:
+    """Return how to recognise, and what it finds and costs in a few words."""
     technique, places = recogniser.technique, len(recogniser.index)
     rate_hz, limit_mb = config.source.rate_hz or board.rate_hz, budget_mb(config, board)
-    try:
-        costs = on_board(probe(technique), load_board("this"), board)
-    except (MapError, ModelError, OSError) as error:  # the trial map needs a little room for temporary files
-        return f"what it takes could not be tried ({error})", None
+    costs = _costs_on(technique, board)
     beside_bytes = bytes_beside_place(recogniser.search.length)
     costs = replace(costs, ram_bytes_per_place=bytes_per_place(technique.spec) + beside_bytes)
     if technique.spec.fine:
         costs = replace(costs, candidates=recogniser.candidates)
-    found = fit(board, costs, places, rate_hz, limit_mb)
-    return described(board, found, places, rate_hz, limit_mb), found.t_query_s
+    camera = technique.spec.parameters.get("camera")
+    demand = Demand(places=places, rate_hz=rate_hz, budget_mb=limit_mb, camera=camera)
+    usual, *fewer = options(board, _label(technique), technique.spec.name, costs, demand)
+    is_open = config.match.candidates is None and recogniser.search.length == 1
+    fitting = [each for each in (usual, *fewer) if not objection(each)] if is_open and usual.fit.shortfalls else []
+    taken = fitting[0] if fitting else usual
+    figures = described(board, taken.fit, places, rate_hz, limit_mb)
+    return taken, f"{taken.accuracy}; {figures}" if taken.accuracy else figures
+
+
+def _label(technique: Technique) -> str:
+    """Name a technique in its form; a way to match that was not measured is named too."""
+    spec = technique.spec
+    other = ", thesis" if spec.name == "cohog" and not spec.in_full else ""
+    return techniques.labelled(spec.name, spec.form) + other
+
+
+def _costs_on(technique: Technique, board: Board) -> TechniqueCosts:
+    """Try a technique here, and convert its costs to `board`."""
+    work = counted.of(technique.spec.name, technique.spec.parameters) if technique.spec.in_full else None
+    return on_board(probe(technique), load_board("this"), board, work)
+
+
+def trusted_candidates(technique: Technique) -> tuple[int, ...]:
+    """Return the numbers of candidates, fewer than the technique's own, with which no wrong place was accepted on the
+    image sets, largest first."""
+    label, camera = _label(technique), technique.spec.parameters.get("camera")
+    measured = accuracy.fewer_candidates(label, camera)
+    return tuple(count for count in measured if accuracy.of(label, camera, count).is_trusted)
+
+
+def trusted_forms(technique: Technique) -> tuple[str, ...]:
+    """Return the smaller forms of a technique that accepted no more wrong places on the image sets than its own form,
+    in the order of their size; all of them where its own form was not measured."""
+    spec, camera = technique.spec, technique.spec.parameters.get("camera")
+    own = accuracy.of(_label(technique), camera)
+    found = []
+    for form in spec.smaller_forms:
+        other = accuracy.of(techniques.labelled(spec.name, form), camera)
+        if own is None or (other and other.accepted_elsewhere <= own.accepted_elsewhere):
+            found.append(form)
+    return tuple(found)
 
 
 def camera_setting(name: str, camera: str | None) -> dict[str, str]:

@@ -29,7 +29,7 @@ from edgevpr.runtime.preflight.offers import Offer
 from edgevpr.runtime.preflight.scale import is_same
 from edgevpr.runtime.preflight.trial import Trial, model_of, trial_of, try_each
 
-_FORMAT = 2  # 1 had no cost of a scan that is paid once
+_FORMAT = 3  # 1 had no cost of a scan that is paid once, 2 times that passed
 _MAX_FILE_BYTES = 10_000_000
 _PICTURES = 8
 _SAME_RAM = 0.02  # kernels keep some RAM for themselves, every version another amount
@@ -180,9 +180,11 @@ def _require_figures(found: StoredFigures) -> None:
             raise TypeError(f"the settings of {trial.label} are none")
         if costs := trial.costs:
             stages = [*astuple(costs.encode), *astuple(costs.match_per_place)]
-            above_0 = [*stages, costs.ram_bytes_per_place, costs.disk_bytes_per_place, costs.process_mb]
-            scans = [*astuple(costs.scan_per_place), *astuple(costs.scan_once)]
-            others = [*scans, costs.encode_mb or 0.0, costs.candidates or 0]
+            sizes = [costs.ram_bytes_per_place, costs.disk_bytes_per_place, costs.process_mb]
+            above_0 = [*stages, *sizes, costs.sequence, costs.in_full]
+            parts = [costs.scan_per_place, costs.scan_once, costs.compare_once]
+            rest = [costs.encode_mb or 0.0, costs.candidates or 0, costs.waited]
+            others = [*(value for part in parts for value in astuple(part)), *rest]
             if not (all(0 < each < math.inf for each in above_0) and all(0 <= each < math.inf for each in others)):
                 raise ValueError(f"the costs of {trial.label} are no figures")
 

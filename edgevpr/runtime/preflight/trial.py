@@ -102,7 +102,8 @@ def trial_of(fields: dict[str, Any]) -> Trial:
     """Make a Trial from the output of `asdict`. Raises TypeError, KeyError or ValueError for anything else."""
     costs = fields["costs"]
     if costs is not None:
-        stages = {key: StageCost(**costs[key]) for key in ("encode", "match_per_place", "scan_per_place", "scan_once")}
+        names = ("encode", "match_per_place", "scan_per_place", "scan_once", "compare_once")
+        stages = {key: StageCost(**costs[key]) for key in names}
         costs = TechniqueCosts(**{**costs, **stages})
     return Trial(**{**fields, "costs": costs})
 

@@ -25,7 +25,7 @@ from edgevpr.runtime.flight.learning import say_learning_stopped
 from edgevpr.runtime.flight.loop import Stop
 from edgevpr.runtime.flight.systemd import notify
 from edgevpr.runtime.preflight.choose import too_late
-from edgevpr.runtime.preflight.pick import outlook, picked_technique
+from edgevpr.runtime.preflight.pick import Outlook, outlook, picked_technique, trusted_candidates, trusted_forms
 from edgevpr.runtime.recognise.learn import Learner, check_positions
 from edgevpr.runtime.recognise.opening import has_map, open_learning, open_recogniser
 from edgevpr.runtime.recognise.recogniser import Recogniser
@@ -52,7 +52,9 @@ def fly(config: Config, positions: Path | None = None) -> int:
         stack.callback(recogniser.place_map.close)
         smaller_forms = smaller_forms_of(config, recogniser, learner, time.monotonic() - begin_s)
         flight_log = stack.enter_context(FlightLog(config.log.path, wait="NOTIFY_SOCKET" in os.environ))
-        _say_start(config, recogniser, flight_log)
+        found = outlook(recogniser, config)
+        recogniser.candidates = found.candidates
+        _say_start(config, recogniser, flight_log, found)
         link = stack.enter_context(_link(address, config.mavlink)) if address else None
         if link and (learner or config.match.reach_m_s or recogniser.technique.spec.heading_within_deg is not None):
             link.want_position()
@@ -78,6 +80,7 @@ def fly(config: Config, positions: Path | None = None) -> int:
                 autopilot=autopilot,
                 stop=stop,
                 learner=learner,
+                fewer_candidates=() if config.match.candidates else trusted_candidates(recogniser.technique),
                 smaller_forms=smaller_forms,
             )
             notify(STOPPING=1)
@@ -141,12 +144,12 @@ def smaller_forms_of(config: Config, recogniser: Recogniser, learner: Learner | 
     is_whole = len(recogniser.index) == len(recogniser.place_map)  # else a smaller form would hold more places
     if own_limits or learner or not is_whole or load_s > _RELOAD_S:
         return ()
-    return recogniser.technique.spec.smaller_forms
+    return trusted_forms(recogniser.technique)
 
 
-def _say_start(config: Config, recogniser: Recogniser, flight_log: FlightLog) -> None:
+def _say_start(config: Config, recogniser: Recogniser, flight_log: FlightLog, found: Outlook) -> None:
     """Say which technique flies, and write the first line of the log."""
-    board, found = recogniser.meter.board, outlook(recogniser, config)
+    board = recogniser.meter.board
     _log.info("version %s on %s", __version__, board.title)
     _log.info("%s", found.reason)
     if config.mavlink.link and config.mavlink.send_fixes and (found.t_query_s or 0.0) > FIX_MAX_AGE_S:

@@ -12,14 +12,44 @@ from edgevpr.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
 from edgevpr.errors import ConfigError, ModelError, UsageError
 from edgevpr.power import machine
 from edgevpr.power.boards import load_board
+from edgevpr.runtime.preflight import accuracy, pick
 from edgevpr.runtime.preflight import choose as choosing
-from edgevpr.runtime.preflight import pick
-from edgevpr.runtime.preflight.choose import choose, fit, preferred
-from edgevpr.runtime.preflight.probe import TechniqueCosts, noise, probe, probe_each
+from edgevpr.runtime.preflight.choose import Demand, best, fit, front, options, preferred, require_best
+from edgevpr.runtime.preflight.probe import TechniqueCosts, noise, probe
 from edgevpr.runtime.preflight.scale import on_board
 from edgevpr.types import StageCost
 
 COSTS = {"regions": REGIONS, "vector": VECTOR}
+
+
+def found(recall, wrong=0):
+    return {
+        "recall_at_1": recall,
+        "sets": 2,
+        "queries": 100,
+        "asked": 120,
+        "accepted": 30,
+        "accepted_wrong": wrong,
+        "accepted_elsewhere": wrong,
+    }
+
+
+@pytest.fixture
+def accuracies(monkeypatch):
+    """Regions find more than vectors; a test may change it."""
+    table = {"regions": found(0.9), "regions, 10 candidates": found(0.8), "vector": found(0.5)}
+    monkeypatch.setattr(accuracy, "_content", lambda: {"forward": table, "nadir": {}})
+    return table
+
+
+def wanted(board, costs, places, rate_hz=1.0):
+    demand = Demand(places=places, rate_hz=rate_hz, budget_mb=100)
+    return [each for name, cost in costs.items() for each in options(board, name, name, cost, demand)]
+
+
+def chosen(board, costs, places, rate_hz=1.0, min_recall=None):
+    taken = best(wanted(board, costs, places, rate_hz), board, min_recall)
+    return taken and taken.label
 
 
 def board(**changes):
@@ -63,20 +93,58 @@ def test_a_technique_is_tried_on_frames_of_a_camera_and_a_map_on_disk():
     assert min(costs.encode.wall_s, costs.match_per_place.wall_s, costs.match_per_place.cpu_s) > 0
 
 
-def test_given_pictures_are_all_encoded_and_the_median_counts():
-    technique = TinyTechnique(fine=True)
-    seconds = itertools.chain([9.0, 1.0, 3.0, 2.0], itertools.repeat(0.0))
+class Clocks:
+    """A wall clock and a clock of the processor, which some work sets forward."""
+
+    def __init__(self):
+        self.wall_s = self.cpu_s = 0.0
+
+    def work(self, cpu_s, others_s=0.0):
+        self.wall_s += cpu_s + others_s
+        self.cpu_s += cpu_s
+
+    def __iter__(self):
+        return iter(({"wall_clock": lambda: self.wall_s, "cpu_clock": lambda: self.cpu_s}).items())
+
+
+def test_given_pictures_are_all_tried_and_the_median_counts():
+    technique, clocks = TinyTechnique(fine=True), Clocks()
+    pictures = [image[:200] for image in noise(3)]
+    takes_s = {picture.tobytes(): takes for picture, takes in zip(pictures, (1.0, 3.0, 2.0), strict=True)}
 
     def slow(image, mask=None):
-        clock[0] += next(seconds)
+        clocks.work(takes_s[image.tobytes()])
         return TinyTechnique.encode(technique, image, mask)
 
-    clock = [0.0]
     technique.encode = slow
-    clocks = {"wall_clock": lambda: clock[0], "cpu_clock": lambda: clock[0] / 2}
-    costs = probe(technique, [image[:200] for image in noise(3)], **clocks)
-    assert costs.encode == StageCost(2.0, 1.0)
+    assert probe(technique, pictures, **dict(clocks)).encode == StageCost(2.0, 2.0)
     assert technique.shapes == {((200, 640), np.dtype(np.uint8))}
+
+
+def test_what_other_programs_take_does_not_count_and_is_said():
+    technique, clocks = TinyTechnique(fine=True), Clocks()
+    others_s = itertools.cycle([0.9, 0.3, 0.0])
+
+    def slow(image, mask=None):
+        clocks.work(0.1, next(others_s))
+        return TinyTechnique.encode(technique, image, mask)
+
+    technique.encode = slow
+    costs = probe(technique, **dict(clocks))
+    assert costs.encode.wall_s == costs.encode.cpu_s == pytest.approx(0.1)
+    assert costs.waited == pytest.approx(0.8, abs=0.01)
+
+
+def test_the_least_of_several_tries_counts():
+    technique, clocks = TinyTechnique(fine=True), Clocks()
+    disturbed = itertools.cycle([0.13, 0.1, 0.17, 0.12])
+
+    def slow(image, mask=None):
+        clocks.work(next(disturbed))
+        return TinyTechnique.encode(technique, image, mask)
+
+    technique.encode = slow
+    assert probe(technique, **dict(clocks)).encode == StageCost(pytest.approx(0.1), pytest.approx(0.1))
 
 
 def test_the_peak_is_the_most_that_was_resident_not_what_is_left():
@@ -101,35 +169,75 @@ def test_a_technique_without_a_fine_part_is_tried_too():
     assert costs.match_per_place.wall_s > 0
 
 
-def test_the_real_techniques_are_probed_best_first():
-    costs = dict(probe_each(techniques.create(name) for name in techniques.AUTOMATIC))
-    assert tuple(costs) == techniques.AUTOMATIC
+def test_the_real_techniques_can_be_probed():
+    costs = {name: probe(techniques.create(name)) for name in techniques.AUTOMATIC}
     assert costs["hog"].ram_bytes_per_place > 100 * costs["cohog"].ram_bytes_per_place
 
 
-def test_the_best_technique_is_taken_where_it_fits():
-    found = choose(board(), COSTS, places=100, rate_hz=1, budget_mb=100)
-    assert found.technique == "regions"
-    assert found.reason == (
-        "regions: 100 places take 0.1 of 100.0 MB, the process 90 of 300 MB, and 2 Hz of 1 are reached with 2 of 4 "
-        "cores"
-    )
+def test_the_most_accurate_is_taken_where_it_fits(accuracies):
+    assert chosen(board(), COSTS, places=100) == "regions"
+    assert chosen(board(), dict(reversed(COSTS.items())), places=100) == "regions", "the order says nothing"
 
 
-def test_the_next_is_taken_where_the_best_is_too_slow():
-    found = choose(board(), COSTS, places=300, rate_hz=1, budget_mb=100)
-    assert found.technique == "vector"
-    assert "\n" not in found.reason
-    assert found.reason.startswith("vector: 300 places take 85.8 of 100.0 MB")
-    assert found.reason.endswith("; regions does not fit, it reaches 0.76 Hz of 1")
+def test_another_is_taken_where_the_most_accurate_is_too_slow(accuracies):
+    assert chosen(board(), COSTS, places=300) == "vector"
 
 
-def test_the_order_of_the_costs_is_the_rank():
-    backwards = dict(reversed(COSTS.items()))
-    assert choose(board(), backwards, places=100, rate_hz=1, budget_mb=100).technique == "vector"
+def test_fewer_candidates_come_before_another_technique(accuracies):
+    two_stages = {**COSTS, "regions": dataclasses.replace(REGIONS, candidates=400)}
+    assert chosen(board(), two_stages, places=200) == "regions"
+    assert chosen(board(), two_stages, places=300) == "regions, 10 candidates"
+    assert [each.label for each in wanted(board(), COSTS, 300)] == ["regions", "vector"], "one stage has no candidates"
+    few = {"regions": dataclasses.replace(REGIONS, candidates=10)}
+    assert [each.label for each in wanted(board(), few, 300)] == ["regions"], "ten are no fewer"
 
 
-def test_a_big_board_takes_the_best_technique_for_a_map_that_a_tiny_one_refuses():
+def test_with_a_least_recall_the_cheapest_that_reaches_it_is_taken(accuracies):
+    accuracies["vector"] = found(0.85)
+    assert [each.label for each in front(wanted(board(), COSTS, 100))] == ["vector", "regions"]
+    assert chosen(board(), COSTS, 100) == "regions"
+    assert chosen(board(), COSTS, 100, min_recall=0.6) == "vector"
+    assert chosen(board(), COSTS, 100, min_recall=0.9) == "regions"
+    assert chosen(board(), COSTS, 100, min_recall=0.95) is None
+
+
+def test_what_is_both_worse_and_dearer_is_not_on_the_front(accuracies):
+    dear = {**COSTS, "vector": dataclasses.replace(VECTOR, encode=StageCost(0.6, 0.6))}
+    assert [each.label for each in front(wanted(board(), dear, 100))] == ["regions"]
+
+
+def test_what_has_accepted_wrong_places_is_never_chosen_by_itself(accuracies):
+    accuracies["regions"] = found(0.9, wrong=1)
+    assert chosen(board(), COSTS, 100) == "vector"
+    assert chosen(board(technique="regions"), COSTS, 100) == "vector"
+    accuracies["vector"] = found(0.5, wrong=2)
+    with pytest.raises(UsageError, match="regions accepted 1 wrong places in 120 queries: name it to use it; vector a"):
+        require_best(wanted(board(), COSTS, 100), board(), Demand(places=100, rate_hz=1, budget_mb=100))
+
+
+def test_a_wrong_place_beside_the_right_one_is_no_objection(accuracies):
+    accuracies["regions"] = {**found(0.9), "accepted_wrong": 1}
+    assert chosen(board(), COSTS, 100) == "regions"
+    assert "30 of 120 accepted, 0 wrong (1 as a neighbour)" in str(accuracy.of("regions", None))
+
+
+def test_what_was_never_measured_is_chosen_only_where_the_board_names_it(accuracies):
+    del accuracies["regions"]
+    assert chosen(board(), COSTS, 100) == "vector"
+    assert chosen(board(technique="regions"), COSTS, 100) == "regions"
+
+
+def test_a_sequence_is_not_chosen_by_itself(accuracies):
+    of_ten = {**COSTS, "regions": dataclasses.replace(REGIONS, sequence=10)}
+    assert chosen(board(), of_ten, 100) == "vector"
+
+
+def test_the_boards_own_technique_goes_before_a_better_one(accuracies):
+    assert chosen(board(technique="vector"), COSTS, 100) == "vector"
+    assert chosen(board(technique="vector"), COSTS, 100, min_recall=0.6) == "regions"
+
+
+def test_a_big_board_takes_a_technique_for_a_map_that_a_tiny_one_refuses(accuracies):
     here = load_board("generic-x86")
     tiny, big = load_board("rpi-zero-2w"), load_board("thesis-xeon")
     fast = TechniqueCosts(
@@ -139,9 +247,10 @@ def test_a_big_board_takes_the_best_technique_for_a_map_that_a_tiny_one_refuses(
         disk_bytes_per_place=286_000,
         process_mb=90.0,
     )
-    assert choose(big, {"vector": on_board(fast, here, big)}, 1000, 1, big.budget_mb).technique == "vector"
+    demand = Demand(places=1000, rate_hz=1, budget_mb=2000)
+    assert best(list(options(big, "vector", "vector", on_board(fast, here, big), demand)), big)
     with pytest.raises(UsageError, match=r"No technique fits Raspberry Pi Zero 2 W with 1000 places at 1 Hz"):
-        choose(tiny, {"vector": on_board(fast, here, tiny)}, 1000, 1, tiny.budget_mb)
+        require_best(list(options(tiny, "vector", "vector", on_board(fast, here, tiny), demand)), tiny, demand)
 
 
 def test_a_large_map_is_scanned_whole_and_compared_in_part():
@@ -173,9 +282,9 @@ def test_the_whole_map_counts_in_ram_and_only_its_candidates_in_time():
     assert fit(board(), two_stages, 50_000, 8, 100).remedies[0] == "with up to 6 places"
 
 
-def test_where_none_fits_the_sentence_says_what_would():
+def test_where_none_fits_the_sentence_says_what_would(accuracies):
     with pytest.raises(UsageError) as raised:
-        choose(board(), COSTS, places=1000, rate_hz=1, budget_mb=100)
+        require_best(wanted(board(), COSTS, 1000), board(), Demand(places=1000, rate_hz=1, budget_mb=100))
     assert str(raised.value) == (
         "No technique fits Test board with 1000 places at 1 Hz (regions does not fit, it reaches 0.24 Hz of 1; vector "
         "does not fit, its map takes 286.0 MB of RAM and 100.0 are allowed and the process takes 376 MB and 300 are "
@@ -200,9 +309,10 @@ def test_a_small_budget_is_the_only_thing_in_the_way():
     assert not fit(board(), VECTOR, places=500, rate_hz=1, budget_mb=143).shortfalls
 
 
-def test_a_board_too_small_for_the_process_itself_has_no_remedy():
+def test_a_board_too_small_for_the_process_itself_has_no_remedy(accuracies):
+    small = board(memory_max_mb=64.0)
     with pytest.raises(UsageError, match=r"the process takes 90 MB and 64 are allowed\): use a larger board\.$"):
-        choose(board(memory_max_mb=64.0), {"regions": REGIONS}, places=10, rate_hz=1, budget_mb=50)
+        require_best(wanted(small, {"regions": REGIONS}, 10), small, Demand(places=10, rate_hz=1, budget_mb=100))
 
 
 def test_the_cpu_share_limits_a_technique_that_keeps_all_cores_busy():
@@ -230,7 +340,8 @@ def test_a_technique_of_the_board_that_is_not_there_is_one_sentence():
         preferred(board(technique="cohgo"))
 
 
-def test_the_technique_that_is_picked_is_the_boards_only_if_it_fits(monkeypatch, caplog):
+def test_the_technique_that_is_picked_is_the_boards_only_if_it_fits(monkeypatch, accuracies):
+    accuracies |= {"cohog": found(0.9), "hog": found(0.4)}
     # The process that runs the tests is large by itself.
     small = board(technique="hog", budget_mb=1.0, memory_max_mb=4000.0)
     for own, places, taken in ((small, 2, "hog"), (small, 100, "cohog")):
@@ -238,7 +349,8 @@ def test_the_technique_that_is_picked_is_the_boards_only_if_it_fits(monkeypatch,
         assert pick.picked_technique("this", places) == taken
 
 
-def test_a_network_that_the_board_wants_and_that_is_not_there_is_passed_over(monkeypatch, caplog):
+def test_a_network_that_the_board_wants_and_that_is_not_there_is_passed_over(monkeypatch, caplog, accuracies):
+    accuracies["cohog"] = found(0.9)
     really = pick.made_for
 
     def made_for(board, name, settings=None):
@@ -269,7 +381,7 @@ def test_for_a_camera_that_looks_down_only_what_can_be_told_so_is_tried():
 
 def test_where_nothing_fits_the_best_is_picked_all_the_same_and_the_log_says_what_it_lacks(monkeypatch, caplog):
     slow = dataclasses.replace(REGIONS, encode=StageCost(30.0, 30.0))
-    monkeypatch.setattr(pick, "probe_each", lambda tried: ((each.spec.name, slow) for each in tried))
+    monkeypatch.setattr(pick, "probe", lambda technique: slow)
     for camera, knows in (("nadir", {"camera": "nadir"}), ("forward", {"camera": "forward"}), (None, {})):
         assert pick.picked_technique("this", 10, camera) == "cohog"
         assert pick.camera_setting("cohog", camera) == knows

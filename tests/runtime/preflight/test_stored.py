@@ -94,7 +94,7 @@ def test_a_few_megabytes_that_a_kernel_keeps_are_no_other_machine(kept):
 
 
 @pytest.mark.parametrize(
-    "text", ["", "{", "[]", "null", '{"format": 2}', '{"format": 2, "trials": 3}', '{"score": {}}']
+    "text", ["", "{", "[]", "null", '{"format": 3}', '{"format": 3, "trials": 3}', '{"score": {}}']
 )
 def test_a_file_that_cannot_be_read_is_said_and_not_used(tmp_path, text):
     path = tmp_path / "m.json"
@@ -131,7 +131,7 @@ def test_figures_that_are_none_are_said_and_not_used(kept, keys, value):
 
 
 def test_another_version_of_the_file_is_said_and_no_file_is_nothing_to_say(kept):
-    kept.write_text('{"format": 3}')
+    kept.write_text('{"format": 2}')
     assert load(kept)[1].startswith(f"{kept} is of another version of edgevpr")
     assert load(kept.with_name("none.json")) == (None, None)
 
