@@ -110,7 +110,7 @@ def report(rows: list[dict[str, Any]], made: dict[str, Any]) -> str:
             f"{row['instructions'] / 1e6:.2f}",
             f"{row['bytes'] / 1e6:.1f}",
             f"{row['multiply_adds'] / 1e6:.1f}",
-            row["calls"],
+            f"{row['calls']}",
             f"{row['here_ms']:.2f}",
             f"{row['instructions'] / 1e6 / mips:.3f}",
         ]

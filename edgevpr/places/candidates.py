@@ -12,15 +12,15 @@ def best_scanned(scanned: np.ndarray, by_hypothesis: np.ndarray | None, among: n
     all). They come in the order of the map file, in which a card reads them fastest.
 
     With `by_hypothesis` float32 (N, H) (see `Technique.coarse_scores`), the best hypotheses of all places together are
-    chosen instead: `count` times six, or `count` times half of the mean number possible for a place where that is less.
-    So a place with only two likely hypotheses leaves room for other places. One place gets six hypotheses at most, or
-    more where there are too few places.
+    chosen instead: `count` times six, or `count` times a third of the mean number possible for a place where that is
+    less. So a place with only two likely hypotheses leaves room for other places. One place gets six hypotheses at
+    most, or more where there are too few places.
     """
     slots = np.flatnonzero(among)
     if by_hypothesis is None or not len(slots):
         return [(slot, None) for slot in slots[np.sort(_largest(scanned[slots], count))].tolist()]
     possible = np.isfinite(by_hypothesis[slots]).sum(axis=1).mean()
-    tries = round(count * max(1.0, min(_TRIED_EACH, possible / 2)))
+    tries = round(count * max(1.0, min(_TRIED_EACH, possible / 3)))
     slots = slots[np.sort(_largest(scanned[slots], tries))]
     scores = by_hypothesis[slots]
     of_place = np.argsort(np.argsort(-scores, axis=1, kind="stable"), axis=1)

@@ -28,8 +28,7 @@ from edgevpr.types import NO_COST, Frame, StageCost, Steps
 
 _PICTURES = 3
 _PLACES = 6
-_TRIED_S = 1.0  # for so long each picture is tried again and again,
-_TRIES = 8  # so often at most
+_TRIES = 8  # of a picture, at most
 _SCANNED = 4096
 _SCANNED_BYTES = 8 << 20  # at most: a small board has no more to spare before the map is loaded
 _ANY_PACK = Pack(cells=1, capacity_mah=1)  # only seconds count here, not charge
@@ -95,6 +94,7 @@ def probe(
     technique: Technique,
     images: Sequence[np.ndarray] | None = None,
     *,
+    tried_s: float = 0.0,
     wall_clock: Callable[[], float] = time.perf_counter,
     cpu_clock: Callable[[], float] = time.process_time,
 ) -> TechniqueCosts:
@@ -102,9 +102,9 @@ def probe(
     a small map on disk, then in a large index.
 
     `images` (uint8, (H, W[, 3])) are all tried, and the median counts, since a real picture may be quick or slow.
-    Without them a few pictures of `noise` are tried, all alike, and the quickest counts. Each picture is tried several
-    times, and the least time of the processor counts: what other programs take is no cost of the technique. Raises
-    ModelError for a technique that fails on a picture.
+    Without them a few pictures of `noise` are tried, all alike, and the quickest counts. The pictures are tried again
+    for about `tried_s` seconds a map, and the least time of the processor counts: what other programs take is no cost
+    of the technique. Raises ModelError for a technique that fails on a picture.
     """
     counted = _least if images is None else _median
     pictures = noise(_PICTURES) if images is None else images
@@ -133,7 +133,7 @@ def probe(
 
         for _ in range(math.ceil((length - 1) / len(frames))):
             asked()  # the frames of the first rounds fill the sequence
-        end_s, rounds = time.monotonic() + _TRIED_S, [asked()]
+        end_s, rounds = time.monotonic() + tried_s, [asked()]
         while len(rounds) < _TRIES and time.monotonic() < end_s:
             rounds.append(asked())
         spent.extend(steps.encode + steps.match for each in rounds for steps in each)

@@ -20,6 +20,7 @@ from edgevpr.runtime.recognise.opening import made_with
 from edgevpr.techniques.networks.card import load_card, weights_of
 from edgevpr.types import StageCost
 
+_TRIED_S = 1.0  # pictures are tried again for so long: a flight that begins has no such time
 _LIMIT_S = 900.0  # ten times what the slowest technique takes on the slowest board
 
 
@@ -113,7 +114,7 @@ def _tried(job: dict[str, Any]) -> Trial:
     try:
         pictures = [read_image(path) for path in job["images"]] or (noise(job["rounds"]) if job["rounds"] else None)
         technique = made_with(job["threads"], offer.name, offer.settings)
-        costs = probe(technique, pictures)
+        costs = probe(technique, pictures, tried_s=_TRIED_S)
         model = model_of(offer.name, offer.settings)
     except EdgevprError as error:
         return _refused(offer, str(error))
