@@ -26,7 +26,7 @@ from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.types import NO_COST, Frame, StageCost, Steps
 
-_PICTURES = 3
+_PICTURES = 2
 _PLACES = 6
 _TRIES = 8  # of a picture, at most
 _SCANNED = 4096
