@@ -32,6 +32,7 @@ from edgevpr.helpers.progress import progress
 from edgevpr.techniques.networks.session import file_sha256
 
 REPOSITORY = Path(__file__).resolve().parents[1]
+RESULTS = REPOSITORY / "benchmarks" / "results"
 TUNED_ON = ("corridor", "aerial_caliterra", "aerial_garfield28")
 FROM_THE_AIR = ("aerial_", "kite_")  # how the names of such sets begin
 
@@ -87,7 +88,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--models", type=Path, default=beside / "models", help="a folder with the original weights: calc/model.onnx"
     )
-    parser.add_argument("--out", type=Path, default=REPOSITORY / "benchmarks" / "results")
+    parser.add_argument("--out", type=Path, default=RESULTS)
     args = parser.parse_args(argv)
     try:
         with ExitStack() as stack:
@@ -115,7 +116,8 @@ def main(argv: list[str] | None = None) -> int:
                 rows = [row for row in wanted if folder.name != JOINED or row.label in JOINED_ROWS]
                 if rows:
                     write_set(args.out / f"{folder.name}.json", folder, rows, commit)
-        write_accuracy(args.out)
+        if args.out.resolve() == RESULTS:  # figures of other sets, or of a trial, do not travel
+            write_accuracy(args.out)
         sets_page.write(args.out, {folder.name: LEFT_OUT[folder.name] for folder in folders if folder.name in LEFT_OUT})
     except EdgevprError as error:
         print(f"run_sets: {error}", file=sys.stderr)

@@ -2,6 +2,8 @@
 
 import dataclasses
 import itertools
+import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -389,3 +391,18 @@ def test_where_nothing_fits_the_best_is_picked_all_the_same_and_the_log_says_wha
     said = [record.message for record in caplog.records if "all the same" in record.message]
     assert len(said) == 3
     assert "a query takes 30.0 s" in said[0]
+
+
+def test_the_figures_that_travel_are_those_of_the_results():
+    assert accuracy.fewer_candidates("cohog", "nadir") == accuracy.fewer_candidates("cohog", None) == (20, 10)
+    for camera in ("forward", "nadir"):
+        for name in ("cohog", "hog 1bit", "seqslam", "netvlad 8bit"):
+            assert accuracy.of(name, camera).queries > 50
+        assert accuracy.of("cohog", camera).is_trusted
+    results = Path(__file__).parents[3] / "benchmarks" / "results"
+    measured = (
+        json.loads((results / "grief_stromovka_seasons.json").read_text()),
+        json.loads((results / "nordland_tiny.json").read_text()),
+    )
+    recalls = [each["techniques"]["cohog"]["recall_at_1"] for each in measured]
+    assert accuracy.of("cohog", "forward").recall_at_1 == pytest.approx(sum(recalls) / 2, abs=1e-4)
