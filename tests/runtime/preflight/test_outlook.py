@@ -1,0 +1,71 @@
+"""What is said when a flight begins, and how many candidates it then compares."""
+
+from dataclasses import replace
+
+import pytest
+
+from edgevpr.config import load_config
+from edgevpr.power.boards import load_board
+from edgevpr.runtime.preflight import pick
+from edgevpr.runtime.preflight.pick import outlook, trusted_candidates
+from edgevpr.runtime.preflight.probe import TechniqueCosts
+from edgevpr.runtime.recognise.opening import open_recogniser
+from edgevpr.types import StageCost
+
+COSTS = TechniqueCosts(
+    encode=StageCost(0.1, 0.1),
+    match_per_place=StageCost(0.01, 0.01),
+    ram_bytes_per_place=170,
+    disk_bytes_per_place=32_000,
+    process_mb=90.0,
+    candidates=42,
+)
+
+
+@pytest.fixture
+def outlook_at(recording, monkeypatch):
+    def found(rate_hz, costs=COSTS, **settings):
+        monkeypatch.setattr(pick, "probe", lambda technique: costs)
+        monkeypatch.setattr(pick, "on_board", lambda costs, *_: costs)
+        config = load_config(None, {"map": str(recording / "cohog.gpkg"), "source.rate_hz": rate_hz, **settings})
+        board = replace(load_board("this"), cores=4, cpu_share=0.5)
+        recogniser = open_recogniser(config, board)
+        # A flight over more places than candidates: this map has few.
+        monkeypatch.setattr(type(recogniser.index), "__len__", lambda index: 1000)
+        with recogniser.place_map:
+            return outlook(recogniser, config)
+
+    return found
+
+
+def test_a_board_that_affords_it_compares_as_many_candidates_as_usual(outlook_at):
+    found = outlook_at(1.0)
+    assert (found.candidates, found.t_query_s) == (42, pytest.approx(0.52))
+    assert "; recall@1 " in found.reason
+    assert "instead" not in found.reason
+
+
+def test_a_slower_board_compares_fewer_and_says_so(outlook_at):
+    found = outlook_at(3.0)
+    assert (found.candidates, found.t_query_s) == (20, pytest.approx(0.3))
+    assert "; 20 candidates instead of 42; recall@1 0." in found.reason
+    assert "3.3 Hz of 3 are reached" in found.reason
+
+
+def test_what_the_configuration_says_is_kept_and_so_is_what_nothing_helps(outlook_at):
+    assert outlook_at(3.0, **{"match.candidates": 42}).candidates == 42
+    assert outlook_at(3.0, **{"match.sequence": 3}).candidates == 42
+    hopeless = outlook_at(3.0, replace(COSTS, encode=StageCost(2.0, 2.0)))
+    assert hopeless.candidates == 42
+    assert "it does not fit (it reaches 0.41 Hz of 3" in hopeless.reason
+
+
+def test_only_numbers_that_accepted_nothing_wrong_are_for_the_governor(recording):
+    config = load_config(None, {"map": str(recording / "cohog.gpkg")})
+    recogniser = open_recogniser(config, load_board("this"))
+    with recogniser.place_map:
+        assert trusted_candidates(recogniser.technique) == (20,)
+    config = load_config(None, {"map": str(recording / "cohog.gpkg"), "match.matching": "thesis"})
+    recogniser = open_recogniser(config, load_board("this"))
+    with recogniser.place_map:
+        assert trusted_candidates(recogniser.technique) == (), "which was never measured so"
