@@ -19,6 +19,7 @@ from bench_encode import frames
 from bench_flight import forget_pages
 from big_map import make_big_map
 
+from edgevpr.helpers.tables import markdown
 from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import compare, scan
@@ -79,11 +80,10 @@ def read_bytes() -> int:
 
 def table(results: list[dict]) -> str:
     """The results as a Markdown table."""
-    lines = ["| a query | KB read ahead | MB read | s on the card |", "|---|---|---|---|"]
-    lines += [
-        f"| {row['camera']} | {row['read_ahead_kb']} | {row['read_mb']:.1f} | {row['card_s']:.2f} |" for row in results
+    rows = [
+        [row["camera"], str(row["read_ahead_kb"]), f"{row['read_mb']:.1f}", f"{row['card_s']:.2f}"] for row in results
     ]
-    return "\n".join(lines)
+    return markdown(("a query", "KB read ahead", "MB read", "s on the card"), rows)
 
 
 if __name__ == "__main__":

@@ -113,7 +113,7 @@ def measure(
 def table(results: list[QueryRow]) -> str:
     """The results as a Markdown table."""
     lines = [
-        f"| a query, {PLACES} places | compared in full | encode ms | whole query ms | exact over all s | ratio "
+        f"| a query, {PLACES} places | candidates | encode ms | whole query ms | exact over all s | ratio "
         "| bytes a place in RAM |",
         "|---|---|---|---|---|---|---|",
     ]

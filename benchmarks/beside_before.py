@@ -15,6 +15,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from edgevpr.helpers.tables import markdown
+
 REPOSITORY = Path(__file__).resolve().parents[1]
 BEFORE = "3b363dc"  # the last commit whose nadir maps held place codes
 TURNS = 15
@@ -68,11 +70,8 @@ def _answer(child: subprocess.Popen) -> list:
 
 def table(results: list[dict]) -> str:
     """The results as a Markdown table."""
-    lines = ["| a query, 10 000 places | before ms | now ms | ratio |", "|---|---|---|---|"]
-    lines += [
-        f"| {row['query']} | {row['before_ms']:.0f} | {row['now_ms']:.0f} | {row['ratio']:.2f} |" for row in results
-    ]
-    return "\n".join(lines)
+    rows = [[row["query"], f"{row['before_ms']:.0f}", f"{row['now_ms']:.0f}", f"{row['ratio']:.2f}"] for row in results]
+    return markdown(("a query, 10 000 places", "before ms", "now ms", "ratio"), rows)
 
 
 if __name__ == "__main__":

@@ -87,9 +87,7 @@ class MatchConfig:
             choices=FORMS,
         )
     )
-    candidates: int | None = bounded(
-        1, 1_000_000, Flag(("--candidates",), "N", "places compared in full (the technique's)")
-    )
+    candidates: int | None = bounded(1, 1_000_000, Flag(("--candidates",), "N", "places compared (the technique's)"))
     sequence: int | None = bounded(1, 100, Flag(("--sequence",), "N", "queries matched together (the technique's)"))
     min_score: float | None = bounded(0, 1, Flag(("--min-score",), "S", "accept from this score on"))
     min_margin: float | None = bounded(

@@ -113,7 +113,7 @@ def evaluate(
     gate: Gate | NoGate | None = None,
     exact: bool = False,
 ) -> TechniqueResult:
-    """Map the references, ask every query, and score the answers. `candidates` places are compared in full (None: the
+    """Map the references, ask every query, and score the answers. `candidates` places are compared (None: the
     technique's own number, as it flies); with `exact` all are, and the scan chooses none. `sequence` queries are
     matched together, in the order of their names (None: the technique's own number). `gate` discards queries; the map
     has all references, as in the thesis (3.3).

@@ -26,7 +26,7 @@ _OTHER_FORM = 2.0  # the larger form takes about this many times the work
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """Settings of recognition: queries a second, places compared in full, and the form of the index (None: the
+    """Settings of recognition: queries a second, places compared, and the form of the index (None: the
     technique has no forms)."""
 
     rate_hz: float

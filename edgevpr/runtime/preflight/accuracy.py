@@ -38,10 +38,15 @@ class Accuracy:
         return f"recall@1 {self.recall_at_1:.2f} on {sets}, {self.accepted} of {self.asked} accepted, {wrong}"
 
 
+def labelled(label: str, candidates: int | None) -> str:
+    """Name a technique with fewer candidates than its own (None: its own)."""
+    return label if candidates is None else _FEWER.format(label, candidates)
+
+
 def of(label: str, camera: str | None, candidates: int | None = None) -> Accuracy | None:
     """Return the accuracy of a technique in a form (see `techniques.labelled`), for a `camera` that looks "nadir" or
     "forward" (None: forward), with fewer `candidates` than its own (None: its own); None where it was not measured."""
-    found = _content()[camera or "forward"].get(label if candidates is None else _FEWER.format(label, candidates))
+    found = _content()[camera or "forward"].get(labelled(label, candidates))
     return Accuracy(**found) if found else None
 
 

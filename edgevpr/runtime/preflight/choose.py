@@ -75,7 +75,7 @@ def options(board: Board, label: str, name: str, costs: TechniqueCosts, demand: 
             continue
         fewer = costs if candidates is None else replace(costs, candidates=candidates)
         yield Option(
-            label=label if candidates is None else f"{label}, {candidates} candidates",
+            label=accuracy.labelled(label, candidates),
             name=name,
             candidates=candidates,
             costs=fewer,
@@ -101,17 +101,17 @@ def best(wanted: Sequence[Option], board: Board, min_recall: float | None = None
     The board's own technique is taken without measured accuracy too: its profile names it.
     """
     own = [each for each in wanted if each.name == board.technique]
+    unmeasured = [each for each in own if each.accuracy is None and not each.fit.shortfalls]
     for among in (own, wanted):
         reaching = [each for each in front(among) if each.recall >= (min_recall or 0.0)]
         if reaching:
             return reaching[0] if min_recall is not None else reaching[-1]
-        named = [each for each in among if each.name == board.technique and each.accuracy is None]
-        if min_recall is None and (unmeasured := [each for each in named if not each.fit.shortfalls]):
+        if unmeasured and min_recall is None:
             return unmeasured[0]
     return None
 
 
-def objection(option: Option, min_recall: float | None = None) -> str | None:
+def objection(option: Option) -> str | None:
     """Say why an option is not chosen by itself; None where nothing is against it."""
     if option.fit.shortfalls:
         return f"{option.label} does not fit, {' and '.join(option.fit.shortfalls)}"
@@ -124,8 +124,6 @@ def objection(option: Option, min_recall: float | None = None) -> str | None:
         )
     if option.costs.sequence > 1:
         return f"{option.label} needs a flight along the mapped way: name it to use it"
-    if option.recall < (min_recall or 0.0):
-        return f"{option.label} has a recall@1 of {option.recall:.2f}"
     return None
 
 

@@ -11,11 +11,11 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from edgevpr.techniques import create
+
 PATH = Path(__file__).with_name("counted.json")
 SMALL, LARGE = 1_000, 10_000  # places of the two maps whose scans were counted
 _CAMERAS = {"forward": "ahead", "nadir": "down"}
-# Of the queries that were counted: candidates, and places compared in full.
-_COMPARED = {"forward": (42, 12), "nadir": (50, 20)}
 _ROUNDS = {"products": "micro-benchmark: a round of products", "passes": "micro-benchmark: a round of passes"}
 
 
@@ -37,11 +37,11 @@ def figures(parts: Mapping[str, float]) -> dict[str, Any]:
         encode = parts[f"{name}: encode a frame"]
         small, large = (parts[f"{name}: encode, and scan {places} places"] - encode for places in (SMALL, LARGE))
         scan_per_place = (large - small) / (LARGE - SMALL)
-        candidates, in_full = _COMPARED[camera]
-        full = in_full * (parts[f"{name}: read a place"] + parts[f"{name}: compare a place in full"])
+        technique = create("cohog", {"camera": camera})
+        full = technique.spec.in_full * (parts[f"{name}: read a place"] + parts[f"{name}: compare a place in full"])
         work = Work(
             encode=encode,
-            match_per_place=(parts[f"{name}: a query"] - encode - large - full) / candidates,
+            match_per_place=(parts[f"{name}: a query"] - encode - large - full) / technique.candidates,
             compare_once=full,
             scan_per_place=scan_per_place,
             scan_once=small - SMALL * scan_per_place,

@@ -42,7 +42,7 @@ class TechniqueCosts:
     (`process_mb`). `encode_mb` is the part of that peak that encoding a frame takes for a moment (None: the kernel does
     not say). `is_network` tells whether its pictures go through a network.
 
-    In a map of more than `candidates` places, all are scanned in RAM and only `candidates` are compared in full (None:
+    In a map of more than `candidates` places, all are scanned in RAM and only `candidates` are compared (None:
     the technique has one stage, and compares all of them). `scan_once` is what a scan costs however small the map: what
     is made of the query for it.
     """
@@ -162,12 +162,17 @@ def probe(
     # What a scan of six places takes is not of these places: it is what is made of the query, and of calling at all.
     scan = _beyond(whole, once) * (1 / len(many))
     compare, part = (counted([each.compare for each in tries]) for tries in (large, half))
-    each_more = _beyond(compare, part) * (1 / max(1, technique.candidates - fewer)) if spec.in_full else NO_COST
+    if spec.in_full:
+        each_more = _beyond(compare, part) * (1 / max(1, technique.candidates - fewer))
+        compare_once = _beyond(compare, each_more * technique.candidates)
+    else:
+        each_more = compare * (1 / technique.candidates) if spec.fine else scan
+        compare_once = NO_COST
     passed = sum(spent, NO_COST)
     return TechniqueCosts(
         encode=counted([each.encode for each in [*small, *large]]),
-        match_per_place=each_more if spec.in_full else compare * (1 / technique.candidates) if spec.fine else scan,
-        compare_once=_beyond(compare, each_more * technique.candidates) if spec.in_full else NO_COST,
+        match_per_place=each_more,
+        compare_once=compare_once,
         in_full=spec.in_full or 1,
         ram_bytes_per_place=bytes_per_place(spec) + bytes_beside_place(length),
         disk_bytes_per_place=spec.coarse.nbytes + (spec.fine.nbytes if spec.fine else 0),

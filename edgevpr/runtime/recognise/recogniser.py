@@ -28,7 +28,7 @@ _log = logging.getLogger(__name__)
 class Recogniser:
     """Recognises places of an open map, frame after frame.
 
-    `candidates` places are compared in full (None: all, see `places.retrieve.compare`). `gate` refuses frames that are
+    `candidates` places are compared (None: all in full, see `places.retrieve.compare`). `gate` refuses frames that are
     not memorable, and `mask` leaves parts of every frame out. `search` joins several queries, and `prior` narrows each;
     without them each query is ranked alone, over the whole map. The governor changes `candidates`; the learner and the
     governor change the index (`take`, `extend`).

@@ -3,23 +3,16 @@
 from dataclasses import replace
 
 import pytest
+from example_costs import REGIONS
 
 from edgevpr.config import load_config
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.preflight import pick
 from edgevpr.runtime.preflight.pick import outlook, trusted_candidates
-from edgevpr.runtime.preflight.probe import TechniqueCosts
 from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.types import StageCost
 
-COSTS = TechniqueCosts(
-    encode=StageCost(0.1, 0.1),
-    match_per_place=StageCost(0.01, 0.01),
-    ram_bytes_per_place=170,
-    disk_bytes_per_place=32_000,
-    process_mb=90.0,
-    candidates=42,
-)
+COSTS = replace(REGIONS, match_per_place=StageCost(0.01, 0.01), candidates=42)
 
 
 @pytest.fixture
