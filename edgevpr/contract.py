@@ -95,7 +95,8 @@ class Picture:
 class FineMatch:
     """The result of comparing one place with the query: `score` in 0..1, and values that only some techniques give
     (else None). `shift_cells` is the step from the query to the place (dx, dy in cells), with its covariance (var x,
-    cov xy, var y). `rotation_deg` is the rotation of the camera since the map was made (clockwise, 0..360). `coverage`
+    cov xy, var y). `rotation_deg` is the rotation of the camera since the map was made (clockwise, 0..360), and
+    `height_ratio` the camera's height above the ground over that of then. `coverage`
     (0..1) is the share of the place's regions that agree with this step, each counted once, however many regions of the
     query resemble it."""
 
@@ -103,6 +104,7 @@ class FineMatch:
     shift_cells: tuple[float, float] | None = None
     covariance_cells2: tuple[float, float, float] | None = None
     rotation_deg: float | None = None
+    height_ratio: float | None = None
     coverage: float | None = None
 
 

@@ -1,5 +1,7 @@
 """Distances on the Earth, for flights of some metres to some kilometres."""
 
+import math
+
 import numpy as np
 
 EARTH_RADIUS_M = 6_371_009.0  # mean radius: over a few kilometres a sphere is within 0.5 % of the ellipsoid
@@ -22,3 +24,10 @@ def metres(lat_deg: np.ndarray, lon_deg: np.ndarray) -> tuple[np.ndarray, np.nda
     north_m = np.radians(lat_deg - lat_0_deg) * EARTH_RADIUS_M
     turn_deg = (lon_deg - lon_0_deg + 180) % 360 - 180
     return np.radians(turn_deg) * EARTH_RADIUS_M * np.cos(np.radians(lat_0_deg)), north_m
+
+
+def moved(lat_deg: float, lon_deg: float, east_m: float, north_m: float) -> tuple[float, float]:
+    """Return the point (lat_deg, lon_deg) that is so many metres east and north of a point: the reverse of `metres`."""
+    north_deg = math.degrees(north_m / EARTH_RADIUS_M)
+    east_deg = math.degrees(east_m / (EARTH_RADIUS_M * max(math.cos(math.radians(lat_deg)), 1e-9)))
+    return lat_deg + north_deg, (lon_deg + east_deg + 180) % 360 - 180

@@ -21,6 +21,21 @@ class Position:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Pose:
+    """How the picture of a place lies on the ground, for a camera that looks straight down. `up_deg` is the compass
+    direction (0..360) of the top of the picture, and `footprint_m` the length on the ground of its longest side. The
+    middle of the picture is the place's position, with `covariance_m2` (variance east, covariance, variance north).
+    `is_surveyed`: cut from a geo-referenced picture, so that nothing is left to refine. `recorded` is the position as
+    it was before it was refined (None: it was not moved)."""
+
+    up_deg: float
+    footprint_m: float
+    covariance_m2: tuple[float, float, float]
+    is_surveyed: bool = False
+    recorded: Position | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Vehicle:
     """The state of the aircraft as the autopilot reports it: estimated position (degrees, metres above sea level),
     heading of the nose (0..360 clockwise from north, None: unknown), and `t_heard_s`, the time of the report on the
@@ -43,7 +58,8 @@ class Vehicle:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Frame:
     """One picture and its known data (None: unknown). `image` is uint8, (H, W) grey or (H, W, 3) BGR. `t_mono_s` is
-    seconds of the monotonic clock, `t_utc_s` seconds since 1970, `heading_deg` 0..360 clockwise from true north."""
+    seconds of the monotonic clock, `t_utc_s` seconds since 1970, `heading_deg` 0..360 clockwise from true north. `pose`
+    is how the picture lies on the ground."""
 
     image: np.ndarray
     name: str
@@ -51,6 +67,7 @@ class Frame:
     t_utc_s: float | None = None
     position: Position | None = None
     heading_deg: float | None = None
+    pose: Pose | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +93,8 @@ class Salience:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Place:
     """A place of the map without its descriptors, which are read separately. Units are those of `Frame`. `salience` is
-    None where the map was made without that gate."""
+    None where the map was made without that gate, and `pose` where it is not known how the picture lies on the
+    ground."""
 
     place_id: int
     source_image: str
@@ -85,6 +103,7 @@ class Place:
     heading_deg: float | None = None
     quality: float = 1.0
     salience: Salience | None = None
+    pose: Pose | None = None
 
 
 @dataclass(frozen=True, slots=True)
