@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from edgevpr.errors import PlaceError
 from edgevpr.places import rows
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.rows import Unreadable
+from edgevpr.places.rows import Content, Unreadable
 from edgevpr.places.sqlite import sentences
 
 _MOST_SAID = 20  # faults of the file that SQLite lists
@@ -15,37 +15,51 @@ _MOST_SAID = 20  # faults of the file that SQLite lists
 
 @dataclass(frozen=True, slots=True)
 class Examined:
-    """One place of a map: `problem` says in a few words what is damaged (None: nothing), and `row` has the values,
-    salience and BLOBs of one that is whole. `has_checksums` tells whether all its BLOBs have one."""
+    """One place of a map: `problem` says in a few words what is damaged (None: nothing), and `content` is that of one
+    that is whole. `has_checksums` tells whether all that should have one does."""
 
     place_id: int
     problem: str | None
-    row: tuple | None
+    content: Content | None
     has_checksums: bool
 
 
 def examine(place_map: PlaceMap) -> Iterator[Examined]:
     """Read everything of every place, in the order they were added."""
-    checksums = place_map.checksums
-    for place_id, row in place_map.scan(f"{rows.VALUES}, {place_map.salience}, {rows.BLOBS}, {checksums}"):
+    spec = place_map.spec
+    columns = f"{rows.VALUES}, {place_map.salience}, {place_map.pose}, {rows.BLOBS}, {place_map.landmarks}"
+    for place_id, row in place_map.scan(f"{columns}, {place_map.checksums}"):
         if row is None:
             yield Examined(place_id, "SQLite cannot read its row", None, False)
             continue
-        *values, coarse, fine, geom_checksum, coarse_checksum, fine_checksum = row
-        values, salience = values[: -rows.SALIENCES], values[-rows.SALIENCES :]
-        has_checksums = not any(
-            blob is not None and checksum is None
-            for blob, checksum in ((row[0], geom_checksum), (coarse, coarse_checksum), (fine, fine_checksum))
+        *parts, coarse, fine, landmarks, geom_sum, coarse_sum, fine_sum, pose_sum, landmarks_sum = row
+        values, salience, pose = rows.split(parts)
+        held = (
+            (row[0], geom_sum),
+            (coarse, coarse_sum),
+            (fine, fine_sum),
+            (pose[0], pose_sum),
+            (landmarks, landmarks_sum),
         )
-        problem, spec = None, place_map.spec
+        has_checksums = not any(part is not None and checksum is None for part, checksum in held)
         try:
-            rows.place_of(place_id, values, salience, geom_checksum)
-            rows.part_of(coarse, spec.coarse, coarse_checksum, "coarse part")
+            rows.place_of(place_id, values, salience, pose, geom_sum, pose_sum)
+            rows.part_of(coarse, spec.coarse, coarse_sum, "coarse part")
             if spec.fine:
-                rows.part_of(fine, spec.fine, fine_checksum, "fine part")
+                rows.part_of(fine, spec.fine, fine_sum, "fine part")
+            rows.landmarks_of(landmarks, landmarks_sum)
         except Unreadable as error:
-            problem = str(error)
-        yield Examined(place_id, problem, None if problem else row[:-3], has_checksums)
+            yield Examined(place_id, str(error), None, has_checksums)
+            continue
+        content = Content(
+            values=tuple(values),
+            salience=tuple(salience),
+            pose=tuple(pose),
+            coarse=coarse,
+            fine=fine,
+            landmarks=landmarks,
+        )
+        yield Examined(place_id, None, content, has_checksums)
 
 
 def faults(place_map: PlaceMap) -> list[str]:
@@ -70,17 +84,11 @@ def absorb(place_map: PlaceMap, other: PlaceMap) -> tuple[int, int]:
         for each in examine(other):
             if each.problem:
                 raise PlaceError(other.path, each.place_id, each.problem)
-            _, time, _, _, source_image, *_, coarse, _ = each.row
-            part = rows.part_of(coarse, other.spec.coarse, None, "coarse part")
+            _, time, _, _, source_image, _ = each.content.values
+            part = rows.part_of(each.content.coarse, other.spec.coarse, None, "coarse part")
             if any(place_map.is_of(place_id, part) for place_id in here.get((source_image, time), ())):
                 already_here += 1
                 continue
-            insert(place_map, each.row)
+            place_map.insert(each.content)
             copied += 1
     return copied, already_here
-
-
-def insert(place_map: PlaceMap, row: tuple, place_id: int | None = None) -> None:
-    """Insert the row of an `Examined`, inside a transaction of the map. Raises sqlite3.Error."""
-    *values, coarse, fine = row
-    place_map.insert(tuple(values[: -rows.SALIENCES]), tuple(values[-rows.SALIENCES :]), coarse, fine, place_id)

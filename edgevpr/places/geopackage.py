@@ -14,7 +14,8 @@ _WGS84_WKT = (
 )
 
 # The checksums (CRC-32 of zlib) stand before the BLOBs: what comes after a large BLOB is found only by reading all of
-# that. A program that moves a place (QGIS) knows nothing of checksums: the trigger takes that of the position away.
+# that. A program that moves a place (QGIS) knows nothing of checksums: the trigger takes that of the position away, and
+# the position that was recorded before the place was refined, which is not the one to refine from any more.
 SCHEMA = f"""
 CREATE TABLE gpkg_spatial_ref_sys (
     srs_name TEXT NOT NULL, srs_id INTEGER PRIMARY KEY, organization TEXT NOT NULL,
@@ -38,11 +39,14 @@ CREATE TABLE gpkg_geometry_columns (
 CREATE TABLE places (
     place_id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, geom POINT, time DATETIME, alt_m DOUBLE, heading_deg DOUBLE,
     source_image TEXT NOT NULL, quality DOUBLE NOT NULL, memorability DOUBLE, staticity DOUBLE, entropy DOUBLE,
-    is_low_quality BOOLEAN, geom_crc32 INTEGER, coarse_crc32 INTEGER,
-    fine_crc32 INTEGER, coarse BLOB NOT NULL, fine BLOB);
+    is_low_quality BOOLEAN, up_deg DOUBLE, footprint_m DOUBLE, var_east_m2 DOUBLE, cov_east_north_m2 DOUBLE,
+    var_north_m2 DOUBLE, is_surveyed BOOLEAN, recorded_lat_deg DOUBLE, recorded_lon_deg DOUBLE,
+    geom_crc32 INTEGER, coarse_crc32 INTEGER, fine_crc32 INTEGER, pose_crc32 INTEGER, landmarks_crc32 INTEGER,
+    coarse BLOB NOT NULL, fine BLOB, landmarks BLOB);
 CREATE TRIGGER places_moved AFTER UPDATE OF geom ON places
 BEGIN
-    UPDATE places SET geom_crc32 = NULL WHERE place_id = NEW.place_id;
+    UPDATE places SET geom_crc32 = NULL, pose_crc32 = NULL, recorded_lat_deg = NULL, recorded_lon_deg = NULL
+    WHERE place_id = NEW.place_id;
 END;
 CREATE TABLE edgevpr_map (
     id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, key TEXT NOT NULL UNIQUE, value TEXT NOT NULL);

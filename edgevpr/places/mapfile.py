@@ -16,8 +16,8 @@ from edgevpr.contract import Descriptor, TechniqueSpec
 from edgevpr.errors import MapError, PlaceError
 from edgevpr.places import geopackage, rows
 from edgevpr.places.connection import MapConnection
-from edgevpr.places.mapspec import differences, has_checksums, has_salience, read_mask, write_mask
-from edgevpr.places.rows import Point, Unreadable
+from edgevpr.places.mapspec import differences, has_checksums, has_pose, has_salience, read_mask, write_mask
+from edgevpr.places.rows import Content, Point, Unreadable
 from edgevpr.places.sqlite import sentences
 from edgevpr.types import Frame, Place, Salience
 
@@ -29,8 +29,8 @@ class PlaceMap:
     """An open map. Use `create`, `open` or `open_for_adding`, and close it (it is a context manager).
 
     `left_out` are the places that could not be read so far, with what is wrong with each in a few words, in the order
-    in which they were found. `salience` and `checksums` are the SQL expressions of a place's salience, and of the
-    checksums of position, coarse and fine part.
+    in which they were found. `salience`, `pose`, `landmarks` and `checksums` are the SQL expressions of a place's
+    salience, pose and landmarks, and of the checksums of position, coarse part, fine part, pose and landmarks.
     """
 
     def __init__(self, file: MapConnection) -> None:
@@ -41,8 +41,14 @@ class PlaceMap:
         self.made_by = made_by if isinstance(made_by, str) else None
         self.has_salience = has_salience(file.found)
         self.salience = rows.SALIENCE if self.has_salience else "NULL, NULL, NULL, NULL"
-        self.checksums = rows.CHECKSUMS if self.has_checksums else "NULL, NULL, NULL"
-        self._geom_checksum, self._coarse_checksum, self._fine_checksum = self.checksums.split(", ")
+        self.has_pose = has_pose(file.found)
+        self.pose = rows.POSE if self.has_pose else ", ".join(["NULL"] * rows.POSES)
+        self.landmarks = rows.LANDMARKS if self.has_pose else "NULL"
+        new = rows.NEW_CHECKSUMS if self.has_pose else "NULL, NULL"
+        self.checksums = f"{rows.CHECKSUMS if self.has_checksums else 'NULL, NULL, NULL'}, {new}"
+        checksums = self.checksums.split(", ")
+        self._geom_checksum, self._coarse_checksum, self._fine_checksum = checksums[:3]
+        self._pose_checksum, self._landmarks_checksum = checksums[3:]
 
     @classmethod
     def create(cls, path: str | Path, spec: TechniqueSpec) -> "PlaceMap":
@@ -98,35 +104,41 @@ class PlaceMap:
         """Commit what is written inside this context, or nothing of it. Raises sqlite3.Error."""
         return self._file.transaction()
 
-    def add(self, frame: Frame, descriptor: Descriptor, salience: Salience | None = None) -> int:
+    def add(
+        self, frame: Frame, descriptor: Descriptor, salience: Salience | None = None, landmarks: bytes | None = None
+    ) -> int:
         """Add one place and return its id once it is safe on the disk. Raises MapError (disk full, ...).
 
         A time that is no date is unknown, and so is an altitude at which nothing flies. In a name that is not UTF-8,
-        the bytes that are not are written as escapes.
+        the bytes that are not are written as escapes. A map of an older format takes no pose and no landmarks.
         """
-        coarse = rows.blob_of(descriptor.coarse, self.spec.coarse)
-        fine = rows.blob_of(descriptor.fine, self.spec.fine)
-        values = rows.values_of(frame, descriptor.quality)
+        content = Content(
+            values=rows.values_of(frame, descriptor.quality),
+            salience=rows.salience_values(salience),
+            pose=rows.pose_values(frame.pose),
+            coarse=rows.blob_of(descriptor.coarse, self.spec.coarse),
+            fine=rows.blob_of(descriptor.fine, self.spec.fine),
+            landmarks=landmarks,
+        )
         with sentences(self.path), self.transaction():
-            place_id = self.insert(values, rows.salience_values(salience), coarse, fine)
+            place_id = self.insert(content)
         return place_id
 
-    def insert(
-        self, values: tuple, salience: tuple, coarse: bytes, fine: bytes | None, place_id: int | None = None
-    ) -> int:
-        """Insert a row inside a `transaction`; `values` are those of `rows.VALUES`, and `salience` of `rows.SALIENCE`
-        (for which a map of an older format has no columns). Raises sqlite3.Error."""
-        columns, row = f"place_id, {rows.VALUES}, {rows.BLOBS}", (place_id, *values, coarse, fine)
+    def insert(self, content: Content, place_id: int | None = None) -> int:
+        """Insert a place inside a `transaction`, as far as the map has columns for it. Raises sqlite3.Error."""
+        geom, coarse, fine = content.values[0], content.coarse, content.fine
+        columns, row = f"place_id, {rows.VALUES}, {rows.BLOBS}", (place_id, *content.values, coarse, fine)
         if self.has_salience:
-            columns += f", {rows.SALIENCE}"
-            row += salience
+            columns, row = f"{columns}, {rows.SALIENCE}", row + content.salience
         if self.has_checksums:
-            columns += f", {rows.CHECKSUMS}"
-            row += tuple(map(rows.crc32, (values[0], coarse, fine)))
+            columns, row = f"{columns}, {rows.CHECKSUMS}", row + tuple(map(rows.crc32, (geom, coarse, fine)))
+        if self.has_pose:
+            columns = f"{columns}, {rows.POSE}, {rows.LANDMARKS}, {rows.NEW_CHECKSUMS}"
+            row += (*content.pose, content.landmarks, rows.pose_crc32(content.pose), rows.crc32(content.landmarks))
         marks = ", ".join("?" * len(row))
         cursor = self.db.execute(f"INSERT INTO places ({columns}) VALUES ({marks})", row)
-        if values[0] is not None:
-            lat_deg, lon_deg = geopackage.read_point(values[0])
+        if geom is not None:
+            lat_deg, lon_deg = geopackage.read_point(geom)
             self.db.execute(geopackage.GROW_EXTENT, {"lat": lat_deg, "lon": lon_deg})
         return cursor.lastrowid
 
@@ -146,15 +158,16 @@ class PlaceMap:
 
         Raises PlaceError for one that is missing or damaged.
         """
-        columns = f"{rows.VALUES}, {self._geom_checksum}, {self.salience}"
+        columns = f"{rows.VALUES}, {self.salience}, {self.pose}, {self._geom_checksum}, {self._pose_checksum}"
         if place_ids is None:
             found = self.scan(columns)
         else:
             found = ((int(place_id), self._file.row(int(place_id), columns)) for place_id in place_ids)
         for place_id, row in found:
             with self._named(place_id):
-                *values, checksum = rows.there(row)[: -rows.SALIENCES]
-                place = rows.place_of(place_id, values, row[-rows.SALIENCES :], checksum)
+                *parts, geom_checksum, pose_checksum = rows.there(row)
+                values, salience, pose = rows.split(parts)
+                place = rows.place_of(place_id, values, salience, pose, geom_checksum, pose_checksum)
             yield place
 
     def coarse_parts(self) -> Iterator[tuple[int, Point | None, float | None, np.ndarray]]:
@@ -193,6 +206,13 @@ class PlaceMap:
             geom, geom_checksum, fine, checksum = rows.there(self._file.row(place_id, columns))
             point = rows.point_of(geom, geom_checksum)
             return rows.part_of(fine, self.spec.fine, checksum, "fine part"), point
+
+    def landmarks_of(self, place_id: int) -> bytes | None:
+        """Read the landmarks of one place from the file, None where it has none. Raises PlaceError for one that is
+        missing or damaged."""
+        columns = f"{self.landmarks}, {self._landmarks_checksum}"
+        with self._named(place_id):
+            return rows.landmarks_of(*rows.there(self._file.row(int(place_id), columns)))
 
     def ids_by(self, columns: str) -> dict[tuple, list[int]]:
         """Return the ids of the places that can be read, by their values in these columns."""

@@ -16,8 +16,8 @@ from edgevpr.contract import PartSpec, TechniqueSpec
 from edgevpr.errors import MapError
 from edgevpr.places import geopackage, rows
 
-FORMAT_VERSION = 3  # 1 had no checksums and no map_id, 2 no salience
-_WITH_CHECKSUMS, _WITH_SALIENCE = 2, 3
+FORMAT_VERSION = 4  # 1 had no checksums and no map_id, 2 no salience, 3 no pose and no landmarks
+_WITH_CHECKSUMS, _WITH_SALIENCE, _WITH_POSE = 2, 3, 4
 _DTYPES = ("|i1", "|u1", "<i1", "<u1", *(f"<{kind}{size}" for kind in "iu" for size in "248"), "<f2", "<f4", "<f8")
 _MOST_PART_BYTES = 64_000_000
 _MOST_STORED = 1000  # rows of the table, and characters that a message shows of a damaged one
@@ -80,6 +80,11 @@ def has_salience(found: Stored) -> bool:
     return found["format_version"] >= _WITH_SALIENCE
 
 
+def has_pose(found: Stored) -> bool:
+    """Tell whether the places of a map have columns of their pose and landmarks."""
+    return found["format_version"] >= _WITH_POSE
+
+
 def spec_of(path: Path, found: Stored) -> TechniqueSpec:
     """Return the specification of the technique that made the map. Raises MapError for one that makes no sense."""
     try:
@@ -106,6 +111,8 @@ def require_layer(path: Path, db: sqlite3.Connection, found: Stored) -> None:
     wanted = set(rows.COLUMNS)
     wanted.update(rows.CHECKSUMS.split(", ") if has_checksums(found) else ())
     wanted.update(rows.SALIENCE.split(", ") if has_salience(found) else ())
+    if has_pose(found):
+        wanted.update(f"{rows.POSE}, {rows.NEW_CHECKSUMS}, {rows.LANDMARKS}".split(", "))
     # A generated column is hidden: it stands in no row, and may be as large as its expression says.
     there = {name: (hidden, kind, key) for _, name, kind, _, _, key, hidden in db.execute("PRAGMA table_xinfo(places)")}
     wrong = sorted(name for name in wanted if there.get(name, (True,))[0])

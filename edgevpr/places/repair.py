@@ -10,7 +10,7 @@ from typing import TypeVar
 
 from edgevpr.errors import MapError
 from edgevpr.places import mapfiles
-from edgevpr.places.examine import Examined, examine, faults, insert
+from edgevpr.places.examine import Examined, examine, faults
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.sqlite import sentences
 
@@ -74,7 +74,7 @@ def repair(path: str | Path, watch: Watch[Examined]) -> Path:
                 while block := list(islice(whole, _AT_ONCE)):
                     with repaired.transaction():
                         for each in block:
-                            insert(repaired, each.row, each.place_id)
+                            repaired.insert(each.content, each.place_id)
             if not len(repaired):
                 raise MapError(f"{path}: no place of it can be read: restore a copy, or build it again.")
         _exchange(path, copy, original)

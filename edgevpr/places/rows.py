@@ -6,28 +6,50 @@ checksum. The exception is the time, of which other programs write many forms: w
 
 import math
 import sqlite3
+import struct
 import zlib
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from edgevpr.contract import PartSpec
 from edgevpr.places import geopackage
 from edgevpr.places.sqlite import is_of_one_row
-from edgevpr.types import Frame, Place, Position, Salience
+from edgevpr.types import Frame, Place, Pose, Position, Salience
 
 CHECKSUMS = "geom_crc32, coarse_crc32, fine_crc32"
+NEW_CHECKSUMS = "pose_crc32, landmarks_crc32"  # of what maps of format 4 have
 VALUES = "geom, time, alt_m, heading_deg, source_image, quality"
 SALIENCE = "memorability, staticity, entropy, is_low_quality"
 SALIENCES = 4  # columns
+POSE = (
+    "up_deg, footprint_m, var_east_m2, cov_east_north_m2, var_north_m2, is_surveyed, recorded_lat_deg, recorded_lon_deg"
+)
+POSES = 8  # columns
 BLOBS = "coarse, fine"
+LANDMARKS = "landmarks"
 COLUMNS = {"place_id", *f"{VALUES}, {BLOBS}".split(", ")}
 
 _LEAST_ROW_BYTES = 16  # no row of a map is smaller, so a file has no more rows than its size allows
 _LOWEST_M, _HIGHEST_M = -1000, 100_000  # above sea level, as in positions.csv
+_MOST_METRES = 1e5  # of a footprint, or the standard deviation of a position
+MOST_LANDMARK_BYTES = 10_000  # of a place
 _MOST_MISSING = 100_000  # ids one after another of which there is no place
 
 Point = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Content:
+    """All that the file has of a place, in the forms of SQLite: its `VALUES`, `SALIENCE` and `POSE`, and its BLOBs."""
+
+    values: tuple
+    salience: tuple
+    pose: tuple
+    coarse: bytes
+    fine: bytes | None
+    landmarks: bytes | None
 
 
 class Unreadable(ValueError):
@@ -39,6 +61,11 @@ def there(row: tuple | None) -> tuple:
     if row is None:
         raise Unreadable("its row is gone")
     return row
+
+
+def split(parts: Sequence) -> tuple[Sequence, Sequence, Sequence]:
+    """Split what was read as `VALUES`, `SALIENCE`, `POSE` into the three."""
+    return parts[: -SALIENCES - POSES], parts[-SALIENCES - POSES : -POSES], parts[-POSES:]
 
 
 def crc32(blob: bytes | None) -> int | None:
@@ -115,8 +142,68 @@ def salience_values(salience: Salience | None) -> tuple:
     return *salience.scores.values(), int(salience.is_low)
 
 
-def place_of(place_id: int, values: Sequence, salience: Sequence, geom_checksum: object) -> Place:
-    """Make a place of its row's `VALUES` and `SALIENCE`. Raises Unreadable."""
+def pose_of(values: Sequence, checksum: object) -> Pose | None:
+    """Return what a row's `POSE` says; None where it says nothing. Raises Unreadable: a wrong pose would make a wrong
+    position."""
+    if checksum is None and all(each is None for each in values):
+        return None
+    if checksum is not None and checksum != pose_crc32(values):
+        raise Unreadable("its pose does not match its checksum")
+    names = POSE.split(", ")
+    up_deg, footprint_m, var_east, cov, var_north, is_surveyed, *recorded = map(_number, values, names)
+    if None in (up_deg, footprint_m, var_east, cov, var_north):
+        raise Unreadable("its pose is not whole")
+    if not (0 < footprint_m <= _MOST_METRES and 0 < var_east <= _MOST_METRES**2 and 0 < var_north <= _MOST_METRES**2):
+        raise Unreadable("its pose is out of range")
+    if not cov**2 <= var_east * var_north:
+        raise Unreadable("its pose has no covariance")
+    lat_deg, lon_deg = recorded
+    if None not in recorded and not (abs(lat_deg) <= 90 and abs(lon_deg) <= 180):
+        raise Unreadable("its recorded position is not on the Earth")
+    return Pose(
+        up_deg=up_deg % 360,
+        footprint_m=footprint_m,
+        covariance_m2=(var_east, cov, var_north),
+        is_surveyed=is_surveyed == 1,
+        recorded=None if None in recorded else Position(lat_deg, lon_deg),
+    )
+
+
+def pose_values(pose: Pose | None) -> tuple:
+    """Return a row's `POSE`."""
+    if pose is None:
+        return (None,) * POSES
+    recorded = (pose.recorded.lat_deg, pose.recorded.lon_deg) if pose.recorded else (None, None)
+    return (
+        float(pose.up_deg),
+        float(pose.footprint_m),
+        *map(float, pose.covariance_m2),
+        int(pose.is_surveyed),
+        *recorded,
+    )
+
+
+def pose_crc32(values: Sequence) -> int | None:
+    """Return the checksum of a row's `POSE`, None where it says nothing."""
+    if all(each is None for each in values):
+        return None
+    return zlib.crc32(struct.pack(f"<{POSES}d", *(math.nan if each is None else float(each) for each in values)))
+
+
+def landmarks_of(blob: object, checksum: object) -> bytes | None:
+    """Return the landmarks of a place, None for one that has none. Raises Unreadable."""
+    if blob is None:
+        return None
+    if not isinstance(blob, bytes) or len(blob) > MOST_LANDMARK_BYTES:
+        raise Unreadable("its landmarks have a wrong size")
+    _hold(blob, checksum, "set of landmarks")
+    return blob
+
+
+def place_of(
+    place_id: int, values: Sequence, salience: Sequence, pose: Sequence, geom_checksum: object, pose_checksum: object
+) -> Place:
+    """Make a place of its row's `VALUES`, `SALIENCE` and `POSE`. Raises Unreadable."""
     point, _ = where_of(values, geom_checksum)
     _, time, alt_m, heading_deg, source_image, quality = values
     return Place(
@@ -127,6 +214,7 @@ def place_of(place_id: int, values: Sequence, salience: Sequence, geom_checksum:
         heading_deg=heading_deg,
         quality=quality,
         salience=salience_of(salience),
+        pose=pose_of(pose, pose_checksum),
     )
 
 

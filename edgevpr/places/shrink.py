@@ -6,7 +6,7 @@ import numpy as np
 
 from edgevpr.contract import TechniqueSpec
 from edgevpr.places import mapfiles
-from edgevpr.places.examine import examine, insert
+from edgevpr.places.examine import examine
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.sqlite import sentences
 from edgevpr.places.thin import best_places
@@ -46,7 +46,7 @@ def shrink(path: str | Path, out: Path, count: int) -> tuple[int, int]:
             with sentences(unfinished), smaller.transaction():
                 for each in examine(place_map):
                     if each.place_id in kept:
-                        insert(smaller, each.row)
+                        smaller.insert(each.content)
     return len(kept), len(whole)
 
 

@@ -24,7 +24,7 @@ from edgevpr.places.geopackage import point_blob
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapinfo import info_of
 from edgevpr.places.near import index_positions, nearest_m
-from edgevpr.places.rows import SALIENCE, readable
+from edgevpr.places.rows import LANDMARKS, POSE, SALIENCE, readable
 from edgevpr.types import Position
 
 PLACES = 40
@@ -163,7 +163,7 @@ def test_a_damaged_page_hides_only_the_places_on_it(map_path):
             continue  # a page that every map needs
         whole = [each for each in found if not each.problem]
         for each in whole:
-            assert each.row[-1] == descriptor(each.place_id - 1).fine.tobytes()
+            assert each.content.fine == descriptor(each.place_id - 1).fine.tobytes()
         lost.append(PLACES - len(whole))
         assert len(whole) + len([each for each in found if each.problem]) >= PLACES - 8 or not whole
     assert lost.count(1) > PLACES, "most pages hold a part of one place"
@@ -278,8 +278,8 @@ def first_format(path):
     written(
         path,
         "DROP TRIGGER places_moved",
-        *(f"ALTER TABLE places DROP COLUMN {part}_crc32" for part in ("geom", "coarse", "fine")),
-        *(f"ALTER TABLE places DROP COLUMN {column}" for column in SALIENCE.split(", ")),
+        *(f"ALTER TABLE places DROP COLUMN {part}_crc32" for part in ("geom", "coarse", "fine", "pose", "landmarks")),
+        *(f"ALTER TABLE places DROP COLUMN {column}" for column in f"{SALIENCE}, {POSE}, {LANDMARKS}".split(", ")),
         "UPDATE edgevpr_map SET value = '1' WHERE key = 'format_version'",
         "DELETE FROM edgevpr_map WHERE key = 'map_id'",
     )

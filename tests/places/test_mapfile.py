@@ -175,7 +175,7 @@ def test_another_technique_or_parameter_is_refused_by_name(map_path):
 
 def test_a_map_from_a_newer_version_is_refused(map_path):
     db = sqlite3.connect(map_path)
-    db.execute("UPDATE edgevpr_map SET value = '4' WHERE key = 'format_version'")
+    db.execute("UPDATE edgevpr_map SET value = '5' WHERE key = 'format_version'")
     db.commit()
     db.close()
     with pytest.raises(MapError, match=r"newer edgevpr .*update edgevpr"):

@@ -1,0 +1,74 @@
+"""How a picture lies on the ground, and its landmarks, kept in the map file."""
+
+import dataclasses
+import sqlite3
+
+import pytest
+from test_mapfile import SPEC, descriptor, frame
+
+from edgevpr.errors import PlaceError
+from edgevpr.places.examine import absorb, examine
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.types import Pose, Position
+
+POSE = Pose(up_deg=271.5, footprint_m=66.0, covariance_m2=(4.0, -1.0, 2.25), recorded=Position(50.1, 8.2))
+LANDMARKS = bytes(range(200))
+
+
+@pytest.fixture
+def posed(tmp_path):
+    """A map of two places: the first has a pose and landmarks."""
+    path = tmp_path / "posed.gpkg"
+    with PlaceMap.create(path, SPEC) as place_map:
+        place_map.add(dataclasses.replace(frame(0), pose=POSE), descriptor(0), landmarks=LANDMARKS)
+        place_map.add(frame(1), descriptor(1))
+    return path
+
+
+def test_pose_and_landmarks_come_back_and_a_place_may_have_none(posed, tmp_path):
+    with PlaceMap.open(posed) as place_map, PlaceMap.create(tmp_path / "copy.gpkg", SPEC) as copy:
+        assert absorb(copy, place_map) == (2, 0)
+        for each in (place_map, copy):
+            first, second = each.places()
+            assert first.pose == POSE
+            assert second.pose is None
+            assert (each.landmarks_of(1), each.landmarks_of(2)) == (LANDMARKS, None)
+            assert {(found.problem, found.has_checksums) for found in examine(each)} == {(None, True)}
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ("up_deg = 90", "pose does not match its checksum"),
+        ("footprint_m = NULL", "pose does not match its checksum"),
+        ("footprint_m = -1, pose_crc32 = NULL", "pose is out of range"),
+        ("footprint_m = 9e99, pose_crc32 = NULL", "pose is out of range"),
+        ("up_deg = 'north', pose_crc32 = NULL", "up_deg is no number"),
+        ("up_deg = NULL, pose_crc32 = NULL", "pose is not whole"),
+        ("cov_east_north_m2 = 99, pose_crc32 = NULL", "pose has no covariance"),
+        ("recorded_lat_deg = 91, pose_crc32 = NULL", "recorded position is not on the Earth"),
+        ("landmarks = x'00'", "set of landmarks does not match its checksum"),
+        ("landmarks = zeroblob(20000)", "its landmarks have a wrong size"),
+    ],
+)
+def test_a_pose_that_cannot_be_true_is_not_believed(posed, change, says):
+    with sqlite3.connect(posed) as db:
+        db.execute(f"UPDATE places SET {change} WHERE place_id = 1")
+    db.close()
+    with PlaceMap.open(posed) as place_map:
+        (broken,) = [each for each in examine(place_map) if each.problem]
+        assert broken.place_id == 1
+        with pytest.raises(PlaceError, match=says):
+            [*place_map.places([1]), place_map.landmarks_of(1)]
+
+
+def test_a_place_moved_by_another_program_keeps_its_pose_and_forgets_where_it_was_recorded(posed):
+    from edgevpr.places.geopackage import point_blob
+
+    with sqlite3.connect(posed) as db:
+        db.execute("UPDATE places SET geom = ? WHERE place_id = 1", (point_blob(51.0, 9.0),))
+    db.close()
+    with PlaceMap.open(posed) as place_map:
+        (place,) = place_map.places([1])
+    assert place.pose == dataclasses.replace(POSE, recorded=None)
+    assert (place.position.lat_deg, place.position.lon_deg) == (51.0, 9.0)
