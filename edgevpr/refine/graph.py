@@ -1,0 +1,252 @@
+"""The pose graph of a map: where each picture lies, which way it is turned and how much ground it shows, so that ties
+between pictures and recorded positions are met as well as can be.
+
+A place has two complex unknowns. Its position p is east + i north, in metres. Its log l has the footprint and the
+direction: exp(l) = footprint_m exp(-i up), which turns a step in the picture (dx - i dy, as shares of its longest side)
+into one on the ground. A tie says that the middle of picture `query` lies `step` away from the middle of picture
+`place`, in that picture, and that it is turned and scaled against it by exp(`turn`):
+
+    (p_query - p_place) exp(-l_place) = step        l_query - l_place = turn
+
+Both are holomorphic, so that least squares over complex numbers is exact, with half the unknowns. The step is compared in
+the picture and not on the ground: ties alone could otherwise be met by a map that shrinks to a point. Recorded positions
+give the whole its place, scale and direction. All three kinds are weighted by how much they scatter, which is estimated
+from the residuals, and those that contradict the others lose their weight (Geman and McClure 1987).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix, csc_matrix, identity
+from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
+from scipy.sparse.linalg import splu
+
+_ROUNDS, _SETTLED = 4, 0.05  # of estimating the scatters, and by how much of themselves they still change
+_MOVES, _STAYS = 40, 1e-4  # of solving, and how far a position still moves, as a share of a footprint
+_LONGEST_MOVE = 0.5  # of a log
+_FIRST = 3.0  # times its own standard deviation a tie is off, as long as nothing better is known
+_SURE = 0.005  # standard deviation of a log that is known
+_LEAST_M, _FIRST_M = 0.5, 10.0  # scatter of recorded positions
+_GONE = 0.1  # a weight below it: what has it contradicts the others
+_MEDIAN_OF_FOUR = 1.832  # of the length of four numbers, normally distributed
+_NOTHING = 1e-6  # is known of the log of a place without ties
+_AT_ONCE = 256  # columns of the inverse
+
+
+@dataclass(frozen=True, slots=True)
+class Ties:
+    """Pairs of pictures of the same ground: `query` and `place` int (T,) are their numbers, `step` and `turn` complex
+    (T,) what one says of the other. `step_sd` and `turn_sd` float (T,) are how exactly, of one axis, in proportion: by
+    how much all of them are to be multiplied shows when they are held against each other."""
+
+    query: np.ndarray
+    place: np.ndarray
+    step: np.ndarray
+    turn: np.ndarray
+    step_sd: np.ndarray
+    turn_sd: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.query)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Solved:
+    """The graph of N places. `position` complex (N,) metres, `log` complex (N,); `position_var` (m^2) and `log_var`
+    float (N,) are their variances, both axes together. `component` int (N,) numbers the groups of places that are tied.
+    Ties scatter by `times` their own standard deviation, and recorded positions by `recorded_sd_m` in one axis. `recorded_counts` and
+    `ties_count` bool tell which recorded positions and ties agree with the rest."""
+
+    position: np.ndarray
+    log: np.ndarray
+    position_var: np.ndarray
+    log_var: np.ndarray
+    component: np.ndarray
+    times: float
+    recorded_sd_m: float
+    recorded_counts: np.ndarray
+    ties_count: np.ndarray
+
+
+def solve(recorded: np.ndarray, recorded_sd_m: np.ndarray, ties: Ties, log: np.ndarray | None = None) -> Solved:
+    """Solve the graph of places recorded at complex (N,) metres. `recorded_sd_m` float (N,) is the scatter of positions
+    that are known apart (NaN: they scatter as the others do). `log` complex (N,) are logs that are known (NaN: not)."""
+    count = len(recorded)
+    known = np.full(count, np.nan + 0j) if log is None else log
+    _, component = connected_components(_graph(ties, count), directed=False)
+    position, log = _first(recorded, known, ties, component)
+    own = np.isnan(recorded_sd_m)
+    times, scatter_m = _FIRST, _FIRST_M
+    variance = np.zeros(2 * count)
+    for _ in range(_ROUNDS):
+        sd_m = np.where(own, scatter_m, recorded_sd_m)
+        position, log, normal, agree = _settled(position, log, recorded, sd_m, known, ties, times)
+        variance = 2 * _inverse_diagonal(normal)  # of one axis is each weight
+        steps, turns, off = _residuals(position, log, recorded, ties)
+        before = times, scatter_m
+        if len(ties):
+            times = max(1.0, float(np.median(_off_ties(steps, turns, ties))) / _MEDIAN_OF_FOUR)
+        if own.any():
+            # What a position is off, and what the solution leaves open there: few ties let it follow every error.
+            scatter_m = max(_LEAST_M, float(np.sqrt(_scatter(off[own]) ** 2 + np.median(variance[:count][own]) / 2)))
+        if abs(np.log(before[0] / times)) < _SETTLED and abs(np.log(before[1] / scatter_m)) < _SETTLED:
+            break
+    return Solved(
+        position=position,
+        log=log,
+        position_var=variance[:count],
+        log_var=variance[count:],
+        component=component,
+        times=times,
+        recorded_sd_m=scatter_m,
+        recorded_counts=_agree(abs(off) / sd_m) >= _GONE,
+        ties_count=agree >= _GONE,
+    )
+
+
+def _settled(
+    position: np.ndarray,
+    log: np.ndarray,
+    recorded: np.ndarray,
+    sd_m: np.ndarray,
+    known: np.ndarray,
+    ties: Ties,
+    times: float,
+) -> tuple[np.ndarray, np.ndarray, csc_matrix, np.ndarray]:
+    """Move positions and logs until they stay, for given scatters (Gauss and Newton). Returns both, the normal matrix
+    (2 N, 2 N), and how far each tie agrees, 0..1."""
+    count = len(position)
+    for _ in range(_MOVES):
+        steps, turns, off = _residuals(position, log, recorded, ties)
+        agree = _agree(_off_ties(steps, turns, ties) / times)
+        by_step, by_turn = (agree / (times * each) ** 2 for each in (ties.step_sd, ties.turn_sd))
+        weights = by_step, by_turn, _agree(abs(off) / sd_m) / sd_m**2
+        jacobian, rest = _linear(position, log, recorded, known, ties, weights)
+        normal = (jacobian.conj().T @ jacobian).tocsc()
+        move = splu(normal + _NOTHING * identity(2 * count)).solve(-(jacobian.conj().T @ rest))
+        # A long step is cut: far from the solution the logs are not as linear as that.
+        share = min(1.0, _LONGEST_MOVE / max(abs(move[count:]).max(initial=0), 1e-9))
+        position, log = position + share * move[:count], log + share * move[count:]
+        if (abs(move[:count]) < _STAYS * np.exp(log.real)).all():
+            break
+    return position, log, normal, agree
+
+
+def _off_ties(steps: np.ndarray, turns: np.ndarray, ties: Ties) -> np.ndarray:
+    return np.hypot(abs(steps) / ties.step_sd, abs(turns) / ties.turn_sd)
+
+
+def _graph(ties: Ties, count: int) -> csc_matrix:
+    return coo_matrix((ties.step_sd, (ties.query, ties.place)), (count, count)).tocsc()
+
+
+def _first(
+    recorded: np.ndarray, known: np.ndarray, ties: Ties, component: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Lay the places of each component out along its strongest ties, and the whole over the recorded positions."""
+    count = len(recorded)
+    position, log = np.zeros(count, complex), np.zeros(count, complex)
+    tree = minimum_spanning_tree(_graph(ties, count))
+    of_pair = {}
+    for at in np.argsort(-ties.step_sd, kind="stable").tolist():  # the strongest of a pair comes last
+        of_pair[int(ties.query[at]), int(ties.place[at])] = at
+    for number in range(component.max(initial=-1) + 1):
+        members = np.flatnonzero(component == number)
+        order, before = breadth_first_order(tree, members[0], directed=False)
+        for at in order[1:].tolist():
+            base = int(before[at])
+            if (at, base) in of_pair:
+                tie = of_pair[at, base]
+                position[at] = position[base] + np.exp(log[base]) * ties.step[tie]
+                log[at] = log[base] + ties.turn[tie]
+            else:
+                tie = of_pair[base, at]
+                log[at] = log[base] - ties.turn[tie]
+                position[at] = position[base] - np.exp(log[at]) * ties.step[tie]
+        scale, offset = _laid_over(position[members], recorded[members])
+        at = members[~np.isnan(known[members])]
+        if len(at):
+            scale = np.exp(np.mean(known[at] - log[at]))
+            offset = np.mean(recorded[members] - scale * position[members])
+        position[members] = scale * position[members] + offset
+        log[members] += np.log(scale)
+    return position, log
+
+
+def _laid_over(shape: np.ndarray, recorded: np.ndarray) -> tuple[complex, complex]:
+    """Return the scale-and-turn and the offset that lay `shape` over the recorded positions; outliers lose their
+    weight. For one point, the scale is 1."""
+    weight = np.ones(len(shape))
+    scale, offset = 1 + 0j, complex(recorded.mean() - shape.mean())
+    for _ in range(20):
+        middle, there = np.average(shape, weights=weight), np.average(recorded, weights=weight)
+        spread = np.sum(weight * abs(shape - middle) ** 2)
+        if spread < 1e-12:
+            break
+        fitted = np.sum(weight * np.conj(shape - middle) * (recorded - there)) / spread
+        if abs(fitted) < 1e-6:
+            break
+        scale, offset = fitted, there - fitted * middle
+        off = abs(scale * shape + offset - recorded)
+        weight = _agree(off / max(_LEAST_M, _scatter(off))) + 1e-6
+    return scale, offset
+
+
+def _residuals(
+    position: np.ndarray, log: np.ndarray, recorded: np.ndarray, ties: Ties
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    steps = (position[ties.query] - position[ties.place]) * np.exp(-log[ties.place]) - ties.step
+    turns = log[ties.query] - log[ties.place] - ties.turn
+    turns = turns.real + 1j * ((turns.imag + np.pi) % (2 * np.pi) - np.pi)
+    return steps, turns, position - recorded
+
+
+def _linear(
+    position: np.ndarray,
+    log: np.ndarray,
+    recorded: np.ndarray,
+    known: np.ndarray,
+    ties: Ties,
+    weights: tuple[np.ndarray, np.ndarray, np.ndarray],
+) -> tuple[csc_matrix, np.ndarray]:
+    """Return the weighted Jacobian (R, 2 N) and the residuals (R,): steps, turns, recorded positions, known logs."""
+    count, many = len(recorded), len(ties)
+    steps, turns, off = _residuals(position, log, recorded, ties)
+    by_step, by_turn, by_recorded = map(np.sqrt, weights)
+    unit = np.exp(-log[ties.place])
+    row, at_known = np.arange(many), np.flatnonzero(~np.isnan(known))
+    sure = np.full(len(at_known), 1 / _SURE)
+    last = 2 * many + count
+    rows = [row, row, row, many + row, many + row, 2 * many + np.arange(count), last + np.arange(len(at_known))]
+    columns = [ties.query, ties.place, count + ties.place, count + ties.query, count + ties.place]
+    columns += [np.arange(count), count + at_known]
+    values = [by_step * unit, -by_step * unit, -by_step * (steps + ties.step), by_turn, -by_turn, by_recorded, sure]
+    shape = (last + len(at_known), 2 * count)
+    jacobian = coo_matrix(
+        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=shape
+    ).tocsc()
+    from_known = sure * (log - known)[at_known]
+    return jacobian, np.concatenate([by_step * steps, by_turn * turns, by_recorded * off, from_known])
+
+
+def _agree(off: np.ndarray) -> np.ndarray:
+    """Return the weight of residuals that are `off` (in standard deviations), 0..1: a half at three."""
+    return 1 / (1 + (off / 4.66) ** 2) ** 2
+
+
+def _scatter(residuals: np.ndarray) -> float:
+    """Return the standard deviation of one axis of complex residuals, of those that agree: from their median."""
+    return float(np.median(abs(residuals))) / 1.1774 if len(residuals) else 0.0
+
+
+def _inverse_diagonal(normal: csc_matrix) -> np.ndarray:
+    """Return the diagonal of the inverse of a Hermitian matrix (M, M), float (M,)."""
+    size = normal.shape[0]
+    solver = splu(normal + _NOTHING * identity(size))
+    found = np.empty(size)
+    for start in range(0, size, _AT_ONCE):
+        some = np.arange(start, min(start + _AT_ONCE, size))
+        units = np.zeros((size, len(some)), complex)
+        units[some, some - start] = 1
+        found[some] = solver.solve(units)[some, some - start].real
+    return found
