@@ -57,7 +57,7 @@ def bounded(low: float, high: float, flag: Flag | None = None) -> Any:
     return field(metadata={"range": (low, high), "flag": flag})
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SourceConfig:
     uri: str | None = keyed(Flag(("--images", "--source"), "SOURCE", SOURCES))
     camera: str | None = keyed(

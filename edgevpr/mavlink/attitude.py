@@ -1,4 +1,4 @@
-"""How the autopilot says it hangs in the air: its attitude at any moment of the last seconds, and its height."""
+"""Attitude and height of the vehicle, from what the autopilot says: at any moment of the last seconds."""
 
 import math
 from dataclasses import dataclass
