@@ -57,7 +57,7 @@ def bounded(low: float, high: float, flag: Flag | None = None) -> Any:
     return field(metadata={"range": (low, high), "flag": flag})
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SourceConfig:
     uri: str | None = keyed(Flag(("--images", "--source"), "SOURCE", SOURCES))
     camera: str | None = keyed(
@@ -72,6 +72,12 @@ class SourceConfig:
         LOWEST_RATE_HZ, HIGHEST_RATE_HZ, Flag(("--rate-hz",), "HZ", "queries a second (default: the board's)")
     )
     mask: str | None = keyed(Flag(("--mask",), "PNG", "black where frames show a display and no ground"))
+    fov_deg: float | None = bounded(
+        5, 150, Flag(("--fov-deg",), "DEG", "field of view across the longest side of the picture")
+    )
+    up_deg: float = bounded(
+        0, 360, Flag(("--up-deg",), "DEG", "where the top of the picture points while the nose points north (0)")
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

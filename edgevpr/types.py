@@ -41,7 +41,8 @@ class Vehicle:
     heading of the nose (0..360 clockwise from north, None: unknown), and `t_heard_s`, the time of the report on the
     clock of the frames. `has_gps`: at that time a receiver had a 3D fix near that position. Without `has_gps` the
     position may be wrong: an autopilot goes on reporting its estimate long after it has lost GPS, and it does not
-    follow a receiver that it does not trust."""
+    follow a receiver that it does not trust. `roll_deg` (right wing down is positive), `pitch_deg` (nose up) and
+    `height_m` above the ground are None where unknown."""
 
     lat_deg: float
     lon_deg: float
@@ -49,6 +50,9 @@ class Vehicle:
     heading_deg: float | None
     t_heard_s: float
     has_gps: bool
+    roll_deg: float | None = None
+    pitch_deg: float | None = None
+    height_m: float | None = None
 
     def is_fresh_at(self, t_mono_s: float) -> bool:
         """Tell whether the report came within one second of `t_mono_s`, such as the time of a frame."""
@@ -58,8 +62,10 @@ class Vehicle:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Frame:
     """One picture and its known data (None: unknown). `image` is uint8, (H, W) grey or (H, W, 3) BGR. `t_mono_s` is
-    seconds of the monotonic clock, `t_utc_s` seconds since 1970, `heading_deg` 0..360 clockwise from true north. `pose`
-    is how the picture lies on the ground."""
+    seconds of the monotonic clock, `t_utc_s` seconds since 1970, `heading_deg` 0..360 clockwise from true north.
+    `roll_deg` (right wing down is positive) and `pitch_deg` (nose up) are those of the airframe or, of a camera on a
+    gimbal, its deviation from straight down; `height_m` is above the ground. `pose` is how the picture lies on the
+    ground."""
 
     image: np.ndarray
     name: str
@@ -67,6 +73,9 @@ class Frame:
     t_utc_s: float | None = None
     position: Position | None = None
     heading_deg: float | None = None
+    roll_deg: float | None = None
+    pitch_deg: float | None = None
+    height_m: float | None = None
     pose: Pose | None = None
 
 
@@ -137,11 +146,12 @@ NO_COST = StageCost(0.0, 0.0)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Steps:
-    """Costs of the steps of one query: `read` the picture (in a flight only), look whether it passes the `gate`,
-    `encode` it, `scan` all places, and `compare` and judge the candidates. A step that the query did not reach has no
-    cost."""
+    """Costs of the steps of one query: `read` the picture (in a flight only), `prepare` it (level it on the ground),
+    look whether it passes the `gate`, `encode` it, `scan` all places, and `compare` and judge the candidates. A step
+    that the query did not reach has no cost."""
 
     read: StageCost = NO_COST
+    prepare: StageCost = NO_COST
     gate: StageCost = NO_COST
     encode: StageCost = NO_COST
     scan: StageCost = NO_COST
@@ -150,7 +160,7 @@ class Steps:
     @property
     def encoding(self) -> StageCost:
         """Cost of encoding as the thesis defines it: everything before matching."""
-        return self.gate + self.encode
+        return self.prepare + self.gate + self.encode
 
     @property
     def match(self) -> StageCost:

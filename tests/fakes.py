@@ -110,6 +110,9 @@ class FakeSource:
             t_utc_s=given and given.t_utc_s,
             position=given and given.position,
             heading_deg=given and given.heading_deg,
+            roll_deg=given and given.roll_deg,
+            pitch_deg=given and given.pitch_deg,
+            height_m=given and given.height_m,
         )
         self._read += 1
         return frame
@@ -151,6 +154,9 @@ class FakeLink:
         pass
 
     def vehicle(self) -> Vehicle | None:
+        return self._vehicle()
+
+    def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
         return self._vehicle()
 
     def listens(self) -> bool:

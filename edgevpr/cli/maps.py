@@ -40,7 +40,7 @@ def add(commands: Any) -> None:
         "--board", default="this", metavar="NAME", help="the board that will fly (default: this machine)"
     )
     build.add_argument("--config", metavar="FILE", help="that of the flight: its camera, mask and salience")
-    add_keys(build, "source.camera", "source.mask", "salience.use")
+    add_keys(build, "source.camera", "source.mask", "source.fov_deg", "source.up_deg", "salience.use")
     build.add_argument(
         "--rate-hz", type=_positive, metavar="HZ", help="places a second of a video (default: every frame)"
     )
@@ -90,6 +90,7 @@ def map_build(args: Namespace) -> int:
     from edgevpr.power.boards import load_board
     from edgevpr.runtime.preflight.pick import camera_setting, picked_technique
     from edgevpr.runtime.recognise.gaps import Gaps
+    from edgevpr.runtime.recognise.levelling import levelling_of
     from edgevpr.runtime.recognise.mapping import build_map
     from edgevpr.runtime.recognise.opening import gate_of, made_for, meter_of, say_other_mask, technique_of
 
@@ -120,9 +121,18 @@ def map_build(args: Namespace) -> int:
     with place_map:
         frames = frames_of(source, "mapping", unusable)
         meter = meter_of(config, here)
+        levelling = levelling_of(config.source, technique, below=True)
         try:
             result = build_map(
-                frames, technique, place_map, meter, lambda error: leave_out(error, unusable), mask, gate, gaps
+                frames,
+                technique,
+                place_map,
+                meter,
+                lambda error: leave_out(error, unusable),
+                mask,
+                gate,
+                gaps,
+                levelling,
             )
         except EdgevprError:
             if is_new and not len(place_map):  # a full disk: an empty map would only stand in the way of the next try

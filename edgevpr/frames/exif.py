@@ -1,4 +1,4 @@
-"""EXIF data that the camera wrote into an image file: position, heading, time."""
+"""Data that the camera wrote into an image file: position, heading and time from EXIF, attitude and height from XMP."""
 
 import logging
 from collections.abc import Callable
@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from edgevpr.frames.positions import ALT_M, GeoTag, parse_time, position_or_none
+from edgevpr.frames.xmp import read_xmp
 from edgevpr.types import Position
 
 T = TypeVar("T")
@@ -19,9 +20,10 @@ class _Senseless(ValueError):
 
 def read_exif(path: str | Path) -> GeoTag:
     """Read the tag of a JPEG, TIFF, PNG or WebP file. Never raises: a value that is absent, broken or senseless is
-    None. What is senseless (minutes of 99, a date of 1e308) is said in the log.
+    None. What is senseless in EXIF (minutes of 99, a date of 1e308) is said in the log.
 
-    The time is that of the GPS receiver, else that of the camera clock, taken as UTC where it has no time zone.
+    The time is that of the GPS receiver, else that of the camera clock, taken as UTC where it has no time zone. The
+    heading is that of the gimbal, which goes with its roll and pitch, else that of EXIF. For the height see `read_xmp`.
     """
     import exifread  # not at the top: most sources never need it
 
@@ -40,10 +42,14 @@ def read_exif(path: str | Path) -> GeoTag:
 
     found = _known(tags) or {}
     gps_time_s = known(_gps_time_s)
+    shooting = read_xmp(path)
     return GeoTag(
-        known(lambda tags: _position(tags, known(_alt_m))),
-        known(_heading_deg),
-        known(_camera_time_s) if gps_time_s is None else gps_time_s,
+        position=known(lambda tags: _position(tags, known(_alt_m))),
+        heading_deg=known(_heading_deg) if shooting.heading_deg is None else shooting.heading_deg,
+        t_utc_s=known(_camera_time_s) if gps_time_s is None else gps_time_s,
+        roll_deg=shooting.roll_deg,
+        pitch_deg=shooting.pitch_deg,
+        height_m=shooting.height_m,
     )
 
 

@@ -20,9 +20,8 @@ class NoMask:
 
     sha256 = None
 
-    def encode(self, technique: Technique, image: np.ndarray) -> Descriptor:
-        """Encode the whole image."""
-        return technique.encode(image)
+    def fitted(self, image: np.ndarray) -> None:
+        """Return None: all of the image shows ground."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,14 +32,18 @@ class Mask:
     allowed: np.ndarray
     sha256: str
 
-    def encode(self, technique: Technique, image: np.ndarray) -> Descriptor:
-        """Encode the part of an image that shows ground."""
+    def fitted(self, image: np.ndarray) -> np.ndarray:
+        """Return the mask in the size of an image, bool (H, W)."""
         height, width = image.shape[:2]
-        fitted = cv2.resize(self.allowed.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
-        return technique.encode(image, fitted.astype(bool))
+        return cv2.resize(self.allowed.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST).astype(bool)
 
 
 AnyMask = NoMask | Mask
+
+
+def encoded(technique: Technique, image: np.ndarray, allowed: np.ndarray | None) -> Descriptor:
+    """Encode the part of an image that `allowed`, bool (H, W), lets through; None: all of it."""
+    return technique.encode(image) if allowed is None else technique.encode(image, allowed)
 
 
 def mask_of(path: str | None) -> AnyMask:

@@ -1,4 +1,4 @@
-"""The file positions.csv: position, heading and time of the images of a folder."""
+"""The file positions.csv: where, when and how the images of a folder were taken."""
 
 import csv
 import io
@@ -14,20 +14,26 @@ from edgevpr.helpers.files import read_file
 from edgevpr.types import Position
 
 _NEEDED_COLUMNS = ("file", "lat", "lon")
-_COLUMNS = (*_NEEDED_COLUMNS, "alt", "heading_deg", "yaw_deg", "time")
+_COLUMNS = (
+    *_NEEDED_COLUMNS, "alt", "heading_deg", "yaw_deg", "roll_deg", "pitch_deg", "height_m", "rel_alt", "time"
+)  # fmt: skip
 ALT_M = (-1000.0, 100_000.0)  # of anything that flies
 _MAX_FILE_BYTES = 100_000_000  # a million images
 # 1900 to 2200. Beyond lie times in milliseconds, which are a thousand times too large.
 _FIRST_S, _LAST_S = -2_208_988_800, 7_258_118_400
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class GeoTag:
-    """Position, heading (0..360 clockwise from true north) and time (seconds since 1970) of an image; None: unknown."""
+    """Position, heading (0..360 clockwise from true north) and time (seconds since 1970) of an image, and roll, pitch
+    and height above the ground as of `Frame`; None: unknown."""
 
     position: Position | None = None
     heading_deg: float | None = None
     t_utc_s: float | None = None
+    roll_deg: float | None = None
+    pitch_deg: float | None = None
+    height_m: float | None = None
 
 
 def find_positions(folder: str | Path) -> Path | None:
@@ -38,9 +44,11 @@ def find_positions(folder: str | Path) -> Path | None:
 
 
 def read_positions(csv_path: str | Path) -> dict[str, GeoTag]:
-    """Read the columns file, lat, lon (degrees) and, where present, alt (m), heading_deg or yaw_deg, and time.
+    """Read the columns file, lat, lon (degrees) and, where present, alt (m), heading_deg or yaw_deg, time, roll_deg
+    (right wing down is positive), pitch_deg (nose up), and height_m above the ground or rel_alt.
 
-    Returns one tag for each file name. A row may leave all but the name empty; other columns are ignored.
+    rel_alt is the height over the take-off point, as DJI writes it: that above the ground only as far as the ground is
+    level. Returns one tag for each file name. A row may leave all but the name empty; other columns are ignored.
     Raises UsageError for a file that cannot be read, and for a wrong value, with its line.
     """
     try:
@@ -112,9 +120,12 @@ def _tag(row: Mapping[str, str], where: str) -> GeoTag:
         raise UsageError(f"{where} has only one of lat and lon: write both, or leave both empty.")
     heading_deg = _number(row, "heading_deg" if row.get("heading_deg") else "yaw_deg", -360, 360, where)
     return GeoTag(
-        None if lat_deg is None or lon_deg is None else position_or_none(lat_deg, lon_deg, alt_m),
-        None if heading_deg is None else heading_deg % 360,
-        _time(row, where),
+        position=None if lat_deg is None or lon_deg is None else position_or_none(lat_deg, lon_deg, alt_m),
+        heading_deg=None if heading_deg is None else heading_deg % 360,
+        t_utc_s=_time(row, where),
+        roll_deg=_number(row, "roll_deg", -180, 180, where),
+        pitch_deg=_number(row, "pitch_deg", -90, 90, where),
+        height_m=_number(row, "height_m" if row.get("height_m") else "rel_alt", *ALT_M, where),
     )
 
 

@@ -71,6 +71,9 @@ class FolderSource(Recording):
             t_utc_s=tag.t_utc_s,
             position=tag.position,
             heading_deg=tag.heading_deg,
+            roll_deg=tag.roll_deg,
+            pitch_deg=tag.pitch_deg,
+            height_m=tag.height_m,
         )
 
     def close(self) -> None:

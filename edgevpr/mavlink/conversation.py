@@ -1,6 +1,7 @@
 """The conversation with the autopilot: what is said next, and what the answers mean. It knows no port and no thread."""
 
 import logging
+import math
 import struct
 from collections import Counter
 from collections.abc import Callable
@@ -47,7 +48,8 @@ class Conversation:
         self._health, self._health_set_s = health, self._clock()
 
     def want_position(self) -> None:
-        """Ask the autopilot for its position, at once and again whenever it has stopped reporting it."""
+        """Ask the autopilot for its position, attitude and height, at once and again whenever it has stopped reporting
+        its position or its attitude."""
         self._ask_position_s = self._clock()
 
     def next_packet(self) -> tuple[bytes, Sending | None] | None:
@@ -121,13 +123,14 @@ class Conversation:
         return message and (message, None)
 
     def _ask_for_position(self, now_s: float) -> None:
-        """Ask for positions again where none came: an autopilot that has restarted has forgotten the request."""
+        """Ask again where no reports came: an autopilot that has restarted has forgotten the request."""
         if self._ask_position_s is None or now_s < self._ask_position_s:
             return
         self._ask_position_s = now_s + ASK_AGAIN_S
         vehicle = self.autopilot.vehicle
-        if vehicle is None or now_s - vehicle.t_heard_s > ASK_AGAIN_S:
-            for request in messages.position_requests(self.autopilot.system_id):
+        heard_s = min(vehicle.t_heard_s if vehicle else -math.inf, self.autopilot.attitudes.t_heard_s)
+        if now_s - heard_s > ASK_AGAIN_S:
+            for request in messages.report_requests(self.autopilot.system_id):
                 self.outbox.put(request)
 
     def _announce(self, severity: Severity, text: str) -> None:

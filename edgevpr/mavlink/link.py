@@ -32,8 +32,8 @@ class Link:
     the port after every loss of the other end. What is said and heard is the `Conversation`'s.
 
     `system_id` is that of the autopilot (None: that of the first heard); a fix that has waited for `max_fix_age_s` is
-    never sent. `send`, `send_fix`, `set_health`, `want_position`, `vehicle`, `listens` and `stats` may be called from
-    any thread; they never block and never raise.
+    never sent. `send`, `send_fix`, `set_health`, `want_position`, `vehicle`, `vehicle_at`, `listens` and `stats` may be
+    called from any thread; they never block and never raise.
     """
 
     def __init__(
@@ -90,12 +90,18 @@ class Link:
         self._conversation.set_health(health)
 
     def want_position(self) -> None:
-        """Ask the autopilot for its position, at once and again whenever it has stopped reporting it."""
+        """Ask the autopilot for its position, attitude and height, at once and again whenever it has stopped reporting
+        its position or its attitude."""
         self._conversation.want_position()
 
     def vehicle(self) -> Vehicle | None:
         """Return the last report of the autopilot on its vehicle; None where there is none, or it had no position."""
         return self._conversation.autopilot.vehicle
+
+    def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
+        """Return the same with the roll, pitch and heading that the vehicle had at the time of a frame; roll and pitch
+        are None where no attitude was heard within 0.3 s of it."""
+        return self._conversation.autopilot.vehicle_at(t_mono_s)
 
     def listens(self) -> bool:
         """Tell whether there is an autopilot that a fix can be sent to at this moment."""

@@ -88,12 +88,16 @@ def position_fix(fix: Fix, t_sent_s: float, target_system: int) -> Message:
     )
 
 
-def position_requests(target_system: int) -> tuple[Message, Message]:
-    """Make two COMMAND_LONG (76) with SET_MESSAGE_INTERVAL (511): GLOBAL_POSITION_INT (33) five times a second,
-    GPS_RAW_INT (24) twice a second. On many autopilots the companion's port streams neither unless asked."""
+def report_requests(target_system: int) -> tuple[Message, ...]:
+    """Make a COMMAND_LONG (76) with SET_MESSAGE_INTERVAL (511) for every report that is wanted: GLOBAL_POSITION_INT
+    (33) five times a second, ATTITUDE (30) ten times, GPS_RAW_INT (24), DISTANCE_SENSOR (132) and TERRAIN_REPORT (136)
+    twice. On many autopilots the companion's port streams none of them unless asked."""
     wanted_us = {
         mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 200_000,
+        mavlink.MAVLINK_MSG_ID_ATTITUDE: 100_000,
         mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 500_000,
+        mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR: 500_000,
+        mavlink.MAVLINK_MSG_ID_TERRAIN_REPORT: 500_000,
     }
     return tuple(
         mavlink.MAVLink_command_long_message(

@@ -1,11 +1,13 @@
-"""The autopilot at the other end of the link: its system id, its presence, its position, and its answers to fixes."""
+"""The autopilot at the other end of the link: its system id, its presence, where and how it flies, its answers."""
 
 import logging
 import math
 from collections import Counter
+from dataclasses import replace
 
 from edgevpr.geodesy import distance_m
 from edgevpr.mavlink.address import Sender
+from edgevpr.mavlink.attitude import Attitudes, Heights
 from edgevpr.mavlink.identity import Identity, Speaker
 from edgevpr.mavlink.messages import AUTOPILOT, POSITION_FIX
 from edgevpr.mavlink.wire import Message, mavlink
@@ -16,6 +18,7 @@ GPS_AGREES_WITHIN_M = 50.0  # at 25 m/s, with one or two seconds between the two
 SILENT_AFTER_S = 5.0  # heartbeats come once a second, and this many may be lost
 
 _GPS_REPORTS = ("GPS_RAW_INT", "GPS2_RAW")
+_HEIGHT_REPORTS = ("DISTANCE_SENSOR", "TERRAIN_REPORT")
 
 log = logging.getLogger(__name__)
 
@@ -33,7 +36,8 @@ class Autopilot:
     def __init__(self, own_component: int, system_id: int | None = None) -> None:
         self.identity = Identity(system_id)
         self.acks: Counter[str] = Counter()  # answers to our fixes, by name of the result
-        self.vehicle: Vehicle | None = None  # the last report, of any age
+        self.vehicle: Vehicle | None = None  # the last report, of any age, without attitude
+        self.attitudes, self._heights = Attitudes(), Heights()
         self._answer: str | None = None  # the newest answer, until `take_answer`
         self._own_component = own_component
         self._heard_s = -math.inf
@@ -52,6 +56,14 @@ class Autopilot:
     def forget_presence(self) -> None:
         """Regard the autopilot as absent until its next heartbeat, as after a reconnection to who knows whom."""
         self._heard_s = -math.inf
+
+    def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
+        """Return the last report, with roll, pitch and heading at the time of a frame as far as they are known."""
+        vehicle, attitude = self.vehicle, self.attitudes.at(t_mono_s)
+        if vehicle is None or attitude is None:
+            return vehicle
+        heading_deg = None if vehicle.heading_deg is None else attitude.yaw_deg % 360
+        return replace(vehicle, roll_deg=attitude.roll_deg, pitch_deg=attitude.pitch_deg, heading_deg=heading_deg)
 
     def take_answer(self) -> str | None:
         """Return the newest answer to a fix (name of a MAV_RESULT) once, then None until the next answer."""
@@ -72,13 +84,19 @@ class Autopilot:
         if self.identity.kept != before:
             self.vehicle, self._last_result = None, None
             self._gps.clear()
+            self.attitudes, self._heights = Attitudes(), Heights()
         if beats:
             self._heard_s = now_s
             return True
         if self._answers_our_fix(message):
             self._hear_result(message.result)
         elif message.get_type() == "GLOBAL_POSITION_INT":
-            self.vehicle = _vehicle(message, now_s, self._has_gps(message, now_s))
+            height_m = self._heights.now(message.relative_alt / 1e3, now_s)
+            self.vehicle = _vehicle(message, now_s, self._has_gps(message, now_s), height_m)
+        elif message.get_type() == "ATTITUDE":
+            self.attitudes.hear(message, now_s)
+        elif message.get_type() in _HEIGHT_REPORTS:
+            self._heights.hear(message, now_s, self.attitudes.at(now_s))
         elif message.get_type() in _GPS_REPORTS:
             self._hear_gps(message, now_s)
         return False
@@ -114,7 +132,7 @@ class Autopilot:
             self._last_result = result
 
 
-def _vehicle(message: Message, now_s: float, has_gps: bool) -> Vehicle | None:
+def _vehicle(message: Message, now_s: float, has_gps: bool, height_m: float) -> Vehicle | None:
     """Read a GLOBAL_POSITION_INT; return None for 0, 0, which an autopilot without a position sends, and for a position
     off the Earth."""
     if (message.lat == 0 and message.lon == 0) or abs(message.lat) > 90e7 or abs(message.lon) > 180e7:
@@ -127,4 +145,5 @@ def _vehicle(message: Message, now_s: float, has_gps: bool) -> Vehicle | None:
         heading_deg=heading_deg,
         t_heard_s=now_s,
         has_gps=has_gps,
+        height_m=height_m,
     )

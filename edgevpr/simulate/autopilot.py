@@ -43,13 +43,16 @@ class ReceivedFix:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Track:
     """Path of the simulated vehicle: seconds from its start on, degrees, metres above sea level, each (N,) float64;
-    `heading_deg` is NaN where unknown."""
+    heading, roll, pitch and height above the ground are NaN where unknown (None: everywhere)."""
 
     t_s: np.ndarray
     lat_deg: np.ndarray
     lon_deg: np.ndarray
     alt_m: np.ndarray
     heading_deg: np.ndarray
+    roll_deg: np.ndarray | None = None
+    pitch_deg: np.ndarray | None = None
+    height_m: np.ndarray | None = None
 
 
 def read_track(csv_path: str | Path) -> Track:
@@ -60,12 +63,14 @@ def read_track(csv_path: str | Path) -> Track:
         raise UsageError(f"{csv_path} has no row with lat, lon and time: a track needs them.")
     tags.sort(key=lambda tag: tag.t_utc_s)
     start_s = tags[0].t_utc_s
-    rows = [
-        (tag.t_utc_s - start_s, tag.position.lat_deg, tag.position.lon_deg, tag.position.alt_m or 0.0, tag.heading_deg)
-        for tag in tags
-    ]
-    t_s, lat_deg, lon_deg, alt_m, heading_deg = np.array(rows, float).T
-    return Track(t_s=t_s, lat_deg=lat_deg, lon_deg=lon_deg, alt_m=alt_m, heading_deg=heading_deg)
+    columns = {
+        "t_s": [tag.t_utc_s - start_s for tag in tags],
+        "lat_deg": [tag.position.lat_deg for tag in tags],
+        "lon_deg": [tag.position.lon_deg for tag in tags],
+        "alt_m": [tag.position.alt_m or 0.0 for tag in tags],
+        **{name: [getattr(tag, name) for tag in tags] for name in ("heading_deg", "roll_deg", "pitch_deg", "height_m")},
+    }
+    return Track(**{name: np.array(column, float) for name, column in columns.items()})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -103,8 +108,8 @@ def run_autopilot(
 ) -> AutopilotSummary:
     """Act as an ArduPilot copter at `link_url` until the time is up, `stop` is set, a signal comes or the line is cut.
 
-    With a `track` it flies along the track from the moment a companion is first heard, reports its position five times
-    a second, and stays where the track ends. Raises LinkError where the link cannot be opened.
+    With a `track` it flies along the track from the moment a companion is first heard, reports its position and
+    attitude five times a second, and stays where the track ends. Raises LinkError where the link cannot be opened.
     """
     stop = stop or threading.Event()
     address = parse_link(link_url)
@@ -161,9 +166,12 @@ class _Autopilot:
                 self._send(_copter_heartbeat())
             if self._track and self._start_s is not None and time.monotonic() >= position_due_s:
                 position_due_s = time.monotonic() + POSITION_S
-                position = _position(self._track, time.monotonic() - self._start_s)
+                t_s = time.monotonic() - self._start_s
+                position = _position(self._track, t_s)
                 self._send(_gps(position))
                 self._send(position)
+                if attitude := _attitude(self._track, t_s):
+                    self._send(attitude)
 
     def summary(self) -> AutopilotSummary:
         return AutopilotSummary(
@@ -233,18 +241,37 @@ def _copter_heartbeat() -> Message:
 
 def _position(track: Track, t_s: float) -> Message:
     lat_deg, lon_deg, alt_m = (np.interp(t_s, track.t_s, each) for each in (track.lat_deg, track.lon_deg, track.alt_m))
-    heading_deg = track.heading_deg[max(0, np.searchsorted(track.t_s, t_s, side="right") - 1)]
+    heading_deg, height_m = _last(track, track.heading_deg, t_s), _last(track, track.height_m, t_s)
     return mavlink.MAVLink_global_position_int_message(
         time_boot_ms=round(t_s * 1000),
         lat=round(lat_deg * 1e7),
         lon=round(lon_deg * 1e7),
         alt=round(alt_m * 1e3),
-        relative_alt=0,
+        relative_alt=0 if math.isnan(height_m) else round(height_m * 1e3),
         vx=0,
         vy=0,
         vz=0,
         hdg=65_535 if math.isnan(heading_deg) else round(heading_deg * 100) % 36_000,
     )
+
+
+def _attitude(track: Track, t_s: float) -> Message | None:
+    """Make the message of the attitude, None where the track does not know it."""
+    roll_deg, pitch_deg, heading_deg = (
+        _last(track, each, t_s) for each in (track.roll_deg, track.pitch_deg, track.heading_deg)
+    )
+    if math.isnan(roll_deg + pitch_deg):
+        return None
+    yaw = 0.0 if math.isnan(heading_deg) else math.remainder(math.radians(heading_deg), math.tau)
+    boot_ms = round(t_s * 1000)
+    return mavlink.MAVLink_attitude_message(boot_ms, math.radians(roll_deg), math.radians(pitch_deg), yaw, 0, 0, 0)
+
+
+def _last(track: Track, values: np.ndarray | None, t_s: float) -> float:
+    """Return the value at the point of the track that was passed last, NaN where it is unknown."""
+    if values is None:
+        return math.nan
+    return float(values[max(0, np.searchsorted(track.t_s, t_s, side="right") - 1)])
 
 
 def _gps(position: Message) -> Message:

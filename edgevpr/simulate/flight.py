@@ -91,7 +91,7 @@ def later_flight(seed: int) -> Flight:
 
 
 def write_flight(folder: str | Path, scene: Scene, flight: Flight) -> Iterator[str]:
-    """Write `folder`/images/*.jpg, and `folder`/positions.csv with the true position of every image.
+    """Write `folder`/images/*.jpg, and `folder`/positions.csv with the true position and attitude of every image.
 
     Yields the name of every image once it is written. Raises OSError where the folder cannot be written.
     """
@@ -101,7 +101,7 @@ def write_flight(folder: str | Path, scene: Scene, flight: Flight) -> Iterator[s
     rng = np.random.default_rng((flight.seed, 3))
     with open(Path(folder) / "positions.csv", "w", encoding="utf-8", newline="") as handle:
         table = csv.writer(handle)
-        table.writerow(("file", "lat", "lon", "alt", "rel_alt", "yaw_deg", "time"))
+        table.writerow(("file", "lat", "lon", "alt", "rel_alt", "yaw_deg", "roll_deg", "pitch_deg", "time"))
         for number, pose in enumerate(flight.poses):
             name = f"frame_{number:04d}.jpg"
             frame = photograph(ground, scene.metres_per_pixel, pose, flight.camera, flight.light, rng)
@@ -109,8 +109,9 @@ def write_flight(folder: str | Path, scene: Scene, flight: Flight) -> Iterator[s
             (images / name).write_bytes(jpeg.tobytes())
             at = to_position(pose)
             taken = flight.start_utc + timedelta(seconds=number * flight.interval_s)
-            numbers = (f"{at.lat_deg:.8f}", f"{at.lon_deg:.8f}", f"{at.alt_m:.2f}", f"{pose.height_m:.2f}")
-            table.writerow((name, *numbers, f"{pose.heading_deg % 360:.2f}", f"{taken:%Y:%m:%d %H:%M:%S}"))
+            where = (f"{at.lat_deg:.8f}", f"{at.lon_deg:.8f}", f"{at.alt_m:.2f}", f"{pose.height_m:.2f}")
+            attitude = (f"{pose.heading_deg % 360:.2f}", f"{pose.roll_deg:.2f}", f"{pose.pitch_deg:.2f}")
+            table.writerow((name, *where, *attitude, f"{taken:%Y:%m:%d %H:%M:%S}"))
             yield name
 
 

@@ -1,6 +1,7 @@
 """positions.csv, right and wrong."""
 
 import os
+import re
 
 import pytest
 
@@ -23,11 +24,18 @@ def written(tmp_path):
 
 def test_a_full_row_is_read_and_other_columns_are_ignored(written):
     tags = read_positions(written(HEADER + FIRST))
-    assert tags == {"0000.jpg": GeoTag(Position(46.84260708, -91.99455989, 198.309), 46.0, 1466699519.0)}
+    assert tags == {
+        "0000.jpg": GeoTag(
+            position=Position(46.84260708, -91.99455989, 198.309),
+            heading_deg=46.0,
+            t_utc_s=1466699519.0,
+            height_m=39.8,
+        )
+    }
 
 
 def test_file_lat_and_lon_are_enough(written):
-    assert read_positions(written("file,lat,lon\na.jpg,-54.5,2\n")) == {"a.jpg": GeoTag(Position(-54.5, 2.0))}
+    assert read_positions(written("file,lat,lon\na.jpg,-54.5,2\n")) == {"a.jpg": GeoTag(position=Position(-54.5, 2.0))}
 
 
 def test_what_is_empty_is_not_known(written):
@@ -36,7 +44,7 @@ def test_what_is_empty_is_not_known(written):
 
 def test_zero_zero_is_a_receiver_without_a_fix(written):
     tags = read_positions(written("file,lat,lon\na.jpg,0,0.0\nb.jpg,0,0.1\n"))
-    assert tags == {"a.jpg": GeoTag(), "b.jpg": GeoTag(Position(0.0, 0.1))}
+    assert tags == {"a.jpg": GeoTag(), "b.jpg": GeoTag(position=Position(0.0, 0.1))}
 
 
 def test_headings_are_turned_into_0_to_360(written):
@@ -47,7 +55,7 @@ def test_headings_are_turned_into_0_to_360(written):
 def test_what_spreadsheets_write_is_read(written):
     text = 'File, Lat, Lon\r\n"a, b.jpg", 1.5, 2\r\n\r\nc.jpg,3,4\r\n'
     tags = read_positions(written(text, "utf-8-sig"))
-    assert tags == {"a, b.jpg": GeoTag(Position(1.5, 2.0)), "c.jpg": GeoTag(Position(3.0, 4.0))}
+    assert tags == {"a, b.jpg": GeoTag(position=Position(1.5, 2.0)), "c.jpg": GeoTag(position=Position(3.0, 4.0))}
 
 
 @pytest.mark.parametrize(
@@ -84,6 +92,7 @@ def test_what_is_no_time_is_refused(text):
         ("b.jpg,ref,46,-181,,,,", "line 3: lon is `-181`: write a number from -180 to 180."),
         ("b.jpg,ref,46,2,high,,,", "line 3: alt is `high`"),
         ("b.jpg,ref,46,2,,,NE,", "line 3: yaw_deg is `NE`"),
+        ("b.jpg,ref,46,2,,low,,", "line 3: rel_alt is `low`: write a number from -1000 to 100000."),
         ("b.jpg,ref,46,2,,,,noon", "line 3: time is `noon`"),
         ("b.jpg,ref,46,2,,,,1466699519000", "line 3: time is `1466699519000`: write 2016-06-23T16:31:59Z"),  # ms
         ("b.jpg,ref,46,2,,,,0001-01-01T00:00:00+14:00", "line 3: time is"),
@@ -136,7 +145,28 @@ def test_positions_beside_a_relative_folder_are_found(tmp_path, monkeypatch):
     assert find_positions(".") == tmp_path / "positions.csv"
 
 
-@pytest.mark.parametrize("column", ["file", "lat", "yaw_deg", "time"])
+def test_attitude_and_height_are_read(written):
+    text = "file,lat,lon,roll_deg,pitch_deg,height_m,rel_alt\na.jpg,,,-12.5,3,80,90\nb.jpg,,,,,,90\n"
+    tags = read_positions(written(text))
+    assert tags["a.jpg"] == GeoTag(roll_deg=-12.5, pitch_deg=3.0, height_m=80.0)
+    assert tags["b.jpg"] == GeoTag(height_m=90.0), "the height over the take-off point stands in"
+
+
+@pytest.mark.parametrize(
+    ("row", "problem"),
+    [
+        ("-181,,", "roll_deg is `-181`: write a number from -180 to 180."),
+        (",91,", "pitch_deg is `91`: write a number from -90 to 90."),
+        (",nan,", "pitch_deg is `nan`"),
+        (",,inf", "height_m is `inf`: write a number from -1000 to 100000."),
+    ],
+)
+def test_an_attitude_or_height_that_cannot_be_is_refused(written, row, problem):
+    with pytest.raises(UsageError, match=f"line 2: {re.escape(problem)}"):
+        read_positions(written(f"file,lat,lon,roll_deg,pitch_deg,height_m\na.jpg,,,{row}\n"))
+
+
+@pytest.mark.parametrize("column", ["file", "lat", "yaw_deg", "rel_alt", "time"])
 def test_a_column_that_stands_there_twice_is_refused(column, written):
     with pytest.raises(UsageError, match=f"line 1 has two columns `{column}`: keep one of them"):
         read_positions(written(HEADER.replace("\n", f", {column.upper()}\n")))

@@ -6,7 +6,7 @@ import pytest
 from pictures import textured
 
 from edgevpr.errors import ImageError, UsageError
-from edgevpr.frames.mask import NoMask, mask_of, read_mask
+from edgevpr.frames.mask import NoMask, encoded, mask_of, read_mask
 from edgevpr.techniques import create
 
 
@@ -64,10 +64,10 @@ def test_what_lies_under_the_mask_changes_nothing(tmp_path, camera):
     picture = textured(1, 240, 320)
     covered = picture.copy()
     covered[:, :150] = np.random.default_rng(1).integers(0, picture.max(), (240, 150))  # ends before the mask
-    one, other = (mask.encode(technique, image) for image in (picture, covered))
+    one, other = (encoded(technique, image, mask.fitted(image)) for image in (picture, covered))
     assert not one.good.all()
     assert one.good.any()
     assert np.array_equal(one.good, other.good)
     assert np.array_equal(one.fine, other.fine)
-    without = NoMask().encode(technique, picture)
+    without = encoded(technique, picture, NoMask().fitted(picture))
     assert not np.array_equal(one.fine, without.fine)

@@ -1,5 +1,7 @@
 """Where the autopilot says it is: from the pinned autopilot only, only while fresh, and never at 0, 0."""
 
+import math
+
 import pytest
 from fakes import FakeClock
 from mavlink_peers import Peer, UdpPort, wait_until
@@ -49,7 +51,13 @@ def test_the_position_of_the_pinned_autopilot_is_known_while_it_is_fresh(link_an
     assert fresh(link, clock) is None
     say(link, peer, 50.1234567, -14.5)
     expected = Vehicle(
-        lat_deg=50.1234567, lon_deg=-14.5, alt_m=312.5, heading_deg=90.5, t_heard_s=clock.now_s, has_gps=False
+        lat_deg=50.1234567,
+        lon_deg=-14.5,
+        alt_m=312.5,
+        heading_deg=90.5,
+        t_heard_s=clock.now_s,
+        has_gps=False,
+        height_m=80.0,
     )
     assert wait_until(lambda: fresh(link, clock)) == expected
     clock.now_s += 1.0
@@ -129,16 +137,129 @@ def test_a_silent_autopilot_is_asked_where_it_is_until_it_says_so(link_and_peer,
     wait_until(lambda: link.stats().autopilot_heard)
     assert link.stats().sent.get("COMMAND_LONG", 0) == 0, "nobody wants to know"
     link.want_position()
-    asked = [peer.expect("COMMAND_LONG") for _ in range(2)]
+    asked = [peer.expect("COMMAND_LONG") for _ in range(5)]
     assert {command.command for command in asked} == {mavlink.MAV_CMD_SET_MESSAGE_INTERVAL}
-    assert {(command.param1, command.param2) for command in asked} == {(33, 200_000), (24, 500_000)}
+    intervals_us = {int(command.param1): command.param2 for command in asked}
+    assert intervals_us == {33: 200_000, 30: 100_000, 24: 500_000, 132: 500_000, 136: 500_000}
     assert all(command.target_system == 7 for command in asked)
+    say_attitude(link, peer)
     say(link, peer, 50.0, 8.0)
     for _ in range(2):  # what is heard needs no asking
         clock.now_s += 4.0
         peer.heartbeat()
+        say_attitude(link, peer)
         say(link, peer, 50.0, 8.0)
-    assert link.stats().sent["COMMAND_LONG"] == 2
+    assert link.stats().sent["COMMAND_LONG"] == 5
     clock.now_s += 6.0  # it has started anew
     peer.heartbeat()
-    assert peer.expect("COMMAND_LONG").param1 in (24, 33)
+    assert peer.expect("COMMAND_LONG").param1 in intervals_us
+
+
+def test_an_autopilot_that_says_no_attitude_is_asked_for_it_again(link_and_peer, clock):
+    link, peer = link_and_peer
+    link.want_position()
+    peer.heartbeat()
+    for _ in range(5):
+        peer.expect("COMMAND_LONG")
+    for _ in range(2):
+        say(link, peer, 50.0, 8.0)
+        clock.now_s += 4.0
+        peer.heartbeat()
+    wait_until(lambda: link.stats().sent["COMMAND_LONG"] == 10)
+
+
+def told(link, peer, message):
+    """Send a message, and wait until it has been heard: a second one after it has been counted."""
+    for each in (message, mavlink.MAVLink_system_time_message(0, 0)):
+        before = link.stats().received.get(each.get_type(), 0)
+        peer.send(each)
+        wait_until(lambda each=each, before=before: link.stats().received.get(each.get_type(), 0) == before + 1)
+
+
+def say_attitude(link, peer, roll_deg=0.0, pitch_deg=0.0, yaw_deg=0.0):
+    told(link, peer, mavlink.MAVLink_attitude_message(0, *map(math.radians, (roll_deg, pitch_deg, yaw_deg)), 0, 0, 0))
+
+
+@pytest.fixture
+def flying(link_and_peer):
+    link, peer = link_and_peer
+    peer.heartbeat()
+    wait_until(lambda: link.stats().autopilot_heard)
+    return link, peer
+
+
+def test_the_attitude_is_that_of_the_frame_s_time(flying, clock):
+    link, peer = flying
+    start_s = clock.now_s
+    for roll_deg, pitch_deg, yaw_deg in ((-10, 4, 350), (10, 8, 10), (20, 0, 20)):
+        say_attitude(link, peer, roll_deg, pitch_deg, yaw_deg)
+        say(link, peer, 50.0, 8.0)
+        clock.now_s += 0.2
+    seen = link.vehicle_at(start_s + 0.05)
+    assert (seen.roll_deg, seen.pitch_deg, seen.heading_deg) == pytest.approx((-5, 5, 355), abs=1e-4)
+    assert link.vehicle_at(start_s + 0.1).heading_deg % 360 == pytest.approx(0, abs=1e-4), "the short way over north"
+    last = link.vehicle_at(start_s + 0.65)
+    assert (last.roll_deg, last.heading_deg) == pytest.approx((20, 20), abs=1e-4), "the last one holds for 0.3 s"
+    for away_s in (-0.35, 0.75):
+        other = link.vehicle_at(start_s + away_s)
+        assert (other.roll_deg, other.pitch_deg, other.heading_deg) == (None, None, 90.5), "the report's own heading"
+    assert link.vehicle().roll_deg is None
+
+
+def test_an_attitude_that_is_no_number_is_not_believed(flying, clock):
+    link, peer = flying
+    say_attitude(link, peer, roll_deg=math.nan)
+    say(link, peer, 50.0, 8.0)
+    assert link.vehicle_at(clock.now_s).roll_deg is None
+
+
+def say_range(link, peer, distance_m, orientation=25, signal_quality=0):
+    told(
+        link,
+        peer,
+        mavlink.MAVLink_distance_sensor_message(
+            0, 20, 10_000, round(distance_m * 100), 0, 0, orientation, 0, signal_quality=signal_quality
+        ),
+    )
+
+
+def say_terrain(link, peer, height_m, spacing=100):
+    told(link, peer, mavlink.MAVLink_terrain_report_message(500_000_000, 80_000_000, spacing, 0.0, height_m, 0, 9))
+
+
+def height_m(link, peer):
+    say(link, peer, 50.0, 8.0)
+    told(link, peer, mavlink.MAVLink_system_time_message(0, 0))
+    return link.vehicle().height_m
+
+
+def test_the_best_height_is_taken(flying, clock):
+    link, peer = flying
+    assert height_m(link, peer) == 80.0, "over the take-off point"
+    say_terrain(link, peer, 65.0)
+    assert height_m(link, peer) == 65.0
+    say_range(link, peer, 60.0)
+    assert height_m(link, peer) == 60.0
+    say_attitude(link, peer, roll_deg=60.0)
+    say_range(link, peer, 60.0)
+    assert height_m(link, peer) == pytest.approx(30.0, abs=0.01), "a range finder looks where the aircraft leans"
+    clock.now_s += 1.1
+    assert height_m(link, peer) == 65.0, "the range is old"
+    clock.now_s += 2.0
+    assert height_m(link, peer) == 80.0, "the terrain is old too"
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"distance_m": 0.1}, {"distance_m": 120.0}, {"orientation": 0}, {"signal_quality": 1}]
+)
+def test_a_range_that_says_nothing_is_not_taken(flying, wrong):
+    link, peer = flying
+    say_range(link, peer, **{"distance_m": 60.0} | wrong)
+    assert height_m(link, peer) == 80.0
+
+
+@pytest.mark.parametrize("report", [(math.nan, 100), (0.0, 0)])
+def test_a_terrain_that_is_unknown_is_not_taken(flying, report):
+    link, peer = flying
+    say_terrain(link, peer, *report)
+    assert height_m(link, peer) == 80.0

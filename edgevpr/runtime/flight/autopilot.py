@@ -34,7 +34,7 @@ class NoAutopilot:
 
     summary = None
 
-    def vehicle(self) -> Vehicle | None:
+    def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
         """Return None: nothing is known."""
 
     def told(self, event: Recognition, used_mah: float) -> Recognition:
@@ -67,9 +67,10 @@ class ToAutopilot:
         foreign = f"{stats.foreign_messages} foreign messages refused" if stats.foreign_messages else ""
         return ", ".join(filter(None, (sent, taken, late, withheld, foreign)))
 
-    def vehicle(self) -> Vehicle | None:
-        """Return the autopilot's last report of its vehicle, None where it has given no position."""
-        return self._link.vehicle()
+    def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
+        """Return the autopilot's last report of its vehicle, with the attitude at the time of a frame; None where it
+        has given no position."""
+        return self._link.vehicle_at(t_mono_s)
 
     def told(self, event: Recognition, used_mah: float) -> Recognition:
         """Tell the autopilot of an event; return the event with reports of its fix and of the fix before it.

@@ -16,7 +16,7 @@ from edgevpr.runtime.flight.pace import Pace
 from edgevpr.runtime.flight.vitals import Vitals
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
-from edgevpr.types import StageCost
+from edgevpr.types import Frame, StageCost
 
 _TURN_S = 0.2  # the loop turns at least this often, with or without frames
 
@@ -89,11 +89,15 @@ def loop(
             pace.taken()
             with meter.working():
                 with stop.breaks_off():
-                    event = recogniser.unread(problem) if problem else recogniser.step(frame, autopilot.vehicle())
+                    event = recogniser.unread(problem) if problem else _recognised(frame, recogniser, autopilot)
                 _tell(_with_reading(event, reading.cost), autopilot, observers, meter)
             governing.look()  # here, so that each reading covers a whole number of queries
     except Stop.Now:
         pass
+
+
+def _recognised(frame: Frame, recogniser: Recogniser, autopilot: Autopilot) -> Recognition:
+    return recogniser.step(frame, autopilot.vehicle_at(frame.t_mono_s))
 
 
 def _with_reading(event: Recognition, reading: StageCost) -> Recognition:

@@ -19,6 +19,7 @@ from edgevpr.frames.images import list_images
 from edgevpr.frames.positions import find_positions
 from edgevpr.places.growing import GrowingIndex
 from edgevpr.places.near import nearest_m
+from edgevpr.runtime.recognise.levelling import laid
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.types import Frame, Place, Position, Vehicle
@@ -76,6 +77,7 @@ class Learner:
         place = None
         try:
             here, objection = self._placed(event.frame, event.vehicle)
+            here = laid(here, event.view)
             objection = objection or self._objection(here.position, event)
             if objection:
                 self.passed_over[objection] += 1
@@ -92,6 +94,7 @@ class Learner:
                 heading_deg=here.heading_deg,
                 quality=event.descriptor.quality,
                 salience=salience,
+                pose=here.pose,
             )
             self._growing.add(place_id, here.position, event.descriptor.coarse, here.heading_deg)
         except MapBusyError:

@@ -13,6 +13,7 @@ from edgevpr.places.rows import readable
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.gaps import Gaps, Kept
 from edgevpr.runtime.recognise.judge import ACCEPT_NOTHING
+from edgevpr.runtime.recognise.levelling import AnyLevelling, laid
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.salience.gate import Gate, NoGate
 from edgevpr.types import Frame
@@ -39,18 +40,27 @@ def build_map(
     mask: AnyMask | None = None,
     gate: Gate | NoGate | None = None,
     gaps: Gaps | None = None,
+    levelling: AnyLevelling | None = None,
 ) -> MappingResult:
     """Add a place for every frame that is not in the map yet, so that an interrupted map can be continued.
 
     A frame goes through the steps of a query, with no place to find. It is in the map already if a place has the same
     name and nearly the same descriptor; the name alone does not tell, since cameras restart their numbering. A frame
     that cannot be encoded is handed to `unusable` and left out; with `unusable` None it raises ModelError. `mask`
-    leaves parts of every frame out. Frames that do not pass the `gate` are left out, but for those that `gaps` keeps.
+    leaves parts of every frame out, and `levelling` lays each on the ground. Frames that do not pass the `gate` are
+    left out, but for those that `gaps` keeps.
     """
     place_map.require(technique.spec)
     nothing = empty_index(technique.spec, 0, None)
     walk = Recogniser(
-        technique=technique, place_map=place_map, index=nothing, rule=ACCEPT_NOTHING, meter=meter, mask=mask, gate=gate
+        technique=technique,
+        place_map=place_map,
+        index=nothing,
+        rule=ACCEPT_NOTHING,
+        meter=meter,
+        mask=mask,
+        gate=gate,
+        levelling=levelling,
     )
     gaps = gaps or Gaps()
     here = place_map.ids_by("source_image")
@@ -60,7 +70,7 @@ def build_map(
     def keep(kept: Iterable[Kept]) -> None:
         nonlocal added, without_position, of_low_quality
         for event, salience in kept:
-            place_map.add(event.frame, event.descriptor, salience)
+            place_map.add(laid(event.frame, event.view), event.descriptor, salience)
             added += 1
             without_position += event.frame.position is None
             if salience and salience.is_low:

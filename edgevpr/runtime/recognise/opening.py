@@ -22,6 +22,7 @@ from edgevpr.power.equations import parse_pack
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.hints import Prior
 from edgevpr.runtime.recognise.judge import accept_rule
+from edgevpr.runtime.recognise.levelling import levelling_of
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.salience.detector import open_detector
 from edgevpr.salience.gate import MOST_ENTROPY, Gate, NoGate, Thresholds
@@ -205,6 +206,7 @@ def _recogniser(
         min_accuracy_m=config.mavlink.min_accuracy_m,
         mask=mask,
         gate=gate_of(config.salience, board.threads),
+        levelling=levelling_of(config.source, technique),
     )
 
 

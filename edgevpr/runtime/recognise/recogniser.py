@@ -9,7 +9,8 @@ from itertools import islice
 
 from edgevpr.contract import Technique
 from edgevpr.errors import EdgevprError, MapError, PlaceError
-from edgevpr.frames.mask import AnyMask, NoMask
+from edgevpr.frames.level import UNKNOWN_VIEW
+from edgevpr.frames.mask import AnyMask, NoMask, encoded
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import compare, named, scan
@@ -18,6 +19,7 @@ from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.gate import says_nothing
 from edgevpr.runtime.recognise.hints import NoPrior, Prior, expected_of
 from edgevpr.runtime.recognise.judge import NEW_FOR_S, AcceptRule, Verdict, judge
+from edgevpr.runtime.recognise.levelling import AnyLevelling, NoLevelling, seen_as
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.salience.gate import Gate, NoGate
 from edgevpr.types import Frame, Vehicle
@@ -29,9 +31,9 @@ class Recogniser:
     """Recognises places of an open map, frame after frame.
 
     `candidates` places are compared (None: all in full, see `places.retrieve.compare`). `gate` refuses frames that are
-    not memorable, and `mask` leaves parts of every frame out. `search` joins several queries, and `prior` narrows each;
-    without them each query is ranked alone, over the whole map. The governor changes `candidates`; the learner and the
-    governor change the index (`take`, `extend`).
+    not memorable, `mask` leaves parts of every frame out, and `levelling` lays each on the ground. `search` joins
+    several queries, and `prior` narrows each; without them each query is ranked alone, over the whole map. The governor
+    changes `candidates`; the learner and the governor change the index (`take`, `extend`).
     """
 
     def __init__(
@@ -48,10 +50,11 @@ class Recogniser:
         min_accuracy_m: float = 1.0,
         mask: AnyMask | None = None,
         gate: Gate | NoGate | None = None,
+        levelling: AnyLevelling | None = None,
     ) -> None:
         self.place_map, self.meter, self.candidates = place_map, meter, candidates
         self._prior, self._min_accuracy_m, self._mask = prior or NoPrior(), min_accuracy_m, mask or NoMask()
-        self._gate = gate or NoGate()
+        self._gate, self.levelling = gate or NoGate(), levelling or NoLevelling()
         self._told = 0  # number of places left out that an event has told of
         self._new: deque[tuple[int, float]] = deque()  # place id, and the time it was learnt at
         self.take(technique, index, rule, search or Alone())
@@ -83,13 +86,16 @@ class Recogniser:
         """
         meter, technique, index = self.meter, self.technique, self.index
         worth = descriptor = hints = ranking = best = nothing = objection = None
-        map_lost = False
+        view, map_lost = UNKNOWN_VIEW, False
         meter.begin()
         try:
+            with meter.step("prepare"):
+                picture = self.levelling.prepare(frame, vehicle, self._mask.fitted(frame.image))
+                view = picture.view
             with meter.step("gate"):
                 worth = self._gate.look(frame.image)
             with meter.step("encode"):
-                descriptor = self._mask.encode(technique, frame.image)
+                descriptor = encoded(technique, picture.image, picture.mask)
             if self._lost:
                 raise MapError(self._lost)
             nothing = says_nothing(descriptor, self.rule.min_quality)
@@ -102,7 +108,7 @@ class Recogniser:
                 with meter.step("scan"):
                     self.place_map.require_unchanged()
                     margin_m = max(self.accuracy_m, self.rule.neighbour_m)
-                    hints = self._prior.hints(frame, vehicle, index, margin_m)
+                    hints = self._prior.hints(seen_as(frame, view), vehicle, index, margin_m)
                     expected = expected_of(hints, index)
                     scanned = scan(technique, descriptor, index, expected)
                 with meter.step("compare"):
@@ -122,6 +128,8 @@ class Recogniser:
                     verdict = judge(ranking, index, self.rule, self.search, is_new)
                     verdict = Verdict(False, objection) if objection else verdict
                 self._prior.learn(best, verdict.accepted, frame.t_mono_s)
+                if self.search.length == 1:  # a sequence is to have one scale
+                    self.levelling.learn(verdict.accepted)
             failed = False
         except Exception as error:
             _log.debug("%s failed", frame.name, exc_info=True)
@@ -131,6 +139,7 @@ class Recogniser:
         return Recognition(
             frame=frame,
             vehicle=vehicle,
+            view=view,
             worth=worth,
             descriptor=descriptor,
             hints=hints,

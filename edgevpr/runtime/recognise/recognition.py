@@ -4,6 +4,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from edgevpr.contract import Descriptor
+from edgevpr.frames.level import UNKNOWN_VIEW, View
 from edgevpr.places.retrieve import Ranking
 from edgevpr.runtime.recognise.hints import Hints
 from edgevpr.salience.gate import Worth
@@ -16,10 +17,10 @@ _OF_THE_BEST = ("place", "reference_image", "score", "position", "shift_cells", 
 class Recognition:
     """Result of one frame.
 
-    The inputs are `frame` and `vehicle`, the autopilot's report when the frame was taken (None: no report).
-    `worth` is what the gate says of the frame (None: no gate looks), `descriptor` is the encoded frame, `hints` what
-    narrowed the search, `ranking` the places found and `best` the first
-    of them; each is None where its step was not reached. `accepted` tells whether `best` is taken for the place, and
+    The inputs are `frame` and `vehicle`, the autopilot's report when the frame was taken (None: no report). `view` is
+    how the picture that was encoded lies on the ground, `worth` what the gate says of the frame (None: no gate looks),
+    `descriptor` the encoded frame, `hints` what narrowed the search, `ranking` the places found and `best` the first of
+    them; each is None where its step was not reached. `accepted` tells whether `best` is taken for the place, and
     `reason` why (not), in a few words. `position` is the place's, and `accuracy_m` its 1-sigma; both are set for an
     accepted match only: any other carries no position. `says_nothing` tells whether the picture holds too little to be
     recognised; a place was then searched for only to go on with a sequence.
@@ -34,6 +35,7 @@ class Recognition:
 
     frame: Frame | None
     vehicle: Vehicle | None = None
+    view: View = UNKNOWN_VIEW
     worth: Worth | None = None
     descriptor: Descriptor | None = None
     hints: Hints | None = None
@@ -62,12 +64,13 @@ def fields_of(event: Recognition) -> dict[str, Any]:
     """Return the event as the flight log (kind "query") and `edgevpr match --json` have it.
 
     The fields are: query, place (id), reference_image, score, position (of the place), the match's step, its covariance
-    and the rotation (all null where no place was found), accepted, reason, accuracy_m, costs; and, where a gate looks,
-    salience.
+    and the rotation (all null where no place was found), accepted, reason, accuracy_m, costs; where a gate looks,
+    salience; and, where anything is known of how the picture lies on the ground, view.
     """
     return {
         "query": event.frame.name,
         **_best(event.best),
+        **({"view": asdict(event.view)} if event.view != UNKNOWN_VIEW else {}),
         **({"salience": event.worth.salience.rounded()} if event.worth else {}),
         "accepted": event.accepted,
         "reason": event.reason,

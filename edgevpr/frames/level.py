@@ -1,0 +1,212 @@
+"""Levelling: lays the picture of a camera that looks down on flat ground, north-up and to scale, in one warp."""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from edgevpr.frames.opencv import cv2
+from edgevpr.types import Frame, Vehicle
+
+MOST_TILT_DEG = 45.0
+_MOST_OFF_DOWN_DEG = 85.0  # of a corner's ray: beyond it are the horizon and ground that fills no pixel
+_LEAST_TILT_DEG, _LEAST_TURN_DEG, _LEAST_ZOOM = 1.0, 1.0, 0.03  # less than these changes no match
+# Ground length of the picture over the length it is scaled to. Beyond these limits too few of its pixels are left, or
+# too little of the output is filled; a height that is so far from the map's is likelier to be wrong.
+_ZOOMS = (0.3, 4.0)
+_LEAST_FILLED = 1 / 3  # of what the same picture would fill if it were taken straight down
+_HIGHEST_M = 10_000.0
+_LONGEST_PX = 1024  # of a warped picture: no technique sees more
+_SUBPIXEL_BITS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Lens:
+    """A camera without distortion. `fov_deg` is its field of view across the longest side of the picture, and `up_deg`
+    the compass direction of the top of the picture while the nose points north."""
+
+    fov_deg: float
+    up_deg: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class View:
+    """The way a picture lies on the ground (None: unknown). `up_deg` is the compass direction (0..360) of its top, and
+    `footprint_m` the length on the ground of its longest side. `aside` is the point straight under the camera, from the
+    middle of the picture, (right, up) as shares of the longest side. `reason` tells why the picture was left tilted
+    (None: it was not)."""
+
+    up_deg: float | None = None
+    footprint_m: float | None = None
+    aside: tuple[float, float] | None = None
+    reason: str | None = None
+
+
+UNKNOWN_VIEW = View()
+
+
+@dataclass(frozen=True, slots=True)
+class Levelled:
+    """A picture as it is encoded: `image` uint8 (H, W[, 3]), `mask` bool (H, W), False where it does not show ground
+    (None: it does everywhere), and how it lies on the ground."""
+
+    image: np.ndarray
+    mask: np.ndarray | None
+    view: View
+
+
+def levelled(
+    frame: Frame,
+    vehicle: Vehicle | None,
+    lens: Lens,
+    footprint_m: float | None = None,
+    *,
+    overlay: np.ndarray | None = None,
+    below: bool = False,
+) -> Levelled:
+    """Lay a picture on flat ground, as far as the frame, else the vehicle, tells how it was taken.
+
+    It is untilted by roll and pitch (unknown: it counts as level), turned north-up by the heading (unknown: its top
+    stays), and scaled by the height so that its longest side shows `footprint_m` (None, or height unknown: it keeps its
+    own scale). In the middle is what the middle of the picture shows, or with `below` the point under the camera.
+    `overlay`, bool (H, W), is False where the picture shows no ground. What needs no warp keeps its image, and so does
+    what bears none: then `View.reason` says why. No value of frame or vehicle raises.
+    """
+    if frame.pose is not None:
+        known = View(up_deg=frame.pose.up_deg, footprint_m=frame.pose.footprint_m, aside=(0.0, 0.0))
+        return Levelled(frame.image, overlay, known)
+    shot = _Shot(frame, vehicle, lens)
+    if reason := shot.objection:
+        return Levelled(frame.image, overlay, View(up_deg=shot.top_deg, reason=reason))
+    zoom = shot.own_m / footprint_m if shot.own_m and footprint_m else 1.0
+    if not _ZOOMS[0] <= zoom <= _ZOOMS[1]:
+        zoom = 1.0
+    if shot.tilt_deg < _LEAST_TILT_DEG and shot.turn_deg < _LEAST_TURN_DEG and abs(zoom - 1) < _LEAST_ZOOM:
+        view = View(up_deg=shot.top_deg, footprint_m=shot.own_m, aside=shot.aside(shot.straight, 1.0))
+        return Levelled(frame.image, overlay, view)
+
+    side = min(shot.longest_px, _LONGEST_PX)
+    out_px = shot.focal_px * zoom * side / shot.longest_px  # that the output has for each unit of height
+    turned = shot.straight if shot.heading_deg is None else shot.level_from_lens(-shot.heading_deg)
+    middle = np.zeros(2) if below else turned[:2, 2] / turned[2, 2] * out_px
+    right, down = (side - 1) / 2 - middle
+    out_from_pixel = np.array([[out_px, 0, right], [0, out_px, down], [0, 0, 1]]) @ turned @ shot.lens_from_pixel
+
+    mask = _quadrangle(out_from_pixel @ shot.corners, side)
+    height, width = (min(1.0, zoom * each / shot.longest_px) for each in frame.image.shape[:2])
+    if (filled := mask.mean() / (height * width)) < _LEAST_FILLED:
+        reason = f"it shows {filled:.0%} of the ground under it at a tilt of {shot.tilt_deg:.0f} degrees"
+        return Levelled(frame.image, overlay, View(up_deg=shot.top_deg, reason=reason))
+    if overlay is not None:
+        mask &= _warped(overlay, out_from_pixel, side)
+    view = View(
+        up_deg=None if shot.heading_deg is None else 0.0,
+        footprint_m=shot.own_m and shot.own_m / zoom,
+        aside=(0.0, 0.0) if below and shot.is_attitude_known else shot.aside(turned, zoom),
+    )
+    image = _shrunk_and_warped(frame.image, out_from_pixel, side, shot.focal_px / out_px)
+    return Levelled(image, None if mask.all() else mask, view)
+
+
+class _Shot:
+    """The way a picture was taken, as far as it is known. Rotations are (3, 3), between the axes of the
+    lens (right and back in the picture, and ahead of it), of the airframe (nose, right, down), and of the level
+    picture (right, back, down)."""
+
+    def __init__(self, frame: Frame, vehicle: Vehicle | None, lens: Lens) -> None:
+        roll_deg, pitch_deg, self.heading_deg, height_m = (
+            _known(frame, vehicle, name) for name in ("roll_deg", "pitch_deg", "heading_deg", "height_m")
+        )
+        self.is_attitude_known = roll_deg is not None and pitch_deg is not None
+        self._level_from_body = _level_from_body(roll_deg, pitch_deg) if self.is_attitude_known else np.eye(3)
+        self._lens = lens
+        height, width = frame.image.shape[:2]
+        self.longest_px = max(height, width)
+        half = math.tan(math.radians(lens.fov_deg) / 2)
+        self.focal_px = self.longest_px / 2 / half
+        self.own_m = 2 * height_m * half if height_m is not None and 0 < height_m <= _HIGHEST_M else None
+        focal, middle = self.focal_px, ((width - 1) / 2, (height - 1) / 2)
+        self.lens_from_pixel = np.linalg.inv([[focal, 0, middle[0]], [0, focal, middle[1]], [0, 0, 1]])
+        across, along = (-0.5, width - 0.5), (-0.5, height - 0.5)
+        self.corners = np.array([[*across, *across[::-1]], [along[0], along[0], along[1], along[1]], [1] * 4])
+        self.straight = self.level_from_lens(lens.up_deg)
+
+    @property
+    def top_deg(self) -> float | None:
+        """Compass direction of the top of the picture."""
+        return None if self.heading_deg is None else (self.heading_deg + self._lens.up_deg) % 360
+
+    @property
+    def turn_deg(self) -> float:
+        """Degrees between the top of the picture and north, 0 where the heading is unknown."""
+        return 0.0 if self.top_deg is None else abs((self.top_deg + 180) % 360 - 180)
+
+    @cached_property
+    def tilt_deg(self) -> float:
+        """Degrees between what the camera looks at and straight down."""
+        return math.degrees(math.acos(np.clip(self.straight[2, 2], -1, 1)))
+
+    @property
+    def objection(self) -> str | None:
+        """The reason why the picture bears no warp, None where there is none."""
+        rays = self.straight @ self.lens_from_pixel @ self.corners
+        lowest = (rays[2] / np.linalg.norm(rays, axis=0)).min()
+        if self.tilt_deg <= MOST_TILT_DEG and lowest >= math.cos(math.radians(_MOST_OFF_DOWN_DEG)):
+            return None
+        return f"it is tilted {self.tilt_deg:.0f} degrees"
+
+    def level_from_lens(self, up_deg: float) -> np.ndarray:
+        """Return the rotation to a level picture whose top points `up_deg` to the right of the nose."""
+        return _body_from_lens(up_deg).T @ self._level_from_body @ _body_from_lens(self._lens.up_deg)
+
+    def aside(self, turned: np.ndarray, zoom: float) -> tuple[float, float] | None:
+        """Return `View.aside` of a picture that is turned like this; None where the attitude is unknown."""
+        right, back = turned[:2, 2] / turned[2, 2] * zoom * self.focal_px / self.longest_px
+        return (float(-right), float(back)) if self.is_attitude_known else None
+
+
+def _known(frame: Frame, vehicle: Vehicle | None, name: str) -> float | None:
+    values = (getattr(frame, name), getattr(vehicle, name, None))
+    return next((value for value in values if value is not None and math.isfinite(value)), None)
+
+
+def _level_from_body(roll_deg: float, pitch_deg: float) -> np.ndarray:
+    """Return the rotation (3, 3) from nose, right, down of the airframe to those of a level one with its heading."""
+    roll, pitch = math.radians(roll_deg), math.radians(pitch_deg)
+    about_right = [[math.cos(pitch), 0, math.sin(pitch)], [0, 1, 0], [-math.sin(pitch), 0, math.cos(pitch)]]
+    about_nose = [[1, 0, 0], [0, math.cos(roll), -math.sin(roll)], [0, math.sin(roll), math.cos(roll)]]
+    return np.array(about_right) @ np.array(about_nose)
+
+
+def _body_from_lens(up_deg: float) -> np.ndarray:
+    """Return the rotation (3, 3) to nose, right, down from right, back, down of a picture whose top points `up_deg` to
+    the right of the nose."""
+    up = math.radians(up_deg)
+    return np.array([[-math.sin(up), -math.cos(up), 0], [math.cos(up), -math.sin(up), 0], [0, 0, 1]])
+
+
+def _quadrangle(corners: np.ndarray, side: int) -> np.ndarray:
+    """Return bool (side, side), True inside the quadrangle of homogeneous corners (3, 4)."""
+    points = np.round((corners[:2] / corners[2]).T * 2**_SUBPIXEL_BITS).astype(np.int32)
+    return cv2.fillConvexPoly(np.zeros((side, side), np.uint8), points, 1, shift=_SUBPIXEL_BITS).view(bool)
+
+
+def _warped(mask: np.ndarray, out_from_pixel: np.ndarray, side: int) -> np.ndarray:
+    """Warp a mask, bool (H, W), to (side, side); False outside."""
+    return cv2.warpPerspective(mask.view(np.uint8), out_from_pixel, (side, side), flags=cv2.INTER_NEAREST).view(bool)
+
+
+def _shrunk_and_warped(image: np.ndarray, out_from_pixel: np.ndarray, side: int, shrink: float) -> np.ndarray:
+    """Warp an image to (side, side). Where `shrink` pixels become one, and they are more than two, their mean is taken
+    first: a warp alone would leave most of them out."""
+    if shrink > 2:
+        height, width = image.shape[:2]
+        small = max(1, round(width / shrink)), max(1, round(height / shrink))
+        across, along = width / small[0], height / small[1]
+        image = cv2.resize(image, small, interpolation=cv2.INTER_AREA)
+        out_from_pixel = out_from_pixel @ [[across, 0, (across - 1) / 2], [0, along, (along - 1) / 2], [0, 0, 1]]
+    # The edge goes on outside, where the mask is False, so that it makes no gradient inside.
+    return cv2.warpPerspective(
+        image, out_from_pixel, (side, side), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )

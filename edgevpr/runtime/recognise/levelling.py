@@ -1,0 +1,113 @@
+"""The first step of the walk: levels every picture, and says how a picture lies on the ground when it becomes a place.
+
+A wrong height scales wrongly, and then less is recognised. So a scaled query that is not accepted is followed by one
+that keeps its own scale, in turns, until a match is accepted.
+"""
+
+import logging
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from edgevpr.config import SourceConfig
+from edgevpr.contract import Technique
+from edgevpr.frames.level import UNKNOWN_VIEW, Lens, Levelled, View, levelled
+from edgevpr.frames.source import is_live
+from edgevpr.geodesy import moved
+from edgevpr.types import Frame, Pose, Position, Vehicle
+
+_GPS_SIGMA_M = 5.0
+_UNTOLD_TILT = 0.1  # of the footprint: so far off is the middle of a picture that is tilted by 7 degrees
+
+_log = logging.getLogger(__name__)
+
+
+class NoLevelling:
+    """Stands in for a `Levelling` where pictures are taken as they are."""
+
+    def prepare(self, frame: Frame, vehicle: Vehicle | None, overlay: np.ndarray | None) -> Levelled:
+        """Return the picture as it is."""
+        return Levelled(frame.image, overlay, UNKNOWN_VIEW)
+
+    def learn(self, accepted: bool) -> None:
+        """Learn nothing."""
+
+
+class Levelling:
+    """Levels the pictures of a camera that looks straight down, see `frames.level`.
+
+    `footprint_m` is the length on the ground to which the longest side is scaled, that of the map's places (None: no
+    picture is scaled). With `below`, for places, the point under the camera is in the middle. `is_live` is False for
+    frames of a recording, of which the autopilot knows nothing.
+    """
+
+    def __init__(self, lens: Lens, *, footprint_m: float | None = None, below: bool = False, is_live: bool) -> None:
+        self.lens, self.footprint_m = lens, footprint_m
+        self._below, self._is_live = below, is_live
+        self._scales, self._could_scale = True, False
+        self._has_said = False
+
+    def prepare(self, frame: Frame, vehicle: Vehicle | None, overlay: np.ndarray | None) -> Levelled:
+        """Level the picture of a frame; `overlay`, bool (H, W), is False where it shows no ground (None: nowhere)."""
+        if not self._is_live or (vehicle and not vehicle.is_fresh_at(frame.t_mono_s)):
+            vehicle = None
+        footprint_m = self.footprint_m if self._scales else None
+        found = levelled(frame, vehicle, self.lens, footprint_m, overlay=overlay, below=self._below)
+        self._could_scale = self.footprint_m is not None and found.view.footprint_m is not None
+        if found.view.reason and not self._has_said:
+            self._has_said = True
+            _log.warning("%s is taken as it is, as others like it will be: %s", frame.name, found.view.reason)
+        return found
+
+    def learn(self, accepted: bool) -> None:
+        """Learn from what became of the last picture whether the next one is to be scaled."""
+        if self._could_scale and not accepted:
+            self._scales = not self._scales
+
+
+AnyLevelling = NoLevelling | Levelling
+
+
+def levelling_of(
+    config: SourceConfig, technique: Technique, *, footprint_m: float | None = None, below: bool = False
+) -> AnyLevelling:
+    """Make the levelling that the configuration asks for; none for a camera that looks ahead, or of unknown lens."""
+    if technique.spec.parameters.get("camera") != "nadir":
+        return NoLevelling()
+    if config.fov_deg is None:
+        _log.info("`source.fov_deg` is not set: pictures are neither untilted nor scaled nor turned")
+        return NoLevelling()
+    live = config.uri is not None and is_live(config.uri)
+    return Levelling(Lens(config.fov_deg, config.up_deg), footprint_m=footprint_m, below=below, is_live=live)
+
+
+def seen_as(frame: Frame, view: View) -> Frame:
+    """Return the frame with the heading that hints are to know: that of the top of its levelled picture."""
+    return frame if view.up_deg is None else replace(frame, heading_deg=view.up_deg)
+
+
+def laid(frame: Frame, view: View) -> Frame:
+    """Return a frame with a position as a place is to have it: with the heading of its levelled picture, and, where
+    height and heading are known, its pose, and the position of the middle of the picture instead of the aircraft's."""
+    frame = seen_as(frame, view)
+    if frame.pose is not None or frame.position is None or view.up_deg is None or view.footprint_m is None:
+        return frame
+    variance_m2 = _GPS_SIGMA_M**2
+    position = frame.position
+    if view.aside is None:
+        variance_m2 += (_UNTOLD_TILT * view.footprint_m) ** 2
+    else:
+        position = _middle(position, view)
+    pose = Pose(up_deg=view.up_deg, footprint_m=view.footprint_m, covariance_m2=(variance_m2, 0.0, variance_m2))
+    return replace(frame, position=position, pose=pose)
+
+
+def _middle(position: Position, view: View) -> Position:
+    """Return the position of what is in the middle of a picture, of that which is `view.aside`."""
+    right_m, up_m = (view.footprint_m * share for share in view.aside)
+    up = math.radians(view.up_deg)
+    east_m = right_m * math.cos(up) + up_m * math.sin(up)
+    north_m = up_m * math.cos(up) - right_m * math.sin(up)
+    lat_deg, lon_deg = moved(position.lat_deg, position.lon_deg, -east_m, -north_m)
+    return Position(lat_deg, lon_deg, position.alt_m)

@@ -1,0 +1,149 @@
+"""Attitude and height from the XMP of drones, right, wrong and hostile."""
+
+import math
+import random
+
+import photographs
+import pytest
+
+from edgevpr.frames.exif import read_exif
+from edgevpr.frames.positions import GeoTag
+from edgevpr.frames.xmp import Shooting, read_xmp
+
+NAMESPACES = (
+    'xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/" xmlns:Camera="http://pix4d.com/camera/1.0/" '
+    'xmlns:drone-parrot="http://www.parrot.com/drone-parrot/1.0/"'
+)
+
+
+def packet(attributes="", elements=""):
+    return (
+        '<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?><x:xmpmeta xmlns:x="adobe:ns:meta/">'
+        '<rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+        f'<rdf:Description rdf:about="" {NAMESPACES} {attributes}>{elements}</rdf:Description></rdf:RDF></x:xmpmeta>'
+    ).encode()
+
+
+@pytest.fixture
+def read(tmp_path):
+    """Read a packet from the place where cameras put it, in a segment before the picture."""
+
+    def of(content):
+        jpeg = photographs.encoded(".jpg", photographs.picture())
+        payload = b"http://ns.adobe.com/xap/1.0/\x00" + content
+        path = tmp_path / "photo.jpg"
+        path.write_bytes(jpeg[:2] + b"\xff\xe1" + (len(payload) + 2).to_bytes(2, "big") + payload + jpeg[2:])
+        return read_xmp(path)
+
+    return of
+
+
+def gimbal(yaw, pitch, roll, maker="drone-dji:Gimbal"):
+    return f'{maker}YawDegree="{yaw}" {maker}PitchDegree="{pitch}" {maker}RollDegree="{roll}"'
+
+
+def test_a_photograph_of_dji(read, tmp_path):
+    attributes = 'drone-dji:RelativeAltitude="+40.10" drone-dji:FlightYawDegree="+10.0" ' + gimbal("-30.0", "-80.0", 0)
+    found = read(packet(attributes))
+    assert found == Shooting(pytest.approx(330), pytest.approx(0), pytest.approx(10), 40.1)
+    assert read_exif(tmp_path / "photo.jpg") == GeoTag(
+        heading_deg=found.heading_deg, roll_deg=found.roll_deg, pitch_deg=found.pitch_deg, height_m=40.1
+    )
+
+
+@pytest.mark.parametrize(
+    ("told", "meant"),
+    [
+        ((120, -90, 0), (120, 0, 0)),
+        ((-60, -90, 180), (120, 0, 0)),  # half a turn of the roll is half a turn of the picture
+        ((100, -90, 20), (120, 0, 0)),
+        ((0, 0, 0), (0, 0, 90)),  # it looks ahead
+    ],
+)
+def test_a_gimbal_that_looks_down_turns_by_its_roll(read, told, meant):
+    found = read(packet(gimbal(*told)))
+    assert (found.heading_deg, found.roll_deg, found.pitch_deg) == pytest.approx(meant, abs=1e-6)
+
+
+def test_a_gimbal_tilted_to_its_side_is_the_same_told_either_way(read):
+    """It looks east and 20 degrees up from straight down, and a roll by -90 turns the top of its picture to north: that
+    is a camera that leans to the left."""
+    found = read(packet(gimbal(90, -70, -90)))
+    assert (found.roll_deg, found.pitch_deg) == pytest.approx((-20, 0), abs=1e-6)
+    assert math.remainder(found.heading_deg, 360) == pytest.approx(0, abs=1e-6)
+
+
+def test_parrot_writes_elements(read):
+    values = {"Yaw": 176.3, "Pitch": -78.4, "Roll": -0.3}
+    elements = "".join(
+        f"<drone-parrot:Camera{axis}Degree>{value}</drone-parrot:Camera{axis}Degree>" for axis, value in values.items()
+    )
+    found = read(packet(elements=elements))
+    assert found.pitch_deg == pytest.approx(11.6, abs=0.01)
+    assert found.height_m is None
+
+
+def test_of_the_tags_of_pix4d_zero_is_straight_down(read):
+    assert read(packet('Camera:Yaw="-10" Camera:Pitch="4.5" Camera:Roll="-3"')) == Shooting(350.0, -3.0, 4.5)
+    assert read(packet('Camera:Yaw="0" Camera:Pitch="0" Camera:Roll="0"')) == Shooting(), "a camera without an IMU"
+
+
+def test_without_a_gimbal_the_nose_tells_the_heading_only(read):
+    attributes = 'drone-dji:FlightYawDegree="-90" drone-dji:FlightRollDegree="5" drone-dji:FlightPitchDegree="5"'
+    assert read(packet(attributes)) == Shooting(heading_deg=270.0)
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "-1e9", "361", "", "0/100", "north"])
+def test_a_senseless_value_is_unknown(read, value):
+    assert read(packet(gimbal(10, value, 0))) == Shooting()
+    assert read(packet(f'drone-dji:RelativeAltitude="{value}"')).height_m in (None, 361.0)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"<x:xmpmeta",
+        b"<x:xmpmeta></x:xmpmeta>",
+        b"</x:xmpmeta><x:xmpmeta>",
+        b"<x:xmpmeta \xff\xfe></x:xmpmeta>",
+        b"<x:xmpmeta xmlns:x='a'>&unknown;</x:xmpmeta>",
+        b"<x:xmpmeta xmlns:x='a'>" + b"<a>" * 20_000 + b"</x:xmpmeta>",
+        b"<x:xmpmeta xmlns:x='a'>" + b"<a>" * 9_000 + b"</a>" * 9_000 + b"</x:xmpmeta>",
+    ],
+)
+def test_rubbish_says_nothing(read, content):
+    assert read(content[:65_000]) == Shooting()
+
+
+def test_entities_that_grow_are_never_read(read):
+    bomb = b'<!DOCTYPE x [<!ENTITY a "1111111111">' + b"".join(
+        f'<!ENTITY {chr(98 + n)} "{f"&{chr(97 + n)};" * 10}">'.encode() for n in range(9)
+    )
+    told = packet('drone-dji:RelativeAltitude="&j;"')
+    assert read(bomb + b"]>" + told) == Shooting(), "an entity that was declared before the packet is unknown in it"
+    within = told.replace(b"<rdf:RDF", bomb + b"]><rdf:RDF").replace(b"&j;", b"40")
+    assert read(within) == Shooting()
+
+
+def test_a_packet_that_is_too_large_or_too_far_is_left_alone(tmp_path):
+    path = tmp_path / "p.jpg"
+    told = packet('drone-dji:RelativeAltitude="40"')
+    for content in (told.replace(b"<rdf:RDF", b" " * 70_000 + b"<rdf:RDF"), bytes(400_000) + told):
+        path.write_bytes(content)
+        assert read_xmp(path) == Shooting()
+    path.write_bytes(bytes(200_000) + told)
+    assert read_xmp(path).height_m == 40.0
+    assert read_xmp(tmp_path) == read_xmp(tmp_path / "missing.jpg") == Shooting()
+
+
+def test_bytes_gone_wrong_never_raise(tmp_path):
+    rng = random.Random(1)
+    told = packet('drone-dji:RelativeAltitude="40" ' + gimbal(10, -90, 0))
+    path = tmp_path / "p.jpg"
+    for _ in range(300):
+        broken = bytearray(told)
+        for _ in range(rng.randrange(1, 6)):
+            broken[rng.randrange(len(broken))] = rng.randrange(256)
+        path.write_bytes(broken)
+        found = read_xmp(path)
+        assert all(value is None or math.isfinite(value) for value in (found.heading_deg, found.height_m))

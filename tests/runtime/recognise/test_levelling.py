@@ -1,0 +1,239 @@
+"""Levelling in the walk: queries find places that were seen from elsewhere, and bad data costs recognition at most."""
+
+import logging
+import math
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from fakes import vehicle_at
+
+from edgevpr.config import load_config
+from edgevpr.frames.level import Lens, View
+from edgevpr.frames.mask import Mask
+from edgevpr.places.index import load_index
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.power.boards import load_board
+from edgevpr.runtime.recognise.hints import Prior
+from edgevpr.runtime.recognise.judge import accept_rule
+from edgevpr.runtime.recognise.levelling import Levelling, NoLevelling, laid, levelling_of
+from edgevpr.runtime.recognise.mapping import build_map
+from edgevpr.runtime.recognise.opening import meter_of
+from edgevpr.runtime.recognise.recogniser import Recogniser
+from edgevpr.simulate.camera import Camera, Light, Pose, photograph
+from edgevpr.techniques import create
+from edgevpr.types import Frame, Position
+
+CAMERA = Camera(noise_sigma=0)
+LENS = Lens(2 * math.degrees(math.atan(320 / CAMERA.focal_px)))
+HEIGHT_M = 100.0
+FOOTPRINT_M = HEIGHT_M * 640 / CAMERA.focal_px
+NORTH_M = (120.0, 240.0, 360.0, 480.0)
+M_PER_DEG = 111_195.0
+STRAIGHT = {"height_m": HEIGHT_M, "heading_deg": 0.0, "roll_deg": 0.0, "pitch_deg": 0.0}
+
+
+@pytest.fixture(scope="module")
+def ground():
+    rng = np.random.default_rng(3)
+    octaves = [rng.random((2**octave, 2**octave), dtype=np.float32) / octave for octave in range(4, 11)]
+    rough = sum(cv2.resize(each, (2400, 2400), interpolation=cv2.INTER_CUBIC) for each in octaves)
+    grey = cv2.normalize(rough, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+    return cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
+
+
+def frame(ground, place, t_mono_s=0.0, told=None, **pose):
+    """The picture of a place, the middle of it in the middle, and what is told of it (None: the truth)."""
+    pose = STRAIGHT | pose
+    heading, pitch = math.radians(pose["heading_deg"]), math.radians(pose["pitch_deg"])
+    ahead_m = math.tan(pitch) * pose["height_m"]
+    where = Pose(east_m=300 - ahead_m * math.sin(heading), north_m=NORTH_M[place] - ahead_m * math.cos(heading), **pose)
+    image = photograph(
+        ground, 0.25, where, CAMERA, Light(sun_azimuth_deg=0, sun_elevation_deg=60), np.random.default_rng(0)
+    )
+    position = Position(50 + where.north_m / M_PER_DEG, 8.0)
+    known = pose if told is None else told
+    return Frame(image=image, name=f"{place}", t_mono_s=t_mono_s, position=position, **known)
+
+
+@pytest.fixture(scope="module")
+def technique():
+    return create("cohog", {"camera": "nadir"})
+
+
+@pytest.fixture(scope="module")
+def place_map(ground, technique, tmp_path_factory):
+    """A map of four places, made at various headings and tilts, north-up."""
+    path = tmp_path_factory.mktemp("levelled") / "m.gpkg"
+    poses = ({"heading_deg": 90.0}, {"pitch_deg": 8.0}, {"heading_deg": 200.0, "pitch_deg": -6.0}, {})
+    frames = [frame(ground, place, **pose) for place, pose in enumerate(poses)]
+    levelling = Levelling(LENS, below=True, is_live=False)
+    with PlaceMap.create(path, technique.spec) as made:
+        build_map(frames, technique, made, meter_of(load_config(None), load_board("this")), levelling=levelling)
+    with PlaceMap.open(path) as opened:
+        yield opened
+
+
+@pytest.fixture
+def walk(place_map, technique):
+    def of(levelling, prior=None, mask=None):
+        return Recogniser(
+            technique=technique,
+            place_map=place_map,
+            index=load_index(place_map, technique, 10**6),
+            rule=accept_rule(technique, load_config(None).match),
+            meter=meter_of(load_config(None), load_board("this")),
+            levelling=levelling,
+            prior=prior,
+            mask=mask,
+        )
+
+    return of
+
+
+def scaling(is_live=False):
+    return Levelling(LENS, footprint_m=FOOTPRINT_M, is_live=is_live)
+
+
+def recognised(event, place):
+    return event.accepted and event.best.place.source_image == f"{place}"
+
+
+def test_a_place_is_stored_north_up(place_map):
+    assert [place.heading_deg for place in place_map.places()] == [0.0, 0.0, 0.0, 0.0]
+
+
+HARD = {"heading_deg": 130.0, "pitch_deg": 20.0, "height_m": 45.0}
+
+
+def test_a_query_from_another_height_heading_and_tilt_finds_its_place(walk, ground):
+    assert not recognised(walk(None).step(frame(ground, 1, **HARD)), 1), "as it is, it is not known"
+    event = walk(scaling()).step(frame(ground, 1, **HARD))
+    assert recognised(event, 1)
+    assert event.view.up_deg == 0.0
+    assert event.view.footprint_m == pytest.approx(FOOTPRINT_M)
+    off_m = 45 * math.tan(math.radians(20))
+    assert math.hypot(*event.view.aside) * FOOTPRINT_M == pytest.approx(off_m)
+    assert event.steps.prepare.wall_s > 0
+    assert event.cost.t_encode_s == pytest.approx((event.steps.prepare + event.steps.gate + event.steps.encode).wall_s)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"heading_deg": None},
+        {"roll_deg": math.nan, "pitch_deg": math.nan},
+        {"height_m": 0.0},
+        {"height_m": -5.0},
+        {"height_m": None},
+        {"heading_deg": math.inf},
+        {"roll_deg": 170.0},
+        {"pitch_deg": 50.0},
+        {"heading_deg": None, "roll_deg": None, "pitch_deg": None, "height_m": None},
+    ],
+)
+def test_a_straight_picture_is_found_whatever_is_told_of_it(walk, ground, wrong):
+    event = walk(scaling()).step(frame(ground, 2, told=STRAIGHT | wrong))
+    assert not event.failed
+    assert recognised(event, 2)
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_a_wrong_height_costs_every_other_query_at_most(walk, ground, factor):
+    asked = walk(scaling())
+    wrong = frame(ground, 2, told=STRAIGHT | {"height_m": HEIGHT_M * factor})
+    events = [asked.step(wrong) for _ in range(4)]
+    assert not events[0].accepted
+    assert all(recognised(event, 2) for event in events[1:]), "once the scale of its own is right, it is kept"
+    assert events[1].view.footprint_m == pytest.approx(FOOTPRINT_M * factor)
+
+
+def test_a_heading_that_jumps_costs_every_other_query_at_most(walk, ground, technique):
+    asked = walk(scaling(), Prior(None, technique.spec.heading_within_deg, is_live=False))
+    for heading_deg in (0.0, 180.0, 90.0, 300.0):
+        wrong = frame(ground, 1, told=STRAIGHT | {"heading_deg": heading_deg})
+        assert any(recognised(asked.step(wrong), 1) for _ in range(2))
+
+
+def test_hints_go_on_to_work_for_a_picture_that_was_turned(walk, ground, technique):
+    event = walk(scaling(), Prior(None, technique.spec.heading_within_deg, is_live=False)).step(
+        frame(ground, 2, heading_deg=75.0)
+    )
+    assert event.hints.heading_deg == 0.0
+    assert recognised(event, 2)
+    assert min(event.best.match.rotation_deg, 360 - event.best.match.rotation_deg) <= 15
+
+
+def test_the_autopilot_is_believed_of_live_frames_while_it_is_fresh(walk, ground):
+    blank = replace(frame(ground, 1, t_mono_s=10.0, told={}, **HARD), position=None)
+
+    def seen(is_live, t_heard_s):
+        vehicle = vehicle_at(50.0, 8.0, t_heard_s, roll_deg=0.0, **HARD)
+        return walk(scaling(is_live)).step(blank, vehicle).view
+
+    assert seen(True, 9.5).up_deg == 0.0
+    assert seen(True, 8.5) == seen(False, 9.5) == View()
+
+
+def test_a_display_is_masked_where_the_warp_puts_it(walk, ground):
+    seen = frame(ground, 1, heading_deg=180.0)
+    image = seen.image.copy()
+    image[:120, :160] = np.random.default_rng(1).integers(0, 256, (120, 160, 3))
+    allowed = np.ones(image.shape[:2], bool)
+    allowed[:124, :164] = False
+    asked = walk(scaling(), mask=Mask(allowed, ""))
+    covered, clean = asked.step(replace(seen, image=image)), asked.step(seen)
+    assert np.array_equal(covered.descriptor.fine, clean.descriptor.fine)
+    assert recognised(covered, 1)
+
+
+def test_a_tilt_that_a_picture_does_not_bear_is_said_once(walk, ground, caplog):
+    asked = walk(scaling())
+    steep = frame(ground, 1, told=STRAIGHT | {"roll_deg": 50.0})
+    with caplog.at_level(logging.WARNING):
+        reasons = [asked.step(steep).view.reason for _ in range(3)]
+    assert reasons == ["it is tilted 50 degrees"] * 3
+    assert [record.message for record in caplog.records] == [
+        "1 is taken as it is, as others like it will be: it is tilted 50 degrees"
+    ]
+
+
+def test_a_place_has_the_position_of_the_middle_of_its_picture():
+    at = Frame(image=np.zeros((8, 8), np.uint8), name="", t_mono_s=0.0, position=Position(50.0, 8.0, 300.0))
+    east = laid(at, View(up_deg=90.0, footprint_m=100.0, aside=(0.0, -0.3)))  # the aircraft is west of the middle
+    assert east.position.lon_deg == pytest.approx(8.0 + 30 / (M_PER_DEG * math.cos(math.radians(50))), abs=1e-7)
+    assert east.position.lat_deg == pytest.approx(50.0, abs=1e-9)
+    assert (east.position.alt_m, east.heading_deg) == (300.0, 90.0)
+    assert (east.pose.up_deg, east.pose.footprint_m, east.pose.covariance_m2) == (90.0, 100.0, (25.0, 0.0, 25.0))
+    untold = laid(at, View(up_deg=0.0, footprint_m=100.0))
+    assert (untold.position, untold.pose.covariance_m2) == (at.position, (125.0, 0.0, 125.0)), "its tilt is unknown"
+
+
+@pytest.mark.parametrize("view", [View(), View(up_deg=0.0), View(footprint_m=50.0, aside=(0.1, 0.1))])
+def test_without_height_or_heading_a_place_has_no_pose(view):
+    at = Frame(image=np.zeros((8, 8), np.uint8), name="", t_mono_s=0.0, position=Position(50.0, 8.0), heading_deg=70.0)
+    found = laid(at, view)
+    assert (found.pose, found.position) == (None, at.position)
+    assert found.heading_deg == (70.0 if view.up_deg is None else view.up_deg)
+
+
+def test_a_place_without_a_position_has_no_pose():
+    at = Frame(image=np.zeros((8, 8), np.uint8), name="", t_mono_s=0.0)
+    assert laid(at, View(up_deg=0.0, footprint_m=50.0, aside=(0.1, 0.1))).pose is None
+
+
+@pytest.mark.parametrize(
+    ("camera", "settings", "kind"),
+    [
+        ("nadir", {"source.fov_deg": 66.0}, Levelling),
+        ("nadir", {}, NoLevelling),
+        ("forward", {"source.fov_deg": 66.0}, NoLevelling),
+    ],
+)
+def test_only_a_camera_that_looks_down_through_a_known_lens_is_levelled(camera, settings, kind, caplog):
+    config = load_config(None, settings)
+    with caplog.at_level(logging.INFO):
+        made = levelling_of(config.source, create("cohog", {"camera": camera}))
+    assert isinstance(made, kind)
+    assert ("source.fov_deg" in caplog.text) == (camera == "nadir" and not settings)
