@@ -149,6 +149,8 @@ def test_where_the_vehicle_is_and_whether_it_listens(link):
     assert (vehicle.lat_deg, vehicle.lon_deg, vehicle.alt_m) == (50.0, 8.0, 300.0)
     assert (vehicle.heading_deg, vehicle.has_gps) == (None, True)
     assert vehicle.is_fresh_at(clock.now_s)
+    seen = link.vehicle_at(clock.now_s)
+    assert (seen.lat_deg, seen.lon_deg, seen.heading_deg, seen.roll_deg) == (50.0, 8.0, None, None)
 
 
 def test_messages_and_health_are_taken(link):

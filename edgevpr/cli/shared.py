@@ -53,7 +53,9 @@ def add_recording(parser: ArgumentParser) -> None:
 def add_positions(parser: ArgumentParser) -> None:
     """Add the flag for the positions that go with a folder of images."""
     parser.add_argument(
-        "--positions", metavar="CSV", help="file,lat,lon[,alt,yaw_deg,roll_deg,pitch_deg,height_m,time] (default: beside the images)"
+        "--positions",
+        metavar="CSV",
+        help="file,lat,lon[,alt,yaw_deg,roll_deg,pitch_deg,height_m,time] (default: beside the images)",
     )
 
 

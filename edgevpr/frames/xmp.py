@@ -15,9 +15,9 @@ _HEIGHTS_M = (-1000.0, 100_000.0)
 
 @dataclass(frozen=True, slots=True)
 class Shooting:
-    """The way a picture was taken (None: unknown): `heading_deg` (0..360) of the top of the picture, roll and pitch of the
-    camera as its deviation from straight down, and height over the take-off point, which is the height above the ground
-    only where the ground is level."""
+    """The way a picture was taken (None: unknown): `heading_deg` (0..360) of its top, roll and pitch of the camera as
+    its deviation from straight down, and height over the take-off point, which is the height above the ground only
+    where the ground is level."""
 
     heading_deg: float | None = None
     roll_deg: float | None = None

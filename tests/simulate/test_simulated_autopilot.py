@@ -133,6 +133,26 @@ def test_it_flies_along_a_track_from_when_a_companion_is_heard(tmp_path):
     assert seen[0].heading_deg in (0.0, 90.0)
 
 
+def test_it_says_how_it_hangs_in_the_air_where_the_track_knows(tmp_path):
+    csv = tmp_path / "positions.csv"
+    csv.write_text(
+        "file,lat,lon,alt,rel_alt,yaw_deg,roll_deg,pitch_deg,time\n"
+        "a.jpg,50.000,8.0,100,80.5,300,-12,7,2026-02-14T00:30:00Z\n"
+    )
+    number = free_port()
+    with Link(parse_link(f"udpin:127.0.0.1:{number}")) as link:
+        autopilot = AutopilotThread(f"udpout:127.0.0.1:{number}", track=read_track(csv))
+
+        def with_attitude():
+            vehicle = link.vehicle_at(time.monotonic())
+            return vehicle if vehicle and vehicle.roll_deg is not None else None
+
+        seen = wait_until(with_attitude)
+        autopilot.finish()
+    assert (seen.roll_deg, seen.pitch_deg, seen.heading_deg) == pytest.approx((-12, 7, 300), abs=1e-3)
+    assert seen.height_m == 80.5
+
+
 def test_a_track_without_times_is_refused(tmp_path):
     (tmp_path / "p.csv").write_text("file,lat,lon\na.jpg,50,8\n")
     with pytest.raises(UsageError, match="lat, lon and time"):

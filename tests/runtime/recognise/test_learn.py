@@ -10,6 +10,7 @@ from fakes import FakeClock, vehicle_at
 from edgevpr.config import load_config
 from edgevpr.contract import Descriptor
 from edgevpr.errors import MapError, UsageError
+from edgevpr.frames.level import UNKNOWN_VIEW, View
 from edgevpr.places.growing import GrowingIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.near import index_positions
@@ -57,7 +58,17 @@ class Bench:
             self.recogniser, self.growing, spacing_m=SPACING_M, gap_m=GAP_M, utc_clock=self.clock.utc_s
         )
 
-    def see(self, north_m=0.0, heard_s_ago=0.1, has_gps=True, fix=None, quality=0.9, position=None, failed=False):
+    def see(
+        self,
+        north_m=0.0,
+        heard_s_ago=0.1,
+        has_gps=True,
+        fix=None,
+        quality=0.9,
+        position=None,
+        failed=False,
+        view=UNKNOWN_VIEW,
+    ):
         """Show a frame, at a place that the autopilot or the frame itself tells; `fix` is whether its own was sent."""
         now_s = self.clock.now_s
         frame = Frame(image=np.zeros((8, 8), np.uint8), name=f"{north_m}", t_mono_s=now_s, position=position)
@@ -69,6 +80,7 @@ class Bench:
         event = Recognition(
             frame=frame,
             vehicle=vehicle,
+            view=view,
             descriptor=Descriptor(coarse=part, quality=quality),
             reason="",
             failed=failed,
@@ -215,3 +227,11 @@ def test_a_flight_that_could_never_know_where_it_is_is_refused(tmp_path):
     check_positions(config(), tmp_path / "positions.csv")
     (tmp_path / "positions.csv").write_text("file,lat,lon\n")
     check_positions(config(), None)
+
+
+def test_what_is_learnt_of_a_levelled_picture_lies_where_its_middle_is(tmp_path):
+    bench = Bench(tmp_path / "m.gpkg")
+    place = bench.see(view=View(up_deg=0.0, footprint_m=100.0, aside=(0.0, -0.3)))
+    assert place.position.lat_deg == pytest.approx(50 + 30 * METRE_DEG, abs=1e-7), "the aircraft is south of it"
+    assert (place.heading_deg, place.pose.up_deg, place.pose.footprint_m) == (0.0, 0.0, 100.0)
+    assert [stored.heading_deg for stored in bench.map.places()] == [0.0]

@@ -1,0 +1,85 @@
+"""A flight whose autopilot tells attitude, heading and height: its pictures are levelled by those of their own time."""
+
+import logging
+
+import numpy as np
+import pytest
+from fakes import FakeClock, FakeLink, FakeSource, vehicle_at
+from flights import STEP_DEG, Flight, of_kind
+from pictures import textured
+
+from edgevpr.config import load_config
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.power.boards import load_board
+from edgevpr.runtime.recognise.mapping import build_map
+from edgevpr.runtime.recognise.opening import meter_of
+from edgevpr.techniques import create
+from edgevpr.types import Frame, Position
+
+PLACES = 5
+
+
+@pytest.fixture(scope="module")
+def place_map(tmp_path_factory):
+    technique = create("cohog", {"camera": "nadir"})
+    path = tmp_path_factory.mktemp("level") / "m.gpkg"
+    frames = (
+        Frame(
+            image=textured(place + 20, 256, 256),
+            name=f"{place}",
+            t_mono_s=0.0,
+            position=Position(50 + place * STEP_DEG, 8.0),
+        )
+        for place in range(PLACES)
+    )
+    with PlaceMap.create(path, technique.spec) as made:
+        build_map(frames, technique, made, meter_of(load_config(None), load_board("this")))
+    return path
+
+
+class TimedLink(FakeLink):
+    """A link that remembers the times at which it was asked for the attitude."""
+
+    asked_s = ()
+
+    def vehicle_at(self, t_mono_s):
+        self.asked_s = (*self.asked_s, t_mono_s)
+        return self.vehicle()
+
+
+def fly(place_map, log, turns, **said):
+    """The queries of a flight over the first places, the nose to the east where it `turns`."""
+    clock = FakeClock()
+
+    def vehicle():
+        return vehicle_at(50.0, 8.0, clock.now_s, heading_deg=90.0 if turns else 0.0, **said)
+
+    link = TimedLink(clock, vehicle=vehicle)
+    images = [np.ascontiguousarray(np.rot90(textured(place + 20, 256, 256), turns)) for place in range(3)]
+    source = FakeSource(images, clock, work=lambda: clock.sleep(1.0))
+    lines = Flight(place_map, log, clock, link, **{"source.fov_deg": 66.0}).fly(source)
+    return of_kind(lines, "query"), link
+
+
+def test_the_attitude_is_asked_for_the_frames_times(place_map, tmp_path):
+    queries, link = fly(place_map, tmp_path / "f.jsonl", 1, roll_deg=0.2, pitch_deg=0.0, height_m=80.0)
+    assert list(link.asked_s) == [query["t_frame_s"] for query in queries]
+    assert [query["reference_image"] for query in queries if query["accepted"]] == ["0", "1", "2"]
+    assert all(query["rotation_deg"] == 0 for query in queries), "each was turned north-up before it was asked"
+    assert all(query["view"]["up_deg"] == 0.0 for query in queries)
+    assert queries[0]["view"]["footprint_m"] == pytest.approx(103.9, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        {"roll_deg": float("nan"), "pitch_deg": float("nan"), "height_m": float("nan")},
+        {"roll_deg": 80.0, "pitch_deg": 0.0, "height_m": -20.0},
+        {"roll_deg": None, "pitch_deg": None, "height_m": 0.0},
+        {"roll_deg": float("inf"), "pitch_deg": -1e9, "height_m": 1e300},
+    ],
+)
+def test_nothing_that_the_autopilot_says_ends_a_flight(place_map, tmp_path, said, caplog):
+    with caplog.at_level(logging.CRITICAL):
+        queries, _ = fly(place_map, tmp_path / "f.jsonl", 0, **said)
+    assert [query["reference_image"] for query in queries if query["accepted"]] == ["0", "1", "2"]
