@@ -24,6 +24,9 @@ class NoMask:
         """Encode the whole image."""
         return technique.encode(image)
 
+    def fitted(self, image: np.ndarray) -> None:
+        """Return None: no part of the image is left out."""
+
 
 @dataclass(frozen=True, slots=True)
 class Mask:
@@ -35,9 +38,12 @@ class Mask:
 
     def encode(self, technique: Technique, image: np.ndarray) -> Descriptor:
         """Encode the part of an image that shows ground."""
+        return technique.encode(image, self.fitted(image))
+
+    def fitted(self, image: np.ndarray) -> np.ndarray:
+        """Return the mask in the size of an image, bool (H, W)."""
         height, width = image.shape[:2]
-        fitted = cv2.resize(self.allowed.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
-        return technique.encode(image, fitted.astype(bool))
+        return cv2.resize(self.allowed.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST).astype(bool)
 
 
 AnyMask = NoMask | Mask

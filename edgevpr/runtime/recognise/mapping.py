@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from edgevpr.contract import Technique
 from edgevpr.errors import ImageError, ModelError
@@ -60,7 +60,7 @@ def build_map(
     def keep(kept: Iterable[Kept]) -> None:
         nonlocal added, without_position, of_low_quality
         for event, salience in kept:
-            place_map.add(event.frame, event.descriptor, salience)
+            place_map.add(event.frame, event.descriptor, salience, event.landmarks)
             added += 1
             without_position += event.frame.position is None
             if salience and salience.is_low:
@@ -79,7 +79,7 @@ def build_map(
             continue
         if seen.worth and seen.worth.lacks:
             not_memorable[seen.worth.lacks] += 1
-        keep(gaps.take(seen))
+        keep(gaps.take(replace(seen, landmarks=walk.landmarks(frame.image))))
     keep(gaps.end())
     return MappingResult(
         added=added,

@@ -205,6 +205,7 @@ def _recogniser(
         min_accuracy_m=config.mavlink.min_accuracy_m,
         mask=mask,
         gate=gate_of(config.salience, board.threads),
+        verify=config.match.verify,
     )
 
 

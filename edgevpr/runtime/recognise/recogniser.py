@@ -7,9 +7,12 @@ import logging
 from collections import deque
 from itertools import islice
 
+import numpy as np
+
 from edgevpr.contract import Technique
 from edgevpr.errors import EdgevprError, MapError, PlaceError
 from edgevpr.frames.mask import AnyMask, NoMask
+from edgevpr.landmarks.agreement import PROVEN
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import compare, named, scan
@@ -19,6 +22,7 @@ from edgevpr.runtime.recognise.gate import says_nothing
 from edgevpr.runtime.recognise.hints import NoPrior, Prior, expected_of
 from edgevpr.runtime.recognise.judge import NEW_FOR_S, AcceptRule, Verdict, judge
 from edgevpr.runtime.recognise.recognition import Recognition
+from edgevpr.runtime.recognise.verify import Verification, landmarks_of
 from edgevpr.salience.gate import Gate, NoGate
 from edgevpr.types import Frame, Vehicle
 
@@ -30,7 +34,8 @@ class Recogniser:
 
     `candidates` places are compared (None: all in full, see `places.retrieve.compare`). `gate` refuses frames that are
     not memorable, and `mask` leaves parts of every frame out. `search` joins several queries, and `prior` narrows each;
-    without them each query is ranked alone, over the whole map. The governor changes `candidates`; the learner and the
+    without them each query is ranked alone, over the whole map. `verify` holds the best place against its landmarks,
+    where the map has some. The governor changes `candidates`; the learner and the
     governor change the index (`take`, `extend`).
     """
 
@@ -48,10 +53,11 @@ class Recogniser:
         min_accuracy_m: float = 1.0,
         mask: AnyMask | None = None,
         gate: Gate | NoGate | None = None,
+        verify: bool = True,
     ) -> None:
         self.place_map, self.meter, self.candidates = place_map, meter, candidates
         self._prior, self._min_accuracy_m, self._mask = prior or NoPrior(), min_accuracy_m, mask or NoMask()
-        self._gate = gate or NoGate()
+        self._gate, self._verifies = gate or NoGate(), verify
         self._told = 0  # number of places left out that an event has told of
         self._new: deque[tuple[int, float]] = deque()  # place id, and the time it was learnt at
         self.take(technique, index, rule, search or Alone())
@@ -82,7 +88,7 @@ class Recogniser:
         Never raises an Exception: an error of a frame, a place or the technique becomes a refusal with its reason.
         """
         meter, technique, index = self.meter, self.technique, self.index
-        worth = descriptor = hints = ranking = best = nothing = objection = None
+        worth = descriptor = hints = ranking = best = nothing = objection = proof = None
         map_lost = False
         meter.begin()
         try:
@@ -121,6 +127,16 @@ class Recogniser:
                     is_new = self._is_new(best.place.place_id, frame.t_mono_s)
                     verdict = judge(ranking, index, self.rule, self.search, is_new)
                     verdict = Verdict(False, objection) if objection else verdict
+                if self._verifies and (verdict.accepted or verdict.is_open):
+                    with meter.step("verify"):
+                        looked = Verification(
+                            technique.spec, frame.image, self._mask.fitted(frame.image), index, self.place_map
+                        )
+                        proof, rival = looked.proof(ranking), 0
+                        if proof and verdict.is_open and proof.inliers >= PROVEN:
+                            rival = looked.rival(ranking, self.rule.neighbour_m)
+                    if proof:
+                        verdict = judge(ranking, index, self.rule, self.search, is_new, proof, rival)
                 self._prior.learn(best, verdict.accepted, frame.t_mono_s)
             failed = False
         except Exception as error:
@@ -136,6 +152,7 @@ class Recogniser:
             hints=hints,
             ranking=ranking,
             best=best,
+            proof=proof,
             accepted=verdict.accepted,
             reason=verdict.reason,
             says_nothing=nothing is not None,
@@ -147,6 +164,11 @@ class Recogniser:
             steps=meter.steps(),
             cost=meter.cost(),
         )
+
+    def landmarks(self, image: np.ndarray) -> bytes | None:
+        """Return what a map keeps of the landmarks of a frame that becomes a place, None for a technique that does not
+        look straight down."""
+        return landmarks_of(self.technique, image, self._mask.fitted(image))
 
     def unread(self, error: Exception) -> Recognition:
         """Return the event of a frame that could not even be read."""

@@ -4,6 +4,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from edgevpr.contract import Descriptor
+from edgevpr.landmarks.agreement import Agreement
 from edgevpr.places.retrieve import Ranking
 from edgevpr.runtime.recognise.hints import Hints
 from edgevpr.salience.gate import Worth
@@ -19,10 +20,12 @@ class Recognition:
     The inputs are `frame` and `vehicle`, the autopilot's report when the frame was taken (None: no report).
     `worth` is what the gate says of the frame (None: no gate looks), `descriptor` is the encoded frame, `hints` what
     narrowed the search, `ranking` the places found and `best` the first
-    of them; each is None where its step was not reached. `accepted` tells whether `best` is taken for the place, and
+    of them; each is None where its step was not reached. `proof` is how the landmarks of frame and place agree (None:
+    they were not held against each other). `accepted` tells whether `best` is taken for the place, and
     `reason` why (not), in a few words. `position` is the place's, and `accuracy_m` its 1-sigma; both are set for an
     accepted match only: any other carries no position. `says_nothing` tells whether the picture holds too little to be
-    recognised; a place was then searched for only to go on with a sequence.
+    recognised; a place was then searched for only to go on with a sequence. `landmarks` are those of a frame that is to
+    become a place, as the map keeps them.
 
     `failed` tells whether the frame, a place or the technique could not be used, and `map_lost` whether that is because
     the map as a whole cannot be read. `left_out` are the places that have been left out since the last event because
@@ -39,6 +42,8 @@ class Recognition:
     hints: Hints | None = None
     ranking: Ranking | None = None
     best: Candidate | None = None
+    proof: Agreement | None = None
+    landmarks: bytes | None = None
     accepted: bool = False
     reason: str
     says_nothing: bool = False
@@ -62,17 +67,30 @@ def fields_of(event: Recognition) -> dict[str, Any]:
     """Return the event as the flight log (kind "query") and `edgevpr match --json` have it.
 
     The fields are: query, place (id), reference_image, score, position (of the place), the match's step, its covariance
-    and the rotation (all null where no place was found), accepted, reason, accuracy_m, costs; and, where a gate looks,
-    salience.
+    and the rotation (all null where no place was found), accepted, reason, accuracy_m, costs; where a gate looks,
+    salience; and, where landmarks were held against each other, landmarks.
     """
     return {
         "query": event.frame.name,
         **_best(event.best),
         **({"salience": event.worth.salience.rounded()} if event.worth else {}),
+        **({"landmarks": _landmarks(event.proof)} if event.proof else {}),
         "accepted": event.accepted,
         "reason": event.reason,
         "accuracy_m": event.accuracy_m,
         "costs": {key: value and float(f"{value:.6g}") for key, value in asdict(event.cost).items()},
+    }
+
+
+def _landmarks(proof: Agreement) -> dict[str, Any]:
+    if proof.shift_share is None:
+        return {"inliers": proof.inliers, "matched": proof.matched}
+    return {
+        "inliers": proof.inliers,
+        "matched": proof.matched,
+        "shift_share": [round(each, 4) for each in proof.shift_share],
+        "rotation_deg": round(proof.rotation_deg, 1),
+        "scale": round(proof.scale, 3),
     }
 
 
