@@ -99,6 +99,7 @@ class MatchConfig:
     min_margin: float | None = bounded(
         0, 1, Flag(("--min-margin",), "M", "accept when this far ahead of a place elsewhere")
     )
+    verify: bool = field()
     neighbour_m: float = bounded(0, 10_000)
     reach_m_s: float | None = bounded(
         0.1, 100, Flag(("--reach-m-s",), "V", "look only where this speed can have led (default: everywhere)")

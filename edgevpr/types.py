@@ -147,8 +147,8 @@ NO_COST = StageCost(0.0, 0.0)
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Steps:
     """Costs of the steps of one query: `read` the picture (in a flight only), `prepare` it (level it on the ground),
-    look whether it passes the `gate`, `encode` it, `scan` all places, and `compare` and judge the candidates. A step
-    that the query did not reach has no cost."""
+    look whether it passes the `gate`, `encode` it, `scan` all places, `compare` and judge the candidates, and `verify`
+    the best one by its landmarks. A step that the query did not reach has no cost."""
 
     read: StageCost = NO_COST
     prepare: StageCost = NO_COST
@@ -156,6 +156,7 @@ class Steps:
     encode: StageCost = NO_COST
     scan: StageCost = NO_COST
     compare: StageCost = NO_COST
+    verify: StageCost = NO_COST
 
     @property
     def encoding(self) -> StageCost:
@@ -165,7 +166,7 @@ class Steps:
     @property
     def match(self) -> StageCost:
         """Cost of matching as the thesis defines it: everything after encoding."""
-        return self.scan + self.compare
+        return self.scan + self.compare + self.verify
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

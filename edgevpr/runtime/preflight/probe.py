@@ -29,6 +29,7 @@ from edgevpr.types import NO_COST, Frame, StageCost, Steps
 _PICTURES = 2
 _PLACES = 6
 _TRIES = 8  # of a picture, at most
+_STEPS = ("encode", "scan", "compare", "verify")
 _SCANNED = 4096
 _SCANNED_BYTES = 8 << 20  # at most: a small board has no more to spare before the map is loaded
 _ANY_PACK = Pack(cells=1, capacity_mah=1)  # only seconds count here, not charge
@@ -138,7 +139,7 @@ def probe(
             rounds.append(asked())
         spent.extend(steps.encode + steps.match for each in rounds for steps in each)
         return [
-            Steps(**{name: _least([getattr(steps, name) for steps in tries]) for name in ("encode", "scan", "compare")})
+            Steps(**{name: _least([getattr(steps, name) for steps in tries]) for name in _STEPS})
             for tries in zip(*rounds, strict=True)
         ]
 
@@ -146,10 +147,12 @@ def probe(
         peak_is_new = machine.forget_peak()
         before_mb = machine.rss_mb()
         # The first frame also starts threads and causes late imports.
-        first = _stepped(walk(trial_map, empty_index(spec, 0, None), 1), frames[0])
+        alone = walk(trial_map, empty_index(spec, 0, None), 1)
+        first = _stepped(alone, frames[0])
         encode_mb = machine.peak_mb() - before_mb if peak_is_new else None
+        landmarks = alone.landmarks(frames[0].image)
         for _ in range(_PLACES):
-            trial_map.add(frames[0], first.descriptor)
+            trial_map.add(frames[0], first.descriptor, landmarks=landmarks)
         index = load_index(trial_map, technique, _PLACES * bytes_per_place(spec))
         small = tried(walk(trial_map, index, 1))
         process_mb = machine.peak_mb() if peak_is_new else machine.rss_mb()
@@ -162,9 +165,11 @@ def probe(
     # What a scan of six places takes is not of these places: it is what is made of the query, and of calling at all.
     scan = _beyond(whole, once) * (1 / len(many))
     compare, part = (counted([each.compare for each in tries]) for tries in (large, half))
+    # Only a picture that is found is verified, and of pictures of noise that is the one in the map.
+    verify = max((each.verify for each in large), key=lambda cost: cost.wall_s)
     if spec.in_full:
         each_more = _beyond(compare, part) * (1 / max(1, technique.candidates - fewer))
-        compare_once = _beyond(compare, each_more * technique.candidates)
+        compare_once = _beyond(compare, each_more * technique.candidates) + verify
     else:
         each_more = compare * (1 / technique.candidates) if spec.fine else scan
         compare_once = NO_COST

@@ -84,7 +84,7 @@ class Learner:
                 return None
             self._map.require_unchanged()  # a place in a file that was deleted would be lost
             salience = event.worth and replace(event.worth.salience, is_low=event.worth.reason is not None)
-            place_id = self._map.add(here, event.descriptor, salience)
+            place_id = self._map.add(here, event.descriptor, salience, self._recogniser.landmarks(event))
             self.learnt += 1
             place = Place(
                 place_id=place_id,

@@ -70,7 +70,7 @@ def build_map(
     def keep(kept: Iterable[Kept]) -> None:
         nonlocal added, without_position, of_low_quality
         for event, salience in kept:
-            place_map.add(laid(event.frame, event.view), event.descriptor, salience)
+            place_map.add(laid(event.frame, event.view), event.descriptor, salience, walk.landmarks(event))
             added += 1
             without_position += event.frame.position is None
             if salience and salience.is_low:

@@ -207,6 +207,7 @@ def _recogniser(
         mask=mask,
         gate=gate_of(config.salience, board.threads),
         levelling=levelling_of(config.source, technique),
+        verify=config.match.verify,
     )
 
 

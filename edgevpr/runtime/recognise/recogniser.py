@@ -9,8 +9,8 @@ from itertools import islice
 
 from edgevpr.contract import Technique
 from edgevpr.errors import EdgevprError, MapError, PlaceError
-from edgevpr.frames.level import UNKNOWN_VIEW
 from edgevpr.frames.mask import AnyMask, NoMask, encoded
+from edgevpr.landmarks.agreement import PROVEN
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import compare, named, scan
@@ -21,6 +21,7 @@ from edgevpr.runtime.recognise.hints import NoPrior, Prior, expected_of
 from edgevpr.runtime.recognise.judge import NEW_FOR_S, AcceptRule, Verdict, judge
 from edgevpr.runtime.recognise.levelling import AnyLevelling, NoLevelling, seen_as
 from edgevpr.runtime.recognise.recognition import Recognition
+from edgevpr.runtime.recognise.verify import Verification, landmarks_of
 from edgevpr.salience.gate import Gate, NoGate
 from edgevpr.types import Frame, Vehicle
 
@@ -32,8 +33,9 @@ class Recogniser:
 
     `candidates` places are compared (None: all in full, see `places.retrieve.compare`). `gate` refuses frames that are
     not memorable, `mask` leaves parts of every frame out, and `levelling` lays each on the ground. `search` joins
-    several queries, and `prior` narrows each; without them each query is ranked alone, over the whole map. The governor
-    changes `candidates`; the learner and the governor change the index (`take`, `extend`).
+    several queries, and `prior` narrows each; without them each query is ranked alone, over the whole map. `verify`
+    holds the best place against its landmarks, where the map has some. The governor changes `candidates`; the learner
+    and the governor change the index (`take`, `extend`).
     """
 
     def __init__(
@@ -51,10 +53,11 @@ class Recogniser:
         mask: AnyMask | None = None,
         gate: Gate | NoGate | None = None,
         levelling: AnyLevelling | None = None,
+        verify: bool = True,
     ) -> None:
         self.place_map, self.meter, self.candidates = place_map, meter, candidates
         self._prior, self._min_accuracy_m, self._mask = prior or NoPrior(), min_accuracy_m, mask or NoMask()
-        self._gate, self.levelling = gate or NoGate(), levelling or NoLevelling()
+        self._gate, self.levelling, self._verifies = gate or NoGate(), levelling or NoLevelling(), verify
         self._told = 0  # number of places left out that an event has told of
         self._new: deque[tuple[int, float]] = deque()  # place id, and the time it was learnt at
         self.take(technique, index, rule, search or Alone())
@@ -85,13 +88,12 @@ class Recogniser:
         Never raises an Exception: an error of a frame, a place or the technique becomes a refusal with its reason.
         """
         meter, technique, index = self.meter, self.technique, self.index
-        worth = descriptor = hints = ranking = best = nothing = objection = None
-        view, map_lost = UNKNOWN_VIEW, False
+        worth = descriptor = hints = ranking = best = nothing = objection = proof = None
+        picture, map_lost = None, False
         meter.begin()
         try:
             with meter.step("prepare"):
                 picture = self.levelling.prepare(frame, vehicle, self._mask.fitted(frame.image))
-                view = picture.view
             with meter.step("gate"):
                 worth = self._gate.look(frame.image)
             with meter.step("encode"):
@@ -108,7 +110,7 @@ class Recogniser:
                 with meter.step("scan"):
                     self.place_map.require_unchanged()
                     margin_m = max(self.accuracy_m, self.rule.neighbour_m)
-                    hints = self._prior.hints(seen_as(frame, view), vehicle, index, margin_m)
+                    hints = self._prior.hints(seen_as(frame, picture.view), vehicle, index, margin_m)
                     expected = expected_of(hints, index)
                     scanned = scan(technique, descriptor, index, expected)
                 with meter.step("compare"):
@@ -127,6 +129,14 @@ class Recogniser:
                     is_new = self._is_new(best.place.place_id, frame.t_mono_s)
                     verdict = judge(ranking, index, self.rule, self.search, is_new)
                     verdict = Verdict(False, objection) if objection else verdict
+                if self._verifies and (verdict.accepted or verdict.is_open):
+                    with meter.step("verify"):
+                        looked = Verification(technique.spec, picture, index, self.place_map)
+                        proof, rival = looked.proof(ranking), 0
+                        if proof and verdict.is_open and proof.inliers >= PROVEN:
+                            rival = looked.rival(ranking, self.rule.neighbour_m)
+                    if proof:
+                        verdict = judge(ranking, index, self.rule, self.search, is_new, proof, rival)
                 self._prior.learn(best, verdict.accepted, frame.t_mono_s)
                 if self.search.length == 1:  # a sequence is to have one scale
                     self.levelling.learn(verdict.accepted)
@@ -139,12 +149,13 @@ class Recogniser:
         return Recognition(
             frame=frame,
             vehicle=vehicle,
-            view=view,
+            picture=picture,
             worth=worth,
             descriptor=descriptor,
             hints=hints,
             ranking=ranking,
             best=best,
+            proof=proof,
             accepted=verdict.accepted,
             reason=verdict.reason,
             says_nothing=nothing is not None,
@@ -156,6 +167,11 @@ class Recogniser:
             steps=meter.steps(),
             cost=meter.cost(),
         )
+
+    def landmarks(self, event: Recognition) -> bytes | None:
+        """Return what a map keeps of the landmarks of a frame that becomes a place, None for a technique that does not
+        look straight down."""
+        return landmarks_of(self.technique, event.picture) if event.picture else None
 
     def unread(self, error: Exception) -> Recognition:
         """Return the event of a frame that could not even be read."""

@@ -4,7 +4,8 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from edgevpr.contract import Descriptor
-from edgevpr.frames.level import UNKNOWN_VIEW, View
+from edgevpr.frames.level import UNKNOWN_VIEW, Levelled, View
+from edgevpr.landmarks.agreement import Agreement
 from edgevpr.places.retrieve import Ranking
 from edgevpr.runtime.recognise.hints import Hints
 from edgevpr.salience.gate import Worth
@@ -17,10 +18,11 @@ _OF_THE_BEST = ("place", "reference_image", "score", "position", "shift_cells", 
 class Recognition:
     """Result of one frame.
 
-    The inputs are `frame` and `vehicle`, the autopilot's report when the frame was taken (None: no report). `view` is
-    how the picture that was encoded lies on the ground, `worth` what the gate says of the frame (None: no gate looks),
+    The inputs are `frame` and `vehicle`, the autopilot's report when the frame was taken (None: no report). `picture`
+    is the picture that was encoded, and how it lies on the ground, `worth` what the gate says of the frame (None: no gate looks),
     `descriptor` the encoded frame, `hints` what narrowed the search, `ranking` the places found and `best` the first of
-    them; each is None where its step was not reached. `accepted` tells whether `best` is taken for the place, and
+    them; each is None where its step was not reached. `proof` is how the landmarks of frame and place agree (None:
+    they were not held against each other). `accepted` tells whether `best` is taken for the place, and
     `reason` why (not), in a few words. `position` is the place's, and `accuracy_m` its 1-sigma; both are set for an
     accepted match only: any other carries no position. `says_nothing` tells whether the picture holds too little to be
     recognised; a place was then searched for only to go on with a sequence.
@@ -35,12 +37,13 @@ class Recognition:
 
     frame: Frame | None
     vehicle: Vehicle | None = None
-    view: View = UNKNOWN_VIEW
+    picture: Levelled | None = None
     worth: Worth | None = None
     descriptor: Descriptor | None = None
     hints: Hints | None = None
     ranking: Ranking | None = None
     best: Candidate | None = None
+    proof: Agreement | None = None
     accepted: bool = False
     reason: str
     says_nothing: bool = False
@@ -55,6 +58,11 @@ class Recognition:
     last_fix: FixReport | None = None
 
     @property
+    def view(self) -> View:
+        """How the picture lies on the ground."""
+        return self.picture.view if self.picture else UNKNOWN_VIEW
+
+    @property
     def is_query(self) -> bool:
         """True where the frame became a query: it could be read and encoded."""
         return self.descriptor is not None
@@ -65,17 +73,31 @@ def fields_of(event: Recognition) -> dict[str, Any]:
 
     The fields are: query, place (id), reference_image, score, position (of the place), the match's step, its covariance
     and the rotation (all null where no place was found), accepted, reason, accuracy_m, costs; where a gate looks,
-    salience; and, where anything is known of how the picture lies on the ground, view.
+    salience; where landmarks were held against each other, landmarks; and, where anything is known of how the picture
+    lies on the ground, view.
     """
     return {
         "query": event.frame.name,
         **_best(event.best),
         **({"view": asdict(event.view)} if event.view != UNKNOWN_VIEW else {}),
         **({"salience": event.worth.salience.rounded()} if event.worth else {}),
+        **({"landmarks": _landmarks(event.proof)} if event.proof else {}),
         "accepted": event.accepted,
         "reason": event.reason,
         "accuracy_m": event.accuracy_m,
         "costs": {key: value and float(f"{value:.6g}") for key, value in asdict(event.cost).items()},
+    }
+
+
+def _landmarks(proof: Agreement) -> dict[str, Any]:
+    if proof.shift_share is None:
+        return {"inliers": proof.inliers, "matched": proof.matched}
+    return {
+        "inliers": proof.inliers,
+        "matched": proof.matched,
+        "shift_share": [round(each, 4) for each in proof.shift_share],
+        "rotation_deg": round(proof.rotation_deg, 1),
+        "scale": round(proof.scale, 3),
     }
 
 

@@ -1,0 +1,117 @@
+"""Landmarks of a picture: points that are found again in another picture of the same ground, and 256 bits of each.
+
+The points are the corners of FAST and the bits those of ORB (Rublee et al. 2011). A place keeps few of them, spread over
+the picture; a query has more, so that most of the place's points that it shows are among them.
+"""
+
+import struct
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+OF_PLACE, OF_QUERY = 250, 1000  # points
+_LONGEST_SIDE_PX = 640
+_FOUND = 4 * OF_PLACE  # corners among which those of a place are chosen
+_LEVELS, _FACTOR = 8, 1.2  # of the pyramid
+_CORNER = 5  # grey levels between a corner and what is around it, so that dark pictures have some
+_PATCH_PX = 31  # of which the bits of a point are made, on its level of the pyramid
+_CELLS = 8  # along the longest side: each has about as many points
+_APART_PX = 3.0  # the same corner is found on several levels, and is one landmark
+
+_VERSION = 1
+_HEADER = struct.Struct("<BH")
+_STORED = np.dtype([("x", "<u2"), ("y", "<u2"), ("angle", "u1"), ("size", "u1"), ("bits", "u1", 32)])
+_SIZES = 0.001  # of the longest side: the step in which sizes are stored
+
+
+@dataclass(frozen=True, slots=True)
+class Landmarks:
+    """K points of a picture. `points` float32 (K, 2) are x to the right and y down from the middle of the picture, as
+    shares of its longest side, so that the numbers of pixels of two cameras do not matter. `angle_deg` float32 (K,) is
+    the direction of each, clockwise from the right. `size` float32 (K,) is the width of the patch it was described by,
+    as a share of the longest side, and `bits` uint8 (K, 32) the description."""
+
+    points: np.ndarray
+    angle_deg: np.ndarray
+    size: np.ndarray
+    bits: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+def describe(image: np.ndarray, mask: np.ndarray | None = None, most: int = OF_PLACE) -> Landmarks:
+    """Find the `most` best landmarks of a uint8 image, (H, W) grey or (H, W, 3) BGR, best first.
+
+    None touches a pixel where `mask` bool (H, W) is False. A picture without corners, or one smaller than a patch, has
+    none.
+    """
+    height, width = image.shape[:2]
+    scale = _LONGEST_SIDE_PX / max(height, width)
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
+    allowed = None
+    if mask is not None:
+        allowed = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+        allowed = cv2.erode(allowed, np.ones((_PATCH_PX, _PATCH_PX), np.uint8), borderValue=1)
+    orb = cv2.ORB_create(max(most, _FOUND), _FACTOR, _LEVELS, fastThreshold=_CORNER, patchSize=_PATCH_PX)
+    found, bits = orb.detectAndCompute(grey, allowed) if min(size) > 2 * _PATCH_PX else ((), None)
+    if bits is None:
+        return Landmarks(np.empty((0, 2), np.float32), *np.empty((2, 0), np.float32), np.empty((0, 32), np.uint8))
+    at_px = np.array([point.pt for point in found], np.float32)
+    order = np.argsort([-point.response for point in found], kind="stable")
+    chosen = order[_spread(at_px[order], most)]
+    middle = (np.array(size, np.float32) - 1) / 2
+    return Landmarks(
+        ((at_px - middle) / _LONGEST_SIDE_PX)[chosen],
+        np.array([point.angle for point in found], np.float32)[chosen],
+        np.array([point.size for point in found], np.float32)[chosen] / _LONGEST_SIDE_PX,
+        bits[chosen],
+    )
+
+
+def _spread(at_px: np.ndarray, most: int) -> np.ndarray:
+    """Choose `most` of the points float32 (K, 2), best first: in turn the best, second best, ... of every cell. Returns
+    their numbers int (up to `most`,)."""
+    # Of the same corner on several levels the best one is left.
+    _, first = np.unique(np.rint(at_px / _APART_PX).astype(int), axis=0, return_index=True)
+    kept = np.sort(first)
+    _, cell = np.unique((at_px[kept] // (_LONGEST_SIDE_PX / _CELLS)).astype(int), axis=0, return_inverse=True)
+    by_cell = np.argsort(cell.ravel(), kind="stable")
+    ordered = cell.ravel()[by_cell]
+    starts = np.searchsorted(ordered, ordered)
+    turn = np.empty(len(kept), int)
+    turn[by_cell] = np.arange(len(kept)) - starts
+    return kept[np.argsort(turn, kind="stable")[:most]]
+
+
+def packed(landmarks: Landmarks) -> bytes:
+    """Return landmarks as a map file keeps them: 38 bytes each, and 3 before them."""
+    stored = np.empty(len(landmarks), _STORED)
+    at = np.rint((landmarks.points.astype(np.float64) + 0.5) * 65535).clip(0, 65535)
+    stored["x"], stored["y"] = at[:, 0], at[:, 1]
+    stored["angle"] = np.rint(landmarks.angle_deg * (256 / 360)).astype(int) % 256
+    stored["size"] = np.rint(landmarks.size / _SIZES).clip(0, 255)
+    stored["bits"] = landmarks.bits
+    return _HEADER.pack(_VERSION, len(stored)) + stored.tobytes()
+
+
+def unpacked(blob: bytes) -> Landmarks:
+    """Return the landmarks that `packed` has written. Raises ValueError for anything else."""
+    if len(blob) < _HEADER.size:
+        raise ValueError("its landmarks have no header")
+    version, count = _HEADER.unpack_from(blob)
+    if version != _VERSION:
+        raise ValueError(f"its landmarks have the form {version}, which this edgevpr does not know")
+    if len(blob) != _HEADER.size + count * _STORED.itemsize:
+        raise ValueError("its landmarks have a wrong size")
+    stored = np.frombuffer(blob, _STORED, offset=_HEADER.size)
+    at = np.stack([stored["x"], stored["y"]], axis=1).astype(np.float64) / 65535 - 0.5
+    return Landmarks(
+        at.astype(np.float32),
+        stored["angle"].astype(np.float32) * np.float32(360 / 256),
+        stored["size"].astype(np.float32) * np.float32(_SIZES),
+        stored["bits"],
+    )
