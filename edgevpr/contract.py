@@ -34,8 +34,9 @@ class TechniqueSpec:
     vectors in RAM. It is one of `forms`, each smaller than the one before (None and empty: there is one form only).
     `sequence` is the usual number of queries matched together. With `scan_counts` the score of the scan is part of the
     final score (see `places.retrieve`). A technique that tries a query in several rotations tries only those within
-    `heading_within_deg` of the rotation that known headings give (None: it does not use headings). Of more places than
-    `in_full`, those that look best at a glance are compared in full (None: all are).
+    `heading_within_deg` of the rotation that known headings give (None: it does not use headings). `cells` is how many
+    cells of a `FineMatch` the longest side of a picture has (None: a shift says nothing about metres). Of more places
+    than `in_full`, those that look best at a glance are compared in full (None: all are).
     """
 
     name: str
@@ -49,6 +50,7 @@ class TechniqueSpec:
     sequence: int = field(default=1, compare=False)
     scan_counts: bool = field(default=False, compare=False)
     heading_within_deg: float | None = field(default=None, compare=False)
+    cells: int | None = field(default=None, compare=False)
     in_full: int | None = field(default=None, compare=False)
 
     @property

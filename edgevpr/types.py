@@ -147,8 +147,8 @@ NO_COST = StageCost(0.0, 0.0)
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Steps:
     """Costs of the steps of one query: `read` the picture (in a flight only), `prepare` it (level it on the ground),
-    look whether it passes the `gate`, `encode` it, `scan` all places, `compare` and judge the candidates, and `verify`
-    the best one by its landmarks. A step that the query did not reach has no cost."""
+    look whether it passes the `gate`, `encode` it, `scan` all places, `compare` and judge the candidates, `verify` the
+    best one by its landmarks, and `locate` the aircraft. A step that the query did not reach has no cost."""
 
     read: StageCost = NO_COST
     prepare: StageCost = NO_COST
@@ -157,6 +157,7 @@ class Steps:
     scan: StageCost = NO_COST
     compare: StageCost = NO_COST
     verify: StageCost = NO_COST
+    locate: StageCost = NO_COST
 
     @property
     def encoding(self) -> StageCost:
@@ -166,7 +167,7 @@ class Steps:
     @property
     def match(self) -> StageCost:
         """Cost of matching as the thesis defines it: everything after encoding."""
-        return self.scan + self.compare + self.verify
+        return self.scan + self.compare + self.verify + self.locate
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

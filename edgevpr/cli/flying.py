@@ -77,7 +77,7 @@ def run_match(args: Namespace) -> int:
             leave_out(ImageError(f"{frame.name}: {event.reason}"), unusable)
             continue
         fields = fields_of(event)
-        here, there = frame.position, fields["position"]
+        here, there = frame.position, fields["located"] or fields["position"]
         if here and there:
             away_m = distance_m(here.lat_deg, here.lon_deg, there["lat_deg"], there["lon_deg"])
             fields["error_m"] = round(float(away_m), 2)

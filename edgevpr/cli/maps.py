@@ -23,9 +23,13 @@ from edgevpr.cli.shared import (
     print_json,
 )  # fmt: skip
 from edgevpr.errors import EdgevprError, ImageError, UsageError
+from edgevpr.helpers.text import shown
 
 if TYPE_CHECKING:
+    from edgevpr.contract import Technique
+    from edgevpr.places.mapfile import PlaceMap
     from edgevpr.places.repair import MapCheck, Watch
+    from edgevpr.refine.refine import Refined
 
 
 def add(commands: Any) -> None:
@@ -44,11 +48,20 @@ def add(commands: Any) -> None:
     build.add_argument(
         "--rate-hz", type=_positive, metavar="HZ", help="places a second of a video (default: every frame)"
     )
+    build.add_argument(
+        "--no-refine", dest="refine", action="store_false", help="do not find out where the pictures really lie"
+    )
     build.add_argument("--append", action="store_true", help="add to an existing map, going on where it broke off")
     add_json(build)
     info = command(maps, "info", map_info, "say what a map holds")
     info.add_argument("map", metavar="MAP")
     add_json(info)
+    refine = command(maps, "refine", map_refine, "find out where the pictures really lie, by matching them")
+    refine.add_argument("map", metavar="MAP")
+    refine.add_argument(
+        "--images", metavar="DIR", help="the images that the map was made of: with them more pictures are tied"
+    )
+    add_json(refine)
     check = command(maps, "check", map_check, "read everything in a map, and say what is damaged")
     check.add_argument("map", metavar="MAP")
     add_json(check)
@@ -139,8 +152,10 @@ def map_build(args: Namespace) -> int:
                 remove(path)
             raise
         places = len(place_map)
+        refined = _refined_after(place_map, technique, args) if args.refine else None
     if args.json:
-        print_json({"map": args.map, "technique": technique.spec.name, "places": places, **asdict(result)})
+        more = {"refined": asdict(refined)} if refined else {}
+        print_json({"map": args.map, "technique": technique.spec.name, "places": places, **asdict(result), **more})
     else:
         print(
             f"{args.map}: {result.added} places added ({result.without_position} without a position), {places} in all"
@@ -152,6 +167,8 @@ def map_build(args: Namespace) -> int:
             print(f"  left out: {lacking}")
         if result.of_low_quality:
             print(f"  {result.of_low_quality} of the places are of low quality, kept to bound the gaps")
+        if refined:
+            _print_refined(args.map, refined, technique.spec.cells)
     return exit_code(unusable)
 
 
@@ -178,10 +195,76 @@ def map_info(args: Namespace) -> int:
         print(f"  time        {info.first_time} to {info.last_time}")
     if info.mean_quality is not None:
         print(f"  quality     {info.mean_quality:.2f} on average (share of the image that says anything)")
+    if info.with_pose:
+        print(
+            f"  pose        of {info.with_pose} places, known to {info.position_sd_m:.1f} m; a picture shows "
+            f"{info.footprint_m:.0f} m of ground along its longest side"
+        )
     if info.of_low_quality:
         print(f"  salience    {info.of_low_quality} of low quality, kept to bound the gaps")
     print(f"  size        {info.file_bytes / 1e6:.1f} MB on disk, {ram_mb:.2f} MB in RAM ({info.made_by})")
     return 0
+
+
+def map_refine(args: Namespace) -> int:
+    """Find out where the pictures of a map really lie, and say it."""
+    from edgevpr.places.mapfile import PlaceMap
+    from edgevpr.runtime.recognise.opening import technique_of
+
+    with PlaceMap.open_for_adding(args.map) as place_map:
+        technique = technique_of(place_map)
+        refined = _refined(place_map, technique, args.images)
+    if args.json:
+        print_json({"map": args.map, **asdict(refined)})
+    else:
+        _print_refined(args.map, refined, technique.spec.cells)
+    return 0
+
+
+def _refined_after(place_map: "PlaceMap", technique: "Technique", args: Namespace) -> "Refined | None":
+    """Refine a map that has just been built, where anything can be refined; the map is whole without it."""
+    if technique.spec.cells is None:
+        return None
+    try:
+        return _refined(place_map, technique, args.source if Path(args.source).is_dir() else None)
+    except EdgevprError as error:
+        print(f"edgevpr: the map is not refined: {error}", file=sys.stderr)
+        return None
+
+
+def _refined(place_map: "PlaceMap", technique: "Technique", images: str | None) -> "Refined":
+    """Refine an open map. Raises UsageError for one that nothing can be refined of, and where SciPy is missing."""
+    if technique.spec.cells is None:
+        raise UsageError(
+            f"{place_map.path} is of {technique.spec.name}, and not of a camera that looks straight down: only `cohog` "
+            "with `--camera nadir` can be refined."
+        )
+    try:
+        from edgevpr.refine.look import pictures
+        from edgevpr.refine.refine import refine
+    except ModuleNotFoundError as error:
+        raise UsageError(
+            f"Refining a map needs SciPy ({error}): install it on the machine that builds maps, with "
+            "`pip install 'edgevpr[maps]'`, and run `edgevpr map refine`."
+        ) from error
+    return refine(place_map, technique, _watched("refining"), pictures(images, technique) if images else None)
+
+
+def _print_refined(path: str, refined: "Refined", cells: int | None) -> None:
+    print(f"{path}: {refined.refined} of {refined.places} places refined, by {refined.ties} ties between pictures")
+    if refined.refined:
+        scatter = f"as recorded they scatter by {refined.recorded_sd_m:.1f} m"
+        moved = f"moved by {refined.moved_m:.1f} m, known to {refined.position_sd_m:.1f} m (medians)"
+        print(f"  position    {moved}; {scatter}")
+        print(f"  footprint   {refined.footprint_m:.0f} m (median), {refined.footprint_m / cells:.2f} m a cell")
+    if refined.surveyed:
+        print(f"  surveyed    {refined.surveyed} were cut from a geo-referenced picture, and stay as they are")
+    if refined.not_tied:
+        print(f"  not tied    {refined.not_tied} stay where they were recorded: a fix there is as fine as the spacing")
+    if refined.without_position:
+        print(f"  no position {refined.without_position} places")
+    for place_id, image, off_m in refined.contradictory:
+        print(f"  amiss       place {place_id} ({shown(image)}): recorded {off_m:.0f} m from where its picture lies")
 
 
 def map_check(args: Namespace) -> int:

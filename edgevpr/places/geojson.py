@@ -5,7 +5,7 @@ from typing import TextIO
 
 from edgevpr.places import geopackage
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.types import Place, Salience
+from edgevpr.types import Place, Pose, Salience
 
 _LOW, _USUAL = "#e0b060", "#2060c0"
 
@@ -38,7 +38,22 @@ def _feature(place: Place) -> dict:
             "source_image": place.source_image,
             "quality": round(place.quality, 4),
             **_salience(place.salience),
+            **_pose(place.pose),
         },
+    }
+
+
+def _pose(pose: Pose | None) -> dict:
+    """Return what is known of how a place's picture lies on the ground."""
+    if pose is None:
+        return {}
+    var_east, cov, var_north = pose.covariance_m2
+    recorded = pose.recorded
+    return {
+        "up_deg": round(pose.up_deg, 1),
+        "footprint_m": round(pose.footprint_m, 2),
+        "covariance_m2": [round(var_east, 3), round(cov, 3), round(var_north, 3)],
+        "recorded": [recorded.lon_deg, recorded.lat_deg] if recorded else None,
     }
 
 

@@ -5,6 +5,7 @@ being written, and never the file. What is read is checked (see `rows`): a place
 the others are used. The open file itself is a `MapConnection`.
 """
 
+import math
 import sqlite3
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
@@ -19,7 +20,7 @@ from edgevpr.places.connection import MapConnection
 from edgevpr.places.mapspec import differences, has_checksums, has_pose, has_salience, read_mask, write_mask
 from edgevpr.places.rows import Content, Point, Unreadable
 from edgevpr.places.sqlite import sentences
-from edgevpr.types import Frame, Place, Salience
+from edgevpr.types import Frame, Place, Pose, Position, Salience
 
 _OTHERS = 0.05  # of the numbers of a coarse part
 _SAME_PICTURE = 0.01  # of the length of a coarse part: far more than rounding, far less than another picture
@@ -142,6 +143,17 @@ class PlaceMap:
             self.db.execute(geopackage.GROW_EXTENT, {"lat": lat_deg, "lon": lon_deg})
         return cursor.lastrowid
 
+    def lay(self, place_id: int, position: Position, pose: Pose | None) -> None:
+        """Move a place inside a `transaction`, and keep how its picture lies there (None: unknown). Raises
+        sqlite3.Error."""
+        geom, values = geopackage.point_blob(position.lat_deg, position.lon_deg), rows.pose_values(pose)
+        # The trigger that follows a move takes away what is written after it.
+        self.db.execute("UPDATE places SET geom = ? WHERE place_id = ?", (geom, place_id))
+        columns = ", ".join(f"{name} = ?" for name in f"geom_crc32, {rows.POSE}, pose_crc32".split(", "))
+        row = (rows.crc32(geom), *values, rows.pose_crc32(values), place_id)
+        self.db.execute(f"UPDATE places SET {columns} WHERE place_id = ?", row)
+        self.db.execute(geopackage.GROW_EXTENT, {"lat": position.lat_deg, "lon": position.lon_deg})
+
     @property
     def mask_sha256(self) -> str | None:
         """The overlay mask that the places were made with; None: none, or unknown."""
@@ -206,6 +218,12 @@ class PlaceMap:
             geom, geom_checksum, fine, checksum = rows.there(self._file.row(place_id, columns))
             point = rows.point_of(geom, geom_checksum)
             return rows.part_of(fine, self.spec.fine, checksum, "fine part"), point
+
+    def footprint_m(self) -> float | None:
+        """Return the median footprint of the places whose pose is known, None where none is."""
+        footprints_m = [row[0] for _, row in self.scan(self.pose.split(", ")[1]) if row]
+        known = [each for each in footprints_m if isinstance(each, float) and 0 < each < math.inf]
+        return float(np.median(known)) if known else None
 
     def landmarks_of(self, place_id: int) -> bytes | None:
         """Read the landmarks of one place from the file, None where it has none. Raises PlaceError for one that is

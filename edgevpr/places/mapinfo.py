@@ -14,7 +14,9 @@ Extent = tuple[float, float, float, float]
 class MapInfo:
     """Summary of a map; `extent` is (lat_min, lon_min, lat_max, lon_max) in degrees, None without positions or where
     the file does not say it. What the file has in another form than edgevpr writes is None too. `of_low_quality` counts
-    the places that were kept only to bound a gap."""
+    the places that were kept only to bound a gap. Of `with_pose` places it is known how the picture lies on the ground:
+    `footprint_m` is the mean length of its longest side there, and `position_sd_m` how exactly the positions are known,
+    one axis, root mean square (None: of none)."""
 
     path: str
     spec: TechniqueSpec
@@ -25,6 +27,9 @@ class MapInfo:
     last_time: str | None
     mean_quality: float | None
     of_low_quality: int
+    with_pose: int
+    footprint_m: float | None
+    position_sd_m: float | None
     file_bytes: int
     made_by: str | None
 
@@ -34,8 +39,10 @@ def info_of(place_map: PlaceMap) -> MapInfo:
     db = place_map.db
     with sentences(place_map.path):
         low = place_map.salience.split(", ")[-1]
-        places, with_position, quality, of_low_quality, *times = db.execute(
-            f"SELECT count(*), count(geom), avg(quality), total({low} = 1), min(time), max(time) FROM places"
+        up, footprint, var_east, _, var_north, *_ = place_map.pose.split(", ")
+        asked = f"count({up}), avg({footprint}), avg({var_east} + {var_north})"
+        places, with_position, quality, of_low_quality, with_pose, footprint_m, var_m2, *times = db.execute(
+            f"SELECT count(*), count(geom), avg(quality), total({low} = 1), {asked}, min(time), max(time) FROM places"
         ).fetchone()
         extent = db.execute(
             "SELECT min_y, min_x, max_y, max_x FROM gpkg_contents WHERE table_name = 'places'"
@@ -51,6 +58,9 @@ def info_of(place_map: PlaceMap) -> MapInfo:
         last_time=last,
         mean_quality=quality,
         of_low_quality=int(of_low_quality),
+        with_pose=with_pose,
+        footprint_m=footprint_m,
+        position_sd_m=math.sqrt(max(0.0, var_m2) / 2) if var_m2 is not None else None,
         file_bytes=place_map.path.stat().st_size,
         made_by=place_map.made_by,
     )

@@ -8,10 +8,10 @@ into one on the ground. A tie says that the middle of picture `query` lies `step
 
     (p_query - p_place) exp(-l_place) = step        l_query - l_place = turn
 
-Both are holomorphic, so that least squares over complex numbers is exact, with half the unknowns. The step is compared in
-the picture and not on the ground: ties alone could otherwise be met by a map that shrinks to a point. Recorded positions
-give the whole its place, scale and direction. All three kinds are weighted by how much they scatter, which is estimated
-from the residuals, and those that contradict the others lose their weight (Geman and McClure 1987).
+Both are holomorphic, so that least squares over complex numbers is exact, with half the unknowns. The step is compared
+in the picture and not on the ground: ties alone could otherwise be met by a map that shrinks to a point. Recorded
+positions give the whole its place, scale and direction. All three kinds are weighted by how much they scatter, which is
+estimated from the residuals, and those that contradict the others lose their weight (Geman and McClure 1987).
 """
 
 from dataclasses import dataclass
@@ -25,6 +25,7 @@ _ROUNDS, _SETTLED = 4, 0.05  # of estimating the scatters, and by how much of th
 _MOVES, _STAYS = 40, 1e-4  # of solving, and how far a position still moves, as a share of a footprint
 _LONGEST_MOVE = 0.5  # of a log
 _FIRST = 3.0  # times its own standard deviation a tie is off, as long as nothing better is known
+_LEAST = 0.5  # times: ties that happen to agree better must not make the others look wrong
 _SURE = 0.005  # standard deviation of a log that is known
 _LEAST_M, _FIRST_M = 0.5, 10.0  # scatter of recorded positions
 _GONE = 0.1  # a weight below it: what has it contradicts the others
@@ -54,8 +55,8 @@ class Ties:
 class Solved:
     """The graph of N places. `position` complex (N,) metres, `log` complex (N,); `position_var` (m^2) and `log_var`
     float (N,) are their variances, both axes together. `component` int (N,) numbers the groups of places that are tied.
-    Ties scatter by `times` their own standard deviation, and recorded positions by `recorded_sd_m` in one axis. `recorded_counts` and
-    `ties_count` bool tell which recorded positions and ties agree with the rest."""
+    Ties scatter by `times` their own standard deviation, and recorded positions by `recorded_sd_m` in one axis.
+    `recorded_counts` and `ties_count` bool tell which recorded positions and ties agree with the rest."""
 
     position: np.ndarray
     log: np.ndarray
@@ -85,7 +86,10 @@ def solve(recorded: np.ndarray, recorded_sd_m: np.ndarray, ties: Ties, log: np.n
         steps, turns, off = _residuals(position, log, recorded, ties)
         before = times, scatter_m
         if len(ties):
-            times = max(1.0, float(np.median(_off_ties(steps, turns, ties))) / _MEDIAN_OF_FOUR)
+            # Ties that hang on nothing else are met exactly: what they say of the scatter is spread over the others.
+            spare = max(2 * len(ties) - 2 * (count - len(np.unique(component))), 1) / (2 * len(ties))
+            off_ties = float(np.median(_off_ties(steps, turns, ties)))
+            times = max(_LEAST, off_ties / _MEDIAN_OF_FOUR / np.sqrt(spare))
         if own.any():
             # What a position is off, and what the solution leaves open there: few ties let it follow every error.
             scatter_m = max(_LEAST_M, float(np.sqrt(_scatter(off[own]) ** 2 + np.median(variance[:count][own]) / 2)))
@@ -140,9 +144,7 @@ def _graph(ties: Ties, count: int) -> csc_matrix:
     return coo_matrix((ties.step_sd, (ties.query, ties.place)), (count, count)).tocsc()
 
 
-def _first(
-    recorded: np.ndarray, known: np.ndarray, ties: Ties, component: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _first(recorded: np.ndarray, known: np.ndarray, ties: Ties, component: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Lay the places of each component out along its strongest ties, and the whole over the recorded positions."""
     count = len(recorded)
     position, log = np.zeros(count, complex), np.zeros(count, complex)

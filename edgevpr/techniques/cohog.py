@@ -105,6 +105,7 @@ class CoHog:
             packed=None if camera == "nadir" else PartSpec((placecode.SIDE**2 * bins // 8,), "|u1"),
             scan_counts=matching == "displacement" and camera == "forward",  # with a nadir camera it adds nothing
             heading_within_deg=_HEADING_WITHIN_DEG if camera == "nadir" else None,
+            cells=w1 // w2 if camera == "nadir" and matching == "displacement" else None,
             in_full=_IN_FULL[camera] if matching == "displacement" else None,
         )
 

@@ -11,6 +11,7 @@ from edgevpr.landmarks.agreement import PROVEN, Agreement
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.retrieve import Ranking, elsewhere, margin
 from edgevpr.places.sequence import Search, SequenceSearch
+from edgevpr.runtime.recognise.locate import Located
 
 NEW_FOR_S = 30.0  # seconds; a place learnt so recently only repeats what the autopilot has just said
 
@@ -87,12 +88,14 @@ def judge(
     is_new: bool,
     proof: Agreement | None = None,
     rival: int = 0,
+    where: Located | None = None,
 ) -> Verdict:
     """Decide whether the best place of a ranking is accepted.
 
     `search` is the search that made the ranking; `is_new` tells whether the best place was learnt within the last
     `NEW_FOR_S` seconds. `proof` is how the landmarks of query and place agree (None: nothing is known of it), and
-    `rival` the number of those of the best place elsewhere that agree.
+    `rival` the number of those of the best place elsewhere that agree. `where` is the position that the best places say
+    together (None: only that of the best one is known).
     """
     proven = proof is not None and _proves(proof, rival)
     may_be_proven = proof is None and search.length == 1 and rule.min_margin < 1
@@ -119,6 +122,8 @@ def judge(
         return Verdict(False, objection)
     if proof is not None and (objection := _disproves(proof, score)):
         return Verdict(False, objection)
+    if where and where.objection:
+        return Verdict(False, where.objection)
     if is_new:  # a fix would only repeat the autopilot's position, and make its errors look confirmed
         return Verdict(False, f"this place was learnt within the last {NEW_FOR_S:g} s and says nothing new")
     landmarks = f"; {proof.inliers} landmarks agree" if proof else ""

@@ -19,7 +19,9 @@ from edgevpr.frames.images import list_images
 from edgevpr.frames.positions import find_positions
 from edgevpr.places.growing import GrowingIndex
 from edgevpr.places.near import nearest_m
-from edgevpr.runtime.recognise.levelling import laid
+from edgevpr.places.retrieve import named
+from edgevpr.runtime.recognise.levelling import GPS_SD_M, laid
+from edgevpr.runtime.recognise.locate import HEARD, as_learnt, located
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.types import Frame, Place, Position, Vehicle
@@ -77,7 +79,7 @@ class Learner:
         place = None
         try:
             here, objection = self._placed(event.frame, event.vehicle)
-            here = laid(here, event.view)
+            here = self._tied(laid(here, event.view), event)
             objection = objection or self._objection(here.position, event)
             if objection:
                 self.passed_over[objection] += 1
@@ -105,6 +107,19 @@ class Learner:
         if place:
             self._recogniser.extend(self._growing.index, place.place_id, here.t_mono_s)
         return place
+
+    def _tied(self, frame: Frame, event: Recognition) -> Frame:
+        """Return the frame where the places around it say that its picture lies, as far as they agree with its recorded
+        position. What they say is only a part of it, so that no error of theirs grows from place to place."""
+        recogniser = self._recogniser
+        if frame.pose or frame.position is None or event.ranking is None or recogniser.technique.spec.cells is None:
+            return frame
+        found = named(event.ranking, recogniser.index, self._map, first=HEARD)
+        if found[0].match.score < recogniser.rule.min_score:
+            return frame
+        where = located(found, recogniser.technique.spec.cells, (0.0, 0.0))  # of the middle of the picture
+        learnt = where and not where.objection and as_learnt(where, frame.position, GPS_SD_M)
+        return replace(frame, position=learnt[0], pose=learnt[1]) if learnt else frame
 
     def _placed(self, frame: Frame, vehicle: Vehicle | None) -> tuple[Frame, str | None]:
         """Return the frame with the position to learn it at, and the objection to learning it there (None: no

@@ -17,7 +17,7 @@ from edgevpr.frames.source import is_live
 from edgevpr.geodesy import moved
 from edgevpr.types import Frame, Pose, Position, Vehicle
 
-_GPS_SIGMA_M = 5.0
+GPS_SD_M = 5.0  # of one axis of a recorded position, as long as nothing better is known
 _UNTOLD_TILT = 0.1  # of the footprint: so far off is the middle of a picture that is tilted by 7 degrees
 
 _log = logging.getLogger(__name__)
@@ -93,7 +93,7 @@ def laid(frame: Frame, view: View) -> Frame:
     frame = seen_as(frame, view)
     if frame.pose is not None or frame.position is None or view.up_deg is None or view.footprint_m is None:
         return frame
-    variance_m2 = _GPS_SIGMA_M**2
+    variance_m2 = GPS_SD_M**2
     position = frame.position
     if view.aside is None:
         variance_m2 += (_UNTOLD_TILT * view.footprint_m) ** 2

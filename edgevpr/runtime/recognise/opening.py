@@ -206,7 +206,7 @@ def _recogniser(
         min_accuracy_m=config.mavlink.min_accuracy_m,
         mask=mask,
         gate=gate_of(config.salience, board.threads),
-        levelling=levelling_of(config.source, technique),
+        levelling=levelling_of(config.source, technique, footprint_m=place_map.footprint_m()),
         verify=config.match.verify,
     )
 

@@ -9,17 +9,19 @@ from itertools import islice
 
 from edgevpr.contract import Technique
 from edgevpr.errors import EdgevprError, MapError, PlaceError
+from edgevpr.frames.level import Levelled
 from edgevpr.frames.mask import AnyMask, NoMask, encoded
-from edgevpr.landmarks.agreement import PROVEN
+from edgevpr.landmarks.agreement import PROVEN, Agreement
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import compare, named, scan
+from edgevpr.places.retrieve import Ranking, compare, named, scan
 from edgevpr.places.sequence import Alone, Search
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.gate import says_nothing
 from edgevpr.runtime.recognise.hints import NoPrior, Prior, expected_of
 from edgevpr.runtime.recognise.judge import NEW_FOR_S, AcceptRule, Verdict, judge
 from edgevpr.runtime.recognise.levelling import AnyLevelling, NoLevelling, seen_as
+from edgevpr.runtime.recognise.locate import HEARD, Located, at_place, located
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.runtime.recognise.verify import Verification, landmarks_of
 from edgevpr.salience.gate import Gate, NoGate
@@ -79,7 +81,7 @@ class Recogniser:
 
     def _take_index(self, index: PlaceIndex) -> None:
         self.index, self._lost = index, None
-        # 1-sigma accuracy of a fix: a match cannot tell where between two places the aircraft is.
+        # 1-sigma accuracy of a place as a fix: such a match cannot tell where between two places the aircraft is.
         self.accuracy_m = max(self._min_accuracy_m, index.spacing_m() or 0.0)
 
     def step(self, frame: Frame, vehicle: Vehicle | None = None) -> Recognition:
@@ -88,8 +90,8 @@ class Recogniser:
         Never raises an Exception: an error of a frame, a place or the technique becomes a refusal with its reason.
         """
         meter, technique, index = self.meter, self.technique, self.index
-        worth = descriptor = hints = ranking = best = nothing = objection = proof = None
-        picture, map_lost = None, False
+        worth = descriptor = hints = ranking = best = where = nothing = objection = proof = picture = None
+        map_lost = False
         meter.begin()
         try:
             with meter.step("prepare"):
@@ -129,14 +131,8 @@ class Recogniser:
                     is_new = self._is_new(best.place.place_id, frame.t_mono_s)
                     verdict = judge(ranking, index, self.rule, self.search, is_new)
                     verdict = Verdict(False, objection) if objection else verdict
-                if self._verifies and (verdict.accepted or verdict.is_open):
-                    with meter.step("verify"):
-                        looked = Verification(technique.spec, picture, index, self.place_map)
-                        proof, rival = looked.proof(ranking), 0
-                        if proof and verdict.is_open and proof.inliers >= PROVEN:
-                            rival = looked.rival(ranking, self.rule.neighbour_m)
-                    if proof:
-                        verdict = judge(ranking, index, self.rule, self.search, is_new, proof, rival)
+                if verdict.accepted or verdict.is_open:
+                    verdict, proof, where = self._look_again(ranking, picture, is_new, verdict)
                 self._prior.learn(best, verdict.accepted, frame.t_mono_s)
                 if self.search.length == 1:  # a sequence is to have one scale
                     self.levelling.learn(verdict.accepted)
@@ -145,7 +141,7 @@ class Recogniser:
             _log.debug("%s failed", frame.name, exc_info=True)
             verdict, failed = Verdict(False, _sentence(error)), True
             map_lost = isinstance(error, MapError) and not isinstance(error, PlaceError)
-        position = best.place.position if verdict.accepted else None
+        where = where if verdict.accepted else None
         return Recognition(
             frame=frame,
             vehicle=vehicle,
@@ -162,11 +158,31 @@ class Recogniser:
             failed=failed,
             map_lost=map_lost,
             left_out=self._newly_left_out(),
-            position=position,
-            accuracy_m=self.accuracy_m if position else None,
+            located=where,
+            accuracy_m=max(self._min_accuracy_m, where.accuracy_m) if where else None,
             steps=meter.steps(),
             cost=meter.cost(),
         )
+
+    def _look_again(
+        self, ranking: Ranking, picture: Levelled, is_new: bool, verdict: Verdict
+    ) -> tuple[Verdict, Agreement | None, Located | None]:
+        """Hold the best place against its landmarks, find out where the aircraft is by it and the places beside it, and
+        judge anew. `verdict` is what the comparison alone led to."""
+        technique, index, place_map = self.technique, self.index, self.place_map
+        proof, rival = None, 0
+        if self._verifies and technique.spec.cells:
+            with self.meter.step("verify"):
+                looked = Verification(technique.spec, picture, index, place_map)
+                proof = looked.proof(ranking)
+                if proof and verdict.is_open and proof.inliers >= PROVEN:
+                    rival = looked.rival(ranking, self.rule.neighbour_m)
+        with self.meter.step("locate"):
+            found = named(ranking, index, place_map, first=HEARD if technique.spec.cells else 1)
+            where = located(found, technique.spec.cells, picture.view.aside, proof)
+            if where is None and found[0].place.position:
+                where = at_place(found[0].place.position, self.accuracy_m)
+        return judge(ranking, index, self.rule, self.search, is_new, proof, rival, where), proof, where
 
     def landmarks(self, event: Recognition) -> bytes | None:
         """Return what a map keeps of the landmarks of a frame that becomes a place, None for a technique that does not

@@ -8,6 +8,7 @@ from edgevpr.frames.level import UNKNOWN_VIEW, Levelled, View
 from edgevpr.landmarks.agreement import Agreement
 from edgevpr.places.retrieve import Ranking
 from edgevpr.runtime.recognise.hints import Hints
+from edgevpr.runtime.recognise.locate import Located
 from edgevpr.salience.gate import Worth
 from edgevpr.types import Candidate, FixReport, Frame, Position, QueryCost, Steps, Vehicle
 
@@ -19,13 +20,14 @@ class Recognition:
     """Result of one frame.
 
     The inputs are `frame` and `vehicle`, the autopilot's report when the frame was taken (None: no report). `picture`
-    is the picture that was encoded, and how it lies on the ground, `worth` what the gate says of the frame (None: no gate looks),
-    `descriptor` the encoded frame, `hints` what narrowed the search, `ranking` the places found and `best` the first of
-    them; each is None where its step was not reached. `proof` is how the landmarks of frame and place agree (None:
-    they were not held against each other). `accepted` tells whether `best` is taken for the place, and
-    `reason` why (not), in a few words. `position` is the place's, and `accuracy_m` its 1-sigma; both are set for an
-    accepted match only: any other carries no position. `says_nothing` tells whether the picture holds too little to be
-    recognised; a place was then searched for only to go on with a sequence.
+    is the picture that was encoded, and how it lies on the ground, `worth` what the gate says of the frame (None: no
+    gate looks), `descriptor` the encoded frame, `hints` what narrowed the search, `ranking` the places found and `best`
+    the first of them; each is None where its step was not reached. `proof` is how the landmarks of frame and place
+    agree (None: they were not held against each other). `accepted` tells whether `best` is taken for the place, and
+    `reason` why (not), in a few words. `located` is where the aircraft is by that, and `accuracy_m` the 1-sigma to send
+    with it; both are set for an accepted match of a place with a position only: any other carries no position.
+    `says_nothing` tells whether the picture holds too little to be recognised; a place was then searched for only to go
+    on with a sequence.
 
     `failed` tells whether the frame, a place or the technique could not be used, and `map_lost` whether that is because
     the map as a whole cannot be read. `left_out` are the places that have been left out since the last event because
@@ -50,7 +52,7 @@ class Recognition:
     failed: bool = False
     map_lost: bool = False
     left_out: tuple[tuple[int, str], ...] = ()
-    position: Position | None = None
+    located: Located | None = None
     accuracy_m: float | None = None
     steps: Steps
     cost: QueryCost
@@ -63,6 +65,11 @@ class Recognition:
         return self.picture.view if self.picture else UNKNOWN_VIEW
 
     @property
+    def position(self) -> Position | None:
+        """Position of the aircraft, of an accepted match only."""
+        return self.located and self.located.position
+
+    @property
     def is_query(self) -> bool:
         """True where the frame became a query: it could be read and encoded."""
         return self.descriptor is not None
@@ -72,9 +79,9 @@ def fields_of(event: Recognition) -> dict[str, Any]:
     """Return the event as the flight log (kind "query") and `edgevpr match --json` have it.
 
     The fields are: query, place (id), reference_image, score, position (of the place), the match's step, its covariance
-    and the rotation (all null where no place was found), accepted, reason, accuracy_m, costs; where a gate looks,
-    salience; where landmarks were held against each other, landmarks; and, where anything is known of how the picture
-    lies on the ground, view.
+    and the rotation (all null where no place was found), accepted, reason, accuracy_m, located (where the aircraft is;
+    null where nothing was accepted), costs; where a gate looks, salience; where landmarks were held against each other,
+    landmarks; and, where anything is known of how the picture lies on the ground, view.
     """
     return {
         "query": event.frame.name,
@@ -85,6 +92,7 @@ def fields_of(event: Recognition) -> dict[str, Any]:
         "accepted": event.accepted,
         "reason": event.reason,
         "accuracy_m": event.accuracy_m,
+        "located": _rounded(event.located),
         "costs": {key: value and float(f"{value:.6g}") for key, value in asdict(event.cost).items()},
     }
 
@@ -98,6 +106,19 @@ def _landmarks(proof: Agreement) -> dict[str, Any]:
         "shift_share": [round(each, 4) for each in proof.shift_share],
         "rotation_deg": round(proof.rotation_deg, 1),
         "scale": round(proof.scale, 3),
+    }
+
+
+def _rounded(where: Located | None) -> dict[str, Any] | None:
+    if where is None:
+        return None
+    return {
+        "lat_deg": round(where.position.lat_deg, 8),
+        "lon_deg": round(where.position.lon_deg, 8),
+        "covariance_m2": [round(each, 3) for each in where.covariance_m2],
+        "heading_deg": where.heading_deg and round(where.heading_deg, 1),
+        "height_ratio": where.height_ratio and round(where.height_ratio, 3),
+        "places": where.places,
     }
 
 

@@ -18,6 +18,7 @@ from edgevpr.config import load_config
 from edgevpr.contract import PartSpec, TechniqueSpec
 from edgevpr.errors import EdgevprError
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log, start_fields
+from edgevpr.runtime.recognise.locate import at_place
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.types import Position, QueryCost, Steps
 
@@ -68,7 +69,7 @@ def test_a_match_is_written_as_it_is_with_nan_as_null(path):
         frame=None,
         accepted=True,
         reason="score 0.9",
-        position=Position(50.12345678901, -1.5, None),
+        located=at_place(Position(50.12345678901, -1.5, None), 20.0),
         accuracy_m=20.0,
         steps=Steps(),
         cost=COST,

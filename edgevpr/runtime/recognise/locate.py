@@ -1,0 +1,219 @@
+"""Where exactly: from places that were recognised to the position of the aircraft, in metres and with a covariance.
+
+A match says by what step the middle of the query's picture lies off the middle of the place's. Where it is known how
+that picture lies on the ground (its `Pose`), this is a position. Several places that show the same ground must then say
+the same, and together say it more exactly. Without a pose, such as ahead, the position is the place's own.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from edgevpr.contract import FineMatch
+from edgevpr.geodesy import metres, moved
+from edgevpr.landmarks.agreement import CONFIRMED, Agreement
+from edgevpr.types import Candidate, Pose, Position
+
+# Chosen on aerial_caliterra and aerial_garfield28. Standard deviations of one axis of a step, as shares of the longest
+# side, that come on top of what a match knows of its own: tilt and relief move parts of a picture by different steps.
+_OF_VOTE, _OF_LANDMARKS = 0.016, 0.008
+_SCALE_SD, _TURN_SD = 0.03, 0.03  # of the pose of a place, which stretch and turn a step
+_OF_SCATTER = 0.25
+_LIKE_THE_BEST = 0.5  # of its score: such a match is heard too
+_DISAGREES = 4.0  # standard deviations
+HEARD = 5  # places at most
+_UNTOLD = 0.05  # of the footprint: so far from the middle is the point under an aircraft that tilts by 4 degrees
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Located:
+    """Where the aircraft is: `position`, with `covariance_m2` (variance east, covariance, variance north).
+    `heading_deg` is the compass direction of the top of the picture, and `height_ratio` the height of the camera over
+    that of the map and `footprint_m` the length on the ground of its longest side (None: unknown). `places` is how many
+    say so. `objection` says why it is not to be believed (None: nothing is against it)."""
+
+    position: Position
+    covariance_m2: tuple[float, float, float]
+    heading_deg: float | None = None
+    height_ratio: float | None = None
+    footprint_m: float | None = None
+    places: int = 1
+    objection: str | None = None
+
+    @property
+    def accuracy_m(self) -> float:
+        """Standard deviation along the worst direction."""
+        var_east, cov, var_north = self.covariance_m2
+        middle, half = (var_east + var_north) / 2, math.hypot((var_east - var_north) / 2, cov)
+        return math.sqrt(middle + half)
+
+
+@dataclass(frozen=True, slots=True)
+class _Lies:
+    """How the query lies on a place: the `step` (2,) of its middle, to the right and down, as a share of the place's
+    longest side, with its covariance (2, 2); its rotation in degrees, and its height over that of then."""
+
+    step: np.ndarray
+    covariance: np.ndarray
+    rotation_deg: float
+    height_ratio: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class _Said:
+    """What one place says: east and north (2,) in metres from the best place, the covariance (2, 2) of the step that
+    led there, and that of its pose."""
+
+    at_m: np.ndarray
+    of_step: np.ndarray
+    of_pose: np.ndarray
+
+
+def at_place(position: Position, accuracy_m: float) -> Located:
+    """Return the position of a place as that of the aircraft, with a standard deviation of one axis."""
+    return Located(position=position, covariance_m2=(accuracy_m**2, 0.0, accuracy_m**2))
+
+
+def located(
+    found: Sequence[Candidate],
+    cells: int | None,
+    aside: tuple[float, float] | None = None,
+    proof: Agreement | None = None,
+) -> Located | None:
+    """Return where the aircraft is by the places `found`, best first; None where the best has no pose.
+
+    `cells` is the number of cells along the longest side of a picture (None: shifts say nothing about metres). `aside`
+    is where the point under the aircraft lies in the query's picture, to the right and up from its middle, as shares of
+    its longest side (None: unknown, about the middle). `proof` is how the landmarks of the best place agree: they know
+    the step better than the vote does. Places whose score is less than half of the best's, and those that do not show
+    the same ground, are not heard.
+    """
+    best = found[0]
+    if cells is None or not _can_say(best):
+        return None
+    lies = {id(each): _by_vote(each.match, cells) for each in found[:HEARD] if _can_say(each)}
+    if proof and proof.is_expected and proof.inliers >= CONFIRMED:
+        lies[id(best)] = _by_landmarks(proof)
+    origin = best.place.position
+    heard = [each for each in found[:HEARD] if _is_heard(each, best)]
+    said = [_said(each, lies[id(each)], origin, aside or (0.0, 0.0)) for each in heard]
+    first, others = said[0], said[1:]
+    against = [each for each in others if _apart(first, each) > _DISAGREES]
+    of_step = np.linalg.inv(sum(np.linalg.inv(each.of_step) for each in said))
+    at_m = of_step @ sum(np.linalg.inv(each.of_step) @ each.at_m for each in said)
+    # What is wrong with the poses is common to neighbours: hearing several makes it no smaller.
+    covariance = of_step + np.mean([each.of_pose for each in said], axis=0)
+    pose, way = best.place.pose, lies[id(best)]
+    if aside is None:
+        covariance += (_UNTOLD * pose.footprint_m * (way.height_ratio or 1.0)) ** 2 * np.eye(2)
+    objection = None
+    if against:
+        off_m = max(float(np.hypot(*(each.at_m - first.at_m))) for each in against)
+        objection = f"places of the same ground say positions that are {off_m:.0f} m apart"
+    lat_deg, lon_deg = moved(origin.lat_deg, origin.lon_deg, *at_m.tolist())
+    return Located(
+        position=Position(lat_deg, lon_deg, origin.alt_m),
+        covariance_m2=(float(covariance[0, 0]), float(covariance[0, 1]), float(covariance[1, 1])),
+        heading_deg=(pose.up_deg + way.rotation_deg) % 360,
+        height_ratio=way.height_ratio,
+        footprint_m=pose.footprint_m * (way.height_ratio or 1.0),
+        places=len(said),
+        objection=objection,
+    )
+
+
+def as_learnt(where: Located, recorded: Position, recorded_sd_m: float) -> tuple[Position, Pose] | None:
+    """Return position and pose of a new place that is `recorded` with a standard deviation of one axis, and lies where
+    places around it say; None where the two contradict each other."""
+    off_m = _off_m(recorded, where.position)
+    by_places, by_record = _matrix(where.covariance_m2), recorded_sd_m**2 * np.eye(2)
+    both = by_places + by_record
+    if math.sqrt(off_m @ np.linalg.solve(both, off_m)) > _DISAGREES:
+        return None
+    gain = by_record @ np.linalg.inv(both)
+    covariance = gain @ by_places
+    pose = Pose(
+        up_deg=where.heading_deg,
+        footprint_m=where.footprint_m,
+        covariance_m2=(float(covariance[0, 0]), float(covariance[0, 1]), float(covariance[1, 1])),
+        recorded=Position(recorded.lat_deg, recorded.lon_deg),
+    )
+    lat_deg, lon_deg = moved(recorded.lat_deg, recorded.lon_deg, *(gain @ off_m).tolist())
+    return Position(lat_deg, lon_deg, recorded.alt_m), pose
+
+
+def _can_say(candidate: Candidate) -> bool:
+    """Tell whether a match can be laid over the ground of its place."""
+    match, place = candidate.match, candidate.place
+    whole = place.position and match.shift_cells is not None and match.rotation_deg is not None
+    return bool(whole and place.pose)
+
+
+def _by_vote(match: FineMatch, cells: int) -> _Lies:
+    covariance = _matrix(match.covariance_cells2 or (0.0, 0.0, 0.0)) / cells**2
+    # Votes scatter around their peak; of their mean, what is left of that.
+    covariance = covariance * _OF_SCATTER + _OF_VOTE**2 * np.eye(2)
+    return _Lies(np.array(match.shift_cells) / cells, covariance, match.rotation_deg, match.height_ratio)
+
+
+def _by_landmarks(proof: Agreement) -> _Lies:
+    covariance = _matrix(proof.covariance_share2) + _OF_LANDMARKS**2 * np.eye(2)
+    return _Lies(np.array(proof.shift_share), covariance, proof.rotation_deg, proof.scale)
+
+
+def _matrix(covariance: tuple[float, float, float]) -> np.ndarray:
+    return np.array([[covariance[0], covariance[1]], [covariance[1], covariance[2]]])
+
+
+def _is_heard(candidate: Candidate, best: Candidate) -> bool:
+    if candidate is best:
+        return True
+    if not _can_say(candidate) or candidate.match.score < _LIKE_THE_BEST * best.match.score:
+        return False
+    # Both show the middle of the query: their middles are not farther from each other than that.
+    room_m = (candidate.place.pose.footprint_m + best.place.pose.footprint_m) / 2
+    return float(np.hypot(*_off_m(best.place.position, candidate.place.position))) <= room_m
+
+
+def _said(candidate: Candidate, lies: _Lies, origin: Position, aside: tuple[float, float]) -> _Said:
+    pose = candidate.place.pose
+    # The point under the aircraft, in the place's picture: first as the query has it, then turned and scaled as it is.
+    ratio, turn = lies.height_ratio or 1.0, math.radians(lies.rotation_deg)
+    right, up = aside
+    dx = lies.step[0] + ratio * (right * math.cos(turn) + up * math.sin(turn))
+    dy = lies.step[1] + ratio * (right * math.sin(turn) - up * math.cos(turn))
+    axes = np.stack(_axes(pose.up_deg), axis=1)
+    off_m = pose.footprint_m * (axes @ (dx, -dy))
+    length_m = float(np.hypot(*off_m))
+    towards = off_m / length_m if length_m else np.zeros(2)
+    aslant = np.array([-towards[1], towards[0]])
+    of_pose = np.outer(towards, towards) * (_SCALE_SD * length_m) ** 2
+    of_pose += np.outer(aslant, aslant) * (_TURN_SD * length_m) ** 2
+    upwards = lies.covariance * [[1, -1], [-1, 1]]  # of a step up, and not down
+    return _Said(
+        at_m=_off_m(origin, candidate.place.position) + off_m,
+        of_step=pose.footprint_m**2 * (axes @ upwards @ axes.T) + of_pose,
+        of_pose=_matrix(pose.covariance_m2),
+    )
+
+
+def _off_m(origin: Position, position: Position) -> np.ndarray:
+    """Return how far a position is from another, east and north (2,)."""
+    lat_deg, lon_deg = np.array([(each.lat_deg, each.lon_deg) for each in (origin, position)]).T
+    east_m, north_m = metres(lat_deg, lon_deg)
+    return np.array([east_m[1], north_m[1]])
+
+
+def _axes(up_deg: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the directions on the ground (east, north) of the right and of the top of a picture."""
+    up = math.radians(up_deg)
+    return np.array([math.cos(up), -math.sin(up)]), np.array([math.sin(up), math.cos(up)])
+
+
+def _apart(one: _Said, other: _Said) -> float:
+    """Return how far apart two places say that the aircraft is, in standard deviations. Their poses are known against
+    each other far better than on the Earth: half of a variance of each is what they may differ by."""
+    off = one.at_m - other.at_m
+    return float(np.sqrt(off @ np.linalg.solve(one.of_step + other.of_step + (one.of_pose + other.of_pose) / 2, off)))
