@@ -70,7 +70,7 @@ def fields_of(event: Recognition) -> dict[str, Any]:
     return {
         "query": event.frame.name,
         **_best(event.best),
-        **({"view": asdict(event.view)} if event.view != UNKNOWN_VIEW else {}),
+        **({"view": event.view.fields()} if event.view != UNKNOWN_VIEW else {}),
         **({"salience": event.worth.salience.rounded()} if event.worth else {}),
         "accepted": event.accepted,
         "reason": event.reason,
