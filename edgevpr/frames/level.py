@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -41,6 +42,15 @@ class View:
     footprint_m: float | None = None
     aside: tuple[float, float] | None = None
     reason: str | None = None
+
+    def fields(self) -> dict[str, Any]:
+        """Return the fields that the flight log has for a view."""
+        return {
+            "up_deg": self.up_deg and round(self.up_deg, 1),
+            "footprint_m": self.footprint_m and round(self.footprint_m, 2),
+            "aside": self.aside and [round(share, 4) for share in self.aside],
+            "reason": self.reason,
+        }
 
 
 UNKNOWN_VIEW = View()

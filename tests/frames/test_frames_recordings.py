@@ -105,6 +105,13 @@ def test_positions_come_from_the_csv_and_for_images_it_does_not_name_from_exif(f
     assert without.position is None
 
 
+def test_attitude_and_height_of_the_csv_go_with_the_image(folder):
+    write_picture(folder / "a.jpg")
+    (folder / "positions.csv").write_text("file,lat,lon,roll_deg,pitch_deg,rel_alt\na.jpg,1,2,-7,3,80\n")
+    (frame,) = (each for each in all_frames(open_source(str(folder), live=False)) if each.name == "a.jpg")
+    assert (frame.roll_deg, frame.pitch_deg, frame.height_m) == (-7.0, 3.0, 80.0)
+
+
 def test_positions_named_by_the_user_count_before_those_that_lie_there(folder, tmp_path):
     write_picture(folder / "a.jpg")
     (folder / "positions.csv").write_text("file,lat,lon\na.jpg,1,2\n")

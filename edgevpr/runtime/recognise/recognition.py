@@ -86,7 +86,7 @@ def fields_of(event: Recognition) -> dict[str, Any]:
     return {
         "query": event.frame.name,
         **_best(event.best),
-        **({"view": asdict(event.view)} if event.view != UNKNOWN_VIEW else {}),
+        **({"view": event.view.fields()} if event.view != UNKNOWN_VIEW else {}),
         **({"salience": event.worth.salience.rounded()} if event.worth else {}),
         **({"landmarks": _landmarks(event.proof)} if event.proof else {}),
         "accepted": event.accepted,
