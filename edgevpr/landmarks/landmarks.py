@@ -1,7 +1,7 @@
 """Landmarks of a picture: points that are found again in another picture of the same ground, and 256 bits of each.
 
-The points are the corners of FAST and the bits those of ORB (Rublee et al. 2011). A place keeps few of them, spread over
-the picture; a query has more, so that most of the place's points that it shows are among them.
+The points are the corners of FAST and the bits those of ORB (Rublee et al. 2011). A place keeps few of them, spread
+over the picture; a query has more, so that most of the place's points that it shows are among them.
 """
 
 import struct

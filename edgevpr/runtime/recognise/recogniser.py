@@ -127,10 +127,15 @@ class Recogniser:
                     is_new = self._is_new(best.place.place_id, frame.t_mono_s)
                     verdict = judge(ranking, index, self.rule, self.search, is_new)
                     verdict = Verdict(False, objection) if objection else verdict
-                if self._verifies and (verdict.accepted or verdict.is_open):
+                # The newest query of a sequence need not be sure by itself.
+                if self._verifies and self.search.length == 1 and (verdict.accepted or verdict.is_open):
                     with meter.step("verify"):
                         looked = Verification(
-                            technique.spec, frame.image, self._mask.fitted(frame.image), index, self.place_map
+                            spec=technique.spec,
+                            image=frame.image,
+                            allowed=self._mask.fitted(frame.image),
+                            index=index,
+                            place_map=self.place_map,
                         )
                         proof, rival = looked.proof(ranking), 0
                         if proof and verdict.is_open and proof.inliers >= PROVEN:

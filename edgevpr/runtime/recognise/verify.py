@@ -23,11 +23,17 @@ def landmarks_of(technique: Technique, image: np.ndarray, allowed: np.ndarray | 
 
 
 class Verification:
-    """Landmarks of one query, held against those of places. They are found when a place is first asked for that has
-    some."""
+    """Landmarks of one query, held against those of places. `allowed` is bool (H, W), True where the image shows ground
+    (None: everywhere). They are found when a place is first asked for that has some."""
 
     def __init__(
-        self, spec: TechniqueSpec, image: np.ndarray, allowed: np.ndarray | None, index: PlaceIndex, place_map: PlaceMap
+        self,
+        *,
+        spec: TechniqueSpec,
+        image: np.ndarray,
+        allowed: np.ndarray | None,
+        index: PlaceIndex,
+        place_map: PlaceMap,
     ) -> None:
         self._spec, self._image, self._allowed = spec, image, allowed
         self._index, self._map = index, place_map
