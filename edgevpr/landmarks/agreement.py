@@ -206,4 +206,4 @@ def _variance(asked: np.ndarray, known: np.ndarray, turn_scale: complex, shift: 
     per_axis = max(float(left.sum()) / max(2 * len(asked) - 4, 1), (_TOLERANCE / 10) ** 2)
     middle = asked.mean()
     spread = float((np.abs(asked - middle) ** 2).mean())
-    return per_axis * _ALIKE / len(asked) * (1 + abs(middle) ** 2 / max(spread, 1e-9))
+    return float(per_axis * _ALIKE / len(asked) * (1 + abs(middle) ** 2 / max(spread, 1e-9)))
