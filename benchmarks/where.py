@@ -87,9 +87,9 @@ def _registered(folder: Path, names: list[str], tags: dict[str, complex]) -> Sol
     longest = {name: max(picture(folder, name).shape[:2]) for name in names}
     step = [complex(float(row["dx_px"]), -float(row["dy_px"])) / longest[row["file_b"]] for row in rows]
     turn = [complex(np.log(float(row["scale"])), -np.radians(float(row["rotation_deg"]))) for row in rows]
-    sds = (np.full(len(rows), each) for each in _PAIR_SD)
+    step_sd, turn_sd = (np.full(len(rows), each) for each in _PAIR_SD)
     query, place = (np.array([number[row[key]] for row in rows]) for key in ("file_a", "file_b"))
-    ties = Ties(query, place, np.array(step), np.array(turn), *sds)
+    ties = Ties(query=query, place=place, step=np.array(step), turn=np.array(turn), step_sd=step_sd, turn_sd=turn_sd)
     return solve(np.array([tags[name] for name in names]), np.full(len(names), np.nan), ties)
 
 

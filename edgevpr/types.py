@@ -22,7 +22,7 @@ class Position:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pose:
-    """How the picture of a place lies on the ground, for a camera that looks straight down. `up_deg` is the compass
+    """The way in which a picture lies on the ground, for a camera that looks straight down. `up_deg` is the compass
     direction (0..360) of the top of the picture, and `footprint_m` the length on the ground of its longest side. The
     middle of the picture is the place's position, with `covariance_m2` (variance east, covariance, variance north).
     `is_surveyed`: cut from a geo-referenced picture, so that nothing is left to refine. `recorded` is the position as

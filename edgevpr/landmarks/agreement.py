@@ -35,7 +35,7 @@ _ALIKE = 40.0
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """How the query is thought to lie on the place: `shift_share` (dx, dy) of its middle, `rotation_deg` and `scale`
+    """Guess of how the query lies on the place: `shift_share` (dx, dy) of its middle, `rotation_deg` and `scale`
     (None: unknown), as in `Agreement`."""
 
     shift_share: tuple[float, float]
@@ -45,7 +45,7 @@ class Expected:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Agreement:
-    """How two pictures agree: `inliers` of the `matched` landmarks lie over each other; `possible` is the number of
+    """Result of a comparison: `inliers` of the `matched` landmarks lie over each other; `possible` is the number of
     landmarks of the picture that has fewer.
 
     The query, turned by `rotation_deg` (clockwise, 0..360) about its middle and scaled by `scale`, lies over the place
@@ -77,8 +77,8 @@ def held_against(query: Landmarks, place: Landmarks, expected: Expected) -> Agre
     if found.inliers >= CONFIRMED:
         return found
     otherwise = agreement(query, place)
-    if otherwise.inliers < PROVEN or _near(*_way(otherwise), expected):
-        return found
+    if otherwise.inliers < PROVEN or otherwise.is_at_rest or _near(*_way(otherwise), expected):
+        return found  # what is at rest may be a display, and says nothing of the ground
     return replace(otherwise, is_expected=False)
 
 
@@ -206,4 +206,4 @@ def _variance(asked: np.ndarray, known: np.ndarray, turn_scale: complex, shift: 
     per_axis = max(float(left.sum()) / max(2 * len(asked) - 4, 1), (_TOLERANCE / 10) ** 2)
     middle = asked.mean()
     spread = float((np.abs(asked - middle) ** 2).mean())
-    return per_axis * _ALIKE / len(asked) * (1 + abs(middle) ** 2 / max(spread, 1e-9))
+    return float(per_axis * _ALIKE / len(asked) * (1 + abs(middle) ** 2 / max(spread, 1e-9)))

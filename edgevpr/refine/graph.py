@@ -34,7 +34,7 @@ _NOTHING = 1e-6  # is known of the log of a place without ties
 _AT_ONCE = 256  # columns of the inverse
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Ties:
     """Pairs of pictures of the same ground: `query` and `place` int (T,) are their numbers, `step` and `turn` complex
     (T,) what one says of the other. `step_sd` and `turn_sd` float (T,) are how exactly, of one axis, in proportion: by

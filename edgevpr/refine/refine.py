@@ -32,7 +32,7 @@ _AMISS = 4.0  # standard deviations
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Refined:
-    """What refining a map has found. Of its `places`, `without_position` have none, `surveyed` needed no refining, and
+    """Result of refining a map. Of its `places`, `without_position` have none, `surveyed` needed no refining, and
     `refined` have a pose now; the others could not be tied. `ties` pairs of pictures agree, `ties_refused` do not.
     `recorded_sd_m` is how much recorded positions scatter in one axis, `moved_m` the median of how far places were
     moved, `position_sd_m` the median standard deviation of a refined position, and `footprint_m` the median footprint

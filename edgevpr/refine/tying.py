@@ -23,7 +23,7 @@ _MOST_OVERLAPPING = 12  # pairs of one place, once the graph is solved
 
 @dataclass(frozen=True, slots=True)
 class Tie:
-    """How one picture lies over another: `step` and `turn` complex, and their standard deviations (see
+    """The way in which one picture lies over another: `step` and `turn` complex, and their standard deviations (see
     `graph.Ties`)."""
 
     step: complex
@@ -75,4 +75,4 @@ def ties_of(found: dict[tuple[int, int], Tie]) -> Ties:
     pairs = np.array(list(found), np.intp).reshape(-1, 2)
     columns = [(tie.step, tie.turn, tie.step_sd, tie.turn_sd) for tie in found.values()]
     step, turn, step_sd, turn_sd = np.array(columns, complex).reshape(-1, 4).T
-    return Ties(pairs[:, 0], pairs[:, 1], step, turn, step_sd.real, turn_sd.real)
+    return Ties(query=pairs[:, 0], place=pairs[:, 1], step=step, turn=turn, step_sd=step_sd.real, turn_sd=turn_sd.real)

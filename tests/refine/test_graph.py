@@ -33,7 +33,8 @@ def ties_of(position, log, seed=0, wrong=0.0, within=0.6):
     lies = rng.random(len(query)) < wrong
     step[lies] = rng.uniform(-0.5, 0.5, lies.sum()) + 1j * rng.uniform(-0.5, 0.5, lies.sum())
     turn[lies] = 1j * rng.uniform(-np.pi, np.pi, lies.sum())
-    return Ties(query, place, step, turn, np.full(len(query), STEP_SD), np.full(len(query), TURN_SD)), lies
+    step_sd, turn_sd = np.full(len(query), STEP_SD), np.full(len(query), TURN_SD)
+    return Ties(query=query, place=place, step=step, turn=turn, step_sd=step_sd, turn_sd=turn_sd), lies
 
 
 def recorded_of(position, seed=0, sd_m=RECORDED_SD_M):

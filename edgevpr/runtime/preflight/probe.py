@@ -150,7 +150,7 @@ def probe(
         alone = walk(trial_map, empty_index(spec, 0, None), 1)
         first = _stepped(alone, frames[0])
         encode_mb = machine.peak_mb() - before_mb if peak_is_new else None
-        landmarks = alone.landmarks(frames[0].image)
+        landmarks = alone.landmarks(first)
         for _ in range(_PLACES):
             trial_map.add(frames[0], first.descriptor, landmarks=landmarks)
         index = load_index(trial_map, technique, _PLACES * bytes_per_place(spec))

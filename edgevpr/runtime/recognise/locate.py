@@ -1,4 +1,5 @@
-"""Where exactly: from places that were recognised to the position of the aircraft, in metres and with a covariance.
+"""Positions in metres: from places that were recognised to the position of the aircraft, in metres and with a
+covariance.
 
 A match says by what step the middle of the query's picture lies off the middle of the place's. Where it is known how
 that picture lies on the ground (its `Pose`), this is a position. Several places that show the same ground must then say
@@ -29,7 +30,7 @@ _UNTOLD = 0.05  # of the footprint: so far from the middle is the point under an
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Located:
-    """Where the aircraft is: `position`, with `covariance_m2` (variance east, covariance, variance north).
+    """Position of the aircraft: `position`, with `covariance_m2` (variance east, covariance, variance north).
     `heading_deg` is the compass direction of the top of the picture, and `height_ratio` the height of the camera over
     that of the map and `footprint_m` the length on the ground of its longest side (None: unknown). `places` is how many
     say so. `objection` says why it is not to be believed (None: nothing is against it)."""
@@ -52,8 +53,8 @@ class Located:
 
 @dataclass(frozen=True, slots=True)
 class _Lies:
-    """How the query lies on a place: the `step` (2,) of its middle, to the right and down, as a share of the place's
-    longest side, with its covariance (2, 2); its rotation in degrees, and its height over that of then."""
+    """The way in which the query lies on a place: the `step` (2,) of its middle, to the right and down, as a share of
+    the place's longest side, with its covariance (2, 2); its rotation in degrees, and its height over that of then."""
 
     step: np.ndarray
     covariance: np.ndarray
@@ -63,7 +64,7 @@ class _Lies:
 
 @dataclass(frozen=True, slots=True)
 class _Said:
-    """What one place says: east and north (2,) in metres from the best place, the covariance (2, 2) of the step that
+    """Position by one place: east and north (2,) in metres from the best place, the covariance (2, 2) of the step that
     led there, and that of its pose."""
 
     at_m: np.ndarray

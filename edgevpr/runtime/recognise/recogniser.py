@@ -171,7 +171,8 @@ class Recogniser:
         judge anew. `verdict` is what the comparison alone led to."""
         technique, index, place_map = self.technique, self.index, self.place_map
         proof, rival = None, 0
-        if self._verifies and technique.spec.cells:
+        # The newest query of a sequence need not be sure by itself.
+        if self._verifies and self.search.length == 1 and technique.spec.cells:
             with self.meter.step("verify"):
                 looked = Verification(technique.spec, picture, index, place_map)
                 proof = looked.proof(ranking)

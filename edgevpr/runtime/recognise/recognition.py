@@ -61,7 +61,7 @@ class Recognition:
 
     @property
     def view(self) -> View:
-        """How the picture lies on the ground."""
+        """The way in which the picture lies on the ground."""
         return self.picture.view if self.picture else UNKNOWN_VIEW
 
     @property

@@ -78,7 +78,7 @@ def test_a_match_is_written_as_it_is_with_nan_as_null(path):
         log.write("match", t_mono_s=12.5, event=match)
     (record,) = read_log(path)
     assert record["t_mono_s"] == 12.5
-    assert record["event"]["position"] == {"lat_deg": 50.1234568, "lon_deg": -1.5, "alt_m": None}
+    assert record["event"]["located"]["position"] == {"lat_deg": 50.1234568, "lon_deg": -1.5, "alt_m": None}
     assert record["event"]["cost"]["used_mah"] == 1.234568e-05
     assert record["event"]["cost"]["marginal_mah"] is None
 

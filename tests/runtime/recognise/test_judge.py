@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from edgevpr.contract import FineMatch, PartSpec, TechniqueSpec
+from edgevpr.landmarks.agreement import PROVEN, Agreement
 from edgevpr.places.index import empty_index
 from edgevpr.places.retrieve import Ranking
 from edgevpr.places.sequence import Alone, SequenceSearch
@@ -91,3 +92,75 @@ def test_in_a_sequence_the_newest_query_need_not_be_sure_by_itself():
 def test_where_there_is_no_place_elsewhere_what_agrees_counts_all_the_same():
     assert judged(0.05, (0.2,)).accepted
     assert not judged(0.03, (0.2,)).accepted
+
+
+def found(inliers, possible=250, shift_share=(0.1, 0.0), is_expected=True):
+    """An agreement of so many landmarks."""
+    return Agreement(
+        inliers=inliers,
+        matched=60,
+        possible=possible,
+        shift_share=shift_share,
+        rotation_deg=0.0,
+        scale=1.0,
+        covariance_share2=(1e-4, 0.0, 1e-4),
+        is_expected=is_expected,
+    )
+
+
+def held(score, ahead, proof, rival=0, rule=RULE, coverage=0.5):
+    """The verdict on a match that scores so much, so far ahead of a place elsewhere."""
+    index = empty_index(TechniqueSpec(name="test", parameters={}, coarse=PartSpec((1,), "<f4")), 10, None)
+    scores = np.array([score, score - ahead], np.float32)
+    matches = {slot: FineMatch(float(value), coverage=coverage) for slot, value in zip((0, 9), scores, strict=True)}
+    ranking = Ranking(np.array([0, 9]), scores, matches)
+    return judge(ranking, index, rule, Alone(), is_new=False, proof=proof, rival=rival)
+
+
+@pytest.mark.parametrize(("score", "ahead", "coverage"), [(0.05, 0.04, 0.5), (0.15, 0.001, 0.5), (0.15, 0.1, 0.02)])
+def test_landmarks_make_up_for_a_weak_vote(score, ahead, coverage):
+    assert held(score, ahead, None, coverage=coverage).is_open
+    assert held(score, ahead, found(PROVEN), coverage=coverage).accepted
+    for proof, rival in (
+        (found(PROVEN - 1), 0),
+        (found(PROVEN), PROVEN // 2 + 1),
+        (found(40), 21),
+        (found(40, shift_share=(0.0, 0.001)), 0),
+        (found(40, is_expected=False), 0),
+    ):
+        verdict = held(score, ahead, proof, rival, coverage=coverage)
+        assert (verdict.accepted, verdict.is_open) == (False, False)
+
+
+@pytest.mark.parametrize("score", [0.0, 0.039, math.nan])
+def test_landmarks_make_up_for_no_vote_at_all(score):
+    assert not held(score, 0.0, None).is_open
+    assert not held(score, 0.0, found(200)).accepted
+
+
+def test_a_rule_that_accepts_nothing_is_not_made_up_for():
+    assert not held(0.5, 0.2, None, rule=AcceptRule(0.08, 1.0, 50.0)).is_open
+
+
+@pytest.mark.parametrize(
+    ("score", "proof", "accepted"),
+    [
+        (0.3, found(4), False),
+        (0.3, found(0), False),
+        (0.3, found(5), True),
+        (0.3, found(0, possible=99), True),
+        (0.19, found(0), True),
+        (0.12, found(30, is_expected=False), False),
+    ],
+)
+def test_a_clear_vote_without_landmarks_that_agree_is_refused(score, proof, accepted):
+    assert held(score, 0.1, proof).accepted == accepted
+
+
+def test_a_sequence_is_not_open_to_proof():
+    index = empty_index(TechniqueSpec(name="test", parameters={}, coarse=PartSpec((1,), "<f4")), 10, None)
+    search = SequenceSearch(2)
+    ranking = Ranking(np.array([0, 9]), np.array([0.05, 0.01], np.float32), {})
+    search.follow(ranking, index, 0.0)
+    search.follow(ranking, index, 1.0)
+    assert not judge(ranking, index, RULE, search, is_new=False).is_open

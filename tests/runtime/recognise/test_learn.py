@@ -10,7 +10,7 @@ from fakes import FakeClock, vehicle_at
 from edgevpr.config import load_config
 from edgevpr.contract import Descriptor
 from edgevpr.errors import MapError, UsageError
-from edgevpr.frames.level import UNKNOWN_VIEW, View
+from edgevpr.frames.level import UNKNOWN_VIEW, Levelled, View
 from edgevpr.places.growing import GrowingIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.near import index_positions
@@ -80,7 +80,7 @@ class Bench:
         event = Recognition(
             frame=frame,
             vehicle=vehicle,
-            view=view,
+            picture=Levelled(frame.image, None, view),
             descriptor=Descriptor(coarse=part, quality=quality),
             reason="",
             failed=failed,

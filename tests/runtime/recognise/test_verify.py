@@ -1,0 +1,202 @@
+"""Verification in the walk of a frame: what landmarks refuse and accept, and maps that have none or damaged ones."""
+
+import shutil
+import sqlite3
+import zlib
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from fakes import FakeClock
+
+from edgevpr.frames.mask import Mask
+from edgevpr.landmarks.landmarks import describe, packed, unpacked
+from edgevpr.places.index import load_index
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.sequence import SequenceSearch
+from edgevpr.power.boards import load_board
+from edgevpr.power.equations import Pack
+from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.recognise.judge import AcceptRule
+from edgevpr.runtime.recognise.mapping import build_map
+from edgevpr.runtime.recognise.recogniser import Recogniser
+from edgevpr.runtime.recognise.recognition import fields_of
+from edgevpr.runtime.recognise.verify import Verification
+from edgevpr.techniques import create
+from edgevpr.types import Frame, Position
+
+PLACES = 4
+RULE = AcceptRule(min_score=0.08, min_margin=0.03, neighbour_m=50.0)
+
+
+def ground(seed):
+    """Ground larger than a picture, with patches of all sizes."""
+    rng = np.random.default_rng(seed)
+    layers = [cv2.GaussianBlur(rng.normal(size=(300, 380)), (0, 0), size) * size for size in (1, 2, 4, 8)]
+    return cv2.normalize(sum(layers), None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+
+
+def frame(seed, right_px=0, down_px=0):
+    image = np.ascontiguousarray(ground(seed)[30 + down_px : 270 + down_px, 30 + right_px : 350 + right_px])
+    return Frame(image=image, name=f"{seed}.png", t_mono_s=0.0, position=Position(50 + seed * 0.001, 8.0))
+
+
+def meter(clock=None):
+    clock = clock or FakeClock()
+    return QueryMeter(load_board("rpi-4b"), Pack(4, 5200), 0.85, wall_clock=clock, cpu_clock=clock.clock.process_cpu_s)
+
+
+@pytest.fixture(scope="module")
+def technique():
+    return create("cohog", {"camera": "nadir"})
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory, technique):
+    path = tmp_path_factory.mktemp("map") / "m.gpkg"
+    with PlaceMap.create(path, technique.spec) as place_map:
+        build_map(map(frame, range(PLACES)), technique, place_map, meter())
+    return path
+
+
+@pytest.fixture
+def mapped(whole, tmp_path):
+    """A copy of the map, to be changed."""
+    return Path(shutil.copy(whole, tmp_path))
+
+
+def keep(path, landmarks, checksum):
+    """Write other landmarks for the second place."""
+    with sqlite3.connect(path) as db:
+        db.execute("UPDATE places SET landmarks = ?, landmarks_crc32 = ? WHERE place_id = 2", (landmarks, checksum))
+    db.close()
+
+
+def asked(path, technique, query, rule=RULE, times=1, **others):
+    """The event of a query; of the last, where it is asked several times."""
+    with PlaceMap.open(path) as place_map:
+        walk = Recogniser(
+            technique=technique,
+            place_map=place_map,
+            index=load_index(place_map, technique, 10**7),
+            rule=rule,
+            meter=meter(),
+            candidates=technique.candidates,
+            **others,
+        )
+        return [walk.step(query) for _ in range(times)][-1]
+
+
+def test_a_map_made_looking_down_has_landmarks_and_they_are_found_again(mapped, technique):
+    event = asked(mapped, technique, frame(1, 20, -10))
+    assert event.accepted
+    assert event.reason.endswith("landmarks agree")
+    assert event.proof.inliers >= 10
+    assert np.array(event.proof.shift_share) * 320 == pytest.approx((20, -10), abs=1.5)
+    said = fields_of(event)["landmarks"]
+    assert (said["inliers"], said["scale"]) == (event.proof.inliers, pytest.approx(1, abs=0.02))
+
+
+def test_a_clear_match_with_the_landmarks_of_another_picture_is_refused(mapped, technique):
+    others = packed(describe(frame(77).image))
+    keep(mapped, others, zlib.crc32(others))
+    event = asked(mapped, technique, frame(1, 20, -10))
+    assert event.best.match.score > 0.2
+    assert (event.accepted, event.failed, event.position) == (False, False, None)
+    assert event.reason.startswith("its landmarks do not agree")
+    assert asked(mapped, technique, frame(2, 20, -10)).accepted, "the other places are as they were"
+
+
+def test_a_place_whose_landmarks_lie_otherwise_than_its_regions_is_refused(mapped, technique):
+    turned = packed(describe(np.ascontiguousarray(np.rot90(frame(1).image, 2))))
+    keep(mapped, turned, zlib.crc32(turned))
+    event = asked(mapped, technique, frame(1, 20, -10))
+    assert not event.accepted
+    assert event.reason.startswith("its landmarks lie otherwise")
+
+
+def test_a_match_that_is_hardly_ahead_is_accepted_for_its_landmarks(mapped, technique):
+    rule = replace(RULE, min_margin=0.99)
+    event = asked(mapped, technique, frame(1, 20, -10), rule)
+    assert event.accepted
+    assert not asked(mapped, technique, frame(1, 20, -10), rule, verify=False).accepted
+    assert not asked(mapped, technique, frame(1), rule).accepted, "what has not moved may be a display"
+
+
+def test_ground_that_is_in_the_map_twice_is_not_accepted_for_its_landmarks(tmp_path, technique):
+    far = Position(51.0, 8.0)
+    twice = [frame(0), frame(1), frame(2), frame(3), replace(frame(1), name="again.png", position=far)]
+    with PlaceMap.create(tmp_path / "m.gpkg", technique.spec) as place_map:
+        build_map(twice, technique, place_map, meter())
+    event = asked(tmp_path / "m.gpkg", technique, frame(1, 20, -10))
+    assert not event.accepted
+    assert "ahead of a place elsewhere" in event.reason
+
+
+def test_other_ground_is_not_accepted_whatever_its_landmarks(mapped, technique):
+    assert not any(asked(mapped, technique, frame(seed)).accepted for seed in range(20, 26))
+
+
+@pytest.mark.parametrize("blob", [None, b"", b"\x09of a newer form", packed(describe(np.zeros((9, 9), np.uint8)))])
+def test_a_place_without_landmarks_is_judged_as_ever(mapped, technique, blob):
+    without = asked(mapped, technique, frame(1, 20, -10), verify=False)
+    keep(mapped, blob, None if blob is None else zlib.crc32(blob))
+    event = asked(mapped, technique, frame(1, 20, -10))
+    assert (event.accepted, event.best, without.accepted) == (True, without.best, True)
+    assert event.proof is None or event.proof.inliers == 0
+    assert without.proof is None
+    assert "landmarks" not in fields_of(without)
+
+
+def test_damaged_landmarks_are_a_refusal_and_the_place_is_left_out(mapped, technique):
+    keep(mapped, b"damaged", 1)
+    event = asked(mapped, technique, frame(1, 20, -10))
+    assert (event.accepted, event.failed, event.map_lost) == (False, True, False)
+    assert "place 2 is damaged" in event.reason
+    assert event.left_out == ((2, "its set of landmarks does not match its checksum"),)
+    again = asked(mapped, technique, frame(1, 20, -10), times=2)
+    assert (again.accepted, again.failed) == (False, False)
+    assert "a place that cannot be read may be the right one" in again.reason or "below" in again.reason
+
+
+def test_the_mask_holds_for_landmarks_too(whole, technique, tmp_path):
+    allowed = np.ones((240, 320), bool)
+    allowed[:, :160] = False
+    with PlaceMap.create(tmp_path / "half.gpkg", technique.spec) as place_map:
+        build_map([frame(1)], technique, place_map, meter(), mask=Mask(allowed, "half"))
+        there = unpacked(place_map.landmarks_of(1))
+    assert len(there) > 30
+    assert there.points[:, 0].min() > 0
+
+
+def test_a_sequence_is_not_held_against_landmarks(mapped, technique):
+    assert asked(mapped, technique, frame(1, 20, -10), times=3, search=SequenceSearch(2)).proof is None
+
+
+def test_a_camera_that_looks_ahead_has_no_landmarks(tmp_path):
+    ahead = create("cohog", {"w1": 208})
+    with PlaceMap.create(tmp_path / "m.gpkg", ahead.spec) as place_map:
+        build_map([frame(0)], ahead, place_map, meter())
+        assert place_map.landmarks_of(1) is None
+    assert asked(tmp_path / "m.gpkg", ahead, frame(0)).proof is None
+
+
+def test_verification_is_a_step_of_its_own_and_counts_as_matching(mapped, technique, monkeypatch):
+    clock = FakeClock()
+    look = Verification.proof
+    monkeypatch.setattr(Verification, "proof", lambda self, ranking: (clock.work(0.02), look(self, ranking))[1])
+    with PlaceMap.open(mapped) as place_map:
+        walk = Recogniser(
+            technique=technique,
+            place_map=place_map,
+            index=load_index(place_map, technique, 10**7),
+            rule=RULE,
+            meter=meter(clock),
+            candidates=technique.candidates,
+        )
+        event = walk.step(frame(1, 20, -10))
+        nothing = walk.step(Frame(image=np.zeros((240, 320), np.uint8), name="nothing", t_mono_s=0.0))
+    assert (event.steps.verify.wall_s, event.cost.t_match_s) == pytest.approx((0.02, 0.02))
+    assert nothing.steps.verify.wall_s == 0
