@@ -3,6 +3,7 @@
 A place that cannot be read must never turn a refused match into an accepted wrong one: see `visit`.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -168,10 +169,12 @@ def elsewhere(index: PlaceIndex, best: int, slots: np.ndarray, neighbour_m: floa
     return np.where(np.isnan(away_m), abs(slots - best) > _NEIGHBOURS_WITHOUT_POSITION, away_m > neighbour_m)
 
 
-def margin(ranking: Ranking, index: PlaceIndex, neighbour_m: float) -> float | None:
-    """Return the margin: the best score less the best score elsewhere. None where no place elsewhere is ranked."""
+def margin(ranking: Ranking, index: PlaceIndex, neighbour_m: float, same: Sequence[int] = ()) -> float | None:
+    """Return the margin: the best score less the best score elsewhere. None where no place elsewhere is ranked. The
+    places numbered `same` are not elsewhere, however far from the best one: they show the same ground."""
     others = ranking.slots[1:]
-    runners_up = ranking.scores[1:][elsewhere(index, ranking.slots[0], others, neighbour_m)]
+    away = elsewhere(index, ranking.slots[0], others, neighbour_m) & ~np.isin(index.place_ids[others], same)
+    runners_up = ranking.scores[1:][away]
     return float(ranking.scores[0] - runners_up[0]) if len(runners_up) else None
 
 

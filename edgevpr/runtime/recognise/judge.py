@@ -95,7 +95,7 @@ def judge(
     `search` is the search that made the ranking; `is_new` tells whether the best place was learnt within the last
     `NEW_FOR_S` seconds. `proof` is how the landmarks of query and place agree (None: nothing is known of it), and
     `rival` the number of those of the best place elsewhere that agree. `where` is the position that the best places say
-    together (None: only that of the best one is known).
+    together (None: only that of the best one is known); a place that says the same as the best one is no rival.
     """
     proven = proof is not None and _proves(proof, rival)
     may_be_proven = proof is None and search.length == 1 and rule.min_margin < 1
@@ -110,7 +110,7 @@ def judge(
         return Verdict(False, objection)
     if len(ranking.unread):
         return Verdict(False, "a place that cannot be read may be the right one")
-    ahead = margin(ranking, index, rule.neighbour_m)
+    ahead = margin(ranking, index, rule.neighbour_m, where.places if where else ())
     if ahead is None and rule.min_score == 0:
         return Verdict(False, "there is no place elsewhere to compare with, and this score alone says nothing")
     if not proven and ahead is not None and not ahead >= rule.min_margin:

@@ -9,6 +9,7 @@ the same, and together say it more exactly. Without a pose, such as ahead, the p
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import compress
 
 import numpy as np
 
@@ -23,7 +24,8 @@ _OF_VOTE, _OF_LANDMARKS = 0.016, 0.008
 _SCALE_SD, _TURN_SD = 0.03, 0.03  # of the pose of a place, which stretch and turn a step
 _OF_SCATTER = 0.25
 _LIKE_THE_BEST = 0.5  # of its score: such a match is heard too
-_DISAGREES = 4.0  # standard deviations
+_DISAGREES = 4.0  # standard deviations: such a place is not heard
+_CONTRADICTS = 0.2  # of the footprint: farther apart than that, one of the two is not the right place
 HEARD = 5  # places at most
 _UNTOLD = 0.05  # of the footprint: so far from the middle is the point under an aircraft that tilts by 4 degrees
 
@@ -32,15 +34,15 @@ _UNTOLD = 0.05  # of the footprint: so far from the middle is the point under an
 class Located:
     """Position of the aircraft: `position`, with `covariance_m2` (variance east, covariance, variance north).
     `heading_deg` is the compass direction of the top of the picture, and `height_ratio` the height of the camera over
-    that of the map and `footprint_m` the length on the ground of its longest side (None: unknown). `places` is how many
-    say so. `objection` says why it is not to be believed (None: nothing is against it)."""
+    that of the map and `footprint_m` the length on the ground of its longest side (None: unknown). `places` are the
+    numbers of those that say so. `objection` says why it is not to be believed (None: nothing is against it)."""
 
     position: Position
     covariance_m2: tuple[float, float, float]
     heading_deg: float | None = None
     height_ratio: float | None = None
     footprint_m: float | None = None
-    places: int = 1
+    places: tuple[int, ...] = ()
     objection: str | None = None
 
     @property
@@ -101,7 +103,9 @@ def located(
     heard = [each for each in found[:HEARD] if _is_heard(each, best)]
     said = [_said(each, lies[id(each)], origin, aside or (0.0, 0.0)) for each in heard]
     first, others = said[0], said[1:]
-    against = [each for each in others if _apart(first, each) > _DISAGREES]
+    agree = [_apart(first, each) <= _DISAGREES for each in others]
+    against_m = [float(np.hypot(*(each.at_m - first.at_m))) for each, ok in zip(others, agree, strict=True) if not ok]
+    heard, said = ([each[0], *compress(each[1:], agree)] for each in (heard, said))
     of_step = np.linalg.inv(sum(np.linalg.inv(each.of_step) for each in said))
     at_m = of_step @ sum(np.linalg.inv(each.of_step) @ each.at_m for each in said)
     # What is wrong with the poses is common to neighbours: hearing several makes it no smaller.
@@ -110,9 +114,8 @@ def located(
     if aside is None:
         covariance += (_UNTOLD * pose.footprint_m * (way.height_ratio or 1.0)) ** 2 * np.eye(2)
     objection = None
-    if against:
-        off_m = max(float(np.hypot(*(each.at_m - first.at_m))) for each in against)
-        objection = f"places of the same ground say positions that are {off_m:.0f} m apart"
+    if max(against_m, default=0.0) > _CONTRADICTS * pose.footprint_m:
+        objection = f"places of the same ground say positions that are {max(against_m):.0f} m apart"
     lat_deg, lon_deg = moved(origin.lat_deg, origin.lon_deg, *at_m.tolist())
     return Located(
         position=Position(lat_deg, lon_deg, origin.alt_m),
@@ -120,7 +123,7 @@ def located(
         heading_deg=(pose.up_deg + way.rotation_deg) % 360,
         height_ratio=way.height_ratio,
         footprint_m=pose.footprint_m * (way.height_ratio or 1.0),
-        places=len(said),
+        places=tuple(each.place.place_id for each in heard),
         objection=objection,
     )
 

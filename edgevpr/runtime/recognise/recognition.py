@@ -118,7 +118,7 @@ def _rounded(where: Located | None) -> dict[str, Any] | None:
         "covariance_m2": [round(each, 3) for each in where.covariance_m2],
         "heading_deg": where.heading_deg and round(where.heading_deg, 1),
         "height_ratio": where.height_ratio and round(where.height_ratio, 3),
-        "places": where.places,
+        "places": list(where.places),
     }
 
 
