@@ -1,0 +1,166 @@
+"""From matches to metres: positions, covariances, and what places must agree on."""
+
+import math
+
+import numpy as np
+import pytest
+
+from edgevpr.contract import FineMatch
+from edgevpr.geodesy import metres, moved
+from edgevpr.landmarks.agreement import Agreement
+from edgevpr.runtime.recognise.locate import as_learnt, at_place, located
+from edgevpr.types import Candidate, Place, Pose, Position
+
+ORIGIN = Position(50.0, 8.0, 120.0)
+CELLS, FOOTPRINT_M = 32, 64.0
+
+
+def candidate(number=1, shift=(0.0, 0.0), east_m=0.0, north_m=0.0, up_deg=0.0, turned_deg=0.0, score=0.3, **pose):
+    lat_deg, lon_deg = moved(ORIGIN.lat_deg, ORIGIN.lon_deg, east_m, north_m)
+    lies = Pose(**{"up_deg": up_deg, "footprint_m": FOOTPRINT_M, "covariance_m2": (4.0, 0.0, 4.0), **pose})
+    place = Place(place_id=number, source_image=f"{number}", position=Position(lat_deg, lon_deg, 120.0), pose=lies)
+    match = FineMatch(score, shift_cells=shift, covariance_cells2=(0.2, 0.0, 0.2), rotation_deg=turned_deg)
+    return Candidate(place, match)
+
+
+def off_m(position):
+    east_m, north_m = metres(np.array([ORIGIN.lat_deg, position.lat_deg]), np.array([ORIGIN.lon_deg, position.lon_deg]))
+    return east_m[1], north_m[1]
+
+
+@pytest.mark.parametrize(
+    ("shift", "up_deg", "there"),
+    [
+        ((4, 0), 0, (8, 0)),  # a cell is 2 m: right is east where the top of the picture is north
+        ((0, 4), 0, (0, -8)),  # and down is south
+        ((4, 0), 90, (0, -8)),  # the top is east: right is south
+        ((0, 4), 90, (-8, 0)),
+        ((4, 0), 180, (-8, 0)),
+        ((0, -4), 270, (-8, 0)),
+        ((4, 0), 45, (8 / math.sqrt(2), -8 / math.sqrt(2))),
+    ],
+)
+def test_a_step_in_the_picture_is_one_on_the_ground(shift, up_deg, there):
+    found = located([candidate(shift=shift, up_deg=up_deg)], CELLS, (0.0, 0.0))
+    assert off_m(found.position) == pytest.approx(there, abs=0.01)
+    assert found.position.alt_m == ORIGIN.alt_m
+
+
+@pytest.mark.parametrize(("up_deg", "turned_deg", "heading_deg"), [(0, 0, 0), (90, 30, 120), (300, 90, 30)])
+def test_the_heading_is_that_of_the_place_and_the_turn_since(up_deg, turned_deg, heading_deg):
+    found = located([candidate(up_deg=up_deg, turned_deg=turned_deg)], CELLS)
+    assert found.heading_deg == pytest.approx(heading_deg)
+
+
+@pytest.mark.parametrize(
+    ("turned_deg", "aside", "there"),
+    [
+        (0, (0.25, 0.0), (16, 0)),
+        (0, (0.0, 0.25), (0, 16)),
+        (90, (0.0, 0.25), (16, 0)),  # the query's top is east
+        (90, (0.25, 0.0), (0, -16)),
+    ],
+)
+def test_the_aircraft_is_where_the_camera_hangs_and_not_where_it_looks(turned_deg, aside, there):
+    found = located([candidate(turned_deg=turned_deg)], CELLS, aside)
+    assert off_m(found.position) == pytest.approx(there, abs=0.01)
+
+
+def test_what_is_aside_of_a_query_from_higher_up_is_farther():
+    proof = Agreement(
+        inliers=20,
+        matched=30,
+        possible=250,
+        shift_share=(0.0, 0.0),
+        rotation_deg=0.0,
+        scale=2.0,
+        covariance_share2=(1e-5, 0.0, 1e-5),
+    )
+    found = located([candidate()], CELLS, (0.25, 0.0), proof)
+    assert off_m(found.position) == pytest.approx((32, 0), abs=0.01)
+    assert (found.height_ratio, found.footprint_m) == (2.0, 128.0)
+
+
+def test_landmarks_know_the_step_better_than_the_vote():
+    proof = Agreement(
+        inliers=20,
+        matched=30,
+        possible=250,
+        shift_share=(0.11, -0.05),
+        rotation_deg=4.0,
+        scale=1.0,
+        covariance_share2=(1e-5, 0.0, 1e-5),
+    )
+    by_vote = located([candidate(shift=(4, -2))], CELLS, (0.0, 0.0))
+    found = located([candidate(shift=(4, -2))], CELLS, (0.0, 0.0), proof)
+    assert off_m(found.position) == pytest.approx((0.11 * 64, 0.05 * 64), abs=0.01)
+    assert found.heading_deg == pytest.approx(4.0)
+    assert found.accuracy_m < by_vote.accuracy_m
+
+
+def test_places_of_the_same_ground_are_heard_together():
+    one, other = candidate(1, shift=(4, 0)), candidate(2, shift=(-4, 0), east_m=16.4)
+    found = located([one, other], CELLS, (0.0, 0.0))
+    assert off_m(found.position) == pytest.approx((8.2, 0), abs=0.01)
+    assert found.places == (1, 2)
+    assert found.accuracy_m < located([one], CELLS, (0.0, 0.0)).accuracy_m
+    assert found.accuracy_m >= 2.0, "what is wrong with the map does not become less by hearing more of it"
+    assert found.objection is None
+
+
+def test_places_that_contradict_each_other_are_refused():
+    found = located([candidate(1, shift=(4, 0)), candidate(2, shift=(8, 10), east_m=10)], CELLS)
+    assert "positions that are" in found.objection
+
+
+def test_a_place_a_little_amiss_is_not_heard_and_no_objection():
+    found = located([candidate(1, shift=(4, 0)), candidate(2, shift=(0, 0), east_m=20)], CELLS, (0.0, 0.0))
+    assert found.places == (1,)
+    assert found.objection is None
+    assert off_m(found.position) == pytest.approx((8, 0), abs=0.01)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        candidate(2, shift=(0, 0), east_m=40, score=0.1),  # it agrees by far less
+        candidate(2, shift=(0, 0), east_m=400),  # other ground
+    ],
+)
+def test_what_does_not_show_the_same_ground_is_not_heard(other):
+    found = located([candidate(1, shift=(4, 0)), other], CELLS)
+    assert (found.places, found.objection) == ((1,), None)
+
+
+def test_an_unknown_tilt_makes_a_fix_less_exact():
+    known, unknown = located([candidate()], CELLS, (0.0, 0.0)), located([candidate()], CELLS, None)
+    assert unknown.accuracy_m > known.accuracy_m + 0.5
+
+
+def test_without_a_pose_or_a_step_there_is_nothing_to_say():
+    bare = Place(place_id=1, source_image="1", position=ORIGIN)
+    assert located([Candidate(bare, candidate().match)], CELLS) is None
+    assert located([Candidate(candidate().place, FineMatch(0.5))], CELLS) is None
+    assert located([candidate()], None) is None, "ahead, a step says nothing about metres"
+    assert at_place(ORIGIN, 20.0).accuracy_m == pytest.approx(20.0)
+
+
+def test_the_covariance_is_that_of_the_place_turned_to_the_ground():
+    found = located([candidate(covariance_m2=(100.0, 0.0, 1.0))], CELLS, (0.0, 0.0))
+    var_east, cov, var_north = found.covariance_m2
+    assert var_east > 100 > 10 > var_north > 1
+    assert abs(cov) < 0.1
+    assert found.accuracy_m == pytest.approx(math.sqrt(var_east), rel=1e-3)
+
+
+def test_a_new_place_lies_between_what_was_recorded_and_what_its_neighbours_say():
+    where = located([candidate(covariance_m2=(25.0, 0.0, 25.0), turned_deg=15)], CELLS, (0.0, 0.0))
+    recorded = Position(*moved(ORIGIN.lat_deg, ORIGIN.lon_deg, 6.0, 0.0), 130.0)
+    position, pose = as_learnt(where, recorded, 5.0)
+    east_m, _ = off_m(position)
+    assert 2.0 < east_m < 4.0
+    assert (pose.up_deg, pose.footprint_m, position.alt_m) == (pytest.approx(15.0), FOOTPRINT_M, 130.0)
+    assert (pose.recorded.lat_deg, pose.recorded.lon_deg) == (recorded.lat_deg, recorded.lon_deg)
+    assert pose.covariance_m2[0] < 25
+    far = Position(*moved(ORIGIN.lat_deg, ORIGIN.lon_deg, 60.0, 0.0))
+    assert as_learnt(where, far, 5.0) is None
