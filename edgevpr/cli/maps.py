@@ -7,6 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from edgevpr.cli import orthophotos
 from edgevpr.cli.shared import (
     add_json,
     add_keys,
@@ -25,15 +26,17 @@ from edgevpr.cli.shared import (
 from edgevpr.errors import EdgevprError, ImageError, UsageError
 
 if TYPE_CHECKING:
+    from edgevpr.frames.source import Source
     from edgevpr.places.repair import MapCheck, Watch
 
 
 def add(commands: Any) -> None:
     """Add the commands and their flags."""
     maps = group(commands, "map", "build, look into, check, repair, merge and export place maps")
-    build = command(maps, "build", map_build, "make a map of a flight")
+    build = command(maps, "build", map_build, "make a map of a flight, or of an orthophoto")
     build.add_argument("map", metavar="MAP", help="the map file to make, e.g. valley.gpkg")
-    add_recording(build)
+    add_recording(build, required=False)
+    orthophotos.add(build)
     build.add_argument("--technique", metavar="NAME", help="see `edgevpr profile` (default: by the board)")
     add_parameters(build, "a parameter of the technique")
     build.add_argument(
@@ -84,7 +87,6 @@ def _number_of_places(text: str) -> int:
 def map_build(args: Namespace) -> int:
     """Make a map of a recording, or continue one."""
     from edgevpr.frames.mask import mask_of
-    from edgevpr.frames.source import open_source
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.places.mapfiles import map_path, remove
     from edgevpr.power.boards import load_board
@@ -95,25 +97,30 @@ def map_build(args: Namespace) -> int:
 
     config = config_of(args, args.config)
     path = map_path(args.map)
-    step_s = 1 / args.rate_hz if args.rate_hz else None
-    source = open_source(args.source, step_s=step_s, positions=path_of(args.positions), live=False)
-    mask = mask_of(config.source.mask)
-    settings, camera, here = parameters_of(args.param), config.source.camera, load_board("this")
+    orthophotos.require_one_source(args)
+    is_cut = args.orthophoto is not None
+    camera = orthophotos.camera_of(config.source.camera) if is_cut else config.source.camera
+    source = orthophotos.open_cuttings(args) if is_cut else _recording(args)
+    mask = mask_of(None if is_cut else config.source.mask)  # the mask hides parts of the aircraft, not of the ground
+    settings, here = parameters_of(args.param), load_board("this")
     gate = gate_of(config.salience, here.threads)
     gaps = Gaps(config.salience.gap_frames, config.salience.gap_m)
+
+    def asked(name: str) -> dict[str, str]:
+        said = {"camera": camera} if camera else {}
+        return settings | (camera_setting(name, camera) if is_cut else said)
+
     is_new = not (args.append and path.exists())
     if not is_new:
         place_map = PlaceMap.open_for_adding(path)
-        asked = settings | ({"camera": camera} if camera else {})
-        technique = technique_of(place_map, args.technique, asked, here)
+        technique = technique_of(place_map, args.technique, asked(args.technique or place_map.spec.name), here)
         say_other_mask(place_map, mask)
     else:
-        if args.technique:
-            name, asked = args.technique, settings | ({"camera": camera} if camera else {})
+        if name := args.technique or (orthophotos.TECHNIQUE if is_cut else None):
+            technique = made_for(here, name, asked(name))
         else:
             name = picked_technique(args.board, source.total or 1, camera)
-            asked = settings | camera_setting(name, camera)
-        technique = made_for(here, name, asked)
+            technique = made_for(here, name, settings | camera_setting(name, camera))
         place_map = PlaceMap.create(path, technique.spec)
         place_map.record_mask(mask.sha256)
     unusable: list[ImageError] = []
@@ -122,7 +129,15 @@ def map_build(args: Namespace) -> int:
         meter = meter_of(config, here)
         try:
             result = build_map(
-                frames, technique, place_map, meter, lambda error: leave_out(error, unusable), mask, gate, gaps
+                frames,
+                technique,
+                place_map,
+                meter,
+                lambda error: leave_out(error, unusable),
+                mask,
+                gate,
+                gaps,
+                technique.min_quality if is_cut else 0.0,
             )
         except EdgevprError:
             if is_new and not len(place_map):  # a full disk: an empty map would only stand in the way of the next try
@@ -130,7 +145,8 @@ def map_build(args: Namespace) -> int:
             raise
         places = len(place_map)
     if args.json:
-        print_json({"map": args.map, "technique": technique.spec.name, "places": places, **asdict(result)})
+        left_out = {"without_data": source.left_out["data"]} if is_cut else {}
+        print_json({"map": args.map, "technique": technique.spec.name, "places": places, **asdict(result), **left_out})
     else:
         print(
             f"{args.map}: {result.added} places added ({result.without_position} without a position), {places} in all"
@@ -140,9 +156,18 @@ def map_build(args: Namespace) -> int:
         if result.not_memorable:
             lacking = ", ".join(f"{count} for want of {what}" for what, count in result.not_memorable.items())
             print(f"  left out: {lacking}")
+        if is_cut:
+            print(f"  left out: {source.left_out['data']} for want of data, {result.says_nothing} for want of texture")
         if result.of_low_quality:
             print(f"  {result.of_low_quality} of the places are of low quality, kept to bound the gaps")
     return exit_code(unusable)
+
+
+def _recording(args: Namespace) -> "Source":
+    from edgevpr.frames.source import open_source
+
+    step_s = 1 / args.rate_hz if args.rate_hz else None
+    return open_source(args.source, step_s=step_s, positions=path_of(args.positions), live=False)
 
 
 def map_info(args: Namespace) -> int:

@@ -44,9 +44,9 @@ def add_json(parser: ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
-def add_recording(parser: ArgumentParser) -> None:
+def add_recording(parser: ArgumentParser, required: bool = True) -> None:
     """Add the flags for the recording that frames come from."""
-    parser.add_argument("--images", "--source", dest="source", required=True, metavar="SOURCE", help=_RECORDING)
+    parser.add_argument("--images", "--source", dest="source", required=required, metavar="SOURCE", help=_RECORDING)
     add_positions(parser)
 
 
