@@ -11,6 +11,7 @@ os.environ.setdefault("GDAL_CACHEMAX", "64")
 
 try:
     import rasterio
+    from rasterio._err import CPLE_BaseError
     from rasterio.crs import CRS
     from rasterio.enums import ColorInterp, Resampling
     from rasterio.errors import NotGeoreferencedWarning, RasterioError
@@ -26,6 +27,7 @@ logging.getLogger("rasterio").setLevel(logging.CRITICAL)  # edgevpr reports each
 
 __all__ = [
     "CRS",
+    "CPLE_BaseError",
     "ColorInterp",
     "NotGeoreferencedWarning",
     "RasterioError",

@@ -33,8 +33,8 @@ class Lattice:
 def lattice_of(
     orthophoto: Orthophoto, footprint_m: float, spacing_m: float, area: Area | None = None, margin_m: float = 0.0
 ) -> Lattice:
-    """Lay a grid over the orthophoto so that a square of `footprint_m` around each place begins inside of it. With an
-    `area`, keep the places that lie in its polygons or within `margin_m` of its paths.
+    """Lay a grid over the orthophoto, so that a square of `footprint_m` around each place lies inside of its extent.
+    With an `area`, keep the places of the same grid that lie in its polygons or within `margin_m` of its paths.
 
     Raises UsageError where the footprint or the spacing does not fit the orthophoto, the area lies elsewhere, or there
     are no places or more than `MOST_PLACES`.
@@ -44,18 +44,22 @@ def lattice_of(
     low, high = np.array([x_m.min(), y_m.min()]), np.array([x_m.max(), y_m.max()])
     _require_fitting(orthophoto, footprint_m, spacing_m, high - low)
     low, high = low + footprint_m / 2, high - footprint_m / 2
+    count = ((high - low) / spacing_m).astype(int) + 1
+    first = (low + high - (count - 1) * spacing_m) / 2  # the south-west place
+    begin, end = np.zeros(2, int), count
     if area:
         _require_touching(orthophoto, area)
         area_low, area_high = _box(area, plane, margin_m)
-        low, high = np.maximum(low, area_low), np.minimum(high, area_high)
-        if (high < low).any():
+        if (area_high < low).any() or (area_low > high).any():
             raise _elsewhere(orthophoto, area)
-    count = ((high - low) / spacing_m).astype(int) + 1
-    _require_bounded(count.prod(), _MOST_POINTS if area else MOST_PLACES, spacing_m)
-    first = (low + high - (count - 1) * spacing_m) / 2  # the south-west place
-    x_m, y_m = (begin + spacing_m * np.arange(number) for begin, number in zip(first, count, strict=True))
+        begin = np.clip(np.ceil((area_low - first) / spacing_m), 0, count).astype(int)
+        end = np.clip(np.floor((area_high - first) / spacing_m) + 1, begin, count).astype(int)
+    _require_bounded((end - begin).prod(), _MOST_POINTS if area else MOST_PLACES, spacing_m)
+    x_m, y_m = (first[axis] + spacing_m * np.arange(begin[axis], end[axis]) for axis in (0, 1))
     y_m = y_m[::-1]
-    wanted = _inside(area, plane, margin_m, x_m, y_m) if area else np.ones((len(y_m), len(x_m)), bool)
+    wanted = np.ones((len(y_m), len(x_m)), bool)
+    if area and wanted.size:
+        wanted = _inside(area, plane, margin_m, x_m, y_m, spacing_m)
     rows, columns = np.nonzero(wanted)
     _require_bounded(len(rows), MOST_PLACES, spacing_m)
     if not len(rows):
@@ -64,7 +68,13 @@ def lattice_of(
             "or a larger margin."
         )
     lon_deg, lat_deg = transform(plane, WGS84, x_m[columns], y_m[rows])
-    return Lattice(rows=rows, columns=columns, lat_deg=np.array(lat_deg), lon_deg=np.array(lon_deg), shape=wanted.shape)
+    return Lattice(
+        rows=rows + count[1] - end[1],
+        columns=columns + begin[0],
+        lat_deg=np.array(lat_deg),
+        lon_deg=np.array(lon_deg),
+        shape=(int(count[1]), int(count[0])),
+    )
 
 
 def _require_fitting(orthophoto: Orthophoto, footprint_m: float, spacing_m: float, size_m: np.ndarray) -> None:
@@ -127,12 +137,11 @@ def _paths_m(area: Area, plane: CRS) -> list[np.ndarray]:
     return [_metres([(way.lat_deg, way.lon_deg) for way in path], plane) for path in area.paths]
 
 
-def _inside(area: Area, plane: CRS, margin_m: float, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
+def _inside(area: Area, plane: CRS, margin_m: float, x_m: np.ndarray, y_m: np.ndarray, step_m: float) -> np.ndarray:
     """Tell which points of the grid lie in the area: bool (rows, columns)."""
     shape = len(y_m), len(x_m)
     inside = np.zeros(shape, bool)
     if area.polygons:
-        step_m = x_m[1] - x_m[0] if len(x_m) > 1 else y_m[0] - y_m[1] if len(y_m) > 1 else 1.0
         grid = rasterio.Affine(step_m, 0, x_m[0] - step_m / 2, 0, -step_m, y_m[0] + step_m / 2)
         rings_m = [[_metres(ring, plane).tolist() for ring in rings] for rings in area.polygons]
         polygons = [{"type": "Polygon", "coordinates": rings} for rings in rings_m]
@@ -143,7 +152,9 @@ def _inside(area: Area, plane: CRS, margin_m: float, x_m: np.ndarray, y_m: np.nd
     return inside
 
 
-def _near(inside: np.ndarray, x_m: np.ndarray, y_m: np.ndarray, begin: np.ndarray, end: np.ndarray, margin_m: float):
+def _near(
+    inside: np.ndarray, x_m: np.ndarray, y_m: np.ndarray, begin: np.ndarray, end: np.ndarray, margin_m: float
+) -> None:
     """Set the points of the grid that lie within the margin of a straight way."""
     low, high = np.minimum(begin, end) - margin_m, np.maximum(begin, end) + margin_m
     columns = slice(*np.searchsorted(x_m, (low[0], high[0])))

@@ -6,7 +6,7 @@ from typing import Protocol
 import numpy as np
 
 from edgevpr.errors import SourceError
-from edgevpr.frames.gdal import CRS, RasterioError, rasterio, transform
+from edgevpr.frames.gdal import CRS, CPLE_BaseError, RasterioError, rasterio, transform
 from edgevpr.frames.georaster import GeoRaster
 from edgevpr.frames.opencv import cv2
 from edgevpr.frames.tiles import TileFolder
@@ -50,7 +50,7 @@ class Orthophoto:
         try:
             self.middle = self._middle()
             lon_deg, lat_deg = self.outline(WGS84)
-        except RasterioError:
+        except (CPLE_BaseError, RasterioError):
             lat_deg = lon_deg = np.array([np.nan])
         if not np.isfinite((lat_deg, lon_deg)).all():
             self.close()
@@ -63,7 +63,7 @@ class Orthophoto:
         self.resolution_m = float(1 / np.sqrt(abs(np.linalg.det(metre_px[1:] - metre_px[0]))))
 
     def _middle(self) -> Position:
-        x, y = self._raster.transform * (self._raster.width / 2, self._raster.height / 2)
+        x, y = _through(self._raster.transform, self._raster.width / 2, self._raster.height / 2)
         (lon_deg,), (lat_deg,) = transform(self._raster.crs, WGS84, [x], [y])
         return Position(lat_deg, (lon_deg + 180) % 360 - 180)
 
@@ -72,7 +72,7 @@ class Orthophoto:
         along, zero = np.linspace(0, 1, _EDGE_POINTS), np.zeros(_EDGE_POINTS)
         columns = np.concatenate((along, along, zero, zero + 1)) * self._raster.width
         rows = np.concatenate((zero, zero + 1, along, along)) * self._raster.height
-        x, y = self._raster.transform * (columns, rows)
+        x, y = _through(self._raster.transform, columns, rows)
         return tuple(np.array(each) for each in transform(self._raster.crs, crs, x, y))
 
     def _pixels(self, at: Position, points_m: np.ndarray) -> np.ndarray:
@@ -81,9 +81,9 @@ class Orthophoto:
         raster = self._raster
         x, y = (np.array(each) for each in transform(local_crs(at), raster.crs, *points_m.T))
         if raster.crs.is_geographic:  # a file may count from 0 to 360 degrees, or over the date line
-            middle, _ = raster.transform * (raster.width / 2, raster.height / 2)
+            middle, _ = _through(raster.transform, raster.width / 2, raster.height / 2)
             x += 360 * np.round((middle - x) / 360)
-        return np.column_stack(~raster.transform * (x, y))
+        return np.column_stack(_through(~raster.transform, x, y))
 
     def cut(self, at: Position, footprint_m: float, side_px: int) -> tuple[np.ndarray, np.ndarray]:
         """Cut a square of ground with its middle at `at` and true north up, `footprint_m` wide.
@@ -121,6 +121,11 @@ class Orthophoto:
     def close(self) -> None:
         """Close the file."""
         self._raster.close()
+
+
+def _through(way: rasterio.Affine, x, y) -> tuple:
+    """Send points (scalars or arrays) through an affine map; its own operator for that differs between releases."""
+    return way.a * x + way.b * y + way.c, way.d * x + way.e * y + way.f
 
 
 def _nothing(side_px: int) -> tuple[np.ndarray, np.ndarray]:

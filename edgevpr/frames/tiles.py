@@ -28,11 +28,14 @@ class TileFolder:
                 f"{folder} holds no map tiles (z/x/y.png or .jpg, the highest zoom counts): give the folder above the "
                 "zooms, or a file."
             )
-        first = next(iter(self._tiles.values()))
-        tile = cv2.imread(str(first), cv2.IMREAD_UNCHANGED)
-        if tile is None or tile.shape[0] != tile.shape[1]:
-            raise SourceError(f"{first} is no square picture, as tiles of a map are: copy the tiles again.")
-        zoom, self._side_px = int(first.parent.parent.name), len(tile)
+        decoded = (cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in self._tiles.values())
+        first = next((tile for tile in decoded if tile is not None), None)
+        if first is None or first.shape[0] != first.shape[1] or first.shape[0] & first.shape[0] - 1:
+            raise SourceError(
+                f"{folder} holds pictures that are no tiles of a map, which are square, of 256 or 512 pixels: copy the "
+                "tiles again."
+            )
+        zoom, self._side_px = max(int(path.name) for path in zooms), len(first)
         columns, rows = zip(*self._tiles, strict=True)
         self._left, self._top = min(columns), min(rows)
         self.width = (max(columns) + 1 - self._left) * self._side_px

@@ -25,7 +25,7 @@ _COLUMNS = ("file", "lat", "lon", "alt", "roll_deg", "pitch_deg", "yaw_deg", "he
 
 @dataclass(frozen=True, slots=True)
 class Weather:
-    """How the flight differs from the orthophoto: the light, and the faults of the camera. The shadows are those of
+    """Differences of the flight from the orthophoto: the light, and the faults of the camera. The shadows are those of
     the orthophoto."""
 
     light: Light
