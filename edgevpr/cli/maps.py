@@ -145,7 +145,7 @@ def map_build(args: Namespace) -> int:
             raise
         places = len(place_map)
     if args.json:
-        left_out = {"without_data": source.left_out["data"]} if is_cut else {}
+        left_out = {"without_data": source.without_data} if is_cut else {}
         print_json({"map": args.map, "technique": technique.spec.name, "places": places, **asdict(result), **left_out})
     else:
         print(
@@ -157,7 +157,7 @@ def map_build(args: Namespace) -> int:
             lacking = ", ".join(f"{count} for want of {what}" for what, count in result.not_memorable.items())
             print(f"  left out: {lacking}")
         if is_cut:
-            print(f"  left out: {source.left_out['data']} for want of data, {result.says_nothing} for want of texture")
+            print(f"  left out: {source.without_data} for want of data, {result.says_nothing} for want of texture")
         if result.of_low_quality:
             print(f"  {result.of_low_quality} of the places are of low quality, kept to bound the gaps")
     return exit_code(unusable)

@@ -1,7 +1,6 @@
 """An orthophoto as a source of frames: a picture of the ground around each place of a grid, as a camera that looks
 straight down, with the nose to the north, would take it."""
 
-from collections import Counter
 from collections.abc import Callable
 
 from edgevpr.errors import ImageError
@@ -18,8 +17,8 @@ _GEO_REFERENCE_M = 1.0  # standard deviation of where the orthophoto says that a
 
 
 class OrthophotoSource(Recording):
-    """A frame for each place of a grid, but for those of which more than a tenth is without data: `left_out` counts
-    these by the reason."""
+    """A frame for each place of a grid, but for those of which more than a tenth is without data; `without_data` counts
+    these."""
 
     def __init__(
         self, orthophoto: Orthophoto, lattice: Lattice, footprint_m: float, clock: Callable[[], float]
@@ -27,7 +26,7 @@ class OrthophotoSource(Recording):
         super().__init__()
         self._orthophoto, self._lattice, self._footprint_m, self._clock = orthophoto, lattice, footprint_m, clock
         self.total = len(lattice)
-        self.left_out: Counter[str] = Counter()
+        self.without_data = 0
         self._read = 0
         variance_m2 = _GEO_REFERENCE_M**2 + (orthophoto.resolution_m / 2) ** 2
         self._pose = Pose(
@@ -53,7 +52,7 @@ class OrthophotoSource(Recording):
             self.refused[Refusal.DAMAGED.value] += 1
             raise
         if valid.mean() < 1 - MOST_WITHOUT_DATA:
-            self.left_out["data"] += 1
+            self.without_data += 1
             return None
         return Frame(
             image=image,

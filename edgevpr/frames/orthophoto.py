@@ -58,6 +58,7 @@ class Orthophoto:
                 f"{path}: its coordinate system ({raster.crs.to_string()[:60]}) cannot be brought to latitude and "
                 "longitude: export it with another, such as UTM or EPSG:4326."
             )
+        lon_deg = self.middle.lon_deg + (lon_deg - self.middle.lon_deg + 180) % 360 - 180
         self.extent_deg = (lat_deg.min(), lon_deg.min(), lat_deg.max(), lon_deg.max())
         metre_px = self._pixels(self.middle, np.array([[0, 0], [1, 0], [0, 1]]))
         self.resolution_m = float(1 / np.sqrt(abs(np.linalg.det(metre_px[1:] - metre_px[0]))))

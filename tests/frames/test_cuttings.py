@@ -90,7 +90,7 @@ def test_places_without_data_are_left_out_and_counted(tmp_path):
     source = source_of(write_raster(tmp_path / "o.tif", picture, "EPSG:32632", to_crs, nodata=0), 60.0, 20.0)
     kept = frames_of(source)
     assert 0 < len(kept) < source.total
-    assert source.left_out == {"data": source.total - len(kept)}
+    assert source.without_data == source.total - len(kept)
     east_m = [ground_m(frame.position.lat_deg, frame.position.lon_deg)[0] for frame in kept]
     assert min(east_m) >= -25 + 30 - 6 - 3  # the data begins 25 m west; a tenth of 60 m may lie beyond, and grid north
 

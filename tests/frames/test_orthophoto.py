@@ -59,6 +59,17 @@ def test_a_place_is_where_it_must_be_with_true_north_up(tmp_path, crs, turned_de
     assert picture[..., 2].mean() > 1.1 * picture[..., 0].mean(), "red comes last"
 
 
+def test_longitudes_may_count_from_0_to_360(tmp_path):
+    path = marked_raster(tmp_path / "o.tif", "EPSG:4326", side_px=720)
+    with rasterio.open(path, "r+") as data:
+        there = data.transform
+        data.transform = rasterio.Affine(there.a, there.b, there.c + 360, there.d, there.e, there.f)
+    picture, valid = cut(path)
+    assert valid.all()
+    require_marks(picture)
+    assert Orthophoto(path).extent_deg[1] == pytest.approx(11.9, abs=0.01)
+
+
 @pytest.mark.parametrize("pixel_m", [0.05, 0.07, 0.45])
 def test_pixels_much_finer_or_coarser_than_the_picture_are_averaged_and_in_place(tmp_path, pixel_m):
     path = marked_raster(tmp_path / "o.tif", pixel_m=pixel_m, side_px=int(84 / pixel_m))
