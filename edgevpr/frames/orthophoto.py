@@ -114,7 +114,8 @@ class Orthophoto:
         picture = cv2.warpPerspective(ground, view, large, borderMode=cv2.BORDER_REPLICATE)
         seen = cv2.warpPerspective(255 * valid.astype(np.uint8), view, large)
         picture = cv2.resize(picture, (side_px, side_px), interpolation=cv2.INTER_AREA)
-        seen = cv2.resize(seen, (side_px, side_px), interpolation=cv2.INTER_AREA) > 127
+        # Wholly known pixels only: one at the edge is mixed with black, and would draw a line around the data.
+        seen = cv2.resize(seen, (side_px, side_px), interpolation=cv2.INTER_AREA) >= 250
         if seen.any():
             picture[~seen] = picture[seen].mean(axis=0)
         return picture, seen

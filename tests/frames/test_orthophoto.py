@@ -265,3 +265,13 @@ def test_a_file_that_ends_early_is_no_crash(tmp_path):
     path.write_bytes(data[: len(data) // 2])
     with pytest.raises(ImageError, match="copy the file again"):
         Orthophoto(path).cut(HOME, 120.0, SIDE_PX)
+
+
+def test_the_edge_of_the_data_draws_no_dark_line(tmp_path):
+    to_crs, _, _ = grid("EPSG:32632", 0.13, 800)
+    picture = np.full((1, 800, 800), 150, np.uint8)
+    picture[..., :400] = 0
+    path = write_raster(tmp_path / "o.tif", picture, "EPSG:32632", to_crs, nodata=0)
+    cut_out, valid = cut(path)
+    assert 0.4 < valid.mean() < 0.6
+    assert cut_out.min() >= 145
