@@ -1,4 +1,4 @@
-"""`edgevpr map`: build, look into, check, repair, merge and export place maps."""
+"""`edgevpr map`: look into, check, repair, merge and export place maps; they are made in `building`."""
 
 import sys
 from argparse import ArgumentTypeError, Namespace
@@ -7,61 +7,21 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from edgevpr.cli.shared import (
-    add_json,
-    add_keys,
-    add_parameters,
-    add_recording,
-    command,
-    config_of,
-    exit_code,
-    frames_of,
-    group,
-    leave_out,
-    parameters_of,
-    path_of,
-    print_json,
-)  # fmt: skip
-from edgevpr.errors import EdgevprError, ImageError, UsageError
-from edgevpr.helpers.text import shown
+from edgevpr.cli import building
+from edgevpr.cli.shared import add_json, command, group, positive, print_json, watched
+from edgevpr.errors import UsageError
 
 if TYPE_CHECKING:
-    from edgevpr.contract import Technique
-    from edgevpr.places.mapfile import PlaceMap
-    from edgevpr.places.repair import MapCheck, Watch
-    from edgevpr.refine.refine import Refined
+    from edgevpr.places.repair import MapCheck
 
 
 def add(commands: Any) -> None:
     """Add the commands and their flags."""
     maps = group(commands, "map", "build, look into, check, repair, merge and export place maps")
-    build = command(maps, "build", map_build, "make a map of a flight")
-    build.add_argument("map", metavar="MAP", help="the map file to make, e.g. valley.gpkg")
-    add_recording(build)
-    build.add_argument("--technique", metavar="NAME", help="see `edgevpr profile` (default: by the board)")
-    add_parameters(build, "a parameter of the technique")
-    build.add_argument(
-        "--board", default="this", metavar="NAME", help="the board that will fly (default: this machine)"
-    )
-    build.add_argument("--config", metavar="FILE", help="that of the flight: its camera, mask and salience")
-    add_keys(build, "source.camera", "source.mask", "source.fov_deg", "source.up_deg", "salience.use")
-    build.add_argument(
-        "--rate-hz", type=_positive, metavar="HZ", help="places a second of a video (default: every frame)"
-    )
-    build.add_argument(
-        "--no-refine", dest="refine", action="store_false", help="do not find out where the pictures really lie"
-    )
-    build.add_argument("--append", action="store_true", help="add to an existing map, going on where it broke off")
-    add_json(build)
+    building.add(maps)
     info = command(maps, "info", map_info, "say what a map holds")
     info.add_argument("map", metavar="MAP")
     add_json(info)
-    refine = command(maps, "refine", map_refine, "find out where the pictures really lie, by matching them")
-    refine.add_argument("map", metavar="MAP")
-    refine.add_argument(
-        "--images", metavar="DIR", help="the images that the map was made of: with them more pictures are tied"
-    )
-    add_json(refine)
     check = command(maps, "check", map_check, "read everything in a map, and say what is damaged")
     check.add_argument("map", metavar="MAP")
     add_json(check)
@@ -75,101 +35,16 @@ def add(commands: Any) -> None:
     smaller.add_argument("out", metavar="OUT", help="the map file to make")
     size = smaller.add_mutually_exclusive_group(required=True)
     size.add_argument("--places", type=_number_of_places, metavar="N", help="as many places")
-    size.add_argument("--mb", type=_positive, metavar="MB", help="as many as such a file holds, MB of 10^6 bytes")
+    size.add_argument("--mb", type=positive, metavar="MB", help="as many as such a file holds, MB of 10^6 bytes")
     export = command(maps, "export", map_export, "write the places for a map viewer")
     export.add_argument("map", metavar="MAP")
     export.add_argument("--geojson", required=True, metavar="FILE", help="GeoJSON file to write, - for standard output")
-
-
-def _positive(text: str) -> float:
-    value = float(text)
-    if not 0 < value < float("inf"):
-        raise ValueError
-    return value
 
 
 def _number_of_places(text: str) -> int:
     if not text.isdecimal() or int(text) < 1:
         raise ArgumentTypeError(f"`{text}` is no number of places: give 1 or more")
     return int(text)
-
-
-def map_build(args: Namespace) -> int:
-    """Make a map of a recording, or continue one."""
-    from edgevpr.frames.mask import mask_of
-    from edgevpr.frames.source import open_source
-    from edgevpr.places.mapfile import PlaceMap
-    from edgevpr.places.mapfiles import map_path, remove
-    from edgevpr.power.boards import load_board
-    from edgevpr.runtime.preflight.pick import camera_setting, picked_technique
-    from edgevpr.runtime.recognise.gaps import Gaps
-    from edgevpr.runtime.recognise.levelling import levelling_of
-    from edgevpr.runtime.recognise.mapping import build_map
-    from edgevpr.runtime.recognise.opening import gate_of, made_for, meter_of, say_other_mask, technique_of
-
-    config = config_of(args, args.config)
-    path = map_path(args.map)
-    step_s = 1 / args.rate_hz if args.rate_hz else None
-    source = open_source(args.source, step_s=step_s, positions=path_of(args.positions), live=False)
-    mask = mask_of(config.source.mask)
-    settings, camera, here = parameters_of(args.param), config.source.camera, load_board("this")
-    gate = gate_of(config.salience, here.threads)
-    gaps = Gaps(config.salience.gap_frames, config.salience.gap_m)
-    is_new = not (args.append and path.exists())
-    if not is_new:
-        place_map = PlaceMap.open_for_adding(path)
-        asked = settings | ({"camera": camera} if camera else {})
-        technique = technique_of(place_map, args.technique, asked, here)
-        say_other_mask(place_map, mask)
-    else:
-        if args.technique:
-            name, asked = args.technique, settings | ({"camera": camera} if camera else {})
-        else:
-            name = picked_technique(args.board, source.total or 1, camera)
-            asked = settings | camera_setting(name, camera)
-        technique = made_for(here, name, asked)
-        place_map = PlaceMap.create(path, technique.spec)
-        place_map.record_mask(mask.sha256)
-    unusable: list[ImageError] = []
-    with place_map:
-        frames = frames_of(source, "mapping", unusable)
-        meter = meter_of(config, here)
-        levelling = levelling_of(config.source, technique, below=True)
-        try:
-            result = build_map(
-                frames,
-                technique,
-                place_map,
-                meter,
-                lambda error: leave_out(error, unusable),
-                mask,
-                gate,
-                gaps,
-                levelling,
-            )
-        except EdgevprError:
-            if is_new and not len(place_map):  # a full disk: an empty map would only stand in the way of the next try
-                remove(path)
-            raise
-        places = len(place_map)
-        refined = _refined_after(place_map, technique, args) if args.refine else None
-    if args.json:
-        more = {"refined": asdict(refined)} if refined else {}
-        print_json({"map": args.map, "technique": technique.spec.name, "places": places, **asdict(result), **more})
-    else:
-        print(
-            f"{args.map}: {result.added} places added ({result.without_position} without a position), {places} in all"
-        )
-        if result.already_here:
-            print(f"  {result.already_here} images were in the map already")
-        if result.not_memorable:
-            lacking = ", ".join(f"{count} for want of {what}" for what, count in result.not_memorable.items())
-            print(f"  left out: {lacking}")
-        if result.of_low_quality:
-            print(f"  {result.of_low_quality} of the places are of low quality, kept to bound the gaps")
-        if refined:
-            _print_refined(args.map, refined, technique.spec.cells)
-    return exit_code(unusable)
 
 
 def map_info(args: Namespace) -> int:
@@ -206,72 +81,11 @@ def map_info(args: Namespace) -> int:
     return 0
 
 
-def map_refine(args: Namespace) -> int:
-    """Find out where the pictures of a map really lie, and say it."""
-    from edgevpr.places.mapfile import PlaceMap
-    from edgevpr.runtime.recognise.opening import technique_of
-
-    with PlaceMap.open_for_adding(args.map) as place_map:
-        technique = technique_of(place_map)
-        refined = _refined(place_map, technique, args.images)
-    if args.json:
-        print_json({"map": args.map, **asdict(refined)})
-    else:
-        _print_refined(args.map, refined, technique.spec.cells)
-    return 0
-
-
-def _refined_after(place_map: "PlaceMap", technique: "Technique", args: Namespace) -> "Refined | None":
-    """Refine a map that has just been built, where anything can be refined; the map is whole without it."""
-    if technique.spec.cells is None:
-        return None
-    try:
-        return _refined(place_map, technique, args.source if Path(args.source).is_dir() else None)
-    except EdgevprError as error:
-        print(f"edgevpr: the map is not refined: {error}", file=sys.stderr)
-        return None
-
-
-def _refined(place_map: "PlaceMap", technique: "Technique", images: str | None) -> "Refined":
-    """Refine an open map. Raises UsageError for one that nothing can be refined of, and where SciPy is missing."""
-    if technique.spec.cells is None:
-        raise UsageError(
-            f"{place_map.path} is of {technique.spec.name}, and not of a camera that looks straight down: only `cohog` "
-            "with `--camera nadir` can be refined."
-        )
-    try:
-        from edgevpr.refine.look import pictures
-        from edgevpr.refine.refine import refine
-    except ModuleNotFoundError as error:
-        raise UsageError(
-            f"Refining a map needs SciPy ({error}): install it on the machine that builds maps, with "
-            "`pip install 'edgevpr[maps]'`, and run `edgevpr map refine`."
-        ) from error
-    return refine(place_map, technique, _watched("refining"), pictures(images, technique) if images else None)
-
-
-def _print_refined(path: str, refined: "Refined", cells: int | None) -> None:
-    print(f"{path}: {refined.refined} of {refined.places} places refined, by {refined.ties} ties between pictures")
-    if refined.refined:
-        scatter = f"as recorded they scatter by {refined.recorded_sd_m:.1f} m"
-        moved = f"moved by {refined.moved_m:.1f} m, known to {refined.position_sd_m:.1f} m (medians)"
-        print(f"  position    {moved}; {scatter}")
-        print(f"  footprint   {refined.footprint_m:.0f} m (median), {refined.footprint_m / cells:.2f} m a cell")
-    if refined.surveyed:
-        print(f"  surveyed    {refined.surveyed} were cut from a geo-referenced picture, and stay as they are")
-    if refined.not_tied:
-        print(f"  not tied    {refined.not_tied} stay where they were recorded: a fix there is as fine as the spacing")
-    if refined.without_position:
-        print(f"  no position {refined.without_position} places")
-    for place_id, image, off_m in refined.contradictory:
-        print(f"  amiss       place {place_id} ({shown(image)}): recorded {off_m:.0f} m from where its picture lies")
-
-
 def map_check(args: Namespace) -> int:
     """Read everything in a map and say what is damaged; the exit code is 1 where anything is."""
     from edgevpr.places.repair import check
 
-    found = check(args.map, _watched("checking"))
+    found = check(args.map, watched("checking"))
     if args.json:
         print_json({**asdict(found), "is_whole": found.is_whole})
     else:
@@ -283,20 +97,14 @@ def map_repair(args: Namespace) -> int:
     """Drop what is damaged in a map, and keep the original."""
     from edgevpr.places.repair import check, repair
 
-    found = check(args.map, _watched("checking"))
+    found = check(args.map, watched("checking"))
     _print_check(found)
     if found.is_whole:
         print("nothing is damaged: the map is as it was")
         return 0
-    original = repair(args.map, _watched("copying"))
+    original = repair(args.map, watched("copying"))
     print(f"{args.map}: repaired, {found.places} places kept, {len(found.damaged)} dropped; the original is {original}")
     return 0
-
-
-def _watched(label: str) -> "Watch":
-    from edgevpr.helpers.progress import progress
-
-    return lambda places, total: progress(places, total, label)
 
 
 def _print_check(found: "MapCheck") -> None:

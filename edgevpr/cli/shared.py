@@ -13,6 +13,7 @@ from edgevpr.helpers.text import shown
 
 if TYPE_CHECKING:
     from edgevpr.frames.source import Source
+    from edgevpr.places.repair import Watch
     from edgevpr.types import Frame
 
 _KEY = "key "  # begins the name under which argparse keeps the value of a flag that is a key of the configuration
@@ -44,9 +45,9 @@ def add_json(parser: ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
-def add_recording(parser: ArgumentParser) -> None:
+def add_recording(parser: ArgumentParser, required: bool = True) -> None:
     """Add the flags for the recording that frames come from."""
-    parser.add_argument("--images", "--source", dest="source", required=True, metavar="SOURCE", help=_RECORDING)
+    parser.add_argument("--images", "--source", dest="source", required=required, metavar="SOURCE", help=_RECORDING)
     add_positions(parser)
 
 
@@ -138,3 +139,18 @@ def exit_code(unusable: list[ImageError]) -> int:
 def print_json(value: Any) -> None:
     """Print a result as JSON, for programs."""
     print(json.dumps(value, indent=2, default=str))
+
+
+def positive(text: str) -> float:
+    """Read a number above zero, for a flag."""
+    value = float(text)
+    if not 0 < value < float("inf"):
+        raise ValueError
+    return value
+
+
+def watched(label: str) -> "Watch":
+    """Return the function that passes things through, of which there are so many, and shows progress."""
+    from edgevpr.helpers.progress import progress
+
+    return lambda places, total: progress(places, total, label)

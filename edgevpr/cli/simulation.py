@@ -20,10 +20,24 @@ def add(commands: Any) -> None:
         "--track", metavar="CSV", help="a positions.csv with times to fly along, from when a companion is first heard"
     )
     add_json(autopilot)
-    flight = command(simulations, "flight", simulate_flight, "write a generated flight: images and positions.csv")
+    text = "write a flight, generated or over an orthophoto: images and positions.csv"
+    flight = command(simulations, "flight", simulate_flight, text)
     flight.add_argument("out", metavar="DIR")
-    flight.add_argument("--which", choices=("map", "query"), default="map", help="the mapping flight, or a later one")
-    flight.add_argument("--seed", type=int, default=1, metavar="N", help="another seed, another landscape (1)")
+    flight.add_argument("--which", choices=("map", "query"), help="the mapping flight (default), or a later one")
+    flight.add_argument("--seed", type=int, default=1, metavar="N", help="another seed, another landscape and sway (1)")
+    over = flight.add_argument_group("over an orthophoto")
+    over.add_argument("--orthophoto", metavar="FILE", help="as for `map build`: needs edgevpr[maps]")
+    over.add_argument(
+        "--track",
+        metavar="FILE",
+        help="a mission, or a positions.csv with height_m[, yaw_deg, roll_deg, pitch_deg]",
+    )
+    over.add_argument("--height-m", type=float, metavar="M", help="over the ground (default: that of the track)")
+    over.add_argument("--every-m", type=float, metavar="M", help="from picture to picture of a mission (20)")
+    over.add_argument("--speed-m-s", type=float, metavar="V", help="over the ground (10)")
+    over.add_argument("--fov-deg", type=float, metavar="A", help="angle of view across the picture (66)")
+    over.add_argument("--sway-deg", type=float, metavar="A", help="most roll, pitch and yaw off the track (2)")
+    over.add_argument("--light", choices=("clear", "hazy"), help="hazy adds veil, blur and noise (clear)")
     demo = command(commands, "demo", run_demo, "the whole job on a generated flight, with a picture")
     demo.add_argument("--out", default="demo_out", metavar="DIR", help="(demo_out)")
 
@@ -41,13 +55,62 @@ def simulate_autopilot(args: Namespace) -> int:
 
 
 def simulate_flight(args: Namespace) -> int:
-    """Write a generated flight: images and positions.csv."""
-    from edgevpr.simulate.flight import fly_and_write
-
+    """Write a flight, generated or over an orthophoto: images and positions.csv."""
     if args.seed < 0:
         raise UsageError(f"--seed is {args.seed}: give 0 or more.")
-    print(fly_and_write(Path(args.out), args.which, args.seed))
+    if args.orthophoto is None:
+        if said := [name for name in ("track", "light", *_NUMBERS) if getattr(args, name) is not None]:
+            raise UsageError(f"--{said[0].replace('_', '-')} goes with --orthophoto: leave it out.")
+        from edgevpr.simulate.flight import fly_and_write
+
+        print(fly_and_write(Path(args.out), args.which or "map", args.seed))
+        return 0
+    if args.track is None or args.which is not None:
+        raise UsageError("A flight over an orthophoto needs its --track, and has no --which.")
+    print(_fly_over(args))
     return 0
+
+
+# The numbers of a flight over an orthophoto: the usual one, the least and the most.
+_NUMBERS = {
+    "height_m": (None, 1.0, 10_000.0),
+    "every_m": (20.0, 0.1, 1e6),
+    "speed_m_s": (10.0, 0.1, 1000.0),
+    "fov_deg": (66.0, 5.0, 120.0),
+    "sway_deg": (2.0, 0.0, 20.0),
+}
+
+
+def _fly_over(args: Namespace) -> str:
+    from edgevpr.frames.orthophoto import Orthophoto  # loads GDAL, or says that it is missing
+    from edgevpr.helpers.progress import progress
+    from edgevpr.simulate.rehearsal import WEATHERS, none_written, write_rehearsal
+    from edgevpr.simulate.track import read_shots
+
+    numbers = {}
+    for name, (usual, least, most) in _NUMBERS.items():
+        numbers[name] = value = usual if getattr(args, name) is None else getattr(args, name)
+        if value is not None and not least <= value <= most:  # false for NaN
+            raise UsageError(f"--{name.replace('_', '-')} is {value:g}: give {least:g} to {most:g}.")
+    orthophoto = Orthophoto(args.orthophoto)
+    shots = read_shots(args.track, numbers["height_m"], numbers["every_m"], numbers["speed_m_s"])
+    taken = write_rehearsal(
+        Path(args.out),
+        orthophoto,
+        shots,
+        WEATHERS[args.light or "clear"],
+        fov_deg=numbers["fov_deg"],
+        sway_deg=numbers["sway_deg"],
+        seed=args.seed,
+    )
+    written = sum(name is not None for name in progress(taken, len(shots), "flying"))
+    if not written:
+        raise none_written(orthophoto, shots)
+    beyond = f" ({len(shots) - written} left out: they would show ground beyond the orthophoto)"
+    return (
+        f"{args.out}: {written} images in images/, where they were taken in positions.csv"
+        f"{beyond if written < len(shots) else ''}"
+    )
 
 
 def run_demo(args: Namespace) -> int:

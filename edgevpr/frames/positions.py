@@ -51,6 +51,12 @@ def read_positions(csv_path: str | Path) -> dict[str, GeoTag]:
     level. Returns one tag for each file name. A row may leave all but the name empty; other columns are ignored.
     Raises UsageError for a file that cannot be read, and for a wrong value, with its line.
     """
+    return {row["file"]: tag_of(row, where) for where, row in rows_of(csv_path)}
+
+
+def rows_of(csv_path: str | Path) -> list[tuple[str, dict[str, str]]]:
+    """Read the lines of a positions.csv: where each stands, for messages, and its values by the name of the column.
+    Raises UsageError as `read_positions`."""
     try:
         text = io.StringIO(read_file(csv_path, _MAX_FILE_BYTES).decode("utf-8-sig"), newline="")
         return _read_rows(csv.reader(text, skipinitialspace=True), csv_path)
@@ -83,7 +89,7 @@ def parse_time(text: str) -> float:
     return seconds
 
 
-def _read_rows(reader: Any, csv_path: str | Path) -> dict[str, GeoTag]:
+def _read_rows(reader: Any, csv_path: str | Path) -> list[tuple[str, dict[str, str]]]:
     header = [name.strip().lower() for name in next(reader, [])]
     missing = [name for name in _NEEDED_COLUMNS if name not in header]
     if missing:
@@ -93,7 +99,7 @@ def _read_rows(reader: Any, csv_path: str | Path) -> dict[str, GeoTag]:
         )
     if twice := [name for name in _COLUMNS if header.count(name) > 1]:
         raise UsageError(f"{csv_path}, line 1 has two columns `{twice[0]}`: keep one of them.")
-    tags: dict[str, GeoTag] = {}
+    rows: list[tuple[str, dict[str, str]]] = []
     lines: dict[str, int] = {}
     for values in reader:
         if not values:
@@ -108,28 +114,30 @@ def _read_rows(reader: Any, csv_path: str | Path) -> dict[str, GeoTag]:
         if name in lines:
             raise UsageError(f"{where}: {name} stands in line {lines[name]} already: keep one of the two.")
         lines[name] = reader.line_num
-        tags[name] = _tag(row, where)
-    return tags
+        rows.append((where, row))
+    return rows
 
 
-def _tag(row: Mapping[str, str], where: str) -> GeoTag:
-    lat_deg = _number(row, "lat", -90, 90, where)
-    lon_deg = _number(row, "lon", -180, 180, where)
-    alt_m = _number(row, "alt", *ALT_M, where)
+def tag_of(row: Mapping[str, str], where: str) -> GeoTag:
+    """Return the tag of a line. Raises UsageError for a wrong value."""
+    lat_deg = number_in(row, "lat", -90, 90, where)
+    lon_deg = number_in(row, "lon", -180, 180, where)
+    alt_m = number_in(row, "alt", *ALT_M, where)
     if (lat_deg is None) != (lon_deg is None):
         raise UsageError(f"{where} has only one of lat and lon: write both, or leave both empty.")
-    heading_deg = _number(row, "heading_deg" if row.get("heading_deg") else "yaw_deg", -360, 360, where)
+    heading_deg = number_in(row, "heading_deg" if row.get("heading_deg") else "yaw_deg", -360, 360, where)
     return GeoTag(
         position=None if lat_deg is None or lon_deg is None else position_or_none(lat_deg, lon_deg, alt_m),
         heading_deg=None if heading_deg is None else heading_deg % 360,
         t_utc_s=_time(row, where),
-        roll_deg=_number(row, "roll_deg", -180, 180, where),
-        pitch_deg=_number(row, "pitch_deg", -90, 90, where),
-        height_m=_number(row, "height_m" if row.get("height_m") else "rel_alt", *ALT_M, where),
+        roll_deg=number_in(row, "roll_deg", -180, 180, where),
+        pitch_deg=number_in(row, "pitch_deg", -90, 90, where),
+        height_m=number_in(row, "height_m" if row.get("height_m") else "rel_alt", *ALT_M, where),
     )
 
 
-def _number(row: Mapping[str, str], column: str, low: float, high: float, where: str) -> float | None:
+def number_in(row: Mapping[str, str], column: str, low: float, high: float, where: str) -> float | None:
+    """Return the number in a column of a line, None where there is none. Raises UsageError for one out of range."""
     text = row.get(column)
     if not text:
         return None

@@ -121,6 +121,14 @@ def _clouds(scene: Scene, cloud_frac: float, seed: int) -> np.ndarray:
     return cv2.resize(cover, scene.height_cm.shape[::-1], interpolation=cv2.INTER_CUBIC)
 
 
+def view_on_ground(pose: Pose, camera: Camera) -> np.ndarray | None:
+    """Return where the corners of the picture lie on the ground, (4, 2) metres east and north; None where the picture
+    shows the horizon."""
+    corners = [(0, 0, 1), (camera.width - 1, 0, 1), (camera.width - 1, camera.height - 1, 1), (0, camera.height - 1, 1)]
+    ground = np.linalg.solve(ground_to_pixel(pose, camera), np.array(corners, float).T).T
+    return ground[:, :2] / ground[:, 2:] if (ground[:, 2] > 0).all() else None  # one over the distance ahead
+
+
 def photograph(
     ground: np.ndarray, metres_per_pixel: float, pose: Pose, camera: Camera, light: Light, rng: np.random.Generator
 ) -> np.ndarray:

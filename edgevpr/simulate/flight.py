@@ -72,7 +72,7 @@ def later_flight(seed: int) -> Flight:
     east_m = np.concatenate((back_m, out_m))
     north_m = np.concatenate((np.full(len(back_m), _LEGS_NORTH_M[3]), np.full(len(out_m), _LEGS_NORTH_M[2])))
     heading_deg = np.concatenate((np.full(len(back_m), 270.0), np.full(len(out_m), 90.0)))
-    drift = [_wander(rng, len(east_m)) for _ in range(5)]
+    drift = [wander(rng, len(east_m)) for _ in range(5)]
     columns = {
         "east_m": east_m,
         "north_m": north_m + 8 * drift[0],
@@ -139,7 +139,7 @@ def _radius_of_latitude_m() -> float:
     return EARTH_RADIUS_M * float(np.cos(np.radians(ORIGIN.lat_deg)))
 
 
-def _wander(rng: np.random.Generator, count: int) -> np.ndarray:
+def wander(rng: np.random.Generator, count: int) -> np.ndarray:
     """Make a slow random swing between -1 and 1, float64 (count,)."""
     t = np.arange(count)[:, None] / 9
     waves = np.sin(2 * np.pi * (t * (1, 2.3) + rng.random(2)))

@@ -1,0 +1,150 @@
+"""`edgevpr map build --orthophoto` and `edgevpr simulate flight --orthophoto`: a map and a flight without flying."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rasterio", reason="rasterio is not installed (pip install 'edgevpr[maps]')")
+
+import rasterio
+from rasters import HOME, textured_raster, write_raster
+
+from edgevpr.cli.main import main
+from edgevpr.frames.positions import read_positions
+from edgevpr.geodesy import distance_m, moved
+from edgevpr.places.mapfile import PlaceMap
+
+
+@pytest.fixture(scope="module")
+def ground(tmp_path_factory):
+    return str(textured_raster(tmp_path_factory.mktemp("ground") / "valley.tif"))
+
+
+@pytest.fixture
+def track(tmp_path):
+    """A path of 142 m, 12 m north of the middle."""
+    ends = [moved(HOME.lat_deg, HOME.lon_deg, east_m, 12.0)[::-1] for east_m in (-71, 71)]
+    path = tmp_path / "track.geojson"
+    path.write_text(json.dumps({"type": "LineString", "coordinates": ends}))
+    return str(path)
+
+
+def run(*command: str) -> int:
+    return main(list(map(str, command)))
+
+
+def test_a_map_of_an_orthophoto_finds_a_flight_over_it(tmp_path, ground, track, capsys):
+    place_map, flight = tmp_path / "m.gpkg", tmp_path / "flight"
+    cut = ("--orthophoto", ground, "--footprint-m", 100, "--spacing-m", 25)
+    assert run("map", "build", place_map, *cut, "--area", track, "--margin-m", 30, "--json") == 0
+    built = json.loads(capsys.readouterr().out)
+    assert built["technique"] == "cohog"
+    assert 15 <= built["places"] == built["added"]
+    assert (built["without_position"], built["without_data"], built["says_nothing"]) == (0, 0, 0)
+    with PlaceMap.open(place_map) as opened:
+        assert opened.spec.parameters["camera"] == "nadir"
+        places = list(opened.places())
+    assert all(place.heading_deg == 0 and place.source_image.startswith("valley.tif_r0") for place in places)
+
+    over = ("--orthophoto", ground, "--track", track, "--height-m", 77, "--every-m", 20)
+    assert run("simulate", "flight", flight, *over) == 0
+    assert "8 images" in capsys.readouterr().out
+    assert run("match", place_map, "--images", flight / "images", "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    taken = read_positions(flight / "positions.csv")
+    off_m = []
+    for query in found:
+        at, named = taken[query["query"]].position, query["position"]
+        off_m.append(distance_m(at.lat_deg, at.lon_deg, named["lat_deg"], named["lon_deg"]))
+    assert sum(query["accepted"] for query in found) >= 6
+    assert np.median(off_m) < 25
+    assert max(off_m) < 50
+
+    # The rest of the grid is added to it, under the same names.
+    assert run("map", "build", place_map, *cut, "--append", "--json") == 0
+    rest = json.loads(capsys.readouterr().out)
+    assert rest["already_here"] == built["places"]
+    assert rest["places"] == rest["added"] + built["places"]
+
+
+def test_water_and_what_is_not_known_are_left_out_and_said(tmp_path, capsys):
+    with rasterio.open(textured_raster(tmp_path / "land.tif")) as data:
+        land, to_crs = data.read(), data.transform
+    land[:, :, :280] = 70
+    land[:, :, 500:] = 0
+    path = write_raster(tmp_path / "coast.tif", land, "EPSG:32632", to_crs, nodata=0)
+    cut = ("--orthophoto", path, "--footprint-m", 80, "--spacing-m", 40)
+    assert run("map", "build", tmp_path / "m.gpkg", *cut) == 0
+    said = capsys.readouterr().out
+    assert "places added (0 without a position)" in said
+    for what in ("data", "texture"):
+        assert int(said.split(f" for want of {what}")[0].split()[-1]) >= 5
+
+
+@pytest.mark.parametrize(
+    ("flags", "code", "said"),
+    [
+        ([], 2, "Give either --images (pictures of a flight) or --orthophoto"),
+        (["--images", "x", "--orthophoto", "GROUND"], 2, "Give either --images"),
+        (["--images", "x", "--footprint-m", "80"], 2, "--footprint-m goes with --orthophoto: leave it out."),
+        (["--images", "x", "--spacing-m", "20"], 2, "--spacing-m goes with --orthophoto"),
+        (["--images", "x", "--area", "f"], 2, "--area goes with --orthophoto"),
+        (["--orthophoto", "GROUND"], 2, "needs --footprint-m"),
+        (["--orthophoto", "GROUND", "--footprint-m", "80"], 2, "and --spacing-m"),
+        (["--orthophoto", "GROUND", "--positions", "p.csv"], 2, "--positions goes with --images"),
+        (["--orthophoto", "GROUND", "--rate-hz", "2"], 2, "--rate-hz goes with --images"),
+        (["--orthophoto", "GROUND", "--camera", "forward"], 2, "give nadir, or leave it out"),
+        (["--orthophoto", "GROUND", "--footprint-m", "80", "--spacing-m", "20", "--margin-m", "5"], 2, "with --area"),
+        (["--orthophoto", "GROUND", "--footprint-m", "8000", "--spacing-m", "20"], 2, "--footprint-m is 8000"),
+        (["--orthophoto", "nothing.tif", "--footprint-m", "80", "--spacing-m", "20"], 1, "no orthophoto nothing.tif"),
+    ],
+)
+def test_a_wrong_request_is_one_sentence_and_no_map(tmp_path, ground, capsys, flags, code, said):
+    flags = [ground if flag == "GROUND" else flag for flag in flags]
+    assert run("map", "build", tmp_path / "m.gpkg", *flags) == code
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "m.gpkg").exists()
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (["--track", "t"], "--track goes with --orthophoto"),
+        (["--fov-deg", "50"], "--fov-deg goes with --orthophoto"),
+        (["--orthophoto", "GROUND"], "needs its --track"),
+        (["--orthophoto", "GROUND", "--track", "TRACK"], "give --height-m"),
+        (["--orthophoto", "GROUND", "--track", "TRACK", "--height-m", "0"], "--height-m is 0: give 1 to 10000."),
+        (["--orthophoto", "GROUND", "--track", "TRACK", "--every-m", "nan"], "--every-m is nan"),
+    ],
+)
+def test_a_wrong_flight_is_one_sentence(tmp_path, ground, track, capsys, flags, said):
+    flags = [{"GROUND": ground, "TRACK": track}.get(flag, flag) for flag in flags]
+    assert run("simulate", "flight", tmp_path / "flight", *flags) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
+
+
+def test_a_track_elsewhere_names_both_extents(tmp_path, ground, capsys):
+    track = tmp_path / "t.csv"
+    track.write_text("file,lat,lon,height_m\na,-35.36,149.16,80\n")
+    assert run("simulate", "flight", tmp_path / "flight", "--orthophoto", ground, "--track", track) == 2
+    assert "the track is at -35.3600..-35.3600 north" in capsys.readouterr().err
+
+
+def test_without_rasterio_the_sentence_says_what_to_install(tmp_path, ground):
+    script = (
+        "import sys; sys.modules['rasterio'] = None\n"
+        "from edgevpr.cli.main import main\n"
+        f"sys.exit(main(['map', 'build', {str(tmp_path / 'm.gpkg')!r}, '--orthophoto', {ground!r}, "
+        "'--footprint-m', '80', '--spacing-m', '20']))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr.endswith("pip install 'edgevpr[maps]'.\n")
+    assert done.stderr.count("\n") == 1
