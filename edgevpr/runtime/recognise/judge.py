@@ -30,9 +30,8 @@ _MIN_COVERAGE = 0.04
 _DISPLAY_SCORE = 0.08
 _AT_REST_CELLS = 1.5
 
-# A match that scores so much has landmarks that agree: six or more had all 413 right matches of all sets that do (none
-# of the two that were tuned on had fewer either), and 8 in 10,000 of places elsewhere have so many by chance. It is
-# asked where both pictures have landmarks enough. Weaker matches, of grass under other light, may have none.
+# A match that scores so much has landmarks that agree: all of the 413 right ones that do, of all sets from the air, had
+# six or more. Weaker ones, of grass under other light, may have none. Asked where both pictures have enough of them.
 _CLEAR_SCORE, _LEAST_INLIERS, _LANDMARKS_ENOUGH = 0.2, 5, 100
 # Landmarks that agree make up for a score that is too low, down to so much of it.
 _OF_SCORE_WHEN_PROVEN = 0.5

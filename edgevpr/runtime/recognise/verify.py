@@ -3,8 +3,6 @@
 It is for cameras that look straight down: ahead, near and far landmarks move by different steps.
 """
 
-from collections.abc import Iterator
-
 from edgevpr.contract import FineMatch, Technique, TechniqueSpec
 from edgevpr.errors import PlaceError
 from edgevpr.frames.level import Levelled
@@ -42,16 +40,14 @@ class Verification:
 
     def rival(self, ranking: Ranking, neighbour_m: float) -> int:
         """Return how many landmarks of the best place elsewhere (see `places.retrieve.elsewhere`) agree, as its own
-        match says that it lies. Raises PlaceError as `proof`."""
-        for slot in self._elsewhere(ranking, neighbour_m):
-            expected = self._expected(ranking.compared.get(slot))
-            known = self._known(slot) if expected else None
-            return agreement(self._asked(), known, expected).inliers if known is not None else 0
-        return 0
-
-    def _elsewhere(self, ranking: Ranking, neighbour_m: float) -> Iterator[int]:
-        away = elsewhere(self._index, ranking.slots[0], ranking.slots, neighbour_m)
-        return (int(slot) for slot in ranking.slots[away])
+        match says that it lies: 0 where there is no such place, and of one without landmarks all that there could be.
+        Raises PlaceError as `proof`."""
+        away = ranking.slots[elsewhere(self._index, ranking.slots[0], ranking.slots, neighbour_m)]
+        if not len(away):
+            return 0
+        expected = self._expected(ranking.compared.get(int(away[0])))
+        known = self._known(int(away[0])) if expected else None
+        return OF_PLACE if known is None else agreement(self._asked(), known, expected).inliers
 
     def _expected(self, match: FineMatch | None) -> Expected | None:
         if match is None or match.shift_cells is None or match.rotation_deg is None or self._spec.cells is None:

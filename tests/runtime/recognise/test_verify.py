@@ -3,6 +3,7 @@
 import shutil
 import sqlite3
 import zlib
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,13 +14,16 @@ from fakes import FakeClock
 
 from edgevpr.frames.mask import Mask
 from edgevpr.landmarks.landmarks import describe, packed, unpacked
+from edgevpr.places.growing import GrowingIndex
 from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.near import index_positions
 from edgevpr.places.sequence import SequenceSearch
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import Pack
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.judge import AcceptRule
+from edgevpr.runtime.recognise.learn import Learner
 from edgevpr.runtime.recognise.mapping import build_map
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import fields_of
@@ -69,9 +73,8 @@ def mapped(whole, tmp_path):
 
 def keep(path, landmarks, checksum):
     """Write other landmarks for the second place."""
-    with sqlite3.connect(path) as db:
+    with closing(sqlite3.connect(path)) as db, db:
         db.execute("UPDATE places SET landmarks = ?, landmarks_crc32 = ? WHERE place_id = 2", (landmarks, checksum))
-    db.close()
 
 
 def asked(path, technique, query, rule=RULE, times=1, **others):
@@ -135,6 +138,14 @@ def test_ground_that_is_in_the_map_twice_is_not_accepted_for_its_landmarks(tmp_p
     assert "ahead of a place elsewhere" in event.reason
 
 
+def test_a_place_elsewhere_without_landmarks_may_be_the_right_one(mapped, technique):
+    rule = replace(RULE, min_margin=0.99)
+    assert asked(mapped, technique, frame(2, 20, -10), rule).accepted
+    with closing(sqlite3.connect(mapped)) as db, db:
+        db.execute("UPDATE places SET landmarks = NULL, landmarks_crc32 = NULL WHERE place_id != 3")
+    assert not asked(mapped, technique, frame(2, 20, -10), rule).accepted
+
+
 def test_other_ground_is_not_accepted_whatever_its_landmarks(mapped, technique):
     assert not any(asked(mapped, technique, frame(seed)).accepted for seed in range(20, 26))
 
@@ -169,6 +180,15 @@ def test_the_mask_holds_for_landmarks_too(whole, technique, tmp_path):
         there = unpacked(place_map.landmarks_of(1))
     assert len(there) > 30
     assert there.points[:, 0].min() > 0
+
+
+def test_a_place_that_is_learnt_in_flight_has_landmarks(tmp_path, technique):
+    with PlaceMap.create(tmp_path / "m.gpkg", technique.spec) as place_map:
+        index_positions(place_map)
+        growing = GrowingIndex(place_map, technique, budget_bytes=10**6, room=10)
+        walk = Recogniser(technique=technique, place_map=place_map, index=growing.index, rule=RULE, meter=meter())
+        place = Learner(walk, growing, spacing_m=10.0, gap_m=100.0).learn(walk.step(frame(1)))
+        assert len(unpacked(place_map.landmarks_of(place.place_id))) > 100
 
 
 def test_a_sequence_is_not_held_against_landmarks(mapped, technique):
