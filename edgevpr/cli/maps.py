@@ -154,7 +154,7 @@ def map_shrink(args: Namespace) -> int:
     count = args.places
     if count is None:
         with PlaceMap.open(args.map) as place_map:
-            count = places_in(int(args.mb * 1e6), place_map.spec)
+            count = places_in(int(args.mb * 1e6), place_map)
         if count < 1:
             raise UsageError(f"--mb {args.mb:g}: not one place of {args.map} fits: give more.")
     kept, places = shrink(args.map, map_path(args.out), count)

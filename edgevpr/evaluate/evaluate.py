@@ -126,7 +126,7 @@ def evaluate(
     meter = meter_of(config, load_board("this"))
     source = open_source(str(dataset.ref_dir), live=False)
     frames = progress(_frames(source), source.total, f"{technique_name}: references")
-    with mapped(frames, technique, meter) as (place_map, index):
+    with mapped(frames, technique, meter, dataset.ref_dir) as (place_map, index):
         length = length_of(technique.spec, sequence)
         rule = accept_rule(technique, config.match, length)
 
@@ -150,14 +150,29 @@ def evaluate(
 
 
 @contextmanager
-def mapped(frames: Iterable[Frame], technique: Technique, meter: QueryMeter) -> Iterator[tuple[PlaceMap, PlaceIndex]]:
-    """Map frames in a temporary folder; give the map, open for reading, and an index with all its places."""
+def mapped(
+    frames: Iterable[Frame], technique: Technique, meter: QueryMeter, images: Path | None = None
+) -> Iterator[tuple[PlaceMap, PlaceIndex]]:
+    """Map frames in a temporary folder, and refine the map as `map build` does; give it, open for reading, and an index
+    with all its places. `images` is the folder that the frames come from."""
     with tempfile.TemporaryDirectory(prefix="edgevpr-eval-") as folder:
         path = Path(folder) / "references.gpkg"
         with PlaceMap.create(path, technique.spec) as place_map:
             build_map(frames, technique, place_map, meter)
+            _refine(place_map, technique, images)
         with PlaceMap.open(path) as place_map:
             yield place_map, load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
+
+
+def _refine(place_map: PlaceMap, technique: Technique, images: Path | None) -> None:
+    if technique.spec.cells is None:
+        return
+    try:
+        from edgevpr.refine.look import pictures
+        from edgevpr.refine.refine import refine
+    except ModuleNotFoundError:  # without SciPy, the maps of this machine are not refined either
+        return
+    refine(place_map, technique, lambda pairs, total: pairs, pictures(images, technique) if images else None)
 
 
 def compare(results: Iterable[TechniqueResult]) -> list[TechniqueResult]:

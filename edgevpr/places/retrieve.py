@@ -162,19 +162,22 @@ def _unread(scanned: np.ndarray, readable: np.ndarray, best: int) -> np.ndarray:
     return slots[scanned[slots] >= least]
 
 
-def elsewhere(index: PlaceIndex, best: int, slots: np.ndarray, neighbour_m: float) -> np.ndarray:
+def elsewhere(
+    index: PlaceIndex, best: int, slots: np.ndarray, neighbour_m: float, same: Sequence[int] = ()
+) -> np.ndarray:
     """Tell which of `slots` (K,) are outside the neighbourhood of the slot `best`, bool (K,): more than `neighbour_m`
-    metres away or, where either has no position, more than two places before or after it in the index."""
+    metres away or, where either has no position, more than two places before or after it in the index. The places
+    numbered `same` are inside, however far away: they show the same ground."""
     away_m = distance_m(index.lat_deg[best], index.lon_deg[best], index.lat_deg[slots], index.lon_deg[slots])
-    return np.where(np.isnan(away_m), abs(slots - best) > _NEIGHBOURS_WITHOUT_POSITION, away_m > neighbour_m)
+    away = np.where(np.isnan(away_m), abs(slots - best) > _NEIGHBOURS_WITHOUT_POSITION, away_m > neighbour_m)
+    return away & ~np.isin(index.place_ids[slots], same) if same else away
 
 
 def margin(ranking: Ranking, index: PlaceIndex, neighbour_m: float, same: Sequence[int] = ()) -> float | None:
     """Return the margin: the best score less the best score elsewhere. None where no place elsewhere is ranked. The
-    places numbered `same` are not elsewhere, however far from the best one: they show the same ground."""
+    places numbered `same` are not elsewhere."""
     others = ranking.slots[1:]
-    away = elsewhere(index, ranking.slots[0], others, neighbour_m) & ~np.isin(index.place_ids[others], same)
-    runners_up = ranking.scores[1:][away]
+    runners_up = ranking.scores[1:][elsewhere(index, ranking.slots[0], others, neighbour_m, same)]
     return float(ranking.scores[0] - runners_up[0]) if len(runners_up) else None
 
 

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 
-from edgevpr.contract import TechniqueSpec
 from edgevpr.places import mapfiles
 from edgevpr.places.examine import examine
 from edgevpr.places.mapfile import PlaceMap
@@ -12,14 +11,15 @@ from edgevpr.places.sqlite import sentences
 from edgevpr.places.thin import best_places
 from edgevpr.types import Place
 
-_PAGE_BYTES, _EMPTY_BYTES, _BESIDE_BLOBS_BYTES = 4096, 53_248, 300  # of a file of SQLite, a map without places, a row
+_EMPTY_BYTES = 57_344  # of a map without places
 _LOW = 0.5  # of its worth is left to a place that was kept only to bound a gap
 
 
-def places_in(file_bytes: int, spec: TechniqueSpec) -> int:
-    """Return how many places a map file of this size holds."""
-    row_bytes = spec.coarse.nbytes + (spec.fine.nbytes if spec.fine else 0) + _BESIDE_BLOBS_BYTES
-    return max(0, file_bytes - _EMPTY_BYTES) // (-(-row_bytes // _PAGE_BYTES) * _PAGE_BYTES)
+def places_in(file_bytes: int, place_map: PlaceMap) -> int:
+    """Return how many places like those of a map a file of this size holds."""
+    places = len(place_map)
+    each = (place_map.path.stat().st_size - _EMPTY_BYTES) / max(places, 1)
+    return places if each <= 0 else min(places, max(0, int((file_bytes - _EMPTY_BYTES) / each)))
 
 
 def worth_of(place: Place) -> float:

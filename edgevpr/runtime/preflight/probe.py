@@ -16,6 +16,7 @@ from edgevpr.contract import Technique
 from edgevpr.errors import ModelError
 from edgevpr.places.index import PlaceIndex, bytes_per_place, empty_index, load_index
 from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.rows import MOST_LANDMARK_BYTES
 from edgevpr.places.sequence import bytes_beside_place, length_of, search_of
 from edgevpr.power import machine
 from edgevpr.power.boards import load_board
@@ -180,7 +181,9 @@ def probe(
         compare_once=compare_once,
         in_full=spec.in_full or 1,
         ram_bytes_per_place=bytes_per_place(spec) + bytes_beside_place(length),
-        disk_bytes_per_place=spec.coarse.nbytes + (spec.fine.nbytes if spec.fine else 0),
+        disk_bytes_per_place=spec.coarse.nbytes
+        + (spec.fine.nbytes if spec.fine else 0)
+        + (MOST_LANDMARK_BYTES if spec.cells else 0),
         process_mb=process_mb + (0.0 if "pymavlink" in sys.modules else _LINK_MB),
         candidates=technique.candidates if spec.fine else None,
         scan_per_place=scan if spec.fine else NO_COST,

@@ -171,18 +171,19 @@ class Recogniser:
         judge anew. `verdict` is what the comparison alone led to."""
         technique, index, place_map = self.technique, self.index, self.place_map
         proof, rival = None, 0
+        looked = Verification(technique.spec, picture, index, place_map)
         # The newest query of a sequence need not be sure by itself.
-        if self._verifies and self.search.length == 1 and technique.spec.cells:
+        if verifies := self._verifies and self.search.length == 1 and technique.spec.cells is not None:
             with self.meter.step("verify"):
-                looked = Verification(technique.spec, picture, index, place_map)
                 proof = looked.proof(ranking)
-                if proof and verdict.is_open and proof.inliers >= PROVEN:
-                    rival = looked.rival(ranking, self.rule.neighbour_m)
         with self.meter.step("locate"):
             found = named(ranking, index, place_map, first=HEARD if technique.spec.cells else 1)
             where = located(found, technique.spec.cells, picture.view.aside, proof)
             if where is None and found[0].place.position:
                 where = at_place(found[0].place.position, self.accuracy_m)
+        if verifies and proof and verdict.is_open and proof.inliers >= PROVEN:
+            with self.meter.step("verify"):
+                rival = looked.rival(ranking, self.rule.neighbour_m, where.places if where else ())
         return judge(ranking, index, self.rule, self.search, is_new, proof, rival, where), proof, where
 
     def landmarks(self, event: Recognition) -> bytes | None:

@@ -3,6 +3,8 @@
 It is for cameras that look straight down: ahead, near and far landmarks move by different steps.
 """
 
+from collections.abc import Sequence
+
 from edgevpr.contract import FineMatch, Technique, TechniqueSpec
 from edgevpr.errors import PlaceError
 from edgevpr.frames.level import Levelled
@@ -38,11 +40,11 @@ class Verification:
         known = self._known(slot) if expected else None
         return held_against(self._asked(), known, expected) if known is not None else None
 
-    def rival(self, ranking: Ranking, neighbour_m: float) -> int:
+    def rival(self, ranking: Ranking, neighbour_m: float, same: Sequence[int]) -> int:
         """Return how many landmarks of the best place elsewhere (see `places.retrieve.elsewhere`) agree, as its own
         match says that it lies: 0 where there is no such place, and of one without landmarks all that there could be.
-        Raises PlaceError as `proof`."""
-        away = ranking.slots[elsewhere(self._index, ranking.slots[0], ranking.slots, neighbour_m)]
+        The places numbered `same` are not elsewhere. Raises PlaceError as `proof`."""
+        away = ranking.slots[elsewhere(self._index, ranking.slots[0], ranking.slots, neighbour_m, same)]
         if not len(away):
             return 0
         expected = self._expected(ranking.compared.get(int(away[0])))
