@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from edgevpr.power.boards import Board
 from edgevpr.power.equations import Pack, marginal_energy_j, pack_ah, stage_energy_j
 from edgevpr.power.machine import pss_mb, rss_mb
-from edgevpr.types import QueryCost, StageCost, Steps
+from edgevpr.types import NO_COST, QueryCost, StageCost, Steps
 
 Clock = Callable[[], float]
 _PSS_EVERY_S = 20.0
@@ -74,13 +74,14 @@ class QueryMeter:
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:
-        """Meter a step of the query (a field of `Steps`): `with meter.step("encode"): ...`."""
+        """Meter a step of the query (a field of `Steps`): `with meter.step("encode"): ...`. A step that is taken again
+        adds to the first."""
         metered = Stage()
         try:
             with stage(self._wall_clock, self._cpu_clock) as metered:
                 yield
         finally:
-            self._taken[name] = metered.cost
+            self._taken[name] = self._taken.get(name, NO_COST) + metered.cost
 
     def steps(self) -> Steps:
         """Return the cost of every step that the query has reached."""

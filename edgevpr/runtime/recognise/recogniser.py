@@ -5,14 +5,15 @@ No link, flight log, thread or clock is inside: what is handed in with a frame d
 
 import logging
 from collections import deque
+from dataclasses import replace
 from itertools import islice
 
-from edgevpr.contract import Technique
+from edgevpr.contract import Descriptor, Technique
 from edgevpr.errors import EdgevprError, MapError, PlaceError
 from edgevpr.frames.mask import AnyMask, NoMask
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import compare, named, scan
+from edgevpr.places.retrieve import Expected, Ranking, compare, named, scan, together
 from edgevpr.places.sequence import Alone, Search
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.gate import says_nothing
@@ -20,7 +21,7 @@ from edgevpr.runtime.recognise.hints import NoPrior, Prior, expected_of
 from edgevpr.runtime.recognise.judge import NEW_FOR_S, AcceptRule, Verdict, judge
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.salience.gate import Gate, NoGate
-from edgevpr.types import Frame, Vehicle
+from edgevpr.types import Candidate, Frame, Vehicle
 
 _log = logging.getLogger(__name__)
 
@@ -99,28 +100,16 @@ class Recogniser:
             elif objection and self.search.length == 1:  # in a sequence it is searched for, to keep the others in step
                 verdict = Verdict(False, objection)
             else:
-                with meter.step("scan"):
-                    self.place_map.require_unchanged()
-                    margin_m = max(self.accuracy_m, self.rule.neighbour_m)
-                    hints = self._prior.hints(frame, vehicle, index, margin_m)
-                    expected = expected_of(hints, index)
-                    scanned = scan(technique, descriptor, index, expected)
-                with meter.step("compare"):
-                    ranking = compare(
-                        technique,
-                        descriptor,
-                        scanned,
-                        self.place_map,
-                        index,
-                        candidates=self.candidates,
-                        neighbour_m=self.rule.neighbour_m,
-                        expected=expected,
-                    )
-                    ranking = self.search.follow(ranking, index, frame.t_mono_s)
-                    (best,) = named(ranking, index, self.place_map, first=1)
-                    is_new = self._is_new(best.place.place_id, frame.t_mono_s)
-                    verdict = judge(ranking, index, self.rule, self.search, is_new)
-                    verdict = Verdict(False, objection) if objection else verdict
+                margin_m = max(self.accuracy_m, self.rule.neighbour_m)
+                hints = self._prior.hints(frame, vehicle, index, margin_m)
+                expected = replace(expected_of(hints, index), height_ratio=self._prior.height_ratio)
+                ranking = self.search.follow(self._look(descriptor, expected), index, frame.t_mono_s)
+                best, verdict = self._judged(frame, ranking)
+                if technique.spec.tries_heights and self.search.length == 1 and not verdict.accepted:
+                    # What spoke against the first look counts in the second as well.
+                    ranking = together(ranking, self._look(descriptor, replace(expected, height_ratio=None)))
+                    best, verdict = self._judged(frame, ranking)
+                verdict = Verdict(False, objection) if objection else verdict
                 self._prior.learn(best, verdict.accepted, frame.t_mono_s)
             failed = False
         except Exception as error:
@@ -147,6 +136,29 @@ class Recogniser:
             steps=meter.steps(),
             cost=meter.cost(),
         )
+
+    def _look(self, descriptor: Descriptor, expected: Expected) -> Ranking:
+        """Search the map for a query. Raises MapError and PlaceError as `compare` does."""
+        with self.meter.step("scan"):
+            self.place_map.require_unchanged()
+            scanned = scan(self.technique, descriptor, self.index, expected)
+        with self.meter.step("compare"):
+            return compare(
+                self.technique,
+                descriptor,
+                scanned,
+                self.place_map,
+                self.index,
+                candidates=self.candidates,
+                neighbour_m=self.rule.neighbour_m,
+                expected=expected,
+            )
+
+    def _judged(self, frame: Frame, ranking: Ranking) -> tuple[Candidate, Verdict]:
+        with self.meter.step("compare"):
+            (best,) = named(ranking, self.index, self.place_map, first=1)
+            is_new = self._is_new(best.place.place_id, frame.t_mono_s)
+            return best, judge(ranking, self.index, self.rule, self.search, is_new)
 
     def unread(self, error: Exception) -> Recognition:
         """Return the event of a frame that could not even be read."""
