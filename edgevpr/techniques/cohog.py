@@ -220,7 +220,9 @@ class CoHog:
         ratio, turn = hypothesis(best)
         ratio = cells_along(self._side + 1, ratio) / (self._side + 1)
         match = replace(matches[best], rotation_deg=360 * turn / ROTATIONS, height_ratio=ratio)
-        return match if match.shift_cells is None else self._aligned(match, self._asking(query, best), reference)
+        if match.shift_cells is None or match.score < self.min_score:  # most are of other places: no need of the detail
+            return match
+        return self._aligned(match, self._asking(query, best), reference)
 
     def _aligned(self, match: FineMatch, asking: Asking, reference: np.ndarray) -> FineMatch:
         """Return a match by the vote with shift, rotation and height to a fraction of a step."""

@@ -81,6 +81,7 @@ class Views:
         self._picture, self._cell_px, self._encode = picture, cell_px, encode
         self._side, self._good = len(square[1]), max(int(square[1].sum()), 1)
         self._encoded = {(1.0, 0): square}
+        self._scaled: dict[float, tuple[np.ndarray, np.ndarray]] = {}
 
     def blocks(self, ratio: float, turn: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the blocks float32 (n, n, 4 bins) of the view of a hypothesis, and which are good, bool (n, n)."""
@@ -122,10 +123,13 @@ class Views:
         which would add pixels and nothing to see: its cells are smaller instead."""
         cell_px = self._cell_px if ratio <= 1 else max(2, self._cell_px // 2)
         side = cells_along(self._side + 1, ratio) * cell_px
-        grey, allowed = self._picture.grey, self._picture.allowed.astype(np.uint8)
-        if side != len(grey):
-            grey = cv2.resize(grey, (side, side), interpolation=cv2.INTER_AREA)
-            allowed = cv2.resize(allowed, (side, side), interpolation=cv2.INTER_NEAREST)
+        if ratio not in self._scaled:
+            grey, allowed = self._picture.grey, self._picture.allowed.astype(np.uint8)
+            if side != len(grey):
+                grey = cv2.resize(grey, (side, side), interpolation=cv2.INTER_AREA)
+                allowed = cv2.resize(allowed, (side, side), interpolation=cv2.INTER_NEAREST)
+            self._scaled[ratio] = grey, allowed
+        grey, allowed = self._scaled[ratio]
         if within:
             middle = (side - 1) / 2
             matrix = cv2.getRotationMatrix2D((middle, middle), -360 * within / ROTATIONS, 1)

@@ -105,7 +105,8 @@ class Recogniser:
                 expected = replace(expected_of(hints, index), height_ratio=self._prior.height_ratio)
                 ranking = self.search.follow(self._look(descriptor, expected), index, frame.t_mono_s)
                 best, verdict = self._judged(frame, ranking)
-                if technique.spec.tries_heights and self.search.length == 1 and not verdict.accepted:
+                again = technique.spec.tries_heights and self.search.length == 1 and self._prior.looks_again
+                if again and not verdict.accepted:
                     # What spoke against the first look counts in the second as well.
                     ranking = together(ranking, self._look(descriptor, replace(expected, height_ratio=None)))
                     best, verdict = self._judged(frame, ranking)
