@@ -91,3 +91,8 @@ def test_in_a_sequence_the_newest_query_need_not_be_sure_by_itself():
 def test_where_there_is_no_place_elsewhere_what_agrees_counts_all_the_same():
     assert judged(0.05, (0.2,)).accepted
     assert not judged(0.03, (0.2,)).accepted
+
+
+@pytest.mark.parametrize(("turn", "is_display"), [(3.0, True), (356.5, True), (9.0, False)])
+def test_a_display_is_found_though_rotations_are_measured(turn, is_display):
+    assert behind((0.15, (0.0, 0.0), turn)).accepted is not is_display
