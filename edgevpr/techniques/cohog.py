@@ -200,7 +200,8 @@ class CoHog:
         for ratio in ratios if len(ratios) > 1 else ():
             of_ratio = _columns(scores, ratio)
             of_ratio *= (by_chance[1.0] / max(by_chance[ratio], 1e-9)) ** _STANDS_OUT
-        return np.clip(scores.max(axis=1), 0, 1), scores
+        best = np.max([_columns(scores, ratio).max(axis=1) for ratio in ratios], axis=0)
+        return np.clip(best, 0, 1), scores
 
     def good_patterns(self, query: Descriptor, turn: int, ratio: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
         """Return the slow patterns float32 (G, 20) of the good regions in the middle of a view of the query (see
