@@ -35,12 +35,14 @@ class Lens:
 class View:
     """The way a picture lies on the ground (None: unknown). `up_deg` is the compass direction (0..360) of its top, and
     `footprint_m` the length on the ground of its longest side. `aside` is the point straight under the camera, from the
-    middle of the picture, (right, up) as shares of the longest side. `reason` tells why the picture was left tilted
+    middle of the picture, (right, up) as shares of the longest side. By `zoom` it was scaled, so that it shows as much
+    less ground. `reason` tells why the picture was left tilted
     (None: it was not)."""
 
     up_deg: float | None = None
     footprint_m: float | None = None
     aside: tuple[float, float] | None = None
+    zoom: float = 1.0
     reason: str | None = None
 
     def fields(self) -> dict[str, Any]:
@@ -113,6 +115,7 @@ def levelled(
     view = View(
         up_deg=None if shot.heading_deg is None else 0.0,
         footprint_m=shot.own_m and shot.own_m / zoom,
+        zoom=zoom,
         aside=(0.0, 0.0) if below and shot.is_attitude_known else shot.aside(turned, zoom),
     )
     image = _shrunk_and_warped(frame.image, out_from_pixel, side, shot.focal_px / out_px)

@@ -31,6 +31,12 @@ def best_scanned(scanned: np.ndarray, by_hypothesis: np.ndarray | None, among: n
     return [(int(slots[at]), np.flatnonzero(tried[at]).tolist()) for at in np.flatnonzero(tried.any(axis=1))]
 
 
+def every_possible(by_hypothesis: np.ndarray, among: np.ndarray) -> list[Chosen]:
+    """Choose all slots where `among` bool (N,) is True, and of each all hypotheses that are not ruled out."""
+    slots = np.flatnonzero(among).tolist()
+    return [(slot, np.flatnonzero(np.isfinite(by_hypothesis[slot])).tolist()) for slot in slots]
+
+
 def _largest(scores: np.ndarray, count: int) -> np.ndarray:
     """Return the indices of the `count` largest of scores (N,), in no order."""
     return np.argpartition(-scores, count)[:count] if count < len(scores) else np.arange(len(scores))

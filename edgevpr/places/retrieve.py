@@ -11,7 +11,7 @@ import numpy as np
 from edgevpr.contract import Descriptor, FineMatch, Technique
 from edgevpr.errors import MapError, PlaceError
 from edgevpr.geodesy import distance_m
-from edgevpr.places.candidates import Chosen, best_scanned
+from edgevpr.places.candidates import Chosen, best_scanned, every_possible
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.visit import Seen, Visit, left_out, require_there
@@ -28,10 +28,12 @@ _LIKELY = 3
 class Expected:
     """Knowledge about the place of a query before the search (None: nothing known). `in_reach` bool (N,), at least one
     True, tells which places the aircraft can be at. `turned_deg` float (N,) is the expected rotation of the camera
-    since each place was mapped (see `Technique.coarse_scores`)."""
+    since each place was mapped, and `height_ratio` the camera's height above the ground over that of then (see
+    `Technique.coarse_scores`)."""
 
     in_reach: np.ndarray | None = None
     turned_deg: np.ndarray | None = None
+    height_ratio: float | None = None
 
 
 NOTHING = Expected()
@@ -63,6 +65,8 @@ class Ranking:
 def scan(technique: Technique, query: Descriptor, index: PlaceIndex, expected: Expected = NOTHING) -> Scan:
     """Score all places of the index by their rows, in one product."""
     hint = {} if expected.turned_deg is None else {"turned_deg": expected.turned_deg}
+    if technique.spec.tries_heights:
+        hint["height_ratio"] = expected.height_ratio
     return Scan(*technique.coarse_scores(query, index.rows, index.mean, **hint))
 
 
@@ -82,10 +86,10 @@ def compare(
     Of more than the technique's `in_full` of them, those that look best at a glance are compared in full.
 
     Where `candidates` is None, or is at least the number of places and more than the technique's own number, all
-    places are compared under every hypothesis, unless `expected` narrows them: exact, but slow. Neighbours of the best
-    place are the places within `neighbour_m` metres of it. Where all candidates are its neighbours, the best-scanned
-    places elsewhere are compared as well, because the margin needs one of them. A technique without a fine part is
-    ranked by the scan.
+    places are compared under every hypothesis of the expected height, unless `expected` says more: exact, but slow.
+    Neighbours of the best place are the places within `neighbour_m` metres of it. Where all candidates are its
+    neighbours, the best-scanned places elsewhere are compared as well, because the margin needs one of them. A
+    technique without a fine part is ranked by the scan.
 
     Where the scan counts (see `TechniqueSpec.scan_counts`), the score is that of the comparison times the mean of the
     scan score and 1: for a wrong place the two scores have little to do with each other.
@@ -100,8 +104,8 @@ def compare(
     spec, scores, in_reach = technique.spec, scanned.scores, expected.in_reach
     one_stage = spec.fine is None
     exact = candidates is None or technique.candidates < candidates >= len(index)
-    nothing_expected = in_reach is None and expected.turned_deg is None
-    by_hypothesis = None if exact and nothing_expected else scanned.by_hypothesis
+    every = exact and in_reach is None and expected.turned_deg is None
+    by_hypothesis = None if every and expected.height_ratio is None else scanned.by_hypothesis
     if one_stage or exact:
         candidates = len(index)
     readable = np.ones(len(index), bool) if one_stage else ~left_out(place_map, index)
@@ -110,6 +114,8 @@ def compare(
     passed_over: list[Seen] = []
 
     def best(among: np.ndarray, count: int, in_full: int | None) -> list[Chosen]:
+        if every and by_hypothesis is not None:
+            return every_possible(by_hypothesis, among)
         chosen = best_scanned(scores, by_hypothesis, among, count)
         if exact or in_full is None or sum(len(tried or [None]) for _, tried in chosen) <= in_full:
             return chosen
@@ -150,6 +156,26 @@ def compare(
         matches,
         _unread(scores, readable, slots[0]),
     )
+
+
+def together(one: Ranking, other: Ranking) -> Ranking:
+    """Join two rankings of the same query, that looked at the same places under different expectations: of a place that
+    both compared the better match counts."""
+    compared = dict(one.compared)
+    for slot, match in other.compared.items():
+        if slot not in compared or match.score > compared[slot].score:
+            compared[slot] = match
+    best = sorted(compared, key=lambda slot: -compared[slot].score)
+    last: dict[int, float] = {}
+    for ranking in (one, other):
+        for slot, score in zip(ranking.slots.tolist(), ranking.scores.tolist(), strict=True):
+            if slot not in compared:
+                last[slot] = max(score, last.get(slot, score))
+    rest = sorted(last, key=lambda slot: -last[slot])
+    least = compared[best[-1]].score
+    scores = [compared[slot].score for slot in best] + [min(last[slot], least) for slot in rest]
+    unread = np.union1d(one.unread, other.unread).astype(np.intp)
+    return Ranking(np.array(best + rest, np.intp), np.array(scores, np.float32), compared, unread)
 
 
 def _unread(scanned: np.ndarray, readable: np.ndarray, best: int) -> np.ndarray:

@@ -74,7 +74,8 @@ class QueryMeter:
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:
-        """Meter a step of the query (a field of `Steps`), or one more part of it: `with meter.step("encode"): ...`."""
+        """Meter a step of the query (a field of `Steps`): `with meter.step("encode"): ...`. A step that is taken again
+        adds to the first."""
         metered = Stage()
         try:
             with stage(self._wall_clock, self._cpu_clock) as metered:

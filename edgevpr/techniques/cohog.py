@@ -20,10 +20,21 @@ import numpy as np
 from edgevpr.contract import Descriptor, FineMatch, PartSpec, Picture, TechniqueSpec
 from edgevpr.errors import UsageError
 from edgevpr.techniques import placecode, placewords
+from edgevpr.techniques.alignment import align
 from edgevpr.techniques.displacement import displacement, share
 from edgevpr.techniques.entropy import block_means, good_blocks
 from edgevpr.techniques.gradients import grey_square, levels, mask_square, normalised_blocks, oriented_cells
 from edgevpr.techniques.patterns import slow_patterns
+from edgevpr.techniques.views import (
+    HEIGHT_RATIOS,
+    ROTATIONS,
+    WITHIN_QUARTER,
+    Asking,
+    Views,
+    cells_along,
+    hypothesis,
+    nearest_ratio,
+)
 
 # The goodness threshold GT of the thesis (6.3.2) and of the authors' public code, each for its own entropy.
 _DEFAULT_GT = {"filled_bins": 0.5, "shannon": 0.4}
@@ -44,10 +55,10 @@ _CANDIDATES = {"forward": 42, "nadir": 50}
 # all aerial sets and the kite joined into one map 20 of 300 pairs, find as many places as all of them compared in full
 # (of the 994 of nordland_tiny four fewer).
 _IN_FULL = {"forward": 12, "nadir": 20}
-_GLANCE = 4  # of so many good regions one
-_ROTATIONS = 24  # of a nadir query whose heading is unknown: 15 degrees apart
-_WITHIN_QUARTER = _ROTATIONS // placewords.QUARTERS
-_HEADING_WITHIN_DEG = 1.5 * 360 / _ROTATIONS  # the expected rotation, and one on either side
+_HEADING_WITHIN_DEG = 1.5 * 360 / ROTATIONS  # the expected rotation, and one on either side
+# The words that a view shares with a place by chance: of this power of their mean is about how far the best of foreign
+# places stand out. Measured between the two tuning sets from the air.
+_STANDS_OUT = 0.62
 
 
 class CoHog:
@@ -55,8 +66,9 @@ class CoHog:
     (below 0: the default for the entropy). `entropy` is "shannon" or "filled_bins".
 
     With `camera` "nadir" the picture is laid into a square with its shape kept, so that a rotated picture shows the
-    same ground, and a query is tried in 24 rotations; places are named by `words` (see `placewords.load`). The map
-    records `camera` and `words`. It does not record `matching`, "displacement" or "thesis": both read the same map.
+    same ground, and a query is tried from five heights (with "thesis" from one) in 24 rotations; places are named by
+    `words` (see `placewords.load`). The map records `camera` and `words`. It does not record `matching`, "displacement"
+    or "thesis": both read the same map.
     """
 
     def __init__(
@@ -93,7 +105,9 @@ class CoHog:
         self.min_quality = _MIN_QUALITY[entropy]
         self.candidates = _CANDIDATES[camera]
         self._vocabulary = placewords.load(words) if camera == "nadir" else None
-        self._asked, self._by_turn, self._within = None, {}, {}
+        # The thesis's score does not tell which of two heights is right.
+        self._ratios = HEIGHT_RATIOS if self._compares_patterns else (1.0,)
+        self._asked, self._views, self._asking_of = None, None, {}
         parameters = {"w1": w1, "w2": w2, "bins": bins, "gt": self._gt, "entropy": entropy, "camera": camera}
         if camera == "nadir":
             parameters["words"] = words
@@ -106,6 +120,7 @@ class CoHog:
             scan_counts=matching == "displacement" and camera == "forward",  # with a nadir camera it adds nothing
             heading_within_deg=_HEADING_WITHIN_DEG if camera == "nadir" else None,
             cells=w1 // w2 if camera == "nadir" and matching == "displacement" else None,
+            tries_heights=camera == "nadir" and len(self._ratios) > 1,
             in_full=_IN_FULL[camera] if matching == "displacement" else None,
         )
 
@@ -119,7 +134,7 @@ class CoHog:
         if self._camera == "nadir":
             image, mask = _in_square(image, mask)
         grey, allowed = grey_square(image, self._w1), mask_square(mask, self._w1)
-        blocks, seen, good = self._regions(grey, allowed)
+        blocks, seen, good = self._regions(grey, allowed, self._w2)
         regions = blocks.reshape(self.spec.fine.shape)
         # The square root of each value in 8 bits: most values are small, and the root keeps more of their digits.
         stored = np.rint(255 * np.sqrt(regions)).astype(np.uint8)
@@ -134,15 +149,17 @@ class CoHog:
             coarse=coarse, fine=stored, regions=regions, good=good.ravel(), quality=quality, picture=picture
         )
 
-    def _regions(self, grey: np.ndarray, allowed: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Compute the blocks float32 (side, side, 4 bins). Also return, as bool (side, side), which of them are wholly
-        allowed, and which of these are good."""
-        blocks = normalised_blocks(oriented_cells(grey, self._w2, self._bins, signed=True, allowed=allowed))
+    def _regions(
+        self, grey: np.ndarray, allowed: np.ndarray | None, cell_px: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Compute the blocks float32 (n, n, 4 bins) of cells of so many pixels. Also return, as bool (n, n), which of
+        them are wholly allowed, and which of these are good."""
+        blocks = normalised_blocks(oriented_cells(grey, cell_px, self._bins, signed=True, allowed=allowed))
         if allowed is None:
             seen = np.ones(blocks.shape[:2], bool)
         else:
-            seen = block_means(allowed.astype(np.float32), self._w2) >= 1.0
-        return blocks, seen, good_blocks(levels(grey), self._entropy, self._w2, self._gt, among=seen)
+            seen = block_means(allowed.astype(np.float32), cell_px) >= 1.0
+        return blocks, seen, good_blocks(levels(grey), self._entropy, cell_px, self._gt, among=seen)
 
     def pack(self, coarse: np.ndarray, mean: np.ndarray) -> np.ndarray:
         """Make the rows of the index, uint8 (N, B), of coarse uint8 (N, 12, 12, bins) and the map's mean
@@ -150,60 +167,102 @@ class CoHog:
         return placecode.pack(coarse.astype(np.float32) / 255, mean / 255)
 
     def coarse_scores(
-        self, query: Descriptor, rows: np.ndarray, mean: np.ndarray | None, turned_deg: np.ndarray | None = None
+        self,
+        query: Descriptor,
+        rows: np.ndarray,
+        mean: np.ndarray | None,
+        turned_deg: np.ndarray | None = None,
+        height_ratio: float | None = None,
     ) -> tuple[np.ndarray, np.ndarray | None]:
         """Compare the query with the place codes `rows`, uint8 (N, B), under shifts. With a nadir camera compare its
         words with those of the places, uint16 (N, 100), under all rotations or those within `spec.heading_within_deg`
-        of `turned_deg` (N,). Returns scores float32 (N,) in 0..1 and, as float32 (N, 24), those of each rotation (None
-        with a forward camera)."""
+        of `turned_deg` (N,), from all heights or the one nearest to `height_ratio`. Returns scores float32 (N,) in 0..1
+        and, as float32 (N, 120), those of each hypothesis (None with a forward camera): 24 rotations from each height.
+        """
         if self._camera == "forward":
             seen = query.picture.seen
             blocks = _middle(query.regions.reshape(self._side, self._side, -1), seen)
             asked = placecode.hypotheses(*placecode.seen_grid(blocks, _middle(seen, seen)), mean / 255)
             return np.clip(placecode.scan_ahead(asked, rows), 0, 1), None
-        expected, needed = None, set(range(_WITHIN_QUARTER))
+        expected, needed = None, set(range(WITHIN_QUARTER))
         if turned_deg is not None:
-            steps = np.rint(turned_deg * (_ROTATIONS / 360)) % _ROTATIONS
+            steps = np.rint(turned_deg * (ROTATIONS / 360)) % ROTATIONS
             expected = np.nan_to_num(steps, nan=-1).astype(np.intp)
             if len(expected) and expected.min() >= 0:
-                needed = {int(turn) % _WITHIN_QUARTER for near in (-1, 0, 1) for turn in np.unique(expected) + near}
-        asking = {turn: self.good_patterns(query, turn) for turn in sorted(needed)}
-        asked = placewords.of_query(self._vocabulary, asking, _WITHIN_QUARTER, self._side)
-        scores = placewords.scan(asked, rows, expected)
-        return scores.max(axis=1), scores
+                needed = {int(turn) % WITHIN_QUARTER for near in (-1, 0, 1) for turn in np.unique(expected) + near}
+        ratios = self._ratios if height_ratio is None else (nearest_ratio(height_ratio),)
+        scores = np.full((len(rows), len(HEIGHT_RATIOS) * ROTATIONS), -np.inf, np.float32)
+        by_chance = {}
+        for ratio in ratios:
+            asking = {turn: self.good_patterns(query, turn, ratio) for turn in sorted(needed)}
+            asked = placewords.of_query(self._vocabulary, asking, WITHIN_QUARTER, self._side)
+            of_ratio = _columns(scores, ratio)
+            of_ratio[:], by_chance[ratio] = placewords.scan(asked, rows, expected, 1 / len(ratios))
+        for ratio in ratios if len(ratios) > 1 else ():
+            of_ratio = _columns(scores, ratio)
+            of_ratio *= (by_chance[1.0] / max(by_chance[ratio], 1e-9)) ** _STANDS_OUT
+        best = np.max([_columns(scores, ratio).max(axis=1) for ratio in ratios], axis=0)
+        return np.clip(best, 0, 1), scores
 
-    def good_patterns(self, query: Descriptor, turn: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the slow patterns float32 (G, 20) of the good regions of a query that is turned back by `turn` steps,
-        and their numbers int (G,)."""
-        regions, good = self._turned(query, turn)
-        return self._patterns(regions[good]), np.flatnonzero(good)
+    def good_patterns(self, query: Descriptor, turn: int, ratio: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+        """Return the slow patterns float32 (G, 20) of the good regions in the middle of a view of the query (see
+        `views`), and their numbers int (G,)."""
+        blocks, numbers = self._views_of(query).middle(ratio, turn)
+        return self._patterns(blocks), numbers
 
     def match(self, query: Descriptor, fine: np.ndarray, hypotheses: Sequence[int] | None = None) -> FineMatch:
         """Compute C = A B^T (thesis 6.2.3), with A the good regions of the query and B those of the place, then the
-        score by `matching`. A query without a good region scores 0. A nadir query is tried in the rotations
-        `hypotheses` (None: all), and the best one counts."""
+        score by `matching`. A query without a good region scores 0. A nadir query is tried under `hypotheses` (None:
+        all), and the best one counts, with shift, rotation and height as its agreeing regions lie (see `alignment`)."""
         reference = self._reference(fine)
         if self._camera == "forward":
             return self._matched(self._asking(query, 0), reference)
-        turns = range(_ROTATIONS) if hypotheses is None else hypotheses
-        matches = {turn: self._matched(self._asking(query, turn), reference) for turn in turns}
-        best = max(matches, key=lambda turn: matches[turn].score)
-        return replace(matches[best], rotation_deg=360 * best / _ROTATIONS)
+        matches = {each: self._matched(self._asking(query, each), reference) for each in self._tried(hypotheses)}
+        best = max(matches, key=lambda each: matches[each].score)
+        ratio, turn = hypothesis(best)
+        ratio = cells_along(self._side + 1, ratio) / (self._side + 1)
+        match = replace(matches[best], rotation_deg=360 * turn / ROTATIONS, height_ratio=ratio)
+        if match.shift_cells is None or match.score < self.min_score:  # most are of other places: no need of the detail
+            return match
+        return self._aligned(match, self._asking(query, best), reference)
+
+    def _aligned(self, match: FineMatch, asking: Asking, reference: np.ndarray) -> FineMatch:
+        """Return a match by the vote with shift, rotation and height to a fraction of a step."""
+        best = (asking.regions @ reference.T).argmax(axis=1)
+        found = align((asking.numbers, asking.side), (best, self._side), match.shift_cells)
+        if found is None:
+            return match
+        return replace(
+            match,
+            shift_cells=found.shift_cells,
+            covariance_cells2=found.covariance_cells2,
+            rotation_deg=(match.rotation_deg + found.turn_deg) % 360,
+            height_ratio=match.height_ratio * found.scale,
+        )
 
     def glance(
         self, query: Descriptor, fine: np.ndarray, hypotheses: Sequence[int] | None = None
     ) -> tuple[float, list[int] | None]:
-        """Compare a quarter of the good regions with those of one place, as `match` does all of them. Returns the share
-        that agrees and, with a nadir camera, the rotation under which the most do."""
+        """Compare a part of the good regions with those of one place, as `match` does all of them: a quarter, or of a
+        nadir query about as many from each height. Returns about the score and, with a nadir camera, the hypothesis
+        under which the most agree."""
         reference = self._reference(fine)
-        turns = (0,) if self._camera == "forward" else range(_ROTATIONS) if hypotheses is None else hypotheses
-        shares = []
-        for turn in turns:
-            numbers, regions = (part[::_GLANCE] for part in self._asking(query, turn))
+        tried = (0,) if self._camera == "forward" else self._tried(hypotheses)
+        scores = []
+        for each in tried:
+            asking = self._asking(query, each)
+            numbers, regions = asking.numbers[:: asking.step], asking.regions[:: asking.step]
             nearest = (regions @ reference.T).argmax(axis=1)
-            shares.append(share(numbers, nearest, self._side, _VOTES_COUNT[self._camera]))
-        best = int(np.argmax(shares))
-        return shares[best], None if self._camera == "forward" else [turns[best]]
+            agree = share(numbers, nearest, (asking.side, self._side), _VOTES_COUNT[self._camera])
+            scores.append(agree * asking.worth_at_glance)
+        best = int(np.argmax(scores))
+        return scores[best], None if self._camera == "forward" else [tried[best]]
+
+    def _tried(self, hypotheses: Sequence[int] | None) -> Sequence[int]:
+        if hypotheses is not None:
+            return hypotheses
+        first = HEIGHT_RATIOS.index(self._ratios[0]) * ROTATIONS
+        return range(first, first + len(self._ratios) * ROTATIONS)
 
     def _reference(self, fine: np.ndarray) -> np.ndarray:
         """Return the fine part of a place as `_comparable` blocks: the stored values are square roots."""
@@ -211,33 +270,27 @@ class CoHog:
         blocks *= blocks
         return self._comparable(blocks)
 
-    def _asking(self, query: Descriptor, turn: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the numbers and descriptors of the good regions of a query that is turned back by `turn` steps. Those
-        of the newest query are kept, since it is compared with many places."""
-        self._keep(query)
-        if turn not in self._by_turn:
-            regions, good = self._turned(query, turn)
-            self._by_turn[turn] = np.flatnonzero(good), self._comparable(regions[good])
-        return self._by_turn[turn]
+    def _asking(self, query: Descriptor, number: int) -> Asking:
+        """Return the good regions of a query under a hypothesis (with a forward camera: as it is). Those of the newest
+        query are kept, since it is compared with many places."""
+        views = self._views_of(query)
+        if number not in self._asking_of:
+            if views is None:
+                regions = self._comparable(query.regions[query.good])
+                asking = Asking(numbers=np.flatnonzero(query.good), regions=regions, side=self._side)
+            else:
+                asking = views.asking(*hypothesis(number), self._comparable)
+            self._asking_of[number] = asking
+        return self._asking_of[number]
 
-    def _turned(self, query: Descriptor, turn: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the regions float32 (blocks, 4 bins) of a query that is turned back by `turn` steps, and which are
-        good, bool (blocks,). Only pictures within a quarter turn are encoded: the others have the same cells."""
-        self._keep(query)
-        quarters, within = divmod(turn, _WITHIN_QUARTER)
-        square = (self._side, self._side)
-        if within not in self._within:
-            blocks, good = query.regions.reshape(*square, -1), query.good.reshape(square)
-            if within:
-                blocks, _, good = self._regions(*self._turned_back(query.picture, within))
-            self._within[within] = blocks, good
-        blocks, good = self._within[within]
-        blocks = placewords.turned_blocks(blocks, -quarters)
-        return blocks.reshape(query.regions.shape), np.rot90(good, -quarters).ravel()
-
-    def _keep(self, query: Descriptor) -> None:
+    def _views_of(self, query: Descriptor) -> Views | None:
         if query is not self._asked:
-            self._asked, self._by_turn, self._within = query, {}, {}
+            self._asked, self._views, self._asking_of = query, None, {}
+            if self._camera == "nadir":
+                square = (self._side, self._side)
+                own = query.regions.reshape(*square, -1), query.good.reshape(square)
+                self._views = Views(query.picture, own, self._w2, lambda *view: self._regions(*view)[::2])
+        return self._views
 
     def _comparable(self, blocks: np.ndarray) -> np.ndarray:
         """Return blocks float32 (N, 4 bins), or for the displacement vote their slow patterns (N, patterns), each of
@@ -248,29 +301,16 @@ class CoHog:
         """Return regions float32 (N, 4 bins) as their slow patterns (N, patterns), each of length 1."""
         return _unit(regions @ slow_patterns(self._bins))
 
-    def _turned_back(self, picture: Picture, turn: int) -> tuple[np.ndarray, np.ndarray]:
-        """Turn a picture and its allowed pixels back by `turn` steps about the middle; the corners are cut off."""
-        middle = (self._w1 - 1) / 2
-        matrix = cv2.getRotationMatrix2D((middle, middle), -360 * turn / _ROTATIONS, 1)
-        size = self._w1, self._w1
-        allowed = picture.allowed.astype(np.uint8)
-        return (
-            cv2.warpAffine(picture.grey, matrix, size, borderMode=cv2.BORDER_REPLICATE),
-            cv2.warpAffine(allowed, matrix, size, flags=cv2.INTER_NEAREST).astype(bool),
-        )
-
-    def _thesis(self, asking: tuple[np.ndarray, np.ndarray], reference: np.ndarray) -> FineMatch:
-        numbers, regions = asking
-        if not len(numbers):
+    def _thesis(self, asking: Asking, reference: np.ndarray) -> FineMatch:
+        if not len(asking.numbers):
             return FineMatch(0.0)
-        return FineMatch(float(np.clip((regions @ reference.T).max(axis=1).mean(), 0, 1)))
+        return FineMatch(float(np.clip((asking.regions @ reference.T).max(axis=1).mean(), 0, 1)))
 
-    def _displacement(self, asking: tuple[np.ndarray, np.ndarray], reference: np.ndarray) -> FineMatch:
-        numbers, regions = asking
-        best = (regions @ reference.T).argmax(axis=1)
-        found = displacement(numbers, best, self._side, _VOTES_COUNT[self._camera])
+    def _displacement(self, asking: Asking, reference: np.ndarray) -> FineMatch:
+        best = (asking.regions @ reference.T).argmax(axis=1)
+        found = displacement(asking.numbers, best, (asking.side, self._side), _VOTES_COUNT[self._camera])
         return FineMatch(
-            found.share,
+            min(1.0, found.share * asking.worth),
             shift_cells=found.shift_cells,
             covariance_cells2=found.covariance_cells2,
             coverage=found.agreeing / len(reference),
@@ -284,6 +324,12 @@ def _require(what: str, value: str, allowed) -> None:
 
 def _grid_spec(bins: int) -> PartSpec:
     return PartSpec((placecode.SIDE, placecode.SIDE, bins), "|u1")
+
+
+def _columns(scores: np.ndarray, ratio: float) -> np.ndarray:
+    """Return the columns of scores (N, H) that are of one height ratio."""
+    first = HEIGHT_RATIOS.index(ratio) * ROTATIONS
+    return scores[:, first : first + ROTATIONS]
 
 
 def _unit(rows: np.ndarray) -> np.ndarray:

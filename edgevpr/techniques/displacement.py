@@ -31,21 +31,24 @@ class Displacement:
 _NOTHING = Displacement(0.0, (0.0, 0.0), (0.0, 0.0, 0.0), 0)
 
 
-def displacement(asking: np.ndarray, best: np.ndarray, side: int, counts: tuple[float, ...]) -> Displacement:
-    """Count the votes of regions on a grid of `side` x `side`.
+def displacement(
+    asking: np.ndarray, best: np.ndarray, sides: tuple[int, int], counts: tuple[float, ...]
+) -> Displacement:
+    """Count the votes of regions on square grids of these `sides`: of the query and of the reference, both even or both
+    odd.
 
     `asking` and `best` are int (G,): each good region of the query, and the region of the reference most similar to it.
-    Both are numbered row by row. A vote that is n cells off a step, along the rows or along the columns, has the weight
-    `counts[n]`; one further off has none. The peak is the step with the largest sum of weighted votes. Without any
-    region the share is 0.
+    Both are numbered row by row. A step is counted from the middle of one grid to that of the other. A vote that is n
+    cells off a step, along the rows or along the columns, has the weight `counts[n]`; one further off has none. The
+    peak is the step with the largest sum of weighted votes. Without any region the share is 0.
     """
     if not len(asking):
         return _NOTHING
     room = len(counts) - 1
-    step, votes, around = _piled(asking, best, side, counts)
+    step, votes, around = _piled(asking, best, sides, counts)
     wide = len(votes)
     weights = _weights(counts)
-    peak_y, peak_x = divmod(int(around.argmax()), 2 * side - 1)
+    peak_y, peak_x = divmod(int(around.argmax()), around.shape[1])
     agreeing = votes[peak_y : peak_y + len(weights), peak_x : peak_x + len(weights)] * weights
     count = float(agreeing.sum())
     shares_x, shares_y = agreeing.sum(axis=0) / count, agreeing.sum(axis=1) / count
@@ -57,30 +60,32 @@ def displacement(asking: np.ndarray, best: np.ndarray, side: int, counts: tuple[
         float((off - mean_y) @ agreeing @ (off - mean_x)) / count,
         float(shares_y @ (off - mean_y) ** 2) + 1 / 12,
     )
-    shift = (peak_x - (side - 1) + mean_x, peak_y - (side - 1) + mean_y)
+    none = sum(sides) // 2 - 1  # the number of no step, along one side
+    shift = (peak_x - none + mean_x, peak_y - none + mean_y)
     near = np.zeros((wide, wide), bool)
     near[peak_y : peak_y + len(weights), peak_x : peak_x + len(weights)] = True
-    agreed = np.zeros(side * side, bool)
+    agreed = np.zeros(sides[1] ** 2, bool)
     agreed[best[near.ravel().take(step)]] = True
     return Displacement(count / len(asking), shift, covariance, int(np.count_nonzero(agreed)))
 
 
-def share(asking: np.ndarray, best: np.ndarray, side: int, counts: tuple[float, ...]) -> float:
+def share(asking: np.ndarray, best: np.ndarray, sides: tuple[int, int], counts: tuple[float, ...]) -> float:
     """Return the `share` of a `displacement` without the rest of it, in half the time."""
-    return float(_piled(asking, best, side, counts)[2].max()) / len(asking) if len(asking) else 0.0
+    return float(_piled(asking, best, sides, counts)[2].max()) / len(asking) if len(asking) else 0.0
 
 
 def _piled(
-    asking: np.ndarray, best: np.ndarray, side: int, counts: tuple[float, ...]
+    asking: np.ndarray, best: np.ndarray, sides: tuple[int, int], counts: tuple[float, ...]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the number of the step of each vote, int (G,), the votes by step, float32 (W, W), and the weighted sum
-    around each possible step, float32 (2 side - 1, 2 side - 1)."""
+    around each possible step, float32 (W - 2 room, W - 2 room)."""
     # Both numbers are those of a grid as wide as there are steps, so that their difference is the number of the step. A
     # border around the possible steps leaves room for the square around the peak.
     room = len(counts) - 1
-    wide = 2 * (side - 1 + room) + 1
-    number = _numbers(side, wide)
-    step = number[best] - number[asking] + wide // 2 * (wide + 1)
+    of_query, of_reference = sides
+    wide = of_query + of_reference - 1 + 2 * room
+    first = (of_query - 1 + room) * (wide + 1)
+    step = _numbers(of_reference, wide)[best] - _numbers(of_query, wide)[asking] + first
     votes = np.bincount(step, minlength=wide * wide).reshape(wide, wide).astype(np.float32)
     around = cv2.filter2D(votes, -1, _weights(counts), borderType=cv2.BORDER_CONSTANT)
     return step, votes, around[room : wide - room, room : wide - room]

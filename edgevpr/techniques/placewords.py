@@ -85,8 +85,11 @@ def of_query(vocabulary: np.ndarray, asking: dict[int, tuple[np.ndarray, np.ndar
     return Asked(word=word, region=region, turn=turn, counts=counts.astype(np.uint16), side=side)
 
 
-def scan(asked: Asked, rows: np.ndarray, expected: np.ndarray | None = None) -> np.ndarray:
-    """Score all places, uint16 (N, 100), under each rotation: float32 (N, R) in 0..1.
+def scan(
+    asked: Asked, rows: np.ndarray, expected: np.ndarray | None = None, voting: float = 1.0
+) -> tuple[np.ndarray, float]:
+    """Score all places, uint16 (N, 100), under each rotation: float32 (N, R) in 0..1. Also return the mean score before
+    the vote. `voting` is the part of the usual number of pairs that vote.
 
     Where the heading is known, place n is scored only under rotation `expected[n]` and the two beside it, with -inf for
     the others. `expected` is int (N,), below 0 where the heading is unknown: such a place is scored under all.
@@ -102,8 +105,9 @@ def scan(asked: Asked, rows: np.ndarray, expected: np.ndarray | None = None) -> 
             near = np.arange(turns) if turn < 0 else np.arange(turn - 1, turn + 2) % turns
             scores[group[:, None], near] = _shared(asked.counts[:, near], rows[group])
     flat = scores.ravel()
+    mean = float(flat[np.isfinite(flat)].mean()) if len(rows) else 0.0
     possible = np.count_nonzero(np.isfinite(flat))
-    voted = _VOTED_EACH * max(1, possible // max(1, len(rows)))
+    voted = round(voting * _VOTED_EACH * max(1, possible // max(1, len(rows))))
     best = np.argpartition(-flat, voted)[:voted] if len(flat) > voted else np.arange(len(flat))
     best = best[np.isfinite(flat[best])]
     slots, turned = np.divmod(best, turns)
@@ -111,7 +115,7 @@ def scan(asked: Asked, rows: np.ndarray, expected: np.ndarray | None = None) -> 
         of_turn = turned == turn
         flat[best[of_turn]] += _VOTE_COUNTS * _votes(asked, int(turn), rows[slots[of_turn]])
     scores /= (_AT_MOST + _VOTE_COUNTS * _AT_MOST) * rows.shape[1]
-    return scores
+    return scores, mean
 
 
 def nearest(vocabulary: np.ndarray, patterns: np.ndarray) -> np.ndarray:

@@ -116,9 +116,11 @@ class VectorTechnique:
         rows: np.ndarray,
         mean: np.ndarray | None = None,
         turned_deg: np.ndarray | None = None,
+        height_ratio: float | None = None,
     ) -> tuple[np.ndarray, None]:
         """Compare a query with all places: `rows` (N, *row shape) and the map's mean (D,), unless the form is `float`,
-        to scores float32 (N,), all 0 for a query of zeros. `turned_deg` is ignored: these vectors know no rotations."""
+        to scores float32 (N,), all 0 for a query of zeros. `turned_deg` and
+        `height_ratio` are ignored: these vectors know neither."""
         asked = query.coarse.astype(np.float32)
         if not asked.any():  # less the mean, zeros would resemble some place, and equal another picture of zeros
             return np.zeros(len(rows), np.float32), None

@@ -12,6 +12,7 @@ from edgevpr.techniques.patterns import slow_patterns
 
 SIDE = 31
 NONE = 1024
+AS_MAPPED = slice(48, 72)  # hypotheses: the 24 rotations from the height of the map
 VOCABULARY = placewords.load("ground_words")
 
 
@@ -99,7 +100,9 @@ def test_the_scan_is_the_count_spelt_out(town):
                         shifts[agreeing] = shifts.get(agreeing, 0) + 1
             inside = [count for (y, x), count in shifts.items() if 1 <= y <= 15 and 1 <= x <= 15]
             expected[slot, turn] = shared + 5 * max(inside, default=0)
-    np.testing.assert_allclose(placewords.scan(asked, rows), expected / (24 * 100), rtol=1e-5)
+    scores, mean = placewords.scan(asked, rows)
+    np.testing.assert_allclose(scores, expected / (24 * 100), rtol=1e-5)
+    assert mean == pytest.approx(np.mean([[np.sum(asked.counts[row, turn]) for turn in range(24)] for row in rows]))
 
 
 @pytest.mark.parametrize(
@@ -119,9 +122,9 @@ def test_of_many_pairs_only_the_best_vote_and_they_come_first(town, monkeypatch)
     many = np.random.default_rng(3).permuted(np.tile(rows[:6], (50, 1)), axis=1)
     many = np.concatenate([many, rows])
     query = technique.encode(view(grounds[9], 16, 16, 75))
-    full = technique.coarse_scores(query, many, None)[1]
+    full = technique.coarse_scores(query, many, None, None, 1.0)[1][:, AS_MAPPED]
     monkeypatch.setattr(placewords, "_VOTED_EACH", 40)
-    some = technique.coarse_scores(query, many, None)[1]
+    some = technique.coarse_scores(query, many, None, None, 1.0)[1][:, AS_MAPPED]
     assert some.argmax() == full.argmax()
     assert np.mean(some < full) > 0.2
     assert (some <= full).all()
@@ -134,7 +137,7 @@ def test_a_known_heading_is_the_full_scan_of_three_rotations(town):
     expected = rng.integers(-1, 24, 120)
     turned_deg = np.where(expected < 0, np.nan, 15.0 * expected)
     query = technique.encode(view(grounds[1], 20, 20, 33))
-    full, near = (technique.coarse_scores(query, many, None, hint)[1] for hint in (None, turned_deg))
+    full, near = (technique.coarse_scores(query, many, None, hint, 1.0)[1][:, AS_MAPPED] for hint in (None, turned_deg))
     apart = abs((np.arange(24) - expected[:, None] + 12) % 24 - 12)
     scanned = (apart <= 1) | (expected[:, None] < 0)
     np.testing.assert_array_equal(near[scanned], full[scanned])

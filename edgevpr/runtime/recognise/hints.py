@@ -1,6 +1,6 @@
-"""Hints for a query beside its picture: where the aircraft can be, and which way its nose points.
+"""Hints for a query beside its picture: where the aircraft can be, which way its nose points, and how high it flies.
 
-Both narrow the search, and neither is ever the only way to find a place: a compass may be wrong and a satellite
+They narrow the search, and none is ever the only way to find a place: a compass may be wrong and a satellite
 position false. A query that is not accepted with hints is therefore followed by one without.
 """
 
@@ -38,7 +38,11 @@ class Hints:
 
 
 class NoPrior:
-    """Stands in for a `Prior` where no query is to be narrowed: it has no hints."""
+    """Stands in for a `Prior` where no query is to be narrowed: it has no hints, and each is looked for from all
+    heights where it is not accepted from that of the map."""
+
+    height_ratio = 1.0
+    looks_again = True
 
     def hints(self, frame: Frame, vehicle: Vehicle | None, index: PlaceIndex, margin_m: float) -> Hints | None:
         """Return None: there are no hints."""
@@ -48,7 +52,9 @@ class NoPrior:
 
 
 class Prior:
-    """Hints for the next query, and a memory of whether hints can be believed.
+    """Hints for the next query, and a memory of whether hints can be believed. `height_ratio` is the height to look
+    from first (see `FineMatch`), and `looks_again` tells whether a query not accepted from there is looked for from all
+    heights.
 
     `reach_m_s` is the highest speed of the aircraft, m/s (None: its position narrows nothing). `heading_within_deg` is
     the largest error of a known heading, degrees (None: no heading narrows anything; see `TechniqueSpec`). `is_live` is
@@ -58,6 +64,8 @@ class Prior:
     def __init__(self, reach_m_s: float | None, heading_within_deg: float | None, is_live: bool) -> None:
         self._reach_m_s, self._heading_within_deg, self._is_live = reach_m_s, heading_within_deg, is_live
         self._last_fix: Sighting | None = None
+        self.height_ratio = 1.0  # of the last accepted match; until there is one, that of the map
+        self.looks_again = True
         self._known: Hints | None = None
         self._believed = True
 
@@ -78,9 +86,13 @@ class Prior:
         return self._known if self._believed else None
 
     def learn(self, found: Candidate, accepted: bool, t_mono_s: float) -> None:
-        """Learn from what a query found whether the next one is to use hints, and keep the position of an accepted
-        match."""
+        """Learn from what a query found whether the next one is to use hints, and keep the position and the
+        height of an accepted match."""
+        # Over ground that is not in the map every second query is looked for from all heights: it takes twice as long.
+        self.looks_again = accepted or not self.looks_again
         self._believed = use_next(self._known, self._believed, found, accepted, self._heading_within_deg)
+        if accepted and found.match.height_ratio:
+            self.height_ratio = found.match.height_ratio
         if accepted and found.place.position:
             self._last_fix = Sighting(found.place.position, t_mono_s)
 

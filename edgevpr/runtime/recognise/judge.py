@@ -29,6 +29,8 @@ _MIN_COVERAGE = 0.04
 # drawn over every frame. Such places scored .14 or more behind a display, and .05 or less in all sets without one.
 _DISPLAY_SCORE = 0.08
 _AT_REST_CELLS = 1.5
+_AT_REST_DEG = 7.5
+_AT_REST_HEIGHT = 0.2
 
 # A match that scores so much has landmarks that agree: all of the 413 right ones that do, of all sets from the air, had
 # six or more. Weaker ones, of grass under other light, may have none. Asked where both pictures have enough of them.
@@ -168,7 +170,10 @@ def _is_display(ranking: Ranking, index: PlaceIndex, rule: AcceptRule) -> str | 
 
 
 def _at_rest(match: FineMatch | None) -> bool:
-    if match is None or match.rotation_deg != 0 or match.shift_cells is None:
+    if match is None or match.rotation_deg is None or match.shift_cells is None:
+        return False
+    off_deg = abs((match.rotation_deg + 180) % 360 - 180)
+    if off_deg > _AT_REST_DEG or abs((match.height_ratio or 1.0) - 1) > _AT_REST_HEIGHT:
         return False
     return max(map(abs, match.shift_cells)) <= _AT_REST_CELLS
 

@@ -16,6 +16,7 @@ from edgevpr.config import Config
 from edgevpr.errors import MapBusyError, MapError, UsageError
 from edgevpr.frames.exif import read_exif
 from edgevpr.frames.images import list_images
+from edgevpr.frames.level import View
 from edgevpr.frames.positions import find_positions
 from edgevpr.places.growing import GrowingIndex
 from edgevpr.places.near import nearest_m
@@ -117,7 +118,7 @@ class Learner:
         found = named(event.ranking, recogniser.index, self._map, first=HEARD)
         if found[0].match.score < recogniser.rule.min_score:
             return frame
-        where = located(found, recogniser.technique.spec.cells, (0.0, 0.0))  # of the middle of the picture
+        where = located(found, recogniser.technique.spec.cells, View(aside=(0.0, 0.0)))  # of the middle of the picture
         learnt = where and not where.objection and as_learnt(where, frame.position, GPS_SD_M)
         return replace(frame, position=learnt[0], pose=learnt[1]) if learnt else frame
 

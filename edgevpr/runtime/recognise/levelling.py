@@ -1,7 +1,6 @@
 """The first step of the walk: levels every picture, and says how a picture lies on the ground when it becomes a place.
 
-A wrong height scales wrongly, and then less is recognised. So a scaled query that is not accepted is followed by one
-that keeps its own scale, in turns, until a match is accepted.
+A wrong height scales wrongly. A technique that `tries_heights` finds the picture all the same.
 """
 
 import logging
@@ -18,7 +17,7 @@ from edgevpr.geodesy import moved
 from edgevpr.types import Frame, Pose, Position, Vehicle
 
 GPS_SD_M = 5.0  # of one axis of a recorded position, as long as nothing better is known
-_UNTOLD_TILT = 0.1  # of the footprint: so far off is the middle of a picture that is tilted by 7 degrees
+UNTOLD_TILT = 0.05  # of the footprint: so far from the middle is the point under an aircraft that tilts by 4 degrees
 
 _log = logging.getLogger(__name__)
 
@@ -29,9 +28,6 @@ class NoLevelling:
     def prepare(self, frame: Frame, vehicle: Vehicle | None, overlay: np.ndarray | None) -> Levelled:
         """Return the picture as it is."""
         return Levelled(frame.image, overlay, UNKNOWN_VIEW)
-
-    def learn(self, accepted: bool) -> None:
-        """Learn nothing."""
 
 
 class Levelling:
@@ -45,25 +41,17 @@ class Levelling:
     def __init__(self, lens: Lens, *, footprint_m: float | None = None, below: bool = False, is_live: bool) -> None:
         self.lens, self.footprint_m = lens, footprint_m
         self._below, self._is_live = below, is_live
-        self._scales, self._could_scale = True, False
         self._has_said = False
 
     def prepare(self, frame: Frame, vehicle: Vehicle | None, overlay: np.ndarray | None) -> Levelled:
         """Level the picture of a frame; `overlay`, bool (H, W), is False where it shows no ground (None: nowhere)."""
         if not self._is_live or (vehicle and not vehicle.is_fresh_at(frame.t_mono_s)):
             vehicle = None
-        footprint_m = self.footprint_m if self._scales else None
-        found = levelled(frame, vehicle, self.lens, footprint_m, overlay=overlay, below=self._below)
-        self._could_scale = self.footprint_m is not None and found.view.footprint_m is not None
+        found = levelled(frame, vehicle, self.lens, self.footprint_m, overlay=overlay, below=self._below)
         if found.view.reason and not self._has_said:
             self._has_said = True
             _log.warning("%s is taken as it is, as others like it will be: %s", frame.name, found.view.reason)
         return found
-
-    def learn(self, accepted: bool) -> None:
-        """Learn from what became of the last picture whether the next one is to be scaled."""
-        if self._could_scale and not accepted:
-            self._scales = not self._scales
 
 
 AnyLevelling = NoLevelling | Levelling
@@ -96,7 +84,7 @@ def laid(frame: Frame, view: View) -> Frame:
     variance_m2 = GPS_SD_M**2
     position = frame.position
     if view.aside is None:
-        variance_m2 += (_UNTOLD_TILT * view.footprint_m) ** 2
+        variance_m2 += (UNTOLD_TILT * view.footprint_m) ** 2
     else:
         position = _middle(position, view)
     pose = Pose(up_deg=view.up_deg, footprint_m=view.footprint_m, covariance_m2=(variance_m2, 0.0, variance_m2))

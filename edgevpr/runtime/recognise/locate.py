@@ -14,8 +14,10 @@ from itertools import compress
 import numpy as np
 
 from edgevpr.contract import FineMatch
+from edgevpr.frames.level import UNKNOWN_VIEW, View
 from edgevpr.geodesy import metres, moved
 from edgevpr.landmarks.agreement import CONFIRMED, Agreement
+from edgevpr.runtime.recognise.levelling import UNTOLD_TILT
 from edgevpr.types import Candidate, Pose, Position
 
 # Chosen on aerial_caliterra and aerial_garfield28. Standard deviations of one axis of a step, as shares of the longest
@@ -27,7 +29,6 @@ _LIKE_THE_BEST = 0.5  # of its score: such a match is heard too
 _DISAGREES = 4.0  # standard deviations: such a place is not heard
 _CONTRADICTS = 0.2  # of the footprint: farther apart than that, one of the two is not the right place
 HEARD = 5  # places at most
-_UNTOLD = 0.05  # of the footprint: so far from the middle is the point under an aircraft that tilts by 4 degrees
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,16 +83,16 @@ def at_place(position: Position, accuracy_m: float) -> Located:
 def located(
     found: Sequence[Candidate],
     cells: int | None,
-    aside: tuple[float, float] | None = None,
+    view: View = UNKNOWN_VIEW,
     proof: Agreement | None = None,
 ) -> Located | None:
     """Return where the aircraft is by the places `found`, best first; None where the best has no pose.
 
-    `cells` is the number of cells along the longest side of a picture (None: shifts say nothing about metres). `aside`
-    is where the point under the aircraft lies in the query's picture, to the right and up from its middle, as shares of
-    its longest side (None: unknown, about the middle). `proof` is how the landmarks of the best place agree: they know
-    the step better than the vote does. Places whose score is less than half of the best's, and those that do not show
-    the same ground, are not heard.
+    `cells` is the number of cells along the longest side of a picture (None: shifts say nothing about metres). `view`
+    is the way in which the query's picture lies on the ground; where it is unknown what is straight under the aircraft,
+    that is about the middle. `proof` is how the landmarks of the best place agree: they know the step better than the
+    vote does. Places whose score is less than half of the best's, and those that do not show the same ground, are not
+    heard.
     """
     best = found[0]
     if cells is None or not _can_say(best):
@@ -101,7 +102,7 @@ def located(
         lies[id(best)] = _by_landmarks(proof)
     origin = best.place.position
     heard = [each for each in found[:HEARD] if _is_heard(each, best)]
-    said = [_said(each, lies[id(each)], origin, aside or (0.0, 0.0)) for each in heard]
+    said = [_said(each, lies[id(each)], origin, view.aside or (0.0, 0.0)) for each in heard]
     first, others = said[0], said[1:]
     agree = [_apart(first, each) <= _DISAGREES for each in others]
     against_m = [float(np.hypot(*(each.at_m - first.at_m))) for each, ok in zip(others, agree, strict=True) if not ok]
@@ -111,8 +112,8 @@ def located(
     # What is wrong with the poses is common to neighbours: hearing several makes it no smaller.
     covariance = of_step + np.mean([each.of_pose for each in said], axis=0)
     pose, way = best.place.pose, lies[id(best)]
-    if aside is None:
-        covariance += (_UNTOLD * pose.footprint_m * (way.height_ratio or 1.0)) ** 2 * np.eye(2)
+    if view.aside is None:
+        covariance += (UNTOLD_TILT * pose.footprint_m * (way.height_ratio or 1.0)) ** 2 * np.eye(2)
     objection = None
     if max(against_m, default=0.0) > _CONTRADICTS * pose.footprint_m:
         objection = f"places of the same ground say positions that are {max(against_m):.0f} m apart"
@@ -121,7 +122,7 @@ def located(
         position=Position(lat_deg, lon_deg, origin.alt_m),
         covariance_m2=(float(covariance[0, 0]), float(covariance[0, 1]), float(covariance[1, 1])),
         heading_deg=(pose.up_deg + way.rotation_deg) % 360,
-        height_ratio=way.height_ratio,
+        height_ratio=way.height_ratio and way.height_ratio * view.zoom,
         footprint_m=pose.footprint_m * (way.height_ratio or 1.0),
         places=tuple(each.place.place_id for each in heard),
         objection=objection,

@@ -5,16 +5,16 @@ No link, flight log, thread or clock is inside: what is handed in with a frame d
 
 import logging
 from collections import deque
+from dataclasses import replace
 from itertools import islice
 
-from edgevpr.contract import Technique
+from edgevpr.contract import Descriptor, Technique
 from edgevpr.errors import EdgevprError, MapError, PlaceError
-from edgevpr.frames.level import Levelled
 from edgevpr.frames.mask import AnyMask, NoMask, encoded
 from edgevpr.landmarks.agreement import PROVEN, Agreement
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import Ranking, compare, named, scan
+from edgevpr.places.retrieve import Expected, Ranking, compare, named, scan, together
 from edgevpr.places.sequence import Alone, Search
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.gate import says_nothing
@@ -25,7 +25,7 @@ from edgevpr.runtime.recognise.locate import HEARD, Located, at_place, located
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.runtime.recognise.verify import Verification, landmarks_of
 from edgevpr.salience.gate import Gate, NoGate
-from edgevpr.types import Frame, Vehicle
+from edgevpr.types import Candidate, Frame, Vehicle
 
 _log = logging.getLogger(__name__)
 
@@ -109,33 +109,19 @@ class Recogniser:
             elif objection and self.search.length == 1:  # in a sequence it is searched for, to keep the others in step
                 verdict = Verdict(False, objection)
             else:
-                with meter.step("scan"):
-                    self.place_map.require_unchanged()
-                    margin_m = max(self.accuracy_m, self.rule.neighbour_m)
-                    hints = self._prior.hints(seen_as(frame, picture.view), vehicle, index, margin_m)
-                    expected = expected_of(hints, index)
-                    scanned = scan(technique, descriptor, index, expected)
-                with meter.step("compare"):
-                    ranking = compare(
-                        technique,
-                        descriptor,
-                        scanned,
-                        self.place_map,
-                        index,
-                        candidates=self.candidates,
-                        neighbour_m=self.rule.neighbour_m,
-                        expected=expected,
-                    )
-                    ranking = self.search.follow(ranking, index, frame.t_mono_s)
-                    (best,) = named(ranking, index, self.place_map, first=1)
-                    is_new = self._is_new(best.place.place_id, frame.t_mono_s)
-                    verdict = judge(ranking, index, self.rule, self.search, is_new)
-                    verdict = Verdict(False, objection) if objection else verdict
-                if verdict.accepted or verdict.is_open:
-                    verdict, proof, where = self._look_again(ranking, picture, is_new, verdict)
+                margin_m = max(self.accuracy_m, self.rule.neighbour_m)
+                hints = self._prior.hints(seen_as(frame, picture.view), vehicle, index, margin_m)
+                expected = replace(expected_of(hints, index), height_ratio=self._prior.height_ratio)
+                ranking = self.search.follow(self._look(descriptor, expected), index, frame.t_mono_s)
+                looked = Verification(technique.spec, picture, index, self.place_map)
+                best, verdict, proof, where = self._judged(frame, ranking, looked)
+                again = technique.spec.tries_heights and self.search.length == 1 and self._prior.looks_again
+                if again and not verdict.accepted:
+                    # What spoke against the first look counts in the second as well.
+                    ranking = together(ranking, self._look(descriptor, replace(expected, height_ratio=None)))
+                    best, verdict, proof, where = self._judged(frame, ranking, looked)
+                verdict = Verdict(False, objection) if objection else verdict
                 self._prior.learn(best, verdict.accepted, frame.t_mono_s)
-                if self.search.length == 1:  # a sequence is to have one scale
-                    self.levelling.learn(verdict.accepted)
             failed = False
         except Exception as error:
             _log.debug("%s failed", frame.name, exc_info=True)
@@ -164,27 +150,49 @@ class Recogniser:
             cost=meter.cost(),
         )
 
-    def _look_again(
-        self, ranking: Ranking, picture: Levelled, is_new: bool, verdict: Verdict
-    ) -> tuple[Verdict, Agreement | None, Located | None]:
-        """Hold the best place against its landmarks, find out where the aircraft is by it and the places beside it, and
-        judge anew. `verdict` is what the comparison alone led to."""
-        technique, index, place_map = self.technique, self.index, self.place_map
+    def _look(self, descriptor: Descriptor, expected: Expected) -> Ranking:
+        """Search the map for a query. Raises MapError and PlaceError as `compare` does."""
+        with self.meter.step("scan"):
+            self.place_map.require_unchanged()
+            scanned = scan(self.technique, descriptor, self.index, expected)
+        with self.meter.step("compare"):
+            return compare(
+                self.technique,
+                descriptor,
+                scanned,
+                self.place_map,
+                self.index,
+                candidates=self.candidates,
+                neighbour_m=self.rule.neighbour_m,
+                expected=expected,
+            )
+
+    def _judged(
+        self, frame: Frame, ranking: Ranking, looked: Verification
+    ) -> tuple[Candidate, Verdict, Agreement | None, Located | None]:
+        """Judge the best place of a ranking. One that is accepted, or may be, is held against its landmarks, and with
+        the places beside it says where the aircraft is; then it is judged anew."""
+        index, place_map, cells = self.index, self.place_map, self.technique.spec.cells
+        with self.meter.step("compare"):
+            (best,) = named(ranking, index, place_map, first=1)
+            is_new = self._is_new(best.place.place_id, frame.t_mono_s)
+            verdict = judge(ranking, index, self.rule, self.search, is_new)
+        if not (verdict.accepted or verdict.is_open):
+            return best, verdict, None, None
         proof, rival = None, 0
-        looked = Verification(technique.spec, picture, index, place_map)
         # The newest query of a sequence need not be sure by itself.
-        if verifies := self._verifies and self.search.length == 1 and technique.spec.cells is not None:
+        if verifies := self._verifies and self.search.length == 1 and cells is not None:
             with self.meter.step("verify"):
                 proof = looked.proof(ranking)
         with self.meter.step("locate"):
-            found = named(ranking, index, place_map, first=HEARD if technique.spec.cells else 1)
-            where = located(found, technique.spec.cells, picture.view.aside, proof)
-            if where is None and found[0].place.position:
-                where = at_place(found[0].place.position, self.accuracy_m)
+            found = named(ranking, index, place_map, first=HEARD if cells else 1)
+            where = located(found, cells, looked.picture.view, proof)
+            if where is None and best.place.position:
+                where = at_place(best.place.position, self.accuracy_m)
         if verifies and proof and verdict.is_open and proof.inliers >= PROVEN:
             with self.meter.step("verify"):
                 rival = looked.rival(ranking, self.rule.neighbour_m, where.places if where else ())
-        return judge(ranking, index, self.rule, self.search, is_new, proof, rival, where), proof, where
+        return best, judge(ranking, index, self.rule, self.search, is_new, proof, rival, where), proof, where
 
     def landmarks(self, event: Recognition) -> bytes | None:
         """Return what a map keeps of the landmarks of a frame that becomes a place, None for a technique that does not

@@ -25,7 +25,7 @@ class Verification:
     some."""
 
     def __init__(self, spec: TechniqueSpec, picture: Levelled, index: PlaceIndex, place_map: PlaceMap) -> None:
-        self._spec, self._picture = spec, picture
+        self._spec, self.picture = spec, picture
         self._index, self._map = index, place_map
         self._query: Landmarks | None = None
 
@@ -71,5 +71,5 @@ class Verification:
 
     def _asked(self) -> Landmarks:
         if self._query is None:
-            self._query = describe(self._picture.image, self._picture.mask, OF_QUERY)
+            self._query = describe(self.picture.image, self.picture.mask, OF_QUERY)
         return self._query

@@ -5,7 +5,17 @@ import pytest
 
 from edgevpr.contract import FineMatch
 from edgevpr.places.index import PlaceIndex
-from edgevpr.runtime.recognise.hints import Hints, Sighting, agree, expected_of, hints_of, reach, use_next
+from edgevpr.runtime.recognise.hints import (
+    Hints,
+    NoPrior,
+    Prior,
+    Sighting,
+    agree,
+    expected_of,
+    hints_of,
+    reach,
+    use_next,
+)
 from edgevpr.types import Candidate, Place, Position, Vehicle
 
 HOME = Position(50.0, 8.0)
@@ -133,3 +143,24 @@ def test_an_accepted_match_says_whether_the_hints_can_be_believed():
     assert use_next(hints, False, found(500), accepted=True, heading_within_deg=WITHIN_DEG) is False
     assert use_next(hints, False, None, accepted=False, heading_within_deg=WITHIN_DEG) is True
     assert use_next(None, False, None, accepted=False, heading_within_deg=WITHIN_DEG) is True
+
+
+def test_the_next_query_is_looked_for_from_the_height_of_the_last_match():
+    prior = Prior(None, WITHIN_DEG, is_live=True)
+    at_height = Candidate(Place(place_id=1, source_image="a"), FineMatch(0.5, height_ratio=0.7))
+    assert prior.height_ratio == NoPrior().height_ratio == 1.0
+    prior.learn(at_height, False, 0.0)
+    assert prior.height_ratio == 1.0
+    prior.learn(at_height, True, 1.0)
+    assert prior.height_ratio == 0.7
+    prior.learn(found(), True, 2.0)
+    assert prior.height_ratio == 0.7, "a technique that tells no height"
+
+
+def test_over_unmapped_ground_every_second_query_is_looked_for_from_all_heights():
+    prior = Prior(None, WITHIN_DEG, is_live=True)
+    again = []
+    for accepted in (False, False, False, True, True, False, False):
+        again.append(prior.looks_again)
+        prior.learn(found(), accepted, 0.0)
+    assert again == [True, False, True, False, True, True, False]

@@ -94,6 +94,11 @@ def test_where_there_is_no_place_elsewhere_what_agrees_counts_all_the_same():
     assert not judged(0.03, (0.2,)).accepted
 
 
+@pytest.mark.parametrize(("turn", "is_display"), [(3.0, True), (356.5, True), (9.0, False)])
+def test_a_display_is_found_though_rotations_are_measured(turn, is_display):
+    assert behind((0.15, (0.0, 0.0), turn)).accepted is not is_display
+
+
 def found(inliers, possible=250, shift_share=(0.1, 0.0), is_expected=True):
     """An agreement of so many landmarks."""
     return Agreement(

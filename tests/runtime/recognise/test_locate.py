@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from edgevpr.contract import FineMatch
+from edgevpr.frames.level import View
 from edgevpr.geodesy import metres, moved
 from edgevpr.landmarks.agreement import Agreement
 from edgevpr.runtime.recognise.locate import as_learnt, at_place, located
@@ -41,7 +42,7 @@ def off_m(position):
     ],
 )
 def test_a_step_in_the_picture_is_one_on_the_ground(shift, up_deg, there):
-    found = located([candidate(shift=shift, up_deg=up_deg)], CELLS, (0.0, 0.0))
+    found = located([candidate(shift=shift, up_deg=up_deg)], CELLS, View(aside=(0.0, 0.0)))
     assert off_m(found.position) == pytest.approx(there, abs=0.01)
     assert found.position.alt_m == ORIGIN.alt_m
 
@@ -62,7 +63,7 @@ def test_the_heading_is_that_of_the_place_and_the_turn_since(up_deg, turned_deg,
     ],
 )
 def test_the_aircraft_is_where_the_camera_hangs_and_not_where_it_looks(turned_deg, aside, there):
-    found = located([candidate(turned_deg=turned_deg)], CELLS, aside)
+    found = located([candidate(turned_deg=turned_deg)], CELLS, View(aside=aside))
     assert off_m(found.position) == pytest.approx(there, abs=0.01)
 
 
@@ -76,7 +77,7 @@ def test_what_is_aside_of_a_query_from_higher_up_is_farther():
         scale=2.0,
         covariance_share2=(1e-5, 0.0, 1e-5),
     )
-    found = located([candidate()], CELLS, (0.25, 0.0), proof)
+    found = located([candidate()], CELLS, View(aside=(0.25, 0.0)), proof)
     assert off_m(found.position) == pytest.approx((32, 0), abs=0.01)
     assert (found.height_ratio, found.footprint_m) == (2.0, 128.0)
 
@@ -91,8 +92,8 @@ def test_landmarks_know_the_step_better_than_the_vote():
         scale=1.0,
         covariance_share2=(1e-5, 0.0, 1e-5),
     )
-    by_vote = located([candidate(shift=(4, -2))], CELLS, (0.0, 0.0))
-    found = located([candidate(shift=(4, -2))], CELLS, (0.0, 0.0), proof)
+    by_vote = located([candidate(shift=(4, -2))], CELLS, View(aside=(0.0, 0.0)))
+    found = located([candidate(shift=(4, -2))], CELLS, View(aside=(0.0, 0.0)), proof)
     assert off_m(found.position) == pytest.approx((0.11 * 64, 0.05 * 64), abs=0.01)
     assert found.heading_deg == pytest.approx(4.0)
     assert found.accuracy_m < by_vote.accuracy_m
@@ -100,10 +101,10 @@ def test_landmarks_know_the_step_better_than_the_vote():
 
 def test_places_of_the_same_ground_are_heard_together():
     one, other = candidate(1, shift=(4, 0)), candidate(2, shift=(-4, 0), east_m=16.4)
-    found = located([one, other], CELLS, (0.0, 0.0))
+    found = located([one, other], CELLS, View(aside=(0.0, 0.0)))
     assert off_m(found.position) == pytest.approx((8.2, 0), abs=0.01)
     assert found.places == (1, 2)
-    assert found.accuracy_m < located([one], CELLS, (0.0, 0.0)).accuracy_m
+    assert found.accuracy_m < located([one], CELLS, View(aside=(0.0, 0.0))).accuracy_m
     assert found.accuracy_m >= 2.0, "what is wrong with the map does not become less by hearing more of it"
     assert found.objection is None
 
@@ -114,7 +115,7 @@ def test_places_that_contradict_each_other_are_refused():
 
 
 def test_a_place_a_little_amiss_is_not_heard_and_no_objection():
-    found = located([candidate(1, shift=(4, 0)), candidate(2, shift=(0, 0), east_m=20)], CELLS, (0.0, 0.0))
+    found = located([candidate(1, shift=(4, 0)), candidate(2, shift=(0, 0), east_m=20)], CELLS, View(aside=(0.0, 0.0)))
     assert found.places == (1,)
     assert found.objection is None
     assert off_m(found.position) == pytest.approx((8, 0), abs=0.01)
@@ -133,7 +134,7 @@ def test_what_does_not_show_the_same_ground_is_not_heard(other):
 
 
 def test_an_unknown_tilt_makes_a_fix_less_exact():
-    known, unknown = located([candidate()], CELLS, (0.0, 0.0)), located([candidate()], CELLS, None)
+    known, unknown = located([candidate()], CELLS, View(aside=(0.0, 0.0))), located([candidate()], CELLS)
     assert unknown.accuracy_m > known.accuracy_m + 0.5
 
 
@@ -146,7 +147,7 @@ def test_without_a_pose_or_a_step_there_is_nothing_to_say():
 
 
 def test_the_covariance_is_that_of_the_place_turned_to_the_ground():
-    found = located([candidate(covariance_m2=(100.0, 0.0, 1.0))], CELLS, (0.0, 0.0))
+    found = located([candidate(covariance_m2=(100.0, 0.0, 1.0))], CELLS, View(aside=(0.0, 0.0)))
     var_east, cov, var_north = found.covariance_m2
     assert var_east > 100 > 10 > var_north > 1
     assert abs(cov) < 0.1
@@ -154,7 +155,7 @@ def test_the_covariance_is_that_of_the_place_turned_to_the_ground():
 
 
 def test_a_new_place_lies_between_what_was_recorded_and_what_its_neighbours_say():
-    where = located([candidate(covariance_m2=(25.0, 0.0, 25.0), turned_deg=15)], CELLS, (0.0, 0.0))
+    where = located([candidate(covariance_m2=(25.0, 0.0, 25.0), turned_deg=15)], CELLS, View(aside=(0.0, 0.0)))
     recorded = Position(*moved(ORIGIN.lat_deg, ORIGIN.lon_deg, 6.0, 0.0), 130.0)
     position, pose = as_learnt(where, recorded, 5.0)
     east_m, _ = off_m(position)

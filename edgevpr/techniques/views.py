@@ -1,0 +1,138 @@
+"""Views of a query: its picture as it would look from other heights and under other headings.
+
+A nadir query (of a camera that looks straight down) is compared with a place under each of several *hypotheses*: a
+height ratio (the camera's height above the ground over that when the place was mapped) and a rotation of the camera
+since then. A view undoes both: the picture is scaled until a cell shows as much ground as a cell of the place, and
+turned back. A query from half the height has a quarter of the cells of a place, and one from twice the height four
+times as many.
+
+Few regions agree by chance more easily than many, so the shares of agreeing votes of different views are not the same
+evidence. They are made comparable by what foreign pictures reach under each (measured between the two tuning sets from
+the air), and so that a view from the mapped height keeps its share.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from edgevpr.contract import Picture
+from edgevpr.techniques.placewords import QUARTERS, turned_blocks
+
+# Each is about 1.4 times the one before: the votes of a view still agree where the height is 1.2 times off.
+HEIGHT_RATIOS = (0.5, 0.7, 1.0, 1.42, 2.0)
+ROTATIONS = 24  # 15 degrees apart
+WITHIN_QUARTER = ROTATIONS // QUARTERS
+_GLANCE = 4  # of so many good regions of a view from the mapped height one
+_BY_CHANCE = 0.72  # the share that agrees by chance falls with this power of the number of regions
+_LARGER_BY_CHANCE = {1.42: 0.87, 2.0: 0.8}  # a larger view has more places to agree on
+# At a glance all views have about as many regions, and differ by the room that their votes scatter in.
+_GLANCE_BY_CHANCE = {0.5: 0.53, 0.7: 0.73, 1.0: 1.0, 1.42: 1.37, 2.0: 1.74}
+
+# Encodes a square picture, float32 (side, side), with its allowed pixels, bool of the same shape or None, in cells of
+# so many pixels: blocks float32 (n, n, 4 bins), and which of them are good, bool (n, n).
+Encode = Callable[[np.ndarray, np.ndarray | None, int], tuple[np.ndarray, np.ndarray]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Asking:
+    """The good regions of a view: their `numbers` int (G,), row by row on a grid of `side` x `side`, and `regions`
+    float32 (G, P), each of length 1. A share of agreeing votes times `worth` is a score, and one of every `step`-th
+    region times `worth_at_glance`."""
+
+    numbers: np.ndarray
+    regions: np.ndarray
+    side: int
+    worth: float = 1.0
+    step: int = _GLANCE
+    worth_at_glance: float = 1.0
+
+
+def hypothesis(number: int) -> tuple[float, int]:
+    """Return the height ratio of a hypothesis and the steps that the camera has turned by."""
+    return HEIGHT_RATIOS[number // ROTATIONS], number % ROTATIONS
+
+
+def nearest_ratio(height_ratio: float) -> float:
+    """Return the height ratio among the hypotheses that is nearest to one expected."""
+    return min(HEIGHT_RATIOS, key=lambda ratio: abs(math.log(ratio / height_ratio)))
+
+
+def cells_along(cells: int, ratio: float) -> int:
+    """Return the cells along one side of a view for a place with so many. The numbers differ by an even one, so that
+    the middle region of the view lies on one of the place."""
+    return cells + 2 * round(cells * (ratio - 1) / 2)
+
+
+def grid_numbers(good: np.ndarray, side: int) -> np.ndarray:
+    """Return the numbers of the good regions, bool (n, n), row by row on a grid of `side` x `side` with the same
+    middle: int (G,)."""
+    return np.flatnonzero(np.pad(good, (side - len(good)) // 2))
+
+
+class Views:
+    """The views of one query, each made when it is first asked for. `square` is that of the query as it is: its blocks
+    float32 (n, n, 4 bins), and which of them are good, bool (n, n). Only views within a quarter turn are encoded: the
+    others have the same cells, turned."""
+
+    def __init__(self, picture: Picture, square: tuple[np.ndarray, np.ndarray], cell_px: int, encode: Encode) -> None:
+        self._picture, self._cell_px, self._encode = picture, cell_px, encode
+        self._side, self._good = len(square[1]), max(int(square[1].sum()), 1)
+        self._encoded = {(1.0, 0): square}
+        self._scaled: dict[float, tuple[np.ndarray, np.ndarray]] = {}
+
+    def blocks(self, ratio: float, turn: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the blocks float32 (n, n, 4 bins) of the view of a hypothesis, and which are good, bool (n, n)."""
+        quarters, within = divmod(turn, WITHIN_QUARTER)
+        if (ratio, within) not in self._encoded:
+            self._encoded[ratio, within] = self._encode(*self._picture_of(ratio, within))
+        blocks, good = self._encoded[ratio, within]
+        return turned_blocks(blocks, -quarters), np.rot90(good, -quarters)
+
+    def middle(self, ratio: float, turn: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the blocks float32 (G, 4 bins) of the good regions of a view that fall on a place with the same
+        middle, and their numbers int (G,) on the grid of the place."""
+        blocks, good = self.blocks(ratio, turn)
+        over = max(0, (len(good) - self._side) // 2)
+        inside = slice(over, len(good) - over)
+        blocks, good = blocks[inside, inside], good[inside, inside]
+        return blocks[good], grid_numbers(good, self._side)
+
+    def asking(self, ratio: float, turn: int, described: Callable[[np.ndarray], np.ndarray]) -> Asking:
+        """Return all good regions of a view, `described` by (G, P) for (G, 4 bins)."""
+        blocks, good = self.blocks(ratio, turn)
+        side = max(len(good), self._side)
+        if ratio > 1:
+            ground = (cells_along(self._side + 1, ratio) / (self._side + 1)) ** 2  # over that of the place
+            worth = ground * _LARGER_BY_CHANCE[ratio]  # no more than one in `ground` of the votes can agree
+        else:
+            worth = 1.0 if ratio == 1 else min(1.0, (int(good.sum()) / self._good) ** _BY_CHANCE)
+        return Asking(
+            numbers=grid_numbers(good, side),
+            regions=described(blocks[good]),
+            side=side,
+            worth=worth,
+            step=max(1, round(_GLANCE * (len(good) / self._side) ** 2)),
+            worth_at_glance=_GLANCE_BY_CHANCE[ratio],
+        )
+
+    def _picture_of(self, ratio: float, within: int) -> tuple[np.ndarray, np.ndarray, int]:
+        """Return the picture of a view, its allowed pixels, and the pixels of a cell. The picture is not enlarged,
+        which would add pixels and nothing to see: its cells are smaller instead."""
+        cell_px = self._cell_px if ratio <= 1 else max(2, self._cell_px // 2)
+        side = cells_along(self._side + 1, ratio) * cell_px
+        if ratio not in self._scaled:
+            grey, allowed = self._picture.grey, self._picture.allowed.astype(np.uint8)
+            if side != len(grey):
+                grey = cv2.resize(grey, (side, side), interpolation=cv2.INTER_AREA)
+                allowed = cv2.resize(allowed, (side, side), interpolation=cv2.INTER_NEAREST)
+            self._scaled[ratio] = grey, allowed
+        grey, allowed = self._scaled[ratio]
+        if within:
+            middle = (side - 1) / 2
+            matrix = cv2.getRotationMatrix2D((middle, middle), -360 * within / ROTATIONS, 1)
+            grey = cv2.warpAffine(grey, matrix, (side, side), borderMode=cv2.BORDER_REPLICATE)
+            allowed = cv2.warpAffine(allowed, matrix, (side, side), flags=cv2.INTER_NEAREST)
+        return grey, allowed.astype(bool), cell_px

@@ -1,0 +1,86 @@
+"""A query from another height than the map's: looked for from there where the first look accepts nothing."""
+
+import cv2
+import pytest
+from pictures import textured
+
+from edgevpr.config import load_config
+from edgevpr.places.index import load_index
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.power.boards import load_board
+from edgevpr.runtime.recognise.hints import Prior
+from edgevpr.runtime.recognise.judge import accept_rule
+from edgevpr.runtime.recognise.mapping import build_map
+from edgevpr.runtime.recognise.opening import meter_of
+from edgevpr.runtime.recognise.recogniser import Recogniser
+from edgevpr.techniques import create
+from edgevpr.types import Frame, Position
+
+PLACES = 4
+
+
+def frame(place, height_ratio=1.0):
+    middle_px = round(384 * height_ratio / 2)
+    seen = textured(place, 800, 800)[400 - middle_px : 400 + middle_px, 400 - middle_px : 400 + middle_px]
+    image = cv2.resize(seen, (384, 384), interpolation=cv2.INTER_AREA if height_ratio > 1 else cv2.INTER_LINEAR)
+    return Frame(image=image, name=str(place), t_mono_s=0.0, position=Position(50 + place * 0.01, 8.0))
+
+
+@pytest.fixture(scope="module")
+def opened(tmp_path_factory):
+    technique, path = create("cohog", {"camera": "nadir"}), tmp_path_factory.mktemp("heights") / "m.gpkg"
+    meter = meter_of(load_config(None), load_board("this"))
+    with PlaceMap.create(path, technique.spec) as place_map:
+        build_map(map(frame, range(PLACES)), technique, place_map, meter)
+    with PlaceMap.open(path) as place_map:
+        yield technique, place_map, load_index(place_map, technique, 10**6), meter
+
+
+def recogniser(opened, monkeypatch, prior=None):
+    """A recogniser, and the heights that its scans are asked to look from."""
+    technique, place_map, index, meter = opened
+    heights, scan = [], type(technique).coarse_scores
+
+    def coarse_scores(query, rows, mean, turned_deg=None, height_ratio=None):
+        heights.append(height_ratio)
+        return scan(technique, query, rows, mean, turned_deg, height_ratio)
+
+    monkeypatch.setattr(technique, "coarse_scores", coarse_scores, raising=False)
+    rule = accept_rule(technique, load_config(None).match)
+    walk = Recogniser(
+        technique=technique, place_map=place_map, index=index, rule=rule, meter=meter, candidates=50, prior=prior
+    )
+    return walk, heights
+
+
+def test_one_look_is_enough_from_the_height_of_the_map(opened, monkeypatch):
+    walk, heights = recogniser(opened, monkeypatch)
+    event = walk.step(frame(2))
+    assert event.accepted
+    assert heights == [1.0]
+    assert event.best.match.height_ratio == pytest.approx(1, abs=0.01)
+
+
+@pytest.mark.parametrize("height_ratio", [0.55, 2.0])
+def test_a_query_from_another_height_is_accepted_at_the_second_look(opened, monkeypatch, height_ratio):
+    walk, heights = recogniser(opened, monkeypatch)
+    event = walk.step(frame(1, height_ratio))
+    assert heights == [1.0, None]
+    assert event.accepted, event.reason
+    assert event.best.place.source_image == "1"
+    assert event.best.match.height_ratio == pytest.approx(height_ratio, rel=0.05)
+
+
+def test_in_a_flight_the_next_query_is_looked_for_from_the_same_height(opened, monkeypatch):
+    walk, heights = recogniser(opened, monkeypatch, Prior(None, None, is_live=False))
+    assert [walk.step(frame(place, 2.0)).accepted for place in (1, 3)] == [True, True]
+    assert heights[:2] == [1.0, None]
+    assert heights[2:] == [pytest.approx(2.0, rel=0.05)]
+
+
+def test_ground_that_is_not_in_the_map_is_accepted_from_no_height(opened, monkeypatch):
+    walk, _ = recogniser(opened, monkeypatch)
+    for height_ratio in (0.5, 1.0, 2.0):
+        event = walk.step(frame(17, height_ratio))
+        assert not event.failed
+        assert not event.accepted

@@ -1,0 +1,90 @@
+"""Queries from other heights: their views, and that `cohog` finds the place, the height and the rotation."""
+
+import cv2
+import numpy as np
+import pytest
+
+from edgevpr.techniques import create
+from edgevpr.techniques.views import HEIGHT_RATIOS, ROTATIONS, cells_along, hypothesis, nearest_ratio
+
+SIDE_PX = 384
+
+
+def ground(seed):
+    """Ground of soft patches of several sizes, of which each height shows some."""
+    rng = np.random.default_rng(seed)
+    layers = [cv2.resize(rng.random((n, n)), (1100, 1100), interpolation=cv2.INTER_CUBIC) for n in (10, 22, 50, 100)]
+    return cv2.normalize(sum(layers), None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+
+
+def seen(seed, height_ratio=1.0, turned_deg=0.0, right_px=0.0):
+    """The ground under a camera that is so many times as high as the map's, and has turned clockwise."""
+    view = cv2.getRotationMatrix2D((549.5 + right_px, 549.5), turned_deg, 1 / height_ratio)
+    view[:, 2] += (SIDE_PX - 1) / 2 - np.array([549.5 + right_px, 549.5])
+    return cv2.warpAffine(ground(seed), view, (SIDE_PX, SIDE_PX))
+
+
+@pytest.fixture(scope="module")
+def town():
+    technique = create("cohog", {"camera": "nadir"})
+    places = [technique.encode(seen(seed)) for seed in range(6)]
+    return technique, places, np.stack([place.coarse for place in places])
+
+
+def test_a_view_has_cells_by_its_height_and_its_middle_on_that_of_the_place():
+    assert [cells_along(32, ratio) for ratio in HEIGHT_RATIOS] == [16, 22, 32, 46, 64]
+    assert [cells_along(13, ratio) % 2 for ratio in HEIGHT_RATIOS] == [1] * 5
+
+
+def test_a_hypothesis_is_a_height_and_a_rotation():
+    assert hypothesis(0) == (0.5, 0)
+    assert hypothesis(2 * ROTATIONS + 7) == (1.0, 7)
+    assert [nearest_ratio(ratio) for ratio in (0.1, 0.58, 0.6, 0.9, 1.3, 5)] == [0.5, 0.5, 0.7, 1.0, 1.42, 2.0]
+
+
+@pytest.mark.parametrize("turned_deg", [0, 130])
+@pytest.mark.parametrize("height_ratio", [0.5, 0.6, 0.7, 0.84, 1.0, 1.19, 1.42, 1.7, 2.0])
+def test_a_query_from_another_height_is_found_with_its_height_rotation_and_shift(town, height_ratio, turned_deg):
+    technique, places, rows = town
+    query = technique.encode(seen(3, height_ratio, turned_deg, right_px=24))
+    _, by_hypothesis = technique.coarse_scores(query, rows, None)
+    likely = [divmod(at, by_hypothesis.shape[1]) for at in np.argsort(-by_hypothesis.ravel())[:180].tolist()]
+    glances = [(technique.glance(query, places[slot].fine, [each])[0], slot, each) for slot, each in likely]
+    _, slot, chosen = max(glances)
+    assert slot == 3
+    match = technique.match(query, places[slot].fine, [chosen])
+    assert match.score > technique.min_score
+    assert match.height_ratio == pytest.approx(height_ratio, rel=0.04)
+    assert abs((match.rotation_deg - turned_deg + 180) % 360 - 180) < 2
+    assert match.shift_cells == pytest.approx((24 / 12, 0), abs=0.4)
+
+
+@pytest.mark.parametrize("height_ratio", [0.5, 1.0, 2.0])
+def test_no_height_lets_other_ground_be_accepted(town, height_ratio):
+    technique, places, _ = town
+    query = technique.encode(seen(11, height_ratio))
+    for place in places[:2]:
+        assert technique.match(query, place.fine).score < technique.min_score
+
+
+def test_a_known_height_leaves_the_others_out(town):
+    technique, _, rows = town
+    query = technique.encode(seen(2, 0.7))
+    _, everything = technique.coarse_scores(query, rows, None)
+    assert everything.shape == (6, 5 * ROTATIONS)
+    assert np.isfinite(everything).all()
+    for expected, number in ((0.66, 1), (1.1, 2), (3.0, 4)):
+        scores, known = technique.coarse_scores(query, rows, None, None, expected)
+        of_height = np.arange(5 * ROTATIONS) // ROTATIONS == number
+        assert np.isfinite(known[:, of_height]).all()
+        assert np.isneginf(known[:, ~of_height]).all()
+        assert (scores >= 0).all()
+
+
+def test_the_score_of_the_thesis_is_tried_from_one_height():
+    technique = create("cohog", {"camera": "nadir", "matching": "thesis"})
+    assert not technique.spec.tries_heights
+    query = technique.encode(seen(1))
+    _, by_hypothesis = technique.coarse_scores(query, query.coarse[None], None)
+    assert np.flatnonzero(np.isfinite(by_hypothesis[0])).tolist() == list(range(48, 72))
+    assert technique.match(query, query.fine).height_ratio == 1.0
