@@ -207,4 +207,4 @@ def test_the_accuracy_of_a_map_is_never_below_what_is_claimed_at_least(walk):
     walk.index.lat_deg[:] = np.linspace(50.0, 50.00001, PLACES)
     walk.take(walk.technique, walk.index, walk.rule, walk.search)
     assert walk.accuracy_m == 20.0
-    assert load_config(None).mavlink.min_accuracy_m == 20.0
+    assert load_config(None).mavlink.min_accuracy_m == 5.0
