@@ -266,3 +266,35 @@ def test_a_place_that_cannot_be_read_is_left_alone(map_path):
         found = refine(place_map, technique_of(place_map), lambda pairs, total: pairs)
     assert found.places == 27
     assert found.refined >= 25
+
+
+def test_what_is_learnt_beside_refined_places_lies_by_them(flown, map_path):
+    from edgevpr.config import load_config
+    from edgevpr.power.boards import load_board
+    from edgevpr.runtime.recognise.learn import Learner
+    from edgevpr.runtime.recognise.opening import open_learning
+
+    folder, poses = flown
+    assert main(["map", "refine", str(map_path), "--images", str(folder / "images")]) == 0
+    flight, rng = mapping_flight(7), np.random.default_rng(9)
+    scene = make_scene(7, 420.0, 220.0)
+    ground = lit(scene, flight.light, flight.seed)
+    seen = dataclasses.replace(poses[5], east_m=poses[5].east_m + 10, heading_deg=140.0, height_m=90.0)
+    shot = photograph(ground, scene.metres_per_pixel, seen, Camera(), flight.light, rng)
+    true = to_position(seen)
+    noisy = Position(*moved(true.lat_deg, true.lon_deg, 6.0, -4.0), true.alt_m)
+    recogniser, growing = open_learning(load_config(None, {"map": str(map_path)}), load_board("this"), None)
+    with recogniser.place_map:
+        learner = Learner(recogniser, growing, spacing_m=5.0, gap_m=100.0)
+        place = learner.learn(recogniser.step(Frame(image=shot, name="new", t_mono_s=1.0, position=noisy)))
+        far = Position(*moved(true.lat_deg, true.lon_deg, 90.0, 0.0))
+        contradicted = learner.learn(recogniser.step(Frame(image=shot, name="far", t_mono_s=99.0, position=far)))
+    assert abs((place.pose.up_deg - 140 + 180) % 360 - 180) < 8
+    assert place.pose.footprint_m == pytest.approx(FOOTPRINT_M * 90 / 80, rel=0.15)
+    assert place.pose.recorded == Position(noisy.lat_deg, noisy.lon_deg)
+    off_m = distance_m(true.lat_deg, true.lon_deg, place.position.lat_deg, place.position.lon_deg)
+    assert off_m < np.hypot(6, 4)
+    assert contradicted.pose is None, "the pictures and the position contradict each other"
+    assert contradicted.position == far
+    with PlaceMap.open(map_path) as place_map:
+        assert [each.pose for each in place_map.places([place.place_id])] == [place.pose]
