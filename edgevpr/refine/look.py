@@ -28,6 +28,7 @@ _ASKED = 0.05  # share of the regions that agree, so that landmarks are asked ab
 # Standard deviations of one axis: of landmarks, which see tilt and relief as turns and scalings, and of a vote, which
 # is of whole cells, of turns of 15 degrees, and of any scaling within a fifth.
 _OF_LANDMARKS, _OF_VOTE = (0.01, 0.05), (0.016, 0.09)
+_TRIED = 8  # rotations of a pair
 _KEPT = 512  # landmarks and descriptors: a place is looked at with its neighbours, which come soon after each other
 _KEPT_PICTURES = 4
 
@@ -35,6 +36,14 @@ _KEPT_PICTURES = 4
 def looker(place_map: PlaceMap, technique: Technique, places: list[Place], encoded: Encoded | None) -> Look:
     """Return the look at a pair of `places`, by their numbers in this list. A place that cannot be read, or has no
     landmarks, ties nothing by them."""
+
+    coarse = {place_id: part for place_id, *_, part in place_map.coarse_parts()}
+
+    def likely(asking: Descriptor, part: np.ndarray) -> list[int]:
+        """Choose the hypotheses to try; neighbours of a map are from about the same height."""
+        _, scores = technique.coarse_scores(asking, part[None], None, height_ratio=1.0)
+        best = np.argsort(-scores[0], kind="stable")[:_TRIED]
+        return best[np.isfinite(scores[0][best])].tolist()
 
     @lru_cache(_KEPT)
     def landmarks(at: int) -> Landmarks | None:
@@ -64,7 +73,7 @@ def looker(place_map: PlaceMap, technique: Technique, places: list[Place], encod
             fine, _ = place_map.fine_part(places[place].place_id)
         except EdgevprError:
             return None
-        match = technique.match(asking, fine, None)
+        match = technique.match(asking, fine, likely(asking, coarse[places[place].place_id]))
         if match.score < _ASKED:
             return None
         found = agreed(query, place, _told(match, technique.spec.cells))

@@ -1,4 +1,5 @@
-"""A map that refines itself: pictures of a generated flight, whose true positions are known, with noisy ones recorded."""
+"""A map that refines itself: pictures of a generated flight, whose true positions are known, with noisy ones
+recorded."""
 
 import csv
 import dataclasses
@@ -76,7 +77,7 @@ def errors_m(place_map, poses):
 
 
 def test_pictures_say_where_they_lie(flown, map_path, capsys):
-    folder, poses = flown
+    _, poses = flown
     with PlaceMap.open(map_path) as place_map:
         before_m, _ = errors_m(place_map, poses)
     assert main(["map", "refine", str(map_path), "--json"]) == 0
