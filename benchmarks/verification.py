@@ -30,6 +30,7 @@ from edgevpr.config import load_config
 from edgevpr.evaluate.dataset import Dataset, load_dataset
 from edgevpr.evaluate.evaluate import mapped
 from edgevpr.frames.images import list_images, read_image
+from edgevpr.frames.level import UNKNOWN_VIEW, Levelled
 from edgevpr.frames.source import open_source
 from edgevpr.helpers.tables import markdown
 from edgevpr.landmarks.agreement import CONFIRMED, Agreement
@@ -153,9 +154,7 @@ def _walk(technique, place_map, index, verify: bool) -> Recogniser:
 
 def _proofs(walk: Recogniser, image: np.ndarray, ranking: Ranking) -> Iterator[Agreement]:
     """Hold the query against every place that it was compared with in full, best first."""
-    looked = Verification(
-        spec=walk.technique.spec, image=image, allowed=None, index=walk.index, place_map=walk.place_map
-    )
+    looked = Verification(walk.technique.spec, Levelled(image, None, UNKNOWN_VIEW), walk.index, walk.place_map)
     for slot in ranking.slots.tolist():
         if slot in ranking.compared:
             yield looked.proof(replace(ranking, slots=np.array([slot])))
