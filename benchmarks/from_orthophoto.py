@@ -167,7 +167,8 @@ def main() -> int:
     text = __doc__.partition("\n\n")[2].partition("Footprints were")[0].strip()
     (run_sets.RESULTS / "from_orthophoto.md").write_text(
         f"# Maps cut from an orthophoto\n\n{text}\n\nRight: the best place is within half a footprint of the truth. "
-        "Wrong: accepted, and the fix is a quarter of a footprint off or more. Errors are median / 90 % of the accepted.\n\n"
+        "Wrong: accepted, and the fix is a quarter of a footprint off or more. Errors: median / 90 % of the accepted."
+        "\n\n"
         f"{markdown(head, table)}\n\nCommit {made['commit']}, {made['date']}, {made['machine']['cpu']}. Made by "
         "`python benchmarks/from_orthophoto.py`.\n"
     )

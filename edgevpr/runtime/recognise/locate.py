@@ -109,6 +109,10 @@ def located(
     heard, said = ([each[0], *compress(each[1:], agree)] for each in (heard, said))
     of_step = np.linalg.inv(sum(np.linalg.inv(each.of_step) for each in said))
     at_m = of_step @ sum(np.linalg.inv(each.of_step) @ each.at_m for each in said)
+    if others := said[1:]:
+        # Places that differ by more than they should say how inexact all of them are (Birge 1932).
+        off = sum((each.at_m - at_m) @ np.linalg.solve(each.of_step, each.at_m - at_m) for each in said)
+        of_step = of_step * max(1.0, float(off) / (2 * len(others)))
     # What is wrong with the poses is common to neighbours: hearing several makes it no smaller.
     covariance = of_step + np.mean([each.of_pose for each in said], axis=0)
     pose, way = best.place.pose, lies[id(best)]
