@@ -10,6 +10,8 @@ and
 of
   aerial_swindale its scale changes by a factor of two from one end to the other.
 * *GPS*: the tag of the query, which is itself some metres off.
+* *true*: of generated flights, whose cameras are where they say, with 5 m of noise on the positions of the map (in one
+  axis) and none on the others. Only this truth is that of the aircraft, and tilt and all.
 
 Writes where.json, where.md, and the pictures where_maps.png and where_overlays.png into benchmarks/results/.
 """
@@ -27,16 +29,19 @@ import run_sets
 
 from edgevpr.frames.images import read_image
 from edgevpr.frames.positions import read_positions
-from edgevpr.geodesy import metres
+from edgevpr.geodesy import metres, moved
 from edgevpr.helpers.tables import markdown
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.refine.graph import Solved, Ties, solve
+from edgevpr.simulate.flight import fly_and_write
 from edgevpr.types import Place
 
 SETS = ("aerial_caliterra", "aerial_garfield28", "aerial_swindale", "aerial_brighton")
 TUNED_ON = ("aerial_caliterra", "aerial_garfield28")
 _PAIR_SD = (0.01, 0.05)  # of a registered pair: of the step, as a share of the longest side, and of the log
 _NEAREST = 4
+NADIR = ("--technique", "cohog", "--camera", "nadir")
+SEEDS, NOISE_M = (11, 12, 13), 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,10 +108,7 @@ def measure(folder: Path, work: Path) -> tuple[dict, list[dict], dict[str, Place
     of, matches = load(folder), {}
     for how, flags in (("before", ["--no-refine"]), ("after", [])):
         path = work / f"{folder.name}_{how}.gpkg"
-        built = run_sets.edgevpr(
-            "map", "build", str(path), "--images", str(folder / "ref"), "--technique", "cohog", "--camera", "nadir",
-            *flags, "--json"
-        )  # fmt: skip
+        built = run_sets.edgevpr("map", "build", str(path), "--images", str(folder / "ref"), *NADIR, *flags, "--json")
         matches[how] = run_sets.edgevpr("match", str(path), "--images", str(folder / "query"), "--json")
     with PlaceMap.open(path) as place_map:
         places = {place.source_image: place for place in place_map.places()}
@@ -153,6 +155,50 @@ def measure(folder: Path, work: Path) -> tuple[dict, list[dict], dict[str, Place
     return row, matches["after"], places, of
 
 
+def generated(work: Path) -> dict:
+    """Map and match generated flights of several seeds, with noise on the positions of the map."""
+    errors: dict[str, list[complex]] = {"before": [], "after": []}
+    variances, queries, accepted = [], 0, {"before": 0, "after": 0}
+    for seed in SEEDS:
+        folder, rng = work / f"seed{seed}", np.random.default_rng(seed)
+        for which in ("map", "query"):
+            fly_and_write(folder / which, which, seed)
+        with open(folder / "map" / "positions.csv", newline="") as handle:
+            rows = list(csv.DictReader(handle))
+        with open(folder / "map" / "positions.csv", "w", newline="") as handle:
+            table = csv.writer(handle)
+            table.writerow(("file", "lat", "lon"))
+            for row in rows:
+                at = moved(float(row["lat"]), float(row["lon"]), *rng.normal(0, NOISE_M, 2).tolist())
+                table.writerow((row["file"], *at))
+        true = {name: tag.position for name, tag in read_positions(folder / "query" / "positions.csv").items()}
+        for how, flags in (("before", ["--no-refine"]), ("after", [])):
+            path = folder / f"{how}.gpkg"
+            images, asked = (str(folder / which / "images") for which in ("map", "query"))
+            run_sets.edgevpr("map", "build", str(path), "--images", images, *NADIR, *flags, "--json")
+            for match in run_sets.edgevpr("match", str(path), "--images", asked, "--json"):
+                queries += how == "after"
+                if not match["accepted"]:
+                    continue
+                accepted[how] += 1
+                here, where = true[match["query"]], match["located"]
+                east_m, north_m = metres(
+                    np.array([here.lat_deg, where["lat_deg"]]), np.array([here.lon_deg, where["lon_deg"]])
+                )
+                errors[how].append(complex(east_m[1], north_m[1]))
+                if how == "after":
+                    variances.append((where["covariance_m2"][0], where["covariance_m2"][2]))
+    return {
+        "set": f"generated, {len(SEEDS)} flights",
+        "use": "report",
+        "spacing_m": 21.0,
+        "queries": queries,
+        "accepted": accepted,
+        "errors": {"true": {how: spread(values) for how, values in errors.items()}},
+        "within": {"true": honest(errors["after"], variances, 0.0)},
+    }
+
+
 def _is_laid(match: dict, places: dict[str, Place]) -> bool:
     return places[match["reference_image"]].pose is not None
 
@@ -186,6 +232,7 @@ def main() -> int:
             rows.append(row)
             shown.append((of, places, matches))
             print(json.dumps(row), flush=True)
+        rows.append(generated(Path(work)))
     (run_sets.RESULTS / "where.json").write_text(json.dumps({**run_sets.made_by(), "sets": rows}, indent=1) + "\n")
     (run_sets.RESULTS / "where.md").write_text(page(rows))
     draw_maps(shown, run_sets.RESULTS / "where_maps.png")
