@@ -3,15 +3,13 @@
 The sets from the air with positions, each mapped and matched by the commands that a user has. Truths:
 
 * *pairs*: every registered pair of pictures (pairs_overlap.csv: local features and homographies, made with the sets)
-and
-  all GPS tags in one pose graph, in metres. A fix is compared with it as it lies to the four nearest pictures of the
-  map, so that what both have from the same tags does not count.
+  and all GPS tags in one pose graph, in metres. A fix is compared with it as it lies to the four nearest pictures of
+  the map, so that what both have from the same tags does not count.
 * *mosaic*: mosaic_positions.csv, laid over the refined map by one similarity. It has no scale of its own, and drifts:
-of
-  aerial_swindale its scale changes by a factor of two from one end to the other.
+  of aerial_swindale its scale changes by a factor of two from one end to the other.
 * *GPS*: the tag of the query, which is itself some metres off.
 * *true*: of generated flights, whose cameras are where they say, with 5 m of noise on the positions of the map (in one
-  axis) and none on the others. Only this truth is that of the aircraft, and tilt and all.
+  axis). Only this truth is that of the aircraft, and not of the middle of its picture.
 
 Writes where.json, where.md, and the pictures where_maps.png and where_overlays.png into benchmarks/results/.
 """
@@ -155,28 +153,29 @@ def measure(folder: Path, work: Path) -> tuple[dict, list[dict], dict[str, Place
     return row, matches["after"], places, of
 
 
-def generated(work: Path) -> dict:
-    """Map and match generated flights of several seeds, with noise on the positions of the map."""
+def generated(work: Path, what: str, lens: tuple[str, ...]) -> dict:
+    """Map and match generated flights of several seeds, with noise on the positions of the map; with a `lens`, attitude
+    and height are used."""
     errors: dict[str, list[complex]] = {"before": [], "after": []}
     variances, queries, accepted = [], 0, {"before": 0, "after": 0}
     for seed in SEEDS:
-        folder, rng = work / f"seed{seed}", np.random.default_rng(seed)
+        folder, rng = work / f"seed{seed}{len(lens)}", np.random.default_rng(seed)
         for which in ("map", "query"):
             fly_and_write(folder / which, which, seed)
         with open(folder / "map" / "positions.csv", newline="") as handle:
             rows = list(csv.DictReader(handle))
         with open(folder / "map" / "positions.csv", "w", newline="") as handle:
-            table = csv.writer(handle)
-            table.writerow(("file", "lat", "lon"))
+            table = csv.DictWriter(handle, rows[0])
+            table.writeheader()
             for row in rows:
                 at = moved(float(row["lat"]), float(row["lon"]), *rng.normal(0, NOISE_M, 2).tolist())
-                table.writerow((row["file"], *at))
+                table.writerow(row | dict(zip(("lat", "lon"), at, strict=True)))
         true = {name: tag.position for name, tag in read_positions(folder / "query" / "positions.csv").items()}
         for how, flags in (("before", ["--no-refine"]), ("after", [])):
             path = folder / f"{how}.gpkg"
             images, asked = (str(folder / which / "images") for which in ("map", "query"))
-            run_sets.edgevpr("map", "build", str(path), "--images", images, *NADIR, *flags, "--json")
-            for match in run_sets.edgevpr("match", str(path), "--images", asked, "--json"):
+            run_sets.edgevpr("map", "build", str(path), "--images", images, *NADIR, *lens, *flags, "--json")
+            for match in run_sets.edgevpr("match", str(path), "--images", asked, *lens, "--json"):
                 queries += how == "after"
                 if not match["accepted"]:
                     continue
@@ -189,7 +188,7 @@ def generated(work: Path) -> dict:
                 if how == "after":
                     variances.append((where["covariance_m2"][0], where["covariance_m2"][2]))
     return {
-        "set": f"generated, {len(SEEDS)} flights",
+        "set": f"{len(SEEDS)} generated flights, {what}",
         "use": "report",
         "spacing_m": 21.0,
         "queries": queries,
@@ -232,7 +231,8 @@ def main() -> int:
             rows.append(row)
             shown.append((of, places, matches))
             print(json.dumps(row), flush=True)
-        rows.append(generated(Path(work)))
+        rows.append(generated(Path(work), "attitude unknown", ()))
+        rows.append(generated(Path(work), "attitude known", ("--fov-deg", "66")))
     (run_sets.RESULTS / "where.json").write_text(json.dumps({**run_sets.made_by(), "sets": rows}, indent=1) + "\n")
     (run_sets.RESULTS / "where.md").write_text(page(rows))
     draw_maps(shown, run_sets.RESULTS / "where_maps.png")

@@ -17,7 +17,9 @@ from edgevpr.geodesy import moved
 from edgevpr.types import Frame, Pose, Position, Vehicle
 
 GPS_SD_M = 5.0  # of one axis of a recorded position, as long as nothing better is known
-UNTOLD_TILT = 0.05  # of the footprint: so far from the middle is the point under an aircraft that tilts by 4 degrees
+# Of the footprint: so far from the middle of the picture is the point under an aircraft that tilts by 3 degrees. Chosen
+# with generated flights and aerial_swindale in view.
+UNTOLD_TILT = 0.04
 
 _log = logging.getLogger(__name__)
 
