@@ -18,7 +18,7 @@ from edgevpr.frames.level import UNKNOWN_VIEW, View
 from edgevpr.geodesy import metres, moved
 from edgevpr.landmarks.agreement import CONFIRMED, Agreement
 from edgevpr.runtime.recognise.levelling import UNTOLD_TILT
-from edgevpr.types import Candidate, Pose, Position
+from edgevpr.types import Candidate, Place, Pose, Position
 
 # Chosen on aerial_caliterra and aerial_garfield28. Standard deviations of one axis of a step, as shares of the longest
 # side, that come on top of what a match knows of its own: tilt and relief move parts of a picture by different steps.
@@ -90,19 +90,18 @@ def located(
 
     `cells` is the number of cells along the longest side of a picture (None: shifts say nothing about metres). `view`
     is the way in which the query's picture lies on the ground; where it is unknown what is straight under the aircraft,
-    that is about the middle. `proof` is how the landmarks of the best place agree: they know the step better than the
+    that is about the middle. `proof` is how the landmarks of the best place agree: they say the step as well as the
     vote does. Places whose score is less than half of the best's, and those that do not show the same ground, are not
     heard.
     """
     best = found[0]
     if cells is None or not _can_say(best):
         return None
-    lies = {id(each): _by_vote(each.match, cells) for each in found[:HEARD] if _can_say(each)}
+    heard = [(each.place, _by_vote(each.match, cells)) for each in found[:HEARD] if _is_heard(each, best)]
     if proof and proof.is_expected and proof.inliers >= CONFIRMED:
-        lies[id(best)] = _by_landmarks(proof)
+        heard.insert(0, (best.place, _by_landmarks(proof)))
     origin = best.place.position
-    heard = [each for each in found[:HEARD] if _is_heard(each, best)]
-    said = [_said(each, lies[id(each)], origin, view.aside or (0.0, 0.0)) for each in heard]
+    said = [_said(place, lies, origin, view.aside or (0.0, 0.0)) for place, lies in heard]
     first, others = said[0], said[1:]
     agree = [_apart(first, each) <= _DISAGREES for each in others]
     against_m = [float(np.hypot(*(each.at_m - first.at_m))) for each, ok in zip(others, agree, strict=True) if not ok]
@@ -115,7 +114,7 @@ def located(
         of_step = of_step * max(1.0, float(off) / (2 * len(others)))
     # What is wrong with the poses is common to neighbours: hearing several makes it no smaller.
     covariance = of_step + np.mean([each.of_pose for each in said], axis=0)
-    pose, way = best.place.pose, lies[id(best)]
+    pose, way = best.place.pose, heard[0][1]
     if view.aside is None:
         covariance += (UNTOLD_TILT * pose.footprint_m * (way.height_ratio or 1.0)) ** 2 * np.eye(2)
     objection = None
@@ -128,7 +127,7 @@ def located(
         heading_deg=(pose.up_deg + way.rotation_deg) % 360,
         height_ratio=way.height_ratio and way.height_ratio * view.zoom,
         footprint_m=pose.footprint_m * (way.height_ratio or 1.0),
-        places=tuple(each.place.place_id for each in heard),
+        places=tuple(dict.fromkeys(place.place_id for place, _ in heard)),
         objection=objection,
     )
 
@@ -186,8 +185,8 @@ def _is_heard(candidate: Candidate, best: Candidate) -> bool:
     return float(np.hypot(*_off_m(best.place.position, candidate.place.position))) <= room_m
 
 
-def _said(candidate: Candidate, lies: _Lies, origin: Position, aside: tuple[float, float]) -> _Said:
-    pose = candidate.place.pose
+def _said(place: Place, lies: _Lies, origin: Position, aside: tuple[float, float]) -> _Said:
+    pose = place.pose
     # The point under the aircraft, in the place's picture: first as the query has it, then turned and scaled as it is.
     ratio, turn = lies.height_ratio or 1.0, math.radians(lies.rotation_deg)
     right, up = aside
@@ -202,7 +201,7 @@ def _said(candidate: Candidate, lies: _Lies, origin: Position, aside: tuple[floa
     of_pose += np.outer(aslant, aslant) * (_TURN_SD * length_m) ** 2
     upwards = lies.covariance * [[1, -1], [-1, 1]]  # of a step up, and not down
     return _Said(
-        at_m=_off_m(origin, candidate.place.position) + off_m,
+        at_m=_off_m(origin, place.position) + off_m,
         of_step=pose.footprint_m**2 * (axes @ upwards @ axes.T) + of_pose,
         of_pose=_matrix(pose.covariance_m2),
     )
