@@ -23,6 +23,10 @@ lint: $(VENV)/installed
 # Figures on real image sets (../shared/data, or the folder named in EDGEVPR_DATA) into benchmarks/results/.
 results: $(VENV)/installed
 	$(BIN)/python benchmarks/run_sets.py
+	$(BIN)/python benchmarks/where.py
+	$(BIN)/python benchmarks/height_and_tilt.py
+	$(BIN)/python benchmarks/verification.py
+	$(BIN)/python benchmarks/from_orthophoto.py
 	$(BIN)/python benchmarks/readme.py
 
 # Speed and memory against the published way, into benchmarks/results/.

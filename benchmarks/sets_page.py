@@ -82,7 +82,8 @@ place 6 at most), with aerial_swindale; how many of them a glance leaves to be c
 many there are (1024, 100 of a place) and how they are counted, with aerial_swindale, aerial_copr and kite_ochota;
 that the scan counts in the score, ahead, with grief_stromovka_seasons and nordland_tiny; what a vote counts that is off
 the peak (ahead 1, 1, 0.75, 0.5) and how many patterns of a region are compared (20 of 32), both with
-grief_stromovka_seasons; and the margin of `cohog, thesis` (0.02, with pictures of foreign sites). The shipped weights
+grief_stromovka_seasons; how many landmarks prove a place (10) and from which score on some must agree (0.2), with all
+sets from the air; how far an unknown tilt is thought to be (3 degrees), with aerial_swindale; and the margin of `cohog, thesis` (0.02, with pictures of foreign sites). The shipped weights
 of calc, on which the networks run, have seen the pictures of aerial_caliterra and aerial_brighton in training: what
 networks reach there is not clean. A sequence wants a flight along the mapped way; only corridor,
 grief_stromovka_seasons and nordland_tiny are such. The pictures of nordland_tiny have 64x32 pixels, which every
@@ -137,9 +138,10 @@ Weights in use:
 
 {markdown(("set", "technique", "queries", "best match", "accepted"), away)}
 
-Distance between the GPS positions of the query and of the place it was matched to: median / 90 % / worst (how many).
-All queries with a position are in it, those too that show nothing of the map. The error cannot be smaller than the
-distance to the nearest place, and GPS on these cameras is noisy: 10 to 20 m off (caliterra), tens of metres (swindale).
+Distance of the query's GPS position from the fix of an accepted match, and from the place of one that is not:
+median / 90 % / worst (how many). All queries with a position are in it, those too that show nothing of the map. GPS on
+these cameras is noisy: 10 to 20 m off (caliterra), tens of metres (swindale). [where.md](where.md) holds fixes against
+better truths.
 """
     corridor = next((content["techniques"] for content in contents if content["set"] == "corridor"), {})
     beside = [
