@@ -65,7 +65,8 @@ def growth_rows(places: tuple[int, ...] = (1_000, 3_000, 10_000, 30_000, 100_000
         return placecode.hypotheses(*placecode.seen_grid(blocks, np.ones((31, 31), bool)), mean)
 
     def ask_down() -> placewords.Asked:
-        return placewords.of_query(placewords.load("ground_words"), dict.fromkeys(range(6), (patterns, numbers)), 6, 31)
+        asking = dict.fromkeys(range(6), (patterns, numbers))
+        return placewords.of_query(placewords.load("ground_words"), asking, 6, (31, 31))
 
     def codes(count: int) -> np.ndarray:
         return rng.integers(0, 256, (count, placecode.SIDE**2), dtype=np.uint8)

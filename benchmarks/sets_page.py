@@ -83,7 +83,9 @@ many there are (1024, 100 of a place) and how they are counted, with aerial_swin
 that the scan counts in the score, ahead, with grief_stromovka_seasons and nordland_tiny; what a vote counts that is off
 the peak (ahead 1, 1, 0.75, 0.5) and how many patterns of a region are compared (20 of 32), both with
 grief_stromovka_seasons; how many landmarks prove a place (10) and from which score on some must agree (0.2), with all
-sets from the air; how far an unknown tilt is thought to be (3 degrees), with aerial_swindale; and the margin of `cohog, thesis` (0.02, with pictures of foreign sites). The shipped weights
+sets from the air; how far an unknown tilt is thought to be (3 degrees), and that from other heights all words of a
+query are counted and two fifths of the usual pairs are compared from each, with aerial_swindale; and the margin of
+`cohog, thesis` (0.02, with pictures of foreign sites). The shipped weights
 of calc, on which the networks run, have seen the pictures of aerial_caliterra and aerial_brighton in training: what
 networks reach there is not clean. A sequence wants a flight along the mapped way; only corridor,
 grief_stromovka_seasons and nordland_tiny are such. The pictures of nordland_tiny have 64x32 pixels, which every

@@ -34,10 +34,10 @@ class TechniqueSpec:
     vectors in RAM. It is one of `forms`, each smaller than the one before (None and empty: there is one form only).
     `sequence` is the usual number of queries matched together. With `scan_counts` the score of the scan is part of the
     final score (see `places.retrieve`). A technique that tries a query in several rotations tries only those within
-    `heading_within_deg` of the rotation that known headings give (None: it does not use headings). One that
-    `tries_heights` finds a query from another height than the map's, and is faster where the height is known. `cells`
-    is how many cells of a `FineMatch` the longest side of a picture has (None: a shift says nothing about metres). Of
-    more places than `in_full`, those that look best at a glance are compared in full (None: all are).
+    `heading_within_deg` of the rotation that known headings give (None: it does not use headings). One that has
+    `height_ratios` finds a query from another height than the map's, when it is asked for from the nearest of them.
+    `cells` is how many cells of a `FineMatch` the longest side of a picture has (None: a shift says nothing about
+    metres). Of more places than `in_full`, those that look best at a glance are compared in full (None: all are).
     """
 
     name: str
@@ -52,7 +52,7 @@ class TechniqueSpec:
     scan_counts: bool = field(default=False, compare=False)
     heading_within_deg: float | None = field(default=None, compare=False)
     cells: int | None = field(default=None, compare=False)
-    tries_heights: bool = field(default=False, compare=False)
+    height_ratios: tuple[float, ...] = field(default=(), compare=False)
     in_full: int | None = field(default=None, compare=False)
 
     @property
@@ -145,7 +145,8 @@ class Technique(Protocol):
         None. `turned_deg` float (N,) is the expected rotation of the camera since each place was mapped, in the sense
         of `FineMatch.rotation_deg` (NaN: unknown). Only a technique with `spec.heading_within_deg` is given
         `turned_deg`; it then allows only rotations near the expected one. Likewise only one with
-        `spec.tries_heights` is given `height_ratio`, in the sense of `FineMatch.height_ratio` (None: unknown)."""
+        `spec.height_ratios` is given `height_ratio`, in the sense of `FineMatch.height_ratio` (None: that of the
+        map)."""
         ...
 
     def match(self, query: Descriptor, fine: np.ndarray, hypotheses: Sequence[int] | None) -> FineMatch:

@@ -65,7 +65,7 @@ class Ranking:
 def scan(technique: Technique, query: Descriptor, index: PlaceIndex, expected: Expected = NOTHING) -> Scan:
     """Score all places of the index by their rows, in one product."""
     hint = {} if expected.turned_deg is None else {"turned_deg": expected.turned_deg}
-    if technique.spec.tries_heights:
+    if technique.spec.height_ratios:
         hint["height_ratio"] = expected.height_ratio
     return Scan(*technique.coarse_scores(query, index.rows, index.mean, **hint))
 
@@ -105,7 +105,7 @@ def compare(
     one_stage = spec.fine is None
     exact = candidates is None or technique.candidates < candidates >= len(index)
     every = exact and in_reach is None and expected.turned_deg is None
-    by_hypothesis = None if every and expected.height_ratio is None else scanned.by_hypothesis
+    by_hypothesis = None if every and not spec.height_ratios else scanned.by_hypothesis
     if one_stage or exact:
         candidates = len(index)
     readable = np.ones(len(index), bool) if one_stage else ~left_out(place_map, index)

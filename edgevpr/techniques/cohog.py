@@ -55,10 +55,8 @@ _CANDIDATES = {"forward": 42, "nadir": 50}
 # all aerial sets and the kite joined into one map 20 of 300 pairs, find as many places as all of them compared in full
 # (of the 994 of nordland_tiny four fewer).
 _IN_FULL = {"forward": 12, "nadir": 20}
+_VOTING_BESIDE = 0.4  # part of the pairs of places and rotations that vote, from another height than the map's
 _HEADING_WITHIN_DEG = 1.5 * 360 / ROTATIONS  # the expected rotation, and one on either side
-# The words that a view shares with a place by chance: of this power of their mean is about how far the best of foreign
-# places stand out. Measured between the two tuning sets from the air.
-_STANDS_OUT = 0.62
 
 
 class CoHog:
@@ -120,7 +118,7 @@ class CoHog:
             scan_counts=matching == "displacement" and camera == "forward",  # with a nadir camera it adds nothing
             heading_within_deg=_HEADING_WITHIN_DEG if camera == "nadir" else None,
             cells=w1 // w2 if camera == "nadir" and matching == "displacement" else None,
-            tries_heights=camera == "nadir" and len(self._ratios) > 1,
+            height_ratios=self._ratios if camera == "nadir" and len(self._ratios) > 1 else (),
             in_full=_IN_FULL[camera] if matching == "displacement" else None,
         )
 
@@ -176,8 +174,9 @@ class CoHog:
     ) -> tuple[np.ndarray, np.ndarray | None]:
         """Compare the query with the place codes `rows`, uint8 (N, B), under shifts. With a nadir camera compare its
         words with those of the places, uint16 (N, 100), under all rotations or those within `spec.heading_within_deg`
-        of `turned_deg` (N,), from all heights or the one nearest to `height_ratio`. Returns scores float32 (N,) in 0..1
-        and, as float32 (N, 120), those of each hypothesis (None with a forward camera): 24 rotations from each height.
+        of `turned_deg` (N,), from the one of five heights that is nearest to `height_ratio`. Returns scores float32
+        (N,) in 0..1 and, as float32 (N, 120), those of each hypothesis (None with a forward camera): 24 rotations from
+        each height.
         """
         if self._camera == "forward":
             seen = query.picture.seen
@@ -190,24 +189,19 @@ class CoHog:
             expected = np.nan_to_num(steps, nan=-1).astype(np.intp)
             if len(expected) and expected.min() >= 0:
                 needed = {int(turn) % WITHIN_QUARTER for near in (-1, 0, 1) for turn in np.unique(expected) + near}
-        ratios = self._ratios if height_ratio is None else (nearest_ratio(height_ratio),)
+        ratio = nearest_ratio(height_ratio or 1.0)
         scores = np.full((len(rows), len(HEIGHT_RATIOS) * ROTATIONS), -np.inf, np.float32)
-        by_chance = {}
-        for ratio in ratios:
-            asking = {turn: self.good_patterns(query, turn, ratio) for turn in sorted(needed)}
-            asked = placewords.of_query(self._vocabulary, asking, WITHIN_QUARTER, self._side)
-            of_ratio = _columns(scores, ratio)
-            of_ratio[:], by_chance[ratio] = placewords.scan(asked, rows, expected, 1 / len(ratios))
-        for ratio in ratios if len(ratios) > 1 else ():
-            of_ratio = _columns(scores, ratio)
-            of_ratio *= (by_chance[1.0] / max(by_chance[ratio], 1e-9)) ** _STANDS_OUT
-        best = np.max([_columns(scores, ratio).max(axis=1) for ratio in ratios], axis=0)
-        return np.clip(best, 0, 1), scores
+        asking = {turn: self.good_patterns(query, turn, ratio) for turn in sorted(needed)}
+        sides = self._views_of(query).side_of(ratio), self._side
+        asked = placewords.of_query(self._vocabulary, asking, WITHIN_QUARTER, sides)
+        of_ratio = _columns(scores, ratio)
+        of_ratio[:] = placewords.scan(asked, rows, expected, 1.0 if ratio == 1.0 else _VOTING_BESIDE)
+        return np.clip(of_ratio.max(axis=1), 0, 1), scores
 
     def good_patterns(self, query: Descriptor, turn: int, ratio: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-        """Return the slow patterns float32 (G, 20) of the good regions in the middle of a view of the query (see
-        `views`), and their numbers int (G,)."""
-        blocks, numbers = self._views_of(query).middle(ratio, turn)
+        """Return the slow patterns float32 (G, 20) of the good regions of a view of the query (see `views`),
+        and their numbers int (G,) on its grid."""
+        blocks, numbers = self._views_of(query).whole(ratio, turn)
         return self._patterns(blocks), numbers
 
     def match(self, query: Descriptor, fine: np.ndarray, hypotheses: Sequence[int] | None = None) -> FineMatch:

@@ -6,7 +6,7 @@ large structures, such as woods and roofs, has few shapes that a coarse picture 
 
 A query has words under each of 24 rotations. Words come in fours, each the one before turned by a quarter turn, so only
 six of the rotations are looked up, and the others follow. A word that is everywhere says little: of a place it counts
-once, of a query four times.
+once, of a query four times, and more often where the query shows more ground than a place (see `views`).
 
 The scan is two steps. All places are scored by how many words they share with the query under each rotation, wherever
 the words are (a bag of words: Sivic and Zisserman 2003). For the best pairs of a place and a rotation, the shared words
@@ -32,7 +32,7 @@ COUNT = 256  # words, each of four turns
 NONE = COUNT * QUARTERS  # the number of no word
 _MAX_FILE_BYTES = 1_000_000
 _ROUNDED = 0.01  # of a length of 1
-_AT_MOST = 4  # times that a word of a query counts
+_AT_MOST = 4  # times that a word of a query counts, for as much ground as a place shows
 _VOTED_EACH = 125  # places of each rotation that is possible: pairs of a place and a rotation
 _BIN_REGIONS = 4  # side of a bin of shifts; two by two of them agree
 _VOTE_COUNTS = 5.0  # as many shared words as one that agrees on the shift; about the ratio of how much both scatter
@@ -49,7 +49,7 @@ class Asked:
     region: np.ndarray
     turn: np.ndarray
     counts: np.ndarray
-    side: int  # regions along one side of the query
+    sides: tuple[int, int]  # regions along one side, of the query and of a place
 
 
 def of_place(vocabulary: np.ndarray, patterns: np.ndarray, good: np.ndarray) -> np.ndarray:
@@ -62,18 +62,23 @@ def of_place(vocabulary: np.ndarray, patterns: np.ndarray, good: np.ndarray) -> 
     return once
 
 
-def of_query(vocabulary: np.ndarray, asking: dict[int, tuple[np.ndarray, np.ndarray]], within: int, side: int) -> Asked:
+def of_query(
+    vocabulary: np.ndarray, asking: dict[int, tuple[np.ndarray, np.ndarray]], within: int, sides: tuple[int, int]
+) -> Asked:
     """Return the words of a query. `asking` has, of the picture turned clockwise by some of the `within` steps of a
     quarter turn, the patterns float32 (G, 20) of the good regions and their numbers int (G,); the other quarters
-    follow. Under the steps that it lacks, and those a quarter turn from them, the query has no words."""
+    follow. Under the steps that it lacks, and those a quarter turn from them, the query has no words. `sides` are the
+    regions along one side of the query and of a place, which has no more."""
     total = within * QUARTERS
+    side, of_place = sides
+    at_most = _AT_MOST * side**2 // of_place**2
     words, regions, turns = [], [], []
     for turn, (patterns, numbers) in asking.items():
         order = np.argsort(_shuffled(side)[numbers])
         found, here = nearest(vocabulary, patterns[order]), numbers[order]
         by_word = np.argsort(found, kind="stable")
         found, here = found[by_word], here[by_word]
-        kept = np.flatnonzero(np.arange(len(found)) - np.searchsorted(found, found) < _AT_MOST)
+        kept = np.flatnonzero(np.arange(len(found)) - np.searchsorted(found, found) < at_most)
         found, here = found[kept], here[kept]
         for quarter in range(QUARTERS):
             words.append(found - found % QUARTERS + (found + quarter) % QUARTERS)
@@ -82,14 +87,12 @@ def of_query(vocabulary: np.ndarray, asking: dict[int, tuple[np.ndarray, np.ndar
             here = turned_numbers(side)[here]
     word, region, turn = (np.concatenate(each) for each in (words, regions, turns))
     counts = np.bincount(word * total + turn, minlength=(NONE + 1) * total).reshape(NONE + 1, total)
-    return Asked(word=word, region=region, turn=turn, counts=counts.astype(np.uint16), side=side)
+    return Asked(word=word, region=region, turn=turn, counts=counts.astype(np.uint16), sides=sides)
 
 
-def scan(
-    asked: Asked, rows: np.ndarray, expected: np.ndarray | None = None, voting: float = 1.0
-) -> tuple[np.ndarray, float]:
-    """Score all places, uint16 (N, 100), under each rotation: float32 (N, R) in 0..1. Also return the mean score before
-    the vote. `voting` is the part of the usual number of pairs that vote.
+def scan(asked: Asked, rows: np.ndarray, expected: np.ndarray | None = None, voting: float = 1.0) -> np.ndarray:
+    """Score all places, uint16 (N, 100), under each rotation: float32 (N, R), at most 1 for a query that shows as much
+    ground as a place. `voting` is the part of the usual number of pairs that vote.
 
     Where the heading is known, place n is scored only under rotation `expected[n]` and the two beside it, with -inf for
     the others. `expected` is int (N,), below 0 where the heading is unknown: such a place is scored under all.
@@ -105,7 +108,6 @@ def scan(
             near = np.arange(turns) if turn < 0 else np.arange(turn - 1, turn + 2) % turns
             scores[group[:, None], near] = _shared(asked.counts[:, near], rows[group])
     flat = scores.ravel()
-    mean = float(flat[np.isfinite(flat)].mean()) if len(rows) else 0.0
     possible = np.count_nonzero(np.isfinite(flat))
     voted = round(voting * _VOTED_EACH * max(1, possible // max(1, len(rows))))
     best = np.argpartition(-flat, voted)[:voted] if len(flat) > voted else np.arange(len(flat))
@@ -115,7 +117,7 @@ def scan(
         of_turn = turned == turn
         flat[best[of_turn]] += _VOTE_COUNTS * _votes(asked, int(turn), rows[slots[of_turn]])
     scores /= (_AT_MOST + _VOTE_COUNTS * _AT_MOST) * rows.shape[1]
-    return scores, mean
+    return scores
 
 
 def nearest(vocabulary: np.ndarray, patterns: np.ndarray) -> np.ndarray:
@@ -210,7 +212,7 @@ def _votes(asked: Asked, turn: int, rows: np.ndarray) -> np.ndarray:
     region = asked.region[mine][order]
     often = asked.counts[:, turn].astype(np.intp)
     first = np.cumsum(often) - often
-    bins, wide = _bins(asked.side)
+    bins, wide = _bins(*asked.sides)
     votes = np.empty(len(rows), np.float32)
     for start in range(0, len(rows), _VOTING_AT_ONCE):
         part = rows[start : start + _VOTING_AT_ONCE]
@@ -242,11 +244,11 @@ def _shuffled(side: int) -> np.ndarray:
 
 
 @lru_cache
-def _bins(side: int) -> tuple[np.ndarray, int]:
+def _bins(side: int, of_place: int) -> tuple[np.ndarray, int]:
     """Return the bin of the shift from each region of a query to each of a place that has a word, int
     (100, side * side), and the number of bins along one side."""
-    y, x = np.divmod(named(side)[:, None], side)
+    y, x = np.divmod(named(of_place)[:, None], of_place)
     query_y, query_x = np.divmod(np.arange(side * side), side)
-    along = (2 * side - 2) // _BIN_REGIONS + 1
+    along = (side + of_place - 2) // _BIN_REGIONS + 1
     rows, columns = ((to - of + side - 1) // _BIN_REGIONS for to, of in ((y, query_y), (x, query_x)))
-    return rows * along + columns, along
+    return (rows * along + columns).astype(np.int32), along

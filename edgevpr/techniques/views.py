@@ -25,11 +25,13 @@ from edgevpr.techniques.placewords import QUARTERS, turned_blocks
 HEIGHT_RATIOS = (0.5, 0.7, 1.0, 1.42, 2.0)
 ROTATIONS = 24  # 15 degrees apart
 WITHIN_QUARTER = ROTATIONS // QUARTERS
-_GLANCE = 4  # of so many good regions of a view from the mapped height one
+# Of so many good regions of a view one, where a view has as many as one from the mapped height: a larger view needs
+# more of them, since it shows less of a place with each.
+_GLANCE = {0.5: 4, 0.7: 4, 1.0: 4, 1.42: 2, 2.0: 2}
 _BY_CHANCE = 0.72  # the share that agrees by chance falls with this power of the number of regions
 _LARGER_BY_CHANCE = {1.42: 0.87, 2.0: 0.8}  # a larger view has more places to agree on
-# At a glance all views have about as many regions, and differ by the room that their votes scatter in.
-_GLANCE_BY_CHANCE = {0.5: 0.53, 0.7: 0.73, 1.0: 1.0, 1.42: 1.37, 2.0: 1.74}
+# At a glance the views differ less by how many regions they have than by the room that their votes scatter in.
+_GLANCE_BY_CHANCE = {0.5: 0.53, 0.7: 0.73, 1.0: 1.0, 1.42: 1.8, 2.0: 2.4}
 
 # Encodes a square picture, float32 (side, side), with its allowed pixels, bool of the same shape or None, in cells of
 # so many pixels: blocks float32 (n, n, 4 bins), and which of them are good, bool (n, n).
@@ -46,7 +48,7 @@ class Asking:
     regions: np.ndarray
     side: int
     worth: float = 1.0
-    step: int = _GLANCE
+    step: int = _GLANCE[1.0]
     worth_at_glance: float = 1.0
 
 
@@ -91,19 +93,20 @@ class Views:
         blocks, good = self._encoded[ratio, within]
         return turned_blocks(blocks, -quarters), np.rot90(good, -quarters)
 
-    def middle(self, ratio: float, turn: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the blocks float32 (G, 4 bins) of the good regions of a view that fall on a place with the same
-        middle, and their numbers int (G,) on the grid of the place."""
+    def whole(self, ratio: float, turn: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the blocks float32 (G, 4 bins) of the good regions of a view, and their numbers int (G,) on a grid of
+        as many as `side_of` tells."""
         blocks, good = self.blocks(ratio, turn)
-        over = max(0, (len(good) - self._side) // 2)
-        inside = slice(over, len(good) - over)
-        blocks, good = blocks[inside, inside], good[inside, inside]
-        return blocks[good], grid_numbers(good, self._side)
+        return blocks[good], grid_numbers(good, self.side_of(ratio))
+
+    def side_of(self, ratio: float) -> int:
+        """Return the regions along one side of the grid of a view, no fewer than those of a place."""
+        return max(cells_along(self._side + 1, ratio) - 1, self._side)
 
     def asking(self, ratio: float, turn: int, described: Callable[[np.ndarray], np.ndarray]) -> Asking:
         """Return all good regions of a view, `described` by (G, P) for (G, 4 bins)."""
         blocks, good = self.blocks(ratio, turn)
-        side = max(len(good), self._side)
+        side = self.side_of(ratio)
         if ratio > 1:
             ground = (cells_along(self._side + 1, ratio) / (self._side + 1)) ** 2  # over that of the place
             worth = ground * _LARGER_BY_CHANCE[ratio]  # no more than one in `ground` of the votes can agree
@@ -114,7 +117,7 @@ class Views:
             regions=described(blocks[good]),
             side=side,
             worth=worth,
-            step=max(1, round(_GLANCE * (len(good) / self._side) ** 2)),
+            step=max(1, round(_GLANCE[ratio] * (len(good) / self._side) ** 2)),
             worth_at_glance=_GLANCE_BY_CHANCE[ratio],
         )
 

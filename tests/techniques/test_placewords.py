@@ -81,7 +81,7 @@ def test_the_scan_is_the_count_spelt_out(town):
     technique, grounds, rows = town
     query = technique.encode(view(grounds[2], 60, -30, 40.0))
     asking = {turn: technique.good_patterns(query, turn) for turn in range(6)}
-    asked = placewords.of_query(VOCABULARY, asking, 6, SIDE)
+    asked = placewords.of_query(VOCABULARY, asking, 6, (SIDE, SIDE))
     places = [round((n + 0.5) * 3.1 - 0.5) for n in range(10)]
     expected = np.zeros((len(rows), 24))
     for turn in range(24):
@@ -100,9 +100,8 @@ def test_the_scan_is_the_count_spelt_out(town):
                         shifts[agreeing] = shifts.get(agreeing, 0) + 1
             inside = [count for (y, x), count in shifts.items() if 1 <= y <= 15 and 1 <= x <= 15]
             expected[slot, turn] = shared + 5 * max(inside, default=0)
-    scores, mean = placewords.scan(asked, rows)
+    scores = placewords.scan(asked, rows)
     np.testing.assert_allclose(scores, expected / (24 * 100), rtol=1e-5)
-    assert mean == pytest.approx(np.mean([[np.sum(asked.counts[row, turn]) for turn in range(24)] for row in rows]))
 
 
 @pytest.mark.parametrize(
@@ -159,7 +158,7 @@ def test_a_picture_without_a_good_region_is_compared_without_a_warning(town):
     query = technique.encode(np.full((512, 512), 90, np.uint8))
     scores, by_rotation = technique.coarse_scores(query, rows, None)
     assert (scores == 0).all()
-    assert np.isfinite(by_rotation).all()
+    assert np.isfinite(by_rotation).sum() == 24 * len(rows)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,8 @@ They narrow the search, and none is ever the only way to find a place: a compass
 position false. A query that is not accepted with hints is therefore followed by one without.
 """
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from edgevpr.geodesy import distance_m
@@ -138,6 +140,14 @@ def expected_of(hints: Hints | None, index: PlaceIndex) -> Expected:
     if hints.heading_deg is not None:
         turned_deg = (hints.heading_deg - index.heading_deg.astype(float)) % 360
     return Expected(in_reach, turned_deg)
+
+
+def other_heights(height_ratios: Sequence[float], first: float) -> list[float]:
+    """Return the heights to look from after the first: all but the one that is nearest to it."""
+    if not height_ratios:
+        return []
+    tried = min(height_ratios, key=lambda ratio: abs(math.log(ratio / first)))
+    return [ratio for ratio in height_ratios if ratio != tried]
 
 
 def agree(hints: Hints, found: Candidate, heading_within_deg: float | None) -> bool:

@@ -1,6 +1,6 @@
 """The first step of the walk: levels every picture, and says how a picture lies on the ground when it becomes a place.
 
-A wrong height scales wrongly. A technique that `tries_heights` finds the picture all the same.
+A wrong height scales wrongly. A technique with `height_ratios` finds the picture all the same.
 """
 
 import logging

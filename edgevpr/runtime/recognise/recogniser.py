@@ -18,7 +18,7 @@ from edgevpr.places.retrieve import Expected, Ranking, compare, named, scan, tog
 from edgevpr.places.sequence import Alone, Search
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.gate import says_nothing
-from edgevpr.runtime.recognise.hints import NoPrior, Prior, expected_of
+from edgevpr.runtime.recognise.hints import NoPrior, Prior, expected_of, other_heights
 from edgevpr.runtime.recognise.judge import NEW_FOR_S, AcceptRule, Verdict, judge
 from edgevpr.runtime.recognise.levelling import AnyLevelling, NoLevelling, seen_as
 from edgevpr.runtime.recognise.locate import HEARD, Located, at_place, located
@@ -28,6 +28,7 @@ from edgevpr.salience.gate import Gate, NoGate
 from edgevpr.types import Candidate, Frame, Vehicle
 
 _log = logging.getLogger(__name__)
+_OF_CANDIDATES = 0.4  # are compared from each height but the first
 
 
 class Recogniser:
@@ -115,11 +116,14 @@ class Recogniser:
                 ranking = self.search.follow(self._look(descriptor, expected), index, frame.t_mono_s)
                 looked = Verification(technique.spec, picture, index, self.place_map)
                 best, verdict, proof, where = self._judged(frame, ranking, looked)
-                again = technique.spec.tries_heights and self.search.length == 1 and self._prior.looks_again
-                if again and not verdict.accepted:
-                    # What spoke against the first look counts in the second as well.
-                    ranking = together(ranking, self._look(descriptor, replace(expected, height_ratio=None)))
-                    best, verdict, proof, where = self._judged(frame, ranking, looked)
+                if not verdict.accepted and self.search.length == 1 and self._prior.looks_again:
+                    others = other_heights(technique.spec.height_ratios, self._prior.height_ratio)
+                    for ratio in others:
+                        # What spoke against the first look counts in the others as well.
+                        look = self._look(descriptor, replace(expected, height_ratio=ratio), _OF_CANDIDATES)
+                        ranking = together(ranking, look)
+                    if others:
+                        best, verdict, proof, where = self._judged(frame, ranking, looked)
                 verdict = Verdict(False, objection) if objection else verdict
                 self._prior.learn(best, verdict.accepted, frame.t_mono_s)
             failed = False
@@ -150,8 +154,10 @@ class Recogniser:
             cost=meter.cost(),
         )
 
-    def _look(self, descriptor: Descriptor, expected: Expected) -> Ranking:
-        """Search the map for a query. Raises MapError and PlaceError as `compare` does."""
+    def _look(self, descriptor: Descriptor, expected: Expected, part: float = 1.0) -> Ranking:
+        """Search the map for a query, with a `part` of the candidates. Raises MapError and PlaceError as `compare`
+        does."""
+        candidates = self.candidates and max(1, round(part * self.candidates))
         with self.meter.step("scan"):
             self.place_map.require_unchanged()
             scanned = scan(self.technique, descriptor, self.index, expected)
@@ -162,7 +168,7 @@ class Recogniser:
                 scanned,
                 self.place_map,
                 self.index,
-                candidates=self.candidates,
+                candidates=candidates,
                 neighbour_m=self.rule.neighbour_m,
                 expected=expected,
             )

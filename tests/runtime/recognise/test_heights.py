@@ -65,7 +65,7 @@ def test_one_look_is_enough_from_the_height_of_the_map(opened, monkeypatch):
 def test_a_query_from_another_height_is_accepted_at_the_second_look(opened, monkeypatch, height_ratio):
     walk, heights = recogniser(opened, monkeypatch)
     event = walk.step(frame(1, height_ratio))
-    assert heights == [1.0, None]
+    assert heights == [1.0, 0.5, 0.7, 1.42, 2.0]
     assert event.accepted, event.reason
     assert event.best.place.source_image == "1"
     assert event.best.match.height_ratio == pytest.approx(height_ratio, rel=0.05)
@@ -74,8 +74,8 @@ def test_a_query_from_another_height_is_accepted_at_the_second_look(opened, monk
 def test_in_a_flight_the_next_query_is_looked_for_from_the_same_height(opened, monkeypatch):
     walk, heights = recogniser(opened, monkeypatch, Prior(None, None, is_live=False))
     assert [walk.step(frame(place, 2.0)).accepted for place in (1, 3)] == [True, True]
-    assert heights[:2] == [1.0, None]
-    assert heights[2:] == [pytest.approx(2.0, rel=0.05)]
+    assert heights[:5] == [1.0, 0.5, 0.7, 1.42, 2.0]
+    assert heights[5:] == [pytest.approx(2.0, rel=0.05)]
 
 
 def test_ground_that_is_not_in_the_map_is_accepted_from_no_height(opened, monkeypatch):
