@@ -200,6 +200,9 @@ def _refined(place_map: "PlaceMap", technique: "Technique", images: str | None) 
 
 
 def _print_refined(path: str, refined: "Refined", cells: int | None) -> None:
+    if refined.without_position == refined.places:
+        print("  not refined: no place has a position")
+        return
     print(f"{path}: {refined.refined} of {refined.places} places refined, by {refined.ties} ties between pictures")
     if refined.refined:
         scatter = f"as recorded they scatter by {refined.recorded_sd_m:.1f} m"
