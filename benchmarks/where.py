@@ -326,7 +326,7 @@ def laid_over(folder: Path, match: dict, side: int = 320, cells: int = 32) -> np
     turn[:, 2] += np.array(match["shift_cells"]) * side / cells
     query = cv2.warpAffine(query, turn, (side, side))
     both = np.dstack([query, query, place])
-    text = f"{'accepted' if match['accepted'] else 'not accepted'} {match['score']:.2f}"
+    text = f"{folder.name}, {'accepted' if match['accepted'] else 'not accepted'}, {match['score']:.2f}"
     cv2.putText(both, text, (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1, cv2.LINE_AA)
     return both
 
