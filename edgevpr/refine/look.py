@@ -26,7 +26,7 @@ Encoded = Callable[[str], Descriptor | None]  # the picture of this name
 _VOTE = 0.06  # share of the regions that agree, so that it is believed without any landmark
 _ASKED = 0.05  # share of the regions that agree, so that landmarks are asked about it
 # Standard deviations of one axis: of landmarks, which see tilt and relief as turns and scalings, and of a vote, which
-# is of whole cells, of turns of 15 degrees, and of any scaling within a fifth.
+# is of whole cells, of turns of 15 degrees, and of any scaling within a fifth where few regions agree.
 _OF_LANDMARKS, _OF_VOTE = (0.01, 0.05), (0.016, 0.09)
 _TRIED = 8  # rotations of a pair
 _KEPT = 512  # landmarks and descriptors: a place is looked at with its neighbours, which come soon after each other
@@ -69,11 +69,14 @@ def looker(place_map: PlaceMap, technique: Technique, places: list[Place], encod
         asking = descriptor(query)
         if asking is None:
             return None
+        part = coarse.get(places[place].place_id)
         try:
             fine, _ = place_map.fine_part(places[place].place_id)
         except EdgevprError:
+            part = None
+        if part is None:
             return None
-        match = technique.match(asking, fine, likely(asking, coarse[places[place].place_id]))
+        match = technique.match(asking, fine, likely(asking, part))
         if match.score < _ASKED:
             return None
         found = agreed(query, place, _told(match, technique.spec.cells))
