@@ -28,6 +28,7 @@ from edgevpr.simulate.scene import Scene, make_scene
 
 _SEED = 1
 _RATE_HZ = 5.0
+_CAMERA = ("--camera", "nadir", "--fov-deg", 66)  # that of the generated flights
 _END_TIMEOUT_S = 10.0
 
 
@@ -101,10 +102,12 @@ def run_demo(folder: str | Path) -> DemoSummary:
     port = _free_udp_port()
     # The flight controller is started first: it listens long before the map is built.
     with _edgevpr("simulate", "autopilot", "--link", f"udpin:127.0.0.1:{port}", "--json") as autopilot:
-        with _edgevpr("map", "build", map_path, "--images", first / "images", "--technique", "cohog") as building:
+        with _edgevpr(
+            "map", "build", map_path, "--images", first / "images", *_CAMERA, "--technique", "cohog"
+        ) as building:
             _output(building)
         flags = ("--link", f"udpout:127.0.0.1:{port}", "--log", log_path, "--rate-hz", _RATE_HZ)
-        with _edgevpr("run", "--map", map_path, "--source", second / "images", *flags) as flying:
+        with _edgevpr("run", "--map", map_path, "--source", second / "images", *_CAMERA, *flags) as flying:
             for _ in progress(_queries(log_path, flying), len(later.poses), "flying"):
                 pass
             _output(flying)

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +19,8 @@ RIGHT_M = 55.0
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Answer:
     """One query: where it was taken, the place that was named, and whether the runtime accepted it. `error_m` is the
-    distance between the two, `nearest_m` that to the nearest place of the map."""
+    distance between the two, `nearest_m` that to the nearest place of the map, and `fix_off_m` that to the fix (None:
+    not accepted)."""
 
     query: str
     reference_image: str
@@ -28,6 +30,7 @@ class Answer:
     accepted: bool
     error_m: float
     nearest_m: float
+    fix_off_m: float | None
 
     @property
     def right(self) -> bool:
@@ -42,7 +45,7 @@ class Answer:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Outcome:
     """Counts, shares and errors of a flight. `recall_at_1` is of the queries on the map. The errors are metres from the
-    point where a picture was taken to the place that was named, of the accepted queries (NaN without any)."""
+    point where a picture was taken to the fix, of the accepted queries (NaN without any)."""
 
     queries: int
     on_map: int
@@ -75,17 +78,22 @@ def read_answers(log_path: Path, map_images: Path, query_images: Path) -> list[A
                     score=line["score"],
                     accepted=line["accepted"],
                     error_m=float(error_m),
+                    fix_off_m=_off_m(line["located"], at) if line["accepted"] else None,
                     nearest_m=float(nearest_m),
                 )
             )
     return answers
 
 
+def _off_m(located: dict[str, Any], at: Position) -> float:
+    return float(distance_m(at.lat_deg, at.lon_deg, located["lat_deg"], located["lon_deg"]))
+
+
 def outcome(answers: Sequence[Answer]) -> Outcome:
     """Sum up the answers of a flight."""
     on_map = [answer for answer in answers if answer.on_map]
     accepted = [answer for answer in answers if answer.accepted]
-    errors_m = [answer.error_m for answer in accepted] or [np.nan]
+    errors_m = [answer.fix_off_m for answer in accepted] or [np.nan]
     return Outcome(
         queries=len(answers),
         on_map=len(on_map),

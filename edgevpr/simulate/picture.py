@@ -116,11 +116,11 @@ def _seen_by(flight: Flight, shape: tuple[int, int], metres_per_pixel: float) ->
 
 def _draw_errors(axes: Axes, answers: Sequence[Answer]) -> None:
     numbers = np.arange(1, len(answers) + 1)
-    errors_m = np.maximum([answer.error_m for answer in answers], 1)
-    axes.bar(numbers, errors_m - 0.8, bottom=0.8, width=0.72, color=[_colour(answer) for answer in answers])
+    errors_m = np.maximum([_off_m(answer) for answer in answers], 0.1)
+    axes.bar(numbers, errors_m - 0.08, bottom=0.08, width=0.72, color=[_colour(answer) for answer in answers])
     axes.set_yscale("log")
-    axes.set_yticks([1, 10, 100], ["1 m", "10 m", "100 m"], fontsize=10, color=_FAINT)
-    axes.set_ylim(0.8, 900)
+    axes.set_yticks([0.1, 1, 10, 100], ["0.1 m", "1 m", "10 m", "100 m"], fontsize=10, color=_FAINT)
+    axes.set_ylim(0.08, 900)
     axes.set_xlim(0.2, len(answers) + 0.8)
     axes.set_xticks([1, *range(5, len(answers) + 1, 5)])
     axes.tick_params(labelsize=10, colors=_FAINT, length=0)
@@ -129,7 +129,7 @@ def _draw_errors(axes: Axes, answers: Sequence[Answer]) -> None:
     axes.set_axisbelow(True)
     axes.set_facecolor("none")
     axes.spines[:].set_visible(False)
-    title = "from each query to the place that scored best (metres, logarithmic)"
+    title = "from each query to its fix, or where there is none to the place that scored best (metres, logarithmic)"
     axes.set_title(title, loc="left", fontsize=11, color=_FAINT, pad=4)
     axes.set_xlabel("query of flight 2", fontsize=10, color=_FAINT, labelpad=1)
 
@@ -177,8 +177,12 @@ def _colour(answer: Answer) -> str:
     return _RIGHT if answer.right else _WRONG
 
 
+def _off_m(answer: Answer) -> float:
+    return answer.error_m if answer.fix_off_m is None else answer.fix_off_m
+
+
 def _verdict(answer: Answer) -> str:
     if answer.accepted:
-        return f"accepted, {answer.error_m:.0f} m off, score {answer.score:.3f}"
+        return f"accepted, {_off_m(answer):.1f} m off, score {answer.score:.3f}"
     where = f"{answer.error_m:.0f} m off" if answer.on_map else "not in the map"
     return f"rejected, {where}, score {answer.score:.3f}"
