@@ -93,11 +93,13 @@ def test_answers_are_judged_by_the_true_positions(tmp_path):
     ):
         (tmp_path / folder / "images").mkdir(parents=True)
         (tmp_path / folder / "positions.csv").write_text("\n".join(["file,lat,lon", *rows]))
-    said = (("q0", "p0", True), ("q1", "p0", True), ("q2", "p1", False))
+    said = (("q0", "p0", 50.00005), ("q1", "p0", 50.0002), ("q2", "p1", None))
     with FlightLog(tmp_path / "log.jsonl") as log:
         log.write("start")
-        for query, place, accepted in said:
-            log.write("query", query=query, reference_image=place, score=0.9, accepted=accepted)
+        for query, place, fix_deg in said:
+            located = fix_deg and {"lat_deg": fix_deg, "lon_deg": 8.0}
+            accepted = fix_deg is not None
+            log.write("query", query=query, reference_image=place, score=0.9, accepted=accepted, located=located)
         log.write("end")
     answers = read_answers(tmp_path / "log.jsonl", tmp_path / "map" / "images", tmp_path / "query" / "images")
     assert [(answer.on_map, answer.right) for answer in answers] == [(True, True), (True, False), (False, False)]
@@ -105,8 +107,13 @@ def test_answers_are_judged_by_the_true_positions(tmp_path):
     got = outcome(answers)
     assert (got.queries, got.on_map, got.accepted, got.accepted_wrong, got.off_map_rejected) == (3, 2, 2, 1, 1)
     assert got.recall_at_1 == 0.5
-    assert got.error_max_m == pytest.approx(111.2, abs=0.1)
-    assert got.error_median_m == pytest.approx((11.12 + 111.2) / 2, abs=0.1)
+    assert [answer.fix_off_m for answer in answers] == [
+        pytest.approx(5.56, abs=0.01),
+        pytest.approx(88.96, abs=0.1),
+        None,
+    ]
+    assert got.error_max_m == pytest.approx(88.96, abs=0.1)
+    assert got.error_median_m == pytest.approx((5.56 + 88.96) / 2, abs=0.1)
 
 
 def test_a_flight_without_an_accepted_match_has_no_error(tmp_path):
