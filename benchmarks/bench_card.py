@@ -22,7 +22,7 @@ from big_map import make_big_map
 from edgevpr.helpers.tables import markdown
 from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import Expected, compare, scan
+from edgevpr.places.retrieve import compare, scan
 from edgevpr.techniques import create
 
 PLACES = 10_000
@@ -46,7 +46,7 @@ def rows(places: int = PLACES) -> list[dict]:
                 read_mb = []
                 for picture in (cv2.flip(frames()[0], 1), *frames()[: TURNS - 1]):
                     asked = technique.encode(picture)
-                    scanned = scan(technique, asked, index, Expected(height_ratio=1.0))
+                    scanned = scan(technique, asked, index)
                     forget_pages(path)
                     before = read_bytes()
                     compare(technique, asked, scanned, place_map, index, candidates=technique.candidates)

@@ -71,11 +71,10 @@ def looking_down(technique: Technique, place_map: PlaceMap, index: PlaceIndex) -
     near = index.within(Position(float(index.lat_deg.mean()), float(index.lon_deg.mean())), REACH_M)
     in_reach = f"{np.count_nonzero(near)} places within {REACH_M:.0f} m"
     cases = (
-        ("nadir", "24 rotations", Expected(height_ratio=1.0)),
-        ("nadir, heights", "24 rotations, 5 heights", NOTHING),
-        ("nadir, heading known", "3 rotations", Expected(turned_deg=turned_deg, height_ratio=1.0)),
-        ("nadir, in reach", in_reach, Expected(in_reach=near, height_ratio=1.0)),
-        ("nadir, both", f"{in_reach}, 3 rotations", Expected(near, turned_deg, 1.0)),
+        ("nadir", "24 rotations", NOTHING),
+        ("nadir, heading known", "3 rotations", Expected(turned_deg=turned_deg)),
+        ("nadir, in reach", in_reach, Expected(in_reach=near)),
+        ("nadir, both", f"{in_reach}, 3 rotations", Expected(near, turned_deg)),
     )
     return [measure(name, beside, technique, place_map, index, expected) for name, beside, expected in cases]
 

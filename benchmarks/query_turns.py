@@ -29,12 +29,10 @@ def main() -> None:
     # A map as it is flown, on parallel legs to and fro, with some sway.
     rng = np.random.default_rng(0)
     turned_deg = (rng.choice([0, 180], PLACES) + rng.normal(0, 5, PLACES)) % 360
-    # As a query of a flight is first looked for; a version from before heights were tried knows of none.
-    height = {"height_ratio": 1.0} if "height_ratio" in Expected.__dataclass_fields__ else {}
     cases = {
         "ahead": ("forward", NOTHING),
-        "down, heading unknown": ("nadir", Expected(**height)),
-        "down, heading known": ("nadir", Expected(turned_deg=turned_deg, **height)),
+        "down, heading unknown": ("nadir", NOTHING),
+        "down, heading known": ("nadir", Expected(turned_deg=turned_deg)),
     }
     with TemporaryDirectory() as folder:
         opened = {}

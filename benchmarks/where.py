@@ -27,7 +27,7 @@ import run_sets
 
 from edgevpr.frames.images import read_image
 from edgevpr.frames.positions import read_positions
-from edgevpr.geodesy import metres, moved
+from edgevpr.geodesy import moved, offset_m
 from edgevpr.helpers.tables import markdown
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.refine.graph import Solved, Ties, solve
@@ -56,8 +56,7 @@ class Set:
 
     def to_metres(self, lat_deg: float, lon_deg: float) -> complex:
         """Return a position in metres."""
-        east_m, north_m = metres(np.array([self.origin[0], lat_deg]), np.array([self.origin[1], lon_deg]))
-        return complex(east_m[1], north_m[1])
+        return complex(*offset_m(*self.origin, lat_deg, lon_deg))
 
 
 def load(folder: Path) -> Set:
@@ -181,10 +180,8 @@ def generated(work: Path, what: str, lens: tuple[str, ...]) -> dict:
                     continue
                 accepted[how] += 1
                 here, where = true[match["query"]], match["located"]
-                east_m, north_m = metres(
-                    np.array([here.lat_deg, where["lat_deg"]]), np.array([here.lon_deg, where["lon_deg"]])
-                )
-                errors[how].append(complex(east_m[1], north_m[1]))
+                off_m = offset_m(here.lat_deg, here.lon_deg, where["lat_deg"], where["lon_deg"])
+                errors[how].append(complex(*off_m))
                 if how == "after":
                     variances.append((where["covariance_m2"][0], where["covariance_m2"][2]))
     return {

@@ -1,5 +1,6 @@
 """The contract of a technique: its specification, its descriptor of an image, and its comparison of query and place."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -20,6 +21,11 @@ class PartSpec:
 
     def __str__(self) -> str:
         return f"{'x'.join(map(str, self.shape))} {np.dtype(self.dtype)}"
+
+
+def nearest_height(height_ratios: Sequence[float], height_ratio: float) -> float:
+    """Return the one of some height ratios that is nearest to another, by their quotient."""
+    return min(height_ratios, key=lambda ratio: abs(math.log(ratio / height_ratio)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -17,14 +17,13 @@ import numpy as np
 
 from edgevpr.places.index import PlaceIndex, load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import Expected, compare, scan
+from edgevpr.places.retrieve import NOTHING, Expected, compare, scan
 from edgevpr.power.speed import pass_round, product_round
 from edgevpr.runtime.preflight import counted
 from edgevpr.techniques import create
 
 PER_PLACE = ("place_ids", "lat_deg", "lon_deg", "heading_deg", "rows")
 _TURNS = 7
-AT_ITS_HEIGHT = Expected(height_ratio=1.0)  # as a query of a flight is first looked for
 
 
 def parts(ahead: str, down: str) -> Iterator[tuple[str, Callable[[], object]]]:
@@ -45,12 +44,12 @@ def of_camera(name: str, camera: str, path: str) -> Iterator[tuple[str, Callable
     with PlaceMap.open(path) as place_map:
         index = load_index(place_map, technique, 100_000_000)
         small = replace(index, **{each: getattr(index, each)[: counted.SMALL] for each in PER_PLACE})
-        known = Expected(turned_deg=rng.choice([0.0, 180.0], len(index)), height_ratio=1.0)
+        known = Expected(turned_deg=rng.choice([0.0, 180.0], len(index)))
         fine, _ = place_map.fine_part(index.place_ids[0])
         asked, one = technique.encode(picture), [0] if camera == "nadir" else None
 
         def scanned(places: PlaceIndex) -> object:
-            return scan(technique, technique.encode(picture), places, AT_ITS_HEIGHT)
+            return scan(technique, technique.encode(picture), places)
 
         def query(expected: Expected) -> object:
             seen, count = technique.encode(picture), technique.candidates
@@ -63,7 +62,7 @@ def of_camera(name: str, camera: str, path: str) -> Iterator[tuple[str, Callable
         yield f"{name}: compare a place in full", lambda: technique.match(asked, fine, one)
         yield f"{name}: encode, and scan {len(small)} places", lambda: scanned(small)
         yield f"{name}: encode, and scan {len(index)} places", lambda: scanned(index)
-        yield f"{name}: a query", lambda: query(AT_ITS_HEIGHT)
+        yield f"{name}: a query", lambda: query(NOTHING)
         if camera == "nadir":
             yield f"{name}: a query, heading known", lambda: query(known)
 

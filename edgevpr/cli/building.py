@@ -114,11 +114,11 @@ def map_build(args: Namespace) -> int:
                 place_map,
                 meter,
                 lambda error: leave_out(error, unusable),
-                mask,
-                gate,
-                gaps,
-                levelling,
-                technique.min_quality if is_cut else 0.0,
+                mask=mask,
+                gate=gate,
+                gaps=gaps,
+                levelling=levelling,
+                min_quality=technique.min_quality if is_cut else 0.0,
             )
         except EdgevprError:
             if is_new and not len(place_map):  # a full disk: an empty map would only stand in the way of the next try
@@ -189,14 +189,13 @@ def _refined(place_map: "PlaceMap", technique: "Technique", images: str | None) 
             "with `--camera nadir` can be refined."
         )
     try:
-        from edgevpr.refine.look import pictures
         from edgevpr.refine.refine import refine
     except ModuleNotFoundError as error:
         raise UsageError(
             f"Refining a map needs SciPy ({error}): install it on the machine that builds maps, with "
             "`pip install 'edgevpr[maps]'`, and run `edgevpr map refine`."
         ) from error
-    return refine(place_map, technique, watched("refining"), pictures(images, technique) if images else None)
+    return refine(place_map, technique, watched("refining"), images)
 
 
 def _print_refined(path: str, refined: "Refined", cells: int | None) -> None:

@@ -168,11 +168,10 @@ def _refine(place_map: PlaceMap, technique: Technique, images: Path | None) -> N
     if technique.spec.cells is None:
         return
     try:
-        from edgevpr.refine.look import pictures
         from edgevpr.refine.refine import refine
     except ModuleNotFoundError:  # without SciPy, the maps of this machine are not refined either
         return
-    refine(place_map, technique, lambda pairs, total: pairs, pictures(images, technique) if images else None)
+    refine(place_map, technique, lambda pairs, total: pairs, images)
 
 
 def compare(results: Iterable[TechniqueResult]) -> list[TechniqueResult]:

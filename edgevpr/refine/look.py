@@ -41,7 +41,7 @@ def looker(place_map: PlaceMap, technique: Technique, places: list[Place], encod
 
     def likely(asking: Descriptor, part: np.ndarray) -> list[int]:
         """Choose the hypotheses to try; neighbours of a map are from about the same height."""
-        _, scores = technique.coarse_scores(asking, part[None], None, height_ratio=1.0)
+        _, scores = technique.coarse_scores(asking, part[None], None)
         best = np.argsort(-scores[0], kind="stable")[:_TRIED]
         return best[np.isfinite(scores[0][best])].tolist()
 

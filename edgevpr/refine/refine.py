@@ -8,6 +8,7 @@ is tied to too few others stays where it was recorded, without a pose.
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -18,7 +19,7 @@ from edgevpr.geodesy import metres, moved
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.sqlite import sentences
 from edgevpr.refine.graph import Solved, solve
-from edgevpr.refine.look import Encoded, looker
+from edgevpr.refine.look import looker, pictures
 from edgevpr.refine.tying import likely_pairs, overlapping_pairs, tied, ties_of
 from edgevpr.types import Place, Pose, Position
 
@@ -58,10 +59,10 @@ class Refined:
         return self.places - self.without_position - self.surveyed - self.refined
 
 
-def refine(place_map: PlaceMap, technique: Technique, watch: Watch, encoded: Encoded | None = None) -> Refined:
+def refine(place_map: PlaceMap, technique: Technique, watch: Watch, images: str | Path | None = None) -> Refined:
     """Refine a map that is open for adding: all of it, or nothing is changed. `watch` passes pairs through and shows
-    progress. `encoded` gives the pictures that the map was made of, where they are at hand. Raises MapError for a map
-    of an older format, and where the file cannot be read or written.
+    progress. `images` is the folder of the pictures that the map was made of, where they are at hand. Raises MapError
+    for a map of an older format, and where the file cannot be read or written.
     """
     if not place_map.has_pose:
         raise MapError(
@@ -82,7 +83,7 @@ def refine(place_map: PlaceMap, technique: Technique, watch: Watch, encoded: Enc
     origin, recorded = was[0], complex_metres(was)
     known_sd_m = np.array([_sd_m(place) if of else np.nan for place, of in zip(placed, surveyed, strict=True)])
     known_log = np.array([log_of(place.pose) if of else np.nan for place, of in zip(placed, surveyed, strict=True)])
-    look = looker(place_map, technique, placed, encoded)
+    look = looker(place_map, technique, placed, pictures(images, technique) if images else None)
     pairs = likely_pairs(recorded)
     found = tied(watch(pairs, len(pairs)), look)
     solved = solve(recorded, known_sd_m, ties_of(found), known_log)

@@ -9,7 +9,7 @@ import numpy as np
 from edgevpr.errors import UsageError
 from edgevpr.frames.missions import Waypoint, read_area
 from edgevpr.frames.positions import number_in, rows_of, tag_of
-from edgevpr.geodesy import distance_m, metres
+from edgevpr.geodesy import distance_m, offset_m
 from edgevpr.types import Position
 
 _HEIGHT_M = (1.0, 10_000.0)
@@ -101,5 +101,5 @@ def _way_m(one: Position, other: Position) -> float:
 
 
 def _course_deg(one: Position | Waypoint, other: Position | Waypoint) -> float:
-    east_m, north_m = metres(np.array([one.lat_deg, other.lat_deg]), np.array([one.lon_deg, other.lon_deg]))
-    return float(np.degrees(np.arctan2(east_m[1], north_m[1])) % 360)
+    east_m, north_m = offset_m(one.lat_deg, one.lon_deg, other.lat_deg, other.lon_deg)
+    return float(np.degrees(np.arctan2(east_m, north_m)) % 360)

@@ -17,7 +17,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from edgevpr.contract import Descriptor, FineMatch, PartSpec, Picture, TechniqueSpec
+from edgevpr.contract import Descriptor, FineMatch, PartSpec, Picture, TechniqueSpec, nearest_height
 from edgevpr.errors import UsageError
 from edgevpr.techniques import placecode, placewords
 from edgevpr.techniques.alignment import align
@@ -33,7 +33,6 @@ from edgevpr.techniques.views import (
     Views,
     cells_along,
     hypothesis,
-    nearest_ratio,
 )
 
 # The goodness threshold GT of the thesis (6.3.2) and of the authors' public code, each for its own entropy.
@@ -189,7 +188,7 @@ class CoHog:
             expected = np.nan_to_num(steps, nan=-1).astype(np.intp)
             if len(expected) and expected.min() >= 0:
                 needed = {int(turn) % WITHIN_QUARTER for near in (-1, 0, 1) for turn in np.unique(expected) + near}
-        ratio = nearest_ratio(height_ratio or 1.0)
+        ratio = nearest_height(HEIGHT_RATIOS, height_ratio or 1.0)
         scores = np.full((len(rows), len(HEIGHT_RATIOS) * ROTATIONS), -np.inf, np.float32)
         asking = {turn: self.good_patterns(query, turn, ratio) for turn in sorted(needed)}
         sides = self._views_of(query).side_of(ratio), self._side

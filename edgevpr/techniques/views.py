@@ -11,7 +11,6 @@ evidence. They are made comparable by what foreign pictures reach under each (me
 the air), and so that a view from the mapped height keeps its share.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -55,11 +54,6 @@ class Asking:
 def hypothesis(number: int) -> tuple[float, int]:
     """Return the height ratio of a hypothesis and the steps that the camera has turned by."""
     return HEIGHT_RATIOS[number // ROTATIONS], number % ROTATIONS
-
-
-def nearest_ratio(height_ratio: float) -> float:
-    """Return the height ratio among the hypotheses that is nearest to one expected."""
-    return min(HEIGHT_RATIOS, key=lambda ratio: abs(math.log(ratio / height_ratio)))
 
 
 def cells_along(cells: int, ratio: float) -> int:

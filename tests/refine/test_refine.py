@@ -15,7 +15,6 @@ from edgevpr.errors import MapError
 from edgevpr.geodesy import distance_m, metres, moved
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapinfo import info_of
-from edgevpr.refine.look import pictures
 from edgevpr.refine.refine import refine
 from edgevpr.runtime.recognise.opening import technique_of
 from edgevpr.simulate.camera import Camera, lit, photograph
@@ -197,8 +196,7 @@ def some_of(built, path, numbers, position=lambda number, place: place.position)
 def refined_of(path, images=None):
     with PlaceMap.open_for_adding(path) as place_map:
         technique = technique_of(place_map)
-        shown = pictures(images, technique) if images else None
-        return refine(place_map, technique, lambda pairs, total: pairs, shown), list(place_map.places())
+        return refine(place_map, technique, lambda pairs, total: pairs, images), list(place_map.places())
 
 
 @pytest.mark.parametrize(

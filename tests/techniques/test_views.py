@@ -4,8 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
+from edgevpr.contract import nearest_height
 from edgevpr.techniques import create
-from edgevpr.techniques.views import HEIGHT_RATIOS, ROTATIONS, cells_along, hypothesis, nearest_ratio
+from edgevpr.techniques.views import HEIGHT_RATIOS, ROTATIONS, cells_along, hypothesis
 
 SIDE_PX = 384
 
@@ -39,7 +40,8 @@ def test_a_view_has_cells_by_its_height_and_its_middle_on_that_of_the_place():
 def test_a_hypothesis_is_a_height_and_a_rotation():
     assert hypothesis(0) == (0.5, 0)
     assert hypothesis(2 * ROTATIONS + 7) == (1.0, 7)
-    assert [nearest_ratio(ratio) for ratio in (0.1, 0.58, 0.6, 0.9, 1.3, 5)] == [0.5, 0.5, 0.7, 1.0, 1.42, 2.0]
+    nearest = [nearest_height(HEIGHT_RATIOS, ratio) for ratio in (0.1, 0.58, 0.6, 0.9, 1.3, 5)]
+    assert nearest == [0.5, 0.5, 0.7, 1.0, 1.42, 2.0]
 
 
 @pytest.mark.parametrize("turned_deg", [0, 130])

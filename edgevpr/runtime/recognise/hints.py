@@ -4,10 +4,10 @@ They narrow the search, and none is ever the only way to find a place: a compass
 position false. A query that is not accepted with hints is therefore followed by one without.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from edgevpr.contract import nearest_height
 from edgevpr.geodesy import distance_m
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.retrieve import Expected
@@ -146,7 +146,7 @@ def other_heights(height_ratios: Sequence[float], first: float) -> list[float]:
     """Return the heights to look from after the first: all but the one that is nearest to it."""
     if not height_ratios:
         return []
-    tried = min(height_ratios, key=lambda ratio: abs(math.log(ratio / first)))
+    tried = nearest_height(height_ratios, first)
     return [ratio for ratio in height_ratios if ratio != tried]
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from edgevpr.config import Config
-from edgevpr.errors import MapBusyError, MapError, UsageError
+from edgevpr.errors import MapBusyError, MapError, PlaceError, UsageError
 from edgevpr.frames.exif import read_exif
 from edgevpr.frames.images import list_images
 from edgevpr.frames.level import View
@@ -80,11 +80,12 @@ class Learner:
         place = None
         try:
             here, objection = self._placed(event.frame, event.vehicle)
-            here = self._tied(laid(here, event.view), event)
+            here = laid(here, event.view)
             objection = objection or self._objection(here.position, event)
             if objection:
                 self.passed_over[objection] += 1
                 return None
+            here = self._tied(here, event)
             self._map.require_unchanged()  # a place in a file that was deleted would be lost
             salience = event.worth and replace(event.worth.salience, is_low=event.worth.reason is not None)
             place_id = self._map.add(here, event.descriptor, salience, self._recogniser.landmarks(event))
@@ -115,7 +116,10 @@ class Learner:
         recogniser = self._recogniser
         if frame.pose or frame.position is None or event.ranking is None or recogniser.technique.spec.cells is None:
             return frame
-        found = named(event.ranking, recogniser.index, self._map, first=HEARD)
+        try:
+            found = named(event.ranking, recogniser.index, self._map, first=HEARD)
+        except PlaceError:  # it is left out from now on; the frame can be learnt without it
+            return frame
         if found[0].match.score < recogniser.rule.min_score:
             return frame
         where = located(found, recogniser.technique.spec.cells, View(aside=(0.0, 0.0)))  # of the middle of the picture

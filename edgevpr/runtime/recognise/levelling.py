@@ -4,7 +4,6 @@ A wrong height scales wrongly. A technique with `height_ratios` finds the pictur
 """
 
 import logging
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +12,7 @@ from edgevpr.config import SourceConfig
 from edgevpr.contract import Technique
 from edgevpr.frames.level import UNKNOWN_VIEW, Lens, Levelled, View, levelled
 from edgevpr.frames.source import is_live
-from edgevpr.geodesy import moved
+from edgevpr.geodesy import axes_of, moved
 from edgevpr.types import Frame, Pose, Position, Vehicle
 
 GPS_SD_M = 5.0  # of one axis of a recorded position, as long as nothing better is known
@@ -95,9 +94,6 @@ def laid(frame: Frame, view: View) -> Frame:
 
 def _middle(position: Position, view: View) -> Position:
     """Return the position of what is in the middle of a picture, of that which is `view.aside`."""
-    right_m, up_m = (view.footprint_m * share for share in view.aside)
-    up = math.radians(view.up_deg)
-    east_m = right_m * math.cos(up) + up_m * math.sin(up)
-    north_m = up_m * math.cos(up) - right_m * math.sin(up)
-    lat_deg, lon_deg = moved(position.lat_deg, position.lon_deg, -east_m, -north_m)
+    off_m = -view.footprint_m * axes_of(view.up_deg) @ view.aside
+    lat_deg, lon_deg = moved(position.lat_deg, position.lon_deg, *off_m.tolist())
     return Position(lat_deg, lon_deg, position.alt_m)

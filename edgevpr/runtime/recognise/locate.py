@@ -15,7 +15,7 @@ import numpy as np
 
 from edgevpr.contract import FineMatch
 from edgevpr.frames.level import UNKNOWN_VIEW, View
-from edgevpr.geodesy import metres, moved
+from edgevpr.geodesy import axes_of, moved, offset_m
 from edgevpr.landmarks.agreement import CONFIRMED, Agreement
 from edgevpr.runtime.recognise.levelling import UNTOLD_TILT
 from edgevpr.types import Candidate, Place, Pose, Position
@@ -192,7 +192,7 @@ def _said(place: Place, lies: _Lies, origin: Position, aside: tuple[float, float
     right, up = aside
     dx = lies.step[0] + ratio * (right * math.cos(turn) + up * math.sin(turn))
     dy = lies.step[1] + ratio * (right * math.sin(turn) - up * math.cos(turn))
-    axes = np.stack(_axes(pose.up_deg), axis=1)
+    axes = axes_of(pose.up_deg)
     off_m = pose.footprint_m * (axes @ (dx, -dy))
     length_m = float(np.hypot(*off_m))
     towards = off_m / length_m if length_m else np.zeros(2)
@@ -209,15 +209,7 @@ def _said(place: Place, lies: _Lies, origin: Position, aside: tuple[float, float
 
 def _off_m(origin: Position, position: Position) -> np.ndarray:
     """Return how far a position is from another, east and north (2,)."""
-    lat_deg, lon_deg = np.array([(each.lat_deg, each.lon_deg) for each in (origin, position)]).T
-    east_m, north_m = metres(lat_deg, lon_deg)
-    return np.array([east_m[1], north_m[1]])
-
-
-def _axes(up_deg: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the directions on the ground (east, north) of the right and of the top of a picture."""
-    up = math.radians(up_deg)
-    return np.array([math.cos(up), -math.sin(up)]), np.array([math.sin(up), math.cos(up)])
+    return np.array(offset_m(origin.lat_deg, origin.lon_deg, position.lat_deg, position.lon_deg))
 
 
 def _apart(one: _Said, other: _Said) -> float:

@@ -60,7 +60,7 @@ class Recogniser:
     ) -> None:
         self.place_map, self.meter, self.candidates = place_map, meter, candidates
         self._prior, self._min_accuracy_m, self._mask = prior or NoPrior(), min_accuracy_m, mask or NoMask()
-        self._gate, self.levelling, self._verifies = gate or NoGate(), levelling or NoLevelling(), verify
+        self._gate, self._levelling, self._verifies = gate or NoGate(), levelling or NoLevelling(), verify
         self._told = 0  # number of places left out that an event has told of
         self._new: deque[tuple[int, float]] = deque()  # place id, and the time it was learnt at
         self.take(technique, index, rule, search or Alone())
@@ -96,7 +96,7 @@ class Recogniser:
         meter.begin()
         try:
             with meter.step("prepare"):
-                picture = self.levelling.prepare(frame, vehicle, self._mask.fitted(frame.image))
+                picture = self._levelling.prepare(frame, vehicle, self._mask.fitted(frame.image))
             with meter.step("gate"):
                 worth = self._gate.look(frame.image)
             with meter.step("encode"):
