@@ -41,8 +41,8 @@ class Vehicle:
     heading of the nose (0..360 clockwise from north, None: unknown), and `t_heard_s`, the time of the report on the
     clock of the frames. `has_gps`: at that time a receiver had a 3D fix near that position. Without `has_gps` the
     position may be wrong: an autopilot goes on reporting its estimate long after it has lost GPS, and it does not
-    follow a receiver that it does not trust. `roll_deg` (right wing down is positive), `pitch_deg` (nose up) and
-    `height_m` above the ground are None where unknown."""
+    follow a receiver that it does not trust. `roll_deg` (right wing down is positive), `pitch_deg` (nose up),
+    `height_m` above the ground and `velocity_m_s` over it (east, north) are None where unknown."""
 
     lat_deg: float
     lon_deg: float
@@ -53,6 +53,7 @@ class Vehicle:
     roll_deg: float | None = None
     pitch_deg: float | None = None
     height_m: float | None = None
+    velocity_m_s: tuple[float, float] | None = None
 
     def is_fresh_at(self, t_mono_s: float) -> bool:
         """Tell whether the report came within one second of `t_mono_s`, such as the time of a frame."""
