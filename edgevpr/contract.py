@@ -102,13 +102,27 @@ class Picture:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Support:
+    """How well all regions of query and place bear out a step, beside those that voted for it. `back` is the share of
+    the place's regions that find their most similar region of the query at this step, and `mutual` the share of those
+    that are also found by it. `likeness` (cosine) is the mean similarity of the query's regions to the most similar one
+    of the place, wherever it is. `log_rank` is the mean natural logarithm of the rank that the region at this step has
+    among all of the place, by similarity: 0 where it is always the most similar."""
+
+    back: float
+    mutual: float
+    likeness: float
+    log_rank: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FineMatch:
     """The result of comparing one place with the query: `score` in 0..1, and values that only some techniques give
     (else None). `shift_cells` is the step from the query to the place (dx, dy in cells), with its covariance (var x,
     cov xy, var y). `rotation_deg` is the rotation of the camera since the map was made (clockwise, 0..360), and
     `height_ratio` the camera's height above the ground over that of then. `coverage`
     (0..1) is the share of the place's regions that agree with this step, each counted once, however many regions of the
-    query resemble it."""
+    query resemble it. `support` is what the other regions say."""
 
     score: float = field(kw_only=False)
     shift_cells: tuple[float, float] | None = None
@@ -116,6 +130,7 @@ class FineMatch:
     rotation_deg: float | None = None
     height_ratio: float | None = None
     coverage: float | None = None
+    support: Support | None = None
 
 
 class Technique(Protocol):

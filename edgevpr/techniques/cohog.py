@@ -21,7 +21,7 @@ from edgevpr.contract import Descriptor, FineMatch, PartSpec, Picture, Technique
 from edgevpr.errors import UsageError
 from edgevpr.techniques import placecode, placewords
 from edgevpr.techniques.alignment import align
-from edgevpr.techniques.displacement import displacement, share
+from edgevpr.techniques.displacement import displacement, share, support
 from edgevpr.techniques.entropy import block_means, good_blocks
 from edgevpr.techniques.gradients import grey_square, levels, mask_square, normalised_blocks, oriented_cells
 from edgevpr.techniques.patterns import slow_patterns
@@ -302,11 +302,14 @@ class CoHog:
     def _displacement(self, asking: Asking, reference: np.ndarray) -> FineMatch:
         best = (asking.regions @ reference.T).argmax(axis=1)
         found = displacement(asking.numbers, best, (asking.side, self._side), _VOTES_COUNT[self._camera])
+        # Looking down, landmarks say more than the other regions do.
+        asks_all = self._camera == "forward" and len(asking.numbers)
         return FineMatch(
             min(1.0, found.share * asking.worth),
             shift_cells=found.shift_cells,
             covariance_cells2=found.covariance_cells2,
             coverage=found.agreeing / len(reference),
+            support=support(asking.numbers, asking.regions, reference, best, found.shift_cells) if asks_all else None,
         )
 
 

@@ -9,11 +9,17 @@ resemble the same few regions of the place: a line here and a line there. Their 
 regions of the place that agree are counted too, each of them once.
 """
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 
 import cv2
 import numpy as np
+
+from edgevpr.contract import Support
+
+_ALONG = 3  # cells: near and far ground move by steps that differ by so much, where the camera looks ahead
+_RANKED = 4  # of so many regions one is ranked: ranks cost more than all the rest
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +78,45 @@ def displacement(
 def share(asking: np.ndarray, best: np.ndarray, sides: tuple[int, int], counts: tuple[float, ...]) -> float:
     """Return the `share` of a `displacement` without the rest of it, in half the time."""
     return float(_piled(asking, best, sides, counts)[2].max()) / len(asking) if len(asking) else 0.0
+
+
+def support(
+    asking: np.ndarray, regions: np.ndarray, reference: np.ndarray, best: np.ndarray, shift_cells: tuple[float, float]
+) -> Support:
+    """Ask all regions about a step that a vote has found. `asking` int (G,) are the numbers of the good `regions` of the
+    query, float32 (G, P), on the grid of the place, whose regions are `reference`, float32 (side * side, P). `best` int
+    (G,) is the most similar region of the place for each."""
+    side = math.isqrt(len(reference))
+    back = (reference @ regions.T).argmax(axis=1)
+    of_y, of_x = np.divmod(asking, side)
+    step_x, step_y = (round(each) for each in shift_cells)
+
+    def along(query: np.ndarray, place: np.ndarray) -> np.ndarray:
+        y, x = np.divmod(place, side)
+        return np.maximum(abs(x - of_x[query] - step_x), abs(y - of_y[query] - step_y)) <= _ALONG
+
+    mutual = (back[best] == np.arange(len(asking))) & along(np.arange(len(asking)), best)
+    return Support(
+        back=float(along(back, np.arange(len(reference))).mean()),
+        mutual=float(np.count_nonzero(mutual)) / len(reference),
+        likeness=float(np.einsum("ij,ij->i", regions, reference[best]).mean()),
+        log_rank=_log_rank(regions[::_RANKED], reference, of_x[::_RANKED] + step_x, of_y[::_RANKED] + step_y, side),
+    )
+
+
+def _log_rank(regions: np.ndarray, reference: np.ndarray, x: np.ndarray, y: np.ndarray, side: int) -> float:
+    """Return the mean log rank of the region of the place at (x, y), or of the most similar of those around it, for
+    each of `regions` where that is on the grid of the place."""
+    rows = np.flatnonzero((x >= 0) & (x < side) & (y >= 0) & (y < side))
+    if not len(rows):
+        return math.log(len(reference))
+    alike = regions[rows] @ reference.T
+    there = np.full(len(rows), -np.inf, np.float32)
+    for off_y in (-1, 0, 1):
+        for off_x in (-1, 0, 1):
+            near = np.clip(y[rows] + off_y, 0, side - 1) * side + np.clip(x[rows] + off_x, 0, side - 1)
+            np.maximum(there, alike[np.arange(len(rows)), near], out=there)
+    return float(np.log(1 + np.count_nonzero(alike > there[:, None], axis=1)).mean())
 
 
 def _piled(
