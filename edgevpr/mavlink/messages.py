@@ -90,14 +90,17 @@ def position_fix(fix: Fix, t_sent_s: float, target_system: int) -> Message:
 
 def report_requests(target_system: int) -> tuple[Message, ...]:
     """Make a COMMAND_LONG (76) with SET_MESSAGE_INTERVAL (511) for every report that is wanted: GLOBAL_POSITION_INT
-    (33) five times a second, ATTITUDE (30) ten times, GPS_RAW_INT (24), DISTANCE_SENSOR (132) and TERRAIN_REPORT (136)
-    twice. On many autopilots the companion's port streams none of them unless asked."""
+    (33) five times a second, ATTITUDE (30) ten times, and twice GPS_RAW_INT (24), DISTANCE_SENSOR (132), TERRAIN_REPORT
+    (136) and what the filter says of itself: EKF_STATUS_REPORT (193) of ArduPilot, ESTIMATOR_STATUS (230) of PX4. On
+    many autopilots the companion's port streams none of them unless asked."""
     wanted_us = {
         mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 200_000,
         mavlink.MAVLINK_MSG_ID_ATTITUDE: 100_000,
         mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 500_000,
         mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR: 500_000,
         mavlink.MAVLINK_MSG_ID_TERRAIN_REPORT: 500_000,
+        mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: 500_000,
+        mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: 500_000,
     }
     return tuple(
         mavlink.MAVLink_command_long_message(
