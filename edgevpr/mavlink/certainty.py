@@ -1,4 +1,4 @@
-"""How well the autopilot knows where it is: while it has GPS, and for as long as it can reckon after that."""
+"""The certainty of the autopilot's own position: while it has GPS, and for as long as it can reckon after that."""
 
 import math
 

@@ -132,7 +132,7 @@ class Conversation:
         vehicle = self.autopilot.vehicle
         heard_s = min(vehicle.t_heard_s if vehicle else -math.inf, self.autopilot.attitudes.t_heard_s)
         if now_s - heard_s > ASK_AGAIN_S:
-            for request in messages.report_requests(self.autopilot.system_id):
+            for request in messages.report_requests(self.autopilot.system_id, self.autopilot.firmware):
                 self.outbox.put(request)
 
     def _announce(self, severity: Severity, text: str) -> None:

@@ -39,6 +39,7 @@ class Autopilot:
     def __init__(self, own_component: int, system_id: int | None = None) -> None:
         self.identity = Identity(system_id)
         self.acks: Counter[str] = Counter()  # answers to our fixes, by name of the result
+        self.firmware = mavlink.MAV_AUTOPILOT_GENERIC  # until it is heard
         self.vehicle: Vehicle | None = None  # the last report, of any age, without attitude
         self.attitudes, self._heights, self.certainty = Attitudes(), Heights(), Certainty()
         self._answer: str | None = None  # the newest answer, until `take_answer`
@@ -90,7 +91,7 @@ class Autopilot:
             self._gps.clear()
             self.attitudes, self._heights, self.certainty = Attitudes(), Heights(), Certainty()
         if beats:
-            self._heard_s = now_s
+            self._heard_s, self.firmware = now_s, message.autopilot
             return True
         if self._answers_our_fix(message):
             self._hear_result(message.result)

@@ -6,10 +6,15 @@ import numpy as np
 import pytest
 from fakes import FakeClock, FakeLink, FakeSource, vehicle_at
 from flights import STEP_DEG, Flight, of_kind
+from mavlink_peers import Peer, UdpPort, wait_until
 from pictures import textured
 
 from edgevpr.contract import FineMatch
 from edgevpr.geodesy import moved
+from edgevpr.mavlink.address import parse_link
+from edgevpr.mavlink.link import Link
+from edgevpr.mavlink.wire import mavlink
+from edgevpr.runtime.flight import autopilot
 from edgevpr.runtime.flight.autopilot import DRY_RUN
 from edgevpr.runtime.flight.consistency import Consistency
 from edgevpr.runtime.recognise.locate import Located
@@ -169,6 +174,36 @@ def test_in_flight_a_fix_held_back_is_in_the_log_and_the_ground_is_told_once(rec
         (6, "edgevpr: fixes agree again"),
     ]
     assert sum(each.name == "vpr_place" for each in link.sent if each.get_type() == "NAMED_VALUE_INT") == 5
+
+
+def test_over_a_real_link_it_is_what_the_autopilot_says_of_itself_that_counts(recording, tmp_path, monkeypatch):
+    monkeypatch.setattr(autopilot, "_SETTLED_WITHIN_S", 60.0)
+    clock, port = FakeClock(), UdpPort()
+    with Link(parse_link(f"udpout:127.0.0.1:{port.number}"), clock=clock) as link:
+        peer = Peer(port)
+        peer.expect("HEARTBEAT")
+        peer.heartbeat()
+        wait_until(link.listens)
+        turns = iter(range(4))
+
+        def turn():
+            """GPS at the first frame only; a filter that reckons from then on, and at the last frame has given up."""
+            turn = next(turns)
+            where = round((50 + turn * STEP_DEG) * 1e7), round(8.05 * 1e7)
+            flags = mavlink.EKF_CONST_POS_MODE if turn == 3 else mavlink.EKF_POS_HORIZ_REL
+            peer.heartbeat()
+            peer.send(mavlink.MAVLink_gps_raw_int_message(0, 1 if turn else 3, *where, 0, 80, 120, 0, 0, 14))
+            peer.send(mavlink.MAVLink_ekf_status_report_message(flags, 0.1, 0.1, 0.1, 0.1, 0.1))
+            peer.send(mavlink.MAVLink_global_position_int_message(0, *where, 0, 80_000, 1500, 0, 0, 0))
+            wait_until(lambda: link.vehicle() and link.vehicle().t_heard_s == clock.now_s)
+
+        flight = Flight(recording / "cohog.gpkg", tmp_path / "log", clock, link, **{"source.rate_hz": 1.0})
+        pictures = [textured(number, 240, 320) for number in (0, 1, 20, 3)]
+        queries = of_kind(flight.fly(FakeSource(pictures, clock, work=turn)), "query")
+        assert peer.expect_text("edgevpr: fix held back, contradicts autopilot")
+    port.close()
+    assert [line["fix"]["sent"] for line in queries] == [True, False, False, True]
+    assert "good to 6 m" in queries[1]["fix"]["why"], "5 m by GPS, and a second of drift"
 
 
 def test_in_flight_with_gps_nothing_is_held_back(recording, tmp_path):
