@@ -24,15 +24,12 @@ class Certainty:
     def __init__(self) -> None:
         self._known: tuple[float, float] | None = None  # standard deviation, time
         self._own: tuple[float, float] | None = None  # the same, as the filter says it
-        self._lost_s = -math.inf  # when the filter last said that it has no position: it then sends an old one
 
     def hear(self, message: Message, now_s: float) -> None:
         """Take in one of the `FILTER_REPORTS`."""
         if message.flags & mavlink.EKF_CONST_POS_MODE or not message.flags & _HAS_POSITION:
-            self._known, self._own, self._lost_s = None, None, now_s
-            return
-        self._lost_s = -math.inf
-        if message.get_type() == "ESTIMATOR_STATUS":
+            self._known = self._own = None  # it goes on to report a position, but an old one
+        elif message.get_type() == "ESTIMATOR_STATUS":
             # That of both axes together: of one it is less, so this is careful. 0: PX4 has none.
             sd_m = message.pos_horiz_accuracy
             self._own = (sd_m, now_s) if 0 < sd_m < math.inf else None
@@ -43,8 +40,6 @@ class Certainty:
 
     def now(self, now_s: float) -> float | None:
         """Return the standard deviation, metres; None where it is unknown, or there is no position."""
-        if now_s - self._lost_s <= _FRESH_S:
-            return None
         if self._own and now_s - self._own[1] <= _FRESH_S:
             return self._own[0]
         return self._known and math.hypot(self._known[0], DRIFT_M_S * (now_s - self._known[1]))

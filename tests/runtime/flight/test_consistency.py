@@ -115,6 +115,11 @@ def test_the_same_place_again_is_no_second_one_until_the_aircraft_has_moved_on()
     assert held(*stuck) == [True] * 12, "a fix that stays where it was says nothing new"
 
 
+def test_an_aircraft_that_creeps_on_has_moved_on_in_the_end():
+    creeping = [seen((500, 0), t_s, flown_m=(0, 12 * t_s)) for t_s in range(12)]
+    assert held(*creeping) == [True] * 7 + [False] * 5
+
+
 def test_places_that_are_partly_the_same_are_not_independent():
     assert held(seen((500, 0), places=(1, 2)), seen((500, 0), 1.0, places=(2, 3))) == [True, True]
     assert held(seen((500, 0), places=(1, 2)), seen((500, 0), 1.0, places=(3, 4))) == [True, False]
@@ -140,6 +145,16 @@ def test_two_that_agree_across_one_that_agrees_with_the_autopilot_do_not_count()
 def test_when_the_autopilot_has_taken_the_fix_the_old_offset_is_a_contradiction_again():
     events = [seen((500, 0)), seen((500, 0), 1.0, places=(2,)), seen((3, 0), 2.0, places=(3,))]
     assert held(*events, seen((500, 0), 3.0, places=(4,))) == [True, False, False, True]
+
+
+def test_the_autopilot_s_reckoning_may_drift_between_two_that_agree():
+    assert held(seen((500, 0)), seen((530, 0), 10.0, places=(2,))) == [True, False]
+    assert held(seen((500, 0)), seen((530, 0), 1.0, places=(2,))) == [True, True]
+
+
+def test_those_that_agree_are_sent_for_as_long_as_they_come():
+    drifting = [seen((500 + 2 * t_s, 0), t_s, places=(t_s,)) for t_s in range(0, 120, 8)]
+    assert held(*drifting) == [True] + [False] * 14
 
 
 def test_what_agreed_long_ago_is_forgotten():
