@@ -47,9 +47,10 @@ class Flag:
     choices: tuple[str, ...] = ()
 
 
-def keyed(flag: Flag | None = None) -> Any:
-    """Make a dataclass field that may be a flag."""
-    return field(metadata={"flag": flag})
+def keyed(flag: Flag | None = None, sets: bool = True) -> Any:
+    """Make a dataclass field that may be a flag. The flag of a key that is true or false takes no value: it `sets`
+    one."""
+    return field(metadata={"flag": flag, "sets": sets})
 
 
 def bounded(low: float, high: float, flag: Flag | None = None) -> Any:
@@ -146,7 +147,9 @@ class MavlinkConfig:
     )
     component_id: int = bounded(1, 255)
     system_id: int | None = bounded(1, 255)
-    send_fixes: bool = field()
+    send_fixes: bool = keyed(
+        Flag(("--dry-run",), None, "send no position fix: decide, log and tell all else as in a flight"), sets=False
+    )
     max_fix_age_s: float = bounded(0.1, 5)
     min_accuracy_m: float = bounded(1, 10_000)
 
@@ -181,11 +184,13 @@ class Config:
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """A key of the configuration that is also a flag: its dotted name, the type of its value (None apart), its flag."""
+    """A key of the configuration that is also a flag: its dotted name, the type of its value (None apart), its flag,
+    and what the flag `sets` where that is true or false."""
 
     name: str
     kind: type
     flag: Flag
+    sets: bool
 
 
 def flagged_keys(cls: type = Config, prefix: str = "") -> Iterator[Key]:
@@ -196,7 +201,7 @@ def flagged_keys(cls: type = Config, prefix: str = "") -> Iterator[Key]:
         if is_dataclass(kind):
             yield from flagged_keys(kind, f"{prefix}{each.name}.")
         elif each.metadata.get("flag"):
-            yield Key(prefix + each.name, kind, each.metadata["flag"])
+            yield Key(prefix + each.name, kind, each.metadata["flag"], each.metadata.get("sets", True))
 
 
 def load_config(path: str | Path | None, overrides: dict[str, Any] | None = None) -> Config:

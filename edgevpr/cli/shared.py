@@ -74,7 +74,7 @@ def add_keys(parser: ArgumentParser, *names: str, **texts: str) -> None:
         flag = key.flag
         text = texts.get(key.name.rpartition(".")[2], flag.text)
         if key.kind is bool:
-            parser.add_argument(*flag.names, dest=_KEY + key.name, action="store_true", default=None, help=text)
+            parser.add_argument(*flag.names, dest=_KEY + key.name, action="store_const", const=key.sets, help=text)
         elif flag.choices:
             parser.add_argument(*flag.names, dest=_KEY + key.name, choices=flag.choices, help=text)
         else:

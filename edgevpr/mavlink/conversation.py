@@ -48,8 +48,8 @@ class Conversation:
         self._health, self._health_set_s = health, self._clock()
 
     def want_position(self) -> None:
-        """Ask the autopilot for its position, attitude and height, at once and again whenever it has stopped reporting
-        its position or its attitude."""
+        """Ask the autopilot for its position, how well it knows it, attitude and height, at once and again whenever it
+        has stopped reporting its position or its attitude."""
         self._ask_position_s = self._clock()
 
     def next_packet(self) -> tuple[bytes, Sending | None] | None:
@@ -91,6 +91,8 @@ class Conversation:
                 self.answers.note_answer(now_s)
                 if self._last_sent:
                     self._last_sent.answer = answer  # an answer names no fix: it is taken for the last one sent
+                    if answer == "ACCEPTED":
+                        self.autopilot.certainty.note_known(self._last_sent.fix.accuracy_m, now_s)
         return is_ours
 
     def tell_of_answers(self) -> None:
@@ -130,7 +132,7 @@ class Conversation:
         vehicle = self.autopilot.vehicle
         heard_s = min(vehicle.t_heard_s if vehicle else -math.inf, self.autopilot.attitudes.t_heard_s)
         if now_s - heard_s > ASK_AGAIN_S:
-            for request in messages.report_requests(self.autopilot.system_id):
+            for request in messages.report_requests(self.autopilot.system_id, self.autopilot.firmware):
                 self.outbox.put(request)
 
     def _announce(self, severity: Severity, text: str) -> None:

@@ -90,8 +90,8 @@ class Link:
         self._conversation.set_health(health)
 
     def want_position(self) -> None:
-        """Ask the autopilot for its position, attitude and height, at once and again whenever it has stopped reporting
-        its position or its attitude."""
+        """Ask the autopilot for its position, how well it knows it, attitude and height, at once and again whenever it
+        has stopped reporting its position or its attitude."""
         self._conversation.want_position()
 
     def vehicle(self) -> Vehicle | None:

@@ -88,10 +88,11 @@ def position_fix(fix: Fix, t_sent_s: float, target_system: int) -> Message:
     )
 
 
-def report_requests(target_system: int) -> tuple[Message, ...]:
+def report_requests(target_system: int, firmware: int) -> tuple[Message, ...]:
     """Make a COMMAND_LONG (76) with SET_MESSAGE_INTERVAL (511) for every report that is wanted: GLOBAL_POSITION_INT
-    (33) five times a second, ATTITUDE (30) ten times, GPS_RAW_INT (24), DISTANCE_SENSOR (132) and TERRAIN_REPORT (136)
-    twice. On many autopilots the companion's port streams none of them unless asked."""
+    (33) five times a second, ATTITUDE (30) ten times, and twice GPS_RAW_INT (24), DISTANCE_SENSOR (132), TERRAIN_REPORT
+    (136) and what the filter of a `firmware` (MAV_AUTOPILOT) says of itself. On many autopilots the companion's port
+    streams none of them unless asked."""
     wanted_us = {
         mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 200_000,
         mavlink.MAVLINK_MSG_ID_ATTITUDE: 100_000,
@@ -99,6 +100,8 @@ def report_requests(target_system: int) -> tuple[Message, ...]:
         mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR: 500_000,
         mavlink.MAVLINK_MSG_ID_TERRAIN_REPORT: 500_000,
     }
+    if firmware in _FILTER_REPORTS:
+        wanted_us[_FILTER_REPORTS[firmware]] = 500_000
     return tuple(
         mavlink.MAVLink_command_long_message(
             target_system, AUTOPILOT, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, message_id, interval_us, 0, 0, 0, 0, 0
@@ -169,6 +172,11 @@ def status_text(severity: Severity, text: str) -> Message:
 
 
 _UNUSED = 2**32 - 1
+# ArduPilot tells the pilot, in a text, of every request for a message that it does not know.
+_FILTER_REPORTS = {
+    mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT,
+    mavlink.MAV_AUTOPILOT_PX4: mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS,
+}
 
 
 def _named_float(t_mono_s: float, name: bytes, value: float) -> Message:

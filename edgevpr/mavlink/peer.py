@@ -4,10 +4,12 @@ import logging
 import math
 from collections import Counter
 from dataclasses import replace
+from typing import Any
 
 from edgevpr.geodesy import distance_m
 from edgevpr.mavlink.address import Sender
 from edgevpr.mavlink.attitude import Attitudes, Heights
+from edgevpr.mavlink.certainty import FILTER_REPORTS, Certainty, gps_sd_m
 from edgevpr.mavlink.identity import Identity, Speaker
 from edgevpr.mavlink.messages import AUTOPILOT, POSITION_FIX
 from edgevpr.mavlink.wire import Message, mavlink
@@ -15,6 +17,7 @@ from edgevpr.types import Vehicle
 
 GPS_GONE_AFTER_S = 2.5  # GPS reports come at least once a second, and one may be lost
 GPS_AGREES_WITHIN_M = 50.0  # at 25 m/s, with one or two seconds between the two reports
+FASTEST_M_S = 150.0  # over ground: a report of more is none of a small aircraft
 SILENT_AFTER_S = 5.0  # heartbeats come once a second, and this many may be lost
 
 _GPS_REPORTS = ("GPS_RAW_INT", "GPS2_RAW")
@@ -36,12 +39,14 @@ class Autopilot:
     def __init__(self, own_component: int, system_id: int | None = None) -> None:
         self.identity = Identity(system_id)
         self.acks: Counter[str] = Counter()  # answers to our fixes, by name of the result
+        self.firmware = mavlink.MAV_AUTOPILOT_GENERIC  # until it is heard
         self.vehicle: Vehicle | None = None  # the last report, of any age, without attitude
-        self.attitudes, self._heights = Attitudes(), Heights()
+        self.attitudes, self._heights, self.certainty = Attitudes(), Heights(), Certainty()
         self._answer: str | None = None  # the newest answer, until `take_answer`
         self._own_component = own_component
         self._heard_s = -math.inf
-        self._gps: dict[str, tuple[float, float, float]] = {}  # each receiver with a fix: lat_deg, lon_deg, time
+        # Each receiver with a fix: lat_deg, lon_deg, standard deviation, time.
+        self._gps: dict[str, tuple[float, float, float, float]] = {}
         self._last_result: int | None = None
 
     @property
@@ -84,35 +89,51 @@ class Autopilot:
         if self.identity.kept != before:
             self.vehicle, self._last_result = None, None
             self._gps.clear()
-            self.attitudes, self._heights = Attitudes(), Heights()
+            self.attitudes, self._heights, self.certainty = Attitudes(), Heights(), Certainty()
         if beats:
-            self._heard_s = now_s
+            self._heard_s, self.firmware = now_s, message.autopilot
             return True
         if self._answers_our_fix(message):
             self._hear_result(message.result)
         elif message.get_type() == "GLOBAL_POSITION_INT":
-            height_m = self._heights.now(message.relative_alt / 1e3, now_s)
-            self.vehicle = _vehicle(message, now_s, self._has_gps(message, now_s), height_m)
+            self._hear_position(message, now_s)
         elif message.get_type() == "ATTITUDE":
             self.attitudes.hear(message, now_s)
         elif message.get_type() in _HEIGHT_REPORTS:
             self._heights.hear(message, now_s, self.attitudes.at(now_s))
         elif message.get_type() in _GPS_REPORTS:
             self._hear_gps(message, now_s)
+        elif message.get_type() in FILTER_REPORTS:
+            self.certainty.hear(message, now_s)
         return False
+
+    def _hear_position(self, message: Message, now_s: float) -> None:
+        by_gps_m = self._gps_sd_m(message, now_s)
+        if by_gps_m is not None:
+            self.certainty.note_known(by_gps_m, now_s)
+        self.vehicle = _vehicle(
+            message,
+            t_heard_s=now_s,
+            has_gps=by_gps_m is not None,
+            height_m=self._heights.now(message.relative_alt / 1e3, now_s),
+            position_sd_m=self.certainty.now(now_s),
+        )
 
     def _hear_gps(self, message: Message, now_s: float) -> None:
         if message.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX:
-            self._gps[message.get_type()] = message.lat / 1e7, message.lon / 1e7, now_s
+            self._gps[message.get_type()] = (message.lat / 1e7, message.lon / 1e7, gps_sd_m(message), now_s)
         else:
             self._gps.pop(message.get_type(), None)
 
-    def _has_gps(self, position: Message, now_s: float) -> bool:
+    def _gps_sd_m(self, position: Message, now_s: float) -> float | None:
+        """Return the standard deviation of the best receiver that is near a position; None where none is."""
         here = position.lat / 1e7, position.lon / 1e7
-        return any(
-            now_s - t_s <= GPS_GONE_AFTER_S and float(distance_m(*here, lat_deg, lon_deg)) <= GPS_AGREES_WITHIN_M
-            for lat_deg, lon_deg, t_s in self._gps.values()
+        near = (
+            sd_m
+            for lat_deg, lon_deg, sd_m, t_s in self._gps.values()
+            if now_s - t_s <= GPS_GONE_AFTER_S and float(distance_m(*here, lat_deg, lon_deg)) <= GPS_AGREES_WITHIN_M
         )
+        return min(near, default=None)
 
     def _answers_our_fix(self, message: Message) -> bool:
         return (
@@ -132,18 +153,17 @@ class Autopilot:
             self._last_result = result
 
 
-def _vehicle(message: Message, now_s: float, has_gps: bool, height_m: float) -> Vehicle | None:
-    """Read a GLOBAL_POSITION_INT; return None for 0, 0, which an autopilot without a position sends, and for a position
-    off the Earth."""
+def _vehicle(message: Message, **known: Any) -> Vehicle | None:
+    """Read a GLOBAL_POSITION_INT; `known` is what it does not say. Return None for 0, 0, which an autopilot without a
+    position sends, and for a position off the Earth."""
     if (message.lat == 0 and message.lon == 0) or abs(message.lat) > 90e7 or abs(message.lon) > 180e7:
         return None
-    heading_deg = message.hdg / 100 if message.hdg <= 36_000 else None  # 65535: unknown
+    east_m_s, north_m_s = message.vy / 100, message.vx / 100
     return Vehicle(
         lat_deg=message.lat / 1e7,
         lon_deg=message.lon / 1e7,
         alt_m=message.alt / 1e3,
-        heading_deg=heading_deg,
-        t_heard_s=now_s,
-        has_gps=has_gps,
-        height_m=height_m,
+        heading_deg=message.hdg / 100 if message.hdg <= 36_000 else None,  # 65535: unknown
+        velocity_m_s=(east_m_s, north_m_s) if math.hypot(east_m_s, north_m_s) <= FASTEST_M_S else None,
+        **known,
     )

@@ -17,6 +17,7 @@ import numpy as np
 
 from edgevpr.errors import LinkError, UsageError
 from edgevpr.frames.positions import read_positions
+from edgevpr.geodesy import offset_m
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.messages import AUTOPILOT, POSITION_FIX
 from edgevpr.mavlink.transport import Transport, open_transport
@@ -25,6 +26,7 @@ from edgevpr.mavlink.wire import Message, Receiver, mavlink
 HEARTBEAT_S = 1.0
 POSITION_S = 0.2
 TURN_S = 0.05
+_FASTEST_M_S = 327.0  # that the message can say
 
 log = logging.getLogger(__name__)
 
@@ -242,17 +244,29 @@ def _copter_heartbeat() -> Message:
 def _position(track: Track, t_s: float) -> Message:
     lat_deg, lon_deg, alt_m = (np.interp(t_s, track.t_s, each) for each in (track.lat_deg, track.lon_deg, track.alt_m))
     heading_deg, height_m = _last(track, track.heading_deg, t_s), _last(track, track.height_m, t_s)
+    east_m_s, north_m_s = _velocity_m_s(track, t_s)
     return mavlink.MAVLink_global_position_int_message(
         time_boot_ms=round(t_s * 1000),
         lat=round(lat_deg * 1e7),
         lon=round(lon_deg * 1e7),
         alt=round(alt_m * 1e3),
         relative_alt=0 if math.isnan(height_m) else round(height_m * 1e3),
-        vx=0,
-        vy=0,
+        vx=round(north_m_s * 100),
+        vy=round(east_m_s * 100),
         vz=0,
         hdg=65_535 if math.isnan(heading_deg) else round(heading_deg * 100) % 36_000,
     )
+
+
+def _velocity_m_s(track: Track, t_s: float) -> tuple[float, float]:
+    """Return the velocity (east, north) on the leg that is being flown; outside the track the vehicle stands."""
+    leg = int(np.searchsorted(track.t_s, t_s, side="right"))
+    if not 0 < leg < len(track.t_s):
+        return 0.0, 0.0
+    (lat_deg, to_lat_deg), (lon_deg, to_lon_deg) = track.lat_deg[leg - 1 : leg + 1], track.lon_deg[leg - 1 : leg + 1]
+    takes_s = track.t_s[leg] - track.t_s[leg - 1]
+    velocity = np.array(offset_m(lat_deg, lon_deg, to_lat_deg, to_lon_deg)) / takes_s
+    return tuple(np.clip(velocity, -_FASTEST_M_S, _FASTEST_M_S).tolist())
 
 
 def _attitude(track: Track, t_s: float) -> Message | None:

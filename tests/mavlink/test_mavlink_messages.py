@@ -107,3 +107,13 @@ def test_a_text_is_cut_to_what_one_message_holds(text, arrives):
     heard = sent_and_received(messages.status_text(Severity.WARNING, text))
     assert heard.severity == mavlink.MAV_SEVERITY_WARNING
     assert heard.get_msgbuf()[11:-2].decode() == arrives
+
+
+@pytest.mark.parametrize(
+    ("firmware", "filter_report"),
+    [(mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, [193]), (mavlink.MAV_AUTOPILOT_PX4, [230]), (mavlink.MAV_AUTOPILOT_PPZ, [])],
+)
+def test_a_firmware_is_asked_only_for_the_report_of_its_own_filter(firmware, filter_report):
+    asked = {int(each.param1) for each in messages.report_requests(1, firmware)}
+    assert sorted(asked & {193, 230}) == filter_report
+    assert {24, 30, 33, 132, 136} <= asked

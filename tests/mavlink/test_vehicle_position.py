@@ -33,11 +33,11 @@ def fresh(link, clock):
     return vehicle if vehicle and vehicle.is_fresh_at(clock.now_s) else None
 
 
-def say(link, peer, lat_deg, lon_deg, hdg=9050, **sender):
+def say(link, peer, lat_deg, lon_deg, hdg=9050, vx=0, vy=0, **sender):
     before = link.stats().received.get("GLOBAL_POSITION_INT", 0)
     peer.send(
         mavlink.MAVLink_global_position_int_message(
-            0, round(lat_deg * 1e7), round(lon_deg * 1e7), 312_500, 80_000, 0, 0, 0, hdg
+            0, round(lat_deg * 1e7), round(lon_deg * 1e7), 312_500, 80_000, vx, vy, 0, hdg
         ),
         **sender,
     )
@@ -49,7 +49,7 @@ def test_the_position_of_the_pinned_autopilot_is_known_while_it_is_fresh(link_an
     peer.heartbeat()
     wait_until(lambda: link.stats().autopilot_heard)
     assert fresh(link, clock) is None
-    say(link, peer, 50.1234567, -14.5)
+    say(link, peer, 50.1234567, -14.5, vx=-300, vy=1250)
     expected = Vehicle(
         lat_deg=50.1234567,
         lon_deg=-14.5,
@@ -58,6 +58,7 @@ def test_the_position_of_the_pinned_autopilot_is_known_while_it_is_fresh(link_an
         t_heard_s=clock.now_s,
         has_gps=False,
         height_m=80.0,
+        velocity_m_s=(12.5, -3.0),
     )
     assert wait_until(lambda: fresh(link, clock)) == expected
     clock.now_s += 1.0
@@ -66,6 +67,14 @@ def test_the_position_of_the_pinned_autopilot_is_known_while_it_is_fresh(link_an
     assert fresh(link, clock) is None
     say(link, peer, 50.2, -14.5, hdg=65535)
     assert wait_until(lambda: fresh(link, clock)).heading_deg is None
+
+
+def test_a_velocity_that_no_small_aircraft_has_is_unknown(link_and_peer, clock):
+    link, peer = link_and_peer
+    peer.heartbeat()
+    wait_until(lambda: link.stats().autopilot_heard)
+    say(link, peer, 50.0, 8.0, vx=32_767, vy=32_767)
+    assert wait_until(lambda: fresh(link, clock)).velocity_m_s is None
 
 
 def test_nobody_else_says_where_we_are(link_and_peer, clock):
@@ -137,10 +146,10 @@ def test_a_silent_autopilot_is_asked_where_it_is_until_it_says_so(link_and_peer,
     wait_until(lambda: link.stats().autopilot_heard)
     assert link.stats().sent.get("COMMAND_LONG", 0) == 0, "nobody wants to know"
     link.want_position()
-    asked = [peer.expect("COMMAND_LONG") for _ in range(5)]
+    asked = [peer.expect("COMMAND_LONG") for _ in range(6)]
     assert {command.command for command in asked} == {mavlink.MAV_CMD_SET_MESSAGE_INTERVAL}
     intervals_us = {int(command.param1): command.param2 for command in asked}
-    assert intervals_us == {33: 200_000, 30: 100_000, 24: 500_000, 132: 500_000, 136: 500_000}
+    assert intervals_us == {33: 200_000, 30: 100_000} | dict.fromkeys((24, 132, 136, 193), 500_000)
     assert all(command.target_system == 7 for command in asked)
     say_attitude(link, peer)
     say(link, peer, 50.0, 8.0)
@@ -149,7 +158,7 @@ def test_a_silent_autopilot_is_asked_where_it_is_until_it_says_so(link_and_peer,
         peer.heartbeat()
         say_attitude(link, peer)
         say(link, peer, 50.0, 8.0)
-    assert link.stats().sent["COMMAND_LONG"] == 5
+    assert link.stats().sent["COMMAND_LONG"] == 6
     clock.now_s += 6.0  # it has started anew
     peer.heartbeat()
     assert peer.expect("COMMAND_LONG").param1 in intervals_us
@@ -159,13 +168,13 @@ def test_an_autopilot_that_says_no_attitude_is_asked_for_it_again(link_and_peer,
     link, peer = link_and_peer
     link.want_position()
     peer.heartbeat()
-    for _ in range(5):
+    for _ in range(6):
         peer.expect("COMMAND_LONG")
     for _ in range(2):
         say(link, peer, 50.0, 8.0)
         clock.now_s += 4.0
         peer.heartbeat()
-    wait_until(lambda: link.stats().sent["COMMAND_LONG"] == 10)
+    wait_until(lambda: link.stats().sent["COMMAND_LONG"] == 12)
 
 
 def told(link, peer, message):

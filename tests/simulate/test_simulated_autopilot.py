@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 
+import numpy as np
 import pytest
 from mavlink_peers import AutopilotThread, Peer, UdpPort, free_port, wait_until
 
@@ -17,7 +18,7 @@ from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Fix, Health
 from edgevpr.mavlink.wire import mavlink
-from edgevpr.simulate.autopilot import judge, read_track, run_autopilot
+from edgevpr.simulate.autopilot import Track, _position, judge, read_track, run_autopilot
 
 
 def a_fix(**changes):
@@ -131,6 +132,20 @@ def test_it_flies_along_a_track_from_when_a_companion_is_heard(tmp_path):
     assert len(set(north)) >= 2, "on the way, too"
     assert (seen[-1].lat_deg, seen[-1].lon_deg, seen[-1].alt_m, seen[-1].heading_deg) == (50.002, 8.0, 110.0, 90.0)
     assert seen[0].heading_deg in (0.0, 90.0)
+    east_m_s, north_m_s = seen[-1].velocity_m_s
+    assert (east_m_s, north_m_s) == (0.0, 0.0), "it stays where the track ends"
+
+
+def test_it_says_how_fast_it_flies_along_the_track():
+    track = Track(
+        t_s=np.array([0.0, 10.0, 20.0, 21.0]),
+        lat_deg=np.array([50.0, 50.001, 50.001, 51.0]),
+        lon_deg=np.array([8.0, 8.0, 8.001, 8.0]),
+        alt_m=np.zeros(4),
+        heading_deg=np.full(4, np.nan),
+    )
+    velocities = [(_position(track, t_s).vx, _position(track, t_s).vy) for t_s in (0.0, 5.0, 15.0, 20.5, 30.0)]
+    assert velocities == [(1112, 0), (1112, 0), (0, 715), (32_700, -7147), (0, 0)], "north, then east; cm/s"
 
 
 def test_it_says_how_it_hangs_in_the_air_where_the_track_knows(tmp_path):

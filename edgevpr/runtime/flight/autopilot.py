@@ -9,12 +9,15 @@ from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.outbox import Sending
 from edgevpr.power.load import MachineLoad
 from edgevpr.runtime.flight.clock import Clock
+from edgevpr.runtime.flight.consistency import Consistency
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.types import FixReport, Vehicle
 
 # Where an autopilot listens, a fix leaves within a fraction of a millisecond. The loop waits for that, at most so long,
 # so that the log can tell what became of the fix.
 _SETTLED_WITHIN_S = 0.02
+
+DRY_RUN = "dry run: no fix is sent"
 
 _log = logging.getLogger(__name__)
 
@@ -50,22 +53,27 @@ class NoAutopilot:
 
 class ToAutopilot:
     """Tells an autopilot of events over an open link. With `send_fixes` an accepted match with a position is sent as a
-    fix; `cores` is the number of the board's cores."""
+    fix, unless it contradicts the autopilot's own position; without, all else is as with it. `cores` is the number of
+    the board's cores."""
 
     def __init__(self, link: Link, *, send_fixes: bool, cores: int, clock: Clock) -> None:
         self._link, self._send_fixes, self._cores, self._clock = link, send_fixes, cores, clock
         self._last: tuple[str, Sending] | None = None
+        self._consistency = Consistency()
+        self._held, self._is_holding = 0, False
 
     @property
     def summary(self) -> str:
-        """Counts so far, in a few words: fixes sent, taken, too late, withheld; messages of others refused."""
+        """Counts so far, in a few words: fixes sent, taken, held back, too late, withheld; messages of others
+        refused."""
         stats = self._link.stats()
-        sent = f"{stats.fixes_sent} fixes sent"
-        taken = f"{stats.acks.get('ACCEPTED', 0)} taken"
+        taken = f"{stats.fixes_sent} fixes sent, {stats.acks.get('ACCEPTED', 0)} taken"
+        sent = taken if self._send_fixes else DRY_RUN
+        held = f"{self._held} held back" if self._held else ""
         late = f"{stats.dropped_stale_fixes} too late to be sent" if stats.dropped_stale_fixes else ""
         withheld = f"{stats.withheld_fixes} withheld for want of answers" if stats.withheld_fixes else ""
         foreign = f"{stats.foreign_messages} foreign messages refused" if stats.foreign_messages else ""
-        return ", ".join(filter(None, (sent, taken, late, withheld, foreign)))
+        return ", ".join(filter(None, (sent, held, late, withheld, foreign)))
 
     def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
         """Return the autopilot's last report of its vehicle, with the attitude at the time of a frame; None where it
@@ -105,19 +113,35 @@ class ToAutopilot:
         """Send the fix of an accepted match, if it has one, and report what became of it."""
         if event.position is None:
             return FixReport(_name(event), False, "the place has no position")
-        if not self._send_fixes:
-            return FixReport(_name(event), False, "send_fixes is off")
         here = event.position
         try:
             fix = messages.Fix(here.lat_deg, here.lon_deg, event.accuracy_m, event.frame.t_mono_s)
         except ValueError as error:  # another program wrote an invalid position
             _log.warning("place %d: %s; no fix is sent", event.best.place.place_id, error)
             return FixReport(_name(event), False, str(error))
+        objection = self._consistency.objection(event)
+        self._say_held(objection)
+        if objection or not self._send_fixes:
+            return FixReport(_name(event), False, objection or DRY_RUN)
         sending = self._link.send_fix(fix)
         if self._link.listens():
             sending.wait(_SETTLED_WITHIN_S)
         self._last = _name(event), sending
         return _reported(*self._last)
+
+    def _say_held(self, objection: str | None) -> None:
+        """Count a fix that is held back, and tell the ground where that begins or is over."""
+        is_holding = objection is not None
+        self._held += is_holding
+        if is_holding == self._is_holding:
+            return
+        self._is_holding = is_holding
+        if is_holding:
+            _log.warning("a fix is %s", objection)
+            self.announce(Mood.WARNING, "fix held back, contradicts autopilot")
+        else:
+            _log.warning("fixes are not held back any more")
+            self.announce(Mood.NOTE, "fixes agree again")
 
 
 Autopilot = NoAutopilot | ToAutopilot

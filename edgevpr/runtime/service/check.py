@@ -21,6 +21,7 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import map_path
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import parse_pack
+from edgevpr.runtime.flight.autopilot import DRY_RUN
 from edgevpr.runtime.preflight.choose import too_late
 from edgevpr.runtime.preflight.pick import outlook
 from edgevpr.runtime.recognise.learn import check_positions
@@ -165,7 +166,7 @@ def _link(config: Config) -> str:
         raise LinkError(
             f"{address} is not there ({error.strerror}): connect it or start the other end, or correct the link."
         ) from error
-    return str(address)
+    return str(address) if config.mavlink.send_fixes else f"{address}, {DRY_RUN}"
 
 
 def _log(config: Config) -> str:

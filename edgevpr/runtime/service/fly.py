@@ -16,7 +16,7 @@ from edgevpr.frames.source import open_source
 from edgevpr.mavlink.address import LinkAddress, parse_link
 from edgevpr.mavlink.link import Link
 from edgevpr.power.boards import Board, load_board
-from edgevpr.runtime.flight.autopilot import NoAutopilot, ToAutopilot
+from edgevpr.runtime.flight.autopilot import DRY_RUN, Mood, NoAutopilot, ToAutopilot
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.flight import fly as fly_with
 from edgevpr.runtime.flight.flight import rate_hz
@@ -56,7 +56,7 @@ def fly(config: Config, positions: Path | None = None) -> int:
         recogniser.candidates = found.candidates
         _say_start(config, recogniser, flight_log, found)
         link = stack.enter_context(_link(address, config.mavlink)) if address else None
-        if link and (learner or config.match.reach_m_s or recogniser.technique.spec.heading_within_deg is not None):
+        if link:
             link.want_position()
         step_s = 1 / rate_hz(config, recogniser)
         source = open_source(config.source.uri, step_s=step_s, positions=positions, live=True)
@@ -67,6 +67,8 @@ def fly(config: Config, positions: Path | None = None) -> int:
         if link:
             send_fixes = config.mavlink.send_fixes
             autopilot = ToAutopilot(link, send_fixes=send_fixes, cores=board.cores, clock=Clock())
+            if not send_fixes:
+                autopilot.announce(Mood.WARNING, DRY_RUN)
         if cannot_learn:
             say_learning_stopped(cannot_learn, flight_log, autopilot)
         stop = Stop()
@@ -152,6 +154,8 @@ def _say_start(config: Config, recogniser: Recogniser, flight_log: FlightLog, fo
     board = recogniser.meter.board
     _log.info("version %s on %s", __version__, board.title)
     _log.info("%s", found.reason)
+    if not config.mavlink.send_fixes:
+        _log.warning("%s", DRY_RUN)
     if config.mavlink.link and config.mavlink.send_fixes and (found.t_query_s or 0.0) > FIX_MAX_AGE_S:
         _log.warning("no fix will be sent: %s", too_late(found.t_query_s))
     if not board.verified:
@@ -166,6 +170,7 @@ def _say_start(config: Config, recogniser: Recogniser, flight_log: FlightLog, fo
         "idle_w": board.idle_w,
         "full_w": board.full_w,
         "power_verified": board.verified,
+        "dry_run": not config.mavlink.send_fixes,
     }
     flight_log.write("start", **start_fields(config, board.name, recogniser.technique.spec), decided=decided)
 

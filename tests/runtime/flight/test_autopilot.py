@@ -13,6 +13,7 @@ from pictures import textured
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.link import Link
 from edgevpr.runtime.flight import autopilot, vitals
+from edgevpr.runtime.flight.autopilot import DRY_RUN
 
 
 def flight(folder, tmp_path, link, clock, technique="cohog", **settings):
@@ -97,7 +98,7 @@ def test_a_match_that_takes_longer_than_a_fix_may_be_old_says_so_in_its_line_and
 
 @pytest.mark.parametrize(
     ("settings", "why"),
-    [({"mavlink.send_fixes": False}, "send_fixes is off"), ({}, "the place has no position")],
+    [({"mavlink.send_fixes": False}, DRY_RUN), ({}, "the place has no position")],
 )
 def test_why_a_fix_is_withheld_is_said(recording, tmp_path, settings, why):
     clock = FakeClock()

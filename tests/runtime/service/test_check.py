@@ -79,6 +79,14 @@ def test_a_query_that_is_too_slow_for_any_fix_is_wrong_unless_no_fixes_are_wante
     assert wrong(config_file, settings | {"board": "this"} | without_fixes) == []
 
 
+def test_a_dry_run_is_said(settings, config_file):
+    settings["mavlink"]["send_fixes"] = False
+    config_file.write_text(yaml.safe_dump(settings))
+    (link,) = [finding for finding in check(config_file) if finding.what == "link"]
+    assert link.ok
+    assert link.message.endswith(", dry run: no fix is sent")
+
+
 def test_all_is_well_and_nothing_is_left_behind(settings, config_file, tmp_path, flight_folder):
     assert wrong(config_file, settings) == []
     assert list(tmp_path.iterdir()) == [config_file]

@@ -91,16 +91,31 @@ def test_the_flight_controller_receives_what_the_log_says(fly, tmp_path):
     assert totals["marginal_mah"] * slack > sum(line["costs"]["marginal_mah"] for line in queries) > 0
 
 
-def test_fixes_are_withheld_when_told_so_and_events_still_go_out(fly, tmp_path):
+def test_a_dry_run_tells_everything_and_sends_no_fix(fly, tmp_path):
+    with autopilot() as (link, asked):
+        said = fly("--link", link, "--rate-hz", "20", "--dry-run").communicate(timeout=120)[1]
+        seen = asked()
+    assert "COMMAND_INT" not in seen["messages"]
+    for name in ("HEARTBEAT", "NAMED_VALUE_INT", "NAMED_VALUE_FLOAT", "ONBOARD_COMPUTER_STATUS"):
+        assert seen["messages"][name] > 0
+    lines = list(read_log(tmp_path / "flight.jsonl"))
+    queries, start_line = of_kind(lines, "query"), lines[0]
+    assert all(line["accepted"] for line in queries)
+    assert {(line["fix"]["sent"], line["fix"]["why"]) for line in queries} == {(False, "dry run: no fix is sent")}
+    assert start_line["decided"]["dry_run"]
+    assert not start_line["config"]["mavlink"]["send_fixes"]
+    assert lines[-1]["mavlink"]["sent"]["STATUSTEXT"] == 1
+    assert said.count("dry run: no fix is sent") == 2, "at the start, and with the counts at the end"
+
+
+def test_a_dry_run_can_stand_in_the_configuration(fly, tmp_path):
     config = tmp_path / "c.yaml"
     config.write_text("mavlink: {send_fixes: false}\n")
     with autopilot() as (link, asked):
         fly("--link", link, "--rate-hz", "20", "--config", str(config)).communicate(timeout=120)
-        seen = asked()
-    assert "COMMAND_INT" not in seen["messages"]
-    assert seen["messages"]["NAMED_VALUE_INT"] > 0
+        assert "COMMAND_INT" not in asked()["messages"]
     queries = of_kind(read_log(tmp_path / "flight.jsonl"), "query")
-    assert {line["fix"]["why"] for line in queries} == {"send_fixes is off"}
+    assert {line["fix"]["why"] for line in queries} == {"dry run: no fix is sent"}
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
