@@ -96,6 +96,9 @@ class MatchConfig:
     )
     candidates: int | None = bounded(1, 1_000_000, Flag(("--candidates",), "N", "places compared (the technique's)"))
     sequence: int | None = bounded(1, 100, Flag(("--sequence",), "N", "queries matched together (the technique's)"))
+    accept_precision: float = bounded(
+        0.5, 0.999999, Flag(("--accept-precision",), "P", "share of the accepted matches that is to be right (0.999)")
+    )
     min_score: float | None = bounded(0, 1, Flag(("--min-score",), "S", "accept from this score on"))
     min_margin: float | None = bounded(
         0, 1, Flag(("--min-margin",), "M", "accept when this far ahead of a place elsewhere")

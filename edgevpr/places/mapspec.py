@@ -131,19 +131,19 @@ def require_layer(path: Path, db: sqlite3.Connection, found: Stored) -> None:
         )
 
 
-def write_mask(db: sqlite3.Connection, sha256: str | None) -> None:
-    """Record which overlay mask (None: none) the places of a map are made with. Raises sqlite3.Error."""
-    db.execute("INSERT OR REPLACE INTO edgevpr_map (key, value) VALUES ('mask_sha256', ?)", (json.dumps(sha256),))
+def write_text(db: sqlite3.Connection, key: str, text: str | None) -> None:
+    """Record something beside the places, such as which overlay mask they are made with. Raises sqlite3.Error."""
+    db.execute("INSERT OR REPLACE INTO edgevpr_map (key, value) VALUES (?, ?)", (key, json.dumps(text)))
 
 
-def read_mask(db: sqlite3.Connection) -> str | None:
-    """Read which overlay mask the places of a map were made with; None for none, or a map that does not say."""
-    row = db.execute("SELECT value FROM edgevpr_map WHERE key = 'mask_sha256'").fetchone()
+def read_text(db: sqlite3.Connection, key: str) -> str | None:
+    """Read what was recorded; None for nothing, or a map that does not say."""
+    row = db.execute("SELECT value FROM edgevpr_map WHERE key = ?", (key,)).fetchone()
     try:
-        sha256 = json.loads(row[0]) if row else None
+        text = json.loads(row[0]) if row else None
     except (ValueError, TypeError):
         return None
-    return sha256 if isinstance(sha256, str) else None
+    return text if isinstance(text, str) else None
 
 
 def differences(theirs: TechniqueSpec, ours: TechniqueSpec) -> list[str]:

@@ -83,9 +83,9 @@ def share(asking: np.ndarray, best: np.ndarray, sides: tuple[int, int], counts: 
 def support(
     asking: np.ndarray, regions: np.ndarray, reference: np.ndarray, best: np.ndarray, shift_cells: tuple[float, float]
 ) -> Support:
-    """Ask all regions about a step that a vote has found. `asking` int (G,) are the numbers of the good `regions` of the
-    query, float32 (G, P), on the grid of the place, whose regions are `reference`, float32 (side * side, P). `best` int
-    (G,) is the most similar region of the place for each."""
+    """Ask all regions about a step that a vote has found. `asking` int (G,) are the numbers of the good `regions` of
+    the query, float32 (G, P), on the grid of the place, whose regions are `reference`, float32 (side * side, P). `best`
+    int (G,) is the most similar region of the place for each."""
     side = math.isqrt(len(reference))
     back = (reference @ regions.T).argmax(axis=1)
     of_y, of_x = np.divmod(asking, side)

@@ -1,16 +1,19 @@
 """The one judge: decides when a match is accepted as the place. A match that is not accepted carries no position."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
+from edgevpr.confidence.model import Evidence, Model, prior
 from edgevpr.config import MatchConfig
 from edgevpr.contract import FineMatch, Technique
-from edgevpr.landmarks.agreement import PROVEN, Agreement
+from edgevpr.landmarks.agreement import Agreement
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.retrieve import Ranking, elsewhere, margin
 from edgevpr.places.sequence import Search, SequenceSearch
+from edgevpr.runtime.recognise.evidence import kind_of, kinds_of, said
 from edgevpr.runtime.recognise.locate import Located
 
 NEW_FOR_S = 30.0  # seconds; a place learnt so recently only repeats what the autopilot has just said
@@ -20,10 +23,6 @@ NEW_FOR_S = 30.0  # seconds; a place learnt so recently only repeats what the au
 # fast, or the other way. At half the speed cohog accepted places three away from the right one.
 _OF_MARGIN_AT_OTHER_SPEEDS = 0.5
 _LONGEST = 10
-
-# Least share of a place's regions that agree, each counted once. Of 961 regions, 48 or more did in every right match of
-# all sets, and 30 at most in the best matches of pictures that are of no place of the map.
-_MIN_COVERAGE = 0.04
 
 # Looking down, a place elsewhere that agrees without any step or rotation, as the best one does, shares with it what is
 # drawn over every frame. Such places scored .14 or more behind a display, and .05 or less in all sets without one.
@@ -37,17 +36,39 @@ _AT_REST_HEIGHT = 0.2
 _CLEAR_SCORE, _LEAST_INLIERS, _LANDMARKS_ENOUGH = 0.2, 5, 100
 # Landmarks that agree make up for a score that is too low, down to so much of it.
 _OF_SCORE_WHEN_PROVEN = 0.5
+# Of a place less far ahead than by this factor, landmarks must tell it from the best one elsewhere.
+_HARDLY_AHEAD = math.log(1.5)
+
+
+@dataclass(frozen=True, slots=True)
+class Sureness:
+    """Decision by confidence: a match is accepted whose confidence, by the model of its kind of evidence, is at least
+    that from which on `precision` of the matches are right."""
+
+    models: Mapping[str, Model]
+    precision: float
+
+    def confidence(self, evidence: Evidence) -> float:
+        """Return the probability that the match with this evidence is right."""
+        return self.models[kind_of(evidence)].confidence(evidence)
+
+    def threshold(self, evidence: Evidence) -> float:
+        """Return the confidence that is needed."""
+        return self.models[kind_of(evidence)].threshold(self.precision)
 
 
 @dataclass(frozen=True, slots=True)
 class AcceptRule:
     """Least score, and least lead over the best place farther away than `neighbour_m` metres, of an accepted match; and
-    least quality of its picture."""
+    least quality of its picture. With `sure` the confidence decides, and both limits come on top where they are set. A
+    match whose score is below `worth_a_look` is never accepted, and its landmarks are not asked."""
 
     min_score: float
     min_margin: float
     neighbour_m: float
     min_quality: float = 0.0
+    sure: Sureness | None = None
+    worth_a_look: float = 0.0
 
 
 ACCEPT_NOTHING = AcceptRule(min_score=1.0, min_margin=1.0, neighbour_m=0.0)
@@ -55,29 +76,34 @@ ACCEPT_NOTHING = AcceptRule(min_score=1.0, min_margin=1.0, neighbour_m=0.0)
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Decision on the best place: accepted as the place or not, and the reason in a few words for the log. `is_open`:
-    it was refused for what landmarks may make up for."""
+    """Decision on the best place: accepted as the place or not, and the reason in a few words for the log."""
 
     accepted: bool
     reason: str
-    is_open: bool = False
 
 
-def accept_rule(technique: Technique, config: MatchConfig, length: int = 1) -> AcceptRule:
-    """Return the configuration's limits, and the technique's own where the configuration leaves them open.
+def accept_rule(
+    technique: Technique, config: MatchConfig, length: int = 1, calibrated: Mapping[str, Model] | None = None
+) -> AcceptRule:
+    """Return the rule of a technique: by confidence where there is a model of its evidence, else by its own limits,
+    where the configuration leaves them open. `calibrated` are the models that a map brings.
 
     A technique's margin is that of one query. The mean score of `length` queries varies less, so the margin of a
     sequence is divided by the root of its length. Lengths above ten count as ten: queries that show the same ground are
-    not independent.
+    not independent. A sequence is judged by limits.
     """
-    own_margin = technique.min_margin
+    kinds = kinds_of(technique.spec) if length == 1 else ()
+    own_score, own_margin = (0.0, 0.0) if kinds else (technique.min_score, technique.min_margin)
     if own_margin < 1:  # a margin of 1 or more accepts nothing, not in sequences either
         own_margin /= math.sqrt(min(length, _LONGEST))
+    models = {kind: (calibrated or {}).get(kind) or prior(kind) for kind in kinds}
     return AcceptRule(
-        technique.min_score if config.min_score is None else config.min_score,
+        own_score if config.min_score is None else config.min_score,
         own_margin if config.min_margin is None else config.min_margin,
         config.neighbour_m,
         technique.min_quality,
+        Sureness(models, config.accept_precision) if kinds else None,
+        _OF_SCORE_WHEN_PROVEN * technique.min_score,
     )
 
 
@@ -90,6 +116,7 @@ def judge(
     proof: Agreement | None = None,
     rival: int = 0,
     where: Located | None = None,
+    evidence: Evidence | None = None,
 ) -> Verdict:
     """Decide whether the best place of a ranking is accepted.
 
@@ -97,28 +124,26 @@ def judge(
     `NEW_FOR_S` seconds. `proof` is how the landmarks of query and place agree (None: nothing is known of it), and
     `rival` the number of those of the best place elsewhere that agree. `where` is the position that the best places say
     together (None: only that of the best one is known); a place that says the same as the best one is no rival.
+    `evidence` is that of the match (None: the rule has no use for it).
     """
-    proven = proof is not None and _proves(proof, rival)
-    may_be_proven = proof is None and search.length == 1 and rule.min_margin < 1
     if search.frames < search.length:
         return Verdict(False, f"the sequence has {search.frames} queries of {search.length} yet")
     score = float(ranking.scores[0])
-    least = rule.min_score * (_OF_SCORE_WHEN_PROVEN if proven else 1)
-    if not score >= least:  # `not >=` refuses NaN as well
-        is_open = may_be_proven and score >= rule.min_score * _OF_SCORE_WHEN_PROVEN
-        return Verdict(False, f"score {score:.3f} is below {least:.3f}", is_open)
+    ahead = margin(ranking, index, rule.neighbour_m, where.places if where else ())
+    if objection := _below_limits(score, ahead, rule):
+        return Verdict(False, objection)
     if isinstance(search, SequenceSearch) and (objection := _lost_track(ranking, index, rule, search)):
         return Verdict(False, objection)
     if len(ranking.unread):
         return Verdict(False, "a place that cannot be read may be the right one")
-    ahead = margin(ranking, index, rule.neighbour_m, where.places if where else ())
-    if ahead is None and rule.min_score == 0:
-        return Verdict(False, "there is no place elsewhere to compare with, and this score alone says nothing")
-    if not proven and ahead is not None and not ahead >= rule.min_margin:
-        reason = f"only {ahead:.3f} ahead of a place elsewhere, {rule.min_margin:.3f} needed"
-        return Verdict(False, reason, may_be_proven)
-    if not proven and search.length == 1 and (objection := _covers_little(ranking)):
-        return Verdict(False, objection, may_be_proven)
+    if rule.sure:
+        verdict = _by_confidence(rule.sure, evidence, proof, rival)
+    elif ahead is None:
+        verdict = Verdict(True, f"score {score:.3f}; there is no place elsewhere to compare with")
+    else:
+        verdict = Verdict(True, f"score {score:.3f}, {ahead:.3f} ahead of any place elsewhere")
+    if not verdict.accepted:
+        return verdict
     if search.length == 1 and (objection := _is_display(ranking, index, rule)):
         return Verdict(False, objection)
     if proof is not None and (objection := _disproves(proof, score)):
@@ -127,16 +152,38 @@ def judge(
         return Verdict(False, where.objection)
     if is_new:  # a fix would only repeat the autopilot's position, and make its errors look confirmed
         return Verdict(False, f"this place was learnt within the last {NEW_FOR_S:g} s and says nothing new")
-    landmarks = f"; {proof.inliers} landmarks agree" if proof else ""
-    if ahead is None:
-        return Verdict(True, f"score {score:.3f}; there is no place elsewhere to compare with{landmarks}")
-    return Verdict(True, f"score {score:.3f}, {ahead:.3f} ahead of any place elsewhere{landmarks}")
+    return verdict
 
 
-def _proves(proof: Agreement, rival: int) -> bool:
-    """Tell whether landmarks alone show that it is the place. Those that have not moved may be a display, and where a
-    place elsewhere has half as many that agree, the ground repeats itself."""
-    return proof.is_expected and not proof.is_at_rest and proof.inliers >= max(PROVEN, 2 * rival)
+def _below_limits(score: float, ahead: float | None, rule: AcceptRule) -> str | None:
+    """Return the reason why a score, `ahead` of any place elsewhere by so much, is below the limits of a rule, None
+    where it is not."""
+    least = max(rule.min_score, rule.worth_a_look if rule.sure else 0.0)
+    if not score >= least:  # `not >=` refuses NaN as well
+        return f"score {score:.3f} is below {least:.3f}"
+    if ahead is None and rule.min_score == 0 and rule.sure is None:
+        return "there is no place elsewhere to compare with, and this score alone says nothing"
+    if ahead is not None and not ahead >= rule.min_margin:
+        return f"only {ahead:.3f} ahead of a place elsewhere, {rule.min_margin:.3f} needed"
+    return None
+
+
+def _by_confidence(sure: Sureness, evidence: Evidence | None, proof: Agreement | None, rival: int) -> Verdict:
+    """Decide by the confidence of a match; say it in words and figures."""
+    if evidence is None:
+        return Verdict(False, "nothing is known that could make it sure")
+    confidence, needed = sure.confidence(evidence), sure.threshold(evidence)
+    figures = f"confidence {confidence:.4f}, {needed:.4f} needed: {said(evidence)}"
+    if not confidence >= needed:
+        return Verdict(False, figures)
+    if proof is not None and is_hardly_ahead(evidence) and proof.inliers < 2 * rival:
+        return Verdict(False, f"{rival} landmarks of a place elsewhere agree as well; {figures}")
+    return Verdict(True, figures)
+
+
+def is_hardly_ahead(evidence: Evidence | None) -> bool:
+    """Tell whether a place elsewhere agrees nearly as well, so that its landmarks must be asked too."""
+    return evidence is not None and evidence["lead"] < _HARDLY_AHEAD
 
 
 def _disproves(proof: Agreement, score: float) -> str | None:
@@ -146,15 +193,6 @@ def _disproves(proof: Agreement, score: float) -> str | None:
     if score >= _CLEAR_SCORE and proof.inliers < _LEAST_INLIERS and proof.possible >= _LANDMARKS_ENOUGH:
         return f"its landmarks do not agree: {proof.inliers} do, and {_LEAST_INLIERS} are needed where so much does"
     return None
-
-
-def _covers_little(ranking: Ranking) -> str | None:
-    """Return the reason why too little of the best place agrees, None where enough does. It is not asked in a sequence,
-    where the newest query need not be sure by itself."""
-    match = ranking.compared.get(int(ranking.slots[0]))
-    if match is None or match.coverage is None or match.coverage >= _MIN_COVERAGE:
-        return None
-    return f"only {match.coverage:.1%} of the place agrees, {_MIN_COVERAGE:.0%} needed"
 
 
 def _is_display(ranking: Ranking, index: PlaceIndex, rule: AcceptRule) -> str | None:

@@ -1,11 +1,13 @@
 """Opening: makes a recogniser of a map, the technique that it was made with, and its index in RAM."""
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
 from edgevpr import techniques
+from edgevpr.confidence.model import Model
+from edgevpr.confidence.stored import from_text
 from edgevpr.config import Config, SalienceConfig
 from edgevpr.contract import Technique
 from edgevpr.errors import ConfigError, MapError, UsageError
@@ -97,7 +99,8 @@ def take_form(recogniser: Recogniser, config: Config, form: str) -> None:
     technique = technique_of(place_map, config.technique, _wanted(config) | {"form": form}, board)
     length = length_of(technique.spec, config.match.sequence)
     index = _loaded(config, board, technique, place_map)
-    recogniser.take(technique, index, accept_rule(technique, config.match, length), search_of(length))
+    rule = accept_rule(technique, config.match, length, calibrated(place_map))
+    recogniser.take(technique, index, rule, search_of(length))
 
 
 def budget_mb(config: Config, board: Board) -> float:
@@ -197,7 +200,7 @@ def _recogniser(
         technique=technique,
         place_map=place_map,
         index=index,
-        rule=accept_rule(technique, config.match, length),
+        rule=accept_rule(technique, config.match, length, calibrated(place_map)),
         meter=meter_of(config, board),
         candidates=config.match.candidates or technique.candidates,
         search=search_of(length),
@@ -209,6 +212,20 @@ def _recogniser(
         levelling=levelling_of(config.source, technique, footprint_m=place_map.footprint_m()),
         verify=config.match.verify,
     )
+
+
+def calibrated(place_map: PlaceMap) -> Mapping[str, Model]:
+    """Return the models of confidence that a map brings; none, with a warning, where they make no sense."""
+    text = place_map.calibration
+    try:
+        return from_text(text).models if text else {}
+    except ValueError as error:
+        _log.warning(
+            "%s: its calibration cannot be used (%s): the shipped one is used; `edgevpr map calibrate` makes it anew",
+            place_map.path,
+            error,
+        )
+        return {}
 
 
 def say_other_mask(place_map: PlaceMap, mask: AnyMask) -> None:

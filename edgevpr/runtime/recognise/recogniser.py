@@ -5,21 +5,23 @@ No link, flight log, thread or clock is inside: what is handed in with a frame d
 
 import logging
 from collections import deque
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from itertools import islice
 
 from edgevpr.contract import Descriptor, Technique
 from edgevpr.errors import EdgevprError, MapError, PlaceError
 from edgevpr.frames.mask import AnyMask, NoMask, encoded
-from edgevpr.landmarks.agreement import PROVEN, Agreement
+from edgevpr.landmarks.agreement import Agreement
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Expected, Ranking, compare, named, scan, together
 from edgevpr.places.sequence import Alone, Search
 from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.recognise.evidence import evidence_ahead, evidence_down
 from edgevpr.runtime.recognise.gate import says_nothing
 from edgevpr.runtime.recognise.hints import NoPrior, Prior, expected_of, other_heights
-from edgevpr.runtime.recognise.judge import NEW_FOR_S, AcceptRule, Verdict, judge
+from edgevpr.runtime.recognise.judge import NEW_FOR_S, AcceptRule, Verdict, is_hardly_ahead, judge
 from edgevpr.runtime.recognise.levelling import AnyLevelling, NoLevelling, seen_as
 from edgevpr.runtime.recognise.locate import HEARD, Located, at_place, located
 from edgevpr.runtime.recognise.recognition import Recognition
@@ -29,6 +31,20 @@ from edgevpr.types import Candidate, Frame, Vehicle
 
 _log = logging.getLogger(__name__)
 _OF_CANDIDATES = 0.4  # are compared from each height but the first
+
+
+@dataclass(frozen=True, slots=True)
+class _Judged:
+    """The best place of a query, the verdict on it, and what led to it."""
+
+    best: Candidate | None
+    verdict: Verdict | None
+    proof: Agreement | None = None
+    where: Located | None = None
+    evidence: dict[str, float] | None = None
+
+
+_NOT_JUDGED = _Judged(None, None)
 
 
 class Recogniser:
@@ -91,7 +107,7 @@ class Recogniser:
         Never raises an Exception: an error of a frame, a place or the technique becomes a refusal with its reason.
         """
         meter, technique, index = self.meter, self.technique, self.index
-        worth = descriptor = hints = ranking = best = where = nothing = objection = proof = picture = None
+        worth = descriptor = hints = ranking = judged = nothing = objection = picture = None
         map_lost = False
         meter.begin()
         try:
@@ -115,23 +131,25 @@ class Recogniser:
                 expected = replace(expected_of(hints, index), height_ratio=self._prior.height_ratio)
                 ranking = self.search.follow(self._look(descriptor, expected), index, frame.t_mono_s)
                 looked = Verification(technique.spec, picture, index, self.place_map)
-                best, verdict, proof, where = self._judged(frame, ranking, looked)
-                if not verdict.accepted and self.search.length == 1 and self._prior.looks_again:
+                judged = self._judged(frame, ranking, looked)
+                if not judged.verdict.accepted and self.search.length == 1 and self._prior.looks_again:
                     others = other_heights(technique.spec.height_ratios, self._prior.height_ratio)
                     for ratio in others:
                         # What spoke against the first look counts in the others as well.
                         look = self._look(descriptor, replace(expected, height_ratio=ratio), _OF_CANDIDATES)
                         ranking = together(ranking, look)
                     if others:
-                        best, verdict, proof, where = self._judged(frame, ranking, looked)
-                verdict = Verdict(False, objection) if objection else verdict
-                self._prior.learn(best, verdict.accepted, frame.t_mono_s)
+                        judged = self._judged(frame, ranking, looked)
+                verdict = Verdict(False, objection) if objection else judged.verdict
+                self._prior.learn(judged.best, verdict.accepted, frame.t_mono_s)
             failed = False
         except Exception as error:
             _log.debug("%s failed", frame.name, exc_info=True)
             verdict, failed = Verdict(False, _sentence(error)), True
             map_lost = isinstance(error, MapError) and not isinstance(error, PlaceError)
-        where = where if verdict.accepted else None
+        judged = judged or _NOT_JUDGED
+        where = judged.where if verdict.accepted else None
+        sure, evidence = self.rule.sure, judged.evidence
         return Recognition(
             frame=frame,
             vehicle=vehicle,
@@ -140,8 +158,10 @@ class Recogniser:
             descriptor=descriptor,
             hints=hints,
             ranking=ranking,
-            best=best,
-            proof=proof,
+            best=judged.best,
+            proof=judged.proof,
+            evidence=evidence,
+            confidence=sure.confidence(evidence) if sure and evidence else None,
             accepted=verdict.accepted,
             reason=verdict.reason,
             says_nothing=nothing is not None,
@@ -173,19 +193,16 @@ class Recogniser:
                 expected=expected,
             )
 
-    def _judged(
-        self, frame: Frame, ranking: Ranking, looked: Verification
-    ) -> tuple[Candidate, Verdict, Agreement | None, Located | None]:
-        """Judge the best place of a ranking. One that is accepted, or may be, is held against its landmarks, and with
-        the places beside it says where the aircraft is; then it is judged anew."""
-        index, place_map, cells = self.index, self.place_map, self.technique.spec.cells
+    def _judged(self, frame: Frame, ranking: Ranking, looked: Verification) -> _Judged:
+        """Judge the best place of a ranking, with its landmarks and what the places beside it say."""
+        index, place_map, cells, rule = self.index, self.place_map, self.technique.spec.cells, self.rule
         with self.meter.step("compare"):
             (best,) = named(ranking, index, place_map, first=1)
             is_new = self._is_new(best.place.place_id, frame.t_mono_s)
-            verdict = judge(ranking, index, self.rule, self.search, is_new)
-        if not (verdict.accepted or verdict.is_open):
-            return best, verdict, None, None
-        proof, rival = None, 0
+        where = proof = None
+        if best.match.score < rule.worth_a_look:
+            evidence = self._evidence(ranking, None, ())
+            return _Judged(best, judge(ranking, index, rule, self.search, is_new, evidence=evidence), evidence=evidence)
         # The newest query of a sequence need not be sure by itself.
         if verifies := self._verifies and self.search.length == 1 and cells is not None:
             with self.meter.step("verify"):
@@ -195,10 +212,20 @@ class Recogniser:
             where = located(found, cells, looked.picture.view, proof)
             if where is None and best.place.position:
                 where = at_place(best.place.position, self.accuracy_m)
-        if verifies and proof and verdict.is_open and proof.inliers >= PROVEN:
+        same = where.places if where else ()
+        evidence, rival = self._evidence(ranking, proof, same), 0
+        if verifies and proof and is_hardly_ahead(evidence):
             with self.meter.step("verify"):
-                rival = looked.rival(ranking, self.rule.neighbour_m, where.places if where else ())
-        return best, judge(ranking, index, self.rule, self.search, is_new, proof, rival, where), proof, where
+                rival = looked.rival(ranking, rule.neighbour_m, same)
+        verdict = judge(ranking, index, rule, self.search, is_new, proof, rival, where, evidence)
+        return _Judged(best, verdict, proof, where, evidence)
+
+    def _evidence(self, ranking: Ranking, proof: Agreement | None, same: Sequence[int]) -> dict[str, float] | None:
+        if self.rule.sure is None:
+            return None
+        if self.technique.spec.cells is None:
+            return evidence_ahead(ranking, self.index, self.rule.neighbour_m)
+        return evidence_down(ranking, self.index, self.rule.neighbour_m, proof, same)
 
     def landmarks(self, event: Recognition) -> bytes | None:
         """Return what a map keeps of the landmarks of a frame that becomes a place, None for a technique that does not

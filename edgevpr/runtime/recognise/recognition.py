@@ -23,11 +23,12 @@ class Recognition:
     is the picture that was encoded, and how it lies on the ground, `worth` what the gate says of the frame (None: no
     gate looks), `descriptor` the encoded frame, `hints` what narrowed the search, `ranking` the places found and `best`
     the first of them; each is None where its step was not reached. `proof` is how the landmarks of frame and place
-    agree (None: they were not held against each other). `accepted` tells whether `best` is taken for the place, and
-    `reason` why (not), in a few words. `located` is where the aircraft is by that, and `accuracy_m` the 1-sigma to send
-    with it; both are set for an accepted match of a place with a position only: any other carries no position.
-    `says_nothing` tells whether the picture holds too little to be recognised; a place was then searched for only to go
-    on with a sequence.
+    agree (None: they were not held against each other), `evidence` what the match offers (see `evidence`), and
+    `confidence` the probability that it is right by that (None: the technique is judged by limits). `accepted` tells
+    whether `best` is taken for the place, and `reason` why (not), in a few words. `located` is where the aircraft is by
+    that, and `accuracy_m` the 1-sigma to send with it; both are set for an accepted match of a place with a position
+    only: any other carries no position. `says_nothing` tells whether the picture holds too little to be recognised; a
+    place was then searched for only to go on with a sequence.
 
     `failed` tells whether the frame, a place or the technique could not be used, and `map_lost` whether that is because
     the map as a whole cannot be read. `left_out` are the places that have been left out since the last event because
@@ -46,6 +47,8 @@ class Recognition:
     ranking: Ranking | None = None
     best: Candidate | None = None
     proof: Agreement | None = None
+    evidence: dict[str, float] | None = None
+    confidence: float | None = None
     accepted: bool = False
     reason: str
     says_nothing: bool = False
@@ -81,7 +84,8 @@ def fields_of(event: Recognition) -> dict[str, Any]:
     The fields are: query, place (id), reference_image, score, position (of the place), the match's step, its covariance
     and the rotation (all null where no place was found), accepted, reason, accuracy_m, located (where the aircraft is;
     null where nothing was accepted), costs; where a gate looks, salience; where landmarks were held against each other,
-    landmarks; and, where anything is known of how the picture lies on the ground, view.
+    landmarks; where the technique has one, the confidence and the evidence that it is made from; and, where anything is
+    known of how the picture lies on the ground, view.
     """
     return {
         "query": event.frame.name,
@@ -89,6 +93,8 @@ def fields_of(event: Recognition) -> dict[str, Any]:
         **({"view": event.view.fields()} if event.view != UNKNOWN_VIEW else {}),
         **({"salience": event.worth.salience.rounded()} if event.worth else {}),
         **({"landmarks": _landmarks(event.proof)} if event.proof else {}),
+        **({"confidence": round(event.confidence, 6)} if event.confidence is not None else {}),
+        **({"evidence": {key: round(each, 3) for key, each in event.evidence.items()}} if event.evidence else {}),
         "accepted": event.accepted,
         "reason": event.reason,
         "accuracy_m": event.accuracy_m,

@@ -1,0 +1,150 @@
+"""Evidence of every query of every set in the map of every set: what `confidence.py` fits and judges.
+
+python benchmarks/confidence_rows.py WORK [SET ...] writes WORK/SET.pkl for each map, unless it is there already.
+"""
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
+
+import pickle
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from hostile_pictures import DATA, camera_of
+
+from edgevpr.calibrate.calibrate import ASKED, ask
+from edgevpr.config import load_config
+from edgevpr.evaluate.dataset import load_dataset
+from edgevpr.evaluate.evaluate import mapped
+from edgevpr.frames.images import list_images, read_image
+from edgevpr.frames.source import open_source
+from edgevpr.places.retrieve import elsewhere
+from edgevpr.power.boards import load_board
+from edgevpr.runtime.recognise.judge import accept_rule
+from edgevpr.runtime.recognise.opening import meter_of
+from edgevpr.runtime.recognise.recogniser import Recogniser
+from edgevpr.techniques import create
+from edgevpr.types import Frame
+
+CONFIG = load_config(None)
+# Sets of the same ground are one site.
+SITES = {"grief_stromovka_monthly": "stromovka", "grief_stromovka_seasons": "stromovka"}
+LIKE = {"train_ie_tower": (12, "images")}  # no truth: every twelfth picture, as a foreign query only
+THINNED = {"nordland_tiny": 5}  # of 994 foreign queries every fifth
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Row:
+    """A query in a map. `kind` is own, foreign, changed (a changed picture of the map itself) or left out (the same
+    without its place). `near`: wrong, and the neighbour of a right place. `veto`: why no confidence would be enough."""
+
+    map: str
+    set: str
+    query: str
+    kind: str
+    right: bool
+    near: bool
+    found: str
+    score: float
+    evidence: dict[str, float]
+    veto: str | None = None
+
+
+def site_of(name: str) -> str:
+    return SITES.get(name, name)
+
+
+def asked_of(name: str, is_own: bool) -> list[Path]:
+    step, folder = LIKE.get(name, (1, "query"))
+    return list_images(DATA / name / folder)[:: step if is_own else step * THINNED.get(name, 1)]
+
+
+def rows_of(name: str) -> Iterator[Row]:
+    """Ask the map of one set everything."""
+    folder, technique = DATA / name, create("cohog", {"camera": camera_of(name)})
+    dataset = load_dataset(folder / "query", folder / "ref", folder / "ground_truth.csv")
+    scored = {query.path.name: query for query in dataset.queries}
+    rule = accept_rule(technique, CONFIG.match)
+    rule = replace(rule, sure=replace(rule.sure, precision=0.5))  # only what speaks against the best places refuses
+    meter = meter_of(CONFIG, load_board("this"))
+    with mapped(_frames(folder / "ref"), technique, meter, folder / "ref") as (place_map, index):
+        walk = Recogniser(
+            technique=technique,
+            place_map=place_map,
+            index=index,
+            rule=rule,
+            meter=meter,
+            candidates=technique.candidates,
+        )
+        names = dataset.references
+        for other in [path.parent.name for path in sorted(DATA.glob("*/ground_truth.csv"))] + list(LIKE):
+            if other != name and site_of(other) == site_of(name):
+                continue
+            for path in asked_of(other, other == name):
+                if other == name and path.name not in scored:
+                    continue
+                event = walk.step(Frame(image=read_image(path), name=path.name, t_mono_s=0.0))
+                if event.evidence is None:
+                    continue
+                found, right, near = event.best.place.source_image, False, False
+                if other == name:
+                    query = scored[path.name]
+                    if found in query.ignored:
+                        continue
+                    right = found in query.right
+                    known = np.flatnonzero([each in query.right or each in query.ignored for each in names])
+                    near = not right and not elsewhere(index, event.ranking.slots[0], known, 0.0).all()
+                refused = not event.accepted and not event.reason.startswith(("confidence", "score"))
+                yield Row(
+                    map=name,
+                    set=other,
+                    query=path.name,
+                    kind="own" if other == name else "foreign",
+                    right=right,
+                    near=near,
+                    found=found,
+                    score=event.best.match.score,
+                    evidence=dict(event.evidence),
+                    veto=event.reason if refused else None,
+                )
+        frames = list(_frames(folder / "ref"))
+        order = np.random.default_rng(15).permutation(len(frames))
+        frames = [frames[at] for at in np.resize(order, min(ASKED, 6 * len(frames)))]
+        ids = {place.source_image: place.place_id for place in place_map.places()}
+        for answer in ask(technique, place_map, index, rule, meter, frames, ids):
+            yield Row(
+                map=name,
+                set=name,
+                query=str(answer.place_id),
+                kind="changed" if answer.there else "left out",
+                right=answer.right,
+                near=False,
+                found="",
+                score=0.0,
+                evidence=dict(answer.evidence),
+            )
+
+
+def _frames(folder: Path) -> Iterator[Frame]:
+    source = open_source(str(folder), live=False)
+    while not source.ended:
+        yield source.read(timeout_s=0)
+
+
+def gather(work: Path, names: list[str]) -> None:
+    work.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        path = work / f"{name}.pkl"
+        if not path.exists():
+            rows = list(rows_of(name))
+            path.with_suffix(".new").write_bytes(pickle.dumps(rows))
+            path.with_suffix(".new").replace(path)
+            print(name, len(rows), flush=True)
+
+
+if __name__ == "__main__":
+    gather(Path(sys.argv[1]), sys.argv[2:] or [path.parent.name for path in sorted(DATA.glob("*/ground_truth.csv"))])

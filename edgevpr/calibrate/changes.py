@@ -1,0 +1,79 @@
+"""Changes of a picture, as another day, season, height and course make them: a map is asked for its own places so.
+
+No real change is one of these. Together they bring the shares of agreeing regions down to what real ones leave, which
+is what a calibration needs: right and wrong matches that are hard to tell apart.
+"""
+
+import cv2
+import numpy as np
+
+_STRENGTH = (0.3, 1.3)  # from a cloud to snow
+_TONES = 6  # points of a curve of tones
+_PATCHES = 2  # at most, of the picture hidden by something that was not there
+
+
+def changed(image: np.ndarray, rng: np.random.Generator, looks_down: bool) -> np.ndarray:
+    """Return a picture as it might look another time: uint8 (H, W[, 3]) to uint8 (H, W) grey. Looking down, the camera
+    may be turned to any heading."""
+    strength = rng.uniform(*_STRENGTH)
+    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
+    seen = _from_beside(grey.astype(np.float32) / 255, rng, strength, looks_down)
+    seen = _another_season(seen, rng, strength)
+    seen = _another_light(seen, rng, strength)
+    _hide(seen, rng, strength)
+    return (255 * np.clip(seen, 0, 1)).round().astype(np.uint8)
+
+
+def _from_beside(grey: np.ndarray, rng: np.random.Generator, strength: float, looks_down: bool) -> np.ndarray:
+    """Look from another spot, height and course, and from a tilted camera."""
+    height, width = grey.shape
+    scale = np.exp(rng.uniform(-1, 1) * 0.15 * strength)
+    turn_deg = rng.uniform(0, 360) if looks_down else rng.uniform(-3, 3) * strength
+    matrix = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), turn_deg, scale)
+    matrix[0, 2] += rng.uniform(-0.15, 0.15) * width * strength
+    matrix[1, 2] += rng.uniform(-0.15, 0.15) * height * strength * (1.0 if looks_down else 0.4)
+    corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
+    moved = corners + (rng.uniform(-0.05, 0.05, (4, 2)) * (width, height) * strength).astype(np.float32)
+    whole = cv2.getPerspectiveTransform(corners, moved) @ np.vstack([matrix, (0, 0, 1)])
+    return cv2.warpPerspective(grey, whole, (width, height), borderMode=cv2.BORDER_REFLECT)
+
+
+def _another_season(grey: np.ndarray, rng: np.random.Generator, strength: float) -> np.ndarray:
+    """Give tones other values, differently in different parts, as leaves and snow do; and a texture of its own."""
+    height, width = grey.shape
+    tones = np.clip(255 * grey, 0, 255).astype(np.uint8)
+    one, other = (_curve(rng, strength)[tones] for _ in range(2))
+    part = np.clip(0.5 + _smooth(rng, (height, width), 6), 0, 1)
+    texture = cv2.GaussianBlur(rng.normal(size=(height, width)).astype(np.float32), (0, 0), max(1.0, width / 200))
+    return part * one + (1 - part) * other + 0.36 * strength * texture
+
+
+def _another_light(grey: np.ndarray, rng: np.random.Generator, strength: float) -> np.ndarray:
+    """Cast soft shadows, expose otherwise, blur half of the pictures, and add the noise of a sensor."""
+    lit = np.clip(grey * np.exp(0.5 * strength * _smooth(rng, grey.shape, 3)), 0, 1)
+    lit = lit ** np.exp(rng.uniform(-1, 1) * 0.7 * strength)
+    if rng.random() < 0.5:
+        lit = cv2.GaussianBlur(lit, (0, 0), 0.3 + strength * grey.shape[1] / 400)
+    return lit + (0.03 * strength * rng.normal(size=grey.shape)).astype(np.float32)
+
+
+def _hide(grey: np.ndarray, rng: np.random.Generator, strength: float) -> None:
+    """Hide a part or two behind a plain patch, in place."""
+    height, width = grey.shape
+    for _ in range(rng.integers(0, _PATCHES + 1)):
+        x, y, half = rng.uniform(0, width), rng.uniform(0, height), rng.uniform(0.05, 0.2) * width * strength
+        rows, columns = (slice(max(0, int(at - half)), int(at + half)) for at in (y, x))
+        grey[rows, columns] = rng.uniform(0, 1)
+
+
+def _curve(rng: np.random.Generator, strength: float) -> np.ndarray:
+    points = np.linspace(0, 1, _TONES)
+    bent = np.clip(points + 0.45 * strength * rng.normal(size=_TONES), 0, 1)
+    return np.interp(np.linspace(0, 1, 256), points, bent).astype(np.float32)
+
+
+def _smooth(rng: np.random.Generator, shape: tuple[int, int], cells: int) -> np.ndarray:
+    """Return a smooth field of values within -1..1, float32 of this shape."""
+    coarse = rng.normal(size=(cells, cells)).astype(np.float32)
+    field = cv2.resize(coarse, shape[::-1], interpolation=cv2.INTER_CUBIC)
+    return field / max(float(np.abs(field).max()), 1e-6)

@@ -1,0 +1,1 @@
+"""How sure a match is: from evidence to the probability that it is right."""
