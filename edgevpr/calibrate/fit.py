@@ -42,9 +42,11 @@ def fitted(start: Logistic, rows: Sequence[Evidence], right: np.ndarray, weights
     return Logistic(start.names, tuple((found[:-1] / scales).tolist()), start.scales, float(found[-1]))
 
 
-def tail_of(wrong: np.ndarray, among: int) -> Tail:
-    """Fit the tail of the logits of wrong matches, float (N,), which are of `among` matches in all. Both Tail.share and
-    the figures of single sites are shares of all matches."""
-    high = np.sort(wrong)[::-1][: max(_FEWEST, round(_TAIL * len(wrong))) + 1]
-    start = float(high[-1])
-    return Tail(start, (len(high) - 1) / among, max(float((high[:-1] - start).mean()), 1e-3))
+def tail_of(wrong: np.ndarray, shares: np.ndarray) -> Tail:
+    """Fit the tail of the logits of wrong matches, float (N,), each of which is this share of all matches, float
+    (N,)."""
+    order = np.argsort(-wrong, kind="stable")
+    wrong, shares = wrong[order], shares[order]
+    count = max(_FEWEST, int(np.searchsorted(np.cumsum(shares), _TAIL * shares.sum())) + 1)
+    start, high, weight = float(wrong[min(count, len(wrong) - 1)]), wrong[:count], shares[:count]
+    return Tail(start, float(weight.sum()), max(float(weight @ (high - start) / weight.sum()), 1e-3))
