@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from edgevpr.belief.hypotheses import Hypotheses, Way, density, fused, joined, mean_of, none, sound
+from edgevpr.belief.hypotheses import Hypotheses, Way, apart, density, fused, joined, mean_of, none, sound
 from edgevpr.belief.motion import Moved
 
 MOST = 64  # hypotheses kept
@@ -25,8 +25,9 @@ PRIOR_LOST = 0.5  # the prior of the probabilities that are handed in
 _LEAVES, _JUMPS, _ENTERS = 0.01, 0.01, 0.02
 _MISSED = 0.2  # how likely a place is unseen by a query over it, against one over ground that is not in the map
 _LEAST_REST = 1e-4  # of the probability that it is none of the candidates
-_GOES_ON, _ODOMETRY = 0.85, 0.6  # shares of these ways to move; odometry comes before going on as before
+_GOES_ON, _ODOMETRY = 0.75, 0.6  # shares of these ways to move; odometry comes before going on as before
 _GOES_ON_SD, _ODOMETRY_SD, _LEAST_SD = 0.5, 0.25, 0.25  # in spacings of the map
+_REACH_SD = 1.5  # standard deviations that the reach is
 _LEARNS = 0.2  # share of the newest step in a velocity
 _SCATTERS = 1.4  # standard deviations of a position: a step as short as that may be none
 _FORGOTTEN = 1e-9  # a hypothesis of less weight
@@ -42,6 +43,11 @@ class Ground:
     spacing: float
     near: float
     is_ordinal: bool = False
+
+    @property
+    def cell(self) -> float:
+        """Ground of one place: an area, or a length where places are in order."""
+        return self.spacing if self.is_ordinal else self.spacing**2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -95,7 +101,8 @@ class Belief:
         Never raises for numbers that make no sense: a candidate that is not finite counts as not seen.
         """
         now, lost, appears = self._left()
-        ways = self._ways(now, moved)
+        places = max(1, places)
+        ways = self._ways(now, moved, places)
         p = np.zeros(0 if seen is None else len(seen.p))
         if seen is None:
             lost += appears  # nobody knows where
@@ -104,7 +111,7 @@ class Belief:
             self._enters = _ENTERS
             with np.errstate(invalid="ignore"):
                 heard = np.flatnonzero((seen.p > 0) & np.isfinite(seen.p) & np.isfinite(seen.at).all(1))
-            there = self._heard(_taken(seen, heard, self._ground), now, ways, moved.elapsed_s, appears, max(1, places))
+            there = self._heard(_taken(seen, heard, self._ground), now, ways, moved.elapsed_s, appears, places)
             after = joined(there, _unseen(now, ways, _MISSED))
         share = after.w / (lost + float(after.w.sum()))
         p[heard] = share[: len(heard)]
@@ -126,20 +133,26 @@ class Belief:
         now = replace(self._now, w=stays * self._now.w, credited=credited)
         return now, lost, self._enters * self._lost + _JUMPS * held
 
-    def _ways(self, now: Hypotheses, moved: Moved) -> list[Way]:
+    def _ways(self, now: Hypotheses, moved: Moved, places: int) -> list[Way]:
         """Return the ways in which each hypothesis can have moved: by odometry, on as before, or anywhere in reach."""
-        spacing, ways = self._ground.spacing, []
+        ground, ways = self._ground, []
+        area = places * ground.cell
+        widest = area / 2 if ground.is_ordinal else math.sqrt(area / math.pi)
+        is_everywhere = not moved.reach < widest
+        reach = max(widest if is_everywhere else moved.reach, _LEAST_SD * ground.spacing)
         is_going = ~np.isnan(now.velocity[:, 0])
         ahead = np.where(is_going[:, None], now.velocity, 0) * moved.elapsed_s
-        left, middle, sd = np.ones(len(now.w)), np.zeros(2), max(moved.reach / 1.5, _LEAST_SD * spacing)
+        left, middle, sd = np.ones(len(now.w)), np.zeros(2), reach / _REACH_SD
         if moved.by is not None:
-            spread = moved.covariance + (_ODOMETRY_SD * spacing) ** 2 * np.eye(2)
+            spread = moved.covariance + (_ODOMETRY_SD * ground.spacing) ** 2 * np.eye(2)
             ways.append(Way(_ODOMETRY * left, now.at + moved.by, now.covariance + spread))
             # Odometry that is wrong by a factor of two is wrong by as much as its length.
-            left, middle, sd = (1 - _ODOMETRY) * left, moved.by, min(sd, spacing + math.hypot(*moved.by))
-        variance = (_GOES_ON_SD * spacing) ** 2 + (_GOES_ON_SD * np.hypot(*ahead.T)) ** 2 / 2
-        ways.append(Way(_GOES_ON * is_going * left, now.at + ahead, now.covariance + _round(variance)))
-        ways.append(Way((1 - _GOES_ON * is_going) * left, now.at + middle, now.covariance + sd**2 * np.eye(2)))
+            left, middle, sd = (1 - _ODOMETRY) * left, moved.by, min(sd, ground.spacing + math.hypot(*moved.by))
+        variance = (_GOES_ON_SD * ground.spacing) ** 2 + (_GOES_ON_SD * np.hypot(*ahead.T)) ** 2 / 2
+        going = now.covariance + variance[:, None, None] * np.eye(2)
+        ways.append(Way(_GOES_ON * is_going * left, now.at + ahead, going))
+        anywhere = now.covariance + sd**2 * np.eye(2)
+        ways.append(Way((1 - _GOES_ON * is_going) * left, now.at + middle, anywhere, is_everywhere / area))
         return ways
 
     def _heard(
@@ -152,52 +165,49 @@ class Belief:
         ratio = np.log(seen.p * places * PRIOR_LOST / ((1 - PRIOR_LOST) * rest))
         born = appears / places * np.exp(ratio)
 
-        off = at[None] - now.anchor[:, None]
         scatter = np.sqrt(of_step[:, 0, 0] if ground.is_ordinal else np.trace(of_step, axis1=1, axis2=2))
-        fresh = np.clip((np.hypot(off[..., 0], off[..., 1]) - _SCATTERS * scatter) / ground.spacing, 0, 1)
+        fresh = np.clip((apart(now.anchor, at) - _SCATTERS * scatter) / ground.spacing, 0, 1)
         # A picture of the same ground says what the one before has said, to whoever was there: also to one who is lost.
         strongest = max(0.0, float(ratio.max(initial=0)))
         same, self._strongest = min(self._strongest, strongest), strongest
-        evidence = np.exp(ratio + (1 - fresh) * (same - now.credited[:, None]))
-        evidence *= now.w[:, None] * ground.spacing ** (1 if ground.is_ordinal else 2)
+        evidence = np.exp(ratio + (1 - fresh) * (same - now.credited[:, None])) * (ground.cell * now.w[:, None])
         led = [way.share[:, None] * evidence * density(way, at, of_step, ground.is_ordinal) for way in ways]
         weight = sum(each.sum(0) for each in led)  # of what has come from hypotheses
         by = sum(led) / np.maximum(weight, _LEAST)
-        stale = float((weight * (by * (1 - fresh)).sum(0)).sum() / max(_LEAST, float((weight + born).sum())))
-        known = math.exp(-stale * same)
+        stale = by * (1 - fresh)
+        staleness = float(weight @ stale.sum(0)) / max(_LEAST, float((weight + born).sum()))
 
-        share = np.concatenate(led).T / np.maximum(weight, _LEAST)[:, None]
         before, of_before = mean_of(
-            share, np.concatenate([way.at for way in ways]), np.concatenate([way.covariance for way in ways])
+            np.concatenate(led).T / np.maximum(weight, _LEAST)[:, None],
+            np.concatenate([way.at for way in ways]),
+            np.concatenate([way.covariance for way in ways]),
         )
-        at_both, of_both = fused(at, of_step, before, of_before + 1e-9 * np.eye(2))
+        at_both, of_both = fused(at, of_step, before, of_before + (_LEAST_SD * ground.spacing) ** 2 * np.eye(2))
+        learns = np.where(np.isnan(now.velocity[:, :1]), 1.0, _LEARNS)
+        kept = (1 - learns) * np.nan_to_num(now.velocity) - learns * now.at / elapsed_s
+        velocity = (by.T @ learns) * at / elapsed_s + by.T @ kept
+        anchor = (1 - stale.sum(0))[:, None] * at + stale.T @ now.anchor
         is_led = weight > born
-        newest = (at[None] - now.at[:, None]) / elapsed_s
-        gain = np.where(np.isnan(now.velocity), 1.0, _LEARNS)[:, None]
-        velocity = gain * newest + (1 - gain) * np.nan_to_num(now.velocity)[:, None]
-        anchor = now.anchor[:, None] + fresh[..., None] * off
         return Hypotheses(
-            w=known * (weight + born),
+            w=math.exp(-staleness * same) * (weight + born),
             at=np.where(is_led[:, None], at_both, at),
             covariance=np.where(is_led[:, None, None], of_both, of_step),
-            velocity=np.where(is_led[:, None], np.einsum("mk,mki->ki", by, velocity), np.nan),
+            velocity=np.where(is_led[:, None], velocity, np.nan),
             heading=_vector(seen.heading_deg),
             credited=np.maximum(ratio, 0),
-            anchor=np.where(is_led[:, None], np.einsum("mk,mki->ki", by, anchor), at),
+            anchor=np.where(is_led[:, None], anchor, at),
         )
 
     def _posterior(self, p: np.ndarray) -> Posterior:
         now = self._now
         if not len(now.w):
             return Posterior(lost=self._lost, p=p, mass=0.0, estimate=None)
-        off = now.at[:, None] - now.at[None]
-        is_near = np.hypot(off[..., 0], off[..., 1]) <= self._ground.near
-        masses = is_near @ now.w
-        there = is_near[masses.argmax()]
+        is_near = apart(now.at, now.at) <= self._ground.near
+        there = is_near[(is_near @ now.w).argmax()]
         mass = float(now.w[there].sum())
         share = now.w[there] / mass
-        at, covariance = mean_of(share, now.at[there], now.covariance[there])
-        north, east = share @ now.heading[there]
+        (at,), (covariance,) = mean_of(share[None], now.at[there], now.covariance[there])
+        north, east = (share @ now.heading[there]).tolist()
         is_known = math.hypot(north, east) > 0.5
         heading_deg = math.degrees(math.atan2(east, north)) % 360 if is_known else None
         estimate = Estimate(at=at, covariance=covariance, heading_deg=heading_deg)
@@ -206,11 +216,13 @@ class Belief:
 
 def _unseen(now: Hypotheses, ways: list[Way], chance: float) -> Hypotheses:
     """Return the hypotheses after they have moved, where a query does not see them, which has this chance."""
-    share = np.stack([way.share for way in ways], 1)
-    at, covariance = mean_of(
-        share, np.stack([way.at for way in ways], 1), np.stack([way.covariance for way in ways], 1)
-    )
-    return replace(now, w=chance * now.w, at=at, covariance=covariance)
+    share = np.stack([way.share for way in ways], 1)[..., None]
+    at = np.stack([way.at for way in ways], 1)
+    covariance = np.stack([way.covariance for way in ways], 1)
+    mean = (share * at).sum(1)
+    off = at - mean[:, None]
+    spread = (share[..., None] * (covariance + off[..., :, None] * off[..., None, :])).sum(1)
+    return replace(now, w=chance * now.w, at=mean, covariance=spread)
 
 
 def _taken(seen: Seen, heard: np.ndarray, ground: Ground) -> Seen:
@@ -222,10 +234,6 @@ def _taken(seen: Seen, heard: np.ndarray, ground: Ground) -> Seen:
         covariance=sound(seen.covariance[heard].astype(float), (_LEAST_SD * ground.spacing) ** 2),
         heading_deg=seen.heading_deg[heard],
     )
-
-
-def _round(variance: np.ndarray) -> np.ndarray:
-    return variance[:, None, None] * np.eye(2)
 
 
 def _vector(heading_deg: np.ndarray) -> np.ndarray:

@@ -33,11 +33,12 @@ class Hypotheses:
 @dataclass(frozen=True, slots=True)
 class Way:
     """One way in which each of M hypotheses can have moved: its `share` (M,), and where it ends: mean `at` (M, 2) with
-    `covariance` (M, 2, 2)."""
+    `covariance` (M, 2, 2). No place of the map has less than the density `least`."""
 
     share: np.ndarray
     at: np.ndarray
     covariance: np.ndarray
+    least: float = 0.0
 
 
 def none() -> Hypotheses:
@@ -61,15 +62,20 @@ def joined(one: Hypotheses, other: Hypotheses) -> Hypotheses:
     )
 
 
+def apart(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return the distances (M, K) between positions (M, 2) and others (K, 2)."""
+    return np.sqrt((one[:, None, 0] - other[None, :, 0]) ** 2 + (one[:, None, 1] - other[None, :, 1]) ** 2)
+
+
 def density(way: Way, at: np.ndarray, covariance: np.ndarray, is_ordinal: bool) -> np.ndarray:
     """Return the density (M, K) of each of K positions `at` (K, 2), known to `covariance` (K, 2, 2), by a way."""
     xx, xy, yy = (way.covariance[:, None, i, j] + covariance[None, :, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
     dx, dy = (at[None, :, i] - way.at[:, None, i] for i in (0, 1))
     if is_ordinal:
         xy, yy, dy = 0.0, _FLAT, 0.0
-    determinant = xx * yy - xy**2
-    squared = (yy * dx**2 - 2 * xy * dx * dy + xx * dy**2) / determinant
-    return np.exp(-squared / 2) / (2 * np.pi * np.sqrt(determinant))
+    determinant = xx * yy - xy * xy
+    squared = (yy * (dx * dx) - 2 * xy * (dx * dy) + xx * (dy * dy)) / determinant
+    return np.maximum(np.exp(-squared / 2) / (2 * np.pi * np.sqrt(determinant)), way.least)
 
 
 def fused(
@@ -86,11 +92,13 @@ def fused(
 
 
 def mean_of(share: np.ndarray, at: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and covariance of mixtures: `share` (..., M) of Gaussians `at` (M, 2) or (..., M, 2)."""
-    mean = np.einsum("...m,...mi->...i", share, at)
-    off = at - mean[..., None, :]
-    spread = covariance + off[..., :, None] * off[..., None, :]
-    return mean, np.einsum("...m,...mij->...ij", share, spread)
+    """Return means (K, 2) and covariances (K, 2, 2) of mixtures: `share` (K, M) of Gaussians `at` (M, 2)."""
+    middle = at.mean(0) if len(at) else np.zeros(2)  # coordinates far from zero would lose digits in their squares
+    off = at - middle
+    second = covariance + off[:, :, None] * off[:, None]
+    mean = share @ off
+    spread = (share @ second.reshape(-1, 4)).reshape(-1, 2, 2) - mean[:, :, None] * mean[:, None]
+    return middle + mean, spread
 
 
 def sound(covariance: np.ndarray, least: float) -> np.ndarray:
