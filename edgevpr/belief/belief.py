@@ -1,13 +1,16 @@
-"""The belief where the aircraft is, followed from query to query: a Bayes filter over the places of a map.
+"""Belief where the aircraft is, followed from query to query: a Bayes filter over the places of a map.
 
-The aircraft is lost (off the map, or on it where no query has seen it), or near one of at most `MOST` hypotheses, each a
-Gaussian on the ground. Being lost is a state like any other: what the map does not explain, it explains.
+The aircraft is lost (off the map, or on it where no query has seen it), or near one of at most `MOST` hypotheses, each
+a Gaussian on the ground. Being lost is a state like any other, and explains what the map does not.
 
-A query is heard by its own probabilities, made with the prior that the aircraft is off the map as likely as on it, and
-there anywhere. Divided by that prior they are likelihoods; a query without history is believed as it stands.
+A query is heard by its own probabilities. Divided by the prior they were made with they are likelihoods, so a query
+without history is believed as it stands. Three things keep a history from being believed too much:
 
-Queries that show the same ground are no new evidence. So each hypothesis remembers what was credited to it where it now
-is, and hears from a query only what goes beyond that, or less than that. A hover changes nothing but the newest look.
+* Between two queries the aircraft may have left the map or be anywhere, so the newest query must always speak for it.
+* Pictures of the same ground are no new evidence. A hypothesis remembers what it was credited with on the ground where
+  it now is, and another look replaces that. During a hover only the newest look counts.
+* Ground that is not in the map, once it was taken for a place, may well look like the way on from there. So a place
+  that fits the history speaks for the map only by so much.
 """
 
 import math
@@ -15,51 +18,25 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from edgevpr.belief.hypotheses import Hypotheses, Way, apart, density, fused, joined, mean_of, none, sound
+from edgevpr.belief.hypotheses import Hypotheses, Way, apart, density, fused, joined, mean_of, none
 from edgevpr.belief.motion import Moved
+from edgevpr.belief.seen import Ground, Seen, usable
 
 MOST = 64  # hypotheses kept
-PRIOR_LOST = 0.5  # the prior of the probabilities that are handed in
+PRIOR_LOST = 0.5  # of the probabilities that are handed in
 
-# Chances between two queries. Together they are also the most that a history can be believed: odds of 1 to their sum.
+# Chances between two queries. The first two are also the most that a history can be believed: odds of 1 to their sum.
 _LEAVES, _JUMPS, _ENTERS = 0.01, 0.01, 0.02
 _MISSED = 0.2  # how likely a place is unseen by a query over it, against one over ground that is not in the map
+_ALIKE = 0.1  # how likely ground that is not in the map, once taken for a place, looks like the way on from there
 _LEAST_REST = 1e-4  # of the probability that it is none of the candidates
 _GOES_ON, _ODOMETRY = 0.75, 0.6  # shares of these ways to move; odometry comes before going on as before
-_GOES_ON_SD, _ODOMETRY_SD, _LEAST_SD = 0.5, 0.25, 0.25  # in spacings of the map
+_GOES_ON_SD, _ODOMETRY_SD = 0.5, 0.25  # in spacings of the map
 _REACH_SD = 1.5  # standard deviations that the reach is
 _LEARNS = 0.2  # share of the newest step in a velocity
 _SCATTERS = 1.4  # standard deviations of a position: a step as short as that may be none
 _FORGOTTEN = 1e-9  # a hypothesis of less weight
 _LEAST = 1e-300  # instead of zero, where a number divides
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Ground:
-    """Measure of a map. `spacing` is the distance over which a picture becomes new evidence: about half a footprint, or
-    1 for a map of places in order (`is_ordinal`), whose second coordinate is 0. Hypotheses within `near` are one
-    position."""
-
-    spacing: float
-    near: float
-    is_ordinal: bool = False
-
-    @property
-    def cell(self) -> float:
-        """Ground of one place: an area, or a length where places are in order."""
-        return self.spacing if self.is_ordinal else self.spacing**2
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Seen:
-    """Positions that one query says by itself, K of them: `p` (K,) the probability of each, whose sum is below 1 by the
-    probability of none; `at` (K, 2) where the aircraft then is, east and north of a fixed origin, or the number of the
-    place and 0; its `covariance` (K, 2, 2); and `heading_deg` (K,), NaN where unknown."""
-
-    p: np.ndarray
-    at: np.ndarray
-    covariance: np.ndarray
-    heading_deg: np.ndarray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,12 +83,13 @@ class Belief:
         p = np.zeros(0 if seen is None else len(seen.p))
         if seen is None:
             lost += appears  # nobody knows where
-            after, heard = _unseen(now, ways, 1.0), np.zeros(0, int)
+            after = _unseen(now, ways, 1.0)
+            heard = np.zeros(0, int)
         else:
             self._enters = _ENTERS
-            with np.errstate(invalid="ignore"):
-                heard = np.flatnonzero((seen.p > 0) & np.isfinite(seen.p) & np.isfinite(seen.at).all(1))
-            there = self._heard(_taken(seen, heard, self._ground), now, ways, moved.elapsed_s, appears, places)
+            heard, seen = usable(seen, self._ground, MOST)
+            there, alike = self._heard(seen, now, ways, moved.elapsed_s, appears, places)
+            lost *= alike
             after = joined(there, _unseen(now, ways, _MISSED))
         share = after.w / (lost + float(after.w.sum()))
         p[heard] = share[: len(heard)]
@@ -123,7 +101,7 @@ class Belief:
 
     def _left(self) -> tuple[Hypotheses, float, float]:
         """Return the hypotheses, and the probabilities to be lost and to have come anywhere on the map, after the time
-        between two queries. What leaks away was credited no more."""
+        between two queries. What leaks away is credited no more."""
         held = float(self._now.w.sum())
         lost = (1 - self._enters) * self._lost + _LEAVES * held
         stays = 1 - _LEAVES - _JUMPS
@@ -139,10 +117,10 @@ class Belief:
         area = places * ground.cell
         widest = area / 2 if ground.is_ordinal else math.sqrt(area / math.pi)
         is_everywhere = not moved.reach < widest
-        reach = max(widest if is_everywhere else moved.reach, _LEAST_SD * ground.spacing)
+        reach = widest if is_everywhere else moved.reach
         is_going = ~np.isnan(now.velocity[:, 0])
         ahead = np.where(is_going[:, None], now.velocity, 0) * moved.elapsed_s
-        left, middle, sd = np.ones(len(now.w)), np.zeros(2), reach / _REACH_SD
+        left, middle, sd = np.ones(len(now.w)), np.zeros(2), max(reach / _REACH_SD, _GOES_ON_SD * ground.spacing)
         if moved.by is not None:
             spread = moved.covariance + (_ODOMETRY_SD * ground.spacing) ** 2 * np.eye(2)
             ways.append(Way(_ODOMETRY * left, now.at + moved.by, now.covariance + spread))
@@ -157,46 +135,50 @@ class Belief:
 
     def _heard(
         self, seen: Seen, now: Hypotheses, ways: list[Way], elapsed_s: float, appears: float, places: int
-    ) -> Hypotheses:
-        """Return one hypothesis for each candidate of a query. Its weight has come from the hypotheses before, each by
-        the ways that lead here, and from nowhere."""
+    ) -> tuple[Hypotheses, float]:
+        """Return one hypothesis for each candidate of a query, whose weight has come from the hypotheses before, each
+        by the ways that lead here, and from nowhere; and how much likelier one who is lost sees the query than if
+        nothing out there were like the map."""
         ground, at, of_step = self._ground, seen.at, seen.covariance
         rest = max(_LEAST_REST, 1 - float(seen.p.sum()))
         ratio = np.log(seen.p * places * PRIOR_LOST / ((1 - PRIOR_LOST) * rest))
         born = appears / places * np.exp(ratio)
 
-        scatter = np.sqrt(of_step[:, 0, 0] if ground.is_ordinal else np.trace(of_step, axis1=1, axis2=2))
-        fresh = np.clip((apart(now.anchor, at) - _SCATTERS * scatter) / ground.spacing, 0, 1)
         # A picture of the same ground says what the one before has said, to whoever was there: also to one who is lost.
         strongest = max(0.0, float(ratio.max(initial=0)))
         same, self._strongest = min(self._strongest, strongest), strongest
+        scatter = np.sqrt(of_step[:, 0, 0] if ground.is_ordinal else np.trace(of_step, axis1=1, axis2=2))
+        fresh = np.clip((apart(now.anchor, at) - _SCATTERS * scatter) / ground.spacing, 0, 1)
         evidence = np.exp(ratio + (1 - fresh) * (same - now.credited[:, None])) * (ground.cell * now.w[:, None])
         led = [way.share[:, None] * evidence * density(way, at, of_step, ground.is_ordinal) for way in ways]
         weight = sum(each.sum(0) for each in led)  # of what has come from hypotheses
         by = sum(led) / np.maximum(weight, _LEAST)
         stale = by * (1 - fresh)
         staleness = float(weight @ stale.sum(0)) / max(_LEAST, float((weight + born).sum()))
+        agreement = float(weight.sum()) * rest / max(_LEAST, float(now.w.sum() * seen.p.sum()))
+        alike = (1 - _ALIKE + _ALIKE * agreement) ** (1 - staleness) if len(now.w) else 1.0
 
         before, of_before = mean_of(
             np.concatenate(led).T / np.maximum(weight, _LEAST)[:, None],
             np.concatenate([way.at for way in ways]),
             np.concatenate([way.covariance for way in ways]),
         )
-        at_both, of_both = fused(at, of_step, before, of_before + (_LEAST_SD * ground.spacing) ** 2 * np.eye(2))
+        at_both, of_both = fused(at, of_step, before, of_before)
         learns = np.where(np.isnan(now.velocity[:, :1]), 1.0, _LEARNS)
         kept = (1 - learns) * np.nan_to_num(now.velocity) - learns * now.at / elapsed_s
         velocity = (by.T @ learns) * at / elapsed_s + by.T @ kept
         anchor = (1 - stale.sum(0))[:, None] * at + stale.T @ now.anchor
-        is_led = weight > born
-        return Hypotheses(
+        is_led = (weight > born)[:, None]
+        there = Hypotheses(
             w=math.exp(-staleness * same) * (weight + born),
-            at=np.where(is_led[:, None], at_both, at),
-            covariance=np.where(is_led[:, None, None], of_both, of_step),
-            velocity=np.where(is_led[:, None], velocity, np.nan),
+            at=np.where(is_led, at_both, at),
+            covariance=np.where(is_led[..., None], of_both, of_step),
+            velocity=np.where(is_led, velocity, np.nan),
             heading=_vector(seen.heading_deg),
             credited=np.maximum(ratio, 0),
-            anchor=np.where(is_led[:, None], anchor, at),
+            anchor=np.where(is_led, anchor, at),
         )
+        return there, alike
 
     def _posterior(self, p: np.ndarray) -> Posterior:
         now = self._now
@@ -225,17 +207,6 @@ def _unseen(now: Hypotheses, ways: list[Way], chance: float) -> Hypotheses:
     return replace(now, w=chance * now.w, at=mean, covariance=spread)
 
 
-def _taken(seen: Seen, heard: np.ndarray, ground: Ground) -> Seen:
-    """Return the candidates `heard` of a query, with probabilities whose sum is at most 1."""
-    p = seen.p[heard].astype(float)
-    return Seen(
-        p=p / max(1.0, float(p.sum())),
-        at=seen.at[heard].astype(float),
-        covariance=sound(seen.covariance[heard].astype(float), (_LEAST_SD * ground.spacing) ** 2),
-        heading_deg=seen.heading_deg[heard],
-    )
-
-
 def _vector(heading_deg: np.ndarray) -> np.ndarray:
     heading = np.radians(heading_deg)
-    return np.nan_to_num(np.stack([np.cos(heading), np.sin(heading)], 1), posinf=0.0, neginf=0.0)
+    return np.nan_to_num(np.stack([np.cos(heading), np.sin(heading)], 1))
