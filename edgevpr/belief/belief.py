@@ -34,7 +34,7 @@ _GOES_ON, _ODOMETRY = 0.75, 0.6  # shares of these ways to move; odometry comes 
 _GOES_ON_SD, _ODOMETRY_SD = 0.5, 0.25  # in spacings of the map
 _REACH_SD = 1.5  # standard deviations that the reach is
 _LEARNS = 0.2  # share of the newest step in a velocity
-_SCATTERS = 1.4  # standard deviations of a position: a step as short as that may be none
+_SCATTERS = 2.0  # standard deviations of a position: a step as short as that may be none
 _FORGOTTEN = 1e-9  # a hypothesis of less weight
 _LEAST = 1e-300  # instead of zero, where a number divides
 
@@ -147,7 +147,7 @@ class Belief:
         # A picture of the same ground says what the one before has said, to whoever was there: also to one who is lost.
         strongest = max(0.0, float(ratio.max(initial=0)))
         same, self._strongest = min(self._strongest, strongest), strongest
-        scatter = np.sqrt(of_step[:, 0, 0] if ground.is_ordinal else np.trace(of_step, axis1=1, axis2=2))
+        scatter = np.sqrt(of_step[:, 0, 0] if ground.is_ordinal else np.trace(of_step, axis1=1, axis2=2) / 2)
         fresh = np.clip((apart(now.anchor, at) - _SCATTERS * scatter) / ground.spacing, 0, 1)
         evidence = np.exp(ratio + (1 - fresh) * (same - now.credited[:, None])) * (ground.cell * now.w[:, None])
         led = [way.share[:, None] * evidence * density(way, at, of_step, ground.is_ordinal) for way in ways]
