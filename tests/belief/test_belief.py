@@ -125,6 +125,20 @@ def test_a_hover_over_what_looks_alike_says_what_one_look_says(p):
     assert max(masses) <= p + 1e-9
 
 
+def test_during_a_hover_the_newest_look_replaces_the_one_before():
+    belief = Belief(IN_ORDER)
+    for p in (0.9, 0.2, 0.6):
+        mass = belief.update(seen([50], [p]), STEP, PLACES).mass
+    assert 0.2 < mass <= 0.6
+    assert belief.update(seen([50], [0.1]), STEP, PLACES).mass < 0.35
+
+
+def test_during_a_hover_a_likelier_place_does_not_win_by_repetition():
+    belief = Belief(IN_ORDER)
+    masses = [belief.update(seen([20, 80], [0.55, 0.4]), STEP, PLACES).mass for _ in range(50)]
+    assert max(masses) < 0.6
+
+
 def test_a_hover_whose_best_place_changes_with_its_neighbours_is_no_flight():
     rng, belief = np.random.default_rng(6), Belief(IN_ORDER)
     masses = [belief.update(seen([50 + rng.integers(-1, 2)], [0.9]), STEP, PLACES).mass for _ in range(100)]
