@@ -120,6 +120,7 @@ class Belief:
         reach = widest if is_everywhere else moved.reach
         is_going = ~np.isnan(now.velocity[:, 0])
         ahead = np.where(is_going[:, None], now.velocity, 0) * moved.elapsed_s
+        ahead *= (moved.reach / np.maximum(np.hypot(*ahead.T), max(moved.reach, _LEAST)))[:, None]
         left, middle, sd = np.ones(len(now.w)), np.zeros(2), max(reach / _REACH_SD, _GOES_ON_SD * ground.spacing)
         if moved.by is not None:
             spread = moved.covariance + (_ODOMETRY_SD * ground.spacing) ** 2 * np.eye(2)
@@ -141,7 +142,7 @@ class Belief:
         nothing out there were like the map."""
         ground, at, of_step = self._ground, seen.at, seen.covariance
         rest = max(_LEAST_REST, 1 - float(seen.p.sum()))
-        ratio = np.log(seen.p * places * PRIOR_LOST / ((1 - PRIOR_LOST) * rest))
+        ratio = np.log(np.maximum(seen.p, _LEAST) * places * PRIOR_LOST / ((1 - PRIOR_LOST) * rest))
         born = appears / places * np.exp(ratio)
 
         # A picture of the same ground says what the one before has said, to whoever was there: also to one who is lost.

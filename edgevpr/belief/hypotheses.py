@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-_ROUNDING = 1e-9  # of a difference of squares: keeps a variance above zero
+_ROUNDING = 1e-12  # share of squares that their difference may lose
+_THINNEST = 1e-6  # ratio of the axes of a covariance, as variances, with which can still be calculated
 _FLAT = 1 / (2 * np.pi)  # a variance whose Gaussian has the density 1 in its middle: a direction that does not exist
 
 
@@ -74,9 +75,16 @@ def density(way: Way, at: np.ndarray, covariance: np.ndarray, is_ordinal: bool) 
     dx, dy = (at[None, :, i] - way.at[:, None, i] for i in (0, 1))
     if is_ordinal:
         xy, yy, dy = 0.0, _FLAT, 0.0
-    determinant = xx * yy - xy * xy
+    determinant = np.maximum(xx * yy - xy * xy, _THINNEST * xx * yy)
     squared = (yy * (dx * dx) - 2 * xy * (dx * dy) + xx * (dy * dy)) / determinant
-    return np.maximum(np.exp(-squared / 2) / (2 * np.pi * np.sqrt(determinant)), way.least)
+    return np.maximum(np.exp(-np.maximum(squared, 0) / 2) / (2 * np.pi * np.sqrt(determinant)), way.least)
+
+
+def firm(covariance: np.ndarray, least: float) -> np.ndarray:
+    """Return covariances (K, 2, 2) that can be inverted: a variance of `least`, and a share of their own, is added to
+    each axis."""
+    more = least + _THINNEST * np.abs(np.trace(covariance, axis1=1, axis2=2))
+    return covariance + more[:, None, None] * np.eye(2)
 
 
 def fused(
@@ -99,4 +107,4 @@ def mean_of(share: np.ndarray, at: np.ndarray, covariance: np.ndarray) -> tuple[
     second = covariance + off[:, :, None] * off[:, None]
     mean = share @ off
     spread = (share @ second.reshape(-1, 4)).reshape(-1, 2, 2) - mean[:, :, None] * mean[:, None]
-    return middle + mean, spread + _ROUNDING * (1 + np.abs(spread).max(initial=0)) * np.eye(2)
+    return middle + mean, firm(spread, _ROUNDING * float(np.abs(second).max(initial=1)))

@@ -11,6 +11,8 @@ import numpy as np
 
 _OF_LENGTH_SD = 0.15  # of the length of a displacement by odometry that can be believed
 
+_LONGEST_S = 3600.0  # after which an aircraft may be anywhere
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Moved:
@@ -33,8 +35,9 @@ def moved(
     unknown). A clock that has gone back, or stood still, says nothing of the time; then odometry says nothing of the
     way.
     """
-    if elapsed_s is None or not (elapsed_s > 0 and math.isfinite(speed_max * elapsed_s)):
+    if elapsed_s is None or not elapsed_s > 0:
         return Moved(reach=speed_max * usual_s, elapsed_s=usual_s)
+    elapsed_s = min(elapsed_s, _LONGEST_S)
     reach = speed_max * elapsed_s
     if velocity is None or not math.hypot(*velocity) <= 2 * speed_max:  # NaN, or too fast even if it is twice the truth
         return Moved(reach=reach, elapsed_s=elapsed_s)

@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from edgevpr.belief.hypotheses import firm
+
 _FARTHEST = 1e8  # metres or places: farther than any two points on the Earth
 _LEAST_SD = 0.25  # of a position, in spacings of the map
 
@@ -54,10 +56,10 @@ def usable(seen: Seen, ground: Ground, most: int) -> tuple[np.ndarray, Seen]:
 
 
 def _sound(covariance: np.ndarray, least_sd: float) -> np.ndarray:
-    """Return covariances (K, 2, 2) that can be inverted. Each axis gets the variance of `least_sd` on top; one that
-    makes no sense is no more than that."""
+    """Return covariances (K, 2, 2) with the variance of `least_sd` on top; one that makes no sense is no more than
+    that."""
     covariance = np.where((np.abs(covariance) < _FARTHEST**2).all((1, 2))[:, None, None], covariance, 0.0)
     covariance = (covariance + covariance.transpose(0, 2, 1)) / 2
     xx, xy, yy = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
     is_sound = (xx >= 0) & (yy >= 0) & (xy * xy <= xx * yy)
-    return np.where(is_sound[:, None, None], covariance, 0.0) + least_sd**2 * np.eye(2)
+    return firm(np.where(is_sound[:, None, None], covariance, 0.0), least_sd**2)

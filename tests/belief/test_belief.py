@@ -294,3 +294,28 @@ def test_memory_is_bounded_whatever_the_map_and_the_flight():
         assert len(posterior.p) == count
         assert posterior.p.sum() + posterior.lost <= 1 + 1e-9
     assert belief.nbytes <= MOST * 14 * 8
+
+
+def some(rng, count, scale):
+    """Any evidence at all, a tenth of it spoilt."""
+    p = rng.random(count) ** rng.choice([1, 30])
+    at = rng.normal(size=(count, 2)) * scale + rng.choice([0, 1e6])
+    root = rng.normal(size=(count, 2, 2)) * rng.choice([0, 1e-6, 1, 1e10])
+    covariance = root @ root.transpose(0, 2, 1)
+    for each in (p, at, covariance):
+        if each.size and rng.random() < 0.1:
+            each.flat[rng.integers(each.size)] = rng.choice([np.nan, np.inf, -np.inf, 1e300, -1])
+    return Seen(p=p, at=at, covariance=covariance, heading_deg=rng.choice([np.nan, 10, np.inf], count))
+
+
+@pytest.mark.parametrize("ground", [IN_ORDER, IN_METRES])
+@pytest.mark.parametrize("places", [1, 1000, 10**6])
+def test_any_numbers_at_all_pass(ground, places):
+    rng, belief = np.random.default_rng(places), Belief(ground)
+    for _ in range(200):
+        query = some(rng, int(rng.integers(0, 60)), rng.choice([0, 1, 100, 1e7]))
+        velocity = rng.choice([0, 1, -3, np.nan, 1e9, np.inf], 2).tolist()
+        elapsed_s = float(rng.choice([1, 1e-9, -1, np.nan, 1e6, 1e12]))
+        posterior = belief.update(query, moved(elapsed_s, 1.0, float(rng.choice([3, 1e5])), tuple(velocity)), places)
+        assert np.isfinite([*posterior.p, posterior.lost, posterior.mass]).all()
+        assert posterior.estimate is None or np.linalg.eigvalsh(posterior.estimate.covariance)[0] > 0
