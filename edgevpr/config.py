@@ -95,6 +95,7 @@ class MatchConfig:
         )
     )
     candidates: int | None = bounded(1, 1_000_000, Flag(("--candidates",), "N", "places compared (the technique's)"))
+    follow: bool = field()
     sequence: int | None = bounded(1, 100, Flag(("--sequence",), "N", "queries matched together (the technique's)"))
     accept_precision: float = bounded(
         0.5, 0.999999, Flag(("--accept-precision",), "P", "share of the accepted matches that is to be right (0.999)")

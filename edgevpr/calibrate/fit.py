@@ -7,8 +7,8 @@ from scipy.optimize import minimize
 
 from edgevpr.confidence.model import Evidence, Logistic, Tail
 
-_TAIL = 0.1  # of the wrong matches: the highest, whose logits the tail is fitted to
-_FEWEST = 5
+_FEWEST = 5  # wrong matches in a tail
+_LEAST_SCALE = 0.05
 
 
 def matrix(rows: Sequence[Evidence], names: Sequence[str]) -> np.ndarray:
@@ -42,11 +42,11 @@ def fitted(start: Logistic, rows: Sequence[Evidence], right: np.ndarray, weights
     return Logistic(start.names, tuple((found[:-1] / scales).tolist()), start.scales, float(found[-1]))
 
 
-def tail_of(wrong: np.ndarray, shares: np.ndarray) -> Tail:
-    """Fit the tail of the logits of wrong matches, float (N,), each of which is this share of all matches, float
-    (N,)."""
+def tail_of(wrong: np.ndarray, shares: np.ndarray, part: float) -> Tail:
+    """Fit the tail of the logits of wrong matches, float (N,), each of which is this share of all matches, float (N,):
+    to the highest `part` of them."""
     order = np.argsort(-wrong, kind="stable")
     wrong, shares = wrong[order], shares[order]
-    count = max(_FEWEST, int(np.searchsorted(np.cumsum(shares), _TAIL * shares.sum())) + 1)
+    count = max(_FEWEST, int(np.searchsorted(np.cumsum(shares), part * shares.sum())) + 1)
     start, high, weight = float(wrong[min(count, len(wrong) - 1)]), wrong[:count], shares[:count]
-    return Tail(start, float(weight.sum()), max(float(weight @ (high - start) / weight.sum()), 1e-3))
+    return Tail(start, float(weight.sum()), max(float(weight @ (high - start) / weight.sum()), _LEAST_SCALE))

@@ -1,17 +1,21 @@
 """The shipped model of confidence, fitted to the matches of many sites."""
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
 
 import numpy as np
 
-from edgevpr.calibrate.calibrate import Answer, adapted
+from edgevpr.calibrate.calibrate import LEFT_OUT, Answer, adapted
 from edgevpr.calibrate.fit import fitted, matrix, nothing_known, tail_of
-from edgevpr.confidence.model import Evidence, Logistic, Model, Tail
+from edgevpr.confidence.model import Evidence, Logistic, Model, Scale, Tail
 from edgevpr.runtime.recognise.evidence import OF_MAP, OF_PLACE
 
 _PULL = 0.3
+# Parts of the wrong matches that are the tail.
+_TAIL_OFF_MAP, _TAIL_OFF_PLACE = 0.02, 0.1
+_FEWEST_WRONG = 20
 _EACH = 100.0  # the weight of the right, and of the wrong, matches of a map
 
 
@@ -30,36 +34,28 @@ def shipped_model(kind: str, sites: Sequence[Site], made_of: str) -> Model:
     """Fit the model of one kind of evidence to these sites, each as important as any other."""
     of_map = _regression(
         OF_MAP[kind],
-        [
-            ([evidence for evidence, right in site.own if right], True)
-            for site in sites
-        ]
+        [([evidence for evidence, right in site.own if right], True) for site in sites]
         + [(site.foreign, False) for site in sites],
     )
     of_place = _regression(
         OF_PLACE[kind],
-        [([evidence for evidence, each in site.own if each == right], right) for site in sites for right in (True, False)]
+        [
+            ([evidence for evidence, each in site.own if each == right], right)
+            for site in sites
+            for right in (True, False)
+        ]
         + [
             ([answer.evidence for answer in site.answers if answer.right == right], right)
             for site in sites
             for right in (True, False)
         ],
     )
-    model = Model(
-        of_map=of_map,
-        of_place=of_place,
-        slope=1.0,
-        offset=0.0,
-        tail=Tail(0.0, 0.0, 1.0),
-        made=date.today().isoformat(),
-        made_of=made_of,
-    )
-    return _made_probable(model, sites)
-
-
-def of_map_alone(model: Model, site: Site) -> Model:
-    """Return the model that the map of a site would carry: adapted to its own answers, where it has any."""
-    return adapted(model, site.answers, site.name) if site.answers else model
+    unknown = Scale(Tail(0.0, 1.0, 1.0), Tail(0.0, 1.0, 1.0), 1.0, 0.0)
+    today = date.today().isoformat()
+    model = Model(of_map=of_map, of_place=of_place, scale=unknown, made=today, made_of=made_of)
+    bare = [(site, model) for site in sites]
+    own = [(site, adapted(model, site.answers, site.name)) for site in sites if site.answers]
+    return replace(model, scale=_scale(bare), adapted_scale=_scale(own) if own else None)
 
 
 def _regression(names: Sequence[str], groups: Iterable[tuple[Sequence[Evidence], bool]]) -> Logistic:
@@ -71,19 +67,34 @@ def _regression(names: Sequence[str], groups: Iterable[tuple[Sequence[Evidence],
     return fitted(nothing_known(names, scales), rows, right, weights, _PULL * len(groups))
 
 
-def _made_probable(model: Model, sites: Sequence[Site]) -> Model:
-    """Return a model whose confidence is a probability, and that knows how many wrong matches are left beyond a logit:
-    as if the aircraft flew over ground of the map half of the time."""
-    logits, right, weights = [], [], []
-    for site in sites:
-        own = of_map_alone(model, site)
-        for group, is_own in ((site.own, True), ([(each, False) for each in site.foreign], False)):
-            if len(group):
-                logits += [own.logit(evidence) for evidence, _ in group]
-                right += [each for _, each in group]
-                weights += [_EACH / len(group)] * len(group)
-    logits, right, weights = np.array(logits), np.array(right), np.array(weights)
-    start = Logistic(("logit",), (1.0,), (1.0,), 0.0)
-    line = fitted(start, [{"logit": each} for each in logits], right, weights, _PULL)
-    tail = tail_of(logits[~right], weights[~right] / weights.sum())
-    return replace(model, slope=line.weights[0], offset=line.bias, tail=tail)
+def _scale(sites: Sequence[tuple[Site, Model]]) -> Scale:
+    """Return what the logits mean that models give at their sites."""
+    off_map = _tail(
+        [[model.of_map.logit(each) for each in site.foreign] for site, model in sites],
+        [len(site.foreign) for site, _ in sites],
+        _TAIL_OFF_MAP,
+    )
+    wrong = [[model.of_place.logit(evidence) for evidence, right in site.own if not right] for site, model in sites]
+    counts = [len(site.own) for site, _ in sites]
+    if sum(map(len, wrong)) < _FEWEST_WRONG:  # places that were left out say more than so few
+        wrong = [
+            [model.of_place.logit(each.evidence) for each in site.answers if each.way == LEFT_OUT]
+            for site, model in sites
+        ]
+        counts = [max(1, len(each)) for each in wrong]
+    scale = Scale(off_map, _tail(wrong, counts, _TAIL_OFF_PLACE), 1.0, 0.0)
+    rows, right, weights = [], [], []
+    for site, model in sites:
+        model = replace(model, scale=scale)
+        for group in (site.own, [(evidence, False) for evidence in site.foreign]):
+            rows += [{"log_chance": -math.log(max(model.chance(evidence), 1e-15))} for evidence, _ in group]
+            right += [each for _, each in group]
+            weights += [_EACH / len(group)] * len(group)
+    line = fitted(Logistic(("log_chance",), (1.0,), (1.0,), 0.0), rows, np.array(right), np.array(weights), _PULL)
+    return replace(scale, slope=line.weights[0], offset=line.bias)
+
+
+def _tail(logits: Sequence[Sequence[float]], counts: Sequence[int], part: float) -> Tail:
+    """Fit the tail of the wrong matches of sites, which have these `counts` of matches; each site counts the same."""
+    shares = [np.full(len(of_site), 1 / (count * len(logits))) for of_site, count in zip(logits, counts, strict=True)]
+    return tail_of(np.concatenate([np.array(each, float) for each in logits]), np.concatenate(shares), part)

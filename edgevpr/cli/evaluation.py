@@ -30,6 +30,7 @@ def add(commands: Any) -> None:
         "--form", default="float", metavar="A,B", help=f"of vectors, one row each: {', '.join(FORMS)} (float)"
     )
     parser.add_argument("--exact", action="store_true", help="compare all places in full, which no flight has time for")
+    parser.add_argument("--follow", action="store_true", help="the queries are those of one flight, in order (cohog)")
     parser.add_argument("--config", metavar="FILE", help="YAML; its sections `salience` and `match` count")
     add_keys(parser, "source.camera", "match.candidates", "match.sequence", "salience.use")
     parser.add_argument("--techniques", default="hog,cohog", metavar="A,B", help="names, comma-separated")
@@ -68,7 +69,15 @@ def evaluate(args: Namespace) -> int:
     dataset = load_dataset(args.query, args.ref, args.ground_truth)
     results = [
         evaluation.evaluate(
-            offer.name, dataset, offer.settings, match.candidates, progress, match.sequence, gate, args.exact
+            offer.name,
+            dataset,
+            offer.settings,
+            match.candidates,
+            progress,
+            match.sequence,
+            gate,
+            args.exact,
+            args.follow,
         )
         for offer, _ in tried
         if offer.label not in errors

@@ -25,7 +25,7 @@ from edgevpr.helpers.text import shown
 _MATCHING_KEYS = (
     "board", "technique", "source.camera", "source.mask", "source.fov_deg", "source.up_deg",
     "match.matching", "match.form", "match.candidates", "match.sequence",
-    "match.min_score", "match.min_margin", "memory.budget_mb", "battery.pack",
+    "match.accept_precision", "match.min_score", "match.min_margin", "memory.budget_mb", "battery.pack",
     "salience.use",
 )  # fmt: skip
 
@@ -38,6 +38,7 @@ def add(commands: Any) -> None:
     match.add_argument("--config", metavar="FILE", help="that of the flight; flags given here override it")
     add_parameters(match, "insist on this parameter")
     add_keys(match, *_MATCHING_KEYS)
+    match.add_argument("--follow", action="store_true", help="the images are those of one flight, in order (cohog)")
     add_json(match)
 
     run = command(commands, "run", run_flight, "recognise places in flight and tell the flight controller")
@@ -67,7 +68,9 @@ def run_match(args: Namespace) -> int:
     from edgevpr.techniques.networks.card import weights_of
 
     config = config_of(args, args.config, map=args.map)
-    recogniser = open_recogniser(config, load_board(config.board), settings=parameters_of(args.param))
+    recogniser = open_recogniser(
+        config, load_board(config.board), settings=parameters_of(args.param), follows=args.follow
+    )
     found = []
     unusable: list[ImageError] = []
     source = open_source(args.source, positions=path_of(args.positions), live=False)

@@ -1,12 +1,14 @@
 """The model of confidence: evidence of a match in, the probability that the match is right out.
 
-A match is right when two things hold: the query shows ground of the map at all, and the best place is the right one of
-it. The first is much the same for every map, since it is how well any two pictures agree by chance. The second is not:
-every map has its own look-alikes. So there is one logistic regression for each, and the product of their probabilities.
-The second is fitted anew for each map that is large enough (see `calibrate`), and starts from the shipped one.
+A match can be wrong in two ways: the query shows no ground of the map at all, or it does, and the best place is another
+one. How well pictures agree by chance is much the same for every map; how much its places look alike is not. So there
+is one logistic regression for each way. Both start from the shipped ones and are adapted to a map that is large enough
+(see `calibrate`).
 
-The threshold that a precision asks for comes from the wrong matches of many sites: above a start their logits fall off
-as an exponential distribution does (peaks over a threshold: Pickands 1975), which says how many are left beyond any.
+How many wrong matches go beyond a logit is known from many sites: the highest fall off as an exponential distribution
+does (peaks over a threshold: Pickands 1975). Both ways together are the chance that a wrong match offers as much. The
+threshold that a precision asks for is where that chance is what is left of 1, and the confidence is a probability made
+of its logarithm (Platt 1999).
 """
 
 import json
@@ -23,7 +25,9 @@ from edgevpr.resources import shipped
 Evidence = Mapping[str, float]
 
 _MAX_FILE_BYTES = 100_000
+_TAILS = "off_map", "off_place"
 _MOST = 40.0  # of a logit: beyond, a probability is 0 or 1 in float64
+_LEAST = 1e-15  # of a chance whose logarithm is taken
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,48 +46,66 @@ class Logistic:
 
 @dataclass(frozen=True, slots=True)
 class Tail:
-    """Wrong matches of many sites, as a share of all: so many as `share` are beyond the logit `start`, and fewer by the
+    """The highest logits of wrong matches: the `share` of all matches is wrong and beyond `start`, and less by the
     factor e with every `scale` more."""
 
     start: float
     share: float
     scale: float
 
-    def beyond(self, wrong: float) -> float:
-        """Return the logit beyond which no more than the share `wrong` is left."""
-        return self.start + self.scale * max(0.0, math.log(self.share / wrong))
+    def beyond(self, logit: float) -> float:
+        """Return the share of matches that are wrong and beyond a logit; 1 at most."""
+        return math.exp(min(0.0, math.log(self.share) + (self.start - logit) / self.scale))
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """What logits mean: the tails of matches `off_map` and `off_place` (see `Model`), and the line that makes the logit
+    of the confidence of the logarithm of the chance."""
+
+    off_map: Tail
+    off_place: Tail
+    slope: float
+    offset: float
+
+    def confidence(self, chance: float) -> float:
+        """Return the probability that a match is right, of the chance that a wrong one offers as much."""
+        return probability(self.offset - self.slope * math.log(max(chance, _LEAST)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Model:
     """Confidence of the matches of one technique and kind of evidence. `of_map` tells whether the query shows ground of
-    the map, `of_place` whether the best place is the right one of it. `slope` and `offset` make a probability of both
-    together (Platt 1999). `made` is the date, and `made_of` what it was fitted to, in words."""
+    the map, `of_place` whether the best place is the right one of it, and `scale` what these logits mean;
+    `adapted_scale` is that of a model that is adapted to its map (None: this one is). `made` is the date, and `made_of`
+    what it was fitted to, in words."""
 
     of_map: Logistic
     of_place: Logistic
-    slope: float
-    offset: float
-    tail: Tail
+    scale: Scale
+    adapted_scale: Scale | None = None
     made: str
     made_of: str
 
-    def logit(self, evidence: Evidence) -> float:
-        """Return the logit of both together. Evidence that is not finite gives the lowest."""
-        parts = self.of_map.logit(evidence), self.of_place.logit(evidence)
-        if not all(map(math.isfinite, parts)):
-            return -_MOST
-        # Of the product p = 1 / ((1 + e^-a) (1 + e^-b)): the odds against it are e^-a + e^-b + e^-(a+b).
-        against = sum(math.exp(min(-each, 2 * _MOST)) for each in (*parts, sum(parts)))
-        return max(-_MOST, min(_MOST, -math.log(against)))
+    def chance(self, evidence: Evidence) -> float:
+        """Return how likely a wrong match offers as much as this evidence, 0..1; 1 where some of it is not finite."""
+        logits = self.of_map.logit(evidence), self.of_place.logit(evidence)
+        if not all(map(math.isfinite, logits)):
+            return 1.0
+        return min(1.0, self.scale.off_map.beyond(logits[0]) + self.scale.off_place.beyond(logits[1]))
 
     def confidence(self, evidence: Evidence) -> float:
         """Return the probability that the match is right, 0..1."""
-        return probability(self.slope * self.logit(evidence) + self.offset)
+        return self.scale.confidence(self.chance(evidence))
+
+    def confidence_of_map(self, evidence: Evidence) -> float:
+        """Return the probability that the query shows ground of the map, whichever place of it, 0..1."""
+        logit = self.of_map.logit(evidence)
+        return self.scale.confidence(self.scale.off_map.beyond(logit) if math.isfinite(logit) else 1.0)
 
     def threshold(self, precision: float) -> float:
         """Return the confidence from which on `precision` (below 1) of the matches are right."""
-        return probability(self.slope * self.tail.beyond(1 - precision) + self.offset)
+        return self.scale.confidence(1 - precision)
 
 
 def probability(logit: float) -> float:
@@ -106,12 +128,12 @@ def from_json(text: str) -> Model:
 
 def model_of(found: Mapping[str, Any]) -> Model:
     """Make a model of what JSON holds. Raises ValueError, KeyError or TypeError where that makes no sense."""
+    adapted = found["adapted_scale"]
     return Model(
         of_map=_logistic(found["of_map"]),
         of_place=_logistic(found["of_place"]),
-        slope=_number(found["slope"]),
-        offset=_number(found["offset"]),
-        tail=Tail(**{key: _number(found["tail"][key]) for key in ("start", "share", "scale")}),
+        scale=_scale(found["scale"]),
+        adapted_scale=None if adapted is None else _scale(adapted),
         made=str(found["made"]),
         made_of=str(found["made_of"]),
     )
@@ -134,6 +156,13 @@ def _logistic(found: dict[str, Any]) -> Logistic:
     if not len(names) == len(weights) == len(scales):
         raise ValueError("as many names as weights and scales are needed")
     return Logistic(names, weights, scales, _number(found["bias"]))
+
+
+def _scale(found: Mapping[str, Any]) -> Scale:
+    tails = [Tail(*(_number(found[key][part]) for part in ("start", "share", "scale"))) for key in _TAILS]
+    if not all(tail.scale > 0 and 0 < tail.share <= 1 for tail in tails):
+        raise ValueError("a tail needs a scale above 0, and a share above 0")
+    return Scale(*tails, _number(found["slope"]), _number(found["offset"]))
 
 
 def _number(value: Any) -> float:

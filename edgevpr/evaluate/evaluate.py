@@ -23,6 +23,7 @@ from edgevpr.places.sequence import length_of, search_of
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import pack_ah, parse_pack, queries_ah, rail_ah, stage_energy_j
 from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.recognise.follow import Follower
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.mapping import build_map
 from edgevpr.runtime.recognise.opening import meter_of
@@ -112,10 +113,12 @@ def evaluate(
     sequence: int | None = None,
     gate: Gate | NoGate | None = None,
     exact: bool = False,
+    follow: bool = False,
 ) -> TechniqueResult:
     """Map the references, ask every query, and score the answers. `candidates` places are compared (None: the
     technique's own number, as it flies); with `exact` all are, and the scan chooses none. `sequence` queries are
-    matched together, in the order of their names (None: the technique's own number). `gate` discards queries; the map
+    matched together, in the order of their names (None: the technique's own number); with `follow` they are followed as
+    those of one flight. `gate` discards queries; the map
     has all references, as in the thesis (3.3).
 
     Raises UsageError for an unknown technique or parameter, ImageError for an image that cannot be used, MapError if
@@ -130,7 +133,9 @@ def evaluate(
         length = length_of(technique.spec, sequence)
         rule = accept_rule(technique, config.match, length)
 
-        def walk(length: int) -> Recogniser:
+        follows = follow and length == 1 and rule.sure is not None
+
+        def walk(length: int, follows: bool) -> Recogniser:
             return Recogniser(
                 technique=technique,
                 place_map=place_map,
@@ -140,12 +145,13 @@ def evaluate(
                 candidates=None if exact else candidates or technique.candidates,
                 search=search_of(length),
                 gate=gate,
+                follower=Follower(place_map, fastest_m_s=None, is_live=False) if follows else None,
             )
 
         # The first query pays for lazy imports, tables and a cold disk, so one that is not counted goes first.
-        _asked(walk(1), dataset.queries[0].path)
+        _asked(walk(1, False), dataset.queries[0].path)
         gate.forget()
-        answers = list(_answers(walk(length), dataset, progress))
+        answers = list(_answers(walk(length, follows), dataset, progress, length > 1 or follows))
     return replace(_summary(technique, len(dataset.references), answers), sequence=length)
 
 
@@ -200,10 +206,9 @@ def _frames(source: Source) -> Iterator[Frame]:
         yield source.read(timeout_s=0)
 
 
-def _answers(recogniser: Recogniser, dataset: Dataset, progress: Progress) -> Iterator[_Answer]:
+def _answers(recogniser: Recogniser, dataset: Dataset, progress: Progress, in_sequence: bool) -> Iterator[_Answer]:
     # Queries that are not scored are part of a sequence as well.
     scored = {query.path.name: query for query in dataset.queries}
-    in_sequence = recogniser.search.length > 1
     folder = dataset.queries[0].path.parent
     asked = list_images(folder) if in_sequence else [query.path for query in dataset.queries]
     for path in progress(asked, len(asked), f"{recogniser.technique.spec.name}: queries"):

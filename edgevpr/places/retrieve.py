@@ -4,7 +4,7 @@ A place that cannot be read must never turn a refused match into an accepted wro
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -60,6 +60,11 @@ class Ranking:
     scores: np.ndarray
     compared: dict[int, FineMatch]
     unread: np.ndarray = field(default_factory=lambda: np.empty(0, np.intp))
+
+    def led_by(self, slot: int) -> "Ranking":
+        """Return the ranking with another place first, with its own score."""
+        order = np.argsort(self.slots != slot, kind="stable")
+        return replace(self, slots=self.slots[order], scores=self.scores[order])
 
 
 def scan(technique: Technique, query: Descriptor, index: PlaceIndex, expected: Expected = NOTHING) -> Scan:

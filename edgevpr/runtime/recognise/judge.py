@@ -38,6 +38,7 @@ _CLEAR_SCORE, _LEAST_INLIERS, _LANDMARKS_ENOUGH = 0.2, 5, 100
 _OF_SCORE_WHEN_PROVEN = 0.5
 # Of a place less far ahead than by this factor, landmarks must tell it from the best one elsewhere.
 _HARDLY_AHEAD = math.log(1.5)
+_LEAST_FOLLOWED = 0.5  # of the probability by the flight so far, for a match that is sure by itself
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +52,10 @@ class Sureness:
     def confidence(self, evidence: Evidence) -> float:
         """Return the probability that the match with this evidence is right."""
         return self.models[kind_of(evidence)].confidence(evidence)
+
+    def of_map(self, evidence: Evidence) -> float:
+        """Return the probability that the query with this evidence shows ground of the map."""
+        return self.models[kind_of(evidence)].confidence_of_map(evidence)
 
     def threshold(self, evidence: Evidence) -> float:
         """Return the confidence that is needed."""
@@ -117,6 +122,7 @@ def judge(
     rival: int = 0,
     where: Located | None = None,
     evidence: Evidence | None = None,
+    followed: float | None = None,
 ) -> Verdict:
     """Decide whether the best place of a ranking is accepted.
 
@@ -124,7 +130,8 @@ def judge(
     `NEW_FOR_S` seconds. `proof` is how the landmarks of query and place agree (None: nothing is known of it), and
     `rival` the number of those of the best place elsewhere that agree. `where` is the position that the best places say
     together (None: only that of the best one is known); a place that says the same as the best one is no rival.
-    `evidence` is that of the match (None: the rule has no use for it).
+    `evidence` is that of the match (None: the rule has no use for it), and `followed` the probability that the aircraft
+    is there by all of the flight (None: the query is taken by itself).
     """
     if search.frames < search.length:
         return Verdict(False, f"the sequence has {search.frames} queries of {search.length} yet")
@@ -137,7 +144,7 @@ def judge(
     if len(ranking.unread):
         return Verdict(False, "a place that cannot be read may be the right one")
     if rule.sure:
-        verdict = _by_confidence(rule.sure, evidence, proof, rival)
+        verdict = _by_confidence(rule.sure, evidence, proof, rival, followed)
     elif ahead is None:
         verdict = Verdict(True, f"score {score:.3f}; there is no place elsewhere to compare with")
     else:
@@ -168,14 +175,22 @@ def _below_limits(score: float, ahead: float | None, rule: AcceptRule) -> str | 
     return None
 
 
-def _by_confidence(sure: Sureness, evidence: Evidence | None, proof: Agreement | None, rival: int) -> Verdict:
-    """Decide by the confidence of a match; say it in words and figures."""
+def _by_confidence(
+    sure: Sureness, evidence: Evidence | None, proof: Agreement | None, rival: int, followed: float | None
+) -> Verdict:
+    """Decide by the confidence of a match, or of the flight so far; say it in words and figures."""
     if evidence is None:
         return Verdict(False, "nothing is known that could make it sure")
     confidence, needed = sure.confidence(evidence), sure.threshold(evidence)
     figures = f"confidence {confidence:.4f}, {needed:.4f} needed: {said(evidence)}"
-    if not confidence >= needed:
+    if followed is not None:
+        figures = f"{followed:.4f} sure by the flight so far; {figures}"
+    by_itself = confidence >= needed
+    by_flight = followed is not None and followed >= sure.precision
+    if not (by_itself or by_flight):
         return Verdict(False, figures)
+    if followed is not None and followed < _LEAST_FOLLOWED:
+        return Verdict(False, f"the flight so far speaks against it: {figures}")
     if proof is not None and is_hardly_ahead(evidence) and proof.inliers < 2 * rival:
         return Verdict(False, f"{rival} landmarks of a place elsewhere agree as well; {figures}")
     return Verdict(True, figures)

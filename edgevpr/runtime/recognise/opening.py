@@ -22,6 +22,8 @@ from edgevpr.places.sequence import bytes_beside_place, length_of, search_of
 from edgevpr.power.boards import Board
 from edgevpr.power.equations import parse_pack
 from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.recognise.evidence import kinds_of
+from edgevpr.runtime.recognise.follow import Follower, NoFollower
 from edgevpr.runtime.recognise.hints import Prior
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.levelling import levelling_of
@@ -36,11 +38,17 @@ _ROOM = 20_000  # places to learn in a flight: 200 km at the usual spacing; beyo
 
 
 def open_recogniser(
-    config: Config, board: Board, *, settings: dict[str, str] | None = None, narrowed: bool = False
+    config: Config,
+    board: Board,
+    *,
+    settings: dict[str, str] | None = None,
+    narrowed: bool = False,
+    follows: bool = False,
 ) -> Recogniser:
     """Open the map, make its technique for the board, and load the index.
 
     With `narrowed`, for a flight, hints narrow each query (see `hints`); otherwise every query searches the whole map.
+    With `follows`, queries are those of one flight, in order (see `follow`).
     Raises an EdgevprError that says what does not go together, such as `settings` of the technique that the map was not
     built with.
     """
@@ -50,7 +58,7 @@ def open_recogniser(
     with _closed_on_error(place_map):
         technique = technique_of(place_map, config.technique, _wanted(config) | (settings or {}), board)
         index = _loaded(config, board, technique, place_map)
-    return _recogniser(config, board, technique, place_map, index, narrowed)
+    return _recogniser(config, board, technique, place_map, index, narrowed=narrowed, follows=follows)
 
 
 def open_learning(config: Config, board: Board, new_technique: str | None) -> tuple[Recogniser, GrowingIndex]:
@@ -79,7 +87,10 @@ def open_learning(config: Config, board: Board, new_technique: str | None) -> tu
             room=_ROOM,
             beside_bytes=bytes_beside_place(length_of(technique.spec, config.match.sequence)),
         )
-    return _recogniser(config, board, technique, place_map, growing.index, narrowed=True), growing
+    recogniser = _recogniser(
+        config, board, technique, place_map, growing.index, narrowed=True, follows=config.match.follow
+    )
+    return recogniser, growing
 
 
 def has_map(path: Path) -> bool:
@@ -189,7 +200,14 @@ def technique_of(
 
 
 def _recogniser(
-    config: Config, board: Board, technique: Technique, place_map: PlaceMap, index: PlaceIndex, narrowed: bool
+    config: Config,
+    board: Board,
+    technique: Technique,
+    place_map: PlaceMap,
+    index: PlaceIndex,
+    *,
+    narrowed: bool,
+    follows: bool,
 ) -> Recogniser:
     length = length_of(technique.spec, config.match.sequence)
     if narrowed:
@@ -211,6 +229,7 @@ def _recogniser(
         gate=gate_of(config.salience, board.threads),
         levelling=levelling_of(config.source, technique, footprint_m=place_map.footprint_m()),
         verify=config.match.verify,
+        follower=_follower(config, technique, place_map) if follows else None,
     )
 
 
@@ -237,8 +256,19 @@ def say_other_mask(place_map: PlaceMap, mask: AnyMask) -> None:
         _log.warning("%s was built %s; more is recognised where map and frames have the same", place_map.path, how)
 
 
+def _follower(config: Config, technique: Technique, place_map: PlaceMap) -> Follower | NoFollower:
+    """Make a follower, for a technique whose matches have a confidence and that is asked for no sequence."""
+    if config.match.sequence is not None or not kinds_of(technique.spec):
+        return NoFollower()
+    return Follower(place_map, fastest_m_s=config.match.reach_m_s, is_live=_is_now(config))
+
+
+def _is_now(config: Config) -> bool:
+    return config.source.uri is not None and is_live(config.source.uri)
+
+
 def _prior(config: Config, technique: Technique) -> Prior:
-    is_now = config.source.uri is not None and is_live(config.source.uri)
+    is_now = _is_now(config)
     return Prior(config.match.reach_m_s, technique.spec.heading_within_deg, is_now)
 
 

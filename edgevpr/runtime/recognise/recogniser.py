@@ -19,6 +19,7 @@ from edgevpr.places.retrieve import Expected, Ranking, compare, named, scan, tog
 from edgevpr.places.sequence import Alone, Search
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.evidence import evidence_ahead, evidence_down
+from edgevpr.runtime.recognise.follow import Followed, Follower, NoFollower
 from edgevpr.runtime.recognise.gate import says_nothing
 from edgevpr.runtime.recognise.hints import NoPrior, Prior, expected_of, other_heights
 from edgevpr.runtime.recognise.judge import NEW_FOR_S, AcceptRule, Verdict, is_hardly_ahead, judge
@@ -42,6 +43,7 @@ class _Judged:
     proof: Agreement | None = None
     where: Located | None = None
     evidence: dict[str, float] | None = None
+    followed: Followed | None = None
 
 
 _NOT_JUDGED = _Judged(None, None)
@@ -53,7 +55,8 @@ class Recogniser:
     `candidates` places are compared (None: all in full, see `places.retrieve.compare`). `gate` refuses frames that are
     not memorable, `mask` leaves parts of every frame out, and `levelling` lays each on the ground. `search` joins
     several queries, and `prior` narrows each; without them each query is ranked alone, over the whole map. `verify`
-    holds the best place against its landmarks, where the map has some. The governor changes `candidates`; the learner
+    holds the best place against its landmarks, where the map has some. `follower` follows the flight from query to
+    query. The governor changes `candidates`; the learner
     and the governor change the index (`take`, `extend`).
     """
 
@@ -73,10 +76,12 @@ class Recogniser:
         gate: Gate | NoGate | None = None,
         levelling: AnyLevelling | None = None,
         verify: bool = True,
+        follower: Follower | NoFollower | None = None,
     ) -> None:
         self.place_map, self.meter, self.candidates = place_map, meter, candidates
         self._prior, self._min_accuracy_m, self._mask = prior or NoPrior(), min_accuracy_m, mask or NoMask()
         self._gate, self._levelling, self._verifies = gate or NoGate(), levelling or NoLevelling(), verify
+        self._follower = follower or NoFollower()
         self._told = 0  # number of places left out that an event has told of
         self._new: deque[tuple[int, float]] = deque()  # place id, and the time it was learnt at
         self.take(technique, index, rule, search or Alone())
@@ -121,10 +126,12 @@ class Recogniser:
                 raise MapError(self._lost)
             nothing = says_nothing(descriptor, self.rule.min_quality)
             objection = nothing or (worth and worth.reason)
+            self._follower.went_on(frame, vehicle)
             if not len(index):
                 verdict = Verdict(False, "the map has no place yet")
             elif objection and self.search.length == 1:  # in a sequence it is searched for, to keep the others in step
                 verdict = Verdict(False, objection)
+                self._follower.saw_nothing(index)
             else:
                 margin_m = max(self.accuracy_m, self.rule.neighbour_m)
                 hints = self._prior.hints(seen_as(frame, picture.view), vehicle, index, margin_m)
@@ -140,6 +147,7 @@ class Recogniser:
                         ranking = together(ranking, look)
                     if others:
                         judged = self._judged(frame, ranking, looked)
+                self._follower.settle()
                 verdict = Verdict(False, objection) if objection else judged.verdict
                 self._prior.learn(judged.best, verdict.accepted, frame.t_mono_s)
             failed = False
@@ -161,6 +169,7 @@ class Recogniser:
             best=judged.best,
             proof=judged.proof,
             evidence=evidence,
+            followed=judged.followed,
             confidence=sure.confidence(evidence) if sure and evidence else None,
             accepted=verdict.accepted,
             reason=verdict.reason,
@@ -193,32 +202,40 @@ class Recogniser:
                 expected=expected,
             )
 
-    def _judged(self, frame: Frame, ranking: Ranking, looked: Verification) -> _Judged:
-        """Judge the best place of a ranking, with its landmarks and what the places beside it say."""
+    def _judged(
+        self, frame: Frame, ranking: Ranking, looked: Verification, followed: Followed | None = None
+    ) -> _Judged:
+        """Judge the best place of a ranking, with its landmarks, what the places beside it say, and the flight so far:
+        that may know better which place is the best (`followed`: it has been asked)."""
         index, place_map, cells, rule = self.index, self.place_map, self.technique.spec.cells, self.rule
         with self.meter.step("compare"):
             (best,) = named(ranking, index, place_map, first=1)
             is_new = self._is_new(best.place.place_id, frame.t_mono_s)
         where = proof = None
-        if best.match.score < rule.worth_a_look:
-            evidence = self._evidence(ranking, None, ())
-            return _Judged(best, judge(ranking, index, rule, self.search, is_new, evidence=evidence), evidence=evidence)
+        is_worth_it = best.match.score >= rule.worth_a_look
         # The newest query of a sequence need not be sure by itself.
-        if verifies := self._verifies and self.search.length == 1 and cells is not None:
+        if verifies := is_worth_it and self._verifies and self.search.length == 1 and cells is not None:
             with self.meter.step("verify"):
                 proof = looked.proof(ranking)
-        with self.meter.step("locate"):
-            found = named(ranking, index, place_map, first=HEARD if cells else 1)
-            where = located(found, cells, looked.picture.view, proof)
-            if where is None and best.place.position:
-                where = at_place(best.place.position, self.accuracy_m)
+        if is_worth_it:
+            with self.meter.step("locate"):
+                found = named(ranking, index, place_map, first=HEARD if cells else 1)
+                where = located(found, cells, looked.picture.view, proof)
+                if where is None and best.place.position:
+                    where = at_place(best.place.position, self.accuracy_m)
         same = where.places if where else ()
         evidence, rival = self._evidence(ranking, proof, same), 0
+        if followed is None and evidence is not None:
+            with self.meter.step("locate"):
+                followed = self._follower.heard(ranking, index, evidence, rule.sure, where)
+            if followed and followed.leads_from(int(ranking.slots[0])):
+                return self._judged(frame, ranking.led_by(followed.slot), looked, followed)
         if verifies and proof and is_hardly_ahead(evidence):
             with self.meter.step("verify"):
                 rival = looked.rival(ranking, rule.neighbour_m, same)
-        verdict = judge(ranking, index, rule, self.search, is_new, proof, rival, where, evidence)
-        return _Judged(best, verdict, proof, where, evidence)
+        sure = followed and followed.confidence
+        verdict = judge(ranking, index, rule, self.search, is_new, proof, rival, where, evidence, sure)
+        return _Judged(best, verdict, proof, where, evidence, followed)
 
     def _evidence(self, ranking: Ranking, proof: Agreement | None, same: Sequence[int]) -> dict[str, float] | None:
         if self.rule.sure is None:

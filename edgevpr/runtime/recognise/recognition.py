@@ -7,6 +7,7 @@ from edgevpr.contract import Descriptor
 from edgevpr.frames.level import UNKNOWN_VIEW, Levelled, View
 from edgevpr.landmarks.agreement import Agreement
 from edgevpr.places.retrieve import Ranking
+from edgevpr.runtime.recognise.follow import Followed
 from edgevpr.runtime.recognise.hints import Hints
 from edgevpr.runtime.recognise.locate import Located
 from edgevpr.salience.gate import Worth
@@ -49,6 +50,7 @@ class Recognition:
     proof: Agreement | None = None
     evidence: dict[str, float] | None = None
     confidence: float | None = None
+    followed: Followed | None = None
     accepted: bool = False
     reason: str
     says_nothing: bool = False
@@ -95,12 +97,17 @@ def fields_of(event: Recognition) -> dict[str, Any]:
         **({"landmarks": _landmarks(event.proof)} if event.proof else {}),
         **({"confidence": round(event.confidence, 6)} if event.confidence is not None else {}),
         **({"evidence": {key: round(each, 3) for key, each in event.evidence.items()}} if event.evidence else {}),
+        **({"followed": _belief(event.followed)} if event.followed else {}),
         "accepted": event.accepted,
         "reason": event.reason,
         "accuracy_m": event.accuracy_m,
         "located": _rounded(event.located),
         "costs": {key: value and float(f"{value:.6g}") for key, value in asdict(event.cost).items()},
     }
+
+
+def _belief(followed: Followed) -> dict[str, Any]:
+    return {"confidence": round(followed.confidence, 6), "lost": round(followed.posterior.lost, 6)}
 
 
 def _landmarks(proof: Agreement) -> dict[str, Any]:

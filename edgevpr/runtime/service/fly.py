@@ -120,7 +120,7 @@ def _opened(config: Config, board: Board) -> tuple[Recogniser, Learner | None, s
     the reason: the places of the map are recognised all the same.
     """
     if not config.mapping.learn:
-        return open_recogniser(config, board, narrowed=True), None, None
+        return open_recogniser(config, board, narrowed=True, follows=config.match.follow), None, None
     name = config.technique
     if name is None and config.map is not None and not has_map(Path(config.map)):
         name = picked_technique(config.board, _NEW_MAP_PLACES, config.source.camera)
@@ -128,7 +128,7 @@ def _opened(config: Config, board: Board) -> tuple[Recogniser, Learner | None, s
         recogniser, growing = open_learning(config, board, name)
     except MapError as error:
         try:
-            return open_recogniser(config, board, narrowed=True), None, str(error)
+            return open_recogniser(config, board, narrowed=True, follows=config.match.follow), None, str(error)
         except MapError:
             raise error from None
     return (

@@ -1,0 +1,192 @@
+"""Following a flight from query to query: what one query says of itself is handed to a belief (see `belief`).
+
+The best place of a query has its confidence. What is left of the probability that it shows ground of the map at all is
+spread over the other places it was compared with.
+"""
+
+import copy
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from edgevpr.belief.belief import Belief, Posterior
+from edgevpr.belief.motion import Moved, moved
+from edgevpr.belief.seen import Ground, Seen
+from edgevpr.contract import FineMatch
+from edgevpr.geodesy import offset_m
+from edgevpr.places.index import PlaceIndex
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.retrieve import Ranking
+from edgevpr.runtime.recognise.judge import Sureness
+from edgevpr.runtime.recognise.locate import Located
+from edgevpr.types import Frame, Position, Vehicle
+
+# Chosen on corridor, aerial_caliterra and aerial_garfield28.
+_SHARPNESS = 10.0  # of two places, how much more likely is the one with more votes: the power of the ratio
+_OTHERS = 0.7  # of what the best place leaves: so often the right one is among the others
+_HEARD = 20  # places of one query
+_NEAR_PLACES, _NEAR_FOOTPRINT, _HALF = 3.0, 0.25, 0.5
+_PLACES_A_QUERY = 3.0  # at most, where nothing is known of the time or of the ground
+_FASTEST_M_S = 30.0  # unless the configuration says another speed
+_LEAST_SPACING_M = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class Followed:
+    """What the flight so far makes of a query: the `slot` of the place that is likeliest now, and the probability
+    `confidence` that the aircraft is there (0 and None without any). `posterior` is the belief behind it."""
+
+    slot: int | None
+    confidence: float
+    posterior: Posterior
+
+    def leads_from(self, slot: int) -> bool:
+        """Tell whether another place than this one is more likely than not."""
+        return self.slot is not None and self.slot != slot and self.confidence > _HALF
+
+
+class NoFollower:
+    """Stands in for a `Follower` where each query is taken by itself."""
+
+    def heard(
+        self, ranking: Ranking, index: PlaceIndex, evidence: Mapping[str, float], sure: Sureness, where: Located | None
+    ) -> None:
+        """Return None: nothing is known of the flight so far."""
+
+    def went_on(self, frame: Frame, vehicle: Vehicle | None) -> None:
+        """Take no note of the time."""
+
+    def saw_nothing(self, index: PlaceIndex) -> None:
+        """Take no note of a picture that says nothing."""
+
+    def settle(self) -> None:
+        """Keep nothing."""
+
+
+class Follower:
+    """Follows one flight over one map: `went_on` for each frame, then `heard` for each look of it, and `settle` keeps
+    what the last look has led to.
+
+    `fastest_m_s` is the highest speed of the aircraft (None: unknown). `is_live` is False for frames of a recording,
+    whose times are those of their own clock.
+    """
+
+    def __init__(self, place_map: PlaceMap, *, fastest_m_s: float | None, is_live: bool) -> None:
+        self._map, self._fastest_m_s, self._is_live = place_map, fastest_m_s or _FASTEST_M_S, is_live
+        self._origin: Position | None = None
+        self._ground: Ground | None = None  # of the map, once it has a place
+        self._t_last_s: float | None = None
+        self._elapsed_s: float | None = None
+        self._velocity_m_s: tuple[float, float] | None = None
+
+    def went_on(self, frame: Frame, vehicle: Vehicle | None) -> None:
+        """Take note of the time that has passed and of the velocity of the aircraft, if they are known."""
+        now_s = frame.t_mono_s if self._is_live else frame.t_utc_s
+        before_s, self._t_last_s = self._t_last_s, now_s
+        self._elapsed_s = None if before_s is None or now_s is None else now_s - before_s
+        is_fresh = self._is_live and vehicle is not None and vehicle.is_fresh_at(frame.t_mono_s)
+        self._velocity_m_s = vehicle.velocity_m_s if is_fresh else None
+
+    def heard(
+        self, ranking: Ranking, index: PlaceIndex, evidence: Mapping[str, float], sure: Sureness, where: Located | None
+    ) -> Followed:
+        """Return what becomes of the belief with the places of a look, of which the best has this `evidence` and says
+        that the aircraft is at `where` (None: at the place)."""
+        self._survey(index)
+        slots, seen = self._seen(ranking, index, evidence, sure, where)
+        self._next = copy.copy(self._belief)
+        posterior = self._next.update(seen, self._moved(), len(index))
+        if not len(slots) or not posterior.p.max() > 0:
+            return Followed(None, 0.0, posterior)
+        best = int(posterior.p.argmax())
+        near = np.hypot(*(seen.at - seen.at[best]).T) <= self._ground.near
+        return Followed(int(slots[best]), float(posterior.p[near].sum()), posterior)
+
+    def saw_nothing(self, index: PlaceIndex) -> None:
+        """Take note of a picture that says nothing: nobody knows whether it shows ground of the map."""
+        if self._ground is not None:
+            self._next = copy.copy(self._belief)
+            self._next.update(None, self._moved(), len(index))
+            self.settle()
+
+    def settle(self) -> None:
+        """Believe what the last look has led to."""
+        self._belief = self._next
+
+    def _survey(self, index: PlaceIndex) -> None:
+        """Measure the ground of the map when its first place is there, and again when its places get positions."""
+        known = ~np.isnan(index.lat_deg)
+        has_positions = known.mean() > _HALF
+        if self._ground is not None and (self._origin is not None or not has_positions):
+            return
+        spacing_m = index.spacing_m() or 0.0
+        self._spread_m = max(_LEAST_SPACING_M, spacing_m)  # of a place without pose
+        if has_positions:
+            first = int(np.flatnonzero(known)[0])
+            self._origin = Position(float(index.lat_deg[first]), float(index.lon_deg[first]))
+            footprint_m = self._map.footprint_m()
+            spacing_m = max(_LEAST_SPACING_M, footprint_m / 2 if footprint_m else spacing_m)
+            near_m = max(_LEAST_SPACING_M, _NEAR_FOOTPRINT * footprint_m if footprint_m else self._spread_m)
+            self._ground = Ground(spacing=spacing_m, near=near_m)
+        else:
+            self._ground = Ground(spacing=1.0, near=_NEAR_PLACES, is_ordinal=True)
+        self._belief = self._next = Belief(self._ground)
+
+    def _moved(self) -> Moved:
+        if self._ground.is_ordinal or self._elapsed_s is None:
+            return moved(None, 1.0, _PLACES_A_QUERY * self._ground.spacing)
+        return moved(self._elapsed_s, 1.0, self._fastest_m_s, self._velocity_m_s)
+
+    def _seen(
+        self,
+        ranking: Ranking,
+        index: PlaceIndex,
+        evidence: Mapping[str, float],
+        sure: Sureness,
+        where: Located | None,
+    ) -> tuple[np.ndarray, Seen]:
+        """Return the slots of the places heard, and what the look says of them."""
+        slots = np.array([slot for slot in ranking.slots.tolist() if slot in ranking.compared][:_HEARD])
+        at = self._positions(slots, index)
+        spread = 1.0 if self._ground.is_ordinal else self._spread_m**2
+        covariance = np.tile(spread * np.eye(2), (len(slots), 1, 1))
+        heading_deg = np.full(len(slots), np.nan)
+        same = np.zeros(len(slots), bool)
+        if where and self._origin:
+            at[0] = offset_m(self._origin.lat_deg, self._origin.lon_deg, where.position.lat_deg, where.position.lon_deg)
+            east, cov, north = where.covariance_m2
+            covariance[0] = (east, cov), (cov, north)
+            heading_deg[0] = np.nan if where.heading_deg is None else where.heading_deg
+            same = np.isin(index.place_ids[slots], where.places) & (slots != slots[0])
+        heard = ~np.isnan(at[:, 0]) & ~same
+        slots, at, covariance, heading_deg = slots[heard], at[heard], covariance[heard], heading_deg[heard]
+        votes = np.array([_votes(ranking.compared[slot]) for slot in slots.tolist()])
+        p = np.zeros(len(slots))
+        if len(slots):
+            near = np.hypot(*(at - at[0]).T) <= self._ground.near
+            confidence = sure.confidence(evidence)
+            p[near] = confidence * _shares(votes[near])
+            left = max(0.0, sure.of_map(evidence) - confidence)
+            p[~near] = _OTHERS * left * _shares(votes[~near])
+        return slots, Seen(p=p, at=at, covariance=covariance, heading_deg=heading_deg)
+
+    def _positions(self, slots: np.ndarray, index: PlaceIndex) -> np.ndarray:
+        """Return where places are, as the belief has it: float (K, 2), NaN where unknown."""
+        if self._origin is None:
+            return np.stack([index.place_ids[slots].astype(float), np.zeros(len(slots))], 1)
+        lat_deg, lon_deg = index.lat_deg[slots], index.lon_deg[slots]
+        return np.stack(offset_m(self._origin.lat_deg, self._origin.lon_deg, lat_deg, lon_deg), 1).astype(float)
+
+
+def _votes(match: FineMatch) -> float:
+    return match.score if match.support is None else math.sqrt(match.score * match.support.back)
+
+
+def _shares(votes: np.ndarray) -> np.ndarray:
+    """Return how probability is shared between places with these votes."""
+    if not len(votes):
+        return votes
+    weight = (np.maximum(votes, 1e-6) / max(float(votes.max()), 1e-6)) ** _SHARPNESS
+    return weight / weight.sum()
