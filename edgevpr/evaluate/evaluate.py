@@ -26,7 +26,7 @@ from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.follow import Follower
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.mapping import build_map
-from edgevpr.runtime.recognise.opening import meter_of
+from edgevpr.runtime.recognise.opening import calibrated, meter_of
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.salience.gate import Gate, NoGate
@@ -131,7 +131,7 @@ def evaluate(
     frames = progress(_frames(source), source.total, f"{technique_name}: references")
     with mapped(frames, technique, meter, dataset.ref_dir) as (place_map, index):
         length = length_of(technique.spec, sequence)
-        rule = accept_rule(technique, config.match, length)
+        rule = accept_rule(technique, config.match, length, calibrated(place_map))
 
         follows = follow and length == 1 and rule.sure is not None
 
@@ -159,13 +159,14 @@ def evaluate(
 def mapped(
     frames: Iterable[Frame], technique: Technique, meter: QueryMeter, images: Path | None = None
 ) -> Iterator[tuple[PlaceMap, PlaceIndex]]:
-    """Map frames in a temporary folder, and refine the map as `map build` does; give it, open for reading, and an index
-    with all its places. `images` is the folder that the frames come from."""
+    """Map frames in a temporary folder, refine and calibrate the map as `map build` does. Give it, open to read, and
+    an index with all its places. `images` is the folder that the frames come from."""
     with tempfile.TemporaryDirectory(prefix="edgevpr-eval-") as folder:
         path = Path(folder) / "references.gpkg"
         with PlaceMap.create(path, technique.spec) as place_map:
             build_map(frames, technique, place_map, meter)
             _refine(place_map, technique, images)
+            _calibrate(place_map, technique, meter, images)
         with PlaceMap.open(path) as place_map:
             yield place_map, load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
 
@@ -178,6 +179,21 @@ def _refine(place_map: PlaceMap, technique: Technique, images: Path | None) -> N
     except ModuleNotFoundError:  # without SciPy, the maps of this machine are not refined either
         return
     refine(place_map, technique, lambda pairs, total: pairs, images)
+
+
+def _calibrate(place_map: PlaceMap, technique: Technique, meter: QueryMeter, images: Path | None) -> None:
+    if images is None:
+        return
+    try:
+        from edgevpr.calibrate.calibrate import calibrate
+    except ModuleNotFoundError:  # without SciPy
+        return
+
+    def pictures(names: Iterable[str]) -> Iterator[Frame]:
+        for name in names:
+            yield Frame(image=read_image(images / name), name=name, t_mono_s=0.0)
+
+    calibrate(technique, place_map, load_config(None).match, meter, pictures, lambda frames, total: frames)
 
 
 def compare(results: Iterable[TechniqueResult]) -> list[TechniqueResult]:

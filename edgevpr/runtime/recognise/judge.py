@@ -186,7 +186,7 @@ def _by_confidence(
     if followed is not None:
         figures = f"{followed:.4f} sure by the flight so far; {figures}"
     by_itself = confidence >= needed
-    by_flight = followed is not None and followed >= sure.precision
+    by_flight = followed is not None and followed >= needed
     if not (by_itself or by_flight):
         return Verdict(False, figures)
     if followed is not None and followed < _LEAST_FOLLOWED:

@@ -36,8 +36,9 @@ _OF_CANDIDATES = 0.4  # are compared from each height but the first
 
 @dataclass(frozen=True, slots=True)
 class _Judged:
-    """The best place of a query, the verdict on it, and what led to it."""
+    """The ranking of a query after all that is known, its best place, the verdict on it, and what led to it."""
 
+    ranking: Ranking | None
     best: Candidate | None
     verdict: Verdict | None
     proof: Agreement | None = None
@@ -46,7 +47,7 @@ class _Judged:
     followed: Followed | None = None
 
 
-_NOT_JUDGED = _Judged(None, None)
+_NOT_JUDGED = _Judged(None, None, None)
 
 
 class Recogniser:
@@ -112,7 +113,7 @@ class Recogniser:
         Never raises an Exception: an error of a frame, a place or the technique becomes a refusal with its reason.
         """
         meter, technique, index = self.meter, self.technique, self.index
-        worth = descriptor = hints = ranking = judged = nothing = objection = picture = None
+        worth = descriptor = hints = judged = nothing = objection = picture = None
         map_lost = False
         meter.begin()
         try:
@@ -165,7 +166,7 @@ class Recogniser:
             worth=worth,
             descriptor=descriptor,
             hints=hints,
-            ranking=ranking,
+            ranking=judged.ranking,
             best=judged.best,
             proof=judged.proof,
             evidence=evidence,
@@ -235,7 +236,7 @@ class Recogniser:
                 rival = looked.rival(ranking, rule.neighbour_m, same)
         sure = followed and followed.confidence
         verdict = judge(ranking, index, rule, self.search, is_new, proof, rival, where, evidence, sure)
-        return _Judged(best, verdict, proof, where, evidence, followed)
+        return _Judged(ranking, best, verdict, proof, where, evidence, followed)
 
     def _evidence(self, ranking: Ranking, proof: Agreement | None, same: Sequence[int]) -> dict[str, float] | None:
         if self.rule.sure is None:
