@@ -64,7 +64,8 @@ def laid(folder: Path) -> Laid:
 
 @dataclass(frozen=True, slots=True)
 class Ground:
-    """Where the canvas of a mosaic lies on the Earth: columns and rows (of the corners of pixels) to metres of `crs`."""
+    """Where the canvas of a mosaic lies on the Earth: `affine` leads from its columns and rows (of the corners of
+    pixels) to metres of `crs`."""
 
     crs: str
     affine: rasterio.Affine
@@ -117,7 +118,7 @@ def write_tif(path: Path, ground: Ground, canvas: np.ndarray, covered: np.ndarra
     bands = np.dstack([canvas[..., ::-1], 255 * covered.astype(np.uint8)]).transpose(2, 0, 1)
     layout = {"driver": "GTiff", "width": width, "height": height, "count": 4, "dtype": "uint8", "crs": ground.crs}
     with rasterio.open(
-        path, "w", transform=ground.affine, tiled=True, compress="deflate", photometric="RGB", **layout
+        path, "w", transform=ground.affine, tiled=True, compress="deflate", photometric="RGB", alpha="yes", **layout
     ) as out:
         out.write(bands)
 
