@@ -12,9 +12,9 @@ the site *rows* one piece of ground repeats itself four times. The autopilot tel
 5 % off, its bias wanders by up to 0.5 m/s, the heading is 5 degrees off. From a third on, the odometry of some flights
 stops, is wrong by a factor of two, or is not a number; some have none.
 
-A fix is *wrong* where the aircraft is over ground of another set, or farther off than both a quarter of the picture's
-longest side and three standard deviations that the fix claims. It is *far off* where it is more than half the longest
-side off, whatever it claims. Lost are the times over the map without a fix that is right.
+A fix is *wrong* where the aircraft is over ground of another set, or farther off than both a quarter of the longest
+side of the map's pictures, on the ground, and three standard deviations that the fix claims. It is *far off* where it
+is more than half that side off, whatever it claims. Lost are the times over the map without a fix that is right.
 
 Positions of kite_ochota, aerial_copr and rows have an assumed scale. The truth is that of the mosaic, which drifts: of
 aerial_swindale its scale changes by a factor of two from one end to the other. aerial_brighton has four pictures to fly
@@ -166,8 +166,7 @@ def _told(event: Recognition, site: Site, query: Row) -> Row:
     if where is None:
         return row
     off_m = site.offset(where.position) - (query["east_m"], query["north_m"])
-    error_m, side_m = float(np.hypot(*off_m)), query["footprint_m"]
-    sd_m = where.accuracy_m
+    error_m, side_m, sd_m = float(np.hypot(*off_m)), site.footprint_m, where.accuracy_m
     foreign = query["over"] != site.name
     is_wrong = foreign or error_m > max(_WRONG_OF_SIDE * side_m, _WRONG_SD * sd_m)
     return row | {
