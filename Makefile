@@ -27,6 +27,7 @@ results: $(VENV)/installed
 	$(BIN)/python benchmarks/height_and_tilt.py
 	$(BIN)/python benchmarks/verification.py
 	$(BIN)/python benchmarks/from_orthophoto.py
+	$(BIN)/python benchmarks/flights.py
 	$(BIN)/python benchmarks/readme.py
 
 # Speed and memory against the published way, into benchmarks/results/.

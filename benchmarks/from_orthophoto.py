@@ -62,14 +62,30 @@ def laid(folder: Path) -> Laid:
     return Laid({name: each - low for name, each in at.items()}, scale, turn, (width, height))
 
 
-def write_mosaic(folder: Path, on: Laid, path: Path) -> dict[str, tuple[float, float]]:
-    """Write the mosaic of a set's map pictures; return where its queries are, (lat_deg, lon_deg) by name."""
+@dataclass(frozen=True, slots=True)
+class Ground:
+    """Where the canvas of a mosaic lies on the Earth: `affine` leads from its columns and rows (of the corners of
+    pixels) to metres of `crs`."""
+
+    crs: str
+    affine: rasterio.Affine
+
+    def position(self, pixel: np.ndarray) -> tuple[float, float]:
+        """Return where a point of the canvas (2,) is, (lat_deg, lon_deg)."""
+        east, north = self.affine @ tuple(pixel + 0.5)
+        (lon,), (lat,) = transform(self.crs, "EPSG:4326", [east], [north])
+        return lat, lon
+
+
+def mosaic_of(folder: Path, on: Laid, part: str) -> tuple[np.ndarray, np.ndarray]:
+    """Lay the pictures of a `part` of a set (ref, query) over each other: uint8 (H, W, 3) BGR, and bool (H, W), True
+    where there is any."""
     width, height = on.size
     canvas, best = np.zeros((height, width, 3), np.uint8), np.zeros((height, width), np.float32)
     for name in sorted(on.middle):
-        if not (folder / "ref" / name).is_file():
+        if not (folder / part / name).is_file():
             continue
-        image = read_image(folder / "ref" / name)
+        image = read_image(folder / part / name)
         high, wide = image.shape[:2]
         cos, sin = on.scale[name] * np.cos(on.turn[name]), on.scale[name] * np.sin(on.turn[name])
         turned = np.array([[cos, -sin], [sin, cos]])
@@ -80,6 +96,11 @@ def write_mosaic(folder: Path, on: Laid, path: Path) -> dict[str, tuple[float, f
         nearer = weight > best
         canvas[nearer] = np.maximum(cv2.warpAffine(image, matrix, on.size)[nearer], 1)
         best[nearer] = weight[nearer]
+    return canvas, best > 0
+
+
+def ground_of(folder: Path, on: Laid) -> Ground:
+    """Fit where a mosaic lies to the tags of its pictures."""
     tags = {name: tag.position for name, tag in read_positions(folder / "positions.csv").items() if tag.position}
     tagged = [name for name in on.middle if name in tags]
     lat_deg, lon_deg = ([getattr(tags[name], key) for name in tagged] for key in ("lat_deg", "lon_deg"))
@@ -88,18 +109,25 @@ def write_mosaic(folder: Path, on: Laid, path: Path) -> dict[str, tuple[float, f
     scale, offset = _similarity(
         np.array([complex(*on.middle[name] * (1, -1)) for name in tagged]), np.array(east_m) + 1j * np.array(north_m)
     )
-    placed = rasterio.Affine(scale.real, scale.imag, offset.real, scale.imag, -scale.real, offset.imag)
-    bands = np.dstack([canvas[..., ::-1], 255 * (best > 0).astype(np.uint8)]).transpose(2, 0, 1)
-    layout = {"driver": "GTiff", "width": width, "height": height, "count": 4, "dtype": "uint8", "crs": crs}
-    with rasterio.open(path, "w", transform=placed, tiled=True, compress="deflate", photometric="RGB", **layout) as out:
+    return Ground(crs, rasterio.Affine(scale.real, scale.imag, offset.real, scale.imag, -scale.real, offset.imag))
+
+
+def write_tif(path: Path, ground: Ground, canvas: np.ndarray, covered: np.ndarray) -> None:
+    """Write a mosaic as a geo-referenced GeoTIFF."""
+    height, width = covered.shape
+    bands = np.dstack([canvas[..., ::-1], 255 * covered.astype(np.uint8)]).transpose(2, 0, 1)
+    layout = {"driver": "GTiff", "width": width, "height": height, "count": 4, "dtype": "uint8", "crs": ground.crs}
+    with rasterio.open(
+        path, "w", transform=ground.affine, tiled=True, compress="deflate", photometric="RGB", alpha="yes", **layout
+    ) as out:
         out.write(bands)
-    truth = {}
-    for name in on.middle:
-        if (folder / "query" / name).is_file():
-            east, north = placed @ tuple(on.middle[name] + 0.5)
-            (lon,), (lat,) = transform(crs, "EPSG:4326", [east], [north])
-            truth[name] = lat, lon
-    return truth
+
+
+def write_mosaic(folder: Path, on: Laid, path: Path) -> dict[str, tuple[float, float]]:
+    """Write the mosaic of a set's map pictures; return where its queries are, (lat_deg, lon_deg) by name."""
+    ground = ground_of(folder, on)
+    write_tif(path, ground, *mosaic_of(folder, on, "ref"))
+    return {name: ground.position(at) for name, at in on.middle.items() if (folder / "query" / name).is_file()}
 
 
 def _similarity(pixels: np.ndarray, metres: np.ndarray) -> tuple[complex, complex]:

@@ -1,0 +1,191 @@
+"""What flights.py found: its figures, its page, and some of the flights drawn over the mosaics."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from flight_sites import Site
+from run_sets import TUNED_ON
+from where import honest, spread
+
+from edgevpr.frames.orthophoto import Orthophoto
+from edgevpr.helpers.tables import markdown
+
+Row = dict[str, object]
+_DRAWN = (
+    ("aerial_caliterra", "across"),
+    ("aerial_swindale", "along"),
+    ("aerial_swindale", "leave"),
+    ("kite_ochota", "across"),
+    ("aerial_copr", "along"),
+    ("rows", "along"),
+)
+_COLOURS = {"right": "#20e020", "wrong": "#ff2020", None: "white"}
+
+
+def summary(rows: Sequence[Row], modes: Sequence[str]) -> dict:
+    """Return the figures of every mode, by what the flights have in common."""
+    groups: dict[str, Callable[[Row], object]] = {
+        "all": lambda row: "all",
+        "use": lambda row: "tune" if row["site"] in TUNED_ON else "report",
+        "site": lambda row: row["site"],
+        "kind": lambda row: row["kind"],
+        "odometry": lambda row: row["odometry"],
+        "flight": lambda row: f"{row['flight']:02d} {row['site']}, {row['kind']}, odometry {row['odometry']}",
+    }
+    found: dict[str, dict] = {}
+    for group, of in groups.items():
+        names = dict.fromkeys(of(row) for row in rows)
+        found[group] = {
+            name: {mode: _figures([row for row in rows if row["mode"] == mode and of(row) == name]) for mode in modes}
+            for name in names
+        }
+    return found
+
+
+def _figures(rows: Sequence[Row]) -> dict:
+    flights = {number: [row for row in rows if row["flight"] == number] for number in {row["flight"] for row in rows}}
+    lost = [_lost(each) for each in flights.values()]
+    fixes = [row for row in rows if row["fix"]]
+    right = [row for row in fixes if row["fix"] == "right"]
+    own = [row for row in fixes if row["over"] == row["site"]]
+    gaps_s = [max(each) for _, _, each in lost if each]
+    return {
+        "flights": len(flights),
+        "queries": len(rows),
+        "over_the_map": sum(row["is_mapped"] for row in rows),
+        "right": len(right),
+        "wrong": len(fixes) - len(right),
+        "far_off": sum(row["is_far"] for row in fixes),
+        "wrong_over_other_ground": sum(row["over"] != row["site"] for row in fixes),
+        "over_the_map_s": round(sum(each[0] for each in lost)),
+        "lost_s": round(sum(each[1] for each in lost)),
+        "longest_gap_s": {
+            "median": round(float(np.median(gaps_s)), 1) if gaps_s else None,
+            "worst": round(max(gaps_s), 1) if gaps_s else None,
+        },
+        "error": spread([complex(row["off_east_m"], row["off_north_m"]) for row in right]) if right else None,
+        "claimed_sd_m": round(float(np.median([row["sd_m"] for row in right])), 2) if right else None,
+        "within": honest(
+            [complex(row["off_east_m"], row["off_north_m"]) for row in own],
+            [(row["var_east_m2"], row["var_north_m2"]) for row in own],
+            0.0,
+        )
+        if own
+        else None,
+    }
+
+
+def _lost(rows: Sequence[Row]) -> tuple[float, float, list[float]]:
+    """Return, of one flight, the seconds over the map, those of queries without a fix that is right, and the times
+    between one such fix, or the begin, and the next, or the end. Each stretch over the map counts by itself."""
+    over_s = lost_s = 0.0
+    gaps_s: list[float] = []
+    since = None
+    for before, row in zip([None, *rows[:-1]], rows, strict=True):
+        if not row["is_mapped"]:
+            since = None
+            continue
+        if since is None:
+            since = row["t_s"]
+        elif before is not None:
+            took_s = row["t_s"] - before["t_s"]
+            over_s += took_s
+            lost_s += took_s * (row["fix"] != "right")
+        gaps_s.append(row["t_s"] - since)
+        if row["fix"] == "right":
+            since = row["t_s"]
+    return over_s, lost_s, gaps_s
+
+
+def page(result: dict, text: str) -> str:
+    """Return the results as Markdown."""
+    tables = [f"By {group}:\n\n{_table(result[group])}" for group in ("use", "site", "kind", "odometry")]
+    return f"""# Flights over real aerial pictures
+
+{text.partition(chr(10) * 2)[2].strip()}
+
+Right, wrong, far off: fixes. Lost: share of the time over the map. Gap: the longest without a right fix over the map,
+median and worst of the flights. Errors: median / 95th percentile of right fixes. Within: shares of errors, axis by
+axis, within one and two standard deviations that the fix claims (asked: .68 and .95), of all fixes over the site's own
+ground.
+
+{_table(result["all"])}
+
+Constants of edgevpr were chosen on {" and ".join(name for name in TUNED_ON if name in result["site"])} (use *tune*), of
+the sites here; on none of these flights.
+
+{(chr(10) * 2).join(tables)}
+
+Commit {result["commit"]}, {result["date"]}, {result["machine"]["cpu"]}; {result["took_s"]} s.
+`python benchmarks/flights.py` makes this page; flights.json has every flight, `--events FILE` every query.
+
+![flights](flights.png)
+
+Green: a right fix. White: refused over the map. Grey: refused beside it, or over ground of another set. Red: a wrong
+fix, with a line to where it says that the aircraft is. The picture is the mosaic that is flown over.
+"""
+
+
+def _table(groups: dict) -> str:
+    head = ("flights", "mode", "number", "queries", "over the map", "right", "wrong", "far off", "lost", "gap s",
+            "error m", "claimed sd m", "within 1, 2 sigma")  # fmt: skip
+    table = []
+    for name, modes in groups.items():
+        for mode, each in modes.items():
+            error, within, gap = each["error"], each["within"], each["longest_gap_s"]
+            table.append(
+                [
+                    name,
+                    mode,
+                    *(str(each[key]) for key in ("flights", "queries", "over_the_map", "right", "wrong", "far_off")),
+                    f"{each['lost_s'] / each['over_the_map_s']:.0%}" if each["over_the_map_s"] else "-",
+                    f"{gap['median']} / {gap['worst']}" if gap["worst"] is not None else "-",
+                    f"{error['median_m']:.1f} / {error['p95_m']:.1f}" if error else "-",
+                    f"{each['claimed_sd_m']:.1f}" if error else "-",
+                    f"{within['one_sigma']:.2f} / {within['two_sigma']:.2f}" if within else "-",
+                ]
+            )
+    return markdown(head, table)
+
+
+def draw(rows: Sequence[Row], sites: dict[str, Site], path: Path) -> None:
+    """Draw some flights over what they were flown over, a row of pictures a mode."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    modes = list(dict.fromkeys(row["mode"] for row in rows))
+    drawn = [each for each in _DRAWN if any((row["site"], row["kind"]) == each for row in rows)]
+    if not drawn:
+        return
+    figure, axes = pyplot.subplots(len(modes), len(drawn), figsize=(4 * len(drawn), 4.3 * len(modes)), squeeze=False)
+    for column, (name, kind) in enumerate(drawn):
+        site = sites[name]
+        half_m = site.room.metres_per_px * len(site.room.values) / 2
+        photo = Orthophoto(site.flown)
+        ground, valid = photo.cut(site.position(np.zeros(2)), 2 * half_m, 700)
+        photo.close()
+        ground[~valid] = 80
+        for axis, mode in zip(axes[:, column], modes, strict=True):
+            these = [row for row in rows if (row["site"], row["kind"], row["mode"]) == (name, kind, mode)]
+            at = np.array([(row["east_m"], row["north_m"]) for row in these])
+            axis.imshow(0.8 * ground[..., ::-1] / 255, extent=(-half_m, half_m, -half_m, half_m))
+            axis.plot(*at.T, color="0.7", lw=0.6)
+            for (east_m, north_m), row in zip(at, these, strict=True):
+                colour = _COLOURS[row["fix"]] if row["fix"] or row["is_mapped"] else "#909090"
+                axis.plot(east_m, north_m, "o", color=colour, ms=4 if row["fix"] else 3, mew=0)
+                if row["fix"] == "wrong":
+                    east, north = (east_m, east_m + row["off_east_m"]), (north_m, north_m + row["off_north_m"])
+                    axis.plot(east, north, color=_COLOURS["wrong"], lw=1)
+            shown = np.vstack([site.way, at])
+            middle, room = (shown.min(axis=0) + shown.max(axis=0)) / 2, np.ptp(shown, axis=0).max() / 2
+            west, south = middle - room - site.footprint_m / 2
+            east, north = middle + room + site.footprint_m / 2
+            axis.set(xlim=(west, east), ylim=(south, north), facecolor="0.25")
+            axis.set_title(f"{name}, {kind}\n{mode}: {sum(row['fix'] == 'right' for row in these)} right, "
+                           f"{sum(row['fix'] == 'wrong' for row in these)} wrong", fontsize=9)  # fmt: skip
+            axis.tick_params(labelsize=7)
+    figure.tight_layout()
+    figure.savefig(path, dpi=75)

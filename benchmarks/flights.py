@@ -1,0 +1,220 @@
+"""Fifty flights over real aerial pictures, every way of recognising asked with the same pictures (`make results`).
+
+Map and flight share no picture. The map of a set is made of its pictures ref/, at their positions in the mosaic of the
+set, and refined. A flight is seen by a simulated camera over the mosaic of its pictures query/, in the same frame: in
+light of its own, swaying by 3 degrees, turned anyhow, from up to a fifth lower or higher than the map, and lower where
+there is too little ground. A picture of which a tenth has none is left out. Where a flight leaves the map, it goes on
+over the mosaic of another set.
+
+Flights follow the mapped way (at the pace of the map, half and twice as fast, backwards, turning back, with a hover,
+with stops, carried elsewhere twice, leaving the map and coming back), cross it, or are over another set altogether. On
+the site *rows* one piece of ground repeats itself four times. The autopilot tells of its odometry only: its scale is
+5 % off, its bias wanders by up to 0.5 m/s, the heading is 5 degrees off. From a third on, the odometry of some flights
+stops, is wrong by a factor of two, or is not a number; some have none.
+
+A fix is *wrong* where the aircraft is over ground of another set, or farther off than both a quarter of the longest
+side of the map's pictures, on the ground, and three standard deviations that the fix claims. It is *far off* where it
+is more than half that side off, whatever it claims. Lost are the times over the map without a fix that is right.
+
+Positions of kite_ochota, aerial_copr and rows have an assumed scale. The truth is that of the mosaic, which drifts: of
+aerial_swindale its scale changes by a factor of two from one end to the other. aerial_brighton has four pictures to fly
+over: too few.
+"""
+
+import argparse
+import csv
+import json
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import cv2
+import flight_sites
+import flight_tracks
+import numpy as np
+import run_sets
+from flight_page import draw, page, summary
+from flight_sites import ROWS, Site
+
+from edgevpr.config import load_config
+from edgevpr.contract import Technique
+from edgevpr.frames.orthophoto import Orthophoto
+from edgevpr.places.index import PlaceIndex
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.sequence import search_of
+from edgevpr.power.boards import load_board
+from edgevpr.runtime.recognise.hints import Prior
+from edgevpr.runtime.recognise.judge import accept_rule
+from edgevpr.runtime.recognise.opening import meter_of, open_recogniser
+from edgevpr.runtime.recognise.recogniser import Recogniser
+from edgevpr.runtime.recognise.recognition import Recognition
+from edgevpr.types import Frame
+
+_SEED = 2026
+_WRONG_OF_SIDE, _WRONG_SD, _FAR_OF_SIDE = 0.25, 3.0, 0.5
+_OVER_THE_MAP = 0.5  # of the picture at least is shown by pictures of the map
+_FEW = ("along", "across", "jump", "leave", "foreign")
+FLOWN = {
+    "aerial_caliterra": flight_tracks.KINDS,
+    "aerial_garfield28": flight_tracks.KINDS,
+    "aerial_swindale": flight_tracks.KINDS,
+    "kite_ochota": flight_tracks.KINDS,
+    "aerial_copr": _FEW,
+    ROWS: ("along", "backwards", "half speed", "across", "jump"),
+}
+Row = dict[str, object]
+
+
+def _recogniser(technique: Technique, place_map: PlaceMap, index: PlaceIndex, *, length: int) -> Recogniser:
+    config = load_config(None)
+    prior = Prior(config.match.reach_m_s, technique.spec.heading_within_deg, True) if length == 1 else None
+    return Recogniser(
+        technique=technique,
+        place_map=place_map,
+        index=index,
+        rule=accept_rule(technique, config.match, length),
+        meter=meter_of(config, load_board(config.board)),
+        candidates=technique.candidates,
+        search=search_of(length),
+        prior=prior,
+        min_accuracy_m=config.mavlink.min_accuracy_m,
+    )
+
+
+# The ways of recognising, as a flight has them.
+MODES: dict[str, Callable[[Technique, PlaceMap, PlaceIndex], Recogniser]] = {
+    "alone": partial(_recogniser, length=1),
+    "sequence 10": partial(_recogniser, length=10),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Flight:
+    """Which flight it is: `number` seeds it, `other` is the site it goes on over where it leaves the map."""
+
+    number: int
+    site: str
+    kind: str
+    odometry: str
+    other: str
+
+
+def planned() -> list[Flight]:
+    """Return all flights."""
+    flights = []
+    for site, kinds in FLOWN.items():
+        others = [name for name in FLOWN if name != site and not {name, site} <= {"aerial_copr", ROWS}]
+        for kind in kinds:
+            number = len(flights)
+            odometry = flight_tracks.ODOMETRY[number % len(flight_tracks.ODOMETRY)]
+            flights.append(Flight(number, site, kind, odometry, others[number % len(others)]))
+    return flights
+
+
+def flown(flight: Flight, sites: dict[str, Site], modes: list[str]) -> list[Row]:
+    """Fly once, and ask every mode with each picture; return a row for each query and mode."""
+    cv2.setNumThreads(1)
+    site, rng = sites[flight.site], np.random.default_rng((_SEED, flight.number))
+    track = flight_tracks.fly(flight.kind, site, sites[flight.other], rng)
+    said = flight_tracks.reports(track, site, flight.odometry, rng)
+    photos = {name: Orthophoto(sites[name].flown) for name in {flight.site, flight.other}}
+    opened = open_recogniser(load_config(None, {"map": str(site.place_map)}), load_board("this"))
+    asked = {mode: MODES[mode](opened.technique, opened.place_map, opened.index) for mode in modes}
+    share = site.covered.at(track.at)
+    rows = []
+    for number, image in enumerate(flight_tracks.photographs(track, photos, sites, rng)):
+        if image is None:
+            continue
+        own = track.over[number] == site.name
+        query: Row = {
+            "flight": flight.number,
+            "site": site.name,
+            "kind": flight.kind,
+            "odometry": flight.odometry,
+            "query": number,
+            "t_s": round(float(track.t_s[number]), 2),
+            "east_m": round(float(track.at[number, 0]), 2),
+            "north_m": round(float(track.at[number, 1]), 2),
+            "over": track.over[number],
+            "is_mapped": bool(own and share[number] >= _OVER_THE_MAP),
+            "footprint_m": round(float(track.footprints_m[number]), 1),
+        }
+        frame = Frame(image=image, name=f"{number:03d}", t_mono_s=float(track.t_s[number]))
+        for mode, recogniser in asked.items():
+            event = recogniser.step(frame, said[number])
+            rows.append(query | {"mode": mode} | _told(event, site, query))
+    for photo in photos.values():
+        photo.close()
+    opened.place_map.close()
+    return rows
+
+
+def _told(event: Recognition, site: Site, query: Row) -> Row:
+    """Return what a query has led to: `fix` is "right", "wrong" or None, with its error by the truth of the query."""
+    best, where, row = event.best, event.located, {}
+    row["reason"] = event.reason
+    row["place"] = best.place.place_id if best else None
+    row["score"] = round(best.match.score, 4) if best else None
+    row["landmarks"] = event.proof.inliers if event.proof else None
+    row["fix"] = None
+    if where is None:
+        return row
+    off_m = site.offset(where.position) - (query["east_m"], query["north_m"])
+    error_m, side_m, sd_m = float(np.hypot(*off_m)), site.footprint_m, where.accuracy_m
+    foreign = query["over"] != site.name
+    is_wrong = foreign or error_m > max(_WRONG_OF_SIDE * side_m, _WRONG_SD * sd_m)
+    return row | {
+        "fix": "wrong" if is_wrong else "right",
+        "is_far": bool(foreign or error_m > _FAR_OF_SIDE * side_m),
+        "off_east_m": round(float(off_m[0]), 2),
+        "off_north_m": round(float(off_m[1]), 2),
+        "sd_m": round(sd_m, 2),
+        "var_east_m2": round(where.covariance_m2[0], 2),
+        "var_north_m2": round(where.covariance_m2[2], 2),
+    }
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--modes", metavar="A,B", default=",".join(MODES), help="ways of recognising (default: all)")
+    parser.add_argument("--sites", metavar="A,B", default=",".join(FLOWN), help="whose maps are flown with (all)")
+    parser.add_argument("--events", type=Path, metavar="CSV", help="write a line for each query and mode, too")
+    parser.add_argument("--out", type=Path, default=run_sets.RESULTS)
+    args = parser.parse_args()
+    data = Path(os.environ.get("EDGEVPR_DATA") or run_sets.REPOSITORY.parent / "shared" / "data")
+    run_sets.find_sets(data, [name for name in FLOWN if name != ROWS])
+    modes, began_s = args.modes.split(","), time.monotonic()
+    flights = [flight for flight in planned() if flight.site in args.sites.split(",")]
+    with (
+        tempfile.TemporaryDirectory(prefix="edgevpr-flights-") as work,
+        ProcessPoolExecutor(len(os.sched_getaffinity(0))) as pool,
+    ):
+        prepare = partial(flight_sites.prepare, data=data, work=Path(work))
+        sites = {site.name: site for site in pool.map(prepare, FLOWN)}
+        rows = []
+        for flight, new in zip(flights, pool.map(partial(flown, sites=sites, modes=modes), flights), strict=True):
+            rows += new
+            fixes = {mode: [row["fix"] for row in new if row["mode"] == mode] for mode in modes}
+            said = ", ".join(f"{mode} {each.count('right')}/{each.count('wrong')}" for mode, each in fixes.items())
+            print(f"{flight.number:3} {flight.site:18} {flight.kind:13} {flight.odometry:12} {said}", flush=True)
+        args.out.mkdir(parents=True, exist_ok=True)
+        draw(rows, sites, args.out / "flights.png")
+    result = {**run_sets.made_by(), "took_s": round(time.monotonic() - began_s), **summary(rows, modes)}
+    (args.out / "flights.json").write_text(json.dumps(result, indent=1) + "\n")
+    (args.out / "flights.md").write_text(page(result, __doc__))
+    if args.events:
+        with open(args.events, "w", newline="") as handle:
+            table = csv.DictWriter(handle, list(max(rows, key=len)))
+            table.writeheader()
+            table.writerows(rows)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
