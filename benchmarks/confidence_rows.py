@@ -21,6 +21,7 @@ from edgevpr.config import load_config
 from edgevpr.evaluate.dataset import load_dataset
 from edgevpr.evaluate.evaluate import mapped
 from edgevpr.frames.images import list_images, read_image
+from edgevpr.frames.level import UNKNOWN_VIEW, Levelled
 from edgevpr.frames.source import open_source
 from edgevpr.places.retrieve import elsewhere
 from edgevpr.power.boards import load_board
@@ -111,11 +112,14 @@ def rows_of(name: str) -> Iterator[Row]:
                     evidence=dict(event.evidence),
                     veto=event.reason if refused else None,
                 )
-        frames = list(_frames(folder / "ref"))
+        frames = [(frame.name, Levelled(frame.image, None, UNKNOWN_VIEW)) for frame in _frames(folder / "ref")]
         order = np.random.default_rng(15).permutation(len(frames))
         frames = [frames[at] for at in np.resize(order, min(ASKED, 6 * len(frames)))]
         ids = {place.source_image: place.place_id for place in place_map.places()}
-        for answer in ask(technique, place_map, index, rule, meter, frames, ids):
+        pictures = ((ids[name], picture) for name, picture in frames)
+        for answer in ask(technique, place_map, index, rule, meter, pictures):
+            if answer.evidence is None:
+                continue
             yield Row(
                 map=name,
                 set=name,

@@ -33,18 +33,18 @@ _log = logging.getLogger(__name__)
 _OF_CANDIDATES = 0.4  # are compared from each height but the first
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Judged:
     """The best place of a query, the verdict on it, and what led to it."""
 
-    best: Candidate | None
-    verdict: Verdict | None
+    best: Candidate | None = None
+    verdict: Verdict | None = None
     proof: Agreement | None = None
     where: Located | None = None
     evidence: dict[str, float] | None = None
 
 
-_NOT_JUDGED = _Judged(None, None)
+_NOT_JUDGED = _Judged()
 
 
 class Recogniser:
@@ -202,7 +202,8 @@ class Recogniser:
         where = proof = None
         if best.match.score < rule.worth_a_look:
             evidence = self._evidence(ranking, None, ())
-            return _Judged(best, judge(ranking, index, rule, self.search, is_new, evidence=evidence), evidence=evidence)
+            verdict = judge(ranking, index, rule, self.search, is_new, evidence=evidence)
+            return _Judged(best=best, verdict=verdict, evidence=evidence)
         # The newest query of a sequence need not be sure by itself.
         if verifies := self._verifies and self.search.length == 1 and cells is not None:
             with self.meter.step("verify"):
@@ -218,7 +219,7 @@ class Recogniser:
             with self.meter.step("verify"):
                 rival = looked.rival(ranking, rule.neighbour_m, same)
         verdict = judge(ranking, index, rule, self.search, is_new, proof, rival, where, evidence)
-        return _Judged(best, verdict, proof, where, evidence)
+        return _Judged(best=best, verdict=verdict, proof=proof, where=where, evidence=evidence)
 
     def _evidence(self, ranking: Ranking, proof: Agreement | None, same: Sequence[int]) -> dict[str, float] | None:
         if self.rule.sure is None:

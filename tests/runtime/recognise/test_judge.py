@@ -144,7 +144,7 @@ def test_landmarks_make_up_for_no_vote_at_all(score):
 
 
 def test_a_rule_that_accepts_nothing_is_not_made_up_for():
-    assert not held(0.5, 0.2, None, rule=AcceptRule(0.08, 1.0, 50.0)).is_open
+    assert not held(0.5, 0.2, None, rule=AcceptRule(min_score=0.08, min_margin=1.0, neighbour_m=50.0)).is_open
 
 
 @pytest.mark.parametrize(
