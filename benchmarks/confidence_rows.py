@@ -40,8 +40,8 @@ THINNED = {"nordland_tiny": 5}  # of 994 foreign queries every fifth
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
-    """A query in a map. `kind` is own, foreign, changed (a changed picture of the map itself) or left out (the same
-    without its place). `near`: wrong, and the neighbour of a right place. `veto`: why no confidence would be enough."""
+    """A query in a map. `kind` is own, foreign, or the way in which a changed picture of the map itself was asked for
+    (see `calibrate`). `near`: wrong, and the neighbour of a right place. `veto`: why no confidence would be enough."""
 
     map: str
     set: str
@@ -124,7 +124,7 @@ def rows_of(name: str) -> Iterator[Row]:
                 map=name,
                 set=name,
                 query=str(answer.place_id),
-                kind="changed" if answer.there else "left out",
+                kind=answer.way,
                 right=answer.right,
                 near=False,
                 found="",

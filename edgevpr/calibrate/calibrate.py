@@ -1,9 +1,10 @@
 """Calibration of a map: it is asked for changed pictures of its own places, and how sure it can be is fitted to the
 answers.
 
-Half of the questions are of a place that the map has. For the other half, that place and all that may show the same
-ground are left out: the best match is then one of the look-alikes that every map has. What the shipped model knows from
-many sites stays, as far as the answers do not say otherwise.
+Each picture is asked for three times. As it is, it is of a place that the map has. Then that place and all that may
+show the same ground are left out: the best match is one of the look-alikes that every map has. At last the picture is
+mirrored: it shows ground that is nowhere, as the same camera would see it in the same country. What the shipped model
+knows from many sites stays, as far as the answers do not say otherwise.
 """
 
 from collections import Counter
@@ -39,6 +40,7 @@ T = TypeVar("T")
 Watch = Callable[[Iterable[T], int], Iterable[T]]
 Pictures = Callable[[Sequence[str]], Iterable[Frame]]  # the frames of these names, as far as they are at hand
 
+THERE, LEFT_OUT, MIRRORED = "there", "left out", "mirrored"
 ASKED = 120  # pictures
 _BESIDE_PLACES = 10  # before and after a place without position: they may show the same ground
 _LEFT_OUT_COUNTS = 0.3  # over ground that is not in the map nobody flies as often
@@ -49,12 +51,12 @@ _EVEN = 0.5  # precision at which hardly anything is refused for want of confide
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Answer:
-    """The answer to one question of a map: of which place the picture was, whether that place was `there` to be found,
-    whether the best place was `right`, and its evidence (None: the picture says too little to look for it). `refused`:
-    something beside the confidence speaks against the best place."""
+    """The answer to one question of a map: of which place the picture was, in which `way` it was asked for (THERE,
+    LEFT_OUT, MIRRORED), whether the best place was `right`, and its evidence (None: the picture says too little to look
+    for it). `refused`: something beside the confidence speaks against the best place."""
 
     place_id: int
-    there: bool
+    way: str
     right: bool
     evidence: Evidence | None
     refused: bool = False
@@ -69,9 +71,8 @@ def ask(
     pictures: Iterable[tuple[int, Levelled]],
     seed: int = 0,
 ) -> Iterator[Answer]:
-    """Ask a map for changed pictures of its own places, with the place and without it. `pictures` are numbers of places
-    with the pictures that they were made of, as they were encoded then. A place that is not in the index is left
-    out."""
+    """Ask a map for changed pictures of its own places, in each way. `pictures` are numbers of places with the pictures
+    that they were made of, as they were encoded then. A place that is not in the index is left out."""
     rng = np.random.default_rng((_SEED, seed))
     rule = replace(rule, sure=replace(rule.sure, precision=_EVEN))
     looks_down = technique.spec.cells is not None
@@ -79,12 +80,15 @@ def ask(
     for place_id, picture in pictures:
         if (slot := slots.get(place_id)) is None:
             continue
-        image, shown = changed(picture.image, rng, looks_down, picture.mask)
-        query = Frame(image=image, name=f"place {place_id}", t_mono_s=0.0)
-        for there in (True, False):
-            among = index if there else _without(index, _same_ground(place_map, index, slot, rule.neighbour_m))
+        others = _without(index, _same_ground(place_map, index, slot, rule.neighbour_m))
+        for way, seen, among in (
+            (THERE, picture, index),
+            (LEFT_OUT, picture, others),
+            (MIRRORED, _mirrored(picture), index),
+        ):
             if not len(among):
                 continue
+            image, shown = changed(seen.image, rng, looks_down, seen.mask)
             walk = Recogniser(
                 technique=technique,
                 place_map=place_map,
@@ -94,14 +98,14 @@ def ask(
                 candidates=technique.candidates,
                 mask=None if shown is None else Mask(shown, sha256=""),
             )
-            event = walk.step(query)
+            event = walk.step(Frame(image=image, name=f"place {place_id}", t_mono_s=0.0))
             if event.evidence is None:
-                yield Answer(place_id=place_id, there=there, right=False, evidence=None)
+                yield Answer(place_id=place_id, way=way, right=False, evidence=None)
                 continue
             best = int(np.flatnonzero(index.place_ids == event.best.place.place_id)[0])
-            right = there and not elsewhere(index, slot, np.array([best]), rule.neighbour_m)[0]
+            right = way == THERE and not elsewhere(index, slot, np.array([best]), rule.neighbour_m)[0]
             refused = not event.accepted and event.confidence >= rule.sure.threshold(event.evidence)
-            yield Answer(place_id=place_id, there=there, right=bool(right), evidence=event.evidence, refused=refused)
+            yield Answer(place_id=place_id, way=way, right=bool(right), evidence=event.evidence, refused=refused)
 
 
 def calibrate(
@@ -154,8 +158,8 @@ def calibrate(
     at_hand = len({each.place_id for each in answers})
     if at_hand < FEWEST_PLACES:
         raise UsageError(
-            f"The pictures of only {at_hand} places of {place_map.path} are at hand, and {FEWEST_PLACES} are needed: "
-            "give the pictures that it was made of, with the same camera and mask."
+            f"Of {place_map.path} the pictures of {at_hand} places are at hand, and those of {FEWEST_PLACES} are "
+            "needed: give the pictures that it was made of, with the same camera and mask."
         )
     found = _calibration(answers, kinds, config.accept_precision)
     place_map.record_calibration(as_text(found))
@@ -178,13 +182,13 @@ def _calibration(answers: Sequence[Answer], kinds: Sequence[str], precision: flo
         )
 
     accepted = [each for each in answers if is_accepted(each)]
-    asked = sum(each.there for each in answers)
+    asked = sum(each.way == THERE for each in answers)
     return Calibration(
         models={kind: model},
         made=date.today().isoformat(),
         asked=asked,
         precision=precision,
-        accepted=sum(each.there for each in accepted) / asked,
+        accepted=sum(each.way == THERE for each in accepted) / asked,
         accepted_wrong=sum(not each.right for each in accepted),
         recognisable=_by_place(answers, sure),
     )
@@ -194,7 +198,7 @@ def _by_place(answers: Sequence[Answer], sure: Sureness) -> dict[int, float]:
     """Return the mean confidence of each place that was asked for. A match that is wrong or refused counts as 0."""
     of_place: dict[int, list[float]] = {}
     for answer in answers:
-        if answer.there:
+        if answer.way == THERE:
             confidence = sure.confidence(answer.evidence) if answer.right and not answer.refused else 0.0
             of_place.setdefault(answer.place_id, []).append(confidence)
     return {place_id: round(float(np.mean(each)), 4) for place_id, each in sorted(of_place.items())}
@@ -203,13 +207,20 @@ def _by_place(answers: Sequence[Answer], sure: Sureness) -> dict[int, float]:
 def adapted(model: Model, answers: Iterable[Answer], made_of: str) -> Model:
     """Return a model for the map that gave these answers, which all have evidence. Where no place was taken for
     another, they say nothing of how that could be told, and the model stays."""
-    answers = list(answers)
+    answers = [each for each in answers if each.way != MIRRORED]
     right = np.array([each.right for each in answers], bool)
     if right.all():
         return model
-    weights = np.array([1.0 if each.there else _LEFT_OUT_COUNTS for each in answers])
+    weights = np.array([1.0 if each.way == THERE else _LEFT_OUT_COUNTS for each in answers])
     of_place = fitted(model.of_place, [each.evidence for each in answers], right, weights, _PULL)
     return replace(model, of_place=of_place, made=date.today().isoformat(), made_of=made_of)
+
+
+def _mirrored(picture: Levelled) -> Levelled:
+    image, mask = (
+        None if each is None else np.ascontiguousarray(each[:, ::-1]) for each in (picture.image, picture.mask)
+    )
+    return Levelled(image, mask, picture.view)
 
 
 def _same_ground(place_map: PlaceMap, index: PlaceIndex, slot: int, neighbour_m: float) -> np.ndarray:

@@ -106,18 +106,12 @@ def from_json(text: str) -> Model:
 
 def model_of(found: Mapping[str, Any]) -> Model:
     """Make a model of what JSON holds. Raises ValueError, KeyError or TypeError where that makes no sense."""
-    slope, tail = (
-        _number(found["slope"]),
-        Tail(**{key: _number(found["tail"][key]) for key in ("start", "share", "scale")}),
-    )
-    if min(slope, tail.share, tail.scale) <= 0:
-        raise ValueError("slope, share and scale must be above 0")
     return Model(
         of_map=_logistic(found["of_map"]),
         of_place=_logistic(found["of_place"]),
-        slope=slope,
+        slope=_number(found["slope"]),
         offset=_number(found["offset"]),
-        tail=tail,
+        tail=Tail(**{key: _number(found["tail"][key]) for key in ("start", "share", "scale")}),
         made=str(found["made"]),
         made_of=str(found["made_of"]),
     )

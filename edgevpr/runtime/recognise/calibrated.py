@@ -5,7 +5,7 @@ import logging
 from edgevpr.confidence.stored import Calibration, from_text
 from edgevpr.errors import MapError
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.runtime.recognise.evidence import require_known
+from edgevpr.runtime.recognise.evidence import require_usable
 
 _log = logging.getLogger(__name__)
 
@@ -18,8 +18,8 @@ def calibration_of(place_map: PlaceMap) -> Calibration | None:
             return None
         found = from_text(text)
         for kind, model in found.models.items():
-            require_known(kind, model)
-    except (ValueError, MapError) as error:
+            require_usable(kind, model)
+    except (ValueError, ArithmeticError, MapError) as error:
         _log.warning(
             "%s: its calibration cannot be used (%s): the shipped one is used; `edgevpr map calibrate` makes it anew",
             place_map.path,

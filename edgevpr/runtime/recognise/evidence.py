@@ -55,13 +55,17 @@ def kind_of(evidence: Mapping[str, float]) -> str:
     return DOWN if "landmarks" in evidence else DOWN_BARE
 
 
-def require_known(kind: str, model: Model) -> None:
-    """Raise ValueError for a model of a kind, or with evidence, that there is not: it comes from another edgevpr."""
+def require_usable(kind: str, model: Model) -> None:
+    """Raise ValueError for a model of a kind, or with evidence, that there is not (it comes from another edgevpr), and
+    ValueError or ArithmeticError for figures that make no sense."""
     if kind not in OF_MAP:
         raise ValueError(f"there is no evidence of kind {kind!r:.40}")
     for name in (*model.of_map.names, *model.of_place.names):
         if name not in OF_MAP[kind] + OF_PLACE[kind]:
             raise ValueError(f"there is no evidence {name!r:.40} of kind {kind}")
+    for value in (-1.0, 0.0, 1.0):
+        model.confidence(dict.fromkeys(OF_MAP[kind] + OF_PLACE[kind], value))
+    model.threshold(0.5), model.threshold(0.999999)
 
 
 def said(evidence: Mapping[str, float]) -> str:
