@@ -21,6 +21,7 @@ from edgevpr.config import load_config
 from edgevpr.evaluate.dataset import load_dataset
 from edgevpr.evaluate.evaluate import mapped
 from edgevpr.frames.images import list_images, read_image
+from edgevpr.frames.level import UNKNOWN_VIEW, Levelled
 from edgevpr.frames.source import open_source
 from edgevpr.places.retrieve import elsewhere
 from edgevpr.power.boards import load_board
@@ -39,7 +40,8 @@ THINNED = {"nordland_tiny": 5}  # of 994 foreign queries every fifth
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
-    """A query in a map. `kind` is own, foreign, or that of a changed picture of the map itself (see `calibrate`). `near`: wrong, and the neighbour of a right place. `veto`: why no confidence would be enough."""
+    """A query in a map. `kind` is own, foreign, or the way in which a changed picture of the map itself was asked for
+    (see `calibrate`). `near`: wrong, and the neighbour of a right place. `veto`: why no confidence would be enough."""
 
     map: str
     set: str
@@ -110,11 +112,14 @@ def rows_of(name: str) -> Iterator[Row]:
                     evidence=dict(event.evidence),
                     veto=event.reason if refused else None,
                 )
-        frames = list(_frames(folder / "ref"))
+        frames = [(frame.name, Levelled(frame.image, None, UNKNOWN_VIEW)) for frame in _frames(folder / "ref")]
         order = np.random.default_rng(15).permutation(len(frames))
         frames = [frames[at] for at in np.resize(order, min(ASKED, 6 * len(frames)))]
         ids = {place.source_image: place.place_id for place in place_map.places()}
-        for answer in ask(technique, place_map, index, rule, meter, frames, ids):
+        pictures = ((ids[name], picture) for name, picture in frames)
+        for answer in ask(technique, place_map, index, rule, meter, pictures):
+            if answer.evidence is None:
+                continue
             yield Row(
                 map=name,
                 set=name,

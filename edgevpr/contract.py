@@ -103,7 +103,7 @@ class Picture:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Support:
-    """How well all regions of query and place bear out a step, beside those that voted for it. `back` is the share of
+    """Support of a step by all regions of query and place, beside those that voted for it. `back` is the share of
     the place's regions that find their most similar region of the query at this step, and `mutual` the share of those
     that are also found by it. `likeness` (cosine) is the mean similarity of the query's regions to the most similar one
     of the place, wherever it is. `log_rank` is the mean natural logarithm of the rank that the region at this step has

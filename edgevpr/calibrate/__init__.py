@@ -1,1 +1,1 @@
-"""How sure a map can be: it is asked for changed pictures of its own places, and its confidence is fitted to that."""
+"""Calibration: a map is asked for changed pictures of its own places, and its confidence is fitted to that."""

@@ -7,8 +7,9 @@ mirrored: it shows ground that is nowhere, as the same camera would see it in th
 knows from many sites stays, as far as the answers do not say otherwise.
 """
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from datetime import date
 from typing import TypeVar
 
@@ -17,42 +18,49 @@ import numpy as np
 from edgevpr.calibrate.changes import changed
 from edgevpr.calibrate.fit import fitted
 from edgevpr.confidence.model import Evidence, Logistic, Model, prior
-from edgevpr.confidence.stored import Calibration, as_text
+from edgevpr.confidence.stored import FEWEST_PLACES, Calibration, as_text
 from edgevpr.config import MatchConfig
 from edgevpr.contract import Technique
+from edgevpr.errors import UsageError
+from edgevpr.frames.level import Levelled
+from edgevpr.frames.mask import AnyMask, Mask, NoMask, encoded
 from edgevpr.geodesy import distance_m
 from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import elsewhere
-from edgevpr.places.sequence import Alone
+from edgevpr.places.rows import readable
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.evidence import kind_of, kinds_of
-from edgevpr.runtime.recognise.judge import AcceptRule, accept_rule
+from edgevpr.runtime.recognise.judge import AcceptRule, Sureness, accept_rule
+from edgevpr.runtime.recognise.levelling import AnyLevelling, NoLevelling
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.types import Frame
 
 T = TypeVar("T")
 Watch = Callable[[Iterable[T], int], Iterable[T]]
+Pictures = Callable[[Sequence[str]], Iterable[Frame]]  # the frames of these names, as far as they are at hand
 
 THERE, LEFT_OUT, MIRRORED = "there", "left out", "mirrored"
-FEWEST_PLACES = 30  # with fewer the shipped model is used as it is
 ASKED = 120  # pictures
 _BESIDE_PLACES = 10  # before and after a place without position: they may show the same ground
 _LEFT_OUT_COUNTS = 0.3  # over ground that is not in the map nobody flies as often
 # How far a map moves the shipped weights; chosen on corridor, with grief_stromovka_seasons and nordland_tiny in view.
 _PULL_OF_MAP, _PULL_OF_PLACE = 20.0, 5.0
 _SEED = 15
+_EVEN = 0.5  # precision at which hardly anything is refused for want of confidence
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Answer:
     """The answer to one question of a map: of which place the picture was, in which `way` it was asked for (THERE,
-    LEFT_OUT, MIRRORED), whether the best place was `right`, and its evidence."""
+    LEFT_OUT, MIRRORED), whether the best place was `right`, and its evidence (None: the picture says too little to look
+    for it). `refused`: something beside the confidence speaks against the best place."""
 
     place_id: int
     way: str
     right: bool
-    evidence: Evidence
+    evidence: Evidence | None
+    refused: bool = False
 
 
 def ask(
@@ -61,41 +69,44 @@ def ask(
     index: PlaceIndex,
     rule: AcceptRule,
     meter: QueryMeter,
-    frames: Iterable[Frame],
-    ids: dict[str, int],
+    pictures: Iterable[tuple[int, Levelled]],
     seed: int = 0,
-) -> Iterable[Answer]:
-    """Ask a map for changed pictures of its own places, with the place and without it. `frames` are pictures that the
-    map was made of, and `ids` the places by the names of their pictures."""
+) -> Iterator[Answer]:
+    """Ask a map for changed pictures of its own places, in each way. `pictures` are numbers of places with the pictures
+    that they were made of, as they were encoded then. A place that is not in the index is left out."""
     rng = np.random.default_rng((_SEED, seed))
-    walk = Recogniser(
-        technique=technique,
-        place_map=place_map,
-        index=index,
-        rule=rule,
-        meter=meter,
-        candidates=technique.candidates,
-    )
+    rule = replace(rule, sure=replace(rule.sure, precision=_EVEN))
     looks_down = technique.spec.cells is not None
-    for frame in frames:
-        place_id = ids[frame.name]
-        slot = int(np.flatnonzero(index.place_ids == place_id)[0])
+    slots = {int(place_id): slot for slot, place_id in enumerate(index.place_ids)}
+    for place_id, picture in pictures:
+        if (slot := slots.get(place_id)) is None:
+            continue
         others = _without(index, _same_ground(place_map, index, slot, rule.neighbour_m))
-        mirrored = np.ascontiguousarray(frame.image[:, ::-1])
-        for way, image, among in (
-            (THERE, frame.image, index),
-            (LEFT_OUT, frame.image, others),
-            (MIRRORED, mirrored, index),
+        for way, seen, among in (
+            (THERE, picture, index),
+            (LEFT_OUT, picture, others),
+            (MIRRORED, _mirrored(picture), index),
         ):
             if not len(among):
                 continue
-            walk.take(technique, among, rule, Alone())
-            event = walk.step(Frame(image=changed(image, rng, looks_down), name=frame.name, t_mono_s=0.0))
+            image, shown = changed(seen.image, rng, looks_down, seen.mask)
+            walk = Recogniser(
+                technique=technique,
+                place_map=place_map,
+                index=among,
+                rule=rule,
+                meter=meter,
+                candidates=technique.candidates,
+                mask=None if shown is None else Mask(shown, sha256=""),
+            )
+            event = walk.step(Frame(image=image, name=f"place {place_id}", t_mono_s=0.0))
             if event.evidence is None:
+                yield Answer(place_id=place_id, way=way, right=False, evidence=None)
                 continue
             best = int(np.flatnonzero(index.place_ids == event.best.place.place_id)[0])
             right = way == THERE and not elsewhere(index, slot, np.array([best]), rule.neighbour_m)[0]
-            yield Answer(place_id=place_id, way=way, right=bool(right), evidence=event.evidence)
+            refused = not event.accepted and event.confidence >= rule.sure.threshold(event.evidence)
+            yield Answer(place_id=place_id, way=way, right=bool(right), evidence=event.evidence, refused=refused)
 
 
 def calibrate(
@@ -103,60 +114,99 @@ def calibrate(
     place_map: PlaceMap,
     config: MatchConfig,
     meter: QueryMeter,
-    pictures: Callable[[Sequence[str]], Iterable[Frame]],
+    pictures: Pictures,
     watch: Watch,
-) -> Calibration | None:
-    """Calibrate a map that is open for adding, and record it there. `pictures` gives the frames of these names, of
-    which the map was made, as far as they are at hand. None where the technique is judged by its limits, the map has
-    too few places, or there are no pictures: the shipped model is then used. Raises MapError for a file that cannot be
-    read or written.
+    mask: AnyMask | None = None,
+    levelling: AnyLevelling | None = None,
+) -> Calibration:
+    """Calibrate a map that is open for adding, and record it there. `mask` and `levelling` are those that the map was
+    made with. Raises UsageError where the technique is judged by its limits, the map has too few places, or too few of
+    their pictures are at hand: the shipped model is then used. Raises MapError for a file that cannot be read or
+    written.
     """
     kinds = kinds_of(technique.spec)
-    places = list(place_map.places()) if kinds else []
-    if len(places) < FEWEST_PLACES:
-        return None
-    ids = {place.source_image: place.place_id for place in places}
+    if not kinds:
+        raise UsageError(
+            f"{place_map.path} is of {technique.spec.name}, whose matches are judged by score and margin: only `cohog` "
+            "has a confidence to calibrate."
+        )
+    index = load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
+    if len(index) < FEWEST_PLACES:
+        raise UsageError(
+            f"{place_map.path} has {len(index)} places, and {FEWEST_PLACES} are needed to calibrate it: the shipped "
+            "confidence is used."
+        )
+    mask, levelling = mask or NoMask(), levelling or NoLevelling()
+    ids = {name: found for (name,), found in place_map.ids_by("source_image").items() if isinstance(name, str)}
     names = sorted(ids)
-    names = [names[at] for at in np.random.default_rng(_SEED).permutation(len(names))[:ASKED].tolist()]
-    rounds = -(-ASKED // len(names))
-    index = load_index(place_map, technique, len(places) * bytes_per_place(technique.spec))
+    names = [names[at] for at in np.random.default_rng(_SEED).permutation(len(names)).tolist()]
+
+    def asked() -> Iterator[Frame]:
+        for done in range(0, ASKED, len(names)):
+            yield from pictures(names[: ASKED - done])
+
+    def as_mapped() -> Iterator[tuple[int, Levelled]]:
+        """Yield what is really the picture of a place: another folder may have the same names."""
+        for frame in watch(asked(), ASKED):
+            picture = levelling.prepare(frame, None, mask.fitted(frame.image))
+            coarse = encoded(technique, picture.image, picture.mask).coarse
+            found = (each for each in ids.get(readable(frame.name), ()) if place_map.is_of(each, coarse))
+            if (place_id := next(found, None)) is not None:
+                yield place_id, picture
+
     rule = accept_rule(technique, config)
-    answers: list[Answer] = []
-    for _ in range(rounds):
-        frames = watch(pictures(names), len(names))
-        answers.extend(ask(technique, place_map, index, rule, meter, frames, ids, seed=len(answers)))
-    kind = kind_of(answers[0].evidence) if answers else kinds[0]
-    answers = [each for each in answers if kind_of(each.evidence) == kind]
-    if not answers:
-        return None
-    model = adapted(prior(kind), answers, f"{len(answers)} answers of the map itself")
-    threshold = model.threshold(config.accept_precision)
-    sure = [model.confidence(each.evidence) for each in answers]
-    there = [each.way == THERE for each in answers]
-    found = Calibration(
-        models={kind: model},
-        made=model.made,
-        asked=sum(there),
-        precision=config.accept_precision,
-        accepted=float(np.mean([c >= threshold for c, each in zip(sure, answers, strict=True) if each.way == THERE])),
-        accepted_wrong=sum(c >= threshold and not each.right for c, each in zip(sure, answers, strict=True)),
-        recognisable=_by_place(answers, sure),
-    )
+    answers = list(ask(technique, place_map, index, rule, meter, as_mapped()))
+    at_hand = len({each.place_id for each in answers})
+    if at_hand < FEWEST_PLACES:
+        raise UsageError(
+            f"Of {place_map.path} the pictures of {at_hand} places are at hand, and those of {FEWEST_PLACES} are "
+            "needed: give the pictures that it was made of, with the same camera and mask."
+        )
+    found = _calibration(answers, kinds, config.accept_precision)
     place_map.record_calibration(as_text(found))
     return found
 
 
-def _by_place(answers: Sequence[Answer], sure: Sequence[float]) -> dict[int, float]:
-    """Return the mean confidence of each place that was asked for; one that was taken for another counts as 0."""
+def _calibration(answers: Sequence[Answer], kinds: Sequence[str], precision: float) -> Calibration:
+    """Fit the model of the kind of evidence that most answers have, and count what it accepts."""
+    counts = Counter(kind_of(each.evidence) for each in answers if each.evidence)
+    kind = max(kinds, key=lambda each: counts[each])
+    mine = [each for each in answers if each.evidence and kind_of(each.evidence) == kind]
+    model = adapted(prior(kind), mine, f"{len(mine)} answers of the map itself")
+    sure = Sureness({each: prior(each) for each in kinds} | {kind: model}, precision)
+
+    def is_accepted(answer: Answer) -> bool:
+        return (
+            answer.evidence is not None
+            and not answer.refused
+            and sure.confidence(answer.evidence) >= sure.threshold(answer.evidence)
+        )
+
+    accepted = [each for each in answers if is_accepted(each)]
+    asked = sum(each.way == THERE for each in answers)
+    return Calibration(
+        models={kind: model},
+        made=date.today().isoformat(),
+        asked=asked,
+        precision=precision,
+        accepted=sum(each.way == THERE for each in accepted) / asked,
+        accepted_wrong=sum(not each.right for each in accepted),
+        recognisable=_by_place(answers, sure),
+    )
+
+
+def _by_place(answers: Sequence[Answer], sure: Sureness) -> dict[int, float]:
+    """Return the mean confidence of each place that was asked for. A match that is wrong or refused counts as 0."""
     of_place: dict[int, list[float]] = {}
-    for answer, confidence in zip(answers, sure, strict=True):
+    for answer in answers:
         if answer.way == THERE:
-            of_place.setdefault(answer.place_id, []).append(confidence if answer.right else 0.0)
+            confidence = sure.confidence(answer.evidence) if answer.right and not answer.refused else 0.0
+            of_place.setdefault(answer.place_id, []).append(confidence)
     return {place_id: round(float(np.mean(each)), 4) for place_id, each in sorted(of_place.items())}
 
 
 def adapted(model: Model, answers: Iterable[Answer], made_of: str) -> Model:
-    """Return a model for the map that gave these answers."""
+    """Return a model for the map that gave these answers, which all have evidence."""
     answers = list(answers)
     right = [each for each in answers if each.right]
     nowhere = [each for each in answers if each.way == MIRRORED]
@@ -176,6 +226,13 @@ def _adapted(
     right = np.array([each.right for each in answers], bool)
     weights = np.repeat([1.0, counts], [len(found), len(beside)])
     return fitted(start, [each.evidence for each in answers], right, weights, pull)
+
+
+def _mirrored(picture: Levelled) -> Levelled:
+    image, mask = (
+        None if each is None else np.ascontiguousarray(each[:, ::-1]) for each in (picture.image, picture.mask)
+    )
+    return Levelled(image, mask, picture.view)
 
 
 def _same_ground(place_map: PlaceMap, index: PlaceIndex, slot: int, neighbour_m: float) -> np.ndarray:

@@ -12,21 +12,27 @@ _TONES = 6  # points of a curve of tones
 _PATCHES = 2  # at most, of the picture hidden by something that was not there
 
 
-def changed(image: np.ndarray, rng: np.random.Generator, looks_down: bool) -> np.ndarray:
+def changed(
+    image: np.ndarray, rng: np.random.Generator, looks_down: bool, shown: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray | None]:
     """Return a picture as it might look another time: uint8 (H, W[, 3]) to uint8 (H, W) grey. Looking down, the camera
-    may be turned to any heading."""
+    may be turned to any heading. `shown`, bool (H, W), is False where the picture shows no ground (None: nowhere); it
+    is returned for the new picture."""
     strength = rng.uniform(*_STRENGTH)
     grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
-    seen = _from_beside(grey.astype(np.float32) / 255, rng, strength, looks_down)
+    warp = _from_beside(grey.shape, rng, strength, looks_down)
+    seen = _warped(grey.astype(np.float32) / 255, warp, cv2.INTER_LINEAR)
     seen = _another_season(seen, rng, strength)
     seen = _another_light(seen, rng, strength)
     _hide(seen, rng, strength)
-    return (255 * np.clip(seen, 0, 1)).round().astype(np.uint8)
+    if shown is not None:
+        shown = _warped(shown.view(np.uint8), warp, cv2.INTER_NEAREST).view(bool)
+    return (255 * np.clip(seen, 0, 1)).round().astype(np.uint8), shown
 
 
-def _from_beside(grey: np.ndarray, rng: np.random.Generator, strength: float, looks_down: bool) -> np.ndarray:
-    """Look from another spot, height and course, and from a tilted camera."""
-    height, width = grey.shape
+def _from_beside(shape: tuple[int, int], rng: np.random.Generator, strength: float, looks_down: bool) -> np.ndarray:
+    """Look from another spot, height and course, and from a tilted camera: return the warp of pixels, (3, 3)."""
+    height, width = shape
     scale = np.exp(rng.uniform(-1, 1) * 0.15 * strength)
     turn_deg = rng.uniform(0, 360) if looks_down else rng.uniform(-3, 3) * strength
     matrix = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), turn_deg, scale)
@@ -34,8 +40,11 @@ def _from_beside(grey: np.ndarray, rng: np.random.Generator, strength: float, lo
     matrix[1, 2] += rng.uniform(-0.15, 0.15) * height * strength * (1.0 if looks_down else 0.4)
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
     moved = corners + (rng.uniform(-0.05, 0.05, (4, 2)) * (width, height) * strength).astype(np.float32)
-    whole = cv2.getPerspectiveTransform(corners, moved) @ np.vstack([matrix, (0, 0, 1)])
-    return cv2.warpPerspective(grey, whole, (width, height), borderMode=cv2.BORDER_REFLECT)
+    return cv2.getPerspectiveTransform(corners, moved) @ np.vstack([matrix, (0, 0, 1)])
+
+
+def _warped(image: np.ndarray, warp: np.ndarray, flags: int) -> np.ndarray:
+    return cv2.warpPerspective(image, warp, image.shape[::-1], flags=flags, borderMode=cv2.BORDER_REFLECT)
 
 
 def _another_season(grey: np.ndarray, rng: np.random.Generator, strength: float) -> np.ndarray:

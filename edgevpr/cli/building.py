@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from edgevpr.cli import orthophotos
+from edgevpr.cli import calibrating, orthophotos
 from edgevpr.cli.shared import (
     add_json,
     add_keys,
@@ -51,6 +51,9 @@ def add(maps: Any) -> None:
     )
     build.add_argument(
         "--no-refine", dest="refine", action="store_false", help="do not find out where the pictures really lie"
+    )
+    build.add_argument(
+        "--no-calibrate", dest="calibrate", action="store_false", help="do not find out how sure the map can be"
     )
     build.add_argument("--append", action="store_true", help="add to an existing map, going on where it broke off")
     add_json(build)
@@ -126,8 +129,12 @@ def map_build(args: Namespace) -> int:
             raise
         places = len(place_map)
         refined = _refined_after(place_map, technique, args) if args.refine else None
+        calibrated = None
+        if args.calibrate:
+            calibrated = calibrating.calibrated_after(args, place_map, technique, config.match, meter, mask, levelling)
     if args.json:
         more = {"refined": asdict(refined)} if refined else {}
+        more |= {"calibration": calibrated.figures()} if calibrated else {}
         more |= {"without_data": source.without_data} if is_cut else {}
         print_json({"map": args.map, "technique": technique.spec.name, "places": places, **asdict(result), **more})
     else:
@@ -145,6 +152,8 @@ def map_build(args: Namespace) -> int:
             print(f"  {result.of_low_quality} of the places are of low quality, kept to bound the gaps")
         if refined:
             _print_refined(args.map, refined, technique.spec.cells)
+        if calibrated:
+            print(f"expect: {calibrated.said()}")
     return exit_code(unusable)
 
 

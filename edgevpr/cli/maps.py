@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from edgevpr.cli import building
+from edgevpr.cli import building, calibrating
 from edgevpr.cli.shared import add_json, command, group, positive, print_json, watched
 from edgevpr.errors import UsageError
 
@@ -19,6 +19,7 @@ def add(commands: Any) -> None:
     """Add the commands and their flags."""
     maps = group(commands, "map", "build, look into, check, repair, merge and export place maps")
     building.add(maps)
+    calibrating.add(maps)
     info = command(maps, "info", map_info, "say what a map holds")
     info.add_argument("map", metavar="MAP")
     add_json(info)
@@ -49,16 +50,20 @@ def _number_of_places(text: str) -> int:
 
 def map_info(args: Namespace) -> int:
     """Say what a map holds."""
+    from edgevpr.confidence.stored import not_calibrated
     from edgevpr.places.index import bytes_per_place
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.places.mapinfo import info_of
+    from edgevpr.runtime.recognise.calibrated import calibration_of
+    from edgevpr.runtime.recognise.evidence import WITH_CONFIDENCE
 
     with PlaceMap.open(args.map) as place_map:
-        info = info_of(place_map)
+        info, calibration = info_of(place_map), calibration_of(place_map)
     spec = info.spec
     ram_mb = info.places * bytes_per_place(spec) / 1e6
     if args.json:
-        print_json({**asdict(info), "bytes_per_place": bytes_per_place(spec), "ram_mb": ram_mb})
+        known = {"calibration": calibration.figures() if calibration else None}
+        print_json({**asdict(info), **known, "bytes_per_place": bytes_per_place(spec), "ram_mb": ram_mb})
         return 0
     settings = ", ".join(f"{key} {value}" for key, value in spec.parameters.items())
     print(f"{info.path}: {info.places} places, {info.with_position} with a position")
@@ -77,6 +82,10 @@ def map_info(args: Namespace) -> int:
         )
     if info.of_low_quality:
         print(f"  salience    {info.of_low_quality} of low quality, kept to bound the gaps")
+    if calibration:
+        print(f"  confidence  calibrated {calibration.made}: {calibration.said()}")
+    elif spec.name == WITH_CONFIDENCE:
+        print(f"  confidence  {not_calibrated(info.places)}")
     print(f"  size        {info.file_bytes / 1e6:.1f} MB on disk, {ram_mb:.2f} MB in RAM ({info.made_by})")
     return 0
 
@@ -141,7 +150,10 @@ def map_merge(args: Namespace) -> int:
                 copied, already_here = absorb(merged, place_map)
                 print(f"{path}: {copied} places copied" + (f", {already_here} there already" if already_here else ""))
             places = len(merged)
+            were_calibrated = any(each.calibration is not None for each in inputs)
     print(f"{out}: {places} places")
+    if were_calibrated:
+        print(f"  not calibrated: how sure the maps were does not hold for it; run `edgevpr map calibrate {out}`")
     return 0
 
 
@@ -167,10 +179,13 @@ def map_export(args: Namespace) -> int:
     from edgevpr.helpers.files import require_folder, write_whole
     from edgevpr.places.geojson import write_geojson
     from edgevpr.places.mapfile import PlaceMap
+    from edgevpr.runtime.recognise.calibrated import calibration_of
 
     with PlaceMap.open(args.map) as place_map:
+        calibration = calibration_of(place_map)
+        recognisable = calibration.recognisable if calibration else {}
         if args.geojson == "-":
-            write_geojson(place_map, sys.stdout)
+            write_geojson(place_map, sys.stdout, recognisable)
             return 0
         out_path = Path(args.geojson)
         if out_path.exists() and out_path.samefile(args.map):
@@ -179,7 +194,7 @@ def map_export(args: Namespace) -> int:
 
         def write(unfinished: Path) -> int:
             with open(unfinished, "w", encoding="utf-8") as out:
-                return write_geojson(place_map, out)
+                return write_geojson(place_map, out, recognisable)
 
         count = write_whole(out_path, write)
     print(f"{out_path}: {count} places")

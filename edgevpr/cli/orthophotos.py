@@ -2,6 +2,7 @@
 
 import time
 from argparse import ArgumentParser, Namespace
+from collections.abc import Collection
 from typing import TYPE_CHECKING
 
 from edgevpr.errors import UsageError
@@ -39,7 +40,7 @@ def require_one_source(args: Namespace) -> None:
     if (args.source is None) == (args.orthophoto is None):
         raise UsageError("Give either --images (pictures of a flight) or --orthophoto: a map is made of one of them.")
     others = _FLAGS if args.orthophoto is None else _OF_A_RECORDING
-    if said := [name for name in others if getattr(args, name) is not None]:
+    if said := [name for name in others if getattr(args, name, None) is not None]:
         source = "--orthophoto" if args.orthophoto is None else "--images"
         raise UsageError(f"--{said[0].replace('_', '-')} goes with {source}: leave it out.")
 
@@ -51,8 +52,9 @@ def camera_of(camera: str | None) -> str:
     return "nadir"
 
 
-def open_cuttings(args: Namespace) -> "OrthophotoSource":
-    """Open the orthophoto and lay the grid of its places. Raises SourceError, and UsageError for what does not fit."""
+def open_cuttings(args: Namespace, only: Collection[str] | None = None) -> "OrthophotoSource":
+    """Open the orthophoto and lay the grid of its places; those of the names in `only` are cut (None: all). Raises
+    SourceError, and UsageError for what does not fit."""
     if args.footprint_m is None or args.spacing_m is None:
         raise UsageError("--orthophoto needs --footprint-m (ground along a picture's longest side) and --spacing-m.")
     if args.margin_m is not None and not (args.area and 0 <= args.margin_m < float("inf")):
@@ -66,4 +68,4 @@ def open_cuttings(args: Namespace) -> "OrthophotoSource":
     margin_m = args.footprint_m if args.margin_m is None else args.margin_m
     orthophoto = Orthophoto(args.orthophoto)
     lattice = lattice_of(orthophoto, args.footprint_m, args.spacing_m, area, margin_m)
-    return OrthophotoSource(orthophoto, lattice, args.footprint_m, time.monotonic)
+    return OrthophotoSource(orthophoto, lattice, args.footprint_m, time.monotonic, only=only)

@@ -1,1 +1,1 @@
-"""How sure a match is: from evidence to the probability that it is right."""
+"""Confidence: from the evidence of a match to the probability that it is right."""

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from edgevpr.confidence.stored import FEWEST_PLACES
 from edgevpr.config import load_config
 from edgevpr.contract import Technique
 from edgevpr.errors import ModelError
@@ -23,10 +24,12 @@ from edgevpr.places.sequence import length_of, search_of
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import pack_ah, parse_pack, queries_ah, rail_ah, stage_energy_j
 from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.recognise.calibrated import calibration_of
+from edgevpr.runtime.recognise.evidence import kinds_of
 from edgevpr.runtime.recognise.follow import Follower
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.mapping import build_map
-from edgevpr.runtime.recognise.opening import calibrated, meter_of
+from edgevpr.runtime.recognise.opening import meter_of
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.salience.gate import Gate, NoGate
@@ -131,7 +134,7 @@ def evaluate(
     frames = progress(_frames(source), source.total, f"{technique_name}: references")
     with mapped(frames, technique, meter, dataset.ref_dir) as (place_map, index):
         length = length_of(technique.spec, sequence)
-        rule = accept_rule(technique, config.match, length, calibrated(place_map))
+        rule = accept_rule(technique, config.match, length, calibration_of(place_map))
 
         follows = follow and length == 1 and rule.sure is not None
 
@@ -182,7 +185,7 @@ def _refine(place_map: PlaceMap, technique: Technique, images: Path | None) -> N
 
 
 def _calibrate(place_map: PlaceMap, technique: Technique, meter: QueryMeter, images: Path | None) -> None:
-    if images is None:
+    if images is None or len(place_map) < FEWEST_PLACES or not kinds_of(technique.spec):
         return
     try:
         from edgevpr.calibrate.calibrate import calibrate

@@ -1,7 +1,7 @@
 """An orthophoto as a source of frames: a picture of the ground around each place of a grid, as a camera that looks
 straight down, with the nose to the north, would take it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 
 from edgevpr.errors import ImageError
 from edgevpr.frames.lattice import Lattice
@@ -21,9 +21,15 @@ class OrthophotoSource(Recording):
     these."""
 
     def __init__(
-        self, orthophoto: Orthophoto, lattice: Lattice, footprint_m: float, clock: Callable[[], float]
+        self,
+        orthophoto: Orthophoto,
+        lattice: Lattice,
+        footprint_m: float,
+        clock: Callable[[], float],
+        *,
+        only: Collection[str] | None = None,
     ) -> None:
-        super().__init__()
+        super().__init__(only)
         self._orthophoto, self._lattice, self._footprint_m, self._clock = orthophoto, lattice, footprint_m, clock
         self.total = len(lattice)
         self.without_data = 0
@@ -45,6 +51,9 @@ class OrthophotoSource(Recording):
         lattice, at = self._lattice, self._read
         row, column = map(_numbered, (lattice.rows[at], lattice.columns[at]), lattice.shape)
         self._read += 1
+        name = f"{decoded_name(self._orthophoto.path.name)}_r{row}_c{column}"
+        if not self.is_wanted(name):
+            return None
         position = Position(float(lattice.lat_deg[at]), float(lattice.lon_deg[at]))
         try:
             image, valid = self._orthophoto.cut(position, self._footprint_m, SIDE_PX)
@@ -56,7 +65,7 @@ class OrthophotoSource(Recording):
             return None
         return Frame(
             image=image,
-            name=f"{decoded_name(self._orthophoto.path.name)}_r{row}_c{column}",
+            name=name,
             t_mono_s=self._clock(),
             position=position,
             heading_deg=0.0,

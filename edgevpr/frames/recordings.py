@@ -1,6 +1,6 @@
 """A folder of images, read in order to its end."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 from edgevpr.errors import ImageError, UsageError
@@ -14,14 +14,20 @@ from edgevpr.types import Frame
 
 
 class Recording:
-    """The common part of all recordings; a subclass sets `ended`."""
+    """The common part of all recordings; a subclass sets `ended`. Frames whose names are not in `only` are passed over
+    (None: all are read)."""
 
     is_live = False
     dropped = latency_s = None
     ended: bool
 
-    def __init__(self) -> None:
+    def __init__(self, only: Collection[str] | None = None) -> None:
         self.refused = {Refusal.DAMAGED.value: 0}
+        self._only = None if only is None else frozenset(only)
+
+    def is_wanted(self, name: str) -> bool:
+        """Tell whether the frame of this name is to be read."""
+        return self._only is None or name in self._only
 
     @property
     def condition(self) -> Condition:
@@ -35,9 +41,15 @@ class Recording:
 class FolderSource(Recording):
     """Each image of a folder once, with the position of its line in positions.csv, else that of its EXIF data."""
 
-    def __init__(self, folder: Path, positions: Path | None, clock: Callable[[], float]):
-        super().__init__()
-        self._paths = list_images(folder)
+    def __init__(
+        self,
+        folder: Path,
+        positions: Path | None,
+        clock: Callable[[], float],
+        only: Collection[str] | None = None,
+    ):
+        super().__init__(only)
+        self._paths = [path for path in list_images(folder) if self.is_wanted(decoded_name(path.name))]
         self.total = len(self._paths)
         self._read = 0
         self._clock = clock

@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Protocol
 from urllib.parse import urlsplit
@@ -72,19 +72,20 @@ def open_source(
     positions: Path | None = None,
     live: bool,
     clock: Callable[[], float] = time.monotonic,
+    only: Collection[str] | None = None,
 ) -> Source:
     """Open the source that `uri` names. `live` allows cameras and streams, which never end.
 
     `step_s` is the least video time in seconds between two frames of a video file. `positions` is the positions.csv of
-    a folder of images; without it, the one in or beside the folder is used, else EXIF. A stream that is not there yet
-    is waited for. Raises SourceError for a source that is unknown, missing or not allowed, and UsageError for positions
-    that make no sense.
+    a folder of images; without it, the one in or beside the folder is used, else EXIF. Of a recording, the frames whose
+    names are in `only` are read (None: all). A stream that is not there yet is waited for. Raises SourceError for a
+    source that is unknown, missing or not allowed, and UsageError for positions that make no sense.
     """
     path = Path(uri)
     if positions and not path.is_dir():
         raise UsageError(f"{positions} can only place the images of a folder, and {uri} is none: leave it out.")
     if path.is_dir():
-        return FolderSource(path, positions, clock)
+        return FolderSource(path, positions, clock, only)
     if is_live(uri):
         if not live:
             raise SourceError(f"{uri} is live and never ends: give a folder of images or a video file here.")
@@ -95,7 +96,7 @@ def open_source(
         raise SourceError(f"{uri} is a single image: give the folder that holds it.")
     from edgevpr.frames.video import VideoSource  # loads FFmpeg
 
-    return VideoSource(path, step_s or 0.0, clock)
+    return VideoSource(path, step_s or 0.0, clock, only)
 
 
 def is_live(uri: str) -> bool:

@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,8 +26,8 @@ class VideoSource(Recording):
     Damaged frames, and those predicted from them, are left out. `read` raises ImageError once for every stretch of
     them, and once for an end that is missing."""
 
-    def __init__(self, path: Path, step_s: float, clock: Callable[[], float]):
-        super().__init__()
+    def __init__(self, path: Path, step_s: float, clock: Callable[[], float], only: Collection[str] | None = None):
+        super().__init__(only)
         self.ended = False
         self._path, self._step_s, self._clock = path, step_s, clock
         whole = open_pictures(str(path), {})
@@ -56,7 +56,8 @@ class VideoSource(Recording):
             elif self._advance(picture := self._ready.popleft()):
                 self._t_due_s = self._t_s + self._step_s
                 name = f"frame {self._index:06d} t={self._t_s:.3f} s"
-                return Frame(image=self._whole.pixels(picture), name=name, t_mono_s=self._clock())
+                if self.is_wanted(name):
+                    return Frame(image=self._whole.pixels(picture), name=name, t_mono_s=self._clock())
             if self._clock() >= deadline_s:
                 break
         return None

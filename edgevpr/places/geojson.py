@@ -1,6 +1,7 @@
 """A map as GeoJSON (RFC 7946): the places without their descriptors, for any map viewer."""
 
 import json
+from collections.abc import Mapping
 from typing import TextIO
 
 from edgevpr.places import geopackage
@@ -8,21 +9,25 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.types import Place, Pose, Salience
 
 _LOW, _USUAL = "#e0b060", "#2060c0"
+# From hardly recognisable to surely, in five equal steps; red and blue are told apart by every eye.
+_RECOGNISABLE = ("#d73027", "#fc8d59", "#fee090", "#91bfdb", "#4575b4")
 
 
-def write_geojson(place_map: PlaceMap, out: TextIO) -> int:
-    """Write all places as one FeatureCollection, one feature a line, and return their number."""
+def write_geojson(place_map: PlaceMap, out: TextIO, recognisable: Mapping[int, float] | None = None) -> int:
+    """Write all places as one FeatureCollection, one feature a line, and return their number. `recognisable` is how
+    surely places are recognised, 0..1 by their numbers, as far as it is known; it gives them their colours."""
+    recognisable = recognisable or {}
     count = 0
     out.write('{"type": "FeatureCollection", "features": [')
     for place in place_map.places():
         out.write(",\n" if count else "\n")
-        out.write(json.dumps(_feature(place)))
+        out.write(json.dumps(_feature(place, recognisable.get(place.place_id))))
         count += 1
     out.write("\n]}\n")
     return count
 
 
-def _feature(place: Place) -> dict:
+def _feature(place: Place, recognisable: float | None) -> dict:
     position = place.position
     geometry = None
     if position:
@@ -38,6 +43,7 @@ def _feature(place: Place) -> dict:
             "source_image": place.source_image,
             "quality": round(place.quality, 4),
             **_salience(place.salience),
+            **_recognisable(recognisable),
             **_pose(place.pose),
         },
     }
@@ -55,6 +61,14 @@ def _pose(pose: Pose | None) -> dict:
         "covariance_m2": [round(var_east, 3), round(cov, 3), round(var_north, 3)],
         "recorded": [recorded.lon_deg, recorded.lat_deg] if recorded else None,
     }
+
+
+def _recognisable(share: float | None) -> dict:
+    """Return how surely a place is recognised, and the colour of that."""
+    if share is None:
+        return {}
+    step = min(int(share * len(_RECOGNISABLE)), len(_RECOGNISABLE) - 1)
+    return {"recognisable": round(share, 3), "marker-color": _RECOGNISABLE[step]}
 
 
 def _salience(salience: Salience | None) -> dict:

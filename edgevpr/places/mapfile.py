@@ -15,7 +15,7 @@ import numpy as np
 
 from edgevpr.contract import Descriptor, TechniqueSpec
 from edgevpr.errors import MapError, PlaceError
-from edgevpr.places import geopackage, rows
+from edgevpr.places import geopackage, mapspec, rows
 from edgevpr.places.connection import MapConnection
 from edgevpr.places.mapspec import differences, has_checksums, has_pose, has_salience, read_text, write_text
 from edgevpr.places.rows import Content, Point, Unreadable
@@ -158,23 +158,23 @@ class PlaceMap:
     def mask_sha256(self) -> str | None:
         """The overlay mask that the places were made with; None: none, or unknown."""
         with sentences(self.path):
-            return read_text(self.db, "mask_sha256")
+            return read_text(self.db, mapspec.MASK)
 
     def record_mask(self, sha256: str | None) -> None:
         """Record the overlay mask that the places are made with (None: none). Raises MapError."""
         with sentences(self.path), self.transaction():
-            write_text(self.db, "mask_sha256", sha256)
+            write_text(self.db, mapspec.MASK, sha256)
 
     @property
     def calibration(self) -> str | None:
-        """What was recorded of how sure the map can be (see `calibrate`), as text; None: nothing, or unreadable."""
+        """Text that was recorded of how sure the map can be (see `calibrate`); None: none, or none that is a text."""
         with sentences(self.path):
-            return read_text(self.db, "calibration")
+            return read_text(self.db, mapspec.CALIBRATION)
 
-    def record_calibration(self, text: str) -> None:
-        """Record how sure the map can be. Raises MapError."""
+    def record_calibration(self, text: str | None) -> None:
+        """Record how sure the map can be (None: unknown). Raises MapError."""
         with sentences(self.path), self.transaction():
-            write_text(self.db, "calibration", text)
+            write_text(self.db, mapspec.CALIBRATION, text)
 
     def places(self, place_ids: Iterable[int] | None = None) -> Iterator[Place]:
         """Yield the places of `place_ids` in the order given, or (None) all places in the order they were added.

@@ -20,6 +20,7 @@ FORMAT_VERSION = 4  # 1 had no checksums and no map_id, 2 no salience, 3 no pose
 _WITH_CHECKSUMS, _WITH_SALIENCE, _WITH_POSE = 2, 3, 4
 _DTYPES = ("|i1", "|u1", "<i1", "<u1", *(f"<{kind}{size}" for kind in "iu" for size in "248"), "<f2", "<f4", "<f8")
 _MOST_PART_BYTES = 64_000_000
+BESIDE = MASK, CALIBRATION = ("mask_sha256", "calibration")
 _MOST_STORED = 1000  # rows of the table, and characters that a message shows of a damaged one
 
 Stored = dict[str, Any]
@@ -55,7 +56,8 @@ def stored(path: Path, db: sqlite3.Connection) -> Stored:
     if application_id != geopackage.APPLICATION_ID or not {"edgevpr_map", "places"} <= tables:
         raise MapError(f"{path}: this is not a place map: give a .gpkg file made by `edgevpr map build`.")
     try:
-        rows = db.execute("SELECT key, value FROM edgevpr_map").fetchmany(_MOST_STORED)
+        # What is kept beside the places is read when it is asked for: a map is of use without it.
+        rows = db.execute("SELECT key, value FROM edgevpr_map WHERE key NOT IN (?, ?)", BESIDE).fetchmany(_MOST_STORED)
         found = {key: json.loads(value) for key, value in rows}
         version = found["format_version"]
         if not isinstance(version, int) or version < 1:
@@ -141,7 +143,7 @@ def read_text(db: sqlite3.Connection, key: str) -> str | None:
     row = db.execute("SELECT value FROM edgevpr_map WHERE key = ?", (key,)).fetchone()
     try:
         text = json.loads(row[0]) if row else None
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, RecursionError):
         return None
     return text if isinstance(text, str) else None
 

@@ -58,8 +58,9 @@ def check(path: str | Path, watch: Watch[Examined]) -> MapCheck:
 def repair(path: str | Path, watch: Watch[Examined]) -> Path:
     """Put a copy of all whole places in the place of a map, and return the path of the original, which is kept.
 
-    The places keep their numbers, and all get checksums. Raises MapError where no place can be read, where the file of
-    an earlier repair is there, and where the copy cannot be written: the map is then as it was.
+    The places keep their numbers, and all get checksums. Mask and calibration are kept where they can be read. Raises
+    MapError where no place can be read, where the file of an earlier repair is there, and where the copy cannot be
+    written: the map is then as it was.
     """
     path = mapfiles.existing(path)
     original = path.with_name(path.name + ".damaged")
@@ -75,6 +76,9 @@ def repair(path: str | Path, watch: Watch[Examined]) -> Path:
                     with repaired.transaction():
                         for each in block:
                             repaired.insert(each.content, each.place_id)
+            with suppress(MapError):
+                repaired.record_mask(damaged.mask_sha256)
+                repaired.record_calibration(damaged.calibration)
             if not len(repaired):
                 raise MapError(f"{path}: no place of it can be read: restore a copy, or build it again.")
         _exchange(path, copy, original)

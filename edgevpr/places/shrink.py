@@ -34,8 +34,9 @@ def worth_of(place: Place) -> float:
 def shrink(path: str | Path, out: Path, count: int) -> tuple[int, int]:
     """Copy the `count` best places of a map to a new one, all or none; return how many were kept, of how many.
 
-    A place that cannot be read is left behind. Raises MapError for a map that cannot be read, or an `out` that is there
-    already or cannot be written.
+    The places keep their numbers, and the map its calibration, which knows places by number. A place that cannot be
+    read is left behind. Raises MapError for a map that cannot be read, or an `out` that is there already or cannot be
+    written.
     """
     with mapfiles.whole_or_none(out) as unfinished, PlaceMap.open(path) as place_map:
         whole = [each.place_id for each in examine(place_map) if not each.problem]
@@ -43,10 +44,11 @@ def shrink(path: str | Path, out: Path, count: int) -> tuple[int, int]:
         kept = {whole[number] for number in chosen(places, count)}
         with PlaceMap.create(unfinished, place_map.spec) as smaller:
             smaller.record_mask(place_map.mask_sha256)
+            smaller.record_calibration(place_map.calibration)
             with sentences(unfinished), smaller.transaction():
                 for each in examine(place_map):
                     if each.place_id in kept:
-                        smaller.insert(each.content)
+                        smaller.insert(each.content, each.place_id)
     return len(kept), len(whole)
 
 

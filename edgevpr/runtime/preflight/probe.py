@@ -120,7 +120,7 @@ def probe(
             technique=technique,
             place_map=place_map,
             index=index,
-            rule=AcceptRule(technique.min_score, technique.min_margin, neighbour_m=0.0),
+            rule=AcceptRule(min_score=technique.min_score, min_margin=technique.min_margin, neighbour_m=0.0),
             meter=meter,
             candidates=candidates,
             search=search_of(length),

@@ -18,6 +18,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from edgevpr.confidence.model import Model
 from edgevpr.contract import TechniqueSpec
 from edgevpr.landmarks.agreement import Agreement
 from edgevpr.places.index import PlaceIndex
@@ -34,6 +35,7 @@ OF_PLACE = {
     DOWN: ("agree", "lead", "coverage", "landmarks"),
     DOWN_BARE: ("agree", "lead", "coverage"),
 }
+WITH_CONFIDENCE = "cohog"  # the technique that gives evidence, for want of its spec (see `kinds_of`)
 _LEAST = 1e-3  # of a share whose logarithm is taken
 _BY_CHANCE = 0.02  # a share that any two pictures reach, where there is no place elsewhere to compare with
 _BESIDE = 0.5  # weight of either neighbour
@@ -51,6 +53,19 @@ def kind_of(evidence: Mapping[str, float]) -> str:
     if "likeness" in evidence:
         return AHEAD
     return DOWN if "landmarks" in evidence else DOWN_BARE
+
+
+def require_usable(kind: str, model: Model) -> None:
+    """Raise ValueError for a model of a kind, or with evidence, that there is not (it comes from another edgevpr), and
+    ValueError or ArithmeticError for figures that make no sense."""
+    if kind not in OF_MAP:
+        raise ValueError(f"there is no evidence of kind {kind!r:.40}")
+    for name in (*model.of_map.names, *model.of_place.names):
+        if name not in OF_MAP[kind] + OF_PLACE[kind]:
+            raise ValueError(f"there is no evidence {name!r:.40} of kind {kind}")
+    for value in (-1.0, 0.0, 1.0):
+        model.confidence(dict.fromkeys(OF_MAP[kind] + OF_PLACE[kind], value))
+    model.threshold(0.5), model.threshold(0.999999)
 
 
 def said(evidence: Mapping[str, float]) -> str:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgevpr.confidence.model import Evidence, Model, prior
+from edgevpr.confidence.stored import Calibration
 from edgevpr.config import MatchConfig
 from edgevpr.contract import FineMatch, Technique
 from edgevpr.landmarks.agreement import Agreement
@@ -62,7 +63,7 @@ class Sureness:
         return self.models[kind_of(evidence)].threshold(self.precision)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class AcceptRule:
     """Least score, and least lead over the best place farther away than `neighbour_m` metres, of an accepted match; and
     least quality of its picture. With `sure` the confidence decides, and both limits come on top where they are set. A
@@ -88,10 +89,10 @@ class Verdict:
 
 
 def accept_rule(
-    technique: Technique, config: MatchConfig, length: int = 1, calibrated: Mapping[str, Model] | None = None
+    technique: Technique, config: MatchConfig, length: int = 1, calibration: Calibration | None = None
 ) -> AcceptRule:
     """Return the rule of a technique: by confidence where there is a model of its evidence, else by its own limits,
-    where the configuration leaves them open. `calibrated` are the models that a map brings.
+    where the configuration leaves them open. `calibration` is that of the map.
 
     A technique's margin is that of one query. The mean score of `length` queries varies less, so the margin of a
     sequence is divided by the root of its length. Lengths above ten count as ten: queries that show the same ground are
@@ -101,14 +102,15 @@ def accept_rule(
     own_score, own_margin = (0.0, 0.0) if kinds else (technique.min_score, technique.min_margin)
     if own_margin < 1:  # a margin of 1 or more accepts nothing, not in sequences either
         own_margin /= math.sqrt(min(length, _LONGEST))
-    models = {kind: (calibrated or {}).get(kind) or prior(kind) for kind in kinds}
+    own = calibration.models if calibration else {}
+    models = {kind: own.get(kind) or prior(kind) for kind in kinds}
     return AcceptRule(
-        own_score if config.min_score is None else config.min_score,
-        own_margin if config.min_margin is None else config.min_margin,
-        config.neighbour_m,
-        technique.min_quality,
-        Sureness(models, config.accept_precision) if kinds else None,
-        _OF_SCORE_WHEN_PROVEN * technique.min_score,
+        min_score=own_score if config.min_score is None else config.min_score,
+        min_margin=own_margin if config.min_margin is None else config.min_margin,
+        neighbour_m=config.neighbour_m,
+        min_quality=technique.min_quality,
+        sure=Sureness(models, config.accept_precision) if kinds else None,
+        worth_a_look=_OF_SCORE_WHEN_PROVEN * technique.min_score,
     )
 
 

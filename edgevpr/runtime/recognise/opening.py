@@ -1,13 +1,11 @@
 """Opening: makes a recogniser of a map, the technique that it was made with, and its index in RAM."""
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from edgevpr import techniques
-from edgevpr.confidence.model import Model
-from edgevpr.confidence.stored import from_text
 from edgevpr.config import Config, SalienceConfig
 from edgevpr.contract import Technique
 from edgevpr.errors import ConfigError, MapError, UsageError
@@ -22,6 +20,7 @@ from edgevpr.places.sequence import bytes_beside_place, length_of, search_of
 from edgevpr.power.boards import Board
 from edgevpr.power.equations import parse_pack
 from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.recognise.calibrated import calibration_of
 from edgevpr.runtime.recognise.evidence import kinds_of
 from edgevpr.runtime.recognise.follow import Follower, NoFollower
 from edgevpr.runtime.recognise.hints import Prior
@@ -110,7 +109,7 @@ def take_form(recogniser: Recogniser, config: Config, form: str) -> None:
     technique = technique_of(place_map, config.technique, _wanted(config) | {"form": form}, board)
     length = length_of(technique.spec, config.match.sequence)
     index = _loaded(config, board, technique, place_map)
-    rule = accept_rule(technique, config.match, length, calibrated(place_map))
+    rule = accept_rule(technique, config.match, length, calibration_of(place_map))
     recogniser.take(technique, index, rule, search_of(length))
 
 
@@ -218,7 +217,7 @@ def _recogniser(
         technique=technique,
         place_map=place_map,
         index=index,
-        rule=accept_rule(technique, config.match, length, calibrated(place_map)),
+        rule=accept_rule(technique, config.match, length, calibration_of(place_map)),
         meter=meter_of(config, board),
         candidates=config.match.candidates or technique.candidates,
         search=search_of(length),
@@ -231,20 +230,6 @@ def _recogniser(
         verify=config.match.verify,
         follower=_follower(config, technique, place_map) if follows else None,
     )
-
-
-def calibrated(place_map: PlaceMap) -> Mapping[str, Model]:
-    """Return the models of confidence that a map brings; none, with a warning, where they make no sense."""
-    text = place_map.calibration
-    try:
-        return from_text(text).models if text else {}
-    except ValueError as error:
-        _log.warning(
-            "%s: its calibration cannot be used (%s): the shipped one is used; `edgevpr map calibrate` makes it anew",
-            place_map.path,
-            error,
-        )
-        return {}
 
 
 def say_other_mask(place_map: PlaceMap, mask: AnyMask) -> None:

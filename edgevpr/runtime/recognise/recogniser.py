@@ -34,20 +34,20 @@ _log = logging.getLogger(__name__)
 _OF_CANDIDATES = 0.4  # are compared from each height but the first
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Judged:
     """The ranking of a query after all that is known, its best place, the verdict on it, and what led to it."""
 
-    ranking: Ranking | None
-    best: Candidate | None
-    verdict: Verdict | None
+    ranking: Ranking | None = None
+    best: Candidate | None = None
+    verdict: Verdict | None = None
     proof: Agreement | None = None
     where: Located | None = None
     evidence: dict[str, float] | None = None
     followed: Followed | None = None
 
 
-_NOT_JUDGED = _Judged(None, None, None)
+_NOT_JUDGED = _Judged()
 
 
 class Recogniser:
@@ -236,7 +236,15 @@ class Recogniser:
                 rival = looked.rival(ranking, rule.neighbour_m, same)
         sure = followed and followed.confidence
         verdict = judge(ranking, index, rule, self.search, is_new, proof, rival, where, evidence, sure)
-        return _Judged(ranking, best, verdict, proof, where, evidence, followed)
+        return _Judged(
+            ranking=ranking,
+            best=best,
+            verdict=verdict,
+            proof=proof,
+            where=where,
+            evidence=evidence,
+            followed=followed,
+        )
 
     def _evidence(self, ranking: Ranking, proof: Agreement | None, same: Sequence[int]) -> dict[str, float] | None:
         if self.rule.sure is None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from edgevpr.confidence.stored import not_calibrated
 from edgevpr.config import Config, load_config
 from edgevpr.errors import EdgevprError, ImageError, LinkError, MapError, UsageError
 from edgevpr.frames.condition import Condition
@@ -24,6 +25,7 @@ from edgevpr.power.equations import parse_pack
 from edgevpr.runtime.flight.autopilot import DRY_RUN
 from edgevpr.runtime.preflight.choose import too_late
 from edgevpr.runtime.preflight.pick import outlook
+from edgevpr.runtime.recognise.calibrated import calibration_of
 from edgevpr.runtime.recognise.learn import check_positions
 from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.types import FIX_MAX_AGE_S
@@ -132,14 +134,18 @@ def _map(config: Config) -> str:
             if not len(place_map):
                 return f"{path}, empty so far"
     recogniser = open_recogniser(config, load_board(config.board))
-    with recogniser.place_map:
+    with recogniser.place_map as place_map:
         found = outlook(recogniser, config)
+        sure = ""
+        if recogniser.rule.sure:
+            calibration = calibration_of(place_map)
+            sure = f"; {calibration.said() if calibration else not_calibrated(len(place_map))}"
     if config.mavlink.link and config.mavlink.send_fixes and (found.t_query_s or 0.0) > FIX_MAX_AGE_S:
         raise UsageError(
             f"No fix would ever be sent ({too_late(found.t_query_s)}): use a faster board, fewer places or candidates, "
             f"or a technique that costs less; {found.reason}."
         )
-    return f"{config.map}, {found.reason}"
+    return f"{config.map}, {found.reason}{sure}"
 
 
 def _source(config: Config) -> str:

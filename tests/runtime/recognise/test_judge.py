@@ -1,44 +1,79 @@
-"""The judge of a single query: score, lead, and how much of the place agrees."""
+"""The judge of a single query: by its confidence, or by score and lead; and what speaks against a match."""
 
 import math
 
 import numpy as np
 import pytest
+from sureness import NEEDED, sure_rule
 
+from edgevpr.config import load_config
 from edgevpr.contract import FineMatch, PartSpec, TechniqueSpec
-from edgevpr.landmarks.agreement import PROVEN, Agreement
+from edgevpr.landmarks.agreement import Agreement
 from edgevpr.places.index import empty_index
 from edgevpr.places.retrieve import Ranking
 from edgevpr.places.sequence import Alone, SequenceSearch
-from edgevpr.runtime.recognise.judge import AcceptRule, judge
+from edgevpr.runtime.recognise.evidence import AHEAD, OF_MAP, OF_PLACE
+from edgevpr.runtime.recognise.judge import AcceptRule, accept_rule, judge
+from edgevpr.techniques import create
 
 RULE = AcceptRule(min_score=0.08, min_margin=0.03, neighbour_m=50.0)
 
 
-def judged(coverage, scores=(0.2, 0.1)):
+def judged(scores=(0.2, 0.1), rule=RULE, evidence=None):
     index = empty_index(TechniqueSpec(name="test", parameters={}, coarse=PartSpec((1,), "<f4")), 10, None)
     slots = np.array([0, 9])[: len(scores)]
-    matches = {int(slot): FineMatch(score, coverage=coverage) for slot, score in zip(slots, scores, strict=True)}
+    matches = {int(slot): FineMatch(score) for slot, score in zip(slots, scores, strict=True)}
     ranking = Ranking(slots, np.array(scores, np.float32), matches)
-    return judge(ranking, index, RULE, Alone(), is_new=False)
+    return judge(ranking, index, rule, Alone(), is_new=False, evidence=evidence)
 
 
-@pytest.mark.parametrize("coverage", [0.0, 0.031, 0.0399, math.nan])
-def test_a_match_in_which_little_of_the_place_agrees_is_refused(coverage):
-    verdict = judged(coverage)
-    assert not verdict.accepted
-    assert verdict.reason.endswith("% of the place agrees, 4% needed")
+def test_a_technique_without_a_confidence_is_judged_by_its_limits():
+    assert judged().accepted
+    assert "is below" in judged((0.05, 0.0)).reason
+    assert "ahead of a place elsewhere" in judged((0.2, 0.19)).reason
 
 
-@pytest.mark.parametrize("coverage", [0.04, 0.05, 1.0])
-def test_a_match_in_which_enough_of_the_place_agrees_is_accepted(coverage):
-    assert judged(coverage).accepted
+CLEAR = {"agree": -1.6, "lead": 0.7, "coverage": -0.5}
 
 
-def test_a_technique_that_does_not_count_what_agrees_is_judged_by_its_score():
-    assert judged(None).accepted
-    assert "is below" in judged(None, (0.05, 0.0)).reason
-    assert "ahead of a place elsewhere" in judged(None, (0.2, 0.19)).reason
+@pytest.mark.parametrize(("confidence", "accepted"), [(1.0, True), (NEEDED, True), (0.8999, False), (math.nan, False)])
+def test_a_match_is_accepted_from_the_needed_confidence_on(confidence, accepted):
+    verdict = judged(rule=sure_rule(lambda evidence: confidence), evidence=CLEAR)
+    assert verdict.accepted is accepted
+    assert verdict.reason.startswith(f"confidence {confidence:.4f}, 0.9000 needed: 2.01 times as many regions agree")
+    assert judged((0.2,), sure_rule(lambda evidence: confidence), CLEAR).accepted is accepted, "no place elsewhere"
+
+
+def test_a_match_that_offers_no_evidence_is_never_sure():
+    assert not judged(rule=sure_rule(lambda evidence: 1.0)).accepted
+
+
+@pytest.mark.parametrize("limit", [{"min_score": 0.21}, {"min_margin": 0.11}, {"worth_a_look": 0.21}])
+def test_limits_come_on_top_of_a_confidence(limit):
+    assert judged(rule=sure_rule(lambda evidence: 1.0), evidence=CLEAR).accepted
+    assert not judged(rule=sure_rule(lambda evidence: 1.0, **limit), evidence=CLEAR).accepted
+
+
+@pytest.mark.parametrize("score", [math.nan, 0.019])
+def test_a_score_that_says_nothing_makes_up_for_no_confidence(score):
+    assert not judged((score, 0.0), sure_rule(lambda evidence: 1.0, worth_a_look=0.02), CLEAR).accepted
+
+
+def test_an_accepted_share_that_is_asked_for_changes_how_much_is_needed():
+    technique = create("cohog", {"w1": 208})
+    needed = []
+    for precision in (0.9, 0.999):
+        config = load_config(None, {"match.accept_precision": precision}).match
+        sure = accept_rule(technique, config).sure
+        needed.append(sure.threshold(dict.fromkeys(OF_MAP[AHEAD] + OF_PLACE[AHEAD], 0.0)))
+    assert needed[0] < needed[1]
+
+
+def test_a_sequence_and_a_technique_without_evidence_are_judged_by_limits():
+    config = load_config(None).match
+    assert accept_rule(create("cohog", {"w1": 208}), config).sure
+    assert accept_rule(create("cohog", {"w1": 208}), config, length=3).sure is None
+    assert accept_rule(create("hog"), config).sure is None
 
 
 def behind(*others, best=(0.3, (0.2, -0.1), 0.0)):
@@ -89,11 +124,6 @@ def test_in_a_sequence_the_newest_query_need_not_be_sure_by_itself():
     assert verdicts[-1].accepted, verdicts[-1].reason
 
 
-def test_where_there_is_no_place_elsewhere_what_agrees_counts_all_the_same():
-    assert judged(0.05, (0.2,)).accepted
-    assert not judged(0.03, (0.2,)).accepted
-
-
 @pytest.mark.parametrize(("turn", "is_display"), [(3.0, True), (356.5, True), (9.0, False)])
 def test_a_display_is_found_though_rotations_are_measured(turn, is_display):
     assert behind((0.15, (0.0, 0.0), turn)).accepted is not is_display
@@ -113,38 +143,25 @@ def found(inliers, possible=250, shift_share=(0.1, 0.0), is_expected=True):
     )
 
 
-def held(score, ahead, proof, rival=0, rule=RULE, coverage=0.5):
+def held(score, ahead, proof, rival=0, rule=RULE, evidence=None):
     """The verdict on a match that scores so much, so far ahead of a place elsewhere."""
     index = empty_index(TechniqueSpec(name="test", parameters={}, coarse=PartSpec((1,), "<f4")), 10, None)
     scores = np.array([score, score - ahead], np.float32)
-    matches = {slot: FineMatch(float(value), coverage=coverage) for slot, value in zip((0, 9), scores, strict=True)}
+    matches = {slot: FineMatch(float(value)) for slot, value in zip((0, 9), scores, strict=True)}
     ranking = Ranking(np.array([0, 9]), scores, matches)
-    return judge(ranking, index, rule, Alone(), is_new=False, proof=proof, rival=rival)
+    return judge(ranking, index, rule, Alone(), is_new=False, proof=proof, rival=rival, evidence=evidence)
 
 
-@pytest.mark.parametrize(("score", "ahead", "coverage"), [(0.05, 0.04, 0.5), (0.15, 0.001, 0.5), (0.15, 0.1, 0.02)])
-def test_landmarks_make_up_for_a_weak_vote(score, ahead, coverage):
-    assert held(score, ahead, None, coverage=coverage).is_open
-    assert held(score, ahead, found(PROVEN), coverage=coverage).accepted
-    for proof, rival in (
-        (found(PROVEN - 1), 0),
-        (found(PROVEN), PROVEN // 2 + 1),
-        (found(40), 21),
-        (found(40, shift_share=(0.0, 0.001)), 0),
-        (found(40, is_expected=False), 0),
-    ):
-        verdict = held(score, ahead, proof, rival, coverage=coverage)
-        assert (verdict.accepted, verdict.is_open) == (False, False)
-
-
-@pytest.mark.parametrize("score", [0.0, 0.039, math.nan])
-def test_landmarks_make_up_for_no_vote_at_all(score):
-    assert not held(score, 0.0, None).is_open
-    assert not held(score, 0.0, found(200)).accepted
-
-
-def test_a_rule_that_accepts_nothing_is_not_made_up_for():
-    assert not held(0.5, 0.2, None, rule=AcceptRule(0.08, 1.0, 50.0)).is_open
+@pytest.mark.parametrize(
+    ("lead", "inliers", "rival", "accepted"),
+    [(0.1, 20, 10, True), (0.1, 20, 11, False), (0.1, 20, 0, True), (0.5, 20, 11, True)],
+)
+def test_landmarks_must_tell_a_place_from_one_that_agrees_nearly_as_well(lead, inliers, rival, accepted):
+    evidence = {"agree": -2.0, "lead": lead, "coverage": -0.5, "landmarks": math.log1p(inliers)}
+    verdict = held(0.15, 0.01, found(inliers), rival, sure_rule(lambda evidence: 1.0), evidence)
+    assert verdict.accepted is accepted
+    if not accepted:
+        assert verdict.reason.startswith("11 landmarks of a place elsewhere agree as well")
 
 
 @pytest.mark.parametrize(
@@ -160,12 +177,3 @@ def test_a_rule_that_accepts_nothing_is_not_made_up_for():
 )
 def test_a_clear_vote_without_landmarks_that_agree_is_refused(score, proof, accepted):
     assert held(score, 0.1, proof).accepted == accepted
-
-
-def test_a_sequence_is_not_open_to_proof():
-    index = empty_index(TechniqueSpec(name="test", parameters={}, coarse=PartSpec((1,), "<f4")), 10, None)
-    search = SequenceSearch(2)
-    ranking = Ranking(np.array([0, 9]), np.array([0.05, 0.01], np.float32), {})
-    search.follow(ranking, index, 0.0)
-    search.follow(ranking, index, 1.0)
-    assert not judge(ranking, index, RULE, search, is_new=False).is_open

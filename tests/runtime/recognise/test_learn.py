@@ -51,7 +51,7 @@ class Bench:
             technique=TECHNIQUE,
             place_map=self.map,
             index=self.growing.index,
-            rule=AcceptRule(0.0, 0.0, 50.0),
+            rule=AcceptRule(min_score=0.0, min_margin=0.0, neighbour_m=50.0),
             meter=meter_of(load_config(None), load_board("this")),
         )
         self.learner = Learner(

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from fakes import FakeClock
+from sureness import landmarks_count, sure_rule
 
 from edgevpr.frames.mask import Mask
 from edgevpr.landmarks.landmarks import describe, packed, unpacked
@@ -33,6 +34,7 @@ from edgevpr.types import Frame, Position
 
 PLACES = 4
 RULE = AcceptRule(min_score=0.08, min_margin=0.03, neighbour_m=50.0)
+BY_LANDMARKS = sure_rule(landmarks_count)
 
 
 def ground(seed):
@@ -93,9 +95,9 @@ def asked(path, technique, query, rule=RULE, times=1, **others):
 
 
 def test_a_map_made_looking_down_has_landmarks_and_they_are_found_again(mapped, technique):
-    event = asked(mapped, technique, frame(1, 20, -10))
+    event = asked(mapped, technique, frame(1, 20, -10), BY_LANDMARKS)
     assert event.accepted
-    assert event.reason.endswith("landmarks agree")
+    assert event.reason.endswith(f"{event.proof.inliers} landmarks agree")
     assert event.proof.inliers >= 10
     assert np.array(event.proof.shift_share) * 320 == pytest.approx((20, -10), abs=1.5)
     said = fields_of(event)["landmarks"]
@@ -120,30 +122,29 @@ def test_a_place_whose_landmarks_lie_otherwise_than_its_regions_is_refused(mappe
     assert event.reason.startswith("its landmarks lie otherwise")
 
 
-def test_a_match_that_is_hardly_ahead_is_accepted_for_its_landmarks(mapped, technique):
-    rule = replace(RULE, min_margin=0.99)
-    event = asked(mapped, technique, frame(1, 20, -10), rule)
-    assert event.accepted
-    assert not asked(mapped, technique, frame(1, 20, -10), rule, verify=False).accepted
-    assert not asked(mapped, technique, frame(1), rule).accepted, "what has not moved may be a display"
+def test_landmarks_are_evidence_where_they_are_asked_and_have_moved(mapped, technique):
+    assert asked(mapped, technique, frame(1, 20, -10), BY_LANDMARKS).accepted
+    bare = asked(mapped, technique, frame(1, 20, -10), BY_LANDMARKS, verify=False)
+    assert (bare.accepted, "landmarks" in bare.evidence) == (False, False)
+    still = asked(mapped, technique, frame(1), BY_LANDMARKS)
+    assert (still.accepted, still.evidence["landmarks"]) == (False, 0.0), "what has not moved may be a display"
 
 
-def test_ground_that_is_in_the_map_twice_is_not_accepted_for_its_landmarks(tmp_path, technique):
+@pytest.mark.parametrize("has_landmarks", [True, False])
+def test_ground_that_is_in_the_map_twice_is_not_accepted_for_its_landmarks(tmp_path, technique, has_landmarks):
+    """A place elsewhere without landmarks may be the right one as well."""
     far = Position(51.0, 8.0)
     twice = [frame(0), frame(1), frame(2), frame(3), replace(frame(1), name="again.png", position=far)]
-    with PlaceMap.create(tmp_path / "m.gpkg", technique.spec) as place_map:
+    path = tmp_path / "m.gpkg"
+    with PlaceMap.create(path, technique.spec) as place_map:
         build_map(twice, technique, place_map, meter())
-    event = asked(tmp_path / "m.gpkg", technique, frame(1, 20, -10))
+    best = asked(path, technique, frame(1, 20, -10), BY_LANDMARKS).best.place.place_id
+    if not has_landmarks:
+        with closing(sqlite3.connect(path)) as db, db:
+            db.execute("UPDATE places SET landmarks = NULL, landmarks_crc32 = NULL WHERE place_id != ?", (best,))
+    event = asked(path, technique, frame(1, 20, -10), BY_LANDMARKS)
     assert not event.accepted
-    assert "ahead of a place elsewhere" in event.reason
-
-
-def test_a_place_elsewhere_without_landmarks_may_be_the_right_one(mapped, technique):
-    rule = replace(RULE, min_margin=0.99)
-    assert asked(mapped, technique, frame(2, 20, -10), rule).accepted
-    with closing(sqlite3.connect(mapped)) as db, db:
-        db.execute("UPDATE places SET landmarks = NULL, landmarks_crc32 = NULL WHERE place_id != 3")
-    assert not asked(mapped, technique, frame(2, 20, -10), rule).accepted
+    assert "landmarks of a place elsewhere agree as well" in event.reason
 
 
 def test_other_ground_is_not_accepted_whatever_its_landmarks(mapped, technique):
@@ -212,7 +213,7 @@ def test_verification_is_a_step_of_its_own_and_counts_as_matching(mapped, techni
             technique=technique,
             place_map=place_map,
             index=load_index(place_map, technique, 10**7),
-            rule=RULE,
+            rule=replace(RULE, worth_a_look=0.04),
             meter=meter(clock),
             candidates=technique.candidates,
         )
