@@ -49,6 +49,8 @@ from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.sequence import search_of
 from edgevpr.power.boards import load_board
+from edgevpr.runtime.recognise.calibrated import calibration_of
+from edgevpr.runtime.recognise.follow import Follower
 from edgevpr.runtime.recognise.hints import Prior
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.opening import meter_of, open_recogniser
@@ -71,25 +73,29 @@ FLOWN = {
 Row = dict[str, object]
 
 
-def _recogniser(technique: Technique, place_map: PlaceMap, index: PlaceIndex, *, length: int) -> Recogniser:
+def _recogniser(
+    technique: Technique, place_map: PlaceMap, index: PlaceIndex, *, length: int = 1, follows: bool = False
+) -> Recogniser:
     config = load_config(None)
     prior = Prior(config.match.reach_m_s, technique.spec.heading_within_deg, True) if length == 1 else None
     return Recogniser(
         technique=technique,
         place_map=place_map,
         index=index,
-        rule=accept_rule(technique, config.match, length),
+        rule=accept_rule(technique, config.match, length, calibration_of(place_map)),
         meter=meter_of(config, load_board(config.board)),
         candidates=technique.candidates,
         search=search_of(length),
         prior=prior,
         min_accuracy_m=config.mavlink.min_accuracy_m,
+        follower=Follower(place_map, fastest_m_s=config.match.reach_m_s, is_live=True) if follows else None,
     )
 
 
 # The ways of recognising, as a flight has them.
 MODES: dict[str, Callable[[Technique, PlaceMap, PlaceIndex], Recogniser]] = {
-    "alone": partial(_recogniser, length=1),
+    "filter": partial(_recogniser, follows=True),
+    "alone": partial(_recogniser),
     "sequence 10": partial(_recogniser, length=10),
 }
 

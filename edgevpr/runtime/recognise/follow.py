@@ -15,6 +15,7 @@ from edgevpr.belief.belief import Belief, Posterior
 from edgevpr.belief.motion import Moved, moved
 from edgevpr.belief.seen import Ground, Seen
 from edgevpr.contract import FineMatch
+from edgevpr.geodesy import moved as moved_by
 from edgevpr.geodesy import offset_m
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
@@ -34,13 +35,31 @@ _LEAST_SPACING_M = 5.0
 
 
 @dataclass(frozen=True, slots=True)
+class Estimate:
+    """Position of the aircraft by the flight so far, with `covariance_m2` (variance east, covariance, variance north),
+    and the heading of the top of its pictures (None: unknown)."""
+
+    position: Position
+    covariance_m2: tuple[float, float, float]
+    heading_deg: float | None
+
+    @property
+    def sd_m(self) -> float:
+        """Standard deviation of one axis."""
+        return math.sqrt((self.covariance_m2[0] + self.covariance_m2[2]) / 2)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Followed:
     """What the flight so far makes of a query: the `slot` of the place that is likeliest now, and the probability
-    `confidence` that the aircraft is there (0 and None without any). `posterior` is the belief behind it."""
+    `confidence` that the aircraft is there (0 and None without any). `lost` is the probability that it is nowhere the
+    flight knows of, and `mass` that of the `estimate` (None: there is none, or the map has no positions)."""
 
     slot: int | None
     confidence: float
-    posterior: Posterior
+    lost: float
+    mass: float
+    estimate: Estimate | None
 
     def leads_from(self, slot: int) -> bool:
         """Tell whether another place than this one is more likely than not."""
@@ -98,11 +117,18 @@ class Follower:
         slots, seen = self._seen(ranking, index, evidence, sure, where)
         self._next = copy.copy(self._belief)
         posterior = self._next.update(seen, self._moved(), len(index))
-        if not len(slots) or not posterior.p.max() > 0:
-            return Followed(None, 0.0, posterior)
-        best = int(posterior.p.argmax())
-        near = np.hypot(*(seen.at - seen.at[best]).T) <= self._ground.near
-        return Followed(int(slots[best]), float(posterior.p[near].sum()), posterior)
+        slot, confidence = None, 0.0
+        if len(slots) and posterior.p.max() > 0:
+            best = int(posterior.p.argmax())
+            slot = int(slots[best])
+            confidence = float(posterior.p[np.hypot(*(seen.at - seen.at[best]).T) <= self._ground.near].sum())
+        return Followed(
+            slot=slot,
+            confidence=confidence,
+            lost=posterior.lost,
+            mass=posterior.mass,
+            estimate=self._estimate(posterior),
+        )
 
     def saw_nothing(self, index: PlaceIndex) -> None:
         """Take note of a picture that says nothing: nobody knows whether it shows ground of the map."""
@@ -114,6 +140,14 @@ class Follower:
     def settle(self) -> None:
         """Believe what the last look has led to."""
         self._belief = self._next
+
+    def _estimate(self, posterior: Posterior) -> Estimate | None:
+        found = posterior.estimate
+        if found is None or self._origin is None:
+            return None
+        lat_deg, lon_deg = moved_by(self._origin.lat_deg, self._origin.lon_deg, *found.at.tolist())
+        covariance_m2 = float(found.covariance[0, 0]), float(found.covariance[0, 1]), float(found.covariance[1, 1])
+        return Estimate(Position(lat_deg, lon_deg), covariance_m2, found.heading_deg)
 
     def _survey(self, index: PlaceIndex) -> None:
         """Measure the ground of the map when its first place is there, and again when its places get positions."""

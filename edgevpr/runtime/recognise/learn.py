@@ -1,7 +1,8 @@
 """Learning in flight: a frame of ground that the map does not have becomes a place, at the autopilot's position.
 
 Every later flight would believe a wrong place, so a doubtful frame is left out: its position is not fresh, or may be an
-echo of our own fixes, its picture is of low quality, or the map file has a place near it already.
+echo of our own fixes, its picture is of low quality, the map file has a place near it already, or the flight so far
+does not know where it is.
 """
 
 import math
@@ -18,9 +19,11 @@ from edgevpr.frames.exif import read_exif
 from edgevpr.frames.images import list_images
 from edgevpr.frames.level import View
 from edgevpr.frames.positions import find_positions
+from edgevpr.geodesy import distance_m
 from edgevpr.places.growing import GrowingIndex
 from edgevpr.places.near import nearest_m
 from edgevpr.places.retrieve import named
+from edgevpr.runtime.recognise.follow import Followed
 from edgevpr.runtime.recognise.levelling import GPS_SD_M, laid
 from edgevpr.runtime.recognise.locate import HEARD, as_learnt, located
 from edgevpr.runtime.recognise.recogniser import Recogniser
@@ -29,6 +32,8 @@ from edgevpr.types import Frame, Place, Position, Vehicle
 
 _ECHO_S = 10.0  # after a fix of ours: so long the autopilot's position may be only that fix
 _QUALITY_MIN = 0.2
+_SURE = 0.9  # of the probability to be lost, or to be where the flight so far says
+_CONTRADICTS_SD, _ROOM_M = 4.0, 20.0  # the place of a match may be farther off than its covariance tells
 
 
 class Learner:
@@ -146,9 +151,24 @@ class Learner:
         # Ask the file, not the index: a place that was dropped from RAM must not be learnt again.
         if nearest_m(self._map, position, self._spacing_m) is not None:
             return "near a place"
+        if objection := _unsure(event.followed, position):
+            return objection
         if event.worth and event.worth.reason and nearest_m(self._map, position, self._gap_m) is not None:
             return "not memorable"
         return None
+
+
+def _unsure(followed: Followed | None, position: Position) -> str | None:
+    """Return the objection to learning a place at a position while the flight so far says otherwise, or does not know:
+    it must be sure to be off the map, or to be there."""
+    if followed is None or followed.estimate is None or followed.lost >= _SURE:
+        return None
+    if followed.mass < _SURE:
+        return "while not sure where it is"
+    here, there = position, followed.estimate.position
+    away_m = float(distance_m(here.lat_deg, here.lon_deg, there.lat_deg, there.lon_deg))
+    sd_m = math.hypot(followed.estimate.sd_m, GPS_SD_M)
+    return "where the flight so far contradicts it" if away_m > _CONTRADICTS_SD * sd_m + _ROOM_M else None
 
 
 def check_positions(config: Config, positions: Path | None) -> None:

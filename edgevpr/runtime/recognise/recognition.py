@@ -107,7 +107,15 @@ def fields_of(event: Recognition) -> dict[str, Any]:
 
 
 def _belief(followed: Followed) -> dict[str, Any]:
-    return {"confidence": round(followed.confidence, 6), "lost": round(followed.posterior.lost, 6)}
+    found = {"confidence": round(followed.confidence, 6), "lost": round(followed.lost, 6)}
+    if (estimate := followed.estimate) is None:
+        return found
+    return found | {
+        "lat_deg": round(estimate.position.lat_deg, 8),
+        "lon_deg": round(estimate.position.lon_deg, 8),
+        "covariance_m2": [round(each, 3) for each in estimate.covariance_m2],
+        "heading_deg": estimate.heading_deg and round(estimate.heading_deg, 1),
+    }
 
 
 def _landmarks(proof: Agreement) -> dict[str, Any]:
