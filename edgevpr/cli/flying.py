@@ -25,7 +25,7 @@ from edgevpr.helpers.text import shown
 _MATCHING_KEYS = (
     "board", "technique", "source.camera", "source.mask", "source.fov_deg", "source.up_deg",
     "match.matching", "match.form", "match.candidates", "match.sequence",
-    "match.min_score", "match.min_margin", "memory.budget_mb", "battery.pack",
+    "match.accept_precision", "match.min_score", "match.min_margin", "memory.budget_mb", "battery.pack",
     "salience.use",
 )  # fmt: skip
 
