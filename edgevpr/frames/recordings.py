@@ -49,13 +49,14 @@ class FolderSource(Recording):
         only: Collection[str] | None = None,
     ):
         super().__init__(only)
-        self._paths = [path for path in list_images(folder) if self.is_wanted(decoded_name(path.name))]
+        paths = list_images(folder)
+        self._paths = [path for path in paths if self.is_wanted(decoded_name(path.name))]
         self.total = len(self._paths)
         self._read = 0
         self._clock = clock
         csv_path = positions or find_positions(folder)
         self._tags = read_positions(csv_path) if csv_path else {}
-        if positions and not any(decoded_name(path.name) in self._tags for path in self._paths):
+        if positions and not any(decoded_name(path.name) in self._tags for path in paths):
             raise UsageError(f"{positions} names none of the images in {folder}: its column `file` must.")
 
     @property

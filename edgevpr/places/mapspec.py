@@ -15,6 +15,7 @@ from edgevpr import __version__
 from edgevpr.contract import PartSpec, TechniqueSpec
 from edgevpr.errors import MapError
 from edgevpr.places import geopackage, rows
+from edgevpr.places.sqlite import is_of_one_row
 
 FORMAT_VERSION = 4  # 1 had no checksums and no map_id, 2 no salience, 3 no pose and no landmarks
 _WITH_CHECKSUMS, _WITH_SALIENCE, _WITH_POSE = 2, 3, 4
@@ -139,12 +140,17 @@ def write_text(db: sqlite3.Connection, key: str, text: str | None) -> None:
 
 
 def read_text(db: sqlite3.Connection, key: str) -> str | None:
-    """Read what was recorded; None for nothing, or a map that does not say."""
-    row = db.execute("SELECT value FROM edgevpr_map WHERE key = ?", (key,)).fetchone()
+    """Read what was recorded; None for nothing, a map that does not say, or a row that cannot be read. Raises
+    sqlite3.Error."""
     try:
+        row = db.execute("SELECT value FROM edgevpr_map WHERE key = ?", (key,)).fetchone()
         text = json.loads(row[0]) if row else None
     except (ValueError, TypeError, RecursionError):
         return None
+    except sqlite3.Error as error:
+        if is_of_one_row(error):
+            return None
+        raise
     return text if isinstance(text, str) else None
 
 

@@ -76,9 +76,8 @@ def repair(path: str | Path, watch: Watch[Examined]) -> Path:
                     with repaired.transaction():
                         for each in block:
                             repaired.insert(each.content, each.place_id)
-            with suppress(MapError):
-                repaired.record_mask(damaged.mask_sha256)
-                repaired.record_calibration(damaged.calibration)
+            repaired.record_mask(damaged.mask_sha256)
+            repaired.record_calibration(damaged.calibration)
             if not len(repaired):
                 raise MapError(f"{path}: no place of it can be read: restore a copy, or build it again.")
         _exchange(path, copy, original)

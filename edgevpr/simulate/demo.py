@@ -103,7 +103,7 @@ def run_demo(folder: str | Path) -> DemoSummary:
     # The flight controller is started first: it listens long before the map is built.
     with _edgevpr("simulate", "autopilot", "--link", f"udpin:127.0.0.1:{port}", "--json") as autopilot:
         with _edgevpr(
-            "map", "build", map_path, "--images", first / "images", *_CAMERA, "--technique", "cohog"
+            "map", "build", map_path, "--images", first / "images", *_CAMERA, "--technique", "cohog", "--no-calibrate"
         ) as building:
             _output(building)
         flags = ("--link", f"udpout:127.0.0.1:{port}", "--log", log_path, "--rate-hz", _RATE_HZ)

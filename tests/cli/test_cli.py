@@ -82,6 +82,23 @@ def test_a_match_below_the_threshold_is_not_accepted(capsys, flight, valley):
     assert not any(each["accepted"] for each in found)
 
 
+def test_more_precision_accepts_no_more(capsys, flight, valley):
+    def accepted(precision):
+        flags = ("--images", flight / "query", "--accept-precision", precision, "--json")
+        found = run_json(capsys, "match", valley, *flags)
+        assert all(0 <= each["confidence"] <= 1 for each in found)
+        return {each["query"] for each in found if each["accepted"]}
+
+    assert accepted("0.999999") <= accepted("0.99") <= accepted("0.5")
+
+
+@pytest.mark.parametrize("precision", ["0.4", "1", "nan"])
+def test_a_precision_that_nothing_can_have_is_refused(capsys, flight, valley, precision):
+    code, said = refused(capsys, "match", valley, "--images", flight / "query", "--accept-precision", precision)
+    assert code == 2
+    assert "`match.accept_precision` is" in said
+
+
 def test_a_setting_of_the_technique_is_used_for_matching(capsys, flight, valley):
     by_flag = run_json(capsys, "match", valley, "--images", flight / "query", "--matching", "thesis", "--json")
     by_param = run_json(capsys, "match", valley, "--images", flight / "query", "--param", "matching=thesis", "--json")

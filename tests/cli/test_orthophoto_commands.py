@@ -12,6 +12,7 @@ pytest.importorskip("rasterio", reason="rasterio is not installed (pip install '
 import rasterio
 from rasters import HOME, textured_raster, write_raster
 
+from edgevpr.calibrate import calibrate
 from edgevpr.cli.main import main
 from edgevpr.frames.positions import read_positions
 from edgevpr.geodesy import distance_m, moved
@@ -64,7 +65,7 @@ def test_a_map_of_an_orthophoto_finds_a_flight_over_it(tmp_path, ground, track, 
     assert max(off_m) < 50
 
     # The rest of the grid is added to it, under the same names.
-    assert run("map", "build", place_map, *cut, "--append", "--json") == 0
+    assert run("map", "build", place_map, *cut, "--append", "--no-calibrate", "--json") == 0
     rest = json.loads(capsys.readouterr().out)
     assert rest["already_here"] == built["places"]
     assert rest["places"] == rest["added"] + built["places"]
@@ -77,7 +78,7 @@ def test_water_and_what_is_not_known_are_left_out_and_said(tmp_path, capsys):
     land[:, :, 500:] = 0
     path = write_raster(tmp_path / "coast.tif", land, "EPSG:32632", to_crs, nodata=0)
     cut = ("--orthophoto", path, "--footprint-m", 80, "--spacing-m", 40)
-    assert run("map", "build", tmp_path / "m.gpkg", *cut) == 0
+    assert run("map", "build", tmp_path / "m.gpkg", *cut, "--no-calibrate") == 0
     said = capsys.readouterr().out
     assert "places added (0 without a position)" in said
     for what in ("data", "texture"):
@@ -148,3 +149,17 @@ def test_without_rasterio_the_sentence_says_what_to_install(tmp_path, ground):
     assert done.returncode == 1
     assert done.stderr.endswith("pip install 'edgevpr[maps]'.\n")
     assert done.stderr.count("\n") == 1
+
+
+def test_a_map_of_an_orthophoto_is_calibrated_with_what_is_cut_again(tmp_path, ground, track, capsys, monkeypatch):
+    monkeypatch.setattr(calibrate, "FEWEST_PLACES", 6)
+    monkeypatch.setattr(calibrate, "ASKED", 6)
+    path = tmp_path / "m.gpkg"
+    cut = ("--orthophoto", ground, "--footprint-m", 100, "--spacing-m", 40, "--area", track, "--margin-m", 30)
+    assert run("map", "build", path, *cut, "--no-refine", "--no-calibrate", "--json") == 0
+    built = json.loads(capsys.readouterr().out)
+    assert built["places"] == 6
+    assert "calibration" not in built
+    assert run("map", "calibrate", path, *cut, "--json") == 0
+    found = json.loads(capsys.readouterr().out)["calibration"]
+    assert (found["asked"], found["places_asked"]) == (6, 6)

@@ -28,11 +28,10 @@ def frames_of(source: OrthophotoSource) -> list:
     return [frame for frame in frames if frame is not None]
 
 
-def source_of(path, footprint_m, spacing_m, area=None, margin_m=0.0) -> OrthophotoSource:
+def source_of(path, footprint_m, spacing_m, area=None, margin_m=0.0, only=None) -> OrthophotoSource:
     orthophoto = Orthophoto(path)
-    return OrthophotoSource(
-        orthophoto, lattice_of(orthophoto, footprint_m, spacing_m, area, margin_m), footprint_m, float
-    )
+    lattice = lattice_of(orthophoto, footprint_m, spacing_m, area, margin_m)
+    return OrthophotoSource(orthophoto, lattice, footprint_m, float, only=only)
 
 
 def off_m(lattice) -> np.ndarray:
@@ -204,3 +203,12 @@ def test_a_large_file_takes_no_more_memory_than_a_small_one(tmp_path):
         assert frames >= 25
         peaks_mb.append(peak_mb)
     assert peaks_mb[1] < peaks_mb[0] + 80, "GDAL keeps 64 MB of blocks, whatever the file"
+
+
+def test_only_the_places_that_are_asked_for_are_cut(tmp_path):
+    path = marked_raster(tmp_path / "o.tif", pixel_m=0.5, side_px=400)
+    whole = frames_of(source_of(path, 80.0, 20.0))
+    asked = [whole[4], whole[2]]
+    cut = frames_of(source_of(path, 80.0, 20.0, only=[each.name for each in asked]))
+    assert [each.name for each in cut] == sorted(each.name for each in asked)
+    assert np.array_equal(cut[0].image, whole[2].image)

@@ -158,6 +158,20 @@ def test_frames_of_a_video_are_at_least_a_step_apart(step_s, stride, video):
     assert abs(source.total - len(frames)) <= 1
 
 
+def test_of_a_recording_only_the_frames_that_are_asked_for_are_read(folder, video):
+    for name in ("a.png", "b.png", "c.png"):
+        write_picture(folder / name)
+    (folder / "d.png").write_bytes(b"no picture, and not asked for")
+    source = open_source(str(folder), live=False, only=["c.png", "a.png", "absent.png"])
+    assert source.total == 2
+    assert [frame.name for frame in all_frames(source)] == ["a.png", "c.png"]
+    named = ["frame 000003 t=0.300 s", "frame 000007 t=0.700 s"]
+    frames = all_frames(open_source(str(video), live=False, only=named))
+    assert [frame.name for frame in frames] == named
+    assert shades_of(frames) == [3, 7]
+    assert all_frames(open_source(str(folder), live=False, only=[])) == []
+
+
 def test_a_reader_in_a_hurry_gets_the_same_frames_of_a_video(video):
     seconds = iter(range(10_000))
     hurried = open_source(str(video), step_s=0.5, live=False, clock=lambda: next(seconds))

@@ -1,5 +1,6 @@
 """The map file: what is confirmed is there, other tools read it, and a wrong map is refused with a reason."""
 
+import contextlib
 import dataclasses
 import io
 import json
@@ -25,6 +26,8 @@ from edgevpr.places.geopackage import point_blob
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapinfo import info_of
 from edgevpr.places.near import index_positions, nearest_m
+from edgevpr.places.repair import repair
+from edgevpr.places.shrink import shrink
 from edgevpr.types import Position
 
 
@@ -249,6 +252,48 @@ def test_geojson_has_every_place_and_no_descriptor(map_path):
     assert features[3]["geometry"]["coordinates"] == pytest.approx([8.0, 50.0003, 103.0])
     assert features[3]["properties"]["source_image"] == "00003.jpg"
     assert "coarse" not in features[3]["properties"]
+
+
+def test_geojson_colours_the_places_of_which_it_is_known_how_recognisable_they_are(map_path):
+    out = io.StringIO()
+    with PlaceMap.open(map_path) as place_map:
+        write_geojson(place_map, out, {2: 0.0, 3: 0.199, 4: 0.2, 5: 1.0, 77: 0.5})
+    found = {each["id"]: each["properties"] for each in json.loads(out.getvalue())["features"]}
+    colours = [found[number]["marker-color"] for number in (2, 3, 4, 5)]
+    assert colours[0] == colours[1]
+    assert len(set(colours)) == 3
+    assert (found[3]["recognisable"], "recognisable" in found[1], "marker-color" in found[1]) == (0.199, False, False)
+
+
+@pytest.mark.parametrize("value", ["", "7", "null", "{", "[" * 100_000, b"\xff"])
+def test_what_is_kept_beside_the_places_may_be_damaged(map_path, value):
+    with PlaceMap.open_for_adding(map_path) as place_map:
+        assert (place_map.mask_sha256, place_map.calibration) == (None, None)
+        place_map.record_mask("m")
+        place_map.record_calibration("how sure")
+    with PlaceMap.open(map_path) as place_map:
+        assert (place_map.mask_sha256, place_map.calibration) == ("m", "how sure")
+    with contextlib.closing(sqlite3.connect(map_path)) as db, db:
+        db.execute("UPDATE edgevpr_map SET value = ? WHERE key IN ('mask_sha256', 'calibration')", (value,))
+    with PlaceMap.open(map_path) as place_map:
+        assert (place_map.mask_sha256, place_map.calibration) == (None, None)
+        assert len(list(place_map.places())) == 10
+
+
+def test_a_smaller_and_a_repaired_map_keep_the_numbers_of_places_and_what_is_known_of_them(map_path, tmp_path):
+    with PlaceMap.open_for_adding(map_path) as place_map:
+        place_map.record_mask("m")
+        place_map.record_calibration("how sure")
+    assert shrink(map_path, tmp_path / "small.gpkg", 4) == (4, 10)
+    with contextlib.closing(sqlite3.connect(map_path)) as db, db:
+        db.execute("UPDATE places SET coarse = x'00' WHERE place_id = 2")
+    repair(map_path, lambda places, total: places)
+    with PlaceMap.open(map_path) as repaired, PlaceMap.open(tmp_path / "small.gpkg") as small:
+        for each in (repaired, small):
+            assert (each.mask_sha256, each.calibration) == ("m", "how sure")
+            for place in each.places():
+                assert place.source_image == f"{place.place_id - 1:05d}.jpg"
+        assert len(repaired) == 9
 
 
 def test_the_map_file_is_found_by_any_path_spelling(tmp_path):

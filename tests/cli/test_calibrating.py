@@ -1,0 +1,183 @@
+"""`edgevpr map calibrate`, what `map build` says at its end, and what the other commands know of a calibrated map."""
+
+import json
+import shutil
+import sys
+
+import cv2
+import pytest
+from pictures import textured
+
+from edgevpr.calibrate import calibrate
+from edgevpr.cli.main import main
+from edgevpr.confidence.stored import from_text
+from edgevpr.places.mapfile import PlaceMap
+
+PLACES = 8
+
+
+@pytest.fixture(autouse=True)
+def few(monkeypatch):
+    monkeypatch.setattr(calibrate, "FEWEST_PLACES", PLACES)
+    monkeypatch.setattr(calibrate, "ASKED", PLACES)
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory):
+    """Pictures with positions, a film of them, and pictures of another flight of the same names."""
+    folder = tmp_path_factory.mktemp("flight")
+    film = cv2.VideoWriter(str(folder / "film.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 10, (320, 240))
+    rows = ["file,lat,lon"]
+    for name in ("ref", "other"):
+        (folder / name).mkdir()
+    for number in range(PLACES):
+        picture = textured(number, 240, 320)
+        cv2.imwrite(str(folder / "ref" / f"{number}.png"), picture)
+        cv2.imwrite(str(folder / "other" / f"{number}.png"), textured(50 + number, 240, 320))
+        film.write(cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR))
+        rows.append(f"{number}.png,{50 + number * 0.002:.6f},8.0")
+    film.release()
+    (folder / "ref" / "positions.csv").write_text("\n".join(rows) + "\n")
+    return folder
+
+
+def built(path, images, *flags):
+    return main(
+        ["map", "build", str(path), "--images", str(images), "--technique", "cohog", "--param", "w1=208", *flags]
+    )
+
+
+@pytest.fixture(scope="module")
+def bare_map(flight, tmp_path_factory):
+    path = tmp_path_factory.mktemp("bare") / "m.gpkg"
+    assert built(path, flight / "ref", "--no-calibrate") == 0
+    return path
+
+
+@pytest.fixture
+def bare(bare_map, tmp_path):
+    return shutil.copy(bare_map, tmp_path / "m.gpkg")
+
+
+@pytest.fixture
+def mapped(bare, flight, capsys):
+    """A calibrated map."""
+    assert main(["map", "calibrate", str(bare), "--images", str(flight / "ref")]) == 0
+    capsys.readouterr()
+    return bare
+
+
+def calibration_in(path):
+    with PlaceMap.open(path) as place_map:
+        text = place_map.calibration
+    return None if text is None else from_text(text)
+
+
+def test_a_build_ends_with_what_to_expect(flight, tmp_path, capsys):
+    path = tmp_path / "m.gpkg"
+    assert built(path, flight / "ref") == 0
+    last = capsys.readouterr().out.splitlines()[-1]
+    found = calibration_in(path)
+    assert last == f"expect: {found.said()}"
+    assert last.startswith(f"expect: of {PLACES} changed pictures of its own places")
+    assert built(tmp_path / "again.gpkg", flight / "ref", "--json") == 0
+    assert json.loads(capsys.readouterr().out)["calibration"] == found.figures()
+
+
+def test_a_build_that_is_told_so_does_not_calibrate(bare, capsys):
+    assert calibration_in(bare) is None
+    assert main(["map", "info", str(bare)]) == 0
+    assert f"confidence  not calibrated ({PLACES} places: fewer than 30)" in capsys.readouterr().out
+
+
+def test_a_build_that_cannot_calibrate_says_why_and_is_whole(flight, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(calibrate, "FEWEST_PLACES", PLACES + 1)
+    assert built(tmp_path / "small.gpkg", flight / "ref") == 0
+    said = capsys.readouterr()
+    assert f"edgevpr: the map is not calibrated: {tmp_path / 'small.gpkg'} has {PLACES} places" in said.err
+    assert "expect:" not in said.out
+    monkeypatch.setitem(sys.modules, "edgevpr.calibrate.calibrate", None)  # as where SciPy is missing
+    assert built(tmp_path / "bare.gpkg", flight / "ref") == 0
+    said = capsys.readouterr()
+    assert "the map is not calibrated: Calibrating a map needs SciPy" in said.err
+    assert f"{PLACES} places added" in said.out
+
+
+def test_a_technique_without_a_confidence_is_built_in_silence(flight, tmp_path, capsys):
+    assert main(["map", "build", str(tmp_path / "m.gpkg"), "--images", str(flight / "ref"), "--technique", "hog"]) == 0
+    assert "calibrat" not in capsys.readouterr().err
+    assert main(["map", "info", str(tmp_path / "m.gpkg")]) == 0
+    assert "confidence" not in capsys.readouterr().out
+    assert main(["map", "calibrate", str(tmp_path / "m.gpkg"), "--images", str(flight / "ref")]) == 2
+    assert "judged by score and margin" in capsys.readouterr().err
+
+
+def test_a_map_is_calibrated_later_and_says_so(bare, flight, capsys):
+    assert main(["map", "calibrate", str(bare), "--images", str(flight / "ref")]) == 0
+    found = calibration_in(bare)
+    assert capsys.readouterr().out == f"{bare}: calibrated: {found.said()}\n"
+    assert main(["map", "info", str(bare)]) == 0
+    assert f"confidence  calibrated {found.made}: of {PLACES} changed pictures" in capsys.readouterr().out
+    assert main(["map", "info", str(bare), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["calibration"] == found.figures()
+
+
+def test_a_map_of_a_video_is_calibrated_with_its_frames(flight, tmp_path):
+    path = tmp_path / "m.gpkg"
+    assert built(path, flight / "film.avi", "--no-calibrate") == 0
+    assert main(["map", "calibrate", str(path), "--images", str(flight / "film.avi")]) == 0
+    assert sorted(calibration_in(path).recognisable) == list(range(1, PLACES + 1))
+
+
+@pytest.mark.parametrize(
+    ("flags", "code", "said"),
+    [
+        (["--images", "FLIGHT/other"], 2, "the pictures of 0 places are at hand"),
+        (["--images", "FLIGHT/absent"], 1, "There is nothing at"),
+        ([], 2, "Give either --images"),
+        (["--images", "FLIGHT/ref", "--positions", "FLIGHT/absent.csv"], 2, "absent.csv"),
+    ],
+)
+def test_what_cannot_be_calibrated_is_a_sentence(bare, flight, capsys, flags, code, said):
+    flags = [each.replace("FLIGHT", str(flight)) for each in flags]
+    assert main(["map", "calibrate", str(bare), *flags]) == code
+    assert said in capsys.readouterr().err
+    assert calibration_in(bare) is None
+
+
+def test_an_export_colours_the_places_that_were_asked_for(mapped, tmp_path):
+    out = tmp_path / "m.geojson"
+    assert main(["map", "export", str(mapped), "--geojson", str(out)]) == 0
+    found = {each["id"]: each["properties"] for each in json.loads(out.read_text())["features"]}
+    recognisable = calibration_in(mapped).recognisable
+    assert {number: each["recognisable"] for number, each in found.items()} == {
+        number: pytest.approx(share, abs=1e-3) for number, share in recognisable.items()
+    }
+    assert all(each["marker-color"].startswith("#") for each in found.values())
+
+
+def test_a_smaller_map_keeps_its_calibration_and_a_merged_one_has_none(mapped, bare_map, tmp_path, capsys):
+    assert main(["map", "shrink", str(mapped), str(tmp_path / "small.gpkg"), "--places", "4"]) == 0
+    assert calibration_in(tmp_path / "small.gpkg") == calibration_in(mapped)
+    merged = tmp_path / "merged.gpkg"
+    assert main(["map", "merge", str(merged), str(mapped), str(bare_map)]) == 0
+    assert f"run `edgevpr map calibrate {merged}`" in capsys.readouterr().out
+    assert calibration_in(merged) is None
+    assert main(["map", "merge", str(tmp_path / "both.gpkg"), str(bare_map), str(bare_map)]) == 0
+    assert "calibrate" not in capsys.readouterr().out
+
+
+def test_a_check_before_the_flight_says_what_to_expect(mapped, bare_map, flight, tmp_path, capsys):
+    for path, said in ((mapped, calibration_in(mapped).said()), (bare_map, "not calibrated (8 places")):
+        config = tmp_path / "c.yaml"
+        config.write_text(f"map: {path}\nsource: {{uri: {flight / 'ref'}}}\nlog: {{path: null}}\n")
+        main(["check", "--config", str(config)])
+        assert said in capsys.readouterr().out
+
+
+def test_a_damaged_calibration_is_a_warning_and_no_more(mapped, capsys, caplog):
+    with PlaceMap.open_for_adding(mapped) as place_map:
+        place_map.record_calibration(place_map.calibration.replace("models", "moduls"))
+    assert main(["map", "info", str(mapped)]) == 0
+    assert "its calibration cannot be used (its checksum is wrong)" in caplog.text
+    assert "not calibrated" in capsys.readouterr().out

@@ -1,0 +1,151 @@
+"""Evidence: what a match offers, by name, and which models can be used with it."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edgevpr.confidence.model import prior
+from edgevpr.contract import FineMatch, PartSpec, Support, TechniqueSpec
+from edgevpr.landmarks.agreement import Agreement
+from edgevpr.places.index import empty_index
+from edgevpr.places.retrieve import Ranking
+from edgevpr.runtime.recognise.evidence import (
+    AHEAD,
+    DOWN,
+    DOWN_BARE,
+    OF_MAP,
+    OF_PLACE,
+    evidence_ahead,
+    evidence_down,
+    kind_of,
+    kinds_of,
+    require_usable,
+    said,
+)
+from edgevpr.techniques import create
+
+SPEC = TechniqueSpec(name="test", parameters={}, coarse=PartSpec((1,), "<f4"))
+INDEX = empty_index(SPEC, 30, None)  # places without position: neighbours are those beside each other
+NEIGHBOUR_M = 50.0
+
+
+def ranked(matches):
+    """A ranking of matches by their slots, best first."""
+    slots = sorted(matches, key=lambda slot: -matches[slot].score)
+    return Ranking(np.array(slots, int), np.array([matches[slot].score for slot in slots], np.float32), matches)
+
+
+def ahead(score, back=0.2, mutual=0.1, likeness=0.7, log_rank=0.0):
+    support = Support(back=back, mutual=mutual, likeness=likeness, log_rank=log_rank)
+    return FineMatch(score, coverage=0.3, support=support)
+
+
+def looked_ahead(matches):
+    return evidence_ahead(ranked(matches), INDEX, NEIGHBOUR_M)
+
+
+def looked_down(matches, proof=None, same=()):
+    return evidence_down(ranked(matches), INDEX, NEIGHBOUR_M, proof, same)
+
+
+def agreement(inliers, is_expected=True, shift_share=(0.1, 0.0)):
+    return Agreement(
+        inliers=inliers,
+        matched=60,
+        possible=250,
+        shift_share=shift_share,
+        rotation_deg=0.0,
+        scale=1.0,
+        covariance_share2=(1e-4, 0.0, 1e-4),
+        is_expected=is_expected,
+    )
+
+
+def test_evidence_has_the_names_that_models_ask_for():
+    down = {5: FineMatch(0.2, coverage=0.3)}
+    for kind, evidence in (
+        (AHEAD, looked_ahead({5: ahead(0.2)})),
+        (DOWN, looked_down(down, agreement(12))),
+        (DOWN_BARE, looked_down(down)),
+    ):
+        assert kind_of(evidence) == kind
+        assert set(evidence) >= {*OF_MAP[kind], *OF_PLACE[kind]}
+        assert said(evidence)
+
+
+def test_a_technique_has_the_kinds_of_its_camera():
+    assert kinds_of(create("cohog", {"w1": 208}).spec) == (AHEAD,)
+    assert kinds_of(create("cohog", {"camera": "nadir"}).spec) == (DOWN, DOWN_BARE)
+    assert kinds_of(create("hog").spec) == kinds_of(create("cohog", {"matching": "thesis"}).spec) == ()
+
+
+def test_the_lead_is_over_places_elsewhere_and_not_over_neighbours():
+    far, near = (looked_ahead({5: ahead(0.2), other: ahead(0.15)}) for other in (20, 6))
+    assert far["lead"] == pytest.approx(math.log(math.sqrt(0.2 / 0.15)))
+    assert near["lead"] > far["lead"], "only chance is elsewhere"
+    down = looked_down({5: FineMatch(0.2, coverage=0.3), 20: FineMatch(0.1, coverage=0.3)})
+    assert down["lead"] == pytest.approx(math.log(2))
+
+
+def test_a_place_with_good_neighbours_leads_more_than_one_alone():
+    alone = {5: ahead(0.2), 15: ahead(0.1), 20: ahead(0.15)}
+    beside = {5: ahead(0.2), 6: ahead(0.18), 15: ahead(0.1), 20: ahead(0.15)}
+    assert looked_ahead(beside)["lead_around"] > looked_ahead(alone)["lead_around"]
+
+
+def test_a_place_elsewhere_whose_regions_agree_better_is_seen():
+    rival = ahead(0.15, mutual=0.3, log_rank=0.5)
+    found = looked_ahead({5: ahead(0.2, log_rank=0.9), 20: rival})
+    assert (found["mutual_best"], found["rank_gap"]) == (0.0, pytest.approx(0.4))
+    alone = looked_ahead({5: ahead(0.2, log_rank=0.9), 20: ahead(0.15, mutual=0.05, log_rank=2.0)})
+    assert (alone["mutual_best"], alone["rank_gap"]) == (1.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("proof", "counts"),
+    [
+        (agreement(12), 12),
+        (agreement(12, is_expected=False), 0),
+        (agreement(12, shift_share=(0.0, 0.001)), 0),
+        (agreement(0), 0),
+    ],
+)
+def test_landmarks_count_where_they_are_expected_and_have_moved(proof, counts):
+    evidence = looked_down({5: FineMatch(0.2, coverage=0.3)}, proof)
+    assert evidence["landmarks"] == pytest.approx(math.log1p(counts))
+
+
+def test_a_place_of_the_same_ground_is_not_elsewhere():
+    matches = {5: FineMatch(0.2, coverage=0.3), 20: FineMatch(0.19, coverage=0.3), 28: FineMatch(0.05, coverage=0.3)}
+    index = type(INDEX)(**(dict(INDEX.arrays) | {"place_ids": np.arange(101, 131)}), mean=INDEX.mean)
+    apart = evidence_down(ranked(matches), index, NEIGHBOUR_M, None)
+    together = evidence_down(ranked(matches), index, NEIGHBOUR_M, None, (121,))
+    assert (apart["lead"], together["lead"]) == (pytest.approx(math.log(0.2 / 0.19)), pytest.approx(math.log(4)))
+
+
+@pytest.mark.parametrize("score", [0.0, 1e-9, 1.0])
+def test_no_share_makes_evidence_infinite(score):
+    matches = {5: ahead(score, back=0.0, mutual=0.0), 20: ahead(0.0, back=0.0, mutual=0.0)}
+    assert all(map(math.isfinite, looked_ahead(matches).values()))
+    assert all(map(math.isfinite, looked_down({5: FineMatch(score), 20: FineMatch(0.0)}).values()))
+
+
+def test_where_nothing_was_compared_there_is_no_evidence():
+    empty = Ranking(np.array([3]), np.array([0.2], np.float32), {})
+    assert evidence_ahead(empty, INDEX, NEIGHBOUR_M) is None
+    assert evidence_down(empty, INDEX, NEIGHBOUR_M, None) is None
+    assert looked_ahead({5: FineMatch(0.2)}) is None, "a technique that gives no support"
+
+
+def test_a_model_of_other_evidence_cannot_be_used():
+    model = prior(DOWN_BARE)
+    require_usable(DOWN, model)
+    with pytest.raises(ValueError, match="no evidence 'landmarks' of kind down_bare"):
+        require_usable(DOWN_BARE, prior(DOWN))
+    with pytest.raises(ValueError, match="no evidence of kind 'sideways'"):
+        require_usable("sideways", model)
+    named = replace(model.of_place, names=("colour", *model.of_place.names[1:]))
+    with pytest.raises(ValueError, match="no evidence 'colour'"):
+        require_usable(DOWN, replace(model, of_place=named))
