@@ -1,9 +1,10 @@
 """How sure a match is, leave-one-site-out on every set: `python confidence.py`, part of `make results`.
 
 The evidence of every query in the map of every set is gathered first (see `confidence_rows`; an hour on two cores,
-kept in --work). Then, for each set, the shipped model is fitted anew to all other sites, adapted to the map of the set as
-`map build` does, and judged by the set's own queries and by those of all other sites. Whatever is reported of a site
-has been fitted without it. Which evidence counts, and how far a map moves the weights, was chosen with all sets in view.
+kept in --work). Then, for each set, the shipped model is fitted anew to all other sites, adapted to the map of the set
+as `map build` does, and judged by the set's own queries and by those of all other sites. Whatever is reported of a site
+has been fitted without it. Which evidence counts, and how far a map moves the weights, was chosen with all sets in
+view.
 
 Writes confidence.json, confidence.md and confidence.png (reliability) into benchmarks/results/; --gallery draws every
 match that was wrongly accepted, to look at.
@@ -30,6 +31,7 @@ from run_sets import RESULTS, TUNED_ON, made_by
 from edgevpr.calibrate.calibrate import LEFT_OUT, MIRRORED, THERE, Answer, adapted
 from edgevpr.calibrate.prior import Site, shipped_model
 from edgevpr.confidence.model import Model, as_json
+from edgevpr.confidence.stored import FEWEST_PLACES
 from edgevpr.evaluate.dataset import load_dataset
 from edgevpr.evaluate.evaluate import mapped
 from edgevpr.evaluate.metrics import roc_auc
@@ -38,7 +40,7 @@ from edgevpr.frames.source import open_source
 from edgevpr.helpers.tables import markdown
 from edgevpr.places.retrieve import elsewhere
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.recognise.evidence import AHEAD, DOWN, DOWN_BARE, OF_MAP, OF_PLACE
+from edgevpr.runtime.recognise.evidence import AHEAD, DOWN, DOWN_BARE, kind_of
 from edgevpr.runtime.recognise.follow import Follower
 from edgevpr.runtime.recognise.judge import Sureness, accept_rule
 from edgevpr.runtime.recognise.opening import meter_of
@@ -62,7 +64,7 @@ def main() -> None:
     names = [path.parent.name for path in sorted(DATA.glob("*/ground_truth.csv"))]
     with ProcessPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         list(pool.map(partial(gather, args.work), [[name] for name in names]))
-        rows = {name: pickle.loads((args.work / f"{name}.pkl").read_bytes()) for name in names}
+        rows = {name: _read(args.work / f"{name}.pkl") for name in names}
         models = {name: model_without(name, rows) for name in names}
         flights = list(pool.map(partial(followed, models=models), FLOWN_ALONG))
     if args.ship:
@@ -82,17 +84,24 @@ def main() -> None:
         _draw_gallery(rows, models, args.gallery)
 
 
+def _read(path: Path) -> list[Row]:
+    """Read gathered rows. A best place that was not worth a look at its landmarks has none that agree."""
+    rows = pickle.loads(path.read_bytes())
+    if camera_of(path.stem) == "nadir":
+        for row in rows:
+            row.evidence.setdefault("landmarks", 0.0)
+    return rows
+
+
 def site(rows: Sequence[Row], kind: str, without: str | None = None) -> Site:
-    """Return what a map says of its site, without the queries of another. A place beside a right one is right."""
-    names = {*OF_MAP[kind], *OF_PLACE[kind]}
-    usable = [row for row in rows if names <= row.evidence.keys()]
+    """Return what a map says of its site, without another's queries. A place beside a right one is right."""
     return Site(
         name=rows[0].map,
-        own=[(row.evidence, row.right or row.near) for row in usable if row.kind == "own"],
-        foreign=[row.evidence for row in usable if row.kind == "foreign" and site_of(row.set) != without],
+        own=[(row.evidence, row.right or row.near) for row in rows if row.kind == "own"],
+        foreign=[row.evidence for row in rows if row.kind == "foreign" and site_of(row.set) != without],
         answers=[
             Answer(place_id=0, way=row.kind, right=row.right, evidence=row.evidence)
-            for row in usable
+            for row in rows
             if row.kind in (THERE, LEFT_OUT, MIRRORED)
         ],
     )
@@ -103,6 +112,8 @@ def model_without(name: str, rows: Rows) -> Model:
     kind = KINDS[camera_of(name)][0]
     others = [of for of in rows if camera_of(of) == camera_of(name) and site_of(of) != site_of(name)]
     model = shipped_model(kind, [site(rows[of], kind, site_of(name)) for of in others], "other sites")
+    if len({row.query for row in rows[name] if row.kind == THERE}) < FEWEST_PLACES:
+        return model
     return adapted(model, site(rows[name], kind).answers, name)
 
 
@@ -134,8 +145,7 @@ def judged(rows: Sequence[Row], model: Model) -> dict:
 
 
 def _sure(model: Model, row: Row) -> float:
-    needed = {*model.of_map.names, *model.of_place.names}
-    return model.confidence(row.evidence) if needed <= row.evidence.keys() else 0.0
+    return Sureness({kind_of(row.evidence): model}, PRECISIONS[-1]).confidence(row.evidence)
 
 
 def _accepted(model: Model, row: Row, precision: float) -> bool:

@@ -112,6 +112,8 @@ def rows_of(name: str) -> Iterator[Row]:
                     evidence=dict(event.evidence),
                     veto=event.reason if refused else None,
                 )
+        if technique.spec.cells and np.isnan(index.lat_deg).any():
+            return  # such a map is not calibrated
         frames = [(frame.name, Levelled(frame.image, None, UNKNOWN_VIEW)) for frame in _frames(folder / "ref")]
         order = np.random.default_rng(15).permutation(len(frames))
         frames = [frames[at] for at in np.resize(order, min(ASKED, 6 * len(frames)))]

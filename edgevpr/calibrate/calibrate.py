@@ -43,6 +43,8 @@ Pictures = Callable[[Sequence[str]], Iterable[Frame]]  # the frames of these nam
 THERE, LEFT_OUT, MIRRORED = "there", "left out", "mirrored"
 ASKED = 120  # pictures
 _BESIDE_PLACES = 10  # before and after a place without position: they may show the same ground
+_MOST_WITHOUT_POSITION = 0.2  # of the places of a map that looks down, whose pictures overlap in any order
+_BESIDE_SPACINGS = 4.0  # around a place whose footprint is unknown, likewise
 _LEFT_OUT_COUNTS = 0.3  # over ground that is not in the map nobody flies as often
 # How far a map moves the shipped weights; chosen on corridor, with grief_stromovka_seasons and nordland_tiny in view.
 _PULL_OF_MAP, _PULL_OF_PLACE = 20.0, 5.0
@@ -136,6 +138,11 @@ def calibrate(
             f"{place_map.path} has {len(index)} places, and {FEWEST_PLACES} are needed to calibrate it: the shipped "
             "confidence is used."
         )
+    if technique.spec.cells is not None and np.isnan(index.lat_deg).mean() > _MOST_WITHOUT_POSITION:
+        raise UsageError(
+            f"{place_map.path}: its places have no positions, so nobody knows which of them show the same ground: the "
+            "shipped confidence is used."
+        )
     mask, levelling = mask or NoMask(), levelling or NoLevelling()
     ids = {name: found for (name,), found in place_map.ids_by("source_image").items() if isinstance(name, str)}
     names = sorted(ids)
@@ -223,6 +230,8 @@ def _adapted(
     start: Logistic, found: Sequence[Answer], beside: Sequence[Answer], counts: float, pull: float
 ) -> Logistic:
     answers = [*found, *beside]
+    if all(each.right for each in answers):  # they say nothing of how a wrong one could be told
+        return start
     right = np.array([each.right for each in answers], bool)
     weights = np.repeat([1.0, counts], [len(found), len(beside)])
     return fitted(start, [each.evidence for each in answers], right, weights, pull)
@@ -238,7 +247,7 @@ def _mirrored(picture: Levelled) -> Levelled:
 def _same_ground(place_map: PlaceMap, index: PlaceIndex, slot: int, neighbour_m: float) -> np.ndarray:
     """Tell which places may show ground of this one, bool (N,)."""
     away_m = distance_m(index.lat_deg[slot], index.lon_deg[slot], index.lat_deg, index.lon_deg)
-    near_m = max(neighbour_m, place_map.footprint_m() or 0.0)
+    near_m = max(neighbour_m, place_map.footprint_m() or _BESIDE_SPACINGS * (index.spacing_m() or 0.0))
     beside = abs(np.arange(len(index)) - slot) <= _BESIDE_PLACES
     return np.where(np.isnan(away_m), beside, away_m <= near_m)
 

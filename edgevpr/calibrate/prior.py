@@ -21,7 +21,7 @@ _EACH = 100.0  # the weight of the right, and of the wrong, matches of a map
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Site:
-    """What a map says of its site: the evidence of real queries, and the `answers` to changed pictures of its own.
+    """Evidence of one site, by its map: that of real queries, and the `answers` to changed pictures of its own.
     `own` are queries of the site with whether their match is right, `foreign` queries of other sites."""
 
     name: str

@@ -60,8 +60,8 @@ class Tail:
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """What logits mean: the tails of matches `off_map` and `off_place` (see `Model`), and the line that makes the logit
-    of the confidence of the logarithm of the chance."""
+    """Meaning of logits: the tails of wrong matches `off_map` and `off_place`, and the line that makes the logit of the
+    confidence of the logarithm of the chance."""
 
     off_map: Tail
     off_place: Tail
@@ -162,7 +162,10 @@ def _scale(found: Mapping[str, Any]) -> Scale:
     tails = [Tail(*(_number(found[key][part]) for part in ("start", "share", "scale"))) for key in _TAILS]
     if not all(tail.scale > 0 and 0 < tail.share <= 1 for tail in tails):
         raise ValueError("a tail needs a scale above 0, and a share above 0")
-    return Scale(*tails, _number(found["slope"]), _number(found["offset"]))
+    slope = _number(found["slope"])
+    if not slope > 0:
+        raise ValueError("more evidence must not make a match less probable")
+    return Scale(*tails, slope, _number(found["offset"]))
 
 
 def _number(value: Any) -> float:

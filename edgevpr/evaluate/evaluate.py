@@ -2,17 +2,16 @@
 
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
-from edgevpr.confidence.stored import FEWEST_PLACES
 from edgevpr.config import load_config
 from edgevpr.contract import Technique
-from edgevpr.errors import ModelError
+from edgevpr.errors import ModelError, UsageError
 from edgevpr.evaluate import metrics
 from edgevpr.evaluate.dataset import Dataset
 from edgevpr.frames.images import list_images, read_image
@@ -185,7 +184,7 @@ def _refine(place_map: PlaceMap, technique: Technique, images: Path | None) -> N
 
 
 def _calibrate(place_map: PlaceMap, technique: Technique, meter: QueryMeter, images: Path | None) -> None:
-    if images is None or len(place_map) < FEWEST_PLACES or not kinds_of(technique.spec):
+    if images is None or not kinds_of(technique.spec):
         return
     try:
         from edgevpr.calibrate.calibrate import calibrate
@@ -196,7 +195,8 @@ def _calibrate(place_map: PlaceMap, technique: Technique, meter: QueryMeter, ima
         for name in names:
             yield Frame(image=read_image(images / name), name=name, t_mono_s=0.0)
 
-    calibrate(technique, place_map, load_config(None).match, meter, pictures, lambda frames, total: frames)
+    with suppress(UsageError):  # too small a map, or one whose pictures cannot tell: it flies with the shipped model
+        calibrate(technique, place_map, load_config(None).match, meter, pictures, lambda frames, total: frames)
 
 
 def compare(results: Iterable[TechniqueResult]) -> list[TechniqueResult]:

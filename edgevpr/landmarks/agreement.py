@@ -44,6 +44,15 @@ class Expected:
     scale: float | None = None
 
 
+def onto(one: Expected, other: Expected) -> Expected:
+    """Return how one place lies on another, of how the same query lies on both."""
+    turn_scale = _turn_scale(other) / _turn_scale(one)
+    shift = complex(*other.shift_share) - turn_scale * complex(*one.shift_share)
+    scale = None if None in (one.scale, other.scale) else float(abs(turn_scale))
+    rotation_deg = float(np.angle(turn_scale, deg=True)) % 360
+    return Expected((float(shift.real), float(shift.imag)), rotation_deg, scale)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Agreement:
     """Result of a comparison: `inliers` of the `matched` landmarks lie over each other; `possible` is the number of

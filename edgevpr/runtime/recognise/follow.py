@@ -51,7 +51,7 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Followed:
-    """What the flight so far makes of a query: the `slot` of the place that is likeliest now, and the probability
+    """Outcome of a query with the flight so far: the `slot` of the place that is likeliest now, and the probability
     `confidence` that the aircraft is there (0 and None without any). `lost` is the probability that it is nowhere the
     flight knows of, and `mass` that of the `estimate` (None: there is none, or the map has no positions)."""
 

@@ -39,6 +39,7 @@ _CLEAR_SCORE, _LEAST_INLIERS, _LANDMARKS_ENOUGH = 0.2, 5, 100
 _OF_SCORE_WHEN_PROVEN = 0.5
 # Of a place less far ahead than by this factor, landmarks must tell it from the best one elsewhere.
 _HARDLY_AHEAD = math.log(1.5)
+_NO_LEAD = math.log(1.05)
 _LEAST_FOLLOWED = 0.5  # of the probability by the flight so far, for a match that is sure by itself
 
 
@@ -51,8 +52,10 @@ class Sureness:
     precision: float
 
     def confidence(self, evidence: Evidence) -> float:
-        """Return the probability that the match with this evidence is right."""
-        return self.models[kind_of(evidence)].confidence(evidence)
+        """Return the probability that the match with this evidence is right: an even chance at best where a place
+        elsewhere agrees as well."""
+        confidence = self.models[kind_of(evidence)].confidence(evidence)
+        return confidence if evidence["lead"] >= _NO_LEAD else min(confidence, 0.5)
 
     def of_map(self, evidence: Evidence) -> float:
         """Return the probability that the query with this evidence shows ground of the map."""

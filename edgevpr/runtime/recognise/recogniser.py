@@ -225,6 +225,9 @@ class Recogniser:
                 if where is None and best.place.position:
                     where = at_place(best.place.position, self.accuracy_m)
         same = where.places if where else ()
+        if verifies and proof and not same:
+            with self.meter.step("verify"):
+                same = looked.same_ground(ranking, HEARD)
         evidence, rival = self._evidence(ranking, proof, same), 0
         if followed is None and evidence is not None:
             with self.meter.step("locate"):

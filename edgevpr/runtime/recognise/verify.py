@@ -5,10 +5,12 @@ It is for cameras that look straight down: ahead, near and far landmarks move by
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from edgevpr.contract import FineMatch, Technique, TechniqueSpec
 from edgevpr.errors import PlaceError
 from edgevpr.frames.level import Levelled
-from edgevpr.landmarks.agreement import Agreement, Expected, agreement, held_against
+from edgevpr.landmarks.agreement import CONFIRMED, Agreement, Expected, agreement, held_against, onto
 from edgevpr.landmarks.landmarks import OF_PLACE, OF_QUERY, Landmarks, describe, packed, unpacked
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
@@ -50,6 +52,23 @@ class Verification:
         expected = self._expected(ranking.compared.get(int(away[0])))
         known = self._known(int(away[0])) if expected else None
         return OF_PLACE if known is None else agreement(self._asked(), known, expected).inliers
+
+    def same_ground(self, ranking: Ranking, heard: int) -> tuple[int, ...]:
+        """Return the numbers of those of the first `heard` places without a position that show ground of the best one:
+        the landmarks of both lie over each other as the two matches say that they must. Where places have positions,
+        these tell. Raises PlaceError as `proof`."""
+        slots = [slot for slot in ranking.slots.tolist() if slot in ranking.compared][:heard]
+        best = slots[0] if slots else None
+        way = self._expected(ranking.compared.get(best))
+        if way is None or not np.isnan(self._index.lat_deg[best]) or (known := self._known(best)) is None:
+            return ()
+        same = []
+        for slot in slots[1:]:
+            other = self._expected(ranking.compared[slot])
+            landmarks = self._known(slot) if other else None
+            if landmarks is not None and agreement(known, landmarks, onto(way, other)).inliers >= CONFIRMED:
+                same.append(int(self._index.place_ids[slot]))
+        return tuple(same)
 
     def _expected(self, match: FineMatch | None) -> Expected | None:
         if match is None or match.shift_cells is None or match.rotation_deg is None or self._spec.cells is None:
