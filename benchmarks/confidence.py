@@ -94,7 +94,7 @@ def _read(path: Path) -> list[Row]:
 
 
 def site(rows: Sequence[Row], kind: str, without: str | None = None) -> Site:
-    """Return what a map says of its site, without another's queries. A place beside a right one is right."""
+    """Return what a map says of its site, without the queries of `without`. A place beside a right one is right."""
     return Site(
         name=rows[0].map,
         own=[(row.evidence, row.right or row.near) for row in rows if row.kind == "own"],
