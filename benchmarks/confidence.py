@@ -160,7 +160,7 @@ def calibration_error(sure: np.ndarray, right: np.ndarray) -> float:
 
 
 def reliability(rows: Rows, models: dict[str, Model]) -> dict:
-    """Return, by camera, confidence and share of right ones of all own queries in ten bins; each set counts the same."""
+    """Return confidence and share of right ones of own queries, by camera, in ten bins; each set counts the same."""
     found = {}
     for camera in KINDS:
         names = [name for name in rows if camera_of(name) == camera]
@@ -275,7 +275,8 @@ def _page(found: dict) -> str:
         f"{markdown(header, cells)}\n\nAt {default}, {taken} of {foreign} foreign queries are accepted, over all "
         "pairings of sets and both cameras.\n\n![reliability](confidence.png)\n\n## Followed from query to query\n\n"
         "Flights along the way of the map, at the default precision, each query by itself and followed; nothing is "
-        "known of time or speed. Share of the queries accepted as the right place; in brackets wrong, beside, foreign.\n\n"
+        "known of time or speed. Share of the queries accepted as the right place; in brackets wrong, beside, "
+        "foreign.\n\n"
         f"{markdown(['set', 'mode', *ways], flown)}\n\nCommit {found['commit']}, {found['date']}, "
         f"{found['machine']['cpu']}. Made by `python benchmarks/confidence.py`.\n"
     )

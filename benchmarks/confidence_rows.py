@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from hostile_pictures import DATA, camera_of
 
-from edgevpr.calibrate.calibrate import ASKED, ask
+from edgevpr.calibrate.calibrate import ask, asked_of
 from edgevpr.config import load_config
 from edgevpr.evaluate.dataset import load_dataset
 from edgevpr.evaluate.evaluate import mapped
@@ -59,7 +59,7 @@ def site_of(name: str) -> str:
     return SITES.get(name, name)
 
 
-def asked_of(name: str, is_own: bool) -> list[Path]:
+def queries_of(name: str, is_own: bool) -> list[Path]:
     step, folder = LIKE.get(name, (1, "query"))
     return list_images(DATA / name / folder)[:: step if is_own else step * THINNED.get(name, 1)]
 
@@ -85,7 +85,7 @@ def rows_of(name: str) -> Iterator[Row]:
         for other in [path.parent.name for path in sorted(DATA.glob("*/ground_truth.csv"))] + list(LIKE):
             if other != name and site_of(other) == site_of(name):
                 continue
-            for path in asked_of(other, other == name):
+            for path in queries_of(other, other == name):
                 if other == name and path.name not in scored:
                     continue
                 event = walk.step(Frame(image=read_image(path), name=path.name, t_mono_s=0.0))
@@ -116,7 +116,7 @@ def rows_of(name: str) -> Iterator[Row]:
             return  # such a map is not calibrated
         frames = [(frame.name, Levelled(frame.image, None, UNKNOWN_VIEW)) for frame in _frames(folder / "ref")]
         order = np.random.default_rng(15).permutation(len(frames))
-        frames = [frames[at] for at in np.resize(order, min(ASKED, 6 * len(frames)))]
+        frames = [frames[at] for at in np.resize(order, min(asked_of(technique), 6 * len(frames)))]
         ids = {place.source_image: place.place_id for place in place_map.places()}
         pictures = ((ids[name], picture) for name, picture in frames)
         for answer in ask(technique, place_map, index, rule, meter, pictures):

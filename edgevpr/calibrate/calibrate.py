@@ -41,7 +41,7 @@ Watch = Callable[[Iterable[T], int], Iterable[T]]
 Pictures = Callable[[Sequence[str]], Iterable[Frame]]  # the frames of these names, as far as they are at hand
 
 THERE, LEFT_OUT, MIRRORED = "there", "left out", "mirrored"
-ASKED = 120  # pictures
+ASKED_AHEAD, ASKED_DOWN = 120, 60  # pictures; looking down, most are looked for from five heights
 _BESIDE_PLACES = 10  # before and after a place without position: they may show the same ground
 _MOST_WITHOUT_POSITION = 0.2  # of the places of a map that looks down, whose pictures overlap in any order
 _BESIDE_SPACINGS = 4.0  # around a place whose footprint is unknown, likewise
@@ -148,13 +148,15 @@ def calibrate(
     names = sorted(ids)
     names = [names[at] for at in np.random.default_rng(_SEED).permutation(len(names)).tolist()]
 
+    count = asked_of(technique)
+
     def asked() -> Iterator[Frame]:
-        for done in range(0, ASKED, len(names)):
-            yield from pictures(names[: ASKED - done])
+        for done in range(0, count, len(names)):
+            yield from pictures(names[: count - done])
 
     def as_mapped() -> Iterator[tuple[int, Levelled]]:
         """Yield what is really the picture of a place: another folder may have the same names."""
-        for frame in watch(asked(), ASKED):
+        for frame in watch(asked(), count):
             picture = levelling.prepare(frame, None, mask.fitted(frame.image))
             coarse = encoded(technique, picture.image, picture.mask).coarse
             found = (each for each in ids.get(readable(frame.name), ()) if place_map.is_of(each, coarse))
@@ -172,6 +174,11 @@ def calibrate(
     found = _calibration(answers, kinds, config.accept_precision)
     place_map.record_calibration(as_text(found))
     return found
+
+
+def asked_of(technique: Technique) -> int:
+    """Return how many pictures a map of this technique is asked for."""
+    return ASKED_AHEAD if technique.spec.cells is None else ASKED_DOWN
 
 
 def _calibration(answers: Sequence[Answer], kinds: Sequence[str], precision: float) -> Calibration:

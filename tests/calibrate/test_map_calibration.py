@@ -56,7 +56,7 @@ def at_hand(*frames):
 def few(monkeypatch):
     """A map of few places is enough, and few questions."""
     monkeypatch.setattr(calibrating, "FEWEST_PLACES", PLACES)
-    monkeypatch.setattr(calibrating, "ASKED", 2 * PLACES)
+    monkeypatch.setattr(calibrating, "asked_of", lambda technique: 2 * PLACES)
 
 
 @pytest.fixture
@@ -150,7 +150,7 @@ def test_the_mask_of_the_map_holds_for_its_pictures(tmp_path):
 
 
 def test_pictures_are_levelled_as_those_of_the_map(tmp_path, monkeypatch):
-    monkeypatch.setattr(calibrating, "ASKED", PLACES)
+    monkeypatch.setattr(calibrating, "asked_of", lambda technique: PLACES)
     down = create("cohog", {"camera": "nadir", "w1": 256})
     tilted = [frame(number, roll_deg=8.0, pitch_deg=-6.0, heading_deg=40.0, height_m=90.0) for number in range(PLACES)]
 

@@ -19,7 +19,7 @@ PLACES = 8
 @pytest.fixture(autouse=True)
 def few(monkeypatch):
     monkeypatch.setattr(calibrate, "FEWEST_PLACES", PLACES)
-    monkeypatch.setattr(calibrate, "ASKED", PLACES)
+    monkeypatch.setattr(calibrate, "asked_of", lambda technique: PLACES)
 
 
 @pytest.fixture(scope="module")

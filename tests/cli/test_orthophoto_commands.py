@@ -153,7 +153,7 @@ def test_without_rasterio_the_sentence_says_what_to_install(tmp_path, ground):
 
 def test_a_map_of_an_orthophoto_is_calibrated_with_what_is_cut_again(tmp_path, ground, track, capsys, monkeypatch):
     monkeypatch.setattr(calibrate, "FEWEST_PLACES", 6)
-    monkeypatch.setattr(calibrate, "ASKED", 6)
+    monkeypatch.setattr(calibrate, "asked_of", lambda technique: 6)
     path = tmp_path / "m.gpkg"
     cut = ("--orthophoto", ground, "--footprint-m", 100, "--spacing-m", 40, "--area", track, "--margin-m", 30)
     assert run("map", "build", path, *cut, "--no-refine", "--no-calibrate", "--json") == 0

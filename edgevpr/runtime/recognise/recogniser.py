@@ -227,7 +227,7 @@ class Recogniser:
         same = where.places if where else ()
         if verifies and proof and not same:
             with self.meter.step("verify"):
-                same = looked.same_ground(ranking, HEARD)
+                same = looked.same_ground(ranking)
         evidence, rival = self._evidence(ranking, proof, same), 0
         if followed is None and evidence is not None:
             with self.meter.step("locate"):

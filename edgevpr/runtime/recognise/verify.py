@@ -17,6 +17,9 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Ranking, elsewhere
 
 
+_MAY_BE_THE_SAME = 12  # places; on kite_ochota, which has no positions, as many as overlap
+
+
 def landmarks_of(technique: Technique, picture: Levelled) -> bytes | None:
     """Return the landmarks that a map keeps of a picture; None for a technique that does not look straight down."""
     return packed(describe(picture.image, picture.mask, OF_PLACE)) if technique.spec.cells else None
@@ -53,11 +56,11 @@ class Verification:
         known = self._known(int(away[0])) if expected else None
         return OF_PLACE if known is None else agreement(self._asked(), known, expected).inliers
 
-    def same_ground(self, ranking: Ranking, heard: int) -> tuple[int, ...]:
-        """Return the numbers of those of the first `heard` places without a position that show ground of the best one:
-        the landmarks of both lie over each other as the two matches say that they must. Where places have positions,
+    def same_ground(self, ranking: Ranking) -> tuple[int, ...]:
+        """Return the numbers of those of the first places without a position that show ground of the best one: the
+        landmarks of both lie over each other as the two matches say that they must. Where places have positions,
         these tell. Raises PlaceError as `proof`."""
-        slots = [slot for slot in ranking.slots.tolist() if slot in ranking.compared][:heard]
+        slots = [slot for slot in ranking.slots.tolist() if slot in ranking.compared][:_MAY_BE_THE_SAME]
         best = slots[0] if slots else None
         way = self._expected(ranking.compared.get(best))
         if way is None or not np.isnan(self._index.lat_deg[best]) or (known := self._known(best)) is None:
