@@ -16,7 +16,6 @@ from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Ranking, elsewhere
 
-
 _MAY_BE_THE_SAME = 12  # places; on kite_ochota, which has no positions, as many as overlap
 
 
