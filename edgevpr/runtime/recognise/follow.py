@@ -96,15 +96,16 @@ class Follower:
         self._map, self._fastest_m_s, self._is_live = place_map, fastest_m_s or _FASTEST_M_S, is_live
         self._origin: Position | None = None
         self._ground: Ground | None = None  # of the map, once it has a place
-        self._t_last_s: float | None = None
+        self._t_now_s: float | None = None
+        self._t_settled_s: float | None = None
         self._elapsed_s: float | None = None
         self._velocity_m_s: tuple[float, float] | None = None
 
     def went_on(self, frame: Frame, vehicle: Vehicle | None) -> None:
         """Take note of the time that has passed and of the velocity of the aircraft, if they are known."""
-        now_s = frame.t_mono_s if self._is_live else frame.t_utc_s
-        before_s, self._t_last_s = self._t_last_s, now_s
-        self._elapsed_s = None if before_s is None or now_s is None else now_s - before_s
+        self._t_now_s = frame.t_mono_s if self._is_live else frame.t_utc_s
+        is_known = None not in (self._t_now_s, self._t_settled_s)
+        self._elapsed_s = self._t_now_s - self._t_settled_s if is_known else None
         is_fresh = self._is_live and vehicle is not None and vehicle.is_fresh_at(frame.t_mono_s)
         self._velocity_m_s = vehicle.velocity_m_s if is_fresh else None
 
@@ -139,7 +140,7 @@ class Follower:
 
     def settle(self) -> None:
         """Believe what the last look has led to."""
-        self._belief = self._next
+        self._belief, self._t_settled_s = self._next, self._t_now_s
 
     def _estimate(self, posterior: Posterior) -> Estimate | None:
         found = posterior.estimate
@@ -195,12 +196,12 @@ class Follower:
             heading_deg[0] = np.nan if where.heading_deg is None else where.heading_deg
             same = np.isin(index.place_ids[slots], where.places) & (slots != slots[0])
         heard = ~np.isnan(at[:, 0]) & ~same
+        confidence = sure.confidence(evidence) if heard[0] else 0.0  # the best place may be the one without a position
         slots, at, covariance, heading_deg = slots[heard], at[heard], covariance[heard], heading_deg[heard]
         votes = np.array([_votes(ranking.compared[slot]) for slot in slots.tolist()])
         p = np.zeros(len(slots))
         if len(slots):
             near = np.hypot(*(at - at[0]).T) <= self._ground.near
-            confidence = sure.confidence(evidence)
             p[near] = confidence * _shares(votes[near])
             left = max(0.0, sure.of_map(evidence) - confidence)
             p[~near] = _OTHERS * left * _shares(votes[~near])
