@@ -40,7 +40,8 @@ FROM_THE_AIR = ("aerial_", "kite_")  # how the names of such sets begin
 @dataclass(frozen=True, slots=True)
 class Variant:
     """One row of the tables: a technique, how it is set, how many queries are matched together and how many places are
-    compared (None: its own numbers), and whether all places are compared in full."""
+    compared (None: its own numbers), whether all places are compared in full, and whether the queries are followed as
+    those of a flight."""
 
     label: str
     technique: str
@@ -48,6 +49,7 @@ class Variant:
     sequence: int | None = None
     candidates: int | None = None
     exact: bool = False
+    follow: bool = False
 
 
 ORIGINAL_CALC = Variant("calc, original weights", "calc", {"model": "calc_original"})
@@ -61,6 +63,7 @@ VARIANTS = (
     Variant("cohog", "cohog"),
     Variant("cohog, exact", "cohog", exact=True),
     Variant("cohog, thesis", "cohog", {"matching": "thesis"}, exact=True),
+    Variant("cohog, followed", "cohog", follow=True),
     Variant("cohog, sequence 10", "cohog", sequence=10),
     *(Variant(f"cohog, {count} candidates", "cohog", candidates=count) for count in (20, 10)),
     Variant("hog", "hog"),
@@ -200,7 +203,16 @@ def write_set(path: Path, folder: Path, wanted: list[Variant], commit: str) -> N
 
         chosen = settings(variant, folder)
         count = variant.candidates
-        result = evaluate(variant.technique, dataset, chosen, count, shown, variant.sequence, exact=variant.exact)
+        result = evaluate(
+            variant.technique,
+            dataset,
+            chosen,
+            count,
+            shown,
+            variant.sequence,
+            exact=variant.exact,
+            follow=variant.follow,
+        )
         rows[variant.label] = {
             **asdict(replace(result, technique=variant.label)),
             "encode_ram_mb": encode_ram_mb(variant.technique, chosen),
