@@ -13,18 +13,26 @@ NEEDED = 0.9
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """A model of confidence that is told what to say of evidence."""
+    """A model of confidence that is told what to say of evidence; a match that is wrong is then of no place at all."""
 
     confidence: Callable[[Evidence], float]
+    of_map: Callable[[Evidence], float] | None = None
+
+    def confidence_of_map(self, evidence: Evidence) -> float:
+        return (self.of_map or self.confidence)(evidence)
 
     def threshold(self, precision: float) -> float:
         return NEEDED
 
 
+def told(confidence: Callable[[Evidence], float], of_map: Callable[[Evidence], float] | None = None) -> Sureness:
+    """The decision by a confidence that is told what to say."""
+    return Sureness(dict.fromkeys(OF_MAP, Told(confidence, of_map)), 0.999)
+
+
 def sure_rule(confidence: Callable[[Evidence], float], **limits: float) -> AcceptRule:
     """The rule that accepts a match whose confidence is `NEEDED`."""
-    sure = Sureness(dict.fromkeys(OF_MAP, Told(confidence)), 0.999)
-    return AcceptRule(**{"min_score": 0.0, "min_margin": 0.0, "neighbour_m": 50.0, "sure": sure, **limits})
+    return AcceptRule(**{"min_score": 0.0, "min_margin": 0.0, "neighbour_m": 50.0, "sure": told(confidence), **limits})
 
 
 def landmarks_count(evidence: Evidence) -> float:

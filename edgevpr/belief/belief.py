@@ -36,6 +36,7 @@ _REACH_SD = 1.5  # standard deviations that the reach is
 _LEARNS = 0.2  # share of the newest step in a velocity
 _SCATTERS = 2.0  # standard deviations of a position: a step as short as that may be none
 _FORGOTTEN = 1e-9  # a hypothesis of less weight
+_MOSTLY = 0.5  # of a share
 _LEAST = 1e-300  # instead of zero, where a number divides
 
 
@@ -77,6 +78,7 @@ class Belief:
 
         Never raises for numbers that make no sense: a candidate that is not finite counts as not seen.
         """
+        odds = (1 - self._lost) / max(self._lost, _FORGOTTEN)
         now, lost, appears = self._left()
         places = max(1, places)
         ways = self._ways(now, moved, places)
@@ -88,9 +90,12 @@ class Belief:
         else:
             self._enters = _ENTERS
             heard, seen = usable(seen, self._ground, MOST)
-            there, alike = self._heard(seen, now, ways, moved.elapsed_s, appears, places)
+            there, alike, staleness, left = self._heard(seen, now, ways, moved.elapsed_s, appears, places)
             lost *= alike
-            after = joined(there, _unseen(now, ways, _MISSED))
+            unseen = _unseen(now, ways, _MISSED)
+            # One who is lost and sees the same again has not moved on either, so staying here is no evidence for it.
+            kept = (left * odds * lost - float(unseen.w.sum())) / max(float(there.w.sum()), _FORGOTTEN)
+            after = joined(replace(there, w=there.w * max(1.0, kept) ** staleness), unseen)
         share = after.w / (lost + float(after.w.sum()))
         p[heard] = share[: len(heard)]
         kept = np.argsort(-share, kind="stable")[:MOST]
@@ -136,18 +141,19 @@ class Belief:
 
     def _heard(
         self, seen: Seen, now: Hypotheses, ways: list[Way], elapsed_s: float, appears: float, places: int
-    ) -> tuple[Hypotheses, float]:
+    ) -> tuple[Hypotheses, float, float, float]:
         """Return one hypothesis for each candidate of a query, whose weight has come from the hypotheses before, each
-        by the ways that lead here, and from nowhere; and how much likelier one who is lost sees the query than if
-        nothing out there were like the map."""
+        by the ways that lead here, and from nowhere; how much likelier one who is lost sees the query than if
+        nothing out there were like the map; how far the query shows the same ground as the one before (0..1), and what
+        is then left of the odds: 1 at most, less where this look says less."""
         ground, at, of_step = self._ground, seen.at, seen.covariance
         rest = max(_LEAST_REST, 1 - float(seen.p.sum()))
         ratio = np.log(np.maximum(seen.p, _LEAST) * places * PRIOR_LOST / ((1 - PRIOR_LOST) * rest))
         born = appears / places * np.exp(ratio)
 
         # A picture of the same ground says what the one before has said, to whoever was there: also to one who is lost.
-        strongest = max(0.0, float(ratio.max(initial=0)))
-        same, self._strongest = min(self._strongest, strongest), strongest
+        strongest, before = max(0.0, float(ratio.max(initial=0))), self._strongest
+        same, self._strongest = min(before, strongest), strongest
         scatter = np.sqrt(of_step[:, 0, 0] if ground.is_ordinal else np.trace(of_step, axis1=1, axis2=2) / 2)
         fresh = np.clip((apart(now.anchor, at) - _SCATTERS * scatter) / ground.spacing, 0, 1)
         evidence = np.exp(ratio + (1 - fresh) * (same - now.credited[:, None])) * (ground.cell * now.w[:, None])
@@ -156,6 +162,8 @@ class Belief:
         by = sum(led) / np.maximum(weight, _LEAST)
         stale = by * (1 - fresh)
         staleness = float(weight @ stale.sum(0)) / max(_LEAST, float((weight + born).sum()))
+        newest = float(ratio[stale.sum(0) > _MOSTLY].max(initial=-math.inf))
+        left = math.exp(min(0.0, newest - before))
         agreement = float(weight.sum()) * rest / max(_LEAST, float(now.w.sum() * seen.p.sum()))
         alike = (1 - _ALIKE + _ALIKE * agreement) ** (1 - staleness) if len(now.w) else 1.0
 
@@ -179,7 +187,7 @@ class Belief:
             credited=np.maximum(ratio, 0),
             anchor=np.where(is_led, anchor, at),
         )
-        return there, alike
+        return there, alike, staleness, left
 
     def _posterior(self, p: np.ndarray) -> Posterior:
         now = self._now

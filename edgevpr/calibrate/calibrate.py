@@ -44,7 +44,7 @@ THERE, LEFT_OUT, MIRRORED = "there", "left out", "mirrored"
 ASKED_AHEAD, ASKED_DOWN = 120, 60  # pictures; looking down, most are looked for from five heights
 _BESIDE_PLACES = 10  # before and after a place without position: they may show the same ground
 _MOST_WITHOUT_POSITION = 0.2  # of the places of a map that looks down, whose pictures overlap in any order
-_BESIDE_SPACINGS = 4.0  # around a place whose footprint is unknown, likewise
+_OVERLAPS = 2.0  # footprints: so far apart a higher and a lower picture, turned, have no ground in common
 _LEFT_OUT_COUNTS = 0.3  # over ground that is not in the map nobody flies as often
 # How far a map moves the shipped weights; chosen on corridor, with grief_stromovka_seasons and nordland_tiny in view.
 _PULL_OF_MAP, _PULL_OF_PLACE = 20.0, 5.0
@@ -79,11 +79,13 @@ def ask(
     rng = np.random.default_rng((_SEED, seed))
     rule = replace(rule, sure=replace(rule.sure, precision=_EVEN))
     looks_down = technique.spec.cells is not None
+    near_m = max(rule.neighbour_m, place_map.footprint_m() or index.spacing_m() or 0.0)
     slots = {int(place_id): slot for slot, place_id in enumerate(index.place_ids)}
     for place_id, picture in pictures:
         if (slot := slots.get(place_id)) is None:
             continue
-        others = _without(index, _same_ground(place_map, index, slot, rule.neighbour_m))
+        may_be_same = _same_ground(index, slot, near_m)
+        others = _without(index, may_be_same)
         for way, seen, among in (
             (THERE, picture, index),
             (LEFT_OUT, picture, others),
@@ -106,7 +108,9 @@ def ask(
                 yield Answer(place_id=place_id, way=way, right=False, evidence=None)
                 continue
             best = int(np.flatnonzero(index.place_ids == event.best.place.place_id)[0])
-            right = way == THERE and not elsewhere(index, slot, np.array([best]), rule.neighbour_m)[0]
+            right = way == THERE and not elsewhere(index, slot, np.array([best]), near_m)[0]
+            if way == THERE and not right and may_be_same[best] and not np.isnan(index.lat_deg[best]):
+                continue  # their pictures may overlap: nobody knows whether it is right
             refused = not event.accepted and event.confidence >= rule.sure.threshold(event.evidence)
             yield Answer(place_id=place_id, way=way, right=bool(right), evidence=event.evidence, refused=refused)
 
@@ -251,12 +255,11 @@ def _mirrored(picture: Levelled) -> Levelled:
     return Levelled(image, mask, picture.view)
 
 
-def _same_ground(place_map: PlaceMap, index: PlaceIndex, slot: int, neighbour_m: float) -> np.ndarray:
-    """Tell which places may show ground of this one, bool (N,)."""
+def _same_ground(index: PlaceIndex, slot: int, near_m: float) -> np.ndarray:
+    """Tell which places may show ground of this one, bool (N,); `near_m` is the ground that a picture shows."""
     away_m = distance_m(index.lat_deg[slot], index.lon_deg[slot], index.lat_deg, index.lon_deg)
-    near_m = max(neighbour_m, place_map.footprint_m() or _BESIDE_SPACINGS * (index.spacing_m() or 0.0))
     beside = abs(np.arange(len(index)) - slot) <= _BESIDE_PLACES
-    return np.where(np.isnan(away_m), beside, away_m <= near_m)
+    return np.where(np.isnan(away_m), beside, away_m <= _OVERLAPS * near_m)
 
 
 def _without(index: PlaceIndex, left_out: np.ndarray) -> PlaceIndex:

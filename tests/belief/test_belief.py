@@ -125,11 +125,29 @@ def test_a_hover_over_what_looks_alike_says_what_one_look_says(p):
     assert max(masses) <= p + 1e-9
 
 
+@pytest.mark.parametrize("ground", [IN_ORDER, IN_METRES])
+@pytest.mark.parametrize("p", [0.9, 0.9999])
+def test_a_hover_does_not_wear_out_what_is_known(ground, p):
+    belief = Belief(ground)
+    for _ in range(300):
+        posterior = belief.update(seen([50], [p]), STEP, PLACES)
+        assert p - 0.1 < posterior.mass <= p + 1e-9
+    assert posterior.p[0] > 0.6
+
+
+@pytest.mark.parametrize("ground", [IN_ORDER, IN_METRES])
+def test_a_hover_whose_looks_differ_is_no_flight_either(ground):
+    rng, belief = np.random.default_rng(13), Belief(ground)
+    for _ in range(300):
+        posterior = belief.update(seen([50, 80], [rng.uniform(0.3, 0.9), 0.05]), STEP, PLACES)
+        assert posterior.mass < 0.93
+
+
 def test_during_a_hover_the_newest_look_replaces_the_one_before():
     belief = Belief(IN_ORDER)
     for p in (0.9, 0.2, 0.6):
         mass = belief.update(seen([50], [p]), STEP, PLACES).mass
-    assert 0.2 < mass <= 0.6
+    assert 0.2 < mass < 0.65
     assert belief.update(seen([50], [0.1]), STEP, PLACES).mass < 0.35
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from pictures import textured
 
-from edgevpr.landmarks.agreement import CONFIRMED, PROVEN, Expected, agreement, held_against
+from edgevpr.landmarks.agreement import CONFIRMED, PROVEN, Expected, agreement, held_against, onto
 from edgevpr.landmarks.landmarks import OF_QUERY, Landmarks, describe, packed, unpacked
 from edgevpr.techniques import create
 
@@ -128,3 +128,28 @@ def test_landmarks_all_on_one_spot_do_not_agree(landscape):
     for expected in (None, Expected((0.0, 0.0), 0.0)):
         assert agreement(asked(cut(landscape, 800, 600)), heap, expected).inliers < CONFIRMED
         assert agreement(heap, place, expected).inliers < CONFIRMED
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        ((840, 600, 0, 1.0), (760, 580, 0, 1.0)),
+        ((840, 600, 40, 1.0), (760, 620, 300, 1.0)),
+        ((830, 580, 20, 1.2), (790, 620, 90, 0.9)),
+    ],
+)
+def test_how_two_places_lie_on_each_other_follows_from_one_query_on_both(landscape, one, other):
+    query = asked(cut(landscape, 800, 600, 10))
+    first, second = cut(landscape, *one), cut(landscape, *other)
+    ways = []
+    for place in (first, second):
+        found = agreement(query, kept(place))
+        ways.append(Expected(found.shift_share, found.rotation_deg, found.scale))
+    truth, told = agreement(asked(first), kept(second)), onto(*ways)
+    assert truth.inliers >= PROVEN
+    assert told.shift_share == pytest.approx(truth.shift_share, abs=0.01)
+    assert abs((told.rotation_deg - truth.rotation_deg + 180) % 360 - 180) < 1.5
+    assert told.scale == pytest.approx(truth.scale, rel=0.03)
+    assert agreement(kept(first), kept(second), told).inliers >= CONFIRMED
+    unscaled = onto(Expected(ways[0].shift_share, ways[0].rotation_deg), ways[1])
+    assert unscaled.scale is None, "where one height is unknown, that of both is"

@@ -1,12 +1,14 @@
 """The displacement vote, against a count by hand."""
 
+import math
+
 import cv2
 import numpy as np
 import pytest
 from pictures import textured
 
 from edgevpr.techniques import create
-from edgevpr.techniques.displacement import displacement
+from edgevpr.techniques.displacement import displacement, support
 
 
 def test_grids_of_other_sizes_are_laid_middle_on_middle():
@@ -113,3 +115,54 @@ def test_a_match_says_how_much_of_the_place_agrees(camera):
     assert own.coverage > 0.4
     assert other.coverage < 0.06
     assert create("cohog", {"matching": "thesis"}).match(here, here.fine).coverage is None
+
+
+def support_by_hand(asking, regions, reference, step):
+    """Every region in turn: back, mutual, likeness and log rank of a step."""
+    side = math.isqrt(len(reference))
+    best = [max(range(len(reference)), key=lambda r: float(regions[q] @ reference[r])) for q in range(len(asking))]
+    back = [max(range(len(asking)), key=lambda q: float(regions[q] @ reference[r])) for r in range(len(reference))]
+
+    def along(q, r):
+        off_x = r % side - asking[q] % side - round(step[0])
+        off_y = r // side - asking[q] // side - round(step[1])
+        return max(abs(off_x), abs(off_y)) <= 3
+
+    log_ranks = []
+    for q in range(0, len(asking), 4):
+        x, y = asking[q] % side + round(step[0]), asking[q] // side + round(step[1])
+        if not (0 <= x < side and 0 <= y < side):
+            continue
+        around = [(j, i) for j in (y - 1, y, y + 1) for i in (x - 1, x, x + 1) if 0 <= i < side and 0 <= j < side]
+        there = max(float(regions[q] @ reference[j * side + i]) for j, i in around)
+        log_ranks.append(math.log(1 + sum(float(regions[q] @ each) > there for each in reference)))
+    return (
+        sum(along(back[r], r) for r in range(len(reference))) / len(reference),
+        sum(back[best[q]] == q and along(q, best[q]) for q in range(len(asking))) / len(reference),
+        sum(float(regions[q] @ reference[best[q]]) for q in range(len(asking))) / len(asking),
+        sum(log_ranks) / len(log_ranks) if log_ranks else math.log(len(reference)),
+    )
+
+
+@pytest.mark.parametrize("step", [(0.0, 0.0), (2.3, -1.2), (-4.0, 3.6), (9.0, 9.0), (30.0, 0.0)])
+@pytest.mark.parametrize("asked", [1, 40, 100])
+def test_the_support_of_a_step_is_that_of_all_regions(step, asked):
+    rng = np.random.default_rng(asked)
+    # Integers, so that sums are exact in any order; the query is the place, moved, with other regions among it.
+    reference = rng.integers(-9, 10, (100, 8)).astype(np.float32)
+    asking = np.sort(rng.choice(100, asked, replace=False))
+    regions = np.where(rng.random((asked, 1)) < 0.7, np.roll(reference, 11, axis=0)[asking], reference[asking][::-1])
+    regions = (regions + rng.integers(-2, 3, regions.shape)).astype(np.float32)
+    best = (regions @ reference.T).argmax(axis=1)
+    found = support(asking, regions, reference, best, step)
+    expected = support_by_hand(asking.tolist(), regions, reference, step)
+    assert (found.back, found.mutual, found.likeness, found.log_rank) == pytest.approx(expected, rel=1e-6)
+
+
+def test_a_picture_supports_its_own_step_entirely():
+    regions = np.eye(100, dtype=np.float32)
+    asking = np.arange(100)
+    own = support(asking, regions, regions, asking, (0.0, 0.0))
+    assert (own.back, own.mutual, own.likeness, own.log_rank) == (1.0, 1.0, 1.0, 0.0)
+    moved = support(asking, regions, regions, asking, (5.0, 0.0))
+    assert (moved.back, moved.mutual) == (0.0, 0.0)

@@ -96,16 +96,19 @@ class Follower:
         self._map, self._fastest_m_s, self._is_live = place_map, fastest_m_s or _FASTEST_M_S, is_live
         self._origin: Position | None = None
         self._ground: Ground | None = None  # of the map, once it has a place
+        self._belief: Belief | None = None
+        self._next: Belief | None = None  # that nobody has settled yet
         self._t_now_s: float | None = None
         self._t_settled_s: float | None = None
         self._elapsed_s: float | None = None
         self._velocity_m_s: tuple[float, float] | None = None
 
     def went_on(self, frame: Frame, vehicle: Vehicle | None) -> None:
-        """Take note of the time that has passed and of the velocity of the aircraft, if they are known."""
-        self._t_now_s = frame.t_mono_s if self._is_live else frame.t_utc_s
-        is_known = None not in (self._t_now_s, self._t_settled_s)
-        self._elapsed_s = self._t_now_s - self._t_settled_s if is_known else None
+        """Take note of the time that has passed since the last look that was kept, and of the velocity of the aircraft,
+        if they are known."""
+        now_s = frame.t_mono_s if self._is_live else frame.t_utc_s
+        before_s, self._t_now_s = self._t_settled_s, now_s
+        self._elapsed_s = None if before_s is None or now_s is None else now_s - before_s
         is_fresh = self._is_live and vehicle is not None and vehicle.is_fresh_at(frame.t_mono_s)
         self._velocity_m_s = vehicle.velocity_m_s if is_fresh else None
 
@@ -139,8 +142,9 @@ class Follower:
             self.settle()
 
     def settle(self) -> None:
-        """Believe what the last look has led to."""
-        self._belief, self._t_settled_s = self._next, self._t_now_s
+        """Believe what the last look has led to; nothing changes where nothing was heard."""
+        self._belief, self._next = self._next or self._belief, None
+        self._t_settled_s = self._t_now_s
 
     def _estimate(self, posterior: Posterior) -> Estimate | None:
         found = posterior.estimate
@@ -167,7 +171,7 @@ class Follower:
             self._ground = Ground(spacing=spacing_m, near=near_m)
         else:
             self._ground = Ground(spacing=1.0, near=_NEAR_PLACES, is_ordinal=True)
-        self._belief = self._next = Belief(self._ground)
+        self._belief, self._next = Belief(self._ground), None
 
     def _moved(self) -> Moved:
         if self._ground.is_ordinal or self._elapsed_s is None:
@@ -195,16 +199,18 @@ class Follower:
             covariance[0] = (east, cov), (cov, north)
             heading_deg[0] = np.nan if where.heading_deg is None else where.heading_deg
             same = np.isin(index.place_ids[slots], where.places) & (slots != slots[0])
-        heard = ~np.isnan(at[:, 0]) & ~same
-        confidence = sure.confidence(evidence) if heard[0] else 0.0  # the best place may be the one without a position
-        slots, at, covariance, heading_deg = slots[heard], at[heard], covariance[heard], heading_deg[heard]
-        votes = np.array([_votes(ranking.compared[slot]) for slot in slots.tolist()])
         p = np.zeros(len(slots))
         if len(slots):
+            votes = np.array([_votes(ranking.compared[slot]) for slot in slots.tolist()])
             near = np.hypot(*(at - at[0]).T) <= self._ground.near
-            p[near] = confidence * _shares(votes[near])
+            near[0] = True  # also where nobody knows its position
+            confidence = sure.confidence(evidence)
+            p[near & ~same] = confidence * _shares(votes[near & ~same])
             left = max(0.0, sure.of_map(evidence) - confidence)
-            p[~near] = _OTHERS * left * _shares(votes[~near])
+            p[~near & ~same] = _OTHERS * left * _shares(votes[~near & ~same])
+        # What speaks for a place without position speaks for no other.
+        heard = ~np.isnan(at[:, 0]) & ~same
+        slots, p, at, covariance, heading_deg = (each[heard] for each in (slots, p, at, covariance, heading_deg))
         return slots, Seen(p=p, at=at, covariance=covariance, heading_deg=heading_deg)
 
     def _positions(self, slots: np.ndarray, index: PlaceIndex) -> np.ndarray:

@@ -15,6 +15,7 @@ from edgevpr.places.growing import GrowingIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.near import index_positions
 from edgevpr.power.boards import load_board
+from edgevpr.runtime.recognise.follow import Estimate, Followed
 from edgevpr.runtime.recognise.judge import AcceptRule
 from edgevpr.runtime.recognise.learn import Learner, check_positions
 from edgevpr.runtime.recognise.opening import meter_of
@@ -68,6 +69,7 @@ class Bench:
         position=None,
         failed=False,
         view=UNKNOWN_VIEW,
+        followed=None,
     ):
         """Show a frame, at a place that the autopilot or the frame itself tells; `fix` is whether its own was sent."""
         now_s = self.clock.now_s
@@ -84,6 +86,7 @@ class Bench:
             descriptor=Descriptor(coarse=part, quality=quality),
             reason="",
             failed=failed,
+            followed=followed,
             steps=Steps(),
             cost=COST,
             fix=None if fix is None else FixReport("0", fix),
@@ -188,6 +191,36 @@ def test_a_fix_that_waits_to_be_sent_may_come_back_and_one_that_was_not_sent_can
 def test_nothing_is_learnt_from_what_failed(bench):
     assert bench.see(failed=True) is None
     assert len(bench.map) == 0
+
+
+def by_flight(lost, mass, north_m=0.0, sd_m=3.0, has_estimate=True):
+    """What a flight knows that is likeliest so far to the north."""
+    there = Estimate(Position(50 + north_m * METRE_DEG, 8.0), (sd_m**2, 0.0, sd_m**2), None)
+    return Followed(slot=0, confidence=mass, lost=lost, mass=mass, estimate=there if has_estimate else None)
+
+
+UNSURE, AGAINST_IT = "while not sure where it is", "where the flight so far contradicts it"
+
+
+@pytest.mark.parametrize(
+    ("followed", "objection"),
+    [
+        (None, None),
+        (by_flight(0.5, 0.5, has_estimate=False), None),
+        (by_flight(0.95, 0.05, north_m=9000.0), None),
+        (by_flight(0.85, 0.15), UNSURE),
+        (by_flight(0.1, 0.85), UNSURE),
+        (by_flight(0.02, 0.95), None),
+        (by_flight(0.02, 0.95, north_m=25.0), None),
+        (by_flight(0.02, 0.95, north_m=300.0), AGAINST_IT),
+        (by_flight(0.02, 0.95, north_m=300.0, sd_m=100.0), None),
+    ],
+)
+def test_a_place_is_learnt_where_the_flight_is_sure_to_be_off_the_map_or_there(bench, followed, objection):
+    place = bench.see(followed=followed)
+    assert (place is None) == (objection is not None)
+    assert bench.learner.passed_over == ({objection: 1} if objection else {})
+    assert bench.see(followed=by_flight(0.99, 0.01), north_m=40.0), "once it is sure, it is learnt"
 
 
 def test_trouble_with_the_file_ends_the_learning_and_nothing_else(bench):

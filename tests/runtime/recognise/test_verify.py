@@ -1,5 +1,6 @@
 """Verification in the walk of a frame: what landmarks refuse and accept, and maps that have none or damaged ones."""
 
+import math
 import shutil
 import sqlite3
 import zlib
@@ -130,21 +131,92 @@ def test_landmarks_are_evidence_where_they_are_asked_and_have_moved(mapped, tech
     assert (still.accepted, still.evidence["landmarks"]) == (False, 0.0), "what has not moved may be a display"
 
 
-@pytest.mark.parametrize("has_landmarks", [True, False])
-def test_ground_that_is_in_the_map_twice_is_not_accepted_for_its_landmarks(tmp_path, technique, has_landmarks):
-    """A place elsewhere without landmarks may be the right one as well."""
-    far = Position(51.0, 8.0)
-    twice = [frame(0), frame(1), frame(2), frame(3), replace(frame(1), name="again.png", position=far)]
-    path = tmp_path / "m.gpkg"
+def made(path, technique, frames):
     with PlaceMap.create(path, technique.spec) as place_map:
-        build_map(twice, technique, place_map, meter())
-    best = asked(path, technique, frame(1, 20, -10), BY_LANDMARKS).best.place.place_id
+        build_map(frames, technique, place_map, meter())
+    return path
+
+
+def far(image):
+    return Frame(image=image, name="again.png", t_mono_s=0.0, position=Position(51.0, 8.0))
+
+
+def test_ground_that_is_in_the_map_twice_is_an_even_chance_at_best(tmp_path, technique):
+    path = made(tmp_path / "m.gpkg", technique, [*map(frame, range(PLACES)), far(frame(1).image)])
+    event = asked(path, technique, frame(1, 20, -10), BY_LANDMARKS)
+    assert (event.accepted, event.confidence) == (False, 0.5)
+
+
+@pytest.mark.parametrize("has_landmarks", [True, False])
+def test_ground_that_is_in_the_map_nearly_twice_is_not_accepted_for_its_landmarks(tmp_path, technique, has_landmarks):
+    """A place elsewhere without landmarks may be the right one as well."""
+    changed = frame(1).image.copy()
+    changed[:, :80] = frame(9).image[:, :80]
+    path = made(tmp_path / "m.gpkg", technique, [*map(frame, range(PLACES)), far(changed)])
     if not has_landmarks:
         with closing(sqlite3.connect(path)) as db, db:
-            db.execute("UPDATE places SET landmarks = NULL, landmarks_crc32 = NULL WHERE place_id != ?", (best,))
+            db.execute("UPDATE places SET landmarks = NULL, landmarks_crc32 = NULL WHERE place_id != 2")
     event = asked(path, technique, frame(1, 20, -10), BY_LANDMARKS)
+    assert event.best.place.source_image == "1.png"
     assert not event.accepted
     assert "landmarks of a place elsewhere agree as well" in event.reason
+
+
+def bare(seed, right_px=0, down_px=0):
+    return replace(frame(seed, right_px, down_px), position=None)
+
+
+@pytest.fixture(scope="module")
+def overlapping(tmp_path_factory, technique):
+    """Places without positions: the first, the fifth and the eighth show the same ground."""
+    same, other = [bare(1, -25, -10), bare(1, 25, 10), bare(1, 0, 28)], list(map(bare, range(2, 7)))
+    order = [same[0], *other[:3], same[1], *other[3:], same[2]]
+    return made(tmp_path_factory.mktemp("overlapping") / "m.gpkg", technique, order)
+
+
+def same_ground(path, technique, query, heard):
+    """The best place of a query, and the numbers of the places that show the same ground."""
+    with PlaceMap.open(path) as place_map:
+        index = load_index(place_map, technique, 10**7)
+        walk = Recogniser(technique=technique, place_map=place_map, index=index, rule=BY_LANDMARKS, meter=meter())
+        event = walk.step(query)
+        looked = Verification(technique.spec, event.picture, index, place_map)
+        return event, int(index.place_ids[event.ranking.slots[0]]), set(looked.same_ground(event.ranking, heard))
+
+
+def test_places_without_positions_that_overlap_are_the_same_ground(overlapping, technique):
+    for query in (bare(1, 3, 2), bare(1, -15, 5)):
+        event, best, same = same_ground(overlapping, technique, query, PLACES + 1)
+        assert {best, *same} == {1, 5, 8}
+        assert event.accepted
+        assert event.evidence["lead"] > math.log(1.5), "places of the same ground are no rivals"
+    assert same_ground(overlapping, technique, bare(1, 3, 2), 1)[2] == set()
+
+
+def test_a_place_that_overlaps_with_none_is_alone(overlapping, technique):
+    _, best, same = same_ground(overlapping, technique, bare(4, 15, 10), 8)
+    assert (best, same) == (4, set())
+
+
+def test_where_places_have_positions_these_tell(tmp_path, technique):
+    path = made(tmp_path / "m.gpkg", technique, [frame(1, -25, -10), frame(2), frame(1, 25, 10), frame(3)])
+    event, best, same = same_ground(path, technique, frame(1, 3, 2), 4)
+    assert best in (1, 3)
+    assert same == set()
+    assert event.accepted
+
+
+def test_places_without_landmarks_or_with_damaged_ones_are_not_the_same_ground(overlapping, technique, tmp_path):
+    path = shutil.copy(overlapping, tmp_path / "m.gpkg")
+    with closing(sqlite3.connect(path)) as db, db:
+        db.execute("UPDATE places SET landmarks = NULL, landmarks_crc32 = NULL WHERE place_id IN (1, 5)")
+    _, best, same = same_ground(path, technique, bare(1, 0, 20), 5)
+    assert (best, same) == (8, set())
+    with closing(sqlite3.connect(path)) as db, db:
+        db.execute("UPDATE places SET landmarks = x'00', landmarks_crc32 = 1 WHERE place_id = 5")
+    event = asked(path, technique, bare(1, 0, 20), BY_LANDMARKS)
+    assert (event.accepted, event.failed) == (False, True)
+    assert "place 5 is damaged" in event.reason
 
 
 def test_other_ground_is_not_accepted_whatever_its_landmarks(mapped, technique):

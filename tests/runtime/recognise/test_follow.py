@@ -1,0 +1,412 @@
+"""Following a flight: what looks at a map become with those before them, over maps in order and maps with positions."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fakes import vehicle_at
+from sureness import told
+
+from edgevpr.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
+from edgevpr.geodesy import distance_m, moved
+from edgevpr.places.index import PlaceIndex, empty_index
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.retrieve import Ranking
+from edgevpr.runtime.recognise.follow import Follower, NoFollower
+from edgevpr.runtime.recognise.locate import Located
+from edgevpr.types import Frame, Pose, Position
+
+PLACES, SPACING_M, FOOTPRINT_M = 150, 20.0, 80.0
+STRIDE = 3  # places from look to look, at one a second: each look is of new ground
+SPEC = TechniqueSpec(name="test", parameters={}, coarse=PartSpec((1,), "<f4"))
+NOTHING = np.zeros((4, 4), np.uint8)
+SURE = 0.98
+BESIDE = 7  # places elsewhere that a look is a little like
+
+
+def at(place):
+    return Position(*moved(50.0, 8.0, 0.6 * SPACING_M * place, 0.8 * SPACING_M * place))
+
+
+def index_of(positions):
+    """An index of places with these positions (None: unknown), numbered from 101."""
+    index = empty_index(SPEC, len(positions), None)
+    index.place_ids[:] = 101 + np.arange(len(positions))
+    for slot, position in enumerate(positions):
+        index.lat_deg[slot], index.lon_deg[slot] = (position.lat_deg, position.lon_deg) if position else (np.nan,) * 2
+    return index
+
+
+IN_ORDER, IN_METRES = index_of([None] * PLACES), index_of([at(place) for place in range(PLACES)])
+
+
+class Flight:
+    """A follower over a real map, and the looks of one flight: `look` hears one and keeps it."""
+
+    def __init__(self, place_map: PlaceMap, index: PlaceIndex, fastest_m_s: float | None = None) -> None:
+        self.follower = Follower(place_map, fastest_m_s=fastest_m_s, is_live=True)
+        self.place_map, self.index, self.t_s = place_map, index, 1000.0
+        self.has_poses = place_map.footprint_m() is not None
+
+    def go_on(self, elapsed_s=float(STRIDE), velocity_m_s=None):
+        self.t_s += elapsed_s
+        vehicle = vehicle_at(50.0, 8.0, self.t_s, velocity_m_s=velocity_m_s)
+        self.follower.went_on(Frame(image=NOTHING, name="", t_mono_s=self.t_s), vehicle)
+
+    def hear(self, place, p, of_map=None, others=(), lead=1.0):
+        """A look whose best place is this one (a number between two is one between two places)."""
+        best = round(place)
+        others = [slot for slot in others or _beside(best, len(self.index)) if slot != best]
+        slots = np.array([best, *others], int)
+        scores = np.array([0.3] + [0.29 if lead < 0.1 else 0.2] * len(others), np.float32)
+        compared = {slot: FineMatch(float(score)) for slot, score in zip(slots.tolist(), scores, strict=True)}
+        evidence = {"agree": -1.0, "lead": lead, "coverage": -1.0}
+        sure = told(lambda evidence: p, lambda evidence: p if of_map is None else of_map)
+        where = None
+        if self.has_poses:
+            number = int(self.index.place_ids[best])
+            where = Located(position=at(place), covariance_m2=(9.0, 1.0, 9.0), heading_deg=350.0, places=(number,))
+        return self.follower.heard(Ranking(slots, scores, compared), self.index, evidence, sure, where)
+
+    def look(self, place, p=0.8, elapsed_s=float(STRIDE), velocity_m_s=None, **more):
+        self.go_on(elapsed_s, velocity_m_s)
+        followed = self.hear(place, p, **more)
+        self.follower.settle()
+        assert_sound(followed)
+        return followed
+
+    def over(self, places, p=0.8, **more):
+        return [self.look(place, p, **more) for place in places]
+
+    def over_nothing(self, looks, rng):
+        """Looks over ground that is not in the map: a little like any place."""
+        return [self.look(int(rng.integers(len(self.index))), 0.02, of_map=0.1) for _ in range(looks)]
+
+
+def _beside(best, places):
+    return np.random.default_rng(best).choice(places, min(places, BESIDE), replace=False).tolist()
+
+
+def assert_sound(followed):
+    assert 0 <= followed.confidence <= 1 + 1e-9
+    assert 0 <= followed.lost <= 1
+    assert 0 <= followed.mass <= 1 + 1e-9
+    if followed.estimate:
+        assert np.isfinite([followed.estimate.position.lat_deg, followed.estimate.position.lon_deg]).all()
+        assert 0 < followed.estimate.sd_m < np.inf
+
+
+def off_m(followed, place):
+    here, there = followed.estimate.position, at(place)
+    return distance_m(here.lat_deg, here.lon_deg, there.lat_deg, there.lon_deg)
+
+
+@pytest.fixture(params=["in order", "positions", "poses"])
+def flight(request, tmp_path):
+    with made_map(tmp_path / "m.gpkg", has_poses=request.param == "poses") as place_map:
+        yield Flight(place_map, IN_ORDER if request.param == "in order" else IN_METRES)
+
+
+@pytest.fixture
+def bare_map(tmp_path):
+    with made_map(tmp_path / "bare.gpkg", has_poses=False) as place_map:
+        yield place_map
+
+
+@pytest.fixture
+def posed_map(tmp_path):
+    with made_map(tmp_path / "posed.gpkg", has_poses=True) as place_map:
+        yield place_map
+
+
+def made_map(path, has_poses):
+    """A map of a few places: a follower asks it for nothing but how large their ground is."""
+    place_map = PlaceMap.create(path, SPEC)
+    for place in range(3):
+        pose = Pose(up_deg=0.0, footprint_m=FOOTPRINT_M, covariance_m2=(4.0, 0.0, 4.0)) if has_poses else None
+        frame = Frame(image=NOTHING, name=f"{place}", t_mono_s=0.0, position=at(place), pose=pose)
+        place_map.add(frame, Descriptor(coarse=np.zeros(1, "<f4")))
+    return place_map
+
+
+@pytest.mark.parametrize("p", [0.01, 0.5, 0.9, 0.9999])
+def test_the_first_look_is_believed_as_it_stands(flight, p):
+    followed = flight.look(20, p)
+    assert followed.slot == 20
+    assert followed.confidence == pytest.approx(p)
+    assert followed.lost == pytest.approx(1 - p)
+    assert not followed.leads_from(20)
+
+
+def test_what_the_best_place_leaves_is_shared_by_the_others(flight):
+    followed = flight.look(20, 0.1, of_map=0.9, others=(40,))
+    assert followed.slot == 40
+    assert 0.1 < followed.confidence < 0.8, "it may be none of those that were compared"
+    assert followed.confidence + followed.lost == pytest.approx(0.9)
+    assert followed.leads_from(20)
+    assert not followed.leads_from(40)
+
+
+def test_looks_that_fit_each_other_say_more_than_each_alone(flight):
+    way = range(10, 100, STRIDE)
+    followed = flight.over(way)
+    assert [each.slot for each in followed] == list(way)
+    assert all(each.confidence > 0.95 for each in followed[4:])
+    assert all(each.lost < 0.01 for each in followed[4:])
+    assert max(each.confidence for each in followed) > SURE
+
+
+def test_a_slow_flight_is_not_lost(flight):
+    followed = [flight.look(30 + look / 2, 0.99, elapsed_s=0.5) for look in range(60)]
+    assert all(each.confidence > 0.7 for each in followed)
+    assert all(each.lost < 0.05 for each in followed)
+
+
+def test_the_flight_tells_two_places_apart_that_look_alike(flight):
+    flight.over(range(10, 40, STRIDE), 0.9)
+    for place in range(40, 52, STRIDE):
+        # The other place has the better score.
+        followed = flight.look(place + 80, 0.5, of_map=0.98, others=(place,), lead=0.01)
+    assert followed.slot == 49
+    assert followed.leads_from(129)
+    assert followed.confidence > 0.9
+
+
+def test_it_recovers_from_a_jump_within_ten_looks(flight):
+    flight.over(range(5, 50, STRIDE), 0.9)
+    after = flight.over(range(100, 130, STRIDE), 0.9)
+    assert after[0].confidence < 0.9, "one look that contradicts the flight is not believed as if there were none"
+    assert after[-1].slot == 127
+    assert after[-1].confidence > SURE
+    assert after[-1].lost < 0.01
+
+
+def test_it_is_lost_within_five_looks_after_it_has_left_the_map(flight):
+    rng = np.random.default_rng(1)
+    assert flight.over(range(10, 60, STRIDE), 0.9)[-1].lost < 0.01
+    away = flight.over_nothing(30, rng)
+    assert all(each.lost > 0.5 for each in away[4:])
+    assert max(each.confidence for each in away) < 0.9
+    assert flight.over(range(80, 110, STRIDE), 0.9)[-1].confidence > SURE, "it is found again"
+
+
+@pytest.mark.parametrize("p", [0.9, 0.9999])
+def test_a_hover_keeps_its_place(flight, p):
+    followed = [flight.look(30, p, elapsed_s=1.0) for _ in range(100)]
+    assert all(each.slot == 30 and each.confidence > 0.6 for each in followed)
+    assert all(each.lost < 2 * (1 - p) + 0.001 for each in followed)
+
+
+@pytest.mark.parametrize("p", [0.3, 0.6, 0.85])
+def test_a_hover_says_no_more_than_its_newest_look(flight, p):
+    followed = [flight.look(30, p, elapsed_s=1.0) for _ in range(50)]
+    assert max(each.confidence for each in followed) <= p + 1e-6
+    assert flight.look(30, 0.2, elapsed_s=1.0).confidence < max(p, 0.35)
+
+
+def test_where_all_places_are_alike_none_is_believed(flight):
+    for look in range(40):
+        best = (57 * look) % PLACES
+        others = [slot for slot in range(PLACES) if slot != best]
+        followed = flight.look(best, 0.5, of_map=0.98, others=others, lead=0.0)
+        assert followed.confidence < 0.9
+
+
+def test_positions_are_those_of_the_places(posed_map, bare_map):
+    posed, bare = Flight(posed_map, IN_METRES), Flight(bare_map, IN_METRES)
+    for place in np.arange(10, 60, 2.5):
+        found = posed.look(place)
+        assert off_m(found, place) < SPACING_M / 2
+    assert found.estimate.sd_m < SPACING_M
+    assert found.estimate.heading_deg == pytest.approx(350.0)
+    assert found.mass > SURE
+    for place in range(10, 60, STRIDE):
+        found = bare.look(place)
+        assert off_m(found, place) < SPACING_M
+    assert found.estimate.heading_deg is None
+    assert found.estimate.sd_m > SPACING_M / 4, "a place says no better where the aircraft is than it is apart"
+
+
+def test_a_map_in_order_has_no_estimate(bare_map):
+    assert Flight(bare_map, IN_ORDER).over(range(5))[-1].estimate is None
+
+
+def test_a_place_that_says_the_same_as_the_best_one_is_no_other(posed_map):
+    where = Located(position=at(20), covariance_m2=(9.0, 0.0, 9.0), places=(121, 141))
+    slots = np.array([20, 40])
+    ranking = Ranking(slots, np.array([0.3, 0.3], np.float32), {20: FineMatch(0.3), 40: FineMatch(0.3)})
+    follower = Follower(posed_map, fastest_m_s=None, is_live=True)
+    sure = told(lambda evidence: 0.6, lambda evidence: 0.9)
+    followed = follower.heard(ranking, IN_METRES, {"lead": 1.0}, sure, where)
+    assert (followed.slot, followed.confidence) == (20, pytest.approx(0.6))
+    assert followed.lost == pytest.approx(0.4)
+
+
+ODOMETRY = {
+    "none": lambda step: None,
+    "true": tuple,
+    "NaN": lambda step: (np.nan, np.nan),
+    "doubled": lambda step: tuple(2 * step),
+    "infinite": lambda step: (np.inf, -np.inf),
+    "stopped": lambda step: (0.0, 0.0),
+}
+
+
+@pytest.mark.parametrize("said", ODOMETRY.values(), ids=ODOMETRY)
+def test_odometry_may_be_absent_or_wrong(flight, said):
+    way = range(10, 70, STRIDE)
+    followed = flight.over(way, 0.9, velocity_m_s=said(SPACING_M * np.array([0.6, 0.8])))
+    assert [each.slot for each in followed] == list(way)
+    assert followed[-1].confidence > SURE
+
+
+def test_what_the_autopilot_said_long_ago_is_not_its_velocity(posed_map):
+    flights = Flight(posed_map, IN_METRES), Flight(posed_map, IN_METRES)
+    for place in range(10, 40, STRIDE):
+        for flight, velocity_m_s in zip(flights, (None, (20.0, -20.0)), strict=True):
+            flight.go_on()
+            said = vehicle_at(50.0, 8.0, flight.t_s - 30.0, velocity_m_s=velocity_m_s)
+            flight.follower.went_on(Frame(image=NOTHING, name="", t_mono_s=flight.t_s), said)
+        ignorant, told_late = (flight.hear(place, 0.8) for flight in flights)
+        assert ignorant == told_late
+        for flight in flights:
+            flight.follower.settle()
+
+
+@pytest.mark.parametrize("elapsed_s", [-100.0, 0.0, float("nan"), float("inf"), 1e9])
+def test_a_clock_that_goes_back_or_jumps_does_no_harm(flight, elapsed_s):
+    flight.over(range(10, 40, STRIDE))
+    flight.look(40, elapsed_s=elapsed_s)
+    flight.t_s = 2000.0
+    assert flight.over(range(43, 79, STRIDE), 0.9)[-1].confidence > SURE
+
+
+@pytest.mark.parametrize("t_utc_s", [None, float("nan")])
+def test_a_recording_without_times_is_followed_too(flight, t_utc_s):
+    follower = flight.follower = Follower(flight.place_map, fastest_m_s=None, is_live=False)
+    for place in range(10, 70, STRIDE):
+        follower.went_on(Frame(image=NOTHING, name="", t_mono_s=0.0, t_utc_s=t_utc_s), None)
+        followed = flight.hear(place, 0.9)
+        follower.settle()
+    assert followed.slot == 67
+    assert followed.confidence > 0.95
+
+
+def test_a_picture_that_says_nothing_only_lets_time_pass(flight):
+    flight.go_on()
+    flight.follower.saw_nothing(flight.index)  # before anything was seen
+    before = flight.over(range(10, 60, STRIDE), 0.9)[-1]
+    for _ in range(3):
+        flight.go_on(1.0)
+        flight.follower.saw_nothing(flight.index)
+    after = flight.look(61, 0.8, elapsed_s=1.0)
+    assert before.confidence > after.confidence > 0.9, "the flight is remembered"
+    assert after.slot == 61
+
+
+def test_of_two_looks_at_one_frame_only_the_last_is_kept(flight):
+    other = Flight(flight.place_map, flight.index)
+    for each in (flight, other):
+        each.over(range(10, 40, STRIDE))
+        each.go_on()
+    flight.hear(90, 0.9)
+    assert flight.hear(40, 0.9) == other.hear(40, 0.9)
+    flight.follower.settle(), other.follower.settle()
+    assert flight.look(43) == other.look(43)
+
+
+def test_a_look_that_is_not_kept_takes_its_time_and_leaves_nothing_else(flight):
+    """So it is with a frame that fails."""
+    other = Flight(flight.place_map, flight.index)
+    for each in (flight, other):
+        each.over(range(10, 40, STRIDE))
+    flight.go_on(1.0)
+    flight.hear(90, 0.999)
+    flight.go_on(2.0)
+    other.go_on(3.0)
+    assert flight.hear(40, 0.8) == other.hear(40, 0.8)
+
+
+def test_nothing_is_kept_where_nothing_was_heard(flight):
+    flight.go_on()
+    flight.follower.settle()
+    assert flight.look(10, 0.8).confidence == pytest.approx(0.8)
+
+
+def test_a_map_that_grows_is_followed(posed_map):
+    flight = Flight(posed_map, index_of([]))
+    flight.go_on()
+    flight.follower.saw_nothing(flight.index)
+    for place in range(0, 90, STRIDE):
+        flight.index = IN_METRES.first(place + 1)
+        followed = flight.look(place, 0.9)
+        assert followed.slot == place
+    assert followed.confidence > SURE
+    assert off_m(followed, 87) < SPACING_M
+
+
+def test_places_that_get_positions_are_surveyed_again(bare_map):
+    flight = Flight(bare_map, IN_ORDER)
+    assert flight.over(range(10))[-1].estimate is None
+    flight.index = IN_METRES
+    first = flight.look(10, 0.8)
+    assert first.confidence == pytest.approx(0.8), "what was believed of places in order is nothing in metres"
+    assert off_m(first, 10) < 1.0
+    assert off_m(flight.over(range(13, 40, STRIDE))[-1], 37) < SPACING_M
+
+
+def test_a_place_without_position_lends_its_confidence_to_no_other(posed_map, bare_map):
+    some = index_of([None if place % 3 == 0 else at(place) for place in range(PLACES)])
+    for place_map in (posed_map, bare_map):
+        flight = Flight(place_map, some)
+        flight.has_poses = False
+        followed = flight.look(30, 0.95, others=(41, 50))
+        assert followed.confidence < 0.1
+        assert not followed.leads_from(30)
+        assert followed.lost > 0.9
+
+
+@pytest.mark.parametrize("position", [None, at(0)])
+def test_a_map_of_one_place(bare_map, position):
+    flight = Flight(bare_map, index_of([position]))
+    followed = flight.over([0] * 10, 0.9, others=(0,), elapsed_s=1.0)
+    assert followed[0].confidence == pytest.approx(0.9)
+    assert max(each.confidence for each in followed) < 0.95
+    assert flight.over([0] * 3, 0.01, others=(0,))[-1].confidence < 0.1
+
+
+def test_without_a_follower_nothing_is_known_of_the_flight():
+    none = NoFollower()
+    none.went_on(Frame(image=NOTHING, name="", t_mono_s=0.0), None)
+    none.saw_nothing(IN_ORDER)
+    ranking = Ranking(np.array([1]), np.array([0.3], np.float32), {1: FineMatch(0.3)})
+    assert none.heard(ranking, IN_ORDER, {"lead": 1.0}, told(lambda evidence: 1.0), None) is None
+    none.settle()
+
+
+BAD = {
+    "NaN": float("nan"),
+    "infinite": float("inf"),
+    "negative": -1.0,
+    "more than sure": 7.0,
+}
+
+
+@pytest.mark.parametrize("p", BAD.values(), ids=BAD)
+def test_confidence_that_makes_no_sense_passes(flight, p):
+    for place in range(10, 28, STRIDE):
+        flight.look(place, p)
+        flight.look(place, 0.5, of_map=p)
+    assert flight.over(range(28, 88, STRIDE), 0.9)[-1].slot == 85
+
+
+def test_scores_that_say_nothing_pass(flight):
+    slots = np.array([3, 30, 50])
+    for score in (0.0, float("nan"), 1e-320):
+        compared = {int(slot): replace(FineMatch(0.1), score=score) for slot in slots}
+        ranking = Ranking(slots, np.full(3, score, np.float32), compared)
+        flight.go_on()
+        assert_sound(
+            flight.follower.heard(ranking, flight.index, {"lead": 1.0}, told(lambda _: 0.3, lambda _: 0.9), None)
+        )
+        flight.follower.settle()

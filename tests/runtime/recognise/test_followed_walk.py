@@ -1,0 +1,177 @@
+"""The walk of a frame with the flight so far: what is accepted for it, what is refused, and what the event says."""
+
+import math
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fakes import FakeClock
+from pictures import textured
+from sureness import sure_rule
+
+from edgevpr.config import load_config
+from edgevpr.places.index import load_index
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.power.boards import load_board
+from edgevpr.power.equations import Pack
+from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.recognise.follow import Follower
+from edgevpr.runtime.recognise.judge import accept_rule
+from edgevpr.runtime.recognise.mapping import build_map
+from edgevpr.runtime.recognise.recogniser import Recogniser
+from edgevpr.runtime.recognise.recognition import fields_of
+from edgevpr.techniques import create
+from edgevpr.types import Frame, Position
+
+PLACES, STRIDE = 40, 3
+TWICE = 20, 36  # both places show the same picture
+TECHNIQUE = create("cohog", {"w1": 208})
+
+
+def frame(place, t_s=0.0, position=True):
+    shown = TWICE[0] if place == TWICE[1] else place
+    there = Position(50 + place * 0.0002, 8.0) if position else None
+    return Frame(image=textured(shown), name=f"{place}.png", t_mono_s=t_s, t_utc_s=t_s, position=there)
+
+
+def meter():
+    clock = FakeClock()
+    return QueryMeter(load_board("rpi-4b"), Pack(4, 5200), 0.85, wall_clock=clock, cpu_clock=clock.clock.process_cpu_s)
+
+
+@pytest.fixture(scope="module", params=[True, False], ids=["positions", "in order"])
+def whole_map(request, tmp_path_factory):
+    path = tmp_path_factory.mktemp("map") / "m.gpkg"
+    with PlaceMap.create(path, TECHNIQUE.spec) as place_map:
+        build_map((frame(place, position=request.param) for place in range(PLACES)), TECHNIQUE, place_map, meter())
+    return path
+
+
+class Walk:
+    """A flight with or without the flight so far in mind; `confidence` is what each match has by itself."""
+
+    def __init__(self, place_map, rule=None, follows=True):
+        self.confidence, self._t_s = 0.8, 0.0
+        self.recogniser = Recogniser(
+            technique=TECHNIQUE,
+            place_map=place_map,
+            index=load_index(place_map, TECHNIQUE, 10**7),
+            rule=rule or sure_rule(lambda evidence: self.confidence, neighbour_m=30.0, min_quality=0.1),
+            meter=meter(),
+            candidates=42,
+            follower=Follower(place_map, fastest_m_s=None, is_live=False) if follows else None,
+        )
+
+    def see(self, place, confidence=None, elapsed_s=float(STRIDE), image=None):
+        self._t_s += elapsed_s
+        self.confidence = confidence or self.confidence
+        seen = frame(place, self._t_s)
+        event = self.recogniser.step(seen if image is None else replace(seen, image=image))
+        assert not event.failed, event.reason
+        return event
+
+
+@pytest.fixture
+def flight(whole_map, tmp_path):
+    with PlaceMap.open(shutil.copy(whole_map, tmp_path)) as place_map:
+        yield Walk(place_map)
+
+
+@pytest.fixture
+def alone(whole_map, tmp_path):
+    with PlaceMap.open(shutil.copy(whole_map, tmp_path / "alone.gpkg")) as place_map:
+        yield Walk(place_map, follows=False)
+
+
+def test_a_match_that_is_refused_alone_is_accepted_with_the_flight(flight, alone):
+    way = range(1, 19, STRIDE)
+    alone_events, events = ([walk.see(place) for place in way] for walk in (alone, flight))
+    assert not any(event.accepted for event in alone_events)
+    assert all(event.followed is None for event in alone_events)
+    assert [event.accepted for event in events[:1] + events[3:]] == [False] + [True] * 3
+    assert events[0].followed.confidence == pytest.approx(0.8)
+    assert events[-1].followed.confidence > 0.9
+    assert "sure by the flight so far; confidence 0.8" in events[-1].reason
+    assert [event.best.place.source_image for event in events] == [f"{place}.png" for place in way]
+    assert events[0].position is None
+
+
+def test_a_match_that_contradicts_the_flight_is_refused_in_words(flight, alone):
+    for place in range(1, 16, STRIDE):
+        flight.see(place)
+    assert alone.see(32, 0.9).accepted
+    event = flight.see(32, 0.9, elapsed_s=1.0)
+    assert (event.accepted, event.position) == (False, None)
+    assert event.reason.startswith("the flight so far speaks against it: 0.")
+    assert event.best.place.source_image == "32.png"
+    assert flight.see(35, 0.9).accepted or flight.see(38, 0.9).accepted, "but not for long"
+
+
+def test_the_flight_knows_which_of_two_places_that_look_the_same_it_is(flight, alone):
+    for place in range(24, 36, STRIDE):
+        flight.see(place, 0.9)
+    # By itself the place that comes first in the map is as good as the other.
+    assert alone.see(TWICE[1], 0.9).best.place.source_image == f"{TWICE[0]}.png"
+    event = flight.see(TWICE[1], 0.9)
+    assert event.best.place.source_image == f"{TWICE[1]}.png"
+    assert event.ranking.slots[0] == event.followed.slot == TWICE[1]
+    assert event.ranking.scores[0] == pytest.approx(event.best.match.score)
+    assert sorted(event.ranking.slots.tolist()) == sorted(set(event.ranking.slots.tolist()))
+    assert event.followed.confidence > 0.5
+    if event.position:
+        assert event.position.lat_deg == pytest.approx(50 + TWICE[1] * 0.0002)
+
+
+def test_the_log_says_what_the_flight_knows(flight, alone):
+    event = flight.see(4)
+    said = fields_of(event)["followed"]
+    assert said["confidence"] == pytest.approx(event.followed.confidence, abs=1e-6)
+    assert said["lost"] == pytest.approx(event.followed.lost, abs=1e-6)
+    assert ("lat_deg" in said) == (event.followed.estimate is not None) == (event.best.place.position is not None)
+    if "lat_deg" in said:
+        assert said["lat_deg"] == pytest.approx(50 + 4 * 0.0002, abs=1e-4)
+        assert len(said["covariance_m2"]) == 3
+        assert said["heading_deg"] is None
+    assert "followed" not in fields_of(alone.see(4))
+
+
+def test_an_aircraft_that_hovers_or_creeps_over_a_place_goes_on_recognising_it(whole_map):
+    """With the models that are shipped."""
+    with PlaceMap.open(whole_map) as place_map:
+        rule = accept_rule(TECHNIQUE, load_config(None).match)
+        hovering = Walk(place_map, rule)
+        assert all(hovering.see(5, elapsed_s=1.0).accepted for _ in range(40))
+        creeping = Walk(place_map, rule)
+        assert all(creeping.see(5 + look // 4, elapsed_s=0.5).accepted for look in range(40))
+
+
+def test_pictures_that_say_nothing_or_cannot_be_used_do_not_lose_it(flight):
+    for place in range(1, 16, STRIDE):
+        flight.see(place)
+    flat = np.full((120, 160), 90, np.uint8)
+    event = flight.see(17, elapsed_s=1.0, image=flat)
+    assert (event.says_nothing, event.accepted, event.followed) == (True, False, None)
+    assert flight.recogniser.step(Frame(image=None, name="none", t_mono_s=0.0)).failed
+    assert flight.see(19).accepted
+
+
+def test_ground_that_is_not_in_the_map_is_not_accepted_for_the_flight(whole_map):
+    rule = sure_rule(lambda evidence: 0.85 if evidence["agree"] > math.log(0.6) else 0.05)
+    with PlaceMap.open(whole_map) as place_map:
+        walk = Walk(place_map, rule)
+        assert [walk.see(place).accepted for place in range(1, 16, STRIDE)][-1]
+        away = [walk.see(0, image=textured(900 + look)) for look in range(10)]
+    assert not any(event.accepted for event in away)
+    assert all(event.followed.lost > 0.5 for event in away[5:])
+
+
+def test_an_index_that_changes_in_flight_is_followed(flight):
+    whole = flight.recogniser.index
+    flight.recogniser.take(TECHNIQUE, whole.first(0), flight.recogniser.rule, flight.recogniser.search)
+    assert flight.see(1).reason == "the map has no place yet"
+    for place in range(4, 19, STRIDE):
+        index = whole.first(place + 3)
+        flight.recogniser.take(TECHNIQUE, index, flight.recogniser.rule, flight.recogniser.search)
+        event = flight.see(place)
+    assert event.accepted
