@@ -7,7 +7,7 @@ from datetime import date
 
 import numpy as np
 
-from edgevpr.calibrate.calibrate import LEFT_OUT, Answer, adapted
+from edgevpr.calibrate.calibrate import Answer, adapted
 from edgevpr.calibrate.fit import fitted, matrix, nothing_known, tail_of
 from edgevpr.confidence.model import Evidence, Logistic, Model, Scale, Tail
 from edgevpr.runtime.recognise.evidence import OF_MAP, OF_PLACE
@@ -76,12 +76,9 @@ def _scale(sites: Sequence[tuple[Site, Model]]) -> Scale:
     )
     wrong = [[model.of_place.logit(evidence) for evidence, right in site.own if not right] for site, model in sites]
     counts = [len(site.own) for site, _ in sites]
-    if sum(map(len, wrong)) < _FEWEST_WRONG:  # places that were left out say more than so few
-        wrong = [
-            [model.of_place.logit(each.evidence) for each in site.answers if each.way == LEFT_OUT]
-            for site, model in sites
-        ]
-        counts = [max(1, len(each)) for each in wrong]
+    if sum(map(len, wrong)) < _FEWEST_WRONG:  # ground of other sites stands in for ground that looks alike
+        wrong = [[model.of_place.logit(each) for each in site.foreign] for site, model in sites]
+        counts = [len(site.foreign) for site, _ in sites]
     scale = Scale(off_map, _tail(wrong, counts, _TAIL_OFF_PLACE), 1.0, 0.0)
     rows, right, weights = [], [], []
     for site, model in sites:

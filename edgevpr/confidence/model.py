@@ -27,6 +27,8 @@ Evidence = Mapping[str, float]
 _MAX_FILE_BYTES = 100_000
 _TAILS = "off_map", "off_place"
 _MOST = 40.0  # of a logit: beyond, a probability is 0 or 1 in float64
+# Of the share that may be wrong. On grief_michigan_monthly, a map of five places, foreign queries were accepted without.
+_NOT_ADAPTED = 0.1
 _LEAST = 1e-15  # of a chance whose logarithm is taken
 
 
@@ -104,8 +106,10 @@ class Model:
         return self.scale.confidence(self.scale.off_map.beyond(logit) if math.isfinite(logit) else 1.0)
 
     def threshold(self, precision: float) -> float:
-        """Return the confidence from which on `precision` (below 1) of the matches are right."""
-        return self.scale.confidence(1 - precision)
+        """Return the confidence from which on `precision` (below 1) of the matches are right. A model that is not
+        adapted to its map knows nothing of the look-alikes there, and asks for more."""
+        wrong = 1 - precision
+        return self.scale.confidence(wrong if self.adapted_scale is None else _NOT_ADAPTED * wrong)
 
 
 def probability(logit: float) -> float:

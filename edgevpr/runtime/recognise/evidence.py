@@ -37,7 +37,7 @@ OF_PLACE = {
 }
 WITH_CONFIDENCE = "cohog"  # the technique that gives evidence, for want of its spec (see `kinds_of`)
 _LEAST = 1e-3  # of a share whose logarithm is taken
-_BY_CHANCE = 0.02  # a share that any two pictures reach, where there is no place elsewhere to compare with
+_BY_CHANCE = 0.07  # a share that pictures of foreign ground reach, where there is no place elsewhere to compare with
 _BESIDE = 0.5  # weight of either neighbour
 
 
