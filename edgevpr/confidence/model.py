@@ -27,7 +27,7 @@ Evidence = Mapping[str, float]
 _MAX_FILE_BYTES = 100_000
 _TAILS = "off_map", "off_place"
 _MOST = 40.0  # of a logit: beyond, a probability is 0 or 1 in float64
-# Of the share that may be wrong. On grief_michigan_monthly, a map of five places, foreign queries were accepted without.
+# Of the share that may be wrong: without it foreign queries were accepted over grief_michigan_monthly, of five places.
 _NOT_ADAPTED = 0.1
 _LEAST = 1e-15  # of a chance whose logarithm is taken
 
