@@ -95,6 +95,7 @@ class Follower:
     def __init__(self, place_map: PlaceMap, *, fastest_m_s: float | None, is_live: bool) -> None:
         self._map, self._fastest_m_s, self._is_live = place_map, fastest_m_s or _FASTEST_M_S, is_live
         self._origin: Position | None = None
+        self._surveyed = 0  # places
         self._ground: Ground | None = None  # of the map, once it has a place
         self._belief: Belief | None = None
         self._next: Belief | None = None  # that nobody has settled yet
@@ -155,11 +156,14 @@ class Follower:
         return Estimate(Position(lat_deg, lon_deg), covariance_m2, found.heading_deg)
 
     def _survey(self, index: PlaceIndex) -> None:
-        """Measure the ground of the map when its first place is there, and again when its places get positions."""
+        """Measure the ground of the map when its first place is there, and again when its places get positions, or have
+        become twice as many: the first few places say little of how far apart the others are."""
         known = ~np.isnan(index.lat_deg)
         has_positions = known.mean() > _HALF
-        if self._ground is not None and (self._origin is not None or not has_positions):
+        is_measured = self._origin is not None and len(index) < 2 * self._surveyed
+        if self._ground is not None and (is_measured or not has_positions):
             return
+        self._surveyed = len(index)
         spacing_m = index.spacing_m() or 0.0
         self._spread_m = max(_LEAST_SPACING_M, spacing_m)  # of a place without pose
         if has_positions:

@@ -40,6 +40,7 @@ _OF_SCORE_WHEN_PROVEN = 0.5
 # Of a place less far ahead than by this factor, landmarks must tell it from the best one elsewhere.
 _HARDLY_AHEAD = math.log(1.5)
 _NO_LEAD = math.log(1.05)
+_EVEN, _MORE_THAN_EVEN = 0.5, 0.501  # chances; the second is needed, whatever precision is asked for
 _LEAST_FOLLOWED = 0.5  # of the probability by the flight so far, for a match that is sure by itself
 
 
@@ -55,15 +56,15 @@ class Sureness:
         """Return the probability that the match with this evidence is right: an even chance at best where a place
         elsewhere agrees as well."""
         confidence = self.models[kind_of(evidence)].confidence(evidence)
-        return confidence if evidence["lead"] >= _NO_LEAD else min(confidence, 0.5)
+        return confidence if evidence["lead"] >= _NO_LEAD else min(confidence, _EVEN)
 
     def of_map(self, evidence: Evidence) -> float:
         """Return the probability that the query with this evidence shows ground of the map."""
         return self.models[kind_of(evidence)].confidence_of_map(evidence)
 
     def threshold(self, evidence: Evidence) -> float:
-        """Return the confidence that is needed."""
-        return self.models[kind_of(evidence)].threshold(self.precision)
+        """Return the confidence that is needed: always more than an even chance."""
+        return max(_MORE_THAN_EVEN, self.models[kind_of(evidence)].threshold(self.precision))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -151,10 +151,13 @@ def test_a_map_of_the_first_format_has_no_id_and_its_positions_tell(recording, t
 
 
 def learning(place_map, tmp_path, acts):
-    """A flight that learns, where the map has nothing, from an autopilot that moves on."""
+    """A flight that learns, where the map has nothing, from an autopilot that moves on. Each picture counts alone:
+    it is the file that decides what is learnt."""
     clock = FakeClock()
     link = FakeLink(clock, vehicle=lambda: vehicle_at(51.0 + clock.now_s / 1000, 8.0, clock.now_s))
-    flight = Flight(place_map, tmp_path / "log", clock, link, learns=True, **{"source.rate_hz": 1.0})
+    flight = Flight(
+        place_map, tmp_path / "log", clock, link, learns=True, **{"source.rate_hz": 1.0, "match.follow": False}
+    )
     calls = iter(acts)
     pictures = [textured(100 + n, 240, 320) for n in range(len(acts))]
     return flight.fly(FakeSource(pictures, clock, work=lambda: next(calls)())), flight

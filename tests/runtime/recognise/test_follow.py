@@ -345,6 +345,16 @@ def test_a_map_that_grows_is_followed(posed_map):
     assert off_m(followed, 87) < SPACING_M
 
 
+def test_a_map_that_grows_is_measured_again(bare_map):
+    """Of one place nobody knows how far the next will be."""
+    flight = Flight(bare_map, IN_METRES)
+    for place in range(0, 40):
+        flight.index = IN_METRES.first(place + 1)
+        followed = flight.look(place, 0.95, elapsed_s=1.0, others=(0,))
+        assert off_m(followed, place) < 2 * SPACING_M
+    assert followed.estimate.sd_m > SPACING_M / 2
+
+
 def test_places_that_get_positions_are_surveyed_again(bare_map):
     flight = Flight(bare_map, IN_ORDER)
     assert flight.over(range(10))[-1].estimate is None

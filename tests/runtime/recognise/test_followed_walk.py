@@ -170,7 +170,7 @@ def test_an_index_that_changes_in_flight_is_followed(flight):
     whole = flight.recogniser.index
     flight.recogniser.take(TECHNIQUE, whole.first(0), flight.recogniser.rule, flight.recogniser.search)
     assert flight.see(1).reason == "the map has no place yet"
-    for place in range(4, 19, STRIDE):
+    for place in range(4, 28, STRIDE):
         index = whole.first(place + 3)
         flight.recogniser.take(TECHNIQUE, index, flight.recogniser.rule, flight.recogniser.search)
         event = flight.see(place)

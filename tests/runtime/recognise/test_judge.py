@@ -12,7 +12,7 @@ from edgevpr.landmarks.agreement import Agreement
 from edgevpr.places.index import empty_index
 from edgevpr.places.retrieve import Ranking
 from edgevpr.places.sequence import Alone, SequenceSearch
-from edgevpr.runtime.recognise.evidence import AHEAD, OF_MAP, OF_PLACE
+from edgevpr.runtime.recognise.evidence import AHEAD, DOWN, DOWN_BARE, OF_MAP, OF_PLACE
 from edgevpr.runtime.recognise.judge import AcceptRule, accept_rule, judge
 from edgevpr.techniques import create
 
@@ -67,6 +67,16 @@ def test_an_accepted_share_that_is_asked_for_changes_how_much_is_needed():
         sure = accept_rule(technique, config).sure
         needed.append(sure.threshold(dict.fromkeys(OF_MAP[AHEAD] + OF_PLACE[AHEAD], 0.0)))
     assert needed[0] < needed[1]
+
+
+@pytest.mark.parametrize("kind", [DOWN, DOWN_BARE])
+@pytest.mark.parametrize("precision", [0.5, 0.999])
+def test_a_place_that_is_not_ahead_of_one_elsewhere_is_never_sure(kind, precision):
+    """Whatever the shipped models say."""
+    config = load_config(None, {"match.accept_precision": precision}).match
+    sure = accept_rule(create("cohog", {"camera": "nadir"}), config).sure
+    evidence = dict.fromkeys(OF_MAP[kind] + OF_PLACE[kind], 5.0) | {"lead": 0.04}
+    assert sure.confidence(evidence) <= 0.5 < sure.threshold(evidence)
 
 
 def test_a_sequence_and_a_technique_without_evidence_are_judged_by_limits():

@@ -123,7 +123,11 @@ def test_after_a_fix_nothing_is_learnt_from_the_autopilot(recording, tmp_path):
     assert flight.learner.totals["left_out"]["just after a fix"] > 10
     assert flight.link.stats().acks["ACCEPTED"] > 10
 
-    lines, _ = fly("silent", **{"mavlink.send_fixes": False})
+    lines, flight = fly("contradicted", **{"mavlink.send_fixes": False})
+    assert not of_kind(lines, "learnt"), "the flight so far knows better"
+    assert flight.learner.totals["left_out"]["where the flight so far contradicts it"] > 10
+
+    lines, _ = fly("silent", **{"mavlink.send_fixes": False, "match.follow": False})
     (learnt,) = of_kind(lines, "learnt")
     assert (learnt["position"]["lat_deg"], learnt["position"]["lon_deg"]) == (51.0, 8.0)
 
