@@ -276,8 +276,8 @@ def _page(found: dict) -> str:
         f"{markdown(header, cells)}\n\nAt {default}, {taken} of {foreign} foreign queries are accepted, over all "
         "pairings of sets and both cameras.\n\n![reliability](confidence.png)\n\n## Followed from query to query\n\n"
         "Flights along the way of the map, at the default precision, each query by itself and followed; nothing is "
-        f"known of time or speed. Of nordland_tiny the first {_MOST_FLOWN} queries fly. Share of the queries accepted as the right place; in brackets wrong, beside, "
-        "foreign.\n\n"
+        f"known of time or speed. Of nordland_tiny the first {_MOST_FLOWN} queries fly. Share of the queries "
+        "accepted as the right place; in brackets wrong, beside, foreign.\n\n"
         f"{markdown(['set', 'mode', *ways], flown)}\n\nCommit {found['commit']}, {found['date']}, "
         f"{found['machine']['cpu']}. Made by `python benchmarks/confidence.py`.\n"
     )
