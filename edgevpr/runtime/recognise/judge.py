@@ -40,7 +40,8 @@ _OF_SCORE_WHEN_PROVEN = 0.5
 # Of a place less far ahead than by this factor, landmarks must tell it from the best one elsewhere.
 _HARDLY_AHEAD = math.log(1.5)
 _NO_LEAD = math.log(1.05)
-_EVEN, _MORE_THAN_EVEN = 0.5, 0.501  # chances; the second is needed, whatever precision is asked for
+_EVEN, _LEAST_SURE = 0.9  # whatever precision is asked for
+_SURE_BY_FLIGHT = 0.99
 _LEAST_FOLLOWED = 0.5  # of the probability by the flight so far, for a match that is sure by itself
 
 
@@ -63,8 +64,8 @@ class Sureness:
         return self.models[kind_of(evidence)].confidence_of_map(evidence)
 
     def threshold(self, evidence: Evidence) -> float:
-        """Return the confidence that is needed: always more than an even chance."""
-        return max(_MORE_THAN_EVEN, self.models[kind_of(evidence)].threshold(self.precision))
+        """Return the confidence that is needed."""
+        return max(_LEAST_SURE, self.models[kind_of(evidence)].threshold(self.precision))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -192,7 +193,7 @@ def _by_confidence(
     if followed is not None:
         figures = f"{followed:.4f} sure by the flight so far; {figures}"
     by_itself = confidence >= needed
-    by_flight = followed is not None and followed >= needed
+    by_flight = followed is not None and followed >= max(needed, _SURE_BY_FLIGHT)
     if not (by_itself or by_flight):
         return Verdict(False, figures)
     if followed is not None and followed < _LEAST_FOLLOWED:
