@@ -33,8 +33,6 @@ def test_a_map_made_looking_down_knows_that_a_view_ahead_is_none_of_its_places(n
         pictures = [Frame(image=read_image(DATA / path), name=path, t_mono_s=0.0) for path in AHEAD[name]]
         events = [recogniser.step(picture) for picture in pictures]
         assert not any(event.accepted for event in events)
-        by_score_alone = [event for event in events if event.best.match.score >= recogniser.rule.min_score]
-        assert sum("of the place agrees, 4% needed" in event.reason for event in by_score_alone) >= 2
         own = next((DATA / name / "query").glob("*.jp*g"), None) or next((DATA / name / "query").glob("*.JP*G"))
         assert recogniser.step(Frame(image=read_image(own), name="own", t_mono_s=0.0)).accepted
 

@@ -127,6 +127,9 @@ class Follower:
             best = int(posterior.p.argmax())
             slot = int(slots[best])
             confidence = float(posterior.p[np.hypot(*(seen.at - seen.at[best]).T) <= self._ground.near].sum())
+            off = np.hypot(*(posterior.estimate.at - seen.at[best])) if posterior.estimate else np.inf
+            if confidence > _HALF and off <= self._ground.near:
+                confidence = max(confidence, posterior.mass)  # with what the look does not see, and knows to be here
         return Followed(
             slot=slot,
             confidence=confidence,

@@ -40,8 +40,8 @@ _OF_SCORE_WHEN_PROVEN = 0.5
 # Of a place less far ahead than by this factor, landmarks must tell it from the best one elsewhere.
 _HARDLY_AHEAD = math.log(1.5)
 _NO_LEAD = math.log(1.05)
-# Probabilities: at best where a place elsewhere agrees as well; and at least, whatever precision is asked for, by the match
-# and by the flight so far.
+# Probabilities: at best where a place elsewhere agrees as well; and at least, whatever precision is asked for, by the
+# match and by the flight so far.
 _EVEN, _LEAST_SURE, _SURE_BY_FLIGHT = 0.5, 0.9, 0.99
 _LEAST_FOLLOWED = 0.5  # of the probability by the flight so far, for a match that is sure by itself
 

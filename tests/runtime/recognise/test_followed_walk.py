@@ -52,7 +52,7 @@ class Walk:
     """A flight with or without the flight so far in mind; `confidence` is what each match has by itself."""
 
     def __init__(self, place_map, rule=None, follows=True):
-        self.confidence, self._t_s = 0.8, 0.0
+        self.confidence, self._t_s = 0.88, 0.0
         self.recogniser = Recogniser(
             technique=TECHNIQUE,
             place_map=place_map,
@@ -90,9 +90,9 @@ def test_a_match_that_is_refused_alone_is_accepted_with_the_flight(flight, alone
     assert not any(event.accepted for event in alone_events)
     assert all(event.followed is None for event in alone_events)
     assert [event.accepted for event in events[:1] + events[3:]] == [False] + [True] * 3
-    assert events[0].followed.confidence == pytest.approx(0.8)
+    assert events[0].followed.confidence == pytest.approx(0.88)
     assert events[-1].followed.confidence > 0.9
-    assert "sure by the flight so far; confidence 0.8" in events[-1].reason
+    assert "sure by the flight so far; confidence 0.88" in events[-1].reason
     assert [event.best.place.source_image for event in events] == [f"{place}.png" for place in way]
     assert events[0].position is None
 
@@ -157,7 +157,7 @@ def test_pictures_that_say_nothing_or_cannot_be_used_do_not_lose_it(flight):
 
 
 def test_ground_that_is_not_in_the_map_is_not_accepted_for_the_flight(whole_map):
-    rule = sure_rule(lambda evidence: 0.85 if evidence["agree"] > math.log(0.6) else 0.05)
+    rule = sure_rule(lambda evidence: 0.89 if evidence["agree"] > math.log(0.6) else 0.05)
     with PlaceMap.open(whole_map) as place_map:
         walk = Walk(place_map, rule)
         assert [walk.see(place).accepted for place in range(1, 16, STRIDE)][-1]
