@@ -18,7 +18,7 @@ from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import margin, named
 from edgevpr.places.sequence import Alone
-from edgevpr.runtime.recognise.judge import AcceptRule, accept_rule, judge
+from edgevpr.runtime.recognise.judge import AcceptRule, judge
 from edgevpr.techniques import create
 from edgevpr.types import Frame, Position
 
@@ -191,11 +191,9 @@ DECEIVED = range(58, 68)
 
 @pytest.mark.skipif(not CORRIDOR.is_dir(), reason=f"{CORRIDOR} is not there")
 def test_on_real_pictures_no_wrong_place_is_accepted_for_want_of_the_right_ones(tmp_path):
-    from edgevpr.config import load_config
-
     dataset = load_dataset(CORRIDOR / "query", CORRIDOR / "ref", CORRIDOR / "ground_truth.csv")
     technique = create("cohog")
-    rule = accept_rule(technique, load_config(None).match)
+    rule = AcceptRule(min_score=technique.min_score, min_margin=technique.min_margin, neighbour_m=50.0)
     with PlaceMap.create(tmp_path / "m.gpkg", technique.spec) as place_map:
         for name in dataset.references:
             image = read_image(CORRIDOR / "ref" / name)
