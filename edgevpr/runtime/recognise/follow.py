@@ -99,6 +99,8 @@ class Follower:
         self._ground: Ground | None = None  # of the map, once it has a place
         self._belief: Belief | None = None
         self._next: Belief | None = None  # that nobody has settled yet
+        self._arrived: tuple[np.ndarray, float] | None = None  # where the newest ground began, and how sure that was
+        self._arriving = self._arrived
         self._t_now_s: float | None = None
         self._t_settled_s: float | None = None
         self._elapsed_s: float | None = None
@@ -126,10 +128,12 @@ class Follower:
         if len(slots) and posterior.p.max() > 0:
             best = int(posterior.p.argmax())
             slot = int(slots[best])
-            confidence = float(posterior.p[np.hypot(*(seen.at - seen.at[best]).T) <= self._ground.near].sum())
+            near = np.hypot(*(seen.at - seen.at[best]).T) <= self._ground.near
+            confidence = float(posterior.p[near].sum())
             off = np.hypot(*(posterior.estimate.at - seen.at[best])) if posterior.estimate else np.inf
             if confidence > _HALF and off <= self._ground.near:
                 confidence = max(confidence, posterior.mass)  # with what the look does not see, and knows to be here
+            confidence = self._not_by_repetition(seen.at[best], confidence, float(seen.p[near].sum()))
         return Followed(
             slot=slot,
             confidence=confidence,
@@ -137,6 +141,16 @@ class Follower:
             mass=posterior.mass,
             estimate=self._estimate(posterior),
         )
+
+    def _not_by_repetition(self, at: np.ndarray, confidence: float, by_itself: float) -> float:
+        """Return a confidence that does not rise while the pictures show the same ground: it is that of the first one
+        there, or that of the newest look by itself."""
+        arrived = self._arrived
+        if arrived is None or np.hypot(*(at - arrived[0])) >= self._ground.spacing:
+            self._arriving = at, confidence
+            return confidence
+        self._arriving = arrived
+        return min(confidence, max(arrived[1], by_itself))
 
     def saw_nothing(self, index: PlaceIndex) -> None:
         """Take note of a picture that says nothing: nobody knows whether it shows ground of the map."""
@@ -148,7 +162,7 @@ class Follower:
     def settle(self) -> None:
         """Believe what the last look has led to; nothing changes where nothing was heard."""
         self._belief, self._next = self._next or self._belief, None
-        self._t_settled_s = self._t_now_s
+        self._arrived, self._t_settled_s = self._arriving, self._t_now_s
 
     def _estimate(self, posterior: Posterior) -> Estimate | None:
         found = posterior.estimate
