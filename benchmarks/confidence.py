@@ -17,14 +17,14 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
 import argparse
 import json
 import pickle
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-from confidence_rows import CONFIG, Row, gather, site_of
+from confidence_rows import CONFIG, Row, frames_of, gather, kind_of_match, site_of, walk_over
 from hostile_pictures import DATA, camera_of
 from run_sets import RESULTS, TUNED_ON, made_by
 
@@ -36,15 +36,12 @@ from edgevpr.evaluate.dataset import load_dataset
 from edgevpr.evaluate.evaluate import mapped
 from edgevpr.evaluate.metrics import roc_auc
 from edgevpr.frames.images import list_images, read_image
-from edgevpr.frames.source import open_source
 from edgevpr.helpers.tables import markdown
-from edgevpr.places.retrieve import elsewhere
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.evidence import AHEAD, DOWN, DOWN_BARE, kind_of
 from edgevpr.runtime.recognise.follow import Follower
 from edgevpr.runtime.recognise.judge import Sureness, accept_rule
 from edgevpr.runtime.recognise.opening import meter_of
-from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.techniques import create
 from edgevpr.types import Frame
 
@@ -204,47 +201,22 @@ def followed(name: str, models: dict[str, Model]) -> dict:
     rule = accept_rule(technique, CONFIG.match)
     rule = replace(rule, sure=Sureness({AHEAD: models[name]}, CONFIG.match.accept_precision))
     made: dict = {"set": name, "ways": {}}
-    with mapped(_frames(folder / "ref"), technique, meter) as (place_map, index):
-
-        def walk(follows: bool) -> Recogniser:
-            return Recogniser(
-                technique=technique,
-                place_map=place_map,
-                index=index,
-                rule=rule,
-                meter=meter,
-                candidates=technique.candidates,
-                follower=Follower(place_map, fastest_m_s=None, is_live=False) if follows else None,
-            )
-
+    with mapped(frames_of(folder / "ref"), technique, meter) as (place_map, index):
         for way, paths in ways.items():
             counts = {}
             for follows in (False, True):
-                recogniser, count = walk(follows), {"queries": 0, "right": 0, "beside": 0, "wrong": 0, "foreign": 0}
+                follower = Follower(place_map, fastest_m_s=None, is_live=False) if follows else None
+                walk = walk_over(place_map, index, technique, rule, follower)
+                count = {"queries": 0, "right": 0, "beside": 0, "wrong": 0, "foreign": 0}
                 for path in paths:
-                    event = recogniser.step(Frame(image=read_image(path), name=path.name, t_mono_s=0.0))
+                    event = walk.step(Frame(image=read_image(path), name=path.name, t_mono_s=0.0))
                     query = truth.get(path.name) if path in own else None
                     count["queries"] += query is not None
                     if event.accepted:
-                        count[_kind(event.best.place.source_image, query, dataset.references, index)] += 1
+                        count[kind_of_match(event.best.place.source_image, query, dataset.references, index)] += 1
                 counts["followed" if follows else "alone"] = count
             made["ways"][way] = counts
     return made
-
-
-def _kind(found: str, query, references: Sequence[str], index) -> str:
-    if query is None:
-        return "foreign"
-    if found in query.right:
-        return "right"
-    known = np.flatnonzero([each in query.right or each in query.ignored for each in references])
-    return "wrong" if elsewhere(index, references.index(found), known, 0.0).all() else "beside"
-
-
-def _frames(folder: Path) -> Iterable[Frame]:
-    source = open_source(str(folder), live=False)
-    while not source.ended:
-        yield source.read(timeout_s=0)
 
 
 def _page(found: dict) -> str:

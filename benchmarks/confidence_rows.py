@@ -9,7 +9,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
 
 import pickle
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,14 +18,18 @@ from hostile_pictures import DATA, camera_of
 
 from edgevpr.calibrate.calibrate import ask, asked_of
 from edgevpr.config import load_config
-from edgevpr.evaluate.dataset import load_dataset
-from edgevpr.evaluate.evaluate import mapped
+from edgevpr.contract import Technique
+from edgevpr.evaluate.dataset import Query, load_dataset
+from edgevpr.evaluate.evaluate import all_frames, mapped
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.level import UNKNOWN_VIEW, Levelled
 from edgevpr.frames.source import open_source
+from edgevpr.places.index import PlaceIndex
+from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import elsewhere
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.recognise.judge import accept_rule
+from edgevpr.runtime.recognise.follow import Follower
+from edgevpr.runtime.recognise.judge import AcceptRule, accept_rule
 from edgevpr.runtime.recognise.opening import meter_of
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.techniques import create
@@ -72,15 +76,8 @@ def rows_of(name: str) -> Iterator[Row]:
     rule = accept_rule(technique, CONFIG.match)
     rule = replace(rule, sure=replace(rule.sure, precision=0.5))  # only what speaks against the best places refuses
     meter = meter_of(CONFIG, load_board("this"))
-    with mapped(_frames(folder / "ref"), technique, meter, folder / "ref") as (place_map, index):
-        walk = Recogniser(
-            technique=technique,
-            place_map=place_map,
-            index=index,
-            rule=rule,
-            meter=meter,
-            candidates=technique.candidates,
-        )
+    with mapped(frames_of(folder / "ref"), technique, meter, folder / "ref") as (place_map, index):
+        walk = walk_over(place_map, index, technique, rule)
         names = dataset.references
         for other in [path.parent.name for path in sorted(DATA.glob("*/ground_truth.csv"))] + list(LIKE):
             if other != name and site_of(other) == site_of(name):
@@ -91,22 +88,18 @@ def rows_of(name: str) -> Iterator[Row]:
                 event = walk.step(Frame(image=read_image(path), name=path.name, t_mono_s=0.0))
                 if event.evidence is None:
                     continue
-                found, right, near = event.best.place.source_image, False, False
-                if other == name:
-                    query = scored[path.name]
-                    if found in query.ignored:
-                        continue
-                    right = found in query.right
-                    known = np.flatnonzero([each in query.right or each in query.ignored for each in names])
-                    near = not right and not elsewhere(index, event.ranking.slots[0], known, 0.0).all()
-                refused = not event.accepted and not event.reason.startswith(("confidence", "score"))
+                found = event.best.place.source_image
+                kind = kind_of_match(found, scored.get(path.name) if other == name else None, names, index)
+                if kind == "ignored":
+                    continue
+                refused = not event.accepted and event.confidence >= rule.sure.threshold(event.evidence)
                 yield Row(
                     map=name,
                     set=other,
                     query=path.name,
                     kind="own" if other == name else "foreign",
-                    right=right,
-                    near=near,
+                    right=kind == "right",
+                    near=kind == "beside",
                     found=found,
                     score=event.best.match.score,
                     evidence=dict(event.evidence),
@@ -114,7 +107,7 @@ def rows_of(name: str) -> Iterator[Row]:
                 )
         if technique.spec.cells and np.isnan(index.lat_deg).any():
             return  # such a map is not calibrated
-        frames = [(frame.name, Levelled(frame.image, None, UNKNOWN_VIEW)) for frame in _frames(folder / "ref")]
+        frames = [(frame.name, Levelled(frame.image, None, UNKNOWN_VIEW)) for frame in frames_of(folder / "ref")]
         order = np.random.default_rng(15).permutation(len(frames))
         frames = [frames[at] for at in np.resize(order, min(asked_of(technique), 6 * len(frames)))]
         ids = {place.source_image: place.place_id for place in place_map.places()}
@@ -135,10 +128,36 @@ def rows_of(name: str) -> Iterator[Row]:
             )
 
 
-def _frames(folder: Path) -> Iterator[Frame]:
-    source = open_source(str(folder), live=False)
-    while not source.ended:
-        yield source.read(timeout_s=0)
+def frames_of(folder: Path) -> Iterator[Frame]:
+    return all_frames(open_source(str(folder), live=False))
+
+
+def walk_over(
+    place_map: PlaceMap, index: PlaceIndex, technique: Technique, rule: AcceptRule, follower: Follower | None = None
+) -> Recogniser:
+    """Return a walk over a map with the technique's own number of candidates."""
+    return Recogniser(
+        technique=technique,
+        place_map=place_map,
+        index=index,
+        rule=rule,
+        meter=meter_of(CONFIG, load_board("this")),
+        candidates=technique.candidates,
+        follower=follower,
+    )
+
+
+def kind_of_match(found: str, query: Query | None, references: Sequence[str], index: PlaceIndex) -> str:
+    """Return what a best place is to a query (None: one of another site): right, ignored, beside a right one, wrong, or
+    foreign."""
+    if query is None:
+        return "foreign"
+    if found in query.right:
+        return "right"
+    if found in query.ignored:
+        return "ignored"
+    known = np.flatnonzero([each in query.right or each in query.ignored for each in references])
+    return "wrong" if elsewhere(index, references.index(found), known, 0.0).all() else "beside"
 
 
 def gather(work: Path, names: list[str]) -> None:

@@ -28,7 +28,7 @@ from run_sets import RESULTS, made_by
 
 from edgevpr.config import load_config
 from edgevpr.evaluate.dataset import Dataset, load_dataset
-from edgevpr.evaluate.evaluate import mapped
+from edgevpr.evaluate.evaluate import all_frames, mapped
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.level import UNKNOWN_VIEW, Levelled
 from edgevpr.frames.source import open_source
@@ -135,9 +135,7 @@ def _of_set(folder: Path, asked: dict[str, list[tuple[str, np.ndarray]]]) -> Row
 
 
 def _frames(folder: Path) -> Iterator[Frame]:
-    source = open_source(str(folder / "ref"), live=False)
-    while not source.ended:
-        yield source.read(timeout_s=0)
+    return all_frames(open_source(str(folder / "ref"), live=False))
 
 
 def _walk(technique, place_map, index, verify: bool) -> Recogniser:

@@ -131,7 +131,10 @@ def map_build(args: Namespace) -> int:
         refined = _refined_after(place_map, technique, args) if args.refine else None
         calibrated = None
         if args.calibrate:
-            calibrated = calibrating.calibrated_after(args, place_map, technique, config.match, meter, mask, levelling)
+            calibrated = calibrating.calibrated_after(
+                technique,
+                lambda: calibrating.calibrated(args, place_map, technique, config.match, meter, mask, levelling),
+            )
     if args.json:
         more = {"refined": asdict(refined)} if refined else {}
         more |= {"calibration": calibrated.figures()} if calibrated else {}

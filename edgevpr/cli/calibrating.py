@@ -2,7 +2,7 @@
 
 import sys
 from argparse import Namespace
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from edgevpr.cli import orthophotos
@@ -14,9 +14,10 @@ from edgevpr.cli.shared import (
     config_of,
     path_of,
     print_json,
+    read_to_end,
     watched,
 )  # fmt: skip
-from edgevpr.errors import EdgevprError, ImageError, UsageError
+from edgevpr.errors import EdgevprError, UsageError
 
 if TYPE_CHECKING:
     from edgevpr.confidence.stored import Calibration
@@ -27,8 +28,6 @@ if TYPE_CHECKING:
     from edgevpr.power.meter import QueryMeter
     from edgevpr.runtime.recognise.levelling import AnyLevelling
     from edgevpr.types import Frame
-
-_READ_TIMEOUT_S = 1.0
 
 
 def add(maps: Any) -> None:
@@ -65,22 +64,14 @@ def map_calibrate(args: Namespace) -> int:
     return 0
 
 
-def calibrated_after(
-    args: Namespace,
-    place_map: "PlaceMap",
-    technique: "Technique",
-    config: "MatchConfig",
-    meter: "QueryMeter",
-    mask: "AnyMask",
-    levelling: "AnyLevelling",
-) -> "Calibration | None":
+def calibrated_after(technique: "Technique", calibrate: "Callable[[], Calibration]") -> "Calibration | None":
     """Calibrate a map that has just been built, where its technique has a confidence; the map is whole without it."""
     from edgevpr.runtime.recognise.evidence import kinds_of
 
     if not kinds_of(technique.spec):
         return None
     try:
-        return calibrated(args, place_map, technique, config, meter, mask, levelling)
+        return calibrate()
     except EdgevprError as error:
         print(f"edgevpr: the map is not calibrated: {error}", file=sys.stderr)
         return None
@@ -119,13 +110,4 @@ def _pictures(args: Namespace, names: Sequence[str]) -> "Iterator[Frame]":
         source = orthophotos.open_cuttings(args, names)
     else:
         source = open_source(args.source, positions=path_of(args.positions), live=False, only=names)
-    try:
-        while not source.ended:
-            try:
-                frame = source.read(_READ_TIMEOUT_S)
-            except ImageError:
-                continue
-            if frame is not None:
-                yield frame
-    finally:
-        source.close()
+    yield from filter(None, read_to_end(source, lambda error: None))

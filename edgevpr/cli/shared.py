@@ -110,16 +110,20 @@ def frames_of(source: "Source", label: str, unusable: list[ImageError]) -> "Iter
     `unusable`, and left out."""
     from edgevpr.helpers.progress import progress
 
-    def until_it_ends() -> "Iterator[Frame | None]":
-        while not source.ended:
-            try:
-                yield source.read(_READ_TIMEOUT_S)
-            except ImageError as error:
-                leave_out(error, unusable)
-                yield None
-        source.close()
+    frames = read_to_end(source, lambda error: leave_out(error, unusable))
+    return (frame for frame in progress(frames, source.total, label) if frame is not None)
 
-    return (frame for frame in progress(until_it_ends(), source.total, label) if frame is not None)
+
+def read_to_end(source: "Source", left_out: Callable[[ImageError], None]) -> "Iterator[Frame | None]":
+    """Read a source that ends, and close it. An image that cannot be used is handed to `left_out`; for it, and where no
+    frame has come yet, None is yielded."""
+    while not source.ended:
+        try:
+            yield source.read(_READ_TIMEOUT_S)
+        except ImageError as error:
+            left_out(error)
+            yield None
+    source.close()
 
 
 def leave_out(error: ImageError, unusable: list[ImageError]) -> None:

@@ -1,7 +1,7 @@
 """Measurement of a technique on a data set by the code that flies: map file, index, retrieval, stage meter."""
 
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -120,8 +120,7 @@ def evaluate(
     """Map the references, ask every query, and score the answers. `candidates` places are compared (None: the
     technique's own number, as it flies); with `exact` all are, and the scan chooses none. `sequence` queries are
     matched together, in the order of their names (None: the technique's own number); with `follow` they are followed as
-    those of one flight. `gate` discards queries; the map
-    has all references, as in the thesis (3.3).
+    those of one flight. `gate` discards queries; the map has all references, as in the thesis (3.3).
 
     Raises UsageError for an unknown technique or parameter, ImageError for an image that cannot be used, MapError if
     the temporary map cannot be written, and ModelError for a network that cannot be used or a query that fails.
@@ -130,7 +129,7 @@ def evaluate(
     config = load_config(None)
     meter = meter_of(config, load_board("this"))
     source = open_source(str(dataset.ref_dir), live=False)
-    frames = progress(_frames(source), source.total, f"{technique_name}: references")
+    frames = progress(all_frames(source), source.total, f"{technique_name}: references")
     with mapped(frames, technique, meter, dataset.ref_dir) as (place_map, index):
         length = length_of(technique.spec, sequence)
         rule = accept_rule(technique, config.match, length, calibration_of(place_map))
@@ -191,9 +190,8 @@ def _calibrate(place_map: PlaceMap, technique: Technique, meter: QueryMeter, ima
     except ModuleNotFoundError:  # without SciPy
         return
 
-    def pictures(names: Iterable[str]) -> Iterator[Frame]:
-        for name in names:
-            yield Frame(image=read_image(images / name), name=name, t_mono_s=0.0)
+    def pictures(names: Collection[str]) -> Iterator[Frame]:
+        return all_frames(open_source(str(images), live=False, only=names))
 
     with suppress(UsageError):  # too small a map, or one whose pictures cannot tell: it flies with the shipped model
         calibrate(technique, place_map, load_config(None).match, meter, pictures, lambda frames, total: frames)
@@ -218,8 +216,8 @@ def as_json(results: Iterable[TechniqueResult]) -> dict[str, Any]:
     return {"techniques": {result.technique: asdict(result) for result in results}}
 
 
-def _frames(source: Source) -> Iterator[Frame]:
-    """Yield all frames of a folder. The first that cannot be used ends the evaluation: a set with holes measures
+def all_frames(source: Source) -> Iterator[Frame]:
+    """Yield all frames of a folder. Raises ImageError for the first that cannot be used: a set with holes measures
     nothing."""
     while not source.ended:
         yield source.read(timeout_s=0)

@@ -13,6 +13,7 @@ import numpy as np
 
 from edgevpr.geodesy import offset_m
 from edgevpr.mavlink.certainty import DRIFT_M_S
+from edgevpr.runtime.recognise.locate import in_sd, matrix_of
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.types import Position, Vehicle
 
@@ -51,7 +52,7 @@ class Consistency:
             self._held = self._believed = None
             return None
         fix = _offset(event, vehicle)
-        if _size(fix.step_m, fix.covariance_m2 + vehicle.position_sd_m**2 * np.eye(2)) <= _CONTRADICTS:
+        if in_sd(fix.step_m, fix.covariance_m2 + vehicle.position_sd_m**2 * np.eye(2)) <= _CONTRADICTS:
             self._held = self._believed = None
             return None
         if self._believed and _differ(self._believed, fix) <= _CONTRADICTS:
@@ -70,7 +71,6 @@ class Consistency:
 
 
 def _offset(event: Recognition, vehicle: Vehicle) -> _Offset:
-    var_east, cov, var_north = event.located.covariance_m2
     # No fix is claimed to be better than the accuracy that is sent with it.
     unsaid_m2 = max(0.0, event.accuracy_m**2 - event.located.accuracy_m**2)
     speed_m_s = math.hypot(*vehicle.velocity_m_s) if vehicle.velocity_m_s else _FASTEST_M_S
@@ -78,7 +78,7 @@ def _offset(event: Recognition, vehicle: Vehicle) -> _Offset:
     here = event.position
     return _Offset(
         step_m=np.array(offset_m(vehicle.lat_deg, vehicle.lon_deg, here.lat_deg, here.lon_deg)),
-        covariance_m2=np.array([[var_east, cov], [cov, var_north]]) + (unsaid_m2 + room_m**2) * np.eye(2),
+        covariance_m2=matrix_of(event.located.covariance_m2) + (unsaid_m2 + room_m**2) * np.eye(2),
         reckoned=Position(vehicle.lat_deg, vehicle.lon_deg),
         t_s=event.frame.t_mono_s,
         places=event.located.places or (event.best.place.place_id,),
@@ -89,7 +89,7 @@ def _differ(one: _Offset, other: _Offset) -> float:
     """Return by how many standard deviations two fixes disagree on where the autopilot is wrong; infinitely where they
     are too far apart in time."""
     apart_s = abs(other.t_s - one.t_s)
-    return _size(other.step_m - one.step_m, _of_both(one, other)) if apart_s <= _GOOD_FOR_S else math.inf
+    return in_sd(other.step_m - one.step_m, _of_both(one, other)) if apart_s <= _GOOD_FOR_S else math.inf
 
 
 def _is_independent(one: _Offset, other: _Offset) -> bool:
@@ -100,14 +100,9 @@ def _is_independent(one: _Offset, other: _Offset) -> bool:
     moved_m = np.array(
         offset_m(one.reckoned.lat_deg, one.reckoned.lon_deg, other.reckoned.lat_deg, other.reckoned.lon_deg)
     )
-    return _size(moved_m, _of_both(one, other)) > _CONTRADICTS
+    return in_sd(moved_m, _of_both(one, other)) > _CONTRADICTS
 
 
 def _of_both(one: _Offset, other: _Offset) -> np.ndarray:
     drift_m = DRIFT_M_S * abs(other.t_s - one.t_s)
     return one.covariance_m2 + other.covariance_m2 + drift_m**2 * np.eye(2)
-
-
-def _size(step_m: np.ndarray, covariance_m2: np.ndarray) -> float:
-    """Return the length of a step in standard deviations (its Mahalanobis distance)."""
-    return math.sqrt(step_m @ np.linalg.solve(covariance_m2, step_m))

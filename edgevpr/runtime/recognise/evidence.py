@@ -25,16 +25,10 @@ from edgevpr.places.index import PlaceIndex
 from edgevpr.places.retrieve import Ranking, elsewhere
 
 AHEAD, DOWN, DOWN_BARE = "ahead", "down", "down_bare"
-OF_MAP = {
-    AHEAD: ("mutual", "coverage", "back", "likeness"),
-    DOWN: ("agree", "lead", "coverage", "landmarks"),
-    DOWN_BARE: ("agree", "lead", "coverage"),
-}
-OF_PLACE = {
-    AHEAD: ("agree", "lead", "lead_around", "mutual_best", "coverage", "rank_gap"),
-    DOWN: ("agree", "lead", "coverage", "landmarks"),
-    DOWN_BARE: ("agree", "lead", "coverage"),
-}
+_LOOKING_DOWN = {DOWN: ("agree", "lead", "coverage", "landmarks"), DOWN_BARE: ("agree", "lead", "coverage")}
+# What tells whether a query shows ground of the map, and which of its places it shows.
+OF_MAP = {AHEAD: ("mutual", "coverage", "back", "likeness"), **_LOOKING_DOWN}
+OF_PLACE = {AHEAD: ("agree", "lead", "lead_around", "mutual_best", "coverage", "rank_gap"), **_LOOKING_DOWN}
 WITH_CONFIDENCE = "cohog"  # the technique that gives evidence, for want of its spec (see `kinds_of`)
 _LEAST = 1e-3  # of a share whose logarithm is taken
 _BY_CHANCE = 0.07  # a share that pictures of foreign ground reach, where there is no place elsewhere to compare with

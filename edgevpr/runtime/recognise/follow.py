@@ -21,7 +21,7 @@ from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Ranking
 from edgevpr.runtime.recognise.judge import Sureness
-from edgevpr.runtime.recognise.locate import Located
+from edgevpr.runtime.recognise.locate import Located, matrix_of
 from edgevpr.types import Frame, Position, Vehicle
 
 # Chosen on corridor, aerial_caliterra and aerial_garfield28.
@@ -216,19 +216,17 @@ class Follower:
         same = np.zeros(len(slots), bool)
         if where and self._origin:
             at[0] = offset_m(self._origin.lat_deg, self._origin.lon_deg, where.position.lat_deg, where.position.lon_deg)
-            east, cov, north = where.covariance_m2
-            covariance[0] = (east, cov), (cov, north)
+            covariance[0] = matrix_of(where.covariance_m2)
             heading_deg[0] = np.nan if where.heading_deg is None else where.heading_deg
             same = np.isin(index.place_ids[slots], where.places) & (slots != slots[0])
+        votes = np.array([_votes(ranking.compared[slot]) for slot in slots.tolist()])
+        near = np.hypot(*(at - at[0]).T) <= self._ground.near
+        near[0] = True  # also where nobody knows its position
+        confidence = sure.confidence(evidence)
+        left = max(0.0, sure.of_map(evidence) - confidence)
         p = np.zeros(len(slots))
-        if len(slots):
-            votes = np.array([_votes(ranking.compared[slot]) for slot in slots.tolist()])
-            near = np.hypot(*(at - at[0]).T) <= self._ground.near
-            near[0] = True  # also where nobody knows its position
-            confidence = sure.confidence(evidence)
-            p[near & ~same] = confidence * _shares(votes[near & ~same])
-            left = max(0.0, sure.of_map(evidence) - confidence)
-            p[~near & ~same] = _OTHERS * left * _shares(votes[~near & ~same])
+        p[near & ~same] = confidence * _shares(votes[near & ~same])
+        p[~near & ~same] = _OTHERS * left * _shares(votes[~near & ~same])
         # What speaks for a place without position speaks for no other.
         heard = ~np.isnan(at[:, 0]) & ~same
         slots, p, at, covariance, heading_deg = (each[heard] for each in (slots, p, at, covariance, heading_deg))

@@ -132,13 +132,23 @@ def located(
     )
 
 
+def matrix_of(covariance: tuple[float, float, float]) -> np.ndarray:
+    """Return a covariance (variance, covariance, variance) as a matrix (2, 2)."""
+    return np.array([[covariance[0], covariance[1]], [covariance[1], covariance[2]]])
+
+
+def in_sd(step: np.ndarray, covariance: np.ndarray) -> float:
+    """Return the length of a step (2,) in standard deviations: its Mahalanobis distance, by a covariance (2, 2)."""
+    return math.sqrt(step @ np.linalg.solve(covariance, step))
+
+
 def as_learnt(where: Located, recorded: Position, recorded_sd_m: float) -> tuple[Position, Pose] | None:
     """Return position and pose of a new place that is `recorded` with a standard deviation of one axis, and lies where
     places around it say; None where the two contradict each other."""
     off_m = _off_m(recorded, where.position)
-    by_places, by_record = _matrix(where.covariance_m2), recorded_sd_m**2 * np.eye(2)
+    by_places, by_record = matrix_of(where.covariance_m2), recorded_sd_m**2 * np.eye(2)
     both = by_places + by_record
-    if math.sqrt(off_m @ np.linalg.solve(both, off_m)) > _DISAGREES:
+    if in_sd(off_m, both) > _DISAGREES:
         return None
     gain = by_record @ np.linalg.inv(both)
     covariance = gain @ by_places
@@ -160,19 +170,15 @@ def _can_say(candidate: Candidate) -> bool:
 
 
 def _by_vote(match: FineMatch, cells: int) -> _Lies:
-    covariance = _matrix(match.covariance_cells2 or (0.0, 0.0, 0.0)) / cells**2
+    covariance = matrix_of(match.covariance_cells2 or (0.0, 0.0, 0.0)) / cells**2
     # Votes scatter around their peak; of their mean, what is left of that.
     covariance = covariance * _OF_SCATTER + _OF_VOTE**2 * np.eye(2)
     return _Lies(np.array(match.shift_cells) / cells, covariance, match.rotation_deg, match.height_ratio)
 
 
 def _by_landmarks(proof: Agreement) -> _Lies:
-    covariance = _matrix(proof.covariance_share2) + _OF_LANDMARKS**2 * np.eye(2)
+    covariance = matrix_of(proof.covariance_share2) + _OF_LANDMARKS**2 * np.eye(2)
     return _Lies(np.array(proof.shift_share), covariance, proof.rotation_deg, proof.scale)
-
-
-def _matrix(covariance: tuple[float, float, float]) -> np.ndarray:
-    return np.array([[covariance[0], covariance[1]], [covariance[1], covariance[2]]])
 
 
 def _is_heard(candidate: Candidate, best: Candidate) -> bool:
@@ -203,7 +209,7 @@ def _said(place: Place, lies: _Lies, origin: Position, aside: tuple[float, float
     return _Said(
         at_m=_off_m(origin, place.position) + off_m,
         of_step=pose.footprint_m**2 * (axes @ upwards @ axes.T) + of_pose,
-        of_pose=_matrix(pose.covariance_m2),
+        of_pose=matrix_of(pose.covariance_m2),
     )
 
 
@@ -215,5 +221,4 @@ def _off_m(origin: Position, position: Position) -> np.ndarray:
 def _apart(one: _Said, other: _Said) -> float:
     """Return how far apart two places say that the aircraft is, in standard deviations. Their poses are known against
     each other far better than on the Earth: half of a variance of each is what they may differ by."""
-    off = one.at_m - other.at_m
-    return float(np.sqrt(off @ np.linalg.solve(one.of_step + other.of_step + (one.of_pose + other.of_pose) / 2, off)))
+    return in_sd(one.at_m - other.at_m, one.of_step + other.of_step + (one.of_pose + other.of_pose) / 2)

@@ -109,8 +109,7 @@ def take_form(recogniser: Recogniser, config: Config, form: str) -> None:
     technique = technique_of(place_map, config.technique, _wanted(config) | {"form": form}, board)
     length = length_of(technique.spec, config.match.sequence)
     index = _loaded(config, board, technique, place_map)
-    rule = accept_rule(technique, config.match, length, calibration_of(place_map))
-    recogniser.take(technique, index, rule, search_of(length))
+    recogniser.take(technique, index, accept_rule(technique, config.match, length), search_of(length))
 
 
 def budget_mb(config: Config, board: Board) -> float:
@@ -253,8 +252,7 @@ def _is_now(config: Config) -> bool:
 
 
 def _prior(config: Config, technique: Technique) -> Prior:
-    is_now = _is_now(config)
-    return Prior(config.match.reach_m_s, technique.spec.heading_within_deg, is_now)
+    return Prior(config.match.reach_m_s, technique.spec.heading_within_deg, _is_now(config))
 
 
 @contextmanager

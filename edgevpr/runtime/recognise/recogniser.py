@@ -57,8 +57,7 @@ class Recogniser:
     not memorable, `mask` leaves parts of every frame out, and `levelling` lays each on the ground. `search` joins
     several queries, and `prior` narrows each; without them each query is ranked alone, over the whole map. `verify`
     holds the best place against its landmarks, where the map has some. `follower` follows the flight from query to
-    query. The governor changes `candidates`; the learner
-    and the governor change the index (`take`, `extend`).
+    query. The governor changes `candidates`; the learner and the governor change the index (`take`, `extend`).
     """
 
     def __init__(
