@@ -42,9 +42,9 @@ class Vehicle:
     clock of the frames. `has_gps`: at that time a receiver had a 3D fix near that position. Without `has_gps` the
     position may be wrong: an autopilot goes on reporting its estimate long after it has lost GPS, and it does not
     follow a receiver that it does not trust. `roll_deg` (right wing down is positive), `pitch_deg` (nose up),
-    `height_m` above the ground and `velocity_m_s` over it (east, north) are None where unknown. `position_sd_m` is the
-    standard deviation of one axis of the position, None where it is unknown or the autopilot has no position of its
-    own to rely on."""
+    `height_m` above the ground, `velocity_m_s` over it (east, north) and `sink_m_s` (down) are None where unknown.
+    `position_sd_m` is the standard deviation of one axis of the position, None where it is unknown or the autopilot has
+    no position of its own to rely on."""
 
     lat_deg: float
     lon_deg: float
@@ -56,6 +56,7 @@ class Vehicle:
     pitch_deg: float | None = None
     height_m: float | None = None
     velocity_m_s: tuple[float, float] | None = None
+    sink_m_s: float | None = None
     position_sd_m: float | None = None
 
     def is_fresh_at(self, t_mono_s: float) -> bool:

@@ -10,6 +10,7 @@ import numpy as np
 
 from edgevpr.frames.condition import Condition
 from edgevpr.mavlink.link import LinkStats
+from edgevpr.mavlink.listener import NoListener
 from edgevpr.mavlink.messages import Fix, Health
 from edgevpr.mavlink.outbox import Outbox, Sending
 from edgevpr.runtime.flight.clock import Clock
@@ -133,6 +134,7 @@ class FakeLink:
         vehicle: Callable[[], Vehicle | None] = lambda: None,
     ) -> None:
         self.answer, self.sent = answer, []
+        self.listener = NoListener()
         self.health = Health.BOOT
         self._clock, self._vehicle = clock, vehicle
         self._outbox = Outbox()
@@ -157,7 +159,10 @@ class FakeLink:
         return self._vehicle()
 
     def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
-        return self._vehicle()
+        vehicle = self._vehicle()
+        if vehicle:
+            self.listener.hear_vehicle(vehicle)
+        return vehicle
 
     def listens(self) -> bool:
         return self.answer is not None

@@ -11,6 +11,7 @@ from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.flight import fly
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log
 from edgevpr.runtime.flight.loop import Stop
+from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.mapping import build_map
 from edgevpr.runtime.recognise.opening import meter_of
@@ -42,7 +43,7 @@ def test_the_whole_walk(tmp_path):
             FakeSource([textured(3), textured(9)], clock),
             config,
             flight_log=flight_log,
-            autopilot=ToAutopilot(link, send_fixes=True, cores=board.cores, clock=clock.clock),
+            autopilot=ToAutopilot(link, Navigator(5.0, 1.0), send_fixes=True, cores=board.cores, clock=clock.clock),
             stop=Stop(),
             clock=clock.clock,
         )

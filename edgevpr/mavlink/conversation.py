@@ -6,17 +6,22 @@ import struct
 from collections import Counter
 from collections.abc import Callable
 
-from edgevpr.mavlink import messages
+from edgevpr.mavlink import messages, positions
 from edgevpr.mavlink.address import Sender
 from edgevpr.mavlink.answers import Answers
+from edgevpr.mavlink.autopilots.channel import Channel
+from edgevpr.mavlink.listener import Listener, NoListener
 from edgevpr.mavlink.messages import Health, Severity
 from edgevpr.mavlink.outbox import Outbox, Sending
 from edgevpr.mavlink.peer import Autopilot
 from edgevpr.mavlink.wire import Message, Receiver, mavlink
 
 HEARTBEAT_S = 1.0
+STATE_S = 0.1  # ArduPilot calls a receiver unhealthy whose positions come more than 215 ms apart
 HEALTH_GOOD_FOR_S = 10.0  # a hung main loop must not look healthy because the link's thread still runs
 ASK_AGAIN_S = 5.0
+
+_NOBODY = NoListener()
 
 log = logging.getLogger(__name__)
 
@@ -29,10 +34,16 @@ class Conversation:
     """
 
     def __init__(
-        self, clock: Callable[[], float], component_id: int, system_id: int | None, max_fix_age_s: float
+        self,
+        clock: Callable[[], float],
+        component_id: int,
+        system_id: int | None,
+        max_fix_age_s: float,
+        listener: Listener = _NOBODY,
     ) -> None:
         self.outbox = Outbox(max_fix_age_s)
-        self.autopilot = Autopilot(component_id, system_id)
+        self.autopilot = Autopilot(component_id, system_id, listener)
+        self._listener = listener
         self.answers = Answers()
         self.receiver = Receiver()
         self.sent: Counter[str] = Counter()
@@ -40,8 +51,10 @@ class Conversation:
         self._health, self._health_set_s = Health.BOOT, clock()
         self._packer = mavlink.MAVLink(None, srcSystem=system_id or 1, srcComponent=component_id)
         self._last_sent: Sending | None = None
-        self._heartbeat_due_s = clock()
+        self._heartbeat_due_s = self._state_due_s = clock()
         self._ask_position_s: float | None = None  # when to ask next; None: not wanted
+        self._asked_for_state = False
+        self._channel = self.channel  # as the listener has heard it
 
     def set_health(self, health: Health) -> None:
         """Set the health in the heartbeats of the next ten seconds. After that, without a new call, it is CRITICAL."""
@@ -51,6 +64,17 @@ class Conversation:
         """Ask the autopilot for its position, how well it knows it, attitude and height, at once and again whenever it
         has stopped reporting its position or its attitude."""
         self._ask_position_s = self._clock()
+
+    @property
+    def channel(self) -> Channel:
+        """The channel by which the autopilot is told positions."""
+        return self.autopilot.interview.choice.channel
+
+    def wait_s(self, longest_s: float) -> float:
+        """Return how long the link may sleep, so long at most, until there is something to say."""
+        if not self.channel.is_continuous:
+            return longest_s
+        return min(longest_s, max(0.0, self._state_due_s - self._clock()))
 
     def next_packet(self) -> tuple[bytes, Sending | None] | None:
         """Choose and pack the next message; return it with the fix in it, if it holds one. None: there is none."""
@@ -65,7 +89,8 @@ class Conversation:
                 continue
             self._packer.seq = (self._packer.seq + 1) % 256
             if sending:
-                self.answers.note_sent(self._clock())
+                if message.get_type() == "COMMAND_INT":  # no other is answered
+                    self.answers.note_sent(self._clock())
             else:
                 self.sent[message.get_type()] += 1
             return packet, sending
@@ -115,24 +140,52 @@ class Conversation:
             return messages.heartbeat(Health.CRITICAL if stuck else self._health), None
         if self.autopilot.listens(now_s):
             self._ask_for_position(now_s)
+            if self.channel.is_continuous and (state := self._state(now_s)):
+                return state, None
             if why := self.answers.why_not(now_s):
                 self.outbox.withhold_fixes(why)
             elif sending := self.outbox.next_fix(now_s):
+                if self.channel is Channel.SENSOR:
+                    return positions.position_sensor(sending.fix, now_s), sending
                 return messages.position_fix(sending.fix, now_s, self.autopilot.system_id), sending
         else:
             self.outbox.drop_stale_fixes(now_s)
         message = self.outbox.next_message()
         return message and (message, None)
 
+    def _state(self, now_s: float) -> Message | None:
+        """Make the next message of a continuous position, where it is due."""
+        if now_s < self._state_due_s:
+            return None
+        self._state_due_s = max(self._state_due_s + STATE_S, now_s)
+        choice, autopilot = self.autopilot.interview.choice, self.autopilot
+        t_s = now_s - choice.lag_s
+        state = self._listener.state_at(t_s)
+        if choice.channel is Channel.GPS_INPUT:
+            return positions.gps_input(state, choice.receiver, t_s, autopilot.unix_s(t_s))
+        if state and state.attitude and autopilot.origin:
+            return positions.odometry(state, autopilot.origin)
+        return None
+
     def _ask_for_position(self, now_s: float) -> None:
         """Ask again where no reports came: an autopilot that has restarted has forgotten the request."""
-        if self._ask_position_s is None or now_s < self._ask_position_s:
+        if self._ask_position_s is None:
+            return
+        for question in self.autopilot.interview.questions(now_s, self.autopilot.system_id):
+            self.outbox.put(question)
+        if self.channel is not self._channel:
+            self._channel = self.channel
+            self._listener.hear_channel(self._channel)
+        if now_s < self._ask_position_s:
             return
         self._ask_position_s = now_s + ASK_AGAIN_S
         vehicle = self.autopilot.vehicle
         heard_s = min(vehicle.t_heard_s if vehicle else -math.inf, self.autopilot.attitudes.t_heard_s)
-        if now_s - heard_s > ASK_AGAIN_S:
-            for request in messages.report_requests(self.autopilot.system_id, self.autopilot.firmware):
+        if now_s - heard_s > ASK_AGAIN_S or self._asked_for_state != self.channel.is_continuous:
+            self._asked_for_state = self.channel.is_continuous
+            for request in messages.report_requests(
+                self.autopilot.system_id, self.autopilot.firmware, self._asked_for_state
+            ):
                 self.outbox.put(request)
 
     def _announce(self, severity: Severity, text: str) -> None:

@@ -10,8 +10,10 @@ from contextlib import suppress
 
 from edgevpr.errors import LinkError
 from edgevpr.mavlink.address import LinkAddress
+from edgevpr.mavlink.autopilots.channel import Channel
 from edgevpr.mavlink.conversation import Conversation
 from edgevpr.mavlink.line import Line
+from edgevpr.mavlink.listener import Listener, NoListener
 from edgevpr.mavlink.messages import Fix, Health
 from edgevpr.mavlink.outbox import MAX_FIX_WAIT_S, Sending
 from edgevpr.mavlink.stats import LinkStats
@@ -24,6 +26,8 @@ RETRY_FIRST_S, RETRY_MAX_S = 0.2, 2.0
 WATCH_S = 0.01  # between two looks whether a fix has left
 FLUSH_S = 0.5
 
+_NOBODY = NoListener()
+
 log = logging.getLogger(__name__)
 
 
@@ -32,8 +36,9 @@ class Link:
     the port after every loss of the other end. What is said and heard is the `Conversation`'s.
 
     `system_id` is that of the autopilot (None: that of the first heard); a fix that has waited for `max_fix_age_s` is
-    never sent. `send`, `send_fix`, `set_health`, `want_position`, `vehicle`, `vehicle_at`, `listens` and `stats` may be
-    called from any thread; they never block and never raise.
+    never sent. `listener` hears how the vehicle moves, and gives the positions of a continuous channel. `send`,
+    `send_fix`, `set_health`, `want_position`, `vehicle`, `vehicle_at`, `channel`, `listens` and `stats` may be called
+    from any thread; they never block and never raise.
     """
 
     def __init__(
@@ -44,10 +49,11 @@ class Link:
         *,
         system_id: int | None = None,
         max_fix_age_s: float = MAX_FIX_WAIT_S,
+        listener: Listener = _NOBODY,
     ) -> None:
         self._address = address
         self._clock = clock
-        self._conversation = Conversation(clock, component_id, system_id, max_fix_age_s)
+        self._conversation = Conversation(clock, component_id, system_id, max_fix_age_s, listener)
         self._line: Line | None = None
         self._reopened = 0
         self._retry_s = RETRY_FIRST_S
@@ -102,6 +108,11 @@ class Link:
         """Return the same with the roll, pitch and heading that the vehicle had at the time of a frame; roll and pitch
         are None where no attitude was heard within 0.3 s of it."""
         return self._conversation.autopilot.vehicle_at(t_mono_s)
+
+    @property
+    def channel(self) -> Channel:
+        """The channel by which the autopilot is told positions."""
+        return self._conversation.channel
 
     def listens(self) -> bool:
         """Tell whether there is an autopilot that a fix can be sent to at this moment."""
@@ -177,7 +188,7 @@ class Link:
             self._transmit(line)
         self._conversation.tell_of_answers()
         writing = [line.transport] if line.is_writing else []
-        timeout_s = min(timeout_s, WATCH_S) if line.is_watched else timeout_s
+        timeout_s = min(timeout_s, WATCH_S) if line.is_watched else self._conversation.wait_s(timeout_s)
         readable, _, _ = select.select([line.transport, self._bell], writing, [], timeout_s)
         if self._bell in readable:
             self._bell.recv(4096)

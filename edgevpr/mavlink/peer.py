@@ -9,8 +9,11 @@ from typing import Any
 from edgevpr.geodesy import distance_m
 from edgevpr.mavlink.address import Sender
 from edgevpr.mavlink.attitude import Attitudes, Heights
+from edgevpr.mavlink.autopilots.channel import Channel
+from edgevpr.mavlink.autopilots.interview import Interview
 from edgevpr.mavlink.certainty import FILTER_REPORTS, Certainty, gps_sd_m
 from edgevpr.mavlink.identity import Identity, Speaker
+from edgevpr.mavlink.listener import Listener, NoListener
 from edgevpr.mavlink.messages import AUTOPILOT, POSITION_FIX
 from edgevpr.mavlink.wire import Message, mavlink
 from edgevpr.types import Vehicle
@@ -20,8 +23,10 @@ GPS_AGREES_WITHIN_M = 50.0  # at 25 m/s, with one or two seconds between the two
 FASTEST_M_S = 150.0  # over ground: a report of more is none of a small aircraft
 SILENT_AFTER_S = 5.0  # heartbeats come once a second, and this many may be lost
 
-_GPS_REPORTS = ("GPS_RAW_INT", "GPS2_RAW")
+_GPS_REPORTS = ("GPS_RAW_INT", "GPS2_RAW")  # of the first receiver, and of the second
 _HEIGHT_REPORTS = ("DISTANCE_SENSOR", "TERRAIN_REPORT")
+_MILLI_G = 9.80665e-3  # m/s2
+_NOBODY = NoListener()
 
 log = logging.getLogger(__name__)
 
@@ -36,8 +41,12 @@ _EXPLANATIONS = {
 class Autopilot:
     """The state of the autopilot, from all messages that arrive. `Identity` says which of them are its own."""
 
-    def __init__(self, own_component: int, system_id: int | None = None) -> None:
+    def __init__(self, own_component: int, system_id: int | None = None, listener: Listener = _NOBODY) -> None:
         self.identity = Identity(system_id)
+        self.interview = Interview()
+        self.origin: tuple[float, float, float] | None = None  # of its local frame: degrees, metres above sea level
+        self._listener = listener
+        self._ahead_s: float | None = None  # of its clock, seconds since 1970, over ours
         self.acks: Counter[str] = Counter()  # answers to our fixes, by name of the result
         self.firmware = mavlink.MAV_AUTOPILOT_GENERIC  # until it is heard
         self.vehicle: Vehicle | None = None  # the last report, of any age, without attitude
@@ -90,6 +99,8 @@ class Autopilot:
             self.vehicle, self._last_result = None, None
             self._gps.clear()
             self.attitudes, self._heights, self.certainty = Attitudes(), Heights(), Certainty()
+            self.interview, self.origin, self._ahead_s = Interview(), None, None
+        self.interview.hear(message)
         if beats:
             self._heard_s, self.firmware = now_s, message.autopilot
             return True
@@ -105,7 +116,23 @@ class Autopilot:
             self._hear_gps(message, now_s)
         elif message.get_type() in FILTER_REPORTS:
             self.certainty.hear(message, now_s)
+        elif message.get_type() == "SCALED_IMU":
+            self._hear_force(message, now_s)
+        elif message.get_type() == "SYSTEM_TIME" and message.time_unix_usec:
+            self._ahead_s = message.time_unix_usec / 1e6 - now_s
+        elif message.get_type() == "GPS_GLOBAL_ORIGIN":
+            self.origin = message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3
         return False
+
+    def unix_s(self, t_mono_s: float) -> float | None:
+        """Return a time of ours by the clock of the autopilot, seconds since 1970; None where it has told none."""
+        return None if self._ahead_s is None else t_mono_s + self._ahead_s
+
+    def _hear_force(self, message: Message, now_s: float) -> None:
+        attitude = self.attitudes.at(now_s)
+        if attitude:
+            force = (message.xacc, message.yacc, message.zacc)
+            self._listener.hear_force(now_s, tuple(each * _MILLI_G for each in force), attitude)
 
     def _hear_position(self, message: Message, now_s: float) -> None:
         by_gps_m = self._gps_sd_m(message, now_s)
@@ -118,8 +145,13 @@ class Autopilot:
             height_m=self._heights.now(message.relative_alt / 1e3, now_s),
             position_sd_m=self.certainty.now(now_s),
         )
+        if self.vehicle:
+            self._listener.hear_vehicle(self.vehicle)
 
     def _hear_gps(self, message: Message, now_s: float) -> None:
+        choice = self.interview.choice
+        if choice.channel is Channel.GPS_INPUT and message.get_type() == _GPS_REPORTS[choice.receiver]:
+            return  # the receiver that we play: it says what we have said
         if message.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX:
             self._gps[message.get_type()] = (message.lat / 1e7, message.lon / 1e7, gps_sd_m(message), now_s)
         else:
@@ -164,6 +196,7 @@ def _vehicle(message: Message, **known: Any) -> Vehicle | None:
         lon_deg=message.lon / 1e7,
         alt_m=message.alt / 1e3,
         heading_deg=message.hdg / 100 if message.hdg <= 36_000 else None,  # 65535: unknown
+        sink_m_s=message.vz / 100,
         velocity_m_s=(east_m_s, north_m_s) if math.hypot(east_m_s, north_m_s) <= FASTEST_M_S else None,
         **known,
     )

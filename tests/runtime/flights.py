@@ -13,6 +13,7 @@ from edgevpr.runtime.flight.flight import Flown, fly
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log
 from edgevpr.runtime.flight.loop import Stop
 from edgevpr.runtime.flight.metering import FlightMeter
+from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.recognise.learn import Learner
 from edgevpr.runtime.recognise.opening import open_learning, open_recogniser
 from edgevpr.runtime.recognise.recogniser import Recogniser
@@ -64,7 +65,10 @@ class Flight:
         autopilot = NoAutopilot()
         if self.link:
             send_fixes = self.config.mavlink.send_fixes
-            autopilot = ToAutopilot(self.link, send_fixes=send_fixes, cores=self.board.cores, clock=self.clock.clock)
+            navigator = self.link.listener = Navigator(self.config.mavlink.min_accuracy_m, 1.0)
+            autopilot = ToAutopilot(
+                self.link, navigator, send_fixes=send_fixes, cores=self.board.cores, clock=self.clock.clock
+            )
         with self.recogniser.place_map, FlightLog(self.log, clock=self.clock) as flight_log:
             self.flown = fly(
                 self.recogniser,

@@ -9,7 +9,7 @@ from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.outbox import Sending
 from edgevpr.power.load import MachineLoad
 from edgevpr.runtime.flight.clock import Clock
-from edgevpr.runtime.flight.consistency import Consistency
+from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.types import FixReport, Vehicle
 
@@ -53,13 +53,13 @@ class NoAutopilot:
 
 class ToAutopilot:
     """Tells an autopilot of events over an open link. With `send_fixes` an accepted match with a position is sent as a
-    fix, unless it contradicts the autopilot's own position; without, all else is as with it. `cores` is the number of
-    the board's cores."""
+    fix, where the `navigator` says that the autopilot is better off with it; without, all else is as with it. `cores`
+    is the number of the board's cores."""
 
-    def __init__(self, link: Link, *, send_fixes: bool, cores: int, clock: Clock) -> None:
+    def __init__(self, link: Link, navigator: Navigator, *, send_fixes: bool, cores: int, clock: Clock) -> None:
         self._link, self._send_fixes, self._cores, self._clock = link, send_fixes, cores, clock
         self._last: tuple[str, Sending] | None = None
-        self._consistency = Consistency()
+        self._navigator = navigator
         self._held, self._is_holding = 0, False
 
     @property
@@ -113,17 +113,15 @@ class ToAutopilot:
         """Send the fix of an accepted match, if it has one, and report what became of it."""
         if event.position is None:
             return FixReport(_name(event), False, "the place has no position")
-        here = event.position
         try:
-            fix = messages.Fix(here.lat_deg, here.lon_deg, event.accuracy_m, event.frame.t_mono_s)
+            advice = self._navigator.advise(event, self._clock.mono_s())
         except ValueError as error:  # another program wrote an invalid position
             _log.warning("place %d: %s; no fix is sent", event.best.place.place_id, error)
             return FixReport(_name(event), False, str(error))
-        objection = self._consistency.objection(event)
-        self._say_held(objection)
-        if objection or not self._send_fixes:
-            return FixReport(_name(event), False, objection or DRY_RUN)
-        sending = self._link.send_fix(fix)
+        self._say_held(advice.why if advice.is_held else None)
+        if advice.fix is None or not self._send_fixes:
+            return FixReport(_name(event), False, advice.why or DRY_RUN)
+        sending = self._link.send_fix(advice.fix)
         if self._link.listens():
             sending.wait(_SETTLED_WITHIN_S)
         self._last = _name(event), sending

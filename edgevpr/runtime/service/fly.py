@@ -23,6 +23,7 @@ from edgevpr.runtime.flight.flight import rate_hz
 from edgevpr.runtime.flight.flightlog import FlightLog, start_fields
 from edgevpr.runtime.flight.learning import say_learning_stopped
 from edgevpr.runtime.flight.loop import Stop
+from edgevpr.runtime.flight.navigator import Muted, Navigator
 from edgevpr.runtime.flight.systemd import notify
 from edgevpr.runtime.preflight.choose import too_late
 from edgevpr.runtime.preflight.pick import Outlook, outlook, picked_technique, trusted_candidates, trusted_forms
@@ -55,10 +56,11 @@ def fly(config: Config, positions: Path | None = None) -> int:
         found = outlook(recogniser, config)
         recogniser.candidates = found.candidates
         _say_start(config, recogniser, flight_log, found)
-        link = stack.enter_context(_link(address, config.mavlink)) if address else None
+        step_s = 1 / rate_hz(config, recogniser)
+        navigator = Navigator(config.mavlink.min_accuracy_m, step_s)
+        link = stack.enter_context(_link(address, config.mavlink, navigator)) if address else None
         if link:
             link.want_position()
-        step_s = 1 / rate_hz(config, recogniser)
         source = open_source(config.source.uri, step_s=step_s, positions=positions, live=True)
         stack.callback(source.close)
         if link and not source.is_live:
@@ -66,7 +68,7 @@ def fly(config: Config, positions: Path | None = None) -> int:
         autopilot = NoAutopilot()
         if link:
             send_fixes = config.mavlink.send_fixes
-            autopilot = ToAutopilot(link, send_fixes=send_fixes, cores=board.cores, clock=Clock())
+            autopilot = ToAutopilot(link, navigator, send_fixes=send_fixes, cores=board.cores, clock=Clock())
             if not send_fixes:
                 autopilot.announce(Mood.WARNING, DRY_RUN)
         if cannot_learn:
@@ -109,8 +111,14 @@ def fly(config: Config, positions: Path | None = None) -> int:
     return 1 if flown.failed else 0
 
 
-def _link(address: LinkAddress, settings: MavlinkConfig) -> Link:
-    return Link(address, settings.component_id, system_id=settings.system_id, max_fix_age_s=settings.max_fix_age_s)
+def _link(address: LinkAddress, settings: MavlinkConfig, navigator: Navigator) -> Link:
+    return Link(
+        address,
+        settings.component_id,
+        system_id=settings.system_id,
+        max_fix_age_s=settings.max_fix_age_s,
+        listener=navigator if settings.send_fixes else Muted(navigator),
+    )
 
 
 def _opened(config: Config, board: Board) -> tuple[Recogniser, Learner | None, str | None]:

@@ -1,22 +1,19 @@
 """A fix that contradicts the autopilot's own position is held back until a second, independent one says the same."""
 
-from dataclasses import replace
-
 import numpy as np
-import pytest
 from fakes import FakeClock, FakeLink, FakeSource, vehicle_at
 from flights import STEP_DEG, Flight, of_kind
 from mavlink_peers import Peer, UdpPort, wait_until
 from pictures import textured
 
 from edgevpr.contract import FineMatch
-from edgevpr.geodesy import moved
+from edgevpr.geodesy import distance_m, moved
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.wire import mavlink
 from edgevpr.runtime.flight import autopilot
 from edgevpr.runtime.flight.autopilot import DRY_RUN
-from edgevpr.runtime.flight.consistency import Consistency
+from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.recognise.locate import Located
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.types import Candidate, Frame, Place, Position, QueryCost, Steps
@@ -25,143 +22,138 @@ NO_COST = QueryCost(
     t_encode_s=0, t_match_s=0, u_encode=0, u_match=0, cpu_s=0, rss_mb=0, used_mah=0, marginal_mah=0
 )  # fmt: skip
 HOME = 50.0, 8.0
+START_S = 1000.0
 
 
-def seen(
-    off_m, t_s=0.0, *, places=(1,), flown_m=(0.0, 0.0), sd_m=20.0, fix_sd_m=8.0, accuracy_m=8.0, heard_ago_s=0.0, **said
-):
-    """An accepted match at `t_s` that lies `off_m` (east, north) off the autopilot's position, which is `flown_m` from
-    home; `said` is what else it says of its vehicle."""
-    here = moved(*HOME, *flown_m)
-    position = Position(*moved(*here, *off_m))
-    said = {"has_gps": False, "position_sd_m": sd_m, "velocity_m_s": (0.0, 15.0)} | said
-    frame = Frame(image=np.zeros((8, 8), np.uint8), name="f", t_mono_s=1000.0 + t_s)
-    place = Place(place_id=places[0] if places else 1, source_image="", position=position)
-    return Recognition(
-        frame=frame,
-        vehicle=vehicle_at(*here, frame.t_mono_s - heard_ago_s, **said),
-        best=Candidate(place, FineMatch(0.5)),
-        accepted=True,
-        reason="",
-        located=Located(position=position, covariance_m2=(fix_sd_m**2, 0.0, fix_sd_m**2), places=places),
-        accuracy_m=accuracy_m,
-        steps=Steps(),
-        cost=NO_COST,
-    )
+class Aircraft:
+    """An aircraft that flies north, and loses GPS as the test begins. Its autopilot reckons without an error."""
+
+    def __init__(self, speed_m_s=15.0, has_gps=False):
+        self.navigator = Navigator(1.0, 1.0)
+        self.speed_m_s, self.has_gps = speed_m_s, has_gps
+        self.t_s = START_S - 5.0
+        self.go_on(START_S, has_gps=True)
+
+    def go_on(self, t_s, **said):
+        said = {"has_gps": self.has_gps, "position_sd_m": 2.0} | said
+        while self.t_s < t_s:
+            self.t_s = round(self.t_s + 0.2, 3)
+            here = moved(*HOME, 0.0, self.speed_m_s * (self.t_s - START_S))
+            velocity = (0.0, self.speed_m_s)
+            self.vehicle = vehicle_at(*here, self.t_s, velocity_m_s=velocity, roll_deg=0.0, pitch_deg=0.0, **said)
+            self.navigator.hear_vehicle(self.vehicle)
+
+    def told(self, off_m, after_s=0.0, *, places=(1,), fix_sd_m=8.0, heard=True):
+        """The advice on a match `after_s` seconds after the loss of GPS, `off_m` (east, north) off the aircraft."""
+        if heard:
+            self.go_on(START_S + after_s)
+        here = moved(self.vehicle.lat_deg, self.vehicle.lon_deg, *off_m)
+        frame = Frame(image=np.zeros((8, 8), np.uint8), name="f", t_mono_s=START_S + after_s)
+        place = Place(place_id=places[0] if places else 1, source_image="", position=Position(*here))
+        event = Recognition(
+            frame=frame,
+            vehicle=self.vehicle,
+            best=Candidate(place, FineMatch(0.5)),
+            accepted=True,
+            reason="",
+            located=Located(position=Position(*here), covariance_m2=(fix_sd_m**2, 0.0, fix_sd_m**2), places=places),
+            accuracy_m=fix_sd_m,
+            steps=Steps(),
+            cost=NO_COST,
+        )
+        return self.navigator.advise(event, START_S + after_s)
+
+    def held(self, *fixes):
+        """Tell which fixes (off_m, after_s, places) are held back, in turn."""
+        return [self.told(off_m, after_s, places=places).is_held for off_m, after_s, places in fixes]
 
 
-def held(*events):
-    """Which of the fixes are held back, in turn."""
-    consistency = Consistency()
-    return [consistency.objection(event) is not None for event in events]
-
-
-def test_a_fix_within_what_both_allow_is_sent():
-    assert held(seen((60, 50)), seen((-80, 0), 1.0), seen((0, 0), 2.0)) == [False] * 3
+def test_a_fix_within_what_both_allow_is_believed():
+    assert Aircraft().held(((10, 20), 1, (1,)), ((-15, 0), 2, (2,)), ((0, 0), 3, (3,))) == [False] * 3
 
 
 def test_one_that_contradicts_is_held_back_and_says_by_how_much():
-    said = Consistency().objection(seen((300, -400)))
-    assert said.startswith("held back: 500 m from where the autopilot is by its own reckoning, which is good to 20 m")
+    advice = Aircraft().told((300, -400), 1.0)
+    assert advice.fix is None
+    assert advice.why.startswith("held back: 500 m from where the aircraft is by the autopilot's reckoning")
 
 
-@pytest.mark.parametrize("more", [{"sd_m": 150.0}, {"fix_sd_m": 150.0}, {"accuracy_m": 150.0}])
-def test_what_either_does_not_know_gives_room(more):
-    assert held(seen((500, 0))) == [True]
-    assert held(seen((500, 0), **more)) == [False]
+def test_an_inexact_fix_has_room():
+    assert Aircraft().told((500, 0), 1.0).is_held
+    assert not Aircraft().told((500, 0), 1.0, fix_sd_m=150.0).is_held
 
 
-@pytest.mark.parametrize(("velocity_m_s", "is_held"), [((0.0, 0.0), True), ((0.0, 25.0), False), (None, False)])
-def test_what_was_flown_since_the_report_gives_room(velocity_m_s, is_held):
-    assert held(seen((100, 0), heard_ago_s=0.9, velocity_m_s=velocity_m_s)) == [is_held]
-
-
-def test_an_inexact_fix_has_room_only_where_it_is_inexact():
-    along = replace(seen((500, 0)).located, covariance_m2=(200.0**2, 0.0, 8.0**2))
-    east, north = seen((500, 0)), seen((0, 500))
-    assert held(replace(east, located=along, accuracy_m=200.0)) == [False]
-    assert held(replace(north, located=replace(along, position=north.position), accuracy_m=200.0)) == [True]
-
-
-@pytest.mark.parametrize(
-    "unknown", [{"sd_m": None}, {"has_gps": True}, {"heard_ago_s": 1.5}], ids=["certainty", "GPS", "stale"]
-)
-def test_where_the_autopilot_s_position_says_nothing_no_fix_is_held_back(unknown):
-    assert held(seen((500, 0), **unknown)) == [False]
-    consistency = Consistency()
-    consistency.objection(seen((500, 0)))
-    consistency.objection(seen((500, 0), 1.0, places=(2,), **unknown))
-    assert consistency.objection(seen((500, 0), 2.0, places=(3,))), "and what was held before is forgotten"
-
-
-def test_without_a_vehicle_no_fix_is_held_back():
-    assert held(replace(seen((500, 0)), vehicle=None)) == [False]
+def test_what_nobody_has_corrected_for_long_gives_room():
+    assert Aircraft().told((300, 0), 1.0).is_held
+    assert not Aircraft().told((300, 0), 60.0).is_held
 
 
 def test_a_second_one_of_another_place_that_says_the_same_is_sent_and_so_are_those_after_it():
-    events = [seen((500, 5 * t_s), t_s, places=(t_s,), flown_m=(0, 15 * t_s)) for t_s in range(6)]
-    assert held(*events) == [True] + [False] * 5
+    aircraft = Aircraft()
+    advices = [aircraft.told((500, 5 * t_s), t_s, places=(t_s,)) for t_s in range(1, 7)]
+    assert [advice.is_held for advice in advices] == [True] + [False] * 5
+    sent = advices[1].fix
+    assert distance_m(sent.lat_deg, sent.lon_deg, *moved(*HOME, 500, 10 + 15 * 2)) < 8, "and not between the two"
 
 
 def test_a_second_one_that_says_something_else_is_held_back_too():
-    assert held(seen((500, 0)), seen((-500, 0), 1.0, places=(2,)), seen((500, 200), 2.0, places=(3,))) == [True] * 3
+    fixes = ((500, 0), 1, (1,)), ((-500, 0), 2, (2,)), ((500, 200), 3, (3,))
+    assert Aircraft().held(*fixes) == [True] * 3
 
 
 def test_the_same_place_again_is_no_second_one_until_the_aircraft_has_moved_on():
-    hovering = [seen((500, 0), t_s) for t_s in range(4)]
-    assert held(*hovering) == [True] * 4
-    assert held(*hovering, seen((500, 0), 5.0, flown_m=(0, 150))) == [True] * 4 + [False]
-    stuck = [seen((500, -15 * t_s), t_s, flown_m=(0, 15 * t_s)) for t_s in range(0, 12)]
-    assert held(*stuck) == [True] * 12, "a fix that stays where it was says nothing new"
-
-
-def test_an_aircraft_that_creeps_on_has_moved_on_in_the_end():
-    creeping = [seen((500, 0), t_s, flown_m=(0, 12 * t_s)) for t_s in range(12)]
-    assert held(*creeping) == [True] * 7 + [False] * 5
+    hovering, creeping = Aircraft(speed_m_s=0.0), Aircraft(speed_m_s=12.0)
+    same = [((500, 0), t_s, (1,)) for t_s in range(1, 13)]
+    assert hovering.held(*same[:6]) == [True] * 6
+    found = creeping.held(*same)
+    assert found[:3] == [True] * 3
+    assert not found[-1]
+    stuck = Aircraft()
+    assert stuck.held(*[((500, -15 * t_s), t_s, (1,)) for t_s in range(1, 8)]) == [True] * 7, "it says nothing new"
 
 
 def test_places_that_are_partly_the_same_are_not_independent():
-    assert held(seen((500, 0), places=(1, 2)), seen((500, 0), 1.0, places=(2, 3))) == [True, True]
-    assert held(seen((500, 0), places=(1, 2)), seen((500, 0), 1.0, places=(3, 4))) == [True, False]
-    assert held(seen((500, 0), places=()), seen((500, 0), 1.0, places=())) == [True, True], "by the best place"
+    assert Aircraft().held(((500, 0), 1, (1, 2)), ((500, 0), 2, (2, 3))) == [True, True]
+    assert Aircraft().held(((500, 0), 1, (1, 2)), ((500, 0), 2, (3, 4))) == [True, False]
+    assert Aircraft().held(((500, 0), 1, ()), ((500, 0), 2, ())) == [True, True], "by the best place"
 
 
 def test_a_single_wrong_one_among_right_ones_is_all_that_is_held_back():
-    events = [seen((0, 0), t_s, places=(t_s,)) for t_s in range(6)]
-    events[3] = seen((500, 0), 3.0, places=(90,))
-    assert held(*events) == [False, False, False, True, False, False]
+    fixes = [((0, 0), t_s, (t_s,)) for t_s in range(1, 7)]
+    fixes[3] = (500, 0), 4, (90,)
+    assert Aircraft().held(*fixes) == [False, False, False, True, False, False]
 
 
 def test_a_wrong_one_among_those_that_agree_against_the_autopilot_is_held_back():
-    events = [seen((500, 0), t_s, places=(t_s,)) for t_s in range(6)]
-    events[3] = seen((-700, 0), 3.0, places=(90,))
-    assert held(*events) == [True, False, False, True, False, False]
+    fixes = [((500, 0), t_s, (t_s,)) for t_s in range(1, 7)]
+    fixes[3] = (-700, 0), 4, (90,)
+    assert Aircraft().held(*fixes) == [True, False, False, True, False, False]
 
 
 def test_two_that_agree_across_one_that_agrees_with_the_autopilot_do_not_count():
-    assert held(seen((500, 0)), seen((0, 0), 1.0, places=(2,)), seen((500, 0), 2.0, places=(3,))) == [True, False, True]
-
-
-def test_when_the_autopilot_has_taken_the_fix_the_old_offset_is_a_contradiction_again():
-    events = [seen((500, 0)), seen((500, 0), 1.0, places=(2,)), seen((3, 0), 2.0, places=(3,))]
-    assert held(*events, seen((500, 0), 3.0, places=(4,))) == [True, False, False, True]
-
-
-def test_the_autopilot_s_reckoning_may_drift_between_two_that_agree():
-    assert held(seen((500, 0)), seen((530, 0), 10.0, places=(2,))) == [True, False]
-    assert held(seen((500, 0)), seen((530, 0), 1.0, places=(2,))) == [True, True]
-
-
-def test_those_that_agree_are_sent_for_as_long_as_they_come():
-    drifting = [seen((500 + 2 * t_s, 0), t_s, places=(t_s,)) for t_s in range(0, 120, 8)]
-    assert held(*drifting) == [True] + [False] * 14
+    fixes = ((500, 0), 1, (1,)), ((0, 0), 2, (2,)), ((500, 0), 3, (3,))
+    assert Aircraft().held(*fixes) == [True, False, True]
 
 
 def test_what_agreed_long_ago_is_forgotten():
-    assert held(seen((500, 0)), seen((500, 0), 31.0, places=(2,))) == [True, True]
-    agreed = seen((500, 0)), seen((500, 0), 1.0, places=(2,))
-    assert held(*agreed, seen((500, 0), 30.0, places=(3,))) == [True, False, False]
-    assert held(*agreed, seen((500, 0), 32.0, places=(3,))) == [True, False, True]
+    near, late = Aircraft(speed_m_s=1.0), Aircraft(speed_m_s=1.0)
+    assert near.held(((900, 0), 1, (1,)), ((900, 0), 28, (2,))) == [True, False]
+    assert late.held(((900, 0), 1, (1,)), ((900, 0), 33, (2,))) == [True, True]
+
+
+def test_against_gps_no_fix_is_believed():
+    aircraft = Aircraft(has_gps=True)
+    advices = [aircraft.told((500, 0), t_s, places=(t_s,)) for t_s in range(1, 5)]
+    assert all(advice.is_held for advice in advices)
+    assert advices[0].why.startswith("held back: 500 m from where GPS")
+
+
+def test_where_the_autopilot_says_nothing_of_its_position_a_fix_is_sent_as_it_is():
+    aircraft = Aircraft()
+    assert not aircraft.told((500, 0), 2.5, heard=False).is_held, "its last report is too old"
+    knows_nothing = Navigator(1.0, 1.0)
+    aircraft.navigator = knows_nothing
+    assert aircraft.told((500, 0), 3.0, heard=False).fix
 
 
 def fly(recording, tmp_path, pictures, off_deg=0.05, has_gps=False, **settings):
@@ -170,7 +162,8 @@ def fly(recording, tmp_path, pictures, off_deg=0.05, has_gps=False, **settings):
 
     def vehicle():
         north = 50 + STEP_DEG * (clock.now_s - 1000.0)
-        return vehicle_at(north, 8.0 + off_deg, clock.now_s, has_gps=has_gps, position_sd_m=20.0)
+        said = {"has_gps": has_gps, "position_sd_m": 20.0, "velocity_m_s": (0.0, STEP_DEG * 111_195)}
+        return vehicle_at(north, 8.0 + off_deg, clock.now_s, **said)
 
     link = FakeLink(clock, vehicle=vehicle)
     flight = Flight(recording / "cohog.gpkg", tmp_path / "log", clock, link, **{"source.rate_hz": 1.0} | settings)
@@ -182,7 +175,7 @@ def test_in_flight_a_fix_held_back_is_in_the_log_and_the_ground_is_told_once(rec
     queries, link = fly(recording, tmp_path, (0, 20, 2, 3, 4))
     assert all(line["accepted"] for line in queries), "held back or not, the match stays accepted"
     assert [line["fix"]["sent"] for line in queries] == [False, False, False, True, True]
-    assert queries[0]["fix"]["why"].startswith("held back: 3574 m from where the autopilot is")
+    assert queries[0]["fix"]["why"].startswith("held back: 3574 m from where the aircraft is")
     assert link.stats().fixes_sent == 2
     assert link.texts() == [
         (4, "edgevpr: fix held back, contradicts autopilot"),
@@ -209,7 +202,8 @@ def test_over_a_real_link_it_is_what_the_autopilot_says_of_itself_that_counts(re
             peer.heartbeat()
             peer.send(mavlink.MAVLink_gps_raw_int_message(0, 1 if turn else 3, *where, 0, 80, 120, 0, 0, 14))
             peer.send(mavlink.MAVLink_ekf_status_report_message(flags, 0.1, 0.1, 0.1, 0.1, 0.1))
-            peer.send(mavlink.MAVLink_global_position_int_message(0, *where, 0, 80_000, 1500, 0, 0, 0))
+            north_cm_s = round(STEP_DEG * 111_195 * 100)
+            peer.send(mavlink.MAVLink_global_position_int_message(0, *where, 0, 80_000, north_cm_s, 0, 0, 0))
             wait_until(lambda: link.vehicle() and link.vehicle().t_heard_s == clock.now_s)
 
         flight = Flight(recording / "cohog.gpkg", tmp_path / "log", clock, link, **{"source.rate_hz": 1.0})
@@ -221,9 +215,10 @@ def test_over_a_real_link_it_is_what_the_autopilot_says_of_itself_that_counts(re
     assert "good to 6 m" in queries[1]["fix"]["why"], "5 m by GPS, and a second of drift"
 
 
-def test_in_flight_with_gps_nothing_is_held_back(recording, tmp_path):
-    queries, link = fly(recording, tmp_path, (0, 1), has_gps=True)
-    assert [line["fix"]["sent"] for line in queries] == [True, True]
+def test_in_flight_with_gps_that_agrees_no_fix_is_needed(recording, tmp_path):
+    queries, link = fly(recording, tmp_path, (0, 1), off_deg=0.0, has_gps=True)
+    assert [line["fix"]["sent"] for line in queries] == [False, False]
+    assert queries[0]["fix"]["why"].startswith("not needed: the autopilot is 0.0 m from our position")
     assert link.texts() == []
 
 

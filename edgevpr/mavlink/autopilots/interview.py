@@ -1,0 +1,87 @@
+"""The questions to an autopilot that has just been heard, and the channel that follows from its answers."""
+
+import logging
+import math
+import struct
+from collections.abc import Iterator
+
+from edgevpr.mavlink.autopilots import ardupilot, px4
+from edgevpr.mavlink.autopilots.channel import Asked, Channel, Choice, Kind, kind_of
+from edgevpr.mavlink.wire import Message, mavlink
+
+_ASK_EVERY_S, _TIMES = 1.0, 4
+_UNKNOWN = Choice(Channel.COMMAND, "command 43003, the only one that is asked of an unknown firmware")
+_FIRMWARES = {mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: ardupilot, mavlink.MAV_AUTOPILOT_PX4: px4}
+_FLOATS = (mavlink.MAV_PARAM_TYPE_REAL32, mavlink.MAV_PARAM_TYPE_REAL64)
+
+log = logging.getLogger(__name__)
+
+
+class Interview:
+    """Asks an autopilot for its version and a few parameters, a few times where answers are missing (an autopilot does
+    not answer for a parameter that it does not have). `choice` is the channel: until all has been asked, that of an
+    autopilot that has answered nothing."""
+
+    def __init__(self) -> None:
+        self.choice = _UNKNOWN
+        self.kind = Kind.OTHER
+        self._firmware = mavlink.MAV_AUTOPILOT_GENERIC
+        self._version: tuple[int, int] | None = None
+        self._parameters: dict[str, float] = {}
+        self._asked, self._ask_s = 0, -math.inf
+        self._is_over = False
+
+    def hear(self, message: Message) -> None:
+        """Take in a message of the autopilot."""
+        match message.get_type():
+            case "HEARTBEAT":
+                self._firmware, self.kind = message.autopilot, kind_of(message.type)
+            case "AUTOPILOT_VERSION":
+                self._version = message.flight_sw_version >> 24 & 255, message.flight_sw_version >> 16 & 255
+            case "PARAM_VALUE" if message.param_id in self._wanted():
+                self._parameters[message.param_id] = _value(message, self._firmware)
+
+    def questions(self, now_s: float, target_system: int) -> Iterator[Message]:
+        """Yield the questions that are due. After the last of them, and a while for the answers, the channel is
+        chosen."""
+        if self._is_over or now_s - self._ask_s < _ASK_EVERY_S:
+            return
+        missing = [name for name in self._wanted() if name not in self._parameters]
+        if self._asked == _TIMES or (self._version and not missing):
+            self._choose()
+            return
+        self._asked, self._ask_s = self._asked + 1, now_s
+        if self._version is None:
+            yield mavlink.MAVLink_command_long_message(
+                target_system,
+                mavlink.MAV_COMP_ID_AUTOPILOT1,
+                mavlink.MAV_CMD_REQUEST_MESSAGE,
+                0,
+                mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION,
+                *[0.0] * 6,
+            )
+        for name in missing:
+            yield mavlink.MAVLink_param_request_read_message(
+                target_system, mavlink.MAV_COMP_ID_AUTOPILOT1, name.encode(), -1
+            )
+
+    def _wanted(self) -> tuple[str, ...]:
+        firmware = _FIRMWARES.get(self._firmware)
+        return firmware.PARAMETERS if firmware else ()
+
+    def _choose(self) -> None:
+        self._is_over = True
+        firmware = _FIRMWARES.get(self._firmware)
+        if firmware:
+            asked = Asked(kind=self.kind, version=self._version, parameters=self._parameters)
+            self.choice = firmware.choice(asked)
+        said = f" {self._version[0]}.{self._version[1]}" if self._version else ""
+        named = {ardupilot: "ArduPilot", px4: "PX4"}.get(firmware, "unknown firmware")
+        log.info("%s%s on a %s: positions go to it by %s", named, said, self.kind.value, self.choice.reason)
+
+
+def _value(message: Message, firmware: int) -> float:
+    """Return the value of a parameter. PX4 sends the bytes of a whole number in the place of the float's."""
+    if firmware != mavlink.MAV_AUTOPILOT_PX4 or message.param_type in _FLOATS:
+        return message.param_value
+    return float(struct.unpack("<i", struct.pack("<f", message.param_value))[0])

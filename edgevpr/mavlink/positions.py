@@ -1,0 +1,145 @@
+"""Messages of a continuous position, and of one that is not a command: pure functions, as in `messages`."""
+
+import math
+from dataclasses import dataclass
+
+from edgevpr.geodesy import offset_m
+from edgevpr.mavlink.messages import Fix
+from edgevpr.mavlink.wire import Message, mavlink
+
+_GPS_EPOCH_S, _LEAP_S = 315_964_800, 18  # 1980-01-06; leap seconds since then, as of 2017
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class State:
+    """Position and motion of the vehicle at `t_mono_s`: altitude above sea level, velocity east, north and down, and
+    standard deviations (1 sigma of one axis; `alt_accuracy_m` of the altitude). `attitude` is roll, pitch and yaw in
+    radians."""
+
+    t_mono_s: float
+    lat_deg: float
+    lon_deg: float
+    alt_m: float
+    velocity_m_s: tuple[float, float, float]
+    accuracy_m: float
+    alt_accuracy_m: float
+    speed_accuracy_m_s: float
+    attitude: tuple[float, float, float] | None = None
+
+
+def position_sensor(fix: Fix, t_sent_s: float) -> Message:
+    """Make a GLOBAL_POSITION_SENSOR (296): a position by vision, without altitude. PX4 takes it to be of the moment at
+    which it arrives, less a parameter of its own."""
+    return mavlink.MAVLink_global_position_sensor_message(
+        target_system=0,
+        target_component=0,
+        id=0,
+        time_usec=round(t_sent_s * 1e6),
+        processing_time=0,
+        source=mavlink.GLOBAL_POSITION_SRC_VISION,
+        flags=0,
+        lat=round(fix.lat_deg * 1e7),
+        lon=round(fix.lon_deg * 1e7),
+        alt=math.nan,
+        alt_ellipsoid=math.nan,
+        eph=fix.accuracy_m,
+        epv=math.nan,
+    )
+
+
+def gps_input(state: State | None, receiver: int, t_mono_s: float, t_unix_s: float | None) -> Message:
+    """Make a GPS_INPUT (232) as the receiver of this number; a `state` of None says that there is no fix. `t_unix_s` is
+    the time of the state by the vehicle's clock, seconds since 1970 (None: unknown)."""
+    week, week_ms = _gps_time(t_unix_s)
+    ignored = mavlink.GPS_INPUT_IGNORE_FLAG_HDOP | mavlink.GPS_INPUT_IGNORE_FLAG_VDOP
+    told = {}
+    if state:
+        east, north, down = state.velocity_m_s
+        told = {
+            "lat": round(state.lat_deg * 1e7),
+            "lon": round(state.lon_deg * 1e7),
+            "alt": state.alt_m,
+            "vn": north,
+            "ve": east,
+            "vd": down,
+            "speed_accuracy": state.speed_accuracy_m_s,
+            "horiz_accuracy": state.accuracy_m,
+            "vert_accuracy": state.alt_accuracy_m,
+        }
+    names = ["lat", "lon", "alt", "vn", "ve", "vd", "speed_accuracy", "horiz_accuracy", "vert_accuracy"]
+    return mavlink.MAVLink_gps_input_message(
+        time_usec=round(t_mono_s * 1e6),
+        gps_id=receiver,
+        ignore_flags=ignored,
+        time_week_ms=week_ms,
+        time_week=week,
+        fix_type=mavlink.GPS_FIX_TYPE_3D_FIX if state else mavlink.GPS_FIX_TYPE_NO_FIX,
+        hdop=0.0,
+        vdop=0.0,
+        # The fewest with which a filter begins, so that a real receiver is always preferred.
+        satellites_visible=6 if state else 0,
+        **{name: told.get(name, 0) for name in names},
+    )
+
+
+def odometry(state: State, origin: tuple[float, float, float]) -> Message:
+    """Make an ODOMETRY (331) in the only frames that ArduPilot takes: position north, east, down of an `origin`
+    (degrees, metres above sea level), velocity along the airframe."""
+    east_m, north_m = offset_m(origin[0], origin[1], state.lat_deg, state.lon_deg)
+    roll, pitch, yaw = state.attitude
+    east, north, down = state.velocity_m_s
+    vx, vy, vz = _along_airframe((north, east, down), roll, pitch, yaw)
+    # The upper triangle of 6 x 6, row by row. Only what is known stands in its diagonal.
+    pose, velocity = [math.nan] * 21, [math.nan] * 21
+    pose[0] = pose[6] = state.accuracy_m**2
+    pose[11] = state.alt_accuracy_m**2
+    velocity[0] = velocity[6] = velocity[11] = state.speed_accuracy_m_s**2
+    return mavlink.MAVLink_odometry_message(
+        time_usec=round(state.t_mono_s * 1e6),
+        frame_id=mavlink.MAV_FRAME_LOCAL_FRD,
+        child_frame_id=mavlink.MAV_FRAME_BODY_FRD,
+        x=float(north_m),
+        y=float(east_m),
+        z=origin[2] - state.alt_m,
+        q=_quaternion(roll, pitch, yaw),
+        vx=vx,
+        vy=vy,
+        vz=vz,
+        rollspeed=math.nan,
+        pitchspeed=math.nan,
+        yawspeed=math.nan,
+        pose_covariance=pose,
+        velocity_covariance=velocity,
+        reset_counter=0,
+        estimator_type=mavlink.MAV_ESTIMATOR_TYPE_VISION,
+        quality=100,
+    )
+
+
+def _gps_time(t_unix_s: float | None) -> tuple[int, int]:
+    """Return week and millisecond of the week of GPS; 0, 0 where the time is unknown."""
+    if t_unix_s is None:
+        return 0, 0
+    weeks, rest_s = divmod(t_unix_s - _GPS_EPOCH_S + _LEAP_S, 604_800)
+    return int(weeks), int(rest_s * 1000)
+
+
+def _quaternion(roll: float, pitch: float, yaw: float) -> list[float]:
+    """Return the rotation from the airframe to north, east, down (w, x, y, z)."""
+    (cr, sr), (cp, sp), (cy, sy) = ((math.cos(each / 2), math.sin(each / 2)) for each in (roll, pitch, yaw))
+    return [
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    ]
+
+
+def _along_airframe(
+    velocity: tuple[float, float, float], roll: float, pitch: float, yaw: float
+) -> tuple[float, float, float]:
+    """Turn a velocity north, east, down to nose, right, down of the airframe."""
+    north, east, down = velocity
+    ahead, right = north * math.cos(yaw) + east * math.sin(yaw), east * math.cos(yaw) - north * math.sin(yaw)
+    ahead, down = ahead * math.cos(pitch) - down * math.sin(pitch), ahead * math.sin(pitch) + down * math.cos(pitch)
+    return ahead, right * math.cos(roll) + down * math.sin(roll), down * math.cos(roll) - right * math.sin(roll)

@@ -1,0 +1,100 @@
+"""The way that an aircraft has flown by its own sensors: velocities, or accelerations, summed up.
+
+A path starts where it may and drifts. It never jumps, so it can be compared with fixes over any time; the position that
+an autopilot reports jumps wherever the autopilot is corrected.
+"""
+
+import math
+from bisect import bisect_left
+from dataclasses import dataclass
+
+import numpy as np
+
+KEPT_S = 6.0  # a frame is at most 5 s old when it is recognised
+_LONGEST_STEP_S = 1.0  # after a longer silence nobody knows the way that was flown
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """A point of a path: time in seconds, metres and m/s, each (2,) east and north."""
+
+    t_s: float
+    at_m: np.ndarray
+    velocity_m_s: np.ndarray
+
+
+class Path:
+    """The points of the last seconds; the last one is `now`. `is_broken` tells that there was a silence in it, until
+    `start`."""
+
+    def __init__(self) -> None:
+        self._points: list[Point] = []
+        self.is_broken = False
+
+    @property
+    def now(self) -> Point | None:
+        return self._points[-1] if self._points else None
+
+    def start(self, t_s: float, velocity_m_s: np.ndarray) -> None:
+        """Begin a new path, at a velocity (2,)."""
+        self._points, self.is_broken = [Point(t_s, np.zeros(2), np.asarray(velocity_m_s, float))], False
+
+    def fly(self, t_s: float, velocity_m_s: np.ndarray) -> float:
+        """Go on to a time at which the velocity (2,) is this one, and return the seconds that it took; 0 for a time
+        that is not later."""
+        last = self._points[-1]
+        step_s = t_s - last.t_s
+        if not step_s > 0:
+            return 0.0
+        self.is_broken |= step_s > _LONGEST_STEP_S
+        velocity_m_s = np.asarray(velocity_m_s, float)
+        at_m = last.at_m + step_s / 2 * (last.velocity_m_s + velocity_m_s)
+        self._points.append(Point(t_s, at_m, velocity_m_s))
+        if self._points[0].t_s < t_s - 2 * KEPT_S:  # seldom: it moves all of them
+            del self._points[: bisect_left(self._points, t_s - KEPT_S, key=_time)]
+        return step_s
+
+    def accelerate(self, t_s: float, acceleration_m_s2: np.ndarray) -> float:
+        """Go on to a time with a mean acceleration (2,) over the ground, and return the seconds that it took."""
+        last = self._points[-1]
+        return self.fly(t_s, last.velocity_m_s + max(0.0, t_s - last.t_s) * np.asarray(acceleration_m_s2, float))
+
+    def at(self, t_s: float) -> Point | None:
+        """Return the point at a time; beyond the end the last velocity goes on. None before the first that is kept, and
+        more than a second beyond the last."""
+        if not self._points or not self._points[0].t_s <= t_s <= self._points[-1].t_s + _LONGEST_STEP_S:
+            return None
+        after = bisect_left(self._points, t_s, key=_time)
+        if after == len(self._points):
+            last = self._points[-1]
+            return Point(t_s, last.at_m + (t_s - last.t_s) * last.velocity_m_s, last.velocity_m_s)
+        if after == 0:
+            return self._points[0]
+        one, other = self._points[after - 1], self._points[after]
+        step_s = other.t_s - one.t_s
+        share = (t_s - one.t_s) / step_s
+        velocity_m_s = one.velocity_m_s + share * (other.velocity_m_s - one.velocity_m_s)
+        at_m = one.at_m + share * step_s / 2 * (one.velocity_m_s + velocity_m_s)
+        return Point(t_s, at_m, velocity_m_s)
+
+
+def over_ground(
+    force_m_s2: tuple[float, float, float], roll_deg: float, pitch_deg: float, yaw_deg: float
+) -> np.ndarray:
+    """Return the acceleration over the ground (2,), east and north, from what accelerometers feel (nose, right, down)
+    at an attitude: gravity has no part in it."""
+    roll, pitch, yaw = map(math.radians, (roll_deg, pitch_deg, yaw_deg))
+    ahead, right, down = force_m_s2
+    low = right * math.sin(roll) + down * math.cos(roll)
+    forward = ahead * math.cos(pitch) + low * math.sin(pitch)
+    sideways = right * math.cos(roll) - down * math.sin(roll)
+    return np.array(
+        [
+            forward * math.sin(yaw) + sideways * math.cos(yaw),
+            forward * math.cos(yaw) - sideways * math.sin(yaw),
+        ]
+    )
+
+
+def _time(point: Point) -> float:
+    return point.t_s

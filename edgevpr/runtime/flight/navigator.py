@@ -1,0 +1,181 @@
+"""Navigation in flight: hears the vehicle's motion from the link and the matches from the loop, and says what is worth
+being sent.
+
+The link calls in its own thread, the loop in the main one.
+"""
+
+import math
+from dataclasses import dataclass
+from threading import Lock
+
+import numpy as np
+
+from edgevpr.geodesy import distance_m, moved
+from edgevpr.mavlink.attitude import Attitude
+from edgevpr.mavlink.autopilots.channel import Channel
+from edgevpr.mavlink.messages import Fix
+from edgevpr.mavlink.positions import State
+from edgevpr.navigation.filter import INERTIAL, RECKONED
+from edgevpr.navigation.navigation import Navigation
+from edgevpr.navigation.path import over_ground
+from edgevpr.navigation.slew import Slew
+from edgevpr.runtime.flight.consistency import Consistency, Seen
+from edgevpr.runtime.recognise.locate import matrix_of
+from edgevpr.runtime.recognise.recognition import Recognition
+from edgevpr.types import Vehicle
+
+# What comes on top of what a fix knows of itself: the attitude is known to about a degree, and the time of a frame to
+# some hundredths of a second.
+_ATTITUDE_SD, _TIME_SD_S = math.tan(math.radians(1.0)), 0.05
+_UNTOLD_ATTITUDE_SD = math.tan(math.radians(15.0))  # where the autopilot tells none: an aircraft that turns banks
+_LOST_M, _LOST_S = 50.0, 60.0  # a continuous position that is worse, or without a fix for longer, is none
+_ALT_SD_M = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class Advice:
+    """Advice on an accepted match: the `fix` that is to be sent, or the reason `why` there is none. `is_held`: it
+    contradicts what is known."""
+
+    fix: Fix | None
+    why: str | None = None
+    is_held: bool = False
+
+
+class Navigator:
+    """Navigates by one autopilot. `map_sd_m` is by how much all fixes may be off together, `every_s` the time between
+    two queries."""
+
+    def __init__(self, map_sd_m: float, every_s: float) -> None:
+        self._lock = Lock()
+        self._map_sd_m, self._every_s = map_sd_m, every_s
+        self._navigation = Navigation(RECKONED, map_sd_m)
+        self._consistency = Consistency()
+        self._slew = Slew()
+        self._vehicle: Vehicle | None = None
+        self._attitude: Attitude | None = None
+        self._is_continuous = False
+
+    def hear_channel(self, channel: Channel) -> None:
+        """Take in by which channel the autopilot is told positions: a continuous position must not rest on the velocity
+        that the autopilot has from it, and is carried on by accelerations."""
+        with self._lock:
+            if channel.is_continuous != self._is_continuous:
+                self._is_continuous = channel.is_continuous
+                self._navigation = Navigation(INERTIAL if self._is_continuous else RECKONED, self._map_sd_m)
+
+    def hear_vehicle(self, vehicle: Vehicle) -> None:
+        """Take in a report of position and velocity."""
+        with self._lock:
+            self._vehicle = vehicle
+            self._navigation.hear_vehicle(vehicle)
+
+    def hear_force(self, t_s: float, force_m_s2: tuple[float, float, float], attitude: Attitude) -> None:
+        """Take in what the accelerometers feel."""
+        acceleration_m_s2 = over_ground(force_m_s2, attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg)
+        with self._lock:
+            self._attitude = attitude
+            self._navigation.hear_acceleration(t_s, acceleration_m_s2)
+
+    def advise(self, event: Recognition, now_s: float) -> Advice:
+        """Take in an accepted match with a position, and say what is to be sent for it. Raises ValueError for a
+        position off the Earth."""
+        if event.view.reason:
+            return Advice(None, f"not sent: {event.view.reason}, so it does not show what is under the aircraft")
+        here = event.position
+        fix = Fix(here.lat_deg, here.lon_deg, event.accuracy_m, event.frame.t_mono_s)
+        with self._lock:
+            vehicle = self._vehicle
+            if vehicle is None or vehicle.velocity_m_s is None or not vehicle.is_fresh_at(now_s):
+                return Advice(fix)  # nothing else is known
+            covariance_m2 = _covariance(event, event.vehicle or vehicle)
+            t_s = event.frame.t_mono_s
+            expected = self._navigation.expected(t_s)
+            if expected is None:
+                if not vehicle.has_gps:
+                    self._navigation.begin(here, math.sqrt(np.linalg.eigvalsh(covariance_m2)[-1]), vehicle, t_s)
+                return Advice(fix)
+            off_m = self._navigation.beside(here, expected)
+            seen = Seen(
+                off_m=off_m,
+                covariance_m2=covariance_m2,
+                path_m=expected.path_m,
+                t_s=t_s,
+                places=event.located.places or (event.best.place.place_id,),
+            )
+            verdict = self._consistency.weighed(seen, expected, vehicle.has_gps)
+            if verdict.objection:
+                return Advice(None, verdict.objection, is_held=True)
+            self._navigation.hear_fix(off_m, covariance_m2, t_s, verdict.is_against)
+            return self._improved(vehicle, now_s)
+
+    def state_at(self, t_s: float) -> State | None:
+        """Return where the vehicle is or was, to be sent as a continuous position; None: that is not known well
+        enough."""
+        with self._lock:
+            vehicle, navigation = self._vehicle, self._navigation
+            estimate = navigation.at(t_s)
+            is_lost = estimate is None or t_s - navigation.fixed_s > _LOST_S or estimate.accuracy_m > _LOST_M
+            if is_lost or vehicle is None:
+                self._slew.forget()
+                return None
+            lat_deg, lon_deg, behind_m = self._slew.followed(estimate)
+            east, north = estimate.velocity_m_s
+            attitude = self._attitude
+            return State(
+                t_mono_s=t_s,
+                lat_deg=lat_deg,
+                lon_deg=lon_deg,
+                alt_m=vehicle.alt_m,
+                velocity_m_s=(east, north, vehicle.sink_m_s or 0.0),
+                accuracy_m=math.hypot(max(estimate.accuracy_m, self._map_sd_m), behind_m),
+                alt_accuracy_m=_ALT_SD_M,
+                speed_accuracy_m_s=estimate.speed_accuracy_m_s,
+                attitude=attitude
+                and (
+                    math.radians(attitude.roll_deg),
+                    math.radians(attitude.pitch_deg),
+                    math.radians(attitude.yaw_deg),
+                ),
+            )
+
+    def _improved(self, vehicle: Vehicle, now_s: float) -> Advice:
+        """Say what is to be sent so that the autopilot is better off, if it can be."""
+        if self._is_continuous:
+            return Advice(None, "taken into the continuous position")
+        estimate = self._navigation.at(now_s)
+        east_m_s, north_m_s = vehicle.velocity_m_s
+        since_s = now_s - vehicle.t_heard_s
+        there = moved(vehicle.lat_deg, vehicle.lon_deg, since_s * east_m_s, since_s * north_m_s)
+        here = estimate.position
+        off_m = float(distance_m(*there, here.lat_deg, here.lon_deg))
+        # Its mean square error is that of the estimate and this; without this, it is that of the estimate alone.
+        if off_m**2 <= 2 * estimate.accuracy_m**2:
+            return Advice(
+                None,
+                f"not needed: the autopilot is {off_m:.1f} m from where we are, good to {estimate.accuracy_m:.1f} m",
+            )
+        # So that the autopilot is right in the middle of the time until the next fix.
+        drift_m_s = self._navigation.path_drift_m_s()
+        at = moved(here.lat_deg, here.lon_deg, *(self._every_s / 2 * each for each in drift_m_s))
+        return Advice(Fix(*at, max(self._map_sd_m, estimate.accuracy_m), now_s))
+
+
+class Muted:
+    """Navigates as a `Navigator` does, and gives no continuous position: for a dry run."""
+
+    def __init__(self, navigator: Navigator) -> None:
+        self.hear_channel, self.hear_vehicle = navigator.hear_channel, navigator.hear_vehicle
+        self.hear_force = navigator.hear_force
+
+    def state_at(self, t_s: float) -> None:
+        return None
+
+
+def _covariance(event: Recognition, vehicle: Vehicle) -> np.ndarray:
+    """Return the covariance (2, 2) of a fix, without what all fixes of the map have in common."""
+    speed_m_s = math.hypot(*vehicle.velocity_m_s)
+    height_m = vehicle.height_m or 0.0
+    tilt_sd = _ATTITUDE_SD if vehicle.roll_deg is not None else _UNTOLD_ATTITUDE_SD
+    more_m2 = (tilt_sd * height_m) ** 2 + (_TIME_SD_S * speed_m_s) ** 2
+    return matrix_of(event.located.covariance_m2) + more_m2 * np.eye(2)
