@@ -1,0 +1,145 @@
+"""A camera under the aircraft: pictures of the ground from the true pose, served over HTTP on loopback.
+
+They are Motion JPEG in NUT, a container of FFmpeg's that gives every picture its time. (Over HTTP alone pictures have
+none: edgevpr then takes the earliest at which one can have been taken, which at five pictures a second is 0.2 s off.)
+A picture is rendered for a moment shortly ahead and leaves at that moment, so it is as if it had been taken then.
+"""
+
+import contextlib
+import threading
+import time
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import av
+import ground
+import numpy as np
+from truth import Truth
+
+from edgevpr.simulate.camera import Pose
+
+PICTURES_HZ = 5.0
+_LEAD_S = 0.08  # rendering takes 20 to 60 ms
+_UNIT = Fraction(1, 10_000)  # of the time stamps, in seconds
+_BEYOND_DEG = 60.0  # a picture that is tilted farther shows the sky
+COLUMNS = ("t_s", "late_s", "east_m", "north_m", "height_m", "heading_deg", "roll_deg", "pitch_deg")
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A picture and the time at which it is taken."""
+
+    number: int
+    t_mono_s: float
+    jpeg: bytes
+
+
+class Camera:
+    """Serves pictures at `uri` from the begin of the `with` block to its end, and writes the true pose of each to a
+    file. `is_level`: on a gimbal; else fixed to the airframe."""
+
+    def __init__(self, truth: Truth, lit_ground: np.ndarray, *, day: str, is_level: bool, port: int, log: Path) -> None:
+        self._truth, self._ground, self._day, self._is_level = truth, lit_ground, day, is_level
+        self._log, self._rng = log, np.random.default_rng(ground.SEED + 1)
+        self._picture: Picture | None = None
+        self._is_on, self._changed = True, threading.Condition()
+        self._server = ThreadingHTTPServer(("127.0.0.1", port), _Viewer)
+        self._server.daemon_threads = True
+        self._server.camera = self
+        self.uri = f"http://127.0.0.1:{self._server.server_port}/"
+        self._threads = [threading.Thread(target=work) for work in (self._server.serve_forever, self._take)]
+
+    def __enter__(self) -> "Camera":
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._is_on = False
+        self._server.shutdown()
+        for thread in self._threads:
+            thread.join()
+        self._server.server_close()
+
+    def next(self, after: int) -> Picture | None:
+        """Wait for a picture after that of a number; None where the camera is off."""
+        with self._changed:
+            self._changed.wait_for(lambda: (self._picture and self._picture.number > after) or not self._is_on)
+            return self._picture if self._is_on else None
+
+    def _take(self) -> None:
+        due_s = time.monotonic() + 1.0
+        number = 0
+        with open(self._log, "w", encoding="utf-8", buffering=1) as log:
+            log.write(",".join(COLUMNS) + "\n")
+            while self._is_on:
+                due_s = max(due_s + 1 / PICTURES_HZ, time.monotonic())  # what was missed is left out
+                time.sleep(max(0.0, due_s - _LEAD_S - time.monotonic()))
+                pose = self._truth.at(due_s)
+                if pose is None:
+                    continue
+                jpeg = self._rendered(pose)
+                time.sleep(max(0.0, due_s - time.monotonic()))
+                late_s = time.monotonic() - due_s
+                number += 1
+                with self._changed:
+                    self._picture = Picture(number, due_s, jpeg)
+                    self._changed.notify_all()
+                where = (pose.east_m, pose.north_m, pose.height_m, pose.heading_deg, pose.roll_deg, pose.pitch_deg)
+                log.write(",".join((f"{due_s:.4f}", f"{late_s:.4f}", *(f"{each:.3f}" for each in where))) + "\n")
+        with self._changed:
+            self._changed.notify_all()
+
+    def _rendered(self, pose: Pose) -> bytes:
+        pose = replace(pose, height_m=max(pose.height_m, 1.0))
+        if self._is_level:
+            pose = replace(pose, roll_deg=0.0, pitch_deg=0.0)
+        elif max(abs(pose.roll_deg), abs(pose.pitch_deg)) > _BEYOND_DEG:
+            pose = replace(pose, height_m=1.0, roll_deg=0.0, pitch_deg=0.0)  # nothing to be seen
+        return ground.picture(self._ground, pose, self._day, self._rng)
+
+
+class _Viewer(BaseHTTPRequestHandler):
+    def log_message(self, *_: object) -> None:
+        pass
+
+    def do_GET(self) -> None:
+        self.send_response(200)
+        self.send_header("Content-Type", "video/x-nut")
+        self.end_headers()
+        with contextlib.suppress(OSError, av.FFmpegError):  # the viewer has gone
+            self._send_pictures()
+
+    def _send_pictures(self) -> None:
+        options = {"flush_packets": "1", "write_index": "0"}
+        with av.open(_Sink(self.wfile), "w", format="nut", options=options, buffer_size=4096) as container:
+            stream = container.add_stream("mjpeg", rate=int(PICTURES_HZ))
+            camera = ground.CAMERAS["later"]
+            stream.width, stream.height, stream.pix_fmt, stream.time_base = (
+                camera.width,
+                camera.height,
+                "yuvj420p",
+                _UNIT,
+            )
+            picture, began_s = self.server.camera.next(0), None
+            while picture:
+                began_s = began_s or picture.t_mono_s
+                packet = av.Packet(picture.jpeg)
+                packet.stream, packet.time_base, packet.is_keyframe = stream, _UNIT, True
+                packet.pts = packet.dts = round((picture.t_mono_s - began_s) / _UNIT)
+                container.mux(packet)
+                self.wfile.flush()
+                picture = self.server.camera.next(picture.number)
+
+
+class _Sink:
+    """A file that FFmpeg can only write to."""
+
+    def __init__(self, file) -> None:
+        self._file = file
+
+    def write(self, data: bytes) -> int:
+        self._file.write(data)
+        return len(data)

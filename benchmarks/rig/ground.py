@@ -1,0 +1,102 @@
+"""The ground that is flown over, in the light of two days, and edgevpr's map of it: made once, kept in a folder."""
+
+import csv
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from edgevpr.simulate.camera import Camera, Light, Pose, lit, photograph
+from edgevpr.simulate.flight import ORIGIN, to_position
+from edgevpr.simulate.scene import make_scene
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+WIDTH_M, DEPTH_M, METRES_PER_PIXEL, SEED = 1400.0, 1000.0, 0.2, 16
+GROUND_ALT_M = ORIGIN.alt_m
+MAPPED_FROM_M, SPACING_M, EDGE_M = 100.0, 30.0, 50.0
+CAMERAS = {"mapping": Camera(), "later": Camera(noise_sigma=3.0, blur_px=2.0)}
+LIGHTS = {
+    "mapping": Light(sun_azimuth_deg=52, sun_elevation_deg=50, exposure=1.1),
+    "later": Light(
+        sun_azimuth_deg=8, sun_elevation_deg=60, warmth=0.7, cloud_frac=0.25, haze_frac=0.1, exposure=1.1, gamma=1.1
+    ),
+}
+FOV_DEG = round(float(np.degrees(2 * np.arctan(Camera().width / 2 / Camera().focal_px))), 2)
+
+
+def lit_ground(work: Path, day: str) -> np.ndarray:
+    """Return the ground in the light of a day, uint8 (H, W, 3) BGR, read from its file only where it is looked at."""
+    files = {name: work / f"ground-{name}.npy" for name in LIGHTS}
+    if not all(path.exists() for path in files.values()):
+        print("making the ground", file=sys.stderr, flush=True)
+        work.mkdir(parents=True, exist_ok=True)
+        scene = make_scene(SEED, WIDTH_M, DEPTH_M, METRES_PER_PIXEL)
+        for number, (name, path) in enumerate(files.items()):
+            unfinished = work / f"unfinished-{name}.npy"
+            np.save(unfinished, lit(scene, LIGHTS[name], SEED + number))
+            unfinished.rename(path)
+    return np.load(files[day], mmap_mode="r")
+
+
+def picture(ground: np.ndarray, pose: Pose, day: str, rng: np.random.Generator) -> bytes:
+    """Take a picture with the camera of that day, as a JPEG."""
+    camera = CAMERAS[day]
+    frame = photograph(ground, METRES_PER_PIXEL, pose, camera, LIGHTS[day], rng)
+    return cv2.imencode(".jpg", frame, (cv2.IMWRITE_JPEG_QUALITY, camera.jpeg_quality))[1].tobytes()
+
+
+def environment() -> dict[str, str]:
+    """Return the environment in which `python -m edgevpr` is the code of this checkout, on one core as on a board."""
+    return {**os.environ, "PYTHONPATH": str(REPOSITORY), "OPENBLAS_NUM_THREADS": "1"}
+
+
+def place_map(work: Path) -> Path:
+    """Return the map of the ground: `edgevpr map build` makes it of the pictures of a mapping flight, a gimbal's, with
+    their true positions."""
+    path, folder = work / "ground.gpkg", work / "mapping"
+    if path.exists():
+        return path
+    ground = lit_ground(work, "mapping")
+    print("flying the mapping flight", file=sys.stderr, flush=True)
+    (folder / "images").mkdir(parents=True, exist_ok=True)
+    rng = np.random.default_rng(SEED)
+    with open(folder / "positions.csv", "w", newline="", encoding="utf-8") as handle:
+        table = csv.writer(handle)
+        table.writerow(("file", "lat", "lon", "alt", "height_m", "yaw_deg"))
+        for number, pose in enumerate(_mapping_poses(rng)):
+            name, at = f"{number:05d}.jpg", to_position(pose)
+            (folder / "images" / name).write_bytes(picture(ground, pose, "mapping", rng))
+            where = (f"{at.lat_deg:.8f}", f"{at.lon_deg:.8f}", f"{at.alt_m:.2f}", f"{pose.height_m:.2f}")
+            table.writerow((name, *where, f"{pose.heading_deg % 360:.2f}"))
+    print("building the map", file=sys.stderr, flush=True)
+    unfinished = work / "unfinished.gpkg"
+    unfinished.unlink(missing_ok=True)
+    pictures = ("--images", folder / "images", "--positions", folder / "positions.csv", "--camera", "nadir")
+    command = ("map", "build", *pictures, "--fov-deg", FOV_DEG, "--technique", "cohog", unfinished)
+    with open(work / "map.txt", "w", encoding="utf-8") as said:
+        subprocess.run(
+            [sys.executable, "-m", "edgevpr", *map(str, command)], env=environment(), check=True, stdout=said
+        )
+    unfinished.rename(path)
+    return path
+
+
+def _mapping_poses(rng: np.random.Generator) -> list[Pose]:
+    """Plan legs to the east and back, a picture every SPACING_M, over all of the ground."""
+    east_m = np.arange(EDGE_M, WIDTH_M - EDGE_M + 1, SPACING_M)
+    poses = []
+    for leg, north_m in enumerate(np.arange(EDGE_M, DEPTH_M - EDGE_M + 1, SPACING_M)):
+        for east in east_m if leg % 2 == 0 else east_m[::-1]:
+            off_east_m, off_north_m, off_height_m, off_deg = rng.normal(0, (1.0, 1.0, 0.7, 1.0))
+            poses.append(
+                Pose(
+                    east_m=float(east + off_east_m),
+                    north_m=float(north_m + off_north_m),
+                    height_m=float(MAPPED_FROM_M + off_height_m),
+                    heading_deg=float((90 if leg % 2 == 0 else 270) + off_deg),
+                )
+            )
+    return poses

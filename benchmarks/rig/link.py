@@ -1,0 +1,149 @@
+"""The MAVLink connection of the rig's own ground station to the autopilot."""
+
+import contextlib
+import socket
+import threading
+import time
+from collections.abc import Callable
+
+from edgevpr.mavlink.wire import Message, Receiver, mavlink
+
+GROUND_STATION, AUTOPILOT = (255, 190), (1, 1)
+STREAMS_HZ = {
+    mavlink.MAVLINK_MSG_ID_SYS_STATUS: 2,
+    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5,
+    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 10,
+    mavlink.MAVLINK_MSG_ID_SIM_STATE: 40,  # the most that a plane gives
+    mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: 5,
+}
+Listener = Callable[[Message, float], None]
+
+
+class Link:
+    """Keeps the newest message of each name that the autopilot sent ("COMMAND_ACK 400" of a command, "HEARTBEAT of 197" of
+    another component), and when it came; tells every message to the listeners, with its time. Raises RuntimeError where nobody answers at `port`."""
+
+    def __init__(self, port: int, listeners: list[Listener]) -> None:
+        self.last: dict[str, Message] = {}
+        self.came_s: dict[str, float] = {}
+        self._listeners = listeners
+        self._socket = _connected(port)
+        self._mav = mavlink.MAVLink(self, *GROUND_STATION)
+        self._is_open, self._lock = True, threading.Lock()
+        self._threads = [threading.Thread(target=work, daemon=True) for work in (self._receive, self._beat)]
+        for thread in self._threads:
+            thread.start()
+
+    def close(self) -> None:
+        self._is_open = False
+        for thread in self._threads:
+            thread.join()
+        self._socket.close()
+
+    def write(self, data: bytes) -> None:
+        """Send bytes, as pymavlink asks for it; an autopilot that is gone hears nothing."""
+        with contextlib.suppress(OSError):
+            self._socket.sendall(data)
+
+    def send(self, message: Message) -> None:
+        with self._lock:
+            self._mav.send(message)
+
+    def wait_for(self, name: str, condition: Callable[[Message], bool], patience_s: float) -> Message | None:
+        """Return the first message of a name, of those that come from now on, that fulfils a condition; None where none
+        comes in time."""
+        asked_s = time.monotonic()
+        while time.monotonic() - asked_s < patience_s:
+            message = self.last.get(name)
+            if message is not None and self.came_s[name] >= asked_s and condition(message):
+                return message
+            time.sleep(0.01)
+        return None
+
+    def command(self, number: int, *values: float, patience_s: float = 4.0) -> int | None:
+        """Send a COMMAND_LONG; return the result of its COMMAND_ACK, None where none comes."""
+        seven = [*values, *[0.0] * (7 - len(values))]
+        asked_s = time.monotonic()
+        self.send(mavlink.MAVLink_command_long_message(*AUTOPILOT, number, 0, *seven))
+        while time.monotonic() - asked_s < patience_s:
+            answer = self.last.get(f"COMMAND_ACK {number}")
+            if answer is not None and self.came_s[f"COMMAND_ACK {number}"] >= asked_s:
+                return answer.result
+            time.sleep(0.01)
+        return None
+
+    def set_parameter(self, name: str, value: float) -> None:
+        """Set a parameter. Raises RuntimeError where the autopilot does not take it."""
+        for _ in range(4):
+            message = mavlink.MAVLink_param_set_message(
+                *AUTOPILOT, name.encode(), float(value), mavlink.MAV_PARAM_TYPE_REAL32
+            )
+            self.send(message)
+            if self.wait_for("PARAM_VALUE", lambda told: told.param_id == name and _near(told.param_value, value), 1.5):
+                return
+        raise RuntimeError(f"the autopilot does not take {name} {value}")
+
+    def upload(self, items: list[Message]) -> None:
+        """Upload a mission. Raises RuntimeError where the autopilot does not take it."""
+        asked_s = time.monotonic()
+        self.send(mavlink.MAVLink_mission_count_message(*AUTOPILOT, len(items)))
+        sent_of_s: dict[str, float] = {}
+        while time.monotonic() - asked_s < 20:
+            for name in ("MISSION_REQUEST_INT", "MISSION_REQUEST"):
+                came_s = self.came_s.get(name, 0.0)
+                if came_s > sent_of_s.get(name, asked_s):
+                    sent_of_s[name] = came_s
+                    self.send(items[self.last[name].seq])
+            if self.came_s.get("MISSION_ACK", 0.0) >= asked_s:
+                if self.last["MISSION_ACK"].type == mavlink.MAV_MISSION_ACCEPTED:
+                    return
+                break
+            time.sleep(0.005)
+        raise RuntimeError("the autopilot does not take the mission")
+
+    def _receive(self) -> None:
+        receiver = Receiver()
+        self._socket.settimeout(0.2)
+        while self._is_open:
+            try:
+                data = self._socket.recv(65536)
+            except TimeoutError:
+                continue
+            except OSError:
+                data = b""
+            if not data:
+                return  # the autopilot is gone; who needs it finds that nothing comes
+            now_s = time.monotonic()
+            for message in receiver.feed(data):
+                name, sender = message.get_type(), message.get_srcComponent()
+                if sender != AUTOPILOT[1]:
+                    self._note(f"{name} of {sender}", message, now_s)
+                else:
+                    self._note(f"{name} {message.command}" if name == "COMMAND_ACK" else name, message, now_s)
+                for listener in self._listeners:
+                    listener(message, now_s)
+
+    def _note(self, name: str, message: Message, now_s: float) -> None:
+        self.last[name] = message
+        self.came_s[name] = now_s  # written last: who sees the time finds the message
+
+    def _beat(self) -> None:
+        kind, autopilot = mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID
+        while self._is_open:
+            self.send(mavlink.MAVLink_heartbeat_message(kind, autopilot, 0, 0, mavlink.MAV_STATE_ACTIVE, 3))
+            time.sleep(0.5)
+
+
+def _connected(port: int) -> socket.socket:
+    give_up_s = time.monotonic() + 30
+    while True:
+        try:
+            return socket.create_connection(("127.0.0.1", port), 1)
+        except OSError:
+            if time.monotonic() > give_up_s:
+                raise RuntimeError(f"no simulator answers at port {port}") from None
+            time.sleep(0.1)
+
+
+def _near(value: float, wanted: float) -> bool:
+    return abs(value - wanted) <= 1e-6 + 1e-5 * abs(wanted)  # a parameter is a float of 32 bits

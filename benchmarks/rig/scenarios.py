@@ -1,0 +1,87 @@
+"""The table of the scenarios: who flies, what is taken away, and what edgevpr is told to do about it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+HEIGHT_M = 100.0
+HOME_M, CLIMB_M = (240.0, 200.0), (560.0, 230.0)  # metres east and north on the ground
+CIRCUIT_M = ((1060.0, 260.0), (1060.0, 730.0), (340.0, 730.0), (340.0, 260.0))
+COPTER_HOME_M = (420.0, 320.0)
+COPTER_CIRCUIT_M = ((980.0, 320.0), (980.0, 680.0), (420.0, 680.0), (420.0, 320.0))
+COPTER_SPEED_M_S = 7.0
+WIND_FROM_DEG = 270.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scenario:
+    """A flight: `gps_s` seconds with GPS, then `off_s` without. From the loss on there is wind, and the autopilot is
+    told to use the `source_set` (None: its own choice). Without `loses_gps` the receiver stays; it moves away by
+    `glitch_m_s` from then on. `parameters` are the autopilot's, `with_edgevpr` those that are set for a flight with
+    edgevpr only; `config` is what edgevpr's configuration says beside the usual. `starts_early`: edgevpr runs before
+    arming. `is_compared`: the same flight without edgevpr says something."""
+
+    vehicle: str = "plane"
+    gps_s: float = 60.0
+    off_s: float = 300.0
+    loses_gps: bool = True
+    wind_m_s: float = 0.0
+    glitch_m_s: float = 0.0
+    source_set: int | None = None
+    is_level: bool = False
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    with_edgevpr: Mapping[str, float] = field(default_factory=dict)
+    config: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    starts_early: bool = False
+    learns: bool = False
+    reboots: bool = False
+    is_compared: bool = True
+
+
+VEHICLE_PARAMETERS = {
+    "plane": {
+        "ROLL_LIMIT_DEG": 35,
+        "WP_LOITER_RAD": 70,
+        "TERRAIN_ENABLE": 0,
+        "THR_FAILSAFE": 0,  # nobody holds a transmitter
+        "FS_SHORT_ACTN": 3,
+        "FS_LONG_ACTN": 0,
+    },
+    "copter": {"FS_THR_ENABLE": 0, "FS_GCS_ENABLE": 0},
+}
+
+_FLOW = {  # a flow sensor and a range finder that reaches the ground, as the second set of sources
+    "FLOW_TYPE": 10,
+    "SIM_FLOW_ENABLE": 1,
+    "RNGFND1_TYPE": 100,
+    "RNGFND1_MIN": 0,
+    "RNGFND1_MAX": 150,
+    "EK3_SRC2_POSXY": 0,
+    "EK3_SRC2_VELXY": 5,
+    "EK3_SRC2_POSZ": 1,
+    "EK3_SRC2_VELZ": 0,
+    "EK3_SRC2_YAW": 1,
+}
+_GPS_INPUT = {"GPS2_TYPE": 14, "GPS_AUTO_SWITCH": 1}
+_ODOMETRY = {
+    "VISO_TYPE": 1,
+    "EK3_SRC2_POSXY": 6,
+    "EK3_SRC2_VELXY": 6,
+    "EK3_SRC2_POSZ": 1,
+    "EK3_SRC2_VELZ": 0,
+    "EK3_SRC2_YAW": 1,
+}
+_GIMBAL = {"source": {"fov_deg": None}}  # the airframe's attitude is not the camera's
+
+SCENARIOS = {
+    "plane_wind": Scenario(wind_m_s=6.0),
+    "plane_still": Scenario(),
+    "plane_level": Scenario(wind_m_s=6.0, is_level=True, config=_GIMBAL),
+    "copter_flow": Scenario(vehicle="copter", source_set=2, parameters=_FLOW),
+    "copter_gps_input": Scenario(vehicle="copter", with_edgevpr=_GPS_INPUT, starts_early=True),
+    "copter_odometry": Scenario(vehicle="copter", source_set=2, with_edgevpr=_ODOMETRY, starts_early=True),
+    "plane_glitch": Scenario(loses_gps=False, glitch_m_s=5.0, off_s=60.0),
+    "plane_clean": Scenario(loses_gps=False, off_s=1800.0, is_compared=False),
+    "learn": Scenario(gps_s=220.0, off_s=60.0, learns=True, is_compared=False),
+    "reboot": Scenario(gps_s=30.0, off_s=60.0, reboots=True, is_compared=False),
+}

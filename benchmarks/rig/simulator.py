@@ -1,0 +1,183 @@
+"""ArduPilot's simulator as a process of its own, and what a scenario asks of it.
+
+Instance N listens on the ports 5760 + 10N, which is the rig's, and 5762 + 10N, which is edgevpr's.
+"""
+
+import atexit
+import contextlib
+import os
+import shutil
+import subprocess
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from ground import GROUND_ALT_M
+from link import STREAMS_HZ, Link, Listener
+
+from edgevpr.mavlink.wire import Message, mavlink
+from edgevpr.simulate.camera import Pose
+from edgevpr.simulate.flight import to_position
+
+VARIABLE = "EDGEVPR_ARDUPILOT"
+
+
+@dataclass(frozen=True, slots=True)
+class Vehicle:
+    """A vehicle of ArduPilot: its binary, the model of its physics, its default parameters and numbers of its modes."""
+
+    binary: str
+    model: str
+    defaults: str
+    modes: dict[str, int]
+
+
+VEHICLES = {
+    "plane": Vehicle("arduplane", "plane", "models/plane.parm", {"AUTO": 10}),
+    "copter": Vehicle("arducopter", "quad", "default_params/copter.parm", {"GUIDED": 4, "LAND": 9}),
+}
+
+
+def tree() -> Path | None:
+    """Return the folder of ArduPilot that EDGEVPR_ARDUPILOT names, None where no simulator has been built there."""
+    folder = Path(os.environ.get(VARIABLE, ""))
+    return folder.resolve() if (folder / "build/sitl/bin/arduplane").exists() else None
+
+
+def at_degrees(east_m: float, north_m: float) -> tuple[float, float]:
+    """Return latitude and longitude of a point of the ground."""
+    where = to_position(Pose(east_m=east_m, north_m=north_m, height_m=0.0, heading_deg=0.0))
+    return where.lat_deg, where.lon_deg
+
+
+class Simulator:
+    """A simulator that starts with the `with` block and ends with it. `home_m` is where it stands, metres east and
+    north; `listeners` hear every message."""
+
+    def __init__(
+        self,
+        vehicle: str,
+        folder: Path,
+        *,
+        instance: int,
+        home_m: tuple[float, float],
+        parameters: dict[str, float],
+        listeners: list[Listener],
+    ) -> None:
+        self.vehicle, self.instance = VEHICLES[vehicle], instance
+        self._folder, self._parameters, self._listeners = folder, parameters, listeners
+        self._home = "{:.7f},{:.7f},{:.0f},90".format(*at_degrees(*home_m), GROUND_ALT_M)
+        self._process: subprocess.Popen | None = None
+        self.link: Link | None = None
+
+    def __enter__(self) -> "Simulator":
+        shutil.rmtree(self._folder, ignore_errors=True)
+        self._folder.mkdir(parents=True)
+        atexit.register(self.kill)
+        try:
+            self.start(wipe=True)
+        except BaseException:
+            self.kill()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.kill()
+        atexit.unregister(self.kill)
+
+    @property
+    def companion_port(self) -> int:
+        """Port that is left for edgevpr."""
+        return 5762 + 10 * self.instance
+
+    def start(self, *, wipe: bool) -> None:
+        """Start the process, with the parameters of old unless they are wiped, and connect to it."""
+        own = self._folder / "rig.parm"
+        own.write_text("".join(f"{name} {value}\n" for name, value in self._parameters.items()))
+        folder = tree()
+        defaults = folder / "Tools/autotest" / self.vehicle.defaults
+        command = [folder / "build/sitl/bin" / self.vehicle.binary, "--model", self.vehicle.model, "--speedup", "1"]
+        command += ["--home", self._home, f"-I{self.instance}", "--sim-address", "127.0.0.1"]
+        command += ["--defaults", f"{defaults},{own}", *(["--wipe"] if wipe else [])]
+        with open(self._folder / "simulator.txt", "ab") as said:
+            self._process = subprocess.Popen(
+                [str(word) for word in command],
+                cwd=self._folder,
+                stdin=subprocess.DEVNULL,
+                stdout=said,
+                stderr=said,
+                start_new_session=True,
+            )
+        self.link = Link(5760 + 10 * self.instance, self._listeners)
+        if not self.link.wait_for("HEARTBEAT", lambda _: True, 30):
+            raise RuntimeError(f"the simulator says nothing: see {self._folder}/simulator.txt")
+        for number, rate_hz in STREAMS_HZ.items():
+            self.link.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, number, 1e6 / rate_hz)
+
+    def kill(self) -> None:
+        """End the process as a loss of power does."""
+        if self.link:
+            self.link.close()
+        if self._process:
+            with contextlib.suppress(ProcessLookupError):
+                self._process.kill()
+            self._process.wait()
+        self.link = self._process = None
+
+    def wait_ready(self) -> None:
+        """Wait until the autopilot knows where it is and would arm. Raises RuntimeError where that takes minutes."""
+        attitude_and_position = mavlink.EKF_ATTITUDE | mavlink.EKF_POS_HORIZ_ABS
+        give_up_s = time.monotonic() + 180
+        while time.monotonic() < give_up_s:
+            ekf, status = (self.link.last.get(name) for name in ("EKF_STATUS_REPORT", "SYS_STATUS"))
+            if ekf and status and ekf.flags & attitude_and_position == attitude_and_position:
+                health = status.onboard_control_sensors_health
+                if health & mavlink.MAV_SYS_STATUS_PREARM_CHECK and not ekf.flags & mavlink.EKF_UNINITIALIZED:
+                    return
+            time.sleep(0.1)
+        raise RuntimeError("the autopilot is never ready")
+
+    def arm(self, mode: str) -> None:
+        """Change the mode and arm. Raises RuntimeError where the autopilot refuses."""
+        number = self.vehicle.modes[mode]
+        self.link.command(mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, number)
+        for _ in range(20):
+            if self.link.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1) == mavlink.MAV_RESULT_ACCEPTED:
+                return
+            time.sleep(1)
+        raise RuntimeError("the autopilot does not arm")
+
+    def wait_height(self, height_m: float) -> None:
+        """Wait until the aircraft is that high. Raises RuntimeError where it does not climb."""
+        if not self.link.wait_for("GLOBAL_POSITION_INT", lambda told: told.relative_alt > 1000 * height_m, 180):
+            raise RuntimeError(f"{height_m:.0f} m are not reached")
+
+    def set_gps(self, is_on: bool) -> None:
+        self.link.set_parameter("SIM_GPS1_ENABLE", int(is_on))
+
+    def set_wind(self, from_deg: float, speed_m_s: float) -> None:
+        self.link.set_parameter("SIM_WIND_DIR", from_deg)
+        self.link.set_parameter("SIM_WIND_SPD", speed_m_s)
+
+
+def mission(home_m: tuple[float, float], climb_m: tuple[float, float], circuit_m, height_m: float) -> list[Message]:
+    """Make the mission of a plane: take off, then round and round the corners of a circuit, (east, north) each."""
+    takeoff, waypoint, jump = (
+        mavlink.MAV_CMD_NAV_TAKEOFF,
+        mavlink.MAV_CMD_NAV_WAYPOINT,
+        mavlink.MAV_CMD_DO_JUMP,
+    )
+    rows = [(waypoint, 0, home_m, 0.0), (takeoff, 12, climb_m, 0.6 * height_m)]
+    rows += [(waypoint, 0, corner_m, height_m) for corner_m in circuit_m]
+    rows += [(jump, 2, None, -1)]
+    items = []
+    for number, (command, first, at_m, height) in enumerate(rows):
+        lat, lon = (round(1e7 * degrees) for degrees in at_degrees(*at_m)) if at_m else (0, 0)
+        second, up_m = (height, 0.0) if command == jump else (0.0, height)
+        frame = mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT
+        items.append(
+            mavlink.MAVLink_mission_item_int_message(
+                1, 1, number, frame, command, 0, 1, first, second, 0.0, 0.0, lat, lon, up_m
+            )
+        )
+    return items
