@@ -44,7 +44,7 @@ class Vehicle:
     follow a receiver that it does not trust. `roll_deg` (right wing down is positive), `pitch_deg` (nose up),
     `height_m` above the ground, `velocity_m_s` over it (east, north) and `sink_m_s` (down) are None where unknown.
     `position_sd_m` is the standard deviation of one axis of the position, None where it is unknown or the autopilot has
-    no position of its own to rely on."""
+    no position of its own to rely on. `t_gps_s` is when the newest position of that receiver came."""
 
     lat_deg: float
     lon_deg: float
@@ -58,6 +58,7 @@ class Vehicle:
     velocity_m_s: tuple[float, float] | None = None
     sink_m_s: float | None = None
     position_sd_m: float | None = None
+    t_gps_s: float | None = None
 
     def is_fresh_at(self, t_mono_s: float) -> bool:
         """Tell whether the report came within one second of `t_mono_s`, such as the time of a frame."""

@@ -90,14 +90,14 @@ def position_fix(fix: Fix, t_sent_s: float, target_system: int) -> Message:
 
 def report_requests(target_system: int, firmware: int, is_continuous: bool = False) -> tuple[Message, ...]:
     """Make a COMMAND_LONG (76) with SET_MESSAGE_INTERVAL (511) for every report that is wanted: GLOBAL_POSITION_INT
-    (33) and ATTITUDE (30) ten times a second, and twice GPS_RAW_INT (24), DISTANCE_SENSOR (132), TERRAIN_REPORT
-    (136) and what the filter of a `firmware` (MAV_AUTOPILOT) says of itself. A continuous position also takes ATTITUDE
-    and SCALED_IMU (26) fifty times a second, and SYSTEM_TIME (2) and GPS_GLOBAL_ORIGIN (49) once. On many autopilots
-    the companion's port streams none of them unless asked."""
+    (33) and ATTITUDE (30) ten times a second, GPS_RAW_INT (24) five times, and twice DISTANCE_SENSOR (132),
+    TERRAIN_REPORT (136) and what the filter of a `firmware` (MAV_AUTOPILOT) says of itself. A continuous position also
+    takes ATTITUDE and SCALED_IMU (26) fifty times a second, and SYSTEM_TIME (2) and GPS_GLOBAL_ORIGIN (49) once. On
+    many autopilots the companion's port streams none of them unless asked."""
     wanted_us = {
         mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 100_000,
         mavlink.MAVLINK_MSG_ID_ATTITUDE: 20_000 if is_continuous else 100_000,
-        mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 500_000,
+        mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 200_000,
         mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR: 500_000,
         mavlink.MAVLINK_MSG_ID_TERRAIN_REPORT: 500_000,
     }

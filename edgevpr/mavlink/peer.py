@@ -3,7 +3,7 @@
 import logging
 import math
 from collections import Counter
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from edgevpr.geodesy import distance_m
@@ -38,6 +38,17 @@ _EXPLANATIONS = {
 }
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Receiver:
+    """A position of a GPS receiver: standard deviation of one axis, when it was new to us, and its own time."""
+
+    lat_deg: float
+    lon_deg: float
+    sd_m: float
+    t_s: float
+    time_usec: int
+
+
 class Autopilot:
     """The state of the autopilot, from all messages that arrive. `Identity` says which of them are its own."""
 
@@ -54,8 +65,7 @@ class Autopilot:
         self._answer: str | None = None  # the newest answer, until `take_answer`
         self._own_component = own_component
         self._heard_s = -math.inf
-        # Each receiver with a fix: lat_deg, lon_deg, standard deviation, time.
-        self._gps: dict[str, tuple[float, float, float, float]] = {}
+        self._gps: dict[str, _Receiver] = {}  # those with a fix
         self._last_result: int | None = None
 
     @property
@@ -135,13 +145,14 @@ class Autopilot:
             self._listener.hear_force(now_s, tuple(each * _MILLI_G for each in force), attitude)
 
     def _hear_position(self, message: Message, now_s: float) -> None:
-        by_gps_m = self._gps_sd_m(message, now_s)
-        if by_gps_m is not None:
-            self.certainty.note_known(by_gps_m, now_s)
+        gps = self._best_gps(message, now_s)
+        if gps:
+            self.certainty.note_known(gps.sd_m, now_s)
         self.vehicle = _vehicle(
             message,
             t_heard_s=now_s,
-            has_gps=by_gps_m is not None,
+            has_gps=gps is not None,
+            t_gps_s=gps and gps.t_s,
             height_m=self._heights.now(message.relative_alt / 1e3, now_s),
             position_sd_m=self.certainty.now(now_s),
         )
@@ -152,20 +163,31 @@ class Autopilot:
         choice = self.interview.choice
         if choice.channel is Channel.GPS_INPUT and message.get_type() == _GPS_REPORTS[choice.receiver]:
             return  # the receiver that we play: it says what we have said
-        if message.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX:
-            self._gps[message.get_type()] = (message.lat / 1e7, message.lon / 1e7, gps_sd_m(message), now_s)
-        else:
-            self._gps.pop(message.get_type(), None)
+        name = message.get_type()
+        if message.fix_type < mavlink.GPS_FIX_TYPE_3D_FIX:
+            self._gps.pop(name, None)
+            return
+        before = self._gps.get(name)
+        # A receiver that is lost is reported on for seconds, with its last position and the time of that.
+        is_old = before is not None and message.time_usec and message.time_usec == before.time_usec
+        self._gps[name] = _Receiver(
+            lat_deg=message.lat / 1e7,
+            lon_deg=message.lon / 1e7,
+            sd_m=gps_sd_m(message),
+            t_s=before.t_s if is_old else now_s,
+            time_usec=message.time_usec,
+        )
 
-    def _gps_sd_m(self, position: Message, now_s: float) -> float | None:
-        """Return the standard deviation of the best receiver that is near a position; None where none is."""
+    def _best_gps(self, position: Message, now_s: float) -> _Receiver | None:
+        """Return the most exact receiver that is near a position; None where none is."""
         here = position.lat / 1e7, position.lon / 1e7
         near = (
-            sd_m
-            for lat_deg, lon_deg, sd_m, t_s in self._gps.values()
-            if now_s - t_s <= GPS_GONE_AFTER_S and float(distance_m(*here, lat_deg, lon_deg)) <= GPS_AGREES_WITHIN_M
+            each
+            for each in self._gps.values()
+            if now_s - each.t_s <= GPS_GONE_AFTER_S
+            and float(distance_m(*here, each.lat_deg, each.lon_deg)) <= GPS_AGREES_WITHIN_M
         )
-        return min(near, default=None)
+        return min(near, key=lambda each: each.sd_m, default=None)
 
     def _answers_our_fix(self, message: Message) -> bool:
         return (

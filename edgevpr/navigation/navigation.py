@@ -12,10 +12,12 @@ from edgevpr.navigation.path import Path, Point
 from edgevpr.types import Position, Vehicle
 
 _GPS_EVERY_S = 1.0
+_GPS_NEW_S = 0.7  # reports come five times a second; when they stay away, the autopilot has begun to reckon
 # The errors of GPS are alike from one second to the next: a position is heard as one of twice its deviation.
 _GPS_ALIKE = 2.0
 _GPS_VELOCITY_SD = 0.3  # m/s
 _UNKNOWN_M = 1e4
+_ANY_M_S = 10.0  # of an aircraft of which only a fix is known
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,11 +63,16 @@ class Navigation:
         position is heard too."""
         if vehicle.velocity_m_s is None:
             return
+        if self._drift is RECKONED and vehicle.position_sd_m is None:
+            self._origin = None  # it does not know its position any more, and its velocity least of all
+            return
         velocity_m_s, t_s = np.array(vehicle.velocity_m_s), vehicle.t_heard_s
-        has_gps = vehicle.has_gps and believes_gps
+        is_new = vehicle.t_gps_s is not None and t_s - vehicle.t_gps_s <= _GPS_NEW_S
+        has_gps = vehicle.has_gps and is_new and believes_gps
         if self._origin is None or self._path.is_broken:
             if vehicle.position_sd_m is not None:
-                self._start(Position(vehicle.lat_deg, vehicle.lon_deg), vehicle.position_sd_m, velocity_m_s, t_s)
+                here = Position(vehicle.lat_deg, vehicle.lon_deg)
+                self._start(here, vehicle.position_sd_m, velocity_m_s, t_s, self._drift.velocity_sd)
                 self._has_gps = has_gps
             return
         if self._drift is RECKONED:
@@ -107,16 +114,13 @@ class Navigation:
         hear(off_m, covariance_m2, age_s)
         self._fixed_s = max(self._fixed_s, t_s)
 
-    def begin(self, position: Position, sd_m: float, vehicle: Vehicle, t_s: float) -> None:
-        """Begin with a fix of a frame taken at `t_s`, where nothing was known of the position before; the vehicle tells
-        how it went on from there."""
-        velocity_m_s = np.array(vehicle.velocity_m_s)
-        now_s = vehicle.t_heard_s
-        on_m = (now_s - t_s) * velocity_m_s
-        position = Position(*moved(position.lat_deg, position.lon_deg, *on_m.tolist()))
-        self._start(position, math.hypot(sd_m, 0.3 * float(np.hypot(*on_m))), velocity_m_s, now_s)
-        self._filter.lose_gps()
-        self._fixed_s = t_s
+    def begin(self, position: Position, sd_m: float, t_s: float, now_s: float) -> None:
+        """Begin with a fix of a frame taken at `t_s`, where nothing was known of the position before, nor of how fast
+        the aircraft is."""
+        if self._drift is INERTIAL:
+            sd_m = math.hypot(sd_m, _ANY_M_S * (now_s - t_s))
+            self._start(position, sd_m, np.zeros(2), now_s, _ANY_M_S)
+            self._fixed_s = t_s
 
     def at(self, t_s: float) -> Estimate | None:
         """Return where the aircraft is, or was, at a time; None where that is not known."""
@@ -140,10 +144,12 @@ class Navigation:
         _, off_m_s, _ = self._filter.errors(0.0)
         return float(off_m_s[0]), float(off_m_s[1])
 
-    def _start(self, position: Position, sd_m: float, velocity_m_s: np.ndarray, t_s: float) -> None:
+    def _start(
+        self, position: Position, sd_m: float, velocity_m_s: np.ndarray, t_s: float, velocity_sd_m_s: float
+    ) -> None:
         self._origin = position
         self._path.start(t_s, velocity_m_s)
-        self._filter.start(np.zeros(2), sd_m, self._drift.velocity_sd)
+        self._filter.start(np.zeros(2), sd_m, velocity_sd_m_s)
 
     def _there(self, t_s: float) -> Point | None:
         return None if self._origin is None or self._path.is_broken else self._path.at(t_s)

@@ -59,6 +59,7 @@ def test_the_position_of_the_pinned_autopilot_is_known_while_it_is_fresh(link_an
         has_gps=False,
         height_m=80.0,
         velocity_m_s=(12.5, -3.0),
+        sink_m_s=0.0,
     )
     assert wait_until(lambda: fresh(link, clock)) == expected
     clock.now_s += 1.0
@@ -146,10 +147,11 @@ def test_a_silent_autopilot_is_asked_where_it_is_until_it_says_so(link_and_peer,
     wait_until(lambda: link.stats().autopilot_heard)
     assert link.stats().sent.get("COMMAND_LONG", 0) == 0, "nobody wants to know"
     link.want_position()
-    asked = [peer.expect("COMMAND_LONG") for _ in range(6)]
+    version, *asked = [peer.expect("COMMAND_LONG") for _ in range(7)]
+    assert (version.command, version.param1) == (mavlink.MAV_CMD_REQUEST_MESSAGE, 148)
     assert {command.command for command in asked} == {mavlink.MAV_CMD_SET_MESSAGE_INTERVAL}
     intervals_us = {int(command.param1): command.param2 for command in asked}
-    assert intervals_us == {33: 200_000, 30: 100_000} | dict.fromkeys((24, 132, 136, 193), 500_000)
+    assert intervals_us == {33: 100_000, 30: 100_000, 24: 200_000} | dict.fromkeys((132, 136, 193), 500_000)
     assert all(command.target_system == 7 for command in asked)
     say_attitude(link, peer)
     say(link, peer, 50.0, 8.0)
@@ -158,23 +160,23 @@ def test_a_silent_autopilot_is_asked_where_it_is_until_it_says_so(link_and_peer,
         peer.heartbeat()
         say_attitude(link, peer)
         say(link, peer, 50.0, 8.0)
-    assert link.stats().sent["COMMAND_LONG"] == 6
+    assert link.stats().sent["COMMAND_LONG"] == 6 + 3, "and the version, which it does not say, each time"
     clock.now_s += 6.0  # it has started anew
     peer.heartbeat()
-    assert peer.expect("COMMAND_LONG").param1 in intervals_us
+    wait_until(lambda: link.stats().sent["COMMAND_LONG"] == 6 + 4 + 6)
 
 
 def test_an_autopilot_that_says_no_attitude_is_asked_for_it_again(link_and_peer, clock):
     link, peer = link_and_peer
     link.want_position()
     peer.heartbeat()
-    for _ in range(6):
+    for _ in range(7):
         peer.expect("COMMAND_LONG")
     for _ in range(2):
         say(link, peer, 50.0, 8.0)
         clock.now_s += 4.0
         peer.heartbeat()
-    wait_until(lambda: link.stats().sent["COMMAND_LONG"] == 12)
+    wait_until(lambda: link.stats().sent["COMMAND_LONG"] == 12 + 3)
 
 
 def told(link, peer, message):

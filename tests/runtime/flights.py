@@ -25,7 +25,8 @@ STEP_DEG = 0.001  # of latitude: 111 m
 class Flight:
     """A flight with a map, ready to be flown: `fly` does so and gives the lines of its log; `flown` is what it came to.
 
-    `settings` are keys of the configuration; with `learns` the flight makes places.
+    `settings` are keys of the configuration; with `learns` the flight makes places; `navigator` is the listener of a
+    real link.
     """
 
     def __init__(
@@ -35,11 +36,12 @@ class Flight:
         clock: FakeClock,
         link: FakeLink | None = None,
         learns: bool = False,
+        navigator: Navigator | None = None,
         **settings,
     ) -> None:
         self.config = load_config(None, {"map": str(place_map), "source.uri": "/dev/video0"} | settings)
         self.board = load_board(self.config.board)
-        self.log, self.clock, self.link = log, clock, link
+        self.log, self.clock, self.link, self.navigator = log, clock, link, navigator
         growing = None
         if learns:
             self.recogniser, growing = open_learning(self.config, self.board, self.config.technique)
@@ -65,7 +67,9 @@ class Flight:
         autopilot = NoAutopilot()
         if self.link:
             send_fixes = self.config.mavlink.send_fixes
-            navigator = self.link.listener = Navigator(self.config.mavlink.min_accuracy_m, 1.0)
+            navigator = self.navigator
+            if navigator is None:  # of a real link it is the listener from the start
+                navigator = self.link.listener = Navigator(self.config.mavlink.min_accuracy_m, 1.0)
             autopilot = ToAutopilot(
                 self.link, navigator, send_fixes=send_fixes, cores=self.board.cores, clock=self.clock.clock
             )

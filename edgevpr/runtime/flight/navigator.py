@@ -24,12 +24,13 @@ from edgevpr.runtime.recognise.locate import matrix_of
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.types import Vehicle
 
-# What comes on top of what a fix knows of itself: the attitude is known to about a degree, and the time of a frame to
+# What comes on top of what a fix knows of itself: the attitude is known to half a degree, and the time of a frame to
 # some hundredths of a second.
-_ATTITUDE_SD, _TIME_SD_S = math.tan(math.radians(1.0)), 0.05
+_ATTITUDE_SD, _TIME_SD_S = math.tan(math.radians(0.5)), 0.03
 _UNTOLD_ATTITUDE_SD = math.tan(math.radians(15.0))  # where the autopilot tells none: an aircraft that turns banks
 _LOST_M, _LOST_S = 50.0, 60.0  # a continuous position that is worse, or without a fix for longer, is none
 _ALT_SD_M = 3.0
+_CONTINUOUS = "taken into the continuous position"
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,14 +88,14 @@ class Navigator:
         with self._lock:
             vehicle = self._vehicle
             if vehicle is None or vehicle.velocity_m_s is None or not vehicle.is_fresh_at(now_s):
-                return Advice(fix)  # nothing else is known
+                return Advice(None, "nothing is heard of the vehicle") if self._is_continuous else Advice(fix)
             covariance_m2 = _covariance(event, event.vehicle or vehicle)
             t_s = event.frame.t_mono_s
             expected = self._navigation.expected(t_s)
             if expected is None:
-                if not vehicle.has_gps:
-                    self._navigation.begin(here, math.sqrt(np.linalg.eigvalsh(covariance_m2)[-1]), vehicle, t_s)
-                return Advice(fix)
+                sd_m = math.sqrt(np.linalg.eigvalsh(covariance_m2)[-1])
+                self._navigation.begin(here, sd_m, t_s, vehicle.t_heard_s)
+                return Advice(None, _CONTINUOUS) if self._is_continuous else Advice(fix)
             off_m = self._navigation.beside(here, expected)
             seen = Seen(
                 off_m=off_m,
@@ -142,7 +143,7 @@ class Navigator:
     def _improved(self, vehicle: Vehicle, now_s: float) -> Advice:
         """Say what is to be sent so that the autopilot is better off, if it can be."""
         if self._is_continuous:
-            return Advice(None, "taken into the continuous position")
+            return Advice(None, _CONTINUOUS)
         estimate = self._navigation.at(now_s)
         east_m_s, north_m_s = vehicle.velocity_m_s
         since_s = now_s - vehicle.t_heard_s

@@ -28,7 +28,8 @@ _OF_SCATTER = 0.25
 _LIKE_THE_BEST = 0.5  # of its score: such a match is heard too
 _DISAGREES = 4.0  # standard deviations: such a place is not heard
 _CONTRADICTS = 0.2  # of the footprint: farther apart than that, one of the two is not the right place
-HEARD = 5  # places at most
+HEARD = 12  # places at most: over a dense map so many show the same ground, and none of them is a rival
+_SAYING = 5  # of these make the position
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,12 +93,12 @@ def located(
     is the way in which the query's picture lies on the ground; where it is unknown what is straight under the aircraft,
     that is about the middle. `proof` is how the landmarks of the best place agree: they say the step as well as the
     vote does. Places whose score is less than half of the best's, and those that do not show the same ground, are not
-    heard.
+    heard; of those that are, the first five make the position.
     """
     best = found[0]
     if cells is None or not _can_say(best):
         return None
-    heard = [(each.place, _by_vote(each.match, cells)) for each in found[:HEARD] if _is_heard(each, best)]
+    heard = [(each.place, _by_vote(each.match, cells)) for each in found if _is_heard(each, best)]
     if proof and proof.is_expected and proof.inliers >= CONFIRMED:
         heard.insert(0, (best.place, _by_landmarks(proof)))
     origin = best.place.position
@@ -106,6 +107,7 @@ def located(
     agree = [_apart(first, each) <= _DISAGREES for each in others]
     against_m = [float(np.hypot(*(each.at_m - first.at_m))) for each, ok in zip(others, agree, strict=True) if not ok]
     heard, said = ([each[0], *compress(each[1:], agree)] for each in (heard, said))
+    said = said[:_SAYING]
     of_step = np.linalg.inv(sum(np.linalg.inv(each.of_step) for each in said))
     at_m = of_step @ sum(np.linalg.inv(each.of_step) @ each.at_m for each in said)
     if others := said[1:]:

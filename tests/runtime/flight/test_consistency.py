@@ -187,7 +187,8 @@ def test_in_flight_a_fix_held_back_is_in_the_log_and_the_ground_is_told_once(rec
 def test_over_a_real_link_it_is_what_the_autopilot_says_of_itself_that_counts(recording, tmp_path, monkeypatch):
     monkeypatch.setattr(autopilot, "_SETTLED_WITHIN_S", 60.0)
     clock, port = FakeClock(), UdpPort()
-    with Link(parse_link(f"udpout:127.0.0.1:{port.number}"), clock=clock) as link:
+    navigator = Navigator(5.0, 1.0)
+    with Link(parse_link(f"udpout:127.0.0.1:{port.number}"), clock=clock, listener=navigator) as link:
         peer = Peer(port)
         peer.expect("HEARTBEAT")
         peer.heartbeat()
@@ -206,19 +207,21 @@ def test_over_a_real_link_it_is_what_the_autopilot_says_of_itself_that_counts(re
             peer.send(mavlink.MAVLink_global_position_int_message(0, *where, 0, 80_000, north_cm_s, 0, 0, 0))
             wait_until(lambda: link.vehicle() and link.vehicle().t_heard_s == clock.now_s)
 
-        flight = Flight(recording / "cohog.gpkg", tmp_path / "log", clock, link, **{"source.rate_hz": 1.0})
+        settings = {"source.rate_hz": 1.0}
+        flight = Flight(recording / "cohog.gpkg", tmp_path / "log", clock, link, navigator=navigator, **settings)
         pictures = [textured(number, 240, 320) for number in (0, 1, 20, 3)]
         queries = of_kind(flight.fly(FakeSource(pictures, clock, work=turn)), "query")
         assert peer.expect_text("edgevpr: fix held back, contradicts autopilot")
     port.close()
-    assert [line["fix"]["sent"] for line in queries] == [True, False, False, True]
-    assert "good to 6 m" in queries[1]["fix"]["why"], "5 m by GPS, and a second of drift"
+    assert [line["fix"]["sent"] for line in queries] == [False, False, False, True]
+    assert "where GPS and the fixes before say" in queries[0]["fix"]["why"]
+    assert "good to 8 m" in queries[1]["fix"]["why"], "5 m by GPS, 5 m of the map, and a second of drift"
 
 
 def test_in_flight_with_gps_that_agrees_no_fix_is_needed(recording, tmp_path):
     queries, link = fly(recording, tmp_path, (0, 1), off_deg=0.0, has_gps=True)
     assert [line["fix"]["sent"] for line in queries] == [False, False]
-    assert queries[0]["fix"]["why"].startswith("not needed: the autopilot is 0.0 m from our position")
+    assert queries[0]["fix"]["why"].startswith("not needed: the autopilot is 0.0 m from where we are")
     assert link.texts() == []
 
 
