@@ -47,7 +47,7 @@ class Conversation:
         self.autopilot = Autopilot(component_id, system_id, listener)
         self._listener = listener
         self.answers = Answers()
-        self.receiver = Receiver(tap)
+        self.receiver = Receiver(tap=tap)
         self.sent: Counter[str] = Counter()
         self._clock = clock
         self._health, self._health_set_s = Health.BOOT, clock()

@@ -25,7 +25,7 @@ class Receiver:
     """The parser of what arrives, apart for each sender: a message that one begins swallows nothing of another's. It
     yields the messages; bytes that are no message are dropped and counted."""
 
-    def __init__(self, tap: Tap = untapped) -> None:
+    def __init__(self, *, tap: Tap = untapped) -> None:
         self._tap = tap
         self.received: Counter[str] = Counter()  # messages by name
         self.bad_bytes = 0

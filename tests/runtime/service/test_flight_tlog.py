@@ -19,7 +19,7 @@ MAVLOGDUMP = Path(sys.prefix) / "bin" / "mavlogdump.py"
 def fly(recording, tmp_path):
     def started(*flags, **environment):
         place_map, pictures = recording / "cohog.gpkg", recording / "blind" / "images"
-        return start(place_map, pictures, tmp_path / "log", "--rate-hz", "10", *flags, **environment)
+        return start(place_map, pictures, tmp_path / "log", "--rate-hz", "60", *flags, **environment)
 
     return started
 
