@@ -39,8 +39,8 @@ class Conversation:
         component_id: int,
         system_id: int | None,
         max_fix_age_s: float,
-        listener: Listener = _NOBODY,
         *,
+        listener: Listener = _NOBODY,
         tap: Tap = untapped,
     ) -> None:
         self.outbox = Outbox(max_fix_age_s)

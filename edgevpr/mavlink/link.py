@@ -36,8 +36,8 @@ class Link:
     the port after every loss of the other end. What is said and heard is the `Conversation`'s.
 
     `system_id` is that of the autopilot (None: that of the first heard); a fix that has waited for `max_fix_age_s` is
-    never sent. `listener` hears how the vehicle moves, and gives the positions of a continuous channel; `tap` gets every
-    packet written and every packet heard, in the link's thread. `send`, `send_fix`, `set_health`, `want_position`,
+    never sent. `listener` hears how the vehicle moves, and gives the positions of a continuous channel. `tap` gets each
+    packet written and each packet heard, in the link's thread. `send`, `send_fix`, `set_health`, `want_position`,
     `vehicle`, `vehicle_at`, `channel`, `listens` and `stats` may be called from any thread; they never block and never
     raise.
     """
@@ -56,7 +56,7 @@ class Link:
         self._address = address
         self._tap = tap
         self._clock = clock
-        self._conversation = Conversation(clock, component_id, system_id, max_fix_age_s, listener, tap=tap)
+        self._conversation = Conversation(clock, component_id, system_id, max_fix_age_s, listener=listener, tap=tap)
         self._line: Line | None = None
         self._reopened = 0
         self._retry_s = RETRY_FIRST_S
