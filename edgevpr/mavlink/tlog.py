@@ -31,7 +31,7 @@ class Tlog:
 
     def __init__(self, path: str | Path) -> None:
         """Open the file. Raises EdgevprError where it cannot be opened."""
-        self._path = Path(path).resolve()
+        self._path = Path(os.path.realpath(path))
         self._waiting = bytearray()
         self._missing = 0  # packets
         self._lock = threading.Lock()  # of these two, and held for no longer than a copy takes

@@ -233,6 +233,9 @@ def test_a_log_that_is_moved_in_flight_goes_on_in_a_new_file(path, monkeypatch):
 def test_a_file_that_cannot_be_opened_is_one_sentence(tmp_path):
     with pytest.raises(EdgevprError, match=r"no/x\.tlog cannot be opened \(No such file or directory\): give a file"):
         Tlog(tmp_path / "no" / "x.tlog")
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    with pytest.raises(EdgevprError, match=r"loop cannot be opened \(Too many levels of symbolic links\)"):
+        Tlog(tmp_path / "loop")
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(EdgevprError, match="it is a pipe or a disk and not a file"):
         Tlog(tmp_path / "pipe")
