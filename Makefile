@@ -12,7 +12,7 @@ export PYTHONDONTWRITEBYTECODE :=
 demo: $(VENV)/installed
 	$(BIN)/edgevpr demo --out demo_out
 
-test: $(VENV)/installed lint
+test: $(VENV)/installed $(VENV)/clients/installed lint
 	$(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder
 
 lint: $(VENV)/installed
@@ -44,6 +44,15 @@ bench-arm64: $(VENV)/installed
 # Everything that a hostile world does, from a seed, into benchmarks/results/.
 hostile: $(VENV)/installed
 	$(BIN)/python benchmarks/hostile.py
+
+# Ground stations' programs for the tests, without what their windows need (1 GB). Where they cannot be had, their tests
+# are skipped.
+CLIENTS := MAVProxy==1.8.75 mavsdk==4.1.0
+$(VENV)/clients/installed: $(VENV)/installed
+	@missing=; for each in $(CLIENTS); do \
+	    $(BIN)/python -m pip install --quiet --disable-pip-version-check --retries 1 --timeout 20 --upgrade --no-deps \
+	        --only-binary :all: --target $(VENV)/clients $$each || { missing=1; echo "$$each: its tests are skipped"; }; \
+	done; [ "$$missing" ] || touch $@
 
 clean:
 	rm -rf $(VENV) demo_out dist build

@@ -161,6 +161,7 @@ class MavlinkConfig:
 @dataclass(frozen=True, slots=True)
 class LogConfig:
     path: str | None = keyed(Flag(("--log",), "FILE", "flight log, JSON lines"))
+    tlog: str | None = keyed(Flag(("--tlog",), "FILE", "every packet of the link, for mavlogdump and ground stations"))
 
 
 @dataclass(frozen=True, slots=True)

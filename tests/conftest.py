@@ -19,6 +19,7 @@ LONGEST = (
     "test_frames_live",
     "test_hostile_inputs",
     "test_mavlink_answers",
+    "test_ground_stations",
     "test_memory",
     "test_hostile_maps",
     "test_demo",

@@ -14,7 +14,7 @@ from edgevpr.mavlink.listener import Listener, NoListener
 from edgevpr.mavlink.messages import Health, Severity
 from edgevpr.mavlink.outbox import Outbox, Sending
 from edgevpr.mavlink.peer import Autopilot
-from edgevpr.mavlink.wire import Message, Receiver, mavlink
+from edgevpr.mavlink.wire import Message, Receiver, Tap, mavlink, untapped
 
 HEARTBEAT_S = 1.0
 STATE_S = 0.1  # ArduPilot calls a receiver unhealthy whose positions come more than 215 ms apart
@@ -39,13 +39,15 @@ class Conversation:
         component_id: int,
         system_id: int | None,
         max_fix_age_s: float,
+        *,
         listener: Listener = _NOBODY,
+        tap: Tap = untapped,
     ) -> None:
         self.outbox = Outbox(max_fix_age_s)
         self.autopilot = Autopilot(component_id, system_id, listener)
         self._listener = listener
         self.answers = Answers()
-        self.receiver = Receiver()
+        self.receiver = Receiver(tap=tap)
         self.sent: Counter[str] = Counter()
         self._clock = clock
         self._health, self._health_set_s = Health.BOOT, clock()

@@ -6,6 +6,7 @@ from contextlib import suppress
 
 from edgevpr.mavlink.outbox import Sending
 from edgevpr.mavlink.transport import Transport
+from edgevpr.mavlink.wire import Tap, untapped
 
 STUCK_S = 0.5  # a port that has taken no byte for this time is reopened: bytes that wait in it would leave late
 
@@ -14,13 +15,16 @@ class Line:
     """A transport into which one packet after another is written.
 
     A fix counts as sent when its bytes have left the system (over TCP: when the other end has confirmed them). One that
-    has not left when it is due makes the line fail: the bytes are thrown away with the transport.
+    has not left when it is due makes the line fail: the bytes are thrown away with the transport. `tap` gets each
+    packet that the port has taken in full.
     """
 
-    def __init__(self, transport: Transport, clock: Callable[[], float]) -> None:
+    def __init__(self, transport: Transport, clock: Callable[[], float], tap: Tap = untapped) -> None:
         self.transport = transport
+        self._tap = tap
         self._clock = clock
-        self._unsent = b""  # the rest of a packet that the port has taken only in part
+        self._packet = b""  # the last one put
+        self._unsent = b""  # the rest of it, where the port has not taken it in full
         self._taken = 0  # bytes that the port has taken so far
         self._leaving: deque[tuple[int, Sending]] = deque()  # fixes on their way out, and where in the bytes each ends
         self._blocked_since_s: float | None = None
@@ -42,7 +46,7 @@ class Line:
 
     def put(self, packet: bytes, sending: Sending | None) -> None:
         """Take the next packet, with the fix in it if it holds one. The packet before must have been taken in full."""
-        self._unsent = packet
+        self._packet = self._unsent = packet
         if sending:
             self._leaving.append((self._taken + len(packet), sending))
 
@@ -53,6 +57,8 @@ class Line:
         taken = self.transport.write(self._unsent)
         self._unsent = self._unsent[taken:]
         self._taken += taken
+        if not self._unsent:
+            self._tap(self._packet)
         if taken:
             self._blocked_since_s = None
         elif self._blocked_since_s is None:

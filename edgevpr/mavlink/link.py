@@ -18,7 +18,7 @@ from edgevpr.mavlink.messages import Fix, Health
 from edgevpr.mavlink.outbox import MAX_FIX_WAIT_S, Sending
 from edgevpr.mavlink.stats import LinkStats
 from edgevpr.mavlink.transport import open_transport
-from edgevpr.mavlink.wire import Message
+from edgevpr.mavlink.wire import Message, Tap, untapped
 from edgevpr.types import Vehicle
 
 TURN_S = 0.25  # longest sleep of the thread when nothing wakes it
@@ -36,9 +36,10 @@ class Link:
     the port after every loss of the other end. What is said and heard is the `Conversation`'s.
 
     `system_id` is that of the autopilot (None: that of the first heard); a fix that has waited for `max_fix_age_s` is
-    never sent. `listener` hears how the vehicle moves, and gives the positions of a continuous channel. `send`,
-    `send_fix`, `set_health`, `want_position`, `vehicle`, `vehicle_at`, `channel`, `listens` and `stats` may be called
-    from any thread; they never block and never raise.
+    never sent. `listener` hears how the vehicle moves, and gives the positions of a continuous channel. `tap` gets each
+    packet written and each packet heard, in the link's thread. `send`, `send_fix`, `set_health`, `want_position`,
+    `vehicle`, `vehicle_at`, `channel`, `listens` and `stats` may be called from any thread; they never block and never
+    raise.
     """
 
     def __init__(
@@ -50,10 +51,12 @@ class Link:
         system_id: int | None = None,
         max_fix_age_s: float = MAX_FIX_WAIT_S,
         listener: Listener = _NOBODY,
+        tap: Tap = untapped,
     ) -> None:
         self._address = address
+        self._tap = tap
         self._clock = clock
-        self._conversation = Conversation(clock, component_id, system_id, max_fix_age_s, listener)
+        self._conversation = Conversation(clock, component_id, system_id, max_fix_age_s, listener=listener, tap=tap)
         self._line: Line | None = None
         self._reopened = 0
         self._retry_s = RETRY_FIRST_S
@@ -70,7 +73,7 @@ class Link:
         to open it again and again, and `stats` gives the reason.
         """
         try:
-            self._line = Line(open_transport(self._address), self._clock)
+            self._line = Line(open_transport(self._address), self._clock, self._tap)
         except OSError as error:
             self._note_trouble(error)
         except LinkError:
@@ -179,7 +182,7 @@ class Link:
             return
         self._retry_s = min(2 * self._retry_s, RETRY_MAX_S)
         self._conversation.outbox.drop_stale_fixes(self._clock())
-        self._line = Line(open_transport(self._address), self._clock)
+        self._line = Line(open_transport(self._address), self._clock, self._tap)
         self._reopened += 1
 
     def _turn(self, line: Line, timeout_s: float) -> None:

@@ -6,21 +6,27 @@ this package must not.
 """
 
 from collections import Counter
-from collections.abc import Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 Message = mavlink.MAVLink_message
+Tap = Callable[[bytes], object]  # gets every whole packet, as it is on the wire
 
 
 _SENDERS_MAX = 8  # whose unfinished messages are kept; a flood from invented addresses must not fill the memory
+
+
+def untapped(packet: bytes) -> None:
+    """Do nothing with a packet: the tap of a link that has no tlog."""
 
 
 class Receiver:
     """The parser of what arrives, apart for each sender: a message that one begins swallows nothing of another's. It
     yields the messages; bytes that are no message are dropped and counted."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, tap: Tap = untapped) -> None:
+        self._tap = tap
         self.received: Counter[str] = Counter()  # messages by name
         self.bad_bytes = 0
         self.forget_partial_message()
@@ -41,7 +47,9 @@ class Receiver:
                 continue
             if message.get_type() == "BAD_DATA":
                 self.bad_bytes += len(message.data)
-            elif isinstance(message, mavlink.MAVLink_unknown):
+                continue
+            self._tap(message.get_msgbuf())
+            if isinstance(message, mavlink.MAVLink_unknown):
                 self.received["UNKNOWN"] += 1  # one name for all: there are 16 million message numbers
             else:
                 self.received[message.get_type()] += 1

@@ -15,13 +15,13 @@ from edgevpr.simulate.autopilot import AutopilotSummary, run_autopilot
 PATIENCE_S = 60.0  # a machine that does much else is slow, and not wrong
 
 
-def wait_until(condition, what: str = "the condition"):
+def wait_until(condition, what: str = "the condition", every_s: float = 0.005):
     """Wait for something that happens at once on a quiet machine; returns what `condition` gave."""
     give_up_s = time.monotonic() + PATIENCE_S
     while time.monotonic() < give_up_s:
         if result := condition():
             return result
-        time.sleep(0.005)
+        time.sleep(every_s)
     raise AssertionError(f"{what} did not come true in {PATIENCE_S:.0f} s")
 
 

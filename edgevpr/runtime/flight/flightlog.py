@@ -1,12 +1,10 @@
 """The flight log: one JSON object a line, appended. A full disk or a pulled card loses lines, but never ends the
 flight."""
 
-import errno
 import json
 import logging
 import math
 import os
-import stat
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -19,11 +17,11 @@ from edgevpr import __version__
 from edgevpr.config import Config
 from edgevpr.contract import TechniqueSpec
 from edgevpr.errors import EdgevprError
+from edgevpr.helpers.appending import append, is_at, open_appending, sync
 from edgevpr.helpers.text import without_passwords
 
 _log = logging.getLogger(__name__)
 _SYNC_EVERY_S = 1.0
-_MODE = 0o640  # positions are nobody else's, and a log is for the group that reads logs, whatever the umask
 
 
 class FlightLog:
@@ -48,7 +46,7 @@ class FlightLog:
         self._written = 0  # lines in the file that is open
         if path is not None:
             try:
-                self._file = _open(path)
+                self._file = open_appending(path)
             except OSError as error:
                 if wait:
                     self._note_trouble(error)
@@ -73,14 +71,14 @@ class FlightLog:
         if self.path is None:
             return
         is_sync_due = self._clock() - self._synced_s >= _SYNC_EVERY_S
-        if is_sync_due and self._file is not None and not _is_at(self._file, self.path):
+        if is_sync_due and self._file is not None and not is_at(self._file, self.path):
             self._note_taken_away()
         lines = _line(kind, {"t_mono_s": self._clock(), **fields})
         if self.state is not None:
             lines = _line("gap", {"t_mono_s": self._clock(), "lost_lines": self.lost_lines}) + lines
         try:
             if self._file is None:
-                self._file, self._written = _open(self.path), 0
+                self._file, self._written = open_appending(self.path), 0
             _append(self._file, lines)
             if is_sync_due:
                 self._sync()
@@ -102,8 +100,7 @@ class FlightLog:
         self._file = None
 
     def _sync(self) -> None:
-        if stat.S_ISREG(os.fstat(self._file.fileno()).st_mode):
-            os.fdatasync(self._file.fileno())
+        sync(self._file)
         self._synced_s = self._clock()
 
     def _lost_one(self, error: OSError) -> None:
@@ -166,52 +163,13 @@ def read_log(path: str | Path) -> Iterator[dict[str, Any]]:
                 yield record
 
 
-def _open(path: str | Path) -> BinaryIO:
-    flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY
-    try:
-        descriptor, is_new = os.open(path, flags | os.O_EXCL, _MODE), True
-    except FileExistsError:  # or a link to a file, which may not be there yet
-        descriptor, is_new = os.open(path, flags, _MODE), False
-    try:
-        kind = os.fstat(descriptor).st_mode
-        if not (stat.S_ISREG(kind) or stat.S_ISCHR(kind)):
-            raise OSError(errno.EINVAL, "it is a pipe or a disk and not a file", str(path))
-        if is_new:
-            with suppress(OSError):  # FAT has no permissions
-                os.fchmod(descriptor, _MODE)
-        # Unbuffered: a line that has been written is safe even if this process is killed next.
-        return os.fdopen(descriptor, "r+b", buffering=0)
-    except BaseException:
-        os.close(descriptor)
-        raise
-
-
-def _is_at(file: BinaryIO, path: str | Path) -> bool:
-    """Tell whether an open file is still the one that is found under `path`."""
-    try:
-        return os.path.samestat(os.fstat(file.fileno()), os.stat(path))
-    except OSError:
-        return False
-
-
 def _append(file: BinaryIO, lines: bytes) -> None:
-    """Append all of `lines` or, as far as the medium allows, nothing. Raises OSError."""
     end = file.seek(0, os.SEEK_END)
     if end:
         file.seek(end - 1)
         if file.read(1) != b"\n":  # cut by a pulled battery, or by a failure that could not be undone
             lines = b"\n" + lines
-    try:
-        rest = memoryview(lines)
-        while rest:  # a nearly full disk takes a part, and reports only at the next part that it is full
-            taken = file.write(rest)
-            if not taken:  # a terminal that is stopped
-                raise OSError(errno.EAGAIN, "it takes nothing more at the moment")
-            rest = rest[taken:]
-    except OSError:
-        with suppress(OSError):
-            file.truncate(end)
-        raise
+    append(file, lines)
 
 
 def _line(kind: str, fields: dict[str, Any]) -> bytes:

@@ -11,10 +11,12 @@ from typing import Any
 
 from edgevpr import __version__
 from edgevpr.config import Config, MavlinkConfig
-from edgevpr.errors import MapError, UsageError
+from edgevpr.errors import EdgevprError, MapError, UsageError
 from edgevpr.frames.source import open_source
 from edgevpr.mavlink.address import LinkAddress, parse_link
 from edgevpr.mavlink.link import Link
+from edgevpr.mavlink.tlog import Tlog
+from edgevpr.mavlink.wire import Tap, untapped
 from edgevpr.power.boards import Board, load_board
 from edgevpr.runtime.flight.autopilot import DRY_RUN, Mood, NoAutopilot, ToAutopilot
 from edgevpr.runtime.flight.clock import Clock
@@ -58,7 +60,8 @@ def fly(config: Config, positions: Path | None = None) -> int:
         _say_start(config, recogniser, flight_log, found)
         step_s = 1 / rate_hz(config, recogniser)
         navigator = Navigator(config.mavlink.min_accuracy_m, step_s)
-        link = stack.enter_context(_link(address, config.mavlink, navigator)) if address else None
+        tap = _tap(stack, config)
+        link = stack.enter_context(_link(address, config.mavlink, navigator, tap)) if address else None
         if link:
             link.want_position()
         source = open_source(config.source.uri, step_s=step_s, positions=positions, live=True)
@@ -111,14 +114,32 @@ def fly(config: Config, positions: Path | None = None) -> int:
     return 1 if flown.failed else 0
 
 
-def _link(address: LinkAddress, settings: MavlinkConfig, navigator: Navigator) -> Link:
+def _link(address: LinkAddress, settings: MavlinkConfig, navigator: Navigator, tap: Tap = untapped) -> Link:
     return Link(
         address,
         settings.component_id,
         system_id=settings.system_id,
         max_fix_age_s=settings.max_fix_age_s,
         listener=navigator if settings.send_fixes else Muted(navigator),
+        tap=tap,
     )
+
+
+def _tap(stack: ExitStack, config: Config) -> Tap:
+    """Open the tlog, if there is to be one, and return the call that takes its packets. A service, which may restart in
+    the air, flies without one that cannot be opened."""
+    if config.log.tlog is None:
+        return untapped
+    if config.mavlink.link is None:
+        _log.warning("there is no link, so there is no tlog either")
+        return untapped
+    try:
+        return stack.enter_context(Tlog(config.log.tlog)).record
+    except EdgevprError as error:
+        if "NOTIFY_SOCKET" not in os.environ:
+            raise
+        _log.warning("%s", error)
+        return untapped
 
 
 def _opened(config: Config, board: Board) -> tuple[Recogniser, Learner | None, str | None]:

@@ -1,0 +1,61 @@
+"""Files that are appended to in flight, each write as a whole or not at all."""
+
+import errno
+import os
+import stat
+from contextlib import suppress
+from pathlib import Path
+from typing import BinaryIO
+
+_MODE = 0o640  # positions are nobody else's, and a log is for the group that reads logs, whatever the umask
+
+
+def open_appending(path: str | Path) -> BinaryIO:
+    """Open a file, or a character device, for appending and reading; a new one gets the mode 0640. It never waits for
+    anybody and has no buffer: a write that has returned is safe even if this process is killed next. Raises OSError."""
+    flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY
+    try:
+        descriptor, is_new = os.open(path, flags | os.O_EXCL, _MODE), True
+    except FileExistsError:  # or a link to a file, which may not be there yet
+        descriptor, is_new = os.open(path, flags, _MODE), False
+    try:
+        kind = os.fstat(descriptor).st_mode
+        if not (stat.S_ISREG(kind) or stat.S_ISCHR(kind)):
+            raise OSError(errno.EINVAL, "it is a pipe or a disk and not a file", str(path))
+        if is_new:
+            with suppress(OSError):  # FAT has no permissions
+                os.fchmod(descriptor, _MODE)
+        return os.fdopen(descriptor, "r+b", buffering=0)
+    except BaseException:
+        os.close(descriptor)
+        raise
+
+
+def append(file: BinaryIO, data: bytes) -> None:
+    """Append all of `data` or, as far as the medium allows, nothing. Raises OSError."""
+    end = file.seek(0, os.SEEK_END)
+    try:
+        rest = memoryview(data)
+        while rest:  # a nearly full disk takes a part, and reports only at the next part that it is full
+            taken = file.write(rest)
+            if not taken:  # a terminal that is stopped
+                raise OSError(errno.EAGAIN, "it takes nothing more at the moment")
+            rest = rest[taken:]
+    except OSError:
+        with suppress(OSError):
+            file.truncate(end)
+        raise
+
+
+def sync(file: BinaryIO) -> None:
+    """Bring what was written to the disk, where there is one. Raises OSError."""
+    if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        os.fdatasync(file.fileno())
+
+
+def is_at(file: BinaryIO, path: str | Path) -> bool:
+    """Tell whether an open file is still the one that is found under `path`."""
+    try:
+        return os.path.samestat(os.fstat(file.fileno()), os.stat(path))
+    except OSError:
+        return False

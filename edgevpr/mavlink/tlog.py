@@ -1,0 +1,113 @@
+"""The telemetry log (tlog): every packet of a link, as ground stations keep it. mavlogdump of pymavlink reads it."""
+
+import errno
+import logging
+import os
+import struct
+import threading
+import time
+from pathlib import Path
+from typing import BinaryIO
+
+from edgevpr.errors import EdgevprError
+from edgevpr.helpers.appending import append, is_at, open_appending, sync
+
+MOST_BYTES = 256_000_000  # of one file, days of a usual link; with the one before it there are at most twice as many
+SPARED_BYTES = 20_000_000  # of the disk, which are left to the flight log
+WAITING_BYTES = 256_000  # of packets that a slow disk keeps waiting: half a minute or more of a usual link
+WRITE_S = 1.0
+CLOSE_S = 2.0
+
+_log = logging.getLogger(__name__)
+
+
+class Tlog:
+    """An open tlog: of each packet the microseconds since 1970 (8 bytes, big endian), then the packet. Close it (it is
+    a context manager).
+
+    A file that is there is appended to. The log has a thread of its own, which writes once a second: a slow disk keeps
+    nobody waiting, and costs packets when too many wait. A full disk ends the log, and nothing else.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        """Open the file. Raises EdgevprError where it cannot be opened."""
+        self._path = Path(os.path.realpath(path))
+        self._waiting = bytearray()
+        self._missing = 0  # packets
+        self._lock = threading.Lock()  # of these two, and held for no longer than a copy takes
+        self._closing, self._ended = threading.Event(), False
+        try:
+            self._file = open_appending(self._path)
+        except OSError as error:
+            raise EdgevprError(
+                f"The tlog {path} cannot be opened ({error.strerror}): give a file in a folder that is there and may "
+                "be written to."
+            ) from error
+        self._thread = threading.Thread(target=self._run, name="tlog", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> "Tlog":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def record(self, packet: bytes) -> None:
+        """Take a packet, to be written soon. May be called from any thread; it never blocks and never raises."""
+        stamp = struct.pack(">Q", time.time_ns() // 1000 & ~3)  # the last two bits would be the number of a link
+        with self._lock:
+            if self._ended:
+                return
+            if len(self._waiting) + len(stamp) + len(packet) > WAITING_BYTES:
+                self._missing += 1
+            else:
+                self._waiting += stamp + packet
+
+    def close(self) -> None:
+        """Write what waits, for two seconds at most, and close the file."""
+        self._closing.set()
+        self._thread.join(CLOSE_S)
+        if self._thread.is_alive():
+            _log.warning("The end of the tlog %s may be missing: the disk is too slow.", self._path)
+        elif self._missing:
+            _log.warning("The tlog %s misses %d packets: the disk was too slow.", self._path, self._missing)
+
+    # The methods below run in the log's own thread.
+
+    def _run(self) -> None:
+        try:
+            while not self._closing.wait(WRITE_S):
+                self._write()
+            self._write()
+        except OSError as error:
+            _log.warning(
+                "The tlog %s has ended (%s): make room, or give a file on another disk, for the next flight; this one "
+                "goes on without it.",
+                self._path,
+                error.strerror,
+            )
+        finally:
+            with self._lock:
+                self._ended = True
+                self._waiting.clear()
+            self._file.close()
+
+    def _write(self) -> None:
+        with self._lock:
+            records, self._waiting = self._waiting, bytearray()
+        if not records:
+            return
+        if not is_at(self._file, self._path):  # moved or deleted in flight
+            self._file = self._reopened()
+        elif os.fstat(self._file.fileno()).st_size + len(records) > MOST_BYTES:
+            self._path.replace(self._path.with_name(f"{self._path.stem}.1{self._path.suffix}"))
+            self._file = self._reopened()
+        disk = os.fstatvfs(self._file.fileno())
+        if disk.f_bavail * disk.f_frsize < SPARED_BYTES:
+            raise OSError(errno.ENOSPC, f"less than {SPARED_BYTES // 1_000_000} MB are left on the disk")
+        append(self._file, records)
+        sync(self._file)
+
+    def _reopened(self) -> BinaryIO:
+        self._file.close()
+        return open_appending(self._path)

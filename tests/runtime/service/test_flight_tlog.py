@@ -1,0 +1,83 @@
+"""`edgevpr run --tlog`: the packets of a flight, whatever ends it."""
+
+import signal
+import subprocess
+import sys
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from flight_process import start, wait_for
+from mavlink_peers import Peer, UdpPort, wait_until
+
+from edgevpr.mavlink.wire import mavlink
+
+MAVLOGDUMP = Path(sys.prefix) / "bin" / "mavlogdump.py"
+
+
+@pytest.fixture
+def fly(recording, tmp_path):
+    def started(*flags, **environment):
+        place_map, pictures = recording / "cohog.gpkg", recording / "blind" / "images"
+        return start(place_map, pictures, tmp_path / "log", "--rate-hz", "60", *flags, **environment)
+
+    return started
+
+
+def dumped(path: Path) -> str:
+    command = [sys.executable, MAVLOGDUMP, "--show-source", path]
+    return subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout
+
+
+def test_a_flight_that_is_killed_leaves_a_log_that_is_read(fly, tmp_path):
+    path = tmp_path / "flight.tlog"
+    with closing(UdpPort()) as port:
+        heartbeat = mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 1, 0, 4, 3)
+        heard = bytes(heartbeat.pack(mavlink.MAVLink(None, 1, 1)))
+        flight = fly("--link", f"udpout:127.0.0.1:{port.number}", "--tlog", path, "--rate-hz", "2")
+        Peer(port).expect("HEARTBEAT")
+        port.send(heard)
+        wait_until(lambda: heard in (written := path.read_bytes()) and b"vpr_mah" in written)
+        flight.send_signal(signal.SIGKILL)
+        flight.communicate()
+    said = dumped(path)
+    assert "HEARTBEAT {type : 2, autopilot : 3" in said, "heard"
+    assert "name : vpr_mah" in said, "sent"
+    assert "BAD_DATA" not in said
+
+
+def test_the_log_of_a_whole_flight_has_what_was_sent(fly, tmp_path):
+    path = tmp_path / "flight.tlog"
+    with closing(UdpPort()) as port:
+        flight = fly("--link", f"udpout:127.0.0.1:{port.number}", "--tlog", path)
+        flight.communicate(timeout=120)
+    assert flight.returncode == 0
+    end = wait_for("end", tmp_path / "log", flight)
+    said = dumped(path)
+    for name, count in end["mavlink"]["sent"].items():
+        assert said.count(f": {name} {{") == count
+
+
+def test_a_log_that_cannot_be_opened_is_said_before_the_flight(fly, tmp_path):
+    flight = fly("--link", "udpout:127.0.0.1:9", "--tlog", tmp_path / "no" / "x.tlog")
+    said = flight.communicate(timeout=120)[1]
+    assert flight.returncode != 0
+    assert "x.tlog cannot be opened (No such file or directory): give a file" in said
+    assert "Traceback" not in said
+
+
+def test_a_service_flies_without_it(fly, tmp_path):
+    with closing(UdpPort()) as port:
+        link = f"udpout:127.0.0.1:{port.number}"
+        socket_path = str(tmp_path / "notify")
+        flight = fly("--link", link, "--tlog", tmp_path / "no" / "x.tlog", NOTIFY_SOCKET=socket_path)
+        said = flight.communicate(timeout=120)[1]
+    assert flight.returncode == 0
+    assert said.count("x.tlog cannot be opened") == 1
+
+
+def test_without_a_link_there_is_none_and_that_is_said(fly, tmp_path):
+    flight = fly("--tlog", tmp_path / "x.tlog")
+    said = flight.communicate(timeout=120)[1]
+    assert "there is no link, so there is no tlog either" in said
+    assert not (tmp_path / "x.tlog").exists()
