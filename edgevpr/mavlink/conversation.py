@@ -12,6 +12,8 @@ from edgevpr.mavlink.answers import Answers
 from edgevpr.mavlink.messages import Health, Severity
 from edgevpr.mavlink.outbox import Outbox, Sending
 from edgevpr.mavlink.peer import Autopilot
+from edgevpr.mavlink.requests import Requests
+from edgevpr.mavlink.texts import Texts
 from edgevpr.mavlink.wire import Message, Receiver, mavlink
 
 HEARTBEAT_S = 1.0
@@ -23,7 +25,8 @@ log = logging.getLogger(__name__)
 
 class Conversation:
     """Packets to be sent, one after another, and the messages that arrive. It holds the `outbox` of what waits, the
-    state of the `autopilot`, the row of `answers` to our fixes, and the count of messages `sent`.
+    state of the `autopilot`, the row of `answers` to our fixes, the `texts` for the ground and the `requests` to us, and
+    the count of messages `sent`.
 
     `set_health` and `want_position` may be called from any thread, all else from that of the link.
     """
@@ -34,6 +37,7 @@ class Conversation:
         self.outbox = Outbox(max_fix_age_s)
         self.autopilot = Autopilot(component_id, system_id)
         self.answers = Answers()
+        self.texts, self.requests = Texts(), Requests()
         self.receiver = Receiver()
         self.sent: Counter[str] = Counter()
         self._clock = clock
@@ -86,19 +90,23 @@ class Conversation:
                 self._packer.srcSystem = self.autopilot.system_id
                 if news := self.autopilot.identity.take_news():
                     self.answers, self._last_sent = Answers(), None  # those of another
-                    self._announce(Severity.WARNING, news)
+                    self.texts.put(Severity.WARNING, news, "autopilot")
             if answer := self.autopilot.take_answer():
                 self.answers.note_answer(now_s)
                 if self._last_sent:
                     self._last_sent.answer = answer  # an answer names no fix: it is taken for the last one sent
                     if answer == "ACCEPTED":
                         self.autopilot.certainty.note_known(self._last_sent.fix.accuracy_m, now_s)
+            if not self.autopilot.identity.is_elsewhere(sender):
+                us = self._packer.srcSystem, self._packer.srcComponent
+                for reply in self.requests.hear(message, us, now_s, lambda: self._heartbeat(now_s)):
+                    self.outbox.put(reply)
         return is_ours
 
     def tell_of_answers(self) -> None:
         """Say once to the ground that fixes have no answers any more, or have them again."""
         if news := self.answers.news(self._clock()):
-            self._announce(Severity.WARNING if self.answers.is_stopped else Severity.INFO, news)
+            self.texts.put(Severity.WARNING if self.answers.is_stopped else Severity.INFO, news, "answers")
 
     def break_off(self, lost_fixes: int) -> None:
         """Forget what ends with the port, with which so many fixes were thrown away."""
@@ -111,18 +119,23 @@ class Conversation:
         late_s = now_s - self._heartbeat_due_s
         if late_s >= 0:
             self._heartbeat_due_s = now_s + HEARTBEAT_S - late_s % HEARTBEAT_S  # keeps the rhythm after missed beats
-            stuck = now_s - self._health_set_s > HEALTH_GOOD_FOR_S
-            return messages.heartbeat(Health.CRITICAL if stuck else self._health), None
+            return self._heartbeat(now_s), None
         if self.autopilot.listens(now_s):
             self._ask_for_position(now_s)
-            if why := self.answers.why_not(now_s):
+            if why := self.requests.why_no_fix() or self.answers.why_not(now_s):
                 self.outbox.withhold_fixes(why)
             elif sending := self.outbox.next_fix(now_s):
                 return messages.position_fix(sending.fix, now_s, self.autopilot.system_id), sending
         else:
             self.outbox.drop_stale_fixes(now_s)
-        message = self.outbox.next_message()
+        message = self.texts.next(now_s) or self.outbox.next_message()
+        while message and not self.requests.admits(message, now_s):
+            message = self.outbox.next_message()
         return message and (message, None)
+
+    def _heartbeat(self, now_s: float) -> Message:
+        stuck = now_s - self._health_set_s > HEALTH_GOOD_FOR_S
+        return messages.heartbeat(Health.CRITICAL if stuck else self._health)
 
     def _ask_for_position(self, now_s: float) -> None:
         """Ask again where no reports came: an autopilot that has restarted has forgotten the request."""
@@ -134,6 +147,3 @@ class Conversation:
         if now_s - heard_s > ASK_AGAIN_S:
             for request in messages.report_requests(self.autopilot.system_id, self.autopilot.firmware):
                 self.outbox.put(request)
-
-    def _announce(self, severity: Severity, text: str) -> None:
-        self.outbox.put(messages.status_text(severity, f"edgevpr: {text}"))
