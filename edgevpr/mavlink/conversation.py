@@ -25,8 +25,8 @@ log = logging.getLogger(__name__)
 
 class Conversation:
     """Packets to be sent, one after another, and the messages that arrive. It holds the `outbox` of what waits, the
-    state of the `autopilot`, the row of `answers` to our fixes, the `texts` for the ground and the `requests` to us, and
-    the count of messages `sent`.
+    state of the `autopilot`, the row of `answers` to our fixes, the `texts` for the ground and the `requests` to us,
+    and the count of messages `sent`.
 
     `set_health` and `want_position` may be called from any thread, all else from that of the link.
     """

@@ -1,4 +1,4 @@
-"""What the ground, or anybody else on the link, may ask of this companion: the list of all that is answered.
+"""The list of all that the ground, or anybody else on the link, may ask of this companion.
 
 Pure functions, a message in, the reaction out. What is not on the list is not obeyed. There are no parameters to be
 written.
@@ -38,9 +38,9 @@ class Wish(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Reaction:
-    """What follows from a message: `replies` to be sent, the `result` of a command (MAV_RESULT; None: it was none), a
+    """The reaction to a message: `replies` to be sent, the `result` of a command (MAV_RESULT; None: it was none), a
     `wish` that is to be fulfilled, and the `interval` (message number, seconds; None: the default) that is to be kept.
-    One without any of them follows from a message that is for us, and is ignored."""
+    One without any of them is that to a message that is for us, and is ignored."""
 
     replies: tuple[Message, ...] = ()
     result: int | None = None

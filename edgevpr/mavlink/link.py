@@ -11,8 +11,8 @@ from contextlib import suppress
 from edgevpr.errors import LinkError
 from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.conversation import Conversation
-from edgevpr.mavlink.line import Line
 from edgevpr.mavlink.ground import Wish
+from edgevpr.mavlink.line import Line
 from edgevpr.mavlink.messages import Fix, Health, Severity
 from edgevpr.mavlink.outbox import MAX_FIX_WAIT_S, Sending
 from edgevpr.mavlink.requests import Wished
@@ -143,8 +143,8 @@ class Link:
         )
 
     def close(self) -> None:
-        """Send the queued messages and texts, receive the answers to the fixes sent, both for half a second at most, and close
-        the port."""
+        """Send the queued messages and texts, receive the answers to the fixes sent, both for half a second at most,
+        and close the port."""
         self._conversation.texts.hurry()
         self._closing.set()
         self._ring()

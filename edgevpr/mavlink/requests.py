@@ -83,7 +83,7 @@ class Requests:
         return found.replies
 
     def why_no_fix(self) -> str | None:
-        """Return the reason why no fix may be sent, from the very acknowledgement of a pause on; None: there is none."""
+        """Return the reason why no fix may be sent, from the acknowledgement of a pause on; None: there is none."""
         return PAUSED if self._is_paused else None
 
     def admits(self, message: Message, now_s: float) -> bool:

@@ -8,8 +8,8 @@ class LinkStats:
     """Counts and state of a link. `trouble` is the reason why it is or last was not open, None once data arrives.
 
     `foreign_messages` came from another autopilot or another address than ours and were refused. `withheld_fixes` were
-    not sent because those before had no answer, or the ground has paused the flight. `commands` counts those that were for
-    us, by result, and `ignored_requests` other messages that were for us.
+    not sent because those before had no answer, or the ground has paused the flight. `commands` counts those that
+    were for us, by result, and `ignored_requests` what else was for us and had no effect.
     """
 
     connected: bool
