@@ -9,11 +9,10 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from edgevpr.frames.condition import Condition
-from edgevpr.mavlink.ground import Wish
 from edgevpr.mavlink.link import LinkStats
 from edgevpr.mavlink.messages import Fix, Health, Severity, status_text
 from edgevpr.mavlink.outbox import Outbox, Sending
-from edgevpr.mavlink.requests import Wished
+from edgevpr.mavlink.wishes import Wish, Wished
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.types import Frame, Vehicle
 

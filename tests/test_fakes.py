@@ -14,10 +14,10 @@ from edgevpr.frames.condition import Condition
 from edgevpr.frames.live import Camera, LiveSource
 from edgevpr.frames.source import open_source
 from edgevpr.mavlink.address import parse_link
-from edgevpr.mavlink.ground import Wish
 from edgevpr.mavlink.link import Link, LinkStats
 from edgevpr.mavlink.messages import Fix, Health, Severity, status_text
 from edgevpr.mavlink.wire import mavlink
+from edgevpr.mavlink.wishes import Wish
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.simulate.autopilot import Track
 

@@ -15,6 +15,7 @@ from edgevpr.mavlink.peer import Autopilot
 from edgevpr.mavlink.requests import Requests
 from edgevpr.mavlink.texts import Texts
 from edgevpr.mavlink.wire import Message, Receiver, mavlink
+from edgevpr.mavlink.wishes import Wishes
 
 HEARTBEAT_S = 1.0
 HEALTH_GOOD_FOR_S = 10.0  # a hung main loop must not look healthy because the link's thread still runs
@@ -25,10 +26,10 @@ log = logging.getLogger(__name__)
 
 class Conversation:
     """Packets to be sent, one after another, and the messages that arrive. It holds the `outbox` of what waits, the
-    state of the `autopilot`, the row of `answers` to our fixes, the `texts` for the ground and the `requests` to us,
-    and the count of messages `sent`.
+    state of the `autopilot`, the row of `answers` to our fixes, the `texts` for the ground, the `requests` to us and
+    the `wishes` among them, and the count of messages `sent`.
 
-    `set_health` and `want_position` may be called from any thread, all else from that of the link.
+    `set_health`, `want_position`, `texts` and `wishes` may be used from any thread, all else from that of the link.
     """
 
     def __init__(
@@ -37,7 +38,8 @@ class Conversation:
         self.outbox = Outbox(max_fix_age_s)
         self.autopilot = Autopilot(component_id, system_id)
         self.answers = Answers()
-        self.texts, self.requests = Texts(), Requests()
+        self.texts, self.wishes = Texts(), Wishes()
+        self.requests = Requests(self.wishes)
         self.receiver = Receiver()
         self.sent: Counter[str] = Counter()
         self._clock = clock
@@ -90,7 +92,7 @@ class Conversation:
                 self._packer.srcSystem = self.autopilot.system_id
                 if news := self.autopilot.identity.take_news():
                     self.answers, self._last_sent = Answers(), None  # those of another
-                    self.texts.put(Severity.WARNING, news, "autopilot")
+                    self._announce(Severity.WARNING, news, "autopilot")
             if answer := self.autopilot.take_answer():
                 self.answers.note_answer(now_s)
                 if self._last_sent:
@@ -98,15 +100,13 @@ class Conversation:
                     if answer == "ACCEPTED":
                         self.autopilot.certainty.note_known(self._last_sent.fix.accuracy_m, now_s)
             if not self.autopilot.identity.is_elsewhere(sender):
-                us = self._packer.srcSystem, self._packer.srcComponent
-                for reply in self.requests.hear(message, us, now_s, lambda: self._heartbeat(now_s)):
-                    self.outbox.put(reply)
+                self._hear_request(message, now_s)
         return is_ours
 
     def tell_of_answers(self) -> None:
         """Say once to the ground that fixes have no answers any more, or have them again."""
         if news := self.answers.news(self._clock()):
-            self.texts.put(Severity.WARNING if self.answers.is_stopped else Severity.INFO, news, "answers")
+            self._announce(Severity.WARNING if self.answers.is_stopped else Severity.INFO, news, "answers")
 
     def break_off(self, lost_fixes: int) -> None:
         """Forget what ends with the port, with which so many fixes were thrown away."""
@@ -122,13 +122,15 @@ class Conversation:
             return self._heartbeat(now_s), None
         if self.autopilot.listens(now_s):
             self._ask_for_position(now_s)
-            if why := self.requests.why_no_fix() or self.answers.why_not(now_s):
+            if why := self.wishes.why_no_fix() or self.answers.why_not(now_s):
                 self.outbox.withhold_fixes(why)
             elif sending := self.outbox.next_fix(now_s):
                 return messages.position_fix(sending.fix, now_s, self.autopilot.system_id), sending
         else:
             self.outbox.drop_stale_fixes(now_s)
-        message = self.texts.next(now_s) or self.outbox.next_message()
+        if text := self.texts.next(now_s):
+            self.outbox.put(text)
+        message = self.outbox.next_message()
         while message and not self.requests.admits(message, now_s):
             message = self.outbox.next_message()
         return message and (message, None)
@@ -147,3 +149,11 @@ class Conversation:
         if now_s - heard_s > ASK_AGAIN_S:
             for request in messages.report_requests(self.autopilot.system_id, self.autopilot.firmware):
                 self.outbox.put(request)
+
+    def _hear_request(self, message: Message, now_s: float) -> None:
+        us = self._packer.srcSystem, self._packer.srcComponent
+        for reply in self.requests.hear(message, us, now_s, lambda: self._heartbeat(now_s)):
+            self.outbox.put(reply)
+
+    def _announce(self, severity: Severity, text: str, topic: str | None = None) -> None:
+        self.texts.put(severity, text, topic)

@@ -11,14 +11,13 @@ from contextlib import suppress
 from edgevpr.errors import LinkError
 from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.conversation import Conversation
-from edgevpr.mavlink.ground import Wish
 from edgevpr.mavlink.line import Line
 from edgevpr.mavlink.messages import Fix, Health, Severity
 from edgevpr.mavlink.outbox import MAX_FIX_WAIT_S, Sending
-from edgevpr.mavlink.requests import Wished
 from edgevpr.mavlink.stats import LinkStats
 from edgevpr.mavlink.transport import open_transport
 from edgevpr.mavlink.wire import Message
+from edgevpr.mavlink.wishes import Wish, Wished
 from edgevpr.types import Vehicle
 
 TURN_S = 0.25  # longest sleep of the thread when nothing wakes it
@@ -94,11 +93,11 @@ class Link:
 
     def offer(self, wishes: Collection[Wish]) -> None:
         """Set the wishes of the ground that can be fulfilled from now on; there are none before the first call."""
-        self._conversation.requests.offer(wishes)
+        self._conversation.wishes.offered = wishes
 
     def take_wishes(self) -> tuple[Wished, ...]:
         """Return the wishes of the ground since the last call."""
-        return self._conversation.requests.take_wishes()
+        return self._conversation.wishes.take()
 
     def set_health(self, health: Health) -> None:
         """Set the health in the heartbeats of the next ten seconds. After that, without a new call, it is CRITICAL."""

@@ -6,10 +6,9 @@ from dataclasses import replace
 from enum import Enum, auto
 
 from edgevpr.mavlink import messages
-from edgevpr.mavlink.ground import Wish
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.outbox import Sending
-from edgevpr.mavlink.requests import Wished
+from edgevpr.mavlink.wishes import Wish, Wished
 from edgevpr.power.load import MachineLoad
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.consistency import Consistency

@@ -2,8 +2,7 @@
 
 import logging
 
-from edgevpr.mavlink.ground import Wish
-from edgevpr.mavlink.requests import Wished
+from edgevpr.mavlink.wishes import Wish, Wished
 from edgevpr.runtime.flight.autopilot import Autopilot, Mood
 from edgevpr.runtime.flight.flightlog import FlightLog
 from edgevpr.runtime.recognise.learn import Learner

@@ -9,9 +9,9 @@ from mavlink_peers import Peer, UdpPort, wait_until
 from pictures import textured
 
 from edgevpr.mavlink.address import parse_link
-from edgevpr.mavlink.ground import Wish
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.wire import mavlink
+from edgevpr.mavlink.wishes import Wish
 from edgevpr.runtime.flight import systemd, vitals
 
 

@@ -8,10 +8,10 @@ import math
 import re
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
-from enum import IntEnum
 
 from edgevpr import __version__
 from edgevpr.mavlink.wire import Message, mavlink
+from edgevpr.mavlink.wishes import Wish
 
 STATUS = mavlink.MAVLINK_MSG_ID_ONBOARD_COMPUTER_STATUS
 # The messages whose interval may be set, and the shortest one in seconds. A longer one leaves messages out; none is
@@ -25,15 +25,6 @@ _ACCEPTED, _DENIED, _UNSUPPORTED = (
     mavlink.MAV_RESULT_UNSUPPORTED,
 )
 _NOT_NOW = mavlink.MAV_RESULT_TEMPORARILY_REJECTED
-
-
-class Wish(IntEnum):
-    """A wish for the flight: the first parameter of MAV_CMD_USER_1 (31010)."""
-
-    PAUSE = 1
-    RESUME = 2
-    LEARN = 3
-    LEARN_NOTHING = 4
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,11 +7,11 @@ from fakes import FakeClock
 from mavlink_peers import Peer, UdpPort, free_port, wait_until
 
 from edgevpr.mavlink.address import parse_link
-from edgevpr.mavlink.ground import Wish
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Fix, Health, Severity, computer_status, query_figures, status_text
 from edgevpr.mavlink.requests import ANSWERED_MAX
 from edgevpr.mavlink.wire import mavlink
+from edgevpr.mavlink.wishes import Wish
 
 STATION = {"system_id": 255, "component_id": 190}
 US = (7, 197)
@@ -116,7 +116,7 @@ def test_the_heartbeat_can_be_asked_for(peer, link, form):
 
 
 def test_the_version_can_be_asked_for(peer, monkeypatch):
-    monkeypatch.setattr("edgevpr.mavlink.ground.__version__", "1.22.3.dev4")
+    monkeypatch.setattr("edgevpr.mavlink.allowed.__version__", "1.22.3.dev4")
     assert answered(peer, command_long(512, 148.0)) == "ACCEPTED"
     version = peer.expect("AUTOPILOT_VERSION")
     assert version.flight_sw_version == 0x01160300
