@@ -3,7 +3,9 @@
 from types import SimpleNamespace
 
 import pytest
-from fakes import FakeClock, FakeLink
+from fakes import FakeClock, FakeLink, FakeSource
+from flights import Flight, of_kind
+from pictures import textured
 
 from edgevpr.frames.level import View
 from edgevpr.runtime.flight.autopilot import ToAutopilot
@@ -99,3 +101,14 @@ def test_a_tilt_that_comes_and_goes_is_not_told(seen):
 
 def test_a_turn_with_level_moments_is_one_tilt(seen):
     assert seen.look("tttttt" + "-t" * 20) == ["tilt too large"]
+
+
+def test_a_flight_that_leaves_its_map_and_comes_back_says_so(recording, tmp_path):
+    clock = FakeClock()
+    link = FakeLink(clock)
+    flight = Flight(recording / "cohog.gpkg", tmp_path / "log", clock, link, **{"source.rate_hz": 1.0})
+    over_map, elsewhere = range(8), range(100, 140)
+    pictures = [textured(number, 240, 320) for number in [*over_map, *elsewhere, *over_map]]
+    lines = flight.fly(FakeSource(pictures, clock))
+    assert link.texts() == [(4, "edgevpr: map left"), (6, "edgevpr: map found again")]
+    assert [line["said"] for line in of_kind(lines, "sight")] == ["map left", "map found again"]
