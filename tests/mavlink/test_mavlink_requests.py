@@ -76,7 +76,9 @@ def unanswered(peer, link, *messages, sender=None):
     for message in messages:
         peer.send(message, **(sender or STATION))
     wait_until(lambda: sum(link.stats().received.values()) == before + len(messages))
-    return [each.get_type() for each in before_mark(peer, link) if each.get_type() != "HEARTBEAT"]
+    # The first mark may overtake the answer to the last message; not so the second.
+    came = before_mark(peer, link) + before_mark(peer, link)
+    return [each.get_type() for each in came if each.get_type() != "HEARTBEAT"]
 
 
 def test_a_ping_to_all_is_answered_to_its_sender_with_its_number_and_time(peer):
