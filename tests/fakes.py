@@ -11,8 +11,9 @@ import numpy as np
 from edgevpr.frames.condition import Condition
 from edgevpr.mavlink.link import LinkStats
 from edgevpr.mavlink.listener import NoListener
-from edgevpr.mavlink.messages import Fix, Health
+from edgevpr.mavlink.messages import Fix, Health, Severity, status_text
 from edgevpr.mavlink.outbox import Outbox, Sending
+from edgevpr.mavlink.wishes import Wish, Wished
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.types import Frame, Vehicle
 
@@ -124,7 +125,8 @@ class FakeSource:
 
 class FakeLink:
     """A link of which nothing gets lost, to an autopilot that listens from when it has an `answer` to fixes (None: it
-    is not there) and says what `vehicle` gives. `sent` is what has left, in order."""
+    is not there) and says what `vehicle` gives. `sent` is what has left, in order; no text waits for its turn. `wish`
+    stands for a command of the ground, which gets its answer."""
 
     def __init__(
         self,
@@ -140,6 +142,7 @@ class FakeLink:
         self._outbox = Outbox()
         self._fixes: list[Fix] = []
         self._acks: Counter[str] = Counter()
+        self._offered, self._wishes = (), []
 
     def send(self, *outgoing) -> None:
         self.sent += outgoing
@@ -148,6 +151,22 @@ class FakeLink:
         sending = self._outbox.put_fix(fix, self._clock())
         self._turn()
         return sending
+
+    def announce(self, severity: Severity, text: str, topic: str | None = None) -> None:
+        self.send(status_text(severity, f"edgevpr: {text}"))
+
+    def offer(self, wishes) -> None:
+        self._offered = wishes
+
+    def take_wishes(self) -> tuple[Wished, ...]:
+        wishes, self._wishes = tuple(self._wishes), []
+        return wishes
+
+    def wish(self, wish: Wish) -> str:
+        if wish not in self._offered:
+            return "TEMPORARILY_REJECTED"
+        self._wishes.append(Wished(wish, 255, 190))
+        return "ACCEPTED"
 
     def set_health(self, health: Health) -> None:
         self.health = health
@@ -180,6 +199,8 @@ class FakeLink:
             acks=dict(self._acks),
             dropped_stale_fixes=self._outbox.dropped_stale_fixes,
             withheld_fixes=self._outbox.withheld_fixes,
+            commands={},
+            ignored_requests=0,
             foreign_messages=0,
             dropped_queue_full=0,
             bad_bytes=0,

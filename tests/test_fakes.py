@@ -6,7 +6,7 @@ from dataclasses import fields
 import cv2
 import pytest
 from fakes import FakeCapture, FakeClock, FakeLink, FakeSource, vehicle_at
-from mavlink_peers import AutopilotThread, UdpPort, wait_until
+from mavlink_peers import AutopilotThread, Peer, UdpPort, wait_until
 from pictures import textured
 
 from edgevpr.errors import ImageError
@@ -16,6 +16,8 @@ from edgevpr.frames.source import open_source
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.link import Link, LinkStats
 from edgevpr.mavlink.messages import Fix, Health, Severity, status_text
+from edgevpr.mavlink.wire import mavlink
+from edgevpr.mavlink.wishes import Wish
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.simulate.autopilot import Track
 
@@ -161,6 +163,34 @@ def test_messages_and_health_are_taken(link):
     stats = link.stats()
     assert isinstance(stats, LinkStats)
     assert (stats.connected, stats.autopilot_heard, stats.autopilot_system_id) == (True, True, 1)
+
+
+@pytest.mark.parametrize("kind", ["real", "fake"])
+def test_a_text_is_announced_and_a_wish_of_the_ground_is_handed_on_where_it_is_offered(kind):
+    clock, port = FakeClock(), UdpPort()
+    link = FakeLink(clock)
+    if kind == "real":
+        link = Link(parse_link(f"udpout:127.0.0.1:{port.number}"), clock=clock)
+        link.start()
+        peer = Peer(port)
+        peer.expect("HEARTBEAT")
+
+    def wish(wish):
+        if kind == "fake":
+            return link.wish(wish)
+        station = {"system_id": 255, "component_id": 190}
+        peer.send(mavlink.MAVLink_command_long_message(1, 197, 31010, 0, wish, 0, 0, 0, 0, 0, 0), **station)
+        return mavlink.enums["MAV_RESULT"][peer.expect("COMMAND_ACK").result].name.removeprefix("MAV_RESULT_")
+
+    link.announce(Severity.WARNING, "camera lost", "camera")
+    wait_until(lambda: link.stats().sent.get("STATUSTEXT") == 1)
+    assert wish(Wish.PAUSE) == "TEMPORARILY_REJECTED"
+    link.offer((Wish.PAUSE,))
+    assert (wish(Wish.PAUSE), wish(Wish.LEARN)) == ("ACCEPTED", "TEMPORARILY_REJECTED")
+    assert [(each.wish, each.sender) for each in link.take_wishes()] == [(Wish.PAUSE, "255/190")]
+    assert link.take_wishes() == ()
+    link.close()
+    port.close()
 
 
 @pytest.mark.parametrize("kind", ["real", "fake"])

@@ -14,7 +14,10 @@ from edgevpr.mavlink.listener import Listener, NoListener
 from edgevpr.mavlink.messages import Health, Severity
 from edgevpr.mavlink.outbox import Outbox, Sending
 from edgevpr.mavlink.peer import Autopilot
+from edgevpr.mavlink.requests import Requests
+from edgevpr.mavlink.texts import Texts
 from edgevpr.mavlink.wire import Message, Receiver, Tap, mavlink, untapped
+from edgevpr.mavlink.wishes import Wishes
 
 HEARTBEAT_S = 1.0
 STATE_S = 0.1  # ArduPilot calls a receiver unhealthy whose positions come more than 215 ms apart
@@ -28,9 +31,10 @@ log = logging.getLogger(__name__)
 
 class Conversation:
     """Packets to be sent, one after another, and the messages that arrive. It holds the `outbox` of what waits, the
-    state of the `autopilot`, the row of `answers` to our fixes, and the count of messages `sent`.
+    state of the `autopilot`, the row of `answers` to our fixes, the `texts` for the ground, the `requests` to us and
+    the `wishes` among them, and the count of messages `sent`.
 
-    `set_health` and `want_position` may be called from any thread, all else from that of the link.
+    `set_health`, `want_position`, `texts` and `wishes` may be used from any thread, all else from that of the link.
     """
 
     def __init__(
@@ -47,6 +51,8 @@ class Conversation:
         self.autopilot = Autopilot(component_id, system_id, listener)
         self._listener = listener
         self.answers = Answers()
+        self.texts, self.wishes = Texts(), Wishes()
+        self.requests = Requests(self.wishes)
         self.receiver = Receiver(tap=tap)
         self.sent: Counter[str] = Counter()
         self._clock = clock
@@ -113,19 +119,21 @@ class Conversation:
                 self._packer.srcSystem = self.autopilot.system_id
                 if news := self.autopilot.identity.take_news():
                     self.answers, self._last_sent = Answers(), None  # those of another
-                    self._announce(Severity.WARNING, news)
+                    self._announce(Severity.WARNING, news, "autopilot")
             if answer := self.autopilot.take_answer():
                 self.answers.note_answer(now_s)
                 if self._last_sent:
                     self._last_sent.answer = answer  # an answer names no fix: it is taken for the last one sent
                     if answer == "ACCEPTED":
                         self.autopilot.certainty.note_known(self._last_sent.fix.accuracy_m, now_s)
+            if not self.autopilot.identity.is_elsewhere(sender):
+                self._hear_request(message, now_s)
         return is_ours
 
     def tell_of_answers(self) -> None:
         """Say once to the ground that fixes have no answers any more, or have them again."""
         if news := self.answers.news(self._clock()):
-            self._announce(Severity.WARNING if self.answers.is_stopped else Severity.INFO, news)
+            self._announce(Severity.WARNING if self.answers.is_stopped else Severity.INFO, news, "answers")
 
     def break_off(self, lost_fixes: int) -> None:
         """Forget what ends with the port, with which so many fixes were thrown away."""
@@ -138,13 +146,12 @@ class Conversation:
         late_s = now_s - self._heartbeat_due_s
         if late_s >= 0:
             self._heartbeat_due_s = now_s + HEARTBEAT_S - late_s % HEARTBEAT_S  # keeps the rhythm after missed beats
-            stuck = now_s - self._health_set_s > HEALTH_GOOD_FOR_S
-            return messages.heartbeat(Health.CRITICAL if stuck else self._health), None
+            return self._heartbeat(now_s), None
         if self.autopilot.listens(now_s):
             self._ask_for_position(now_s)
             if self.channel.is_continuous and (state := self._state(now_s)):
                 return state, None
-            if why := self.answers.why_not(now_s):
+            if why := self.wishes.why_no_fix() or self.answers.why_not(now_s):
                 self.outbox.withhold_fixes(why)
             elif sending := self.outbox.next_fix(now_s):
                 if self.channel is Channel.SENSOR:
@@ -152,8 +159,16 @@ class Conversation:
                 return messages.position_fix(sending.fix, now_s, self.autopilot.system_id), sending
         else:
             self.outbox.drop_stale_fixes(now_s)
+        if text := self.texts.next(now_s):
+            self.outbox.put(text)
         message = self.outbox.next_message()
+        while message and not self.requests.admits(message, now_s):
+            message = self.outbox.next_message()
         return message and (message, None)
+
+    def _heartbeat(self, now_s: float) -> Message:
+        stuck = now_s - self._health_set_s > HEALTH_GOOD_FOR_S
+        return messages.heartbeat(Health.CRITICAL if stuck else self._health)
 
     def _state(self, now_s: float) -> Message | None:
         """Make the next message of a continuous position, where it is due."""
@@ -190,5 +205,10 @@ class Conversation:
             ):
                 self.outbox.put(request)
 
-    def _announce(self, severity: Severity, text: str) -> None:
-        self.outbox.put(messages.status_text(severity, f"edgevpr: {text}"))
+    def _hear_request(self, message: Message, now_s: float) -> None:
+        us = self._packer.srcSystem, self._packer.srcComponent
+        for reply in self.requests.hear(message, us, now_s, lambda: self._heartbeat(now_s)):
+            self.outbox.put(reply)
+
+    def _announce(self, severity: Severity, text: str, topic: str | None = None) -> None:
+        self.texts.put(severity, text, topic)

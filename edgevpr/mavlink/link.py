@@ -5,7 +5,7 @@ import select
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import suppress
 
 from edgevpr.errors import LinkError
@@ -14,11 +14,12 @@ from edgevpr.mavlink.autopilots.channel import Channel
 from edgevpr.mavlink.conversation import Conversation
 from edgevpr.mavlink.line import Line
 from edgevpr.mavlink.listener import Listener, NoListener
-from edgevpr.mavlink.messages import Fix, Health
+from edgevpr.mavlink.messages import Fix, Health, Severity
 from edgevpr.mavlink.outbox import MAX_FIX_WAIT_S, Sending
 from edgevpr.mavlink.stats import LinkStats
 from edgevpr.mavlink.transport import open_transport
 from edgevpr.mavlink.wire import Message, Tap, untapped
+from edgevpr.mavlink.wishes import Wish, Wished
 from edgevpr.types import Vehicle
 
 TURN_S = 0.25  # longest sleep of the thread when nothing wakes it
@@ -37,9 +38,9 @@ class Link:
 
     `system_id` is that of the autopilot (None: that of the first heard); a fix that has waited for `max_fix_age_s` is
     never sent. `listener` hears how the vehicle moves, and gives the positions of a continuous channel. `tap` gets each
-    packet written and each packet heard, in the link's thread. `send`, `send_fix`, `set_health`, `want_position`,
-    `vehicle`, `vehicle_at`, `channel`, `listens` and `stats` may be called from any thread; they never block and never
-    raise.
+    packet written and each packet heard, in the link's thread. `send`, `send_fix`, `announce`, `offer`, `take_wishes`,
+    `set_health`, `want_position`, `vehicle`, `vehicle_at`, `channel`, `listens` and `stats` may be called from any
+    thread; they never block and never raise.
     """
 
     def __init__(
@@ -94,6 +95,19 @@ class Link:
         self._ring()
         return sending
 
+    def announce(self, severity: Severity, text: str, topic: str | None = None) -> None:
+        """Let a text for the people on the ground wait for its turn (see `Texts`)."""
+        self._conversation.texts.put(severity, text, topic)
+        self._ring()
+
+    def offer(self, wishes: Collection[Wish]) -> None:
+        """Set the wishes of the ground that can be fulfilled from now on; there are none before the first call."""
+        self._conversation.wishes.offered = wishes
+
+    def take_wishes(self) -> tuple[Wished, ...]:
+        """Return the wishes of the ground since the last call."""
+        return self._conversation.wishes.take()
+
     def set_health(self, health: Health) -> None:
         """Set the health in the heartbeats of the next ten seconds. After that, without a new call, it is CRITICAL."""
         self._conversation.set_health(health)
@@ -133,6 +147,8 @@ class Link:
             acks=dict(autopilot.acks),
             dropped_stale_fixes=outbox.dropped_stale_fixes,
             withheld_fixes=outbox.withheld_fixes,
+            commands=dict(said.requests.results),
+            ignored_requests=said.requests.ignored,
             foreign_messages=autopilot.identity.foreign_messages,
             dropped_queue_full=outbox.dropped_queue_full,
             bad_bytes=said.receiver.bad_bytes,
@@ -140,8 +156,9 @@ class Link:
         )
 
     def close(self) -> None:
-        """Send the queued messages, receive the answers to the fixes sent, both for half a second at most, and close
-        the port."""
+        """Send the queued messages and texts, receive the answers to the fixes sent, both for half a second at most,
+        and close the port."""
+        self._conversation.texts.hurry()
         self._closing.set()
         self._ring()
         if self._thread.ident is None:  # never started
@@ -240,7 +257,8 @@ class Link:
         with suppress(OSError):
             while self._is_connected() and time.monotonic() < give_up_s:
                 self._turn(self._line, timeout_s=0.01)
-                if not self._conversation.outbox and self._line.is_idle and self._all_answered():
+                waiting = self._conversation.outbox or self._conversation.texts
+                if not waiting and self._line.is_idle and self._all_answered():
                     break
 
     def _all_answered(self) -> bool:

@@ -20,6 +20,7 @@ class Health(IntEnum):
     """The state of this companion in its heartbeat (MAV_STATE)."""
 
     BOOT = mavlink.MAV_STATE_BOOT
+    STANDBY = mavlink.MAV_STATE_STANDBY  # paused by the ground
     ACTIVE = mavlink.MAV_STATE_ACTIVE
     CRITICAL = mavlink.MAV_STATE_CRITICAL  # it runs, but does not work: no frames come, or its main loop hangs
 
@@ -115,11 +116,13 @@ def report_requests(target_system: int, firmware: int, is_continuous: bool = Fal
     )
 
 
-def place_match(t_mono_s: float, place_id: int, score: float) -> tuple[Message, Message]:
-    """Make the event of an accepted match: NAMED_VALUE_INT (252) `vpr_place`, NAMED_VALUE_FLOAT (251) `vpr_score`."""
+def place_match(t_mono_s: float, place_id: int, score: float, confidence: float | None = None) -> tuple[Message, ...]:
+    """Make the event of an accepted match: NAMED_VALUE_INT (252) `vpr_place`, NAMED_VALUE_FLOAT (251) `vpr_score`, and
+    `vpr_conf`, the probability that it is right, where that is known."""
     return (
         mavlink.MAVLink_named_value_int_message(_boot_ms(t_mono_s), b"vpr_place", place_id),
         _named_float(t_mono_s, b"vpr_score", score),
+        *((_named_float(t_mono_s, b"vpr_conf", confidence),) if confidence is not None else ()),
     )
 
 

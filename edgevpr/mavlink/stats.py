@@ -8,7 +8,8 @@ class LinkStats:
     """Counts and state of a link. `trouble` is the reason why it is or last was not open, None once data arrives.
 
     `foreign_messages` came from another autopilot or another address than ours and were refused. `withheld_fixes` were
-    not sent because those before had no answer.
+    not sent because those before had no answer, or the ground has paused the flight. `commands` counts those that
+    were for us, by result, and `ignored_requests` what else was for us and had no effect.
     """
 
     connected: bool
@@ -20,6 +21,8 @@ class LinkStats:
     acks: dict[str, int]
     dropped_stale_fixes: int
     withheld_fixes: int
+    commands: dict[str, int]
+    ignored_requests: int
     foreign_messages: int
     dropped_queue_full: int
     bad_bytes: int

@@ -67,6 +67,11 @@ def test_the_event_of_a_match_carries_the_place_and_its_score():
     assert (score.get_type(), score.name, score.value) == ("NAMED_VALUE_FLOAT", "vpr_score", 0.625)
 
 
+def test_the_event_of_a_match_carries_its_confidence_where_there_is_one():
+    *_, confidence = map(sent_and_received, messages.place_match(12.5, 4711, 0.625, 0.75))
+    assert (confidence.get_type(), confidence.name, confidence.value) == ("NAMED_VALUE_FLOAT", "vpr_conf", 0.75)
+
+
 def test_the_figures_of_a_query_carry_the_cpu_share_and_the_charge():
     cpu, charge = map(sent_and_received, messages.query_figures(12.5, 0.25, 3.5))
     assert (cpu.name, cpu.value) == ("vpr_cpu", 0.25)

@@ -1,12 +1,14 @@
 """The channel to the autopilot: tells it of every event, and gives what it says of its vehicle."""
 
 import logging
+from collections.abc import Collection
 from dataclasses import replace
 from enum import Enum, auto
 
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.outbox import Sending
+from edgevpr.mavlink.wishes import Wish, Wished
 from edgevpr.power.load import MachineLoad
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.navigator import Navigator
@@ -44,10 +46,17 @@ class NoAutopilot:
         """Return the event, with a report that the fix of an accepted match was not sent."""
         return replace(event, fix=FixReport(_name(event), False, "there is no link")) if event.accepted else event
 
-    def announce(self, mood: Mood, text: str) -> None:
+    def announce(self, mood: Mood, text: str, topic: str | None = None) -> None:
         """Say nothing."""
 
-    def report(self, healthy: bool, load: MachineLoad, temperature_c: float | None) -> None:
+    def wishes(self) -> tuple[Wished, ...]:
+        """Return none."""
+        return ()
+
+    def offer(self, wishes: Collection[Wish]) -> None:
+        """Offer nothing."""
+
+    def report(self, health: messages.Health, load: MachineLoad, temperature_c: float | None) -> None:
         """Report nothing."""
 
 
@@ -90,19 +99,29 @@ class ToAutopilot:
         now_s = self._clock.mono_s()
         if event.accepted:
             best = event.best
-            self._link.send(*messages.place_match(now_s, best.place.place_id, best.match.score))
+            match = messages.place_match(now_s, best.place.place_id, best.match.score, _confidence(event))
+            self._link.send(*match)
         if event.is_query:
             cpu_share = event.cost.whole.utilisation(self._cores)
             self._link.send(*messages.query_figures(now_s, cpu_share, used_mah))
         return replace(event, fix=fix, last_fix=last)
 
-    def announce(self, mood: Mood, text: str) -> None:
-        """Send a text to people on the ground."""
-        self._link.send(messages.status_text(_SEVERITY[mood], f"edgevpr: {text}"))
+    def announce(self, mood: Mood, text: str, topic: str | None = None) -> None:
+        """Send a text to people on the ground, when its turn comes. The newest text of a `topic` takes the place of one
+        that still waits."""
+        self._link.announce(_SEVERITY[mood], text, topic)
 
-    def report(self, healthy: bool, load: MachineLoad, temperature_c: float | None) -> None:
+    def wishes(self) -> tuple[Wished, ...]:
+        """Return the wishes of the ground since the last call."""
+        return self._link.take_wishes()
+
+    def offer(self, wishes: Collection[Wish]) -> None:
+        """Set the wishes that can be fulfilled from now on."""
+        self._link.offer(wishes)
+
+    def report(self, health: messages.Health, load: MachineLoad, temperature_c: float | None) -> None:
         """Report the state of this companion computer, once a second."""
-        self._link.set_health(messages.Health.ACTIVE if healthy else messages.Health.CRITICAL)
+        self._link.set_health(health)
         self._link.send(
             messages.computer_status(
                 self._clock.mono_s(), load.core_shares, load.ram_used_bytes, load.ram_total_bytes, temperature_c
@@ -136,10 +155,10 @@ class ToAutopilot:
         self._is_holding = is_holding
         if is_holding:
             _log.warning("a fix is %s", objection)
-            self.announce(Mood.WARNING, "fix held back, contradicts autopilot")
+            self.announce(Mood.WARNING, "fix held back, contradicts autopilot", "held back")
         else:
             _log.warning("fixes are not held back any more")
-            self.announce(Mood.NOTE, "fixes agree again")
+            self.announce(Mood.NOTE, "fixes agree again", "held back")
 
 
 Autopilot = NoAutopilot | ToAutopilot
@@ -147,6 +166,13 @@ Autopilot = NoAutopilot | ToAutopilot
 
 def _reported(query: str, sending: Sending) -> FixReport:
     return FixReport(query, sending.sent, sending.why, sending.answer)
+
+
+def _confidence(event: Recognition) -> float | None:
+    """Return the confidence of an accepted match: its own, or by the flight so far where that is higher."""
+    if event.confidence is None:
+        return None
+    return max(event.confidence, event.followed.confidence if event.followed else 0.0)
 
 
 def _name(event: Recognition) -> str:

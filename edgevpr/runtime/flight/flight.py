@@ -8,6 +8,7 @@ from edgevpr.frames.source import Source
 from edgevpr.power.equations import parse_pack
 from edgevpr.runtime.flight.autopilot import Autopilot
 from edgevpr.runtime.flight.clock import Clock
+from edgevpr.runtime.flight.commands import Commands
 from edgevpr.runtime.flight.flightlog import FlightLog
 from edgevpr.runtime.flight.governing import Governing
 from edgevpr.runtime.flight.learning import Learning
@@ -16,6 +17,7 @@ from edgevpr.runtime.flight.mapstate import MapState
 from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.flight.pace import Pace
 from edgevpr.runtime.flight.querylog import QueryLog, totals_of
+from edgevpr.runtime.flight.sight import Sight
 from edgevpr.runtime.flight.tally import Tally
 from edgevpr.runtime.flight.vitals import Vitals
 from edgevpr.runtime.recognise.learn import Learner
@@ -74,14 +76,17 @@ def fly(
         fewer_candidates=fewer_candidates,
         smaller_forms=smaller_forms,
     )
+    commands = Commands(autopilot, flight_log, learner)
     vitals = Vitals(
         source=source,
         flight_log=flight_log,
         autopilot=autopilot,
         meter=meter,
         tally=tally,
+        commands=commands,
         clock=clock,
         remarks=(
+            lambda: commands.summary,
             lambda: autopilot.summary,
             lambda: governing.held,
             lambda: learner and learner.summary,
@@ -92,7 +97,7 @@ def fly(
     def totals() -> dict[str, Any]:
         return totals_of(tally, meter, source, map_state)
 
-    observers: list[Observer] = [tally, map_state, QueryLog(flight_log, meter, totals)]
+    observers: list[Observer] = [tally, map_state, Sight(flight_log, autopilot), QueryLog(flight_log, meter, totals)]
     if learner:
         observers.append(Learning(learner, flight_log, autopilot))
     try:
@@ -101,6 +106,7 @@ def fly(
             recogniser,
             autopilot,
             observers,
+            commands=commands,
             governing=governing,
             vitals=vitals,
             meter=meter,

@@ -80,7 +80,7 @@ class Governing:
             if first:
                 _log.warning("the index cannot be loaded as %s: %s", form, error)
                 self._flight_log.write("index lost", form=form, problem=str(error))
-                self._autopilot.announce(Mood.WARNING, "its map cannot be read, see its log")
+                self._autopilot.announce(Mood.WARNING, "its map cannot be read, see its log", "map")
             return
         self._wanted_form = None
         self._index_mb[form] = self._recogniser.index.nbytes / 1e6
@@ -94,7 +94,7 @@ class Governing:
         _log.log(logging.INFO if change.back else logging.WARNING, "%s: %s", said, change.why)
         fields = {"from": asdict(change.before), "to": asdict(change.after), "why": change.why}
         self._flight_log.write("governor", **fields)
-        self._autopilot.announce(Mood.NOTE if change.back else Mood.WARNING, text)
+        self._autopilot.announce(Mood.NOTE if change.back else Mood.WARNING, text, "limits")
 
 
 def _governor(

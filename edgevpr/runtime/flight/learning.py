@@ -37,4 +37,4 @@ def say_learning_stopped(problem: str, flight_log: FlightLog, autopilot: Autopil
     """Announce that nothing more is learnt, and write the reason to the log."""
     _log.warning("nothing more is learnt: %s", problem)
     flight_log.write("learning stopped", problem=problem)
-    autopilot.announce(Mood.WARNING, "nothing more is learnt, see its log")
+    autopilot.announce(Mood.WARNING, "nothing more is learnt, see its log", "learning")

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import Protocol
 
@@ -10,6 +10,7 @@ from edgevpr.errors import ImageError
 from edgevpr.frames.source import Source
 from edgevpr.runtime.flight.autopilot import Autopilot
 from edgevpr.runtime.flight.clock import Clock
+from edgevpr.runtime.flight.commands import Commands
 from edgevpr.runtime.flight.governing import Governing
 from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.flight.pace import Pace
@@ -64,6 +65,7 @@ def loop(
     autopilot: Autopilot,
     observers: Sequence[Observer],
     *,
+    commands: Commands,
     governing: Governing,
     vitals: Vitals,
     meter: FlightMeter,
@@ -75,8 +77,13 @@ def loop(
     try:
         while not (stop.asked or source.ended):
             vitals.beat()
+            commands.obey()
             if (wait_s := pace.wait_s()) > 0:
                 clock.sleep(min(wait_s, _TURN_S))
+                continue
+            if commands.is_paused:
+                _pass_over(source, clock)
+                pace.taken()
                 continue
             frame = problem = None
             with meter.reading_frame(source.is_live) as reading:
@@ -94,6 +101,16 @@ def loop(
             governing.look()  # here, so that each reading covers a whole number of queries
     except Stop.Now:
         pass
+
+
+def _pass_over(source: Source, clock: Clock) -> None:
+    """Let the newest picture of a camera or stream go by, so that none is old when the flight goes on; a recording
+    waits."""
+    if source.is_live:
+        with suppress(ImageError):
+            source.read(_TURN_S)
+    else:
+        clock.sleep(_TURN_S)
 
 
 def _recognised(frame: Frame, recogniser: Recogniser, autopilot: Autopilot) -> Recognition:

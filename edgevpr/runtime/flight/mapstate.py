@@ -35,10 +35,10 @@ class MapState:
                 _log.warning("the map is damaged, place %d is the first to be left out", event.left_out[0][0])
                 count = len(event.left_out)
                 text = f"map damaged, {count} place{'' if count == 1 else 's'} left out"
-                self._autopilot.announce(Mood.WARNING, text)
+                self._autopilot.announce(Mood.WARNING, text, "left out")
             self.left_out += len(event.left_out)
         if event.is_query and event.map_lost != self._is_lost:
             self._is_lost = event.map_lost
             self._flight_log.write("map", state="cannot be read" if self._is_lost else "read again", why=event.reason)
             text = "its map cannot be read, see its log" if self._is_lost else "its map is read again"
-            self._autopilot.announce(Mood.WARNING if self._is_lost else Mood.NOTE, text)
+            self._autopilot.announce(Mood.WARNING if self._is_lost else Mood.NOTE, text, "map")

@@ -5,13 +5,16 @@ from collections.abc import Callable, Sequence
 
 from edgevpr.frames.condition import Condition
 from edgevpr.frames.source import Source
+from edgevpr.mavlink.messages import Health
 from edgevpr.power.load import machine_load
 from edgevpr.runtime.flight.autopilot import Autopilot, Mood
 from edgevpr.runtime.flight.clock import Clock
+from edgevpr.runtime.flight.commands import Commands
 from edgevpr.runtime.flight.flightlog import FlightLog
 from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.flight.systemd import notify, watchdog_interval_s
 from edgevpr.runtime.flight.tally import FAILURES_IN_A_ROW, Tally
+from edgevpr.runtime.flight.trouble import Trouble
 
 _HEALTH_S = 1.0
 _TROUBLES = {Condition.LOST: "lost", Condition.FROZEN: "frozen", Condition.DAMAGED: "damaged"}
@@ -32,15 +35,19 @@ class Vitals:
         autopilot: Autopilot,
         meter: FlightMeter,
         tally: Tally,
+        commands: Commands,
         clock: Clock,
         remarks: Sequence[Callable[[], str | None]] = (),
     ) -> None:
         self._source, self._flight_log, self._autopilot = source, flight_log, autopilot
-        self._meter, self._tally, self._clock, self._remarks = meter, tally, clock, remarks
+        self._meter, self._tally, self._commands, self._clock, self._remarks = meter, tally, commands, clock, remarks
         self._watchdog_s = watchdog_interval_s()
         self._watchdog_due_s = self._health_due_s = clock.mono_s()
         self._trouble: str | None = None
-        self._is_failing = self._sees_nothing = False
+        failing = f"{FAILURES_IN_A_ROW} frames in a row have failed"
+        told = {"flight_log": flight_log, "autopilot": autopilot}
+        self._failing = Trouble("failing", failing, "frames are recognised again", **told)
+        self._blind = Trouble("camera", "camera shows nothing", "camera shows ground again", **told)
 
     def beat(self) -> None:
         """Send the watchdog's beat and the report, where they are due."""
@@ -55,13 +62,12 @@ class Vitals:
     def _tell(self) -> None:
         self._meter.look_at_heat()
         self._say_source()
-        self._say_failures()
-        self._say_nothing_seen()
+        self._failing.note(self._tally.is_failing)
+        self._blind.note(self._tally.sees_nothing)
         counts = f"{self._tally.queries} queries, {self._tally.accepted} accepted, {self._meter.used_mah:.2f} mAh"
         remarks = (remark() for remark in self._remarks)
         notify(STATUS="; ".join(filter(None, (self._source.state, counts, *remarks, self._flight_log.state))))
-        healthy = not (self._trouble or self._is_failing or self._sees_nothing)
-        self._autopilot.report(healthy, machine_load(), self._meter.thermal.temperature_c)
+        self._autopilot.report(self._health(), machine_load(), self._meter.thermal.temperature_c)
 
     def _say_source(self) -> None:
         trouble = _TROUBLES.get(self._source.condition)
@@ -69,24 +75,11 @@ class Vitals:
             self._trouble = trouble
             _log.warning("source: %s", self._source.state)
             self._flight_log.write("source", state=self._source.state, refused=self._source.refused)
-            self._autopilot.announce(Mood.WARNING if trouble else Mood.NOTE, f"camera {trouble or 'is back'}")
+            self._autopilot.announce(Mood.WARNING if trouble else Mood.NOTE, f"camera {trouble or 'is back'}", "source")
 
-    def _say_failures(self) -> None:
-        failing = f"{FAILURES_IN_A_ROW} frames in a row have failed"
-        self._is_failing = self._said(
-            "failing", self._is_failing, self._tally.is_failing, failing, "frames are recognised again"
-        )
-
-    def _say_nothing_seen(self) -> None:
-        self._sees_nothing = self._said(
-            "camera", self._sees_nothing, self._tally.sees_nothing, "camera shows nothing", "camera shows ground again"
-        )
-
-    def _said(self, kind: str, was_so: bool, is_so: bool, begun: str, over: str) -> bool:
-        """Tell everybody where a trouble has begun or is over, with a line of this kind in the log; return `is_so`."""
-        if is_so != was_so:
-            said = begun if is_so else over
-            _log.warning("%s", said)
-            self._flight_log.write(kind, said=said)
-            self._autopilot.announce(Mood.WARNING if is_so else Mood.NOTE, said)
-        return is_so
+    def _health(self) -> Health:
+        if self._trouble:
+            return Health.CRITICAL
+        if self._commands.is_paused:
+            return Health.STANDBY
+        return Health.CRITICAL if self._failing.is_so or self._blind.is_so else Health.ACTIVE

@@ -40,8 +40,8 @@ class Learner:
     """Adds places to an open map, then to the index in RAM: every place in the index is already safe on disk.
 
     `learnt` counts the places, and `passed_over` the frames that were left out, by reason. A frame is passed over while
-    another program is writing to the file. At any other error of the file learning stops for good, and `trouble` says
-    why: the flight goes on with the places that are there.
+    another program is writing to the file, and while learning `is_off`. At any other error of the file learning stops
+    for good, and `trouble` says why: the flight goes on with the places that are there.
     """
 
     def __init__(
@@ -56,6 +56,7 @@ class Learner:
         self.learnt = 0
         self.passed_over: Counter[str] = Counter()
         self.trouble: str | None = None
+        self.is_off = False
         self._recogniser, self._growing, self._spacing_m, self._gap_m = recogniser, growing, spacing_m, gap_m
         self._map, self._utc_clock = recogniser.place_map, utc_clock
         self._t_fix_s = -math.inf
@@ -80,7 +81,7 @@ class Learner:
         """
         if event.fix and event.fix.sent is not False:
             self._t_fix_s = event.frame.t_mono_s
-        if self.trouble is not None or event.failed:
+        if self.trouble is not None or self.is_off or event.failed:
             return None
         place = None
         try:

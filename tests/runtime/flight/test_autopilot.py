@@ -142,6 +142,24 @@ def test_the_cost_of_every_query_is_told(recording, tmp_path):
     assert told["vpr_mah"] == pytest.approx(flown.flown.totals["used_mah"], rel=0.01)
 
 
+@pytest.mark.parametrize("technique", ["cohog", "hog"])
+def test_how_sure_an_accepted_match_is_is_told_where_it_is_known(recording, tmp_path, technique):
+    clock = FakeClock()
+    link = FakeLink(clock)
+    flown = flight(recording, tmp_path, link, clock, technique)
+    lines = flown.fly(FakeSource(pictures(2) + pictures(1, first=100), clock))
+    queries = of_kind(lines, "query")
+    assert [line["accepted"] for line in queries] == [True, True, False]
+    told = [each.value for each in link.sent if getattr(each, "name", "") == "vpr_conf"]
+    known = [
+        max(line["confidence"], line.get("followed", line)["confidence"])
+        for line in queries
+        if line["accepted"] and "confidence" in line
+    ]
+    assert told == pytest.approx(known)
+    assert all(0.9 <= each <= 1 for each in told)
+
+
 def test_a_camera_that_is_lost_is_told_and_is_critical_until_it_is_back(recording, tmp_path):
     clock = FakeClock()
     link, health = FakeLink(clock), []

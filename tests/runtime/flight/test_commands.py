@@ -1,0 +1,192 @@
+"""A flight that is commanded from the ground: it pauses and goes on, and learns or not."""
+
+import shutil
+
+import pytest
+from fakes import FakeClock, FakeLink, FakeSource, vehicle_at
+from flights import Flight, of_kind
+from mavlink_peers import Peer, UdpPort, wait_until
+from pictures import textured
+
+from edgevpr.mavlink.address import parse_link
+from edgevpr.mavlink.link import Link
+from edgevpr.mavlink.wire import mavlink
+from edgevpr.mavlink.wishes import Wish
+from edgevpr.runtime.flight import systemd, vitals
+
+
+@pytest.fixture
+def clock():
+    return FakeClock()
+
+
+def flight(recording, tmp_path, clock, link, technique="cohog", **settings):
+    return Flight(recording / f"{technique}.gpkg", tmp_path / "log", clock, link, **{"source.rate_hz": 1.0} | settings)
+
+
+def pictures(count, first=0):
+    return [textured(first + number, 240, 320) for number in range(count)]
+
+
+def queries(lines):
+    return [line["query"] for line in of_kind(lines, "query")]
+
+
+def test_a_paused_flight_asks_and_sends_nothing_and_goes_on_with_the_newest_picture(recording, tmp_path, clock):
+    link, answers, health = FakeLink(clock), [], []
+    wishes = {2: Wish.PAUSE, 5: Wish.RESUME}
+
+    def work():
+        health.append(link.health.name)
+        if wish := wishes.get(len(health)):
+            answers.append(link.wish(wish))
+
+    lines = flight(recording, tmp_path, clock, link).fly(FakeSource(pictures(7), clock, work=work))
+    assert answers == ["ACCEPTED", "ACCEPTED"]
+    assert queries(lines) == ["frame 000000", "frame 000001", "frame 000005", "frame 000006"]
+    assert health == ["ACTIVE", "ACTIVE", "STANDBY", "STANDBY", "STANDBY", "ACTIVE", "ACTIVE"]
+    assert link.stats().fixes_sent == 4
+    assert [(line["wish"], line["sender"], line["said"]) for line in of_kind(lines, "command")] == [
+        ("PAUSE", "255/190", "paused by command"),
+        ("RESUME", "255/190", "goes on by command"),
+    ]
+    assert link.texts() == [(6, "edgevpr: paused by command"), (6, "edgevpr: goes on by command")]
+
+
+def test_a_command_that_is_sent_once_more_is_logged_and_announced_once(recording, tmp_path, clock):
+    link, read = FakeLink(clock), []
+
+    def work():
+        read.append(1)
+        if len(read) in (1, 2):
+            link.wish(Wish.PAUSE)
+
+    lines = flight(recording, tmp_path, clock, link).fly(FakeSource(pictures(4), clock, work=work))
+    assert [line["is_new"] for line in of_kind(lines, "command")] == [True, False]
+    assert link.texts() == [(6, "edgevpr: paused by command")]
+
+
+def test_while_paused_the_watchdog_is_fed_and_the_status_says_so(recording, tmp_path, clock, monkeypatch):
+    told = []
+    monkeypatch.setenv("WATCHDOG_USEC", "2000000")
+    monkeypatch.delenv("WATCHDOG_PID", raising=False)
+    assert systemd.watchdog_interval_s() == 1.0
+    monkeypatch.setattr(vitals, "notify", lambda **said: told.append(said))
+    link = FakeLink(clock)
+    source = FakeSource(pictures(9), clock, work=lambda: link.wish(Wish.PAUSE))
+    lines = flight(recording, tmp_path, clock, link).fly(source)
+    assert queries(lines) == ["frame 000000"]
+    assert sum("WATCHDOG" in each for each in told) == 9
+    assert "streaming; 1 queries, 1 accepted" in told[-1]["STATUS"]
+    assert "; paused" in told[-1]["STATUS"]
+
+
+def test_a_camera_that_is_lost_while_paused_is_critical(recording, tmp_path, clock):
+    link, health = FakeLink(clock), []
+
+    def work():
+        link.wish(Wish.PAUSE)
+        health.append(link.health.name)
+        source.is_lost = len(health) >= 3
+
+    source = FakeSource(pictures(5), clock, work=work)
+    flight(recording, tmp_path, clock, link).fly(source)
+    assert health == ["ACTIVE", "STANDBY", "STANDBY", "CRITICAL", "CRITICAL"]
+
+
+def test_a_recording_waits_while_paused(recording, tmp_path, clock):
+    link = FakeLink(clock)
+    flown = flight(recording, tmp_path, clock, link)
+    source = FakeSource(pictures(3), clock, is_live=False, work=lambda: link.wish(Wish.PAUSE))
+    clock.at(30.0, lambda: link.wish(Wish.RESUME))
+    clock.at(60.0, flown.stop)
+    started_s = clock.now_s
+    lines = flown.fly(source)
+    assert queries(lines) == ["frame 000000", "frame 000001"], "paused, gone on, and paused again by the second"
+    assert clock.now_s - started_s == pytest.approx(60.0, abs=0.5)
+
+
+def learning_flight(recording, tmp_path, clock, link):
+    """A flight that learns wherever the autopilot is, 111 m on every second."""
+    shutil.copy(recording / "cohog.gpkg", tmp_path / "m.gpkg")
+    settings = {"source.rate_hz": 1.0, "mapping.spacing_m": 20.0, "match.follow": False}
+    return Flight(tmp_path / "m.gpkg", tmp_path / "log", clock, link, learns=True, **settings)
+
+
+def test_learning_is_switched_off_and_on(recording, tmp_path, clock):
+    link = FakeLink(clock, vehicle=lambda: vehicle_at(51.0 + clock.now_s / 1000, 8.0, clock.now_s))
+    read = []
+
+    def work():
+        read.append(1)
+        if wish := {3: Wish.LEARN_NOTHING, 6: Wish.LEARN}.get(len(read)):
+            assert link.wish(wish) == "ACCEPTED"
+
+    flown = learning_flight(recording, tmp_path, clock, link)
+    lines = flown.fly(FakeSource(pictures(8, 100), clock, work=work))
+    learnt = [line["query"] for line in of_kind(lines, "learnt")]
+    assert learnt == [f"frame {number:06d}" for number in (0, 1, 2, 6, 7)]
+    assert link.texts() == [(6, "edgevpr: learning off by command"), (6, "edgevpr: learning on by command")]
+
+
+def test_fixes_that_are_sent_while_nothing_is_learnt_still_keep_their_echo_from_being_learnt(
+    recording, tmp_path, clock
+):
+    link = FakeLink(clock, vehicle=lambda: vehicle_at(51.0 + clock.now_s / 1000, 8.0, clock.now_s))
+    read = []
+
+    def work():
+        read.append(1)
+        if wish := {1: Wish.LEARN_NOTHING, 3: Wish.LEARN}.get(len(read)):
+            assert link.wish(wish) == "ACCEPTED"
+
+    flown = learning_flight(recording, tmp_path, clock, link)
+    lines = flown.fly(FakeSource(pictures(3) + pictures(12, 100), clock, work=work))
+    assert link.stats().fixes_sent == 3
+    assert [line["query"] for line in of_kind(lines, "learnt")] == ["frame 000012", "frame 000013", "frame 000014"]
+
+
+def test_a_flight_that_does_not_learn_cannot_be_told_to(recording, tmp_path, clock):
+    link, answers = FakeLink(clock), []
+    source = FakeSource(pictures(1), clock, work=lambda: answers.extend([link.wish(Wish.LEARN), link.wish(4)]))
+    lines = flight(recording, tmp_path, clock, link).fly(source)
+    assert answers == ["TEMPORARILY_REJECTED"] * 2
+    assert not of_kind(lines, "command")
+
+
+def test_nor_can_one_whose_learning_has_stopped_for_good(recording, tmp_path, clock):
+    link, answers = FakeLink(clock, vehicle=lambda: vehicle_at(51.0, 8.0, clock.now_s)), []
+    flown = learning_flight(recording, tmp_path, clock, link)
+
+    def work():
+        answers.append(link.wish(Wish.LEARN))
+        flown.learner.trouble = "the disk is full"
+
+    flown.fly(FakeSource(pictures(2), clock, work=work))
+    assert answers == ["ACCEPTED", "TEMPORARILY_REJECTED"]
+
+
+def test_a_ground_station_pauses_a_flight_over_a_real_link(recording, tmp_path, clock):
+    port, acks = UdpPort(), []
+    with Link(parse_link(f"udpout:127.0.0.1:{port.number}"), clock=clock) as link:
+        peer = Peer(port)
+        peer.expect("HEARTBEAT")
+        peer.heartbeat()
+        wait_until(link.listens)
+
+        def work():
+            if len(acks) < 1:
+                station = {"system_id": 255, "component_id": 190}
+                peer.send(mavlink.MAVLink_command_long_message(1, 197, 31010, 0, 1, 0, 0, 0, 0, 0, 0), **station)
+                acks.append(peer.expect("COMMAND_ACK").result)
+
+        source = FakeSource(pictures(4), clock, work=work)
+        lines = flight(recording, tmp_path, clock, link).fly(source)
+        peer.expect_text("edgevpr: paused by command")
+        clock.now_s += 1.0
+        while peer.expect("HEARTBEAT").system_status != mavlink.MAV_STATE_STANDBY:
+            clock.now_s += 1.0
+    port.close()
+    assert acks == [mavlink.MAV_RESULT_ACCEPTED]
+    assert [line["fix"]["why"] for line in of_kind(lines, "query")] == ["not sent: paused by the ground"]
+    assert [line["sender"] for line in of_kind(lines, "command")] == ["255/190"]

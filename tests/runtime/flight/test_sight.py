@@ -1,0 +1,114 @@
+"""The map that is left and found again, and the tilt that is too large: told once, and not at every flicker."""
+
+from types import SimpleNamespace
+
+import pytest
+from fakes import FakeClock, FakeLink, FakeSource
+from flights import Flight, of_kind
+from pictures import textured
+
+from edgevpr.frames.level import View
+from edgevpr.runtime.flight.autopilot import ToAutopilot
+from edgevpr.runtime.flight.flightlog import FlightLog, read_log
+from edgevpr.runtime.flight.sight import Sight
+
+
+class Seen:
+    """A sight with its listeners; `look` shows it pictures, one a second."""
+
+    def __init__(self, folder):
+        self.clock, self.log = FakeClock(), folder / "log"
+        self.link = FakeLink(self.clock)
+        autopilot = ToAutopilot(self.link, send_fixes=True, cores=1, clock=self.clock.clock)
+        self.sight = Sight(FlightLog(self.log, clock=self.clock), autopilot)
+
+    def look(self, outcomes: str, every_s: float = 1.0):
+        """`+` accepted, `-` not, `L` not and lost, `0` shows nothing, `x` failed, `t` tilted, `n` not worth a search,
+        `u` no query."""
+        for outcome in outcomes:
+            self.clock.now_s += every_s
+            self.sight.tell(
+                SimpleNamespace(
+                    is_query=outcome != "u",
+                    accepted=outcome == "+",
+                    failed=outcome == "x",
+                    says_nothing=outcome == "0",
+                    worth=SimpleNamespace(reason="grass" if outcome == "n" else None),
+                    view=View(reason="it is tilted 50 degrees" if outcome == "t" else None),
+                    followed=SimpleNamespace(lost=0.95 if outcome == "L" else 0.2),
+                    frame=SimpleNamespace(t_mono_s=self.clock.now_s),
+                )
+            )
+        return [text.removeprefix("edgevpr: ") for _, text in self.link.texts()]
+
+
+@pytest.fixture
+def seen(tmp_path):
+    return Seen(tmp_path)
+
+
+def test_the_map_is_left_after_thirty_queries_without_a_match_and_found_with_two(seen):
+    assert seen.look("+++" + "-" * 29) == []
+    assert seen.look("-") == ["map left"]
+    assert seen.look("-" * 50) == ["map left"]
+    assert seen.look("+--") == ["map left"]
+    assert seen.look("+") == ["map left", "map found again"]
+    assert [(line["kind"], line["said"]) for line in read_log(seen.log)] == [
+        ("sight", "map left"),
+        ("sight", "map found again"),
+    ]
+    assert [severity for severity, _ in seen.link.texts()] == [4, 6]
+
+
+def test_a_flight_that_knows_to_be_lost_needs_ten(seen):
+    assert seen.look("+++" + "L" * 9) == []
+    assert seen.look("L") == ["map left"]
+
+
+def test_and_ten_in_a_row(seen):
+    assert seen.look("+++" + "LLLLLLLLL-L") == []
+
+
+def test_a_map_that_was_hardly_ever_recognised_cannot_be_left(seen):
+    assert seen.look("-" * 100 + "++" + "-" * 100) == []
+
+
+def test_matches_far_apart_do_not_make_a_left_map_found(seen):
+    assert seen.look("+++" + "-" * 30 + ("+" + "-" * 10) * 5) == ["map left"]
+
+
+def test_at_the_edge_of_the_map_not_every_match_is_news(seen):
+    assert seen.look("+++" + ("-" * 20 + "+") * 20) == []
+
+
+@pytest.mark.parametrize("outcome", "0xtnu")
+def test_what_says_nothing_of_the_map_does_not_count(seen, outcome):
+    assert "map left" not in seen.look("+++" + "-" * 29 + outcome * 40)
+    assert seen.look("-")[-1] == "map left"
+
+
+def test_a_tilt_is_told_when_it_lasts_five_seconds_and_when_it_is_over_for_as_long(seen):
+    assert seen.look("-" + "t" * 5) == []
+    assert seen.look("t") == ["tilt too large"]
+    assert seen.look("-----") == ["tilt too large"]
+    assert seen.look("-") == ["tilt too large", "tilt is fine again"]
+    assert [line["kind"] for line in read_log(seen.log)] == ["tilt", "tilt"]
+
+
+def test_a_tilt_that_comes_and_goes_is_not_told(seen):
+    assert seen.look("tttt--" * 10) == []
+
+
+def test_a_turn_with_level_moments_is_one_tilt(seen):
+    assert seen.look("tttttt" + "-t" * 20) == ["tilt too large"]
+
+
+def test_a_flight_that_leaves_its_map_and_comes_back_says_so(recording, tmp_path):
+    clock = FakeClock()
+    link = FakeLink(clock)
+    flight = Flight(recording / "cohog.gpkg", tmp_path / "log", clock, link, **{"source.rate_hz": 1.0})
+    over_map, elsewhere = range(8), range(100, 140)
+    pictures = [textured(number, 240, 320) for number in [*over_map, *elsewhere, *over_map]]
+    lines = flight.fly(FakeSource(pictures, clock))
+    assert link.texts() == [(4, "edgevpr: map left"), (6, "edgevpr: map found again")]
+    assert [line["said"] for line in of_kind(lines, "sight")] == ["map left", "map found again"]
