@@ -1,5 +1,4 @@
-"""Where the aircraft is at any moment: its path, the filter of the path's errors, and the point of the Earth where the
-path begins."""
+"""The position of the aircraft at any moment, by its path and the filter of the path's errors."""
 
 import math
 from dataclasses import dataclass

@@ -10,6 +10,7 @@ from pictures import textured
 from edgevpr.frames.level import View
 from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log
+from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.flight.sight import Sight
 
 
@@ -19,7 +20,7 @@ class Seen:
     def __init__(self, folder):
         self.clock, self.log = FakeClock(), folder / "log"
         self.link = FakeLink(self.clock)
-        autopilot = ToAutopilot(self.link, send_fixes=True, cores=1, clock=self.clock.clock)
+        autopilot = ToAutopilot(self.link, Navigator(5.0, 1.0), send_fixes=True, cores=1, clock=self.clock.clock)
         self.sight = Sight(FlightLog(self.log, clock=self.clock), autopilot)
 
     def look(self, outcomes: str, every_s: float = 1.0):
