@@ -5,6 +5,7 @@ Each keeps the promises of the real thing, and `test_fakes.py` holds both to the
 
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,6 +13,8 @@ from edgevpr.frames.condition import Condition
 from edgevpr.mavlink.link import LinkStats
 from edgevpr.mavlink.messages import Fix, Health
 from edgevpr.mavlink.outbox import Outbox, Sending
+from edgevpr.mavlink.reasons import State
+from edgevpr.mavlink.replies import Replies
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.types import Frame, Vehicle
 
@@ -135,7 +138,7 @@ class FakeLink:
         self.answer, self.sent = answer, []
         self.health = Health.BOOT
         self._clock, self._vehicle = clock, vehicle
-        self._outbox = Outbox()
+        self._outbox, self._replies = Outbox(), Replies()
         self._fixes: list[Fix] = []
         self._acks: Counter[str] = Counter()
 
@@ -157,7 +160,8 @@ class FakeLink:
         return self._vehicle()
 
     def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
-        return self._vehicle()
+        vehicle = self._vehicle()
+        return vehicle and replace(vehicle, t_fix_s=self._replies.t_fix_s)
 
     def listens(self) -> bool:
         return self.answer is not None
@@ -175,6 +179,8 @@ class FakeLink:
             acks=dict(self._acks),
             dropped_stale_fixes=self._outbox.dropped_stale_fixes,
             withheld_fixes=self._outbox.withheld_fixes,
+            unanswered_fixes=self._replies.unanswered,
+            refused_why=self._replies.refusal and self._replies.refusal.brief,
             foreign_messages=0,
             dropped_queue_full=0,
             bad_bytes=0,
@@ -194,8 +200,9 @@ class FakeLink:
             return
         while (sending := self._outbox.next_fix(self._clock())) is not None:
             self._fixes.append(sending.fix)
+            self._replies.note_sent(sending, self._clock())
             sending.settle(True)
-            sending.answer = self.answer
+            self._replies.hear(self.answer, State(gps_age_s=0.0), self._clock())
             self._acks[self.answer] += 1
 
 

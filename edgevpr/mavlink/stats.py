@@ -8,7 +8,8 @@ class LinkStats:
     """Counts and state of a link. `trouble` is the reason why it is or last was not open, None once data arrives.
 
     `foreign_messages` came from another autopilot or another address than ours and were refused. `withheld_fixes` were
-    not sent because those before had no answer.
+    not sent because those before had no answer. `unanswered_fixes` were sent and had no answer within a second, and
+    `refused_why` is why the last one was refused (None: none was), in a few words.
     """
 
     connected: bool
@@ -20,6 +21,8 @@ class LinkStats:
     acks: dict[str, int]
     dropped_stale_fixes: int
     withheld_fixes: int
+    unanswered_fixes: int
+    refused_why: str | None
     foreign_messages: int
     dropped_queue_full: int
     bad_bytes: int
