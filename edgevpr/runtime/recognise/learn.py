@@ -75,7 +75,7 @@ class Learner:
         return {"places": self.learnt, "left_out": dict(self.passed_over), "stopped": self.trouble}
 
     def learn(self, event: Recognition) -> Place | None:
-        """Make a place of an event's frame and return it, or None where the frame is left out. Never raises MapError."""
+        """Make a place of an event's frame and return it; None: the frame is left out. Never raises MapError."""
         if self.trouble is not None or event.failed:
             return None
         place = None
