@@ -41,7 +41,7 @@ class Reason(NamedTuple):
 
 TAKEN = Reason("", "it takes them")
 GPS_IN_USE = Reason("GPS in use", "a GPS receiver of its has a fix, and while it has GPS it takes no other position")
-NOT_STARTED = Reason("filter not started", "its position filter has not started yet")
+NOT_STARTED = Reason("filter not started", "its position filter has not started: a plane starts it with GPS only")
 NO_ORIGIN = Reason(
     "no origin",
     "it gives no origin when asked for it: it must have had GPS once, or be sent SET_GPS_GLOBAL_ORIGIN, before it can "
@@ -58,7 +58,9 @@ UNKNOWN = Reason(
     "see its log", "its GPS was in use a moment ago, it has no origin, or it has nothing to reckon by: it does not say"
 )
 WRONG_FORM = Reason("wrong form", "it does not like their form")
-NO_COMMAND = Reason("43003 not known", "its firmware does not know command 43003, or was built without it")
+NO_COMMAND = Reason(
+    "43003 not known", "its firmware does not know command 43003, or was built without it, as for boards of 1 MB"
+)
 
 NO_COMMAND_ANSWERED = Reason(
     "signing? system id?",
@@ -94,12 +96,12 @@ def why_failed(state: State) -> Reason:
     # PX4 answers with TEMPORARILY_REJECTED while it has GPS, and uses this flag for glitches of it.
     if state.is_px4:
         return NO_ORIGIN if state.has_origin is False else NOT_PLAUSIBLE
+    if state.has_origin is False and not state.has_gps:
+        return NO_ORIGIN
     if flags & mavlink.EKF_UNINITIALIZED:
         return NOT_STARTED
     if state.has_gps:
         return GPS_IN_USE
-    if state.has_origin is False:
-        return NO_ORIGIN
     if state.is_armed is False:
         return NOT_ARMED
     if flags & mavlink.EKF_CONST_POS_MODE:

@@ -26,6 +26,8 @@ AIRBORNE = State(is_armed=True, gps_age_s=60.0, has_origin=True, filter_flags=0)
         (AIRBORNE._replace(filter_flags=CONST), reasons.NOT_RECKONING),
         (AIRBORNE._replace(is_armed=None, filter_flags=CONST), reasons.NOT_RECKONING),
         (AIRBORNE._replace(gps_age_s=0.0, filter_flags=UNINITIALIZED), reasons.NOT_STARTED),
+        (AIRBORNE._replace(has_origin=False, filter_flags=UNINITIALIZED), reasons.NO_ORIGIN),
+        (AIRBORNE._replace(gps_age_s=0.0, has_origin=False), reasons.GPS_IN_USE),
         (AIRBORNE._replace(is_px4=True, filter_flags=UNINITIALIZED), reasons.NOT_PLAUSIBLE),
         (State(is_px4=True, has_origin=False), reasons.NO_ORIGIN),
     ],
