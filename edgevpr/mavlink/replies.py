@@ -50,12 +50,12 @@ class Replies:
         reason = why(result, state)
         self._say(result, reason)
         sending = self._open.popleft() if self._open else None
-        if sending:
-            refused_why = None if reason is TAKEN else reason.sentence
-            sending.conclude(Answer(result, refused_why, now_s - sending.t_sent_s))
         if result == "ACCEPTED":
             self._taken_s = now_s
         self._note_fixes()
+        if sending:
+            refused_why = None if reason is TAKEN else reason.sentence
+            sending.conclude(Answer(result, refused_why, now_s - sending.t_sent_s))
         return sending
 
     def time_out(self, now_s: float) -> None:
@@ -75,11 +75,11 @@ class Replies:
         return news
 
     def _give_up(self, sending: Sending, reason: str) -> None:
+        self._taken_s = max(self._taken_s, sending.t_sent_s)  # the other end may have it all the same
+        self._note_fixes()
         if sending.sent:
             self.unanswered += 1
             sending.conclude(Answer(None, reason, None))
-        self._taken_s = max(self._taken_s, sending.t_sent_s)  # the other end may have it all the same
-        self._note_fixes()
 
     def _note_fixes(self) -> None:
         # One value for other threads to read.
