@@ -43,6 +43,12 @@ class Replies:
         self._open.append(sending)
         self._note_fixes()
 
+    def note_unanswerable(self, sending: Sending, now_s: float) -> None:
+        """Note that a fix was handed to the port in a message that has no answer: it may be taken."""
+        sending.t_sent_s = self._taken_s = now_s
+        self._note_fixes()
+        sending.conclude(Answer(None, "its message has no answer", None))
+
     def hear(self, result: str, state: State, now_s: float) -> Sending | None:
         """Take in an answer, the name of a MAV_RESULT, of an autopilot in this state; return the fix that it answers,
         None where there is none."""

@@ -86,6 +86,13 @@ def test_a_fix_may_be_in_the_position_unless_it_was_refused():
     assert replies.t_fix_s == 17.0, "a fix was taken, whichever it was"
 
 
+def test_a_message_without_answers_is_waited_for_by_nobody_and_may_be_taken():
+    replies, sending = Replies(), Sending(Fix(50.0, 8.0, 20.0, 5.0), 6.0)
+    replies.note_unanswerable(sending, 5.0)
+    assert sending.outcome == Answer(None, "its message has no answer", None)
+    assert (len(replies), replies.unanswered, replies.t_fix_s) == (0, 0, 5.0)
+
+
 @pytest.fixture
 def clock():
     return FakeClock()

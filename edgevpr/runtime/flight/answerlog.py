@@ -24,7 +24,8 @@ class AnswerLog:
         Its fields are: query, sent, result (the name of a MAV_RESULT; null: no answer), why (null: it was taken),
         latency_ms from sending to answer, t_sent_s on the clock of t_mono_s.
         """
-        settled = [each for each in self._awaited if each[1].outcome or each[1].sent is False]
+        # An answer can be there a moment before the link has noted that the fix has left.
+        settled = [each for each in self._awaited if each[1].sent is False or (each[1].sent and each[1].outcome)]
         for query, sending in settled:
             self._awaited.remove((query, sending))
             outcome = sending.outcome
