@@ -1,5 +1,6 @@
 """The values that packages pass to each other: frozen dataclasses."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,7 +45,8 @@ class Vehicle:
     follow a receiver that it does not trust. `roll_deg` (right wing down is positive), `pitch_deg` (nose up),
     `height_m` above the ground, `velocity_m_s` over it (east, north) and `sink_m_s` (down) are None where unknown.
     `position_sd_m` is the standard deviation of one axis of the position, None where it is unknown or the autopilot has
-    no position of its own to rely on. `t_gps_s` is when the newest position of that receiver came."""
+    no position of its own to rely on. `t_gps_s` is when the newest position of that receiver came, and `t_fix_s` when
+    the newest fix of ours was sent or taken that may be in that position (-inf: none is)."""
 
     lat_deg: float
     lon_deg: float
@@ -59,6 +61,7 @@ class Vehicle:
     sink_m_s: float | None = None
     position_sd_m: float | None = None
     t_gps_s: float | None = None
+    t_fix_s: float = -math.inf
 
     def is_fresh_at(self, t_mono_s: float) -> bool:
         """Tell whether the report came within one second of `t_mono_s`, such as the time of a frame."""

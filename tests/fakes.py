@@ -5,6 +5,7 @@ Each keeps the promises of the real thing, and `test_fakes.py` holds both to the
 
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,6 +14,8 @@ from edgevpr.mavlink.link import LinkStats
 from edgevpr.mavlink.listener import NoListener
 from edgevpr.mavlink.messages import Fix, Health, Severity, status_text
 from edgevpr.mavlink.outbox import Outbox, Sending
+from edgevpr.mavlink.reasons import State
+from edgevpr.mavlink.replies import Replies
 from edgevpr.mavlink.wishes import Wish, Wished
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.types import Frame, Vehicle
@@ -139,7 +142,7 @@ class FakeLink:
         self.listener = NoListener()
         self.health = Health.BOOT
         self._clock, self._vehicle = clock, vehicle
-        self._outbox = Outbox()
+        self._outbox, self._replies = Outbox(), Replies()
         self._fixes: list[Fix] = []
         self._acks: Counter[str] = Counter()
         self._offered, self._wishes = (), []
@@ -179,8 +182,10 @@ class FakeLink:
 
     def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
         vehicle = self._vehicle()
-        if vehicle:
-            self.listener.hear_vehicle(vehicle)
+        if vehicle is None:
+            return None
+        vehicle = replace(vehicle, t_fix_s=self._replies.t_fix_s)
+        self.listener.hear_vehicle(vehicle)
         return vehicle
 
     def listens(self) -> bool:
@@ -201,6 +206,8 @@ class FakeLink:
             withheld_fixes=self._outbox.withheld_fixes,
             commands={},
             ignored_requests=0,
+            unanswered_fixes=self._replies.unanswered,
+            refused_why=self._replies.refusal and self._replies.refusal.brief,
             foreign_messages=0,
             dropped_queue_full=0,
             bad_bytes=0,
@@ -220,8 +227,9 @@ class FakeLink:
             return
         while (sending := self._outbox.next_fix(self._clock())) is not None:
             self._fixes.append(sending.fix)
+            self._replies.note_sent(sending, self._clock())
             sending.settle(True)
-            sending.answer = self.answer
+            self._replies.hear(self.answer, State(gps_age_s=0.0), self._clock())
             self._acks[self.answer] += 1
 
 

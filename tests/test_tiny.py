@@ -49,6 +49,7 @@ def test_the_whole_walk(tmp_path):
         )
     assert (flown.queries, flown.accepted, flown.failed) == (2, 1, 0)
     assert link.stats().fixes_sent == 1
-    known, unknown = read_log(tmp_path / "log")
+    known, answer, unknown = read_log(tmp_path / "log")
     assert (known["place"], known["accepted"], known["fix"]["sent"]) == (4, True, True)
+    assert (answer["kind"], answer["query"], answer["result"]) == ("answer", known["query"], "ACCEPTED")
     assert (unknown["accepted"], unknown["fix"], unknown["last_fix"]["answer"]) == (False, None, "ACCEPTED")

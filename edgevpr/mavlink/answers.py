@@ -1,6 +1,5 @@
 """The answers to our fixes: an autopilot that gives none is sent none."""
 
-import logging
 import math
 
 UNANSWERED_MAX = 5
@@ -8,8 +7,6 @@ TRIED_AGAIN_AFTER_S = 10.0  # while the sending is stopped, one fix in so long a
 # An answer takes some tens of milliseconds, over a radio up to half a second. So long after the last fix it is said
 # that the sending is stopped; and so long after the first answer, those to the fixes before it have arrived, too.
 ANSWERED_WITHIN_S = 1.0
-
-log = logging.getLogger(__name__)
 
 
 class Answers:
@@ -48,18 +45,10 @@ class Answers:
             self._resumes_s = now_s + ANSWERED_WITHIN_S
         self.unanswered = 0
 
-    def news(self, now_s: float) -> str | None:
-        """Return once, in a few words, that the sending has stopped or goes on; None: there is no news."""
+    def has_changed(self, now_s: float) -> bool:
+        """Tell once that the sending has stopped, or goes on; `is_stopped` says which."""
         is_stopped = self.unanswered >= UNANSWERED_MAX
         if is_stopped == self.is_stopped or (is_stopped and now_s - self._sent_s < ANSWERED_WITHIN_S):
-            return None
+            return False
         self.is_stopped = is_stopped
-        if is_stopped:
-            log.warning(
-                "five fixes in a row had no answer: no more are sent, but for one every %g s, until one is answered: "
-                "does the autopilot know command 43003, and does its port ask for signed messages?",
-                TRIED_AGAIN_AFTER_S,
-            )
-            return "fixes stopped: five had no answer"
-        log.warning("position fixes are answered again: they are sent again")
-        return "fixes are answered again"
+        return True

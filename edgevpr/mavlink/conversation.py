@@ -5,19 +5,23 @@ import math
 import struct
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 
 from edgevpr.mavlink import messages, positions
 from edgevpr.mavlink.address import Sender
-from edgevpr.mavlink.answers import Answers
+from edgevpr.mavlink.answers import TRIED_AGAIN_AFTER_S, Answers
 from edgevpr.mavlink.autopilots.channel import Channel
 from edgevpr.mavlink.listener import Listener, NoListener
 from edgevpr.mavlink.messages import Health, Severity
 from edgevpr.mavlink.outbox import Outbox, Sending
 from edgevpr.mavlink.peer import Autopilot
+from edgevpr.mavlink.reasons import why_silent
+from edgevpr.mavlink.replies import Replies
 from edgevpr.mavlink.requests import Requests
 from edgevpr.mavlink.texts import Texts
 from edgevpr.mavlink.wire import Message, Receiver, Tap, mavlink, untapped
 from edgevpr.mavlink.wishes import Wishes
+from edgevpr.types import Vehicle
 
 HEARTBEAT_S = 1.0
 STATE_S = 0.1  # ArduPilot calls a receiver unhealthy whose positions come more than 215 ms apart
@@ -31,10 +35,11 @@ log = logging.getLogger(__name__)
 
 class Conversation:
     """Packets to be sent, one after another, and the messages that arrive. It holds the `outbox` of what waits, the
-    state of the `autopilot`, the row of `answers` to our fixes, the `texts` for the ground, the `requests` to us and
-    the `wishes` among them, and the count of messages `sent`.
+    state of the `autopilot`, the fixes that wait for `replies`, the row of those without `answers`, the `texts` for the
+    ground, the `requests` to us and the `wishes` among them, and the count of messages `sent`.
 
-    `set_health`, `want_position`, `texts` and `wishes` may be used from any thread, all else from that of the link.
+    `set_health`, `want_position`, `vehicle_at`, `texts` and `wishes` may be used from any thread, all else from that of
+    the link.
     """
 
     def __init__(
@@ -50,7 +55,7 @@ class Conversation:
         self.outbox = Outbox(max_fix_age_s)
         self.autopilot = Autopilot(component_id, system_id, listener)
         self._listener = listener
-        self.answers = Answers()
+        self.answers, self.replies = Answers(), Replies()
         self.texts, self.wishes = Texts(), Wishes()
         self.requests = Requests(self.wishes)
         self.receiver = Receiver(tap=tap)
@@ -58,7 +63,6 @@ class Conversation:
         self._clock = clock
         self._health, self._health_set_s = Health.BOOT, clock()
         self._packer = mavlink.MAVLink(None, srcSystem=system_id or 1, srcComponent=component_id)
-        self._last_sent: Sending | None = None
         self._heartbeat_due_s = self._state_due_s = clock()
         self._ask_position_s: float | None = None  # when to ask next; None: not wanted
         self._asked_for_state = False
@@ -97,8 +101,12 @@ class Conversation:
                 continue
             self._packer.seq = (self._packer.seq + 1) % 256
             if sending:
-                if message.get_type() == "COMMAND_INT":  # no other is answered
-                    self.answers.note_sent(self._clock())
+                now_s = self._clock()
+                if message.get_type() == "COMMAND_INT":
+                    self.answers.note_sent(now_s)
+                    self.replies.note_sent(sending, now_s)
+                else:
+                    self.replies.note_unanswerable(sending, now_s)
             else:
                 self.sent[message.get_type()] += 1
             return packet, sending
@@ -106,8 +114,7 @@ class Conversation:
 
     def note_departed(self, fixes: list[Sending]) -> None:
         """Note the fixes that have left. This comes before `hear` takes in the answer to one of them."""
-        for self._last_sent in fixes:
-            self.sent["COMMAND_INT"] += 1
+        self.sent["COMMAND_INT"] += len(fixes)
 
     def hear(self, data: bytes, now_s: float, sender: Sender | None) -> bool:
         """Take in bytes that arrived from `sender` (None: there is only one); return True where they hold a heartbeat
@@ -118,26 +125,37 @@ class Conversation:
                 is_ours = True
                 self._packer.srcSystem = self.autopilot.system_id
                 if news := self.autopilot.identity.take_news():
-                    self.answers, self._last_sent = Answers(), None  # those of another
+                    self.answers = Answers()  # those of another
+                    self.replies.break_off("another autopilot has taken its place")
                     self._announce(Severity.WARNING, news, "autopilot")
             if answer := self.autopilot.take_answer():
-                self.answers.note_answer(now_s)
-                if self._last_sent:
-                    self._last_sent.answer = answer  # an answer names no fix: it is taken for the last one sent
-                    if answer == "ACCEPTED":
-                        self.autopilot.certainty.note_known(self._last_sent.fix.accuracy_m, now_s)
+                self._hear_answer(answer, now_s)
             if not self.autopilot.identity.is_elsewhere(sender):
                 self._hear_request(message, now_s)
         return is_ours
 
     def tell_of_answers(self) -> None:
-        """Say once to the ground that fixes have no answers any more, or have them again."""
-        if news := self.answers.news(self._clock()):
-            self._announce(Severity.WARNING if self.answers.is_stopped else Severity.INFO, news, "answers")
+        """Give up the fixes that have waited too long for their answers, and say once to the ground that fixes have no
+        answers any more, or have them again, or are refused, or taken again."""
+        now_s = self._clock()
+        self.replies.time_out(now_s)
+        if self.answers.has_changed(now_s):
+            self._say_silence(now_s)
+        if news := self.replies.take_news():
+            is_alarming, text = news
+            self._announce(Severity.WARNING if is_alarming else Severity.INFO, text, "fixes")
+
+    def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
+        """Return the autopilot's last report, with its attitude at the time of a frame, and the time of the newest fix
+        that may be in its position: a continuous position may be in it at any time."""
+        vehicle = self.autopilot.vehicle_at(t_mono_s)
+        t_fix_s = self._clock() if self.channel.is_continuous else self.replies.t_fix_s
+        return vehicle and replace(vehicle, t_fix_s=t_fix_s)
 
     def break_off(self, lost_fixes: int) -> None:
         """Forget what ends with the port, with which so many fixes were thrown away."""
         self.answers.note_lost(lost_fixes)
+        self.replies.break_off("the link was lost before its answer came")
         self.autopilot.forget_presence()
         self.receiver.forget_partial_message()
 
@@ -209,6 +227,28 @@ class Conversation:
         us = self._packer.srcSystem, self._packer.srcComponent
         for reply in self.requests.hear(message, us, now_s, lambda: self._heartbeat(now_s)):
             self.outbox.put(reply)
+
+    def _hear_answer(self, answer: str, now_s: float) -> None:
+        self.answers.note_answer(now_s)
+        readiness = self.autopilot.readiness
+        sending = self.replies.hear(answer, readiness.state(now_s), now_s)
+        if sending and answer == "ACCEPTED":
+            self.autopilot.certainty.note_known(sending.fix.accuracy_m, now_s)
+        if answer == "FAILED" and readiness.asks_origin(now_s):
+            self.outbox.put(messages.origin_request(self.autopilot.system_id))
+
+    def _say_silence(self, now_s: float) -> None:
+        if self.answers.is_stopped:
+            reason = why_silent(self.autopilot.readiness.state(now_s))
+            log.warning(
+                "five fixes in a row had no answer, and only one every %g s is sent until one is answered: %s",
+                TRIED_AGAIN_AFTER_S,
+                reason.sentence,
+            )
+            self._announce(Severity.WARNING, f"fixes unanswered: {reason.brief}", "answers")
+        else:
+            log.warning("position fixes are answered again: they are sent again")
+            self._announce(Severity.INFO, "fixes are answered again", "answers")
 
     def _announce(self, severity: Severity, text: str, topic: str | None = None) -> None:
         self.texts.put(severity, text, topic)

@@ -1,6 +1,7 @@
 """The link to the flight controller: one thread, the only one to touch the socket or serial port."""
 
 import logging
+import math
 import select
 import socket
 import threading
@@ -123,8 +124,9 @@ class Link:
 
     def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
         """Return the same with the roll, pitch and heading that the vehicle had at the time of a frame; roll and pitch
-        are None where no attitude was heard within 0.3 s of it."""
-        return self._conversation.autopilot.vehicle_at(t_mono_s)
+        are None where no attitude was heard within 0.3 s of it. It also says when the newest fix that may be in its
+        position was sent."""
+        return self._conversation.vehicle_at(t_mono_s)
 
     @property
     def channel(self) -> Channel:
@@ -149,6 +151,8 @@ class Link:
             withheld_fixes=outbox.withheld_fixes,
             commands=dict(said.requests.results),
             ignored_requests=said.requests.ignored,
+            unanswered_fixes=said.replies.unanswered,
+            refused_why=said.replies.refusal and said.replies.refusal.brief,
             foreign_messages=autopilot.identity.foreign_messages,
             dropped_queue_full=outbox.dropped_queue_full,
             bad_bytes=said.receiver.bad_bytes,
@@ -257,15 +261,14 @@ class Link:
         with suppress(OSError):
             while self._is_connected() and time.monotonic() < give_up_s:
                 self._turn(self._line, timeout_s=0.01)
-                waiting = self._conversation.outbox or self._conversation.texts
-                if not waiting and self._line.is_idle and self._all_answered():
+                waits = self._conversation.outbox or self._conversation.texts
+                is_all_answered = not len(self._conversation.replies)  # so that the final counts include all answers
+                if not waits and self._line.is_idle and is_all_answered:
                     break
 
-    def _all_answered(self) -> bool:
-        """Tell whether as many answers came as fixes were sent, so that the final counts include all answers."""
-        return self._conversation.autopilot.acks.total() >= self.stats().fixes_sent
-
     def _close_all(self) -> None:
+        self._conversation.replies.break_off("the flight ended before its answer came")
+        self._conversation.outbox.drop_stale_fixes(math.inf)
         if self._line is not None:
             self._line.close()
             self._line = None

@@ -116,6 +116,13 @@ def report_requests(target_system: int, firmware: int, is_continuous: bool = Fal
     )
 
 
+def origin_request(target_system: int) -> Message:
+    """Make a COMMAND_LONG (76) with REQUEST_MESSAGE (512) for GPS_GLOBAL_ORIGIN (49)."""
+    origin = mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN
+    request = mavlink.MAV_CMD_REQUEST_MESSAGE
+    return mavlink.MAVLink_command_long_message(target_system, AUTOPILOT, request, 0, origin, 0, 0, 0, 0, 0, 0)
+
+
 def place_match(t_mono_s: float, place_id: int, score: float, confidence: float | None = None) -> tuple[Message, ...]:
     """Make the event of an accepted match: NAMED_VALUE_INT (252) `vpr_place`, NAMED_VALUE_FLOAT (251) `vpr_score`, and
     `vpr_conf`, the probability that it is right, where that is known."""

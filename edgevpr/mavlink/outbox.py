@@ -1,6 +1,7 @@
 """The queues of the link: messages, of which the newest matter most, and fixes, which are never sent late."""
 
 from collections import deque
+from dataclasses import dataclass
 from threading import Event, Lock
 
 from edgevpr.mavlink.messages import Fix
@@ -15,18 +16,38 @@ FIXES_MAX = 8
 MAX_FIX_WAIT_S = 1.0
 
 
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """Answer of the autopilot to a fix: the name of a MAV_RESULT, why it was refused in words (None: it was taken), and
+    the time from sending to answer. Both `result` and `latency_s` are None for a fix that was not answered in time."""
+
+    result: str | None
+    why: str | None
+    latency_s: float | None
+
+
 class Sending:
     """A fix to be sent by `due_s`, and its outcome. `sent` is None while the fix waits, then True, or False (`why`
-    gives the reason). `answer` is the answer of the autopilot, the name of a MAV_RESULT, None while there is none. Once
-    the fix is queued, only the link's thread changes these."""
+    gives the reason). `t_sent_s` is when the port was given it, and `outcome` the answer of the autopilot, each None
+    until then. Once the fix is queued, only the link's thread changes these."""
 
     def __init__(self, fix: Fix, due_s: float) -> None:
         self.fix = fix
         self.due_s = due_s
         self.sent: bool | None = None
         self.why: str | None = None
-        self.answer: str | None = None
+        self.t_sent_s: float | None = None
+        self.outcome: Answer | None = None
         self._settled = Event()
+
+    @property
+    def answer(self) -> str | None:
+        """The answer of the autopilot, the name of a MAV_RESULT; None: no answer (yet)."""
+        return self.outcome and self.outcome.result
+
+    def conclude(self, outcome: Answer) -> None:
+        """Set the answer, or that there is none."""
+        self.outcome = outcome
 
     def settle(self, sent: bool, why: str | None = None) -> None:
         """Set the outcome: sent, or not sent and why."""

@@ -1,6 +1,5 @@
 """The autopilot at the other end of the link: its system id, its presence, where and how it flies, its answers."""
 
-import logging
 import math
 from collections import Counter
 from dataclasses import dataclass, replace
@@ -15,6 +14,7 @@ from edgevpr.mavlink.certainty import FILTER_REPORTS, Certainty, gps_sd_m
 from edgevpr.mavlink.identity import Identity, Speaker
 from edgevpr.mavlink.listener import Listener, NoListener
 from edgevpr.mavlink.messages import AUTOPILOT, POSITION_FIX
+from edgevpr.mavlink.readiness import GPS_REPORTS, Readiness
 from edgevpr.mavlink.wire import Message, mavlink
 from edgevpr.types import Vehicle
 
@@ -23,19 +23,9 @@ GPS_AGREES_WITHIN_M = 50.0  # at 25 m/s, with one or two seconds between the two
 FASTEST_M_S = 150.0  # over ground: a report of more is none of a small aircraft
 SILENT_AFTER_S = 5.0  # heartbeats come once a second, and this many may be lost
 
-_GPS_REPORTS = ("GPS_RAW_INT", "GPS2_RAW")  # of the first receiver, and of the second
 _HEIGHT_REPORTS = ("DISTANCE_SENSOR", "TERRAIN_REPORT")
 _MILLI_G = 9.80665e-3  # m/s2
 _NOBODY = NoListener()
-
-log = logging.getLogger(__name__)
-
-_EXPLANATIONS = {
-    mavlink.MAV_RESULT_ACCEPTED: "it takes them",
-    mavlink.MAV_RESULT_FAILED: "GPS still in use, or it has no origin or nothing else to navigate by",
-    mavlink.MAV_RESULT_DENIED: "it does not like their form",
-    mavlink.MAV_RESULT_UNSUPPORTED: "its firmware does not know command 43003",
-}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,11 +52,11 @@ class Autopilot:
         self.firmware = mavlink.MAV_AUTOPILOT_GENERIC  # until it is heard
         self.vehicle: Vehicle | None = None  # the last report, of any age, without attitude
         self.attitudes, self._heights, self.certainty = Attitudes(), Heights(), Certainty()
+        self.readiness = Readiness()
         self._answer: str | None = None  # the newest answer, until `take_answer`
         self._own_component = own_component
         self._heard_s = -math.inf
         self._gps: dict[str, _Receiver] = {}  # those with a fix
-        self._last_result: int | None = None
 
     @property
     def system_id(self) -> int | None:
@@ -106,23 +96,26 @@ class Autopilot:
         if not self.identity.admits(Speaker(message.get_srcSystem(), address), beats, now_s):
             return False
         if self.identity.kept != before:
-            self.vehicle, self._last_result = None, None
+            self.vehicle = None
             self._gps.clear()
+            self.readiness = Readiness()
             self.attitudes, self._heights, self.certainty = Attitudes(), Heights(), Certainty()
             self.interview, self.origin, self._ahead_s = Interview(), None, None
         self.interview.hear(message)
+        if self._is_for_us(message):
+            self.readiness.hear(message, now_s)
         if beats:
             self._heard_s, self.firmware = now_s, message.autopilot
             return True
-        if self._answers_our_fix(message):
-            self._hear_result(message.result)
+        if message.get_type() == "COMMAND_ACK":
+            self._hear_ack(message)
         elif message.get_type() == "GLOBAL_POSITION_INT":
             self._hear_position(message, now_s)
         elif message.get_type() == "ATTITUDE":
             self.attitudes.hear(message, now_s)
         elif message.get_type() in _HEIGHT_REPORTS:
             self._heights.hear(message, now_s, self.attitudes.at(now_s))
-        elif message.get_type() in _GPS_REPORTS:
+        elif message.get_type() in GPS_REPORTS:
             self._hear_gps(message, now_s)
         elif message.get_type() in FILTER_REPORTS:
             self.certainty.hear(message, now_s)
@@ -161,7 +154,7 @@ class Autopilot:
 
     def _hear_gps(self, message: Message, now_s: float) -> None:
         choice = self.interview.choice
-        if choice.channel is Channel.GPS_INPUT and message.get_type() == _GPS_REPORTS[choice.receiver]:
+        if choice.channel is Channel.GPS_INPUT and message.get_type() == GPS_REPORTS[choice.receiver]:
             return  # the receiver that we play: it says what we have said
         name = message.get_type()
         if message.fix_type < mavlink.GPS_FIX_TYPE_3D_FIX:
@@ -189,22 +182,16 @@ class Autopilot:
         )
         return min(near, key=lambda each: each.sd_m, default=None)
 
-    def _answers_our_fix(self, message: Message) -> bool:
-        return (
-            message.get_type() == "COMMAND_ACK"
-            and message.command == POSITION_FIX
-            and message.target_component in (0, self._own_component)  # 0: broadcast
-        )
+    def _is_for_us(self, message: Message) -> bool:
+        """Tell whether a message is no answer to the command of another."""
+        return message.get_type() != "COMMAND_ACK" or message.target_component in (0, self._own_component)  # 0: to all
 
-    def _hear_result(self, result: int) -> None:
-        known = mavlink.enums["MAV_RESULT"].get(result)
-        name = known.name.removeprefix("MAV_RESULT_") if known else str(result)
-        self.acks[name] += 1
-        self._answer = name
-        if result != self._last_result:
-            level = logging.INFO if result == mavlink.MAV_RESULT_ACCEPTED else logging.WARNING
-            log.log(level, "the autopilot's answer to position fixes: %s (%s)", name, _EXPLANATIONS.get(result, "?"))
-            self._last_result = result
+    def _hear_ack(self, message: Message) -> None:
+        is_final = message.result != mavlink.MAV_RESULT_IN_PROGRESS
+        if message.command == POSITION_FIX and is_final and self._is_for_us(message):
+            known = mavlink.enums["MAV_RESULT"].get(message.result)
+            self._answer = known.name.removeprefix("MAV_RESULT_") if known else str(message.result)
+            self.acks[self._answer] += 1
 
 
 def _vehicle(message: Message, **known: Any) -> Vehicle | None:

@@ -8,8 +8,9 @@ class LinkStats:
     """Counts and state of a link. `trouble` is the reason why it is or last was not open, None once data arrives.
 
     `foreign_messages` came from another autopilot or another address than ours and were refused. `withheld_fixes` were
-    not sent because those before had no answer, or the ground has paused the flight. `commands` counts those that
-    were for us, by result, and `ignored_requests` what else was for us and had no effect.
+    not sent because those before had no answer, or the ground has paused the flight. `unanswered_fixes` were sent and
+    had no answer within a second, and `refused_why` is why the last one was refused (None: none was), in a few words.
+    `commands` counts those that were for us, by result, and `ignored_requests` what else was for us and had no effect.
     """
 
     connected: bool
@@ -23,6 +24,8 @@ class LinkStats:
     withheld_fixes: int
     commands: dict[str, int]
     ignored_requests: int
+    unanswered_fixes: int
+    refused_why: str | None
     foreign_messages: int
     dropped_queue_full: int
     bad_bytes: int

@@ -130,7 +130,7 @@ def test_answers_to_fixes_are_counted_by_result_and_explained_when_they_change(l
     assert link.stats().acks == {"FAILED": 3, "ACCEPTED": 1, "99": 1}
     said = [record.getMessage() for record in caplog.records if "FAILED" in record.getMessage()]
     assert len(said) == 1
-    assert "GPS still in use" in said[0]
+    assert "it is not armed" in said[0]
 
 
 def test_events_and_figures_go_to_anyone_but_a_fix_waits_for_an_autopilot(link, peer, clock):

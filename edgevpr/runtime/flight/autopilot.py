@@ -10,6 +10,7 @@ from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.outbox import Sending
 from edgevpr.mavlink.wishes import Wish, Wished
 from edgevpr.power.load import MachineLoad
+from edgevpr.runtime.flight.answerlog import AnswerLog
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.recognise.recognition import Recognition
@@ -39,6 +40,9 @@ class NoAutopilot:
 
     summary = None
 
+    def __init__(self) -> None:
+        self.answers = AnswerLog()
+
     def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
         """Return None: nothing is known."""
 
@@ -63,26 +67,30 @@ class NoAutopilot:
 class ToAutopilot:
     """Tells an autopilot of events over an open link. With `send_fixes` an accepted match with a position is sent as a
     fix, where the `navigator` says that the autopilot is better off with it; without, all else is as with it. `cores`
-    is the number of the board's cores."""
+    is the number of the board's cores. `answers` waits for those to the fixes."""
 
     def __init__(self, link: Link, navigator: Navigator, *, send_fixes: bool, cores: int, clock: Clock) -> None:
         self._link, self._send_fixes, self._cores, self._clock = link, send_fixes, cores, clock
         self._last: tuple[str, Sending] | None = None
+        self.answers = AnswerLog()
         self._navigator = navigator
         self._held, self._is_holding = 0, False
 
     @property
     def summary(self) -> str:
-        """Counts so far, in a few words: fixes sent, taken, held back, too late, withheld; messages of others
-        refused."""
+        """Counts so far, in a few words: fixes sent, taken, refused, unanswered, held back, too late, withheld;
+        messages of others refused."""
         stats = self._link.stats()
         taken = f"{stats.fixes_sent} fixes sent, {stats.acks.get('ACCEPTED', 0)} taken"
         sent = taken if self._send_fixes else DRY_RUN
+        refusals = sum(stats.acks.values()) - stats.acks.get("ACCEPTED", 0)
+        refused = f"{refusals} refused ({stats.refused_why})" if refusals else ""
+        unanswered = f"{stats.unanswered_fixes} unanswered" if stats.unanswered_fixes else ""
         held = f"{self._held} held back" if self._held else ""
         late = f"{stats.dropped_stale_fixes} too late to be sent" if stats.dropped_stale_fixes else ""
         withheld = f"{stats.withheld_fixes} withheld for want of answers" if stats.withheld_fixes else ""
         foreign = f"{stats.foreign_messages} foreign messages refused" if stats.foreign_messages else ""
-        return ", ".join(filter(None, (sent, held, late, withheld, foreign)))
+        return ", ".join(filter(None, (sent, refused, unanswered, held, late, withheld, foreign)))
 
     def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
         """Return the autopilot's last report of its vehicle, with the attitude at the time of a frame; None where it
@@ -144,6 +152,7 @@ class ToAutopilot:
         if self._link.listens():
             sending.wait(_SETTLED_WITHIN_S)
         self._last = _name(event), sending
+        self.answers.wait_for(*self._last)
         return _reported(*self._last)
 
     def _say_held(self, objection: str | None) -> None:

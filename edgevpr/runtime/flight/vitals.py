@@ -50,11 +50,12 @@ class Vitals:
         self._blind = Trouble("camera", "camera shows nothing", "camera shows ground again", **told)
 
     def beat(self) -> None:
-        """Send the watchdog's beat and the report, where they are due."""
+        """Send the watchdog's beat and the report, where they are due, and log the answers to fixes that have come."""
         now_s = self._clock.mono_s()
         if self._watchdog_s and now_s >= self._watchdog_due_s:
             notify(WATCHDOG=1)
             self._watchdog_due_s = now_s + self._watchdog_s
+        self._autopilot.answers.write(self._flight_log)
         if now_s >= self._health_due_s:
             self._health_due_s = now_s + _HEALTH_S
             self._tell()

@@ -30,7 +30,9 @@ from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.types import Frame, Place, Position, Vehicle
 
-_ECHO_S = 10.0  # after a fix of ours: so long the autopilot's position may be only that fix
+# After a fix that the autopilot took, or perhaps took: so long its position may be only that fix. One that it refused
+# has no echo. That of the frame itself has none either: the position was heard before it.
+_ECHO_S = 10.0
 _QUALITY_MIN = 0.2
 _SURE = 0.9  # of the probability to be lost, or to be where the flight so far says
 _CONTRADICTS_SD, _ROOM_M = 4.0, 20.0  # the place of a match may be farther off than its covariance tells
@@ -59,7 +61,6 @@ class Learner:
         self.is_off = False
         self._recogniser, self._growing, self._spacing_m, self._gap_m = recogniser, growing, spacing_m, gap_m
         self._map, self._utc_clock = recogniser.place_map, utc_clock
-        self._t_fix_s = -math.inf
 
     @property
     def summary(self) -> str:
@@ -75,12 +76,7 @@ class Learner:
         return {"places": self.learnt, "left_out": dict(self.passed_over), "stopped": self.trouble}
 
     def learn(self, event: Recognition) -> Place | None:
-        """Make a place of an event's frame and return it, or None where the frame is left out. Never raises MapError.
-
-        If the event has sent or queued a fix, the autopilot's position may be an echo of that fix for the next 10 s.
-        """
-        if event.fix and event.fix.sent is not False:
-            self._t_fix_s = event.frame.t_mono_s
+        """Make a place of an event's frame and return it; None: the frame is left out. Never raises MapError."""
         if self.trouble is not None or self.is_off or event.failed:
             return None
         place = None
@@ -141,7 +137,7 @@ class Learner:
             return frame, "without a fresh position"
         if not vehicle.has_gps:  # without GPS the position it goes on reporting is only estimated
             return frame, "without GPS"
-        if frame.t_mono_s - self._t_fix_s < _ECHO_S:
+        if frame.t_mono_s - vehicle.t_fix_s < _ECHO_S:
             return frame, "just after a fix"
         position = Position(vehicle.lat_deg, vehicle.lon_deg, vehicle.alt_m)
         return replace(frame, position=position, heading_deg=vehicle.heading_deg, t_utc_s=self._utc_clock()), None

@@ -93,6 +93,7 @@ def fly(config: Config, positions: Path | None = None) -> int:
             notify(STOPPING=1)
         if link:
             link.close()  # sends waiting messages first, so that the log's last line counts them
+            autopilot.answers.write(flight_log)
         flight_log.write(
             "end",
             accepted=flown.accepted,

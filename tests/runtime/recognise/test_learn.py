@@ -22,7 +22,7 @@ from edgevpr.runtime.recognise.opening import meter_of
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.techniques import create
-from edgevpr.types import FixReport, Frame, Position, QueryCost, Steps
+from edgevpr.types import Frame, Position, QueryCost, Steps
 
 TECHNIQUE = create("hog", {"w1": 32})
 SPACING_M = 10.0
@@ -64,20 +64,21 @@ class Bench:
         north_m=0.0,
         heard_s_ago=0.1,
         has_gps=True,
-        fix=None,
+        t_fix_s=-math.inf,
         quality=0.9,
         position=None,
         failed=False,
         view=UNKNOWN_VIEW,
         followed=None,
     ):
-        """Show a frame, at a place that the autopilot or the frame itself tells; `fix` is whether its own was sent."""
+        """Show a frame, at a place that the autopilot or the frame itself tells; `t_fix_s` is when a fix was sent or
+        taken that may be in what the autopilot tells."""
         now_s = self.clock.now_s
         frame = Frame(image=np.zeros((8, 8), np.uint8), name=f"{north_m}", t_mono_s=now_s, position=position)
         vehicle = None
         if heard_s_ago is not None:
             there = 50 + north_m * METRE_DEG, 8.0, now_s - heard_s_ago
-            vehicle = vehicle_at(*there, alt_m=312.0, heading_deg=90.0, has_gps=has_gps)
+            vehicle = vehicle_at(*there, alt_m=312.0, heading_deg=90.0, has_gps=has_gps, t_fix_s=t_fix_s)
         part = np.random.default_rng(int(abs(north_m))).random(TECHNIQUE.spec.coarse.shape).astype("<f2")
         event = Recognition(
             frame=frame,
@@ -89,7 +90,6 @@ class Bench:
             followed=followed,
             steps=Steps(),
             cost=COST,
-            fix=None if fix is None else FixReport("0", fix),
         )
         return self.learner.learn(event)
 
@@ -114,7 +114,7 @@ def test_a_frame_becomes_a_place_in_file_and_index_where_the_autopilot_is(bench)
 
 def test_a_recordings_own_position_counts_before_the_autopilots_and_is_no_echo(bench):
     own = Position(51.0, 9.0)
-    assert bench.see(position=own, fix=True).position == own
+    assert bench.see(position=own, t_fix_s=bench.clock.now_s).position == own
     assert bench.see(position=Position(52.0, 9.0), heard_s_ago=None) is not None
 
 
@@ -160,32 +160,10 @@ def test_a_frame_that_says_little_is_left_out(bench, quality):
 
 def test_after_a_fix_of_ours_the_autopilot_may_only_repeat_it(bench):
     sent_s = bench.clock.now_s
-    assert bench.see(fix=True) is None
-    for seconds, expected in ((9.9, False), (10.0, True)):
+    for seconds, expected in ((0.0, False), (9.9, False), (10.0, True)):
         bench.clock.now_s = sent_s + seconds
-        assert (bench.see() is not None) == expected
+        assert (bench.see(t_fix_s=sent_s) is not None) == expected
     assert bench.learner.passed_over == {"just after a fix": 2}
-
-
-def test_a_fix_that_waits_to_be_sent_may_come_back_and_one_that_was_not_sent_cannot(tmp_path):
-    for fix, learnt in ((None, True), (False, True)):
-        bench = Bench(tmp_path / f"{fix}.gpkg")
-        assert (bench.see(fix=fix) is not None) == learnt
-        bench.map.close()
-    waits = FixReport("0", None)
-    bench = Bench(tmp_path / "waits.gpkg")
-    bench.learner.learn(
-        Recognition(
-            frame=Frame(image=np.zeros((8, 8), np.uint8), name="0", t_mono_s=bench.clock.now_s),
-            reason="",
-            steps=Steps(),
-            cost=COST,
-            descriptor=Descriptor(coarse=np.zeros(1), quality=0.0),
-            fix=waits,
-        )
-    )
-    assert bench.see() is None
-    bench.map.close()
 
 
 def test_nothing_is_learnt_from_what_failed(bench):

@@ -78,6 +78,9 @@ def test_the_flight_controller_receives_what_the_log_says(fly, tmp_path):
     told_later = {line["last_fix"]["query"] for line in queries[1:] if line["last_fix"] and line["last_fix"]["sent"]}
     told = {line["query"] for line in queries if line["fix"]["sent"]} | told_later
     assert sent.count(True) <= seen["fixes_accepted"] <= len(told) + 1
+    answers = of_kind(lines, "answer")
+    assert [line["result"] for line in answers if line["sent"]] == ["ACCEPTED"] * seen["fixes_accepted"]
+    assert {line["query"] for line in answers if line["sent"]} == told | {line["query"] for line in answers[-1:]}
     assert f"{seen['fixes_accepted']} fixes sent, {seen['fixes_accepted']} taken" in said
     for line in queries:
         cost = line["costs"]

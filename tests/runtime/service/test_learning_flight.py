@@ -105,14 +105,14 @@ def test_a_small_budget_bounds_the_memory_while_the_file_keeps_all(recording, tm
     assert max(told_mb) < told_mb[9] + 3, "twenty places more would be 5.7 MB"
 
 
-def test_after_a_fix_nothing_is_learnt_from_the_autopilot(recording, tmp_path):
+def test_after_a_fix_that_may_be_taken_nothing_is_learnt_from_the_autopilot(recording, tmp_path):
     """The autopilot says to be where no place is; the frames show places of the map."""
-    shutil.copy(recording / "cohog.gpkg", tmp_path / "m.gpkg")
     pictures = [cv2.imread(str(path)) for path in sorted((recording / "seen" / "images").iterdir())]
 
-    def fly(log, **settings):
+    def fly(log, answer="ACCEPTED", **settings):
+        shutil.copy(recording / "cohog.gpkg", tmp_path / "m.gpkg")
         clock = FakeClock()
-        link = FakeLink(clock, vehicle=lambda: vehicle_at(51.0, 8.0, clock.now_s))
+        link = FakeLink(clock, answer=answer, vehicle=lambda: vehicle_at(51.0, 8.0, clock.now_s))
         settings = {"source.rate_hz": 15.0} | settings
         flight = Flight(tmp_path / "m.gpkg", tmp_path / log, clock, link, learns=True, **settings)
         return flight.fly(FakeSource(pictures, clock)), flight
@@ -122,6 +122,10 @@ def test_after_a_fix_nothing_is_learnt_from_the_autopilot(recording, tmp_path):
     assert flight.learner.totals["places"] == 0
     assert flight.learner.totals["left_out"]["just after a fix"] > 10
     assert flight.link.stats().acks["ACCEPTED"] > 10
+
+    lines, flight = fly("refused", answer="FAILED", **{"match.follow": False})
+    assert len(of_kind(lines, "learnt")) == 1, "a fix that was refused is in no position"
+    assert flight.link.stats().acks["FAILED"] > 10
 
     lines, flight = fly("contradicted", **{"mavlink.send_fixes": False})
     assert not of_kind(lines, "learnt"), "the flight so far knows better"
