@@ -62,7 +62,8 @@ class Asking:
 
     def __exit__(self, kind: type | None, error: BaseException | None, where: TracebackType | None) -> None:
         with suppress(OSError):
-            self._transport.throw_away()
+            if self._waiting or self._transport.unsent():  # a line that takes nothing must not delay the end
+                self._transport.throw_away()
         self._transport.close()
 
     @property

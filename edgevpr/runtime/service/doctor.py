@@ -145,8 +145,8 @@ def _streams(reading: Reading) -> Finding:
             f"{' and '.join(missing)} does not come, even on request: an autopilot that does not know its position "
             "yet may keep it back; let it have GPS.",
         )
-    said = ", ".join(f"{name} {reading.streams_hz.get(name, 0):g} Hz" for name in _NEEDED)
-    return Finding("streams", True, f"without being asked {said}; in flight edgevpr asks for what it needs")
+    said = ", ".join(f"{name} {reading.streams_hz[name]:g} Hz" for name in _NEEDED if name in reading.streams_hz)
+    return Finding("streams", True, f"without being asked: {said or 'none'}; in flight edgevpr asks for what it needs")
 
 
 def _filter(reading: Reading) -> Finding:
