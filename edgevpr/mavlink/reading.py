@@ -34,7 +34,7 @@ class Filter:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reading:
-    """What was read from an autopilot; None and empty is what it did not say.
+    """The answers of an autopilot; None and empty stand for what it did not say.
 
     `firmware` is "ardupilot", "px4" or "other"; `vehicle` is "plane", "copter", "rover" or "other"; `gps_fix` holds
     the fix type of each receiver; `streams_hz` the messages that came without being asked for, `heard` all that came.

@@ -1,4 +1,4 @@
-"""What `edgevpr doctor` finds out about this machine: Python, limits of its control groups, devices, room on disk."""
+"""This machine, as `edgevpr doctor` finds it: Python, limits of its control groups, devices, room on disk."""
 
 import getpass
 import grp
@@ -84,11 +84,13 @@ def device(what: str, path: str, root: Path = Path("/")) -> Finding:
             what, False, f"{path} may not be used by {_user()} ({mode}): log in again after the change.",
             (f"sudo usermod --append --groups {group} {_user()}",),
         )  # fmt: skip
-    if _is_console(file.resolve().name, root):
+    if console := _console_on(file.resolve(), root):
         return Finding(
-            what, False, f"{path} is the console of the kernel, which writes into the link.",
-            (f"remove console={file.resolve().name} from the kernel's command line (cmdline.txt), and reboot",),
-        )  # fmt: skip
+            what,
+            False,
+            f"{path} is the console of the kernel, which writes into the link.",
+            (f"remove console={console} from the kernel's command line (cmdline.txt), and reboot",),
+        )
     return Finding(what, True, f"{path}, {mode}")
 
 
@@ -139,10 +141,11 @@ def _service_limit(root: Path, name: str) -> str:
     return f"; the service has {name} {limit}" if limit else ""
 
 
-def _is_console(name: str, root: Path) -> bool:
+def _console_on(device_file: Path, root: Path) -> str | None:
+    """Return the name by which the kernel has its console on a device, None where it has not."""
     words = (machine.text(root / "proc/cmdline") or "").split()
-    consoles = {word.removeprefix("console=").split(",")[0] for word in words if word.startswith("console=")}
-    return any((root / "dev" / each).resolve().name == name for each in consoles)
+    consoles = (word.removeprefix("console=").split(",")[0] for word in words if word.startswith("console="))
+    return next((each for each in consoles if (root / "dev" / each).resolve() == device_file), None)
 
 
 def _group_name(number: int) -> str:

@@ -143,7 +143,7 @@ def _map(config: Config) -> str:
     return f"{config.map}, {found.reason}{sure}"
 
 
-def _source(config: Config, look: Callable[[Source], str]) -> str:
+def _source(config: Config, look: Callable[[Source, str], str]) -> str:
     uri = config.source.uri
     if uri is None:
         raise UsageError("There is no source of frames: write `source: {uri: ...}`.")
@@ -151,19 +151,19 @@ def _source(config: Config, look: Callable[[Source], str]) -> str:
         check_positions(config, None)
     source = open_source(uri, live=True)
     try:
-        return f"{uri}, {look(source)}"
+        return f"{uri}, {look(source, uri)}"
     finally:
         source.close()
 
 
-def _opened(source: Source) -> str:
+def _opened(source: Source, uri: str) -> str:
     # Wait until FFmpeg has given up (5 s at most): a capture that returns while Python ends aborts the process.
     while source.condition is Condition.OPENING:
         time.sleep(0.05)
     return source.state
 
 
-def _with_a_frame(source: Source) -> str:
+def _with_a_frame(source: Source, uri: str) -> str:
     """Wait for a frame until the source itself says that none comes, 15 s at most."""
     end_s = time.monotonic() + _FRAME_WAIT_S
     is_hopeless = False
@@ -174,8 +174,8 @@ def _with_a_frame(source: Source) -> str:
                 height, width = frame.image.shape[:2]
                 return f"{source.state}, {width} x {height} pixels"
     raise SourceError(
-        f"No frame comes from the source ({source.state}): start the camera or the stream, correct `source: "
-        "{uri: ...}`, or leave the source out with --offline."
+        f"{uri}: no frame comes ({source.state}): start the camera or the stream, correct `source: {{uri: ...}}`, or "
+        "check with --offline."
     )
 
 

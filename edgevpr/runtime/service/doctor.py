@@ -103,6 +103,7 @@ def autopilot_findings(reading: Reading, address: LinkAddress) -> Iterator[Findi
 
 def _link(reading: Reading, address: LinkAddress) -> Finding:
     who = f"{address}: {_NAMES.get(reading.firmware, 'an autopilot')}, system {reading.system_id}"
+    who += ", armed" if reading.is_armed else ""
     if not reading.answers:
         why = "it signs its packets, so it may want signed requests" if reading.signs else (
             "the wire from the board's TX to its RX, or a signing key, may be the reason"

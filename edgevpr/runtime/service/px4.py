@@ -35,9 +35,13 @@ class Channel:
 
 def channel(version: tuple[int, int, int] | None, parameters: Parameters) -> Channel:
     """Choose the way of the fixes by version and parameters."""
-    if version and version[:2] >= _FUSES_296 and int(parameters.get("EKF2_AGP0_CTRL", 0)) & _HORIZONTAL:
+    if _can_fuse(version, parameters) and int(parameters["EKF2_AGP0_CTRL"]) & _HORIZONTAL:
         return Channel("global position", f"EKF2_AGP0_CTRL={parameters['EKF2_AGP0_CTRL']}")
     return Channel("single fixes", "EKF2_AGP0_CTRL does not take positions")
+
+
+def _can_fuse(version: tuple[int, int, int] | None, parameters: Parameters) -> bool:
+    return version is not None and version[:2] >= _FUSES_296 and "EKF2_AGP0_CTRL" in parameters
 
 
 def findings(reading: Reading) -> Iterator[Finding]:
@@ -70,12 +74,11 @@ def _firmware(reading: Reading) -> Finding:
 def _channel(reading: Reading) -> Finding:
     parameters = reading.parameters
     chosen = channel(reading.version, parameters)
-    if chosen.name == "single fixes" and "EKF2_AGP0_CTRL" not in parameters:
+    if not _can_fuse(reading.version, parameters):
         return Finding(
             "channel",
             True,
-            "Single fixes by command 43003: this firmware has no EKF2_AGP0_CTRL. It takes them only while it reckons "
-            "without GPS.",
+            "Single fixes by command 43003, while it reckons without GPS: this firmware does not fuse message 296.",
         )
     wrong = []
     if chosen.name == "single fixes":
@@ -88,8 +91,8 @@ def _channel(reading: Reading) -> Finding:
         return Finding(
             "channel",
             False,
-            "PX4 can take positions as measurements (message 296), but is not set for it: change this, and reboot. The "
-            "delay is the time from the picture to the fix, in ms: what `edgevpr profile` says of a query, 300 at most.",
+            "PX4 can take positions as measurements (message 296), but is not set for it: change this, and reboot. "
+            "The delay is the time from picture to fix, in ms: that of a query by `edgevpr profile`, 300 at most.",
             tuple(wrong),
         )
     return Finding("channel", True, f"Positions as measurements (message 296): {chosen.reason}.")
