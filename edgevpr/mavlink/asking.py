@@ -162,9 +162,10 @@ class Asking:
                 if rest:
                     self._waiting.appendleft(rest)
                     break
-        select.select([self._transport], [], [], wait_s)
-        data = self._transport.read()
-        if not data:  # a refused datagram makes the port readable at once
+        readable, _, _ = select.select([self._transport], [], [], wait_s)
+        # A serial port without a byte would look lost; a refused datagram makes its port readable again and again.
+        data = self._transport.read() if readable else b""
+        if readable and not data:
             time.sleep(0.01)
         arrived = self._receiver.feed(data, self._transport.sender)
         self._arrived.extend(message for message in arrived if self._is_ours(message))

@@ -1,18 +1,56 @@
-"""An autopilot that answers questions, over a real UDP socket, in a thread of its own; it notes all that it is told."""
+"""An autopilot that answers questions, over UDP or a serial cable, in a thread of its own; it notes what it is told."""
 
 import math
+import os
+import select
 import socket
 import struct
 import threading
 import time
+from contextlib import suppress
+from pathlib import Path
 
 from edgevpr.mavlink.wire import Receiver, mavlink
 
 BEAT_S = 0.05  # twenty times as fast as a real one, so that nothing is waited for
 
 
+class UdpEnd:
+    def __init__(self, to: int) -> None:
+        self._to = ("127.0.0.1", to)
+        self._sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._sock.bind(("127.0.0.1", 0))
+        self._sock.settimeout(BEAT_S)
+
+    def read(self) -> bytes:
+        with suppress(TimeoutError, ConnectionRefusedError):
+            data, self._to = self._sock.recvfrom(65_536)
+            return data
+        return b""
+
+    def write(self, data: bytes) -> None:
+        self._sock.sendto(data, self._to)
+
+    def close(self) -> None:
+        self._sock.close()
+
+
+class SerialEnd:
+    def __init__(self, device: Path) -> None:
+        self._file = os.open(device, os.O_RDWR | os.O_NOCTTY)
+
+    def read(self) -> bytes:
+        return os.read(self._file, 4096) if select.select([self._file], [], [], BEAT_S)[0] else b""
+
+    def write(self, data: bytes) -> None:
+        os.write(self._file, data)
+
+    def close(self) -> None:
+        os.close(self._file)
+
+
 class AnsweringAutopilot:
-    """Sends to the UDP port `to`. `messages` are those it can be asked for, by name; `parameters` its parameters.
+    """Speaks to the UDP port `to`, or over the serial device of that path. `messages` are those it can be asked for, by name; `parameters` its parameters.
 
     `loses` so many of the questions of each kind that come first; `is_mute` answers nothing at all; `says_unknown`
     answers for a parameter that it has not (else it is silent, as older firmware is).
@@ -24,7 +62,7 @@ class AnsweringAutopilot:
         version_1=False, noise=b"",
     ) -> None:  # fmt: skip
         self.heard = []
-        self._to, self._parameters, self._loses, self._noise = ("127.0.0.1", to), parameters or {}, loses, noise
+        self._parameters, self._loses, self._noise = parameters or {}, loses, noise
         self._messages = {message.get_msgId(): message for message in messages}
         self._firmware, self._vehicle, self._is_mute = firmware, vehicle, is_mute
         self._says_unknown, self._version_1 = says_unknown, version_1
@@ -32,9 +70,7 @@ class AnsweringAutopilot:
         if key:
             self._packer.signing.secret_key, self._packer.signing.sign_outgoing = key, True
         self._receiver = Receiver()
-        self._sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._sock.bind(("127.0.0.1", 0))
-        self._sock.settimeout(BEAT_S)
+        self._port = UdpEnd(to) if isinstance(to, int) else SerialEnd(to)
         self._lost = {}
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -46,7 +82,7 @@ class AnsweringAutopilot:
     def __exit__(self, *_):
         self._stop.set()
         self._thread.join()
-        self._sock.close()
+        self._port.close()
 
     def names(self) -> set[str]:
         """Names of all messages that were heard."""
@@ -59,12 +95,8 @@ class AnsweringAutopilot:
                 beat_s = time.monotonic() + BEAT_S
                 self._send(mavlink.MAVLink_heartbeat_message(self._vehicle, self._firmware, 1, 0, 4, 3))
                 if self._noise:
-                    self._sock.sendto(self._noise, self._to)
-            try:
-                data, self._to = self._sock.recvfrom(65_536)
-            except (TimeoutError, ConnectionRefusedError):
-                continue
-            for message in self._receiver.feed(data):
+                    self._port.write(self._noise)
+            for message in self._receiver.feed(self._port.read()):
                 self.heard.append(message)
                 if not self._is_mute and not self._is_lost(message):
                     self._answer(message)
@@ -99,7 +131,7 @@ class AnsweringAutopilot:
         self._send(mavlink.MAVLink_param_value_message(name.encode(), value, kind, len(self._parameters), 0))
 
     def _send(self, message) -> None:
-        self._sock.sendto(message.pack(self._packer, force_mavlink1=self._version_1), self._to)
+        self._port.write(message.pack(self._packer, force_mavlink1=self._version_1))
         self._packer.seq = (self._packer.seq + 1) % 256
 
 

@@ -115,6 +115,19 @@ def test_where_no_autopilot_is_there_is_no_reading(address):
         assert asking.bad_bytes == 0
 
 
+def test_a_serial_cable_is_a_link_too(tmp_path):
+    cable = SerialCable(tmp_path)
+    cable.plug()
+    answers = {"messages": healthy_messages(), "parameters": {"GPS1_TYPE": 14}}
+    with (
+        AnsweringAutopilot(tmp_path / "b", **answers),
+        Asking(LinkAddress("serial", str(tmp_path / "a"), 115_200)) as asking,
+    ):
+        said = read_autopilot(asking, {"ardupilot": ["GPS1_TYPE"]})
+    cable.unplug()
+    assert (said.version, said.parameters) == ((4, 7, 0), {"GPS1_TYPE": 14})
+
+
 def test_what_cannot_be_opened_is_a_sentence():
     server = LinkAddress("tcp", "127.0.0.1", free_port(socket.SOCK_STREAM))
     with pytest.raises(LinkError, match=r"is not there \(Connection refused\): connect it or start the other end"):
