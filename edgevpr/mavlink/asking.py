@@ -94,7 +94,8 @@ class Asking:
         return None
 
     def parameters(self, names: Iterable[str], bytewise: bool) -> dict[str, float | int]:
-        """Read parameters by name (PARAM_REQUEST_READ); those that the autopilot does not have are left out.
+        """Read parameters by name (PARAM_REQUEST_READ); those that the autopilot does not have, and those that are no
+        number, are left out.
 
         `bytewise`: it packs whole numbers into the bytes of the float (PX4), as AUTOPILOT_VERSION says.
         """
@@ -130,8 +131,8 @@ class Asking:
             if said is None:
                 return
             waiting.remove(said.param_id)
-            if said.get_type() == "PARAM_VALUE":
-                found[said.param_id] = _value(said, bytewise)
+            if said.get_type() == "PARAM_VALUE" and math.isfinite(value := _value(said, bytewise)):
+                found[said.param_id] = value
 
     def _first(self, wait_s: float, wanted: Callable[[Message], bool]) -> Message | None:
         return next((message for message in self._messages(wait_s) if wanted(message)), None)
@@ -209,8 +210,7 @@ def _parameter_name(message: Message) -> str | None:
 
 def _value(said: Message, bytewise: bool) -> float | int:
     """Read a PARAM_VALUE: the float32 is the number itself, or holds the bytes of a whole number."""
-    if said.param_type >= mavlink.MAV_PARAM_TYPE_REAL32:
-        return said.param_value
-    if bytewise:
+    is_whole = said.param_type < mavlink.MAV_PARAM_TYPE_REAL32
+    if is_whole and bytewise:
         return struct.unpack("<i", struct.pack("<f", said.param_value))[0]
-    return round(said.param_value) if math.isfinite(said.param_value) else said.param_value
+    return int(said.param_value) if is_whole and math.isfinite(said.param_value) else said.param_value

@@ -50,14 +50,15 @@ class SerialEnd:
 
 
 class AnsweringAutopilot:
-    """Speaks to the UDP port `to`, or over the serial device of that path. `messages` are those it can be asked for, by name; `parameters` its parameters.
+    """Speaks to the UDP port `to`, or over the serial device of that path.
 
-    `loses` so many of the questions of each kind that come first; `is_mute` answers nothing at all; `says_unknown`
-    answers for a parameter that it has not (else it is silent, as older firmware is).
+    `messages` are those it can be asked for, `parameters` those it has. It `loses` so many of the first questions of
+    each kind; `is_mute` answers nothing at all; `says_unknown` answers for a parameter that it has not (else it is
+    silent, as older firmware is).
     """
 
     def __init__(
-        self, to: int, *, parameters=None, messages=(), firmware=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
+        self, to: int | Path, *, parameters=None, messages=(), firmware=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
         vehicle=mavlink.MAV_TYPE_QUADROTOR, system_id=1, loses=0, is_mute=False, says_unknown=True, key=None,
         version_1=False, noise=b"",
     ) -> None:  # fmt: skip

@@ -70,6 +70,11 @@ def test_a_parameter_that_older_firmware_is_silent_about_is_left_out(address, mo
     assert [m.param_id for m in peer.heard if m.get_type() == "PARAM_REQUEST_READ"] == ["A", "B", "A", "A"]
 
 
+def test_a_parameter_that_is_no_number_is_left_out(address):
+    said, _ = read(address, ["A", "B"], messages=healthy_messages(), parameters={"A": float("nan"), "B": float("inf")})
+    assert said.parameters == {}
+
+
 def test_px4_packs_whole_numbers_into_the_bytes_of_a_float(address):
     said, _ = read(address, ["EKF2_AGP0_CTRL", "MAV_1_RATE", "EKF2_AGP0_DELAY"], firmware=mavlink.MAV_AUTOPILOT_PX4,
                    messages=healthy_messages((1, 17, 0), mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE),

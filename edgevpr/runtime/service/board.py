@@ -15,6 +15,7 @@ from edgevpr.errors import UsageError
 from edgevpr.mavlink.address import LinkAddress
 from edgevpr.places.mapfiles import map_path
 from edgevpr.power import machine
+from edgevpr.power.boards import load_board
 from edgevpr.runtime.service.finding import Finding, looked_at
 
 LOG_ROOM_MB = 10  # some hours of queries
@@ -25,11 +26,12 @@ _SERVICE = Path("sys/fs/cgroup/system.slice/edgevpr.service")
 
 
 def board_findings(config: Config, address: LinkAddress | None, root: Path = Path("/")) -> Iterator[Finding]:
-    """Examine this machine for a flight with a configuration over a link."""
+    """Examine this machine for a flight with a configuration over a link. Raises ConfigError for a board that
+    is unknown."""
     yield python(sys.version_info[:2], sys.maxsize > 2**32)
     specs = (importlib.util.find_spec(name) for name in _LARGEST)
     yield bytecode([Path(spec.origin) for spec in specs if spec and spec.origin])
-    yield _memory(root)
+    yield _memory(config, root)
     yield Finding("cores", True, f"{machine.cores(root):g} for this process{_service_limit(root, 'cpu.max')}")
     if address and address.kind == "serial":
         yield device("serial", address.where, root)
@@ -121,9 +123,9 @@ def _map_room(config: Config) -> Finding:
     return Finding("map", True, f"{path}, {free_mb:.0f} MB free")
 
 
-def _memory(root: Path) -> Finding:
-    said = f"{machine.ram_limit_mb(root):.0f} of {machine.ram_mb(root):.0f} MB for this process"
-    said += _service_limit(root, "memory.max")
+def _memory(config: Config, root: Path) -> Finding:
+    limit_mb = machine.ram_limit_mb(root)
+    said = f"{limit_mb:.0f} of {machine.ram_mb(root):.0f} MB for this process{_service_limit(root, 'memory.max')}"
     controllers = machine.text(root / "sys/fs/cgroup/cgroup.controllers")
     if controllers is not None and "memory" not in controllers.split():
         return Finding(
@@ -131,6 +133,14 @@ def _memory(root: Path) -> Finding:
             False,
             f"{said}; the kernel runs without the memory controller, so no limit of the service is kept.",
             ("cgroup_enable=memory in /boot/firmware/cmdline.txt, and reboot",),
+        )
+    needed_mb = load_board(config.board).memory_max_mb
+    if limit_mb < needed_mb:
+        return Finding(
+            "memory",
+            False,
+            f"{said}: less than what the profile of the board spares for edgevpr.",
+            (f"MemoryMax={1e6 * needed_mb:.0f}",),
         )
     return Finding("memory", True, said)
 

@@ -36,7 +36,9 @@ class Diagnosis:
 
 def doctor(config: Config, address: LinkAddress, say: Callable[[str], None], root: Path = Path("/")) -> Diagnosis:
     """Examine the autopilot at the other end of a link, and this machine (its files below `root`). `say` is told in a
-    few words what is waited for. Raises LinkAddressError for an address that is wrong."""
+    few words what is waited for. Raises LinkAddressError for an address that is wrong, and ConfigError for a board that
+    is unknown."""
+    about_board = list(board_findings(config, address, root))
     say(f"asking the autopilot at {address}")
     reading, trouble = None, None
     try:
@@ -50,7 +52,7 @@ def doctor(config: Config, address: LinkAddress, say: Callable[[str], None], roo
         trouble = Finding("link", False, str(error))
     say("")
     about_autopilot = [trouble] if trouble else list(autopilot_findings(reading, address))
-    return Diagnosis(about_autopilot + list(board_findings(config, address, root)), reading)
+    return Diagnosis(about_autopilot + about_board, reading)
 
 
 def silence(address: LinkAddress, bad_bytes: int, others: set[int]) -> Finding:

@@ -29,7 +29,7 @@ def root(tmp_path) -> Path:
 
 
 def config(tmp_path, **keys) -> Config:
-    return load_config(None, {"log.path": str(tmp_path / "flight.jsonl"), **keys})
+    return load_config(None, {"log.path": str(tmp_path / "flight.jsonl"), "board": "rpi-zero-2w", **keys})
 
 
 def found(configuration: Config, root: Path, link: str = "udpin:127.0.0.1:14550") -> dict:
@@ -53,7 +53,12 @@ def test_the_limits_of_control_groups_are_told(root, tmp_path):
     (root / "sys/fs/cgroup/user.slice").mkdir()
     (root / "sys/fs/cgroup/user.slice/memory.max").write_text("128000000\n")
     findings = found(config(tmp_path), root)
-    assert findings["memory"].message == "128 of 512 MB for this process; the service has memory.max 256000000"
+    assert not findings["memory"].ok
+    assert findings["memory"].changes == ("MemoryMax=256000000",)
+    assert findings["memory"].message.startswith("128 of 512 MB for this process; the service has memory.max 256000000")
+    (root / "sys/fs/cgroup/user.slice/memory.max").write_text("300000000\n")
+    findings = found(config(tmp_path), root)
+    assert findings["memory"].message == "300 of 512 MB for this process; the service has memory.max 256000000"
     assert findings["cores"].message.endswith("the service has cpu.max 100000 100000")
 
 

@@ -1,8 +1,10 @@
 """`edgevpr doctor`: the rules, on what might be read of a flight controller; and the command over a real link."""
 
 import json
+import re
 import socket
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from answering_autopilot import AnsweringAutopilot, healthy_messages
@@ -258,6 +260,19 @@ def test_a_silent_line_is_explained_by_what_arrives():
     assert silence(UDP, 0, {5, 3}).changes == ("mavlink: {system_id: 3}",)
     for url in ("udpin:0.0.0.0:14550", "udpout:10.0.0.2:14550", "tcp:10.0.0.2:5760"):
         assert silence(parse_link(url), 0, set()).message.startswith(f"{url}: no heartbeat of an autopilot in 5 s: ")
+
+
+def test_the_pages_of_the_vehicles_name_what_is_told_to_change():
+    docs = Path(__file__).parents[3] / "docs"
+    copter, px4_page = (docs / "ardupilot-copter.md").read_text(), (docs / "px4.md").read_text()
+    bare = with_parameters(replace(COPTER, parameters=PLAIN), GPS_AUTO_SWITCH=0)
+    for parameter, value in (change.split("=") for change in wrong(bare)["channel"]):
+        assert re.search(rf"`{parameter}`.*\| {value} \|", copter)
+    for change in (*wrong(replace(COPTER, parameters=PLAIN | {"VISO_TYPE": 1}))["channel"], "VISO_TYPE=1"):
+        assert f"`{change}`" in copter
+    unset = with_parameters(PX4, EKF2_AGP0_CTRL=0, EKF2_AGP0_ID=0)
+    for parameter, value in (change.split("=") for change in (*wrong(unset)["channel"], *px4.port_changes(921_600))):
+        assert re.search(rf"`{parameter}` \| {value}[ |]", px4_page)
 
 
 # The command.
