@@ -1,5 +1,6 @@
 """What `edgevpr doctor` says of a machine, on trees of files that stand for /proc, /sys and /dev."""
 
+import grp
 import os
 import shutil
 import sys
@@ -131,9 +132,15 @@ def test_a_device_that_is_absent_or_none_is_wrong(root, tmp_path):
 
 
 @pytest.mark.skipif(os.getuid() == 0, reason="root may open everything")
-def test_a_device_of_another_group_names_the_group():
-    finding = device("serial", "/dev/mem")
-    assert finding.changes[0].startswith("sudo usermod --append --groups ")
+def test_a_device_that_may_not_be_used_names_its_group():
+    controller, port = os.openpty()
+    os.chmod(os.ttyname(port), 0)
+    finding = device("serial", os.ttyname(port))
+    group = grp.getgrgid(os.fstat(port).st_gid).gr_name
+    assert "may not be used by" in finding.message
+    assert finding.changes[0].startswith(f"sudo usermod --append --groups {group} ")
+    os.close(controller)
+    os.close(port)
 
 
 def test_room_for_log_and_map_is_looked_at(root, tmp_path, monkeypatch):
