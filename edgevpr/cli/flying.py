@@ -48,6 +48,7 @@ def add(commands: Any) -> None:
 
     check = command(commands, "check", run_check, "say whether a configuration would fly")
     check.add_argument("--config", required=True, metavar="FILE")
+    check.add_argument("--offline", action="store_true", help="wait for no frame and no heartbeat: on the bench")
     check.add_argument(
         "--learn-mask", metavar="PNG", help="instead, learn from the source which part of its frames shows no ground"
     )
@@ -111,16 +112,18 @@ def run_flight(args: Namespace) -> int:
 
 def run_check(args: Namespace) -> int:
     """Say whether a configuration would fly."""
+    from edgevpr.helpers.progress import waiting
     from edgevpr.runtime.service.check import check, learn_mask
+    from edgevpr.runtime.service.finding import lines
 
     if args.learn_mask:
         print(learn_mask(args.config, Path(args.learn_mask), args.source))
         return 0
     if args.source:
         raise UsageError("--source goes with --learn-mask: a check looks at the source of the configuration.")
-    findings = check(args.config)
-    for finding in findings:
-        print(f"{'ok   ' if finding.ok else 'WRONG'}  {finding.what:<14} {shown(finding.message)}")
+    findings = check(args.config, offline=args.offline, say=waiting)
+    for line in lines(findings):
+        print(shown(line))
     return 0 if all(finding.ok for finding in findings) else 1
 
 

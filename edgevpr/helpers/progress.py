@@ -5,6 +5,7 @@ from collections.abc import Iterable, Iterator
 from typing import TextIO, TypeVar
 
 T = TypeVar("T")
+_LINE = 79
 
 
 def progress(iterable: Iterable[T], total: int, label: str, stream: TextIO | None = None) -> Iterator[T]:
@@ -26,3 +27,12 @@ def progress(iterable: Iterable[T], total: int, label: str, stream: TextIO | Non
             stream.flush()
     if terminal and shown is not None:
         stream.write("\n")
+
+
+def waiting(text: str, stream: TextIO | None = None) -> None:
+    """Show on a terminal what is waited for, in a line that the next call replaces; "" clears it. Elsewhere nothing is
+    written: the result says what came of it."""
+    stream = stream or sys.stderr
+    if stream.isatty():
+        stream.write(f"{text[:_LINE]:<{_LINE}}\r")
+        stream.flush()

@@ -3,7 +3,7 @@
 import io
 import os
 
-from edgevpr.helpers.progress import progress
+from edgevpr.helpers.progress import progress, waiting
 
 
 def test_a_file_gets_a_line_for_every_tenth():
@@ -37,3 +37,22 @@ def test_without_a_total_a_file_gets_a_line_for_every_hundred():
     out = io.StringIO()
     assert len(list(progress(range(250), 0, "video", out))) == 250
     assert out.getvalue().splitlines() == ["video  1", "video  100", "video  200"]
+
+
+def test_a_terminal_sees_what_is_waited_for_until_it_is_over():
+    reader, writer = os.openpty()
+    with os.fdopen(writer, "w") as terminal:
+        for text in ("waiting for the source", "for the link", ""):
+            waiting(text, terminal)
+        drawn = ""
+        while drawn.count("\r") < 3:
+            drawn += os.read(reader, 4096).decode()
+    os.close(reader)
+    assert [line.rstrip() for line in drawn.split("\r")] == ["waiting for the source", "for the link", "", ""]
+    assert {len(line) for line in drawn.split("\r")[:3]} == {79}
+
+
+def test_a_file_is_not_told_what_is_waited_for():
+    out = io.StringIO()
+    waiting("waiting for the source", out)
+    assert out.getvalue() == ""

@@ -1,23 +1,22 @@
 """`edgevpr check`: would this configuration fly? Everything is opened as `edgevpr run` opens it, and closed again."""
 
 import os
-import shutil
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
 from edgevpr.confidence.stored import not_calibrated
 from edgevpr.config import Config, load_config
-from edgevpr.errors import EdgevprError, ImageError, LinkError, MapError, UsageError
+from edgevpr.errors import EdgevprError, ImageError, LinkError, MapError, SourceError, UsageError
 from edgevpr.frames.condition import Condition
 from edgevpr.frames.overlay import FEWEST_FRAMES, learn_overlay, require_png, write_mask
 from edgevpr.frames.source import Source, open_source
 from edgevpr.helpers.files import require_folder
-from edgevpr.mavlink.address import parse_link
-from edgevpr.mavlink.transport import open_transport
+from edgevpr.mavlink.address import LinkAddress, parse_link
+from edgevpr.mavlink.asking import Asking
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import map_path
 from edgevpr.power.boards import load_board
@@ -28,39 +27,44 @@ from edgevpr.runtime.preflight.pick import outlook
 from edgevpr.runtime.recognise.calibrated import calibration_of
 from edgevpr.runtime.recognise.learn import check_positions
 from edgevpr.runtime.recognise.opening import open_recogniser
+from edgevpr.runtime.service.board import log_room
+from edgevpr.runtime.service.doctor import silence
+from edgevpr.runtime.service.finding import Finding, looked_at
 from edgevpr.types import FIX_MAX_AGE_S
 
-_LOG_ROOM_MB = 10  # some hours of queries
+_FRAME_WAIT_S = 15.0  # longer than any source takes to say that it is lost
+_WITHOUT_FRAMES = (Condition.LOST, Condition.FROZEN, Condition.DAMAGED)
 # Pictures that a mask is learnt from: so far apart that the ground has moved, and of a minute of flight at most.
 _LEARNT_FROM, _APART_S = 3 * FEWEST_FRAMES, 0.5
 
 
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """One thing that was checked; `message` says what it is or, in one sentence, what is wrong with it."""
+def check(
+    config_path: str | Path, *, offline: bool = False, say: Callable[[str], None] = lambda text: None
+) -> list[Finding]:
+    """Check everything that a flight needs; never raises for an error that the user can correct.
 
-    what: str
-    ok: bool
-    message: str
-
-
-def check(config_path: str | Path) -> list[Finding]:
-    """Check everything that a flight needs; never raises for an error that the user can correct."""
+    A frame of the source and a heartbeat of the autopilot are waited for, unless `offline`: then it is enough that
+    source and link can be opened. `say` is told in a few words what is waited for.
+    """
     try:
         config = load_config(config_path)
     except EdgevprError as error:
         return [Finding("configuration", False, str(error))]
     findings = [
         Finding("configuration", True, str(config_path)),
-        _looked_at("board", _board, config),
-        _looked_at("battery", _battery, config),
+        looked_at("board", lambda: _board(config)),
+        looked_at("battery", lambda: _battery(config)),
     ]
     if all(finding.ok for finding in findings):
-        findings.append(_looked_at("map", _map, config))
+        findings.append(looked_at("map", lambda: _map(config)))
     else:
         findings.append(Finding("map", False, "Not looked at: correct the board or the battery first."))
-    findings += [_looked_at("source", _source, config), _looked_at("link", _link, config)]
-    return [*findings, _looked_at("log", _log, config)]
+    say("waiting for the source of frames")
+    findings.append(looked_at("source", lambda: _source(config, _opened if offline else _with_a_frame)))
+    say("waiting for the flight controller")
+    findings.append(looked_at("link", lambda: _link(config, _only_opened if offline else _with_a_heartbeat)))
+    say("")
+    return [*findings, looked_at("log", lambda: log_room(config))]
 
 
 def learn_mask(config_path: str | Path, out: Path, recording: str | None = None) -> str:
@@ -103,15 +107,6 @@ def _pictures(source: Source) -> Iterator[np.ndarray]:
             time.sleep(_APART_S)
 
 
-def _looked_at(what: str, look: Callable[[Config], str], config: Config) -> Finding:
-    try:
-        return Finding(what, True, look(config))
-    except EdgevprError as error:
-        return Finding(what, False, str(error))
-    except OSError as error:
-        return Finding(what, False, f"{error.filename}: {error.strerror}: check the path and its permissions.")
-
-
 def _board(config: Config) -> str:
     board = load_board(config.board)
     return f"{board.title}, {board.cores} cores, up to {board.memory_max_mb:.0f} MB for edgevpr"
@@ -148,43 +143,57 @@ def _map(config: Config) -> str:
     return f"{config.map}, {found.reason}{sure}"
 
 
-def _source(config: Config) -> str:
-    if config.source.uri is None:
+def _source(config: Config, look: Callable[[Source, str], str]) -> str:
+    uri = config.source.uri
+    if uri is None:
         raise UsageError("There is no source of frames: write `source: {uri: ...}`.")
     if config.mapping.learn:
         check_positions(config, None)
-    source = open_source(config.source.uri, live=True)
+    source = open_source(uri, live=True)
+    try:
+        return f"{uri}, {look(source, uri)}"
+    finally:
+        source.close()
+
+
+def _opened(source: Source, uri: str) -> str:
     # Wait until FFmpeg has given up (5 s at most): a capture that returns while Python ends aborts the process.
     while source.condition is Condition.OPENING:
         time.sleep(0.05)
-    state = source.state
-    source.close()
-    return f"{config.source.uri}, {state}"
+    return source.state
 
 
-def _link(config: Config) -> str:
-    if config.mavlink.link is None:
+def _with_a_frame(source: Source, uri: str) -> str:
+    """Wait for a frame until the source itself says that none comes, 15 s at most."""
+    end_s = time.monotonic() + _FRAME_WAIT_S
+    is_hopeless = False
+    while not (is_hopeless or source.ended) and time.monotonic() < end_s:
+        is_hopeless = source.condition in _WITHOUT_FRAMES  # before the look: a last frame may wait
+        with suppress(ImageError):
+            if frame := source.read(0.25):
+                height, width = frame.image.shape[:2]
+                return f"{source.state}, {width} x {height} pixels"
+    raise SourceError(
+        f"{uri}: no frame comes ({source.state}): start the camera or the stream, correct `source: {{uri: ...}}`, or "
+        "check with --offline."
+    )
+
+
+def _link(config: Config, look: Callable[[Asking, LinkAddress], str]) -> str:
+    settings = config.mavlink
+    if settings.link is None:
         return "none, so what is recognised goes into the log only"
-    address = parse_link(config.mavlink.link)
-    try:
-        open_transport(address).close()
-    except OSError as error:
-        raise LinkError(
-            f"{address} is not there ({error.strerror}): connect it or start the other end, or correct the link."
-        ) from error
-    return str(address) if config.mavlink.send_fixes else f"{address}, {DRY_RUN}"
+    address = parse_link(settings.link)
+    with Asking(address, settings.component_id, settings.system_id) as asking:
+        said = f"{address}{look(asking, address)}"
+    return said if settings.send_fixes else f"{said}, {DRY_RUN}"
 
 
-def _log(config: Config) -> str:
-    if config.log.path is None:
-        return "none, so nothing of the flight is kept"
-    # Unlike all else, the log is not opened: a check as root would leave a file that the service may not write.
-    path = Path(config.log.path).absolute()
-    if path.is_dir() or not path.parent.is_dir():
-        raise UsageError(f"{path} is no file in a folder that is there: correct `log: {{path: ...}}`.")
-    if not os.access(path if path.exists() else path.parent, os.W_OK):
-        raise UsageError(f"{path} may not be written by this user: change its permissions or `log: {{path: ...}}`.")
-    free_mb = shutil.disk_usage(path.parent).free / 1e6
-    if free_mb < _LOG_ROOM_MB:
-        raise UsageError(f"{path}: only {free_mb:.1f} MB are free there, {_LOG_ROOM_MB} are needed: make room.")
-    return str(path)
+def _only_opened(asking: Asking, address: LinkAddress) -> str:
+    return ""
+
+
+def _with_a_heartbeat(asking: Asking, address: LinkAddress) -> str:
+    if asking.heartbeat() is None:
+        raise LinkError(silence(address, asking.bad_bytes, asking.others).message)
+    return f", autopilot heard: system {asking.system_id}"

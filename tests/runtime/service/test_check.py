@@ -11,9 +11,11 @@ from pathlib import Path
 import cv2
 import pytest
 import yaml
+from answering_autopilot import AnsweringAutopilot
 from pictures import textured
 
 from edgevpr import techniques
+from edgevpr.mavlink.address import parse_link
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.preflight import pick
 from edgevpr.runtime.service.check import Finding, check
@@ -60,9 +62,9 @@ def config_file(tmp_path) -> Path:
 
 
 def wrong(config_file: Path, settings: dict) -> list[Finding]:
-    """What `check` finds wrong."""
+    """What `check` finds wrong without an autopilot and without waiting for a frame."""
     config_file.write_text(yaml.safe_dump(settings))
-    findings = check(config_file)
+    findings = check(config_file, offline=True)
     assert [finding.what for finding in findings] == ITEMS
     return [finding for finding in findings if not finding.ok]
 
@@ -82,7 +84,7 @@ def test_a_query_that_is_too_slow_for_any_fix_is_wrong_unless_no_fixes_are_wante
 def test_a_dry_run_is_said(settings, config_file):
     settings["mavlink"]["send_fixes"] = False
     config_file.write_text(yaml.safe_dump(settings))
-    (link,) = [finding for finding in check(config_file) if finding.what == "link"]
+    (link,) = [finding for finding in check(config_file, offline=True) if finding.what == "link"]
     assert link.ok
     assert link.message.endswith(", dry run: no fix is sent")
 
@@ -166,7 +168,7 @@ def test_places_that_the_budget_does_not_hold_are_told(flight_folder, settings, 
         while len(place_map) * technique.spec.coarse.nbytes < 1e6:
             place_map.add(frame, descriptor)
     config_file.write_text(yaml.safe_dump(settings | {"map": str(big), "memory": {"budget_mb": 1}}))
-    (finding,) = (each for each in check(config_file) if each.what == "map")
+    (finding,) = (each for each in check(config_file, offline=True) if each.what == "map")
     assert "places are left to the map file" in finding.message
 
 
@@ -231,17 +233,74 @@ def test_a_disk_without_room_for_the_log_is_found(settings, config_file, monkeyp
     assert "only 1.0 MB are free there" in finding.message
 
 
-def edgevpr_check(config_file: Path) -> subprocess.CompletedProcess:
-    return subprocess.run(
-        [sys.executable, "-m", "edgevpr", "check", "--config", str(config_file)], capture_output=True, text=True
-    )
+def wrong_online(config_file: Path, settings: dict, **how) -> list[Finding]:
+    """What `check` finds wrong when it waits for a frame and a heartbeat."""
+    config_file.write_text(yaml.safe_dump(settings))
+    return [finding for finding in check(config_file, **how) if not finding.ok]
+
+
+def autopilot_of(settings: dict, **how) -> AnsweringAutopilot:
+    return AnsweringAutopilot(parse_link(settings["mavlink"]["link"]).number, **how)
+
+
+def test_a_frame_and_a_heartbeat_are_waited_for_and_told(settings, config_file):
+    told = []
+    config_file.write_text(yaml.safe_dump(settings))
+    with autopilot_of(settings, system_id=7) as autopilot:
+        findings = {finding.what: finding for finding in check(config_file, say=told.append)}
+    assert all(finding.ok for finding in findings.values())
+    assert findings["source"].message.endswith("images, reading, 160 x 120 pixels")
+    assert findings["link"].message.endswith(", autopilot heard: system 7")
+    assert told == ["waiting for the source of frames", "waiting for the flight controller", ""]
+    assert autopilot.names() <= {"HEARTBEAT"}
+
+
+def test_an_autopilot_that_is_not_heard_is_wrong(settings, config_file):
+    (finding,) = wrong_online(config_file, settings)
+    assert finding.what == "link"
+    assert ": no heartbeat of an autopilot in 5 s: let the autopilot" in finding.message
+
+
+def test_another_autopilot_than_the_configured_is_wrong(settings, config_file):
+    settings["mavlink"]["system_id"] = 3
+    with autopilot_of(settings, system_id=4):
+        (finding,) = wrong_online(config_file, settings)
+    assert finding.message.endswith("the autopilots heard are of system 4, none is the one configured.")
+
+
+def test_a_camera_that_does_not_deliver_is_wrong(settings, config_file):
+    settings["source"]["uri"] = f"rtsp://127.0.0.1:{free_port(socket.SOCK_STREAM)}/camera"
+    settings["mavlink"]["link"] = None
+    (finding,) = wrong_online(config_file, settings)
+    assert finding.what == "source"
+    assert finding.message.startswith(f"{settings['source']['uri']}: no frame comes (nothing there, reopening in")
+
+
+def test_images_that_cannot_be_read_are_no_frame(settings, config_file, tmp_path):
+    folder = tmp_path / "images"
+    folder.mkdir()
+    (folder / "1.png").write_bytes(b"no picture")
+    settings["source"]["uri"], settings["mavlink"]["link"] = str(folder), None
+    (finding,) = wrong_online(config_file, settings)
+    assert (finding.what, ": no frame comes (" in finding.message) == ("source", True)
+    shutil.copy(next(Path(settings["map"]).parent.glob("images/*.png")), folder / "2.png")
+    assert wrong_online(config_file, settings) == []
+
+
+def edgevpr_check(config_file: Path, *arguments: str) -> subprocess.CompletedProcess:
+    command = [sys.executable, "-m", "edgevpr", "check", "--config", str(config_file), *arguments]
+    return subprocess.run(command, capture_output=True, text=True)
 
 
 def test_the_command_prints_a_line_for_each_thing_and_exits_with_0(settings, config_file):
     config_file.write_text(yaml.safe_dump(settings))
-    done = edgevpr_check(config_file)
+    done = edgevpr_check(config_file, "--offline")
     assert (done.returncode, done.stderr) == (0, "")
     assert [line.split()[1] for line in done.stdout.splitlines()] == ITEMS
+    with autopilot_of(settings):
+        done = edgevpr_check(config_file)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert edgevpr_check(config_file).returncode == 1
 
 
 def test_the_command_exits_with_1_and_a_sentence_also_for_a_typo(config_file):

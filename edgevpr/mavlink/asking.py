@@ -1,0 +1,216 @@
+"""Questions to an autopilot on the ground: bounded in time and tries, over a link of any kind. Nothing is ever set."""
+
+import math
+import select
+import struct
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import suppress
+from types import TracebackType
+
+from edgevpr.errors import LinkError
+from edgevpr.mavlink import messages
+from edgevpr.mavlink.address import LinkAddress
+from edgevpr.mavlink.messages import AUTOPILOT, Health
+from edgevpr.mavlink.transport import open_transport
+from edgevpr.mavlink.wire import Message, Receiver, mavlink
+
+HEARTBEAT_S = 1.0
+HEARTBEAT_WAIT_S = 5.0  # an autopilot sends one each second
+TRIES, ANSWER_WAIT_S = 3, 1.0
+IN_FLIGHT = 10  # parameters asked for at once; ArduPilot drops what comes on top of 20
+_FINAL = (mavlink.MAV_RESULT_DENIED, mavlink.MAV_RESULT_UNSUPPORTED, mavlink.MAV_RESULT_FAILED)
+_WAITING_MAX = 64  # a port that takes nothing must not fill the memory
+_SIGNED = mavlink.MAVLINK_IFLAG_SIGNED
+
+
+class Asking:
+    """A conversation with one autopilot by a caller that waits for each answer. As every companion it sends a heartbeat
+    a second, without which some ports do not answer.
+
+    `heard` counts the autopilot's messages by name, `signed` those of them that carry a signature, `others` are the
+    system ids of further autopilots on the link, `bad_bytes` are bytes that are no message. Every method raises
+    LinkError where the link is lost.
+    """
+
+    def __init__(self, address: LinkAddress, component_id: int = 197, system_id: int | None = None) -> None:
+        """Open the link; raises LinkError where it cannot be opened, as `open_transport` does, and where nothing is
+        there."""
+        self.system_id = system_id
+        self.heard: Counter[str] = Counter()
+        self.signed = 0
+        self.others: set[int] = set()
+        self.says_version_1 = False  # of its last message
+        self._address = address
+        self._receiver = Receiver()
+        self._packer = mavlink.MAVLink(None, srcSystem=system_id or 1, srcComponent=component_id)
+        self._waiting: deque[bytes] = deque(maxlen=_WAITING_MAX)  # packets to be written, one datagram each
+        self._arrived: deque[Message] = deque()  # not looked at yet
+        self._heartbeat_due_s = 0.0
+        self._autopilot_heard = False
+        try:
+            self._transport = open_transport(address)
+        except OSError as error:
+            raise LinkError(
+                f"{address} is not there ({error.strerror or error}): connect it or start the other end, or correct "
+                "the link."
+            ) from error
+
+    def __enter__(self) -> "Asking":
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, where: TracebackType | None) -> None:
+        with suppress(OSError):
+            if self._waiting or self._transport.unsent():  # a line that takes nothing must not delay the end
+                self._transport.throw_away()
+        self._transport.close()
+
+    @property
+    def bad_bytes(self) -> int:
+        return self._receiver.bad_bytes
+
+    def heartbeat(self, wait_s: float = HEARTBEAT_WAIT_S) -> Message | None:
+        """Wait for a heartbeat of the autopilot; from then on only that one is listened to. None: none came."""
+        return self._first(wait_s, lambda message: message.get_type() == "HEARTBEAT")
+
+    def listen(self, wait_s: float) -> None:
+        """Count what the autopilot sends without being asked."""
+        for _ in self._messages(wait_s):
+            pass
+
+    def message(self, message_id: int) -> Message | None:
+        """Ask for one message (MAV_CMD_REQUEST_MESSAGE); None where the autopilot refuses it, or nothing comes."""
+        name = mavlink.mavlink_map[message_id].msgname
+        for _ in range(TRIES):
+            self._put(
+                mavlink.MAVLink_command_long_message(
+                    self.system_id, AUTOPILOT, mavlink.MAV_CMD_REQUEST_MESSAGE, 0, message_id, 0, 0, 0, 0, 0, 0
+                )
+            )
+            answer = self._first(ANSWER_WAIT_S, lambda message: message.get_type() == name or _refuses(message))
+            if answer is not None:
+                return answer if answer.get_type() == name else None
+        return None
+
+    def parameters(self, names: Iterable[str], bytewise: bool) -> dict[str, float | int]:
+        """Read parameters by name (PARAM_REQUEST_READ); those that the autopilot does not have, and those that are no
+        number, are left out.
+
+        `bytewise`: it packs whole numbers into the bytes of the float (PX4), as AUTOPILOT_VERSION says.
+        """
+        found: dict[str, float | int] = {}
+        missing = list(dict.fromkeys(names))
+        for _ in range(TRIES):
+            for start in range(0, len(missing), IN_FLIGHT):
+                self._read_parameters(missing[start : start + IN_FLIGHT], found, bytewise)
+            missing = [name for name in missing if name not in found]
+        return found
+
+    def round_trips_s(self, count: int) -> list[float]:
+        """Measure by TIMESYNC, so many times, the seconds from a question to its answer; a lost one is left out."""
+        times_s = []
+        for _ in range(count):
+            sent_ns = time.monotonic_ns()
+            self._put(mavlink.MAVLink_timesync_message(0, sent_ns))
+
+            def answers(message: Message, sent_ns: int = sent_ns) -> bool:
+                return message.get_type() == "TIMESYNC" and message.tc1 != 0 and message.ts1 == sent_ns
+
+            if self._first(ANSWER_WAIT_S, answers):
+                times_s.append((time.monotonic_ns() - sent_ns) / 1e9)
+        return times_s
+
+    def _read_parameters(self, names: Collection[str], found: dict[str, float | int], bytewise: bool) -> None:
+        """Ask for a few parameters, and put into `found` what comes until all are there or a second is quiet."""
+        waiting = set(names)
+        for name in names:
+            self._put(mavlink.MAVLink_param_request_read_message(self.system_id, AUTOPILOT, name.encode(), -1))
+        while waiting:
+            said = self._first(ANSWER_WAIT_S, lambda message: _parameter_name(message) in waiting)
+            if said is None:
+                return
+            waiting.remove(said.param_id)
+            if said.get_type() == "PARAM_VALUE" and math.isfinite(value := _value(said, bytewise)):
+                found[said.param_id] = value
+
+    def _first(self, wait_s: float, wanted: Callable[[Message], bool]) -> Message | None:
+        return next((message for message in self._messages(wait_s) if wanted(message)), None)
+
+    def _messages(self, wait_s: float) -> Iterator[Message]:
+        """Yield the autopilot's messages of the next `wait_s` seconds, those that have arrived already first."""
+        end_s = time.monotonic() + wait_s
+        while True:
+            while self._arrived:
+                yield self._arrived.popleft()
+            now_s = time.monotonic()
+            if now_s >= end_s:
+                return
+            try:
+                self._turn(now_s, min(end_s - now_s, 0.05 if self._waiting else 0.25))
+            except OSError as error:
+                raise LinkError(f"{self._address} was lost ({error.strerror or error}): look at the cable.") from error
+
+    def _turn(self, now_s: float, wait_s: float) -> None:
+        """Write what the port takes at once, and read what comes within `wait_s`."""
+        if self._transport.connected:
+            if now_s >= self._heartbeat_due_s:
+                self._heartbeat_due_s = now_s + HEARTBEAT_S
+                self._put(messages.heartbeat(Health.BOOT))
+            while self._waiting:
+                packet = self._waiting.popleft()
+                rest = packet[self._transport.write(packet) :]
+                if rest:
+                    self._waiting.appendleft(rest)
+                    break
+        readable, _, _ = select.select([self._transport], [], [], wait_s)
+        # A serial port without a byte would look lost; a refused datagram makes its port readable again and again.
+        data = self._transport.read() if readable else b""
+        if readable and not data:
+            time.sleep(0.01)
+        arrived = self._receiver.feed(data, self._transport.sender)
+        self._arrived.extend(message for message in arrived if self._is_ours(message))
+
+    def _is_ours(self, message: Message) -> bool:
+        beats = message.get_type() == "HEARTBEAT" and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID
+        if message.get_srcComponent() != AUTOPILOT or message.get_srcSystem() == 0:
+            return False
+        if beats and self.system_id is None:
+            self.system_id = self._packer.srcSystem = message.get_srcSystem()
+        if message.get_srcSystem() != self.system_id:
+            self.others |= {message.get_srcSystem()} if beats else set()
+            return False
+        if beats:
+            self._autopilot_heard = True
+            self._transport.answer_sender()
+        if not self._autopilot_heard:
+            return False
+        self.heard[message.get_type()] += 1
+        self.signed += bool(message.get_header().incompat_flags & _SIGNED)
+        self.says_version_1 = message.get_msgbuf()[0] == mavlink.PROTOCOL_MARKER_V1
+        return True
+
+    def _put(self, message: Message) -> None:
+        self._waiting.append(message.pack(self._packer))
+        self._packer.seq = (self._packer.seq + 1) % 256
+
+
+def _refuses(message: Message) -> bool:
+    return (
+        message.get_type() == "COMMAND_ACK"
+        and message.command == mavlink.MAV_CMD_REQUEST_MESSAGE
+        and message.result in _FINAL
+    )
+
+
+def _parameter_name(message: Message) -> str | None:
+    """Return the name of the parameter that a message gives, or says to be unknown."""
+    return message.param_id if message.get_type() in ("PARAM_VALUE", "PARAM_ERROR") else None
+
+
+def _value(said: Message, bytewise: bool) -> float | int:
+    """Read a PARAM_VALUE: the float32 is the number itself, or holds the bytes of a whole number."""
+    is_whole = said.param_type < mavlink.MAV_PARAM_TYPE_REAL32
+    if is_whole and bytewise:
+        return struct.unpack("<i", struct.pack("<f", said.param_value))[0]
+    return int(said.param_value) if is_whole and math.isfinite(said.param_value) else said.param_value

@@ -1,0 +1,135 @@
+"""All that an autopilot says of itself on the ground, asked for once and put into plain values."""
+
+import statistics
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from edgevpr.mavlink.asking import Asking
+from edgevpr.mavlink.wire import Message, mavlink
+
+LISTEN_S = 4.0
+ROUND_TRIPS = 10
+
+_FIRMWARES = {mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: "ardupilot", mavlink.MAV_AUTOPILOT_PX4: "px4"}
+_VEHICLES = {  # MAV_TYPE
+    "plane": (1, 19, 20, 21, 22, 23, 24, 25),  # what takes off upright and flies on wings has a plane's firmware
+    "copter": (2, 3, 4, 13, 14, 15, 29, 35, 43),
+    "rover": (10, 11, 46),
+}
+_RELEASES = {0: "-dev", 64: "-alpha", 128: "-beta", 192: "-rc", 255: ""}  # FIRMWARE_VERSION_TYPE
+_BYTEWISE = mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Filter:
+    """The state of the autopilot's filter (EKF), by the flags that it reports."""
+
+    flags: int
+    has_attitude: bool
+    has_position: bool  # horizontal, absolute
+    has_velocity: bool
+    holds_still: bool  # it takes the vehicle for standing, since it has nothing to navigate by
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reading:
+    """The answers of an autopilot; None and empty stand for what it did not say.
+
+    `firmware` is "ardupilot", "px4" or "other"; `vehicle` is "plane", "copter", "rover" or "other"; `gps_fix` holds
+    the fix type of each receiver; `streams_hz` the messages that came without being asked for, `heard` all that came.
+    `clock_ahead_s` is how far the UTC of the autopilot is ahead of this machine's.
+    """
+
+    system_id: int
+    firmware: str
+    vehicle: str
+    is_armed: bool
+    version: tuple[int, int, int] | None
+    version_text: str | None
+    parameters: dict[str, float | int]
+    streams_hz: dict[str, float]
+    heard: tuple[str, ...]
+    gps_fix: tuple[int | None, int | None]
+    filter: Filter | None
+    origin: tuple[float, float] | None
+    signs: bool
+    answers: bool
+    says_version_1: bool
+    other_systems: tuple[int, ...]
+    bad_bytes: int
+    round_trip_s: float | None
+    clock_ahead_s: float | None
+
+
+def read_autopilot(asking: Asking, wanted: Mapping[str, Iterable[str]]) -> Reading | None:
+    """Read all that can be read; None where no heartbeat comes. `wanted` are the names of parameters by firmware.
+
+    It takes ten seconds, half a minute where the autopilot does not answer. Raises LinkError where the link is lost.
+    """
+    beat = asking.heartbeat()
+    if beat is None:
+        return None
+    firmware = _FIRMWARES.get(beat.autopilot, "other")
+    before = asking.heard.copy()
+    asking.listen(LISTEN_S)
+    streams_hz = {name: count / LISTEN_S for name, count in sorted((asking.heard - before).items())}
+    said = asking.message(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
+    trips_s = asking.round_trips_s(ROUND_TRIPS if said else 1)
+    answers = bool(said or trips_s or asking.heard["COMMAND_ACK"])
+    ask = asking.message if answers else _no_message
+    is_px4 = firmware == "px4"
+    report = ask(mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS if is_px4 else mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT)
+    first, second = ask(mavlink.MAVLINK_MSG_ID_GPS_RAW_INT), ask(mavlink.MAVLINK_MSG_ID_GPS2_RAW)
+    for message_id in (mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT, mavlink.MAVLINK_MSG_ID_ATTITUDE):
+        ask(message_id)
+    origin, clock = ask(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN), ask(mavlink.MAVLINK_MSG_ID_SYSTEM_TIME)
+    clock_ahead_s = clock.time_unix_usec / 1e6 - time.time() if clock and clock.time_unix_usec else None
+    bytewise = bool(said.capabilities & _BYTEWISE) if said else is_px4
+    names = wanted.get(firmware, ()) if answers else ()
+    return Reading(
+        system_id=asking.system_id,
+        firmware=firmware,
+        vehicle=next((name for name, types in _VEHICLES.items() if beat.type in types), "other"),
+        is_armed=bool(beat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED),
+        version=_version(said.flight_sw_version) if said else None,
+        version_text=_version_text(said.flight_sw_version) if said else None,
+        parameters=asking.parameters(names, bytewise),
+        streams_hz=streams_hz,
+        heard=tuple(sorted(asking.heard)),
+        gps_fix=(first and first.fix_type, second and second.fix_type),
+        filter=report and _filter(report),
+        origin=(origin.latitude / 1e7, origin.longitude / 1e7) if origin else None,
+        signs=asking.signed > 0,
+        answers=answers,
+        says_version_1=asking.says_version_1,
+        other_systems=tuple(sorted(asking.others)),
+        bad_bytes=asking.bad_bytes,
+        round_trip_s=statistics.median(trips_s) if trips_s else None,
+        clock_ahead_s=clock_ahead_s,
+    )
+
+
+def _no_message(message_id: int) -> Message | None:
+    """Stand in for `Asking.message` where the autopilot answers nothing: each question would take three seconds."""
+    return None
+
+
+def _filter(report: Message) -> Filter:
+    """Read EKF_STATUS_REPORT or ESTIMATOR_STATUS: those of the flags that are used here have the same values."""
+    return Filter(
+        flags=report.flags,
+        has_attitude=bool(report.flags & mavlink.EKF_ATTITUDE),
+        has_position=bool(report.flags & mavlink.EKF_POS_HORIZ_ABS),
+        has_velocity=bool(report.flags & mavlink.EKF_VELOCITY_HORIZ),
+        holds_still=bool(report.flags & mavlink.EKF_CONST_POS_MODE),
+    )
+
+
+def _version(packed: int) -> tuple[int, int, int]:
+    return packed >> 24, packed >> 16 & 255, packed >> 8 & 255
+
+
+def _version_text(packed: int) -> str:
+    major, minor, patch = _version(packed)
+    return f"{major}.{minor}.{patch}{_RELEASES.get(packed & 255, '')}"

@@ -1,0 +1,196 @@
+"""`edgevpr doctor`: is this flight controller, with this board, set up for edgevpr? It reads, and never writes."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from edgevpr.config import Config
+from edgevpr.errors import LinkAddressError, LinkError
+from edgevpr.mavlink.address import LinkAddress
+from edgevpr.mavlink.asking import Asking
+from edgevpr.mavlink.reading import Reading, read_autopilot
+from edgevpr.runtime.service import ardupilot, px4
+from edgevpr.runtime.service.board import board_findings
+from edgevpr.runtime.service.finding import Finding
+
+_SLOW_S = 0.25  # a round trip: fixes would be as late
+_BAD_BYTES = 300  # the rest of a message or two at the start is usual
+_NEEDED = ("GLOBAL_POSITION_INT", "ATTITUDE", "GPS_RAW_INT")
+_CLOCK_S = 60.0
+_GPS_3D = 3
+_ADVICE = {"ardupilot": ardupilot, "px4": px4}
+_NAMES = {"ardupilot": "ArduPilot", "px4": "PX4"}
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosis:
+    """All findings, and what was read of the autopilot (None: nothing)."""
+
+    findings: list[Finding]
+    reading: Reading | None
+
+    @property
+    def is_fine(self) -> bool:
+        return all(finding.ok for finding in self.findings)
+
+
+def doctor(config: Config, address: LinkAddress, say: Callable[[str], None], root: Path = Path("/")) -> Diagnosis:
+    """Examine the autopilot at the other end of a link, and this machine (its files below `root`). `say` is told in a
+    few words what is waited for. Raises LinkAddressError for an address that is wrong, and ConfigError for a board that
+    is unknown."""
+    about_board = list(board_findings(config, address, root))
+    say(f"asking the autopilot at {address}")
+    reading, trouble = None, None
+    try:
+        with Asking(address, config.mavlink.component_id, config.mavlink.system_id) as asking:
+            reading = read_autopilot(asking, {name: rules.PARAMETERS for name, rules in _ADVICE.items()})
+            if reading is None:
+                trouble = silence(address, asking.bad_bytes, asking.others)
+    except LinkAddressError:
+        raise
+    except LinkError as error:
+        trouble = Finding("link", False, str(error))
+    say("")
+    about_autopilot = [trouble] if trouble else list(autopilot_findings(reading, address))
+    return Diagnosis(about_autopilot + about_board, reading)
+
+
+def silence(address: LinkAddress, bad_bytes: int, others: set[int]) -> Finding:
+    """Explain that no heartbeat was heard, by what else arrived."""
+    if others:
+        systems = " and ".join(map(str, sorted(others)))
+        return Finding(
+            "link",
+            False,
+            f"{address}: the autopilots heard are of system {systems}, none is the one configured.",
+            (f"mavlink: {{system_id: {min(others)}}}",),
+        )
+    if address.kind == "serial":
+        seen = "bytes arrive that are no MAVLink (another baud rate?)" if bad_bytes else "nothing arrives (TX and RX?)"
+        return Finding(
+            "link",
+            False,
+            f"{address}: no heartbeat in 5 s, {seen}: set the port of the flight controller for MAVLink 2 at this "
+            "baud rate, and reboot it.",
+            tuple(
+                f"{_NAMES[name]}: {', '.join(rules.port_changes(address.number))}" for name, rules in _ADVICE.items()
+            ),
+        )
+    advice = {
+        "udpin": "let the autopilot, its simulator or a router send to this port",
+        "udpout": "start what listens there, or correct host and port",
+        "tcp": "something answers there that is no flight controller, or one that is still starting",
+    }
+    return Finding("link", False, f"{address}: no heartbeat of an autopilot in 5 s: {advice[address.kind]}.")
+
+
+def autopilot_findings(reading: Reading, address: LinkAddress) -> Iterator[Finding]:
+    """Judge what was read: first what holds for every autopilot, then the rules of its firmware."""
+    yield _link(reading, address)
+    yield _signing(reading)
+    if reading.other_systems:
+        yield Finding(
+            "vehicles",
+            False,
+            f"System {' and '.join(map(str, reading.other_systems))} is on this link too: name the one to fly with.",
+            (f"mavlink: {{system_id: {reading.system_id}}}",),
+        )
+    if reading.firmware not in _ADVICE:
+        yield Finding("firmware", False, "It is neither ArduPilot nor PX4: edgevpr sends no fixes to it.")
+    elif reading.answers:
+        yield from _ADVICE[reading.firmware].findings(reading)
+    if reading.answers:
+        yield from (_streams(reading), _filter(reading), _gps(reading), _origin(reading), _clock(reading))
+
+
+def _link(reading: Reading, address: LinkAddress) -> Finding:
+    who = f"{address}: {_NAMES.get(reading.firmware, 'an autopilot')}, system {reading.system_id}"
+    who += ", armed" if reading.is_armed else ""
+    if not reading.answers:
+        why = "it signs its packets, so it may want signed requests" if reading.signs else (
+            "the wire from the board's TX to its RX, or a signing key, may be the reason"
+        )  # fmt: skip
+        return Finding("link", False, f"{who} is heard, but answers nothing: {why}.")
+    if reading.bad_bytes > _BAD_BYTES:
+        return Finding(
+            "link",
+            False,
+            f"{who}: {reading.bad_bytes} bytes arrived damaged: look at ground wire, cable and baud rate.",
+        )
+    if reading.round_trip_s is None:
+        return Finding("link", True, f"{who}; it does not answer TIMESYNC")
+    trip = f"an answer takes {1000 * reading.round_trip_s:.0f} ms"
+    if reading.round_trip_s > _SLOW_S:
+        faster = _ADVICE[reading.firmware].port_changes(921_600) if reading.firmware in _ADVICE else ()
+        return Finding("link", False, f"{who}; {trip}, so every fix comes late: use a faster line.", faster)
+    return Finding("link", True, f"{who}; {trip}")
+
+
+def _signing(reading: Reading) -> Finding:
+    if not reading.signs:
+        return Finding("signing", True, "off: whoever is on this link can send")
+    if reading.answers:
+        return Finding("signing", True, "it signs its packets, and answers unsigned requests on this port")
+    return Finding(
+        "signing",
+        False,
+        "It signs its packets and answers no unsigned request: no fix would be taken without its key.",
+        ("give edgevpr the key of this vehicle, or clear the key of this port",),
+    )
+
+
+def _streams(reading: Reading) -> Finding:
+    missing = [name for name in _NEEDED if name not in reading.heard]
+    if missing:
+        return Finding(
+            "streams",
+            False,
+            f"{' and '.join(missing)} does not come, even on request: an autopilot that does not know its position "
+            "yet may keep it back; let it have GPS.",
+        )
+    said = ", ".join(f"{name} {reading.streams_hz[name]:g} Hz" for name in _NEEDED if name in reading.streams_hz)
+    return Finding("streams", True, f"without being asked: {said or 'none'}; in flight edgevpr asks for what it needs")
+
+
+def _filter(reading: Reading) -> Finding:
+    state = reading.filter
+    if state is None:
+        return Finding("filter", False, "It does not say how its filter is, so no fix could be weighed against it.")
+    flags = f"flags 0x{state.flags:x}"
+    if state.has_attitude and state.has_position and not state.holds_still:
+        return Finding("filter", True, f"attitude and position are known ({flags})")
+    lacks = "position" if state.has_attitude else "attitude"
+    return Finding("filter", False, f"The filter has no {lacks} yet ({flags}): wait, outdoors and standing still.")
+
+
+def _gps(reading: Reading) -> Finding:
+    fixes = [fix for fix in reading.gps_fix if fix is not None]
+    if any(fix >= _GPS_3D for fix in fixes):
+        return Finding("gps", True, f"fix type {' and '.join(map(str, fixes))}")
+    return Finding("gps", False, "No GPS receiver has a fix: take off only with one, so that the start is known.")
+
+
+def _origin(reading: Reading) -> Finding:
+    if reading.origin is None:
+        return Finding(
+            "origin",
+            False,
+            "The filter has no origin, and without one no position on the Earth is taken: wait for a GPS fix, or set "
+            "the EKF origin from the ground station.",
+        )
+    return Finding("origin", True, f"{reading.origin[0]:.6f}, {reading.origin[1]:.6f}")
+
+
+def _clock(reading: Reading) -> Finding:
+    ahead_s = reading.clock_ahead_s
+    if ahead_s is None:
+        return Finding("clock", True, "the autopilot has no time of day yet, so the board's is not compared with it")
+    if abs(ahead_s) > _CLOCK_S:
+        return Finding(
+            "clock",
+            False,
+            f"The board's clock is {abs(ahead_s):.0f} s {'behind' if ahead_s > 0 else 'ahead of'} the autopilot's: "
+            "flight logs and signatures would carry the wrong time.",
+            ("timedatectl set-ntp true, or a clock chip",),
+        )
+    return Finding("clock", True, f"{abs(ahead_s):.1f} s {'behind' if ahead_s > 0 else 'ahead of'} the autopilot's")

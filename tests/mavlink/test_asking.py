@@ -1,0 +1,150 @@
+"""Questions to an autopilot over a real UDP link: answered, lost, refused, signed, and never answered."""
+
+import socket
+
+import pytest
+from answering_autopilot import AnsweringAutopilot, healthy_messages
+from mavlink_peers import SerialCable, free_port
+
+from edgevpr.errors import LinkAddressError, LinkError
+from edgevpr.mavlink import asking as module
+from edgevpr.mavlink import reading
+from edgevpr.mavlink.address import LinkAddress, parse_link
+from edgevpr.mavlink.asking import Asking
+from edgevpr.mavlink.reading import read_autopilot
+from edgevpr.mavlink.wire import mavlink
+
+READ_ONLY = {"HEARTBEAT", "COMMAND_LONG", "PARAM_REQUEST_READ", "TIMESYNC"}
+
+
+@pytest.fixture
+def address() -> LinkAddress:
+    return LinkAddress("udpin", "127.0.0.1", free_port())
+
+
+@pytest.fixture(autouse=True)
+def _listens_briefly(monkeypatch):
+    monkeypatch.setattr(reading, "LISTEN_S", 0.2)
+
+
+def read(address, names=(), **autopilot):
+    with AnsweringAutopilot(address.number, **autopilot) as peer, Asking(address) as asking:
+        return read_autopilot(asking, {"ardupilot": names, "px4": names}), peer
+
+
+def test_all_that_an_autopilot_says_is_read(address):
+    said, _ = read(address, ["GPS1_TYPE", "ABSENT", "FS_EKF_THRESH"], messages=healthy_messages(),
+                      parameters={"GPS1_TYPE": 14, "FS_EKF_THRESH": 0.5}, system_id=7)  # fmt: skip
+    assert (said.system_id, said.firmware, said.vehicle) == (7, "ardupilot", "copter")
+    assert (said.version, said.version_text) == ((4, 7, 0), "4.7.0")
+    assert said.parameters == {"GPS1_TYPE": 14, "FS_EKF_THRESH": 0.5}
+    assert (said.gps_fix, said.origin) == ((3, None), (50.0, 14.0))
+    assert (said.filter.has_position, said.filter.holds_still) == (True, False)
+    assert abs(said.clock_ahead_s) < 60
+    assert said.round_trip_s > 0
+    assert (said.answers, said.signs, said.says_version_1, said.other_systems) == (True, False, False, ())
+    assert said.streams_hz["HEARTBEAT"] > 0
+    assert {"GLOBAL_POSITION_INT", "ATTITUDE", "GPS_RAW_INT"} <= set(said.heard)
+
+
+def test_nothing_is_ever_set(address):
+    _, peer = read(address, ["GPS1_TYPE"], messages=healthy_messages(), parameters={"GPS1_TYPE": 1})
+    assert peer.names() == READ_ONLY
+    assert {message.command for message in peer.heard if message.get_type() == "COMMAND_LONG"} == {512}
+    assert {message.get_srcComponent() for message in peer.heard} == {197}
+
+
+def test_questions_that_are_lost_are_asked_again(address):
+    names = [f"P{number}" for number in range(12)]
+    answers = {"messages": healthy_messages(), "parameters": dict.fromkeys(names, 3)}
+    with AnsweringAutopilot(address.number, loses=1, **answers), Asking(address) as asking:
+        assert asking.heartbeat(60)
+        assert asking.message(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
+        assert asking.parameters(names, bytewise=False) == dict.fromkeys(names, 3)
+
+
+def test_a_parameter_that_older_firmware_is_silent_about_is_left_out(address, monkeypatch):
+    monkeypatch.setattr(module, "ANSWER_WAIT_S", 0.3)
+    said, peer = read(address, ["A", "B"], says_unknown=False, messages=healthy_messages(), parameters={"B": 2})
+    assert said.parameters == {"B": 2}
+    assert [m.param_id for m in peer.heard if m.get_type() == "PARAM_REQUEST_READ"] == ["A", "B", "A", "A"]
+
+
+def test_a_parameter_that_is_no_number_is_left_out(address):
+    said, _ = read(address, ["A", "B"], messages=healthy_messages(), parameters={"A": float("nan"), "B": float("inf")})
+    assert said.parameters == {}
+
+
+def test_px4_packs_whole_numbers_into_the_bytes_of_a_float(address):
+    said, _ = read(address, ["EKF2_AGP0_CTRL", "MAV_1_RATE", "EKF2_AGP0_DELAY"], firmware=mavlink.MAV_AUTOPILOT_PX4,
+                   messages=healthy_messages((1, 17, 0), mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE),
+                   parameters={"EKF2_AGP0_CTRL": 1, "MAV_1_RATE": -1, "EKF2_AGP0_DELAY": 300.0})  # fmt: skip
+    assert said.firmware == "px4"
+    assert said.parameters == {"EKF2_AGP0_CTRL": 1, "MAV_1_RATE": -1, "EKF2_AGP0_DELAY": 300.0}
+
+
+def test_an_autopilot_that_is_heard_and_answers_nothing_is_told_from_one_that_signs(address, monkeypatch):
+    monkeypatch.setattr(module, "ANSWER_WAIT_S", 0.1)
+    said, _ = read(address, ["A"], is_mute=True)
+    assert (said.answers, said.signs, said.version, said.parameters) == (False, False, None, {})
+
+
+def test_a_signature_is_seen_without_its_key(address, monkeypatch):
+    monkeypatch.setattr(module, "ANSWER_WAIT_S", 0.1)
+    said, _ = read(address, is_mute=True, key=bytes(32))
+    assert (said.answers, said.signs) == (False, True)
+
+
+def test_mavlink_1_and_damaged_bytes_are_seen(address):
+    said, _ = read(address, messages=healthy_messages(), version_1=True, noise=bytes(50))
+    assert said.says_version_1
+    assert said.bad_bytes >= 50
+
+
+def test_a_second_autopilot_is_named_and_not_listened_to(address):
+    with AnsweringAutopilot(address.number, system_id=9, messages=healthy_messages((4, 5, 1))):
+        said, _ = read(address, ["A"], system_id=9, messages=healthy_messages((4, 5, 1)))
+    assert (said.system_id, said.other_systems) == (9, ())
+    with AnsweringAutopilot(address.number, system_id=3), AnsweringAutopilot(address.number, system_id=4) as other:
+        with Asking(address, system_id=4) as asking:
+            assert asking.heartbeat(60).get_srcSystem() == 4
+            asking.listen(0.3)
+        assert asking.others == {3}
+        assert asking.heard.keys() == {"HEARTBEAT"}
+    assert {message.get_srcSystem() for message in other.heard} <= {4}
+
+
+def test_where_no_autopilot_is_there_is_no_reading(address):
+    with Asking(address) as asking:
+        assert asking.heartbeat(0.1) is None
+        assert asking.bad_bytes == 0
+
+
+def test_a_serial_cable_is_a_link_too(tmp_path):
+    cable = SerialCable(tmp_path)
+    cable.plug()
+    answers = {"messages": healthy_messages(), "parameters": {"GPS1_TYPE": 14}}
+    with (
+        AnsweringAutopilot(tmp_path / "b", **answers),
+        Asking(LinkAddress("serial", str(tmp_path / "a"), 115_200)) as asking,
+    ):
+        said = read_autopilot(asking, {"ardupilot": ["GPS1_TYPE"]})
+    cable.unplug()
+    assert (said.version, said.parameters) == ((4, 7, 0), {"GPS1_TYPE": 14})
+
+
+def test_what_cannot_be_opened_is_a_sentence():
+    server = LinkAddress("tcp", "127.0.0.1", free_port(socket.SOCK_STREAM))
+    with pytest.raises(LinkError, match=r"is not there \(Connection refused\): connect it or start the other end"):
+        Asking(server)
+    with pytest.raises(LinkAddressError, match="there is no host"):
+        Asking(parse_link("udpout:no-such-host.invalid:14550"))
+
+
+def test_a_cable_that_is_pulled_is_a_sentence(tmp_path):
+    cable = SerialCable(tmp_path)
+    cable.plug()
+    asking = Asking(LinkAddress("serial", str(tmp_path / "a"), 115_200))
+    cable.unplug()
+    with pytest.raises(LinkError, match=r"was lost \(.*\): look at the cable"), asking:
+        asking.listen(60)

@@ -1,0 +1,364 @@
+"""`edgevpr doctor`: the rules, on what might be read of a flight controller; and the command over a real link."""
+
+import json
+import re
+import socket
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from answering_autopilot import AnsweringAutopilot, healthy_messages
+from mavlink_peers import free_port
+
+from edgevpr.cli.main import main
+from edgevpr.mavlink import reading as module
+from edgevpr.mavlink.address import parse_link
+from edgevpr.mavlink.reading import Filter, Reading
+from edgevpr.mavlink.wire import mavlink
+from edgevpr.runtime.service import ardupilot, px4
+from edgevpr.runtime.service.doctor import autopilot_findings, silence
+
+UDP, SERIAL = parse_link("udpin:127.0.0.1:14550"), parse_link("serial:/dev/ttyAMA0:57600")
+PLAIN = {"GPS1_TYPE": 1, "GPS2_TYPE": 0, "GPS_AUTO_SWITCH": 1, "VISO_TYPE": 0, "FLOW_TYPE": 0, "EK3_SRC1_POSXY": 3}
+READY = Filter(flags=0x33F, has_attitude=True, has_position=True, has_velocity=True, holds_still=False)
+COPTER = Reading(
+    system_id=1,
+    firmware="ardupilot",
+    vehicle="copter",
+    is_armed=False,
+    version=(4, 6, 2),
+    version_text="4.6.2",
+    parameters=PLAIN | {"GPS2_TYPE": 14},
+    streams_hz={"ATTITUDE": 4.0},
+    heard=("ATTITUDE", "GLOBAL_POSITION_INT", "GPS_RAW_INT"),
+    gps_fix=(3, None),
+    filter=READY,
+    origin=(50.0, 14.0),
+    signs=False,
+    answers=True,
+    says_version_1=False,
+    other_systems=(),
+    bad_bytes=0,
+    round_trip_s=0.02,
+    clock_ahead_s=0.1,
+)
+PX4 = replace(
+    COPTER,
+    firmware="px4",
+    version=(1, 17, 0),
+    version_text="1.17.0",
+    parameters={"EKF2_AGP0_CTRL": 1, "EKF2_AGP0_ID": px4.SENSOR_ID, "EKF2_AGP0_DELAY": 250.0, "MAV_1_CONFIG": 102},
+)
+
+
+def with_parameters(reading: Reading, **parameters) -> Reading:
+    return replace(reading, parameters=reading.parameters | parameters)
+
+
+def wrong(reading: Reading, link=UDP) -> dict:
+    """What is wrong, and the changes that it needs."""
+    return {each.what: each.changes for each in autopilot_findings(reading, link) if not each.ok}
+
+
+def said(reading: Reading, what: str, link=UDP) -> str:
+    return next(each.message for each in autopilot_findings(reading, link) if each.what == what)
+
+
+def test_a_copter_and_a_px4_that_are_set_up_have_nothing_wrong():
+    assert wrong(COPTER) == {}
+    assert wrong(PX4) == {}
+    assert said(PX4, "channel") == "Positions as measurements (message 296): EKF2_AGP0_CTRL=1."
+
+
+# The channel of an ArduPilot.
+
+
+@pytest.mark.parametrize(
+    ("vehicle", "parameters", "name", "reason"),
+    [
+        ("copter", {"GPS2_TYPE": 14}, "gps", "GPS2_TYPE=14"),
+        ("copter", {"GPS1_TYPE": 14, "GPS2_TYPE": 14}, "gps", "GPS1_TYPE=14"),
+        ("copter", {"GPS2_TYPE": 14, "VISO_TYPE": 1}, "gps", "GPS2_TYPE=14"),
+        ("copter", {"VISO_TYPE": 1}, "odometry", "VISO_TYPE=1"),
+        ("plane", {"VISO_TYPE": 1}, "odometry", "VISO_TYPE=1"),
+        ("plane", {}, "single fixes", "a plane goes on by dead reckoning"),
+        ("copter", {"FLOW_TYPE": 6, "EK3_SRC2_VELXY": 5}, "single fixes", "FLOW_TYPE=6 holds the velocity"),
+    ],
+)
+def test_the_channel_follows_from_the_parameters(vehicle, parameters, name, reason):
+    assert ardupilot.channel(vehicle, PLAIN | parameters) == ardupilot.Channel(name, reason)
+
+
+def test_the_channel_follows_from_the_older_names_too():
+    assert ardupilot.channel("copter", {"GPS_TYPE": 1, "GPS_TYPE2": 14}).reason == "GPS_TYPE2=14"
+    assert ardupilot.channel("copter", {"GPS_TYPE": 14}).reason == "GPS_TYPE=14"
+
+
+@pytest.mark.parametrize("vehicle", ["copter", "rover", "other"])
+@pytest.mark.parametrize(
+    "parameters", [{}, PLAIN, {"FLOW_TYPE": 6}, {"FLOW_TYPE": 0, "EK3_SRC1_VELXY": 5}, {"VISO_TYPE": 2}]
+)
+def test_without_anything_that_carries_it_there_is_no_channel(vehicle, parameters):
+    assert ardupilot.channel(vehicle, parameters) is None
+
+
+def test_a_copter_without_a_channel_is_told_what_to_change_for_its_firmware():
+    bare = replace(COPTER, parameters=PLAIN)
+    assert wrong(bare) == {"channel": ("GPS2_TYPE=14",)}
+    assert "lands by its EKF failsafe after some 9 s" in said(bare, "channel")
+    assert wrong(with_parameters(bare, GPS_AUTO_SWITCH=0)) == {"channel": ("GPS2_TYPE=14", "GPS_AUTO_SWITCH=1")}
+    older = replace(COPTER, parameters={"GPS_TYPE": 1, "GPS_TYPE2": 0, "GPS_AUTO_SWITCH": 1})
+    assert wrong(older) == {"channel": ("GPS_TYPE2=14",)}
+    assert "takes the place of the second receiver (type 1)" in said(with_parameters(bare, GPS2_TYPE=1), "channel")
+    assert "the flow is not used" in said(with_parameters(bare, FLOW_TYPE=6), "channel")
+    assert "stops by its EKF failsafe" in said(replace(bare, vehicle="rover"), "channel")
+
+
+def test_a_receiver_over_mavlink_must_be_switched_to_and_used_by_the_filter():
+    assert wrong(with_parameters(COPTER, GPS_AUTO_SWITCH=0)) == {"channel": ("GPS_AUTO_SWITCH=1",)}
+    assert wrong(with_parameters(COPTER, GPS_AUTO_SWITCH=2)) == {"channel": ("GPS_AUTO_SWITCH=1",)}
+    assert wrong(with_parameters(COPTER, GPS_AUTO_SWITCH=4)) == {}
+    assert wrong(with_parameters(COPTER, EK3_SRC1_POSXY=6)) == {"channel": ("EK3_SRC1_POSXY=3",)}
+    only = replace(COPTER, parameters=PLAIN | {"GPS1_TYPE": 14, "GPS_AUTO_SWITCH": 0})
+    assert wrong(only) == {}
+
+
+def test_odometry_needs_a_source_set_and_an_origin():
+    visual = replace(COPTER, parameters=PLAIN | {"VISO_TYPE": 1})
+    changes = ("EK3_SRC2_POSXY=6", "EK3_SRC2_VELXY=6", "EK3_SRC2_POSZ=1", "EK3_SRC2_YAW=1")
+    assert wrong(visual) == {"channel": changes}
+    prepared = with_parameters(visual, EK3_SRC2_POSXY=6)
+    assert said(prepared, "channel").endswith("when GPS is lost, the operator switches to source set 2.")
+    assert wrong(prepared) == {}
+    assert set(wrong(replace(prepared, origin=None))) == {"channel", "origin"}
+    assert said(with_parameters(visual, EK3_SRC1_POSXY=6), "channel") == "ODOMETRY: VISO_TYPE=1."
+
+
+def test_a_plane_is_told_whether_it_knows_its_airspeed():
+    plane = replace(COPTER, vehicle="plane", parameters=PLAIN)
+    assert wrong(plane) == {}
+    assert "drifts faster" in said(plane, "airspeed")
+    assert "drifts faster" in said(with_parameters(plane, ARSPD_TYPE=1, ARSPD_USE=0), "airspeed")
+    assert "the wind is known" in said(with_parameters(plane, ARSPD_TYPE=1, ARSPD_USE=1), "airspeed")
+    assert "airspeed" not in {each.what for each in autopilot_findings(COPTER, UDP)}
+
+
+@pytest.mark.parametrize(
+    ("change", "what", "changes"),
+    [
+        ({"version": (4, 4, 4), "version_text": "4.4.4"}, "firmware", ("ArduPilot 4.5 or later",)),
+        ({"version": None, "version_text": None}, "firmware", ()),
+        ({"firmware": "other"}, "firmware", ()),
+        ({"says_version_1": True}, "port", ("SERIALn_PROTOCOL=2",)),
+        ({"bad_bytes": 5000}, "link", ()),
+        ({"other_systems": (2, 3)}, "vehicles", ("mavlink: {system_id: 1}",)),
+        ({"filter": None}, "filter", ()),
+        ({"filter": replace(READY, has_position=False)}, "filter", ()),
+        ({"filter": replace(READY, has_attitude=False)}, "filter", ()),
+        ({"filter": replace(READY, holds_still=True)}, "filter", ()),
+        ({"gps_fix": (None, None)}, "gps", ()),
+        ({"gps_fix": (1, 2)}, "gps", ()),
+        ({"origin": None}, "origin", ()),
+        ({"clock_ahead_s": 86_400.0}, "clock", ("timedatectl set-ntp true, or a clock chip",)),
+        ({"clock_ahead_s": -86_400.0}, "clock", ("timedatectl set-ntp true, or a clock chip",)),
+        ({"heard": ("ATTITUDE",)}, "streams", ()),
+    ],
+)
+def test_each_thing_that_is_wrong_is_the_only_one_found(change, what, changes):
+    assert wrong(replace(COPTER, **change)) == {what: changes}
+
+
+def test_an_armed_vehicle_is_said():
+    assert ", armed; an answer takes 20 ms" in said(replace(COPTER, is_armed=True), "link")
+
+
+def test_what_the_autopilot_does_not_know_is_not_wrong():
+    assert wrong(replace(COPTER, clock_ahead_s=None, round_trip_s=None, gps_fix=(0, 4))) == {}
+
+
+def test_the_filter_must_be_the_third():
+    assert wrong(with_parameters(COPTER, EK3_ENABLE=0)) == {"EKF3": ("EK3_ENABLE=1",)}
+    assert wrong(with_parameters(COPTER, AHRS_EKF_TYPE=2, EK3_ENABLE=1)) == {"EKF3": ("AHRS_EKF_TYPE=3",)}
+
+
+def test_a_port_with_mavlink_1_is_named():
+    ports = {"SERIAL0_PROTOCOL": 2, "SERIAL1_PROTOCOL": 1, "SERIAL2_PROTOCOL": 5, "SERIAL1_BAUD": 57}
+    assert wrong(replace(with_parameters(COPTER, **ports), says_version_1=True)) == {"port": ("SERIAL1_PROTOCOL=2",)}
+    assert said(with_parameters(COPTER, **ports), "port").endswith("SERIAL0 (baud 0), SERIAL1 (baud 57)")
+
+
+def test_a_slow_line_is_to_be_faster():
+    assert wrong(replace(COPTER, round_trip_s=0.4), SERIAL) == {"link": ("SERIALn_PROTOCOL=2", "SERIALn_BAUD=921")}
+    px4_changes = ("MAV_1_CONFIG=102", "MAV_1_MODE=2", "SER_TEL2_BAUD=921600")
+    assert wrong(replace(PX4, round_trip_s=0.4), SERIAL) == {"link": px4_changes}
+
+
+@pytest.mark.parametrize(("baud", "code"), [(57_600, 57), (111_100, 111), (115_200, 115), (1_500_000, 1500)])
+def test_ardupilot_has_its_own_numbers_for_baud_rates(baud, code):
+    assert ardupilot.port_changes(baud) == ("SERIALn_PROTOCOL=2", f"SERIALn_BAUD={code}")
+
+
+def test_who_answers_nothing_is_judged_by_nothing_but_that():
+    mute = replace(COPTER, answers=False, version=None, parameters={}, heard=(), filter=None, origin=None)
+    assert set(wrong(mute)) == {"link"}
+    assert set(wrong(replace(mute, signs=True))) == {"link", "signing"}
+    assert wrong(replace(COPTER, signs=True)) == {}
+
+
+# PX4.
+
+
+@pytest.mark.parametrize(
+    ("version", "parameters", "name"),
+    [
+        ((1, 17, 0), {"EKF2_AGP0_CTRL": 1}, "global position"),
+        ((2, 0, 0), {"EKF2_AGP0_CTRL": 3}, "global position"),
+        ((1, 17, 0), {"EKF2_AGP0_CTRL": 2}, "single fixes"),
+        ((1, 17, 0), {}, "single fixes"),
+        ((1, 16, 1), {"EKF2_AGP0_CTRL": 1}, "single fixes"),
+        (None, {"EKF2_AGP0_CTRL": 1}, "single fixes"),
+    ],
+)
+def test_the_channel_of_a_px4(version, parameters, name):
+    assert px4.channel(version, parameters).name == name
+
+
+def test_a_px4_that_can_take_positions_is_told_how():
+    bare = with_parameters(PX4, EKF2_AGP0_CTRL=0, EKF2_AGP0_ID=0, EKF2_AGP0_DELAY=0.0)
+    assert wrong(bare) == {"channel": ("EKF2_AGP0_CTRL=1", "EKF2_AGP0_ID=1", "EKF2_AGP0_DELAY=300")}
+    assert wrong(with_parameters(PX4, EKF2_AGP0_DELAY=0.0)) == {"channel": ("EKF2_AGP0_DELAY=300",)}
+    without = replace(PX4, version=(1, 16, 0), parameters={})
+    assert wrong(without) == {}
+    assert said(without, "channel").endswith("this firmware does not fuse message 296.")
+    assert wrong(with_parameters(without, EKF2_AGP0_CTRL=0)) == {}
+
+
+def test_an_old_or_a_silent_px4_is_wrong():
+    assert wrong(replace(PX4, version=(1, 14, 3), version_text="1.14.3", parameters={})) == {
+        "firmware": ("PX4 1.15 or later",)
+    }
+    assert "firmware" in wrong(replace(PX4, version=None))
+    assert wrong(replace(PX4, says_version_1=True)) == {"port": ("MAV_PROTO_VER=2",)}
+
+
+def test_a_px4_that_takes_another_pose_is_told_of():
+    assert "EKF2_EV_CTRL=11" in said(with_parameters(PX4, EKF2_EV_CTRL=11), "vision")
+    assert "MAV_1_CONFIG=102 (mode ?)" in said(PX4, "port")
+
+
+# Nothing heard.
+
+
+def test_a_silent_line_is_explained_by_what_arrives():
+    nothing = silence(SERIAL, 0, set())
+    assert (nothing.ok, "nothing arrives (TX and RX?)" in nothing.message) == (False, True)
+    assert nothing.changes == (
+        "ArduPilot: SERIALn_PROTOCOL=2, SERIALn_BAUD=57",
+        "PX4: MAV_1_CONFIG=102, MAV_1_MODE=2, SER_TEL2_BAUD=57600",
+    )
+    assert "another baud rate?" in silence(SERIAL, 900, set()).message
+    assert silence(UDP, 0, {5, 3}).changes == ("mavlink: {system_id: 3}",)
+    for url in ("udpin:0.0.0.0:14550", "udpout:10.0.0.2:14550", "tcp:10.0.0.2:5760"):
+        assert silence(parse_link(url), 0, set()).message.startswith(f"{url}: no heartbeat of an autopilot in 5 s: ")
+
+
+def test_the_pages_of_the_vehicles_name_what_is_told_to_change():
+    docs = Path(__file__).parents[3] / "docs"
+    copter, px4_page = (docs / "ardupilot-copter.md").read_text(), (docs / "px4.md").read_text()
+    bare = with_parameters(replace(COPTER, parameters=PLAIN), GPS_AUTO_SWITCH=0)
+    for parameter, value in (change.split("=") for change in wrong(bare)["channel"]):
+        assert re.search(rf"`{parameter}`.*\| {value} \|", copter)
+    for change in (*wrong(replace(COPTER, parameters=PLAIN | {"VISO_TYPE": 1}))["channel"], "VISO_TYPE=1"):
+        assert f"`{change}`" in copter
+    unset = with_parameters(PX4, EKF2_AGP0_CTRL=0, EKF2_AGP0_ID=0)
+    for parameter, value in (change.split("=") for change in (*wrong(unset)["channel"], *px4.port_changes(921_600))):
+        assert re.search(rf"`{parameter}` \| {value}[ |]", px4_page)
+
+
+# The command.
+
+
+@pytest.fixture
+def _quick(monkeypatch):
+    monkeypatch.setattr(module, "LISTEN_S", 0.2)
+
+
+@pytest.fixture
+def link() -> str:
+    return f"udpin:127.0.0.1:{free_port()}"
+
+
+def peer(link: str, **autopilot) -> AnsweringAutopilot:
+    return AnsweringAutopilot(parse_link(link).number, messages=healthy_messages(), **autopilot)
+
+
+def findings_of(printed: str) -> dict[str, tuple[bool, str]]:
+    found = (line.split(maxsplit=2) for line in printed.splitlines() if not line.startswith(" "))
+    return {what: (verdict == "ok", message) for verdict, what, message in found}
+
+
+@pytest.mark.usefixtures("_quick")
+def test_the_command_over_a_link(link, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with peer(link, parameters=PLAIN | {"GPS2_TYPE": 14}) as autopilot:
+        code = main(["doctor", "--link", link])
+    found = findings_of(capsys.readouterr().out)
+    assert {what: message for what, (ok, message) in found.items() if not ok and what != "bytecode"} == {}
+    assert code == (0 if found["bytecode"][0] else 1)
+    assert found["channel"][1] == "A GPS receiver over MAVLink (GPS_INPUT): GPS2_TYPE=14."
+    assert list(tmp_path.iterdir()) == []
+    assert autopilot.names() == {"HEARTBEAT", "COMMAND_LONG", "PARAM_REQUEST_READ", "TIMESYNC"}
+
+
+@pytest.mark.usefixtures("_quick")
+def test_the_command_prints_the_change_and_exits_with_1(link, capsys):
+    with peer(link, parameters=PLAIN):
+        assert main(["doctor", "--link", link]) == 1
+    printed = capsys.readouterr().out
+    assert not findings_of(printed)["channel"][0]
+    assert "  change: GPS2_TYPE=14\n" in printed
+
+
+@pytest.mark.usefixtures("_quick")
+def test_the_command_prints_json(link, capsys, tmp_path):
+    config = tmp_path / "config.yaml"
+    config.write_text(f"mavlink: {{link: '{link}'}}\nlog: {{path: null}}\n")
+    with peer(link, parameters=PLAIN, vehicle=mavlink.MAV_TYPE_FIXED_WING, system_id=42):
+        main(["doctor", "--config", str(config), "--json"])
+    result = json.loads(capsys.readouterr().out)
+    assert (result["link"], result["reading"]["system_id"], result["reading"]["vehicle"]) == (link, 42, "plane")
+    assert result["ok"] == all(each["ok"] for each in result["findings"])
+    assert {"what", "ok", "message", "changes"} == set(result["findings"][0])
+
+
+@pytest.mark.usefixtures("_quick")
+def test_where_no_autopilot_is_the_command_says_so_and_looks_at_the_board(link, capsys):
+    assert main(["doctor", "--link", link]) == 1
+    found = findings_of(capsys.readouterr().out)
+    assert found["link"] == (
+        False,
+        f"{link}: no heartbeat of an autopilot in 5 s: let the autopilot, its simulator or a router send to this port.",
+    )
+    assert "python" in found
+    assert "channel" not in found
+
+
+def test_a_server_that_is_not_up_is_wrong(capsys):
+    link = f"tcp:127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    assert main(["doctor", "--link", link]) == 1
+    assert findings_of(capsys.readouterr().out)["link"][1].startswith(f"{link} is not there (Connection refused)")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["--link", "udp:127.0.0.1"], "is no MAVLink link"),
+        (["--link", "serial:/dev/null:fast"], "the baud rate must be a number"),
+        (["--link", "udpout:no-such-host.invalid:14550"], "there is no host"),
+        ([], "There is no link to the flight controller"),
+        (["--config", "/absent.yaml"], "cannot be read"),
+    ],
+)
+def test_a_wrong_request_is_a_sentence_and_exits_with_2(arguments, sentence, capsys):
+    assert main(["doctor", *arguments]) == 2
+    assert sentence in capsys.readouterr().err
