@@ -44,13 +44,13 @@ class Expected:
 class Navigation:
     """The position by the autopilot's motion and our fixes. `drift` says how the path is made: of the autopilot's
     velocity (`RECKONED`) or of accelerations (`INERTIAL`). `map_sd_m` is the standard deviation of one axis of what all
-    fixes have in common."""
+    fixes have in common. `has_gps`: at the last report, the autopilot's position was one by GPS."""
 
     def __init__(self, drift: Drift, map_sd_m: float) -> None:
         self._drift = drift
         self._path, self._filter = Path(), Filter(drift, map_sd_m)
         self._origin: Position | None = None
-        self._has_gps, self._gps_s, self._fixed_s = False, -math.inf, -math.inf
+        self.has_gps, self._gps_s, self._fixed_s = False, -math.inf, -math.inf
 
     @property
     def fixed_s(self) -> float:
@@ -72,16 +72,16 @@ class Navigation:
             if vehicle.position_sd_m is not None:
                 here = Position(vehicle.lat_deg, vehicle.lon_deg)
                 self._start(here, vehicle.position_sd_m, velocity_m_s, t_s, self._drift.velocity_sd)
-                self._has_gps = has_gps
+                self.has_gps = has_gps
             return
         if self._drift is RECKONED:
             self._filter.go_on(self._path.fly(t_s, velocity_m_s))
         here = self._path.at(t_s)
         if here is None:
             return
-        if self._has_gps and not has_gps:
+        if self.has_gps and not has_gps:
             self._filter.lose_gps()
-        self._has_gps = has_gps
+        self.has_gps = has_gps
         if has_gps and t_s - self._gps_s >= _GPS_EVERY_S:
             self._gps_s = t_s
             off_m = self._from_origin(vehicle.lat_deg, vehicle.lon_deg) - here.at_m

@@ -31,6 +31,8 @@ _UNTOLD_ATTITUDE_SD = math.tan(math.radians(15.0))  # where the autopilot tells 
 _LOST_M, _LOST_S = 50.0, 60.0  # a continuous position that is worse, or without a fix for longer, is none
 _ALT_SD_M = 3.0
 _CONTINUOUS = "taken into the continuous position"
+# ArduPilot refuses a fix then, and PX4 takes it with a gain that makes its velocity jump.
+_HAS_GPS = "not needed: the autopilot has GPS"
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,6 +146,8 @@ class Navigator:
         """Say what is to be sent so that the autopilot is better off, if it can be."""
         if self._is_continuous:
             return Advice(None, _CONTINUOUS)
+        if self._navigation.has_gps:
+            return Advice(None, _HAS_GPS)
         estimate = self._navigation.at(now_s)
         east_m_s, north_m_s = vehicle.velocity_m_s
         since_s = now_s - vehicle.t_heard_s

@@ -221,7 +221,7 @@ def test_over_a_real_link_it_is_what_the_autopilot_says_of_itself_that_counts(re
 def test_in_flight_with_gps_that_agrees_no_fix_is_needed(recording, tmp_path):
     queries, link = fly(recording, tmp_path, (0, 1), off_deg=0.0, has_gps=True)
     assert [line["fix"]["sent"] for line in queries] == [False, False]
-    assert queries[0]["fix"]["why"].startswith("not needed: the autopilot is 0.0 m from where we are")
+    assert queries[0]["fix"]["why"] == "not needed: the autopilot has GPS"
     assert link.texts() == []
 
 

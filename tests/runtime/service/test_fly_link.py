@@ -1,6 +1,6 @@
 """The link of a flight is opened as the configuration says."""
 
-from contextlib import closing
+from contextlib import ExitStack, closing
 
 import pytest
 from mavlink_peers import Peer, UdpPort, wait_until
@@ -9,13 +9,17 @@ from edgevpr.config import load_config
 from edgevpr.errors import ConfigError
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.messages import Fix
+from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.service import fly
 
 
 def test_the_keys_of_the_configuration_reach_the_link():
     keys = {"mavlink.system_id": 5, "mavlink.component_id": 191, "mavlink.max_fix_age_s": 0.2}
     config = load_config(None, keys)
-    with closing(UdpPort()) as port, fly._link(parse_link(f"udpout:127.0.0.1:{port.number}"), config.mavlink) as link:
+    with ExitStack() as stack:
+        port = stack.enter_context(closing(UdpPort()))
+        address = parse_link(f"udpout:127.0.0.1:{port.number}")
+        link = stack.enter_context(fly._link(address, config.mavlink, Navigator(5.0, 1.0)))
         heartbeat = Peer(port).expect("HEARTBEAT")
         assert (heartbeat.get_srcSystem(), heartbeat.get_srcComponent()) == (5, 191)
         sending = link.send_fix(Fix(50.0, 8.0, 20.0, link._clock()))
