@@ -7,7 +7,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # Where this is set, each of the hundreds of processes that the tests start compiles edgevpr anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test lint results bench bench-arm64 hostile clean
+.PHONY: demo test lint results bench bench-arm64 hostile rig clean
 
 demo: $(VENV)/installed
 	$(BIN)/edgevpr demo --out demo_out
@@ -44,6 +44,11 @@ bench-arm64: $(VENV)/installed
 # Everything that a hostile world does, from a seed, into benchmarks/results/.
 hostile: $(VENV)/installed
 	$(BIN)/python benchmarks/hostile.py
+
+# Flights with a real ArduPilot in its own simulator, whose built source EDGEVPR_ARDUPILOT names, into
+# benchmarks/results/. An hour and a half.
+rig: $(VENV)/installed
+	$(BIN)/python benchmarks/rig/rig.py --all
 
 clean:
 	rm -rf $(VENV) demo_out dist build

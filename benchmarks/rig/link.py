@@ -9,19 +9,21 @@ from collections.abc import Callable
 from edgevpr.mavlink.wire import Message, Receiver, mavlink
 
 GROUND_STATION, AUTOPILOT = (255, 190), (1, 1)
+# SIM_STATE is the truth; a plane, whose loop turns 50 times a second, gives it no more often.
 STREAMS_HZ = {
     mavlink.MAVLINK_MSG_ID_SYS_STATUS: 2,
     mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5,
     mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 10,
-    mavlink.MAVLINK_MSG_ID_SIM_STATE: 40,  # the most that a plane gives
+    mavlink.MAVLINK_MSG_ID_SIM_STATE: 40,
     mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: 5,
 }
 Listener = Callable[[Message, float], None]
 
 
 class Link:
-    """Keeps the newest message of each name that the autopilot sent ("COMMAND_ACK 400" of a command, "HEARTBEAT of 197" of
-    another component), and when it came; tells every message to the listeners, with its time. Raises RuntimeError where nobody answers at `port`."""
+    """Keeps the newest message of each name that the autopilot sent ("COMMAND_ACK 400" of a command, "HEARTBEAT of 197"
+    of another component), and when it came; tells every message to the listeners, with its time. Raises RuntimeError
+    where nobody answers at `port`."""
 
     def __init__(self, port: int, listeners: list[Listener]) -> None:
         self.last: dict[str, Message] = {}
