@@ -1,6 +1,7 @@
 """One run of a scenario: the simulator, the camera and edgevpr between them, and a record of it all in a folder."""
 
 import json
+import shutil
 import subprocess
 import sys
 import time
@@ -55,7 +56,8 @@ class Run:
 
     def __init__(self, plan: Plan) -> None:
         self._plan, self._scenario, self._folder = plan, plan.scenario, plan.folder
-        self._folder.mkdir(parents=True, exist_ok=True)
+        shutil.rmtree(self._folder, ignore_errors=True)
+        self._folder.mkdir(parents=True)
         self.truth, self._open = Truth(), ExitStack()
         self.recorder = Recorder(self.truth, self._folder / "track.csv")
         self._edgevpr: subprocess.Popen | None = None
@@ -67,8 +69,6 @@ class Run:
         plan, scenario = self._plan, self._scenario
         place_map = ground.place_map(plan.work)
         self._map = self._folder / "learnt.gpkg" if scenario.learns else place_map
-        for old in [*self._folder.glob("learnt.gpkg*"), *self._folder.glob("flight.jsonl*")]:
-            old.unlink()
         is_copter = scenario.vehicle == "copter"
         more = {} if plan.is_control else scenario.with_edgevpr
         with ExitStack() as stack:
