@@ -88,8 +88,8 @@ class Run:
                     Camera(
                         self.truth,
                         ground.lit_ground(plan.work, "later"),
-                        day="later",
                         is_level=scenario.is_level,
+                        is_stamped=scenario.is_stamped,
                         port=8090 + plan.instance,
                         log=self._folder / "pictures.csv",
                     )
