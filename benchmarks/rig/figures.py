@@ -1,5 +1,6 @@
 """The figures of a run, from the files in its folder: the autopilot's estimate, edgevpr's fixes, what was answered."""
 
+import csv
 import json
 import math
 from pathlib import Path
@@ -52,6 +53,8 @@ def figures_of(folder: Path) -> Row:
     found["said"] = [[round(t_s - loss_s, 1), text] for t_s, sender, text in run["texts"] if sender != 1]
     if log:
         found["fixes"] = _fixes(_fix_rows(folder, log))
+        found["sent"] = _sent(folder, loss_s)
+        found["wire_ms"] = _wire_ms(folder, log)
         found["answers"] = dict(log[-1].get("mavlink", {}).get("acks", {}))
         queries = [line for line in log if line["kind"] == "query"]
         found["queries"] = len(queries)
@@ -139,6 +142,46 @@ def _fixes(rows: list[Row]) -> Row:
 def _within(sigmas: np.ndarray) -> list[float]:
     """Return the shares of errors, axis by axis, within one and two standard deviations."""
     return [round(float((sigmas <= limit).mean()), 2) for limit in (1, 2)]
+
+
+def _sent(folder: Path, loss_s: float) -> Row:
+    """Return, by the name of the message, how well the positions that were sent after the loss are met by the true
+    ones of their times."""
+    sent, found = _sent_table(folder), {}
+    for kind in np.unique(sent["kind"]):
+        is_of = (sent["kind"] == kind) & (sent["t_s"] >= loss_s)
+        if is_of.sum() < 2:
+            continue
+        rows = {name: column[is_of] for name, column in sent.items()}
+        off_m = np.stack((rows["east_m"] - rows["true_east_m"], rows["north_m"] - rows["true_north_m"]), axis=1)
+        found[str(kind)] = {
+            "rate_hz": round(len(off_m) / float(np.ptp(rows["t_s"])), 1),
+            "error": spread(np.hypot(*off_m.T)),
+            "claimed_m": round(float(np.median(rows["accuracy_m"])), 2),
+            "within": _within(abs(off_m) / np.maximum(rows["accuracy_m"], 1e-3)[:, None]),
+        }
+    return found
+
+
+def _wire_ms(folder: Path, log: list[Row]) -> list[float] | None:
+    """Return how long it takes from a picture to the bytes of its fix on the wire, median and 99 %."""
+    sent = _sent_table(folder)
+    sent_s = sent["t_s"][sent["kind"] == "COMMAND_INT"]
+    queries = [(line["t_frame_s"], line["t_mono_s"]) for line in log if line["kind"] == "query"]
+    took_ms = [
+        1e3 * float(each - taken_s)
+        for taken_s, logged_s in queries
+        for each in sent_s[(sent_s > taken_s) & (sent_s <= logged_s)]
+    ]
+    return [round(float(each), 1) for each in np.quantile(took_ms, (0.5, 0.99))] if took_ms else None
+
+
+def _sent_table(folder: Path) -> dict[str, np.ndarray]:
+    with open(folder / "sent.csv", encoding="utf-8", newline="") as handle:
+        lines = list(csv.DictReader(handle))
+    columns = ("t_s", "east_m", "north_m", "accuracy_m", "true_east_m", "true_north_m")
+    numbers = {name: np.array([float(line[name]) for line in lines]) for name in columns}
+    return {"kind": np.array([line["kind"] for line in lines], str), **numbers}
 
 
 def _learnt(folder: Path, log: list[Row], loss_s: float) -> Row | None:

@@ -69,6 +69,10 @@ the answer, median and 99 %.
 
 {_fixes(found)}
 
+What was sent to the autopilot, after the loss, against the true position of the time that it was sent for:
+
+{_sent(found)}
+
 {_remarks(found)}
 
 Commit {result["commit"]}, {result["date"]}, {result["machine"]["cpu"]}. `make rig` makes this page.
@@ -124,6 +128,36 @@ def _fixes(found: dict[str, dict[str, Row]]) -> str:
                 " / ".join(str(each) for each in run["query_ms"]) if run["query_ms"] else "-",
             ]
         )
+    return markdown(head, table)
+
+
+def _sent(found: dict[str, dict[str, Row]]) -> str:
+    head = (
+        "flight",
+        "message",
+        "a second",
+        "median",
+        "90 %",
+        "max",
+        "claimed m",
+        "within 1, 2 sigma",
+        "picture to wire",
+    )
+    table = []
+    for name, runs in found.items():
+        run = runs.get("with", {})
+        for kind, each in run.get("sent", {}).items():
+            table.append(
+                [
+                    name,
+                    kind,
+                    str(each["rate_hz"]),
+                    *(_number(each["error"].get(key)) for key in ("median", "p90", "max")),
+                    _number(each["claimed_m"]),
+                    "{:.2f} / {:.2f}".format(*each["within"]),
+                    "{:.0f} / {:.0f} ms".format(*run["wire_ms"]) if run["wire_ms"] else "-",
+                ]
+            )
     return markdown(head, table)
 
 
