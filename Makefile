@@ -46,7 +46,7 @@ hostile: $(VENV)/installed
 	$(BIN)/python benchmarks/hostile.py
 
 # Flights with a real ArduPilot in its own simulator, whose built source EDGEVPR_ARDUPILOT names, into
-# benchmarks/results/. An hour and a half.
+# benchmarks/results/: two and a half hours.
 rig: $(VENV)/installed
 	$(BIN)/python benchmarks/rig/rig.py --all
 

@@ -9,12 +9,15 @@ from typing import Any
 import numpy as np
 
 from edgevpr.runtime.flight.flightlog import read_log
+from edgevpr.simulate.camera import Camera, Pose, ground_to_pixel
 from edgevpr.simulate.flight import to_metres
 
 ROLL_DEG = ((0, 6), (6, 20), (20, 90))
 AFTER_S = (10, 30, 60, 120, 180, 240, 300)
 _TAKEN_WITHIN_S = 0.05  # a query belongs to the picture of its time
 _ALARMS = ("failsafe", "variance", "stopped aiding", "crash", "emergency")
+
+_POSE = ("east_m", "north_m", "height_m", "heading_deg", "roll_deg", "pitch_deg")
 
 Row = dict[str, Any]
 
@@ -185,7 +188,8 @@ def _sent_table(folder: Path) -> dict[str, np.ndarray]:
 
 
 def _learnt(folder: Path, log: list[Row], loss_s: float) -> Row | None:
-    """Return the errors of the places learnt in flight, and how many were learnt after the loss."""
+    """Return the errors of the places learnt in flight, against the ground in the middle of their pictures, and how
+    many were learnt after the loss."""
     taken_s = {line["query"]: line["t_frame_s"] for line in log if line["kind"] == "query"}
     places = [line for line in log if line["kind"] == "learnt" and line["query"] in taken_s]
     if not places:
@@ -193,11 +197,20 @@ def _learnt(folder: Path, log: list[Row], loss_s: float) -> Row | None:
     pictures, errors_m, after = read_table(folder / "pictures.csv"), [], 0
     for line in places:
         at_s = taken_s[line["query"]]
-        of = pictures[np.argmin(abs(pictures["t_s"] - at_s))]
+        seen_east_m, seen_north_m = _looked_at(pictures[np.argmin(abs(pictures["t_s"] - at_s))])
         east_m, north_m = to_metres(line["position"]["lat_deg"], line["position"]["lon_deg"])
-        errors_m.append(math.hypot(east_m - of["east_m"], north_m - of["north_m"]))
+        errors_m.append(math.hypot(east_m - seen_east_m, north_m - seen_north_m))
         after += at_s > loss_s
     return {"error": spread(np.array(errors_m)), "after_the_loss": after}
+
+
+def _looked_at(picture: np.void) -> np.ndarray:
+    """Return the point of the ground, east and north, in the middle of a picture."""
+    camera = Camera()
+    pose = Pose(**{name: float(picture[name]) for name in _POSE})
+    middle = (camera.width - 1) / 2, (camera.height - 1) / 2, 1.0
+    east, north, scale = np.linalg.solve(ground_to_pixel(pose, camera), middle)
+    return np.array((east, north)) / scale
 
 
 def _gps_alarm(said: list) -> float | None:

@@ -43,11 +43,17 @@ def main() -> None:
     if arguments.all:
         for name, scenario in SCENARIOS.items():
             for is_control in (False, True)[: 1 + scenario.is_compared]:
-                fly(plan(arguments, words, name, is_control))
+                try:
+                    fly(plan(arguments, words, name, is_control))
+                except RuntimeError as error:  # one that does not arm, for example: the page has the others
+                    print(f"rig: {name}: {error}", file=sys.stderr, flush=True)
         return write_page(arguments.work)
     if arguments.scenario is None:
         sys.exit(f"rig: name a scenario ({', '.join(SCENARIOS)}), or --all.")
-    print(json.dumps(fly(plan(arguments, words, arguments.scenario, arguments.control))))
+    try:
+        print(json.dumps(fly(plan(arguments, words, arguments.scenario, arguments.control))))
+    except RuntimeError as error:
+        sys.exit(f"rig: {error}")
 
 
 def parsed() -> tuple[argparse.Namespace, tuple[str, ...]]:
