@@ -254,7 +254,7 @@ class Run:
 
     def _glitch(self, since_s: float) -> None:
         north_deg = self._scenario.glitch_m_s * since_s / _EARTH_DEGREE_M
-        self._simulator.link.set_parameter("SIM_GPS1_GLTCH_X", north_deg)
+        self._simulator.link.put_parameter("SIM_GPS1_GLTCH_X", north_deg)
 
     def _say(self, what: str) -> None:
         print(f"{self._plan.folder.name}: {what}: {self.recorder.line()}", file=sys.stderr, flush=True)

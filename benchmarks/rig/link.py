@@ -74,13 +74,15 @@ class Link:
             time.sleep(0.01)
         return None
 
+    def put_parameter(self, name: str, value: float) -> None:
+        """Set a parameter, and do not wait: one that has changed by next to nothing is not answered."""
+        kind = mavlink.MAV_PARAM_TYPE_REAL32
+        self.send(mavlink.MAVLink_param_set_message(*AUTOPILOT, name.encode(), float(value), kind))
+
     def set_parameter(self, name: str, value: float) -> None:
         """Set a parameter. Raises RuntimeError where the autopilot does not take it."""
         for _ in range(4):
-            message = mavlink.MAVLink_param_set_message(
-                *AUTOPILOT, name.encode(), float(value), mavlink.MAV_PARAM_TYPE_REAL32
-            )
-            self.send(message)
+            self.put_parameter(name, value)
             if self.wait_for("PARAM_VALUE", lambda told: told.param_id == name and _near(told.param_value, value), 1.5):
                 return
         raise RuntimeError(f"the autopilot does not take {name} {value}")
