@@ -10,6 +10,7 @@ import numpy as np
 from figures import by_second, read_table, worse_by
 from run_sets import made_by
 from scenarios import SCENARIOS
+from simulator import VEHICLES
 
 from edgevpr.helpers.tables import markdown
 
@@ -99,10 +100,16 @@ def _estimates(found: dict[str, dict[str, Row]]) -> str:
                     *(_number(after.get(key)) for key in ("median", "p90", "max")),
                     *(_number(at.get(key)) for key in ("10", "30", "60", "300")),
                     f"{worse[0]} at {worse[1]} s" if worse else "-",
-                    " ".join(str(mode) for _, mode in run["modes"]),
+                    _modes(name, run),
                 ]
             )
     return markdown(head, table)
+
+
+def _modes(name: str, run: Row) -> str:
+    names = {number: word for word, number in VEHICLES[SCENARIOS[name].vehicle].modes.items()}
+    told = [names.get(mode, str(mode)) + (f" at {t_s:.0f} s" if t_s > 1 else "") for t_s, mode in run["modes"]]
+    return ", ".join(told)
 
 
 def _fixes(found: dict[str, dict[str, Row]]) -> str:

@@ -33,8 +33,10 @@ class Vehicle:
 
 
 VEHICLES = {
-    "plane": Vehicle("arduplane", "plane", "models/plane.parm", {"AUTO": 10}),
-    "copter": Vehicle("arducopter", "quad", "default_params/copter.parm", {"GUIDED": 4, "LAND": 9}),
+    "plane": Vehicle("arduplane", "plane", "models/plane.parm", {"CIRCLE": 1, "AUTO": 10, "RTL": 11, "LOITER": 12}),
+    "copter": Vehicle(
+        "arducopter", "quad", "default_params/copter.parm", {"ALT_HOLD": 2, "GUIDED": 4, "RTL": 6, "LAND": 9}
+    ),
 }
 
 
