@@ -7,7 +7,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # Where this is set, each of the hundreds of processes that the tests start compiles edgevpr anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test lint results bench bench-arm64 hostile clean
+.PHONY: demo test lint results bench bench-arm64 hostile rig clean
 
 demo: $(VENV)/installed
 	$(BIN)/edgevpr demo --out demo_out
@@ -53,6 +53,11 @@ $(VENV)/clients/installed: $(VENV)/installed
 	    $(BIN)/python -m pip install --quiet --disable-pip-version-check --retries 1 --timeout 20 --upgrade --no-deps \
 	        --only-binary :all: --target $(VENV)/clients $$each || { missing=1; echo "$$each: its tests are skipped"; }; \
 	done; [ "$$missing" ] || touch $@
+
+# Flights with a real ArduPilot in its own simulator, whose built source EDGEVPR_ARDUPILOT names, into
+# benchmarks/results/: two and a half hours.
+rig: $(VENV)/installed
+	$(BIN)/python benchmarks/rig/rig.py --all
 
 clean:
 	rm -rf $(VENV) demo_out dist build

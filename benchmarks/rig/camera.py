@@ -1,8 +1,8 @@
 """A camera under the aircraft: pictures of the ground from the true pose, served over HTTP on loopback.
 
-They are Motion JPEG in NUT, a container of FFmpeg's that gives every picture its time. (Over HTTP alone pictures have
-none: edgevpr then takes the earliest at which one can have been taken, which at five pictures a second is 0.2 s off.)
-A picture is rendered for a moment shortly ahead and leaves at that moment, so it is as if it had been taken then.
+They are Motion JPEG in NUT, a container of FFmpeg's that gives every picture its time; or without times, one after the
+other in the parts of an answer, as cheap cameras do. A picture is rendered for a moment shortly ahead and leaves at
+that moment, so it is as if it had been taken then.
 """
 
 import contextlib
@@ -38,10 +38,12 @@ class Picture:
 
 class Camera:
     """Serves pictures at `uri` from the begin of the `with` block to its end, and writes the true pose of each to a
-    file. `is_level`: on a gimbal; else fixed to the airframe."""
+    file. `is_level`: on a gimbal; else fixed to the airframe. `is_stamped`: the pictures have their times."""
 
-    def __init__(self, truth: Truth, lit_ground: np.ndarray, *, day: str, is_level: bool, port: int, log: Path) -> None:
-        self._truth, self._ground, self._day, self._is_level = truth, lit_ground, day, is_level
+    def __init__(
+        self, truth: Truth, lit_ground: np.ndarray, *, is_level: bool, is_stamped: bool, port: int, log: Path
+    ) -> None:
+        self._truth, self._ground, self._is_level, self.is_stamped = truth, lit_ground, is_level, is_stamped
         self._log, self._rng = log, np.random.default_rng(ground.SEED + 1)
         self._picture: Picture | None = None
         self._is_on, self._changed = True, threading.Condition()
@@ -98,7 +100,7 @@ class Camera:
             pose = replace(pose, roll_deg=0.0, pitch_deg=0.0)
         elif max(abs(pose.roll_deg), abs(pose.pitch_deg)) > _BEYOND_DEG:
             pose = replace(pose, height_m=1.0, roll_deg=0.0, pitch_deg=0.0)  # nothing to be seen
-        return ground.picture(self._ground, pose, self._day, self._rng)
+        return ground.picture(self._ground, pose, "later", self._rng)
 
 
 class _Viewer(BaseHTTPRequestHandler):
@@ -106,13 +108,24 @@ class _Viewer(BaseHTTPRequestHandler):
         pass
 
     def do_GET(self) -> None:
+        is_stamped = self.server.camera.is_stamped
         self.send_response(200)
-        self.send_header("Content-Type", "video/x-nut")
+        self.send_header("Content-Type", "video/x-nut" if is_stamped else "multipart/x-mixed-replace; boundary=picture")
         self.end_headers()
         with contextlib.suppress(OSError, av.FFmpegError):  # the viewer has gone
-            self._send_pictures()
+            if is_stamped:
+                self._send_stamped()
+            else:
+                self._send_parts()
 
-    def _send_pictures(self) -> None:
+    def _send_parts(self) -> None:
+        picture = self.server.camera.next(0)
+        while picture:
+            head = f"--picture\r\nContent-Type: image/jpeg\r\nContent-Length: {len(picture.jpeg)}\r\n\r\n"
+            self.wfile.write(head.encode() + picture.jpeg + b"\r\n")
+            picture = self.server.camera.next(picture.number)
+
+    def _send_stamped(self) -> None:
         options = {"flush_packets": "1", "write_index": "0"}
         with av.open(_Sink(self.wfile), "w", format="nut", options=options, buffer_size=4096) as container:
             stream = container.add_stream("mjpeg", rate=int(PICTURES_HZ))

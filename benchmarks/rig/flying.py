@@ -1,6 +1,7 @@
 """One run of a scenario: the simulator, the camera and edgevpr between them, and a record of it all in a folder."""
 
 import json
+import shutil
 import subprocess
 import sys
 import time
@@ -12,6 +13,7 @@ from typing import Any
 import ground
 from camera import Camera
 from recording import COMPANION, Recorder
+from relay import Relay
 from scenarios import (
     CIRCUIT_M,
     CLIMB_M,
@@ -55,11 +57,13 @@ class Run:
 
     def __init__(self, plan: Plan) -> None:
         self._plan, self._scenario, self._folder = plan, plan.scenario, plan.folder
-        self._folder.mkdir(parents=True, exist_ok=True)
+        shutil.rmtree(self._folder, ignore_errors=True)
+        self._folder.mkdir(parents=True)
         self.truth, self._open = Truth(), ExitStack()
         self.recorder = Recorder(self.truth, self._folder / "track.csv")
         self._edgevpr: subprocess.Popen | None = None
         self._camera: Camera | None = None
+        self._relay: Relay | None = None
         self.marks_s: dict[str, float] = {}
         self._corner = 0
 
@@ -67,9 +71,7 @@ class Run:
         plan, scenario = self._plan, self._scenario
         place_map = ground.place_map(plan.work)
         self._map = self._folder / "learnt.gpkg" if scenario.learns else place_map
-        for old in [*self._folder.glob("learnt.gpkg*"), *self._folder.glob("flight.jsonl*")]:
-            old.unlink()
-        is_copter = scenario.vehicle == "copter"
+        home_m = COPTER_HOME_M if scenario.vehicle == "copter" else HOME_M
         more = {} if plan.is_control else scenario.with_edgevpr
         with ExitStack() as stack:
             stack.callback(self.recorder.close)
@@ -78,7 +80,7 @@ class Run:
                     scenario.vehicle,
                     self._folder / "simulator",
                     instance=plan.instance,
-                    home_m=COPTER_HOME_M if is_copter else HOME_M,
+                    home_m=home_m,
                     parameters={**VEHICLE_PARAMETERS[scenario.vehicle], **scenario.parameters, **more},
                     listeners=[self.truth.listen, self.recorder.listen],
                 )
@@ -88,10 +90,19 @@ class Run:
                     Camera(
                         self.truth,
                         ground.lit_ground(plan.work, "later"),
-                        day="later",
                         is_level=scenario.is_level,
+                        is_stamped=scenario.is_stamped,
                         port=8090 + plan.instance,
                         log=self._folder / "pictures.csv",
+                    )
+                )
+                self._relay = stack.enter_context(
+                    Relay(
+                        self.truth,
+                        self._folder / "sent.csv",
+                        autopilot_port=self._simulator.companion_port,
+                        port=8290 + plan.instance,
+                        origin_m=home_m,
                     )
                 )
             stack.callback(self.end_edgevpr)
@@ -157,7 +168,7 @@ class Run:
 
     def _config(self) -> dict[str, Any]:
         source = {"uri": self._camera.uri, "camera": "nadir", "rate_hz": self._plan.rate_hz, "fov_deg": ground.FOV_DEG}
-        link = {"link": f"tcp:127.0.0.1:{self._simulator.companion_port}", "min_accuracy_m": 1.0}
+        link = {"link": f"tcp:127.0.0.1:{self._relay.port}", "min_accuracy_m": 1.0}
         config: dict[str, Any] = {
             "map": str(self._map),
             "source": source,
@@ -243,7 +254,7 @@ class Run:
 
     def _glitch(self, since_s: float) -> None:
         north_deg = self._scenario.glitch_m_s * since_s / _EARTH_DEGREE_M
-        self._simulator.link.set_parameter("SIM_GPS1_GLTCH_X", north_deg)
+        self._simulator.link.put_parameter("SIM_GPS1_GLTCH_X", north_deg)
 
     def _say(self, what: str) -> None:
         print(f"{self._plan.folder.name}: {what}: {self.recorder.line()}", file=sys.stderr, flush=True)

@@ -9,19 +9,21 @@ from collections.abc import Callable
 from edgevpr.mavlink.wire import Message, Receiver, mavlink
 
 GROUND_STATION, AUTOPILOT = (255, 190), (1, 1)
+# SIM_STATE is the truth; a plane, whose loop turns 50 times a second, gives it no more often.
 STREAMS_HZ = {
     mavlink.MAVLINK_MSG_ID_SYS_STATUS: 2,
     mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5,
     mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 10,
-    mavlink.MAVLINK_MSG_ID_SIM_STATE: 40,  # the most that a plane gives
+    mavlink.MAVLINK_MSG_ID_SIM_STATE: 40,
     mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: 5,
 }
 Listener = Callable[[Message, float], None]
 
 
 class Link:
-    """Keeps the newest message of each name that the autopilot sent ("COMMAND_ACK 400" of a command, "HEARTBEAT of 197" of
-    another component), and when it came; tells every message to the listeners, with its time. Raises RuntimeError where nobody answers at `port`."""
+    """Keeps the newest message of each name that the autopilot sent ("COMMAND_ACK 400" of a command, "HEARTBEAT of 197"
+    of another component), and when it came; tells every message to the listeners, with its time. Raises RuntimeError
+    where nobody answers at `port`."""
 
     def __init__(self, port: int, listeners: list[Listener]) -> None:
         self.last: dict[str, Message] = {}
@@ -72,13 +74,15 @@ class Link:
             time.sleep(0.01)
         return None
 
+    def put_parameter(self, name: str, value: float) -> None:
+        """Set a parameter, and do not wait: one that has changed by next to nothing is not answered."""
+        kind = mavlink.MAV_PARAM_TYPE_REAL32
+        self.send(mavlink.MAVLink_param_set_message(*AUTOPILOT, name.encode(), float(value), kind))
+
     def set_parameter(self, name: str, value: float) -> None:
         """Set a parameter. Raises RuntimeError where the autopilot does not take it."""
         for _ in range(4):
-            message = mavlink.MAVLink_param_set_message(
-                *AUTOPILOT, name.encode(), float(value), mavlink.MAV_PARAM_TYPE_REAL32
-            )
-            self.send(message)
+            self.put_parameter(name, value)
             if self.wait_for("PARAM_VALUE", lambda told: told.param_id == name and _near(told.param_value, value), 1.5):
                 return
         raise RuntimeError(f"the autopilot does not take {name} {value}")

@@ -3,9 +3,10 @@
 A camera is rendered from the true pose over ground that edgevpr generates. edgevpr runs as a process between the camera
 and the autopilot's MAVLink port, and GPS is taken away. Each flight is made with and without edgevpr.
 
-The simulator is ArduPilot built from its public source (4.7-dev, commit 90700977, `./waf configure --board sitl && ./waf
-plane copter`); EDGEVPR_ARDUPILOT names that folder. `make rig`, or `python benchmarks/rig/rig.py --all`, flies every
-scenario and writes benchmarks/results/rig.md; `python benchmarks/rig/rig.py plane_wind --control` flies one.
+The simulator is ArduPilot built from its public source (github.com/ArduPilot/ardupilot, 4.7-dev, commit 90700977) by
+`./waf configure --board sitl && ./waf plane copter`; EDGEVPR_ARDUPILOT names the folder of that source.
+`make rig`, or `python benchmarks/rig/rig.py --all`, flies every scenario and writes benchmarks/results/rig.md;
+`python benchmarks/rig/rig.py plane_wind --control` flies one.
 """
 
 import os
@@ -42,11 +43,17 @@ def main() -> None:
     if arguments.all:
         for name, scenario in SCENARIOS.items():
             for is_control in (False, True)[: 1 + scenario.is_compared]:
-                fly(plan(arguments, words, name, is_control))
+                try:
+                    fly(plan(arguments, words, name, is_control))
+                except RuntimeError as error:  # one that does not arm, for example: the page has the others
+                    print(f"rig: {name}: {error}", file=sys.stderr, flush=True)
         return write_page(arguments.work)
     if arguments.scenario is None:
         sys.exit(f"rig: name a scenario ({', '.join(SCENARIOS)}), or --all.")
-    print(json.dumps(fly(plan(arguments, words, arguments.scenario, arguments.control))))
+    try:
+        print(json.dumps(fly(plan(arguments, words, arguments.scenario, arguments.control))))
+    except RuntimeError as error:
+        sys.exit(f"rig: {error}")
 
 
 def parsed() -> tuple[argparse.Namespace, tuple[str, ...]]:

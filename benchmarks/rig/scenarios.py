@@ -15,11 +15,14 @@ WIND_FROM_DEG = 270.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scenario:
-    """A flight: `gps_s` seconds with GPS, then `off_s` without. From the loss on there is wind, and the autopilot is
-    told to use the `source_set` (None: its own choice). Without `loses_gps` the receiver stays; it moves away by
-    `glitch_m_s` from then on. `parameters` are the autopilot's, `with_edgevpr` those that are set for a flight with
-    edgevpr only; `config` is what edgevpr's configuration says beside the usual. `starts_early`: edgevpr runs before
-    arming. `is_compared`: the same flight without edgevpr says something."""
+    """A flight: `gps_s` seconds with GPS, then `off_s` without.
+
+    From the loss on there is wind, and the autopilot is told to use the `source_set` (None: its own choice). Without
+    `loses_gps` the receiver stays; it moves away by `glitch_m_s` from then on. The camera `is_level` on a gimbal, or
+    fixed to the airframe, and its pictures are `is_stamped` with their times, or not. `parameters` are the
+    autopilot's, `with_edgevpr` those that are set for a flight with edgevpr only; `config` is what edgevpr's
+    configuration says beside the usual. `starts_early`: edgevpr runs before arming. `is_compared`: the same flight
+    without edgevpr says something."""
 
     vehicle: str = "plane"
     gps_s: float = 60.0
@@ -29,6 +32,7 @@ class Scenario:
     glitch_m_s: float = 0.0
     source_set: int | None = None
     is_level: bool = False
+    is_stamped: bool = True
     parameters: Mapping[str, float] = field(default_factory=dict)
     with_edgevpr: Mapping[str, float] = field(default_factory=dict)
     config: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
@@ -77,6 +81,7 @@ SCENARIOS = {
     "plane_wind": Scenario(wind_m_s=6.0),
     "plane_still": Scenario(),
     "plane_level": Scenario(wind_m_s=6.0, is_level=True, config=_GIMBAL),
+    "plane_mjpeg": Scenario(wind_m_s=6.0, is_stamped=False, is_compared=False),
     "copter_flow": Scenario(vehicle="copter", source_set=2, parameters=_FLOW),
     "copter_gps_input": Scenario(vehicle="copter", with_edgevpr=_GPS_INPUT, starts_early=True),
     "copter_odometry": Scenario(vehicle="copter", source_set=2, with_edgevpr=_ODOMETRY, starts_early=True),

@@ -6,7 +6,7 @@ Instance N listens on the ports 5760 + 10N, which is the rig's, and 5762 + 10N, 
 import atexit
 import contextlib
 import os
-import shutil
+import socket
 import subprocess
 import time
 from dataclasses import dataclass
@@ -33,8 +33,10 @@ class Vehicle:
 
 
 VEHICLES = {
-    "plane": Vehicle("arduplane", "plane", "models/plane.parm", {"AUTO": 10}),
-    "copter": Vehicle("arducopter", "quad", "default_params/copter.parm", {"GUIDED": 4, "LAND": 9}),
+    "plane": Vehicle("arduplane", "plane", "models/plane.parm", {"CIRCLE": 1, "AUTO": 10, "RTL": 11, "LOITER": 12}),
+    "copter": Vehicle(
+        "arducopter", "quad", "default_params/copter.parm", {"ALT_HOLD": 2, "GUIDED": 4, "RTL": 6, "LAND": 9}
+    ),
 }
 
 
@@ -71,8 +73,8 @@ class Simulator:
         self.link: Link | None = None
 
     def __enter__(self) -> "Simulator":
-        shutil.rmtree(self._folder, ignore_errors=True)
         self._folder.mkdir(parents=True)
+        self._say_where_taken()
         atexit.register(self.kill)
         try:
             self.start(wipe=True)
@@ -123,6 +125,15 @@ class Simulator:
                 self._process.kill()
             self._process.wait()
         self.link = self._process = None
+
+    def _say_where_taken(self) -> None:
+        """Raise RuntimeError where another simulator of this instance runs: its last port is left open."""
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind(("", self.companion_port + 1))
+            except OSError:
+                raise RuntimeError(f"instance {self.instance} of the simulator is in use: give another") from None
 
     def wait_ready(self) -> None:
         """Wait until the autopilot knows where it is and would arm. Raises RuntimeError where that takes minutes."""

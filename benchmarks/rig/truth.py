@@ -12,7 +12,7 @@ from edgevpr.mavlink.wire import Message
 from edgevpr.simulate.camera import Pose
 from edgevpr.simulate.flight import to_metres
 
-_KEPT = 100  # states, two seconds
+_KEPT = 240  # states, six seconds: a fix is 5 s old at the most
 _AHEAD_S = 0.3  # the farthest that a state is carried on
 
 
