@@ -79,6 +79,7 @@ class SourceConfig:
     up_deg: float = bounded(
         0, 360, Flag(("--up-deg",), "DEG", "where the top of the picture points while the nose points north (0)")
     )
+    gimbal: bool = field()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -75,7 +75,7 @@ _ODOMETRY = {
     "EK3_SRC2_VELZ": 0,
     "EK3_SRC2_YAW": 1,
 }
-_GIMBAL = {"source": {"fov_deg": None}}  # the airframe's attitude is not the camera's
+_GIMBAL = {"source": {"gimbal": True}}
 
 SCENARIOS = {
     "plane_wind": Scenario(wind_m_s=6.0),

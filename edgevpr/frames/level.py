@@ -36,13 +36,15 @@ class View:
     """The way a picture lies on the ground (None: unknown). `up_deg` is the compass direction (0..360) of its top, and
     `footprint_m` the length on the ground of its longest side. `aside` is the point straight under the camera, from the
     middle of the picture, (right, up) as shares of the longest side. By `zoom` it was scaled, so that it shows as much
-    less ground. `reason` tells why the picture was left tilted
-    (None: it was not)."""
+    less ground. `lean_m` is the way on the ground, metres east and north, from what the middle of the picture shows to
+    the point straight under the camera, of a picture that was left as it is since its lens is unknown. `reason` tells
+    why the picture was left tilted (None: it was not)."""
 
     up_deg: float | None = None
     footprint_m: float | None = None
     aside: tuple[float, float] | None = None
     zoom: float = 1.0
+    lean_m: tuple[float, float] | None = None
     reason: str | None = None
 
     def fields(self) -> dict[str, Any]:
@@ -51,6 +53,7 @@ class View:
             "up_deg": self.up_deg and round(self.up_deg, 1),
             "footprint_m": self.footprint_m and round(self.footprint_m, 2),
             "aside": self.aside and [round(share, 4) for share in self.aside],
+            "lean_m": self.lean_m and [round(each, 2) for each in self.lean_m],
             "reason": self.reason,
         }
 
@@ -120,6 +123,26 @@ def levelled(
     )
     image = _shrunk_and_warped(frame.image, out_from_pixel, side, shot.focal_px / out_px)
     return Levelled(image, None if mask.all() else mask, view)
+
+
+def leaning(frame: Frame, vehicle: Vehicle | None) -> View:
+    """Return how far a picture of an unknown lens looks aside, as far as the frame, else the vehicle, tells how it was
+    taken; of a picture that bears no warp, the reason. No value of frame or vehicle raises."""
+    roll_deg, pitch_deg, heading_deg, height_m = (
+        _known(frame, vehicle, name) for name in ("roll_deg", "pitch_deg", "heading_deg", "height_m")
+    )
+    if roll_deg is None or pitch_deg is None:
+        return UNKNOWN_VIEW
+    ahead, right, down = _level_from_body(roll_deg, pitch_deg)[:, 2]
+    tilt_deg = math.degrees(math.acos(max(-1.0, min(1.0, down))))
+    if tilt_deg > MOST_TILT_DEG:
+        return View(reason=f"it is tilted {tilt_deg:.0f} degrees")
+    if heading_deg is None or height_m is None or not 0 <= height_m <= _HIGHEST_M:
+        return UNKNOWN_VIEW
+    heading = math.radians(heading_deg)
+    north = height_m / down * (ahead * math.cos(heading) - right * math.sin(heading))
+    east = height_m / down * (ahead * math.sin(heading) + right * math.cos(heading))
+    return View(lean_m=(-float(east), -float(north)))
 
 
 class _Shot:

@@ -30,6 +30,10 @@ _ATTITUDE_SD, _TIME_SD_S = math.tan(math.radians(0.5)), 0.03
 _UNTOLD_ATTITUDE_SD = math.tan(math.radians(15.0))  # where the autopilot tells none: an aircraft that turns banks
 _LOST_M, _LOST_S = 50.0, 60.0  # a continuous position that is worse, or without a fix for longer, is none
 _ALT_SD_M = 3.0
+# An autopilot takes the ten positions of a second for independent ones. Their errors are alike for about five seconds,
+# so each says as little as one of fifty that were independent. Without this it trusted them more than its own gyros:
+# an ArduPilot copter tilted with our errors, which made our errors larger, and was lost after a minute.
+_ALIKE = math.sqrt(50)
 _CONTINUOUS = "taken into the continuous position"
 # ArduPilot refuses a fix then, and PX4 takes it with a gain that makes its velocity jump.
 _HAS_GPS = "not needed: the autopilot has GPS"
@@ -131,9 +135,9 @@ class Navigator:
                 lon_deg=lon_deg,
                 alt_m=vehicle.alt_m,
                 velocity_m_s=(east, north, vehicle.sink_m_s or 0.0),
-                accuracy_m=math.hypot(max(estimate.accuracy_m, self._map_sd_m), behind_m),
+                accuracy_m=_ALIKE * math.hypot(max(estimate.accuracy_m, self._map_sd_m), behind_m),
                 alt_accuracy_m=_ALT_SD_M,
-                speed_accuracy_m_s=estimate.speed_accuracy_m_s,
+                speed_accuracy_m_s=_ALIKE * estimate.speed_accuracy_m_s,
                 attitude=attitude
                 and (
                     math.radians(attitude.roll_deg),

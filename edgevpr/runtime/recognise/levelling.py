@@ -10,7 +10,7 @@ import numpy as np
 
 from edgevpr.config import SourceConfig
 from edgevpr.contract import Technique
-from edgevpr.frames.level import UNKNOWN_VIEW, Lens, Levelled, View, levelled
+from edgevpr.frames.level import UNKNOWN_VIEW, Lens, Levelled, View, leaning, levelled
 from edgevpr.frames.source import is_live
 from edgevpr.geodesy import axes_of, moved
 from edgevpr.types import Frame, Pose, Position, Vehicle
@@ -31,23 +31,45 @@ class NoLevelling:
         return Levelled(frame.image, overlay, UNKNOWN_VIEW)
 
 
+class Leaning:
+    """Takes the pictures of a camera that looks straight down as they are, for want of a lens, and says how far they
+    look aside. `is_live` is as that of `Levelling`."""
+
+    def __init__(self, is_live: bool) -> None:
+        self._is_live = is_live
+
+    def prepare(self, frame: Frame, vehicle: Vehicle | None, overlay: np.ndarray | None) -> Levelled:
+        """Return the picture as it is."""
+        return Levelled(frame.image, overlay, leaning(frame, _now(vehicle, frame) if self._is_live else None))
+
+
 class Levelling:
     """Levels the pictures of a camera that looks straight down, see `frames.level`.
 
     `footprint_m` is the length on the ground to which the longest side is scaled, that of the map's places (None: no
-    picture is scaled). With `below`, for places, the point under the camera is in the middle. `is_live` is False for
-    frames of a recording, of which the autopilot knows nothing.
+    picture is scaled). With `below`, for places, the point under the camera is in the middle. `on_gimbal`: the camera
+    is kept level, whatever the airframe does. `is_live` is False for frames of a recording, of which the autopilot
+    knows nothing.
     """
 
-    def __init__(self, lens: Lens, *, footprint_m: float | None = None, below: bool = False, is_live: bool) -> None:
+    def __init__(
+        self,
+        lens: Lens,
+        *,
+        footprint_m: float | None = None,
+        below: bool = False,
+        on_gimbal: bool = False,
+        is_live: bool,
+    ) -> None:
         self.lens, self.footprint_m = lens, footprint_m
-        self._below, self._is_live = below, is_live
+        self._below, self._on_gimbal, self._is_live = below, on_gimbal, is_live
         self._has_said = False
 
     def prepare(self, frame: Frame, vehicle: Vehicle | None, overlay: np.ndarray | None) -> Levelled:
         """Level the picture of a frame; `overlay`, bool (H, W), is False where it shows no ground (None: nowhere)."""
-        if not self._is_live or (vehicle and not vehicle.is_fresh_at(frame.t_mono_s)):
-            vehicle = None
+        vehicle = _now(vehicle, frame) if self._is_live else None
+        if vehicle and self._on_gimbal:
+            vehicle = replace(vehicle, roll_deg=0.0, pitch_deg=0.0)
         found = levelled(frame, vehicle, self.lens, self.footprint_m, overlay=overlay, below=self._below)
         if found.view.reason and not self._has_said:
             self._has_said = True
@@ -55,7 +77,7 @@ class Levelling:
         return found
 
 
-AnyLevelling = NoLevelling | Levelling
+AnyLevelling = NoLevelling | Leaning | Levelling
 
 
 def levelling_of(
@@ -64,11 +86,17 @@ def levelling_of(
     """Make the levelling that the configuration asks for; none for a camera that looks ahead, or of unknown lens."""
     if technique.spec.parameters.get("camera") != "nadir":
         return NoLevelling()
+    live = config.uri is not None and is_live(config.uri)
     if config.fov_deg is None:
         _log.info("`source.fov_deg` is not set: pictures are neither untilted nor scaled nor turned")
-        return NoLevelling()
-    live = config.uri is not None and is_live(config.uri)
-    return Levelling(Lens(config.fov_deg, config.up_deg), footprint_m=footprint_m, below=below, is_live=live)
+        return NoLevelling() if config.gimbal else Leaning(live)
+    return Levelling(
+        Lens(config.fov_deg, config.up_deg),
+        footprint_m=footprint_m,
+        below=below,
+        on_gimbal=config.gimbal,
+        is_live=live,
+    )
 
 
 def seen_as(frame: Frame, view: View) -> Frame:
@@ -80,6 +108,10 @@ def laid(frame: Frame, view: View) -> Frame:
     """Return a frame with a position as a place is to have it: with the heading of its levelled picture, and, where
     height and heading are known, its pose, and the position of the middle of the picture instead of the aircraft's."""
     frame = seen_as(frame, view)
+    if frame.position and view.lean_m:
+        east_m, north_m = view.lean_m
+        lat_deg, lon_deg = moved(frame.position.lat_deg, frame.position.lon_deg, -east_m, -north_m)
+        return replace(frame, position=Position(lat_deg, lon_deg, frame.position.alt_m))
     if frame.pose is not None or frame.position is None or view.up_deg is None or view.footprint_m is None:
         return frame
     variance_m2 = GPS_SD_M**2
@@ -90,6 +122,10 @@ def laid(frame: Frame, view: View) -> Frame:
         position = _middle(position, view)
     pose = Pose(up_deg=view.up_deg, footprint_m=view.footprint_m, covariance_m2=(variance_m2, 0.0, variance_m2))
     return replace(frame, position=position, pose=pose)
+
+
+def _now(vehicle: Vehicle | None, frame: Frame) -> Vehicle | None:
+    return vehicle if vehicle and vehicle.is_fresh_at(frame.t_mono_s) else None
 
 
 def _middle(position: Position, view: View) -> Position:

@@ -117,7 +117,9 @@ def located(
     # What is wrong with the poses is common to neighbours: hearing several makes it no smaller.
     covariance = of_step + np.mean([each.of_pose for each in said], axis=0)
     pose, way = best.place.pose, heard[0][1]
-    if view.aside is None:
+    if view.lean_m is not None:
+        at_m = at_m + view.lean_m
+    elif view.aside is None:
         covariance += (UNTOLD_TILT * pose.footprint_m * (way.height_ratio or 1.0)) ** 2 * np.eye(2)
     objection = None
     if max(against_m, default=0.0) > _CONTRADICTS * pose.footprint_m:

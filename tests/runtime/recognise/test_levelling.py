@@ -10,18 +10,19 @@ import pytest
 from fakes import vehicle_at
 
 from edgevpr.config import load_config
-from edgevpr.frames.level import Lens, View
+from edgevpr.frames.level import UNKNOWN_VIEW, Lens, View
 from edgevpr.frames.mask import Mask
+from edgevpr.geodesy import offset_m
 from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.hints import Prior
 from edgevpr.runtime.recognise.judge import accept_rule
-from edgevpr.runtime.recognise.levelling import Levelling, NoLevelling, laid, levelling_of
+from edgevpr.runtime.recognise.levelling import Leaning, Levelling, NoLevelling, laid, levelling_of
 from edgevpr.runtime.recognise.mapping import build_map
 from edgevpr.runtime.recognise.opening import meter_of
 from edgevpr.runtime.recognise.recogniser import Recogniser
-from edgevpr.simulate.camera import Camera, Light, Pose, photograph
+from edgevpr.simulate.camera import Camera, Light, Pose, ground_to_pixel, photograph
 from edgevpr.techniques import create
 from edgevpr.types import Frame, Position
 
@@ -224,7 +225,8 @@ def test_a_place_without_a_position_has_no_pose():
     ("camera", "settings", "kind"),
     [
         ("nadir", {"source.fov_deg": 66.0}, Levelling),
-        ("nadir", {}, NoLevelling),
+        ("nadir", {}, Leaning),
+        ("nadir", {"source.gimbal": True}, NoLevelling),
         ("forward", {"source.fov_deg": 66.0}, NoLevelling),
     ],
 )
@@ -233,4 +235,46 @@ def test_only_a_camera_that_looks_down_through_a_known_lens_is_levelled(camera, 
     with caplog.at_level(logging.INFO):
         made = levelling_of(config.source, create("cohog", {"camera": camera}))
     assert isinstance(made, kind)
-    assert ("source.fov_deg" in caplog.text) == (camera == "nadir" and not settings)
+    assert ("source.fov_deg" in caplog.text) == (camera == "nadir" and "source.fov_deg" not in settings)
+
+
+@pytest.mark.parametrize("heading_deg", [0.0, 90.0, 215.0])
+@pytest.mark.parametrize(("roll_deg", "pitch_deg"), [(0.0, 0.0), (20.0, 0.0), (0.0, -15.0), (-25.0, 10.0)])
+def test_a_picture_of_an_unknown_lens_says_how_far_it_looks_aside(roll_deg, pitch_deg, heading_deg):
+    how = {"heading_deg": heading_deg, "roll_deg": roll_deg, "pitch_deg": pitch_deg}
+    pose = Pose(east_m=0.0, north_m=0.0, height_m=80.0, **how)
+    camera = Camera()
+    to_pixel = ground_to_pixel(pose, camera)
+    east, north, scale = np.linalg.solve(to_pixel, (camera.width / 2 - 0.5, camera.height / 2 - 0.5, 1.0))
+    told = how | {"height_m": 80.0}
+    vehicle = vehicle_at(50.0, 8.0, 5.0, **told)
+    frame = Frame(image=np.zeros((48, 64), np.uint8), name="", t_mono_s=5.0)
+    view = Leaning(is_live=True).prepare(frame, vehicle, None).view
+    assert view.lean_m == pytest.approx((-east / scale, -north / scale), abs=0.15)
+    assert Leaning(is_live=False).prepare(frame, vehicle, None).view == UNKNOWN_VIEW, "it is of another time"
+    assert Leaning(is_live=True).prepare(replace(frame, t_mono_s=7.0), vehicle, None).view == UNKNOWN_VIEW
+    assert Leaning(is_live=False).prepare(replace(frame, **told), None, None).view == view, "a recording's own"
+
+
+def test_one_that_leans_too_far_says_so_and_of_one_whose_heading_is_unknown_nothing_is_known():
+    frame = Frame(image=np.zeros((48, 64), np.uint8), name="", t_mono_s=5.0, roll_deg=50.0, pitch_deg=0.0)
+    assert Leaning(is_live=False).prepare(frame, None, None).view.reason == "it is tilted 50 degrees"
+    assert Leaning(is_live=False).prepare(replace(frame, roll_deg=20.0), None, None).view == UNKNOWN_VIEW
+
+
+def test_a_place_of_an_unknown_lens_lies_where_the_picture_looks():
+    here = Position(50.0, 8.0, 300.0)
+    frame = Frame(image=np.zeros((8, 8), np.uint8), name="", t_mono_s=0.0, position=here, heading_deg=70.0)
+    placed = laid(frame, View(lean_m=(30.0, -40.0)))
+    assert offset_m(50.0, 8.0, placed.position.lat_deg, placed.position.lon_deg) == pytest.approx((-30.0, 40.0))
+    assert (placed.position.alt_m, placed.heading_deg, placed.pose) == (300.0, 70.0, None)
+
+
+def test_a_gimbal_keeps_the_camera_level_whatever_the_airframe_does():
+    frame = Frame(image=np.random.default_rng(1).integers(0, 255, (48, 64), np.uint8), name="", t_mono_s=5.0)
+    told = {"heading_deg": 30.0, "height_m": 80.0}
+    banked, level = (vehicle_at(50.0, 8.0, 5.0, roll_deg=roll, pitch_deg=5.0 * roll, **told) for roll in (9.0, 0.0))
+    hung = Levelling(Lens(66.0), on_gimbal=True, is_live=True).prepare(frame, banked, None)
+    fixed = Levelling(Lens(66.0), is_live=True).prepare(frame, level, None)
+    assert hung.view == fixed.view
+    assert np.array_equal(hung.image, fixed.image)
