@@ -145,6 +145,12 @@ class SalienceConfig:
     gap_m: float = bounded(1, 100_000)
 
 
+@dataclass(frozen=True, slots=True)
+class SourceSetsConfig:
+    gps: int | None = bounded(1, 3)
+    no_gps: int | None = bounded(1, 3)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MavlinkConfig:
     link: str | None = keyed(
@@ -157,6 +163,7 @@ class MavlinkConfig:
     )
     max_fix_age_s: float = bounded(0.1, 5)
     min_accuracy_m: float = bounded(1, 10_000)
+    source_sets: SourceSetsConfig
 
 
 @dataclass(frozen=True, slots=True)

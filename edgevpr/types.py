@@ -36,6 +36,16 @@ class Pose:
     recorded: Position | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class Receiver:
+    """Position of a GPS receiver, with the standard deviation of one axis, and the time at which it was new."""
+
+    lat_deg: float
+    lon_deg: float
+    sd_m: float
+    t_s: float
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Vehicle:
     """The state of the aircraft as the autopilot reports it: estimated position (degrees, metres above sea level),
@@ -45,8 +55,9 @@ class Vehicle:
     follow a receiver that it does not trust. `roll_deg` (right wing down is positive), `pitch_deg` (nose up),
     `height_m` above the ground, `velocity_m_s` over it (east, north) and `sink_m_s` (down) are None where unknown.
     `position_sd_m` is the standard deviation of one axis of the position, None where it is unknown or the autopilot has
-    no position of its own to rely on. `t_gps_s` is when the newest position of that receiver came, and `t_fix_s` when
-    the newest fix of ours was sent or taken that may be in that position (-inf: none is)."""
+    no position of its own to rely on. `gps` is the newest position of a receiver, near
+    that position or not (None: there is none that is new), and `t_fix_s` when the newest fix of ours was sent or taken
+    that may be in the position (-inf: none is)."""
 
     lat_deg: float
     lon_deg: float
@@ -60,7 +71,7 @@ class Vehicle:
     velocity_m_s: tuple[float, float] | None = None
     sink_m_s: float | None = None
     position_sd_m: float | None = None
-    t_gps_s: float | None = None
+    gps: Receiver | None = None
     t_fix_s: float = -math.inf
 
     def is_fresh_at(self, t_mono_s: float) -> bool:

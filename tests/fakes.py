@@ -18,7 +18,7 @@ from edgevpr.mavlink.reasons import State
 from edgevpr.mavlink.replies import Replies
 from edgevpr.mavlink.wishes import Wish, Wished
 from edgevpr.runtime.flight.clock import Clock
-from edgevpr.types import Frame, Vehicle
+from edgevpr.types import Frame, Receiver, Vehicle
 
 
 class FakeClock:
@@ -252,5 +252,5 @@ class FakeCapture:
 def vehicle_at(lat_deg: float, lon_deg: float, t_heard_s: float, **other) -> Vehicle:
     """What an autopilot says that is there."""
     known = {"alt_m": 300.0, "heading_deg": None, "has_gps": True} | other
-    known.setdefault("t_gps_s", t_heard_s if known["has_gps"] else None)
+    known.setdefault("gps", Receiver(lat_deg, lon_deg, 1.0, t_heard_s) if known["has_gps"] else None)
     return Vehicle(lat_deg=lat_deg, lon_deg=lon_deg, t_heard_s=t_heard_s, **known)

@@ -139,6 +139,18 @@ def query_figures(t_mono_s: float, cpu_share: float, used_mah: float) -> tuple[M
     return (_named_float(t_mono_s, b"vpr_cpu", cpu_share), _named_float(t_mono_s, b"vpr_mah", used_mah))
 
 
+def gps_distance(t_mono_s: float, off_m: float) -> Message:
+    """Make the distance between GPS and an accepted match, NAMED_VALUE_FLOAT (251) `vpr_gps_m`."""
+    return _named_float(t_mono_s, b"vpr_gps_m", off_m)
+
+
+def source_set(number: int, target_system: int) -> Message:
+    """Make a COMMAND_LONG (76) with SET_EKF_SOURCE_SET (42007)."""
+    return mavlink.MAVLink_command_long_message(
+        target_system, AUTOPILOT, mavlink.MAV_CMD_SET_EKF_SOURCE_SET, 0, number, 0, 0, 0, 0, 0, 0
+    )
+
+
 def computer_status(
     t_mono_s: float,
     core_shares: Sequence[float],

@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from edgevpr.geodesy import distance_m
@@ -16,7 +16,7 @@ from edgevpr.mavlink.listener import Listener, NoListener
 from edgevpr.mavlink.messages import AUTOPILOT, POSITION_FIX
 from edgevpr.mavlink.readiness import GPS_REPORTS, Readiness
 from edgevpr.mavlink.wire import Message, mavlink
-from edgevpr.types import Vehicle
+from edgevpr.types import Receiver, Vehicle
 
 GPS_GONE_AFTER_S = 2.5  # GPS reports come at least once a second, and one may be lost
 GPS_AGREES_WITHIN_M = 50.0  # at 25 m/s, with one or two seconds between the two reports
@@ -26,17 +26,6 @@ SILENT_AFTER_S = 5.0  # heartbeats come once a second, and this many may be lost
 _HEIGHT_REPORTS = ("DISTANCE_SENSOR", "TERRAIN_REPORT")
 _MILLI_G = 9.80665e-3  # m/s2
 _NOBODY = NoListener()
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Receiver:
-    """A position of a GPS receiver: standard deviation of one axis, when it was new to us, and its own time."""
-
-    lat_deg: float
-    lon_deg: float
-    sd_m: float
-    t_s: float
-    time_usec: int
 
 
 class Autopilot:
@@ -56,7 +45,7 @@ class Autopilot:
         self._answer: str | None = None  # the newest answer, until `take_answer`
         self._own_component = own_component
         self._heard_s = -math.inf
-        self._gps: dict[str, _Receiver] = {}  # those with a fix
+        self._gps: dict[str, tuple[int, Receiver]] = {}  # those with a fix, and their own time of it
 
     @property
     def system_id(self) -> int | None:
@@ -138,14 +127,15 @@ class Autopilot:
             self._listener.hear_force(now_s, tuple(each * _MILLI_G for each in force), attitude)
 
     def _hear_position(self, message: Message, now_s: float) -> None:
-        gps = self._best_gps(message, now_s)
-        if gps:
+        gps = self._best_gps(now_s)
+        has_gps = gps is not None and _is_near(gps, message)
+        if has_gps:
             self.certainty.note_known(gps.sd_m, now_s)
         self.vehicle = _vehicle(
             message,
             t_heard_s=now_s,
-            has_gps=gps is not None,
-            t_gps_s=gps and gps.t_s,
+            has_gps=has_gps,
+            gps=gps,
             height_m=self._heights.now(message.relative_alt / 1e3, now_s),
             position_sd_m=self.certainty.now(now_s),
         )
@@ -160,27 +150,16 @@ class Autopilot:
         if message.fix_type < mavlink.GPS_FIX_TYPE_3D_FIX:
             self._gps.pop(name, None)
             return
-        before = self._gps.get(name)
+        time_usec, before = self._gps.get(name, (0, None))
         # A receiver that is lost is reported on for seconds, with its last position and the time of that.
-        is_old = before is not None and message.time_usec and message.time_usec == before.time_usec
-        self._gps[name] = _Receiver(
-            lat_deg=message.lat / 1e7,
-            lon_deg=message.lon / 1e7,
-            sd_m=gps_sd_m(message),
-            t_s=before.t_s if is_old else now_s,
-            time_usec=message.time_usec,
-        )
+        t_s = before.t_s if before and message.time_usec and message.time_usec == time_usec else now_s
+        found = Receiver(message.lat / 1e7, message.lon / 1e7, gps_sd_m(message), t_s)
+        self._gps[name] = message.time_usec, found
 
-    def _best_gps(self, position: Message, now_s: float) -> _Receiver | None:
-        """Return the most exact receiver that is near a position; None where none is."""
-        here = position.lat / 1e7, position.lon / 1e7
-        near = (
-            each
-            for each in self._gps.values()
-            if now_s - each.t_s <= GPS_GONE_AFTER_S
-            and float(distance_m(*here, each.lat_deg, each.lon_deg)) <= GPS_AGREES_WITHIN_M
-        )
-        return min(near, key=lambda each: each.sd_m, default=None)
+    def _best_gps(self, now_s: float) -> Receiver | None:
+        """Return the most exact receiver; None where there is none."""
+        new = (each for _, each in self._gps.values() if now_s - each.t_s <= GPS_GONE_AFTER_S)
+        return min(new, key=lambda each: each.sd_m, default=None)
 
     def _is_for_us(self, message: Message) -> bool:
         """Tell whether a message is no answer to the command of another."""
@@ -192,6 +171,11 @@ class Autopilot:
             known = mavlink.enums["MAV_RESULT"].get(message.result)
             self._answer = known.name.removeprefix("MAV_RESULT_") if known else str(message.result)
             self.acks[self._answer] += 1
+
+
+def _is_near(gps: Receiver, position: Message) -> bool:
+    off_m = distance_m(gps.lat_deg, gps.lon_deg, position.lat / 1e7, position.lon / 1e7)
+    return float(off_m) <= GPS_AGREES_WITHIN_M
 
 
 def _vehicle(message: Message, **known: Any) -> Vehicle | None:

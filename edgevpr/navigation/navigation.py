@@ -66,8 +66,7 @@ class Navigation:
             self._origin = None  # it does not know its position any more, and its velocity least of all
             return
         velocity_m_s, t_s = np.array(vehicle.velocity_m_s), vehicle.t_heard_s
-        is_new = vehicle.t_gps_s is not None and t_s - vehicle.t_gps_s <= _GPS_NEW_S
-        has_gps = vehicle.has_gps and is_new and believes_gps
+        has_gps = reckons_by_gps(vehicle) and believes_gps
         if self._origin is None or self._path.is_broken:
             if vehicle.position_sd_m is not None:
                 here = Position(vehicle.lat_deg, vehicle.lon_deg)
@@ -133,8 +132,8 @@ class Navigation:
             t_s=t_s,
             position=Position(*moved(self._origin.lat_deg, self._origin.lon_deg, *at_m.tolist())),
             velocity_m_s=(float(velocity_m_s[0]), float(velocity_m_s[1])),
-            accuracy_m=_worst_sd(covariance[:2, :2]),
-            speed_accuracy_m_s=_worst_sd(covariance[2:, 2:]),
+            accuracy_m=worst_sd(covariance[:2, :2]),
+            speed_accuracy_m_s=worst_sd(covariance[2:, 2:]),
         )
 
     def path_drift_m_s(self) -> tuple[float, float]:
@@ -157,5 +156,11 @@ class Navigation:
         return np.array(offset_m(self._origin.lat_deg, self._origin.lon_deg, lat_deg, lon_deg))
 
 
-def _worst_sd(covariance: np.ndarray) -> float:
+def reckons_by_gps(vehicle: Vehicle) -> bool:
+    """Tell whether a reported position is one by GPS: has a receiver, near it, a position that is still new."""
+    return vehicle.has_gps and vehicle.gps is not None and vehicle.t_heard_s - vehicle.gps.t_s <= _GPS_NEW_S
+
+
+def worst_sd(covariance: np.ndarray) -> float:
+    """Return the standard deviation along the worst direction of a covariance (2, 2)."""
     return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))

@@ -5,6 +5,7 @@ from collections.abc import Collection
 from dataclasses import replace
 from enum import Enum, auto
 
+from edgevpr.config import SourceSetsConfig
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.outbox import Sending
@@ -13,6 +14,7 @@ from edgevpr.power.load import MachineLoad
 from edgevpr.runtime.flight.answerlog import AnswerLog
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.navigator import Navigator
+from edgevpr.runtime.flight.sourcesets import SourceSets
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.types import FixReport, Vehicle
 
@@ -21,6 +23,8 @@ from edgevpr.types import FixReport, Vehicle
 _SETTLED_WITHIN_S = 0.02
 
 DRY_RUN = "dry run: no fix is sent"
+
+_NO_SETS = SourceSets(SourceSetsConfig(None, None))
 
 _log = logging.getLogger(__name__)
 
@@ -50,6 +54,9 @@ class NoAutopilot:
         """Return the event, with a report that the fix of an accepted match was not sent."""
         return replace(event, fix=FixReport(_name(event), False, "there is no link")) if event.accepted else event
 
+    def compare_gps(self, off_m: float, is_wrong: bool) -> None:
+        """Tell nobody."""
+
     def announce(self, mood: Mood, text: str, topic: str | None = None) -> None:
         """Say nothing."""
 
@@ -67,13 +74,23 @@ class NoAutopilot:
 class ToAutopilot:
     """Tells an autopilot of events over an open link. With `send_fixes` an accepted match with a position is sent as a
     fix, where the `navigator` says that the autopilot is better off with it; without, all else is as with it. `cores`
-    is the number of the board's cores. `answers` waits for those to the fixes."""
+    is the number of the board's cores. `source_sets` are those that may be asked for. `answers` waits for those to the
+    fixes."""
 
-    def __init__(self, link: Link, navigator: Navigator, *, send_fixes: bool, cores: int, clock: Clock) -> None:
+    def __init__(
+        self,
+        link: Link,
+        navigator: Navigator,
+        *,
+        send_fixes: bool,
+        cores: int,
+        clock: Clock,
+        source_sets: SourceSets = _NO_SETS,
+    ) -> None:
         self._link, self._send_fixes, self._cores, self._clock = link, send_fixes, cores, clock
         self._last: tuple[str, Sending] | None = None
         self.answers = AnswerLog()
-        self._navigator = navigator
+        self._navigator, self._source_sets = navigator, source_sets
         self._held, self._is_holding = 0, False
 
     @property
@@ -114,6 +131,11 @@ class ToAutopilot:
             self._link.send(*messages.query_figures(now_s, cpu_share, used_mah))
         return replace(event, fix=fix, last_fix=last)
 
+    def compare_gps(self, off_m: float, is_wrong: bool) -> None:
+        """Tell by how many metres a match lies off GPS, and navigate by GPS no longer while it is wrong."""
+        self._link.send(messages.gps_distance(self._clock.mono_s(), off_m))
+        self._navigator.believe_gps(not is_wrong)
+
     def announce(self, mood: Mood, text: str, topic: str | None = None) -> None:
         """Send a text to people on the ground, when its turn comes. The newest text of a `topic` takes the place of one
         that still waits."""
@@ -128,13 +150,24 @@ class ToAutopilot:
         self._link.offer(wishes)
 
     def report(self, health: messages.Health, load: MachineLoad, temperature_c: float | None) -> None:
-        """Report the state of this companion computer, once a second."""
+        """Report the state of this companion computer, once a second, and ask for other sources where that is due."""
         self._link.set_health(health)
+        self._ask_for_sources()
         self._link.send(
             messages.computer_status(
                 self._clock.mono_s(), load.core_shares, load.ram_used_bytes, load.ram_total_bytes, temperature_c
             )
         )
+
+    def _ask_for_sources(self) -> None:
+        vehicle, now_s = self._link.vehicle(), self._clock.mono_s()
+        if vehicle is None or not vehicle.is_fresh_at(now_s) or not self._send_fixes:
+            return
+        has_own = self._navigator.state_at(now_s) is not None
+        if number := self._source_sets.wanted(now_s, self._navigator.has_gps, has_own):
+            _log.warning("the autopilot is asked for its source set %d", number)
+            self.announce(Mood.WARNING, f"source set {number} asked for", "sources")
+            self._link.send(messages.source_set(number, self._link.stats().autopilot_system_id or 0))
 
     def _fixed(self, event: Recognition) -> FixReport:
         """Send the fix of an accepted match, if it has one, and report what became of it."""

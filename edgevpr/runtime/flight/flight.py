@@ -11,6 +11,7 @@ from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.commands import Commands
 from edgevpr.runtime.flight.flightlog import FlightLog
 from edgevpr.runtime.flight.governing import Governing
+from edgevpr.runtime.flight.gpswatch import GpsWatch
 from edgevpr.runtime.flight.learning import Learning
 from edgevpr.runtime.flight.loop import Observer, Stop, loop
 from edgevpr.runtime.flight.mapstate import MapState
@@ -97,7 +98,13 @@ def fly(
     def totals() -> dict[str, Any]:
         return totals_of(tally, meter, source, map_state)
 
-    observers: list[Observer] = [tally, map_state, Sight(flight_log, autopilot), QueryLog(flight_log, meter, totals)]
+    observers: list[Observer] = [
+        tally,
+        map_state,
+        Sight(flight_log, autopilot),
+        GpsWatch(config.mavlink.min_accuracy_m, flight_log, autopilot),
+        QueryLog(flight_log, meter, totals),
+    ]
     if learner:
         observers.append(Learning(learner, flight_log, autopilot))
     try:

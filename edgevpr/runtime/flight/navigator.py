@@ -16,7 +16,7 @@ from edgevpr.mavlink.autopilots.channel import Channel
 from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.positions import State
 from edgevpr.navigation.filter import INERTIAL, RECKONED
-from edgevpr.navigation.navigation import Navigation
+from edgevpr.navigation.navigation import Navigation, reckons_by_gps
 from edgevpr.navigation.path import over_ground
 from edgevpr.navigation.slew import Slew
 from edgevpr.runtime.flight.consistency import Consistency, Seen
@@ -61,7 +61,16 @@ class Navigator:
         self._slew = Slew()
         self._vehicle: Vehicle | None = None
         self._attitude: Attitude | None = None
-        self._is_continuous = False
+        self._is_continuous, self._believes_gps = False, True
+
+    @property
+    def has_gps(self) -> bool:
+        """True where the autopilot's position is one by GPS that can be believed."""
+        return self._navigation.has_gps
+
+    def believe_gps(self, believes: bool) -> None:
+        """Navigate by GPS, or no longer."""
+        self._believes_gps = believes
 
     def hear_channel(self, channel: Channel) -> None:
         """Take in by which channel the autopilot is told positions: a continuous position must not rest on the velocity
@@ -75,7 +84,7 @@ class Navigator:
         """Take in a report of position and velocity."""
         with self._lock:
             self._vehicle = vehicle
-            self._navigation.hear_vehicle(vehicle)
+            self._navigation.hear_vehicle(vehicle, self._believes_gps)
 
     def hear_force(self, t_s: float, force_m_s2: tuple[float, float, float], attitude: Attitude) -> None:
         """Take in what the accelerometers feel."""
@@ -110,7 +119,7 @@ class Navigator:
                 t_s=t_s,
                 places=event.located.places or (event.best.place.place_id,),
             )
-            verdict = self._consistency.weighed(seen, expected, vehicle.has_gps)
+            verdict = self._consistency.weighed(seen, expected, self.has_gps)
             if verdict.objection:
                 return Advice(None, verdict.objection, is_held=True)
             self._navigation.hear_fix(off_m, covariance_m2, t_s, verdict.is_against)
@@ -150,7 +159,7 @@ class Navigator:
         """Say what is to be sent so that the autopilot is better off, if it can be."""
         if self._is_continuous:
             return Advice(None, _CONTINUOUS)
-        if self._navigation.has_gps:
+        if reckons_by_gps(vehicle):
             return Advice(None, _HAS_GPS)
         estimate = self._navigation.at(now_s)
         east_m_s, north_m_s = vehicle.velocity_m_s

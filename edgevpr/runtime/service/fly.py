@@ -26,6 +26,7 @@ from edgevpr.runtime.flight.flightlog import FlightLog, start_fields
 from edgevpr.runtime.flight.learning import say_learning_stopped
 from edgevpr.runtime.flight.loop import Stop
 from edgevpr.runtime.flight.navigator import Muted, Navigator
+from edgevpr.runtime.flight.sourcesets import SourceSets
 from edgevpr.runtime.flight.systemd import notify
 from edgevpr.runtime.preflight.choose import too_late
 from edgevpr.runtime.preflight.pick import Outlook, outlook, picked_technique, trusted_candidates, trusted_forms
@@ -71,7 +72,14 @@ def fly(config: Config, positions: Path | None = None) -> int:
         autopilot = NoAutopilot()
         if link:
             send_fixes = config.mavlink.send_fixes
-            autopilot = ToAutopilot(link, navigator, send_fixes=send_fixes, cores=board.cores, clock=Clock())
+            autopilot = ToAutopilot(
+                link,
+                navigator,
+                send_fixes=send_fixes,
+                cores=board.cores,
+                clock=Clock(),
+                source_sets=SourceSets(config.mavlink.source_sets),
+            )
             if not send_fixes:
                 autopilot.announce(Mood.WARNING, DRY_RUN)
         if cannot_learn:

@@ -1,0 +1,91 @@
+"""GPS against the map: a receiver that is far from where confident matches say is jammed, spoofed, or has a glitch."""
+
+import math
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+
+from edgevpr.geodesy import offset_m
+from edgevpr.navigation.navigation import worst_sd
+from edgevpr.runtime.recognise.locate import in_sd, matrix_of
+from edgevpr.runtime.recognise.recognition import Recognition
+from edgevpr.types import Vehicle
+
+_CONTRADICTS = 4.0  # standard deviations of both
+_LEAST_M = 15.0  # less is no danger, and seconds of a bad receiver
+_IN_A_ROW = 3
+_WITHIN_S = 30.0  # those in a row
+_TIME_SD_S = 0.1  # between a position of the receiver and a frame
+_ATTITUDE_SD = math.tan(math.radians(1.0))
+
+
+@dataclass(frozen=True, slots=True)
+class _Against:
+    """A match that contradicts GPS: the time, the places, and by how much (2,) metres."""
+
+    t_s: float
+    places: Collection[int]
+    off_m: np.ndarray
+
+
+class Integrity:
+    """Compares every accepted match with the receiver. Three in a row, of different places, that lie off GPS by the
+    same step say that GPS `is_wrong`; three that agree with it say that it is right again. `map_sd_m` is by how much
+    all matches may be off together, `off_m` by how many metres the last one lay off (None: there is no receiver)."""
+
+    def __init__(self, map_sd_m: float) -> None:
+        self._map_sd_m = map_sd_m
+        self._against: list[_Against] = []
+        self._agreeing = 0
+        self.is_wrong = False
+        self.off_m: float | None = None
+
+    def look(self, event: Recognition) -> str | None:
+        """Take in an accepted match with a position; return once, in a few words, that GPS is wrong, or right again;
+        None: there is no news."""
+        vehicle = event.vehicle
+        if vehicle is None or vehicle.gps is None or not vehicle.is_fresh_at(event.frame.t_mono_s):
+            self.off_m = None
+            return None
+        off_m, sd_m = _beside(event, vehicle), self._sd_m(event, vehicle)
+        self.off_m = math.hypot(*off_m)
+        if self.off_m <= _LEAST_M or in_sd(off_m, sd_m**2 * np.eye(2)) <= _CONTRADICTS:
+            self._against.clear()
+            self._agreeing += 1
+            if self.is_wrong and self._agreeing >= _IN_A_ROW:
+                self.is_wrong = False
+                return "GPS agrees with the map again"
+            return None
+        self._agreeing = 0
+        places = event.located.places or (event.best.place.place_id,)
+        this = _Against(event.frame.t_mono_s, places, off_m)
+        self._against = [
+            each
+            for each in self._against
+            if this.t_s - each.t_s <= _WITHIN_S and _are_alike(each, this, sd_m) and not set(each.places) >= set(places)
+        ]
+        self._against.append(this)
+        if not self.is_wrong and len(self._against) >= _IN_A_ROW:
+            self.is_wrong = True
+            return f"GPS is {self.off_m:.0f} m from the map's position"
+        return None
+
+    def _sd_m(self, event: Recognition, vehicle: Vehicle) -> float:
+        speed_m_s = math.hypot(*vehicle.velocity_m_s) if vehicle.velocity_m_s else 0.0
+        of_fix_m = worst_sd(matrix_of(event.located.covariance_m2))
+        tilt_m = _ATTITUDE_SD * (vehicle.height_m or 0.0)
+        return math.hypot(of_fix_m, self._map_sd_m, vehicle.gps.sd_m, tilt_m, _TIME_SD_S * speed_m_s)
+
+
+def _beside(event: Recognition, vehicle: Vehicle) -> np.ndarray:
+    """Return the step (2,), metres, from the receiver's position at the time of the frame to the match."""
+    gps, here = vehicle.gps, event.position
+    off_m = np.array(offset_m(gps.lat_deg, gps.lon_deg, here.lat_deg, here.lon_deg))
+    return off_m - (event.frame.t_mono_s - gps.t_s) * np.array(vehicle.velocity_m_s or (0.0, 0.0))
+
+
+def _are_alike(one: _Against, other: _Against, sd_m: float) -> bool:
+    """Tell whether two matches lie off GPS by the same step, as far as a receiver moves away at 10 m/s."""
+    room_m = math.hypot(2 * sd_m, 10.0 * (other.t_s - one.t_s))
+    return math.hypot(*(other.off_m - one.off_m)) <= 2 * room_m
