@@ -61,18 +61,16 @@ def run_autopilot(
     system_id: int = 1,
     track: Track | None = None,
     vehicle: str = DEFAULT_VEHICLE,
-    gps: bool | None = None,
+    gps: bool = False,
 ) -> AutopilotSummary:
     """Act as a flight controller at `link_url` until the time is up, `stop` is set, a signal comes or the line is cut.
 
     With a `track` it flies along the track from the moment a companion is first heard, and stays where the track ends;
-    without, it flies nobody knows where, and tells no position. `gps`: whether it has GPS (None: with a track); with
-    GPS it takes no fix. Raises LinkError where the link cannot be opened, UsageError for an unknown vehicle.
+    without, it flies nobody knows where, and tells no position. With `gps` it takes no fix. Raises LinkError where the
+    link cannot be opened, UsageError for an unknown vehicle.
     """
     motion = AlongTrack(track) if track else Nowhere()
-    has_gps = track is not None if gps is None else gps
-    controller = FlightController(vehicle, motion, gps=has_gps, system_id=system_id)
-    return serve(controller, link_url, duration_s, stop)
+    return serve(FlightController(vehicle, motion, gps=gps, system_id=system_id), link_url, duration_s, stop)
 
 
 def serve(

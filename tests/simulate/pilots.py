@@ -7,7 +7,7 @@ import subprocess
 import time
 from pathlib import Path
 
-from mavlink_peers import PATIENCE_S, free_port  # noqa: F401
+from mavlink_peers import PATIENCE_S
 
 from edgevpr.geodesy import distance_m
 from edgevpr.mavlink.wire import Receiver, mavlink
@@ -95,7 +95,11 @@ class Pilot:
         """Send a position fix; return the result in the answer to it."""
         fields = {"frame": 0, "z": math.nan, "param1": self.now_s, "param2": age_s, "param3": 5.0} | changes
         place = {"x": round(lat_deg * 1e7), "y": round(lon_deg * 1e7)}
-        return self.answer(mavlink.MAVLink_command_int_message(1, 1, command=FIX, current=0, autocontinue=0, param4=0, **place, **fields))
+        return self.answer(
+            mavlink.MAVLink_command_int_message(
+                1, 1, command=FIX, current=0, autocontinue=0, param4=0, **place, **fields
+            )
+        )
 
     def set(self, name: str, value: float) -> None:
         for _ in range(3):

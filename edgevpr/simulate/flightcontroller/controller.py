@@ -137,8 +137,12 @@ class FlightController:
         return result
 
     def _set_interval(self, command: Message) -> tuple[int, list[Message]]:
-        is_known = self._streams.ask(int(command.param1), command.param2, self._now_s)
-        return (mavlink.MAV_RESULT_ACCEPTED if is_known else mavlink.MAV_RESULT_DENIED), []
+        number = int(command.param1)
+        if self._streams.ask(number, command.param2, self._now_s):
+            return mavlink.MAV_RESULT_ACCEPTED, []
+        if self.brain.firmware == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA:
+            self.brain.texts.append((mavlink.MAV_SEVERITY_INFO, f"No ap_message for mavlink id ({number})"))
+        return mavlink.MAV_RESULT_DENIED, []
 
     def _get_interval(self, command: Message) -> tuple[int, list[Message]]:
         number = int(command.param1)

@@ -3,13 +3,14 @@
 AP_VisualOdom."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from edgevpr.mavlink.wire import Message, mavlink
 from edgevpr.simulate.flightcontroller.parameters import Parameters
 from edgevpr.simulate.flightcontroller.truth import Truth, beside
 
-NO_GPS, NO_FIX, FIX_3D = mavlink.GPS_FIX_TYPE_NO_GPS, mavlink.GPS_FIX_TYPE_NO_FIX, mavlink.GPS_FIX_TYPE_3D_FIX
+NO_FIX, FIX_3D = mavlink.GPS_FIX_TYPE_NO_FIX, mavlink.GPS_FIX_TYPE_3D_FIX
+_BEST_FIX = mavlink.GPS_FIX_TYPE_RTK_FIXED  # so good is that of ArduPilot's simulator
 _BY_MAVLINK = 14  # of GPS1_TYPE and GPS2_TYPE
 GPS_S = 0.2  # from one report of the simulated GPS to the next
 SIMULATED_SD_M = 0.3
@@ -39,10 +40,9 @@ class Measurement:
 class Gps:
     """A receiver as the autopilot sees it: its last report, and whether it comes often enough."""
 
-    def __init__(self, silent_type: int) -> None:
-        self.fix_type = silent_type
+    def __init__(self) -> None:
+        self.fix_type = NO_FIX
         self.last: Measurement | None = None
-        self._silent_type = silent_type  # what is said of it after four seconds of silence
         self._heard_s = -math.inf
         self._mean_s = 0.0
         self._late = 0
@@ -65,14 +65,14 @@ class Gps:
     def age(self, now_s: float) -> None:
         """Give up a receiver that has been silent for four seconds."""
         if now_s - self._heard_s > _TIMEOUT_S:
-            self.fix_type, self.last, self._mean_s = self._silent_type, None, 0.0
+            self.fix_type, self.last, self._mean_s = NO_FIX, None, 0.0
 
 
 class Receivers:
     """The first GPS, which sees the true position (and its glitch) while it is enabled, and the second one."""
 
     def __init__(self, parameters: Parameters) -> None:
-        self.first, self.second = Gps(NO_GPS), Gps(NO_FIX)
+        self.first, self.second = Gps(), Gps()
         self._parameters = parameters
         self._due_s = 0.0
         self._is_second_primary = False
@@ -89,21 +89,21 @@ class Receivers:
 
     def step(self, truth: Truth, now_s: float) -> None:
         """Let the simulated receiver report, and the silent ones be given up."""
-        if now_s >= self._due_s and self._parameters["SIM_GPS1_ENABLE"]:
+        if now_s >= self._due_s:
             self._due_s = now_s + GPS_S - 1e-6
-            glitch_deg = self._parameters["SIM_GPS1_GLTCH_X"], self._parameters["SIM_GPS1_GLTCH_Y"]
-            self.first.report(
-                FIX_3D,
-                Measurement(
-                    lat_deg=truth.lat_deg + glitch_deg[0],
-                    lon_deg=truth.lon_deg + glitch_deg[1],
-                    alt_m=truth.alt_m,
-                    sd_m=SIMULATED_SD_M,
-                    t_s=now_s,
-                    velocity_m_s=truth.velocity_m_s,
-                ),
+            north_deg, east_deg = self._parameters["SIM_GPS1_GLTCH_X"], self._parameters["SIM_GPS1_GLTCH_Y"]
+            seen = Measurement(
+                lat_deg=truth.lat_deg + north_deg,
+                lon_deg=truth.lon_deg + east_deg,
+                alt_m=truth.alt_m,
+                sd_m=SIMULATED_SD_M,
+                t_s=now_s,
+                velocity_m_s=truth.velocity_m_s,
             )
-        self.first.age(now_s)
+            if self._parameters["SIM_GPS1_ENABLE"]:
+                self.first.report(_BEST_FIX, seen)
+            else:  # it goes on to report, without a fix
+                self.first.report(NO_FIX, replace(self.first.last or seen, t_s=now_s))
         self.second.age(now_s)
         primary, other = (self.second, self.first) if self._is_second_primary else (self.first, self.second)
         if max(other.fix_type, FIX_3D - 1) > primary.fix_type:

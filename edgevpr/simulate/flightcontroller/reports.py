@@ -1,4 +1,4 @@
-"""What a flight controller says of itself: one function a message, from a `Moment` to the message, None where there is
+"""Reports of a flight controller on itself: one function a message, from a `Moment` to the message, None where there is
 nothing to say. Messages that a real one knows and this one has nothing to say of are in `SILENT`."""
 
 import math
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from edgevpr.mavlink.wire import Message, mavlink
 from edgevpr.simulate.flightcontroller.ardupilot import ArduPilot
 from edgevpr.simulate.flightcontroller.px4 import Px4
-from edgevpr.simulate.flightcontroller.receivers import FIX_3D, Gps
+from edgevpr.simulate.flightcontroller.receivers import FIX_3D, NO_FIX, Gps
 from edgevpr.simulate.flightcontroller.truth import Truth
 
 _UNKNOWN_16 = 65_535
@@ -101,9 +101,9 @@ def _second_gps(now: Moment) -> Message | None:
 
 def _gps(gps: Gps, now: Moment) -> dict:
     last = gps.last
-    if last is None or not now.is_known:
+    if last is None or not now.is_known:  # a second GPS that has never been heard, or has been silent for long
         lost = {"lat": 0, "lon": 0, "alt": 0, "eph": 9999, "epv": 9999, "vel": 0, "cog": 0}
-        return {"time_usec": 0, "fix_type": min(gps.fix_type, FIX_3D - 1), **lost, "satellites_visible": 0}
+        return {"time_usec": 0, "fix_type": NO_FIX, **lost, "satellites_visible": 0}
     east_m_s, north_m_s = last.velocity_m_s.real, last.velocity_m_s.imag
     return {
         "time_usec": round(last.t_s * 1e6),
@@ -115,7 +115,7 @@ def _gps(gps: Gps, now: Moment) -> dict:
         "epv": 200,
         "vel": min(_UNKNOWN_16 - 1, round(abs(last.velocity_m_s) * 100)),
         "cog": round(math.degrees(math.atan2(east_m_s, north_m_s)) % 360 * 100) % 36_000,
-        "satellites_visible": 10,
+        "satellites_visible": 10 if gps.fix_type >= FIX_3D else 3,
         "h_acc": round(last.sd_m * 1e3),
         "v_acc": round(last.sd_m * 1e3),
     }

@@ -1,4 +1,4 @@
-"""Where the simulated vehicle truly is. East and north are one complex number: east + 1j * north."""
+"""The true state of the simulated vehicle. East and north are one complex number: east + 1j * north."""
 
 from dataclasses import dataclass
 from typing import Protocol
