@@ -102,11 +102,6 @@ def test_ardupilot_judges_a_command_by_its_form(changes, result):
     assert controller.hear(command)[0].result == result
 
 
-def test_ardupilot_denies_a_fix_as_command_long():
-    command = mavlink.MAVLink_command_long_message(1, 1, messages.POSITION_FIX, 0, 0, 0, 5, 0, 50, 14, math.nan)
-    assert FlightController("arduplane", Nowhere(), gps=False).hear(command)[0].result == DENIED
-
-
 @pytest.mark.parametrize("vehicle", VEHICLES)
 def test_none_takes_a_fix_while_it_has_gps(vehicle):
     flown = Flown(vehicle).in_air()

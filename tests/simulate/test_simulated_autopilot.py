@@ -5,19 +5,24 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 
 import numpy as np
 import pytest
 from mavlink_peers import AutopilotThread, Peer, UdpPort, free_port, wait_until
 
+from edgevpr.cli.simulation import _VEHICLES
 from edgevpr.errors import LinkError, UsageError
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Fix, Health
 from edgevpr.mavlink.wire import mavlink
-from edgevpr.simulate.autopilot import run_autopilot
+from edgevpr.simulate.autopilot import run_autopilot, serve
+from edgevpr.simulate.flight import ORIGIN
+from edgevpr.simulate.flightcontroller.controller import VEHICLES, FlightController
+from edgevpr.simulate.flightcontroller.freeflight import FreeFlight
 from edgevpr.simulate.flightcontroller.recorded import Track, read_track, truth_at
 
 
@@ -170,3 +175,32 @@ def test_it_ends_when_its_time_is_up():
 def test_a_link_that_cannot_be_opened_is_one_sentence(link):
     with pytest.raises(LinkError, match="cannot be opened"):
         run_autopilot(link.format(free_port(socket.SOCK_STREAM)))
+
+
+def test_gps_is_switched_off_by_a_parameter_and_the_clock_may_run_fast():
+    number = free_port()
+    companion = Peer(UdpPort(number))
+    controller = FlightController("arducopter", FreeFlight("copter", ORIGIN), gps=True)
+    stop = threading.Event()
+    served = threading.Thread(
+        target=serve, args=(controller, f"udpout:127.0.0.1:{number}", None, stop), kwargs={"speedup": 100.0}
+    )
+    served.start()
+    try:
+        companion.expect_text("EKF3 IMU0 is using GPS")
+        for number, *values in ((176, 1, 4), (400, 1), (22, 0, 0, 0, 0, 0, 0, 30)):  # GUIDED, arm, take off
+            values += [0] * (7 - len(values))
+            companion.send(mavlink.MAVLink_command_long_message(1, 1, number, 0, *values), component_id=197)
+            assert companion.expect("COMMAND_ACK").result == mavlink.MAV_RESULT_ACCEPTED
+        companion.send(mavlink.MAVLink_param_set_message(1, 1, b"SIM_GPS1_ENABLE", 0, 9), component_id=197)
+        assert companion.expect("PARAM_VALUE").param_value == 0
+        companion.expect_text("EKF Failsafe: changed to LAND Mode")
+        companion.expect_text("EKF3 IMU0 stopped aiding")
+    finally:
+        stop.set()
+        served.join()
+        companion.port.close()
+
+
+def test_the_command_line_knows_every_vehicle():
+    assert set(_VEHICLES) == set(VEHICLES)

@@ -105,7 +105,7 @@ class ArduPilot:
         return flags | (mavlink.EKF_GPS_GLITCHING if self.test_ratio > 1 else 0)
 
     def take_fix(self, command: Message, truth: Truth, now_s: float) -> int:
-        """Judge command 43003, and set the position where it is accepted. A COMMAND_LONG comes with another frame."""
+        """Judge command 43003, and set the position where it is accepted."""
         is_global = command.frame in (mavlink.MAV_FRAME_GLOBAL, mavlink.MAV_FRAME_GLOBAL_INT)
         if not is_global or not math.isnan(command.z):
             return _DENIED

@@ -114,7 +114,7 @@ class FlightController:
 
     def _obey(self, command: Message) -> list[Message]:
         if command.command == POSITION_FIX:
-            return [self._ack(command, self._judge(_as_int(command)))]
+            return [self._ack(command, self._judge(command))]
         known = _COMMANDS.get(command.command)
         if known is None:
             return [self._ack(command, mavlink.MAV_RESULT_UNSUPPORTED)]
@@ -122,6 +122,8 @@ class FlightController:
         return [self._ack(command, result), *answers]
 
     def _judge(self, command: Message) -> int:
+        if command.get_type() == "COMMAND_LONG":  # PX4 would take that too, with a latitude in float32
+            return mavlink.MAV_RESULT_UNSUPPORTED
         result = self.brain.take_fix(command, self._truth, self._now_s)
         self.answers.append(result)
         if result == mavlink.MAV_RESULT_ACCEPTED:
@@ -215,25 +217,3 @@ _COMMANDS = {
     mavlink.MAV_CMD_DO_SET_MODE: FlightController._set_mode,
     mavlink.MAV_CMD_SET_EKF_SOURCE_SET: FlightController._use_source_set,
 }
-
-
-def _as_int(command: Message) -> Message:
-    """Return a COMMAND_LONG as the COMMAND_INT that firmware makes of it: relative to home, a latitude in float32."""
-    if command.get_type() == "COMMAND_INT":
-        return command
-    lat, lon = (int(each * 1e7) if abs(each) <= 180 else 0 for each in (command.param5, command.param6))
-    return mavlink.MAVLink_command_int_message(
-        target_system=command.target_system,
-        target_component=command.target_component,
-        frame=mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT,
-        command=command.command,
-        current=0,
-        autocontinue=0,
-        param1=command.param1,
-        param2=command.param2,
-        param3=command.param3,
-        param4=command.param4,
-        x=lat,
-        y=lon,
-        z=command.param7,
-    )
