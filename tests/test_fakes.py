@@ -19,7 +19,7 @@ from edgevpr.mavlink.messages import Fix, Health, Severity, status_text
 from edgevpr.mavlink.wire import mavlink
 from edgevpr.mavlink.wishes import Wish
 from edgevpr.runtime.flight.clock import Clock
-from edgevpr.simulate.autopilot import Track
+from edgevpr.simulate.flightcontroller.recorded import Track
 
 COUNT = 3
 
@@ -100,7 +100,7 @@ def link(request):
     """A link with an autopilot that takes fixes and says where it is; gives it with its clock."""
     clock = FakeClock()
     if request.param == "fake":
-        yield FakeLink(clock, vehicle=lambda: vehicle_at(50.0, 8.0, clock.now_s, has_gps=True)), clock
+        yield FakeLink(clock, vehicle=lambda: vehicle_at(50.0, 8.0, clock.now_s, has_gps=False)), clock
         return
     port = UdpPort()
     number = port.number
@@ -111,7 +111,7 @@ def link(request):
 
     def is_ready():
         clock.now_s = time.monotonic() + ahead_s  # the link says nothing twice while its clock stands still
-        return real.listens() and real.vehicle() and real.vehicle().has_gps
+        return real.listens() and real.vehicle()
 
     try:
         with Link(parse_link(f"udpout:127.0.0.1:{number}"), clock=clock) as real:
@@ -149,7 +149,7 @@ def test_where_the_vehicle_is_and_whether_it_listens(link):
     assert link.listens()
     vehicle = link.vehicle()
     assert (vehicle.lat_deg, vehicle.lon_deg, vehicle.alt_m) == (50.0, 8.0, 300.0)
-    assert (vehicle.heading_deg, vehicle.has_gps) == (None, True)
+    assert (vehicle.heading_deg, vehicle.has_gps) == (None, False)
     assert vehicle.is_fresh_at(clock.now_s)
     seen = link.vehicle_at(clock.now_s)
     assert (seen.lat_deg, seen.lon_deg, seen.heading_deg, seen.roll_deg) == (50.0, 8.0, None, None)

@@ -9,6 +9,9 @@ from typing import Any
 from edgevpr.cli.shared import add_json, command, group, print_json
 from edgevpr.errors import UsageError
 
+# Those of edgevpr.simulate.flightcontroller.controller, which is not loaded for a page of help.
+_VEHICLES = ("arduplane", "arducopter", "ardurover", "px4-copter", "px4-plane")
+
 
 def add(commands: Any) -> None:
     """Add the commands and their flags."""
@@ -18,6 +21,10 @@ def add(commands: Any) -> None:
     autopilot.add_argument("--duration-s", type=float, metavar="S", help="how long (default: until stopped)")
     autopilot.add_argument(
         "--track", metavar="CSV", help="a positions.csv with times to fly along, from when a companion is first heard"
+    )
+    autopilot.add_argument("--vehicle", choices=_VEHICLES, default=_VEHICLES[0], help=f"({_VEHICLES[0]})")
+    autopilot.add_argument(
+        "--no-gps", action="store_true", help="it has lost GPS, as it always has without --track: then it takes fixes"
     )
     add_json(autopilot)
     text = "write a flight, generated or over an orthophoto: images and positions.csv"
@@ -44,9 +51,12 @@ def add(commands: Any) -> None:
 
 def simulate_autopilot(args: Namespace) -> int:
     """Run a simulated flight controller, and print what it has received."""
-    from edgevpr.simulate.autopilot import read_track, run_autopilot
+    from edgevpr.simulate.autopilot import run_autopilot
+    from edgevpr.simulate.flightcontroller.recorded import read_track
 
-    summary = run_autopilot(args.link, args.duration_s, track=read_track(args.track) if args.track else None)
+    track = read_track(args.track) if args.track else None
+    has_gps = track is not None and not args.no_gps
+    summary = run_autopilot(args.link, args.duration_s, track=track, vehicle=args.vehicle, gps=has_gps)
     if args.json:
         print_json(asdict(summary))
     else:

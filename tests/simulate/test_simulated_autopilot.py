@@ -1,24 +1,29 @@
 """The simulated flight controller: strict, and honest about what it saw."""
 
 import json
-import math
 import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 
 import numpy as np
 import pytest
 from mavlink_peers import AutopilotThread, Peer, UdpPort, free_port, wait_until
 
+from edgevpr.cli.simulation import _VEHICLES
 from edgevpr.errors import LinkError, UsageError
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Fix, Health
 from edgevpr.mavlink.wire import mavlink
-from edgevpr.simulate.autopilot import Track, _position, judge, read_track, run_autopilot
+from edgevpr.simulate.autopilot import run_autopilot, serve
+from edgevpr.simulate.flight import ORIGIN
+from edgevpr.simulate.flightcontroller.controller import VEHICLES, FlightController
+from edgevpr.simulate.flightcontroller.freeflight import FreeFlight
+from edgevpr.simulate.flightcontroller.recorded import Track, read_track, truth_at
 
 
 def a_fix(**changes):
@@ -26,26 +31,6 @@ def a_fix(**changes):
     for field, value in changes.items():
         setattr(command, field, value)
     return command
-
-
-@pytest.mark.parametrize(
-    ("command", "result"),
-    [
-        (a_fix(), mavlink.MAV_RESULT_ACCEPTED),
-        (a_fix(frame=mavlink.MAV_FRAME_GLOBAL_INT), mavlink.MAV_RESULT_ACCEPTED),
-        (a_fix(frame=mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT), mavlink.MAV_RESULT_DENIED),
-        (a_fix(z=0.0), mavlink.MAV_RESULT_DENIED),
-        (a_fix(param3=0.0), mavlink.MAV_RESULT_DENIED),
-        (a_fix(param3=-1.0), mavlink.MAV_RESULT_DENIED),
-        (a_fix(param3=math.nan), mavlink.MAV_RESULT_DENIED),
-        (a_fix(param3=math.inf), mavlink.MAV_RESULT_DENIED),
-        (a_fix(x=900_000_001), mavlink.MAV_RESULT_DENIED),
-        (a_fix(y=-1_800_000_001), mavlink.MAV_RESULT_DENIED),
-        (a_fix(command=400), mavlink.MAV_RESULT_UNSUPPORTED),
-    ],
-)
-def test_a_command_is_judged_by_its_form(command, result):
-    assert judge(command) == result
 
 
 def test_it_answers_counts_and_remembers():
@@ -63,7 +48,7 @@ def test_it_answers_counts_and_remembers():
     assert (heartbeat.get_srcSystem(), heartbeat.get_srcComponent()) == (1, 1)
     assert heartbeat.autopilot == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
     results = []
-    for command in (a_fix(x=501234567), a_fix(z=3.0), a_fix(command=400)):
+    for command in (a_fix(x=501234567), a_fix(z=3.0), a_fix(command=31_000)):
         send(command)
         results.append(companion.expect("COMMAND_ACK").result)
     assert results == [mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_DENIED, mavlink.MAV_RESULT_UNSUPPORTED]
@@ -83,7 +68,7 @@ def test_it_answers_counts_and_remembers():
     assert summary.messages["COMMAND_INT"] == summary.messages_by_sender["1/197"]["COMMAND_INT"] == 5
     assert (summary.lost_packets, summary.bad_bytes) == (3, 5)
     assert json.loads(summary.to_json())["fixes"][0]["lat_deg"] == 50.1234567
-    assert "2 accepted, 1 denied" in str(summary)
+    assert "2 accepted, 0 failed, 1 denied" in str(summary)
 
 
 def test_it_is_a_process_that_ends_well_on_sigterm_and_says_what_it_saw():
@@ -116,6 +101,7 @@ def test_it_flies_along_a_track_from_when_a_companion_is_heard(tmp_path):
     csv.write_text("\n".join(["file,lat,lon,alt,yaw_deg,time", *rows]))
     number = free_port()
     with Link(parse_link(f"udpin:127.0.0.1:{number}")) as link:
+        link.want_position()
         autopilot = AutopilotThread(f"udpout:127.0.0.1:{number}", track=read_track(csv))
         seen = []
 
@@ -144,8 +130,12 @@ def test_it_says_how_fast_it_flies_along_the_track():
         alt_m=np.zeros(4),
         heading_deg=np.full(4, np.nan),
     )
-    velocities = [(_position(track, t_s).vx, _position(track, t_s).vy) for t_s in (0.0, 5.0, 15.0, 20.5, 30.0)]
-    assert velocities == [(1112, 0), (1112, 0), (0, 715), (32_700, -7147), (0, 0)], "north, then east; cm/s"
+    velocities = [truth_at(track, t_s).velocity_m_s for t_s in (0.0, 5.0, 15.0, 20.5, 30.0)]
+    expected = [11.12j, 11.12j, 7.15 + 0j, -71.47 + 327j, 0j]
+    assert [each.real for each in velocities] == pytest.approx([each.real for each in expected], abs=0.01)
+    assert [each.imag for each in velocities] == pytest.approx([each.imag for each in expected], abs=0.01), (
+        "north first"
+    )
 
 
 def test_it_says_how_it_hangs_in_the_air_where_the_track_knows(tmp_path):
@@ -156,6 +146,7 @@ def test_it_says_how_it_hangs_in_the_air_where_the_track_knows(tmp_path):
     )
     number = free_port()
     with Link(parse_link(f"udpin:127.0.0.1:{number}")) as link:
+        link.want_position()
         autopilot = AutopilotThread(f"udpout:127.0.0.1:{number}", track=read_track(csv))
 
         def with_attitude():
@@ -184,3 +175,32 @@ def test_it_ends_when_its_time_is_up():
 def test_a_link_that_cannot_be_opened_is_one_sentence(link):
     with pytest.raises(LinkError, match="cannot be opened"):
         run_autopilot(link.format(free_port(socket.SOCK_STREAM)))
+
+
+def test_gps_is_switched_off_by_a_parameter_and_the_clock_may_run_fast():
+    number = free_port()
+    companion = Peer(UdpPort(number))
+    controller = FlightController("arducopter", FreeFlight("copter", ORIGIN), gps=True)
+    stop = threading.Event()
+    served = threading.Thread(
+        target=serve, args=(controller, f"udpout:127.0.0.1:{number}", None, stop), kwargs={"speedup": 100.0}
+    )
+    served.start()
+    try:
+        companion.expect_text("EKF3 IMU0 is using GPS")
+        for number, *values in ((176, 1, 4), (400, 1), (22, 0, 0, 0, 0, 0, 0, 30)):  # GUIDED, arm, take off
+            values += [0] * (7 - len(values))
+            companion.send(mavlink.MAVLink_command_long_message(1, 1, number, 0, *values), component_id=197)
+            assert companion.expect("COMMAND_ACK").result == mavlink.MAV_RESULT_ACCEPTED
+        companion.send(mavlink.MAVLink_param_set_message(1, 1, b"SIM_GPS1_ENABLE", 0, 9), component_id=197)
+        assert companion.expect("PARAM_VALUE").param_value == 0
+        companion.expect_text("EKF Failsafe: changed to LAND Mode")
+        companion.expect_text("EKF3 IMU0 stopped aiding")
+    finally:
+        stop.set()
+        served.join()
+        companion.port.close()
+
+
+def test_the_command_line_knows_every_vehicle():
+    assert set(_VEHICLES) == set(VEHICLES)
