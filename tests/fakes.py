@@ -176,6 +176,7 @@ class FakeLink:
             dropped_stale_fixes=self._outbox.dropped_stale_fixes,
             withheld_fixes=self._outbox.withheld_fixes,
             foreign_messages=0,
+            refused_signatures={},
             dropped_queue_full=0,
             bad_bytes=0,
             reopened=0,

@@ -12,6 +12,7 @@ from edgevpr.mavlink.answers import Answers
 from edgevpr.mavlink.messages import Health, Severity
 from edgevpr.mavlink.outbox import Outbox, Sending
 from edgevpr.mavlink.peer import Autopilot
+from edgevpr.mavlink.signing import NOT_SIGNING, NotSigning, Signing
 from edgevpr.mavlink.wire import Message, Receiver, mavlink
 
 HEARTBEAT_S = 1.0
@@ -29,13 +30,21 @@ class Conversation:
     """
 
     def __init__(
-        self, clock: Callable[[], float], component_id: int, system_id: int | None, max_fix_age_s: float
+        self,
+        clock: Callable[[], float],
+        component_id: int,
+        system_id: int | None,
+        max_fix_age_s: float,
+        *,
+        signing: Signing | NotSigning = NOT_SIGNING,
     ) -> None:
         self.outbox = Outbox(max_fix_age_s)
         self.autopilot = Autopilot(component_id, system_id)
         self.answers = Answers()
-        self.receiver = Receiver()
+        self.signing = signing
+        self.receiver = Receiver(self.signing.admits)
         self.sent: Counter[str] = Counter()
+        self.component_id = component_id
         self._clock = clock
         self._health, self._health_set_s = Health.BOOT, clock()
         self._packer = mavlink.MAVLink(None, srcSystem=system_id or 1, srcComponent=component_id)
@@ -56,6 +65,7 @@ class Conversation:
         """Choose and pack the next message; return it with the fix in it, if it holds one. None: there is none."""
         while (chosen := self._next_message(self._clock())) is not None:
             message, sending = chosen
+            self.signing.stamp(self._packer)
             try:
                 packet = message.pack(self._packer)
             except (struct.error, OverflowError) as error:  # a value that its field cannot hold must not end the link

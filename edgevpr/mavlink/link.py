@@ -14,6 +14,7 @@ from edgevpr.mavlink.conversation import Conversation
 from edgevpr.mavlink.line import Line
 from edgevpr.mavlink.messages import Fix, Health
 from edgevpr.mavlink.outbox import MAX_FIX_WAIT_S, Sending
+from edgevpr.mavlink.signing import NOT_SIGNING, NotSigning, Signing
 from edgevpr.mavlink.stats import LinkStats
 from edgevpr.mavlink.transport import open_transport
 from edgevpr.mavlink.wire import Message
@@ -44,10 +45,11 @@ class Link:
         *,
         system_id: int | None = None,
         max_fix_age_s: float = MAX_FIX_WAIT_S,
+        signing: Signing | NotSigning = NOT_SIGNING,
     ) -> None:
         self._address = address
         self._clock = clock
-        self._conversation = Conversation(clock, component_id, system_id, max_fix_age_s)
+        self._conversation = Conversation(clock, component_id, system_id, max_fix_age_s, signing=signing)
         self._line: Line | None = None
         self._reopened = 0
         self._retry_s = RETRY_FIRST_S
@@ -120,6 +122,7 @@ class Link:
             dropped_stale_fixes=outbox.dropped_stale_fixes,
             withheld_fixes=outbox.withheld_fixes,
             foreign_messages=autopilot.identity.foreign_messages,
+            refused_signatures=dict(said.signing.refused),
             dropped_queue_full=outbox.dropped_queue_full,
             bad_bytes=said.receiver.bad_bytes,
             reopened=self._reopened,

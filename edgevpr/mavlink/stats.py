@@ -8,7 +8,8 @@ class LinkStats:
     """Counts and state of a link. `trouble` is the reason why it is or last was not open, None once data arrives.
 
     `foreign_messages` came from another autopilot or another address than ours and were refused. `withheld_fixes` were
-    not sent because those before had no answer.
+    not sent because those before had no answer. With a signing key, `refused_signatures` counts the messages without a
+    right signature or time stamp, by reason.
     """
 
     connected: bool
@@ -21,6 +22,7 @@ class LinkStats:
     dropped_stale_fixes: int
     withheld_fixes: int
     foreign_messages: int
+    refused_signatures: dict[str, int]
     dropped_queue_full: int
     bad_bytes: int
     reopened: int

@@ -6,7 +6,7 @@ this package must not.
 """
 
 from collections import Counter
-from collections.abc import Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -18,9 +18,10 @@ _SENDERS_MAX = 8  # whose unfinished messages are kept; a flood from invented ad
 
 class Receiver:
     """The parser of what arrives, apart for each sender: a message that one begins swallows nothing of another's. It
-    yields the messages; bytes that are no message are dropped and counted."""
+    yields the messages that are admitted; bytes that are no message are dropped and counted."""
 
-    def __init__(self) -> None:
+    def __init__(self, admits: Callable[[Message], bool] = lambda message: True) -> None:
+        self._admits = admits
         self.received: Counter[str] = Counter()  # messages by name
         self.bad_bytes = 0
         self.forget_partial_message()
@@ -43,7 +44,7 @@ class Receiver:
                 self.bad_bytes += len(message.data)
             elif isinstance(message, mavlink.MAVLink_unknown):
                 self.received["UNKNOWN"] += 1  # one name for all: there are 16 million message numbers
-            else:
+            elif self._admits(message):
                 self.received[message.get_type()] += 1
                 yield message
 

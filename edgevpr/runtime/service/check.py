@@ -16,7 +16,8 @@ from edgevpr.frames.condition import Condition
 from edgevpr.frames.overlay import FEWEST_FRAMES, learn_overlay, require_png, write_mask
 from edgevpr.frames.source import Source, open_source
 from edgevpr.helpers.files import require_folder
-from edgevpr.mavlink.address import parse_link
+from edgevpr.mavlink.address import parse_links
+from edgevpr.mavlink.signing import read_key
 from edgevpr.mavlink.transport import open_transport
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import map_path
@@ -163,16 +164,21 @@ def _source(config: Config) -> str:
 
 
 def _link(config: Config) -> str:
-    if config.mavlink.link is None:
+    addresses = [each for each in parse_links(config.mavlink.link, config.mavlink.ground) if each]
+    if not addresses:
         return "none, so what is recognised goes into the log only"
-    address = parse_link(config.mavlink.link)
-    try:
-        open_transport(address).close()
-    except OSError as error:
-        raise LinkError(
-            f"{address} is not there ({error.strerror}): connect it or start the other end, or correct the link."
-        ) from error
-    return str(address) if config.mavlink.send_fixes else f"{address}, {DRY_RUN}"
+    for address in addresses:
+        try:
+            open_transport(address).close()
+        except OSError as error:
+            raise LinkError(
+                f"{address} is not there ({error.strerror}): connect it or start the other end, or correct the link."
+            ) from error
+    said = [str(address) for address in addresses]
+    if config.mavlink.signing_key is not None:
+        read_key(config.mavlink.signing_key)  # the time is not looked at, for the same reason as the log in `_log`
+        said.append("signed")
+    return ", ".join(said if config.mavlink.send_fixes else [*said, DRY_RUN])
 
 
 def _log(config: Config) -> str:

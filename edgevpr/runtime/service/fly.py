@@ -13,8 +13,10 @@ from edgevpr import __version__
 from edgevpr.config import Config, MavlinkConfig
 from edgevpr.errors import MapError, UsageError
 from edgevpr.frames.source import open_source
-from edgevpr.mavlink.address import LinkAddress, parse_link
+from edgevpr.mavlink.address import LinkAddress, parse_links
+from edgevpr.mavlink.ground import GroundLink
 from edgevpr.mavlink.link import Link
+from edgevpr.mavlink.signing import open_signing
 from edgevpr.power.boards import Board, load_board
 from edgevpr.runtime.flight.autopilot import DRY_RUN, Mood, NoAutopilot, ToAutopilot
 from edgevpr.runtime.flight.clock import Clock
@@ -42,7 +44,7 @@ def fly(config: Config, positions: Path | None = None) -> int:
     EdgevprError, one sentence, where the flight cannot start."""
     if config.source.uri is None:
         raise UsageError("There is no source of frames: name one with --source, or `source: {uri: ...}`.")
-    address = parse_link(config.mavlink.link) if config.mavlink.link is not None else None
+    address, ground = parse_links(config.mavlink.link, config.mavlink.ground)
     if config.mapping.learn:
         check_positions(config, positions)
     board = load_board(config.board)
@@ -58,6 +60,7 @@ def fly(config: Config, positions: Path | None = None) -> int:
         link = stack.enter_context(_link(address, config.mavlink)) if address else None
         if link:
             link.want_position()
+        ground_link = stack.enter_context(GroundLink(ground, link)) if link and ground else None
         step_s = 1 / rate_hz(config, recogniser)
         source = open_source(config.source.uri, step_s=step_s, positions=positions, live=True)
         stack.callback(source.close)
@@ -94,6 +97,7 @@ def fly(config: Config, positions: Path | None = None) -> int:
             unusable=flown.failed,
             **flown.totals,
             mavlink=link.stats() if link else None,
+            **({"ground": ground_link.stats()} if ground_link else {}),
             **({"learnt": learner.totals} if learner else {}),
         )
         _log.info(
@@ -110,7 +114,13 @@ def fly(config: Config, positions: Path | None = None) -> int:
 
 
 def _link(address: LinkAddress, settings: MavlinkConfig) -> Link:
-    return Link(address, settings.component_id, system_id=settings.system_id, max_fix_age_s=settings.max_fix_age_s)
+    return Link(
+        address,
+        settings.component_id,
+        system_id=settings.system_id,
+        max_fix_age_s=settings.max_fix_age_s,
+        signing=open_signing(settings.signing_key, settings.signing_state),
+    )
 
 
 def _opened(config: Config, board: Board) -> tuple[Recogniser, Learner | None, str | None]:
