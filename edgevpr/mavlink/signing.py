@@ -16,7 +16,7 @@ from types import MappingProxyType
 
 from edgevpr.errors import ConfigError
 from edgevpr.helpers.files import open_file
-from edgevpr.mavlink.timestamps import FUTURE, OLD, TimeStamps
+from edgevpr.mavlink.timestamps import CROWDED, FUTURE, OLD, TimeStamps
 from edgevpr.mavlink.wire import Message, mavlink
 
 KEY_BYTES = 32
@@ -31,6 +31,7 @@ _MEANING = {
     WRONG: "the other end has another key, or somebody forges them",
     OLD: "they are sent again by somebody, or the other end does not hear us, from whom it takes the time",
     FUTURE: "a clock of some sender is wrong, or those of all others are",
+    CROWDED: "there are more of them than an aircraft and its ground have",
 }
 
 log = logging.getLogger(__name__)

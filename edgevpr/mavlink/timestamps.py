@@ -18,7 +18,9 @@ _KEPT_EVERY = 30 * TICKS_S
 # before, to us or by us, is less than a minute old, and a replay of it passes for no new stream.
 _MOVED_ON = _KEPT_EVERY + 60 * TICKS_S
 
-OLD, FUTURE = "old time stamp", "time stamp from the future"
+_STREAMS_MAX = 64  # far more than are on the air; invented ones must not fill the memory
+
+OLD, FUTURE, CROWDED = "old time stamp", "time stamp from the future", "too many senders"
 
 Stream = tuple[int, int, int]  # system, component and link id of a sender
 
@@ -68,13 +70,22 @@ class TimeStamps:
             now = max(self._largest, self._now())
             if stamp <= self._streams.get(stream, now - _NEAR):
                 return OLD
-            if self._streams and stream not in self._streams and stamp > now + _NEAR:
-                return FUTURE
+            if stream not in self._streams:
+                if self._streams and stamp > now + _NEAR:
+                    return FUTURE
+                if self._is_crowded(now):
+                    return CROWDED
             self._streams[stream] = stamp
             if stamp > now:
                 self._rebase(stamp)
                 self._move_on(stamp)
             return None
+
+    def _is_crowded(self, now: int) -> bool:
+        if len(self._streams) >= _STREAMS_MAX:
+            # What these have sent stays refused: as a new stream's it would be older than a minute.
+            self._streams = {stream: last for stream, last in self._streams.items() if last > now - _NEAR}
+        return len(self._streams) >= _STREAMS_MAX
 
     def _now(self) -> int:
         """Return the time of the system's clock, or that which has gone on since the largest time was learnt."""

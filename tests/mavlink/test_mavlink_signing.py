@@ -25,7 +25,7 @@ from edgevpr.mavlink.signing import (
     open_signing,
     read_key,
 )
-from edgevpr.mavlink.timestamps import FUTURE, OLD, TICKS_S, TimeStamps
+from edgevpr.mavlink.timestamps import CROWDED, FUTURE, OLD, TICKS_S, TimeStamps
 from edgevpr.mavlink.wire import Receiver, mavlink
 
 KEY, OTHER_KEY = bytes(range(32)), bytes(32)
@@ -135,6 +135,17 @@ def test_a_new_stream_must_be_within_a_minute(signing, ahead_s, refused):
     new = Signer(stamp=NOW + ahead_s * TICKS_S, link_id=1).packet()
     admitted(signing, Signer().packet(), new)
     assert signing.refused == refused
+
+
+def test_invented_senders_fill_no_memory_and_shut_out_nobody_for_long(signing, clock):
+    streams = [Signer(system_id=system_id, link_id=2) for system_id in range(1, 256)]
+    packets = [each.packet() for each in streams]
+    admitted(signing, *packets)
+    assert signing.refused == {CROWDED: 255 - 64}
+    ours = Signer()
+    assert admitted(signing, ours.packet()) == [False]
+    clock.now_s += 61
+    assert admitted(signing, ours.packet(NOW + 61 * TICKS_S), *packets) == [True] + [False] * 255, "a replay passed"
 
 
 def test_the_first_stream_may_be_ahead_and_sets_the_time(signing, clock):
