@@ -76,15 +76,15 @@ class Signing:
         signing.timestamp = self._stamps.next()
 
     def admits(self, message: Message) -> bool:
-        """Tell whether a message is to be believed. Count it where it is not, except for RADIO_STATUS without a
-        signature: a radio has no key, and nobody here needs its word."""
-        reason = self._refusal(message.get_msgbuf(), message.get_header())
-        if reason is None:
+        """Tell whether a message is to be believed, and count it where it is not. A RADIO_STATUS needs no signature,
+        since a radio has no key; but it must not speak for an autopilot."""
+        header = message.get_header()
+        reason = self._refusal(message.get_msgbuf(), header)
+        if reason is None or (reason == UNSIGNED and _is_of_radio(header)):
             return True
-        if not (reason == UNSIGNED and message.get_msgId() == mavlink.MAVLINK_MSG_ID_RADIO_STATUS):
-            if reason not in self.refused:
-                log.warning("messages are refused (%s): %s", reason, _MEANING[reason])
-            self.refused[reason] += 1
+        if reason not in self.refused:
+            log.warning("messages are refused (%s): %s", reason, _MEANING[reason])
+        self.refused[reason] += 1
         return False
 
     def _refusal(self, packet: bytes, header: mavlink.MAVLink_header) -> str | None:
@@ -96,6 +96,10 @@ class Signing:
             return WRONG
         stamp = int.from_bytes(packet[-_STAMP_BYTES - _SIGNATURE_BYTES : -_SIGNATURE_BYTES], "little")
         return self._stamps.refusal((header.srcSystem, header.srcComponent, packet[-_BLOCK_BYTES]), stamp)
+
+
+def _is_of_radio(header: mavlink.MAVLink_header) -> bool:
+    return header.msgId == mavlink.MAVLINK_MSG_ID_RADIO_STATUS and header.srcComponent != mavlink.MAV_COMP_ID_AUTOPILOT1
 
 
 def open_signing(key_path: str | None, state_path: str | None) -> Signing | NotSigning:

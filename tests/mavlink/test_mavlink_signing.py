@@ -113,10 +113,12 @@ def test_unsigned_messages_are_refused_counted_and_told_once(signing, caplog):
     assert caplog.text.count("does not sign") == 1
 
 
-def test_an_unsigned_radio_status_is_not_counted_and_tells_nobody_anything(signing):
+def test_a_radio_status_needs_no_signature_but_must_not_speak_for_the_autopilot(signing):
     message = mavlink.MAVLink_radio_status_message(1, 2, 3, 4, 5, 6, 7)
-    assert admitted(signing, unsigned(message)) == [False]
+    assert admitted(signing, message.pack(mavlink.MAVLink(None, 51, 68))) == [True]
     assert signing.refused == {}
+    assert admitted(signing, unsigned(message)) == [False]
+    assert signing.refused == {UNSIGNED: 1}
     assert admitted(signing, Signer().packet(message=message)) == [True]
 
 
