@@ -27,9 +27,12 @@ _PAGE_MB = 4096 / 1e6
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
-    """What was tried, and what came of it. `believed` are the messages of a known kind that came through,
-    `grown_mb` is the memory of the process after the first tenth and at the end, `us_each` and `mb_s` are the CPU time
-    of hearing alone."""
+    """What was tried, and what came of it.
+
+    `believed` are the messages of a known kind that came through, among them the autopilot's own first, and those that
+    a change has left whole. `grown_mb` is what the process has grown by since the first tenth. `us_each` and `mb_s` are
+    of the CPU time of hearing alone.
+    """
 
     kind: str
     packets: int
@@ -52,8 +55,8 @@ class _Maker:
     """Makes packets from a seed. Signed ones have time stamps that go on with the clock of their hearer."""
 
     def __init__(self, rng: random.Random, stamp: int) -> None:
-        self.rng, self._stamp = rng, stamp
-        self._sent: list[bytes] = []
+        self.rng, self._start, self._stamp = rng, stamp, stamp
+        self.recorded = b""  # a true message
 
     def packet(self, *, length: int | None = None, system_id: int = 1, component_id: int = 1, flags: int = 0) -> bytes:
         """Make a message of any kind with any content and a right checksum; `length` is not always the kind's own."""
@@ -64,10 +67,10 @@ class _Maker:
         crc = mavlink.x25crc(covered + bytes([kind.crc_extra])).crc
         return b"\xfd" + covered + crc.to_bytes(2, "little")
 
-    def signed(self, key: bytes = KEY, *, ahead: int = 0, **header: int) -> bytes:
+    def signed(self, key: bytes = KEY, stamp: int | None = None, **header: int) -> bytes:
         self._stamp += 1000
         packet = self.packet(flags=mavlink.MAVLINK_IFLAG_SIGNED, **header)
-        packet += b"\x00" + (self._stamp + ahead).to_bytes(6, "little")
+        packet += b"\x00" + (self._stamp if stamp is None else stamp).to_bytes(6, "little")
         return packet + hashlib.sha256(key + packet).digest()[:6]
 
     def mutated(self, packet: bytes) -> bytes:
@@ -86,15 +89,15 @@ class _Maker:
         return make(length=one_of(256), system_id=one_of(256), component_id=one_of(256))
 
     def forged(self) -> bytes:
-        """Make a message with another key, an old or far time stamp, one of before, or an invented stream's."""
-        far = self.rng.choice((-(10**9), 2**46))
-        self._sent = [*self._sent[-50:], self.signed(ahead=-(10**8))]
+        """Make a message with another key, of a time before the autopilot's or far ahead; the autopilot's own again, or
+        one without a signature."""
+        before, far = self.rng.randrange(self._start), self._start + self.rng.randrange(2**40, 2**46)
         return self.rng.choice(
             (
-                lambda: self.signed(OTHER_KEY, ahead=far),
-                lambda: self.signed(ahead=-(10**9)),
-                lambda: self.signed(system_id=self.rng.randrange(2, 256), ahead=2**46),
-                lambda: self.rng.choice(self._sent),
+                lambda: self.signed(OTHER_KEY, self.rng.choice((before, far))),
+                lambda: self.signed(stamp=before),
+                lambda: self.signed(stamp=self.rng.choice((before, far)), system_id=self.rng.randrange(2, 256)),
+                lambda: self.recorded,
                 lambda: self.packet(),
             )
         )()
@@ -145,7 +148,8 @@ class Hearer:
         if with_key:
             packer.signing.sign_outgoing, packer.signing.secret_key = True, KEY
             packer.signing.timestamp = stamps.next() + TICKS_S // 1000
-        assert self.conversation.hear(beat.pack(packer), self.clock(), None)
+        self.maker.recorded = beat.pack(packer)
+        assert self.conversation.hear(self.maker.recorded, self.clock(), None)
 
     def hear(self, packets: list[bytes], senders: int) -> None:
         """Hear packets from one or many senders, then say what is to be said, a fix among it."""

@@ -29,7 +29,7 @@ _MAKE_ONE = "`(umask 077; head -c 32 /dev/urandom > FILE)` makes one"
 _MEANING = {
     UNSIGNED: "the other end does not sign: give it the key, or remove `mavlink.signing_key`",
     WRONG: "the other end has another key, or somebody forges them",
-    OLD: "they are sent again by somebody, or the other end does not hear us, from whom it takes the time",
+    OLD: "usual for a moment after a start; else they are sent again by somebody, or the other end does not hear us",
     FUTURE: "a clock of some sender is wrong, or those of all others are",
     CROWDED: "there are more of them than an aircraft and its ground have",
 }
