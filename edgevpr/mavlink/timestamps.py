@@ -40,6 +40,7 @@ class TimeStamps:
         self._path, self._mono_s, self._utc_s = path, mono_s, utc_s
         self._lock, self._writing = Lock(), Lock()
         self._streams: dict[Stream, int] = {}
+        self._said = False
         self._written = _read(path)
         self._rebase(self._written + _MOVED_ON)
         self._largest = self._kept = self._now()
@@ -115,7 +116,9 @@ class TimeStamps:
                 self._written = stamp
 
     def _say_not_kept(self, error: OSError) -> None:
-        log.warning("%s: the time of signed messages is not kept (%s)", self._path, error.strerror)
+        if not self._said:
+            self._said = True
+            log.warning("%s: the time of signed messages is not kept (%s)", self._path, error.strerror)
 
 
 def _read(path: Path) -> int:
