@@ -16,6 +16,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import bench_streams
+import hostile_bytes
 import hostile_flights
 import hostile_inputs
 import hostile_kills
@@ -28,13 +29,14 @@ from edgevpr.helpers.tables import markdown
 
 RESULTS = Path(__file__).resolve().parent / "results"
 # name: (title, how it is run, usual count: of the pictures of each stream, of each set of pictures, kind of packet or
-# input, and in all of maps and of kills of each kind)
+# input, and in all of maps and of kills of each kind; of `bytes`, ten times as many bytes)
 PARTS = {
     "streams": ("Streams: pictures that are cut, corrupted, lost or frozen", bench_streams.run, 240),
     "flights": ("Flights behind such streams: how much older than claimed a picture was", hostile_flights.run, 800),
     "pictures": ("Pictures that say nothing, and those of the other camera", hostile_pictures.run_in_groups, 276),
     "maps": ("Maps that are damaged", hostile_maps.run, 200),
     "links": ("Links: packets and autopilots that are not ours", hostile_links.run, 1000),
+    "bytes": ("Bytes and packets: random, changed, and forged", hostile_bytes.run, 1_000_000),
     "kills": ("`kill -9` while mapping and learning", hostile_kills.run, 40),
     "inputs": ("Files and command lines that are wrong", hostile_inputs.run, 150),
 }

@@ -209,6 +209,7 @@ class FakeLink:
             unanswered_fixes=self._replies.unanswered,
             refused_why=self._replies.refusal and self._replies.refusal.brief,
             foreign_messages=0,
+            refused_signatures={},
             dropped_queue_full=0,
             bad_bytes=0,
             reopened=0,

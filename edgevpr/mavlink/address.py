@@ -39,5 +39,13 @@ def parse_link(url: str) -> LinkAddress:
     return LinkAddress(kind, where, int(number))
 
 
+def parse_links(flight: str | None, ground: str | None) -> tuple[LinkAddress | None, LinkAddress | None]:
+    """Read the links to the flight controller and to the ground, None where there is none. Raises LinkAddressError for
+    one that is wrong, and for one to the ground alone."""
+    if flight is None and ground is not None:
+        raise LinkAddressError("`mavlink.ground` is a second link: name the flight controller's as `mavlink.link`.")
+    return (None if flight is None else parse_link(flight)), (None if ground is None else parse_link(ground))
+
+
 def _is_whole_number(text: str, low: int, high: int) -> bool:
     return text.isascii() and text.isdigit() and len(text) < 10 and low <= int(text) <= high

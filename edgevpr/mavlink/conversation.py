@@ -18,6 +18,7 @@ from edgevpr.mavlink.peer import Autopilot
 from edgevpr.mavlink.reasons import why_silent
 from edgevpr.mavlink.replies import Replies
 from edgevpr.mavlink.requests import Requests
+from edgevpr.mavlink.signing import NOT_SIGNING, NotSigning, Signing
 from edgevpr.mavlink.texts import Texts
 from edgevpr.mavlink.wire import Message, Receiver, Tap, mavlink, untapped
 from edgevpr.mavlink.wishes import Wishes
@@ -51,6 +52,7 @@ class Conversation:
         *,
         listener: Listener = _NOBODY,
         tap: Tap = untapped,
+        signing: Signing | NotSigning = NOT_SIGNING,
     ) -> None:
         self.outbox = Outbox(max_fix_age_s)
         self.autopilot = Autopilot(component_id, system_id, listener)
@@ -58,8 +60,10 @@ class Conversation:
         self.answers, self.replies = Answers(), Replies()
         self.texts, self.wishes = Texts(), Wishes()
         self.requests = Requests(self.wishes)
-        self.receiver = Receiver(tap=tap)
+        self.signing = signing
+        self.receiver = Receiver(signing.admits, tap=tap)
         self.sent: Counter[str] = Counter()
+        self.component_id = component_id
         self._clock = clock
         self._health, self._health_set_s = Health.BOOT, clock()
         self._packer = mavlink.MAVLink(None, srcSystem=system_id or 1, srcComponent=component_id)
@@ -92,6 +96,7 @@ class Conversation:
         """Choose and pack the next message; return it with the fix in it, if it holds one. None: there is none."""
         while (chosen := self._next_message(self._clock())) is not None:
             message, sending = chosen
+            self.signing.stamp(self._packer)
             try:
                 packet = message.pack(self._packer)
             except (struct.error, OverflowError) as error:  # a value that its field cannot hold must not end the link

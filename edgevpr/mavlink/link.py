@@ -17,6 +17,7 @@ from edgevpr.mavlink.line import Line
 from edgevpr.mavlink.listener import Listener, NoListener
 from edgevpr.mavlink.messages import Fix, Health, Severity
 from edgevpr.mavlink.outbox import MAX_FIX_WAIT_S, Sending
+from edgevpr.mavlink.signing import NOT_SIGNING, NotSigning, Signing
 from edgevpr.mavlink.stats import LinkStats
 from edgevpr.mavlink.transport import open_transport
 from edgevpr.mavlink.wire import Message, Tap, untapped
@@ -54,11 +55,14 @@ class Link:
         max_fix_age_s: float = MAX_FIX_WAIT_S,
         listener: Listener = _NOBODY,
         tap: Tap = untapped,
+        signing: Signing | NotSigning = NOT_SIGNING,
     ) -> None:
         self._address = address
         self._tap = tap
         self._clock = clock
-        self._conversation = Conversation(clock, component_id, system_id, max_fix_age_s, listener=listener, tap=tap)
+        self._conversation = Conversation(
+            clock, component_id, system_id, max_fix_age_s, listener=listener, tap=tap, signing=signing
+        )
         self._line: Line | None = None
         self._reopened = 0
         self._retry_s = RETRY_FIRST_S
@@ -154,6 +158,7 @@ class Link:
             unanswered_fixes=said.replies.unanswered,
             refused_why=said.replies.refusal and said.replies.refusal.brief,
             foreign_messages=autopilot.identity.foreign_messages,
+            refused_signatures=dict(said.signing.refused),
             dropped_queue_full=outbox.dropped_queue_full,
             bad_bytes=said.receiver.bad_bytes,
             reopened=self._reopened,

@@ -1,6 +1,7 @@
 """The queues of the link: messages, of which the newest matter most, and fixes, which are never sent late."""
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from threading import Event, Lock
 
@@ -70,12 +71,14 @@ class Outbox:
         self.dropped_queue_full = 0
         self.dropped_stale_fixes = 0
         self.withheld_fixes = 0
+        self.copy_to: Callable[[Message], None] = lambda message: None  # gets every message that is queued, and no fix
 
     def put(self, message: Message) -> None:
         """Queue a message; if the queue is full, the oldest message is dropped."""
         with self._lock:
             self.dropped_queue_full += len(self._messages) == MESSAGES_MAX
             self._messages.append(message)
+        self.copy_to(message)
 
     def put_fix(self, fix: Fix, now_s: float) -> Sending:
         """Queue a fix, to be sent within the longest wait and before its frame is 5 s old, or not at all."""

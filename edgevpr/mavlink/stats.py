@@ -11,6 +11,7 @@ class LinkStats:
     not sent because those before had no answer, or the ground has paused the flight. `unanswered_fixes` were sent and
     had no answer within a second, and `refused_why` is why the last one was refused (None: none was), in a few words.
     `commands` counts those that were for us, by result, and `ignored_requests` what else was for us and had no effect.
+    With a signing key, `refused_signatures` counts the messages without a right signature or time stamp, by reason.
     """
 
     connected: bool
@@ -27,6 +28,7 @@ class LinkStats:
     unanswered_fixes: int
     refused_why: str | None
     foreign_messages: int
+    refused_signatures: dict[str, int]
     dropped_queue_full: int
     bad_bytes: int
     reopened: int

@@ -23,10 +23,10 @@ def untapped(packet: bytes) -> None:
 
 class Receiver:
     """The parser of what arrives, apart for each sender: a message that one begins swallows nothing of another's. It
-    yields the messages; bytes that are no message are dropped and counted."""
+    yields the messages that are admitted; bytes that are no message are dropped and counted."""
 
-    def __init__(self, *, tap: Tap = untapped) -> None:
-        self._tap = tap
+    def __init__(self, admits: Callable[[Message], bool] = lambda message: True, *, tap: Tap = untapped) -> None:
+        self._admits, self._tap = admits, tap
         self.received: Counter[str] = Counter()  # messages by name
         self.bad_bytes = 0
         self.forget_partial_message()
@@ -48,10 +48,11 @@ class Receiver:
             if message.get_type() == "BAD_DATA":
                 self.bad_bytes += len(message.data)
                 continue
-            self._tap(message.get_msgbuf())
+            if message.get_msgId() != mavlink.MAVLINK_MSG_ID_SETUP_SIGNING:  # which holds a key
+                self._tap(message.get_msgbuf())
             if isinstance(message, mavlink.MAVLink_unknown):
                 self.received["UNKNOWN"] += 1  # one name for all: there are 16 million message numbers
-            else:
+            elif self._admits(message):
                 self.received[message.get_type()] += 1
                 yield message
 

@@ -30,7 +30,7 @@ class Drift:
 # Dead reckoning by an autopilot: nearly all of the error is wind that it does not know. In simulation, an ArduPilot
 # plane in a wind of 6 m/s was 5 m/s wrong 10 s after the loss of GPS, and up to 7.5 m/s later.
 RECKONED = Drift(
-    velocity_sd=2.5, acceleration_sd=0.0, position_noise=0.3, velocity_noise=0.5, acceleration_noise=0.0
+    velocity_sd=4.0, acceleration_sd=0.0, position_noise=0.3, velocity_noise=0.5, acceleration_noise=0.0
 )  # fmt: skip
 # Accelerations turned by the autopilot's attitude: half a degree of tilt is 0.09 m/s2.
 INERTIAL = Drift(

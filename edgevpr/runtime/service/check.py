@@ -15,8 +15,9 @@ from edgevpr.frames.condition import Condition
 from edgevpr.frames.overlay import FEWEST_FRAMES, learn_overlay, require_png, write_mask
 from edgevpr.frames.source import Source, open_source
 from edgevpr.helpers.files import require_folder
-from edgevpr.mavlink.address import LinkAddress, parse_link
+from edgevpr.mavlink.address import LinkAddress, parse_links
 from edgevpr.mavlink.asking import Asking
+from edgevpr.mavlink.signing import read_key
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import map_path
 from edgevpr.power.boards import load_board
@@ -181,12 +182,18 @@ def _with_a_frame(source: Source, uri: str) -> str:
 
 def _link(config: Config, look: Callable[[Asking, LinkAddress], str]) -> str:
     settings = config.mavlink
-    if settings.link is None:
+    address, ground = parse_links(settings.link, settings.ground)
+    if address is None:
         return "none, so what is recognised goes into the log only"
-    address = parse_link(settings.link)
     with Asking(address, settings.component_id, settings.system_id) as asking:
-        said = f"{address}{look(asking, address)}"
-    return said if settings.send_fixes else f"{said}, {DRY_RUN}"
+        said = [f"{address}{look(asking, address)}"]
+    if ground:
+        with Asking(ground, settings.component_id, settings.system_id):
+            said.append(f"ground station at {ground}")
+    if settings.signing_key is not None:
+        read_key(settings.signing_key)  # the time is not looked at, for the same reason as the log in `_log`
+        said.append("signed")
+    return ", ".join(said if settings.send_fixes else [*said, DRY_RUN])
 
 
 def _only_opened(asking: Asking, address: LinkAddress) -> str:

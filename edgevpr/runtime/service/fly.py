@@ -13,8 +13,10 @@ from edgevpr import __version__
 from edgevpr.config import Config, MavlinkConfig
 from edgevpr.errors import EdgevprError, MapError, UsageError
 from edgevpr.frames.source import open_source
-from edgevpr.mavlink.address import LinkAddress, parse_link
+from edgevpr.mavlink.address import LinkAddress, parse_links
+from edgevpr.mavlink.ground import GroundLink
 from edgevpr.mavlink.link import Link
+from edgevpr.mavlink.signing import open_signing
 from edgevpr.mavlink.tlog import Tlog
 from edgevpr.mavlink.wire import Tap, untapped
 from edgevpr.power.boards import Board, load_board
@@ -46,7 +48,7 @@ def fly(config: Config, positions: Path | None = None) -> int:
     EdgevprError, one sentence, where the flight cannot start."""
     if config.source.uri is None:
         raise UsageError("There is no source of frames: name one with --source, or `source: {uri: ...}`.")
-    address = parse_link(config.mavlink.link) if config.mavlink.link is not None else None
+    address, ground = parse_links(config.mavlink.link, config.mavlink.ground)
     if config.mapping.learn:
         check_positions(config, positions)
     board = load_board(config.board)
@@ -65,6 +67,7 @@ def fly(config: Config, positions: Path | None = None) -> int:
         link = stack.enter_context(_link(address, config.mavlink, navigator, tap)) if address else None
         if link:
             link.want_position()
+        ground_link = stack.enter_context(GroundLink(ground, link)) if link and ground else None
         source = open_source(config.source.uri, step_s=step_s, positions=positions, live=True)
         stack.callback(source.close)
         if link and not source.is_live:
@@ -108,6 +111,7 @@ def fly(config: Config, positions: Path | None = None) -> int:
             unusable=flown.failed,
             **flown.totals,
             mavlink=link.stats() if link else None,
+            **({"ground": ground_link.stats()} if ground_link else {}),
             **({"learnt": learner.totals} if learner else {}),
         )
         _log.info(
@@ -131,6 +135,7 @@ def _link(address: LinkAddress, settings: MavlinkConfig, navigator: Navigator, t
         max_fix_age_s=settings.max_fix_age_s,
         listener=navigator if settings.send_fixes else Muted(navigator),
         tap=tap,
+        signing=open_signing(settings.signing_key, settings.signing_state),
     )
 
 

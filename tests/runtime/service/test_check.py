@@ -89,6 +89,21 @@ def test_a_dry_run_is_said(settings, config_file):
     assert link.message.endswith(", dry run: no fix is sent")
 
 
+def test_a_ground_link_and_a_signing_key_are_looked_at(settings, config_file, tmp_path):
+    key = tmp_path / "key"
+    key.write_bytes(bytes(32))
+    key.chmod(0o600)
+    settings["mavlink"] |= {"ground": "udpout:127.0.0.1:9", "signing_key": str(key)}
+    assert wrong(config_file, settings) == []
+    assert not key.with_name("key.time").exists(), "root must not make what the service is to write"
+    key.chmod(0o640)
+    (finding,) = wrong(config_file, settings)
+    assert (finding.what, "chmod 600" in finding.message) == ("link", True)
+    settings["mavlink"] = {"ground": "udpout:127.0.0.1:9"}
+    (finding,) = wrong(config_file, settings)
+    assert (finding.what, "second link" in finding.message) == ("link", True)
+
+
 def test_all_is_well_and_nothing_is_left_behind(settings, config_file, tmp_path, flight_folder):
     assert wrong(config_file, settings) == []
     assert list(tmp_path.iterdir()) == [config_file]

@@ -33,3 +33,16 @@ def test_the_keys_of_the_configuration_reach_the_link():
 def test_a_value_out_of_range_is_refused(key, value):
     with pytest.raises(ConfigError, match=key):
         load_config(None, {f"mavlink.{key}": value})
+
+
+def test_the_key_and_where_the_time_is_kept_reach_the_link(tmp_path):
+    key, state = tmp_path / "key", tmp_path / "state"
+    key.write_bytes(bytes(32))
+    key.chmod(0o600)
+    config = load_config(None, {"mavlink.signing_key": str(key), "mavlink.signing_state": str(state)})
+    with closing(UdpPort()) as port, fly._link(parse_link(f"udpout:127.0.0.1:{port.number}"), config.mavlink):
+        assert Peer(port).expect("HEARTBEAT").get_header().incompat_flags == 1  # signed
+    assert state.exists()
+    key.chmod(0o644)
+    with pytest.raises(ConfigError, match="chmod 600"):
+        fly._link(parse_link("udpout:127.0.0.1:9"), config.mavlink)

@@ -1,0 +1,218 @@
+"""Hostile bytes: random ones, streams that are damaged, and packets of any content with a right checksum or signature,
+heard by the whole of a link but its port: parser, signing, the choice of the autopilot, and what it says."""
+
+import gc
+import hashlib
+import logging
+import random
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from edgevpr.mavlink.conversation import Conversation
+from edgevpr.mavlink.messages import Fix
+from edgevpr.mavlink.signing import NOT_SIGNING, Signing
+from edgevpr.mavlink.timestamps import TICKS_S, TimeStamps
+from edgevpr.mavlink.wire import mavlink
+
+BYTES = 10  # times as many bytes as packets are tried
+BATCH = 500  # packets between two looks at what the link says
+SENDERS = 20  # addresses of a listening port
+KEY, OTHER_KEY = bytes(range(32)), bytes(32)
+_KINDS = tuple(mavlink.mavlink_map.values())
+_PAGE_MB = 4096 / 1e6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Row:
+    """What was tried, and what came of it.
+
+    `believed` are the messages of a known kind that came through, among them the autopilot's own first, and those that
+    a change has left whole. `grown_mb` is what the process has grown by since the first tenth. `us_each` and `mb_s` are
+    of the CPU time of hearing alone.
+    """
+
+    kind: str
+    packets: int
+    mb: float
+    believed: int
+    exceptions: int
+    grown_mb: float
+    us_each: float
+    mb_s: float
+
+
+class _Clock:
+    now_s = 1000.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+class _Maker:
+    """Makes packets from a seed. Signed ones have time stamps that go on with the clock of their hearer."""
+
+    def __init__(self, rng: random.Random, stamp: int) -> None:
+        self.rng, self._start, self._stamp = rng, stamp, stamp
+        self.recorded = b""  # a true message
+
+    def packet(self, *, length: int | None = None, system_id: int = 1, component_id: int = 1, flags: int = 0) -> bytes:
+        """Make a message of any kind with any content and a right checksum; `length` is not always the kind's own."""
+        kind = self.rng.choice(_KINDS)
+        payload = self.rng.randbytes(kind.unpacker.size if length is None else length)
+        head = bytes([len(payload), flags, 0, self.rng.randrange(256), system_id, component_id])
+        covered = head + kind.id.to_bytes(3, "little") + payload
+        crc = mavlink.x25crc(covered + bytes([kind.crc_extra])).crc
+        return b"\xfd" + covered + crc.to_bytes(2, "little")
+
+    def signed(self, key: bytes = KEY, stamp: int | None = None, **header: int) -> bytes:
+        self._stamp += 1000
+        packet = self.packet(flags=mavlink.MAVLINK_IFLAG_SIGNED, **header)
+        packet += b"\x00" + (self._stamp if stamp is None else stamp).to_bytes(6, "little")
+        return packet + hashlib.sha256(key + packet).digest()[:6]
+
+    def mutated(self, packet: bytes) -> bytes:
+        """Flip some bits, or cut, or double, or lose a part."""
+        way, at = self.rng.randrange(4), self.rng.randrange(len(packet))
+        if way == 0:
+            changed = bytearray(packet)
+            for _ in range(self.rng.randint(1, 8)):
+                changed[self.rng.randrange(len(packet))] ^= 1 << self.rng.randrange(8)
+            return bytes(changed)
+        to = self.rng.randrange(at, len(packet)) + 1
+        return (packet[:at], packet[:to] + packet[at:], packet[:at] + packet[to:])[way - 1]
+
+    def any_header(self, make: Callable[..., bytes]) -> bytes:
+        one_of = self.rng.randrange
+        return make(length=one_of(256), system_id=one_of(256), component_id=one_of(256))
+
+    def forged(self) -> bytes:
+        """Make a message with another key, of a time before the autopilot's or far ahead; the autopilot's own again, or
+        one without a signature."""
+        before, far = self.rng.randrange(self._start), self._start + self.rng.randrange(2**40, 2**46)
+        return self.rng.choice(
+            (
+                lambda: self.signed(OTHER_KEY, self.rng.choice((before, far))),
+                lambda: self.signed(stamp=before),
+                lambda: self.signed(stamp=self.rng.choice((before, far)), system_id=self.rng.randrange(2, 256)),
+                lambda: self.recorded,
+                lambda: self.packet(),
+            )
+        )()
+
+
+# Kind: whether there is a key, and what makes the next packet of it.
+KINDS: dict[str, tuple[bool, Callable[[_Maker], bytes]]] = {
+    "changed anywhere": (False, lambda maker: maker.mutated(maker.packet())),
+    "any content, right checksum": (False, lambda maker: maker.packet()),
+    "any header and length, right checksum": (False, lambda maker: maker.any_header(maker.packet)),
+    "signed, changed anywhere": (True, lambda maker: maker.mutated(maker.signed())),
+    "signed, any content": (True, lambda maker: maker.signed()),
+    "signed, any header and length": (True, lambda maker: maker.any_header(maker.signed)),
+    "forged, old, replayed or unsigned": (True, _Maker.forged),
+}
+
+
+def _random_bytes(maker: _Maker) -> bytes:
+    return maker.rng.randbytes(BYTES)
+
+
+def _beginnings(maker: _Maker) -> bytes:
+    """Make ten bytes, among them more beginnings of messages than chance has."""
+    return bytes(maker.rng.choice((0xFD, 0xFE, 0, 1, 255, maker.rng.randrange(256))) for _ in range(BYTES))
+
+
+BYTE_KINDS: dict[str, tuple[bool, Callable[[_Maker], bytes]]] = {
+    "random bytes": (False, _random_bytes),
+    "random bytes, with a key": (True, _random_bytes),
+    "beginnings of messages": (False, _beginnings),
+}
+
+
+class Hearer:
+    """A link without its port, which knows its autopilot. Its clock goes on by a hundredth of a second a packet."""
+
+    def __init__(self, rng: random.Random, folder: Path, with_key: bool) -> None:
+        self.clock = _Clock()
+        stamps = TimeStamps(folder / "time", self.clock, lambda: 1.8e9 + self.clock.now_s)
+        signing = Signing(KEY, stamps) if with_key else NOT_SIGNING
+        self.conversation = Conversation(self.clock, 197, None, 1.0, signing=signing)
+        self.conversation.want_position()
+        self.maker = _Maker(rng, stamps.next())
+        self.failures: list[str] = []
+        self.heard_s = 0.0
+        beat = mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 1, 0, 4, 3)
+        packer = mavlink.MAVLink(None, 1, 1)
+        if with_key:
+            packer.signing.sign_outgoing, packer.signing.secret_key = True, KEY
+            packer.signing.timestamp = stamps.next() + TICKS_S // 1000
+        self.maker.recorded = beat.pack(packer)
+        assert self.conversation.hear(self.maker.recorded, self.clock(), None)
+
+    def hear(self, packets: list[bytes], senders: int) -> None:
+        """Hear packets from one or many senders, then say what is to be said, a fix among it."""
+        sender = ("192.0.2.1", self.maker.rng.randrange(senders)) if senders > 1 else None
+        begin_s = time.thread_time()
+        for packet in packets:
+            self.clock.now_s += 0.01
+            self._try(lambda packet=packet: self.conversation.hear(packet, self.clock.now_s, sender))
+        self.heard_s += time.thread_time() - begin_s
+        self._try(self._speak)
+
+    def _speak(self) -> None:
+        self.conversation.outbox.put_fix(Fix(50.0, 8.0, 20.0, self.clock.now_s), self.clock.now_s)
+        while (said := self.conversation.next_packet()) is not None:
+            if said[1]:
+                self.conversation.note_departed([said[1]])
+        self.conversation.tell_of_answers()
+        self.conversation.autopilot.vehicle_at(self.clock.now_s)
+
+    def _try(self, act: Callable[[], object]) -> None:
+        try:
+            act()
+        except Exception as error:  # which of them does not matter: none is right
+            self.failures.append(repr(error))
+
+
+def run(count: int, seed: int) -> list[Row]:
+    """Try `count` packets of every kind, and ten times as many bytes of the kinds that are no packets."""
+    rng = random.Random(seed)
+    logger = logging.getLogger("edgevpr.mavlink")
+    level, logger.level = logger.level, logging.CRITICAL  # thousands of warnings are what is wanted
+    try:
+        return [_row(kind, *made, count, rng) for kind, made in {**BYTE_KINDS, **KINDS}.items()]
+    finally:
+        logger.level = level
+
+
+def _row(kind: str, with_key: bool, make: Callable[[_Maker], bytes], count: int, rng: random.Random) -> Row:
+    with TemporaryDirectory(ignore_cleanup_errors=True) as folder:  # the time may just be being kept in it
+        hearer = Hearer(rng, Path(folder), with_key)
+        done = heard_bytes = 0
+        before_mb = None
+        while done < count:
+            packets = [make(hearer.maker) for _ in range(min(BATCH, count - done))]
+            hearer.hear(packets, senders=SENDERS if done // BATCH % 2 else 1)
+            done += len(packets)
+            heard_bytes += sum(map(len, packets))
+            if before_mb is None and done >= count / 10:
+                before_mb = _rss_mb()
+        after_mb = _rss_mb()
+        received = hearer.conversation.receiver.received
+    return Row(
+        kind=kind,
+        packets=count,
+        mb=round(heard_bytes / 1e6, 1),
+        believed=received.total() - received["UNKNOWN"],
+        exceptions=len(hearer.failures),
+        grown_mb=round(after_mb - before_mb, 1),
+        us_each=round(1e6 * hearer.heard_s / count, 1),
+        mb_s=round(heard_bytes / 1e6 / hearer.heard_s, 2),
+    )
+
+
+def _rss_mb() -> float:
+    gc.collect()
+    return int(Path("/proc/self/statm").read_text().split()[1]) * _PAGE_MB

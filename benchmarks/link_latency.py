@@ -1,0 +1,219 @@
+"""How long a fix takes from `send_fix` to the wire, and what an idle link costs: writes results/link.md.
+
+python benchmarks/link_latency.py [--fixes N] [--idle-s S]
+
+The other end is another process, which notes when it has read a fix: its waking up is in the time. It streams what
+edgevpr asks an autopilot for: attitude ten times a second and position five times, with heartbeats.
+"""
+
+import argparse
+import json
+import os
+import pty
+import select
+import socket
+import statistics
+import subprocess
+import sys
+import time
+import tty
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from run_sets import made_by
+
+from edgevpr.helpers.tables import markdown
+from edgevpr.mavlink.address import parse_link
+from edgevpr.mavlink.link import Link
+from edgevpr.mavlink.messages import POSITION_FIX, Fix
+from edgevpr.mavlink.signing import NOT_SIGNING, Signing
+from edgevpr.mavlink.timestamps import TimeStamps
+from edgevpr.mavlink.wire import Message, Receiver, mavlink
+
+RESULTS = Path(__file__).resolve().parent / "results"
+EVERY_S = 0.02  # between two fixes, and a little more each time, so that they meet the streams everywhere
+KEY = bytes(range(32))
+STREAMS: dict[float, Callable[[], Message]] = {
+    1.0: lambda: mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 1, 0, 4, 3),
+    0.1: lambda: mavlink.MAVLink_attitude_message(0, 0.1, 0.2, 0.3, 0.0, 0.0, 0.0),
+    0.2: lambda: mavlink.MAVLink_global_position_int_message(0, 50 * 10**7, 8 * 10**7, 0, 0, 0, 0, 0, 0),
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkRow:
+    """One kind of link: milliseconds from `send_fix` to the other end, and the share of a core while it is idle."""
+
+    link: str
+    fixes: int
+    median_ms: float
+    p99_ms: float
+    most_ms: float
+    idle_cpu_share: float
+    idle_messages_s: float
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--fixes", type=int, default=1000)
+    parser.add_argument("--idle-s", type=float, default=60.0)
+    parser.add_argument("--peer", nargs=3, metavar=("KIND", "FD", "KEY"), help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.peer:
+        _peer(args.peer[0], int(args.peer[1]), bytes.fromhex(args.peer[2]))
+        return
+    rows = [asdict(row(kind, signed, args.fixes, args.idle_s)) for kind in OPENERS for signed in (False, True)]
+    page = report(made := made_by(), rows)
+    (RESULTS / "link.json").write_text(json.dumps({**made, "rows": rows}, indent=2) + "\n")
+    (RESULTS / "link.md").write_text(page)
+    print(page)
+
+
+def row(kind: str, signed: bool, fixes: int, idle_s: float) -> LinkRow:
+    """Measure one kind of link, with or without signing."""
+    with TemporaryDirectory(ignore_cleanup_errors=True) as folder, OPENERS[kind]() as (url, descriptor):
+        signing = Signing(KEY, TimeStamps(Path(folder) / "time")) if signed else NOT_SIGNING
+        command = [sys.executable, __file__, "--peer", kind, str(descriptor), KEY.hex() if signed else ""]
+        with subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, pass_fds=[descriptor], text=True
+        ) as peer:
+            with Link(parse_link(url), signing=signing) as link:
+                while not link.listens():
+                    time.sleep(0.01)
+                sent_s = _send(link, fixes)
+                time.sleep(1.0)
+                cpu_share, messages_s = _idle(link, idle_s)
+            arrived_s = json.loads(peer.communicate("")[0])
+    took_ms = sorted(1000 * (arrived_s[str(number)] - sent_s[number]) for number in range(fixes))
+    return LinkRow(
+        link=f"{kind}, signed" if signed else kind,
+        fixes=len(took_ms),
+        median_ms=statistics.median(took_ms),
+        p99_ms=took_ms[round(0.99 * (fixes - 1))],
+        most_ms=took_ms[-1],
+        idle_cpu_share=cpu_share,
+        idle_messages_s=messages_s,
+    )
+
+
+def _send(link: Link, fixes: int) -> list[float]:
+    """Send fixes as a flight does, waiting until each has left; return the times of their sending."""
+    sent_s = []
+    for number in range(fixes):
+        time.sleep(EVERY_S + number % 17 / 1000)
+        now_s = time.monotonic()
+        sending = link.send_fix(Fix(number / 1e7, 8.0, 20.0, now_s))
+        sent_s.append(now_s)
+        sending.wait(0.02)
+    return sent_s
+
+
+def _idle(link: Link, idle_s: float) -> tuple[float, float]:
+    """Return the share of a core that this process takes while its link is idle, and the messages heard a second."""
+    before, cpu_s, begin_s = sum(link.stats().received.values()), time.process_time(), time.monotonic()
+    time.sleep(idle_s)
+    cpu_s, lasted_s = time.process_time() - cpu_s, time.monotonic() - begin_s
+    return cpu_s / lasted_s, (sum(link.stats().received.values()) - before) / lasted_s
+
+
+@contextmanager
+def _udp() -> Iterator[tuple[str, int]]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind(("127.0.0.1", 0))
+        yield f"udpout:127.0.0.1:{sock.getsockname()[1]}", sock.fileno()
+
+
+@contextmanager
+def _tcp() -> Iterator[tuple[str, int]]:
+    with socket.create_server(("127.0.0.1", 0)) as sock:
+        yield f"tcp:127.0.0.1:{sock.getsockname()[1]}", sock.fileno()
+
+
+@contextmanager
+def _serial() -> Iterator[tuple[str, int]]:
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    yield f"serial:{os.ttyname(slave)}:921600", master
+    os.close(master)
+    os.close(slave)
+
+
+# The kinds of link, each with its address and what the other end reads from.
+OPENERS = {"udp": _udp, "tcp": _tcp, "serial (pty)": _serial}
+
+
+class _Port:
+    """The other end: of a UDP socket, a listening TCP socket or the master of a pseudo terminal."""
+
+    def __init__(self, kind: str, descriptor: int) -> None:
+        self.descriptor, self._to = descriptor, None
+        self._sock = None if kind.startswith("serial") else socket.socket(fileno=descriptor)
+        if kind == "tcp":
+            self._sock = self._sock.accept()[0]
+            self._sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self.descriptor = self._sock.fileno()
+        elif kind == "udp":
+            self._to = self._sock.recvfrom(4096)[1]
+
+    def read(self) -> bytes:
+        return os.read(self.descriptor, 4096)
+
+    def write(self, data: bytes) -> None:
+        if self._to:
+            self._sock.sendto(data, self._to)
+        else:
+            os.write(self.descriptor, data)
+
+
+def _peer(kind: str, descriptor: int, key: bytes) -> None:
+    """Be an autopilot until standard input ends, then print when each fix was read."""
+    port, packer, receiver = _Port(kind, descriptor), mavlink.MAVLink(None, 1, 1), Receiver()
+    if key:
+        packer.signing.sign_outgoing, packer.signing.secret_key = True, key
+        packer.signing.timestamp = int((time.time() - 1_420_070_400 + 120) * 1e5)
+    due_s = dict.fromkeys(STREAMS, time.monotonic())
+    arrived_s: dict[int, float] = {}
+    while True:
+        wait_s = max(0.0, min(due_s.values()) - time.monotonic())
+        ready, _, _ = select.select([sys.stdin, port.descriptor], [], [], wait_s)
+        if sys.stdin in ready:
+            break
+        if port.descriptor in ready:
+            data, now_s = port.read(), time.monotonic()
+            for message in receiver.feed(data):
+                if message.get_type() == "COMMAND_INT":
+                    arrived_s[message.x] = now_s
+                    port.write(mavlink.MAVLink_command_ack_message(POSITION_FIX, 0).pack(packer))
+        for every_s, make in STREAMS.items():
+            if time.monotonic() >= due_s[every_s]:
+                due_s[every_s] += every_s
+                port.write(make().pack(packer))
+    print(json.dumps(arrived_s))
+
+
+def report(made: dict, rows: list[dict]) -> str:
+    """Return the page for people."""
+    columns = ["link", "fixes", "median, ms", "99 %, ms", "most, ms", "idle, % of a core", "messages/s"]
+    cells = [
+        [
+            each["link"],
+            str(each["fixes"]),
+            *(f"{each[name]:.2f}" for name in ("median_ms", "p99_ms", "most_ms")),
+            f"{100 * each['idle_cpu_share']:.2f}",
+            f"{each['idle_messages_s']:.1f}",
+        ]
+        for each in rows
+    ]
+    return (
+        "# From a fix to the wire, and an idle link\n\nMade by `python benchmarks/link_latency.py`, "
+        f"{made['date']}, commit {made['commit']}, {made['machine']['cores']} cores of {made['machine']['cpu']}. From "
+        "`send_fix` to the moment when another process on this machine has read the bytes; and the CPU time of a link "
+        f"that only hears an autopilot and beats.\n\n{markdown(columns, cells)}\n"
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,113 @@
+"""Losses as they happen with pymavlink's connections at the other end, or with other programs at the device."""
+
+import os
+import pty
+import socket
+import tty
+from contextlib import closing
+
+import pytest
+import serial
+from fakes import FakeClock
+from mavlink_peers import UdpPort, free_port, wait_until
+
+from edgevpr.mavlink.address import parse_link
+from edgevpr.mavlink.link import Link
+from edgevpr.mavlink.wire import mavlink
+
+BEAT = mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 1, 0, 4, 3)
+
+
+@pytest.fixture
+def mavutil(monkeypatch):
+    monkeypatch.setenv("MAVLINK20", "1")
+    from pymavlink import mavutil
+
+    return mavutil
+
+
+def beat_until_heard(other, link: Link, beats: int) -> None:
+    """Let pymavlink's end beat until the link has heard it so often, and read a heartbeat of the link."""
+
+    def heard() -> bool:
+        other.recv_match(blocking=False)
+        other.mav.heartbeat_send(2, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 1, 0, 4)
+        return link.stats().received.get("HEARTBEAT", 0) >= beats and link.stats().autopilot_heard
+
+    wait_until(heard, "hearing pymavlink")
+
+
+def test_a_tcp_server_of_pymavlink_closes_refuses_and_comes_back(mavutil):
+    url = f"tcpin:127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    other = mavutil.mavlink_connection(url, dialect="all", source_system=7, source_component=1)
+    with Link(parse_link(url.replace("tcpin", "tcp"))) as link:
+        for times in (1, 2, 3):
+            beat_until_heard(other, link, beats=link.stats().received.get("HEARTBEAT", 0) + 1)
+            other.close()
+            other.listen.close()
+            wait_until(lambda: link.stats().trouble == "Connection refused", "being refused")
+            assert not link.listens(), "no fix must leave for who answers next"
+            other = mavutil.mavlink_connection(url, dialect="all", source_system=7, source_component=1)
+            wait_until(lambda times=times: link.stats().reopened == times, "coming back")
+    other.close()
+    other.listen.close()
+
+
+def test_a_udp_end_of_pymavlink_starts_again_at_its_port(mavutil):
+    url = f"udpin:127.0.0.1:{free_port()}"
+    with Link(parse_link(url.replace("udpin", "udpout"))) as link:
+        for _ in range(3):
+            with closing(mavutil.mavlink_connection(url, dialect="all", source_system=7, source_component=1)) as other:
+                first = other.recv_match(type="HEARTBEAT", blocking=True, timeout=60)
+                assert first.get_srcComponent() == 197
+                beat_until_heard(other, link, beats=link.stats().received.get("HEARTBEAT", 0) + 1)
+        assert (link.stats().reopened, link.stats().bad_bytes) == (0, 0)
+
+
+def test_a_program_of_pymavlink_cannot_take_our_port_away(mavutil):
+    """Two of pymavlink's own bind to one port without a word, and the first then hears nothing."""
+    number = free_port()
+    url = f"udpin:127.0.0.1:{number}"
+    with Link(parse_link(url), clock=FakeClock()) as link, closing(UdpPort(to=number)) as port:
+        for everywhere in (url, url.replace("127.0.0.1", "0.0.0.0")):
+            with pytest.raises(OSError, match="in use"):
+                mavutil.mavlink_connection(everywhere)
+        port.send(BEAT.pack(mavlink.MAVLink(None, 7, 1)))
+        wait_until(link.listens, "hearing the autopilot")
+
+
+def test_a_device_that_another_program_probes_when_it_appears_is_opened_later(tmp_path):
+    """A modem manager opens what is plugged in: at the start that is said, in flight it is waited for."""
+    device = tmp_path / "ttyACM0"
+    with Link(parse_link(f"serial:{device}:57600")) as link:
+        assert link.stats().trouble == "No such file or directory"
+        master, slave = pty.openpty()
+        tty.setraw(slave)
+        with serial.Serial(os.ttyname(slave), exclusive=True):
+            device.symlink_to(os.ttyname(slave))
+            wait_until(lambda: "in use by another program" in link.stats().trouble, "finding it in use")
+        wait_until(lambda: link.stats().connected, "opening it")
+        os.write(master, BEAT.pack(mavlink.MAVLink(None, 7, 1)))
+        wait_until(link.listens, "hearing the autopilot")
+        assert link.stats().trouble is None
+    os.close(master)
+    os.close(slave)
+
+
+def test_a_device_that_comes_back_under_another_number_is_found_by_its_name(tmp_path):
+    """A flight controller that restarts may become ttyACM1; its name in by-id leads there, and the old one is gone."""
+    device = tmp_path / "usb-ArduPilot-if00"
+    with Link(parse_link(f"serial:{device}:57600")) as link:
+        for system_id in (7, 7, 7):
+            master, slave = pty.openpty()
+            tty.setraw(slave)
+            fresh = tmp_path / "fresh"
+            fresh.symlink_to(os.ttyname(slave))
+            fresh.replace(device)
+            wait_until(lambda: link.stats().connected, "opening it")
+            os.write(master, BEAT.pack(mavlink.MAVLink(None, system_id, 1)))
+            wait_until(link.listens, "hearing the autopilot")
+            os.close(master)
+            os.close(slave)
+            wait_until(lambda: not link.listens(), "noticing the loss")
+        assert link.stats().received["HEARTBEAT"] == 3

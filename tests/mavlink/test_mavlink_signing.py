@@ -1,0 +1,296 @@
+"""Signing, against pymavlink's own: true, forged, replayed, future and unsigned messages, and the keys of users."""
+
+import os
+import re
+import stat
+import time
+from contextlib import closing
+
+import pytest
+from fakes import FakeClock
+from mavlink_peers import Peer, UdpPort, free_port, wait_until
+
+from edgevpr.errors import ConfigError
+from edgevpr.mavlink.address import parse_link
+from edgevpr.mavlink.conversation import Conversation
+from edgevpr.mavlink.link import Link
+from edgevpr.mavlink.messages import Fix
+from edgevpr.mavlink.signing import (
+    _MAKE_ONE,
+    NOT_SIGNING,
+    TO_AUTOPILOT,
+    UNSIGNED,
+    WRONG,
+    Signing,
+    open_signing,
+    read_key,
+)
+from edgevpr.mavlink.timestamps import CROWDED, FUTURE, OLD, TICKS_S, TimeStamps
+from edgevpr.mavlink.wire import Receiver, mavlink
+
+KEY, OTHER_KEY = bytes(range(32)), bytes(32)
+NOW = 1_000_000 * TICKS_S  # the time stamp that the clocks of these tests begin with
+UTC_S = 1_420_070_400 + NOW / TICKS_S
+
+
+@pytest.fixture
+def clock():
+    return FakeClock()
+
+
+@pytest.fixture
+def signing(tmp_path, clock):
+    start_s = clock.now_s
+    return Signing(KEY, TimeStamps(tmp_path / "time", clock, lambda: UTC_S + clock.now_s - start_s))
+
+
+class Signer:
+    """One stream of signed heartbeats, made by pymavlink."""
+
+    def __init__(self, key: bytes = KEY, stamp: int = NOW, link_id: int = 0, system_id: int = 7) -> None:
+        self.packer = mavlink.MAVLink(None, system_id, 1)
+        self.packer.signing.sign_outgoing = True
+        self.packer.signing.secret_key, self.packer.signing.link_id = key, link_id
+        self.packer.signing.timestamp = stamp
+
+    def packet(self, stamp: int | None = None, message=None) -> bytes:
+        if stamp is not None:
+            self.packer.signing.timestamp = stamp
+        message = message or mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 1, 0, 4, 3)
+        return message.pack(self.packer)
+
+
+def admitted(signing: Signing, *packets: bytes) -> list[bool]:
+    receiver = Receiver(signing.admits)
+    return [bool(list(receiver.feed(packet))) for packet in packets]
+
+
+def unsigned(message=None) -> bytes:
+    message = message or mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 1, 0, 4, 3)
+    return message.pack(mavlink.MAVLink(None, 7, 1))
+
+
+def test_signed_messages_are_admitted_in_their_order_and_once(signing):
+    signer = Signer()
+    first, second, third = (signer.packet() for _ in range(3))
+    assert admitted(signing, first, third, second, third, first) == [True, True, False, False, False]
+    assert signing.refused == {OLD: 3}
+
+
+def test_a_forged_message_from_the_far_future_shuts_out_no_true_one(signing, clock):
+    signer = Signer()
+    forged = Signer(OTHER_KEY).packet(2**48 - 1)
+    assert admitted(signing, signer.packet(), forged, signer.packet()) == [True, False, True]
+    assert signing.refused == {WRONG: 1}
+    packer = mavlink.MAVLink(None, 1, 197)
+    signing.stamp(packer)
+    assert packer.signing.timestamp < NOW + 200 * TICKS_S, "our own time has moved with a forged one"
+
+
+def test_pymavlinks_own_check_is_shut_out_by_one_forged_message():
+    """The reason why edgevpr has a check of its own: where this fails, it may not be needed any more."""
+    checking = mavlink.MAVLink(None)
+    checking.robust_parsing = True
+    checking.signing.secret_key = KEY
+    signer = Signer()
+    packets = signer.packet(), Signer(OTHER_KEY).packet(2**48 - 1), signer.packet()
+    assert [checking.parse_char(packet).get_type() for packet in packets] == ["HEARTBEAT", "BAD_DATA", "BAD_DATA"]
+
+
+@pytest.mark.parametrize("place", range(len(Signer().packet())))
+def test_a_message_that_was_changed_anywhere_is_refused(signing, place):
+    packet = bytearray(Signer().packet())
+    packet[place] ^= 0x10
+    assert admitted(signing, packet) == [False]
+
+
+def test_unsigned_messages_are_refused_counted_and_told_once(signing, caplog):
+    old_protocol = mavlink.MAVLink_heartbeat_message(2, 3, 1, 0, 4, 3).pack(
+        mavlink.MAVLink(None, 7, 1), force_mavlink1=True
+    )
+    assert not any(admitted(signing, unsigned(), unsigned(), old_protocol))
+    assert signing.refused == {UNSIGNED: 3}
+    assert caplog.text.count("does not sign") == 1
+
+
+def test_a_radio_status_needs_no_signature_but_must_not_speak_for_the_autopilot(signing):
+    message = mavlink.MAVLink_radio_status_message(1, 2, 3, 4, 5, 6, 7)
+    assert admitted(signing, message.pack(mavlink.MAVLink(None, 51, 68))) == [True]
+    assert signing.refused == {}
+    assert admitted(signing, unsigned(message)) == [False]
+    assert signing.refused == {UNSIGNED: 1}
+    assert admitted(signing, Signer().packet(message=message)) == [True]
+
+
+def test_setup_signing_is_not_obeyed(signing):
+    setup = mavlink.MAVLink_setup_signing_message(1, 197, OTHER_KEY, 2**47)
+    signer = Signer()
+    assert admitted(signing, unsigned(setup), signer.packet(message=setup)) == [False, True]
+    assert admitted(signing, Signer(OTHER_KEY, link_id=1).packet(), signer.packet()) == [False, True]
+
+
+@pytest.mark.parametrize(
+    ("ahead_s", "refused"),
+    [(-3600, {OLD: 1}), (-61, {OLD: 1}), (-59, {}), (59, {}), (61, {FUTURE: 1}), (3600, {FUTURE: 1})],
+)
+def test_a_new_stream_must_be_within_a_minute(signing, ahead_s, refused):
+    new = Signer(stamp=NOW + ahead_s * TICKS_S, link_id=1).packet()
+    admitted(signing, Signer().packet(), new)
+    assert signing.refused == refused
+
+
+def test_invented_senders_fill_no_memory_and_shut_out_nobody_for_long(signing, clock):
+    streams = [Signer(system_id=system_id, link_id=2) for system_id in range(1, 256)]
+    packets = [each.packet() for each in streams]
+    admitted(signing, *packets)
+    assert signing.refused == {CROWDED: 255 - 64}
+    ours = Signer()
+    assert admitted(signing, ours.packet()) == [False]
+    clock.now_s += 61
+    assert admitted(signing, ours.packet(NOW + 61 * TICKS_S), *packets) == [True] + [False] * 255, "a replay passed"
+
+
+def test_the_first_stream_may_be_ahead_and_sets_the_time(signing, clock):
+    """A board without a clock chip that was off for a week learns the time from the autopilot."""
+    week = 7 * 86_400 * TICKS_S
+    assert admitted(signing, Signer(stamp=NOW + week).packet()) == [True]
+    packer = mavlink.MAVLink(None, 1, 197)
+    clock.now_s += 5
+    signing.stamp(packer)
+    assert packer.signing.timestamp == NOW + week + 5 * TICKS_S
+    assert admitted(signing, Signer(stamp=NOW, link_id=1).packet()) == [False]
+
+
+def test_our_time_stamps_grow_with_every_message_and_with_time(signing, clock):
+    packer = mavlink.MAVLink(None, 1, 197)
+    stamps = []
+    for step_s in (0, 0, 1, 0):
+        clock.now_s += step_s
+        signing.stamp(packer)
+        stamps.append(packer.signing.timestamp)
+    assert stamps == [NOW + 1, NOW + 2, NOW + TICKS_S, NOW + TICKS_S + 1]
+    assert (packer.signing.link_id, packer.signing.secret_key) == (TO_AUTOPILOT, KEY)
+
+
+def test_what_was_recorded_on_one_link_is_old_on_the_other(signing):
+    packet = Signer().packet()
+    assert admitted(signing, packet) == [True]
+    assert admitted(signing.of_ground(), packet) == [False]
+
+
+@pytest.fixture
+def key_file(tmp_path):
+    path = tmp_path / "signing.key"
+    path.write_bytes(KEY)
+    path.chmod(0o600)
+    return path
+
+
+def test_a_link_and_pymavlink_understand_each_other_by_key(key_file, monkeypatch):
+    monkeypatch.setenv("MAVLINK20", "1")
+    from pymavlink import mavutil
+
+    number = free_port()
+    signing = open_signing(str(key_file), None)
+    with Link(parse_link(f"udpin:127.0.0.1:{number}"), signing=signing) as link:
+        other = mavutil.mavlink_connection(
+            f"udpout:127.0.0.1:{number}", dialect="all", source_system=7, source_component=1
+        )
+        other.setup_signing(KEY, sign_outgoing=True)
+        with closing(other):
+
+            def beat() -> bool:
+                other.mav.heartbeat_send(2, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 1, 0, 4)
+                other.recv_match(blocking=True, timeout=0.1)
+                return link.stats().autopilot_heard
+
+            wait_until(beat, "believing the autopilot that signs")
+            link.send_fix(Fix(50.0, 14.0, 25.0, time.monotonic()))
+            fix = wait_until(lambda: other.recv_match(type="COMMAND_INT", blocking=True, timeout=1), "the fix")
+            assert fix.get_signed()
+            assert fix.get_link_id() == TO_AUTOPILOT
+            assert other.mav.signing.badsig_count == 0
+    assert (key_file.parent / "signing.key.time").exists()
+
+
+@pytest.mark.parametrize("key", [None, OTHER_KEY])
+def test_no_fix_goes_to_who_has_not_the_key(key, tmp_path, clock):
+    signing = Signing(KEY, TimeStamps(tmp_path / "time", clock, lambda: UTC_S))
+    with (
+        closing(UdpPort()) as port,
+        Link(parse_link(f"udpout:127.0.0.1:{port.number}"), clock=clock, signing=signing) as link,
+    ):
+        peer = Peer(port, system_id=7)
+        peer.expect("HEARTBEAT")
+        signer = Signer(key) if key else None
+        for count in (1, 2):
+            port.send(signer.packet() if signer else unsigned())
+            wait_until(lambda count=count: link.stats().refused_signatures == {WRONG if key else UNSIGNED: count})
+        assert not link.stats().autopilot_heard
+        assert link.stats().received == {}
+
+
+def test_a_replay_is_refused_after_the_port_was_opened_anew(signing, clock):
+    conversation = Conversation(clock, 197, None, 1.0, signing=signing)
+    packet = Signer().packet()
+    assert conversation.hear(packet, clock(), None)
+    conversation.break_off(0)
+    assert not conversation.hear(packet, clock(), None)
+
+
+def test_without_a_key_everything_is_admitted_and_nothing_signed():
+    assert open_signing(None, None) is NOT_SIGNING
+    packer = mavlink.MAVLink(None)
+    NOT_SIGNING.stamp(packer)
+    assert not packer.signing.sign_outgoing
+    assert admitted(NOT_SIGNING, unsigned(), Signer(OTHER_KEY).packet()) == [True, True]
+
+
+@pytest.mark.parametrize("mode", [0o600, 0o400])
+def test_a_key_that_only_its_owner_may_read_is_taken(key_file, mode):
+    key_file.chmod(mode)
+    assert read_key(str(key_file)) == KEY
+    link = key_file.with_name("link.key")
+    link.symlink_to(key_file)
+    assert read_key(str(link)) == KEY
+
+
+@pytest.mark.parametrize("mode", [0o640, 0o604, 0o610, 0o602, 0o440])
+def test_a_key_that_others_may_open_is_refused_also_behind_a_link(key_file, mode):
+    key_file.chmod(mode)
+    link = key_file.with_name("link.key")
+    link.symlink_to(key_file)
+    for path in (key_file, link):
+        with pytest.raises(ConfigError, match=re.escape(f"`chmod 600 {path}`")):
+            read_key(str(path))
+
+
+@pytest.mark.parametrize(("content", "says"), [(b"", "only 0"), (KEY[:31], "only 31"), (KEY + b"\n", "more")])
+def test_a_key_of_another_length_is_refused(key_file, content, says):
+    key_file.write_bytes(content)
+    with pytest.raises(ConfigError, match=f"has 32 bytes, and this file has {says}"):
+        read_key(str(key_file))
+
+
+def test_a_key_that_is_no_file_is_refused(tmp_path):
+    os.mkfifo(tmp_path / "pipe", 0o600)
+    for name in ("missing", "pipe", "."):
+        with pytest.raises(ConfigError, match=r"cannot be read .* makes one"):
+            read_key(str(tmp_path / name))
+
+
+def test_a_credential_of_systemd_is_taken(key_file, monkeypatch):
+    """With `User=`, the service reads it by an access list, which shows as the right of its group."""
+    key_file.chmod(0o440)
+    monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(key_file.parent))
+    assert read_key(str(key_file)) == KEY
+    key_file.chmod(0o444)
+    with pytest.raises(ConfigError, match="others may open"):
+        read_key(str(key_file))
+
+
+def test_what_makes_a_key_makes_one_that_is_taken(tmp_path):
+    command = _MAKE_ONE.split("`")[1].replace("FILE", str(tmp_path / "key"))
+    assert os.system(command) == 0
+    assert len(read_key(str(tmp_path / "key"))) == 32
+    assert stat.S_IMODE((tmp_path / "key").stat().st_mode) == 0o600

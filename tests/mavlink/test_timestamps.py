@@ -1,0 +1,123 @@
+"""The time of signed messages: never back, whatever ends the process and whatever the clock of the board says."""
+
+import subprocess
+import sys
+
+import pytest
+from fakes import FakeClock
+from mavlink_peers import wait_until
+
+from edgevpr.errors import ConfigError
+from edgevpr.mavlink.timestamps import OLD, TICKS_S, TimeStamps
+
+STREAM = (7, 1, 0)
+MINUTE = 60 * TICKS_S
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "time"
+
+
+def stamps_at(path, utc_s: float = 0.0, clock=None) -> TimeStamps:
+    """Those of a board whose clock stands at `utc_s`: 0 without a clock chip."""
+    return TimeStamps(path, clock or FakeClock(), lambda: utc_s)
+
+
+def test_a_board_without_a_clock_chip_goes_on_where_it_was(path):
+    last = 0
+    for _ in range(3):
+        stamps = stamps_at(path)
+        first = stamps.next()
+        assert first >= last + MINUTE
+        last = max(stamps.next() for _ in range(1000))
+
+
+def test_it_is_kept_every_half_minute_and_the_next_start_is_a_minute_beyond_all_that_was_used(path):
+    clock = FakeClock()
+    stamps = stamps_at(path, clock=clock)
+    for _ in range(200):
+        clock.now_s += 1
+        last = stamps.next()
+    wait_until(lambda: last - int(path.read_text()) < 30 * TICKS_S, "keeping the time")
+    after = stamps_at(path)
+    assert after.next() >= last + MINUTE
+    assert after.refusal(STREAM, last) == OLD, "a message of before was admitted after the restart"
+
+
+def test_a_time_that_is_learnt_is_kept_at_once(path):
+    stamps = stamps_at(path)
+    learnt = 10**12
+    assert stamps.refusal(STREAM, learnt) is None
+    wait_until(lambda: int(path.read_text()) == learnt, "keeping the time")
+    assert stamps_at(path).next() >= learnt + MINUTE
+
+
+def test_a_clock_that_is_set_forward_is_followed_and_one_that_is_set_back_is_not(path):
+    utc_s = [1.8e9]
+    stamps = TimeStamps(path, FakeClock(), lambda: utc_s[0])
+    first = stamps.next()
+    utc_s[0] += 86_400
+    assert stamps.next() == pytest.approx(first + 86_400 * TICKS_S, abs=100 * TICKS_S)
+    last = stamps.next()
+    utc_s[0] -= 10 * 86_400
+    assert stamps.next() == last + 1
+
+
+KILLED = """
+import sys, time
+from pathlib import Path
+from edgevpr.mavlink.timestamps import TimeStamps
+mono_s = 0.0
+stamps = TimeStamps(Path(sys.argv[1]), lambda: mono_s, lambda: 0.0)
+while True:
+    mono_s += 0.01
+    print(stamps.next(), flush=True)
+"""
+
+
+def test_it_never_goes_back_over_kill_9(path):
+    last = 0
+    for lines in (1, 5000, 20_000):
+        with subprocess.Popen([sys.executable, "-c", KILLED, str(path)], stdout=subprocess.PIPE, text=True) as process:
+            first = last_before = int(process.stdout.readline())
+            for _ in range(lines):
+                last_before = int(process.stdout.readline())
+            process.kill()
+            rest = process.stdout.read().splitlines(keepends=True)
+            last_before = max([last_before, *(int(line) for line in rest if line.endswith("\n"))])
+        assert first > last
+        last = last_before
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"soon\n", b"-5\n", b"12.5\n", b"9" * 20, b"\xff\x00", b"1" * 100, "²".encode()]
+)
+def test_a_file_that_holds_no_time_is_refused_with_a_sentence(path, content):
+    path.write_bytes(content)
+    with pytest.raises(ConfigError, match="time"):
+        stamps_at(path)
+    assert path.read_bytes() == content
+
+
+def test_a_place_that_cannot_be_written_is_refused_with_a_sentence(tmp_path):
+    with pytest.raises(ConfigError, match="signing_state"):
+        stamps_at(tmp_path / "no-folder" / "time")
+
+
+def test_a_disk_that_becomes_full_in_flight_ends_nothing(path, monkeypatch, caplog):
+    clock = FakeClock()
+    stamps = stamps_at(path, clock=clock)
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("edgevpr.mavlink.timestamps.write_whole", full)
+    tries = []
+    monkeypatch.setattr("edgevpr.mavlink.timestamps.Thread.start", lambda thread: tries.append(thread.run()))
+    first = stamps.next()
+    for _ in range(3):
+        clock.now_s += 60
+        assert stamps.next() > first
+    assert (len(tries), caplog.text.count("is not kept (No space left on device)")) == (3, 1)
+    stamps_at(path)  # nor does it at the next start, where there is a time from before
