@@ -5,8 +5,8 @@ import math
 from edgevpr.mavlink.wire import Message, mavlink
 
 GPS_SD_M = 5.0  # of a receiver that does not say how good it is
-# An ArduPilot plane, simulated, drifts at 5 m/s in a wind of 6 m/s that came with the loss of GPS: in a gale it would be
-# four times as much, or four standard deviations.
+# An ArduPilot plane, simulated, drifts at 5 m/s in a wind of 6 m/s that came with the loss of GPS: in a gale it would
+# be four times as much, or four standard deviations.
 DRIFT_M_S = 5.0
 _FRESH_S = 3.0  # of what the filter says, which is asked for twice a second
 _GPS_UNKNOWN = (0, 2**32 - 1)  # of h_acc: not sent, and not known

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgevpr.mavlink.certainty import DRIFT_M_S
 from edgevpr.navigation.navigation import Expected
 from edgevpr.runtime.recognise.locate import in_sd
 
@@ -19,6 +18,7 @@ from edgevpr.runtime.recognise.locate import in_sd
 # one agrees with it within the second seven times in eight, else the next does.
 _CONTRADICTS, _AGREES = 4.0, 2.0
 _GOOD_FOR_S = 30.0  # after that the reckoning may have drifted anywhere
+_DRIFT_M_S = 2.5  # between two fixes that agree; more is a contradiction, and the next fix tells
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,5 +87,5 @@ def _is_independent(one: Seen, other: Seen) -> bool:
 
 
 def _of_both(one: Seen, other: Seen) -> np.ndarray:
-    drift_m = DRIFT_M_S * abs(other.t_s - one.t_s)
+    drift_m = _DRIFT_M_S * abs(other.t_s - one.t_s)
     return one.covariance_m2 + other.covariance_m2 + drift_m**2 * np.eye(2)

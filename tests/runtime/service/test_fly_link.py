@@ -40,9 +40,12 @@ def test_the_key_and_where_the_time_is_kept_reach_the_link(tmp_path):
     key.write_bytes(bytes(32))
     key.chmod(0o600)
     config = load_config(None, {"mavlink.signing_key": str(key), "mavlink.signing_state": str(state)})
-    with closing(UdpPort()) as port, fly._link(parse_link(f"udpout:127.0.0.1:{port.number}"), config.mavlink):
+    with ExitStack() as stack:
+        port = stack.enter_context(closing(UdpPort()))
+        address = parse_link(f"udpout:127.0.0.1:{port.number}")
+        stack.enter_context(fly._link(address, config.mavlink, Navigator(5.0, 1.0)))
         assert Peer(port).expect("HEARTBEAT").get_header().incompat_flags == 1  # signed
     assert state.exists()
     key.chmod(0o644)
     with pytest.raises(ConfigError, match="chmod 600"):
-        fly._link(parse_link("udpout:127.0.0.1:9"), config.mavlink)
+        fly._link(parse_link("udpout:127.0.0.1:9"), config.mavlink, Navigator(5.0, 1.0))
