@@ -70,7 +70,7 @@ _GPS_INPUT = {"GPS2_TYPE": 14, "GPS_AUTO_SWITCH": 1}
 _ODOMETRY = {
     "VISO_TYPE": 1,
     "EK3_SRC2_POSXY": 6,
-    "EK3_SRC2_VELXY": 6,
+    "EK3_SRC2_VELXY": 0,
     "EK3_SRC2_POSZ": 1,
     "EK3_SRC2_VELZ": 0,
     "EK3_SRC2_YAW": 1,

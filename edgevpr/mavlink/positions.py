@@ -7,6 +7,7 @@ from edgevpr.geodesy import offset_m
 from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.wire import Message, mavlink
 
+_YAW_SD = math.radians(5.0)
 _GPS_EPOCH_S, _LEAP_S = 315_964_800, 18  # 1980-01-06; leap seconds since then, as of 2017
 
 
@@ -84,15 +85,20 @@ def gps_input(state: State | None, receiver: int, t_mono_s: float, t_unix_s: flo
 
 def odometry(state: State, origin: tuple[float, float, float]) -> Message:
     """Make an ODOMETRY (331) in the only frames that ArduPilot takes: position north, east, down of an `origin`
-    (degrees, metres above sea level), velocity along the airframe."""
+    (degrees, metres above sea level), velocity along the airframe.
+
+    ArduPilot takes the cube root of the sum of the squared variances of a position for its standard deviation
+    (`GCS_MAVLINK::handle_odometry`, 4.7-dev), and the same of the angles; so the variances are those that give it the
+    right one. No angle may be NaN. The height's own is none of ours, and zero.
+    """
     east_m, north_m = offset_m(origin[0], origin[1], state.lat_deg, state.lon_deg)
     roll, pitch, yaw = state.attitude
     east, north, down = state.velocity_m_s
     vx, vy, vz = _along_airframe((north, east, down), roll, pitch, yaw)
-    # The upper triangle of 6 x 6, row by row. Only what is known stands in its diagonal.
-    pose, velocity = [math.nan] * 21, [math.nan] * 21
-    pose[0] = pose[6] = state.accuracy_m**2
-    pose[11] = state.alt_accuracy_m**2
+    # The upper triangle of 6 x 6, row by row: only its diagonal is known.
+    pose, velocity = [0.0] * 21, [0.0] * 21
+    pose[0] = pose[6] = math.sqrt(state.accuracy_m**3 / 2)
+    pose[20] = math.sqrt(_YAW_SD**3)
     velocity[0] = velocity[6] = velocity[11] = state.speed_accuracy_m_s**2
     return mavlink.MAVLink_odometry_message(
         time_usec=round(state.t_mono_s * 1e6),

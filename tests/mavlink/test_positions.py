@@ -65,8 +65,12 @@ def test_odometry_lies_north_east_down_of_the_origin_and_moves_along_the_airfram
     assert -math.asin(earth_from_body[2, 0]) == pytest.approx(-0.2, abs=1e-6), "the pitch"
     velocity = earth_from_body @ (heard.vx, heard.vy, heard.vz)
     assert velocity == pytest.approx((-4.0, 3.0, 0.5), abs=1e-5)
-    assert (heard.pose_covariance[0], heard.pose_covariance[6], heard.pose_covariance[11]) == (6.25, 6.25, 9.0)
+    # As ArduPilot reads them (GCS_MAVLINK::handle_odometry).
+    position, angle = (math.fsum(heard.pose_covariance[each] ** 2 for each in at) for at in ((0, 6, 11), (15, 18, 20)))
+    assert position ** (1 / 3) == pytest.approx(2.5)
+    assert math.degrees(angle ** (1 / 3)) == pytest.approx(5.0)
     assert heard.velocity_covariance[0] == pytest.approx(0.16)
+    assert not any(map(math.isnan, (*heard.pose_covariance, *heard.velocity_covariance)))
 
 
 def test_a_sensor_says_accuracy_and_no_altitude():
