@@ -164,6 +164,7 @@ class MavlinkConfig:
     max_fix_age_s: float = bounded(0.1, 5)
     min_accuracy_m: float = bounded(1, 10_000)
     source_sets: SourceSetsConfig
+    set_origin: bool = field()
     ground: str | None = field()
     signing_key: str | None = field()
     signing_state: str | None = field()

@@ -214,13 +214,17 @@ class QueryCost:
         return StageCost(self.t_encode_s + self.t_match_s, self.cpu_s)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FixReport:
     """The outcome of the position fix of a `query`. `sent` is True, False (`why` gives the reason), or None while the
     fix waits to be sent or, over TCP, to be confirmed by the other end. `answer` is the answer of the autopilot, the
-    name of a MAV_RESULT; None: no answer (yet)."""
+    name of a MAV_RESULT; None: no answer (yet). `lat_deg`, `lon_deg` and `accuracy_m` are what it says (None: there was
+    nothing to be sent)."""
 
     query: str
     sent: bool | None
     why: str | None = None
     answer: str | None = None
+    lat_deg: float | None = None
+    lon_deg: float | None = None
+    accuracy_m: float | None = None

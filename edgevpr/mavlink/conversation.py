@@ -22,12 +22,13 @@ from edgevpr.mavlink.signing import NOT_SIGNING, NotSigning, Signing
 from edgevpr.mavlink.texts import Texts
 from edgevpr.mavlink.wire import Message, Receiver, Tap, mavlink, untapped
 from edgevpr.mavlink.wishes import Wishes
-from edgevpr.types import Vehicle
+from edgevpr.types import Position, Vehicle
 
 HEARTBEAT_S = 1.0
 STATE_S = 0.1  # ArduPilot calls a receiver unhealthy whose positions come more than 215 ms apart
 HEALTH_GOOD_FOR_S = 10.0  # a hung main loop must not look healthy because the link's thread still runs
 ASK_AGAIN_S = 5.0
+ORIGIN_WITHIN_S = 5.0  # an autopilot that has one tells it once a second when asked to
 
 _NOBODY = NoListener()
 
@@ -53,8 +54,10 @@ class Conversation:
         listener: Listener = _NOBODY,
         tap: Tap = untapped,
         signing: Signing | NotSigning = NOT_SIGNING,
+        origin: Position | None = None,
     ) -> None:
         self.outbox = Outbox(max_fix_age_s)
+        self._origin = origin  # for an autopilot that has none
         self.autopilot = Autopilot(component_id, system_id, listener)
         self._listener = listener
         self.answers, self.replies = Answers(), Replies()
@@ -71,6 +74,7 @@ class Conversation:
         self._ask_position_s: float | None = None  # when to ask next; None: not wanted
         self._asked_for_state = False
         self._channel = self.channel  # as the listener has heard it
+        self._odometry_since_s = math.inf
 
     def set_health(self, health: Health) -> None:
         """Set the health in the heartbeats of the next ten seconds. After that, without a new call, it is CRITICAL."""
@@ -203,6 +207,10 @@ class Conversation:
         state = self._listener.state_at(t_s)
         if choice.channel is Channel.GPS_INPUT:
             return positions.gps_input(state, choice.receiver, t_s, autopilot.unix_s(t_s))
+        if autopilot.origin is None and self._origin and now_s - self._odometry_since_s > ORIGIN_WITHIN_S:
+            log.warning("the autopilot has no origin: it is set to the first place of the map")
+            here, self._origin = self._origin, None
+            return messages.origin(autopilot.system_id, here.lat_deg, here.lon_deg, here.alt_m or 0.0)
         if state and state.attitude and autopilot.origin:
             return positions.odometry(state, autopilot.origin)
         return None
@@ -214,7 +222,7 @@ class Conversation:
         for question in self.autopilot.interview.questions(now_s, self.autopilot.system_id):
             self.outbox.put(question)
         if self.channel is not self._channel:
-            self._channel = self.channel
+            self._channel, self._odometry_since_s = self.channel, now_s
             self._listener.hear_channel(self._channel)
         if now_s < self._ask_position_s:
             return

@@ -22,7 +22,7 @@ from edgevpr.mavlink.stats import LinkStats
 from edgevpr.mavlink.transport import open_transport
 from edgevpr.mavlink.wire import Message, Tap, untapped
 from edgevpr.mavlink.wishes import Wish, Wished
-from edgevpr.types import Vehicle
+from edgevpr.types import Position, Vehicle
 
 TURN_S = 0.25  # longest sleep of the thread when nothing wakes it
 RETRY_FIRST_S, RETRY_MAX_S = 0.2, 2.0
@@ -40,9 +40,9 @@ class Link:
 
     `system_id` is that of the autopilot (None: that of the first heard); a fix that has waited for `max_fix_age_s` is
     never sent. `listener` hears how the vehicle moves, and gives the positions of a continuous channel. `tap` gets each
-    packet written and each packet heard, in the link's thread. `send`, `send_fix`, `announce`, `offer`, `take_wishes`,
-    `set_health`, `want_position`, `vehicle`, `vehicle_at`, `channel`, `listens` and `stats` may be called from any
-    thread; they never block and never raise.
+    packet written and each packet heard, in the link's thread. `origin` is set where an autopilot that flies by
+    ODOMETRY has none. `send`, `send_fix`, `announce`, `offer`, `take_wishes`, `set_health`, `want_position`, `vehicle`,
+    `vehicle_at`, `channel`, `listens` and `stats` may be called from any thread; they never block and never raise.
     """
 
     def __init__(
@@ -56,12 +56,20 @@ class Link:
         listener: Listener = _NOBODY,
         tap: Tap = untapped,
         signing: Signing | NotSigning = NOT_SIGNING,
+        origin: Position | None = None,
     ) -> None:
         self._address = address
         self._tap = tap
         self._clock = clock
         self._conversation = Conversation(
-            clock, component_id, system_id, max_fix_age_s, listener=listener, tap=tap, signing=signing
+            clock,
+            component_id,
+            system_id,
+            max_fix_age_s,
+            listener=listener,
+            tap=tap,
+            signing=signing,
+            origin=origin,
         )
         self._line: Line | None = None
         self._reopened = 0

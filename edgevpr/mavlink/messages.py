@@ -123,6 +123,13 @@ def origin_request(target_system: int) -> Message:
     return mavlink.MAVLink_command_long_message(target_system, AUTOPILOT, request, 0, origin, 0, 0, 0, 0, 0, 0)
 
 
+def origin(target_system: int, lat_deg: float, lon_deg: float, alt_m: float) -> Message:
+    """Make a SET_GPS_GLOBAL_ORIGIN (48)."""
+    return mavlink.MAVLink_set_gps_global_origin_message(
+        target_system, round(lat_deg * 1e7), round(lon_deg * 1e7), round(alt_m * 1e3)
+    )
+
+
 def place_match(t_mono_s: float, place_id: int, score: float, confidence: float | None = None) -> tuple[Message, ...]:
     """Make the event of an accepted match: NAMED_VALUE_INT (252) `vpr_place`, NAMED_VALUE_FLOAT (251) `vpr_score`, and
     `vpr_conf`, the probability that it is right, where that is known."""

@@ -13,6 +13,7 @@ from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.listener import NoListener
 from edgevpr.mavlink.positions import State
 from edgevpr.mavlink.wire import mavlink
+from edgevpr.types import Position
 
 ARDUPILOT, PX4 = mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, mavlink.MAV_AUTOPILOT_PX4
 STATE = State(
@@ -165,6 +166,26 @@ def test_a_copter_with_our_receiver_gets_a_position_ten_times_a_second(port):
             peer.send(report(0, kind, 470_000_000, 80_000_000, 0, 80, 80, 0, 0, 6, **more))
         peer.send(mavlink.MAVLink_global_position_int_message(0, 470_000_000, 80_000_000, 0, 80_000, 0, 0, 0, 0))
         assert wait_until(link.vehicle).has_gps is False
+    finally:
+        link.close()
+
+
+def test_odometry_waits_for_an_origin_and_sets_one_where_it_may(port):
+    clock, ear = FakeClock(), Ear()
+    address = parse_link(f"udpout:127.0.0.1:{port.number}")
+    link = Link(address, clock=clock, listener=ear, origin=Position(46.5, 7.5, 400.0))
+    link.want_position()
+    link.start()
+    peer = Questioned(port, ARDUPILOT, {"VISO_TYPE": (1.0, mavlink.MAV_PARAM_TYPE_INT8)})
+    try:
+        peer.expect("HEARTBEAT")
+        told(peer, clock, lambda: ear.channels)
+        assert ear.channels == [Channel.ODOMETRY]
+        told(peer, clock, lambda: link.stats().sent.get("SET_GPS_GLOBAL_ORIGIN"))
+        assert "ODOMETRY" not in link.stats().sent
+        peer.send(mavlink.MAVLink_gps_global_origin_message(465_000_000, 75_000_000, 400_000))
+        told(peer, clock, lambda: link.stats().sent.get("ODOMETRY", 0) > 3)
+        assert link.stats().sent["SET_GPS_GLOBAL_ORIGIN"] == 1
     finally:
         link.close()
 

@@ -52,7 +52,7 @@ class NoAutopilot:
 
     def told(self, event: Recognition, used_mah: float) -> Recognition:
         """Return the event, with a report that the fix of an accepted match was not sent."""
-        return replace(event, fix=FixReport(_name(event), False, "there is no link")) if event.accepted else event
+        return replace(event, fix=_unsent(event, "there is no link")) if event.accepted else event
 
     def compare_gps(self, off_m: float, is_wrong: bool) -> None:
         """Tell nobody."""
@@ -172,15 +172,15 @@ class ToAutopilot:
     def _fixed(self, event: Recognition) -> FixReport:
         """Send the fix of an accepted match, if it has one, and report what became of it."""
         if event.position is None:
-            return FixReport(_name(event), False, "the place has no position")
+            return _unsent(event, "the place has no position")
         try:
             advice = self._navigator.advise(event, self._clock.mono_s())
         except ValueError as error:  # another program wrote an invalid position
             _log.warning("place %d: %s; no fix is sent", event.best.place.place_id, error)
-            return FixReport(_name(event), False, str(error))
+            return _unsent(event, str(error))
         self._say_held(advice.why if advice.is_held else None)
         if advice.fix is None or not self._send_fixes:
-            return FixReport(_name(event), False, advice.why or DRY_RUN)
+            return _unsent(event, advice.why or DRY_RUN)
         sending = self._link.send_fix(advice.fix)
         if self._link.listens():
             sending.wait(_SETTLED_WITHIN_S)
@@ -207,7 +207,20 @@ Autopilot = NoAutopilot | ToAutopilot
 
 
 def _reported(query: str, sending: Sending) -> FixReport:
-    return FixReport(query, sending.sent, sending.why, sending.answer)
+    fix = sending.fix
+    return FixReport(
+        query=query,
+        sent=sending.sent,
+        why=sending.why,
+        answer=sending.answer,
+        lat_deg=round(fix.lat_deg, 7),
+        lon_deg=round(fix.lon_deg, 7),
+        accuracy_m=round(fix.accuracy_m, 2),
+    )
+
+
+def _unsent(event: Recognition, why: str) -> FixReport:
+    return FixReport(query=_name(event), sent=False, why=why)
 
 
 def _confidence(event: Recognition) -> float | None:

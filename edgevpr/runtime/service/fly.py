@@ -19,6 +19,7 @@ from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.signing import open_signing
 from edgevpr.mavlink.tlog import Tlog
 from edgevpr.mavlink.wire import Tap, untapped
+from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import Board, load_board
 from edgevpr.runtime.flight.autopilot import DRY_RUN, Mood, NoAutopilot, ToAutopilot
 from edgevpr.runtime.flight.clock import Clock
@@ -35,7 +36,7 @@ from edgevpr.runtime.preflight.pick import Outlook, outlook, picked_technique, t
 from edgevpr.runtime.recognise.learn import Learner, check_positions
 from edgevpr.runtime.recognise.opening import has_map, open_learning, open_recogniser
 from edgevpr.runtime.recognise.recogniser import Recogniser
-from edgevpr.types import FIX_MAX_AGE_S
+from edgevpr.types import FIX_MAX_AGE_S, Position
 
 _RELOAD_S = 10.0  # a map that takes longer to load is not loaded again in flight: nothing is recognised meanwhile
 _NEW_MAP_PLACES = 1000  # a technique picked for an empty map must be able to fly with so many
@@ -64,7 +65,8 @@ def fly(config: Config, positions: Path | None = None) -> int:
         step_s = 1 / rate_hz(config, recogniser)
         navigator = Navigator(config.mavlink.min_accuracy_m, step_s)
         tap = _tap(stack, config)
-        link = stack.enter_context(_link(address, config.mavlink, navigator, tap)) if address else None
+        origin = _first_position(recogniser.place_map) if config.mavlink.set_origin else None
+        link = stack.enter_context(_link(address, config.mavlink, navigator, tap, origin)) if address else None
         if link:
             link.want_position()
         ground_link = stack.enter_context(GroundLink(ground, link)) if link and ground else None
@@ -127,7 +129,13 @@ def fly(config: Config, positions: Path | None = None) -> int:
     return 1 if flown.failed else 0
 
 
-def _link(address: LinkAddress, settings: MavlinkConfig, navigator: Navigator, tap: Tap = untapped) -> Link:
+def _link(
+    address: LinkAddress,
+    settings: MavlinkConfig,
+    navigator: Navigator,
+    tap: Tap = untapped,
+    origin: Position | None = None,
+) -> Link:
     return Link(
         address,
         settings.component_id,
@@ -135,8 +143,13 @@ def _link(address: LinkAddress, settings: MavlinkConfig, navigator: Navigator, t
         max_fix_age_s=settings.max_fix_age_s,
         listener=navigator if settings.send_fixes else Muted(navigator),
         tap=tap,
+        origin=origin,
         signing=open_signing(settings.signing_key, settings.signing_state),
     )
+
+
+def _first_position(place_map: PlaceMap) -> Position | None:
+    return next((place.position for place in place_map.places() if place.position), None)
 
 
 def _tap(stack: ExitStack, config: Config) -> Tap:

@@ -37,7 +37,9 @@ def test_a_query_says_whether_its_fix_was_sent_and_what_was_answered_to_the_last
     queries = of_kind(lines, "query")
     assert fixes(lines) == [(True, None)] * 3
     assert queries[0]["last_fix"] is None
-    assert queries[1]["last_fix"] == {"query": "frame 000000", "sent": True, "why": None, "answer": "ACCEPTED"}
+    first = queries[0]["fix"]
+    assert (first["query"], first["lat_deg"], first["lon_deg"]) == ("frame 000000", 50.0, 8.0)
+    assert queries[1]["last_fix"] == first | {"answer": "ACCEPTED"}
     assert queries[2]["last_fix"]["query"] == "frame 000001"
     assert link.stats().fixes_sent == 3
 
