@@ -15,7 +15,7 @@ from simulator import VEHICLES
 from edgevpr.helpers.tables import markdown
 
 RESULTS = Path(__file__).resolve().parents[1] / "results"
-_SHOWN_PER_M = 1.0  # pixels of the ground in the picture
+_SHOWN_PER_M = 0.4  # pixels of the ground in the picture
 _TRUE, _WITH, _WITHOUT = "white", "#20e020", "#ff3030"
 
 Row = dict[str, Any]
@@ -206,7 +206,7 @@ def _draw(work: Path, names: list[str], path: Path) -> None:
     size = round(ground.WIDTH_M * _SHOWN_PER_M), round(ground.DEPTH_M * _SHOWN_PER_M)
     shown = 0.6 * cv2.resize(lit, size, interpolation=cv2.INTER_AREA)[..., ::-1] / 255
     rows = -(-len(names) // 2)
-    figure, axes = pyplot.subplots(rows, 2, figsize=(16, 6.2 * rows), squeeze=False)
+    figure, axes = pyplot.subplots(rows, 2, figsize=(14, 5.4 * rows), squeeze=False)
     for axis in axes.flat[len(names) :]:
         axis.axis("off")
     for axis, name in zip(axes.flat, names, strict=False):
@@ -225,7 +225,7 @@ def _draw(work: Path, names: list[str], path: Path) -> None:
             axis.plot(after["east_m"], after["north_m"], color=_TRUE, lw=0.9, ls=style)
             if len(after):
                 titles.append(f"{word}: median {np.median(after['error_m']):.0f} m, max {after['error_m'].max():.0f} m")
-        axis.set(xlim=(-150, ground.WIDTH_M + 150), ylim=(-150, ground.DEPTH_M + 150), facecolor="0.25")
+        axis.set(xlim=(-80, ground.WIDTH_M + 80), ylim=(-80, ground.DEPTH_M + 80), facecolor="0.25")
         axis.set_title("; ".join(titles), fontsize=10)
         axis.tick_params(labelsize=7)
     figure.tight_layout()
