@@ -185,8 +185,12 @@ def _remarks(found: dict[str, dict[str, Row]]) -> str:
             if run.get("heard_again_s") is not None:
                 told.append(f"heard again {run['heard_again_s']} s after the autopilot was back")
             if name in ("plane_glitch", "plane_clean") and which == "with":
-                alarm_s = run["gps_m_alarm_s"]
-                told.append("GPS was not doubted" if alarm_s is None else f"GPS was doubted after {alarm_s} s")
+                alarms_s = run["gps_alarms_s"]
+                minutes = run["estimate"]["after"]["n"] / 600
+                doubted = ", ".join(f"{each} s" for each in alarms_s)
+                told.append(
+                    f"GPS was doubted at {doubted}" if alarms_s else f"GPS was not doubted in {minutes:.0f} min"
+                )
             if told:
                 lines.append(f"* {name}, {which} edgevpr: {'; '.join(told)}.")
     return "\n".join(lines)
