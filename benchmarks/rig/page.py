@@ -7,7 +7,7 @@ from typing import Any
 import cv2
 import ground
 import numpy as np
-from figures import by_second, read_table, worse_by
+from figures import by_second, figures_of, read_table, worse_by
 from run_sets import made_by
 from scenarios import SCENARIOS
 from simulator import VEHICLES
@@ -35,14 +35,14 @@ def write_page(work: Path) -> None:
 def _runs(runs: Path, name: str) -> dict[str, Row]:
     """Return the figures of a scenario's runs: `with` edgevpr, and `without`."""
     folders = {"with": runs / name, "without": runs / f"{name}-control"}
-    found = {
-        which: json.loads((folder / "figures.json").read_text())
-        for which, folder in folders.items()
-        if (folder / "figures.json").exists()
-    }
+    found = {which: figures_of(folder) for which, folder in folders.items() if _is_whole(folder)}
     if len(found) == 2:
         found["with"]["worse_by_m"] = worse_by(*(_seconds(folder) for folder in folders.values()))
     return found
+
+
+def _is_whole(folder: Path) -> bool:
+    return (folder / "run.json").exists()  # written at the end of a run
 
 
 def _seconds(folder: Path) -> np.ndarray:
@@ -220,7 +220,7 @@ def _draw(work: Path, names: list[str], path: Path) -> None:
             (work / "runs" / f"{name}-control", _WITHOUT, ":", "without"),
             (work / "runs" / name, _WITH, "-", "with"),
         ):
-            if not (folder / "figures.json").exists():
+            if not _is_whole(folder):
                 continue
             loss_s = json.loads((folder / "run.json").read_text())["marks_s"]["loss"]
             track = read_table(folder / "track.csv")
