@@ -101,6 +101,7 @@ def test_the_figures_of_a_run(rig, tmp_path):
         }
         for t, east, var in located
     ]
+    log.append({"kind": "gps", "t_mono_s": 107.0, "is_wrong": True})
     log.append({"kind": "end", "mavlink": {"acks": {"ACCEPTED": 2}}})
     (tmp_path / "flight.jsonl").write_text("".join(json.dumps(line) + "\n" for line in log))
     run = {
@@ -127,6 +128,7 @@ def test_the_figures_of_a_run(rig, tmp_path):
     assert found["fixes"]["within"] == [0.75, 1.0]
     assert found["sent"]["COMMAND_INT"]["error"]["max"] == 3.0
     assert found["wire_ms"] == [100.0, 100.0]
+    assert found["gps_alarms_s"] == [7.0]
     assert found["answers"] == {"ACCEPTED": 2}
 
 

@@ -65,7 +65,9 @@ def figures_of(folder: Path) -> Row:
         ages_s = np.array([line["t_mono_s"] - line["t_frame_s"] for line in queries])
         found["query_ms"] = [round(1e3 * float(each)) for each in np.quantile(ages_s, (0.5, 0.99))] if queries else None
         found["learnt"] = _learnt(folder, log, loss_s)
-        found["gps_m_alarm_s"] = _gps_alarm(found["said"])
+        found["gps_alarms_s"] = [
+            round(line["t_mono_s"] - loss_s, 1) for line in log if line["kind"] == "gps" and line["is_wrong"]
+        ]
     if "back" in run["marks_s"]:
         found["heard_again_s"] = round(run["marks_s"]["heard_again"] - run["marks_s"]["back"], 2)
     return found
@@ -211,8 +213,3 @@ def _looked_at(picture: np.void) -> np.ndarray:
     middle = (camera.width - 1) / 2, (camera.height - 1) / 2, 1.0
     east, north, scale = np.linalg.solve(ground_to_pixel(pose, camera), middle)
     return np.array((east, north)) / scale
-
-
-def _gps_alarm(said: list) -> float | None:
-    """Return when edgevpr first said to the ground that GPS is wrong, seconds after the loss; None where it did not."""
-    return min((t_s for t_s, text in said if "gps" in text.lower()), default=None)

@@ -7,7 +7,7 @@ from typing import Any
 import cv2
 import ground
 import numpy as np
-from figures import by_second, read_table, worse_by
+from figures import by_second, figures_of, read_table, worse_by
 from run_sets import made_by
 from scenarios import SCENARIOS
 from simulator import VEHICLES
@@ -15,7 +15,7 @@ from simulator import VEHICLES
 from edgevpr.helpers.tables import markdown
 
 RESULTS = Path(__file__).resolve().parents[1] / "results"
-_SHOWN_PER_M = 1.0  # pixels of the ground in the picture
+_SHOWN_PER_M = 0.4  # pixels of the ground in the picture
 _TRUE, _WITH, _WITHOUT = "white", "#20e020", "#ff3030"
 
 Row = dict[str, Any]
@@ -35,14 +35,14 @@ def write_page(work: Path) -> None:
 def _runs(runs: Path, name: str) -> dict[str, Row]:
     """Return the figures of a scenario's runs: `with` edgevpr, and `without`."""
     folders = {"with": runs / name, "without": runs / f"{name}-control"}
-    found = {
-        which: json.loads((folder / "figures.json").read_text())
-        for which, folder in folders.items()
-        if (folder / "figures.json").exists()
-    }
+    found = {which: figures_of(folder) for which, folder in folders.items() if _is_whole(folder)}
     if len(found) == 2:
         found["with"]["worse_by_m"] = worse_by(*(_seconds(folder) for folder in folders.values()))
     return found
+
+
+def _is_whole(folder: Path) -> bool:
+    return (folder / "run.json").exists()  # written at the end of a run
 
 
 def _seconds(folder: Path) -> np.ndarray:
@@ -185,8 +185,12 @@ def _remarks(found: dict[str, dict[str, Row]]) -> str:
             if run.get("heard_again_s") is not None:
                 told.append(f"heard again {run['heard_again_s']} s after the autopilot was back")
             if name in ("plane_glitch", "plane_clean") and which == "with":
-                alarm_s = run["gps_m_alarm_s"]
-                told.append("GPS was not doubted" if alarm_s is None else f"GPS was doubted after {alarm_s} s")
+                alarms_s = run["gps_alarms_s"]
+                minutes = run["estimate"]["after"]["n"] / 600
+                doubted = ", ".join(f"{each} s" for each in alarms_s)
+                told.append(
+                    f"GPS was doubted at {doubted}" if alarms_s else f"GPS was not doubted in {minutes:.0f} min"
+                )
             if told:
                 lines.append(f"* {name}, {which} edgevpr: {'; '.join(told)}.")
     return "\n".join(lines)
@@ -206,7 +210,7 @@ def _draw(work: Path, names: list[str], path: Path) -> None:
     size = round(ground.WIDTH_M * _SHOWN_PER_M), round(ground.DEPTH_M * _SHOWN_PER_M)
     shown = 0.6 * cv2.resize(lit, size, interpolation=cv2.INTER_AREA)[..., ::-1] / 255
     rows = -(-len(names) // 2)
-    figure, axes = pyplot.subplots(rows, 2, figsize=(16, 6.2 * rows), squeeze=False)
+    figure, axes = pyplot.subplots(rows, 2, figsize=(14, 5.4 * rows), squeeze=False)
     for axis in axes.flat[len(names) :]:
         axis.axis("off")
     for axis, name in zip(axes.flat, names, strict=False):
@@ -216,7 +220,7 @@ def _draw(work: Path, names: list[str], path: Path) -> None:
             (work / "runs" / f"{name}-control", _WITHOUT, ":", "without"),
             (work / "runs" / name, _WITH, "-", "with"),
         ):
-            if not (folder / "figures.json").exists():
+            if not _is_whole(folder):
                 continue
             loss_s = json.loads((folder / "run.json").read_text())["marks_s"]["loss"]
             track = read_table(folder / "track.csv")
@@ -225,7 +229,7 @@ def _draw(work: Path, names: list[str], path: Path) -> None:
             axis.plot(after["east_m"], after["north_m"], color=_TRUE, lw=0.9, ls=style)
             if len(after):
                 titles.append(f"{word}: median {np.median(after['error_m']):.0f} m, max {after['error_m'].max():.0f} m")
-        axis.set(xlim=(-150, ground.WIDTH_M + 150), ylim=(-150, ground.DEPTH_M + 150), facecolor="0.25")
+        axis.set(xlim=(-80, ground.WIDTH_M + 80), ylim=(-80, ground.DEPTH_M + 80), facecolor="0.25")
         axis.set_title("; ".join(titles), fontsize=10)
         axis.tick_params(labelsize=7)
     figure.tight_layout()
