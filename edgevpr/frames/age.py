@@ -1,11 +1,14 @@
 """The time at which the pictures of a stream were taken, on this machine's clock."""
 
 import math
+from collections import deque
+from statistics import median
 
 _RESTART_S = 5.0  # a longer jump of the delay: the sender has begun anew, or something has held the stream up
 _BACKLOG_S = 0.005  # a picture that comes sooner than all before it by more has waited to be fetched
 _IN_TIME = 3  # pictures in a row after which none is waiting any more
 _WAITED_S = 0.002  # a picture that took longer to get was not there before
+_USUAL_OF, _AS_USUAL = 9, 1.5  # waits whose median is the usual one, and the share of it that is no delay
 _WINDOW_S, _STEADY_S = 5.0, 0.2  # delays that differ by no more for so long are the way, and not a jam
 
 
@@ -56,14 +59,20 @@ class StampedTime:
 
 
 class UnstampedTime:
-    """Time for streams without time stamps (MJPEG over HTTP): a picture that was waited for has come since it was asked
-    for. One that was there already may have come at any moment since the last one that was waited for was."""
+    """Time for streams without time stamps (MJPEG over HTTP). A picture that was waited for, for no longer than usual,
+    has just come. One that took longer may have been held up on its way: it has come since it was asked for. One that
+    was there already may have come at any moment since the last one that was waited for."""
 
     def __init__(self, opened_s: float) -> None:
-        self._waited_s = opened_s
+        self._since_s = opened_s
+        self._waits_s: deque[float] = deque(maxlen=_USUAL_OF)
 
     def taken_s(self, asked_s: float, t_mono_s: float) -> float:
-        """Return the earliest time at which the picture asked for at `asked_s` and got at `t_mono_s` can have come."""
-        if t_mono_s - asked_s > _WAITED_S:
-            self._waited_s = asked_s
-        return self._waited_s
+        """Return the time of the picture asked for at `asked_s` and got at `t_mono_s`: where that is in doubt, the
+        earliest at which it can have come."""
+        wait_s = t_mono_s - asked_s
+        if wait_s > _WAITED_S:
+            usual_s = median(self._waits_s) if len(self._waits_s) == _USUAL_OF else 0.0
+            self._since_s = t_mono_s if wait_s <= _AS_USUAL * usual_s else asked_s
+            self._waits_s.append(wait_s)
+        return self._since_s

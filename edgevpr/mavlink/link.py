@@ -135,9 +135,9 @@ class Link:
         return self._conversation.autopilot.vehicle
 
     def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
-        """Return the same with the roll, pitch and heading that the vehicle had at the time of a frame; roll and pitch
-        are None where no attitude was heard within 0.3 s of it. It also says when the newest fix that may be in its
-        position was sent."""
+        """Return the same with the position, roll, pitch and heading that the vehicle had at the time of a frame; roll
+        and pitch are None where no attitude was heard within 0.3 s of it. It also says when the newest fix that may be
+        in its position was sent."""
         return self._conversation.vehicle_at(t_mono_s)
 
     @property

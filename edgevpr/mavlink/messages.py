@@ -93,17 +93,17 @@ def report_requests(target_system: int, firmware: int, is_continuous: bool = Fal
     """Make a COMMAND_LONG (76) with SET_MESSAGE_INTERVAL (511) for every report that is wanted: GLOBAL_POSITION_INT
     (33) and ATTITUDE (30) ten times a second, GPS_RAW_INT (24) five times, and twice DISTANCE_SENSOR (132),
     TERRAIN_REPORT (136) and what the filter of a `firmware` (MAV_AUTOPILOT) says of itself. A continuous position also
-    takes ATTITUDE and SCALED_IMU (26) fifty times a second, and SYSTEM_TIME (2) and GPS_GLOBAL_ORIGIN (49) once. On
-    many autopilots the companion's port streams none of them unless asked."""
+    takes ATTITUDE and SCALED_IMU (26) twenty-five times a second, and SYSTEM_TIME (2) and GPS_GLOBAL_ORIGIN (49) once.
+    On many autopilots the companion's port streams none of them unless asked."""
     wanted_us = {
         mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 100_000,
-        mavlink.MAVLINK_MSG_ID_ATTITUDE: 20_000 if is_continuous else 100_000,
+        mavlink.MAVLINK_MSG_ID_ATTITUDE: _DENSE_US if is_continuous else 100_000,
         mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 200_000,
         mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR: 500_000,
         mavlink.MAVLINK_MSG_ID_TERRAIN_REPORT: 500_000,
     }
     if is_continuous:
-        wanted_us[mavlink.MAVLINK_MSG_ID_SCALED_IMU] = 20_000
+        wanted_us[mavlink.MAVLINK_MSG_ID_SCALED_IMU] = _DENSE_US
         wanted_us[mavlink.MAVLINK_MSG_ID_SYSTEM_TIME] = 1_000_000
         wanted_us[mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN] = 1_000_000
     if firmware in _FILTER_REPORTS:
@@ -205,6 +205,7 @@ def status_text(severity: Severity, text: str) -> Message:
     return mavlink.MAVLink_statustext_message(severity, data)
 
 
+_DENSE_US = 40_000  # an ArduPilot plane, whose loop turns fifty times a second, denies more than forty messages
 _UNUSED = 2**32 - 1
 # ArduPilot tells the pilot, in a text, of every request for a message that it does not know.
 _FILTER_REPORTS = {

@@ -5,7 +5,7 @@ from collections import Counter
 from dataclasses import replace
 from typing import Any
 
-from edgevpr.geodesy import distance_m
+from edgevpr.geodesy import distance_m, moved
 from edgevpr.mavlink.address import Sender
 from edgevpr.mavlink.attitude import Attitudes, Heights
 from edgevpr.mavlink.autopilots.channel import Channel
@@ -61,8 +61,13 @@ class Autopilot:
         self._heard_s = -math.inf
 
     def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
-        """Return the last report, with roll, pitch and heading at the time of a frame as far as they are known."""
+        """Return the last report, with position, roll, pitch and heading at the time of a frame as far as they are
+        known."""
         vehicle, attitude = self.vehicle, self.attitudes.at(t_mono_s)
+        if vehicle and vehicle.velocity_m_s and vehicle.is_fresh_at(t_mono_s):
+            by_m = ((t_mono_s - vehicle.t_heard_s) * each for each in vehicle.velocity_m_s)
+            lat_deg, lon_deg = moved(vehicle.lat_deg, vehicle.lon_deg, *by_m)
+            vehicle = replace(vehicle, lat_deg=lat_deg, lon_deg=lon_deg)
         if vehicle is None or attitude is None:
             return vehicle
         heading_deg = None if vehicle.heading_deg is None else attitude.yaw_deg % 360

@@ -91,3 +91,13 @@ def test_without_stamps_a_picture_that_was_there_already_is_as_old_as_the_last_w
     assert time.taken_s(asked_s=10.5, t_mono_s=10.5001) == 10.0
     assert time.taken_s(asked_s=10.5, t_mono_s=10.6) == 10.5, "it was waited for since then"
     assert time.taken_s(asked_s=13.0, t_mono_s=13.0005) == 10.5, "it may have come at any moment since"
+
+
+def test_without_stamps_one_that_comes_when_it_is_due_is_new_and_one_that_was_held_up_may_be_old():
+    time = UnstampedTime(opened_s=0.0)
+    taken_s = [time.taken_s(0.2 * number, 0.2 * number + 0.19) for number in range(20)]
+    assert taken_s[:9] == pytest.approx([0.2 * number for number in range(9)]), "what is usual is not known yet"
+    assert taken_s[9:] == pytest.approx([0.2 * number + 0.19 for number in range(9, 20)])
+    assert time.taken_s(4.0, 6.0) == 4.0
+    assert time.taken_s(6.0, 6.0005) == 4.0, "it was held up with it"
+    assert time.taken_s(6.1, 6.25) == 6.25

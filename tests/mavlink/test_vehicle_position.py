@@ -6,6 +6,7 @@ import pytest
 from fakes import FakeClock
 from mavlink_peers import Peer, UdpPort, wait_until
 
+from edgevpr.geodesy import offset_m
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.wire import mavlink
@@ -68,6 +69,21 @@ def test_the_position_of_the_pinned_autopilot_is_known_while_it_is_fresh(link_an
     assert fresh(link, clock) is None
     say(link, peer, 50.2, -14.5, hdg=65535)
     assert wait_until(lambda: fresh(link, clock)).heading_deg is None
+
+
+def test_at_the_time_of_a_frame_it_is_where_its_velocity_takes_it(link_and_peer, clock):
+    link, peer = link_and_peer
+    peer.heartbeat()
+    wait_until(lambda: link.stats().autopilot_heard)
+    say(link, peer, 50.0, 8.0, vx=2000, vy=-1000)
+    now_s = wait_until(lambda: fresh(link, clock)).t_heard_s
+    for seconds in (-0.4, 0.25):
+        there = link.vehicle_at(now_s + seconds)
+        assert offset_m(50.0, 8.0, there.lat_deg, there.lon_deg) == pytest.approx(
+            (-10 * seconds, 20 * seconds), abs=1e-6
+        )
+    old = link.vehicle_at(now_s + 1.5)
+    assert (old.lat_deg, old.lon_deg) == (50.0, 8.0), "nobody knows"
 
 
 def test_a_velocity_that_no_small_aircraft_has_is_unknown(link_and_peer, clock):
