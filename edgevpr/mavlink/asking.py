@@ -1,11 +1,9 @@
 """Questions to an autopilot on the ground: bounded in time and tries, over a link of any kind. Nothing is ever set."""
 
-import math
 import select
-import struct
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from types import TracebackType
 
@@ -13,6 +11,8 @@ from edgevpr.errors import LinkError
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.messages import AUTOPILOT, Health
+from edgevpr.mavlink.parameter import value_of
+from edgevpr.mavlink.signing import NOT_SIGNING, NotSigning, Signing
 from edgevpr.mavlink.transport import open_transport
 from edgevpr.mavlink.wire import Message, Receiver, mavlink
 
@@ -30,11 +30,18 @@ class Asking:
     a second, without which some ports do not answer.
 
     `heard` counts the autopilot's messages by name, `signed` those of them that carry a signature, `others` are the
-    system ids of further autopilots on the link, `bad_bytes` are bytes that are no message. Every method raises
-    LinkError where the link is lost.
+    system ids of further autopilots on the link, `bad_bytes` are bytes that are no message, `refused` counts messages
+    without the right signature by reason (`signs`: there is a key). Every method raises LinkError where the link is
+    lost.
     """
 
-    def __init__(self, address: LinkAddress, component_id: int = 197, system_id: int | None = None) -> None:
+    def __init__(
+        self,
+        address: LinkAddress,
+        component_id: int = 197,
+        system_id: int | None = None,
+        signing: Signing | NotSigning = NOT_SIGNING,
+    ) -> None:
         """Open the link; raises LinkError where it cannot be opened, as `open_transport` does, and where nothing is
         there."""
         self.system_id = system_id
@@ -43,7 +50,8 @@ class Asking:
         self.others: set[int] = set()
         self.says_version_1 = False  # of its last message
         self._address = address
-        self._receiver = Receiver()
+        self._signing = signing
+        self._receiver = Receiver(signing.admits)
         self._packer = mavlink.MAVLink(None, srcSystem=system_id or 1, srcComponent=component_id)
         self._waiting: deque[bytes] = deque(maxlen=_WAITING_MAX)  # packets to be written, one datagram each
         self._arrived: deque[Message] = deque()  # not looked at yet
@@ -69,6 +77,14 @@ class Asking:
     @property
     def bad_bytes(self) -> int:
         return self._receiver.bad_bytes
+
+    @property
+    def signs(self) -> bool:
+        return self._signing is not NOT_SIGNING
+
+    @property
+    def refused(self) -> Mapping[str, int]:
+        return self._signing.refused
 
     def heartbeat(self, wait_s: float = HEARTBEAT_WAIT_S) -> Message | None:
         """Wait for a heartbeat of the autopilot; from then on only that one is listened to. None: none came."""
@@ -131,7 +147,7 @@ class Asking:
             if said is None:
                 return
             waiting.remove(said.param_id)
-            if said.get_type() == "PARAM_VALUE" and math.isfinite(value := _value(said, bytewise)):
+            if said.get_type() == "PARAM_VALUE" and (value := value_of(said, bytewise)) is not None:
                 found[said.param_id] = value
 
     def _first(self, wait_s: float, wanted: Callable[[Message], bool]) -> Message | None:
@@ -191,6 +207,7 @@ class Asking:
         return True
 
     def _put(self, message: Message) -> None:
+        self._signing.stamp(self._packer)
         self._waiting.append(message.pack(self._packer))
         self._packer.seq = (self._packer.seq + 1) % 256
 
@@ -206,11 +223,3 @@ def _refuses(message: Message) -> bool:
 def _parameter_name(message: Message) -> str | None:
     """Return the name of the parameter that a message gives, or says to be unknown."""
     return message.param_id if message.get_type() in ("PARAM_VALUE", "PARAM_ERROR") else None
-
-
-def _value(said: Message, bytewise: bool) -> float | int:
-    """Read a PARAM_VALUE: the float32 is the number itself, or holds the bytes of a whole number."""
-    is_whole = said.param_type < mavlink.MAV_PARAM_TYPE_REAL32
-    if is_whole and bytewise:
-        return struct.unpack("<i", struct.pack("<f", said.param_value))[0]
-    return int(said.param_value) if is_whole and math.isfinite(said.param_value) else said.param_value

@@ -187,7 +187,7 @@ class Conversation:
         else:
             self.outbox.drop_stale_fixes(now_s)
         if text := self.texts.next(now_s):
-            self.outbox.put(text)
+            return text, None  # not by the outbox, of which the ground's link gets a copy: it has its own texts
         message = self.outbox.next_message()
         while message and not self.requests.admits(message, now_s):
             message = self.outbox.next_message()

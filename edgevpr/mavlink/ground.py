@@ -29,6 +29,8 @@ class GroundLink(Link):
         super().__init__(address, clock=clock)
         self._conversation = GroundConversation(flight._conversation, clock)
         flight._conversation.outbox.copy_to = self._tell
+        # Texts wait for their turn on each link by itself: on one that is lost they wait for ever.
+        flight._conversation.texts.copy_to = self.announce
 
     def _tell(self, message: Message) -> None:
         if message.get_type() in FOR_PEOPLE:

@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 
 from edgevpr.geodesy import offset_m
+from edgevpr.mavlink.autopilots.px4 import SENSOR_ID
 from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.wire import Message, mavlink
 
@@ -34,7 +35,7 @@ def position_sensor(fix: Fix, t_sent_s: float) -> Message:
     return mavlink.MAVLink_global_position_sensor_message(
         target_system=0,
         target_component=0,
-        id=0,
+        id=SENSOR_ID,
         time_usec=round(t_sent_s * 1e6),
         processing_time=0,
         source=mavlink.GLOBAL_POSITION_SRC_VISION,

@@ -6,17 +6,13 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from edgevpr.mavlink.asking import Asking
+from edgevpr.mavlink.autopilots.channel import Asked, Kind, kind_of
 from edgevpr.mavlink.wire import Message, mavlink
 
 LISTEN_S = 4.0
 ROUND_TRIPS = 10
 
 _FIRMWARES = {mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: "ardupilot", mavlink.MAV_AUTOPILOT_PX4: "px4"}
-_VEHICLES = {  # MAV_TYPE
-    "plane": (1, 19, 20, 21, 22, 23, 24, 25),  # what takes off upright and flies on wings has a plane's firmware
-    "copter": (2, 3, 4, 13, 14, 15, 29, 35, 43),
-    "rover": (10, 11, 46),
-}
 _RELEASES = {0: "-dev", 64: "-alpha", 128: "-beta", 192: "-rc", 255: ""}  # FIRMWARE_VERSION_TYPE
 _BYTEWISE = mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
 
@@ -36,9 +32,10 @@ class Filter:
 class Reading:
     """The answers of an autopilot; None and empty stand for what it did not say.
 
-    `firmware` is "ardupilot", "px4" or "other"; `vehicle` is "plane", "copter", "rover" or "other"; `gps_fix` holds
-    the fix type of each receiver; `streams_hz` the messages that came without being asked for, `heard` all that came.
-    `clock_ahead_s` is how far the UTC of the autopilot is ahead of this machine's.
+    `firmware` is "ardupilot", "px4" or "other"; `vehicle` is the value of its `Kind`; `gps_fix` holds the fix type of
+    each receiver; `streams_hz` the messages that came without being asked for, `heard` all that came. `signs`: its
+    messages are signed; `is_signed_to`: ours are. `clock_ahead_s` is how far the UTC of the autopilot is ahead of this
+    machine's.
     """
 
     system_id: int
@@ -54,12 +51,18 @@ class Reading:
     filter: Filter | None
     origin: tuple[float, float] | None
     signs: bool
+    is_signed_to: bool
     answers: bool
     says_version_1: bool
     other_systems: tuple[int, ...]
     bad_bytes: int
     round_trip_s: float | None
     clock_ahead_s: float | None
+
+    @property
+    def asked(self) -> Asked:
+        """Answers by which the flight chooses the channel."""
+        return Asked(kind=Kind(self.vehicle), version=self.version and self.version[:2], parameters=self.parameters)
 
 
 def read_autopilot(asking: Asking, wanted: Mapping[str, Iterable[str]]) -> Reading | None:
@@ -90,7 +93,7 @@ def read_autopilot(asking: Asking, wanted: Mapping[str, Iterable[str]]) -> Readi
     return Reading(
         system_id=asking.system_id,
         firmware=firmware,
-        vehicle=next((name for name, types in _VEHICLES.items() if beat.type in types), "other"),
+        vehicle=kind_of(beat.type).value,
         is_armed=bool(beat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED),
         version=_version(said.flight_sw_version) if said else None,
         version_text=_version_text(said.flight_sw_version) if said else None,
@@ -101,6 +104,7 @@ def read_autopilot(asking: Asking, wanted: Mapping[str, Iterable[str]]) -> Readi
         filter=report and _filter(report),
         origin=(origin.latitude / 1e7, origin.longitude / 1e7) if origin else None,
         signs=asking.signed > 0,
+        is_signed_to=asking.signs,
         answers=answers,
         says_version_1=asking.says_version_1,
         other_systems=tuple(sorted(asking.others)),

@@ -16,17 +16,18 @@ from types import MappingProxyType
 
 from edgevpr.errors import ConfigError
 from edgevpr.helpers.files import open_file
-from edgevpr.mavlink.timestamps import CROWDED, FUTURE, OLD, TimeStamps
+from edgevpr.mavlink.timestamps import CROWDED, FUTURE, OLD, BorrowedTimeStamps, TimeStamps
 from edgevpr.mavlink.wire import Message, mavlink
 
 KEY_BYTES = 32
-TO_AUTOPILOT, TO_GROUND = 1, 2  # link ids: who hears us over both has two streams, each with its own time
+# Link ids: who hears us over two has two streams, each with its own time.
+TO_AUTOPILOT, TO_GROUND, TO_ASK = 1, 2, 3
 UNSIGNED, WRONG = "unsigned", "wrong signature"
 _SIGNATURE_BYTES, _STAMP_BYTES = 6, 6
 _BLOCK_BYTES = 1 + _STAMP_BYTES + _SIGNATURE_BYTES  # link id, time stamp, signature
 _MAKE_ONE = "`(umask 077; head -c 32 /dev/urandom > FILE)` makes one"
 
-_MEANING = {
+MEANING = {
     UNSIGNED: "the other end does not sign: give it the key, or remove `mavlink.signing_key`",
     WRONG: "the other end has another key, or somebody forges them",
     OLD: "usual for a moment after a start; else they are sent again by somebody, or the other end does not hear us",
@@ -83,7 +84,7 @@ class Signing:
         if reason is None or (reason == UNSIGNED and _is_of_radio(header)):
             return True
         if reason not in self.refused:
-            log.warning("messages are refused (%s): %s", reason, _MEANING[reason])
+            log.warning("messages are refused (%s): %s", reason, MEANING[reason])
         self.refused[reason] += 1
         return False
 
@@ -105,10 +106,21 @@ def _is_of_radio(header: mavlink.MAVLink_header) -> bool:
 def open_signing(key_path: str | None, state_path: str | None) -> Signing | NotSigning:
     """Read the key and the time kept; without a key there is no signing. `state_path` is where the time is kept, None:
     beside the key. Raises ConfigError."""
+    return _opened(key_path, state_path, TimeStamps, TO_AUTOPILOT)
+
+
+def open_signing_to_ask(key_path: str | None, state_path: str | None) -> Signing | NotSigning:
+    """Open the same for questions on the ground: the time that is kept is read, and not written. Raises ConfigError."""
+    return _opened(key_path, state_path, BorrowedTimeStamps, TO_ASK)
+
+
+def _opened(
+    key_path: str | None, state_path: str | None, time_stamps: type[TimeStamps], link_id: int
+) -> Signing | NotSigning:
     if key_path is None:
         return NOT_SIGNING
     key = read_key(key_path)
-    return Signing(key, TimeStamps(Path(state_path or f"{key_path}.time")))
+    return Signing(key, time_stamps(Path(state_path or f"{key_path}.time")), link_id)
 
 
 def read_key(path: str) -> bytes:

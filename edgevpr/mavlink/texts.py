@@ -2,6 +2,7 @@
 
 import logging
 import math
+from collections.abc import Callable
 from threading import Lock
 
 from edgevpr.mavlink.messages import Severity, status_text
@@ -27,6 +28,7 @@ class Texts:
         self._said: dict[str, str] = {}  # the last text of each topic
         self._spacing_s = SPACING_S
         self._sent_s = -math.inf
+        self.copy_to: Callable[[Severity, str, str | None], None] = lambda severity, text, topic: None  # every text
 
     def put(self, severity: Severity, text: str, topic: str | None = None) -> None:
         """Let a text wait. One without a topic is about nothing else (it is its own topic, and may be said again)."""
@@ -44,6 +46,7 @@ class Texts:
                 del self._waiting[topic_or_text, severity]
             if len(self._waiting) > WAITING_MAX:
                 self._drop_one()
+        self.copy_to(severity, text, topic)
 
     def next(self, now_s: float) -> Message | None:
         """Return the text that is to be sent at this moment, None where there is none or it is too early."""

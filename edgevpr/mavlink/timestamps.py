@@ -121,6 +121,19 @@ class TimeStamps:
             log.warning("%s: the time of signed messages is not kept (%s)", self._path, error.strerror)
 
 
+class BorrowedTimeStamps(TimeStamps):
+    """Time stamps for a program that only asks: the file is read, and never written. It may run as root, whose file the
+    service could not write.
+
+    So the next flight does not know what was sent meanwhile. It need not: with a link id of its own the program is
+    another stream, which the autopilot compares with the flight's only for whether a new one is a minute old. Both
+    begin at the same kept time, and the program ends within that minute.
+    """
+
+    def _write(self, stamp: int) -> None:
+        """Do nothing."""
+
+
 def _read(path: Path) -> int:
     """Read the kept time stamp, 0 where there is none."""
     try:

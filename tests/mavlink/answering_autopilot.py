@@ -54,13 +54,13 @@ class AnsweringAutopilot:
 
     `messages` are those it can be asked for, `parameters` those it has. It `loses` so many of the first questions of
     each kind; `is_mute` answers nothing at all; `says_unknown` answers for a parameter that it has not (else it is
-    silent, as older firmware is).
+    silent, as older firmware is). With `wants_signed` it takes only what pymavlink finds signed with its `key`.
     """
 
     def __init__(
         self, to: int | Path, *, parameters=None, messages=(), firmware=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
         vehicle=mavlink.MAV_TYPE_QUADROTOR, system_id=1, loses=0, is_mute=False, says_unknown=True, key=None,
-        version_1=False, noise=b"",
+        version_1=False, noise=b"", wants_signed=False,
     ) -> None:  # fmt: skip
         self.heard = []
         self._parameters, self._loses, self._noise = parameters or {}, loses, noise
@@ -70,7 +70,10 @@ class AnsweringAutopilot:
         self._packer = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=1)
         if key:
             self._packer.signing.secret_key, self._packer.signing.sign_outgoing = key, True
-        self._receiver = Receiver()
+            self._packer.signing.timestamp = int((time.time() - 1_420_070_400) * 1e5)
+        self._receiver = Receiver(lambda message: not wants_signed or message.get_signed())
+        if wants_signed:
+            self._receiver._parser_of(None).signing.secret_key = key
         self._port = UdpEnd(to) if isinstance(to, int) else SerialEnd(to)
         self._lost = {}
         self._stop = threading.Event()

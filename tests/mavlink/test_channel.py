@@ -57,6 +57,7 @@ def test_the_receiver_is_the_one_that_is_ours_and_as_late_as_it_is_taken_to_be()
 
 def test_a_copter_with_nothing_set_up_is_told_what_to_set():
     assert "GPS2_TYPE=14" in ardupilot.choice(asked(Kind.COPTER, GPS1_TYPE=1)).reason
+    assert "GPS_TYPE2=14" in ardupilot.choice(asked(Kind.ROVER, GPS_TYPE=1, GPS_TYPE2=0)).reason
     assert "GPS2_TYPE" not in ardupilot.choice(asked(Kind.PLANE, GPS1_TYPE=1)).reason
 
 
@@ -65,11 +66,20 @@ def test_a_px4_gets_the_sensor_s_message_where_it_fuses_it():
     assert px4.choice(asked(version=(1, 17), EKF2_AGP0_CTRL=2)).channel is Channel.COMMAND
     assert px4.choice(asked(version=(1, 16), EKF2_AGP0_CTRL=1)).channel is Channel.COMMAND
     assert px4.choice(asked(version=None)).channel is Channel.COMMAND
+    assert px4.choice(asked(version=None, EKF2_AGP0_CTRL=3)).channel is Channel.SENSOR
+
+
+def test_a_px4_can_be_told_to_fuse_where_it_has_the_parameter():
+    assert px4.can_fuse(asked(version=(1, 17), EKF2_AGP0_CTRL=0))
+    assert not px4.can_fuse(asked(version=(1, 17)))
+    assert not px4.can_fuse(asked(version=(1, 16), EKF2_AGP0_CTRL=0))
 
 
 def test_kinds():
     assert kind_of(mavlink.MAV_TYPE_HEXAROTOR) is Kind.COPTER
     assert kind_of(mavlink.MAV_TYPE_FIXED_WING) is Kind.PLANE
+    assert kind_of(mavlink.MAV_TYPE_VTOL_TILTROTOR) is Kind.PLANE
+    assert kind_of(mavlink.MAV_TYPE_SURFACE_BOAT) is Kind.ROVER
     assert kind_of(mavlink.MAV_TYPE_SUBMARINE) is Kind.OTHER
 
 

@@ -7,7 +7,7 @@ from fakes import FakeClock
 from mavlink_peers import Peer, UdpPort, free_port, wait_until
 
 from edgevpr.errors import LinkAddressError
-from edgevpr.mavlink.address import parse_link, parse_links
+from edgevpr.mavlink.address import LinkAddress, parse_link, parse_links
 from edgevpr.mavlink.ground import GroundLink
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import (
@@ -73,6 +73,30 @@ def test_what_the_link_itself_has_to_say_is_said_on_the_ground_too(two, clock):
     clock.now_s += 2.0
     autopilot.heartbeat()
     assert station.expect("STATUSTEXT").text == "edgevpr: fixes unanswered: signing? system id?"
+
+
+def test_the_ground_hears_texts_while_the_flight_controller_s_cable_is_out(clock, tmp_path):
+    with closing(UdpPort()) as port:
+        flight = Link(LinkAddress("serial", str(tmp_path / "absent"), 57_600), clock=clock)
+        with flight, GroundLink(parse_link(f"udpout:127.0.0.1:{port.number}"), flight, clock):
+            station = Peer(port, system_id=255)
+            flight.announce(Severity.WARNING, "link lost", "link")
+            station.expect_text("edgevpr: link lost")
+            assert not flight.stats().connected
+            clock.now_s += 6.0
+            flight.announce(Severity.INFO, "link back", "link")
+            station.expect_text("edgevpr: link back")
+
+
+def test_a_text_is_said_once_on_each_link(two, clock):
+    flight, autopilot, _, station = two
+    flight.announce(Severity.INFO, "once")
+    for peer in (autopilot, station):
+        peer.expect_text("edgevpr: once")
+    clock.now_s += 6.0
+    flight.announce(Severity.INFO, "then")
+    for peer in (autopilot, station):
+        assert "edgevpr: once" not in [getattr(each, "text", "") for each in peer.expect_text("edgevpr: then")]
 
 
 def test_both_ends_hear_the_same_vehicle_component_and_health(two, clock):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from edgevpr.geodesy import moved
+from edgevpr.mavlink.autopilots.px4 import SENSOR_ID
 from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.positions import State, gps_input, odometry, position_sensor
 from edgevpr.mavlink.wire import Receiver, mavlink
@@ -78,4 +79,5 @@ def test_a_sensor_says_accuracy_and_no_altitude():
     assert (heard.lat, heard.lon, heard.eph) == (475_000_000, 82_500_000, 4.0)
     assert math.isnan(heard.alt)
     assert math.isnan(heard.epv)
+    assert heard.id == SENSOR_ID != 0, "EKF2_AGP0_ID 0 is a slot that is off"
     assert heard.source == mavlink.GLOBAL_POSITION_SRC_VISION

@@ -8,7 +8,7 @@ from fakes import FakeClock
 from mavlink_peers import wait_until
 
 from edgevpr.errors import ConfigError
-from edgevpr.mavlink.timestamps import OLD, TICKS_S, TimeStamps
+from edgevpr.mavlink.timestamps import OLD, TICKS_S, BorrowedTimeStamps, TimeStamps
 
 STREAM = (7, 1, 0)
 MINUTE = 60 * TICKS_S
@@ -121,3 +121,21 @@ def test_a_disk_that_becomes_full_in_flight_ends_nothing(path, monkeypatch, capl
         assert stamps.next() > first
     assert (len(tries), caplog.text.count("is not kept (No space left on device)")) == (3, 1)
     stamps_at(path)  # nor does it at the next start, where there is a time from before
+
+
+def test_a_borrowed_time_goes_on_from_the_file_and_leaves_it_as_it_is(path):
+    clock = FakeClock()
+    flown = stamps_at(path, clock=clock).next()
+    before = path.read_bytes()
+    borrowed = BorrowedTimeStamps(path, clock, lambda: 0.0)
+    assert borrowed.next() > flown
+    clock.now_s += 300
+    assert borrowed.refusal((1, 1, 0), borrowed.next() + 3600 * TICKS_S) is None  # the time is learnt
+    assert borrowed.next() > flown + 3600 * TICKS_S
+    assert path.read_bytes() == before
+    assert stamps_at(path, clock=clock).next() < flown + 3600 * TICKS_S
+
+
+def test_a_borrowed_time_needs_no_file(tmp_path):
+    assert BorrowedTimeStamps(tmp_path / "absent" / "time").next() > 0
+    assert list(tmp_path.iterdir()) == []

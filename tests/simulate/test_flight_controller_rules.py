@@ -245,11 +245,11 @@ def test_a_px4_copter_without_any_aid_lands_after_five_seconds():
     assert any("Failsafe" in text for text in flown.texts)
 
 
-def sensed(flown: Flown, north_m: float = 0.0, eph_m: float = 5.0):
+def sensed(flown: Flown, north_m: float = 0.0, eph_m: float = 5.0, number: int = 1):
     return mavlink.MAVLink_global_position_sensor_message(
         target_system=1,
         target_component=1,
-        id=0,
+        id=number,
         time_usec=0,
         processing_time=0,
         source=2,
@@ -271,8 +271,10 @@ def test_px4_fuses_message_296():
     assert flown.error_m < 5
     assert flown.flags & mavlink.ESTIMATOR_POS_HORIZ_ABS, "no failsafe"
     assert flown.fix() == NOT_NOW, "it does not reckon"
-    flown.tell(sensed(flown, eph_m=0.0))
-    flown.wait(7)
+    for _ in range(14):
+        flown.tell(sensed(flown, eph_m=0.0))
+        flown.tell(sensed(flown, number=2))  # of another slot
+        flown.wait(0.5)
     assert not flown.flags & mavlink.ESTIMATOR_POS_HORIZ_ABS
 
 

@@ -4,8 +4,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum, auto
 
-from edgevpr.mavlink.wire import mavlink
-
 
 class Channel(Enum):
     """A way to tell an autopilot a position. The first two are for single fixes, rare and late; the last two ask for an
@@ -52,13 +50,17 @@ class Asked:
 
 
 def kind_of(mav_type: int) -> Kind:
-    """Return the kind of a vehicle by the type in its HEARTBEAT (MAV_TYPE)."""
+    """Return the kind of a vehicle by the type in its HEARTBEAT (MAV_TYPE).
+
+    What takes off upright and flies on wings is a plane: on its wings it reckons by airspeed and without sideslip, as a
+    plane does. While it hovers it has no more than a copter has; its type does not tell which it does.
+    """
     return _KINDS.get(mav_type, Kind.OTHER)
 
 
-_COPTERS = ("QUADROTOR", "COAXIAL", "HELICOPTER", "HEXAROTOR", "OCTOROTOR", "TRICOPTER", "DODECAROTOR", "DECAROTOR")
-_KINDS = {
-    mavlink.MAV_TYPE_FIXED_WING: Kind.PLANE,
-    mavlink.MAV_TYPE_GROUND_ROVER: Kind.ROVER,
-    mavlink.MAV_TYPE_SURFACE_BOAT: Kind.ROVER,
-} | {getattr(mavlink, f"MAV_TYPE_{name}"): Kind.COPTER for name in _COPTERS}
+_NUMBERS = {  # MAV_TYPE
+    Kind.PLANE: (1, 19, 20, 21, 22, 23, 24, 25),
+    Kind.COPTER: (2, 3, 4, 13, 14, 15, 29, 35, 43),
+    Kind.ROVER: (10, 11, 46),
+}
+_KINDS = {number: kind for kind, numbers in _NUMBERS.items() for number in numbers}

@@ -2,17 +2,16 @@
 
 import logging
 import math
-import struct
 from collections.abc import Iterator
 
 from edgevpr.mavlink.autopilots import ardupilot, px4
 from edgevpr.mavlink.autopilots.channel import Asked, Channel, Choice, Kind, kind_of
+from edgevpr.mavlink.parameter import value_of
 from edgevpr.mavlink.wire import Message, mavlink
 
 _ASK_EVERY_S, _TIMES = 1.0, 4
 _UNKNOWN = Choice(Channel.COMMAND, "command 43003, the only one that is asked of an unknown firmware")
 _FIRMWARES = {mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: ardupilot, mavlink.MAV_AUTOPILOT_PX4: px4}
-_FLOATS = (mavlink.MAV_PARAM_TYPE_REAL32, mavlink.MAV_PARAM_TYPE_REAL64)
 
 log = logging.getLogger(__name__)
 
@@ -39,7 +38,9 @@ class Interview:
             case "AUTOPILOT_VERSION":
                 self._version = message.flight_sw_version >> 24 & 255, message.flight_sw_version >> 16 & 255
             case "PARAM_VALUE" if message.param_id in self._wanted():
-                self._parameters[message.param_id] = _value(message, self._firmware)
+                value = value_of(message, bytewise=self._firmware == mavlink.MAV_AUTOPILOT_PX4)
+                if value is not None:
+                    self._parameters[message.param_id] = value
 
     def questions(self, now_s: float, target_system: int) -> Iterator[Message]:
         """Yield the questions that are due. After the last of them, and a while for the answers, the channel is
@@ -78,10 +79,3 @@ class Interview:
         said = f" {self._version[0]}.{self._version[1]}" if self._version else ""
         named = {ardupilot: "ArduPilot", px4: "PX4"}.get(firmware, "unknown firmware")
         log.info("%s%s on a %s: positions go to it by %s", named, said, self.kind.value, self.choice.reason)
-
-
-def _value(message: Message, firmware: int) -> float:
-    """Return the value of a parameter. PX4 sends the bytes of a whole number in the place of the float's."""
-    if firmware != mavlink.MAV_AUTOPILOT_PX4 or message.param_type in _FLOATS:
-        return message.param_value
-    return float(struct.unpack("<i", struct.pack("<f", message.param_value))[0])

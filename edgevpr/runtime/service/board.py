@@ -13,6 +13,7 @@ from pathlib import Path
 from edgevpr.config import Config
 from edgevpr.errors import UsageError
 from edgevpr.mavlink.address import LinkAddress
+from edgevpr.mavlink.tlog import SPARED_BYTES
 from edgevpr.places.mapfiles import map_path
 from edgevpr.power import machine
 from edgevpr.power.boards import load_board
@@ -37,7 +38,7 @@ def board_findings(config: Config, address: LinkAddress | None, root: Path = Pat
         yield device("serial", address.where, root)
     if config.source.uri and config.source.uri.startswith("/dev/"):
         yield device("camera", config.source.uri, root)
-    yield looked_at("log", lambda: log_room(config))
+    yield from log_findings(config)
     if config.map:
         yield _map_room(config)
 
@@ -96,19 +97,29 @@ def device(what: str, path: str, root: Path = Path("/")) -> Finding:
     return Finding(what, True, f"{path}, {mode}")
 
 
-def log_room(config: Config) -> str:
-    """Describe where the flight log goes. Raises UsageError where it could not be written, or the disk is full."""
-    if config.log.path is None:
-        return "none, so nothing of the flight is kept"
-    # Unlike all else, the log is not opened: a check as root would leave a file that the service may not write.
-    path = Path(config.log.path).absolute()
+def log_findings(config: Config) -> Iterator[Finding]:
+    """Tell where the flight log goes, and the tlog if there is to be one, and whether they can be written."""
+    log = config.log
+    if log.path is None:
+        yield Finding("log", True, "none, so nothing of the flight is kept")
+    else:
+        yield looked_at("log", lambda: _room(log.path, "path", LOG_ROOM_MB))
+    if log.tlog is not None and config.mavlink.link is None:
+        yield Finding("tlog", True, "none, since there is no link")
+    elif log.tlog is not None:
+        yield looked_at("tlog", lambda: _room(log.tlog, "tlog", SPARED_BYTES / 1e6 + LOG_ROOM_MB))
+
+
+def _room(file: str, key: str, needed_mb: float) -> str:
+    # Unlike all else, a log is not opened: a check as root would leave a file that the service may not write.
+    path = Path(file).absolute()
     if path.is_dir() or not path.parent.is_dir():
-        raise UsageError(f"{path} is no file in a folder that is there: correct `log: {{path: ...}}`.")
+        raise UsageError(f"{path} is no file in a folder that is there: correct `log: {{{key}: ...}}`.")
     if not os.access(path if path.exists() else path.parent, os.W_OK):
-        raise UsageError(f"{path} may not be written by this user: change its permissions or `log: {{path: ...}}`.")
+        raise UsageError(f"{path} may not be written by this user: change its permissions or `log: {{{key}: ...}}`.")
     free_mb = shutil.disk_usage(path.parent).free / 1e6
-    if free_mb < LOG_ROOM_MB:
-        raise UsageError(f"{path}: only {free_mb:.1f} MB are free there, {LOG_ROOM_MB} are needed: make room.")
+    if free_mb < needed_mb:
+        raise UsageError(f"{path}: only {free_mb:.1f} MB are free there, {needed_mb:g} are needed: make room.")
     return str(path)
 
 

@@ -17,7 +17,7 @@ from edgevpr.frames.source import Source, open_source
 from edgevpr.helpers.files import require_folder
 from edgevpr.mavlink.address import LinkAddress, parse_links
 from edgevpr.mavlink.asking import Asking
-from edgevpr.mavlink.signing import read_key
+from edgevpr.mavlink.signing import open_signing_to_ask
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import map_path
 from edgevpr.power.boards import load_board
@@ -28,7 +28,7 @@ from edgevpr.runtime.preflight.pick import outlook
 from edgevpr.runtime.recognise.calibrated import calibration_of
 from edgevpr.runtime.recognise.learn import check_positions
 from edgevpr.runtime.recognise.opening import open_recogniser
-from edgevpr.runtime.service.board import log_room
+from edgevpr.runtime.service.board import log_findings
 from edgevpr.runtime.service.doctor import silence
 from edgevpr.runtime.service.finding import Finding, looked_at
 from edgevpr.types import FIX_MAX_AGE_S
@@ -65,7 +65,7 @@ def check(
     say("waiting for the flight controller")
     findings.append(looked_at("link", lambda: _link(config, _only_opened if offline else _with_a_heartbeat)))
     say("")
-    return [*findings, looked_at("log", lambda: log_room(config))]
+    return [*findings, *log_findings(config)]
 
 
 def learn_mask(config_path: str | Path, out: Path, recording: str | None = None) -> str:
@@ -185,13 +185,13 @@ def _link(config: Config, look: Callable[[Asking, LinkAddress], str]) -> str:
     address, ground = parse_links(settings.link, settings.ground)
     if address is None:
         return "none, so what is recognised goes into the log only"
-    with Asking(address, settings.component_id, settings.system_id) as asking:
+    signing = open_signing_to_ask(settings.signing_key, settings.signing_state)
+    with Asking(address, settings.component_id, settings.system_id, signing) as asking:
         said = [f"{address}{look(asking, address)}"]
     if ground:
         with Asking(ground, settings.component_id, settings.system_id):
             said.append(f"ground station at {ground}")
     if settings.signing_key is not None:
-        read_key(settings.signing_key)  # the time is not looked at, for the same reason as the log in `_log`
         said.append("signed")
     return ", ".join(said if settings.send_fixes else [*said, DRY_RUN])
 
@@ -202,5 +202,5 @@ def _only_opened(asking: Asking, address: LinkAddress) -> str:
 
 def _with_a_heartbeat(asking: Asking, address: LinkAddress) -> str:
     if asking.heartbeat() is None:
-        raise LinkError(silence(address, asking.bad_bytes, asking.others).message)
+        raise LinkError(silence(address, asking.bad_bytes, asking.others, asking.refused).message)
     return f", autopilot heard: system {asking.system_id}"

@@ -1,14 +1,16 @@
 """`edgevpr doctor`: is this flight controller, with this board, set up for edgevpr? It reads, and never writes."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 from edgevpr.config import Config
 from edgevpr.errors import LinkAddressError, LinkError
 from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.asking import Asking
 from edgevpr.mavlink.reading import Reading, read_autopilot
+from edgevpr.mavlink.signing import MEANING, open_signing_to_ask
 from edgevpr.runtime.service import ardupilot, px4
 from edgevpr.runtime.service.board import board_findings
 from edgevpr.runtime.service.finding import Finding
@@ -37,15 +39,17 @@ class Diagnosis:
 def doctor(config: Config, address: LinkAddress, say: Callable[[str], None], root: Path = Path("/")) -> Diagnosis:
     """Examine the autopilot at the other end of a link, and this machine (its files below `root`). `say` is told in a
     few words what is waited for. Raises LinkAddressError for an address that is wrong, and ConfigError for a board that
-    is unknown."""
+    is unknown or a signing key that cannot be used."""
+    settings = config.mavlink
+    signing = open_signing_to_ask(settings.signing_key, settings.signing_state)
     about_board = list(board_findings(config, address, root))
     say(f"asking the autopilot at {address}")
     reading, trouble = None, None
     try:
-        with Asking(address, config.mavlink.component_id, config.mavlink.system_id) as asking:
+        with Asking(address, settings.component_id, settings.system_id, signing) as asking:
             reading = read_autopilot(asking, {name: rules.PARAMETERS for name, rules in _ADVICE.items()})
             if reading is None:
-                trouble = silence(address, asking.bad_bytes, asking.others)
+                trouble = silence(address, asking.bad_bytes, asking.others, asking.refused)
     except LinkAddressError:
         raise
     except LinkError as error:
@@ -55,8 +59,13 @@ def doctor(config: Config, address: LinkAddress, say: Callable[[str], None], roo
     return Diagnosis(about_autopilot + about_board, reading)
 
 
-def silence(address: LinkAddress, bad_bytes: int, others: set[int]) -> Finding:
-    """Explain that no heartbeat was heard, by what else arrived."""
+def silence(
+    address: LinkAddress, bad_bytes: int, others: set[int], refused: Mapping[str, int] = MappingProxyType({})
+) -> Finding:
+    """Explain that no heartbeat was heard, by what else arrived; `refused` counts what is not believed, by reason."""
+    if refused:
+        why = max(refused, key=refused.get)
+        return Finding("link", False, f"{address}: messages arrive, and are refused ({why}): {MEANING[why]}.")
     if others:
         systems = " and ".join(map(str, sorted(others)))
         return Finding(
@@ -98,18 +107,36 @@ def autopilot_findings(reading: Reading, address: LinkAddress) -> Iterator[Findi
     if reading.firmware not in _ADVICE:
         yield Finding("firmware", False, "It is neither ArduPilot nor PX4: edgevpr sends no fixes to it.")
     elif reading.answers:
+        yield _firmware(reading)
         yield from _ADVICE[reading.firmware].findings(reading)
     if reading.answers:
         yield from (_streams(reading), _filter(reading), _gps(reading), _origin(reading), _clock(reading))
+
+
+def _firmware(reading: Reading) -> Finding:
+    name, needed = _NAMES[reading.firmware], _ADVICE[reading.firmware].KNOWS_FIXES
+    least = f"{needed[0]}.{needed[1]} or later"
+    if reading.version is None:
+        return Finding("firmware", False, f"{name} does not tell its version: update it to {least}.")
+    if reading.version[:2] < needed:
+        return Finding(
+            "firmware",
+            False,
+            f"{name} {reading.version_text} does not know position fixes (command 43003): update it.",
+            (f"{name} {least}",),
+        )
+    return Finding("firmware", True, f"{name} {reading.version_text}, {reading.vehicle}")
 
 
 def _link(reading: Reading, address: LinkAddress) -> Finding:
     who = f"{address}: {_NAMES.get(reading.firmware, 'an autopilot')}, system {reading.system_id}"
     who += ", armed" if reading.is_armed else ""
     if not reading.answers:
-        why = "it signs its packets, so it may want signed requests" if reading.signs else (
-            "the wire from the board's TX to its RX, or a signing key, may be the reason"
-        )  # fmt: skip
+        why = "the wire from the board's TX to its RX, or a signing key, may be the reason"
+        if reading.signs:
+            why = "it signs its packets, so it may want signed requests"
+        if reading.is_signed_to:
+            why = "the wire from the board's TX to its RX, or the clock of this board, may be the reason"
         return Finding("link", False, f"{who} is heard, but answers nothing: {why}.")
     if reading.bad_bytes > _BAD_BYTES:
         return Finding(
@@ -127,6 +154,8 @@ def _link(reading: Reading, address: LinkAddress) -> Finding:
 
 
 def _signing(reading: Reading) -> Finding:
+    if reading.is_signed_to:
+        return Finding("signing", True, "its packets carry the right signature, and so do ours")
     if not reading.signs:
         return Finding("signing", True, "off: whoever is on this link can send")
     if reading.answers:
@@ -135,7 +164,7 @@ def _signing(reading: Reading) -> Finding:
         "signing",
         False,
         "It signs its packets and answers no unsigned request: no fix would be taken without its key.",
-        ("give edgevpr the key of this vehicle, or clear the key of this port",),
+        ("mavlink: {signing_key: FILE} with the key of this vehicle, or clear the key of this port",),
     )
 
 

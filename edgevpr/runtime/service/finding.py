@@ -27,6 +27,11 @@ def looked_at(what: str, look: Callable[[], str]) -> Finding:
         return Finding(what, False, f"{error.filename}: {error.strerror}: check the path and its permissions.")
 
 
+def sentence(words: str) -> str:
+    """Make a sentence of a reason in a few words."""
+    return f"{words[0].upper()}{words[1:]}."
+
+
 def lines(findings: list[Finding]) -> Iterator[str]:
     """Write findings for people: a line each, and below it a line for every change."""
     for finding in findings:

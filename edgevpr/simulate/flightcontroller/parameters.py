@@ -90,6 +90,7 @@ ARDUPILOT_KINDS = {
 }
 
 PX4 = {
+    "EKF2_AGP0_ID": 1,
     "EKF2_AGP0_CTRL": 1,
     "EKF2_AGP0_DELAY": 0.0,
     "EKF2_AGP0_GATE": 3.0,

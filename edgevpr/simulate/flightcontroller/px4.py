@@ -119,7 +119,8 @@ class Px4:
 
     def take_global_position(self, message: Message, truth: Truth, now_s: float) -> None:
         """Fuse a GLOBAL_POSITION_SENSOR (296). Its own times are ignored: it is as old as the parameter says."""
-        if not message.eph > 0 or not self.parameters["EKF2_AGP0_CTRL"] & 1:
+        is_ours = message.id == self.parameters["EKF2_AGP0_ID"] != 0  # 0: the slot is off
+        if not message.eph > 0 or not is_ours or not self.parameters["EKF2_AGP0_CTRL"] & 1:
             return
         delay_s = self.parameters["EKF2_AGP0_DELAY"] / 1e3
         is_starting = now_s - self._other_heard_s > _SILENT_AFTER_S

@@ -104,6 +104,34 @@ def test_a_ground_link_and_a_signing_key_are_looked_at(settings, config_file, tm
     assert (finding.what, "second link" in finding.message) == ("link", True)
 
 
+@pytest.mark.parametrize(("key", "is_fine"), [(bytes(32), True), (bytes(range(32)), False), (None, False)])
+def test_a_heartbeat_must_be_signed_where_there_is_a_key(settings, config_file, tmp_path, key, is_fine):
+    (tmp_path / "key").touch(mode=0o600)
+    (tmp_path / "key").write_bytes(bytes(32))
+    settings["mavlink"]["signing_key"] = str(tmp_path / "key")
+    config_file.write_text(yaml.safe_dump(settings))
+    with AnsweringAutopilot(parse_link(settings["mavlink"]["link"]).number, key=key):
+        (link,) = [each for each in check(config_file) if each.what == "link"]
+    assert link.ok is is_fine
+    assert ("autopilot heard: system 1, signed" if is_fine else "messages arrive, and are refused (") in link.message
+    assert {path.name for path in tmp_path.iterdir()} == {"key", "config.yaml"}
+
+
+def test_a_tlog_is_looked_at_like_the_flight_log(settings, config_file, tmp_path):
+    settings["log"]["tlog"] = str(tmp_path / "flight.tlog")
+    config_file.write_text(yaml.safe_dump(settings))
+    found = check(config_file, offline=True)
+    assert [(each.what, each.ok, each.message) for each in found][-1] == ("tlog", True, str(tmp_path / "flight.tlog"))
+    assert list(tmp_path.iterdir()) == [config_file]
+    settings["log"]["tlog"] = str(tmp_path / "absent" / "flight.tlog")
+    config_file.write_text(yaml.safe_dump(settings))
+    (finding,) = [each for each in check(config_file, offline=True) if not each.ok]
+    assert (finding.what, "correct `log: {tlog: ...}`" in finding.message) == ("tlog", True)
+    settings["mavlink"]["link"] = None
+    config_file.write_text(yaml.safe_dump(settings))
+    assert check(config_file, offline=True)[-1] == Finding("tlog", True, "none, since there is no link")
+
+
 def test_all_is_well_and_nothing_is_left_behind(settings, config_file, tmp_path, flight_folder):
     assert wrong(config_file, settings) == []
     assert list(tmp_path.iterdir()) == [config_file]

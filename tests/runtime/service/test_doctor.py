@@ -13,7 +13,10 @@ from mavlink_peers import free_port
 from edgevpr.cli.main import main
 from edgevpr.mavlink import reading as module
 from edgevpr.mavlink.address import parse_link
+from edgevpr.mavlink.autopilots.ardupilot import choice as ardupilot_choice
+from edgevpr.mavlink.autopilots.px4 import SENSOR_ID
 from edgevpr.mavlink.reading import Filter, Reading
+from edgevpr.mavlink.signing import UNSIGNED, WRONG
 from edgevpr.mavlink.wire import mavlink
 from edgevpr.runtime.service import ardupilot, px4
 from edgevpr.runtime.service.doctor import autopilot_findings, silence
@@ -35,6 +38,7 @@ COPTER = Reading(
     filter=READY,
     origin=(50.0, 14.0),
     signs=False,
+    is_signed_to=False,
     answers=True,
     says_version_1=False,
     other_systems=(),
@@ -47,7 +51,7 @@ PX4 = replace(
     firmware="px4",
     version=(1, 17, 0),
     version_text="1.17.0",
-    parameters={"EKF2_AGP0_CTRL": 1, "EKF2_AGP0_ID": px4.SENSOR_ID, "EKF2_AGP0_DELAY": 250.0, "MAV_1_CONFIG": 102},
+    parameters={"EKF2_AGP0_CTRL": 1, "EKF2_AGP0_ID": SENSOR_ID, "EKF2_AGP0_DELAY": 0.0, "MAV_1_CONFIG": 102},
 )
 
 
@@ -67,39 +71,49 @@ def said(reading: Reading, what: str, link=UDP) -> str:
 def test_a_copter_and_a_px4_that_are_set_up_have_nothing_wrong():
     assert wrong(COPTER) == {}
     assert wrong(PX4) == {}
-    assert said(PX4, "channel") == "Positions as measurements (message 296): EKF2_AGP0_CTRL=1."
+    assert said(PX4, "channel") == "Message 296, as its EKF2_AGP0_CTRL fuses positions."
 
 
 # The channel of an ArduPilot.
 
 
 @pytest.mark.parametrize(
-    ("vehicle", "parameters", "name", "reason"),
+    ("vehicle", "parameters", "sentence"),
     [
-        ("copter", {"GPS2_TYPE": 14}, "gps", "GPS2_TYPE=14"),
-        ("copter", {"GPS1_TYPE": 14, "GPS2_TYPE": 14}, "gps", "GPS1_TYPE=14"),
-        ("copter", {"GPS2_TYPE": 14, "VISO_TYPE": 1}, "gps", "GPS2_TYPE=14"),
-        ("copter", {"VISO_TYPE": 1}, "odometry", "VISO_TYPE=1"),
-        ("plane", {"VISO_TYPE": 1}, "odometry", "VISO_TYPE=1"),
-        ("plane", {}, "single fixes", "a plane goes on by dead reckoning"),
-        ("copter", {"FLOW_TYPE": 6, "EK3_SRC2_VELXY": 5}, "single fixes", "FLOW_TYPE=6 holds the velocity"),
+        ("copter", {"GPS2_TYPE": 14}, "GPS_INPUT as receiver 2, as its GPS2_TYPE is 14."),
+        ("copter", {"GPS1_TYPE": 14, "GPS2_TYPE": 14}, "GPS_INPUT as receiver 1, as its GPS1_TYPE is 14."),
+        ("plane", {}, "Command 43003, which a plane that reckons takes at any time."),
+        ("plane", {"Q_ENABLE": 1, "GPS2_TYPE": 14}, "GPS_INPUT as receiver 2, as its GPS2_TYPE is 14."),
+        ("copter", {"FLOW_TYPE": 6, "EK3_SRC2_VELXY": 5}, "Command 43003: FLOW_TYPE=6 carries it from fix to fix."),
     ],
 )
-def test_the_channel_follows_from_the_parameters(vehicle, parameters, name, reason):
-    assert ardupilot.channel(vehicle, PLAIN | parameters) == ardupilot.Channel(name, reason)
+def test_the_channel_is_the_one_that_the_flight_will_choose(vehicle, parameters, sentence):
+    reading = replace(COPTER, vehicle=vehicle, parameters=PLAIN | parameters)
+    assert (said(reading, "channel"), wrong(reading)) == (sentence, {})
+    assert ardupilot_choice(reading.asked).channel.name in {"GPS_INPUT", "COMMAND"}
 
 
 def test_the_channel_follows_from_the_older_names_too():
-    assert ardupilot.channel("copter", {"GPS_TYPE": 1, "GPS_TYPE2": 14}).reason == "GPS_TYPE2=14"
-    assert ardupilot.channel("copter", {"GPS_TYPE": 14}).reason == "GPS_TYPE=14"
+    older = {"GPS_TYPE": 1, "GPS_TYPE2": 14, "EK3_SRC1_POSXY": 3}
+    assert "GPS_TYPE2 is 14" in said(replace(COPTER, parameters=older), "channel")
+    assert "GPS_TYPE is 14" in said(replace(COPTER, parameters=older | {"GPS_TYPE": 14}), "channel")
 
 
-@pytest.mark.parametrize("vehicle", ["copter", "rover", "other"])
+@pytest.mark.parametrize("vehicle", ["copter", "rover", "vehicle"])
 @pytest.mark.parametrize(
-    "parameters", [{}, PLAIN, {"FLOW_TYPE": 6}, {"FLOW_TYPE": 0, "EK3_SRC1_VELXY": 5}, {"VISO_TYPE": 2}]
+    "parameters", [PLAIN, {"FLOW_TYPE": 6}, {"FLOW_TYPE": 0, "EK3_SRC1_VELXY": 5}, {"VISO_TYPE": 2}]
 )
-def test_without_anything_that_carries_it_there_is_no_channel(vehicle, parameters):
-    assert ardupilot.channel(vehicle, parameters) is None
+def test_without_anything_that_carries_it_single_fixes_are_wrong(vehicle, parameters):
+    found = wrong(replace(COPTER, vehicle=vehicle, parameters=PLAIN | parameters))
+    assert found == {"channel": ("GPS2_TYPE=14",)}
+
+
+def test_a_plane_that_hovers_needs_what_a_copter_needs():
+    hovers = replace(COPTER, vehicle="plane", parameters=PLAIN | {"Q_ENABLE": 1})
+    assert wrong(hovers) == {"channel": ("GPS2_TYPE=14",)}
+    assert "while it hovers (Q_ENABLE=1): without GPS it falls back to QHOVER or QLAND" in said(hovers, "channel")
+    assert wrong(with_parameters(hovers, Q_ENABLE=0)) == {}
+    assert wrong(with_parameters(hovers, FLOW_TYPE=6, EK3_SRC1_VELXY=5)) == {}
 
 
 def test_a_copter_without_a_channel_is_told_what_to_change_for_its_firmware():
@@ -125,13 +139,22 @@ def test_a_receiver_over_mavlink_must_be_switched_to_and_used_by_the_filter():
 
 def test_odometry_needs_a_source_set_and_an_origin():
     visual = replace(COPTER, parameters=PLAIN | {"VISO_TYPE": 1})
-    changes = ("EK3_SRC2_POSXY=6", "EK3_SRC2_VELXY=6", "EK3_SRC2_POSZ=1", "EK3_SRC2_YAW=1")
+    changes = ("EK3_SRC2_POSXY=6", "EK3_SRC2_VELXY=0", "EK3_SRC2_POSZ=1", "EK3_SRC2_YAW=1")
     assert wrong(visual) == {"channel": changes}
     prepared = with_parameters(visual, EK3_SRC2_POSXY=6)
     assert said(prepared, "channel").endswith("when GPS is lost, the operator switches to source set 2.")
     assert wrong(prepared) == {}
     assert set(wrong(replace(prepared, origin=None))) == {"channel", "origin"}
-    assert said(with_parameters(visual, EK3_SRC1_POSXY=6), "channel") == "ODOMETRY: VISO_TYPE=1."
+    assert said(with_parameters(visual, EK3_SRC1_POSXY=6), "channel") == "ODOMETRY, as its VISO_TYPE is 1."
+    assert said(replace(visual, vehicle="plane"), "channel").startswith("ODOMETRY, as its VISO_TYPE is 1, but no ")
+
+
+def test_the_velocity_of_odometry_must_not_be_fused():
+    fused = replace(COPTER, parameters=PLAIN | {"VISO_TYPE": 1, "EK3_SRC2_POSXY": 6, "EK3_SRC2_VELXY": 6})
+    assert wrong(fused) == {"channel": ("EK3_SRC2_VELXY=0",)}
+    assert "trust it more than its gyros" in said(fused, "channel")
+    elsewhere = with_parameters(fused, EK3_SRC2_VELXY=0, EK3_SRC3_VELXY=6)  # a set without our position
+    assert wrong(elsewhere) == {}
 
 
 def test_a_plane_is_told_whether_it_knows_its_airspeed():
@@ -202,42 +225,37 @@ def test_who_answers_nothing_is_judged_by_nothing_but_that():
     mute = replace(COPTER, answers=False, version=None, parameters={}, heard=(), filter=None, origin=None)
     assert set(wrong(mute)) == {"link"}
     assert set(wrong(replace(mute, signs=True))) == {"link", "signing"}
+    signed = replace(mute, signs=True, is_signed_to=True)
+    assert set(wrong(signed)) == {"link"}
+    assert "the clock of this board" in said(signed, "link")
+    assert said(signed, "signing") == "its packets carry the right signature, and so do ours"
     assert wrong(replace(COPTER, signs=True)) == {}
 
 
 # PX4.
 
 
-@pytest.mark.parametrize(
-    ("version", "parameters", "name"),
-    [
-        ((1, 17, 0), {"EKF2_AGP0_CTRL": 1}, "global position"),
-        ((2, 0, 0), {"EKF2_AGP0_CTRL": 3}, "global position"),
-        ((1, 17, 0), {"EKF2_AGP0_CTRL": 2}, "single fixes"),
-        ((1, 17, 0), {}, "single fixes"),
-        ((1, 16, 1), {"EKF2_AGP0_CTRL": 1}, "single fixes"),
-        (None, {"EKF2_AGP0_CTRL": 1}, "single fixes"),
-    ],
-)
-def test_the_channel_of_a_px4(version, parameters, name):
-    assert px4.channel(version, parameters).name == name
-
-
 def test_a_px4_that_can_take_positions_is_told_how():
-    bare = with_parameters(PX4, EKF2_AGP0_CTRL=0, EKF2_AGP0_ID=0, EKF2_AGP0_DELAY=0.0)
-    assert wrong(bare) == {"channel": ("EKF2_AGP0_CTRL=1", "EKF2_AGP0_ID=1", "EKF2_AGP0_DELAY=300")}
-    assert wrong(with_parameters(PX4, EKF2_AGP0_DELAY=0.0)) == {"channel": ("EKF2_AGP0_DELAY=300",)}
-    without = replace(PX4, version=(1, 16, 0), parameters={})
-    assert wrong(without) == {}
-    assert said(without, "channel").endswith("this firmware does not fuse message 296.")
-    assert wrong(with_parameters(without, EKF2_AGP0_CTRL=0)) == {}
+    bare = with_parameters(PX4, EKF2_AGP0_CTRL=0, EKF2_AGP0_ID=0, EKF2_AGP0_DELAY=300.0)
+    assert wrong(bare) == {"channel": ("EKF2_AGP0_CTRL=1", "EKF2_AGP0_ID=1", "EKF2_AGP0_DELAY=0")}
+    assert wrong(with_parameters(PX4, EKF2_AGP0_DELAY=250.0)) == {"channel": ("EKF2_AGP0_DELAY=0",)}
+    assert wrong(with_parameters(PX4, EKF2_AGP0_CTRL=2)) == {"channel": ("EKF2_AGP0_CTRL=1",)}
+
+
+@pytest.mark.parametrize("change", [{"version": (1, 16, 0)}, {"parameters": {}}])
+def test_a_px4_without_message_296_must_reckon_well_by_itself(change):
+    without = replace(PX4, **change)
+    assert wrong(without) == {"channel": ("PX4 1.17 or later, with EKF2_AGP0_CTRL", "or EKF2_OF_CTRL=1")}
+    assert wrong(replace(without, vehicle="plane")) == {}
+    assert said(replace(without, vehicle="plane"), "channel").startswith("Command 43003, as ")
+    assert wrong(with_parameters(without, EKF2_OF_CTRL=1)) == {}
 
 
 def test_an_old_or_a_silent_px4_is_wrong():
-    assert wrong(replace(PX4, version=(1, 14, 3), version_text="1.14.3", parameters={})) == {
+    assert wrong(replace(PX4, vehicle="plane", version=(1, 14, 3), version_text="1.14.3", parameters={})) == {
         "firmware": ("PX4 1.15 or later",)
     }
-    assert "firmware" in wrong(replace(PX4, version=None))
+    assert set(wrong(replace(PX4, version=None))) == {"firmware"}
     assert wrong(replace(PX4, says_version_1=True)) == {"port": ("MAV_PROTO_VER=2",)}
 
 
@@ -258,6 +276,11 @@ def test_a_silent_line_is_explained_by_what_arrives():
     )
     assert "another baud rate?" in silence(SERIAL, 900, set()).message
     assert silence(UDP, 0, {5, 3}).changes == ("mavlink: {system_id: 3}",)
+    refused = silence(UDP, 0, set(), {UNSIGNED: 4, WRONG: 5}).message
+    assert refused == (
+        f"{UDP}: messages arrive, and are refused (wrong signature): the other end has another key, or somebody forges "
+        "them."
+    )
     for url in ("udpin:0.0.0.0:14550", "udpout:10.0.0.2:14550", "tcp:10.0.0.2:5760"):
         assert silence(parse_link(url), 0, set()).message.startswith(f"{url}: no heartbeat of an autopilot in 5 s: ")
 
@@ -270,7 +293,8 @@ def test_the_pages_of_the_vehicles_name_what_is_told_to_change():
         assert re.search(rf"`{parameter}`.*\| {value} \|", copter)
     for change in (*wrong(replace(COPTER, parameters=PLAIN | {"VISO_TYPE": 1}))["channel"], "VISO_TYPE=1"):
         assert f"`{change}`" in copter
-    unset = with_parameters(PX4, EKF2_AGP0_CTRL=0, EKF2_AGP0_ID=0)
+    assert "EK3_SRC2_VELXY=6" not in copter
+    unset = with_parameters(PX4, EKF2_AGP0_CTRL=0, EKF2_AGP0_ID=0, EKF2_AGP0_DELAY=300.0)
     for parameter, value in (change.split("=") for change in (*wrong(unset)["channel"], *px4.port_changes(921_600))):
         assert re.search(rf"`{parameter}` \| {value}[ |]", px4_page)
 
@@ -305,7 +329,7 @@ def test_the_command_over_a_link(link, capsys, tmp_path, monkeypatch):
     found = findings_of(capsys.readouterr().out)
     assert {what: message for what, (ok, message) in found.items() if not ok and what != "bytecode"} == {}
     assert code == (0 if found["bytecode"][0] else 1)
-    assert found["channel"][1] == "A GPS receiver over MAVLink (GPS_INPUT): GPS2_TYPE=14."
+    assert found["channel"][1] == "GPS_INPUT as receiver 2, as its GPS2_TYPE is 14."
     assert list(tmp_path.iterdir()) == []
     assert autopilot.names() == {"HEARTBEAT", "COMMAND_LONG", "PARAM_REQUEST_READ", "TIMESYNC"}
 
@@ -329,6 +353,23 @@ def test_the_command_prints_json(link, capsys, tmp_path):
     assert (result["link"], result["reading"]["system_id"], result["reading"]["vehicle"]) == (link, 42, "plane")
     assert result["ok"] == all(each["ok"] for each in result["findings"])
     assert {"what", "ok", "message", "changes"} == set(result["findings"][0])
+
+
+@pytest.mark.usefixtures("_quick")
+@pytest.mark.parametrize(("key", "is_heard"), [(bytes(range(32)), True), (bytes(32), False)])
+def test_the_command_signs_with_the_key_of_its_configuration(link, capsys, tmp_path, key, is_heard):
+    (tmp_path / "key").touch(mode=0o600)
+    (tmp_path / "key").write_bytes(bytes(range(32)))
+    (tmp_path / "c.yaml").write_text(f"mavlink: {{signing_key: {tmp_path}/key}}\nlog: {{path: null}}\n")
+    with peer(link, parameters=PLAIN | {"GPS2_TYPE": 14}, key=key, wants_signed=True):
+        main(["doctor", "--config", str(tmp_path / "c.yaml"), "--link", link])
+    found = findings_of(capsys.readouterr().out)
+    assert ("channel" in found) == is_heard
+    if is_heard:
+        assert found["signing"] == (True, "its packets carry the right signature, and so do ours")
+    else:
+        assert "messages arrive, and are refused (wrong signature)" in found["link"][1]
+    assert {path.name for path in tmp_path.iterdir()} == {"key", "c.yaml"}, "the time is not written"
 
 
 @pytest.mark.usefixtures("_quick")
