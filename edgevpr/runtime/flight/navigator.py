@@ -61,7 +61,7 @@ class Navigator:
         self._slew = Slew()
         self._vehicle: Vehicle | None = None
         self._attitude: Attitude | None = None
-        self._is_continuous, self._believes_gps = False, True
+        self._channel, self._believes_gps = Channel.COMMAND, True
 
     @property
     def has_gps(self) -> bool:
@@ -76,9 +76,9 @@ class Navigator:
         """Take in by which channel the autopilot is told positions: a continuous position must not rest on the velocity
         that the autopilot has from it, and is carried on by accelerations."""
         with self._lock:
-            if channel.is_continuous != self._is_continuous:
-                self._is_continuous = channel.is_continuous
-                self._navigation = Navigation(INERTIAL if self._is_continuous else RECKONED, self._map_sd_m)
+            if channel.is_continuous != self._channel.is_continuous:
+                self._navigation = Navigation(INERTIAL if channel.is_continuous else RECKONED, self._map_sd_m)
+            self._channel = channel
 
     def hear_vehicle(self, vehicle: Vehicle) -> None:
         """Take in a report of position and velocity."""
@@ -103,14 +103,14 @@ class Navigator:
         with self._lock:
             vehicle = self._vehicle
             if vehicle is None or vehicle.velocity_m_s is None or not vehicle.is_fresh_at(now_s):
-                return Advice(None, "nothing is heard of the vehicle") if self._is_continuous else Advice(fix)
+                return Advice(None, "nothing is heard of the vehicle") if self._channel.is_continuous else Advice(fix)
             covariance_m2 = _covariance(event, event.vehicle or vehicle)
             t_s = event.frame.t_mono_s
             expected = self._navigation.expected(t_s)
             if expected is None:
                 sd_m = math.sqrt(np.linalg.eigvalsh(covariance_m2)[-1])
                 self._navigation.begin(here, sd_m, t_s, vehicle.t_heard_s)
-                return Advice(None, _CONTINUOUS) if self._is_continuous else Advice(fix)
+                return Advice(None, _CONTINUOUS) if self._channel.is_continuous else Advice(fix)
             off_m = self._navigation.beside(here, expected)
             seen = Seen(
                 off_m=off_m,
@@ -157,7 +157,7 @@ class Navigator:
 
     def _improved(self, vehicle: Vehicle, now_s: float) -> Advice:
         """Say what is to be sent so that the autopilot is better off, if it can be."""
-        if self._is_continuous:
+        if self._channel.is_continuous:
             return Advice(None, _CONTINUOUS)
         if reckons_by_gps(vehicle):
             return Advice(None, _HAS_GPS)
@@ -167,6 +167,8 @@ class Navigator:
         there = moved(vehicle.lat_deg, vehicle.lon_deg, since_s * east_m_s, since_s * north_m_s)
         here = estimate.position
         off_m = float(distance_m(*there, here.lat_deg, here.lon_deg))
+        if self._channel is Channel.SENSOR:  # PX4 fuses it, and gives its position up where none comes for some seconds
+            return Advice(Fix(here.lat_deg, here.lon_deg, max(self._map_sd_m, estimate.accuracy_m), now_s))
         # Its mean square error is that of the estimate and this; without this, it is that of the estimate alone.
         if off_m**2 <= 2 * estimate.accuracy_m**2:
             return Advice(
