@@ -175,8 +175,8 @@ class Navigator:
                 None,
                 f"not needed: the autopilot is {off_m:.1f} m from where we are, good to {estimate.accuracy_m:.1f} m",
             )
-        # So that the autopilot is right in the middle of the time until the next fix. Now it is off by that, along one of
-        # two axes: of the variance of an axis it is half.
+        # So that the autopilot is right in the middle of the time until the next fix. Now it is off by that, along one
+        # of two axes: of the variance of an axis it is half.
         ahead_m = [self._every_s / 2 * each for each in self._navigation.path_drift_m_s()]
         at = moved(here.lat_deg, here.lon_deg, *ahead_m)
         accuracy_m = math.hypot(max(self._map_sd_m, estimate.accuracy_m), math.hypot(*ahead_m) / math.sqrt(2))
