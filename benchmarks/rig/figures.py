@@ -45,7 +45,7 @@ def figures_of(folder: Path) -> Row:
     run = json.loads((folder / "run.json").read_text())
     track, loss_s = read_table(folder / "track.csv"), run["marks_s"]["loss"]
     log = list(read_log(folder / "flight.jsonl")) if (folder / "flight.jsonl").exists() else []
-    found: Row = {key: run[key] for key in ("scenario", "is_control", "rate_hz", "words", "edgevpr_exit")}
+    found: Row = {key: run.get(key) for key in ("commit", "scenario", "is_control", "rate_hz", "words", "edgevpr_exit")}
     found["estimate"] = _estimate(track, loss_s)
     found["modes"] = _modes(track, loss_s)
     found["alarms"] = [

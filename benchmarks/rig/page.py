@@ -76,13 +76,22 @@ What was sent to the autopilot, after the loss, against the true position of the
 
 {_remarks(found)}
 
-Commit {result["commit"]}, {result["date"]}, {result["machine"]["cpu"]}. `make rig` makes this page.
+Flown with edgevpr at {_commits(found)}; {result["date"]}, {result["machine"]["cpu"]}. `make rig` makes this page.
 
 ![tracks](rig.png)
 
 White: where the aircraft was, from the loss of GPS on. Green: where its autopilot took it to be, with edgevpr. Red:
 where it took it to be without edgevpr, in another flight, whose own true track is dotted.
 """
+
+
+def _commits(found: dict[str, dict[str, Row]]) -> str:
+    """Return the commits of the flights with edgevpr, and which flights are of each."""
+    flown: dict[str, list[str]] = {}
+    for name, runs in found.items():
+        if "with" in runs:
+            flown.setdefault(runs["with"]["commit"] or "an unnoted commit", []).append(name)
+    return "; ".join(f"{commit} ({', '.join(names)})" for commit, names in flown.items())
 
 
 def _estimates(found: dict[str, dict[str, Row]]) -> str:
