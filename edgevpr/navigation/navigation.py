@@ -62,26 +62,24 @@ class Navigation:
         position is heard too."""
         if vehicle.velocity_m_s is None:
             return
+        had_gps, self.has_gps = self.has_gps, reckons_by_gps(vehicle) and believes_gps
         if self._drift is RECKONED and vehicle.position_sd_m is None:
             self._origin = None  # it does not know its position any more, and its velocity least of all
             return
         velocity_m_s, t_s = np.array(vehicle.velocity_m_s), vehicle.t_heard_s
-        has_gps = reckons_by_gps(vehicle) and believes_gps
         if self._origin is None or self._path.is_broken:
             if vehicle.position_sd_m is not None:
                 here = Position(vehicle.lat_deg, vehicle.lon_deg)
                 self._start(here, vehicle.position_sd_m, velocity_m_s, t_s, self._drift.velocity_sd)
-                self.has_gps = has_gps
             return
         if self._drift is RECKONED:
             self._filter.go_on(self._path.fly(t_s, velocity_m_s))
+        if had_gps and not self.has_gps:
+            self._filter.lose_gps()
         here = self._path.at(t_s)
         if here is None:
             return
-        if self.has_gps and not has_gps:
-            self._filter.lose_gps()
-        self.has_gps = has_gps
-        if has_gps and t_s - self._gps_s >= _GPS_EVERY_S:
+        if self.has_gps and t_s - self._gps_s >= _GPS_EVERY_S:
             self._gps_s = t_s
             off_m = self._from_origin(vehicle.lat_deg, vehicle.lon_deg) - here.at_m
             sd_m = _GPS_ALIKE * (vehicle.position_sd_m or _UNKNOWN_M)

@@ -163,7 +163,7 @@ class ToAutopilot:
         vehicle, now_s = self._link.vehicle(), self._clock.mono_s()
         if vehicle is None or not vehicle.is_fresh_at(now_s) or not self._send_fixes:
             return
-        has_own = self._navigator.state_at(now_s) is not None
+        has_own = self._navigator.knows_position(now_s)
         if number := self._source_sets.wanted(now_s, self._navigator.has_gps, has_own):
             _log.warning("the autopilot is asked for its source set %d", number)
             self.announce(Mood.WARNING, f"source set {number} asked for", "sources")

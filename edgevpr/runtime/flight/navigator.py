@@ -16,7 +16,7 @@ from edgevpr.mavlink.autopilots.channel import Channel
 from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.positions import State
 from edgevpr.navigation.filter import INERTIAL, RECKONED
-from edgevpr.navigation.navigation import Navigation, reckons_by_gps
+from edgevpr.navigation.navigation import Estimate, Navigation, reckons_by_gps
 from edgevpr.navigation.path import over_ground
 from edgevpr.navigation.slew import Slew
 from edgevpr.runtime.flight.consistency import Consistency, Seen
@@ -37,6 +37,7 @@ _ALIKE = math.sqrt(50)
 _CONTINUOUS = "taken into the continuous position"
 # ArduPilot refuses a fix then, and PX4 takes it with a gain that makes its velocity jump.
 _HAS_GPS = "not needed: the autopilot has GPS"
+_HAS_WRONG_GPS = "not sent: the autopilot has GPS, which the map contradicts, and takes no fix"
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,14 +126,17 @@ class Navigator:
             self._navigation.hear_fix(off_m, covariance_m2, t_s, verdict.is_against)
             return self._improved(vehicle, now_s)
 
-    def state_at(self, t_s: float) -> State | None:
-        """Return where the vehicle is or was, to be sent as a continuous position; None: that is not known well
-        enough."""
+    def knows_position(self, now_s: float) -> bool:
+        """Tell whether the position is known well enough to be sent as a continuous one."""
         with self._lock:
-            vehicle, navigation = self._vehicle, self._navigation
-            estimate = navigation.at(t_s)
-            is_lost = estimate is None or t_s - navigation.fixed_s > _LOST_S or estimate.accuracy_m > _LOST_M
-            if is_lost or vehicle is None:
+            return self._known(now_s) is not None
+
+    def state_at(self, t_s: float) -> State | None:
+        """Return where the vehicle is or was, later than at the last call, to be sent as a continuous position; None:
+        that is not known well enough."""
+        with self._lock:
+            vehicle, estimate = self._vehicle, self._known(t_s)
+            if estimate is None or vehicle is None:
                 self._slew.forget()
                 return None
             lat_deg, lon_deg, behind_m = self._slew.followed(estimate)
@@ -155,12 +159,18 @@ class Navigator:
                 ),
             )
 
+    def _known(self, t_s: float) -> Estimate | None:
+        estimate = self._navigation.at(t_s)
+        if estimate is None or t_s - self._navigation.fixed_s > _LOST_S or estimate.accuracy_m > _LOST_M:
+            return None
+        return estimate
+
     def _improved(self, vehicle: Vehicle, now_s: float) -> Advice:
         """Say what is to be sent so that the autopilot is better off, if it can be."""
         if self._channel.is_continuous:
             return Advice(None, _CONTINUOUS)
         if reckons_by_gps(vehicle):
-            return Advice(None, _HAS_GPS)
+            return Advice(None, _HAS_GPS if self._believes_gps else _HAS_WRONG_GPS)
         estimate = self._navigation.at(now_s)
         east_m_s, north_m_s = vehicle.velocity_m_s
         since_s = now_s - vehicle.t_heard_s

@@ -1,0 +1,180 @@
+"""A simulated flight for the navigator: a true path, an autopilot that reckons, and matches with noise and age. It has
+no link: reports, forces and matches are given by hand, in the order of their time."""
+
+import math
+from collections import deque
+
+import numpy as np
+from fakes import vehicle_at
+
+from edgevpr.contract import FineMatch
+from edgevpr.frames.level import Levelled, View
+from edgevpr.geodesy import moved, offset_m
+from edgevpr.mavlink.attitude import Attitude
+from edgevpr.runtime.flight.navigator import Advice, Navigator
+from edgevpr.runtime.recognise.locate import Located
+from edgevpr.runtime.recognise.recognition import Recognition
+from edgevpr.types import Candidate, Frame, Place, Position, QueryCost, Receiver, Steps, Vehicle
+
+HOME = 47.0, 8.0
+GPS_SD_M = 1.0
+_STEP_S = 0.02
+_REPORT_STEPS, _STATE_STEPS = 10, 5  # five reports and ten states a second
+_GRAVITY_M_S2 = 9.80665
+_DRIFT_M_S = 5.0  # as edgevpr takes an autopilot's own position to go wrong
+_PICTURE = np.zeros((8, 8), np.uint8)
+_NO_COST = QueryCost(
+    t_encode_s=0, t_match_s=0, u_encode=0, u_match=0, cpu_s=0, rss_mb=0, used_mah=0, marginal_mah=0
+)  # fmt: skip
+
+
+def match_at(
+    position: Position, t_s: float, vehicle: Vehicle | None, sd_m: float, places, view: View | None = None
+) -> Recognition:
+    """An accepted match of a frame taken at `t_s`."""
+    return Recognition(
+        frame=Frame(image=_PICTURE, name=f"{t_s:.1f} s", t_mono_s=t_s),
+        vehicle=vehicle,
+        picture=view and Levelled(_PICTURE, None, view),
+        best=Candidate(Place(place_id=places[0], source_image="", position=position), FineMatch(0.5)),
+        accepted=True,
+        reason="",
+        located=Located(position=position, covariance_m2=(sd_m**2, 0.0, sd_m**2), places=tuple(places)),
+        accuracy_m=sd_m,
+        steps=Steps(),
+        cost=_NO_COST,
+    )
+
+
+class Air:
+    """A flight in wide circles at `speed_m_s`, with GPS until `lose_gps`. Its autopilot then reckons, wrong by `wind`
+    (2,) m/s, which changes by `gusts` m/s a second, and by `velocity_sd` m/s of noise; what is sent it takes. Matches
+    of `fix_sd_m` and `other_sd_m`, which say `said_sd_m` of themselves, come every `every_s` and are `late_s` old.
+    `gps_off_m` (2,) is by how much the receiver is wrong; the autopilot follows it until it `reject_gps`."""
+
+    def __init__(
+        self,
+        navigator: Navigator,
+        *,
+        speed_m_s=15.0,
+        wind=(0.0, 0.0),
+        gusts=0.0,
+        velocity_sd=0.1,
+        fix_sd_m=3.0,
+        said_sd_m=None,
+        other_sd_m=1.0,  # half a degree of attitude at 100 m, and some hundredths of a second: no match knows of them
+        every_s=1.0,
+        late_s=0.4,
+        map_off=(0.0, 0.0),
+        bias=(0.0, 0.0),
+        attitude=(0.0, 0.0),
+        seed=7,
+    ):
+        self.navigator, self.rng = navigator, np.random.default_rng(seed)
+        self.speed_m_s, self.velocity_sd, self.fix_sd_m, self.attitude = speed_m_s, velocity_sd, fix_sd_m, attitude
+        self.gusts, self.noise_sd_m = gusts, math.hypot(fix_sd_m, other_sd_m)
+        self.said_sd_m = said_sd_m or fix_sd_m
+        self.wind, self.map_off, self.bias = map(np.array, (wind, map_off, bias))
+        self.every_steps, self.late_steps = round(every_s / _STEP_S), round(late_s / _STEP_S)
+        self.step, self.at_m, self.gps_off_m, self.has_gps = 0, np.zeros(2), np.zeros(2), True
+        self.has_receiver = True
+        self.off_m = np.zeros(2)  # by how much the autopilot is wrong
+        self.known = GPS_SD_M, 0.0  # how well it knew its position, and when
+        self.way, self.waiting, self.vehicle = [self.at_m], deque(), None
+        self.is_silent = self.knows_nothing = False
+        self.sees, self.takes_fixes, self.events = True, True, []
+        self.advices: list[tuple[float, Advice]] = []
+        self.errors_m, self.states = [], []  # of the autopilot once a second; of a continuous channel
+
+    @property
+    def t_s(self) -> float:
+        return self.step * _STEP_S
+
+    @property
+    def sent(self):
+        return [(t_s, advice.fix) for t_s, advice in self.advices if advice.fix]
+
+    def lose_gps(self) -> None:
+        self.has_receiver = False
+        self.reject_gps()
+
+    def reject_gps(self) -> None:
+        self.has_gps, self.known = False, (GPS_SD_M, self.t_s)
+
+    def velocity(self, t_s: float) -> np.ndarray:
+        return self.speed_m_s * np.array([math.sin(t_s / 20), math.cos(t_s / 20)])
+
+    def off(self, lat_deg: float, lon_deg: float, t_s: float | None = None) -> np.ndarray:
+        """Metres (2,) of a position from where the aircraft was."""
+        true_m = self.at_m if t_s is None else self.way[round(t_s / _STEP_S)]
+        return np.array(offset_m(*HOME, lat_deg, lon_deg)) - true_m
+
+    def fly(self, seconds: float) -> "Air":
+        for _ in range(round(seconds / _STEP_S)):
+            self.step += 1
+            before, velocity = self.velocity(self.t_s - _STEP_S), self.velocity(self.t_s)
+            if not self.has_gps:
+                self.wind = self.wind + self.rng.normal(0, self.gusts * math.sqrt(_STEP_S), 2)
+            self.at_m = self.at_m + _STEP_S * (before + velocity) / 2
+            self.way.append(self.at_m)
+            self.off_m = self.gps_off_m if self.has_gps else self.off_m - _STEP_S * self.wind
+            if not self.is_silent:
+                self._feel((velocity - before) / _STEP_S)
+                if self.step % _REPORT_STEPS == 0:
+                    self._report(velocity)
+            if self.step % _STATE_STEPS == 0:
+                self.states.append((self.t_s, self.navigator.state_at(self.t_s)))
+            if self.step % self.every_steps == 0 and self.sees:
+                self.waiting.append((self.step, self.vehicle))
+            if self.waiting and self.waiting[0][0] <= self.step - self.late_steps:
+                self.match(*self.waiting.popleft())
+            if self.step % 50 == 0:
+                self.errors_m.append(self.off_m)
+        return self
+
+    def tell(self, event: Recognition) -> Advice:
+        return self.navigator.advise(event, self.t_s)
+
+    def match(self, step, vehicle, off_m=(0.0, 0.0), view=None) -> Advice:
+        seen_m = self.way[step] + self.map_off + self.rng.normal(0, self.noise_sd_m, 2) + off_m
+        place = round(step * _STEP_S)
+        event = match_at(Position(*moved(*HOME, *seen_m)), step * _STEP_S, vehicle, self.said_sd_m, (place,), view)
+        self.events.append(event)
+        advice = self.tell(event)
+        self.advices.append((self.t_s, advice))
+        if advice.fix and self.takes_fixes:
+            fix = advice.fix
+            self.off_m = self.off(fix.lat_deg, fix.lon_deg, fix.t_frame_s)
+            self.known = fix.accuracy_m, self.t_s
+        return advice
+
+    def match_now(self, **changes) -> Advice:
+        return self.match(self.step, self.vehicle, **changes)
+
+    def _feel(self, acceleration_m_s2: np.ndarray) -> None:
+        east, north = acceleration_m_s2 + self.bias + self.rng.normal(0, 0.2, 2)
+        self.navigator.hear_force(self.t_s, (north, east, -_GRAVITY_M_S2), Attitude(self.t_s, 0.0, 0.0, 0.0))
+
+    def _report(self, velocity: np.ndarray) -> None:
+        here, there = (moved(*HOME, *(self.at_m + off_m)) for off_m in (self.off_m, self.gps_off_m))
+        wrong = np.zeros(2) if self.has_gps else self.rng.normal(0, self.velocity_sd, 2) - self.wind
+        if self.has_gps:
+            self.known = GPS_SD_M, self.t_s
+        sd_m = math.hypot(self.known[0], _DRIFT_M_S * (self.t_s - self.known[1]))
+        roll_deg, pitch_deg = self.attitude
+        self.vehicle = vehicle_at(
+            *here,
+            self.t_s,
+            has_gps=self.has_gps,
+            gps=Receiver(*there, GPS_SD_M, self.t_s) if self.has_receiver else None,
+            velocity_m_s=tuple(velocity + wrong),
+            position_sd_m=None if self.knows_nothing else sd_m,
+            height_m=100.0,
+            roll_deg=roll_deg,
+            pitch_deg=pitch_deg,
+        )
+        self.navigator.hear_vehicle(self.vehicle)
+
+
+def lengths(errors_m) -> np.ndarray:
+    return np.hypot(*np.array(errors_m).T)

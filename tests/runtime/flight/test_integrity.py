@@ -1,0 +1,245 @@
+"""GPS against the map: a receiver that is wrong is found, one that is right is left in peace."""
+
+import math
+
+import numpy as np
+import pytest
+from air import GPS_SD_M, HOME, Air, lengths, match_at
+from fakes import FakeClock, FakeLink, vehicle_at
+
+from edgevpr.frames.level import View
+from edgevpr.geodesy import moved
+from edgevpr.mavlink.autopilots.channel import Channel
+from edgevpr.runtime.flight.autopilot import NoAutopilot, ToAutopilot
+from edgevpr.runtime.flight.flightlog import FlightLog, read_log
+from edgevpr.runtime.flight.gpswatch import GpsWatch
+from edgevpr.runtime.flight.integrity import Integrity
+from edgevpr.runtime.flight.navigator import Advice, Navigator
+from edgevpr.types import Position, Receiver
+
+MAP_SD_M = 5.0
+AWAY = np.array([0.6, 0.8])
+
+
+class Watched(Air):
+    """A flight whose every match is told to the autopilot and to the watch over GPS, as the loop does; `news` are the
+    watch's lines of the flight log."""
+
+    def __init__(self, tmp_path, navigator=None, **how):
+        super().__init__(navigator or Navigator(MAP_SD_M, 1.0), **{"fix_sd_m": 2.0, "late_s": 0.0} | how)
+        self.clock = FakeClock(0.0)
+        self.link = FakeLink(self.clock)
+        self.autopilot = ToAutopilot(self.link, self.navigator, send_fixes=True, cores=4, clock=self.clock.clock)
+        self.log = tmp_path / "log"
+        self.watch = GpsWatch(MAP_SD_M, FlightLog(self.log, clock=self.clock), self.autopilot)
+        self.drift_m_s = 0.0
+
+    def tell(self, event):
+        self.clock.now_s = self.t_s
+        event = self.autopilot.told(event, 0.0)
+        self.watch.tell(event)
+        self.reports = [*getattr(self, "reports", []), event.fix]
+        return Advice(None, event.fix.why)
+
+    def fly(self, seconds):
+        for _ in range(round(seconds)):
+            self.gps_off_m = self.gps_off_m + self.drift_m_s * AWAY
+            super().fly(1)
+        return self
+
+    @property
+    def news(self):
+        return [line for line in read_log(self.log) if line["kind"] == "gps"] if self.log.exists() else []
+
+    def distances(self):
+        return [each.value for each in self.link.sent if getattr(each, "name", "") == "vpr_gps_m"]
+
+
+def until_found(air, seconds=120):
+    """Fly until the alarm; return the seconds from when GPS was 30 m off."""
+    is_off_s = None
+    for _ in range(seconds):
+        air.fly(1)
+        if is_off_s is None and math.hypot(*air.gps_off_m) >= 30:
+            is_off_s = air.t_s
+        if air.news:
+            return air.news[0]["t_mono_s"] - (air.t_s if is_off_s is None else is_off_s)
+    raise AssertionError("no alarm")
+
+
+def glitch(air, drift_m_s):
+    if drift_m_s is None:
+        air.gps_off_m = np.array([100.0, 0.0])
+    else:
+        air.drift_m_s = drift_m_s
+
+
+GLITCHES = pytest.mark.parametrize("drift_m_s", [None, 1.0, 2.0, 5.0], ids=["jump", "1 m/s", "2 m/s", "5 m/s"])
+
+
+@GLITCHES
+@pytest.mark.parametrize("fix_sd_m", [1.0, 3.0])
+def test_a_receiver_that_jumps_or_drifts_away_is_found_within_fifteen_seconds_of_thirty_metres(
+    tmp_path, drift_m_s, fix_sd_m
+):
+    air = Watched(tmp_path, fix_sd_m=fix_sd_m).fly(30)
+    assert air.news == []
+    glitch(air, drift_m_s)
+    assert until_found(air) < 15
+    air.fly(60)
+    (news,) = air.news
+    assert news["is_wrong"]
+    said_m, rest = news["said"].removeprefix("GPS is ").split(" ", 1)
+    assert float(said_m) == pytest.approx(news["off_m"], abs=0.6)
+    assert rest == "m from the map's position"
+    assert [text for _, text in air.link.texts() if "GPS" in text] == [f"edgevpr: {news['said']}"]
+    assert len(air.distances()) == len(air.events)
+    assert air.distances()[-1] == pytest.approx(math.hypot(*air.gps_off_m), abs=15)
+
+
+def test_one_that_the_autopilot_does_not_follow_is_found_too(tmp_path):
+    air = Watched(tmp_path).fly(30)
+    air.reject_gps()
+    glitch(air, None)
+    assert until_found(air) < 6
+
+
+def test_it_is_over_when_gps_agrees_again(tmp_path):
+    air = Watched(tmp_path).fly(30)
+    glitch(air, None)
+    air.fly(30)
+    air.gps_off_m = np.zeros(2)
+    air.fly(30)
+    assert [line["is_wrong"] for line in air.news] == [True, False]
+    assert air.news[1]["said"] == "GPS agrees with the map again"
+    assert air.link.texts()[-1] == (6, "edgevpr: GPS agrees with the map again")
+    assert air.navigator.has_gps
+    glitch(air, None)
+    air.fly(30)
+    assert [line["is_wrong"] for line in air.news] == [True, False, True]
+
+
+@GLITCHES
+def test_the_navigation_believes_the_fixes_and_no_longer_gps_but_sends_none_to_an_autopilot_that_has_it(
+    tmp_path, drift_m_s
+):
+    air = Watched(tmp_path).fly(60)
+    assert air.navigator.has_gps
+    glitch(air, drift_m_s)
+    until_found(air)
+    air.fly(60)
+    assert not air.navigator.has_gps
+    off_m = []
+    for _ in range(20):
+        air.fly(1)
+        here = air.navigator._navigation.at(air.t_s).position
+        off_m.append(air.off(here.lat_deg, here.lon_deg))
+    assert lengths(off_m).max() < 8, "where the autopilot is 60 m off and more"
+    assert air.link.stats().fixes_sent == 0
+    whys = {report.why for report in air.reports[-20:]}
+    assert whys == {"not sent: the autopilot has GPS, which the map contradicts, and takes no fix"}
+
+
+def test_an_autopilot_that_rejects_a_wrong_receiver_is_sent_fixes(tmp_path):
+    air = Watched(tmp_path, wind=(6.0, 0.0)).fly(30)
+    air.reject_gps()
+    glitch(air, None)
+    air.fly(30)
+    assert air.link.stats().fixes_sent > 10
+
+
+def test_a_continuous_position_leaves_a_wrong_gps_too(tmp_path):
+    navigator = Navigator(MAP_SD_M, 1.0)
+    navigator.hear_channel(Channel.GPS_INPUT)
+    air = Watched(tmp_path, navigator).fly(40)
+    glitch(air, 5.0)
+    air.fly(60)
+    assert air.news[0]["is_wrong"]
+    last = air.states[-1][1]
+    assert math.hypot(*air.off(last.lat_deg, last.lon_deg)) < 10
+
+
+@pytest.mark.parametrize("fix_sd_m", [1.0, 3.0, 8.0])
+def test_no_false_alarm_in_thirty_minutes_of_noise_outliers_and_a_wandering_receiver(fix_sd_m):
+    """Five flights, whose maps are off by what the configuration says."""
+    for seed in range(5):
+        rng, integrity = np.random.default_rng(seed), Integrity(MAP_SD_M)
+        map_off_m = MAP_SD_M * np.array([math.cos(seed), math.sin(seed)])
+        at_m, wander_m, velocity = np.zeros(2), np.zeros(2), (12.0, 5.0)
+        for t_s in map(float, range(1800)):
+            at_m = at_m + velocity
+            wander_m = 59 / 60 * wander_m + rng.normal(0, 2 * math.sqrt(2 / 60), 2)
+            off_m = map_off_m + rng.normal(0, fix_sd_m, 2)
+            if rng.random() < 0.01:
+                turn = rng.uniform(0, 2 * math.pi)
+                off_m = 100 * np.array([math.cos(turn), math.sin(turn)])
+            gps = moved(*HOME, *(at_m + wander_m))
+            known = {"gps": Receiver(*gps, GPS_SD_M, t_s), "velocity_m_s": velocity, "height_m": 100.0}
+            seen = Position(*moved(*HOME, *(at_m + off_m)))
+            assert integrity.look(match_at(seen, t_s, vehicle_at(*gps, t_s, **known), fix_sd_m, (int(t_s),))) is None
+            assert integrity.off_m is not None
+
+
+def looks(integrity, *matches, t_s=0.0):
+    """Let matches be looked at: by how many metres off to the east, of which places, and so many seconds later."""
+    said = []
+    for off_m, places, after_s in matches:
+        t_s += after_s
+        position = Position(*moved(*HOME, off_m, 0.0))
+        said.append(integrity.look(match_at(position, t_s, vehicle_at(*HOME, t_s), 3.0, places)))
+    return said
+
+
+def test_three_of_different_places_that_say_the_same_are_needed():
+    far = "GPS is 100 m from the map's position"
+    assert looks(Integrity(5.0), (100, (1,), 0), (100, (2,), 1), (100, (3,), 1)) == [None, None, far]
+    assert looks(Integrity(5.0), *[(100, (1,), 1)] * 20) == [None] * 20, "one place may be a wrong one"
+    assert looks(Integrity(5.0), *[(100, (number // 3,), 1) for number in range(7)]) == [*[None] * 6, far]
+    assert looks(Integrity(5.0), (100, (1,), 0), (-100, (2,), 1), (100, (3,), 1), (300, (4,), 1)) == [None] * 4
+    assert looks(Integrity(5.0), *[(100, (number,), 16) for number in range(5)]) == [None] * 5, "too long ago"
+    assert looks(Integrity(5.0), (100, (1,), 0), (100, (2,), 1), (0, (3,), 1), (100, (4,), 1)) == [None] * 4
+
+
+def test_less_than_fifteen_metres_is_no_alarm_however_exact_the_matches_are():
+    exact = Integrity(0.1)
+    t_s = 0.0
+    for number in range(20):
+        event = match_at(Position(*moved(*HOME, 14.0, 0.0)), t_s, vehicle_at(*HOME, t_s), 0.1, (number,))
+        assert exact.look(event) is None
+
+
+def test_without_a_receiver_or_with_an_old_report_nothing_is_compared(tmp_path):
+    integrity = Integrity(5.0)
+    here = Position(*HOME)
+    for vehicle in (None, vehicle_at(*HOME, 5.0, has_gps=False), vehicle_at(*HOME, 3.0)):
+        assert integrity.look(match_at(here, 5.0, vehicle, 3.0, (1,))) is None
+        assert integrity.off_m is None
+    air = Watched(tmp_path).fly(3)
+    air.lose_gps()
+    air.link.sent.clear()
+    air.fly(5)
+    assert air.distances() == []
+
+
+def test_a_picture_that_does_not_show_the_ground_below_is_not_compared(tmp_path):
+    air = Watched(tmp_path).fly(3)
+    before = len(air.distances())
+    air.match_now(view=View(reason="it tilts by 40 degrees"))
+    assert len(air.distances()) == before
+
+
+def test_the_time_between_receiver_and_frame_is_allowed_for():
+    integrity, speed_m_s = Integrity(0.1), 25.0
+    for number in range(10):
+        t_s = float(number)
+        gps = moved(*HOME, speed_m_s * (t_s - 0.8), 0.0)
+        vehicle = vehicle_at(*gps, t_s, gps=Receiver(*gps, 0.1, t_s - 0.8), velocity_m_s=(speed_m_s, 0.0))
+        seen = Position(*moved(*HOME, speed_m_s * t_s, 0.0))
+        assert integrity.look(match_at(seen, t_s, vehicle, 0.1, (number,))) is None
+        assert integrity.off_m < 0.1
+
+
+def test_without_a_link_the_log_has_nothing_of_gps(tmp_path):
+    log = FlightLog(tmp_path / "log")
+    GpsWatch(5.0, log, NoAutopilot()).tell(match_at(Position(*HOME), 5.0, None, 3.0, (1,)))
+    assert list(read_log(tmp_path / "log")) == []
