@@ -1,6 +1,7 @@
 """GPS against the map: a receiver that is wrong is found, one that is right is left in peace."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -25,20 +26,19 @@ class Watched(Air):
     """A flight whose every match is told to the autopilot and to the watch over GPS, as the loop does; `news` are the
     watch's lines of the flight log."""
 
-    def __init__(self, tmp_path, navigator=None, **how):
+    def __init__(self, flight_log, clock, navigator=None, **how):
         super().__init__(navigator or Navigator(MAP_SD_M, 1.0), **{"fix_sd_m": 2.0, "late_s": 0.0} | how)
-        self.clock = FakeClock(0.0)
+        self.clock = clock
         self.link = FakeLink(self.clock)
         self.autopilot = ToAutopilot(self.link, self.navigator, send_fixes=True, cores=4, clock=self.clock.clock)
-        self.log = tmp_path / "log"
-        self.watch = GpsWatch(MAP_SD_M, FlightLog(self.log, clock=self.clock), self.autopilot)
-        self.drift_m_s = 0.0
+        self.log, self.drift_m_s, self.reports = flight_log.path, 0.0, []
+        self.watch = GpsWatch(MAP_SD_M, flight_log, self.autopilot)
 
     def tell(self, event):
         self.clock.now_s = self.t_s
         event = self.autopilot.told(event, 0.0)
         self.watch.tell(event)
-        self.reports = [*getattr(self, "reports", []), event.fix]
+        self.reports.append(event.fix)
         return Advice(None, event.fix.why)
 
     def fly(self, seconds):
@@ -49,10 +49,18 @@ class Watched(Air):
 
     @property
     def news(self):
-        return [line for line in read_log(self.log) if line["kind"] == "gps"] if self.log.exists() else []
+        return [line for line in read_log(self.log) if line["kind"] == "gps"]
 
     def distances(self):
         return [each.value for each in self.link.sent if getattr(each, "name", "") == "vpr_gps_m"]
+
+
+@pytest.fixture
+def watched(tmp_path):
+    """Makes one flight."""
+    clock = FakeClock(0.0)
+    with FlightLog(tmp_path / "log", clock=clock) as flight_log:
+        yield partial(Watched, flight_log, clock)
 
 
 def until_found(air, seconds=120):
@@ -80,9 +88,9 @@ GLITCHES = pytest.mark.parametrize("drift_m_s", [None, 1.0, 2.0, 5.0], ids=["jum
 @GLITCHES
 @pytest.mark.parametrize("fix_sd_m", [1.0, 3.0])
 def test_a_receiver_that_jumps_or_drifts_away_is_found_within_fifteen_seconds_of_thirty_metres(
-    tmp_path, drift_m_s, fix_sd_m
+    watched, drift_m_s, fix_sd_m
 ):
-    air = Watched(tmp_path, fix_sd_m=fix_sd_m).fly(30)
+    air = watched(fix_sd_m=fix_sd_m).fly(30)
     assert air.news == []
     glitch(air, drift_m_s)
     assert until_found(air) < 15
@@ -97,15 +105,15 @@ def test_a_receiver_that_jumps_or_drifts_away_is_found_within_fifteen_seconds_of
     assert air.distances()[-1] == pytest.approx(math.hypot(*air.gps_off_m), abs=15)
 
 
-def test_one_that_the_autopilot_does_not_follow_is_found_too(tmp_path):
-    air = Watched(tmp_path).fly(30)
+def test_one_that_the_autopilot_does_not_follow_is_found_too(watched):
+    air = watched().fly(30)
     air.reject_gps()
     glitch(air, None)
     assert until_found(air) < 6
 
 
-def test_it_is_over_when_gps_agrees_again(tmp_path):
-    air = Watched(tmp_path).fly(30)
+def test_it_is_over_when_gps_agrees_again(watched):
+    air = watched().fly(30)
     glitch(air, None)
     air.fly(30)
     air.gps_off_m = np.zeros(2)
@@ -121,9 +129,9 @@ def test_it_is_over_when_gps_agrees_again(tmp_path):
 
 @GLITCHES
 def test_the_navigation_believes_the_fixes_and_no_longer_gps_but_sends_none_to_an_autopilot_that_has_it(
-    tmp_path, drift_m_s
+    watched, drift_m_s
 ):
-    air = Watched(tmp_path).fly(60)
+    air = watched().fly(60)
     assert air.navigator.has_gps
     glitch(air, drift_m_s)
     until_found(air)
@@ -140,18 +148,18 @@ def test_the_navigation_believes_the_fixes_and_no_longer_gps_but_sends_none_to_a
     assert whys == {"not sent: the autopilot has GPS, which the map contradicts, and takes no fix"}
 
 
-def test_an_autopilot_that_rejects_a_wrong_receiver_is_sent_fixes(tmp_path):
-    air = Watched(tmp_path, wind=(6.0, 0.0)).fly(30)
+def test_an_autopilot_that_rejects_a_wrong_receiver_is_sent_fixes(watched):
+    air = watched(wind=(6.0, 0.0)).fly(30)
     air.reject_gps()
     glitch(air, None)
     air.fly(30)
     assert air.link.stats().fixes_sent > 10
 
 
-def test_a_continuous_position_leaves_a_wrong_gps_too(tmp_path):
+def test_a_continuous_position_leaves_a_wrong_gps_too(watched):
     navigator = Navigator(MAP_SD_M, 1.0)
     navigator.hear_channel(Channel.GPS_INPUT)
-    air = Watched(tmp_path, navigator).fly(40)
+    air = watched(navigator).fly(40)
     glitch(air, 5.0)
     air.fly(60)
     assert air.news[0]["is_wrong"]
@@ -208,21 +216,21 @@ def test_less_than_fifteen_metres_is_no_alarm_however_exact_the_matches_are():
         assert exact.look(event) is None
 
 
-def test_without_a_receiver_or_with_an_old_report_nothing_is_compared(tmp_path):
+def test_without_a_receiver_or_with_an_old_report_nothing_is_compared(watched):
     integrity = Integrity(5.0)
     here = Position(*HOME)
     for vehicle in (None, vehicle_at(*HOME, 5.0, has_gps=False), vehicle_at(*HOME, 3.0)):
         assert integrity.look(match_at(here, 5.0, vehicle, 3.0, (1,))) is None
         assert integrity.off_m is None
-    air = Watched(tmp_path).fly(3)
+    air = watched().fly(3)
     air.lose_gps()
     air.link.sent.clear()
     air.fly(5)
     assert air.distances() == []
 
 
-def test_a_picture_that_does_not_show_the_ground_below_is_not_compared(tmp_path):
-    air = Watched(tmp_path).fly(3)
+def test_a_picture_that_does_not_show_the_ground_below_is_not_compared(watched):
+    air = watched().fly(3)
     before = len(air.distances())
     air.match_now(view=View(reason="it tilts by 40 degrees"))
     assert len(air.distances()) == before
@@ -240,6 +248,6 @@ def test_the_time_between_receiver_and_frame_is_allowed_for():
 
 
 def test_without_a_link_the_log_has_nothing_of_gps(tmp_path):
-    log = FlightLog(tmp_path / "log")
-    GpsWatch(5.0, log, NoAutopilot()).tell(match_at(Position(*HOME), 5.0, None, 3.0, (1,)))
+    with FlightLog(tmp_path / "log") as log:
+        GpsWatch(5.0, log, NoAutopilot()).tell(match_at(Position(*HOME), 5.0, None, 3.0, (1,)))
     assert list(read_log(tmp_path / "log")) == []

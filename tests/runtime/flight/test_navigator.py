@@ -1,6 +1,7 @@
 """What is worth being sent: with a true path beside it, an aircraft that takes what is sent is never worse off."""
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -177,7 +178,7 @@ def test_a_continuous_position_comes_ten_times_a_second_and_does_not_jump():
     steps_s = np.diff([t_s for t_s, _ in states])
     assert steps_s == pytest.approx(0.1)
     beyond_m = []
-    for (_, one), (_, other) in zip(states, states[1:], strict=False):
+    for (_, one), (_, other) in pairwise(states):
         east_m, north_m = np.array(other.velocity_m_s[:2]) * 0.1
         carried = navigator.moved(one.lat_deg, one.lon_deg, east_m, north_m)
         beyond_m.append(float(distance_m(*carried, other.lat_deg, other.lon_deg)))

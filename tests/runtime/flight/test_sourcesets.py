@@ -1,0 +1,107 @@
+"""The autopilot is asked for another set of sources (42007) where its operator allows it, once, over a real link."""
+
+import pytest
+from air import Air
+from controlled import LOAD, Controlled
+from fakes import FakeClock, FakeLink
+
+from edgevpr.config import SourceSetsConfig
+from edgevpr.mavlink.autopilots.channel import Channel
+from edgevpr.mavlink.messages import Health
+from edgevpr.mavlink.wire import mavlink
+from edgevpr.runtime.flight.autopilot import ToAutopilot
+from edgevpr.runtime.flight.navigator import Navigator
+from edgevpr.runtime.flight.sourcesets import SourceSets
+
+ASK = mavlink.MAV_CMD_SET_EKF_SOURCE_SET
+ALLOWED = SourceSetsConfig(gps=1, no_gps=2)
+
+
+def asked(flown):
+    return [int(each.param1) for _, each in flown.commands(ASK)]
+
+
+def in_air(flown):
+    flown.brain.set_mode(13)
+    flown.until(lambda: flown.brain.why_not_arm(flown.now_s) is None)
+    flown.brain.arm(True)
+    return flown.fly(20)
+
+
+def lose_and_find(flown):
+    flown.controller.set("SIM_GPS1_ENABLE", 0)
+    flown.fly(20)
+    flown.controller.set("SIM_GPS1_ENABLE", 1)
+    flown.fly(20)
+
+
+def test_the_set_without_gps_is_asked_for_once_and_the_other_after_ten_seconds_of_gps():
+    with Controlled("arduplane", source_sets=ALLOWED) as flown:
+        in_air(flown)
+        assert asked(flown) == []
+        lost_s = flown.now_s
+        flown.controller.set("SIM_GPS1_ENABLE", 0)
+        flown.fly(20)
+        assert asked(flown) == [2]
+        assert flown.commands(ASK)[0][0] < lost_s + 6
+        assert flown.brain._source_set == 2
+        found_s = flown.now_s
+        flown.controller.set("SIM_GPS1_ENABLE", 1)
+        flown.fly(20)
+        assert asked(flown) == [2, 1]
+        assert flown.commands(ASK)[1][0] >= found_s + 10
+        assert flown.brain._source_set == 1
+        assert {(each.target_system, each.target_component) for _, each in flown.commands(ASK)} == {(1, 1)}
+
+
+def test_a_receiver_that_is_wrong_counts_as_none():
+    with Controlled("arduplane", source_sets=ALLOWED) as flown:
+        in_air(flown)
+        flown.autopilot.compare_gps(100.0, is_wrong=True)
+        flown.fly(3)
+        assert asked(flown) == [2]
+        flown.autopilot.compare_gps(3.0, is_wrong=False)
+        flown.fly(15)
+        assert asked(flown) == [2, 1]
+
+
+@pytest.mark.parametrize(
+    ("gps", "no_gps", "send_fixes"), [(None, None, True), (1, None, True), (None, 2, True), (1, 2, False)]
+)
+def test_without_both_numbers_and_in_a_dry_run_none_is_asked_for(gps, no_gps, send_fixes):
+    with Controlled("arduplane", source_sets=SourceSetsConfig(gps, no_gps), send_fixes=send_fixes) as flown:
+        in_air(flown)
+        lose_and_find(flown)
+        assert asked(flown) == []
+
+
+def test_without_a_position_of_ours_none_is_asked_for():
+    sets = SourceSets(ALLOWED)
+    assert sets.wanted(0.0, has_gps=False, has_own=False) is None
+    assert sets.wanted(1.0, has_gps=False, has_own=True) == 2
+    assert sets.wanted(2.0, has_gps=False, has_own=True) is None
+
+
+def test_gps_that_comes_and_goes_is_not_asked_for():
+    sets = SourceSets(ALLOWED)
+    assert [sets.wanted(float(t_s), has_gps=True, has_own=True) for t_s in range(30)] == [None] * 30
+    assert sets.wanted(30.0, has_gps=False, has_own=True) == 2
+    blinks = [sets.wanted(float(t_s), has_gps=t_s % 9 != 0, has_own=True) for t_s in range(31, 100)]
+    assert blinks == [None] * 69
+
+
+def test_looking_whether_to_ask_moves_no_continuous_position():
+    """The autopilot is told positions 0.2 s ago, as ArduPilot takes a receiver to be so late."""
+    plain, asking = (Air(Navigator(1.0, 1.0)) for _ in range(2))
+    clock = FakeClock()
+    link = FakeLink(clock, vehicle=lambda: asking.vehicle)
+    autopilot = ToAutopilot(link, asking.navigator, send_fixes=True, cores=4, clock=clock.clock)
+    for air in (plain, asking):
+        air.navigator.hear_channel(Channel.GPS_INPUT)
+    for _ in range(20):
+        plain.fly(1)
+        asking.fly(1)
+        clock.now_s = asking.t_s + 0.2
+        autopilot.report(Health.ACTIVE, LOAD, None)
+    assert asking.states == plain.states
+    assert asking.states[-1][1]
