@@ -148,6 +148,23 @@ def test_the_navigation_believes_the_fixes_and_no_longer_gps_but_sends_none_to_a
     assert whys == {"not sent: the autopilot has GPS, which the map contradicts, and takes no fix"}
 
 
+@pytest.mark.parametrize("channel", [Channel.COMMAND, Channel.GPS_INPUT])
+@pytest.mark.parametrize("drift_m_s", [1.0, 5.0])
+def test_a_receiver_that_makes_up_its_speed_too_misleads_the_navigation_until_it_is_found(watched, drift_m_s, channel):
+    air = watched()
+    air.navigator.hear_channel(channel)
+    air.fly(60)
+    air.spoofed_m_s = drift_m_s * AWAY
+    glitch(air, drift_m_s)
+    assert until_found(air) < 15
+    air.fly(20)
+    for _ in range(20):
+        air.fly(1)
+        here = air.navigator._navigation.at(air.t_s).position
+        assert math.hypot(*air.off(here.lat_deg, here.lon_deg)) < 8
+    assert air.link.stats().fixes_sent == 0
+
+
 def test_an_autopilot_that_rejects_a_wrong_receiver_is_sent_fixes(watched):
     air = watched(wind=(6.0, 0.0)).fly(30)
     air.reject_gps()
