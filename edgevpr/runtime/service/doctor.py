@@ -174,7 +174,7 @@ def _streams(reading: Reading) -> Finding:
         return Finding(
             "streams",
             False,
-            f"{' and '.join(missing)} does not come, even on request: an autopilot that does not know its position "
+            f"No {' and no '.join(missing)} comes, even on request: an autopilot that does not know its position "
             "yet may keep it back; let it have GPS.",
         )
     said = ", ".join(f"{name} {reading.streams_hz[name]:g} Hz" for name in _NEEDED if name in reading.streams_hz)
