@@ -174,6 +174,7 @@ class MavlinkConfig:
 class LogConfig:
     path: str | None = keyed(Flag(("--log",), "FILE", "flight log, JSON lines"))
     tlog: str | None = keyed(Flag(("--tlog",), "FILE", "every packet of the link, for mavlogdump and ground stations"))
+    max_mb: float | None = bounded(1, 1_000_000)
 
 
 @dataclass(frozen=True, slots=True)

@@ -58,7 +58,9 @@ def fly(config: Config, positions: Path | None = None) -> int:
         recogniser, learner, cannot_learn = _opened(config, board)
         stack.callback(recogniser.place_map.close)
         smaller_forms = smaller_forms_of(config, recogniser, learner, time.monotonic() - begin_s)
-        flight_log = stack.enter_context(FlightLog(config.log.path, wait="NOTIFY_SOCKET" in os.environ))
+        flight_log = stack.enter_context(
+            FlightLog(config.log.path, wait="NOTIFY_SOCKET" in os.environ, max_mb=config.log.max_mb)
+        )
         found = outlook(recogniser, config)
         recogniser.candidates = found.candidates
         _say_start(config, recogniser, flight_log, found)
