@@ -178,6 +178,11 @@ class LogConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class StatusConfig:
+    socket: str | None = field()
+
+
+@dataclass(frozen=True, slots=True)
 class BatteryConfig:
     pack: str = keyed(Flag(("--battery",), "PACK", "cells and capacity of the pack, e.g. 4S5200"))
     regulator_efficiency: float = bounded(0.1, 1)
@@ -197,6 +202,7 @@ class Config:
     salience: SalienceConfig
     mavlink: MavlinkConfig
     log: LogConfig
+    status: StatusConfig
     battery: BatteryConfig
 
 

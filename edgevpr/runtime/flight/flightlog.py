@@ -8,7 +8,7 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import asdict, is_dataclass
+from dataclasses import asdict
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -18,7 +18,7 @@ from edgevpr.config import Config
 from edgevpr.contract import TechniqueSpec
 from edgevpr.errors import EdgevprError
 from edgevpr.helpers.appending import append, is_at, open_appending, set_aside, sync
-from edgevpr.helpers.text import without_passwords
+from edgevpr.helpers.jsonline import json_line
 
 _log = logging.getLogger(__name__)
 _SYNC_EVERY_S = 1.0
@@ -220,33 +220,4 @@ def _append(file: BinaryIO, lines: bytes) -> None:
 
 def _line(kind: str, fields: dict[str, Any]) -> bytes:
     now = datetime.now(timezone.utc).isoformat(timespec="milliseconds").replace("+00:00", "Z")
-    text = json.dumps(_plain({"kind": kind, "time": now, **fields}), ensure_ascii=False, allow_nan=False)
-    # Text that is not UTF-8 (a foreign file name) becomes a \u escape, which JSON reads back unchanged.
-    return text.encode("utf-8", "backslashreplace") + b"\n"
-
-
-def _plain(value: Any) -> Any:
-    """Return `value` in JSON's types."""
-    if isinstance(value, str):
-        return without_passwords(value)
-    if value is None or isinstance(value, (bool, int)):
-        return value
-    if isinstance(value, float):
-        return _readable(value)
-    if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    if is_dataclass(value):
-        return _plain(asdict(value))
-    if hasattr(value, "tolist"):  # NumPy's scalars and arrays
-        return _plain(value.tolist())
-    return without_passwords(str(value))
-
-
-def _readable(value: float) -> float | None:
-    """Round to seven decimals (a centimetre of latitude, and what MAVLink carries) or seven digits, whichever is
-    more."""
-    if not math.isfinite(value):
-        return None
-    return round(value, 7) if abs(value) >= 1 else float(f"{value:.7g}")
+    return json_line({"kind": kind, "time": now, **fields})
