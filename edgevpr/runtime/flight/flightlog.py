@@ -164,6 +164,7 @@ class FlightLog:
         )
         _log.warning("%s", self.state)
         self._let_go()
+        self._has_start = False
 
     def _let_go(self) -> None:
         if self._file is not None:

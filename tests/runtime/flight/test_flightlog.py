@@ -139,6 +139,21 @@ def test_reading_leaves_out_a_cut_last_line_and_what_is_no_record(path):
     assert list(read_log(path)) == [{"kind": "a"}, {"kind": "b"}]
 
 
+def test_a_flight_that_was_cut_at_any_byte_is_read_up_to_its_last_whole_line(path):
+    with FlightLog(path) as log:
+        for n in range(3):
+            log.write("query", n=n, place="Přeštice")
+    whole = path.read_bytes()
+    ends = [place + 1 for place, byte in enumerate(whole) if byte == ord("\n")]
+    for cut in range(len(whole)):
+        path.write_bytes(whole[:cut])
+        kept = sum(end - 1 <= cut for end in ends)  # the last byte of a line, its end, may be missing
+        assert numbers(path) == list(range(kept))
+        with FlightLog(path) as log:
+            log.write("start")
+        assert [each["kind"] for each in read_log(path)] == ["query"] * kept + ["start"]
+
+
 def test_a_full_device_is_said_once_counted_and_never_raised(caplog):
     with FlightLog("/dev/full") as log:
         for _ in range(5):
@@ -253,6 +268,15 @@ def test_a_log_that_is_moved_in_flight_loses_nothing(path, caplog):
     assert kinds(path) == ["start", "gap", "c", "d", "e"]
     assert log.lost_lines == 0
     assert "was moved or replaced in flight, and 0 lines" in caplog.text
+
+
+def test_a_log_in_whose_place_another_one_was_put_has_its_start_there_too(path):
+    with FlightLog(path) as log:
+        log.write("start")
+        path.rename(path.with_suffix(".mine"))
+        path.write_bytes(b'{"kind": "end"}\n')
+        log.write("a")
+    assert kinds(path) == ["end", "start", "gap", "a"]
 
 
 def test_a_log_whose_folder_is_deleted_is_tried_again(path, caplog):
