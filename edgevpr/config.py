@@ -174,6 +174,12 @@ class MavlinkConfig:
 class LogConfig:
     path: str | None = keyed(Flag(("--log",), "FILE", "flight log, JSON lines"))
     tlog: str | None = keyed(Flag(("--tlog",), "FILE", "every packet of the link, for mavlogdump and ground stations"))
+    max_mb: float | None = bounded(1, 1_000_000)
+
+
+@dataclass(frozen=True, slots=True)
+class StatusConfig:
+    socket: str | None = field()
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,6 +202,7 @@ class Config:
     salience: SalienceConfig
     mavlink: MavlinkConfig
     log: LogConfig
+    status: StatusConfig
     battery: BatteryConfig
 
 

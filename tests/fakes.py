@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from edgevpr.frames.condition import Condition
+from edgevpr.mavlink.autopilots.channel import Channel
 from edgevpr.mavlink.link import LinkStats
 from edgevpr.mavlink.listener import NoListener
 from edgevpr.mavlink.messages import Fix, Health, Severity, status_text
@@ -187,6 +188,10 @@ class FakeLink:
         vehicle = replace(vehicle, t_fix_s=self._replies.t_fix_s)
         self.listener.hear_vehicle(vehicle)
         return vehicle
+
+    @property
+    def channel(self) -> Channel:
+        return Channel.COMMAND
 
     def listens(self) -> bool:
         return self.answer is not None

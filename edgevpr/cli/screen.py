@@ -19,6 +19,12 @@ def guarded_output() -> Iterator[None]:
         yield
 
 
+def erase_lines(count: int) -> None:
+    """Go so many lines up on the terminal, and clear all from there."""
+    if count and isinstance(sys.stdout, _Guarded):
+        sys.stdout.erase(count)
+
+
 class LineFormatter(logging.Formatter):
     """Makes one line of each message, so that a file name with a line break cannot write a message of its own. The
     traceback that follows an unforeseen error keeps its lines."""
@@ -43,6 +49,9 @@ class _Guarded(io.TextIOBase):
         except UnicodeEncodeError:  # a terminal that is not set to UTF-8
             self._stream.write(safe.encode("ascii", "backslashreplace").decode("ascii"))
         return len(text)
+
+    def erase(self, lines: int) -> None:
+        self._stream.write(f"\x1b[{lines}F\x1b[J")
 
     def flush(self) -> None:
         self._stream.flush()

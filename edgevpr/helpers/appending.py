@@ -53,6 +53,25 @@ def sync(file: BinaryIO) -> None:
         os.fdatasync(file.fileno())
 
 
+def earlier_part(path: str | Path) -> Path:
+    """Return the name under which the part before a file is kept: NAME.1.jsonl beside NAME.jsonl, with links
+    followed."""
+    path = Path(os.path.realpath(path))
+    return path.with_name(f"{path.stem}.1{path.suffix}")
+
+
+def set_aside(path: str | Path) -> None:
+    """Rename a file that is full to `earlier_part`, in place of the one before. Raises OSError."""
+    earlier = earlier_part(path)
+    os.replace(os.path.realpath(path), earlier)
+    with suppress(OSError):  # a folder that cannot be synced, as on FAT
+        folder = os.open(earlier.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
+
 def is_at(file: BinaryIO, path: str | Path) -> bool:
     """Tell whether an open file is still the one that is found under `path`."""
     try:

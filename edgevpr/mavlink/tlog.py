@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from edgevpr.errors import EdgevprError
-from edgevpr.helpers.appending import append, is_at, open_appending, sync
+from edgevpr.helpers.appending import append, is_at, open_appending, set_aside, sync
 
 MOST_BYTES = 256_000_000  # of one file, days of a usual link; with the one before it there are at most twice as many
 SPARED_BYTES = 20_000_000  # of the disk, which are left to the flight log
@@ -100,7 +100,7 @@ class Tlog:
         if not is_at(self._file, self._path):  # moved or deleted in flight
             self._file = self._reopened()
         elif os.fstat(self._file.fileno()).st_size + len(records) > MOST_BYTES:
-            self._path.replace(self._path.with_name(f"{self._path.stem}.1{self._path.suffix}"))
+            set_aside(self._path)
             self._file = self._reopened()
         disk = os.fstatvfs(self._file.fileno())
         if disk.f_bavail * disk.f_frsize < SPARED_BYTES:

@@ -14,12 +14,14 @@ from edgevpr.runtime.flight.flightlog import FlightLog, read_log
 from edgevpr.runtime.flight.loop import Stop
 from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.flight.navigator import Navigator
+from edgevpr.runtime.flight.statussocket import NoReaders, Readers
 from edgevpr.runtime.recognise.learn import Learner
 from edgevpr.runtime.recognise.opening import open_learning, open_recogniser
 from edgevpr.runtime.recognise.recogniser import Recogniser
 
 PLACES = 30
 STEP_DEG = 0.001  # of latitude: 111 m
+_NOBODY = NoReaders()
 
 
 class Flight:
@@ -63,6 +65,7 @@ class Flight:
         meter: FlightMeter | None = None,
         smaller_forms: tuple[str, ...] = (),
         fewer_candidates: tuple[int, ...] = (),
+        readers: Readers = _NOBODY,
     ) -> list[dict]:
         autopilot = NoAutopilot()
         if self.link:
@@ -86,6 +89,7 @@ class Flight:
                 smaller_forms=smaller_forms,
                 clock=self.clock.clock,
                 meter=meter,
+                readers=readers,
             )
         return list(read_log(self.log))
 

@@ -15,6 +15,7 @@ from edgevpr.runtime.flight.answerlog import AnswerLog
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.flight.sourcesets import SourceSets
+from edgevpr.runtime.flight.status import LinkState
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.types import FixReport, Vehicle
 
@@ -56,6 +57,9 @@ class NoAutopilot:
 
     def compare_gps(self, off_m: float, is_wrong: bool) -> None:
         """Tell nobody."""
+
+    def state(self) -> None:
+        """Return None: there is no link."""
 
     def announce(self, mood: Mood, text: str, topic: str | None = None) -> None:
         """Say nothing."""
@@ -109,6 +113,20 @@ class ToAutopilot:
         foreign = f"{stats.foreign_messages} foreign messages refused" if stats.foreign_messages else ""
         return ", ".join(filter(None, (sent, refused, unanswered, held, late, withheld, foreign)))
 
+    def state(self) -> LinkState:
+        """Return the state of the link, of the autopilot's answers and of the navigation."""
+        stats = self._link.stats()
+        return LinkState(
+            connected=stats.connected,
+            trouble=stats.trouble,
+            autopilot=stats.autopilot_system_id if stats.autopilot_heard else None,
+            channel=self._link.channel.name,
+            fixes=self.summary,
+            answers=stats.acks,
+            unanswered=stats.unanswered_fixes,
+            accuracy_m=self._navigator.accuracy_m(self._clock.mono_s()),
+        )
+
     def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
         """Return the autopilot's last report of its vehicle, with the attitude at the time of a frame; None where it
         has given no position."""
@@ -124,7 +142,7 @@ class ToAutopilot:
         now_s = self._clock.mono_s()
         if event.accepted:
             best = event.best
-            match = messages.place_match(now_s, best.place.place_id, best.match.score, _confidence(event))
+            match = messages.place_match(now_s, best.place.place_id, best.match.score, confidence_of(event))
             self._link.send(*match)
         if event.is_query:
             cpu_share = event.cost.whole.utilisation(self._cores)
@@ -223,7 +241,7 @@ def _unsent(event: Recognition, why: str) -> FixReport:
     return FixReport(query=_name(event), sent=False, why=why)
 
 
-def _confidence(event: Recognition) -> float | None:
+def confidence_of(event: Recognition) -> float | None:
     """Return the confidence of an accepted match: its own, or by the flight so far where that is higher."""
     if event.confidence is None:
         return None

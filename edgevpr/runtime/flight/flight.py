@@ -10,6 +10,7 @@ from edgevpr.runtime.flight.autopilot import Autopilot
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.commands import Commands
 from edgevpr.runtime.flight.flightlog import FlightLog
+from edgevpr.runtime.flight.flightstate import FlightState
 from edgevpr.runtime.flight.governing import Governing
 from edgevpr.runtime.flight.gpswatch import GpsWatch
 from edgevpr.runtime.flight.learning import Learning
@@ -19,10 +20,13 @@ from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.flight.pace import Pace
 from edgevpr.runtime.flight.querylog import QueryLog, totals_of
 from edgevpr.runtime.flight.sight import Sight
+from edgevpr.runtime.flight.statussocket import NoReaders, Readers
 from edgevpr.runtime.flight.tally import Tally
 from edgevpr.runtime.flight.vitals import Vitals
 from edgevpr.runtime.recognise.learn import Learner
 from edgevpr.runtime.recognise.recogniser import Recogniser
+
+_NOBODY = NoReaders()
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,11 +57,12 @@ def fly(
     smaller_forms: tuple[str, ...] = (),
     clock: Clock | None = None,
     meter: FlightMeter | None = None,
+    readers: Readers = _NOBODY,
 ) -> Flown:
     """Fly until the source has ended or `stop` is asked for.
 
     `learner` makes places (None: nothing is learnt); `fewer_candidates`, and `smaller_forms` of the index, are those
-    that the governor may change to. `clock` and `meter` are the real ones unless given.
+    that the governor may change to. `clock` and `meter` are the real ones unless given. `readers` are told the status.
     """
     clock = clock or Clock()
     if meter is None:
@@ -78,6 +83,22 @@ def fly(
         smaller_forms=smaller_forms,
     )
     commands = Commands(autopilot, flight_log, learner)
+    state = FlightState(
+        source=source,
+        autopilot=autopilot,
+        meter=meter,
+        tally=tally,
+        pace=pace,
+        commands=commands,
+        clock=clock,
+        remarks=(
+            lambda: commands.summary,
+            lambda: governing.held,
+            lambda: learner and learner.summary,
+            lambda: map_state.summary,
+            lambda: flight_log.state,
+        ),
+    )
     vitals = Vitals(
         source=source,
         flight_log=flight_log,
@@ -86,13 +107,8 @@ def fly(
         tally=tally,
         commands=commands,
         clock=clock,
-        remarks=(
-            lambda: commands.summary,
-            lambda: autopilot.summary,
-            lambda: governing.held,
-            lambda: learner and learner.summary,
-            lambda: map_state.summary,
-        ),
+        state=state,
+        readers=readers,
     )
 
     def totals() -> dict[str, Any]:
@@ -100,6 +116,7 @@ def fly(
 
     observers: list[Observer] = [
         tally,
+        state,
         map_state,
         Sight(flight_log, autopilot),
         GpsWatch(config.mavlink.min_accuracy_m, flight_log, autopilot),

@@ -8,7 +8,7 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import asdict, is_dataclass
+from dataclasses import asdict
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -17,8 +17,8 @@ from edgevpr import __version__
 from edgevpr.config import Config
 from edgevpr.contract import TechniqueSpec
 from edgevpr.errors import EdgevprError
-from edgevpr.helpers.appending import append, is_at, open_appending, sync
-from edgevpr.helpers.text import without_passwords
+from edgevpr.helpers.appending import append, is_at, open_appending, set_aside, sync
+from edgevpr.helpers.jsonline import json_line
 
 _log = logging.getLogger(__name__)
 _SYNC_EVERY_S = 1.0
@@ -29,11 +29,19 @@ class FlightLog:
 
     `state` is None while lines are written, else a sentence that says why they are not. `lost_lines` counts the missing
     lines. Every write tries again, and the first one that succeeds is preceded by a line of kind "gap". A log that was
-    deleted or moved in flight is noticed within a second or so, and goes on in a new file of that name.
+    deleted or moved in flight goes on in a new file of that name.
+
+    A file of half of `max_mb` (None: without limit) is renamed to `earlier_part`, and the log goes on in a new file.
+    Every file that begins in flight begins with the line of kind "start" again, with `repeated`, so that it can be read
+    alone.
     """
 
     def __init__(
-        self, path: str | Path | None, clock: Callable[[], float] = time.monotonic, wait: bool = False
+        self,
+        path: str | Path | None,
+        clock: Callable[[], float] = time.monotonic,
+        wait: bool = False,
+        max_mb: float | None = None,
     ) -> None:
         """Open for appending. Raises EdgevprError where the file cannot be opened. With `wait`, for a service that may
         restart in the air, every line tries to open the file again instead."""
@@ -44,9 +52,15 @@ class FlightLog:
         self._synced_s = -math.inf
         self._file: BinaryIO | None = None
         self._written = 0  # lines in the file that is open
+        self._part_bytes = math.inf if max_mb is None else 1e6 * max_mb / 2
+        self._is_bounded = True
+        self._start, self._has_start = (
+            b"",
+            True,
+        )  # the start line as it is repeated; the open file has it, or needs none
         if path is not None:
             try:
-                self._file = open_appending(path)
+                self._open()
             except OSError as error:
                 if wait:
                     self._note_trouble(error)
@@ -70,20 +84,23 @@ class FlightLog:
         """
         if self.path is None:
             return
-        is_sync_due = self._clock() - self._synced_s >= _SYNC_EVERY_S
-        if is_sync_due and self._file is not None and not is_at(self._file, self.path):
+        if self._file is not None and not is_at(self._file, self.path):
             self._note_taken_away()
         lines = _line(kind, {"t_mono_s": self._clock(), **fields})
+        if kind == "start":
+            self._start = lines.removesuffix(b"}\n") + b', "repeated": true}\n'
         if self.state is not None:
             lines = _line("gap", {"t_mono_s": self._clock(), "lost_lines": self.lost_lines}) + lines
         try:
             if self._file is None:
-                self._file, self._written = open_appending(self.path), 0
-            _append(self._file, lines)
-            if is_sync_due:
+                self._open()
+            self._make_room(len(lines))
+            _append(self._file, lines if self._has_start or kind == "start" else self._start + lines)
+            self._has_start = True
+            if self._clock() - self._synced_s >= _SYNC_EVERY_S:
                 self._sync()
         except OSError as error:
-            self._lost_one(error)
+            self._lost_one(kind, error)
         else:
             self._written += 1
             self._say_recovered()
@@ -99,12 +116,41 @@ class FlightLog:
             _log.warning("The end of the flight log %s may be missing (%s).", self.path, error.strerror)
         self._file = None
 
+    def _open(self) -> None:
+        self._file, self._written = open_appending(self.path), 0
+        if os.fstat(self._file.fileno()).st_size == 0:
+            self._has_start = False
+
+    def _make_room(self, more_bytes: int) -> None:
+        """Begin a new part where the file would become too large. One that cannot be renamed is written on: a line is
+        worth more than the limit."""
+        size = os.fstat(self._file.fileno()).st_size
+        if not size or size + len(self._start) + more_bytes <= self._part_bytes:
+            return
+        try:
+            set_aside(self.path)
+        except OSError as error:
+            if self._is_bounded:
+                self._is_bounded = False
+                _log.warning(
+                    "The flight log %s grows past log.max_mb, since it cannot be renamed (%s): let the flight write to "
+                    "its folder.",
+                    self.path,
+                    error.strerror,
+                )
+            return
+        self._sync()
+        self._let_go()
+        self._open()
+
     def _sync(self) -> None:
         sync(self._file)
         self._synced_s = self._clock()
 
-    def _lost_one(self, error: OSError) -> None:
+    def _lost_one(self, kind: str, error: OSError) -> None:
         self.lost_lines += 1
+        if kind == "start":
+            self._has_start = False
         self._note_trouble(error)
         self._let_go()  # the medium may be another one when it comes back, so the file is opened anew
 
@@ -118,6 +164,7 @@ class FlightLog:
         )
         _log.warning("%s", self.state)
         self._let_go()
+        self._has_start = False
 
     def _let_go(self) -> None:
         if self._file is not None:
@@ -174,33 +221,4 @@ def _append(file: BinaryIO, lines: bytes) -> None:
 
 def _line(kind: str, fields: dict[str, Any]) -> bytes:
     now = datetime.now(timezone.utc).isoformat(timespec="milliseconds").replace("+00:00", "Z")
-    text = json.dumps(_plain({"kind": kind, "time": now, **fields}), ensure_ascii=False, allow_nan=False)
-    # Text that is not UTF-8 (a foreign file name) becomes a \u escape, which JSON reads back unchanged.
-    return text.encode("utf-8", "backslashreplace") + b"\n"
-
-
-def _plain(value: Any) -> Any:
-    """Return `value` in JSON's types."""
-    if isinstance(value, str):
-        return without_passwords(value)
-    if value is None or isinstance(value, (bool, int)):
-        return value
-    if isinstance(value, float):
-        return _readable(value)
-    if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    if is_dataclass(value):
-        return _plain(asdict(value))
-    if hasattr(value, "tolist"):  # NumPy's scalars and arrays
-        return _plain(value.tolist())
-    return without_passwords(str(value))
-
-
-def _readable(value: float) -> float | None:
-    """Round to seven decimals (a centimetre of latitude, and what MAVLink carries) or seven digits, whichever is
-    more."""
-    if not math.isfinite(value):
-        return None
-    return round(value, 7) if abs(value) >= 1 else float(f"{value:.7g}")
+    return json_line({"kind": kind, "time": now, **fields})

@@ -131,6 +131,12 @@ class Navigator:
         with self._lock:
             return self._known(now_s) is not None
 
+    def accuracy_m(self, now_s: float) -> float | None:
+        """Return how well the position is known, the standard deviation of one axis; None: it is not known."""
+        with self._lock:
+            estimate = self._navigation.at(now_s)
+            return estimate and max(estimate.accuracy_m, self._map_sd_m)
+
     def state_at(self, t_s: float) -> State | None:
         """Return where the vehicle is or was, later than at the last call, to be sent as a continuous position; None:
         that is not known well enough."""

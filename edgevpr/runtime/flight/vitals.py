@@ -1,7 +1,6 @@
 """The state of a flight, reported once a second, and the watchdog's beat."""
 
 import logging
-from collections.abc import Callable, Sequence
 
 from edgevpr.frames.condition import Condition
 from edgevpr.frames.source import Source
@@ -11,7 +10,9 @@ from edgevpr.runtime.flight.autopilot import Autopilot, Mood
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.commands import Commands
 from edgevpr.runtime.flight.flightlog import FlightLog
+from edgevpr.runtime.flight.flightstate import FlightState
 from edgevpr.runtime.flight.metering import FlightMeter
+from edgevpr.runtime.flight.statussocket import Readers
 from edgevpr.runtime.flight.systemd import notify, watchdog_interval_s
 from edgevpr.runtime.flight.tally import FAILURES_IN_A_ROW, Tally
 from edgevpr.runtime.flight.trouble import Trouble
@@ -23,9 +24,9 @@ _log = logging.getLogger(__name__)
 
 
 class Vitals:
-    """Tells systemd that the loop turns and how the flight goes, and the autopilot how this companion computer is. It
-    tells everybody, once, when the camera is lost, frozen or damaged or shows nothing, when nothing can be recognised
-    any more, and when that is over. `remarks` are added to systemd's status."""
+    """Tells systemd that the loop turns, it and the `readers` how the flight goes, and the autopilot how this companion
+    computer is. It tells everybody, once, when the camera is lost, frozen or damaged or shows nothing, when nothing can
+    be recognised any more, and when that is over."""
 
     def __init__(
         self,
@@ -37,10 +38,12 @@ class Vitals:
         tally: Tally,
         commands: Commands,
         clock: Clock,
-        remarks: Sequence[Callable[[], str | None]] = (),
+        state: FlightState,
+        readers: Readers,
     ) -> None:
         self._source, self._flight_log, self._autopilot = source, flight_log, autopilot
-        self._meter, self._tally, self._commands, self._clock, self._remarks = meter, tally, commands, clock, remarks
+        self._meter, self._tally, self._commands, self._clock = meter, tally, commands, clock
+        self._state, self._readers = state, readers
         self._watchdog_s = watchdog_interval_s()
         self._watchdog_due_s = self._health_due_s = clock.mono_s()
         self._trouble: str | None = None
@@ -65,10 +68,11 @@ class Vitals:
         self._say_source()
         self._failing.note(self._tally.is_failing)
         self._blind.note(self._tally.sees_nothing)
-        counts = f"{self._tally.queries} queries, {self._tally.accepted} accepted, {self._meter.used_mah:.2f} mAh"
-        remarks = (remark() for remark in self._remarks)
-        notify(STATUS="; ".join(filter(None, (self._source.state, counts, *remarks, self._flight_log.state))))
-        self._autopilot.report(self._health(), machine_load(), self._meter.thermal.temperature_c)
+        health, load = self._health(), machine_load()
+        status = self._state.status(health, load)
+        notify(STATUS=status.summary)
+        self._readers.tell(status)
+        self._autopilot.report(health, load, self._meter.thermal.temperature_c)
 
     def _say_source(self) -> None:
         trouble = _TROUBLES.get(self._source.condition)

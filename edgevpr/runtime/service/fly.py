@@ -30,6 +30,7 @@ from edgevpr.runtime.flight.learning import say_learning_stopped
 from edgevpr.runtime.flight.loop import Stop
 from edgevpr.runtime.flight.navigator import Muted, Navigator
 from edgevpr.runtime.flight.sourcesets import SourceSets
+from edgevpr.runtime.flight.statussocket import NoReaders, Readers, StatusSocket, usual_path
 from edgevpr.runtime.flight.systemd import notify
 from edgevpr.runtime.preflight.choose import too_late
 from edgevpr.runtime.preflight.pick import Outlook, outlook, picked_technique, trusted_candidates, trusted_forms
@@ -58,7 +59,10 @@ def fly(config: Config, positions: Path | None = None) -> int:
         recogniser, learner, cannot_learn = _opened(config, board)
         stack.callback(recogniser.place_map.close)
         smaller_forms = smaller_forms_of(config, recogniser, learner, time.monotonic() - begin_s)
-        flight_log = stack.enter_context(FlightLog(config.log.path, wait="NOTIFY_SOCKET" in os.environ))
+        flight_log = stack.enter_context(
+            FlightLog(config.log.path, wait="NOTIFY_SOCKET" in os.environ, max_mb=config.log.max_mb)
+        )
+        readers = stack.enter_context(_readers(config))
         found = outlook(recogniser, config)
         recogniser.candidates = found.candidates
         _say_start(config, recogniser, flight_log, found)
@@ -102,6 +106,7 @@ def fly(config: Config, positions: Path | None = None) -> int:
                 learner=learner,
                 fewer_candidates=() if config.match.candidates else trusted_candidates(recogniser.technique),
                 smaller_forms=smaller_forms,
+                readers=readers,
             )
             notify(STOPPING=1)
         if link:
@@ -167,6 +172,20 @@ def _tap(stack: ExitStack, config: Config) -> Tap:
             raise
         _log.warning("%s", error)
         return untapped
+
+
+def _readers(config: Config) -> Readers:
+    """Open the status socket, if there is to be one. A service flies without one that cannot be opened."""
+    path = config.status.socket or usual_path()
+    if path is None:
+        return NoReaders()
+    try:
+        return StatusSocket(path)
+    except EdgevprError as error:
+        if "NOTIFY_SOCKET" not in os.environ:
+            raise
+        _log.warning("%s", error)
+        return NoReaders()
 
 
 def _opened(config: Config, board: Board) -> tuple[Recogniser, Learner | None, str | None]:

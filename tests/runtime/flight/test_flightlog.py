@@ -17,6 +17,7 @@ from full_disk import no_file_larger_than
 from edgevpr.config import load_config
 from edgevpr.contract import PartSpec, TechniqueSpec
 from edgevpr.errors import EdgevprError
+from edgevpr.helpers.appending import earlier_part
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log, start_fields
 from edgevpr.runtime.recognise.locate import at_place
 from edgevpr.runtime.recognise.recognition import Recognition
@@ -138,6 +139,21 @@ def test_reading_leaves_out_a_cut_last_line_and_what_is_no_record(path):
     assert list(read_log(path)) == [{"kind": "a"}, {"kind": "b"}]
 
 
+def test_a_flight_that_was_cut_at_any_byte_is_read_up_to_its_last_whole_line(path):
+    with FlightLog(path) as log:
+        for n in range(3):
+            log.write("query", n=n, place="Přeštice")
+    whole = path.read_bytes()
+    ends = [place + 1 for place, byte in enumerate(whole) if byte == ord("\n")]
+    for cut in range(len(whole)):
+        path.write_bytes(whole[:cut])
+        kept = sum(end - 1 <= cut for end in ends)  # the last byte of a line, its end, may be missing
+        assert numbers(path) == list(range(kept))
+        with FlightLog(path) as log:
+            log.write("start")
+        assert [each["kind"] for each in read_log(path)] == ["query"] * kept + ["start"]
+
+
 def test_a_full_device_is_said_once_counted_and_never_raised(caplog):
     with FlightLog("/dev/full") as log:
         for _ in range(5):
@@ -232,11 +248,9 @@ def test_a_log_that_is_deleted_in_flight_goes_on_and_says_how_much_is_lost(path,
         flown(log, clock, "start", "a", "b")
         path.unlink()
         flown(log, clock, "c", "d", "e")
-    assert kinds(path)[:1] == ["gap"]
-    assert kinds(path)[-1] == "e"
+    assert kinds(path) == ["start", "gap", "c", "d", "e"]
     (gap,) = [record for record in read_log(path) if record["kind"] == "gap"]
-    assert gap["lost_lines"] == log.lost_lines == 6 - (len(kinds(path)) - 1)  # a second's lines may go into the old one
-    assert log.lost_lines <= 4
+    assert gap["lost_lines"] == log.lost_lines == 3
     said = [record.getMessage() for record in caplog.records]
     assert re.match(rf"The flight log {path} was deleted in flight, and {log.lost_lines} lines of it are lost", said[0])
     assert said[1] == f"The flight log {path} is written again; {log.lost_lines} lines are missing."
@@ -250,10 +264,19 @@ def test_a_log_that_is_moved_in_flight_loses_nothing(path, caplog):
         flown(log, clock, "start", "a", "b")
         path.rename(path.with_suffix(".1"))
         flown(log, clock, "c", "d", "e")
-    both = kinds(path.with_suffix(".1")) + kinds(path)
-    assert [kind for kind in both if kind != "gap"] == ["start", "a", "b", "c", "d", "e"]
+    assert kinds(path.with_suffix(".1")) == ["start", "a", "b"]
+    assert kinds(path) == ["start", "gap", "c", "d", "e"]
     assert log.lost_lines == 0
     assert "was moved or replaced in flight, and 0 lines" in caplog.text
+
+
+def test_a_log_in_whose_place_another_one_was_put_has_its_start_there_too(path):
+    with FlightLog(path) as log:
+        log.write("start")
+        path.rename(path.with_suffix(".mine"))
+        path.write_bytes(b'{"kind": "end"}\n')
+        log.write("a")
+    assert kinds(path) == ["end", "start", "gap", "a"]
 
 
 def test_a_log_whose_folder_is_deleted_is_tried_again(path, caplog):
@@ -267,7 +290,7 @@ def test_a_log_whose_folder_is_deleted_is_tried_again(path, caplog):
         assert log.state
         path.parent.mkdir()
         flown(log, clock, "f")
-    assert kinds(path) == ["gap", "f"]
+    assert kinds(path) == ["start", "gap", "f"]
     assert log.lost_lines == 6
 
 
@@ -340,6 +363,128 @@ def test_a_log_that_was_killed_loses_nothing_that_was_written(path):
     script += "log = FlightLog(sys.argv[1])\nfor i in range(50): log.write('match', i=i)\nos.kill(os.getpid(), 9)"
     assert subprocess.run([sys.executable, "-c", script, str(path)]).returncode == -9
     assert [record["i"] for record in read_log(path)] == list(range(50))
+
+
+PART_MB = 0.004  # two of them are the limit of the tests below
+
+
+def numbers(path: Path) -> list[int]:
+    return [record["n"] for record in read_log(path) if record["kind"] == "query"]
+
+
+def written(path: Path, count: int, **settings) -> FlightLog:
+    with FlightLog(path, max_mb=2 * PART_MB, **settings) as log:
+        log.write("start", version="1")
+        for n in range(count):
+            log.write("query", n=n)
+    return log
+
+
+def test_a_log_that_is_full_goes_on_in_a_new_part_and_both_can_be_read_alone(path, caplog):
+    written(path, 80)
+    first, second = numbers(earlier_part(path)), numbers(path)
+    assert earlier_part(path).name == "flight.1.jsonl"
+    assert first + second == list(range(80))
+    (start,), (again,) = ([each for each in read_log(part) if each["kind"] == "start"] for part in parts(path))
+    assert again == {**start, "repeated": True}
+    assert kinds(path)[0] == "start"
+    assert not caplog.records
+
+
+def parts(path: Path) -> tuple[Path, Path]:
+    return earlier_part(path), path
+
+
+def test_the_newest_lines_are_kept_and_the_disk_use_is_bounded(path):
+    written(path, 1000)
+    assert all(part.stat().st_size <= 1e6 * PART_MB for part in parts(path))
+    kept = numbers(earlier_part(path)) + numbers(path)
+    assert kept == list(range(kept[0], 1000))
+    assert kept[0] > 900
+    assert {kinds(part)[0] for part in parts(path)} == {"start"}
+    assert len(list(path.parent.iterdir())) == 2
+    assert earlier_part(path).stat().st_mode & 0o777 == path.stat().st_mode & 0o777 == 0o640
+
+
+def test_without_a_limit_there_is_one_file(path):
+    with FlightLog(path) as log:
+        for n in range(1000):
+            log.write("query", n=n)
+    assert numbers(path) == list(range(1000))
+    assert not earlier_part(path).exists()
+
+
+def test_a_flight_that_follows_a_long_one_begins_a_part_with_its_own_start(path):
+    path.write_bytes(b'{"kind": "query", "n": 7}\n' * 150 + b'{"kind": "qu')
+    written(path, 1)
+    assert kinds(path) == ["start", "query"]
+    assert "repeated" not in next(read_log(path))
+    assert numbers(earlier_part(path)) == [7] * 150
+
+
+def test_a_part_is_kept_beside_the_file_that_a_link_leads_to(tmp_path):
+    (tmp_path / "card").mkdir()
+    link = tmp_path / "flight.jsonl"
+    link.symlink_to(tmp_path / "card" / "flight.jsonl")
+    written(link, 80)
+    assert link.is_symlink()
+    assert numbers(tmp_path / "card" / "flight.1.jsonl") + numbers(link) == list(range(80))
+
+
+def test_a_log_that_cannot_be_renamed_is_written_on_and_said_once(path, caplog):
+    earlier_part(path).mkdir()
+    log = written(path, 200)
+    assert numbers(path) == list(range(200))
+    assert (log.state, log.lost_lines) == (None, 0)
+    assert [record.getMessage() for record in caplog.records] == [
+        f"The flight log {path} grows past log.max_mb, since it cannot be renamed (Is a directory): let the flight "
+        "write to its folder."
+    ]
+
+
+def test_a_start_that_was_lost_is_made_up_for(path):
+    path.write_bytes(b'{"kind": "end"}\n')  # of the flight before
+    with FlightLog(path) as log:
+        with no_file_larger_than(path.stat().st_size):
+            log.write("start", version="1")
+        log.write("query", n=1)
+        log.write("query", n=2)
+    assert kinds(path) == ["end", "start", "gap", "query", "query"]
+
+
+def test_a_disk_that_is_full_when_a_part_begins_loses_lines_and_no_part(path):
+    log = FlightLog(path, max_mb=2 * PART_MB)
+    log.write("start")
+    log.write("query", n=1)
+    before = path.read_bytes()
+    with no_file_larger_than(10):
+        log.write("query", n=2, fill="x" * int(1e6 * PART_MB))
+    assert log.state
+    assert earlier_part(path).read_bytes() == before
+    assert path.read_bytes() == b""
+    log.write("query", n=3)
+    log.close()
+    assert kinds(path) == ["start", "gap", "query"]
+    assert log.lost_lines == 1
+
+
+def test_kill_9_at_any_time_loses_no_line_of_the_parts(path):
+    script = "import sys; from itertools import count; from edgevpr.runtime.flight.flightlog import FlightLog\n"
+    script += f"log = FlightLog(sys.argv[1], max_mb={2 * PART_MB})\nlog.write('start')\n"
+    script += "for n in count(int(sys.argv[2])):\n    log.write('query', n=n); print(n, flush=True)"
+    begin = 0
+    for _ in range(5):
+        writing = subprocess.Popen([sys.executable, "-c", script, path, str(begin)], stdout=subprocess.PIPE, text=True)
+        said = [-1]
+        while int(said[-1]) < begin + 300:  # a dozen parts on
+            said.append(writing.stdout.readline())
+        writing.kill()
+        said += writing.communicate()[0].split()
+        kept = [n for part in parts(path) if part.exists() for n in numbers(part)]
+        assert kept == list(range(kept[0], kept[-1] + 1))
+        assert kept[-1] >= int(said[-1]), "what was written is there"
+        assert kept[-1] - kept[0] > 20
+        begin = kept[-1] + 1
 
 
 def test_a_service_waits_for_the_medium_of_its_log(tmp_path, caplog):

@@ -13,6 +13,7 @@ import pytest
 from flight_process import start, wait_for
 from flights import PLACES, STEP_DEG, of_kind
 
+from edgevpr.helpers.appending import earlier_part
 from edgevpr.runtime.flight.flightlog import read_log
 
 
@@ -146,6 +147,20 @@ def test_kill_9_costs_no_line_that_was_written(fly, tmp_path):
     again.communicate(timeout=120)
     assert again.returncode == 0
     assert list(read_log(log))[-1]["kind"] == "end"
+
+
+def test_a_log_that_is_full_in_flight_goes_on_in_a_new_part(fly, tmp_path):
+    log, config = tmp_path / "flight.jsonl", tmp_path / "c.yaml"
+    config.write_text("log: {max_mb: 1}\n")
+    log.write_bytes(b'{"kind": "end", "of": "the flight before"}\n' * 11_200)  # twenty kilobytes short of half
+    run = fly("--rate-hz", "60", "--config", str(config))
+    run.communicate(timeout=120)
+    assert run.returncode == 0
+    earlier, later = list(read_log(earlier_part(log))), list(read_log(log))
+    queries = [line["query"] for line in of_kind(earlier, "query") + of_kind(later, "query")]
+    assert queries == [f"{number:02d}.png" for number in range(PLACES)]
+    assert later[0] == {**earlier[11_200], "repeated": True}
+    assert later[0]["kind"] == "start"
 
 
 def test_a_full_disk_does_not_end_the_flight(fly):

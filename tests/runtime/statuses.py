@@ -1,0 +1,55 @@
+"""A status to be told and read."""
+
+from dataclasses import replace
+
+from edgevpr.runtime.flight.status import LinkState, Seen, Status
+
+MATCH = Seen(
+    query="0007.jpg",
+    age_s=3.2,
+    accepted=True,
+    reason="confidence 0.9991",
+    place=812,
+    reference_image="0812.jpg",
+    score=0.87,
+    confidence=0.9991,
+    lat_deg=50.1,
+    lon_deg=8.2,
+    accuracy_m=12.0,
+)
+LINK = LinkState(
+    connected=True,
+    trouble=None,
+    autopilot=1,
+    channel="COMMAND",
+    fixes="3 fixes sent, 2 taken",
+    answers={"ACCEPTED": 2, "DENIED": 1},
+    unanswered=0,
+    accuracy_m=7.25,
+)
+STATUS = Status(
+    version="0.1.0",
+    time="2026-11-22T10:00:00Z",
+    elapsed_s=3725.0,
+    health="ACTIVE",
+    paused=False,
+    source="streaming",
+    latency_s=0.12,
+    queries=1204,
+    accepted=1100,
+    failed=3,
+    rate_hz=1.94,
+    asked_rate_hz=2.0,
+    cpu_cores=0.31,
+    rss_mb=61.5,
+    machine_cpu_share=0.12,
+    machine_ram_mb=380.0,
+    machine_ram_total_mb=512.0,
+    used_mah=12.346,
+    temperature_c=54.3,
+    throttled=False,
+    newest=replace(MATCH, accepted=False, reason="score 0.4 is too low", age_s=0.4),
+    match=MATCH,
+    link=LINK,
+    remarks=["held to 1 Hz"],
+)
