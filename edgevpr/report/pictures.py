@@ -1,0 +1,43 @@
+"""Pictures of places and queries out of folders, small enough to stand inside a page."""
+
+import base64
+from collections.abc import Sequence
+from pathlib import Path
+
+from edgevpr.errors import ImageError, UsageError
+from edgevpr.frames.images import EXTENSIONS, read_image
+from edgevpr.frames.small import small_jpeg
+
+
+class Album:
+    """Folders in which pictures are looked for by the names that the log gives them. Raises UsageError for a folder
+    that is not there."""
+
+    def __init__(self, folders: Sequence[str | Path]) -> None:
+        self._folders = [Path(folder).resolve() for folder in folders]
+        for given, folder in zip(folders, self._folders, strict=True):
+            if not folder.is_dir():
+                raise UsageError(f"--images {given}: there is no such folder: give one that holds pictures.")
+
+    def picture(self, name: str | None) -> str | None:
+        """Return a picture as an address that holds all of it (data:); None where there is none, or none that can be
+        read."""
+        for folder in self._folders if name and "\0" not in name else ():
+            for ending in ("", *EXTENSIONS):
+                path = (folder / f"{name}{ending}").resolve()
+                # A log of somebody else may name any file of this machine: only what is in the folder is shown.
+                if not path.is_relative_to(folder) or not _is_file(path):
+                    continue
+                try:
+                    jpeg = small_jpeg(read_image(path))
+                except ImageError:
+                    continue
+                return "data:image/jpeg;base64," + base64.b64encode(jpeg).decode()
+        return None
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a name that is too long
+        return False
