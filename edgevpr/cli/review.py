@@ -19,9 +19,11 @@ def add(commands: Any) -> None:
     _add_log(report)
     report.add_argument("--out", required=True, metavar="FILE", help="the page to write (.html)")
     report.add_argument("--map", metavar="MAP", help="draw over its ground (default: that of the log's first line)")
-    report.add_argument(
-        "--images", action="append", default=[], metavar="DIR", help="pictures of the map, recorded frames; repeatable"
-    )
+    for flag, text in (
+        ("--images", "frames of this flight"),
+        ("--map-images", "the pictures that the map was made of"),
+    ):
+        report.add_argument(flag, action="append", default=[], metavar="DIR", help=f"folder with {text}; repeatable")
     export = command(commands, "export", run_export, "write matches, fixes and places of a flight, for a map viewer")
     _add_log(export)
     form = export.add_mutually_exclusive_group(required=True)
@@ -49,9 +51,9 @@ def run_report(args: Namespace) -> int:
 
     out = _out(args.out, args.log)
     require_folder(out)
-    album = Album(args.images)
+    frames, references = Album(args.images), Album(args.map_images)
     flight = read_flight(args.log, args.flight)
-    page = page_of(flight, _ground(args.map, flight), album)
+    page = page_of(flight, _ground(args.map, flight), frames, references)
     write_whole(out, lambda unfinished: unfinished.write_text(page, "utf-8", "backslashreplace"))
     print(f"{out}: {len(flight.queries)} queries, flight {flight.number} of {flight.flights} in {args.log}")
     return 0

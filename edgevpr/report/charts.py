@@ -4,9 +4,10 @@ The drawing stretches to the width that there is, and its lines and dots keep th
 it, so that it stays readable on a phone.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from html import escape
+from itertools import pairwise
 
 Points = Sequence[tuple[float, float]]
 
@@ -16,6 +17,7 @@ _WIDE, _HIGH = 1000.0, 100.0
 _MOST_POINTS = 1200  # of a line: more than there are pixels
 _STEPS_S = (1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400, 28800, 86400)
 _MOST_TICKS = 6
+_GAP, _LEAST_GAP_S = 5.0, 3.0  # a line is broken where a point is missing for so many usual steps, and so long
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,28 +31,20 @@ class Series:
     are_dots: bool = False
 
 
-def chart(title: str, unit: str, series: Sequence[Series], span_s: float, floor: float = 0.0, top: float = 0.0) -> str:
-    """Draw series over time, from 0 to `span_s`. The axis begins at `floor` and reaches to the highest value, and to
-    `top` at least; a series without points is left out, and a chart without any is empty ("")."""
+def chart(title: str, unit: str, series: Sequence[Series], span_s: float, top: float = 0.0) -> str:
+    """Draw series over time, from 0 to `span_s`. The axis reaches from 0 to the highest value, and to `top` at least; a
+    series without points is left out, and a chart without any is empty ("")."""
     series = [each for each in series if each.points]
     if not series:
         return ""
     highest = nice(max(top, *(value for each in series for _, value in each.points)))
-    room = highest - floor or 1.0
-    drawn = []
-    for each in series:
-        at = [
-            (_across(t_s, span_s), _HIGH * (1 - (min(max(value, floor), highest) - floor) / room))
-            for t_s, value in _thinned(each.points)
-        ]
-        kind = "dots" if each.are_dots else "line"
-        drawn.append(f'<path class="{kind} {each.colour}" d="{dots(at) if each.are_dots else _line(at)}"/>')
+    drawn = "".join(_drawn(each, span_s, highest) for each in series)
     legend = "".join(f'<span class="key {each.colour}">{escape(each.name)}</span>' for each in series if each.name)
     said = f"{title}, {unit}" if unit else title
     return (
         f'<figure class="chart"><figcaption><b>{escape(title)}</b> {escape(unit)} {legend}</figcaption>'
-        f'<div class="plot"><div class="scale"><span>{figure(highest)}</span><span>{figure(floor)}</span></div>'
-        f"<div>{_svg(said, _HIGH, _grid(span_s, _HIGH) + ''.join(drawn))}{_times(span_s)}</div></div></figure>"
+        f'<div class="plot"><div class="scale"><span>{figure(highest)}</span><span>0</span></div>'
+        f"<div>{_svg(said, _HIGH, _grid(span_s, _HIGH) + drawn)}{_times(span_s)}</div></div></figure>"
     )
 
 
@@ -68,6 +62,11 @@ def lanes(rows: Sequence[tuple[str, str, Sequence[float]]], span_s: float) -> st
 def dots(points: Points) -> str:
     """Return the path of dots: lines without length, which a round end makes into dots of any size."""
     return "".join(f"M{x:.1f} {y:.1f}h0" for x, y in points)
+
+
+def way(points: Points) -> str:
+    """Return the path of a line through points; a single one is a dot."""
+    return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in points) + ("h0" if len(points) == 1 else "")
 
 
 def nice(value: float) -> float:
@@ -92,6 +91,15 @@ def clock(t_s: float) -> str:
     if minutes < 60:
         return f"{minutes}:{seconds:02d}"
     return f"{minutes // 60}:{minutes % 60:02d}:{seconds:02d}"
+
+
+def _drawn(series: Series, span_s: float, highest: float) -> str:
+    parts = [series.points] if series.are_dots else _ways(_thinned(series.points))
+    path = dots if series.are_dots else way
+    said = "".join(
+        path([(_across(t_s, span_s), _HIGH * (1 - max(value, 0.0) / highest)) for t_s, value in part]) for part in parts
+    )
+    return f'<path class="{"dots" if series.are_dots else "line"} {series.colour}" d="{said}"/>'
 
 
 def _zeros(value: float) -> int:
@@ -131,9 +139,16 @@ def _times(span_s: float) -> str:
     return f'<div class="times">{"".join(ticks)}</div>'
 
 
-def _line(at: Points) -> str:
-    """Return the path of a line; a single point is a dot."""
-    return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in at) + ("h0" if len(at) == 1 else "")
+def _ways(points: Points) -> Iterator[Points]:
+    """Yield the parts of a line, which is broken where nothing is known for longer than usual."""
+    steps_s = sorted(after[0] - before[0] for before, after in pairwise(points))
+    most_s = max(_LEAST_GAP_S, _GAP * steps_s[len(steps_s) // 2]) if steps_s else 0.0
+    first = 0
+    for at, (before, after) in enumerate(pairwise(points), start=1):
+        if after[0] - before[0] > most_s:
+            yield points[first:at]
+            first = at
+    yield points[first:]
 
 
 def _thinned(points: Points) -> Points:

@@ -1,6 +1,5 @@
 """A flight as its log tells it, in values that are small and sure."""
 
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
@@ -107,7 +106,15 @@ def read_flight(path: str | Path, number: int | None = None) -> Flight:
     path = Path(path)
     if not path.is_file():
         raise UsageError(f"{path}: there is no such flight log: give the file that `log.path` names.")
-    flights = [_Reading(path, count, lines).flight for count, lines in enumerate(_by_start(read_log(path)), start=1)]
+    flights: list[Flight] = []
+    for line in read_log(path):
+        kind = text(line, "kind")
+        if kind is None:
+            continue
+        if kind == "start" or not flights:  # lines without a start before them are a flight too
+            flights.append(Flight(path=path, number=len(flights) + 1))
+            reading = _Reading(flights[-1])
+        reading.read(kind, line)
     if not flights:
         raise EdgevprError(f"{path} holds no line of a flight log: give one that a flight has written.")
     if number is not None and not 1 <= number <= len(flights):
@@ -117,35 +124,18 @@ def read_flight(path: str | Path, number: int | None = None) -> Flight:
     return chosen
 
 
-def _by_start(lines: Iterable[dict[str, Any]]) -> Iterator[list[dict[str, Any]]]:
-    """Yield the lines of one flight after the other; those before the first start are a flight too."""
-    flight: list[dict[str, Any]] = []
-    for line in lines:
-        kind = text(line, "kind")
-        if kind is None:
-            continue
-        if kind == "start" and flight:
-            yield flight
-            flight = []
-        flight.append(line)
-    if flight:
-        yield flight
-
-
 class _Reading:
     """Reads the lines of one flight in their order."""
 
-    def __init__(self, path: Path, count: int, lines: list[dict[str, Any]]) -> None:
-        self.flight = Flight(path=path, number=count)
+    def __init__(self, flight: Flight) -> None:
+        self.flight = flight
         self._at: dict[str, int] = {}  # the number of a query by its name
         self._cpu_s = self._elapsed_s = 0.0
-        self._start_s = next((each for line in lines if (each := number(line, "t_mono_s")) is not None), 0.0)
-        for line in lines:
-            self._read(line)
+        self._start_s: float | None = None
 
-    def _read(self, line: dict[str, Any]) -> None:
-        flight, kind = self.flight, line["kind"]
-        t_s = max(0.0, (number(line, "t_mono_s") or self._start_s) - self._start_s)
+    def read(self, kind: str, line: dict[str, Any]) -> None:
+        """Read a line."""
+        flight, t_s = self.flight, self._since_start(number(line, "t_mono_s"))
         flight.span_s = max(flight.span_s, t_s)
         if kind == "start":
             flight.start = line
@@ -154,7 +144,7 @@ class _Reading:
         elif kind == "query":
             self._take_answer(line, "last_fix", "answer")
             self._at[text(line, "query") or ""] = len(flight.queries)
-            flight.queries.append(self._query(line))
+            flight.queries.append(self._query(line, t_s))
         elif kind == "answer":
             self._take_answer({"answer": line}, "answer", "result")
         elif kind == "unusable":
@@ -164,14 +154,22 @@ class _Reading:
         else:
             flight.remarks.append(Remark(t_s, kind, _said(line)))
 
+    def _since_start(self, t_mono_s: float | None) -> float:
+        """Return the seconds since the first line that has a time; of a line without, those of the latest before it."""
+        if t_mono_s is None:
+            return self.flight.span_s
+        if self._start_s is None:
+            self._start_s = t_mono_s
+        return max(0.0, t_mono_s - self._start_s)
+
     def _take_answer(self, line: dict[str, Any], key: str, answer: str) -> None:
         """Add to an earlier query what became of its fix since."""
         at, told = self._at.get(text(line, key, "query") or ""), value(line, key)
         if at is None or not isinstance(told, dict):
             return
         query = self.flight.queries[at]
-        if query.fix is None or (query.fix.outcome is not Outcome.UNANSWERED and told.get(answer) is None):
-            return
+        if query.fix is None or (query.fix.outcome is not Outcome.UNANSWERED and key == "last_fix"):
+            return  # its line of kind "answer" knows more
         fix = replace(
             query.fix,
             outcome=_outcome(told, told.get(answer)),
@@ -180,19 +178,19 @@ class _Reading:
         )
         self.flight.queries[at] = replace(query, fix=fix)
 
-    def _query(self, line: dict[str, Any]) -> Query:
-        t_mono_s = number(line, "t_frame_s") or number(line, "t_mono_s") or self._start_s
+    def _query(self, line: dict[str, Any], t_s: float) -> Query:
+        t_mono_s = number(line, "t_frame_s")
         accepted = line.get("accepted") is True
         at = point(line, "located") or point(line, "position") if accepted else None
-        gps_at = _gps_at(line, t_mono_s)
+        gps_at = None if t_mono_s is None else _gps_at(line, t_mono_s)
         costs = number(line, "costs", "t_encode_s"), number(line, "costs", "t_match_s")
         place = number(line, "place")
         heard_s = number(line, "vehicle", "t_heard_s")
-        is_heard = heard_s is not None and abs(t_mono_s - heard_s) <= _FRESH_S
+        is_heard = None not in (heard_s, t_mono_s) and abs(t_mono_s - heard_s) <= _FRESH_S
         latency_s = number(line, "totals", "latency_s")
         return Query(
             name=text(line, "query") or "",
-            t_s=max(0.0, t_mono_s - self._start_s),
+            t_s=t_s if t_mono_s is None else self._since_start(t_mono_s),
             time=text(line, "time") or "",
             accepted=accepted,
             reason=text(line, "reason") or "no reason is given",

@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
+from itertools import chain, groupby
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import numpy as np
 from edgevpr.errors import EdgevprError
 from edgevpr.geodesy import axes_of, offset_m
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.report.charts import Points, dots
+from edgevpr.report.charts import Points, dots, way
 from edgevpr.report.flight import Flight, Outcome
 from edgevpr.report.values import Point
 from edgevpr.types import Pose
@@ -21,6 +22,11 @@ _MARGIN = 0.04
 _SHAPES = 0.55, 1.8  # the least and the most height that a drawing has for its width
 _MOST_PLACES = 6000  # more are a whole page of dots; then every second, third, ... is drawn
 _ROUND = (1, 2, 5)
+_FIXES = (
+    (Outcome.TAKEN, "fixes taken", "taken"),
+    (Outcome.UNANSWERED, "fixes not answered", "unanswered"),
+    (Outcome.REFUSED, "fixes refused", "refused"),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,12 +41,17 @@ class Ground:
 
 @dataclass(frozen=True, slots=True)
 class Layer:
-    """What a person may hide: its name, the class that colours it, and the points or, as a line, the way."""
+    """What a person may hide: its name, the class that colours it, and the points or, as lines, the ways."""
 
     name: str
     colour: str
-    points: Sequence[Point]
-    is_line: bool = False
+    points: Sequence[Point] = ()
+    ways: Sequence[Sequence[Point]] = ()
+
+    @property
+    def everything(self) -> Sequence[Point]:
+        """All its points."""
+        return [*self.points, *chain.from_iterable(self.ways)]
 
 
 def read_ground(path: str | Path) -> Ground:
@@ -66,22 +77,23 @@ def layers_of(flight: Flight) -> list[Layer]:
     found = [
         Layer("places found", "found", list(dict.fromkeys(each.place_at for each in queries if each.place_at))),
         Layer("places learnt", "learnt", flight.learnt),
-        Layer("GPS", "gps", [each.gps_at for each in queries if each.gps_at], is_line=True),
-        Layer("autopilot", "autopilot", [each.autopilot_at for each in queries if each.autopilot_at], is_line=True),
+        Layer("GPS", "gps", ways=_ways(each.gps_at for each in queries)),
+        Layer("autopilot", "autopilot", ways=_ways(each.autopilot_at for each in queries)),
         Layer("matches", "accepted", [each.at for each in queries if each.at]),
     ]
-    colours = {Outcome.TAKEN: "taken", Outcome.UNANSWERED: "unanswered", Outcome.REFUSED: "refused"}
-    for outcome, colour in colours.items():
-        at = [each.at for each in fixed if each.outcome is outcome]
-        found.append(
-            Layer({"taken": "fixes taken", "refused": "fixes refused"}.get(colour, "fixes not answered"), colour, at)
-        )
-    return [each for each in found if each.points]
+    for outcome, name, colour in _FIXES:
+        found.append(Layer(name, colour, [each.at for each in fixed if each.outcome is outcome]))
+    return [each for each in found if each.everything]
+
+
+def _ways(points: Iterable[Point | None]) -> list[list[Point]]:
+    """Return the lines through points, each up to one that is not known."""
+    return [list(several) for are_known, several in groupby(points, bool) if are_known]
 
 
 def draw(ground: Ground, layers: Sequence[Layer], named: Iterable[tuple[str, Point]] = ()) -> str:
     """Draw the ground with the layers over it, and labels at the `named` points; "" where nothing has a position."""
-    everything = [at for at, _ in ground.at] + [at for layer in layers for at in layer.points]
+    everything = [at for at, _ in ground.at] + [at for layer in layers for at in layer.everything]
     if not everything:
         return ""
     view = _View(everything, max((pose.footprint_m for _, pose in ground.at if pose), default=20.0))
@@ -93,8 +105,8 @@ def draw(ground: Ground, layers: Sequence[Layer], named: Iterable[tuple[str, Poi
         f'<path class="dots place layer-places" d="{dots(view.on([at for at, _ in shown]))}"/>' if shown else "",
     ]
     for layer in layers:
-        path = view.way(layer.points) if layer.is_line else dots(view.on(layer.points))
-        kind = "line" if layer.is_line else "dots"
+        path = dots(view.on(layer.points)) + "".join(way(view.on(each)) for each in layer.ways)
+        kind = "line" if layer.ways else "dots"
         parts.append(f'<path class="{kind} {layer.colour} layer-{layer.colour}" d="{path}"/>')
     labels = "".join(
         f'<a class="label" href="#moment-{escape(name)}" style="left:{x / _WIDE:.2%};top:{y / view.high:.2%}">'
@@ -102,7 +114,7 @@ def draw(ground: Ground, layers: Sequence[Layer], named: Iterable[tuple[str, Poi
         for name, at in named
         for x, y in view.on([at])
     )
-    keys = [Layer("places of the map", "places", ()), *layers] if shown else layers
+    keys = [Layer("places of the map", "places"), *layers] if shown else layers
     boxes = "".join(
         f'<label class="key {each.colour}"><input type="checkbox" checked id="show-{each.colour}">'
         f"{escape(each.name)}</label>"
@@ -136,10 +148,6 @@ class _View:
         """Return points of the drawing."""
         east_m, north_m = self._metres(points)
         return list(zip(*self._drawn(east_m, north_m), strict=True))
-
-    def way(self, points: Sequence[Point]) -> str:
-        """Return the path of a line."""
-        return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in self.on(points)) + ("h0" if len(points) == 1 else "")
 
     def square(self, at: Point, pose: Pose) -> str:
         """Return the path of the ground that a picture shows, as a square of its longest side."""

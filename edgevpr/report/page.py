@@ -22,8 +22,9 @@ _MOST_REMARKS = 200
 _NUMBER = re.compile(r"\d+(\.\d+)?")
 
 
-def page_of(flight: Flight, ground: Ground, album: Album) -> str:
-    """Return the page: HTML with all that it shows inside."""
+def page_of(flight: Flight, ground: Ground, frames: Album, references: Album) -> str:
+    """Return the page: HTML with all that it shows inside. `frames` has the pictures of the flight, `references` those
+    that the map was made of."""
     moments = worst(flight)
     body = [
         _head(flight),
@@ -32,7 +33,9 @@ def page_of(flight: Flight, ground: Ground, album: Album) -> str:
         _section("Over the ground", _ground(flight, ground, moments)),
         _section("What became of every query", _lanes(flight)),
         _section("Over time", _charts(flight)),
-        _section("Worst moments", "".join(_moment(at, each, album) for at, each in enumerate(moments, start=1))),
+        _section(
+            "Worst moments", "".join(_moment(at, each, frames, references) for at, each in enumerate(moments, start=1))
+        ),
         _section("Why matches were refused", _counts(_refusals(flight))),
         _section("Why fixes were not sent, or not taken", _counts(_objections(flight))),
         _section("What was said", _remarks(flight)),
@@ -87,9 +90,9 @@ def _figures(flight: Flight) -> str:
         ("queries", str(len(queries)), ""),
         ("accepted", str(accepted), share),
         ("fixes sent", str(sent), ""),
-        ("taken", str(outcomes[Outcome.TAKEN]), ""),
-        ("refused", str(outcomes[Outcome.REFUSED]), ""),
-        ("not answered", str(outcomes[Outcome.UNANSWERED]), ""),
+        ("fixes taken", str(outcomes[Outcome.TAKEN]), ""),
+        ("fixes refused", str(outcomes[Outcome.REFUSED]), ""),
+        ("fixes not answered", str(outcomes[Outcome.UNANSWERED]), ""),
         *([("in continuous position", str(outcomes[Outcome.CONTINUOUS]), "")] if outcomes[Outcome.CONTINUOUS] else []),
         ("from GPS, median", figure(median(off_m) if off_m else None, "m"), ""),
         ("from GPS, most", figure(max(off_m, default=None), "m"), ""),
@@ -143,8 +146,8 @@ def _lanes(flight: Flight) -> str:
         ("match refused", "refused", [each.t_s for each in queries if not each.accepted]),
         ("frame not usable", "unusable", flight.unusable),
         *((each.value, colour, _times(queries, each)) for each, colour in _OUTCOMES.items()),
-        ("autopilot heard", "autopilot", [each.t_s for each in queries if each.has_link]),
-        ("autopilot silent", "refused", [each.t_s for each in queries if each.has_link is False]),
+        ("autopilot heard", "autopilot", heard := [each.t_s for each in queries if each.has_link]),
+        ("autopilot silent", "refused", [each.t_s for each in queries if heard and each.has_link is False]),
     ]
     rows = [row for row in rows if row[2]]
     return lanes(rows, flight.span_s) if rows else ""
@@ -211,16 +214,16 @@ def _all(queries: Sequence[Query], field: str) -> list[float]:
     return [known for _, known in _over(queries, field)]
 
 
-def _moment(at: int, moment: Moment, album: Album) -> str:
+def _moment(at: int, moment: Moment, frames: Album, references: Album) -> str:
     query = moment.query
     found = "no place was found"
     if query.place is not None:
         found = f"place {query.place} ({query.reference_image or 'without a name'}), score {figure(query.score)}"
     sure = "" if query.confidence is None else f", confidence {query.confidence:.4f}"
-    pictures = [("seen", query.name), ("place found", query.reference_image)]
+    pictures = [("seen", query.name, frames), ("place found", query.reference_image, references)]
     pair = "".join(
         f'<figure><img alt="{_text(name)}" src="{data}"><figcaption>{_text(f"{what}: {name}")}</figcaption></figure>'
-        for what, name in pictures
+        for what, name, album in pictures
         if name and (data := album.picture(name))
     )
     return (

@@ -10,14 +10,14 @@ from edgevpr.frames.small import small_jpeg
 
 
 class Album:
-    """Folders in which pictures are looked for by the names that the log gives them. Raises UsageError for a folder
-    that is not there."""
+    """Folders in which pictures are looked for by the names that the log gives them. A flight and the map it flies over
+    each have one: pictures of both often have the same names. Raises UsageError for a folder that is not there."""
 
     def __init__(self, folders: Sequence[str | Path]) -> None:
         self._folders = [Path(folder).resolve() for folder in folders]
         for given, folder in zip(folders, self._folders, strict=True):
             if not folder.is_dir():
-                raise UsageError(f"--images {given}: there is no such folder: give one that holds pictures.")
+                raise UsageError(f"{given}: there is no such folder: give one that holds pictures.")
 
     def picture(self, name: str | None) -> str | None:
         """Return a picture as an address that holds all of it (data:); None where there is none, or none that can be
