@@ -262,5 +262,9 @@ def _gps_at(line: dict[str, Any], t_mono_s: float) -> Point | None:
 
 def _said(line: dict[str, Any]) -> str:
     said = next((each for key in _SAYING if (each := text(line, key))), None)
+    before, after = line.get("from"), line.get("to")  # of the governor
+    if said and isinstance(before, dict) and isinstance(after, dict):
+        changed = [f"{key} {before.get(key)} to {each}" for key, each in after.items() if before.get(key) != each]
+        return ": ".join(filter(None, (", ".join(changed), said)))
     others = {"kind", "time", "t_mono_s"}
     return said or ", ".join(f"{key} {each}" for key, each in line.items() if key not in others)

@@ -41,7 +41,7 @@ class Ground:
 
 @dataclass(frozen=True, slots=True)
 class Layer:
-    """What a person may hide: its name, the class that colours it, and the points or, as lines, the ways."""
+    """Part of the drawing that a person may hide: its name, the class that colours it, and the points or, as lines, the ways."""
 
     name: str
     colour: str
@@ -121,11 +121,12 @@ def draw(ground: Ground, layers: Sequence[Layer], named: Iterable[tuple[str, Poi
         for each in keys
     )
     length_m, share = view.ruler()
+    ruler = f"{length_m:g} m" if length_m < 1000 else f"{length_m / 1000:.0f} km"
     return (
         f'<div class="ground"><div class="legend">{boxes}</div>'
         f'<div class="view" style="aspect-ratio:{_WIDE:g}/{view.high:.0f}">'
         f'<svg role="img" aria-label="the flight over the ground of the map" viewBox="0 0 {_WIDE:g} {view.high:.0f}">'
-        f'{"".join(parts)}</svg>{labels}<div class="ruler" style="width:{share:.1%}">{length_m:g} m</div>'
+        f'{"".join(parts)}</svg>{labels}<div class="ruler" style="width:{share:.1%}">{ruler}</div>'
         '<div class="north">N ↑</div></div></div>'
     )
 

@@ -125,6 +125,9 @@ def _notes(flight: Flight, ground: Ground) -> str:
         and not any(each.has_link for each in queries)
         and "The log has no report of the autopilot's position: its track and the distance from GPS are not known.",
         ground.trouble,
+        ground.at
+        and len(ground.at) < ground.places
+        and f"{ground.places - len(ground.at)} of {ground.places} places of the map have no position and are not drawn.",
     ]
     items = "".join(f"<li>{_text(note)}</li>" for note in notes if note)
     return f'<section class="notes"><ul>{items}</ul></section>' if items else ""
