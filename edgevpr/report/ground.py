@@ -41,7 +41,8 @@ class Ground:
 
 @dataclass(frozen=True, slots=True)
 class Layer:
-    """Part of the drawing that a person may hide: its name, the class that colours it, and the points or, as lines, the ways."""
+    """Part of the drawing that a person may hide: its name, the class that colours it, and the points or, as lines, the
+    ways."""
 
     name: str
     colour: str

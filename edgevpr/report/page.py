@@ -112,6 +112,7 @@ def _figures(flight: Flight) -> str:
 def _notes(flight: Flight, ground: Ground) -> str:
     queries = flight.queries
     has_places = any(each.place_at for each in queries) or bool(ground.at)
+    nowhere = ground.places - len(ground.at)
     notes = [
         not flight.start and "The log lacks the first line of this flight: how it was set is not known.",
         not flight.end
@@ -125,9 +126,7 @@ def _notes(flight: Flight, ground: Ground) -> str:
         and not any(each.has_link for each in queries)
         and "The log has no report of the autopilot's position: its track and the distance from GPS are not known.",
         ground.trouble,
-        ground.at
-        and len(ground.at) < ground.places
-        and f"{ground.places - len(ground.at)} of {ground.places} places of the map have no position and are not drawn.",
+        nowhere and f"{nowhere} of {ground.places} places of the map have no position and are not drawn.",
     ]
     items = "".join(f"<li>{_text(note)}</li>" for note in notes if note)
     return f'<section class="notes"><ul>{items}</ul></section>' if items else ""
@@ -243,7 +242,7 @@ def _refusals(flight: Flight) -> Counter[str]:
 
 
 def _objections(flight: Flight) -> Counter[str]:
-    fixes = (each.fix for each in flight.queries if each.fix)
+    fixes = [each.fix for each in flight.queries if each.fix and each.fix.outcome is not Outcome.CONTINUOUS]
     return Counter(f"{fix.outcome.value}: {_NUMBER.sub('…', fix.why)}" for fix in fixes if fix.why)
 
 

@@ -5,8 +5,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from edgevpr.errors import ImageError, UsageError
-from edgevpr.frames.images import EXTENSIONS, read_image
-from edgevpr.frames.small import small_jpeg
 
 
 class Album:
@@ -22,22 +20,20 @@ class Album:
     def picture(self, name: str | None) -> str | None:
         """Return a picture as an address that holds all of it (data:); None where there is none, or none that can be
         read."""
-        for folder in self._folders if name and "\0" not in name else ():
+        if not self._folders or not name:
+            return None
+        from edgevpr.frames.images import EXTENSIONS, read_image  # a page without pictures needs no OpenCV
+        from edgevpr.frames.small import small_jpeg
+
+        for folder in self._folders:
             for ending in ("", *EXTENSIONS):
-                path = (folder / f"{name}{ending}").resolve()
-                # A log of somebody else may name any file of this machine: only what is in the folder is shown.
-                if not path.is_relative_to(folder) or not _is_file(path):
-                    continue
                 try:
+                    path = (folder / f"{name}{ending}").resolve()
+                    # A log of somebody else may name any file of this machine: only what is in the folder is shown.
+                    if not path.is_relative_to(folder) or not path.is_file():
+                        continue
                     jpeg = small_jpeg(read_image(path))
-                except ImageError:
+                except (ImageError, OSError, ValueError):  # no picture, or a name that no file can have
                     continue
                 return "data:image/jpeg;base64," + base64.b64encode(jpeg).decode()
         return None
-
-
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except OSError:  # a name that is too long
-        return False

@@ -75,7 +75,7 @@ def test_only_pictures_of_the_folders_that_are_given_are_shown(tmp_path):
     album = Album([folder])
     assert album.picture("one.png")
     assert album.picture("one"), "without its ending"
-    for name in ("../secret.png", str(tmp_path / "secret.png"), "broken.png", "a\0b", "x" * 5000, "", None):
+    for name in ("../secret.png", str(tmp_path / "secret.png"), "broken.png", "a\0b", "\ud800", "x" * 5000, "", None):
         assert album.picture(name) is None
 
 
