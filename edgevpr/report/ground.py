@@ -20,6 +20,7 @@ from edgevpr.types import Pose
 _WIDE = 1000.0  # of the drawing, in its own units
 _MARGIN = 0.04
 _SHAPES = 0.55, 1.8  # the least and the most height that a drawing has for its width
+_MOST_VH = 80  # of the height of the window
 _MOST_PLACES = 6000  # more are a whole page of dots; then every second, third, ... is drawn
 _ROUND = (1, 2, 5)
 _FIXES = (
@@ -121,11 +122,12 @@ def draw(ground: Ground, layers: Sequence[Layer], named: Iterable[tuple[str, Poi
         f"{escape(each.name)}</label>"
         for each in keys
     )
+    shape = _WIDE / view.high  # labels lie right only while the view has exactly this
     length_m, share = view.ruler()
     ruler = f"{length_m:g} m" if length_m < 1000 else f"{length_m / 1000:.0f} km"
     return (
         f'<div class="ground"><div class="legend">{boxes}</div>'
-        f'<div class="view" style="aspect-ratio:{_WIDE:g}/{view.high:.0f}">'
+        f'<div class="view" style="aspect-ratio:{shape:.4f};max-width:{_MOST_VH * shape:.1f}vh">'
         f'<svg role="img" aria-label="the flight over the ground of the map" viewBox="0 0 {_WIDE:g} {view.high:.0f}">'
         f'{"".join(parts)}</svg>{labels}<div class="ruler" style="width:{share:.1%}">{ruler}</div>'
         '<div class="north">N ↑</div></div></div>'

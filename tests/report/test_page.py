@@ -196,9 +196,23 @@ def test_the_test_with_a_browser_sees_requests_and_errors(tmp_path):
     assert "http://example.test/x.png" in shown.requests
 
 
-def test_a_page_fits_a_phone(made, tmp_path):
+def measured(made, folder, measure, width_px):
+    """What a script measures in the page, which itself lets no script run."""
     content = re.sub(r"<meta http-equiv[^>]*>", "", made.read_text("utf-8"))
-    measure = "document.title = `${document.documentElement.scrollWidth} of ${innerWidth}`"
-    (tmp_path / "phone.html").write_text(content.replace("</body>", f"<script>{measure}</script></body>"))
-    wide, room = map(int, re.search(r"<title>(\d+) of (\d+)<", show(tmp_path / "phone.html", 360).content).groups())
+    script = f"<script>document.title = {measure}</script></body>"
+    (folder / "measured.html").write_text(content.replace("</body>", script), "utf-8")
+    return re.search("<title>([^<]*)<", show(folder / "measured.html", width_px).content)[1]
+
+
+def test_a_page_fits_a_phone(made, tmp_path):
+    measure = "`${document.documentElement.scrollWidth} ${innerWidth}`"
+    wide, room = map(int, measured(made, tmp_path, measure, 360).split())
     assert wide <= room <= 500
+
+
+@pytest.mark.parametrize("width_px", [360, 1200])
+def test_the_view_of_the_ground_has_the_shape_of_its_drawing(made, tmp_path, width_px):
+    of = "document.querySelector('.view')"
+    measure = f"`${{{of}.clientWidth}} ${{{of}.clientHeight}} ${{{of}.firstChild.getAttribute('viewBox')}}`"
+    wide, high, _, _, drawn_wide, drawn_high = map(float, measured(made, tmp_path, measure, width_px).split())
+    assert wide / high == pytest.approx(drawn_wide / drawn_high, rel=0.01), "else its labels lie beside the points"
