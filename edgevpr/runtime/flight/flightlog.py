@@ -204,7 +204,7 @@ def read_log(path: str | Path) -> Iterator[dict[str, Any]]:
         for line in handle:
             try:
                 record = json.loads(line)
-            except ValueError:
+            except (ValueError, RecursionError):
                 continue
             if isinstance(record, dict):
                 yield record

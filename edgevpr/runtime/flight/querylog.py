@@ -44,6 +44,7 @@ class QueryLog:
             fix=event.fix,
             last_fix=event.last_fix,
             reading=event.steps.read,
+            vehicle=event.vehicle,
             board=self._meter.heat_fields(),
             hints=event.hints.fields() if event.hints else None,
             totals=self._totals(),

@@ -1,0 +1,104 @@
+"""Commands for after a flight: `edgevpr report` and `edgevpr export`."""
+
+import sys
+from argparse import ArgumentTypeError, Namespace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from edgevpr.cli.shared import command
+from edgevpr.errors import MapError, UsageError
+
+if TYPE_CHECKING:
+    from edgevpr.report.flight import Flight
+    from edgevpr.report.ground import Ground
+
+
+def add(commands: Any) -> None:
+    """Add the commands and their flags."""
+    report = command(commands, "report", run_report, "make a page of a flight from its log, for any browser, offline")
+    _add_log(report)
+    report.add_argument("--out", required=True, metavar="FILE", help="the page to write (.html)")
+    report.add_argument("--map", metavar="MAP", help="draw over its ground (default: that of the log's first line)")
+    for flag, text in (
+        ("--images", "frames of this flight"),
+        ("--map-images", "the pictures that the map was made of"),
+    ):
+        report.add_argument(flag, action="append", default=[], metavar="DIR", help=f"folder with {text}; repeatable")
+    export = command(commands, "export", run_export, "write matches, fixes and places of a flight, for a map viewer")
+    _add_log(export)
+    form = export.add_mutually_exclusive_group(required=True)
+    for name in ("geojson", "csv", "kml"):
+        form.add_argument(f"--{name}", metavar="FILE", help="file to write, - for standard output")
+
+
+def _add_log(parser: Any) -> None:
+    parser.add_argument("log", metavar="LOG")
+    parser.add_argument("--flight", type=_number, metavar="N", help="the flight of the log, from 1 (default: the last)")
+
+
+def _number(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise ArgumentTypeError(f"`{text}` is no number of a flight: give 1 or more")
+    return int(text)
+
+
+def run_report(args: Namespace) -> int:
+    """Make the page of a flight."""
+    from edgevpr.helpers.files import require_folder, write_whole
+    from edgevpr.report.flight import read_flight
+    from edgevpr.report.page import page_of
+    from edgevpr.report.pictures import Album
+
+    out = _out(args.out, args.log)
+    require_folder(out)
+    frames, references = Album(args.images), Album(args.map_images)
+    flight = read_flight(args.log, args.flight)
+    page = page_of(flight, _ground(args.map, flight), frames, references)
+    write_whole(out, lambda unfinished: unfinished.write_text(page, "utf-8", "backslashreplace"))
+    print(f"{out}: {len(flight.queries)} queries, flight {flight.number} of {flight.flights} in {args.log}")
+    return 0
+
+
+def run_export(args: Namespace) -> int:
+    """Write what a flight found, for other programs."""
+    from edgevpr.helpers.files import require_folder, write_whole
+    from edgevpr.report.export import WRITERS, features_of
+    from edgevpr.report.flight import read_flight
+
+    form, target = next((name, given) for name in WRITERS if (given := getattr(args, name)) is not None)
+    features = features_of(read_flight(args.log, args.flight))
+    write = WRITERS[form]
+    if target == "-":
+        write(features, sys.stdout)
+        return 0
+    out = _out(target, args.log)
+    require_folder(out)
+
+    def written(unfinished: Path) -> None:
+        with open(unfinished, "w", encoding="utf-8", errors="backslashreplace", newline="") as handle:
+            write(features, handle)
+
+    write_whole(out, written)
+    print(f"{out}: {len(features)} points")
+    return 0
+
+
+def _out(target: str, log: str) -> Path:
+    out = Path(target)
+    if out.exists() and Path(log).exists() and out.samefile(log):
+        raise UsageError(f"{out} is the flight log itself: give another name.")
+    return out
+
+
+def _ground(given: str | None, flight: "Flight") -> "Ground":
+    """Read the map that was given, or else that of the log, which need not be on this machine."""
+    from edgevpr.report.ground import Ground, read_ground
+
+    if given:
+        return read_ground(given)
+    if flight.map_path is None:
+        return Ground(trouble="The log does not name a map: give it with --map.")
+    try:
+        return read_ground(flight.map_path)
+    except (MapError, UsageError) as error:
+        return Ground(trouble=f"The map of the flight is not drawn: {error} Its place can be given with --map.")
