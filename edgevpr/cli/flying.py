@@ -117,9 +117,11 @@ def run_match(args: Namespace) -> int:
 
 def run_flight(args: Namespace) -> int:
     """Fly with a configuration."""
+    from edgevpr.runtime.flight.reloading import Reread
     from edgevpr.runtime.service.fly import fly
 
-    return fly(config_of(args, args.config), path_of(args.positions))
+    reread = Reread(lambda: config_of(args, args.config)) if args.config else None
+    return fly(config_of(args, args.config), path_of(args.positions), reread)
 
 
 def run_check(args: Namespace) -> int:
