@@ -158,8 +158,8 @@ def run_service(args: Namespace) -> int:
         )
     if args.action == "install":
         install(path_of(args.config), args.dry_run, _say)
-        next_steps = ("edgevpr check", "edgevpr doctor", "systemctl enable --now edgevpr")
-        _say(f"next   {', '.join(next_steps)}: deploy/README.md")
+        _say("next   sudo -u edgevpr /opt/edgevpr/bin/edgevpr check --config /etc/edgevpr/config.yaml")
+        _say("next   systemctl enable --now edgevpr (restart, where an earlier one runs)")
     elif args.config:
         raise UsageError("--config goes with `service install`: uninstalling leaves the configuration as it is.")
     else:

@@ -31,7 +31,11 @@ def program_steps(venv: Path) -> tuple[Step, ...]:
 
     def pip(*words: str | Path) -> None:
         _require_stopped()
-        command(python, "-I", "-m", "pip", "--disable-pip-version-check", "--no-input", "install", *words)
+        with tempfile.TemporaryDirectory(
+            dir=venv
+        ) as folder:  # /tmp may be memory, of which a small board has too little
+            quiet = "--disable-pip-version-check", "--no-input"
+            command(python, "-I", "-m", "pip", *quiet, "install", *words, TMPDIR=folder)
 
     def install_packages() -> None:
         for broken in _broken(site()):
@@ -41,7 +45,7 @@ def program_steps(venv: Path) -> tuple[Step, ...]:
     def install_own() -> None:
         for broken in _broken(site()):
             shutil.rmtree(broken)
-        with tempfile.TemporaryDirectory() as folder:
+        with tempfile.TemporaryDirectory(dir=venv) as folder:
             pip("--no-deps", "--no-index", "--force-reinstall", ownwheel.write_wheel(Path(folder)))
 
     return (
@@ -98,7 +102,7 @@ def _require_stopped() -> None:
 def _has_packages(site: Path, python: tuple[int, int], lock: str) -> bool:
     """Tell whether all that the lock names for this Python is there, in its version and installed to the end."""
     there = {
-        _canonical(each.name): each.version
+        _canonical(each.name or ""): each.version
         for each in metadata.distributions(path=[str(site)])
         if each.read_text("RECORD")
     }

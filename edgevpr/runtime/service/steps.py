@@ -38,16 +38,25 @@ def walk(steps: Iterable[Step], dry_run: bool, say: Callable[[str], None]) -> No
 def _take(step: Step) -> None:
     try:
         step.do()
+        os.sync()  # what another run will find so, is so after a power cut too
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         raise EdgevprError(f"{step.what}: {where}{error.strerror or error}; {_AGAIN}.") from error
 
 
-def command(*words: str | Path) -> None:
+def command(*words: str | Path, **environment: str) -> None:
     """Run a program of the system; raises EdgevprError with the last that it said where it fails."""
+    path = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"  # `su` leaves those two out
     name = Path(words[0]).name
     try:
-        done = subprocess.run(words, stdin=subprocess.DEVNULL, capture_output=True, text=True, errors="replace")
+        done = subprocess.run(
+            words,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            env={**os.environ, "PATH": path, **environment},
+        )
     except FileNotFoundError as error:
         raise EdgevprError(f"{name} is not on this machine; {_AGAIN}.") from error
     if done.returncode:
