@@ -5,7 +5,8 @@ import re
 import shutil
 import subprocess
 import sys
-import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import metadata, util
 from pathlib import Path
 
@@ -29,24 +30,21 @@ def program_steps(venv: Path) -> tuple[Step, ...]:
     def site() -> Path | None:
         return (found := _probed(python)) and found[0]
 
-    def pip(*words: str | Path) -> None:
-        _require_stopped()
-        with tempfile.TemporaryDirectory(
-            dir=venv
-        ) as folder:  # /tmp may be memory, of which a small board has too little
-            quiet = "--disable-pip-version-check", "--no-input"
-            command(python, "-I", "-m", "pip", *quiet, "install", *words, TMPDIR=folder)
+    def pip(folder: Path, *words: str | Path) -> None:
+        for broken in site().glob("*.dist-info"):  # left by a run that was broken off, and a package to pip
+            if not (broken / "RECORD").is_file():
+                shutil.rmtree(broken)
+        quiet = "--disable-pip-version-check", "--no-input"
+        command(python, "-I", "-m", "pip", *quiet, "install", *words, TMPDIR=str(folder))
 
     def install_packages() -> None:
-        for broken in _broken(site()):
-            shutil.rmtree(broken)
-        pip("--require-hashes", "--only-binary", ":all:", "--requirement", lock)
+        with _room(venv) as folder:
+            pip(folder, "--require-hashes", "--only-binary", ":all:", "--requirement", lock)
 
     def install_own() -> None:
-        for broken in _broken(site()):
-            shutil.rmtree(broken)
-        with tempfile.TemporaryDirectory(dir=venv) as folder:
-            pip("--no-deps", "--no-index", "--force-reinstall", ownwheel.write_wheel(Path(folder)))
+        with _room(venv) as folder:
+            wheel = ownwheel.write_wheel(folder)
+            pip(folder, "--no-deps", "--no-index", "--no-compile", "--force-reinstall", wheel)
 
     return (
         Step(f"virtual environment in /{VENV}", lambda: site() is not None, lambda: _make_venv(venv)),
@@ -63,7 +61,7 @@ def program_steps(venv: Path) -> tuple[Step, ...]:
         Step(
             "compiled bytecode, for a quick start",
             lambda: site() is not None and _is_compiled(site() / NAME),
-            lambda: command(python, "-I", "-m", "compileall", "-q", site()),
+            lambda: command(python, "-I", "-m", "compileall", "-q", site() / NAME),
         ),
     )
 
@@ -111,9 +109,17 @@ def _has_packages(site: Path, python: tuple[int, int], lock: str) -> bool:
     return all(there.get(_canonical(name)) == version for name, version, when in wanted if not when or own in when)
 
 
-def _broken(site: Path | None) -> list[Path]:
-    """List what an installation that was broken off has left, which pip would take for a package."""
-    return [each for each in site.glob("*.dist-info") if not (each / "RECORD").is_file()] if site else []
+@contextmanager
+def _room(venv: Path) -> Iterator[Path]:
+    """Give a folder for what is unfinished. /tmp may be memory, of which a small board has too little."""
+    _require_stopped()
+    folder = venv / "unfinished"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder)
 
 
 def _canonical(name: str) -> str:
@@ -121,7 +127,8 @@ def _canonical(name: str) -> str:
 
 
 def _is_compiled(package: Path) -> bool:
-    return all(any((path.parent / "__pycache__").glob(f"{path.stem}.*.pyc")) for path in package.rglob("*.py"))
+    modules = list(package.rglob("*.py"))
+    return bool(modules) and all(any((path.parent / "__pycache__").glob(f"{path.stem}.*.pyc")) for path in modules)
 
 
 def remove_program(path: Path) -> None:
