@@ -54,9 +54,21 @@ def add(commands: Any) -> None:
     )
     check.add_argument("--images", "--source", dest="source", metavar="SOURCE", help="learn it from this recording")
 
-    service = command(commands, "service", print_unit, "print the systemd unit for a board")
-    service.add_argument("--board", default="this", metavar="NAME")
-    service.add_argument("--config", metavar="FILE", help="(that of the unit that is shipped)")
+    service = command(commands, "service", run_service, "print the systemd unit for a board, or install it all")
+    service.add_argument(
+        "action",
+        nargs="?",
+        choices=("print", "install", "uninstall"),
+        default="print",
+        help="install: user, folders, program, unit and udev rules; uninstall leaves maps, logs and configuration",
+    )
+    service.add_argument("--board", metavar="NAME", help="print: the board (default: this); else its configuration's")
+    service.add_argument(
+        "--config", metavar="FILE", help="print: the unit's; install: to become /etc/edgevpr/config.yaml"
+    )
+    service.add_argument(
+        "--dry-run", action="store_true", help="say what install and uninstall would do, and do nothing"
+    )
 
 
 def run_match(args: Namespace) -> int:
@@ -105,9 +117,11 @@ def run_match(args: Namespace) -> int:
 
 def run_flight(args: Namespace) -> int:
     """Fly with a configuration."""
+    from edgevpr.runtime.flight.reloading import Reread
     from edgevpr.runtime.service.fly import fly
 
-    return fly(config_of(args, args.config), path_of(args.positions))
+    reread = Reread(lambda: config_of(args, args.config)) if args.config else None
+    return fly(config_of(args, args.config), path_of(args.positions), reread)
 
 
 def run_check(args: Namespace) -> int:
@@ -127,10 +141,33 @@ def run_check(args: Namespace) -> int:
     return 0 if all(finding.ok for finding in findings) else 1
 
 
-def print_unit(args: Namespace) -> int:
-    """Print the systemd unit for a board."""
+def run_service(args: Namespace) -> int:
+    """Print the systemd unit for a board, or make or end the service of this machine."""
     from edgevpr.power.boards import load_board
+    from edgevpr.runtime.service.install import install, uninstall
     from edgevpr.runtime.service.unit import render_unit
 
-    print(render_unit(load_board(args.board), args.config), end="")
+    if args.action == "print":
+        if args.dry_run:
+            raise UsageError("--dry-run goes with `service install` and `service uninstall`: printing changes nothing.")
+        print(render_unit(load_board(args.board or "this"), args.config), end="")
+        return 0
+    if args.board:
+        raise UsageError(
+            "--board goes with printing: the service that is installed is for the board in its configuration."
+        )
+    if args.action == "install":
+        install(path_of(args.config), args.dry_run, _say)
+        _say("next   sudo -u edgevpr /opt/edgevpr/bin/edgevpr check --config /etc/edgevpr/config.yaml")
+        _say("next   systemctl enable --now edgevpr (restart, where an earlier one runs)")
+    elif args.config:
+        raise UsageError("--config goes with `service install`: uninstalling leaves the configuration as it is.")
+    else:
+        uninstall(args.dry_run, _say)
+    if args.dry_run:
+        _say("dry run: nothing was changed")
     return 0
+
+
+def _say(line: str) -> None:
+    print(shown(line), flush=True)  # some steps take minutes

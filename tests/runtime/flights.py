@@ -14,6 +14,7 @@ from edgevpr.runtime.flight.flightlog import FlightLog, read_log
 from edgevpr.runtime.flight.loop import Stop
 from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.flight.navigator import Navigator
+from edgevpr.runtime.flight.reloading import Reread
 from edgevpr.runtime.flight.statussocket import NoReaders, Readers
 from edgevpr.runtime.recognise.learn import Learner
 from edgevpr.runtime.recognise.opening import open_learning, open_recogniser
@@ -57,6 +58,7 @@ class Flight:
             else None
         )
         self.stop = Stop()
+        self.reread: Reread | None = None
         self.flown: Flown | None = None
 
     def fly(
@@ -85,6 +87,7 @@ class Flight:
                 autopilot=autopilot,
                 stop=self.stop,
                 learner=self.learner,
+                reread=self.reread,
                 fewer_candidates=fewer_candidates,
                 smaller_forms=smaller_forms,
                 clock=self.clock.clock,

@@ -19,6 +19,7 @@ from edgevpr.runtime.flight.mapstate import MapState
 from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.flight.pace import Pace
 from edgevpr.runtime.flight.querylog import QueryLog, totals_of
+from edgevpr.runtime.flight.reloading import NoReloading, Reloading, Reread
 from edgevpr.runtime.flight.sight import Sight
 from edgevpr.runtime.flight.statussocket import NoReaders, Readers
 from edgevpr.runtime.flight.tally import Tally
@@ -53,6 +54,7 @@ def fly(
     autopilot: Autopilot,
     stop: Stop,
     learner: Learner | None = None,
+    reread: Reread | None = None,
     fewer_candidates: tuple[int, ...] = (),
     smaller_forms: tuple[str, ...] = (),
     clock: Clock | None = None,
@@ -61,8 +63,9 @@ def fly(
 ) -> Flown:
     """Fly until the source has ended or `stop` is asked for.
 
-    `learner` makes places (None: nothing is learnt); `fewer_candidates`, and `smaller_forms` of the index, are those
-    that the governor may change to. `clock` and `meter` are the real ones unless given. `readers` are told the status.
+    `learner` makes places (None: nothing is learnt); `reread` asks for the configuration to be read again;
+    `fewer_candidates`, and `smaller_forms` of the index, are those that the governor may change to. `clock` and `meter`
+    are the real ones unless given. `readers` are told the status.
     """
     clock = clock or Clock()
     if meter is None:
@@ -82,6 +85,9 @@ def fly(
         fewer_candidates=fewer_candidates,
         smaller_forms=smaller_forms,
     )
+    reloading: Reloading | NoReloading = NoReloading()
+    if reread:
+        reloading = Reloading(reread, config, flight_log, lambda new: governing.take(new, rate_hz(new, recogniser)))
     commands = Commands(autopilot, flight_log, learner)
     state = FlightState(
         source=source,
@@ -132,6 +138,7 @@ def fly(
             observers,
             commands=commands,
             governing=governing,
+            reloading=reloading,
             vitals=vitals,
             meter=meter,
             pace=pace,

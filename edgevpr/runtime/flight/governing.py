@@ -51,6 +51,13 @@ class Governing:
         what = lowered(self._governor.setting, self._governor.asked)
         return f"held to {what}" if what else None
 
+    def take(self, config: Config, rate_hz: float) -> None:
+        """Fly on with another rate, and accept matches with the precision of another configuration."""
+        self._config = config
+        self._governor.ask_rate(rate_hz)
+        self._pace.set_rate(self._governor.setting.rate_hz)
+        self._recogniser.accept_with(config.match.accept_precision)
+
     def look(self) -> None:
         """Look at the load of the flight, once a second, and change the settings if needed."""
         if self._wanted_form:  # without an index nothing is recognised, and the load tells nothing

@@ -121,6 +121,11 @@ class Governor:
         """Setting in force while no limit is passed."""
         return self._settings[0]
 
+    def ask_rate(self, rate_hz: float) -> None:
+        """Ask for another rate: what is lowered stays lowered as much."""
+        factor = rate_hz / self.asked.rate_hz
+        self._settings = [replace(each, rate_hz=each.rate_hz * factor) for each in self._settings]
+
     def look(self, now_s: float, reading: Reading) -> Change | None:
         """Judge a reading; None: all stays as it is. Call it about once a second, each time with a reading over a whole
         number of queries."""

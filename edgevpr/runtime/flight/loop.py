@@ -14,6 +14,7 @@ from edgevpr.runtime.flight.commands import Commands
 from edgevpr.runtime.flight.governing import Governing
 from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.flight.pace import Pace
+from edgevpr.runtime.flight.reloading import NoReloading, Reloading
 from edgevpr.runtime.flight.vitals import Vitals
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
@@ -67,6 +68,7 @@ def loop(
     *,
     commands: Commands,
     governing: Governing,
+    reloading: Reloading | NoReloading,
     vitals: Vitals,
     meter: FlightMeter,
     pace: Pace,
@@ -78,6 +80,7 @@ def loop(
         while not (stop.asked or source.ended):
             vitals.beat()
             commands.obey()
+            reloading.look()
             if (wait_s := pace.wait_s()) > 0:
                 clock.sleep(min(wait_s, _TURN_S))
                 continue

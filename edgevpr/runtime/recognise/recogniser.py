@@ -92,6 +92,11 @@ class Recogniser:
         self.technique, self.rule, self.search = technique, rule, search
         self._take_index(index)
 
+    def accept_with(self, precision: float) -> None:
+        """Accept matches with this precision from the next frame on. A rule that goes by limits stays as it is."""
+        if self.rule.sure:
+            self.rule = replace(self.rule, sure=replace(self.rule.sure, precision=precision))
+
     def extend(self, index: PlaceIndex, place_id: int, t_mono_s: float) -> None:
         """Recognise in an index that has one place more, learnt from the frame taken at `t_mono_s`."""
         self._new.append((place_id, t_mono_s))

@@ -1,4 +1,5 @@
-"""A flight from start to end: everything is opened, flown with, and closed; SIGTERM and SIGINT end it."""
+"""A flight from start to end: everything is opened, flown with, and closed; SIGTERM and SIGINT end it, SIGHUP has
+its configuration read again."""
 
 import logging
 import os
@@ -29,6 +30,7 @@ from edgevpr.runtime.flight.flightlog import FlightLog, start_fields
 from edgevpr.runtime.flight.learning import say_learning_stopped
 from edgevpr.runtime.flight.loop import Stop
 from edgevpr.runtime.flight.navigator import Muted, Navigator
+from edgevpr.runtime.flight.reloading import Reread
 from edgevpr.runtime.flight.sourcesets import SourceSets
 from edgevpr.runtime.flight.statussocket import NoReaders, Readers, StatusSocket, usual_path
 from edgevpr.runtime.flight.systemd import notify
@@ -45,9 +47,9 @@ _NEW_MAP_PLACES = 1000  # a technique picked for an empty map must be able to fl
 _log = logging.getLogger(__name__)
 
 
-def fly(config: Config, positions: Path | None = None) -> int:
-    """Open everything, fly, close everything; return the exit code, 1 if any frame failed, else 0. Raises an
-    EdgevprError, one sentence, where the flight cannot start."""
+def fly(config: Config, positions: Path | None = None, reread: Reread | None = None) -> int:
+    """Open everything, fly, close everything; return the exit code, 1 if any frame failed, else 0. `reread` is asked by
+    SIGHUP. Raises an EdgevprError, one sentence, where the flight cannot start."""
     if config.source.uri is None:
         raise UsageError("There is no source of frames: name one with --source, or `source: {uri: ...}`.")
     address, ground = parse_links(config.mavlink.link, config.mavlink.ground)
@@ -94,7 +96,7 @@ def fly(config: Config, positions: Path | None = None) -> int:
         if cannot_learn:
             say_learning_stopped(cannot_learn, flight_log, autopilot)
         stop = Stop()
-        with _signals(stop):
+        with _signals(stop, reread):
             notify(READY=1)
             flown = fly_with(
                 recogniser,
@@ -104,6 +106,7 @@ def fly(config: Config, positions: Path | None = None) -> int:
                 autopilot=autopilot,
                 stop=stop,
                 learner=learner,
+                reread=reread,
                 fewer_candidates=() if config.match.candidates else trusted_candidates(recogniser.technique),
                 smaller_forms=smaller_forms,
                 readers=readers,
@@ -259,9 +262,10 @@ def _say_recording(config: Config, learner: Learner | None) -> None:
 
 
 @contextmanager
-def _signals(stop: Stop) -> Iterator[None]:
-    """Let SIGTERM and SIGINT end the flight inside this context."""
-    before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGINT)}
+def _signals(stop: Stop, reread: Reread | None) -> Iterator[None]:
+    """Let SIGTERM and SIGINT end the flight inside this context, and SIGHUP have its configuration read again."""
+    handlers = {signal.SIGTERM: stop, signal.SIGINT: stop} | ({signal.SIGHUP: reread} if reread else {})
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
     try:
         yield
     finally:

@@ -9,7 +9,7 @@ from edgevpr.power.boards import Board
 from edgevpr.resources import shipped
 
 # ProtectHome and PrivateTmp put empty folders in their place.
-_HIDDEN_FROM_THE_SERVICE = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")
+HIDDEN_FROM_THE_SERVICE = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")
 _RUNS = re.compile(r"(?m)^(ExecStart=.* --config )(\S+)$")
 
 
@@ -40,7 +40,7 @@ def _visible(path: Path, usual: str) -> Path:
     except (OSError, RuntimeError) as error:  # links in a circle; RuntimeError before Python 3.13
         raise UsageError(f"{path} leads nowhere ({error}): give the path of a file, e.g. {usual}.") from error
     written = leads_to if ".." in path.parts else path.absolute()
-    for folder in _HIDDEN_FROM_THE_SERVICE:
+    for folder in HIDDEN_FROM_THE_SERVICE:
         if hidden := next((each for each in (written, leads_to) if each.is_relative_to(folder)), None):
             raise UsageError(
                 f"{hidden} is out of sight of the service, which has no access to {folder}: copy it to {usual}."

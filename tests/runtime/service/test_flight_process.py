@@ -10,10 +10,12 @@ import time
 from contextlib import contextmanager
 
 import pytest
-from flight_process import start, wait_for
+from flight_process import cpu_s, start, wait_for
 from flights import PLACES, STEP_DEG, of_kind
 
+from edgevpr.cli.main import main
 from edgevpr.helpers.appending import earlier_part
+from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.flight.flightlog import read_log
 
 
@@ -133,6 +135,42 @@ def test_a_signal_ends_the_flight_with_everything_flushed(fly, tmp_path, number)
     # By the flight's own clock, which other programs cannot hold up: the service manager waits two seconds.
     assert lines[-1]["t_mono_s"] - lines[0]["t_mono_s"] < 2 * lines[-1]["queries"] + 2.0
     assert lines[-1]["queries"] < PLACES
+
+
+def test_a_long_query_is_broken_off_when_the_flight_is_to_end(recording, tmp_path):
+    """Many regions of thirty places, compared as the thesis does, take seconds."""
+    place_map, images, log = tmp_path / "slow.gpkg", recording / "blind" / "images", tmp_path / "flight.jsonl"
+    built = ["map", "build", place_map, "--images", images, "--technique", "cohog", "--param", "w1=1200"]
+    assert main([*map(str, built), "--no-calibrate"]) == 0
+    with manager(tmp_path) as (listening, environment):
+        run = start(place_map, images, log, "--matching", "thesis", **environment)
+        while b"READY=1" not in listening.recv(4096):
+            pass
+        busy_s = cpu_s(run.pid)
+        while cpu_s(run.pid) < busy_s + 0.5:  # more than reading and encoding take
+            assert run.poll() is None
+            time.sleep(0.02)
+        run.terminate()
+        said = run.communicate(timeout=60)[1]
+    assert run.returncode == 0, said
+    lines = list(read_log(log))
+    assert [line["kind"] for line in lines] == ["start", "end"], "what is broken off is no query"
+
+
+def test_a_flight_that_learns_ends_with_map_and_log_flushed(recording, tmp_path):
+    place_map, log = tmp_path / "m.gpkg", tmp_path / "flight.jsonl"
+    flags = ("--learn", "--technique", "hog", "--rate-hz", "25")
+    run = start(place_map, recording / "seen" / "images", log, *flags)
+    wait_for("learnt", log, run)
+    run.terminate()
+    assert run.wait(timeout=60) == 0
+    run.stderr.close()
+    lines = list(read_log(log))
+    learnt = [line["place"] for line in of_kind(lines, "learnt")]
+    assert lines[-1]["kind"] == "end"
+    assert lines[-1]["learnt"]["places"] == len(learnt)
+    with PlaceMap.open(place_map) as kept:
+        assert [place.place_id for place in kept.places()] == learnt
 
 
 def test_kill_9_costs_no_line_that_was_written(fly, tmp_path):

@@ -103,7 +103,7 @@ def test_no_way_round_leads_to_what_the_service_cannot_see(path):
 
 
 def test_a_link_to_what_the_service_cannot_see_is_followed(tmp_path, monkeypatch):
-    monkeypatch.setattr(unit_text, "_HIDDEN_FROM_THE_SERVICE", (str(tmp_path / "home"),))
+    monkeypatch.setattr(unit_text, "HIDDEN_FROM_THE_SERVICE", (str(tmp_path / "home"),))
     (tmp_path / "home").mkdir()
     (tmp_path / "c.yaml").symlink_to(tmp_path / "home" / "c.yaml")
     with pytest.raises(UsageError, match=r"home/c\.yaml is out of sight of the service"):
@@ -141,6 +141,10 @@ def test_the_unit_keeps_trying_in_flight_but_not_after_a_usage_error():
     assert unit["Restart"] == "always"
     assert unit["StartLimitIntervalSec"] == "0"
     assert unit["RestartPreventExitStatus"] == str(UsageError.exit_code)
+
+
+def test_reloading_asks_the_flight_to_read_its_configuration_again():
+    assert directives(UNIT.read_text())["ExecReload"] == "/bin/kill -HUP $MAINPID"
 
 
 def test_serial_ports_and_cameras_stay_within_reach():
