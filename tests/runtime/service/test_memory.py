@@ -60,9 +60,12 @@ def test_a_flight_completes_within_a_hard_limit_of_memory(flight):
     assert largest["VmPeak"] < LIMIT_BYTES / 1e6
 
 
-def test_the_whole_process_stays_under_130_mb(flight):
+def test_the_whole_process_takes_60_mb_of_its_own_and_140_with_the_libraries(flight):
     largest = flight[1]
-    assert 30 < largest["Pss"] <= largest["VmHWM"] < 130
+    assert 30 < largest["Pss"] <= largest["VmHWM"]
+    assert largest["RssAnon"] < 60
+    # Pages of libraries are counted as the system has them in its cache: the same flight had 93, 103 and 132 MB.
+    assert largest["VmHWM"] < 140
 
 
 def test_the_log_tells_the_memory_that_the_kernel_counts(flight):
