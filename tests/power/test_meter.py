@@ -6,9 +6,9 @@ import time
 import pytest
 
 from edgevpr.power.boards import load_board
-from edgevpr.power.equations import Pack
-from edgevpr.power.meter import PssMeter, query_cost, stage
-from edgevpr.types import StageCost
+from edgevpr.power.equations import Pack, parse_pack
+from edgevpr.power.meter import PssMeter, QueryMeter, query_cost, stage
+from edgevpr.types import NO_COST, StageCost
 
 
 def clock(*readings):
@@ -17,7 +17,7 @@ def clock(*readings):
 
 def test_a_stage_costs_what_both_clocks_have_moved_on():
     with stage(clock(100.0, 100.75), clock(7.0, 8.5)) as metered:
-        assert metered.cost is None
+        assert metered.cost == NO_COST
     assert metered.cost == StageCost(wall_s=0.75, cpu_s=1.5)
 
 
@@ -84,3 +84,24 @@ def test_the_real_process_has_its_share_of_the_memory_it_shows():
         StageCost(0.1, 0.1), StageCost(0.1, 0.1), load_board("rpi-4b"), Pack(4, 5200), 0.85, pss_mb=pss_mb
     )
     assert 1 < cost.pss_mb <= 1.05 * cost.rss_mb
+
+
+def test_a_signal_between_a_step_and_the_setting_of_its_cost_is_not_masked():
+    """A flight is ended by an exception from a signal's handler, which can be raised at any call: here, of the clock."""
+
+    class Ended(BaseException):
+        pass
+
+    calls = []
+
+    def counted():
+        calls.append(1)
+        if len(calls) == 2:  # the first is of the beginning of the step
+            raise Ended
+        return 0.0
+
+    meter = QueryMeter(load_board("generic-x86"), parse_pack("4S5200"), 0.85, wall_clock=counted)
+    meter.begin()
+    with pytest.raises(Ended), meter.step("encode"):
+        pass
+    assert meter.steps().encode == NO_COST

@@ -59,8 +59,8 @@ def test_a_flight_tells_its_status_opens_no_port_and_removes_its_socket(fly, tmp
     listening = [each for each in psutil.Process(run.pid).net_connections("inet") if each.status == "LISTEN"]
     assert not listening
     run.terminate()
-    run.communicate(timeout=PATIENCE_S)
-    assert run.returncode == 0
+    said = run.communicate(timeout=PATIENCE_S)
+    assert run.returncode == 0, said
     assert not path.exists()
 
 
