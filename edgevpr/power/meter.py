@@ -17,8 +17,8 @@ _PSS_EVERY_S = 20.0
 
 @dataclass(slots=True)
 class Stage:
-    """A stage that is being metered; `cost` is set once the stage is over. A signal that breaks it off while it is being
-    set leaves none."""
+    """A stage that is being metered; `cost` is set once the stage is over. A signal that breaks it off while it is
+    being set leaves none."""
 
     cost: StageCost = NO_COST
 

@@ -87,7 +87,7 @@ def test_the_real_process_has_its_share_of_the_memory_it_shows():
 
 
 def test_a_signal_between_a_step_and_the_setting_of_its_cost_is_not_masked():
-    """A flight is ended by an exception from a signal's handler, which can be raised at any call: here, of the clock."""
+    """A flight is ended by an exception of a signal's handler, which can come at any call: here, of the clock."""
 
     class Ended(BaseException):
         pass
