@@ -99,11 +99,7 @@ class Asking:
         """Ask for one message (MAV_CMD_REQUEST_MESSAGE); None where the autopilot refuses it, or nothing comes."""
         name = mavlink.mavlink_map[message_id].msgname
         for _ in range(TRIES):
-            self._put(
-                mavlink.MAVLink_command_long_message(
-                    self.system_id, AUTOPILOT, mavlink.MAV_CMD_REQUEST_MESSAGE, 0, message_id, 0, 0, 0, 0, 0, 0
-                )
-            )
+            self._put(messages.message_request(self.system_id, message_id))
             answer = self._first(ANSWER_WAIT_S, lambda message: message.get_type() == name or _refuses(message))
             if answer is not None:
                 return answer if answer.get_type() == name else None
@@ -141,7 +137,7 @@ class Asking:
         """Ask for a few parameters, and put into `found` what comes until all are there or a second is quiet."""
         waiting = set(names)
         for name in names:
-            self._put(mavlink.MAVLink_param_request_read_message(self.system_id, AUTOPILOT, name.encode(), -1))
+            self._put(messages.parameter_request(self.system_id, name))
         while waiting:
             said = self._first(ANSWER_WAIT_S, lambda message: _parameter_name(message) in waiting)
             if said is None:

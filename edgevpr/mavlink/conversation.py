@@ -248,7 +248,8 @@ class Conversation:
         if sending and answer == "ACCEPTED":
             self.autopilot.certainty.note_known(sending.fix.accuracy_m, now_s)
         if answer == "FAILED" and readiness.asks_origin(now_s):
-            self.outbox.put(messages.origin_request(self.autopilot.system_id))
+            origin = mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN
+            self.outbox.put(messages.message_request(self.autopilot.system_id, origin))
 
     def _say_silence(self, now_s: float) -> None:
         if self.answers.is_stopped:

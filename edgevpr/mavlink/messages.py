@@ -116,11 +116,15 @@ def report_requests(target_system: int, firmware: int, is_continuous: bool = Fal
     )
 
 
-def origin_request(target_system: int) -> Message:
-    """Make a COMMAND_LONG (76) with REQUEST_MESSAGE (512) for GPS_GLOBAL_ORIGIN (49)."""
-    origin = mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN
+def message_request(target_system: int, message_id: int) -> Message:
+    """Make a COMMAND_LONG (76) with REQUEST_MESSAGE (512) for one message."""
     request = mavlink.MAV_CMD_REQUEST_MESSAGE
-    return mavlink.MAVLink_command_long_message(target_system, AUTOPILOT, request, 0, origin, 0, 0, 0, 0, 0, 0)
+    return mavlink.MAVLink_command_long_message(target_system, AUTOPILOT, request, 0, message_id, 0, 0, 0, 0, 0, 0)
+
+
+def parameter_request(target_system: int, name: str) -> Message:
+    """Make a PARAM_REQUEST_READ (20) for a parameter by its name."""
+    return mavlink.MAVLink_param_request_read_message(target_system, AUTOPILOT, name.encode(), -1)
 
 
 def origin(target_system: int, lat_deg: float, lon_deg: float, alt_m: float) -> Message:

@@ -4,6 +4,7 @@ import logging
 import math
 from collections.abc import Iterator
 
+from edgevpr.mavlink import messages
 from edgevpr.mavlink.autopilots import ardupilot, px4
 from edgevpr.mavlink.autopilots.channel import Asked, Channel, Choice, Kind, kind_of
 from edgevpr.mavlink.parameter import value_of
@@ -19,7 +20,8 @@ log = logging.getLogger(__name__)
 class Interview:
     """Asks an autopilot for its version and a few parameters, a few times where answers are missing (an autopilot does
     not answer for a parameter that it does not have). `choice` is the channel: until all has been asked, that of an
-    autopilot that has answered nothing."""
+    autopilot that has answered nothing. A first answer that comes late still counts, a second one does not: a parameter
+    that is changed in flight changes no channel."""
 
     def __init__(self) -> None:
         self.choice = _UNKNOWN
@@ -35,11 +37,13 @@ class Interview:
         match message.get_type():
             case "HEARTBEAT":
                 self._firmware, self.kind = message.autopilot, kind_of(message.type)
-            case "AUTOPILOT_VERSION":
+            case "AUTOPILOT_VERSION" if self._version is None:
+                self._is_over = False
                 self._version = message.flight_sw_version >> 24 & 255, message.flight_sw_version >> 16 & 255
-            case "PARAM_VALUE" if message.param_id in self._wanted():
+            case "PARAM_VALUE" if message.param_id in self._wanted() and message.param_id not in self._parameters:
                 value = value_of(message, bytewise=self._firmware == mavlink.MAV_AUTOPILOT_PX4)
                 if value is not None:
+                    self._is_over = False
                     self._parameters[message.param_id] = value
 
     def questions(self, now_s: float, target_system: int) -> Iterator[Message]:
@@ -53,18 +57,9 @@ class Interview:
             return
         self._asked, self._ask_s = self._asked + 1, now_s
         if self._version is None:
-            yield mavlink.MAVLink_command_long_message(
-                target_system,
-                mavlink.MAV_COMP_ID_AUTOPILOT1,
-                mavlink.MAV_CMD_REQUEST_MESSAGE,
-                0,
-                mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION,
-                *[0.0] * 6,
-            )
+            yield messages.message_request(target_system, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
         for name in missing:
-            yield mavlink.MAVLink_param_request_read_message(
-                target_system, mavlink.MAV_COMP_ID_AUTOPILOT1, name.encode(), -1
-            )
+            yield messages.parameter_request(target_system, name)
 
     def _wanted(self) -> tuple[str, ...]:
         firmware = _FIRMWARES.get(self._firmware)

@@ -135,7 +135,7 @@ class Navigator:
         """Return how well the position is known, the standard deviation of one axis; None: it is not known."""
         with self._lock:
             estimate = self._navigation.at(now_s)
-            return estimate and max(estimate.accuracy_m, self._map_sd_m)
+            return estimate and self._claimed_m(estimate)
 
     def state_at(self, t_s: float) -> State | None:
         """Return where the vehicle is or was, later than at the last call, to be sent as a continuous position; None:
@@ -154,7 +154,7 @@ class Navigator:
                 lon_deg=lon_deg,
                 alt_m=vehicle.alt_m,
                 velocity_m_s=(east, north, vehicle.sink_m_s or 0.0),
-                accuracy_m=_ALIKE * math.hypot(max(estimate.accuracy_m, self._map_sd_m), behind_m),
+                accuracy_m=_ALIKE * math.hypot(self._claimed_m(estimate), behind_m),
                 alt_accuracy_m=_ALT_SD_M,
                 speed_accuracy_m_s=_ALIKE * estimate.speed_accuracy_m_s,
                 attitude=attitude
@@ -178,13 +178,13 @@ class Navigator:
         if reckons_by_gps(vehicle):
             return Advice(None, _HAS_GPS if self._believes_gps else _HAS_WRONG_GPS)
         estimate = self._navigation.at(now_s)
+        here, claimed_m = estimate.position, self._claimed_m(estimate)
+        if self._channel is Channel.SENSOR:  # PX4 fuses it, and gives its position up where none comes for some seconds
+            return Advice(Fix(here.lat_deg, here.lon_deg, claimed_m, now_s))
         east_m_s, north_m_s = vehicle.velocity_m_s
         since_s = now_s - vehicle.t_heard_s
         there = moved(vehicle.lat_deg, vehicle.lon_deg, since_s * east_m_s, since_s * north_m_s)
-        here = estimate.position
         off_m = float(distance_m(*there, here.lat_deg, here.lon_deg))
-        if self._channel is Channel.SENSOR:  # PX4 fuses it, and gives its position up where none comes for some seconds
-            return Advice(Fix(here.lat_deg, here.lon_deg, max(self._map_sd_m, estimate.accuracy_m), now_s))
         # Its mean square error is that of the estimate and this; without this, it is that of the estimate alone.
         if off_m**2 <= 2 * estimate.accuracy_m**2:
             return Advice(
@@ -195,8 +195,11 @@ class Navigator:
         # of two axes: of the variance of an axis it is half.
         ahead_m = [self._every_s / 2 * each for each in self._navigation.path_drift_m_s()]
         at = moved(here.lat_deg, here.lon_deg, *ahead_m)
-        accuracy_m = math.hypot(max(self._map_sd_m, estimate.accuracy_m), math.hypot(*ahead_m) / math.sqrt(2))
-        return Advice(Fix(*at, accuracy_m, now_s))
+        return Advice(Fix(*at, math.hypot(claimed_m, math.hypot(*ahead_m) / math.sqrt(2)), now_s))
+
+    def _claimed_m(self, estimate: Estimate) -> float:
+        """Return the accuracy that is claimed for an estimate: never better than what all fixes have in common."""
+        return max(self._map_sd_m, estimate.accuracy_m)
 
 
 class Muted:
