@@ -1,9 +1,10 @@
 """`edgevpr eval`: measure techniques on a data set with ground truth."""
 
+import os
 import sys
-from argparse import Namespace
+from argparse import ArgumentTypeError, Namespace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from edgevpr.cli.shared import (
     add_json,
@@ -12,6 +13,7 @@ from edgevpr.cli.shared import (
     command,
     config_of,
     parameters_of,
+    positive,
     print_json,
     value_of,
 )
@@ -19,20 +21,49 @@ from edgevpr.config import FORMS
 from edgevpr.errors import ModelError, UsageError
 from edgevpr.helpers.text import shown
 
+if TYPE_CHECKING:
+    from edgevpr.evaluate.dataset import Dataset
+    from edgevpr.evaluate.plan import Plan
+
+_MOST_WORKERS = 256
+
 
 def add(commands: Any) -> None:
     """Add the command and its flags."""
     parser = command(commands, "eval", evaluate, "measure techniques on a data set with ground truth")
-    parser.add_argument("--query", required=True, metavar="DIR")
-    parser.add_argument("--ref", required=True, metavar="DIR")
-    parser.add_argument("--ground-truth", required=True, metavar="CSV")
+    parser.add_argument(
+        "--data",
+        nargs="+",
+        metavar="FOLDER",
+        help="a data set in one folder, of any layout that is known; several: --out",
+    )
+    parser.add_argument("--sets", metavar="FILE", help="YAML: many sets by many rows, with --out")
+    parser.add_argument(
+        "--out", metavar="FOLDER", help="write results.json, .csv, .md and a page; an interrupted run goes on there"
+    )
+    parser.add_argument("--workers", type=_count, metavar="N", help="with --out: processes at work (all cores)")
+    parser.add_argument("--cache", metavar="FOLDER", help="with --out: where finished work is kept (OUT/cache)")
+    parser.add_argument("--query", metavar="DIR")
+    parser.add_argument("--ref", metavar="DIR")
+    parser.add_argument("--ground-truth", metavar="CSV", help="(default: right is what is near, by the positions)")
+    parser.add_argument("--within-m", type=positive, default=25.0, metavar="M", help="near is within so much (25)")
+    parser.add_argument("--within-deg", type=positive, metavar="DEG", help="and with headings that differ by no more")
+    parser.add_argument(
+        "--overlap", type=positive, metavar="SHARE", help="and with so much ground in common, looking down (--fov-deg)"
+    )
+    parser.add_argument(
+        "--similarity",
+        nargs="+",
+        metavar="FILE",
+        help="instead of techniques, measure stored similarities (.npy, .npz, .csv; a row for each query)",
+    )
     parser.add_argument(
         "--form", default="float", metavar="A,B", help=f"of vectors, one row each: {', '.join(FORMS)} (float)"
     )
     parser.add_argument("--exact", action="store_true", help="compare all places in full, which no flight has time for")
     parser.add_argument("--follow", action="store_true", help="the queries are those of one flight, in order (cohog)")
     parser.add_argument("--config", metavar="FILE", help="YAML; its sections `salience` and `match` count")
-    add_keys(parser, "source.camera", "match.candidates", "match.sequence", "salience.use")
+    add_keys(parser, "source.camera", "source.fov_deg", "match.candidates", "match.sequence", "salience.use")
     parser.add_argument("--techniques", default="hog,cohog", metavar="A,B", help="names, comma-separated")
     add_parameters(parser, "a parameter of a technique", "TECHNIQUE.KEY=VALUE")
     parser.add_argument("--plot", metavar="FILE", help="draw the precision-recall curves (.png, .pdf, .svg)")
@@ -40,33 +71,164 @@ def add(commands: Any) -> None:
 
 
 def evaluate(args: Namespace) -> int:
-    """Measure techniques, one after another."""
+    """Measure stored similarities, or techniques, one after another."""
+    if args.similarity:
+        return _measure_similarities(args)
+    if args.out:
+        return _measure_many(args)
+    return _measure_techniques(args)
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or not 1 <= int(text) <= _MOST_WORKERS:
+        raise ArgumentTypeError(f"`{text}` is no number of workers: give 1 to {_MOST_WORKERS}")
+    return int(text)
+
+
+def _measure_many(args: Namespace) -> int:
+    """Measure many rows on many sets, with all that an earlier run has left."""
+    from edgevpr.evaluate.many import measure
+    from edgevpr.evaluate.output import as_json, write_results
+    from edgevpr.evaluate.tables import quality_text
+    from edgevpr.helpers.progress import progress
+
+    if args.plot:
+        raise UsageError("--plot goes without --out: the page in that folder has the curves.")
+    plan = _plan(args)
+    out = Path(args.out)
+    out.mkdir(parents=True, exist_ok=True)
+    outcome = measure(plan, args.cache or out / "cache", args.workers or len(os.sched_getaffinity(0)), progress)
+    write_results(out, outcome)
+    if args.json:
+        print_json(as_json(outcome))
+    else:
+        for of in outcome.sets:
+            if results := [each.result for each in outcome.found if each.set_name == of.name]:
+                print(f"{shown(of.name)}\n\n{quality_text(results)}\n")
+        print(f"{out / 'index.html'}: look at it. The cache holds {outcome.cache_bytes / 1e6:,.1f} MB.")
+    if outcome.damaged:
+        print(f"edgevpr: {outcome.damaged} entries of the cache were damaged, and were made anew", file=sys.stderr)
+    for (name, row), why in outcome.failed.items():
+        print(f"edgevpr: {shown(f'{name}, {row} was not measured: {why}')}", file=sys.stderr)
+    return 1 if outcome.failed else 0
+
+
+def _plan(args: Namespace) -> "Plan":
+    from edgevpr.evaluate.plan import RowPlan, SetPlan, of_flags, read_plan
+    from edgevpr.runtime.preflight.offers import offers
+
+    if args.sets:
+        if args.data or args.query or args.ref:
+            raise UsageError("--sets names all sets: leave --data, --query and --ref out.")
+        return read_plan(args.sets)
+    if not args.data:
+        raise UsageError("Name the data sets with --data, or a file of sets and rows with --sets.")
+    config, wanted, forms = config_of(args, args.config), _wanted(args), _forms(args)
+    if config.salience.use:
+        raise UsageError("--salience goes without --out: measure it on one set at a time.")
+    rows = {
+        offer.label: RowPlan(
+            technique=offer.name,
+            parameters={key: value for key, value in offer.settings.items() if key != "form"},
+            form=offer.settings.get("form"),
+            candidates=config.match.candidates,
+            sequence=config.match.sequence,
+            exact=args.exact,
+            follow=args.follow,
+        )
+        for offer in offers(wanted, forms, _settings(args, wanted))
+    }
+    common = SetPlan(
+        within_m=args.within_m,
+        within_deg=args.within_deg,
+        overlap=args.overlap,
+        fov_deg=value_of(args, "source.fov_deg"),
+    )
+    return of_flags(args.data, rows, common)
+
+
+def _wanted(args: Namespace) -> list[str]:
     from edgevpr import techniques
+
+    wanted = [name.strip() for name in args.techniques.split(",") if name.strip()]
+    if not wanted:
+        raise UsageError(f"--techniques names none: use some of {', '.join(techniques.names())}.")
+    return wanted
+
+
+def _forms(args: Namespace) -> list[str]:
+    forms = [form.strip() for form in args.form.split(",")]
+    if unknown := [form for form in forms if form not in FORMS]:
+        raise UsageError(f"--form names `{unknown[0]}`: use some of {', '.join(FORMS)}.")
+    return forms
+
+
+def _dataset(args: Namespace) -> "Dataset":
+    from edgevpr.evaluate.dataset import load_dataset
+    from edgevpr.evaluate.layouts import of_positions, open_folder
+    from edgevpr.evaluate.nearby import Nearness
+
+    rule = Nearness(args.within_m, args.within_deg, args.overlap, value_of(args, "source.fov_deg"))
+    if args.sets or args.workers or args.cache:
+        raise UsageError("Name a folder for the results with --out.")
+    if args.data:
+        if len(args.data) > 1:
+            raise UsageError("Several sets need a folder for the results: name it with --out.")
+        return open_folder(args.data[0], rule)
+    if not (args.query and args.ref):
+        raise UsageError("Name a data set with --data or --query and --ref, or stored similarities with --similarity.")
+    if args.ground_truth:
+        return load_dataset(args.query, args.ref, args.ground_truth)
+    return of_positions(args.query, args.ref, rule)
+
+
+def _measure_similarities(args: Namespace) -> int:
+    from dataclasses import asdict
+
+    from edgevpr.evaluate.curves import plot
+    from edgevpr.evaluate.similarity import measure, read_similarities
+    from edgevpr.evaluate.tables import quality_text
+    from edgevpr.evaluate.truth import read_truth
+    from edgevpr.frames.images import list_images
+    from edgevpr.helpers.figures import require_picture
+    from edgevpr.helpers.text import decoded_name
+
+    if not args.ground_truth:
+        raise UsageError("Name the ground truth of the stored similarities with --ground-truth.")
+    if args.plot:
+        require_picture(Path(args.plot))
+    truth = read_truth(args.ground_truth)
+    references = [decoded_name(path.name) for path in list_images(args.ref)] if args.ref else None
+    results = [measure(Path(file).stem, read_similarities(file), truth, references) for file in args.similarity]
+    if args.plot:
+        plot({Path(args.ground_truth).resolve().parent.name: results}, Path(args.plot))
+    if args.json:
+        print_json({"similarities": {result.technique: asdict(result) for result in results}})
+    else:
+        print(quality_text(results))
+    return 0
+
+
+def _measure_techniques(args: Namespace) -> int:
     from edgevpr.evaluate import evaluate as evaluation
     from edgevpr.evaluate.curves import plot
-    from edgevpr.evaluate.dataset import load_dataset
     from edgevpr.evaluate.tables import results_text
     from edgevpr.helpers.figures import require_picture
     from edgevpr.helpers.progress import progress
     from edgevpr.runtime.preflight.offers import offers, usable
     from edgevpr.runtime.recognise.opening import gate_of
 
-    wanted = [name.strip() for name in args.techniques.split(",") if name.strip()]
-    if not wanted:
-        raise UsageError(f"--techniques names none: use some of {', '.join(techniques.names())}.")
+    wanted, forms = _wanted(args), _forms(args)
     config = config_of(args, args.config)
     match, gate = config.match, gate_of(config.salience)
     if args.plot:
         require_picture(Path(args.plot))
-    forms = [form.strip() for form in args.form.split(",")]
-    if unknown := [form for form in forms if form not in FORMS]:
-        raise UsageError(f"--form names `{unknown[0]}`: use some of {', '.join(FORMS)}.")
     # A wrong setting is reported before the first hour of work; a network that cannot be used stops no other.
     tried = list(usable(offers(wanted, forms, _settings(args, wanted))))
     errors = {offer.label: each for offer, each in tried if isinstance(each, ModelError)}
     if len(errors) == len(tried):
         raise next(iter(errors.values()))
-    dataset = load_dataset(args.query, args.ref, args.ground_truth)
+    dataset = _dataset(args)
     results = [
         evaluation.evaluate(
             offer.name,
@@ -84,7 +246,7 @@ def evaluate(args: Namespace) -> int:
     ]
     results = evaluation.compare(results)
     if args.plot:
-        plot({Path(args.ground_truth).resolve().parent.name: results}, Path(args.plot))
+        plot({Path(args.data[0] if args.data else args.query).resolve().name: results}, Path(args.plot))
     if args.json:
         print_json(evaluation.as_json(results))
     else:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from edgevpr.evaluate.evaluate import TechniqueResult
+from edgevpr.evaluate.quality import Quality
 from edgevpr.helpers.figures import figure
 
 _PANELS_A_ROW = 3
@@ -11,7 +11,7 @@ _PANELS_A_ROW = 3
 _LINES = ("-", "--", ":", "-.")
 
 
-def plot(results: Mapping[str, Sequence[TechniqueResult]], path: Path) -> None:
+def plot(results: Mapping[str, Sequence[Quality]], path: Path) -> None:
     """Draw one panel per data set with one curve per technique, best AUC first in the legend, and write it to `path`.
 
     If all scores of a technique are the same, its curve is one point: it is drawn as a mark.

@@ -1,73 +1,51 @@
 """Measurement of a technique on a data set by the code that flies: map file, index, retrieval, stage meter."""
 
 import tempfile
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from edgevpr.config import load_config
 from edgevpr.contract import Technique
-from edgevpr.errors import ModelError, UsageError
+from edgevpr.errors import UsageError
 from edgevpr.evaluate import metrics
+from edgevpr.evaluate.asking import Answer, Asking, Progress, Walk, answers
 from edgevpr.evaluate.dataset import Dataset
-from edgevpr.frames.images import list_images, read_image
+from edgevpr.evaluate.quality import Quality, figures
 from edgevpr.frames.source import Source, open_source
 from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import Ranking, elsewhere
-from edgevpr.places.sequence import length_of, search_of
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import pack_ah, parse_pack, queries_ah, rail_ah, stage_energy_j
 from edgevpr.power.meter import QueryMeter
-from edgevpr.runtime.recognise.calibrated import calibration_of
 from edgevpr.runtime.recognise.evidence import kinds_of
-from edgevpr.runtime.recognise.follow import Follower
-from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.mapping import build_map
 from edgevpr.runtime.recognise.opening import meter_of
-from edgevpr.runtime.recognise.recogniser import Recogniser
-from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.salience.gate import Gate, NoGate
 from edgevpr.techniques import create, labelled
 from edgevpr.techniques.networks.card import weights_of
 from edgevpr.types import NO_COST, Frame, StageCost
 
-T = TypeVar("T")
-Progress = Callable[[Iterable[T], int, str], Iterable[T]]
-_NOTHING_FOUND = Ranking(np.empty(0, np.intp), np.empty(0, np.float32), {})  # a picture that says nothing
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TechniqueResult:
+class TechniqueResult(Quality):
     """Result of a technique (in one form) on a data set: its quality, its weights and its cost.
 
     Times are means over the queries: `t_match_s` is for all references, `t_match_per_ref_s` for one. `u_encode` and
     `u_match` are shares of all cores over those times (5.1). A place takes `descriptor_bytes` in RAM, and its fine part
     `fine_bytes` on disk. `ah_total` (5.7) is drawn from the pack, `ah_total_cpu_rail` from the thesis's rail of 2.5 V,
-    both for all queries; `ah_assumes` names board, pack and efficiency. `precision_recall` are the points of the curve,
-    from the highest threshold down. `accepted` queries would have moved the aircraft by the technique's own rule,
-    `accepted_wrong` of them to a wrong place, `accepted_elsewhere` of these to one that is no neighbour of a right
-    place (see `places.retrieve.elsewhere`). `roc_auc` is None if all best matches are right, or none is. `pcu` depends
-    on all techniques that are compared: `compare` fills it in, with the `t_encode_max_s` it used. `sequence` is the
+    both for all queries; `ah_assumes` names board, pack and efficiency. `accepted` queries would have moved the
+    aircraft by the technique's own rule, `accepted_wrong` of them to a wrong place, `accepted_elsewhere` of these to
+    one that is no neighbour of a right place (see `places.retrieve.elsewhere`). `pcu` depends on all techniques that
+    are compared: `compare` fills it in, with the `t_encode_max_s` it used. `sequence` is the
     number of queries that were matched together. `discarded` queries were not memorable, and count as missed.
     """
 
-    technique: str
     parameters: dict[str, int | float | str]
-    queries: int
-    references: int
-    recall_at_1: float
-    recall_at_5: float
-    recall_at_10: float
-    precision_at_100_recall: float
-    recall_at_100_precision: float
-    auc: float
-    ep: float
-    roc_auc: float | None
     accepted: int
     accepted_wrong: int
     accepted_elsewhere: int
@@ -81,29 +59,11 @@ class TechniqueResult:
     ah_total: float
     ah_total_cpu_rail: float
     ah_assumes: str
-    precision_recall: tuple[tuple[float, float], ...]
     sequence: int = 1
     discarded: int = 0
     weights: str | None = None
     pcu: float | None = None
     t_encode_max_s: float | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Answer:
-    """The answer to one query. `score` is that of its best match, `first_right` the rank of the first right one, both
-    among the references that count. `accepted`: the flight would have accepted the match; `accepted_wrong`: it would
-    have, and the match is wrong; `accepted_elsewhere`: and not beside a right one either. `discarded`: the query was
-    not memorable. `encoding` and `matching` are the costs of the two stages."""
-
-    score: float
-    first_right: float
-    accepted: bool
-    accepted_wrong: bool
-    accepted_elsewhere: bool
-    discarded: bool
-    encoding: StageCost
-    matching: StageCost
 
 
 def evaluate(
@@ -131,29 +91,11 @@ def evaluate(
     source = open_source(str(dataset.ref_dir), live=False)
     frames = progress(all_frames(source), source.total, f"{technique_name}: references")
     with mapped(frames, technique, meter, dataset.ref_dir) as (place_map, index):
-        length = length_of(technique.spec, sequence)
-        rule = accept_rule(technique, config.match, length, calibration_of(place_map))
-
-        follows = follow and length == 1 and rule.sure is not None
-
-        def walk(length: int, follows: bool) -> Recogniser:
-            return Recogniser(
-                technique=technique,
-                place_map=place_map,
-                index=index,
-                rule=rule,
-                meter=meter,
-                candidates=None if exact else candidates or technique.candidates,
-                search=search_of(length),
-                gate=gate,
-                follower=Follower(place_map, fastest_m_s=None, is_live=False) if follows else None,
-            )
-
-        # The first query pays for lazy imports, tables and a cold disk, so one that is not counted goes first.
-        _asked(walk(1, False), dataset.queries[0].path)
-        gate.forget()
-        answers = list(_answers(walk(length, follows), dataset, progress, length > 1 or follows))
-    return replace(_summary(technique, len(dataset.references), answers), sequence=length)
+        asking = Asking(candidates=candidates, sequence=sequence, exact=exact, follow=follow)
+        walk = Walk(technique, place_map, index, meter, asking=asking, gate=gate)
+        walk.warm_up(dataset.queries[0].path)
+        found = list(answers(walk, dataset, progress))
+    return replace(summary(technique, len(dataset.references), found), sequence=walk.length)
 
 
 @contextmanager
@@ -164,12 +106,32 @@ def mapped(
     an index with all its places. `images` is the folder that the frames come from."""
     with tempfile.TemporaryDirectory(prefix="edgevpr-eval-") as folder:
         path = Path(folder) / "references.gpkg"
-        with PlaceMap.create(path, technique.spec) as place_map:
-            build_map(frames, technique, place_map, meter)
-            _refine(place_map, technique, images)
-            _calibrate(place_map, technique, meter, images)
-        with PlaceMap.open(path) as place_map:
-            yield place_map, load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
+        make_map(path, frames, technique, meter, images)
+        with opened(path, technique) as (place_map, index):
+            yield place_map, index
+
+
+def make_map(
+    path: Path,
+    frames: Iterable[Frame],
+    technique: Technique,
+    meter: QueryMeter,
+    images: Path | None,
+    encoder: Technique | None = None,
+) -> None:
+    """Map frames in a new file, refine and calibrate the map as `map build` does. `encoder` makes the places (None: the
+    technique)."""
+    with PlaceMap.create(path, technique.spec) as place_map:
+        build_map(frames, encoder or technique, place_map, meter)
+        _refine(place_map, technique, images)
+        _calibrate(place_map, technique, meter, images)
+
+
+@contextmanager
+def opened(path: Path, technique: Technique) -> Iterator[tuple[PlaceMap, PlaceIndex]]:
+    """Give a map, open to read, and an index with all its places."""
+    with PlaceMap.open(path) as place_map:
+        yield place_map, load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
 
 
 def _refine(place_map: PlaceMap, technique: Technique, images: Path | None) -> None:
@@ -216,6 +178,15 @@ def as_json(results: Iterable[TechniqueResult]) -> dict[str, Any]:
     return {"techniques": {result.technique: asdict(result) for result in results}}
 
 
+def from_json(row: dict[str, Any]) -> TechniqueResult:
+    """Return a result that JSON has held, whatever stands beside it."""
+    known = {each.name: row[each.name] for each in fields(TechniqueResult) if each.name in row}
+    for name, value in known.items():
+        if name.endswith("_interval") and value:
+            known[name] = tuple(value)
+    return TechniqueResult(**{**known, "precision_recall": tuple(map(tuple, known["precision_recall"]))})
+
+
 def all_frames(source: Source) -> Iterator[Frame]:
     """Yield all frames of a folder. Raises ImageError for the first that cannot be used: a set with holes measures
     nothing."""
@@ -223,49 +194,11 @@ def all_frames(source: Source) -> Iterator[Frame]:
         yield source.read(timeout_s=0)
 
 
-def _answers(recogniser: Recogniser, dataset: Dataset, progress: Progress, in_sequence: bool) -> Iterator[_Answer]:
-    # Queries that are not scored are part of a sequence as well.
-    scored = {query.path.name: query for query in dataset.queries}
-    folder = dataset.queries[0].path.parent
-    asked = list_images(folder) if in_sequence else [query.path for query in dataset.queries]
-    for path in progress(asked, len(asked), f"{recogniser.technique.spec.name}: queries"):
-        event = _asked(recogniser, path)
-        if path.name not in scored:
-            continue
-        discarded = event.worth is not None and event.worth.reason is not None
-        query, ranking = scored[path.name], (None if discarded else event.ranking) or _NOTHING_FOUND
-        # Slots of the index follow the order of mapping, which is that of the references' names.
-        right = np.array([name in query.right for name in dataset.references])
-        ignored = np.array([name in query.ignored for name in dataset.references])
-        at = metrics.counting(ranking.slots, ignored)
-        wrong = event.accepted and not (right | ignored)[ranking.slots[0]]
-        away = wrong and elsewhere(recogniser.index, ranking.slots[0], np.flatnonzero(right | ignored), 0.0).all()
-        yield _Answer(
-            score=float(ranking.scores[at[0]]) if len(at) else 0.0,
-            first_right=metrics.first_right(ranking.slots[at], right),
-            accepted=event.accepted,
-            accepted_wrong=bool(wrong),
-            accepted_elsewhere=bool(away),
-            discarded=discarded,
-            encoding=event.steps.encoding,
-            matching=event.steps.match,
-        )
-
-
-def _asked(recogniser: Recogniser, path: Path) -> Recognition:
-    """Recognise one image. A failure ends the evaluation (ModelError): a set with holes measures nothing."""
-    event = recogniser.step(Frame(image=read_image(path), name=path.name, t_mono_s=0.0))  # a folder has no gaps
-    if event.failed:
-        raise ModelError(event.reason)
-    return event
-
-
-def _summary(technique: Technique, references: int, answers: list[_Answer]) -> TechniqueResult:
+def summary(technique: Technique, references: int, answers: Sequence[Answer]) -> TechniqueResult:
+    """Return the result of a technique from its answers to all queries; `sequence` and the PCU are those of nobody."""
     queries = len(answers)
     scores = np.array([answer.score for answer in answers])
     ranks = np.array([answer.first_right for answer in answers])
-    precision, recall = metrics.precision_recall(scores, ranks == 0)
-
     config = load_config(None)
     board, pack, efficiency = load_board("this"), parse_pack(config.battery.pack), config.battery.regulator_efficiency
     encoding, matching = _total(answer.encoding for answer in answers), _total(answer.matching for answer in answers)
@@ -280,14 +213,7 @@ def _summary(technique: Technique, references: int, answers: list[_Answer]) -> T
         parameters=technique.spec.parameters,
         queries=queries,
         references=references,
-        recall_at_1=metrics.recall_at(1, ranks),
-        recall_at_5=metrics.recall_at(5, ranks),
-        recall_at_10=metrics.recall_at(10, ranks),
-        precision_at_100_recall=metrics.precision_at_100_recall(precision, recall),
-        recall_at_100_precision=metrics.recall_at_100_precision(precision, recall),
-        auc=metrics.auc(precision, recall),
-        ep=metrics.extended_precision(precision, recall),
-        roc_auc=metrics.roc_auc(scores, ranks == 0),
+        **figures(scores, ranks),
         accepted=sum(answer.accepted for answer in answers),
         accepted_wrong=sum(answer.accepted_wrong for answer in answers),
         accepted_elsewhere=sum(answer.accepted_elsewhere for answer in answers),
@@ -305,7 +231,6 @@ def _summary(technique: Technique, references: int, answers: list[_Answer]) -> T
             f"{board.title}, {board.idle_w:g} W idle and {board.full_w:g} W at full load ({board.source}), "
             f"pack {config.battery.pack}, regulator efficiency {efficiency:g}"
         ),
-        precision_recall=tuple(zip(precision.round(5).tolist(), recall.round(5).tolist(), strict=True)),
     )
 
 

@@ -51,6 +51,12 @@ def auc(precision: np.ndarray, recall: np.ndarray) -> float:
     return float(np.sum((precision[:-1] + precision[1:]) / 2 * np.diff(recall)))
 
 
+def auc_from_zero(precision: np.ndarray, recall: np.ndarray) -> float:
+    """Compute the area under the same curve, begun at recall 0 and precision 1: the figure of scikit-learn, and of most
+    papers."""
+    return float((1 + precision[0]) / 2 * recall[0]) + auc(precision, recall)
+
+
 def recall_at_100_precision(precision: np.ndarray, recall: np.ndarray) -> float:
     """Return the largest recall at which every accepted match is right; 0 if the best-scoring match is wrong."""
     return float(recall[precision == 1].max(initial=0))

@@ -20,9 +20,9 @@ def aligned(rows: Sequence[Sequence[str]], left: int = 1) -> list[str]:
     ]
 
 
-def markdown(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a Markdown table: the first column flush left, the others flush right."""
-    ruler = ["---"] + ["---:"] * (len(headings) - 1)
+def markdown(headings: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1) -> str:
+    """Return a Markdown table: the first `left` columns flush left, the others flush right."""
+    ruler = ["---"] * left + ["---:"] * (len(headings) - left)
     return "\n".join("| " + " | ".join(line) + " |" for line in (headings, ruler, *rows))
 
 

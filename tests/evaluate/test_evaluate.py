@@ -102,11 +102,13 @@ def test_progress_is_shown_for_references_and_queries(folder):
 
 def test_the_text_tables_line_up_and_name_what_their_figures_rest_on(folder):
     printed = results_text(compare([evaluate("hog", load(folder), HOG)]))
-    reached, paid, notes = printed.split("\n\n")
-    for table in (reached, paid):
+    *tables, notes = printed.split("\n\n")
+    assert len(tables) == 3
+    for table in tables:
         head, row = table.splitlines()
         assert len(head) == len(row) <= 120
-    assert reached.splitlines()[1].split()[:2] == ["hog", "0.875"]
+    found, _, paid = tables
+    assert found.splitlines()[1].split()[:2] == ["hog", "0.875"]
     assert "3528" in paid  # 7 x 7 blocks of 36 values, 2 bytes each
     assert "8 queries scored against 8 references" in notes
     assert "t_e,max" in notes
@@ -115,3 +117,8 @@ def test_the_text_tables_line_up_and_name_what_their_figures_rest_on(folder):
 def test_a_markdown_table_has_a_cell_for_every_heading():
     lines = markdown(("set", "recall"), [["corridor", "0.66"], ["park", "0.2"]]).splitlines()
     assert lines == ["| set | recall |", "| --- | ---: |", "| corridor | 0.66 |", "| park | 0.2 |"]
+
+
+def test_columns_of_text_in_a_markdown_table_are_flush_left():
+    lines = markdown(("fault", "kept", "s"), [["power cut", "the log", "2"]], left=2).splitlines()
+    assert lines[1] == "| --- | --- | ---: |"

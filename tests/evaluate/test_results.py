@@ -1,0 +1,164 @@
+"""The command on many sets and rows, and the files and the page that it leaves."""
+
+import csv
+import json
+import re
+import shutil
+
+import pytest
+from browser import show
+from generated_sets import make_set
+
+from edgevpr.cli.main import main
+
+NASTY = "<script>alert(1)</script><img src=http://example.test/x.png>"
+PLAN = f"""
+sets:
+  meadow: {{folder: meadow}}
+  "{NASTY}": {{folder: meadow, camera: nadir}}
+rows:
+  cohog: {{technique: cohog, parameters: {{w1: 208}}}}
+  "hog|{NASTY}": {{technique: hog, parameters: {{w1: 64}}, form: 1bit}}
+"""
+
+
+def run(*argv):
+    return main(["eval", *map(str, argv)])
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory):
+    """A folder with the results of two sets by two rows."""
+    folder = tmp_path_factory.mktemp("results")
+    make_set(folder / "meadow")
+    (folder / "plan.yaml").write_text(PLAN)
+    assert run("--sets", folder / "plan.yaml", "--out", folder / "out", "--workers", "1") == 0
+    return folder / "out"
+
+
+def test_every_result_says_who_made_it(out):
+    content = json.loads((out / "results.json").read_text())
+    assert len(content["results"]) == 4
+    assert content["seeds"]["resamples"] > 0
+    for each in content["results"]:
+        made = each["made"]
+        assert made["machine"]["cpu"] == content["machine"]["cpu"]
+        assert made["versions"]["numpy"]
+        assert made["versions"]["edgevpr"] == content["versions"]["edgevpr"]
+        assert re.fullmatch(r"\d{4}-\d\d-\d\d", made["first"])
+        assert each["queries"] == 5
+        assert each["recall_at_k"][0] == each["recall_at_1"]
+        assert each["recall_at_k"] == sorted(each["recall_at_k"])
+        assert each["pcu"] > 0
+
+
+def test_tables_say_the_same(out):
+    content = json.loads((out / "results.json").read_text())
+    with open(out / "results.csv", newline="") as handle:
+        lines = list(csv.DictReader(handle))
+    for line, each in zip(lines, content["results"], strict=True):
+        assert (line["set"], line["row"]) == (each["set"], each["row"])
+        assert float(line["recall_at_1"]) == each["recall_at_1"]
+        assert float(line["t_encode_s"]) == each["t_encode_s"]
+        assert line["first"] == each["made"]["first"]
+    said = (out / "results.md").read_text()
+    rows = [line for line in said.splitlines() if line.startswith("| cohog |")]
+    assert [f"{each['recall_at_1']:.3f}" in row for each, row in zip(content["results"][::2], rows[::2], strict=True)]
+    assert "hog\\|<script>" in said, "a name does not break a table"
+
+
+def test_the_page_shows_curves_costs_and_matches(out):
+    page = (out / "index.html").read_text()
+    for part in ("All sets", "Precision over recall", "Recall@K", "its 95 % interval", "over charge", "over memory"):
+        assert part in page, part
+    assert page.count('<div class="match wrong">') >= 4
+    wrong = re.search(r'<div class="match wrong">.*?</div></div>', page)[0]
+    shown = re.findall(r'<img alt="([^"]*)" src="data:image/jpeg;base64,[^"]+"><figcaption>(\w+): ', wrong)
+    assert [what for _, what in shown] == ["query", "found", "right"]
+    scores = [
+        float(each)
+        for each in re.findall(r'<div class="match wrong"><p>.*?score ([\d.e-]+)', page.split("<details")[1])
+    ]
+    assert scores == sorted(scores, reverse=True)
+    assert "<script" not in page
+    assert "measured earlier" not in page
+
+
+def test_a_second_run_says_that_it_measured_nothing(out, tmp_path, capsys):
+    shutil.copytree(out.parent, tmp_path / "copy")
+    folder = tmp_path / "copy"
+    assert run("--sets", folder / "plan.yaml", "--out", folder / "out", "--workers", "2") == 0
+    assert "cache holds" in capsys.readouterr().out
+    assert "4 of 4 results were measured earlier" in (folder / "out" / "index.html").read_text()
+    before, now = (json.loads((each / "results.json").read_text())["results"] for each in (out, folder / "out"))
+    for one, other in zip(before, now, strict=True):
+        assert other["made"] == {**one["made"], "was_kept": True}
+        assert {**other, "made": 0} == {**one, "made": 0}
+    assert "earlier, 2" in (folder / "out" / "results.md").read_text()
+
+
+def test_a_browser_asks_for_nothing_and_complains_of_nothing(out):
+    shown = show(out / "index.html")
+    assert "Precision over recall" in shown.content
+    assert (shown.console, shown.requests) == ([], [])
+
+
+def test_the_page_fits_a_phone(out, tmp_path):
+    content = re.sub(r"<meta http-equiv[^>]*>", "", (out / "index.html").read_text("utf-8"))
+    measure = "`${document.documentElement.scrollWidth} ${innerWidth}`"
+    content = content.replace("</body>", f"<script>document.title = {measure}</script></body>")
+    (tmp_path / "measured.html").write_text(content, "utf-8")
+    wide, room = map(int, re.search("<title>([^<]*)<", show(tmp_path / "measured.html", 390).content)[1].split())
+    assert wide <= room <= 500
+
+
+def test_sets_by_flags_print_json(out, tmp_path, capsys):
+    meadow, other = out.parent / "meadow", make_set(tmp_path / "other", first=6)
+    flags = ["--techniques", "hog", "--param", "hog.w1=64", "--form", "float,8bit", "--json", "--workers", "1"]
+    assert run("--data", meadow, other, "--out", tmp_path / "out", *flags) == 0
+    content = json.loads(capsys.readouterr().out)
+    assert [(each["set"], each["row"]) for each in content["results"]] == [
+        (name, row) for name in ("meadow", "other") for row in ("hog", "hog 8bit")
+    ]
+
+
+def test_what_could_not_be_measured_is_said_everywhere(tmp_path, capsys):
+    broken = make_set(tmp_path / "broken")
+    (broken / "ref" / "r1.png").write_bytes(b"")
+    flags = ["--techniques", "hog", "--param", "hog.w1=64", "--workers", "1"]
+    assert run("--data", broken, "--out", tmp_path / "out", *flags) == 1
+    assert "broken, hog was not measured: " in capsys.readouterr().err
+    assert json.loads((tmp_path / "out" / "results.json").read_text())["failed"][0]["set"] == "broken"
+    for name in ("index.html", "results.md"):
+        assert "r1.png is empty" in (tmp_path / "out" / name).read_text()
+
+
+@pytest.mark.parametrize(
+    ("argv", "said"),
+    [
+        (["--data", "SET", "SET"], "name it with --out"),
+        (["--sets", "plan.yaml"], "Name a folder for the results with --out"),
+        (["--data", "SET", "--workers", "2"], "Name a folder for the results with --out"),
+        (["--out", "out"], "Name the data sets with --data"),
+        (["--sets", "plan.yaml", "--data", "SET", "--out", "out"], "leave --data, --query and --ref out"),
+        (["--sets", "gone.yaml", "--out", "out"], "gone.yaml cannot be read"),
+        (["--data", "gone", "--out", "out"], "there is no such folder"),
+        (["--data", "SET", "--out", "out", "--plot", "a.png"], "--plot goes without --out"),
+        (["--data", "SET", "--out", "out", "--techniques", "cohogg"], "cohogg"),
+        (["--data", "SET", "--out", "out", "--salience"], "--salience goes without --out"),
+    ],
+)
+def test_a_wrong_request_gets_one_sentence(out, tmp_path, monkeypatch, capsys, argv, said):
+    monkeypatch.chdir(tmp_path)
+    meadow = str(out.parent / "meadow")
+    assert run(*[meadow if each == "SET" else each for each in argv]) == 2
+    err = capsys.readouterr().err
+    assert said in err
+    assert "Traceback" not in err
+
+
+@pytest.mark.parametrize("count", ["0", "-1", "x", "1000"])
+def test_a_wrong_number_of_workers_is_refused(count, capsys):
+    with pytest.raises(SystemExit):
+        run("--data", "x", "--out", "y", "--workers", count)
+    assert "give 1 to 256" in capsys.readouterr().err
