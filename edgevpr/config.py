@@ -8,7 +8,7 @@ import os
 import types
 import typing
 from collections.abc import Iterator
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -170,11 +170,13 @@ class MavlinkConfig:
     signing_state: str | None = field()
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LogConfig:
     path: str | None = keyed(Flag(("--log",), "FILE", "flight log, JSON lines"))
     tlog: str | None = keyed(Flag(("--tlog",), "FILE", "every packet of the link, for mavlogdump and ground stations"))
     max_mb: float | None = bounded(1, 1_000_000)
+    record: str | None = keyed(Flag(("--record",), "FOLDER", "frames and all else that `edgevpr replay` needs"))
+    record_mb: float = bounded(10, 1_000_000)
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,6 +247,21 @@ def load_config(path: str | Path | None, overrides: dict[str, Any] | None = None
                 target = target[section]
             target[key] = value
     return build(Config, merged, str(path or "the command line"))
+
+
+def changed_config(config: Config, path: str | Path) -> Config:
+    """Return a configuration with the keys of a YAML file in place of its own. Raises ConfigError."""
+    return build(Config, _overlaid(asdict(config), read_yaml(path), str(path), ""), str(path))
+
+
+def with_logs_in(config: Config, folder: str) -> Config:
+    """Return a configuration in which the relative paths of all that a flight writes about itself are meant from a
+    folder."""
+    log = config.log
+    named = {"path": log.path, "tlog": log.tlog, "record": log.record}
+    return replace(
+        config, log=replace(log, **{key: path and os.path.join(folder, path) for key, path in named.items()})
+    )
 
 
 def build(cls: type[T], mapping: dict[str, Any], where: str, prefix: str = "") -> T:

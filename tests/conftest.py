@@ -13,6 +13,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 LONGEST = (
     "test_learning_flight",
     "test_frames_damage",
+    "test_soak",
     "test_flight_process",
     "test_hostile_links",
     "test_gate",

@@ -5,6 +5,7 @@ Each keeps the promises of the real thing, and `test_fakes.py` holds both to the
 
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -31,6 +32,8 @@ class FakeClock:
         self._events: list[tuple[float, Callable[[], object]]] = []
         self.clock = Clock(
             mono_s=self,
+            wall_s=self,
+            utc_s=self.utc_s,
             process_cpu_s=lambda: self.cpu_s,
             thread_cpu_s=lambda: self.thread_cpu_s,
             sleep=self.sleep,
@@ -147,6 +150,9 @@ class FakeLink:
         self._fixes: list[Fix] = []
         self._acks: Counter[str] = Counter()
         self._offered, self._wishes = (), []
+
+    def turn(self, what: str) -> AbstractContextManager[None]:
+        return nullcontext()
 
     def send(self, *outgoing) -> None:
         self.sent += outgoing

@@ -22,7 +22,7 @@ def changed(
     grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
     warp = _from_beside(grey.shape, rng, strength, looks_down)
     seen = _warped(grey.astype(np.float32) / 255, warp, cv2.INTER_LINEAR)
-    seen = _another_season(seen, rng, strength)
+    seen = another_season(seen, rng, strength)
     seen = _another_light(seen, rng, strength)
     _hide(seen, rng, strength)
     if shown is not None:
@@ -47,8 +47,12 @@ def _warped(image: np.ndarray, warp: np.ndarray, flags: int) -> np.ndarray:
     return cv2.warpPerspective(image, warp, image.shape[::-1], flags=flags, borderMode=cv2.BORDER_REFLECT)
 
 
-def _another_season(grey: np.ndarray, rng: np.random.Generator, strength: float) -> np.ndarray:
-    """Give tones other values, differently in different parts, as leaves and snow do; and a texture of its own."""
+def another_season(grey: np.ndarray, rng: np.random.Generator, strength: float) -> np.ndarray:
+    """Give tones other values, differently in different parts, as leaves and snow do; and a texture of its own.
+
+    `grey` is float32 (H, W), 0..1, and so is the result, but for values beyond. `strength` is 0 (hardly anything) to
+    1.3.
+    """
     height, width = grey.shape
     tones = np.clip(255 * grey, 0, 255).astype(np.uint8)
     one, other = (_curve(rng, strength)[tones] for _ in range(2))

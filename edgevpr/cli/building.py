@@ -33,6 +33,13 @@ if TYPE_CHECKING:
     from edgevpr.refine.refine import Refined
 
 
+_WITHOUT_POSITIONS = (
+    "no place has a position, and a map without positions sends no fixes: it only says which place is recognised. Give "
+    "pictures with GPS in their EXIF data, or a positions.csv beside them (file,lat,lon[,alt,...], --positions); of a "
+    "video, cut it into pictures first"
+)
+
+
 def add(maps: Any) -> None:
     """Add the commands and their flags to those of maps."""
     build = command(maps, "build", map_build, "make a map of a flight, or of an orthophoto")
@@ -70,10 +77,11 @@ def map_build(args: Namespace) -> int:
     from edgevpr.frames.mask import mask_of
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.places.mapfiles import map_path, remove
+    from edgevpr.places.mapinfo import info_of
     from edgevpr.power.boards import load_board
     from edgevpr.runtime.preflight.pick import camera_setting, picked_technique
     from edgevpr.runtime.recognise.gaps import Gaps
-    from edgevpr.runtime.recognise.levelling import levelling_of
+    from edgevpr.runtime.recognise.levelling import NoLevelling, levelling_of
     from edgevpr.runtime.recognise.mapping import build_map
     from edgevpr.runtime.recognise.opening import gate_of, made_for, meter_of, say_other_mask, technique_of
 
@@ -109,7 +117,8 @@ def map_build(args: Namespace) -> int:
     with place_map:
         frames = frames_of(source, "mapping", unusable)
         meter = meter_of(config, here)
-        levelling = levelling_of(config.source, technique, below=True)
+        # What is cut lies on the ground already, and no lens has seen it.
+        levelling = NoLevelling() if is_cut else levelling_of(config.source, technique, below=True)
         try:
             result = build_map(
                 frames,
@@ -128,6 +137,7 @@ def map_build(args: Namespace) -> int:
                 remove(path)
             raise
         places = len(place_map)
+        has_positions = info_of(place_map).with_position > 0
         refined = _refined_after(place_map, technique, args) if args.refine else None
         calibrated = None
         if args.calibrate:
@@ -157,6 +167,8 @@ def map_build(args: Namespace) -> int:
             _print_refined(args.map, refined, technique.spec.cells)
         if calibrated:
             print(f"expect: {calibrated.said()}")
+        if places and not has_positions:
+            print(f"{args.map}: {_WITHOUT_POSITIONS}")
     return exit_code(unusable)
 
 

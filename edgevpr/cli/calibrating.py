@@ -46,7 +46,7 @@ def map_calibrate(args: Namespace) -> int:
     from edgevpr.frames.mask import mask_of
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.power.boards import load_board
-    from edgevpr.runtime.recognise.levelling import levelling_of
+    from edgevpr.runtime.recognise.levelling import NoLevelling, levelling_of
     from edgevpr.runtime.recognise.opening import meter_of, technique_of
 
     config = config_of(args, args.config)
@@ -54,7 +54,7 @@ def map_calibrate(args: Namespace) -> int:
     mask = mask_of(None if args.orthophoto else config.source.mask)
     with PlaceMap.open_for_adding(args.map) as place_map:
         technique = technique_of(place_map)
-        levelling = levelling_of(config.source, technique, below=True)
+        levelling = NoLevelling() if args.orthophoto else levelling_of(config.source, technique, below=True)
         meter = meter_of(config, load_board("this"))
         found = calibrated(args, place_map, technique, config.match, meter, mask, levelling)
     if args.json:

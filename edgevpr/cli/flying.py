@@ -1,5 +1,6 @@
 """Commands that use a map: `edgevpr match`, `run`, `check` and `service`."""
 
+import os
 from argparse import Namespace
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from edgevpr.cli.shared import (
     path_of,
     print_json,
 )  # fmt: skip
+from edgevpr.config import Config, with_logs_in
 from edgevpr.errors import ImageError, UsageError
 from edgevpr.helpers.text import shown
 
@@ -117,11 +119,12 @@ def run_match(args: Namespace) -> int:
 
 def run_flight(args: Namespace) -> int:
     """Fly with a configuration."""
-    from edgevpr.runtime.flight.reloading import Reread
     from edgevpr.runtime.service.fly import fly
 
-    reread = Reread(lambda: config_of(args, args.config)) if args.config else None
-    return fly(config_of(args, args.config), path_of(args.positions), reread)
+    def config() -> Config:
+        return with_logs_in(config_of(args, args.config), os.environ.get("LOGS_DIRECTORY", ""))
+
+    return fly(config(), path_of(args.positions), config if args.config else None)
 
 
 def run_check(args: Namespace) -> int:

@@ -9,13 +9,25 @@ import threading
 from functools import cache
 
 from edgevpr import __version__
-from edgevpr.cli import doctor, evaluation, flying, maps, networks, profile, review, salience, simulation, top
+from edgevpr.cli import (
+    doctor,
+    evaluation,
+    flying,
+    maps,
+    networks,
+    profile,
+    replaying,
+    review,
+    salience,
+    simulation,
+    top,
+)
 from edgevpr.cli.screen import LineFormatter, guarded_output
 from edgevpr.config import require_sayable
 from edgevpr.errors import EdgevprError
 from edgevpr.helpers.text import shown
 
-_GROUPS = (maps, flying, top, review, doctor, profile, salience, evaluation, simulation, networks)
+_GROUPS = (maps, flying, top, review, replaying, doctor, profile, salience, evaluation, simulation, networks)
 
 
 def program() -> None:

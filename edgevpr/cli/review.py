@@ -1,5 +1,6 @@
 """Commands for after a flight: `edgevpr report` and `edgevpr export`."""
 
+import logging
 import sys
 from argparse import ArgumentTypeError, Namespace
 from pathlib import Path
@@ -12,6 +13,8 @@ if TYPE_CHECKING:
     from edgevpr.report.flight import Flight
     from edgevpr.report.ground import Ground
 
+_log = logging.getLogger(__name__)
+
 
 def add(commands: Any) -> None:
     """Add the commands and their flags."""
@@ -20,7 +23,7 @@ def add(commands: Any) -> None:
     report.add_argument("--out", required=True, metavar="FILE", help="the page to write (.html)")
     report.add_argument("--map", metavar="MAP", help="draw over its ground (default: that of the log's first line)")
     for flag, text in (
-        ("--images", "frames of this flight"),
+        ("--images", "frames of this flight (those of its recording need none)"),
         ("--map-images", "the pictures that the map was made of"),
     ):
         report.add_argument(flag, action="append", default=[], metavar="DIR", help=f"folder with {text}; repeatable")
@@ -45,14 +48,15 @@ def _number(text: str) -> int:
 def run_report(args: Namespace) -> int:
     """Make the page of a flight."""
     from edgevpr.helpers.files import require_folder, write_whole
-    from edgevpr.report.flight import read_flight
     from edgevpr.report.page import page_of
     from edgevpr.report.pictures import Album
+    from edgevpr.runtime.flight.recording import frames_of, recording_of
 
     out = _out(args.out, args.log)
     require_folder(out)
-    frames, references = Album(args.images), Album(args.map_images)
-    flight = read_flight(args.log, args.flight)
+    flight = _read(args)
+    folder = recording_of(flight.recording, args.log)
+    frames, references = Album(args.images, frames_of(folder) if folder else {}), Album(args.map_images)
     page = page_of(flight, _ground(args.map, flight), frames, references)
     write_whole(out, lambda unfinished: unfinished.write_text(page, "utf-8", "backslashreplace"))
     print(f"{out}: {len(flight.queries)} queries, flight {flight.number} of {flight.flights} in {args.log}")
@@ -63,10 +67,9 @@ def run_export(args: Namespace) -> int:
     """Write what a flight found, for other programs."""
     from edgevpr.helpers.files import require_folder, write_whole
     from edgevpr.report.export import WRITERS, features_of
-    from edgevpr.report.flight import read_flight
 
     form, target = next((name, given) for name in WRITERS if (given := getattr(args, name)) is not None)
-    features = features_of(read_flight(args.log, args.flight))
+    features = features_of(_read(args))
     write = WRITERS[form]
     if target == "-":
         write(features, sys.stdout)
@@ -81,6 +84,15 @@ def run_export(args: Namespace) -> int:
     write_whole(out, written)
     print(f"{out}: {len(features)} points")
     return 0
+
+
+def _read(args: Namespace) -> "Flight":
+    from edgevpr.report.flight import read_flight
+
+    flight = read_flight(args.log, args.flight)
+    if flight.missing:
+        _log.warning("%s", flight.missing)
+    return flight
 
 
 def _out(target: str, log: str) -> Path:

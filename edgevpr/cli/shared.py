@@ -61,7 +61,7 @@ def add_positions(parser: ArgumentParser) -> None:
 
 
 def add_parameters(parser: ArgumentParser, text: str, form: str = "KEY=VALUE") -> None:
-    """Add --param, for parameters of a technique; it may be given several times."""
+    """Add --param, for parameters of a technique or a vehicle; it may be given several times."""
     parser.add_argument("--param", action="append", default=[], metavar=form, help=text)
 
 
@@ -92,11 +92,11 @@ def config_of(args: Namespace, path: str | None = None, **others: Any) -> Config
     return load_config(path, said | others)
 
 
-def parameters_of(pairs: list[str]) -> dict[str, str]:
+def parameters_of(pairs: list[str], example: str = "gt=0.4") -> dict[str, str]:
     """Read ["gt=0.4"] as {"gt": "0.4"}. Raises UsageError for another form."""
     for pair in pairs:
         if "=" not in pair:
-            raise UsageError(f"--param {pair}: write KEY=VALUE, e.g. gt=0.4.")
+            raise UsageError(f"--param {pair}: write KEY=VALUE, e.g. {example}.")
     return dict(pair.split("=", 1) for pair in pairs)
 
 

@@ -6,11 +6,12 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from edgevpr.cli.shared import add_json, command, group, print_json
+from edgevpr.cli.shared import add_json, add_parameters, command, group, parameters_of, print_json
 from edgevpr.errors import UsageError
 
 # Those of edgevpr.simulate.flightcontroller.controller, which is not loaded for a page of help.
 _VEHICLES = ("arduplane", "arducopter", "ardurover", "px4-copter", "px4-plane")
+_PARAMETER = "GPS2_TYPE=14"  # an example
 
 
 def add(commands: Any) -> None:
@@ -20,12 +21,13 @@ def add(commands: Any) -> None:
     autopilot.add_argument("--link", default="udpin:127.0.0.1:14550", metavar="URL", help="(udpin:127.0.0.1:14550)")
     autopilot.add_argument("--duration-s", type=float, metavar="S", help="how long (default: until stopped)")
     autopilot.add_argument(
-        "--track", metavar="CSV", help="a positions.csv with times to fly along, from when a companion is first heard"
+        "--track", metavar="CSV", help="a positions.csv with times to fly along, from when a flight is first heard"
     )
     autopilot.add_argument("--vehicle", choices=_VEHICLES, default=_VEHICLES[0], help=f"({_VEHICLES[0]})")
     autopilot.add_argument(
         "--no-gps", action="store_true", help="it has lost GPS, as it always has without --track: then it takes fixes"
     )
+    add_parameters(autopilot, f"a parameter of the vehicle, e.g. {_PARAMETER}, as if set before it was started")
     add_json(autopilot)
     text = "write a flight, generated or over an orthophoto: images and positions.csv"
     flight = command(simulations, "flight", simulate_flight, text)
@@ -56,7 +58,14 @@ def simulate_autopilot(args: Namespace) -> int:
 
     track = read_track(args.track) if args.track else None
     has_gps = track is not None and not args.no_gps
-    summary = run_autopilot(args.link, args.duration_s, track=track, vehicle=args.vehicle, gps=has_gps)
+    summary = run_autopilot(
+        args.link,
+        args.duration_s,
+        track=track,
+        vehicle=args.vehicle,
+        gps=has_gps,
+        parameters=parameters_of(args.param, _PARAMETER),
+    )
     if args.json:
         print_json(asdict(summary))
     else:

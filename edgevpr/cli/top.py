@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 _SOCKET = "/run/edgevpr/status.sock"
 _LOOK_S = 1.5  # a status comes once a second
 _ONCE_S = 10.0  # a slow frame delays it
+_CHANNELS = {"COMMAND": "command 43003", "SENSOR": "message 296"}  # the others are called as their messages
 
 Row = tuple[str, str]
 
@@ -109,7 +110,7 @@ def _link(link: "LinkState | None") -> list[Row]:
         return [("link", "none")]
     heard = "no flight controller is heard"
     if link.autopilot is not None:
-        heard = f"flight controller {link.autopilot}, told by {link.channel}"
+        heard = f"flight controller {link.autopilot}, told by {_CHANNELS.get(link.channel, link.channel)}"
     state = link.trouble or ("open" if link.connected else "not open")
     answers = ", ".join(f"{count} {name}" for name, count in link.answers.items()) or "none"
     unanswered = f", {link.unanswered} missing" if link.unanswered else ""

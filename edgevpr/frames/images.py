@@ -13,6 +13,7 @@ from edgevpr.helpers.files import read_file
 
 EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm")
 MIN_SIDE_PX = 16
+_NAMED = 3  # folders, in a sentence
 # The largest survey cameras that are flown have 100 megapixels (11664 x 8750); decoded that is 300 MB. Without a limit
 # a file of 1 MB, which compresses well, takes gigabytes.
 MAX_PIXELS = 102_100_000
@@ -38,11 +39,12 @@ def list_images(folder: str | Path) -> list[Path]:
         raise SourceError(f"The folder {folder} does not exist: give the folder that holds the images.") from None
     except OSError as error:
         raise SourceError(f"{folder} cannot be listed ({error.strerror}): give a folder of images.") from error
-    # Files that begin with a dot are metadata of other systems (._IMG_1.jpg), not photographs.
-    images = [name for name in names if name.lower().endswith(EXTENSIONS) and not name.startswith(".")]
+    images = [name for name in names if _is_image(name)]
     if not images:
-        raise SourceError(f"The folder {folder} holds no images ({' '.join(EXTENSIONS)}): give the one that does.")
-    return [folder / name for name in sorted(images, key=_counting_order)]
+        inner = [path for path in map(folder.joinpath, sorted(names, key=counting_order)) if _holds_images(path)]
+        advice = f"give {' or '.join(map(str, inner[:_NAMED]))}" if inner else "give the one that does"
+        raise SourceError(f"The folder {folder} holds no images ({' '.join(EXTENSIONS)}): {advice}.")
+    return [folder / name for name in sorted(images, key=counting_order)]
 
 
 def read_image(path: str | Path) -> np.ndarray:
@@ -66,7 +68,7 @@ def read_image(path: str | Path) -> np.ndarray:
     header = read_header(data)
     if header:
         _require_usual(path, header)
-    image = _decoded(data) if header else None
+    image = decoded(data) if header else None
     if image is None:
         raise ImageError(f"{path} is not an image edgevpr can decode: give a JPEG, PNG, TIFF, BMP or WebP file.")
     if image.dtype != np.uint8:
@@ -93,12 +95,26 @@ def _other_depth(path: str | Path, bits: int) -> ImageError:
     return ImageError(f"{path} has {bits} bits a channel; edgevpr reads 8-bit images: convert it first.")
 
 
-def _counting_order(name: str) -> tuple[list[str | int], str]:
+def _is_image(name: str) -> bool:
+    # Files that begin with a dot are metadata of other systems (._IMG_1.jpg), not photographs.
+    return name.lower().endswith(EXTENSIONS) and not name.startswith(".")
+
+
+def _holds_images(folder: Path) -> bool:
+    try:
+        return any(_is_image(path.name) for path in folder.iterdir())
+    except OSError:
+        return False  # no folder, or one that may not be listed
+
+
+def counting_order(name: str) -> tuple[list[str | int], str]:
+    """Return the key that sorts names with their numbers in counting order (2 before 10)."""
     parts = re.split(r"(\d+)", name.lower())
     return [int(part) if i % 2 else part for i, part in enumerate(parts)], name
 
 
-def _decoded(data: bytes) -> np.ndarray | None:
+def decoded(data: bytes) -> np.ndarray | None:
+    """Decode an image file, (H, W, 3) BGR or (H, W) grey; None where it cannot be."""
     try:
         return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
     except cv2.error:  # a header that promises more pixels than OpenCV is willing to hold

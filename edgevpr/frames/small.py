@@ -7,9 +7,9 @@ _LONGEST_PX = 640
 _QUALITY = 80
 
 
-def small_jpeg(image: np.ndarray) -> bytes:
-    """Return a picture, uint8, grey or BGR, as a JPEG whose longest side has 640 pixels at most."""
-    scale = min(1.0, _LONGEST_PX / max(image.shape[:2]))
+def small_jpeg(image: np.ndarray, longest_px: int = _LONGEST_PX) -> bytes:
+    """Return a picture, uint8, grey or BGR, as a JPEG whose longest side has 640 pixels at most, or `longest_px`."""
+    scale = min(1.0, longest_px / max(image.shape[:2]))
     if scale < 1:
         size = tuple(max(1, round(scale * side)) for side in image.shape[1::-1])
         image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)

@@ -1,13 +1,14 @@
 """Files that are appended to in flight, each write as a whole or not at all."""
 
 import errno
+import fcntl
 import os
 import stat
 from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
-_MODE = 0o640  # positions are nobody else's, and a log is for the group that reads logs, whatever the umask
+MODE = 0o640  # positions are nobody else's, and a log is for the group that reads logs, whatever the umask
 
 
 def open_appending(path: str | Path) -> BinaryIO:
@@ -15,16 +16,16 @@ def open_appending(path: str | Path) -> BinaryIO:
     anybody and has no buffer: a write that has returned is safe even if this process is killed next. Raises OSError."""
     flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY
     try:
-        descriptor, is_new = os.open(path, flags | os.O_EXCL, _MODE), True
+        descriptor, is_new = os.open(path, flags | os.O_EXCL, MODE), True
     except FileExistsError:  # or a link to a file, which may not be there yet
-        descriptor, is_new = os.open(path, flags, _MODE), False
+        descriptor, is_new = os.open(path, flags, MODE), False
     try:
         kind = os.fstat(descriptor).st_mode
         if not (stat.S_ISREG(kind) or stat.S_ISCHR(kind)):
             raise OSError(errno.EINVAL, "it is a pipe or a disk and not a file", str(path))
         if is_new:
             with suppress(OSError):  # FAT has no permissions
-                os.fchmod(descriptor, _MODE)
+                os.fchmod(descriptor, MODE)
         return os.fdopen(descriptor, "r+b", buffering=0)
     except BaseException:
         os.close(descriptor)
@@ -64,12 +65,31 @@ def set_aside(path: str | Path) -> None:
     """Rename a file that is full to `earlier_part`, in place of the one before. Raises OSError."""
     earlier = earlier_part(path)
     os.replace(os.path.realpath(path), earlier)
-    with suppress(OSError):  # a folder that cannot be synced, as on FAT
-        folder = os.open(earlier.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    sync_folder(earlier)
+
+
+def sync_folder(path: str | Path) -> None:
+    """Bring the name of a file to the disk, where the folder can be synced: with links followed, and not on FAT."""
+    with suppress(OSError):
+        folder = os.open(os.path.dirname(os.path.realpath(path)), os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:
             os.fsync(folder)
         finally:
             os.close(folder)
+
+
+def try_lock(file: BinaryIO) -> bool:
+    """Lock an open file until it is closed. Return False where another process has it; a medium that has no locks, and
+    what is no file, is locked by nobody."""
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        return True
+    try:
+        fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
+    return True
 
 
 def is_at(file: BinaryIO, path: str | Path) -> bool:

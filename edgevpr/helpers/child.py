@@ -57,16 +57,21 @@ def serve_parent(work: Callable[[Any], Any]) -> None:
     The life of the child is tied to its parent's: when that ends, however it ends, the kernel kills the child, even in
     an endless loop of a library. What a library prints does not get into the answer.
     """
-    import ctypes  # not at the top: the parent may be a flight, which has no use for it
-
     asked = json.load(sys.stdin)
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != asked["parent_pid"]:  # it ended before the line above
-        sys.exit(1)
+    end_with_parent(asked["parent_pid"])
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     with answers:
         json.dump(work(asked["job"]), answers)
+
+
+def end_with_parent(parent_pid: int) -> None:
+    """Let the kernel kill this process when its parent ends, however that ends."""
+    import ctypes  # not at the top: the parent may be a flight, which has no use for it
+
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent_pid:  # it ended before the line above
+        sys.exit(1)
 
 
 def last_line(ended: Ended) -> str:

@@ -75,6 +75,7 @@ class Conversation:
         self._asked_for_state = False
         self._channel = self.channel  # as the listener has heard it
         self._odometry_since_s = math.inf
+        self._is_there = self._was_there = False
 
     def set_health(self, health: Health) -> None:
         """Set the health in the heartbeats of the next ten seconds. After that, without a new call, it is CRITICAL."""
@@ -144,9 +145,11 @@ class Conversation:
         return is_ours
 
     def tell_of_answers(self) -> None:
-        """Give up the fixes that have waited too long for their answers, and say once to the ground that fixes have no
-        answers any more, or have them again, or are refused, or taken again."""
+        """Give up the fixes that have waited too long for their answers, and say once to the ground that the autopilot
+        is silent, or back, and that fixes have no answers any more, or have them again, or are refused, or taken
+        again."""
         now_s = self._clock()
+        self._tell_of_presence(now_s)
         self.replies.time_out(now_s)
         if self.answers.has_changed(now_s):
             self._say_silence(now_s)
@@ -167,6 +170,11 @@ class Conversation:
         self.replies.break_off("the link was lost before its answer came")
         self.autopilot.forget_presence()
         self.receiver.forget_partial_message()
+
+    def end(self) -> None:
+        """Give up all fixes: those that wait for their answers, and those that wait to be sent."""
+        self.replies.break_off("the flight ended before its answer came")
+        self.outbox.drop_stale_fixes(math.inf)
 
     def _next_message(self, now_s: float) -> tuple[Message, Sending | None] | None:
         """Return the message that is next and the fix in it, if it holds one; None: there is no message."""
@@ -250,6 +258,17 @@ class Conversation:
         if answer == "FAILED" and readiness.asks_origin(now_s):
             origin = mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN
             self.outbox.put(messages.message_request(self.autopilot.system_id, origin))
+
+    def _tell_of_presence(self, now_s: float) -> None:
+        is_there = self.autopilot.listens(now_s)
+        if is_there == self._is_there:
+            return
+        if is_there and self._was_there:
+            self._announce(Severity.INFO, "autopilot is back", "autopilot")
+        elif not is_there:
+            log.warning("the autopilot is silent")
+            self._announce(Severity.WARNING, "autopilot is silent", "autopilot")
+        self._is_there, self._was_there = is_there, self._was_there or is_there
 
     def _say_silence(self, now_s: float) -> None:
         if self.answers.is_stopped:

@@ -23,11 +23,15 @@ SILENT_AFTER_S = 5.0
 
 class GroundLink(Link):
     """The link to the ground beside the one to the `flight` controller. It has the same identity and health, and its
-    own thread and port, so that a ground station that is lost holds up no fix."""
+    own thread and port, so that a ground station that is lost holds up no fix; the turns it shares."""
+
+    name = "ground"
 
     def __init__(self, address: LinkAddress, flight: Link, clock: Callable[[], float] = time.monotonic) -> None:
-        super().__init__(address, clock=clock)
-        self._conversation = GroundConversation(flight._conversation, clock)
+        super().__init__(address, clock=clock, tape=flight._tape)
+        self._turns = flight._turns
+        with self.turn("ground link"):
+            self._conversation = GroundConversation(flight._conversation, self._turns.now_s)
         flight._conversation.outbox.copy_to = self._tell
         # Texts wait for their turn on each link by itself: on one that is lost they wait for ever.
         flight._conversation.texts.copy_to = self.announce

@@ -8,6 +8,7 @@ from edgevpr.mavlink.outbox import Sending
 from edgevpr.mavlink.transport import Transport
 from edgevpr.mavlink.wire import Tap, untapped
 
+LOST = "the link was lost before it had left"
 STUCK_S = 0.5  # a port that has taken no byte for this time is reopened: bytes that wait in it would leave late
 
 
@@ -67,8 +68,8 @@ class Line:
             raise ConnectionError("the port takes no more bytes")
 
     def departed(self) -> list[Sending]:
-        """Return the fixes that have left since the last call, settled as sent. Raises ConnectionError where one has
-        waited too long."""
+        """Return the fixes that have left since the last call, settled as sent. Raises ConnectionError where there are
+        none, and one has waited too long."""
         departed = []
         # Read before the bytes are asked for: a clock that jumps meanwhile must not condemn what has just left.
         now_s = self._clock()
@@ -76,7 +77,7 @@ class Line:
         while self._leaving and self._leaving[0][0] <= left:
             departed.append(self._leaving.popleft()[1])
             departed[-1].settle(True)
-        if self._leaving and now_s > self._leaving[0][1].due_s:
+        if not departed and self._leaving and now_s > self._leaving[0][1].due_s:
             raise ConnectionError("a position fix has waited too long in it")
         return departed
 
@@ -88,7 +89,7 @@ class Line:
         self.transport.close()
         lost = len(self._leaving)
         for _, sending in self._leaving:
-            sending.settle(False, "the link was lost before it had left")
+            sending.settle(False, LOST)
         self._leaving.clear()
         self._unsent = b""
         return lost

@@ -1,15 +1,16 @@
 """The link to the flight controller: one thread, the only one to touch the socket or serial port."""
 
 import logging
-import math
 import select
 import socket
 import threading
 import time
+from base64 import b64encode
 from collections.abc import Callable, Collection
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 
 from edgevpr.errors import LinkError
+from edgevpr.helpers.tape import NO_TAPE, Tape
 from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.autopilots.channel import Channel
 from edgevpr.mavlink.conversation import Conversation
@@ -20,6 +21,7 @@ from edgevpr.mavlink.outbox import MAX_FIX_WAIT_S, Sending
 from edgevpr.mavlink.signing import NOT_SIGNING, NotSigning, Signing
 from edgevpr.mavlink.stats import LinkStats
 from edgevpr.mavlink.transport import open_transport
+from edgevpr.mavlink.turns import Turns
 from edgevpr.mavlink.wire import Message, Tap, untapped
 from edgevpr.mavlink.wishes import Wish, Wished
 from edgevpr.types import Position, Vehicle
@@ -31,6 +33,8 @@ FLUSH_S = 0.5
 
 _NOBODY = NoListener()
 
+Step = Callable[..., None]  # takes note of a step of a turn
+
 log = logging.getLogger(__name__)
 
 
@@ -41,9 +45,12 @@ class Link:
     `system_id` is that of the autopilot (None: that of the first heard); a fix that has waited for `max_fix_age_s` is
     never sent. `listener` hears how the vehicle moves, and gives the positions of a continuous channel. `tap` gets each
     packet written and each packet heard, in the link's thread. `origin` is set where an autopilot that flies by
-    ODOMETRY has none. `send`, `send_fix`, `announce`, `offer`, `take_wishes`, `set_health`, `want_position`, `vehicle`,
-    `vehicle_at`, `channel`, `listens` and `stats` may be called from any thread; they never block and never raise.
+    ODOMETRY has none. The `tape` takes note of all that is heard and said. `send`, `send_fix`, `announce`, `offer`,
+    `take_wishes`, `set_health`, `want_position`, `vehicle`, `vehicle_at`, `channel`, `listens`, `stats` and `turn` may
+    be called from any thread; none waits for the other end, and none raises.
     """
+
+    name = "link"
 
     def __init__(
         self,
@@ -57,20 +64,23 @@ class Link:
         tap: Tap = untapped,
         signing: Signing | NotSigning = NOT_SIGNING,
         origin: Position | None = None,
+        tape: Tape = NO_TAPE,
     ) -> None:
         self._address = address
-        self._tap = tap
+        self._tap, self._tape = tap, tape
         self._clock = clock
-        self._conversation = Conversation(
-            clock,
-            component_id,
-            system_id,
-            max_fix_age_s,
-            listener=listener,
-            tap=tap,
-            signing=signing,
-            origin=origin,
-        )
+        self._turns = Turns(clock, tape)
+        with self.turn("begin"):
+            self._conversation = Conversation(
+                self._turns.now_s,
+                component_id,
+                system_id,
+                max_fix_age_s,
+                listener=listener,
+                tap=tap,
+                signing=signing,
+                origin=origin,
+            )
         self._line: Line | None = None
         self._reopened = 0
         self._retry_s = RETRY_FIRST_S
@@ -95,50 +105,64 @@ class Link:
             raise
         self._thread.start()
 
+    def turn(self, what: str) -> AbstractContextManager[None]:
+        """Let the link say and hear nothing inside this context, in which time stands still: what is done there with
+        the link and with its listener is done at once. `what` names it on the tape."""
+        return self._turns.taken(what)
+
     def send(self, *outgoing: Message) -> None:
         """Queue messages. If the queue is full, the oldest messages are dropped and counted."""
-        for message in outgoing:
-            self._conversation.outbox.put(message)
+        with self.turn("send"):
+            for message in outgoing:
+                self._conversation.outbox.put(message)
         self._ring()
 
     def send_fix(self, fix: Fix) -> Sending:
         """Queue a position fix, to be sent within `max_fix_age_s` and only to an autopilot that is there, or never. The
         returned `Sending` gives the outcome as soon as it is known."""
-        sending = self._conversation.outbox.put_fix(fix, self._clock())
+        with self.turn("send_fix"):
+            sending = self._conversation.outbox.put_fix(fix, self._turns.now_s())
         self._ring()
         return sending
 
     def announce(self, severity: Severity, text: str, topic: str | None = None) -> None:
         """Let a text for the people on the ground wait for its turn (see `Texts`)."""
-        self._conversation.texts.put(severity, text, topic)
+        with self.turn("announce"):
+            self._conversation.texts.put(severity, text, topic)
         self._ring()
 
     def offer(self, wishes: Collection[Wish]) -> None:
         """Set the wishes of the ground that can be fulfilled from now on; there are none before the first call."""
-        self._conversation.wishes.offered = wishes
+        with self.turn("offer"):
+            self._conversation.wishes.offered = wishes
 
     def take_wishes(self) -> tuple[Wished, ...]:
         """Return the wishes of the ground since the last call."""
-        return self._conversation.wishes.take()
+        with self.turn("take_wishes"):
+            return self._conversation.wishes.take()
 
     def set_health(self, health: Health) -> None:
         """Set the health in the heartbeats of the next ten seconds. After that, without a new call, it is CRITICAL."""
-        self._conversation.set_health(health)
+        with self.turn("set_health"):
+            self._conversation.set_health(health)
 
     def want_position(self) -> None:
         """Ask the autopilot for its position, how well it knows it, attitude and height, at once and again whenever it
         has stopped reporting its position or its attitude."""
-        self._conversation.want_position()
+        with self.turn("want_position"):
+            self._conversation.want_position()
 
     def vehicle(self) -> Vehicle | None:
         """Return the last report of the autopilot on its vehicle; None where there is none, or it had no position."""
-        return self._conversation.autopilot.vehicle
+        with self.turn("vehicle"):
+            return self._conversation.autopilot.vehicle
 
     def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
         """Return the same with the position, roll, pitch and heading that the vehicle had at the time of a frame; roll
         and pitch are None where no attitude was heard within 0.3 s of it. It also says when the newest fix that may be
         in its position was sent."""
-        return self._conversation.vehicle_at(t_mono_s)
+        with self.turn("vehicle_at"):
+            return self._conversation.vehicle_at(t_mono_s)
 
     @property
     def channel(self) -> Channel:
@@ -147,14 +171,40 @@ class Link:
 
     def listens(self) -> bool:
         """Tell whether there is an autopilot that a fix can be sent to at this moment."""
-        return self._is_connected() and self._conversation.autopilot.listens(self._clock())
+        with self.turn("listens"):
+            is_connected, *_ = self._tape.read("port", self._port)
+            return is_connected and self._conversation.autopilot.listens(self._turns.now_s())
 
     def stats(self) -> LinkStats:
+        with self.turn("stats"):
+            return self._stats()
+
+    def close(self) -> None:
+        """Send the queued messages and texts, receive the answers to the fixes sent, both for half a second at most,
+        and close the port."""
+        with self.turn("close"):
+            self._conversation.texts.hurry()
+        self._closing.set()
+        self._ring()
+        if self._thread.ident is None:  # never started
+            self._close_all()
+        else:
+            self._thread.join(2 * FLUSH_S)
+
+    def __enter__(self) -> "Link":
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _stats(self) -> LinkStats:
         said, autopilot, outbox = self._conversation, self._conversation.autopilot, self._conversation.outbox
+        connected, trouble, reopened = self._tape.read("port", self._port)
         return LinkStats(
-            connected=self._is_connected(),
-            trouble=self._trouble,
-            autopilot_heard=autopilot.listens(self._clock()),
+            connected=connected,
+            trouble=trouble,
+            autopilot_heard=autopilot.listens(self._turns.now_s()),
             autopilot_system_id=autopilot.system_id,
             sent=dict(said.sent),
             received=dict(said.receiver.received),
@@ -169,26 +219,11 @@ class Link:
             refused_signatures=dict(said.signing.refused),
             dropped_queue_full=outbox.dropped_queue_full,
             bad_bytes=said.receiver.bad_bytes,
-            reopened=self._reopened,
+            reopened=reopened,
         )
 
-    def close(self) -> None:
-        """Send the queued messages and texts, receive the answers to the fixes sent, both for half a second at most,
-        and close the port."""
-        self._conversation.texts.hurry()
-        self._closing.set()
-        self._ring()
-        if self._thread.ident is None:  # never started
-            self._close_all()
-        else:
-            self._thread.join(2 * FLUSH_S)
-
-    def __enter__(self) -> "Link":
-        self.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+    def _port(self) -> tuple[bool, str | None, int]:
+        return self._is_connected(), self._trouble, self._reopened
 
     def _is_connected(self) -> bool:
         line = self._line
@@ -215,15 +250,19 @@ class Link:
         if self._closing.wait(self._retry_s):
             return
         self._retry_s = min(2 * self._retry_s, RETRY_MAX_S)
-        self._conversation.outbox.drop_stale_fixes(self._clock())
+        with self._turns.of_link(self.name) as step:
+            self._conversation.outbox.drop_stale_fixes(self._turns.now_s())
+            step("waits")
         self._line = Line(open_transport(self._address), self._clock, self._tap)
         self._reopened += 1
 
     def _turn(self, line: Line, timeout_s: float) -> None:
         """Write what the port takes, wait until there is something to do or the time is up, and read."""
-        if line.transport.connected:
-            self._transmit(line)
-        self._conversation.tell_of_answers()
+        with self._turns.of_link(self.name) as step:
+            if line.transport.connected:
+                self._transmit(line, step)
+            self._conversation.tell_of_answers()
+            step("answers")
         writing = [line.transport] if line.is_writing else []
         timeout_s = min(timeout_s, WATCH_S) if line.is_watched else self._conversation.wait_s(timeout_s)
         readable, _, _ = select.select([line.transport, self._bell], writing, [], timeout_s)
@@ -239,28 +278,41 @@ class Link:
             if self._trouble is not None:
                 log.info("%s is back", self._address)
                 self._trouble = None
-        self._conversation.note_departed(line.departed())  # before its answer is read
-        if self._conversation.hear(data, self._clock(), line.transport.sender):
+        with self._turns.of_link(self.name) as step:
+            self._note_departed(line, step)  # before its answer is read
+            try:
+                beats = self._conversation.hear(data, self._turns.now_s(), line.transport.sender)
+            finally:
+                verdicts = self._conversation.signing.take_verdicts()
+                step("heard", b64encode(data).decode(), line.transport.sender, verdicts)
+        if beats:
             line.transport.answer_sender()
 
-    def _transmit(self, line: Line) -> None:
+    def _transmit(self, line: Line, step: Step) -> None:
         while True:
             # Before writing: what has waited too long must not be written on.
-            self._conversation.note_departed(line.departed())
+            self._note_departed(line, step)
             if not line.is_writing:
-                if (next_one := self._conversation.next_packet()) is None:
+                next_one = self._conversation.next_packet()
+                step("said", next_one and b64encode(next_one[0]).decode())
+                if next_one is None:
                     return
                 line.put(*next_one)
             line.write()
             if line.is_writing:
                 return
 
+    def _note_departed(self, line: Line, step: Step) -> None:
+        if departed := line.departed():
+            step("departed", len(departed))
+            self._conversation.note_departed(departed)
+
     def _lose(self, error: Exception) -> None:
-        lost_fixes = 0
-        if self._line is not None:
-            lost_fixes = self._line.close()
+        with self._turns.of_link(self.name) as step:
+            lost_fixes = self._line.close() if self._line else 0
             self._line = None
-        self._conversation.break_off(lost_fixes)
+            step("lost", lost_fixes)
+            self._conversation.break_off(lost_fixes)
         self._note_trouble(error)
 
     def _note_trouble(self, error: Exception) -> None:
@@ -280,11 +332,11 @@ class Link:
                     break
 
     def _close_all(self) -> None:
-        self._conversation.replies.break_off("the flight ended before its answer came")
-        self._conversation.outbox.drop_stale_fixes(math.inf)
-        if self._line is not None:
-            self._line.close()
+        with self._turns.of_link(self.name) as step:
+            lost_fixes = self._line.close() if self._line else 0
             self._line = None
+            step("closed", lost_fixes)
+            self._conversation.end()
         self._bell.close()
         self._bell_button.close()
 

@@ -11,6 +11,10 @@ from edgevpr.types import Vehicle
 class Listener(Protocol):
     """Hears the motion of the vehicle, in the thread of the link; its methods never block and never raise."""
 
+    def hear_autopilot(self, t_s: float) -> None:
+        """Take in that there is an autopilot from `t_s` on, or another one than before."""
+        ...
+
     def hear_channel(self, channel: Channel) -> None:
         """Take in by which channel the autopilot is told positions, when that has been found out."""
         ...
@@ -31,6 +35,9 @@ class Listener(Protocol):
 
 class NoListener:
     """Stands in for a `Listener` where nobody navigates."""
+
+    def hear_autopilot(self, t_s: float) -> None:
+        pass
 
     def hear_channel(self, channel: Channel) -> None:
         pass

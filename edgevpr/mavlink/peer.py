@@ -95,6 +95,7 @@ class Autopilot:
             self.readiness = Readiness()
             self.attitudes, self._heights, self.certainty = Attitudes(), Heights(), Certainty()
             self.interview, self.origin, self._ahead_s = Interview(), None, None
+            self._listener.hear_autopilot(now_s)
         self.interview.hear(message)
         if self._is_for_us(message):
             self.readiness.hear(message, now_s)

@@ -47,6 +47,10 @@ class NotSigning:
         """Return the same: there is nothing to keep apart."""
         return self
 
+    def take_verdicts(self) -> list[str | None]:
+        """Return none: nothing is judged."""
+        return []
+
     def stamp(self, packer: mavlink.MAVLink) -> None:
         """Do nothing."""
 
@@ -65,10 +69,16 @@ class Signing:
     def __init__(self, key: bytes, stamps: TimeStamps, link_id: int = TO_AUTOPILOT) -> None:
         self.refused: Counter[str] = Counter()
         self._key, self._stamps, self._link_id = key, stamps, link_id
+        self._verdicts: list[str | None] = []
 
     def of_ground(self) -> "Signing":
         """Return that of the link to the ground: the same key and time, another link id."""
         return Signing(self._key, self._stamps, TO_GROUND)
+
+    def take_verdicts(self) -> list[str | None]:
+        """Return of every message since the last call why it was refused, None where it was admitted."""
+        verdicts, self._verdicts = self._verdicts, []
+        return verdicts
 
     def stamp(self, packer: mavlink.MAVLink) -> None:
         """Let a packer sign its next message."""
@@ -81,7 +91,9 @@ class Signing:
         since a radio has no key; but it must not speak for an autopilot."""
         header = message.get_header()
         reason = self._refusal(message.get_msgbuf(), header)
-        if reason is None or (reason == UNSIGNED and _is_of_radio(header)):
+        is_admitted = reason is None or (reason == UNSIGNED and _is_of_radio(header))
+        self._verdicts.append(None if is_admitted else reason)
+        if is_admitted:
             return True
         if reason not in self.refused:
             log.warning("messages are refused (%s): %s", reason, MEANING[reason])

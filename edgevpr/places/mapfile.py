@@ -40,6 +40,8 @@ class PlaceMap:
         self.left_out: dict[int, str] = {}
         made_by = file.found.get("made_by")
         self.made_by = made_by if isinstance(made_by, str) else None
+        map_id = file.found.get("map_id")
+        self.map_id = map_id if isinstance(map_id, str) else None
         self.has_salience = has_salience(file.found)
         self.salience = rows.SALIENCE if self.has_salience else "NULL, NULL, NULL, NULL"
         self.has_pose = has_pose(file.found)

@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+from edgevpr.power import machine
 from edgevpr.power.boards import Board
 from edgevpr.power.equations import Pack, marginal_energy_j, pack_ah, stage_energy_j
-from edgevpr.power.machine import pss_mb, rss_mb
 from edgevpr.types import NO_COST, QueryCost, StageCost, Steps
 
 Clock = Callable[[], float]
@@ -34,25 +34,25 @@ def stage(wall_clock: Clock = time.perf_counter, cpu_clock: Clock = time.process
         metered.cost = StageCost(wall_clock() - wall_s, cpu_clock() - cpu_s)
 
 
-class PssMeter:
-    """PSS (memory with shared pages in proportion) of this process, read at most once in twenty seconds: the kernel
+class OwnMemory:
+    """Memory of this process. PSS (with shared pages in proportion) is read at most once in twenty seconds: the kernel
     walks through all pages for it, which takes some hundredths of a query's time."""
 
-    def __init__(self, clock: Clock = time.monotonic, read: Callable[[], float | None] = pss_mb) -> None:
+    def __init__(self, clock: Clock = time.monotonic, read: Callable[[], float | None] = machine.pss_mb) -> None:
         self._clock, self._read = clock, read
         self._read_s, self._pss_mb = -math.inf, None
 
-    def look(self) -> float | None:
-        """Return the value read last, MB; None where the kernel does not say."""
+    def look(self) -> tuple[float, float | None]:
+        """Return RSS now, and the PSS that was read last, both MB; None where the kernel does not say."""
         now_s = self._clock()
         if now_s - self._read_s >= _PSS_EVERY_S:
             self._read_s, self._pss_mb = now_s, self._read()
-        return self._pss_mb
+        return machine.rss_mb(), self._pss_mb
 
 
 class QueryMeter:
     """Meters the steps of query after query, and computes the charge that each query draws from the pack of a board.
-    `wall_clock` and `cpu_clock` (all threads) give seconds."""
+    `wall_clock` and `cpu_clock` (all threads) give seconds, `memory_mb` RSS and PSS of this process."""
 
     def __init__(
         self,
@@ -62,11 +62,12 @@ class QueryMeter:
         *,
         wall_clock: Clock = time.perf_counter,
         cpu_clock: Clock = time.process_time,
+        memory_mb: Callable[[], tuple[float, float | None]] | None = None,
     ) -> None:
         self.board = board
         self._pack, self._regulator_efficiency = pack, regulator_efficiency
         self._wall_clock, self._cpu_clock = wall_clock, cpu_clock
-        self._pss = PssMeter()
+        self._memory_mb = memory_mb or OwnMemory().look
         self._taken: dict[str, StageCost] = {}
 
     def begin(self) -> None:
@@ -90,9 +91,15 @@ class QueryMeter:
 
     def cost(self) -> QueryCost:
         """Return the cost of the query so far."""
-        steps = self.steps()
+        steps, (rss_mb, pss_mb) = self.steps(), self._memory_mb()
         return query_cost(
-            steps.encoding, steps.match, self.board, self._pack, self._regulator_efficiency, pss_mb=self._pss.look()
+            steps.encoding,
+            steps.match,
+            self.board,
+            self._pack,
+            self._regulator_efficiency,
+            rss_mb=rss_mb,
+            pss_mb=pss_mb,
         )
 
 
@@ -103,6 +110,7 @@ def query_cost(
     pack: Pack,
     regulator_efficiency: float,
     *,
+    rss_mb: float,
     pss_mb: float | None = None,
 ) -> QueryCost:
     """Compute the cost of one query by 5.1-5.6, as the pack sees it: the energies of both stages are added, not their
@@ -119,7 +127,7 @@ def query_cost(
         u_encode=stages[0][0],
         u_match=stages[1][0],
         cpu_s=encode.cpu_s + match.cpu_s,
-        rss_mb=rss_mb(),
+        rss_mb=rss_mb,
         used_mah=1000 * pack_ah(used_j, pack, regulator_efficiency),
         marginal_mah=1000 * pack_ah(marginal_j, pack, regulator_efficiency),
         pss_mb=pss_mb,

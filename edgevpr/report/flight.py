@@ -5,10 +5,9 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
-from edgevpr.errors import EdgevprError, UsageError
 from edgevpr.geodesy import distance_m, moved
 from edgevpr.report.values import Point, number, point, text, value
-from edgevpr.runtime.flight.flightlog import read_log
+from edgevpr.runtime.flight.wholeflight import flight_of
 
 _FRESH_S = 1.0  # an older report of the autopilot says nothing of a frame
 _CONTINUOUS = "taken into the continuous position"  # which is sent all the time and not answered
@@ -41,8 +40,8 @@ class Fix:
 class Query:
     """One query, `t_s` seconds after the start. `at` is the position of an accepted match, `place_at` that of the place
     found, `autopilot_at` and `gps_at` where autopilot and receiver say that the aircraft was when the frame was taken,
-    and `off_m` is from there to the match. `cores` are those that the process kept busy since the query before. None
-    is unknown, of whatever it is."""
+    and `off_m` is from there to the match: from the autopilot that has GPS, else from the receiver. `cores` are those
+    that the process kept busy since the query before. None is unknown, of whatever it is."""
 
     name: str
     t_s: float
@@ -81,7 +80,8 @@ class Remark:
 @dataclass(slots=True, kw_only=True)
 class Flight:
     """One flight of a log: `number` of `flights` in it. `start` and `end` are the first and the last line ({}: it lacks
-    one). `unusable` are the times of frames that never became queries, `learnt` the positions of new places."""
+    one). `unusable` are the times of frames that never became queries, `learnt` the positions of new places. `missing`
+    is a sentence about files of the flight that are not there (None: none)."""
 
     path: Path
     number: int
@@ -92,6 +92,7 @@ class Flight:
     remarks: list[Remark] = field(default_factory=list)
     unusable: list[float] = field(default_factory=list)
     learnt: list[Point] = field(default_factory=list)
+    missing: str | None = None
     span_s: float = 0.0
 
     @property
@@ -99,29 +100,23 @@ class Flight:
         """The map, as the first line names it."""
         return text(self.start, "map")
 
+    @property
+    def recording(self) -> str | None:
+        """The folder of its recording, as the first line names it."""
+        return text(self.start, "recording")
+
 
 def read_flight(path: str | Path, number: int | None = None) -> Flight:
-    """Read one flight of a log, the last one unless its `number` (1, 2, ...) is given. Raises UsageError where there is
-    no such file or flight, and EdgevprError for a file without a line of a flight."""
-    path = Path(path)
-    if not path.is_file():
-        raise UsageError(f"{path}: there is no such flight log: give the file that `log.path` names.")
-    flights: list[Flight] = []
-    for line in read_log(path):
-        kind = text(line, "kind")
-        if kind is None:
-            continue
-        if kind == "start" or not flights:  # lines without a start before them are a flight too
-            flights.append(Flight(path=path, number=len(flights) + 1))
-            reading = _Reading(flights[-1])
-        reading.read(kind, line)
-    if not flights:
-        raise EdgevprError(f"{path} holds no line of a flight log: give one that a flight has written.")
-    if number is not None and not 1 <= number <= len(flights):
-        raise UsageError(f"--flight {number}: {path} holds {len(flights)}: give 1 to {len(flights)}.")
-    chosen = flights[(number or 0) - 1]
-    chosen.flights = len(flights)
-    return chosen
+    """Read one flight of a log, with the files before it where it is one of several (see `wholeflight.flight_of`, also
+    for what is raised): the last flight in the file unless its `number` (1, 2, ...) is given."""
+    lines = flight_of(path, number)
+    flight = Flight(path=lines.path, number=lines.number, flights=lines.flights, missing=lines.missing)
+    if lines.missing:
+        flight.remarks.append(Remark(0.0, "missing", lines.missing))
+    reading = _Reading(flight)
+    for line in lines:
+        reading.read(line["kind"], line)
+    return flight
 
 
 class _Reading:
@@ -187,6 +182,9 @@ class _Reading:
         place = number(line, "place")
         heard_s = number(line, "vehicle", "t_heard_s")
         is_heard = None not in (heard_s, t_mono_s) and abs(t_mono_s - heard_s) <= _FRESH_S
+        autopilot_at = point(line, "vehicle") if is_heard else None
+        # An autopilot that has GPS knows by how much its receiver lags: at 20 m/s that is metres.
+        truth = autopilot_at if gps_at and value(line, "vehicle", "has_gps") is True else gps_at
         latency_s = number(line, "totals", "latency_s")
         return Query(
             name=text(line, "query") or "",
@@ -201,9 +199,9 @@ class _Reading:
             at=at,
             accuracy_m=number(line, "accuracy_m"),
             place_at=point(line, "position"),
-            autopilot_at=point(line, "vehicle") if is_heard else None,
+            autopilot_at=autopilot_at,
             gps_at=gps_at,
-            off_m=float(distance_m(*gps_at, *at)) if gps_at and at else None,
+            off_m=float(distance_m(*truth, *at)) if truth and at else None,
             fix=_fix(line),
             wall_ms=None if None in costs else 1e3 * sum(costs),
             latency_ms=None if latency_s is None else 1e3 * latency_s,

@@ -11,8 +11,8 @@ import numpy as np
 
 from edgevpr.errors import EdgevprError
 from edgevpr.geodesy import axes_of, offset_m
+from edgevpr.pages.charts import Points, dots, way
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.report.charts import Points, dots, way
 from edgevpr.report.flight import Flight, Outcome
 from edgevpr.report.values import Point
 from edgevpr.types import Pose

@@ -9,15 +9,15 @@ from pathlib import Path
 from statistics import median
 
 from edgevpr.helpers.text import shown
-from edgevpr.report.charts import UNKNOWN, Points, Series, chart, clock, figure, lanes
+from edgevpr.pages.charts import UNKNOWN, Points, Series, figure
+from edgevpr.pages.html import foreign, page, section, table
+from edgevpr.report.charts import chart, clock, lanes
 from edgevpr.report.flight import Flight, Outcome, Query
 from edgevpr.report.ground import Ground, draw, layers_of
 from edgevpr.report.moments import Moment, worst
 from edgevpr.report.pictures import Album
 from edgevpr.report.values import text, value
 
-# The browser is told to load nothing from anywhere, whatever a name in the log looks like.
-_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 _MOST_REMARKS = 200
 _NUMBER = re.compile(r"\d+(\.\d+)?")
 
@@ -28,38 +28,21 @@ def page_of(flight: Flight, ground: Ground, frames: Album, references: Album) ->
     moments = worst(flight)
     body = [
         _head(flight),
-        _section("", _figures(flight)),
+        section("", _figures(flight)),
         _notes(flight, ground),
-        _section("Over the ground", _ground(flight, ground, moments)),
-        _section("What became of every query", _lanes(flight)),
-        _section("Over time", _charts(flight)),
-        _section(
+        section("Over the ground", _ground(flight, ground, moments)),
+        section("What became of every query", _lanes(flight)),
+        section("Over time", _charts(flight)),
+        section(
             "Worst moments", "".join(_moment(at, each, frames, references) for at, each in enumerate(moments, start=1))
         ),
-        _section("Why matches were refused", _counts(_refusals(flight))),
-        _section("Why fixes were not sent, or not taken", _counts(_objections(flight))),
-        _section("What was said", _remarks(flight)),
-        _section("How it was set", _settings(flight)),
+        section("Why matches were refused", _counts(_refusals(flight))),
+        section("Why fixes were not sent, or not taken", _counts(_objections(flight))),
+        section("What was said", _remarks(flight)),
+        section("How it was set", _settings(flight)),
     ]
     style = Path(__file__).with_name("page.css").read_text("utf-8")
-    return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        '<meta name="color-scheme" content="light dark"><link rel="icon" href="data:,">'
-        f"<title>{_text(_title(flight))}</title><style>{style}</style></head>\n<body>{''.join(body)}</body></html>\n"
-    )
-
-
-def _text(said: str) -> str:
-    """Return foreign text fit for the page."""
-    return escape(shown(said))
-
-
-def _section(title: str, content: str) -> str:
-    if not content:
-        return ""
-    return f"<section>{f'<h2>{title}</h2>' if title else ''}{content}</section>\n"
+    return page(_title(flight), style, "".join(body))
 
 
 def _title(flight: Flight) -> str:
@@ -76,7 +59,7 @@ def _head(flight: Flight) -> str:
         (version := text(flight.start, "version")) and f"edgevpr {version}",
         f"{flight.path}, flight {flight.number} of {flight.flights}",
     ]
-    return f'<h1>{_text(_title(flight))}</h1><p class="soft">{_text(", ".join(filter(None, known)))}</p>'
+    return f'<h1>{foreign(_title(flight))}</h1><p class="soft">{foreign(", ".join(filter(None, known)))}</p>'
 
 
 def _figures(flight: Flight) -> str:
@@ -128,7 +111,7 @@ def _notes(flight: Flight, ground: Ground) -> str:
         ground.trouble,
         nowhere and f"{nowhere} of {ground.places} places of the map have no position and are not drawn.",
     ]
-    items = "".join(f"<li>{_text(note)}</li>" for note in notes if note)
+    items = "".join(f"<li>{foreign(note)}</li>" for note in notes if note)
     return f'<section class="notes"><ul>{items}</ul></section>' if items else ""
 
 
@@ -224,14 +207,15 @@ def _moment(at: int, moment: Moment, frames: Album, references: Album) -> str:
     sure = "" if query.confidence is None else f", confidence {query.confidence:.4f}"
     pictures = [("seen", query.name, frames), ("place found", query.reference_image, references)]
     pair = "".join(
-        f'<figure><img alt="{_text(name)}" src="{data}"><figcaption>{_text(f"{what}: {name}")}</figcaption></figure>'
+        f'<figure><img alt="{foreign(name)}" src="{data}"><figcaption>{foreign(f"{what}: {name}")}</figcaption>'
+        "</figure>"
         for what, name, album in pictures
         if name and (data := album.picture(name))
     )
     return (
-        f'<div class="moment" id="moment-{at}"><h3><i>{at}</i>{clock(query.t_s)} – {_text(moment.why)}</h3>'
-        f'<p class="soft">{_text(query.name)}: {_text(found + sure)}; '
-        f"{'accepted' if query.accepted else 'refused'}: {_text(query.reason)}</p>"
+        f'<div class="moment" id="moment-{at}"><h3><i>{at}</i>{clock(query.t_s)} – {foreign(moment.why)}</h3>'
+        f'<p class="soft">{foreign(query.name)}: {foreign(found + sure)}; '
+        f"{'accepted' if query.accepted else 'refused'}: {foreign(query.reason)}</p>"
         + (f'<div class="pair">{pair}</div></div>' if pair else "</div>")
     )
 
@@ -249,7 +233,7 @@ def _objections(flight: Flight) -> Counter[str]:
 def _counts(counter: Counter[str]) -> str:
     if not counter:
         return ""
-    return _table(("times", "why"), [(str(count), said) for said, count in counter.most_common(20)])
+    return table(("times", "why"), [(str(count), said) for said, count in counter.most_common(20)])
 
 
 def _remarks(flight: Flight) -> str:
@@ -259,13 +243,7 @@ def _remarks(flight: Flight) -> str:
     more = len(flight.remarks) - len(remarks)
     rows = [(clock(each.t_s), each.kind, each.said) for each in remarks]
     left_out = f'<p class="soft">and {more} more lines</p>' if more else ""
-    return _table(("time", "of", "said"), rows) + left_out
-
-
-def _table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    head = "".join(f"<th>{each}</th>" for each in headings)
-    lines = "".join(f"<tr>{''.join(f'<td>{_text(cell)}</td>' for cell in row)}</tr>" for row in rows)
-    return f'<div class="scroll"><table><tr>{head}</tr>{lines}</table></div>'
+    return table(("time", "of", "said"), rows) + left_out
 
 
 def _settings(flight: Flight) -> str:
@@ -273,6 +251,6 @@ def _settings(flight: Flight) -> str:
     config = value(flight.start, "config")
     if not isinstance(config, dict):
         return ""
-    said = f"<p>{_text(reason)}</p>" if reason else ""
+    said = f"<p>{foreign(reason)}</p>" if reason else ""
     dumped = escape(shown(json.dumps(config, indent=1, ensure_ascii=False), keep="\n"))
     return f"{said}<details><summary>configuration</summary><pre>{dumped}</pre></details>"

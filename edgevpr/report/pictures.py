@@ -1,17 +1,21 @@
 """Pictures of places and queries out of folders, small enough to stand inside a page."""
 
-import base64
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
+from types import MappingProxyType
 
 from edgevpr.errors import ImageError, UsageError
+from edgevpr.pages.html import address_of
 
 
 class Album:
-    """Folders in which pictures are looked for by the names that the log gives them. A flight and the map it flies over
-    each have one: pictures of both often have the same names. Raises UsageError for a folder that is not there."""
+    """Folders in which pictures are looked for by the names that the log gives them; `recorded` are those of a
+    recording, by these names. A flight and the map it flies over each have one: pictures of both often have the same
+    names. Raises UsageError for a folder that is not there."""
 
-    def __init__(self, folders: Sequence[str | Path]) -> None:
+    def __init__(self, folders: Sequence[str | Path], recorded: Mapping[str, Path] = MappingProxyType({})) -> None:
+        self._recorded = recorded
         self._folders = [Path(folder).resolve() for folder in folders]
         for given, folder in zip(folders, self._folders, strict=True):
             if not folder.is_dir():
@@ -20,11 +24,14 @@ class Album:
     def picture(self, name: str | None) -> str | None:
         """Return a picture as an address that holds all of it (data:); None where there is none, or none that can be
         read."""
-        if not self._folders or not name:
+        if not name or not (self._folders or name in self._recorded):
             return None
         from edgevpr.frames.images import EXTENSIONS, read_image  # a page without pictures needs no OpenCV
         from edgevpr.frames.small import small_jpeg
 
+        if path := self._recorded.get(name):
+            with suppress(ImageError):
+                return address_of(small_jpeg(read_image(path)))
         for folder in self._folders:
             for ending in ("", *EXTENSIONS):
                 try:
@@ -35,5 +42,5 @@ class Album:
                     jpeg = small_jpeg(read_image(path))
                 except (ImageError, OSError, ValueError):  # no picture, or a name that no file can have
                     continue
-                return "data:image/jpeg;base64," + base64.b64encode(jpeg).decode()
+                return address_of(jpeg)
         return None

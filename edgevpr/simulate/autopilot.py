@@ -7,9 +7,10 @@ import signal
 import threading
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from types import MappingProxyType
 
 from edgevpr.errors import LinkError
 from edgevpr.mavlink.address import parse_link
@@ -20,6 +21,7 @@ from edgevpr.simulate.flightcontroller.controller import STEP_S, FlightControlle
 from edgevpr.simulate.flightcontroller.recorded import AlongTrack, Nowhere, Track
 
 DEFAULT_VEHICLE = "arduplane"
+_QUESTIONS = {"HEARTBEAT", "PARAM_REQUEST_LIST", "PARAM_REQUEST_READ", "PING", "TIMESYNC"}
 _WAITING_BYTES = 65_536  # of a line that takes none: what is said beyond that is lost
 
 log = logging.getLogger(__name__)
@@ -62,15 +64,21 @@ def run_autopilot(
     track: Track | None = None,
     vehicle: str = DEFAULT_VEHICLE,
     gps: bool = False,
+    parameters: Mapping[str, str] = MappingProxyType({}),
 ) -> AutopilotSummary:
     """Act as a flight controller at `link_url` until the time is up, `stop` is set, a signal comes or the line is cut.
 
-    With a `track` it flies along the track from the moment a companion is first heard, and stays where the track ends;
-    without, it flies nobody knows where, and tells no position. With `gps` it takes no fix. Raises LinkError where the
-    link cannot be opened, UsageError for an unknown vehicle.
+    With a `track` it flies along the track from the moment a companion first says more than a question, as a flight
+    does and `check` and `doctor` do not, and stays where the track ends; without, it flies nobody knows where, and
+    tells no position. With `gps` it takes no fix. Its time of day is that of this machine; `parameters` are set before
+    it starts. Raises LinkError where the link cannot be opened, UsageError for an unknown vehicle or parameter, and for
+    a value that a parameter cannot have.
     """
     motion = AlongTrack(track) if track else Nowhere()
-    return serve(FlightController(vehicle, motion, gps=gps, system_id=system_id), link_url, duration_s, stop)
+    controller = FlightController(vehicle, motion, gps=gps, system_id=system_id, start_utc_s=time.time())
+    for name, text in parameters.items():
+        controller.brain.parameters.set_written(name, text)
+    return serve(controller, link_url, duration_s, stop)
 
 
 def serve(
@@ -88,6 +96,7 @@ def serve(
         transport = open_transport(address)
     except OSError as error:
         raise LinkError(f"{address}: it cannot be opened ({error.strerror or error}): is the other end up?") from error
+    log.info("%s is up at %s", controller, address)
     port = _Port(transport, controller, speedup)
     with _set_by_signals(stop):
         try:
@@ -143,11 +152,12 @@ class _Port:
         self._by_sender[sender][message.get_type()] += 1
         self._lost_packets += (message.get_seq() - self._next_seq.get(sender, message.get_seq())) % 256
         self._next_seq[sender] = (message.get_seq() + 1) % 256
+        if sender == self._companion and not _is_question(message):
+            self._controller.begin()
         if message.get_type() != "HEARTBEAT":
             return
         if message.type == mavlink.MAV_TYPE_ONBOARD_CONTROLLER:
             self._companion = sender
-            self._controller.begin()
             self._transport.answer_sender()
         elif self._companion is None:
             self._transport.answer_sender()
@@ -161,6 +171,13 @@ class _Port:
             if len(self._waiting) < _WAITING_BYTES:
                 data = self._waiting + packet
                 self._waiting = data[self._transport.write(data) :]
+
+
+def _is_question(message: Message) -> bool:
+    """Tell whether a message only asks, and neither tells nor sets anything."""
+    if message.get_type() in ("COMMAND_INT", "COMMAND_LONG"):
+        return message.command == mavlink.MAV_CMD_REQUEST_MESSAGE
+    return message.get_type() in _QUESTIONS
 
 
 @contextmanager

@@ -14,6 +14,7 @@ from pathlib import Path
 from edgevpr.errors import EdgevprError
 from edgevpr.helpers.progress import progress
 from edgevpr.runtime.flight.flightlog import read_log
+from edgevpr.runtime.flight.wholeflight import flight_of
 from edgevpr.simulate.camera import lit
 from edgevpr.simulate.flight import (
     SCENE_DEPTH_M,
@@ -126,7 +127,7 @@ def run_demo(folder: str | Path) -> DemoSummary:
     )
     ground = lit(scene, mapping.light, mapping.seed)
     draw(picture_path, ground, scene.metres_per_pixel, mapping, answers, first / "images", second / "images", headline)
-    lines = list(read_log(log_path))
+    lines = list(flight_of(log_path))
     costs = [line["costs"] for line in lines if line["kind"] == "query"]
     return DemoSummary(
         places=len(mapping.poses),

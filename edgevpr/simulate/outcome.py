@@ -9,7 +9,7 @@ import numpy as np
 
 from edgevpr.frames.positions import find_positions, read_positions
 from edgevpr.geodesy import distance_m
-from edgevpr.runtime.flight.flightlog import read_log
+from edgevpr.runtime.flight.wholeflight import flight_of
 from edgevpr.types import Position
 
 # A place is the right one where the two pictures share 30 % of their ground, which is 78 m long from a height of 80 m.
@@ -64,7 +64,7 @@ def read_answers(log_path: Path, map_images: Path, query_images: Path) -> list[A
     taken = {name: tag.position for name, tag in read_positions(find_positions(query_images)).items()}
     lat_deg, lon_deg = np.array([(place.lat_deg, place.lon_deg) for place in places.values()]).T
     answers = []
-    for line in read_log(log_path):
+    for line in flight_of(log_path):
         if line["kind"] == "query":
             at, named = taken[line["query"]], places[line["reference_image"]]
             error_m = distance_m(at.lat_deg, at.lon_deg, named.lat_deg, named.lon_deg)

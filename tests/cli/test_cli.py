@@ -192,6 +192,22 @@ def test_maps_are_merged_and_exported(capsys, flight, valley, tmp_path):
     assert len(json.loads(capsys.readouterr().out)["features"]) == 6
 
 
+def test_a_map_without_positions_says_that_it_sends_no_fixes(capsys, flight, tmp_path):
+    path, bare = tmp_path / "m.gpkg", tmp_path / "bare"
+    shutil.copytree(flight / "ref", bare)
+    build = ["map", "build", str(path), "--technique", "cohog", "--images"]
+    assert main([*build, str(bare)]) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert said[-1].startswith(f"{path}: no place has a position, and a map without positions sends no fixes")
+    assert "positions.csv" in said[-1]
+    for file in bare.iterdir():  # other names, so that they are no pictures of the map
+        file.rename(bare / f"again_{file.name}")
+    rows = (flight / "positions.csv").read_text().splitlines()
+    (bare / "positions.csv").write_text("\n".join([rows[0], *(f"again_{row}" for row in rows[1:])]))
+    assert main([*build, str(bare), "--append"]) == 0
+    assert "sends no fixes" not in capsys.readouterr().out
+
+
 def test_unusable_images_are_named_and_the_others_mapped(capsys, flight, tmp_path):
     folder = tmp_path / "mixed"
     shutil.copytree(flight / "ref", folder)

@@ -71,14 +71,17 @@ def test_a_map_of_an_orthophoto_finds_a_flight_over_it(tmp_path, ground, track, 
     assert rest["places"] == rest["added"] + built["places"]
 
 
-def test_water_and_what_is_not_known_are_left_out_and_said(tmp_path, capsys):
+def test_water_and_what_is_not_known_are_left_out_and_said(tmp_path, capsys, caplog):
     with rasterio.open(textured_raster(tmp_path / "land.tif")) as data:
         land, to_crs = data.read(), data.transform
     land[:, :, :280] = 70
     land[:, :, 500:] = 0
     path = write_raster(tmp_path / "coast.tif", land, "EPSG:32632", to_crs, nodata=0)
     cut = ("--orthophoto", path, "--footprint-m", 80, "--spacing-m", 40)
-    assert run("map", "build", tmp_path / "m.gpkg", *cut, "--no-calibrate") == 0
+    with caplog.at_level("INFO"):
+        assert run("map", "build", tmp_path / "m.gpkg", *cut, "--no-calibrate") == 0
+        assert run("map", "calibrate", tmp_path / "m.gpkg", *cut) == 2  # too few places, but of the same camera
+    assert "fov_deg" not in caplog.text, "no camera has taken them"
     said = capsys.readouterr().out
     assert "places added (0 without a position)" in said
     for what in ("data", "texture"):

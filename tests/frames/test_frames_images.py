@@ -170,3 +170,17 @@ def test_a_folder_without_images_is_refused(tmp_path):
         list_images(tmp_path / "nowhere")
     with pytest.raises(SourceError, match=r"cannot be listed \(Not a directory\)"):
         list_images(tmp_path / "notes.txt")
+
+
+def test_where_the_images_lie_in_a_folder_inside_that_one_is_named(tmp_path):
+    for name in ("notes", "night", "day_2", "day_10"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "notes" / "._IMG_1.jpg").touch()
+    (tmp_path / "day_10" / "IMG_1.jpg").touch()
+    with pytest.raises(SourceError) as refused:
+        list_images(tmp_path)
+    assert str(refused.value).endswith(f"): give {tmp_path}/day_10.")
+    (tmp_path / "day_2" / "IMG_1.jpg").touch()
+    with pytest.raises(SourceError) as refused:
+        list_images(tmp_path)
+    assert str(refused.value).endswith(f"): give {tmp_path}/day_2 or {tmp_path}/day_10.")

@@ -3,6 +3,8 @@
 import io
 import os
 
+from fakes import FakeClock
+
 from edgevpr.helpers.progress import progress, waiting
 
 
@@ -56,3 +58,18 @@ def test_a_file_is_not_told_what_is_waited_for():
     out = io.StringIO()
     waiting("waiting for the source", out)
     assert out.getvalue() == ""
+
+
+def test_the_time_that_is_left_is_told_once_it_can_be_known():
+    out, clock = io.StringIO(), FakeClock()
+
+    def slow():
+        for each in range(40):
+            clock.now_s += 20.0
+            yield each
+
+    list(progress(slow(), 40, "sets", out, clock))
+    lines = out.getvalue().splitlines()
+    assert lines[0] == "sets  1/40  2 %, 13 min left"
+    assert lines[-2] == "sets  36/40  90 %, 80 s left"
+    assert lines[-1] == "sets  40/40  100 %"

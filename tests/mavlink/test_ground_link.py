@@ -93,10 +93,22 @@ def test_a_text_is_said_once_on_each_link(two, clock):
     flight.announce(Severity.INFO, "once")
     for peer in (autopilot, station):
         peer.expect_text("edgevpr: once")
-    clock.now_s += 6.0
+    clock.now_s += 5.0
     flight.announce(Severity.INFO, "then")
     for peer in (autopilot, station):
         assert "edgevpr: once" not in [getattr(each, "text", "") for each in peer.expect_text("edgevpr: then")]
+
+
+def test_the_ground_hears_that_the_autopilot_is_silent_and_that_it_is_back(two, clock):
+    flight, autopilot, _, station = two
+    clock.now_s += 6.0
+    flight.send(text("wake up"))
+    station.expect_text("edgevpr: autopilot is silent")
+    clock.now_s += 6.0
+    autopilot.heartbeat(system_id=7)
+    wait_until(flight.listens)
+    flight.send(text("wake up"))
+    station.expect_text("edgevpr: autopilot is back")
 
 
 def test_both_ends_hear_the_same_vehicle_component_and_health(two, clock):

@@ -45,6 +45,8 @@ def test_an_unplugged_cable_is_found_again_when_it_is_plugged_in(tmp_path, caplo
             cable.plug()
             autopilot = AutopilotThread(there, system_id=7)
             wait_until(lambda: link.stats().autopilot_heard and link.stats().trouble is None, "hearing the autopilot")
+            beats = link.stats().sent["HEARTBEAT"]
+            wait_until(lambda beats=beats: link.stats().sent["HEARTBEAT"] > beats, "a heartbeat as its companion")
             link.send_fix(Fix(50.0, 14.0, 25.0, time.monotonic()))
             wait_until(lambda times=times: link.stats().acks == {"ACCEPTED": times}, "the answer to the fix")
             cable.unplug()

@@ -169,7 +169,7 @@ def test_the_ground_station_hears_each_reason_once_and_that_fixes_are_taken_agai
     link, peer = link_and_peer
     beat(link, peer)
     for result in (ACCEPTED, FAILED, FAILED, mavlink.MAV_RESULT_DENIED, ACCEPTED, ACCEPTED):
-        clock.now_s += 6.0  # the ground is told one thing in five seconds
+        clock.now_s += 5.0  # the ground is told one thing in five seconds
         say(link, peer, gps(mavlink.GPS_FIX_TYPE_3D_FIX))
         beat(link, peer)
         sending = link.send_fix(Fix(50.0, 8.0, 20.0, clock.now_s))

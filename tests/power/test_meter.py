@@ -7,7 +7,7 @@ import pytest
 
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import Pack, parse_pack
-from edgevpr.power.meter import PssMeter, QueryMeter, query_cost, stage
+from edgevpr.power.meter import OwnMemory, QueryMeter, query_cost, stage
 from edgevpr.types import NO_COST, StageCost
 
 
@@ -43,7 +43,7 @@ def test_a_query_costs_by_the_closed_form():
         pass
     with stage(clock(0.4, 1.9), clock(0.4, 3.4)) as matching:
         pass
-    cost = query_cost(encoding.cost, matching.cost, load_board("rpi-4b"), Pack(4, 5200), 0.85)
+    cost = query_cost(encoding.cost, matching.cost, load_board("rpi-4b"), Pack(4, 5200), 0.85, rss_mb=80.0)
     assert cost.u_encode == pytest.approx(0.25, abs=1e-9)
     assert cost.u_match == pytest.approx(0.5, abs=1e-9)
     assert (cost.t_encode_s, cost.t_match_s) == pytest.approx((0.4, 1.5), abs=1e-9)
@@ -53,14 +53,15 @@ def test_a_query_costs_by_the_closed_form():
     marginal_j = 4.53 * 0.25 * 0.4 + 4.53 * 0.5 * 1.5
     assert cost.used_mah == pytest.approx(1000 * total_j / volt_hours, abs=1e-9)
     assert cost.marginal_mah == pytest.approx(1000 * marginal_j / volt_hours, abs=1e-9)
-    assert cost.rss_mb > 1
+    assert cost.rss_mb == 80.0
 
 
 def test_energy_summed_over_many_short_stages_is_the_closed_form():
     board, pack = load_board("rpi-3b-plus"), Pack(3, 2200)
     ticks = [(0.01 * (1 + i % 3), 0.02 * (i % 2)) for i in range(1000)]  # wall, CPU seconds
     summed_mah = sum(
-        query_cost(StageCost(wall_s, cpu_s), StageCost(0, 0), board, pack, 0.9).used_mah for wall_s, cpu_s in ticks
+        query_cost(StageCost(wall_s, cpu_s), StageCost(0, 0), board, pack, 0.9, rss_mb=80.0).used_mah
+        for wall_s, cpu_s in ticks
     )
     wall_s, core_s = (sum(column) for column in zip(*ticks, strict=True))
     closed_j = board.idle_w * wall_s + (board.full_w - board.idle_w) * core_s / board.cores
@@ -69,21 +70,18 @@ def test_energy_summed_over_many_short_stages_is_the_closed_form():
 
 def test_the_memory_that_takes_long_to_read_is_read_every_twenty_seconds():
     now_s, answers = [0.0], iter([80.0, 81.0, None])
-    pss = PssMeter(lambda: now_s[0], lambda: next(answers))
+    memory = OwnMemory(lambda: now_s[0], lambda: next(answers))
     seen = []
     for now_s[0] in (0.0, 0.1, 19.9, 20.0, 39.9, 40.0, 59.9):
-        seen.append(pss.look())
+        seen.append(memory.look()[1])
     assert seen == [80.0, 80.0, 80.0, 81.0, 81.0, None, None]
 
 
 def test_the_real_process_has_its_share_of_the_memory_it_shows():
-    pss_mb = PssMeter().look()
+    rss_mb, pss_mb = OwnMemory().look()
     if pss_mb is None:
         pytest.skip("this kernel does not say")
-    cost = query_cost(
-        StageCost(0.1, 0.1), StageCost(0.1, 0.1), load_board("rpi-4b"), Pack(4, 5200), 0.85, pss_mb=pss_mb
-    )
-    assert 1 < cost.pss_mb <= 1.05 * cost.rss_mb
+    assert 1 < pss_mb <= 1.05 * rss_mb
 
 
 def test_a_signal_between_a_step_and_the_setting_of_its_cost_is_not_masked():

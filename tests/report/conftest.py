@@ -13,9 +13,10 @@ from edgevpr.config import load_config
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.flight import fly
-from edgevpr.runtime.flight.flightlog import FlightLog, start_fields
+from edgevpr.runtime.flight.flightlog import FlightLog
 from edgevpr.runtime.flight.loop import Stop
 from edgevpr.runtime.flight.navigator import Navigator
+from edgevpr.runtime.flight.startline import start_fields
 from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.types import Frame, Receiver, Vehicle
 
@@ -58,7 +59,7 @@ def flown(tmp_path_factory):
     autopilot = ToAutopilot(link, link.listener, send_fixes=True, cores=board.cores, clock=clock.clock)
     source = FakeSource([Frame(image=each, name=name, t_mono_s=0.0) for name, each in pictures.items()], clock)
     with recogniser.place_map, FlightLog(folder / "flight.jsonl", clock=clock) as log:
-        log.write("start", **start_fields(config, board.name, recogniser.technique.spec))
+        log.write("start", **start_fields(config, board.name, recogniser.technique.spec, recogniser.place_map))
         fly(recogniser, source, config, flight_log=log, autopilot=autopilot, stop=Stop(), clock=clock.clock)
         log.write("end", queries=SEEN)
     return folder

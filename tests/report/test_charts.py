@@ -4,7 +4,8 @@ import re
 
 import pytest
 
-from edgevpr.report.charts import Series, chart, clock, figure, lanes, nice
+from edgevpr.pages.charts import Series, figure, nice
+from edgevpr.report.charts import chart, clock, lanes
 
 
 def paths(drawn, kind):

@@ -6,7 +6,9 @@ import pytest
 from logs import query, write_log
 
 from edgevpr.errors import EdgevprError, UsageError
+from edgevpr.helpers.numbered import numbered
 from edgevpr.report.flight import Outcome, read_flight
+from edgevpr.runtime.flight.flightlog import FlightLog
 
 
 def outcomes(flight):
@@ -47,13 +49,37 @@ def test_the_next_query_knows_of_an_answer_too(tmp_path):
 
 
 def test_the_last_of_several_flights_is_taken_unless_another_is_asked_for(tmp_path):
-    log = write_log(tmp_path / "log", ("query", query("a")), end=False)
-    write_log(log, ("query", query("b")), ("query", query("c")))
+    log, newer = write_log(tmp_path / "log", ("query", query("a")), end=False), tmp_path / "newer"
+    write_log(newer, ("query", query("b")), ("query", query("c")))
+    with open(log, "ab") as handle:
+        handle.write(newer.read_bytes())
     assert [each.name for each in read_flight(log).queries] == ["b", "c"]
     first = read_flight(log, 1)
     assert ([each.name for each in first.queries], first.end, first.flights) == (["a"], {}, 2)
     with pytest.raises(UsageError, match="holds 2: give 1 to 2"):
         read_flight(log, 3)
+
+
+def test_a_flight_of_several_files_is_read_whole_and_what_is_missing_is_a_remark(tmp_path):
+    path = tmp_path / "flight.jsonl"
+    with FlightLog(path, max_mb=0.02) as log:
+        log.write("start", map="m.gpkg", t_mono_s=1000.0)
+        for second in range(1, 5):
+            fields = query(str(second), reason="x" * 3000) | {"t_mono_s": 1000.0 + second}
+            log.write("query", **fields)
+            log.write("camera", t_mono_s=1000.5 + second, said="camera shows nothing")
+    flight = read_flight(path)
+    assert [each.name for each in flight.queries] == ["1", "2", "3", "4"]
+    assert [each.t_s for each in flight.queries] == [1.0, 2.0, 3.0, 4.0]
+    assert len(flight.remarks) == 4
+    assert "repeated" not in flight.start
+    first, *_ = numbered(path)
+    first.unlink()
+    flight = read_flight(path)
+    assert (flight.map_path, flight.start["repeated"]) == ("m.gpkg", True)
+    assert flight.remarks[0].said == flight.missing
+    assert "flight.jsonl: 1." in flight.missing
+    assert 0 < len(flight.queries) < 4
 
 
 @pytest.mark.parametrize("rest", [b'{"kind": "que', b"\xff\xfe{", b"[" * 100_000, b"{}\n[]\nnull\n3"])

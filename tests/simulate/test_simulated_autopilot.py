@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 from mavlink_peers import AutopilotThread, Peer, UdpPort, free_port, wait_until
 
+from edgevpr.cli.main import main
 from edgevpr.cli.simulation import _VEHICLES
 from edgevpr.errors import LinkError, UsageError
-from edgevpr.mavlink import messages
+from edgevpr.mavlink import messages, reading
 from edgevpr.mavlink.address import parse_link
+from edgevpr.mavlink.asking import Asking
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Fix, Health
 from edgevpr.mavlink.wire import mavlink
@@ -23,7 +25,7 @@ from edgevpr.simulate.autopilot import run_autopilot, serve
 from edgevpr.simulate.flight import ORIGIN
 from edgevpr.simulate.flightcontroller.controller import VEHICLES, FlightController
 from edgevpr.simulate.flightcontroller.freeflight import FreeFlight
-from edgevpr.simulate.flightcontroller.recorded import Track, read_track, truth_at
+from edgevpr.simulate.flightcontroller.recorded import Nowhere, Track, read_track, truth_at
 
 
 def a_fix(**changes):
@@ -122,6 +124,30 @@ def test_it_flies_along_a_track_from_when_a_companion_is_heard(tmp_path):
     assert (east_m_s, north_m_s) == (0.0, 0.0), "it stays where the track ends"
 
 
+def test_questions_do_not_start_the_track_and_whatever_a_flight_says_does(monkeypatch):
+    monkeypatch.setattr(reading, "LISTEN_S", 0.2)
+    track = Track(
+        t_s=np.array([0.0, 0.1]),
+        lat_deg=np.array([50.0, 50.1]),
+        lon_deg=np.array([8.0, 8.0]),
+        alt_m=np.zeros(2),
+        heading_deg=np.full(2, np.nan),
+    )
+    link = f"127.0.0.1:{free_port()}"
+    autopilot = AutopilotThread(f"udpin:{link}", track=track, vehicle="px4-copter", gps=True)
+    try:
+        with Asking(parse_link(f"udpout:{link}")) as asking:
+            assert reading.read_autopilot(asking, {"px4": ("EKF2_AGP0_CTRL",)}).parameters == {"EKF2_AGP0_CTRL": 1}
+            there = asking.message(mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT)
+        assert there.lat / 1e7 == 50.0
+        with Link(parse_link(f"udpout:{link}")) as flight:
+            wait_until(lambda: flight.stats().autopilot_heard)
+            flight.send(*messages.place_match(time.monotonic(), 3, 0.5))
+            wait_until(lambda: (vehicle := flight.vehicle()) and vehicle.lat_deg == 50.1, "the end of the track")
+    finally:
+        autopilot.finish()
+
+
 def test_it_says_how_fast_it_flies_along_the_track():
     track = Track(
         t_s=np.array([0.0, 10.0, 20.0, 21.0]),
@@ -200,6 +226,74 @@ def test_gps_is_switched_off_by_a_parameter_and_the_clock_may_run_fast():
         stop.set()
         served.join()
         companion.port.close()
+
+
+@pytest.mark.parametrize("vehicle", ["arduplane", "px4-copter"])
+def test_it_tells_the_time_of_this_machine(vehicle):
+    number = free_port()
+    companion = Peer(UdpPort(number))
+    before_s = time.time()
+    autopilot = AutopilotThread(f"udpout:127.0.0.1:{number}", vehicle=vehicle)
+    try:
+        companion.expect("HEARTBEAT")
+        companion.send(messages.message_request(1, mavlink.MAVLINK_MSG_ID_SYSTEM_TIME), component_id=197)
+        told_s = companion.expect("SYSTEM_TIME").time_unix_usec / 1e6
+    finally:
+        autopilot.finish()
+        companion.port.close()
+    assert before_s <= told_s <= time.time()
+
+
+def test_without_a_machine_its_clock_is_handed_in():
+    controller = FlightController("arduplane", Nowhere(), gps=False, start_utc_s=1_000.0)
+    controller.advance(5.0)
+    asked = messages.message_request(1, mavlink.MAVLINK_MSG_ID_SYSTEM_TIME)
+    told = next(each for each in controller.hear(asked) if each.get_type() == "SYSTEM_TIME")
+    assert told.time_unix_usec / 1e6 == pytest.approx(1_005.0, abs=0.05)
+
+
+def test_the_command_says_what_is_up_and_sets_parameters():
+    number = free_port()
+    link = f"udpin:127.0.0.1:{number}"
+    command = ["simulate", "autopilot", "--vehicle", "arducopter", "--param", "GPS2_TYPE=14", "--link", link, "--json"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "edgevpr", *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    try:
+        said = process.stderr.readline()
+        with Asking(parse_link(f"udpout:127.0.0.1:{number}")) as asking:
+            assert asking.heartbeat().type == mavlink.MAV_TYPE_QUADROTOR
+            assert asking.parameters(["GPS2_TYPE"], bytewise=False) == {"GPS2_TYPE": 14}
+        process.terminate()
+        printed, more = process.communicate(timeout=60)
+    finally:
+        process.kill()
+        process.wait()
+    assert said == f"edgevpr: a simulated arducopter that has lost GPS, system 1, is up at {link}\n"
+    assert more == ""
+    assert json.loads(printed)["companion"] == "1/197"
+
+
+@pytest.mark.parametrize(
+    ("written", "sentence"),
+    [
+        ("GPS2_TIPE=14", "no parameter GPS2_TIPE: did you mean GPS2_TYPE?"),
+        ("gps2_type=14", "did you mean GPS2_TYPE?"),
+        ("XYZ=1", "it has AHRS_EKF_TYPE, "),
+        ("GPS2_TYPE=1.5", "its value is a whole number"),
+        ("GPS2_TYPE=99999999999", "its value is a whole number"),
+        ("SIM_WIND_SPD=nan", "its value is a number"),
+        ("SIM_WIND_SPD=fast", "its value is a number"),
+        ("GPS2_TYPE", "write KEY=VALUE, e.g. GPS2_TYPE=14."),
+    ],
+)
+def test_a_parameter_that_makes_no_sense_is_one_sentence(written, sentence, capsys):
+    link = f"udpin:127.0.0.1:{free_port()}"
+    assert main(["simulate", "autopilot", "--link", link, "--param", written]) == 2
+    printed, said = capsys.readouterr()
+    assert printed == ""
+    assert sentence in said
+    assert said.count("\n") == 1
 
 
 def test_the_command_line_knows_every_vehicle():

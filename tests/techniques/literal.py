@@ -84,8 +84,9 @@ def blocks(cells):
                 *cells[row + 1, col],
                 *cells[row + 1, col + 1],
             ]
+            # OpenCV enlarges a flat region on ARM to 90.000003 here and there: that is no gradient.
             length = math.sqrt(sum(value * value for value in vector))
-            out.append([value / length if length else 0.0 for value in vector])
+            out.append([value / length if length > 1e-5 else 0.0 for value in vector])
     return np.array(out)
 
 

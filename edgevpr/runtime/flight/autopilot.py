@@ -13,6 +13,7 @@ from edgevpr.mavlink.wishes import Wish, Wished
 from edgevpr.power.load import MachineLoad
 from edgevpr.runtime.flight.answerlog import AnswerLog
 from edgevpr.runtime.flight.clock import Clock
+from edgevpr.runtime.flight.flightlog import FlightLog
 from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.flight.sourcesets import SourceSets
 from edgevpr.runtime.flight.status import LinkState
@@ -45,8 +46,8 @@ class NoAutopilot:
 
     summary = None
 
-    def __init__(self) -> None:
-        self.answers = AnswerLog()
+    def log_answers(self, flight_log: FlightLog) -> None:
+        """Write nothing: no fix is sent."""
 
     def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
         """Return None: nothing is known."""
@@ -78,8 +79,8 @@ class NoAutopilot:
 class ToAutopilot:
     """Tells an autopilot of events over an open link. With `send_fixes` an accepted match with a position is sent as a
     fix, where the `navigator` says that the autopilot is better off with it; without, all else is as with it. `cores`
-    is the number of the board's cores. `source_sets` are those that may be asked for. `answers` waits for those to the
-    fixes."""
+    is the number of the board's cores. `source_sets` are those that may be asked for. Whatever is done with what the
+    link's thread uses too is done in a turn of its own."""
 
     def __init__(
         self,
@@ -93,7 +94,7 @@ class ToAutopilot:
     ) -> None:
         self._link, self._send_fixes, self._cores, self._clock = link, send_fixes, cores, clock
         self._last: tuple[str, Sending] | None = None
-        self.answers = AnswerLog()
+        self._answers = AnswerLog()
         self._navigator, self._source_sets = navigator, source_sets
         self._held, self._is_holding = 0, False
 
@@ -115,17 +116,23 @@ class ToAutopilot:
 
     def state(self) -> LinkState:
         """Return the state of the link, of the autopilot's answers and of the navigation."""
-        stats = self._link.stats()
-        return LinkState(
-            connected=stats.connected,
-            trouble=stats.trouble,
-            autopilot=stats.autopilot_system_id if stats.autopilot_heard else None,
-            channel=self._link.channel.name,
-            fixes=self.summary,
-            answers=stats.acks,
-            unanswered=stats.unanswered_fixes,
-            accuracy_m=self._navigator.accuracy_m(self._clock.mono_s()),
-        )
+        with self._link.turn("state"):
+            stats = self._link.stats()
+            return LinkState(
+                connected=stats.connected,
+                trouble=stats.trouble,
+                autopilot=stats.autopilot_system_id if stats.autopilot_heard else None,
+                channel=self._link.channel.name,
+                fixes=self.summary,
+                answers=stats.acks,
+                unanswered=stats.unanswered_fixes,
+                accuracy_m=self._navigator.accuracy_m(self._clock.mono_s()),
+            )
+
+    def log_answers(self, flight_log: FlightLog) -> None:
+        """Write a line for every answer to a fix that has come since the last call (see `AnswerLog`)."""
+        with self._link.turn("answers"):
+            self._answers.write(flight_log)
 
     def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
         """Return the autopilot's last report of its vehicle, with the attitude at the time of a frame; None where it
@@ -137,8 +144,22 @@ class ToAutopilot:
 
         `used_mah` is the charge that the board has drawn so far.
         """
-        last = _reported(*self._last) if self._last else None
-        fix = self._fixed(event) if event.accepted else None
+        with self._link.turn("told"):
+            last = _reported(*self._last) if self._last else None
+            fix, sending = self._fixed(event) if event.accepted else (None, None)
+            is_heard = self._link.listens()
+        if sending:
+            if is_heard:
+                sending.wait(_SETTLED_WITHIN_S)
+            self._last = _name(event), sending
+        with self._link.turn("told of its fix"):
+            if sending:
+                self._answers.wait_for(*self._last)
+                fix = _reported(*self._last)
+            self._tell(event, used_mah)
+        return replace(event, fix=fix, last_fix=last)
+
+    def _tell(self, event: Recognition, used_mah: float) -> None:
         now_s = self._clock.mono_s()
         if event.accepted:
             best = event.best
@@ -147,12 +168,12 @@ class ToAutopilot:
         if event.is_query:
             cpu_share = event.cost.whole.utilisation(self._cores)
             self._link.send(*messages.query_figures(now_s, cpu_share, used_mah))
-        return replace(event, fix=fix, last_fix=last)
 
     def compare_gps(self, off_m: float, is_wrong: bool) -> None:
         """Tell by how many metres a match lies off GPS, and navigate by GPS no longer while it is wrong."""
-        self._link.send(messages.gps_distance(self._clock.mono_s(), off_m))
-        self._navigator.believe_gps(not is_wrong)
+        with self._link.turn("gps"):
+            self._link.send(messages.gps_distance(self._clock.mono_s(), off_m))
+            self._navigator.believe_gps(not is_wrong)
 
     def announce(self, mood: Mood, text: str, topic: str | None = None) -> None:
         """Send a text to people on the ground, when its turn comes. The newest text of a `topic` takes the place of one
@@ -169,13 +190,14 @@ class ToAutopilot:
 
     def report(self, health: messages.Health, load: MachineLoad, temperature_c: float | None) -> None:
         """Report the state of this companion computer, once a second, and ask for other sources where that is due."""
-        self._link.set_health(health)
-        self._ask_for_sources()
-        self._link.send(
-            messages.computer_status(
-                self._clock.mono_s(), load.core_shares, load.ram_used_bytes, load.ram_total_bytes, temperature_c
+        with self._link.turn("report"):
+            self._link.set_health(health)
+            self._ask_for_sources()
+            self._link.send(
+                messages.computer_status(
+                    self._clock.mono_s(), load.core_shares, load.ram_used_bytes, load.ram_total_bytes, temperature_c
+                )
             )
-        )
 
     def _ask_for_sources(self) -> None:
         vehicle, now_s = self._link.vehicle(), self._clock.mono_s()
@@ -187,24 +209,19 @@ class ToAutopilot:
             self.announce(Mood.WARNING, f"source set {number} asked for", "sources")
             self._link.send(messages.source_set(number, self._link.stats().autopilot_system_id or 0))
 
-    def _fixed(self, event: Recognition) -> FixReport:
-        """Send the fix of an accepted match, if it has one, and report what became of it."""
+    def _fixed(self, event: Recognition) -> tuple[FixReport | None, Sending | None]:
+        """Send the fix of an accepted match, if it has one; return its sending, or the report that there is none."""
         if event.position is None:
-            return _unsent(event, "the place has no position")
+            return _unsent(event, "the place has no position"), None
         try:
             advice = self._navigator.advise(event, self._clock.mono_s())
         except ValueError as error:  # another program wrote an invalid position
             _log.warning("place %d: %s; no fix is sent", event.best.place.place_id, error)
-            return _unsent(event, str(error))
+            return _unsent(event, str(error)), None
         self._say_held(advice.why if advice.is_held else None)
         if advice.fix is None or not self._send_fixes:
-            return _unsent(event, advice.why or DRY_RUN)
-        sending = self._link.send_fix(advice.fix)
-        if self._link.listens():
-            sending.wait(_SETTLED_WITHIN_S)
-        self._last = _name(event), sending
-        self.answers.wait_for(*self._last)
-        return _reported(*self._last)
+            return _unsent(event, advice.why or DRY_RUN), None
+        return None, self._link.send_fix(advice.fix)
 
     def _say_held(self, objection: str | None) -> None:
         """Count a fix that is held back, and tell the ground where that begins or is over."""

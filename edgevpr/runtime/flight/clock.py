@@ -2,15 +2,27 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from functools import partial
+
+from edgevpr.helpers.tape import Tape
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Clock:
     """Clocks in seconds: `mono_s` since the start of the machine, which stamps every frame and message of a flight;
-    `process_cpu_s` CPU time of all threads; `thread_cpu_s` that of the calling thread. `sleep` waits."""
+    `wall_s` the one by which the steps of a query are timed; `utc_s` since 1970; `process_cpu_s` CPU time of all
+    threads; `thread_cpu_s` that of the calling thread. `sleep` waits."""
 
     mono_s: Callable[[], float] = time.monotonic
+    wall_s: Callable[[], float] = time.perf_counter
+    utc_s: Callable[[], float] = time.time
     process_cpu_s: Callable[[], float] = time.process_time
     thread_cpu_s: Callable[[], float] = time.thread_time
     sleep: Callable[[float], None] = time.sleep
+
+
+def taped(clock: Clock, tape: Tape) -> Clock:
+    """Return the same clocks, each look at which is on the tape."""
+    names = [each.name for each in fields(clock) if each.name != "sleep"]
+    return replace(clock, **{name: partial(tape.read, name, getattr(clock, name)) for name in names})

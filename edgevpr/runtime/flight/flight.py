@@ -5,7 +5,7 @@ from typing import Any
 
 from edgevpr.config import Config
 from edgevpr.frames.source import Source
-from edgevpr.power.equations import parse_pack
+from edgevpr.helpers.tape import NO_TAPE
 from edgevpr.runtime.flight.autopilot import Autopilot
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.commands import Commands
@@ -16,7 +16,7 @@ from edgevpr.runtime.flight.gpswatch import GpsWatch
 from edgevpr.runtime.flight.learning import Learning
 from edgevpr.runtime.flight.loop import Observer, Stop, loop
 from edgevpr.runtime.flight.mapstate import MapState
-from edgevpr.runtime.flight.metering import FlightMeter
+from edgevpr.runtime.flight.metering import FlightMeter, meter_of_flight
 from edgevpr.runtime.flight.pace import Pace
 from edgevpr.runtime.flight.querylog import QueryLog, totals_of
 from edgevpr.runtime.flight.reloading import NoReloading, Reloading, Reread
@@ -69,9 +69,7 @@ def fly(
     """
     clock = clock or Clock()
     if meter is None:
-        battery = config.battery
-        pack, efficiency = parse_pack(battery.pack), battery.regulator_efficiency
-        meter = FlightMeter(recogniser.meter.board, pack, efficiency, clock=clock)
+        meter = meter_of_flight(config, recogniser.meter.board, clock, NO_TAPE)
     map_state = MapState(flight_log, autopilot)
     tally, pace = Tally(), Pace(rate_hz(config, recogniser), clock)
     governing = Governing(

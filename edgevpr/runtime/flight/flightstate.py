@@ -9,7 +9,6 @@ from edgevpr import __version__
 from edgevpr.frames.source import Source
 from edgevpr.mavlink.messages import Health
 from edgevpr.power.load import MachineLoad
-from edgevpr.power.machine import rss_mb
 from edgevpr.runtime.flight.autopilot import Autopilot, confidence_of
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.commands import Commands
@@ -58,7 +57,9 @@ class FlightState:
         rate_hz, cpu_cores = self._lately(totals["elapsed_s"], totals["process_cpu_s"])
         return Status(
             version=__version__,
-            time=datetime.now(timezone.utc).isoformat(timespec="seconds").replace("+00:00", "Z"),
+            time=datetime.fromtimestamp(self._clock.utc_s(), timezone.utc)
+            .isoformat(timespec="seconds")
+            .replace("+00:00", "Z"),
             elapsed_s=totals["elapsed_s"],
             health=health.name,
             paused=self._commands.is_paused,
@@ -70,7 +71,7 @@ class FlightState:
             rate_hz=rate_hz,
             asked_rate_hz=self._pace.rate_hz,
             cpu_cores=cpu_cores,
-            rss_mb=rss_mb(),
+            rss_mb=self._meter.rss_mb(),
             machine_cpu_share=sum(load.core_shares) / max(1, len(load.core_shares)),
             machine_ram_mb=load.ram_used_bytes / 1e6,
             machine_ram_total_mb=load.ram_total_bytes / 1e6,

@@ -4,7 +4,6 @@ import logging
 from dataclasses import asdict
 
 from edgevpr.config import Config
-from edgevpr.power.thermal import limit_c
 from edgevpr.runtime.flight.autopilot import Autopilot, Mood
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.flightlog import FlightLog
@@ -41,7 +40,7 @@ class Governing:
         self._recogniser, self._pace, self._config = recogniser, pace, config
         self._meter, self._flight_log, self._autopilot, self._clock = meter, flight_log, autopilot, clock
         self._index_mb = {recogniser.technique.spec.form: recogniser.index.nbytes / 1e6}
-        self._governor = _governor(recogniser, pace, fewer_candidates, smaller_forms, self._index_mb)
+        self._governor = _governor(recogniser, pace, fewer_candidates, smaller_forms, self._index_mb, meter.limit_c)
         self._wanted_form: str | None = None  # a form that could not be loaded
         self._reload_due_s = 0.0
 
@@ -110,11 +109,11 @@ def _governor(
     fewer_candidates: tuple[int, ...],
     smaller_forms: tuple[str, ...],
     index_mb: dict[str | None, float],
+    hottest_c: float,
 ) -> Governor:
     """Make the governor that keeps a recogniser within its board's profile. A sequence needs queries as often as the
     map was made, and its rivals compared."""
     board, spec = recogniser.meter.board, recogniser.technique.spec
-    hottest_c = limit_c() if board.thermal_limit_c is None else board.thermal_limit_c
     in_sequence = recogniser.search.length > 1
     asked = Setting(pace.rate_hz, recogniser.candidates, spec.form)
     settings = steps(asked, in_sequence, () if in_sequence else fewer_candidates, smaller_forms)

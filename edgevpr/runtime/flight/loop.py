@@ -8,6 +8,7 @@ from typing import Protocol
 
 from edgevpr.errors import ImageError
 from edgevpr.frames.source import Source
+from edgevpr.helpers.tape import NO_TAPE, Tape
 from edgevpr.runtime.flight.autopilot import Autopilot
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.commands import Commands
@@ -33,22 +34,29 @@ class Observer(Protocol):
         ...
 
 
+class StopNow(BaseException):
+    """Raised to end a flight at once."""
+
+
 class Stop:
     """Signal handler that ends a flight. While a frame is recognised the flight ends at once, so that a long comparison
     does not delay the end; otherwise it ends after the present turn of the loop."""
 
-    class Now(BaseException):
-        """Raised to end the flight at once."""
+    def __init__(self, tape: Tape = NO_TAPE) -> None:
+        self._tape = tape
+        self._asked = self._breakable = False
 
-    def __init__(self) -> None:
-        self.asked = False
-        self._breakable = False
+    @property
+    def asked(self) -> bool:
+        """True where the flight is to end."""
+        return self._tape.read("stop", lambda: self._asked)
 
     def __call__(self, *_: object) -> None:
-        self.asked = True
+        self._asked = True
         if self._breakable:
             self._breakable = False  # a second signal finds nothing more to break off
-            raise self.Now
+            self._tape.note("stopped")
+            raise StopNow
 
     @contextmanager
     def breaks_off(self) -> Iterator[None]:
@@ -58,6 +66,7 @@ class Stop:
             yield
         finally:
             self._breakable = False
+        self._tape.read("went on", lambda: True)
 
 
 def loop(
@@ -102,7 +111,7 @@ def loop(
                     event = recogniser.unread(problem) if problem else _recognised(frame, recogniser, autopilot)
                 _tell(_with_reading(event, reading.cost), autopilot, observers, meter)
             governing.look()  # here, so that each reading covers a whole number of queries
-    except Stop.Now:
+    except StopNow:
         pass
 
 

@@ -2,16 +2,18 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, astuple
 from typing import Any
 
+from edgevpr.config import Config
+from edgevpr.helpers.tape import NO_TAPE, Tape
 from edgevpr.power.boards import Board
 from edgevpr.power.energy import RunningEnergy
-from edgevpr.power.equations import Pack, marginal_energy_j, pack_ah
-from edgevpr.power.load import OwnLoad
+from edgevpr.power.equations import Pack, marginal_energy_j, pack_ah, parse_pack
+from edgevpr.power.load import MachineLoad, OwnLoad, machine_load
 from edgevpr.power.machine import rss_mb
-from edgevpr.power.meter import Stage, stage
-from edgevpr.power.thermal import ThermalWatch
+from edgevpr.power.meter import OwnMemory, QueryMeter, Stage, stage
+from edgevpr.power.thermal import ThermalState, ThermalWatch, limit_c
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.governor import Reading
 from edgevpr.runtime.recognise.recognition import Recognition
@@ -19,8 +21,9 @@ from edgevpr.types import StageCost
 
 
 class FlightMeter:
-    """Meter of a flight, from the moment it is made. `thermal` is the last look at the board's heat;
-    `queries_throttled` counts the queries made while the board slowed itself down. `close` it when done."""
+    """Meter of a flight, from the moment it is made. `thermal` is the last look at the board's heat, and `limit_c` the
+    temperature from which on it slows itself down; `queries_throttled` counts the queries made meanwhile. What is read
+    of the machine is on the `tape`. `close` it when done."""
 
     def __init__(
         self,
@@ -30,13 +33,16 @@ class FlightMeter:
         *,
         clock: Clock,
         watch: ThermalWatch | None = None,
+        tape: Tape = NO_TAPE,
     ) -> None:
+        self._tape = tape
         self._board, self._pack, self._regulator_efficiency = board, pack, regulator_efficiency
         self._clock = clock
         self._energy = RunningEnergy(board, clock.mono_s, clock.process_cpu_s)
         self._load = OwnLoad(board.cores, clock.mono_s, clock.process_cpu_s)
-        self._watch = watch or ThermalWatch(clock=clock.mono_s)
-        self.thermal = self._watch.look()
+        self._watch = watch or ThermalWatch()
+        self.look_at_heat()
+        self.limit_c = self._tape.read("limit_c", limit_c) if board.thermal_limit_c is None else board.thermal_limit_c
         self.queries_throttled = 0
 
     @property
@@ -100,7 +106,16 @@ class FlightMeter:
 
     def look_at_heat(self) -> None:
         """Look at the sensors, once a second or so."""
-        self.thermal = self._watch.look()
+        self.thermal = ThermalState(*self._tape.read("heat", lambda: astuple(self._watch.look())))
+
+    def machine_load(self) -> MachineLoad:
+        """Return the load of the machine since the last look at it, once a second."""
+        core_shares, *ram_bytes = self._tape.read("load", lambda: astuple(machine_load()))
+        return MachineLoad(tuple(core_shares), *ram_bytes)
+
+    def rss_mb(self) -> float:
+        """Return the memory of this process, MB."""
+        return self._tape.read("rss_mb", rss_mb)
 
     def heat_fields(self) -> dict[str, Any]:
         """Return the fields of the log: temperature, frequency, whether the board slows itself down, and why."""
@@ -112,7 +127,7 @@ class FlightMeter:
         return Reading(
             cpu_share=cpu_share,
             late_share=late_share,
-            rss_mb=rss_mb(),
+            rss_mb=self.rss_mb(),
             temperature_c=self.thermal.temperature_c,
             throttled=self.thermal.throttled,
         )
@@ -123,3 +138,22 @@ class FlightMeter:
 
     def _mah(self, energy_j: float) -> float:
         return 1000 * pack_ah(energy_j, self._pack, self._regulator_efficiency)
+
+
+def meter_of_flight(config: Config, board: Board, clock: Clock, tape: Tape) -> FlightMeter:
+    """Make the meter of a flight on a board that is fed by the configured pack."""
+    pack, efficiency = parse_pack(config.battery.pack), config.battery.regulator_efficiency
+    return FlightMeter(board, pack, efficiency, clock=clock, tape=tape)
+
+
+def meter_of_queries(config: Config, board: Board, clock: Clock, tape: Tape) -> QueryMeter:
+    """Make the meter of the queries of a flight."""
+    memory = OwnMemory()
+    return QueryMeter(
+        board,
+        parse_pack(config.battery.pack),
+        config.battery.regulator_efficiency,
+        wall_clock=clock.wall_s,
+        cpu_clock=clock.process_cpu_s,
+        memory_mb=lambda: tape.read("memory_mb", memory.look),
+    )

@@ -34,6 +34,7 @@ _ALT_SD_M = 3.0
 # so each says as little as one of fifty that were independent. Without this it trusted them more than its own gyros:
 # an ArduPilot copter tilted with our errors, which made our errors larger, and was lost after a minute.
 _ALIKE = math.sqrt(50)
+_UNHEARD, _UNHEARD_S = "nothing is heard of the vehicle", 5.0
 _CONTINUOUS = "taken into the continuous position"
 # ArduPilot refuses a fix then, and PX4 takes it with a gain that makes its velocity jump.
 _HAS_GPS = "not needed: the autopilot has GPS"
@@ -62,6 +63,7 @@ class Navigator:
         self._slew = Slew()
         self._vehicle: Vehicle | None = None
         self._attitude: Attitude | None = None
+        self._appeared_s = -math.inf
         self._channel, self._believes_gps = Channel.COMMAND, True
 
     @property
@@ -80,6 +82,11 @@ class Navigator:
             if channel.is_continuous != self._channel.is_continuous:
                 self._navigation = Navigation(INERTIAL if channel.is_continuous else RECKONED, self._map_sd_m)
             self._channel = channel
+
+    def hear_autopilot(self, t_s: float) -> None:
+        """Take in that there is an autopilot, or another one than before."""
+        with self._lock:
+            self._appeared_s, self._vehicle = t_s, None
 
     def hear_vehicle(self, vehicle: Vehicle) -> None:
         """Take in a report of position and velocity."""
@@ -103,8 +110,10 @@ class Navigator:
         fix = Fix(here.lat_deg, here.lon_deg, event.accuracy_m, event.frame.t_mono_s)
         with self._lock:
             vehicle = self._vehicle
-            if vehicle is None or vehicle.velocity_m_s is None or not vehicle.is_fresh_at(now_s):
-                return Advice(None, "nothing is heard of the vehicle") if self._channel.is_continuous else Advice(fix)
+            if vehicle is None or not vehicle.is_fresh_at(now_s):
+                return self._unheard(fix, now_s)
+            if vehicle.velocity_m_s is None:
+                return Advice(None, _UNHEARD) if self._channel.is_continuous else Advice(fix)
             covariance_m2 = _covariance(event, event.vehicle or vehicle)
             t_s = event.frame.t_mono_s
             expected = self._navigation.expected(t_s)
@@ -165,6 +174,14 @@ class Navigator:
                 ),
             )
 
+    def _unheard(self, fix: Fix, now_s: float) -> Advice:
+        """Say what is to be sent to an autopilot that reports no position: it may have none, and need ours; or its
+        report is on its way, and it has GPS."""
+        if self._channel.is_continuous:
+            return Advice(None, _UNHEARD)
+        since_s = max(self._appeared_s, self._vehicle.t_heard_s if self._vehicle else -math.inf)
+        return Advice(fix) if now_s - since_s > _UNHEARD_S else Advice(None, f"not sent yet: {_UNHEARD}")
+
     def _known(self, t_s: float) -> Estimate | None:
         estimate = self._navigation.at(t_s)
         if estimate is None or t_s - self._navigation.fixed_s > _LOST_S or estimate.accuracy_m > _LOST_M:
@@ -206,8 +223,8 @@ class Muted:
     """Navigates as a `Navigator` does, and gives no continuous position: for a dry run."""
 
     def __init__(self, navigator: Navigator) -> None:
-        self.hear_channel, self.hear_vehicle = navigator.hear_channel, navigator.hear_vehicle
-        self.hear_force = navigator.hear_force
+        self.hear_autopilot, self.hear_channel = navigator.hear_autopilot, navigator.hear_channel
+        self.hear_vehicle, self.hear_force = navigator.hear_vehicle, navigator.hear_force
 
     def state_at(self, t_s: float) -> None:
         return None

@@ -6,8 +6,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
 from typing import Any
 
-from edgevpr.config import Config
-from edgevpr.errors import EdgevprError
+from edgevpr.config import Config, build
+from edgevpr.errors import ConfigError, EdgevprError
+from edgevpr.helpers.tape import NO_TAPE, Tape
 from edgevpr.runtime.flight.flightlog import FlightLog
 
 # Neither opens anything anew, nor decides who is told what.
@@ -17,13 +18,33 @@ _log = logging.getLogger(__name__)
 
 
 class Reread:
-    """Signal handler that asks for the configuration to be read again, by `read`."""
+    """Signal handler that asks for the configuration to be read again, by `read`. What is read is on the `tape`."""
 
-    def __init__(self, read: Callable[[], Config]) -> None:
-        self.read, self.asked = read, False
+    def __init__(self, read: Callable[[], Config], tape: Tape = NO_TAPE) -> None:
+        self._read, self._tape, self._asked = read, tape, False
 
     def __call__(self, *_: object) -> None:
-        self.asked = True
+        self._asked = True
+
+    def take(self) -> bool:
+        """Tell once that the configuration is to be read again."""
+        asked = self._tape.read("reread", lambda: self._asked)
+        if asked:
+            self._asked = False
+        return asked
+
+    def read(self) -> Config:
+        """Read the configuration. Raises ConfigError."""
+        found = self._tape.read("config", self._found)
+        if problem := found.get("problem"):
+            raise ConfigError(problem)
+        return build(Config, found, "the configuration")
+
+    def _found(self) -> dict[str, Any]:
+        try:
+            return asdict(self._read())
+        except EdgevprError as error:
+            return {"problem": str(error)}
 
 
 class NoReloading:
@@ -42,9 +63,8 @@ class Reloading:
 
     def look(self) -> None:
         """Read the configuration, if that is asked for, and say what comes of it."""
-        if not self._reread.asked:
+        if not self._reread.take():
             return
-        self._reread.asked = False
         try:
             new = self._reread.read()
         except EdgevprError as error:
@@ -62,6 +82,7 @@ class Reloading:
         )
         if taken:
             self._take(self._config)
+            self._flight_log.restate(config=asdict(self._config))
         said = [f"{name} is {'the default' if value is None else value}" for name, value in taken.items()]
         _log.info("the configuration is read again: %s", ", ".join(said) or "nothing changes")
         if refused:

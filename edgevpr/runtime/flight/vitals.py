@@ -5,7 +5,6 @@ import logging
 from edgevpr.frames.condition import Condition
 from edgevpr.frames.source import Source
 from edgevpr.mavlink.messages import Health
-from edgevpr.power.load import machine_load
 from edgevpr.runtime.flight.autopilot import Autopilot, Mood
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.commands import Commands
@@ -50,6 +49,7 @@ class Vitals:
         failing = f"{FAILURES_IN_A_ROW} frames in a row have failed"
         told = {"flight_log": flight_log, "autopilot": autopilot}
         self._failing = Trouble("failing", failing, "frames are recognised again", **told)
+        self._has_log = True
         self._blind = Trouble("camera", "camera shows nothing", "camera shows ground again", **told)
 
     def beat(self) -> None:
@@ -58,17 +58,19 @@ class Vitals:
         if self._watchdog_s and now_s >= self._watchdog_due_s:
             notify(WATCHDOG=1)
             self._watchdog_due_s = now_s + self._watchdog_s
-        self._autopilot.answers.write(self._flight_log)
+        self._autopilot.log_answers(self._flight_log)
         if now_s >= self._health_due_s:
             self._health_due_s = now_s + _HEALTH_S
+            self._flight_log.sync_due(now_s)
             self._tell()
 
     def _tell(self) -> None:
         self._meter.look_at_heat()
         self._say_source()
         self._failing.note(self._tally.is_failing)
+        self._say_log()
         self._blind.note(self._tally.sees_nothing)
-        health, load = self._health(), machine_load()
+        health, load = self._health(), self._meter.machine_load()
         status = self._state.status(health, load)
         notify(STATUS=status.summary)
         self._readers.tell(status)
@@ -81,6 +83,14 @@ class Vitals:
             _log.warning("source: %s", self._source.state)
             self._flight_log.write("source", state=self._source.state, refused=self._source.refused)
             self._autopilot.announce(Mood.WARNING if trouble else Mood.NOTE, f"camera {trouble or 'is back'}", "source")
+
+    def _say_log(self) -> None:
+        """Tell the ground of a flight log that cannot be written; the journal has the reason."""
+        has_log = self._flight_log.is_written
+        if has_log != self._has_log:
+            self._has_log = has_log
+            text = f"flight log {'is written again' if has_log else 'cannot be written'}"
+            self._autopilot.announce(Mood.NOTE if has_log else Mood.WARNING, text, "log")
 
     def _health(self) -> Health:
         if self._trouble:

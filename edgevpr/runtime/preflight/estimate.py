@@ -176,7 +176,14 @@ def _costs_on(trial: Trial, here: Board, board: Board) -> TechniqueCosts:
 
 def _technique(option: Option, board: Board, plan: FlightPlan, stored: bool, on_front: bool) -> TechniqueEstimate:
     costs, found = option.costs, option.fit
-    query = query_cost(costs.encode, costs.match(plan.places), board, plan.pack, plan.regulator_efficiency)
+    query = query_cost(
+        costs.encode,
+        costs.match(plan.places),
+        board,
+        plan.pack,
+        plan.regulator_efficiency,
+        rss_mb=costs.process_mb,
+    )
     flight_s = 60 * plan.flight_min
     marginal_mah = queries_ah(min(plan.rate_hz, found.reachable_hz) * flight_s, query.marginal_mah)
     # Equation 5.7 leaves out the idle power between two queries; the pack supplies it all the same.

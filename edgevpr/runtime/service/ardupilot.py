@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from edgevpr.mavlink.autopilots import ardupilot
 from edgevpr.mavlink.autopilots.channel import Channel, Choice, Kind
 from edgevpr.mavlink.reading import Reading
-from edgevpr.runtime.service.finding import Finding, sentence
+from edgevpr.runtime.service.finding import Finding, Plan, sentence
 
 Parameters = Mapping[str, float | int]
 
@@ -20,21 +20,25 @@ PARAMETERS = (
 
 _USE_BEST, _PRIMARY_WHILE_FIXED = 1, 4  # GPS_AUTO_SWITCH: both take the other receiver when the first has no fix
 _FROM_GPS, _FROM_FLOW, _FROM_VISION = 3, 5, 6  # EK3_SRCn_...
+_NO_RECEIVER, _ANY_RECEIVER = 0, 1  # GPSn_TYPE
 _MAVLINK_1, _MAVLINK_2 = 1, 2  # SERIALn_PROTOCOL
 KNOWS_FIXES = (4, 5)  # release notes of 4.5.0: MAV_CMD_EXTERNAL_POSITION_ESTIMATE
 _SHORT_BAUDS = {111_100: 111}  # SERIALn_BAUD is in thousands, rounded down; above 2000 it is the rate itself
 
 
-def findings(reading: Reading) -> Iterator[Finding]:
+def findings(reading: Reading, plan: Plan) -> Iterator[Finding]:
     """Judge what was read of an ArduPilot."""
     yield _filter_used(reading.parameters)
     chosen = ardupilot.choice(reading.asked)
-    if chosen.channel is Channel.GPS_INPUT:
+    if chosen.channel.is_continuous and not plan.sends_fixes:
+        yield _dry(chosen, reading)
+    elif chosen.channel is Channel.GPS_INPUT:
         yield _gps(chosen, reading.parameters)
     elif chosen.channel is Channel.ODOMETRY:
         yield _odometry(chosen, reading)
     else:
-        yield _single_fixes(chosen, reading)
+        found = _single_fixes(chosen, reading)
+        yield found if found.ok or plan.sends_fixes else _not_yet(found)
         yield from _airspeed(reading)
     yield _ports(reading)
 
@@ -91,6 +95,32 @@ def _gps(chosen: Choice, parameters: Parameters) -> Finding:
     if wrong:
         return Finding("channel", False, f"{chosen.reason}, but it would not be used.", tuple(wrong))
     return Finding("channel", True, sentence(chosen.reason))
+
+
+def _dry(chosen: Choice, reading: Reading) -> Finding:
+    """Judge a continuous channel in a dry run, which sends no position: AP_Arming wants one of all that is set up."""
+    if chosen.channel is Channel.GPS_INPUT:
+        name = ardupilot.receiver_name(reading.parameters, chosen.receiver)
+        change = f"{name}={_NO_RECEIVER if chosen.receiver == ardupilot.SECOND else _ANY_RECEIVER}"
+    else:
+        change = "VISO_TYPE=0"
+    return Finding(
+        "channel",
+        False,
+        f"{chosen.reason}. A dry run (`send_fixes: false`) sends no position that way, so this {reading.vehicle} would "
+        "not arm: change this until the first flight with fixes on, and reboot.",
+        (change,),
+    )
+
+
+def _not_yet(found: Finding) -> Finding:
+    """Put off what only a flight with fixes needs: with a second receiver that has no fix a dry run would not arm."""
+    return Finding(
+        "channel",
+        True,
+        f"A dry run (`send_fixes: false`) needs no change. The first flight with fixes on needs "
+        f"{' and '.join(found.changes)}: {found.message}",
+    )
 
 
 def _odometry(chosen: Choice, reading: Reading) -> Finding:

@@ -18,6 +18,7 @@ from edgevpr.helpers.files import require_folder
 from edgevpr.mavlink.address import LinkAddress, parse_links
 from edgevpr.mavlink.asking import Asking
 from edgevpr.mavlink.signing import open_signing_to_ask
+from edgevpr.mavlink.wire import mavlink
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import map_path
 from edgevpr.power.boards import load_board
@@ -28,8 +29,9 @@ from edgevpr.runtime.preflight.pick import outlook
 from edgevpr.runtime.recognise.calibrated import calibration_of
 from edgevpr.runtime.recognise.learn import check_positions
 from edgevpr.runtime.recognise.opening import open_recogniser
+from edgevpr.runtime.service import px4
 from edgevpr.runtime.service.board import log_findings
-from edgevpr.runtime.service.doctor import silence
+from edgevpr.runtime.service.doctor import plan_of, silence
 from edgevpr.runtime.service.finding import Finding, looked_at
 from edgevpr.types import FIX_MAX_AGE_S
 
@@ -180,14 +182,14 @@ def _with_a_frame(source: Source, uri: str) -> str:
     )
 
 
-def _link(config: Config, look: Callable[[Asking, LinkAddress], str]) -> str:
+def _link(config: Config, look: Callable[[Asking, LinkAddress, Config], str]) -> str:
     settings = config.mavlink
     address, ground = parse_links(settings.link, settings.ground)
     if address is None:
         return "none, so what is recognised goes into the log only"
     signing = open_signing_to_ask(settings.signing_key, settings.signing_state)
     with Asking(address, settings.component_id, settings.system_id, signing) as asking:
-        said = [f"{address}{look(asking, address)}"]
+        said = [f"{address}{look(asking, address, config)}"]
     if ground:
         with Asking(ground, settings.component_id, settings.system_id):
             said.append(f"ground station at {ground}")
@@ -196,11 +198,15 @@ def _link(config: Config, look: Callable[[Asking, LinkAddress], str]) -> str:
     return ", ".join(said if settings.send_fixes else [*said, DRY_RUN])
 
 
-def _only_opened(asking: Asking, address: LinkAddress) -> str:
+def _only_opened(asking: Asking, address: LinkAddress, config: Config) -> str:
     return ""
 
 
-def _with_a_heartbeat(asking: Asking, address: LinkAddress) -> str:
-    if asking.heartbeat() is None:
+def _with_a_heartbeat(asking: Asking, address: LinkAddress, config: Config) -> str:
+    beat = asking.heartbeat()
+    if beat is None:
         raise LinkError(silence(address, asking.bad_bytes, asking.others, asking.refused).message)
-    return f", autopilot heard: system {asking.system_id}"
+    said = f", autopilot heard: system {asking.system_id}"
+    if beat.autopilot == mavlink.MAV_AUTOPILOT_PX4 and px4.is_too_rare(every_s := plan_of(config).every_s):
+        said += f" ({px4.rarity(every_s)}: `edgevpr doctor` says more)"
+    return said

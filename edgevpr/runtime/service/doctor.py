@@ -11,9 +11,10 @@ from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.asking import Asking
 from edgevpr.mavlink.reading import Reading, read_autopilot
 from edgevpr.mavlink.signing import MEANING, open_signing_to_ask
+from edgevpr.power.boards import load_board
 from edgevpr.runtime.service import ardupilot, px4
 from edgevpr.runtime.service.board import board_findings
-from edgevpr.runtime.service.finding import Finding
+from edgevpr.runtime.service.finding import Finding, Plan
 
 _SLOW_S = 0.25  # a round trip: fixes would be as late
 _BAD_BYTES = 300  # the rest of a message or two at the start is usual
@@ -55,8 +56,13 @@ def doctor(config: Config, address: LinkAddress, say: Callable[[str], None], roo
     except LinkError as error:
         trouble = Finding("link", False, str(error))
     say("")
-    about_autopilot = [trouble] if trouble else list(autopilot_findings(reading, address))
+    about_autopilot = [trouble] if trouble else list(autopilot_findings(reading, address, plan_of(config)))
     return Diagnosis(about_autopilot + about_board, reading)
+
+
+def plan_of(config: Config) -> Plan:
+    """Return what a flight with this configuration will do. Raises ConfigError for a board that is unknown."""
+    return Plan(config.mavlink.send_fixes, 1 / (config.source.rate_hz or load_board(config.board).rate_hz))
 
 
 def silence(
@@ -93,8 +99,9 @@ def silence(
     return Finding("link", False, f"{address}: no heartbeat of an autopilot in 5 s: {advice[address.kind]}.")
 
 
-def autopilot_findings(reading: Reading, address: LinkAddress) -> Iterator[Finding]:
-    """Judge what was read: first what holds for every autopilot, then the rules of its firmware."""
+def autopilot_findings(reading: Reading, address: LinkAddress, plan: Plan) -> Iterator[Finding]:
+    """Judge what was read for the flight that is to be: first what holds for every autopilot, then the rules of its
+    firmware."""
     yield _link(reading, address)
     yield _signing(reading)
     if reading.other_systems:
@@ -108,7 +115,7 @@ def autopilot_findings(reading: Reading, address: LinkAddress) -> Iterator[Findi
         yield Finding("firmware", False, "It is neither ArduPilot nor PX4: edgevpr sends no fixes to it.")
     elif reading.answers:
         yield _firmware(reading)
-        yield from _ADVICE[reading.firmware].findings(reading)
+        yield from _ADVICE[reading.firmware].findings(reading, plan)
     if reading.answers:
         yield from (_streams(reading), _filter(reading), _gps(reading), _origin(reading), _clock(reading))
 

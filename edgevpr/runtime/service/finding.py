@@ -7,6 +7,14 @@ from edgevpr.errors import EdgevprError
 
 
 @dataclass(frozen=True, slots=True)
+class Plan:
+    """The flight that is to be: whether it sends fixes (else it is a dry run), and the seconds between two queries."""
+
+    sends_fixes: bool
+    every_s: float
+
+
+@dataclass(frozen=True, slots=True)
 class Finding:
     """One thing that was checked; `message` says what it is or, in one sentence, what is wrong with it. `changes` are
     the exact changes that put it right, such as `GPS2_TYPE=14`."""

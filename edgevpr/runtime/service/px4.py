@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from edgevpr.mavlink.autopilots import px4
 from edgevpr.mavlink.autopilots.channel import Channel, Kind
 from edgevpr.mavlink.reading import Reading
-from edgevpr.runtime.service.finding import Finding, sentence
+from edgevpr.runtime.service.finding import Finding, Plan, sentence
 
 Parameters = Mapping[str, float | int]
 
@@ -20,12 +20,14 @@ PARAMETERS = (
 _VISION_POSITION = 1  # bit of EKF2_EV_CTRL
 KNOWS_FIXES = (1, 15)
 _MOST_DELAY_MS = 50  # our position is one of the moment at which it is sent
+_SILENT_S = 5.0  # aux_global_position.cpp: positions of message 296 are used no more
 _TELEM2, _ONBOARD = 102, 2  # MAV_1_CONFIG, MAV_1_MODE
 
 
-def findings(reading: Reading) -> Iterator[Finding]:
+def findings(reading: Reading, plan: Plan) -> Iterator[Finding]:
     """Judge what was read of a PX4."""
     yield _channel(reading)
+    yield from _rate(reading, plan)
     yield from _vision(reading.parameters)
     yield _ports(reading)
 
@@ -33,6 +35,31 @@ def findings(reading: Reading) -> Iterator[Finding]:
 def port_changes(baud: int) -> tuple[str, ...]:
     """List what TELEM 2, the usual port for a companion, needs at the other end of a serial line."""
     return f"MAV_1_CONFIG={_TELEM2}", f"MAV_1_MODE={_ONBOARD}", f"SER_TEL2_BAUD={baud}"
+
+
+def is_too_rare(every_s: float) -> bool:
+    """Tell whether PX4 drops message 296 between two queries that are so many seconds apart."""
+    return every_s >= _SILENT_S
+
+
+def rarity(every_s: float) -> str:
+    """Say how the rate of the queries stands to the silence that PX4 bears."""
+    return f"a query every {every_s:g} s, and PX4 drops positions after {_SILENT_S:g} s of silence"
+
+
+def _rate(reading: Reading, plan: Plan) -> Iterator[Finding]:
+    if px4.choice(reading.asked).channel is not Channel.SENSOR:
+        return
+    if not is_too_rare(plan.every_s):
+        yield Finding("rate", True, rarity(plan.every_s))
+        return
+    yield Finding(
+        "rate",
+        False,
+        f"There is {rarity(plan.every_s)}: it would never keep one. Ask more often, where `edgevpr profile --rate-hz` "
+        "says that the board can, or take a faster board.",
+        (f"source: {{rate_hz: {2 / _SILENT_S:g}}}, or more: not every query is a match",),
+    )
 
 
 def _channel(reading: Reading) -> Finding:

@@ -22,6 +22,7 @@ VEHICLES: dict[str, Callable[[Motion], ArduPilot | Px4]] = {
     "px4-copter": lambda motion: Px4("copter", motion),
     "px4-plane": lambda motion: Px4("plane", motion),
 }
+_START_UTC_S = 1_770_000_000.0  # where nobody says when it starts
 _FORCED = 21_196  # of an arming that passes over the checks
 _NO_POSITION, _ONLY_VELOCITY = 0b000_111, 0b011_111  # of the type mask: a set bit is a value that is ignored
 
@@ -38,13 +39,17 @@ class ReceivedFix:
 
 
 class FlightController:
-    """One vehicle of a firmware, of those in VEHICLES. Without `gps` it has lost GPS in flight, before the start."""
+    """One vehicle of a firmware, of those in VEHICLES. Without `gps` it has lost GPS in flight, before the start, which
+    is at `start_utc_s` by its clock."""
 
-    def __init__(self, vehicle: str, motion: Motion, *, gps: bool, system_id: int = 1) -> None:
+    def __init__(
+        self, vehicle: str, motion: Motion, *, gps: bool, system_id: int = 1, start_utc_s: float = _START_UTC_S
+    ) -> None:
         if vehicle not in VEHICLES:
             raise UsageError(f"There is no vehicle {vehicle!r}: choose one of {', '.join(VEHICLES)}.")
         self.brain = VEHICLES[vehicle](motion)
-        self.system_id = system_id
+        self.vehicle, self.system_id = vehicle, system_id
+        self._start_utc_s = start_utc_s
         self.fixes: list[ReceivedFix] = []
         self.answers: list[int] = []  # to fixes, MAV_RESULT
         self._motion = motion
@@ -53,6 +58,10 @@ class FlightController:
         self._has_begun = False
         if not gps:
             self.brain.lose_gps(self._truth, 0.0)
+
+    def __str__(self) -> str:
+        gps = "with GPS" if self.brain.parameters["SIM_GPS1_ENABLE"] else "that has lost GPS"
+        return f"a simulated {self.vehicle} {gps}, system {self.system_id},"
 
     @property
     def error_m(self) -> float:
@@ -64,7 +73,7 @@ class FlightController:
         self.brain.parameters.set(name, value)
 
     def begin(self) -> None:
-        """Note that a companion is heard; a track starts when it first is."""
+        """Note that a flight is heard; a track starts when it first is."""
         if not self._has_begun:
             self._has_begun = True
             self._motion.begin(self._now_s)
@@ -200,7 +209,13 @@ class FlightController:
         )
 
     def _moment(self) -> Moment:
-        return Moment(t_s=self._now_s, truth=self._truth, brain=self.brain, is_known=self._motion.is_known)
+        return Moment(
+            t_s=self._now_s,
+            start_utc_s=self._start_utc_s,
+            truth=self._truth,
+            brain=self.brain,
+            is_known=self._motion.is_known,
+        )
 
     def _wind_m_s(self) -> complex:
         parameters = self.brain.parameters

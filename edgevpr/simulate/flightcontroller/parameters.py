@@ -1,10 +1,13 @@
 """Parameters of a flight controller, and the messages in which they travel."""
 
+import difflib
 import struct
 
+from edgevpr.errors import UsageError
 from edgevpr.mavlink.wire import Message, mavlink
 
 _NAME_BYTES = 16
+_MOST = 2**31 - 1
 
 
 class Parameters:
@@ -25,6 +28,23 @@ class Parameters:
     def set(self, name: str, value: float) -> None:
         """Set the value of a parameter, which must exist."""
         self._values[name] = type(self._values[name])(value)
+
+    def set_written(self, name: str, text: str) -> None:
+        """Set a parameter to a number as a user writes it. Raises UsageError for a name that does not exist, and for a
+        text that is no value of it."""
+        if name not in self._values:
+            near = difflib.get_close_matches(name.upper(), self._values, n=1)
+            hint = f"did you mean {near[0]}?" if near else f"it has {', '.join(sorted(self._values))}."
+            raise UsageError(f"The simulated vehicle has no parameter {name}: {hint}")
+        kind = type(self._values[name])
+        try:
+            value = kind(text)
+        except ValueError:
+            value = None
+        if value is None or not -_MOST <= value <= _MOST:  # false for NaN
+            wanted = "a whole number" if kind is int else "a number"
+            raise UsageError(f"{name}={text}: its value is {wanted}, e.g. {self._values[name]}.")
+        self.set(name, value)
 
     def answer(self, message: Message) -> list[Message]:
         """Return the answers to a PARAM_REQUEST_READ, PARAM_REQUEST_LIST or PARAM_SET; none for an unknown name."""

@@ -47,7 +47,7 @@ def read_track(csv_path: str | Path) -> Track:
 
 
 class AlongTrack:
-    """Flies along a track from the moment a companion is first heard, stays where it ends, and obeys nobody."""
+    """Flies along a track from the moment a flight is first heard, stays where it ends, and obeys nobody."""
 
     is_flying = is_known = True
 

@@ -13,7 +13,6 @@ from edgevpr.simulate.flightcontroller.truth import Truth
 
 _UNKNOWN_16 = 65_535
 _G_MG = 1000
-_UNIX_S = 1_770_000_000  # the date of the simulation
 _CAPABILITIES = (
     mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
     | mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
@@ -23,9 +22,11 @@ _CAPABILITIES = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Moment:
-    """The vehicle at a time: where it truly is, what its firmware makes of it, and whether its position may be told."""
+    """The vehicle at a time, `t_s` seconds after its start, which was at `start_utc_s`: where it truly is, what its
+    firmware makes of it, and whether its position may be told."""
 
     t_s: float
+    start_utc_s: float
     truth: Truth
     brain: ArduPilot | Px4
     is_known: bool
@@ -157,7 +158,7 @@ def _raw_imu(now: Moment) -> Message:
 
 
 def _time(now: Moment) -> Message:
-    return mavlink.MAVLink_system_time_message(round((_UNIX_S + now.t_s) * 1e6), now.boot_ms)
+    return mavlink.MAVLink_system_time_message(round((now.start_utc_s + now.t_s) * 1e6), now.boot_ms)
 
 
 def _truth(now: Moment) -> Message | None:
@@ -176,8 +177,10 @@ def _truth(now: Moment) -> Message | None:
 
 def _version(now: Moment) -> Message:
     nothing = [0] * 8
+    is_px4 = now.brain.firmware == mavlink.MAV_AUTOPILOT_PX4
+    encoding = mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE if is_px4 else 0
     return mavlink.MAVLink_autopilot_version_message(
-        _CAPABILITIES, now.brain.version, 0, 0, 0, nothing, nothing, nothing, 0, 0, 0
+        _CAPABILITIES | encoding, now.brain.version, 0, 0, 0, nothing, nothing, nothing, 0, 0, 0
     )
 
 

@@ -36,7 +36,7 @@ class Motion(Protocol):
         ...
 
     def begin(self, now_s: float) -> None:
-        """Note that a companion is heard for the first time."""
+        """Note that a flight is heard for the first time."""
         ...
 
     def step(self, now_s: float, dt_s: float) -> Truth:

@@ -4,6 +4,7 @@ A model file is not trusted: it is run once before it may fly, and every result 
 """
 
 import hashlib
+import os
 import threading
 from functools import cache
 from pathlib import Path
@@ -119,6 +120,8 @@ def _session(path: Path, sha256: str, threads: int) -> Any:
 
 def import_onnxruntime() -> Any:
     """Import onnxruntime and return it. Raises ModelError if it cannot be imported."""
+    # Else a thread of it reports its use to its maker, and keeps a file for that in the home folder (1.31 and 1.32).
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
     try:
         import onnxruntime
     except Exception as error:  # a broken installation raises OSError, or an error of NumPy

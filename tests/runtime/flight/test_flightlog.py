@@ -3,10 +3,12 @@
 import json
 import logging
 import os
+import platform
 import re
 import shutil
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +19,11 @@ from full_disk import no_file_larger_than
 from edgevpr.config import load_config
 from edgevpr.contract import PartSpec, TechniqueSpec
 from edgevpr.errors import EdgevprError
-from edgevpr.helpers.appending import earlier_part
-from edgevpr.runtime.flight.flightlog import FlightLog, read_log, start_fields
+from edgevpr.helpers.numbered import numbered
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.runtime.flight.flightlog import FlightLog, read_log
+from edgevpr.runtime.flight.startline import start_fields
+from edgevpr.runtime.flight.wholeflight import flight_of
 from edgevpr.runtime.recognise.locate import at_place
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.types import Position, QueryCost, Steps
@@ -95,11 +100,17 @@ def test_numpy_paths_infinities_and_foreign_file_names_are_written(path):
 
 
 def test_the_first_line_says_who_flies_with_what(path):
-    spec = TechniqueSpec(name="cohog", parameters={"image": 512}, coarse=PartSpec((4,), "<f4"))
+    spec = TechniqueSpec(name="cohog", parameters={"image": 512}, coarse=PartSpec((4,), "<f4"), model_sha256="ab")
     config = load_config(None, {"map": "valley.gpkg"})
-    with FlightLog(path) as log:
-        log.write("start", **start_fields(config, "rpi-zero-2w", spec))
+    with FlightLog(path) as log, PlaceMap.create(path.with_name("valley.gpkg"), spec) as place_map:
+        log.write("start", **start_fields(config, "rpi-zero-2w", spec, place_map))
     (record,) = read_log(path)
+    assert record["map_identity"] is None, "a map without places may be any"
+    assert record["model_sha256"] == "ab"
+    assert record["libraries"]["numpy"] == np.__version__
+    assert "scipy" not in record["libraries"], "not loaded by a flight"
+    assert record["python"] == platform.python_version()
+    assert record["machine"] == platform.machine()
     assert record["technique"] == "cohog"
     assert record["parameters"] == {"image": 512}
     assert record["board"] == "rpi-zero-2w"
@@ -119,19 +130,73 @@ def test_the_disk_is_synced_at_most_once_a_second_and_at_the_end(path, syncs):
     assert len(syncs) == 4
 
 
-def test_flights_are_appended_one_after_another(path):
-    for flight in ("first", "second"):
+def test_a_line_that_no_other_follows_is_synced_too(path, syncs):
+    clock = FakeClock()
+    with FlightLog(path, clock) as log:
+        log.write("first")
+        log.write("second")
+        log.sync_due(clock())
+        assert len(syncs) == 1
+        clock.now_s += 1.0
+        log.sync_due(clock())
+        assert len(syncs) == 2
+        clock.now_s += 1.0
+        log.sync_due(clock())
+        assert len(syncs) == 2, "nothing waits"
+
+
+def test_a_sync_that_fails_between_lines_is_trouble_and_no_exception(path, monkeypatch, caplog):
+    clock = FakeClock()
+    with FlightLog(path, clock) as log:
+        log.write("first")
+        log.write("second")
+        clock.now_s += 1.0
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "fdatasync", lambda fd: os.write(os.open("/dev/full", os.O_WRONLY), b"x"))
+            log.sync_due(clock())
+        assert "No space left on device" in log.state
+        log.write("third")
+    assert kinds(path) == ["first", "second", "gap", "third"]
+
+
+def test_every_flight_has_a_file_of_its_own_and_the_newest_the_name(path):
+    for flight in ("first", "second", "third"):
         with FlightLog(path) as log:
             log.write(flight)
-    assert kinds(path) == ["first", "second"]
+    assert [each.name for each in numbered(path)] == ["flight-0001.jsonl", "flight-0002.jsonl"]
+    assert [kinds(each) for each in (*numbered(path), path)] == [["first"], ["second"], ["third"]]
 
 
-def test_after_a_pulled_battery_it_goes_on_on_a_new_line(path):
-    path.write_bytes(b'{"kind": "match"}\n{"kind": "ma')
+def test_a_log_that_is_opened_and_not_written_leaves_the_one_before(path):
+    for flight in (["start", "query"], []):
+        with FlightLog(path) as log:
+            for kind in flight:
+                log.write(kind)
+    assert kinds(path) == ["start", "query"]
+    assert not numbered(path)
+
+
+def test_a_service_that_never_gets_beyond_its_start_line_leaves_no_files(path):
     with FlightLog(path) as log:
         log.write("start")
-    assert [record["kind"] for record in read_log(path)] == ["match", "start"]
-    assert path.read_bytes().startswith(b'{"kind": "match"}\n{"kind": "ma\n{"kind": "start"')
+        log.write("query")
+    for number in range(10):
+        with FlightLog(path, max_mb=1) as log:
+            log.write("start", number=number)
+    (only,) = numbered(path)
+    assert kinds(only) == ["start", "query"]
+    (start,) = read_log(path)
+    assert start["number"] == 9
+
+
+def test_a_flight_whose_log_a_pulled_battery_cut_is_set_aside_as_it_is(path):
+    cut = b'{"kind": "start"}\n{"kind": "ma'
+    path.write_bytes(cut)
+    with FlightLog(path) as log:
+        log.write("start")
+    (aside,) = numbered(path)
+    assert aside.read_bytes() == cut
+    assert kinds(path) == ["start"]
 
 
 def test_reading_leaves_out_a_cut_last_line_and_what_is_no_record(path):
@@ -151,7 +216,10 @@ def test_a_flight_that_was_cut_at_any_byte_is_read_up_to_its_last_whole_line(pat
         assert numbers(path) == list(range(kept))
         with FlightLog(path) as log:
             log.write("start")
-        assert [each["kind"] for each in read_log(path)] == ["query"] * kept + ["start"]
+        assert [each["kind"] for each in read_log(path)] == ["start"]
+        for aside in numbered(path):
+            assert numbers(aside) == list(range(kept))
+            aside.unlink()
 
 
 def test_a_full_device_is_said_once_counted_and_never_raised(caplog):
@@ -276,6 +344,20 @@ def test_a_log_in_whose_place_another_one_was_put_has_its_start_there_too(path):
         path.rename(path.with_suffix(".mine"))
         path.write_bytes(b'{"kind": "end"}\n')
         log.write("a")
+    assert kinds(path) == ["start", "gap", "a"]
+    (aside,) = numbered(path)
+    assert kinds(aside) == ["end"]
+
+
+def test_another_file_that_cannot_be_set_aside_has_the_start_line_too(path, monkeypatch):
+    with FlightLog(path) as log:
+        log.write("start")
+        with no_file_larger_than(0):
+            log.write("lost")
+        path.rename(path.with_suffix(".mine"))
+        path.write_bytes(b'{"kind": "end"}\n')
+        monkeypatch.setattr(os, "replace", refusing)
+        log.write("a")
     assert kinds(path) == ["end", "start", "gap", "a"]
 
 
@@ -297,8 +379,10 @@ def test_a_log_whose_folder_is_deleted_is_tried_again(path, caplog):
 def test_the_password_of_a_camera_stands_in_no_line(path):
     config = load_config(None, {"source.uri": "rtsp://pilot:secret@10.0.0.2/cam", "log.path": str(path)})
     spec = TechniqueSpec(name="cohog", parameters={}, coarse=PartSpec((4,), "<f4"))
-    with FlightLog(path) as log:
-        log.write("start", **start_fields(config, "rpi-5", spec), source=Path("rtsp://pilot:secret@10.0.0.2"))
+    with FlightLog(path) as log, PlaceMap.create(path.with_name("m.gpkg"), spec) as place_map:
+        log.write(
+            "start", **start_fields(config, "rpi-5", spec, place_map), source=Path("rtsp://pilot:secret@10.0.0.2")
+        )
         log.write("source", state="rtsp://pilot:secret@10.0.0.2/cam lost")
     assert "secret" not in path.read_text()
     assert next(read_log(path))["config"]["source"]["uri"] == "rtsp://pilot:***@10.0.0.2/cam"
@@ -365,102 +449,218 @@ def test_a_log_that_was_killed_loses_nothing_that_was_written(path):
     assert [record["i"] for record in read_log(path)] == list(range(50))
 
 
-PART_MB = 0.004  # two of them are the limit of the tests below
+PART_MB = 0.004  # four of them are the limit of the tests below
 
 
 def numbers(path: Path) -> list[int]:
     return [record["n"] for record in read_log(path) if record["kind"] == "query"]
 
 
-def written(path: Path, count: int, **settings) -> FlightLog:
-    with FlightLog(path, max_mb=2 * PART_MB, **settings) as log:
+def written(path: Path, count: int, begin: int = 0, **settings) -> FlightLog:
+    with FlightLog(path, max_mb=4 * PART_MB, **settings) as log:
         log.write("start", version="1")
-        for n in range(count):
+        for n in range(begin, begin + count):
             log.write("query", n=n)
     return log
 
 
-def test_a_log_that_is_full_goes_on_in_a_new_part_and_both_can_be_read_alone(path, caplog):
-    written(path, 80)
-    first, second = numbers(earlier_part(path)), numbers(path)
-    assert earlier_part(path).name == "flight.1.jsonl"
-    assert first + second == list(range(80))
-    (start,), (again,) = ([each for each in read_log(part) if each["kind"] == "start"] for part in parts(path))
-    assert again == {**start, "repeated": True}
-    assert kinds(path)[0] == "start"
+def parts(path: Path) -> list[Path]:
+    return [*numbered(path), path]
+
+
+def test_a_log_that_is_full_goes_on_in_a_new_file_and_each_can_be_read_alone(path, caplog):
+    written(path, 120)
+    assert [each.name for each in parts(path)] == ["flight-0001.jsonl", "flight-0002.jsonl", "flight.jsonl"]
+    assert [n for part in parts(path) for n in numbers(part)] == list(range(120))
+    (start,), *again = ([each for each in read_log(part) if each["kind"] == "start"] for part in parts(path))
+    assert again == [[{**start, "repeated": True, "part": part}] for part in (2, 3)]
+    assert {kinds(part)[0] for part in parts(path)} == {"start"}
     assert not caplog.records
 
 
-def parts(path: Path) -> tuple[Path, Path]:
-    return earlier_part(path), path
-
-
-def test_the_newest_lines_are_kept_and_the_disk_use_is_bounded(path):
-    written(path, 1000)
+def test_a_flight_and_those_before_it_stay_within_the_limit_and_the_oldest_go_first(path, caplog):
+    for flight in range(10):
+        written(path, 100, 100 * flight)
+        assert sum(part.stat().st_size for part in numbered(path)) <= 3e6 * PART_MB, "the newest may grow"
     assert all(part.stat().st_size <= 1e6 * PART_MB for part in parts(path))
-    kept = numbers(earlier_part(path)) + numbers(path)
+    kept = [n for part in parts(path) for n in numbers(part)]
     assert kept == list(range(kept[0], 1000))
-    assert kept[0] > 900
+    assert kept[0] < 900, "the flight before is there still, in part"
     assert {kinds(part)[0] for part in parts(path)} == {"start"}
-    assert len(list(path.parent.iterdir())) == 2
-    assert earlier_part(path).stat().st_mode & 0o777 == path.stat().st_mode & 0o777 == 0o640
+    assert {part.stat().st_mode & 0o777 for part in parts(path)} == {0o640}
+    said = [each for each in caplog.messages if each.startswith("Old flight logs are deleted, ")]
+    assert 0 < len(said) == len(caplog.messages) <= 10, "once a flight"
 
 
-def test_without_a_limit_there_is_one_file(path):
-    with FlightLog(path) as log:
+def test_many_crashed_flights_do_not_push_out_the_log_of_a_long_one(path):
+    with FlightLog(path, max_mb=1) as log:
+        log.write("start")
         for n in range(1000):
-            log.write("query", n=n)
-    assert numbers(path) == list(range(1000))
-    assert not earlier_part(path).exists()
+            log.write("query", n=n, fill="x" * 500)
+    given = []
+    for crash in range(150):
+        with FlightLog(path, max_mb=1) as log:
+            log.write("start")
+            log.write("source", state="x" * (500 if crash < 120 else 1))  # the newest are the smallest in the end
+        given.append(numbered(path)[-1])
+    assert given == sorted(set(given)), "no number is given twice"
+    kept = [each for each in parts(path) if numbers(each)]
+    assert [n for part in kept for n in numbers(part)] == list(range(1000))
+    assert len(parts(path)) < 150
 
 
-def test_a_flight_that_follows_a_long_one_begins_a_part_with_its_own_start(path):
-    path.write_bytes(b'{"kind": "query", "n": 7}\n' * 150 + b'{"kind": "qu')
-    written(path, 1)
-    assert kinds(path) == ["start", "query"]
-    assert "repeated" not in next(read_log(path))
-    assert numbers(earlier_part(path)) == [7] * 150
+def test_a_file_that_another_flight_writes_is_not_deleted(path):
+    with FlightLog(path, max_mb=4 * PART_MB) as first, FlightLog(path, max_mb=4 * PART_MB) as second:
+        second.write("start")
+        second.write("query", n=-1)
+        for n in range(400):  # in several times the room that there is
+            first.write("query", n=n)
+        second.write("query", n=-2)
+        assert (second.state, second.lost_lines) == (None, 0)
+    assert numbers(path.with_name("flight-0001.jsonl")) == [-1, -2]
+    assert not path.with_name("flight-0002.jsonl").exists()
 
 
-def test_a_part_is_kept_beside_the_file_that_a_link_leads_to(tmp_path):
+def test_without_a_limit_a_flight_is_one_file_and_nothing_is_deleted(path):
+    for flight in range(3):
+        with FlightLog(path) as log:
+            for n in range(1000):
+                log.write("query", n=1000 * flight + n)
+    assert [n for part in parts(path) for n in numbers(part)] == list(range(3000))
+    assert len(parts(path)) == 3
+
+
+def test_a_number_is_not_given_again_while_there_is_a_higher_one(path):
+    path.with_name("flight-0041.jsonl").touch()
+    path.with_name("flight-20260101.jsonl").touch()  # of somebody else
+    path.with_name("flight-0050.tlog").touch()
+    for _ in range(3):
+        with FlightLog(path) as log:
+            log.write("query")
+        path.with_name("flight-0007.jsonl").unlink(missing_ok=True)
+    assert [each.name for each in numbered(path)][1:] == ["flight-0042.jsonl", "flight-0043.jsonl"]
+
+
+def test_a_start_line_is_repeated_with_what_has_changed_since(path):
+    with FlightLog(path, max_mb=4 * PART_MB) as log:
+        log.write("start", config={"rate_hz": 1.0}, version="1")
+        log.write("query", n=1)
+        log.restate(config={"rate_hz": 2.0})
+        log.write("query", n=2, fill="x" * int(1e6 * PART_MB))
+    start, again = (next(read_log(part)) for part in parts(path))
+    assert start["config"] == {"rate_hz": 1.0}
+    assert again == {**start, "config": {"rate_hz": 2.0}, "repeated": True, "part": 2}
+
+
+def test_a_log_is_set_aside_beside_the_file_that_a_link_leads_to(tmp_path):
     (tmp_path / "card").mkdir()
     link = tmp_path / "flight.jsonl"
     link.symlink_to(tmp_path / "card" / "flight.jsonl")
     written(link, 80)
     assert link.is_symlink()
-    assert numbers(tmp_path / "card" / "flight.1.jsonl") + numbers(link) == list(range(80))
+    assert numbers(tmp_path / "card" / "flight-0001.jsonl") + numbers(link) == list(range(80))
 
 
-def test_a_log_that_cannot_be_renamed_is_written_on_and_said_once(path, caplog):
-    earlier_part(path).mkdir()
-    log = written(path, 200)
+def refusing(*_: object, **more: object) -> None:
+    raise OSError(30, "Read-only file system")
+
+
+def test_a_log_that_cannot_be_renamed_is_written_on_and_said_once(path, caplog, monkeypatch):
+    monkeypatch.setattr(os, "replace", refusing)
+    written(path, 100)
+    log = written(path, 100, 100)
     assert numbers(path) == list(range(200))
+    assert not numbered(path), "no number is left without a file"
     assert (log.state, log.lost_lines) == (None, 0)
-    assert [record.getMessage() for record in caplog.records] == [
-        f"The flight log {path} grows past log.max_mb, since it cannot be renamed (Is a directory): let the flight "
-        "write to its folder."
+    said = (
+        f"The flight log {path} cannot be set aside (Read-only file system), so it is written on, and may grow past "
+        "log.max_mb: let the flight write to its folder."
+    )
+    assert caplog.messages == [said, said], "once a flight"
+    last = flight_of(path)
+    assert (last.number, last.flights) == (2, 2)
+    assert [line["n"] for line in last if line["kind"] == "query"] == list(range(100, 200))
+
+
+def test_a_folder_that_may_not_be_written_costs_no_line(tmp_path):
+    """A user without rights, since root may write anywhere."""
+    if os.geteuid() != 0:
+        enter = []
+    elif not (enter := shutil.which("setpriv") and ["setpriv", "--reuid=65534", "--clear-groups"]):
+        pytest.skip("as root, this machine lacks setpriv to become another user")
+    folder = Path(tempfile.mkdtemp())
+    try:
+        path = folder / "flight.jsonl"
+        path.write_bytes(b'{"kind": "query", "n": 0}\n')
+        path.chmod(0o666)
+        folder.chmod(0o555)
+        script = "import sys; from edgevpr.runtime.flight.flightlog import FlightLog\n"
+        script += "with FlightLog(sys.argv[1]) as log:\n    log.write('start'); log.write('query', n=1)"
+        run = subprocess.run([*enter, sys.executable, "-c", script, path], capture_output=True, text=True)
+        if "ModuleNotFoundError" in run.stderr or "can't open" in run.stderr:
+            pytest.skip("another user may not read this checkout")
+        assert run.returncode == 0, run.stderr
+        assert "cannot be set aside (Permission denied)" in run.stderr
+        assert kinds(path) == ["query", "start", "query"]
+    finally:
+        folder.chmod(0o755)
+        shutil.rmtree(folder)
+
+
+def test_what_cannot_be_deleted_is_said_once(path, caplog, monkeypatch):
+    monkeypatch.setattr(Path, "unlink", refusing)
+    written(path, 400)
+    assert [n for part in parts(path) for n in numbers(part)] == list(range(400))
+    assert caplog.messages == [
+        f"The oldest flight logs beside {path} cannot be deleted (Read-only file system), so they grow past "
+        "log.max_mb: let the flight write to their folder."
     ]
 
 
+def test_two_flights_with_the_same_log_have_files_of_their_own(path, caplog):
+    with FlightLog(path, max_mb=4 * PART_MB) as first, FlightLog(path, max_mb=4 * PART_MB) as second:
+        for log, name in ((first, "a"), (second, "b")):
+            log.write("start", name=name)
+        for n in range(30):
+            for log, name in ((first, "a"), (second, "b")):
+                log.write("query", n=n, fill=name * 100)
+        assert (first.state, second.state, first.lost_lines, second.lost_lines) == (None, None, 0, 0)
+    own = path.with_name("flight-0001.jsonl")
+    assert caplog.messages == [
+        f"The flight log {path} is written by another edgevpr: this flight is in {own}. Give each flight a `log.path` "
+        "of its own."
+    ]
+    seen = {}
+    for part in parts(path):
+        start, *lines = read_log(part)
+        assert {line["fill"][0] for line in lines} == {start["name"]}, "lines of one flight only"
+        seen[start["name"]] = part
+    for name, part in seen.items():
+        whole = flight_of(part)
+        assert whole.missing is None
+        assert [line["n"] for line in whole if line["kind"] == "query"] == list(range(30)), name
+
+
 def test_a_start_that_was_lost_is_made_up_for(path):
-    path.write_bytes(b'{"kind": "end"}\n')  # of the flight before
     with FlightLog(path) as log:
-        with no_file_larger_than(path.stat().st_size):
+        with no_file_larger_than(10):
             log.write("start", version="1")
         log.write("query", n=1)
         log.write("query", n=2)
-    assert kinds(path) == ["end", "start", "gap", "query", "query"]
+    assert kinds(path) == ["start", "gap", "query", "query"]
+    assert flight_of(path).missing is None
 
 
-def test_a_disk_that_is_full_when_a_part_begins_loses_lines_and_no_part(path):
-    log = FlightLog(path, max_mb=2 * PART_MB)
+def test_a_disk_that_is_full_when_a_file_begins_loses_lines_and_no_file(path):
+    log = FlightLog(path, max_mb=4 * PART_MB)
     log.write("start")
     log.write("query", n=1)
     before = path.read_bytes()
     with no_file_larger_than(10):
         log.write("query", n=2, fill="x" * int(1e6 * PART_MB))
     assert log.state
-    assert earlier_part(path).read_bytes() == before
+    (aside,) = numbered(path)
+    assert aside.read_bytes() == before
     assert path.read_bytes() == b""
     log.write("query", n=3)
     log.close()
@@ -468,15 +668,15 @@ def test_a_disk_that_is_full_when_a_part_begins_loses_lines_and_no_part(path):
     assert log.lost_lines == 1
 
 
-def test_kill_9_at_any_time_loses_no_line_of_the_parts(path):
+def test_kill_9_at_any_time_loses_no_line_and_no_file(path):
     script = "import sys; from itertools import count; from edgevpr.runtime.flight.flightlog import FlightLog\n"
-    script += f"log = FlightLog(sys.argv[1], max_mb={2 * PART_MB})\nlog.write('start')\n"
+    script += f"log = FlightLog(sys.argv[1], max_mb={4 * PART_MB})\nlog.write('start')\n"
     script += "for n in count(int(sys.argv[2])):\n    log.write('query', n=n); print(n, flush=True)"
     begin = 0
     for _ in range(5):
         writing = subprocess.Popen([sys.executable, "-c", script, path, str(begin)], stdout=subprocess.PIPE, text=True)
         said = [-1]
-        while int(said[-1]) < begin + 300:  # a dozen parts on
+        while int(said[-1]) < begin + 300:  # half a dozen files on
             said.append(writing.stdout.readline())
         writing.kill()
         said += writing.communicate()[0].split()
@@ -497,3 +697,12 @@ def test_a_service_waits_for_the_medium_of_its_log(tmp_path, caplog):
     log.close()
     assert [(line["kind"], line.get("n")) for line in read_log(path)] == [("gap", None), ("query", 2)]
     assert log.state is None
+
+
+def test_a_service_whose_medium_is_there_in_time_begins_its_log_with_the_start_line(tmp_path):
+    path = tmp_path / "card" / "flight.jsonl"
+    with FlightLog(path, wait=True) as log:
+        path.parent.mkdir()
+        log.write("start")
+    assert kinds(path) == ["start", "gap"]
+    assert flight_of(path).flights == 1

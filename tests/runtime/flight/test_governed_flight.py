@@ -18,7 +18,7 @@ from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.preflight import accuracy
 from edgevpr.runtime.recognise.opening import open_learning, open_recogniser
 from edgevpr.runtime.recognise.recogniser import Recogniser
-from edgevpr.runtime.service.fly import smaller_forms_of
+from edgevpr.runtime.service.course import smaller_forms_of
 
 TURN_S = 4.0  # more than the governor's patience: each reading can bring a change
 CALM = Reading(cpu_share=0.01, late_share=0.0, rss_mb=100.0, temperature_c=40.0, throttled=False)

@@ -6,7 +6,7 @@ from flights import Flight, of_kind
 from pictures import textured
 
 from edgevpr.errors import ImageError
-from edgevpr.runtime.flight.loop import Stop
+from edgevpr.runtime.flight.loop import Stop, StopNow
 from edgevpr.runtime.flight.pace import Pace
 
 PICTURE = textured(1, 240, 320)
@@ -58,7 +58,7 @@ def test_a_stop_while_others_are_told_lets_them_finish(recording, tmp_path, cloc
     lines = flown.fly(FakeSource([PICTURE] * 9, clock))
     assert len(of_kind(lines, "query")) <= 1
     stop = Stop()
-    with pytest.raises(Stop.Now), stop.breaks_off():
+    with pytest.raises(StopNow), stop.breaks_off():
         stop()
     assert stop.asked
 

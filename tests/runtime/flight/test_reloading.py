@@ -121,3 +121,21 @@ def test_a_real_process_reads_its_file_again_and_flies_on(recording, tmp_path):
     assert "source.rate_hz is 50" in said
     assert "only a new start changes mavlink.component_id" in said
     assert list(read_log(log))[-1]["kind"] == "end"
+
+
+def test_the_start_line_is_repeated_with_the_configuration_that_is_in_force(recording, tmp_path):
+    config, log = tmp_path / "c.yaml", tmp_path / "flight.jsonl"
+    config.write_text("source: {rate_hz: 2}\n")
+    run = start(recording / "cohog.gpkg", recording / "blind" / "images", log, "--config", str(config))
+    begun = wait_for("start", log, run)
+    wait_for("query", log, run)
+    config.write_text("source: {rate_hz: 3}\nmavlink: {component_id: 7}\n")
+    run.send_signal(signal.SIGHUP)
+    wait_for("reload", log, run)
+    log.rename(tmp_path / "taken.jsonl")
+    again = wait_for("start", log, run)
+    run.terminate()
+    run.communicate(timeout=120)
+    assert (begun["config"]["source"]["rate_hz"], again["config"]["source"]["rate_hz"]) == (2.0, 3.0)
+    begun["config"]["source"]["rate_hz"] = 3.0
+    assert again == {**begun, "repeated": True, "part": 2}, "what may not change in flight is as it was"

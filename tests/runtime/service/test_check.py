@@ -12,6 +12,7 @@ import cv2
 import pytest
 import yaml
 from answering_autopilot import AnsweringAutopilot
+from mavlink_peers import AutopilotThread
 from pictures import textured
 
 from edgevpr import techniques
@@ -352,3 +353,18 @@ def test_the_command_exits_with_1_and_a_sentence_also_for_a_typo(config_file):
     assert done.returncode == 1
     assert "unknown key `bord` (did you mean `board`?)" in done.stdout
     assert "Traceback" not in done.stderr
+
+
+def test_a_px4_that_would_be_told_too_rarely_is_said(settings, config_file):
+    said = []
+    for rate_hz in (None, 0.5):  # that of the board: every 5 s
+        settings["source"]["rate_hz"] = rate_hz
+        config_file.write_text(yaml.safe_dump(settings))
+        autopilot = AutopilotThread(settings["mavlink"]["link"].replace("udpin", "udpout"), vehicle="px4-copter")
+        try:
+            (link,) = [each for each in check(config_file) if each.what == "link"]
+        finally:
+            autopilot.finish()
+        assert link.ok
+        said.append("PX4 drops positions after 5 s of silence" in link.message)
+    assert said == [True, False]

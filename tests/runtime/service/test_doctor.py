@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from answering_autopilot import AnsweringAutopilot, healthy_messages
-from mavlink_peers import free_port
+from mavlink_peers import AutopilotThread, free_port
 
 from edgevpr.cli.main import main
 from edgevpr.mavlink import reading as module
@@ -20,8 +20,10 @@ from edgevpr.mavlink.signing import UNSIGNED, WRONG
 from edgevpr.mavlink.wire import mavlink
 from edgevpr.runtime.service import ardupilot, px4
 from edgevpr.runtime.service.doctor import autopilot_findings, silence
+from edgevpr.runtime.service.finding import Plan
 
 UDP, SERIAL = parse_link("udpin:127.0.0.1:14550"), parse_link("serial:/dev/ttyAMA0:57600")
+FIXES, DRY = Plan(sends_fixes=True, every_s=1.0), Plan(sends_fixes=False, every_s=1.0)
 PLAIN = {"GPS1_TYPE": 1, "GPS2_TYPE": 0, "GPS_AUTO_SWITCH": 1, "VISO_TYPE": 0, "FLOW_TYPE": 0, "EK3_SRC1_POSXY": 3}
 READY = Filter(flags=0x33F, has_attitude=True, has_position=True, has_velocity=True, holds_still=False)
 COPTER = Reading(
@@ -59,13 +61,13 @@ def with_parameters(reading: Reading, **parameters) -> Reading:
     return replace(reading, parameters=reading.parameters | parameters)
 
 
-def wrong(reading: Reading, link=UDP) -> dict:
+def wrong(reading: Reading, link=UDP, plan=FIXES) -> dict:
     """What is wrong, and the changes that it needs."""
-    return {each.what: each.changes for each in autopilot_findings(reading, link) if not each.ok}
+    return {each.what: each.changes for each in autopilot_findings(reading, link, plan) if not each.ok}
 
 
-def said(reading: Reading, what: str, link=UDP) -> str:
-    return next(each.message for each in autopilot_findings(reading, link) if each.what == what)
+def said(reading: Reading, what: str, link=UDP, plan=FIXES) -> str:
+    return next(each.message for each in autopilot_findings(reading, link, plan) if each.what == what)
 
 
 def test_a_copter_and_a_px4_that_are_set_up_have_nothing_wrong():
@@ -163,7 +165,7 @@ def test_a_plane_is_told_whether_it_knows_its_airspeed():
     assert "drifts faster" in said(plane, "airspeed")
     assert "drifts faster" in said(with_parameters(plane, ARSPD_TYPE=1, ARSPD_USE=0), "airspeed")
     assert "the wind is known" in said(with_parameters(plane, ARSPD_TYPE=1, ARSPD_USE=1), "airspeed")
-    assert "airspeed" not in {each.what for each in autopilot_findings(COPTER, UDP)}
+    assert "airspeed" not in {each.what for each in autopilot_findings(COPTER, UDP, FIXES)}
 
 
 @pytest.mark.parametrize(
@@ -232,7 +234,60 @@ def test_who_answers_nothing_is_judged_by_nothing_but_that():
     assert wrong(replace(COPTER, signs=True)) == {}
 
 
+# A dry run.
+
+
+@pytest.mark.parametrize("vehicle", ["copter", "rover"])
+def test_a_dry_run_needs_no_second_receiver_and_hears_that_the_first_flight_with_fixes_does(vehicle):
+    bare = replace(COPTER, vehicle=vehicle, parameters=PLAIN | {"GPS_AUTO_SWITCH": 0})
+    assert wrong(bare) == {"channel": ("GPS2_TYPE=14", "GPS_AUTO_SWITCH=1")}
+    assert wrong(bare, plan=DRY) == {}
+    message = said(bare, "channel", plan=DRY)
+    assert "The first flight with fixes on needs GPS2_TYPE=14 and GPS_AUTO_SWITCH=1: This " in message
+    plane = replace(COPTER, vehicle="plane", parameters=PLAIN)
+    assert said(plane, "channel", plan=DRY) == said(plane, "channel"), "nothing is needed, dry or not"
+
+
+@pytest.mark.parametrize(
+    ("parameters", "change"),
+    [
+        ({"GPS2_TYPE": 14}, "GPS2_TYPE=0"),
+        ({"GPS1_TYPE": 14}, "GPS1_TYPE=1"),
+        ({"VISO_TYPE": 1, "EK3_SRC2_POSXY": 6}, "VISO_TYPE=0"),
+    ],
+)
+def test_a_dry_run_could_not_arm_with_what_waits_for_positions(parameters, change):
+    ready = replace(COPTER, parameters=PLAIN | parameters)
+    assert wrong(ready) == {}
+    assert wrong(ready, plan=DRY) == {"channel": (change,)}
+    assert "would not arm" in said(ready, "channel", plan=DRY)
+    older = replace(COPTER, parameters={"GPS_TYPE": 1, "GPS_TYPE2": 14})
+    assert wrong(older, plan=DRY) == {"channel": ("GPS_TYPE2=0",)}
+
+
+def test_what_a_dry_run_bears_is_wrong_before_it_too():
+    assert wrong(with_parameters(COPTER, GPS2_TYPE=0, EK3_ENABLE=0), plan=DRY) == {"EKF3": ("EK3_ENABLE=1",)}
+    assert set(wrong(with_parameters(PX4, EKF2_AGP0_CTRL=0), plan=DRY)) == {"channel"}
+
+
 # PX4.
+
+
+def test_a_px4_that_is_told_too_rarely_would_keep_no_position():
+    assert "a query every 4.9 s" in said(PX4, "rate", plan=Plan(True, 4.9))
+    for plan in (Plan(True, 5.0), Plan(False, 5.0)):
+        assert set(wrong(PX4, plan=plan)) == {"rate"}
+    assert "source: {rate_hz: 0.4}" in wrong(PX4, plan=Plan(True, 5.0))["rate"][0]
+    plane = replace(PX4, vehicle="plane", version=(1, 16, 0))  # command 43003: it reckons from fix to fix
+    assert wrong(plane, plan=Plan(True, 5.0)) == {}
+    assert "rate" not in {each.what for each in autopilot_findings(COPTER, UDP, Plan(True, 5.0))}
+
+
+def test_the_page_of_px4_names_the_same_silence():
+    page = " ".join((Path(__file__).parents[3] / "docs/px4.md").read_text().split())
+    silence_s = re.search(r"PX4 stops using positions after (\d+) s of silence", page)[1]
+    assert f"PX4 drops positions after {silence_s} s of silence" in px4.rarity(1.0)
+    assert px4.is_too_rare(float(silence_s))
 
 
 def test_a_px4_that_can_take_positions_is_told_how():
@@ -341,6 +396,27 @@ def test_the_command_prints_the_change_and_exits_with_1(link, capsys):
     printed = capsys.readouterr().out
     assert not findings_of(printed)["channel"][0]
     assert "  change: GPS2_TYPE=14\n" in printed
+
+
+@pytest.mark.usefixtures("_quick")
+def test_the_command_knows_from_the_configuration_that_the_run_is_dry_and_how_often_it_asks(link, capsys, tmp_path):
+    config = tmp_path / "config.yaml"
+    config.write_text("board: rpi-zero-2w\nmavlink: {send_fixes: false}\nlog: {path: null}\n")
+    with peer(link, parameters=PLAIN):
+        main(["doctor", "--config", str(config), "--link", link])
+    assert "A dry run (`send_fixes: false`) needs no change" in findings_of(capsys.readouterr().out)["channel"][1]
+    autopilot = AutopilotThread(link.replace("udpin", "udpout"), vehicle="px4-copter")
+    try:
+        main(["doctor", "--config", str(config), "--link", link])
+        slow = findings_of(capsys.readouterr().out)
+        config.write_text(config.read_text() + "source: {rate_hz: 0.5}\n")
+        main(["doctor", "--config", str(config), "--link", link])
+        quick = findings_of(capsys.readouterr().out)
+    finally:
+        autopilot.finish()
+    assert (slow["channel"][0], slow["rate"][0], quick["rate"][0]) == (True, False, True)
+    assert quick["clock"][0], "its time is that of this machine"
+    assert "a query every 5 s" in slow["rate"][1]
 
 
 @pytest.mark.usefixtures("_quick")

@@ -14,7 +14,8 @@ from flight_process import cpu_s, start, wait_for
 from flights import PLACES, STEP_DEG, of_kind
 
 from edgevpr.cli.main import main
-from edgevpr.helpers.appending import earlier_part
+from edgevpr.helpers.numbered import numbered
+from edgevpr.places.identity import identity_of
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.flight.flightlog import read_log
 
@@ -96,6 +97,9 @@ def test_the_flight_controller_receives_what_the_log_says(fly, tmp_path):
     assert totals["marginal_mah"] * slack > sum(line["costs"]["marginal_mah"] for line in queries) > 0
 
 
+WITHHELD = {"dry run: no fix is sent", "not sent yet: nothing is heard of the vehicle"}  # the second for five seconds
+
+
 def test_a_dry_run_tells_everything_and_sends_no_fix(fly, tmp_path):
     with autopilot() as (link, asked):
         said = fly("--link", link, "--rate-hz", "20", "--dry-run").communicate(timeout=120)[1]
@@ -106,10 +110,11 @@ def test_a_dry_run_tells_everything_and_sends_no_fix(fly, tmp_path):
     lines = list(read_log(tmp_path / "flight.jsonl"))
     queries, start_line = of_kind(lines, "query"), lines[0]
     assert all(line["accepted"] for line in queries)
-    assert {(line["fix"]["sent"], line["fix"]["why"]) for line in queries} == {(False, "dry run: no fix is sent")}
+    assert not any(line["fix"]["sent"] for line in queries)
+    assert {line["fix"]["why"] for line in queries} <= WITHHELD
     assert start_line["decided"]["dry_run"]
     assert not start_line["config"]["mavlink"]["send_fixes"]
-    assert lines[-1]["mavlink"]["sent"]["STATUSTEXT"] == 1
+    assert lines[-1]["mavlink"]["sent"]["STATUSTEXT"] == 2, "started, and dry run"
     assert said.count("dry run: no fix is sent") == 2, "at the start, and with the counts at the end"
 
 
@@ -120,7 +125,7 @@ def test_a_dry_run_can_stand_in_the_configuration(fly, tmp_path):
         fly("--link", link, "--rate-hz", "20", "--config", str(config)).communicate(timeout=120)
         assert "COMMAND_INT" not in asked()["messages"]
     queries = of_kind(read_log(tmp_path / "flight.jsonl"), "query")
-    assert {line["fix"]["why"] for line in queries} == {"dry run: no fix is sent"}
+    assert {line["fix"]["why"] for line in queries} <= WITHHELD
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
@@ -187,18 +192,34 @@ def test_kill_9_costs_no_line_that_was_written(fly, tmp_path):
     assert list(read_log(log))[-1]["kind"] == "end"
 
 
-def test_a_log_that_is_full_in_flight_goes_on_in_a_new_part(fly, tmp_path):
-    log, config = tmp_path / "flight.jsonl", tmp_path / "c.yaml"
-    config.write_text("log: {max_mb: 1}\n")
-    log.write_bytes(b'{"kind": "end", "of": "the flight before"}\n' * 11_200)  # twenty kilobytes short of half
-    run = fly("--rate-hz", "60", "--config", str(config))
-    run.communicate(timeout=120)
-    assert run.returncode == 0
-    earlier, later = list(read_log(earlier_part(log))), list(read_log(log))
-    queries = [line["query"] for line in of_kind(earlier, "query") + of_kind(later, "query")]
-    assert queries == [f"{number:02d}.png" for number in range(PLACES)]
-    assert later[0] == {**earlier[11_200], "repeated": True}
-    assert later[0]["kind"] == "start"
+def test_each_flight_has_its_log_and_says_with_which_map_it_flew(fly, tmp_path):
+    log = tmp_path / "flight.jsonl"
+    for _ in range(2):
+        run = fly("--rate-hz", "60")
+        run.communicate(timeout=120)
+        assert run.returncode == 0
+    (aside,) = numbered(log)
+    for flown in (aside, log):
+        lines = list(read_log(flown))
+        assert [line["kind"] for line in (lines[0], lines[-1])] == ["start", "end"]
+        assert [line["query"] for line in of_kind(lines, "query")] == [f"{n:02d}.png" for n in range(PLACES)]
+    with PlaceMap.open(lines[0]["map"]) as place_map:
+        assert lines[0]["map_identity"]["sha256"] == identity_of(place_map).sha256
+    assert set(lines[0]["libraries"]) == {"numpy", "cv2"}
+
+
+def test_a_second_flight_with_the_same_log_is_told_and_both_are_kept(fly, tmp_path):
+    log = tmp_path / "flight.jsonl"
+    first = fly("--rate-hz", "0.5")
+    wait_for_queries(log, 1, first)
+    said = fly("--rate-hz", "60").communicate(timeout=120)[1]
+    assert f"{log} is written by another edgevpr: this flight is in {tmp_path / 'flight-0001.jsonl'}." in said
+    first.terminate()
+    assert first.wait(timeout=60) == 0
+    first.stderr.close()
+    for flown in (log, tmp_path / "flight-0001.jsonl"):
+        assert [line["kind"] for line in read_log(flown)].count("start") == 1
+        assert list(read_log(flown))[-1]["kind"] == "end"
 
 
 def test_a_full_disk_does_not_end_the_flight(fly):
@@ -242,3 +263,11 @@ def test_a_source_that_is_not_there_yet_leaves_the_loop_turning(recording, tmp_p
         assert run.wait(timeout=60) == 0
         run.stderr.close()
     assert os.path.exists(log)
+
+
+def test_a_relative_log_of_the_service_lies_in_its_folder_of_logs(fly, tmp_path):
+    (tmp_path / "logs").mkdir()
+    run = fly("--rate-hz", "60", log="own.jsonl", LOGS_DIRECTORY=str(tmp_path / "logs"))
+    said = run.communicate(timeout=120)[1]
+    assert run.returncode == 0, said
+    assert list(read_log(tmp_path / "logs" / "own.jsonl"))[-1]["kind"] == "end"

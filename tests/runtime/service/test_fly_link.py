@@ -8,9 +8,11 @@ from mavlink_peers import Peer, UdpPort, wait_until
 from edgevpr.config import load_config
 from edgevpr.errors import ConfigError
 from edgevpr.mavlink.address import parse_link
+from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Fix
+from edgevpr.mavlink.signing import NOT_SIGNING, open_signing
 from edgevpr.runtime.flight.navigator import Navigator
-from edgevpr.runtime.service import fly
+from edgevpr.runtime.service import course
 
 
 def test_the_keys_of_the_configuration_reach_the_link():
@@ -19,7 +21,7 @@ def test_the_keys_of_the_configuration_reach_the_link():
     with ExitStack() as stack:
         port = stack.enter_context(closing(UdpPort()))
         address = parse_link(f"udpout:127.0.0.1:{port.number}")
-        link = stack.enter_context(fly._link(address, config.mavlink, Navigator(5.0, 1.0)))
+        link = stack.enter_context(course.link_of(Link, address, config.mavlink, Navigator(5.0, 1.0), NOT_SIGNING))
         heartbeat = Peer(port).expect("HEARTBEAT")
         assert (heartbeat.get_srcSystem(), heartbeat.get_srcComponent()) == (5, 191)
         sending = link.send_fix(Fix(50.0, 8.0, 20.0, link._clock()))
@@ -43,9 +45,10 @@ def test_the_key_and_where_the_time_is_kept_reach_the_link(tmp_path):
     with ExitStack() as stack:
         port = stack.enter_context(closing(UdpPort()))
         address = parse_link(f"udpout:127.0.0.1:{port.number}")
-        stack.enter_context(fly._link(address, config.mavlink, Navigator(5.0, 1.0)))
+        signing = open_signing(config.mavlink.signing_key, config.mavlink.signing_state)
+        stack.enter_context(course.link_of(Link, address, config.mavlink, Navigator(5.0, 1.0), signing))
         assert Peer(port).expect("HEARTBEAT").get_header().incompat_flags == 1  # signed
     assert state.exists()
     key.chmod(0o644)
     with pytest.raises(ConfigError, match="chmod 600"):
-        fly._link(parse_link("udpout:127.0.0.1:9"), config.mavlink, Navigator(5.0, 1.0))
+        open_signing(config.mavlink.signing_key, config.mavlink.signing_state)

@@ -1,5 +1,6 @@
 """Networks that work, and one sentence for each that does not: none of them may fly."""
 
+import os
 import subprocess
 import sys
 
@@ -158,6 +159,21 @@ def test_without_onnxruntime_the_others_fly(models):
     assert done.stdout.startswith("onnxruntime cannot be imported (")
     assert done.stdout.endswith("hog, cohog and seqslam fly without it.\n")
     assert done.stdout.count("\n") == 1
+
+
+def test_onnxruntime_leaves_nothing_at_home_and_reports_nothing(models, tmp_path):
+    write_network(models)
+    script = "from edgevpr.techniques.networks.session import open_backbone as o; o('tiny', 'features')"
+    home = tmp_path / "home"
+    home.mkdir()
+    variables = {
+        name: value for name, value in os.environ.items() if name not in ("ORT_DISABLE_TELEMETRY", "XDG_CACHE_HOME")
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", script], env={**variables, "HOME": str(home)}, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert not list(home.rglob("*"))
 
 
 def test_a_card_alone_imports_no_onnxruntime(models):

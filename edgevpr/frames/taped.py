@@ -1,0 +1,95 @@
+"""Frames that are recorded while they are read, and the source of the same frames later.
+
+A picture is kept as a JPEG, and the flight goes on with the picture in the JPEG: what is flown again is what was flown,
+to the last bit.
+"""
+
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from typing import Any
+
+import numpy as np
+
+from edgevpr.errors import ImageError
+from edgevpr.frames.condition import Condition
+from edgevpr.frames.images import decoded
+from edgevpr.frames.opencv import cv2
+from edgevpr.frames.source import Source
+from edgevpr.helpers.tape import Tape
+from edgevpr.types import Frame, Position
+
+_QUALITY = 95
+_UNPACKED = "image", "position", "pose"
+_STATE = "ended", "dropped", "refused", "latency_s", "condition", "state"
+
+
+class RecordedSource:
+    """A source whose frames and state are noted on a tape; `keep` takes the JPEG of a frame, and gives its number."""
+
+    def __init__(self, source: Source, tape: Tape, keep: Callable[[bytes], int]) -> None:
+        self.is_live, self.total = source.is_live, source.total
+        self._source, self._tape, self._keep = source, tape, keep
+        tape.note("is_live", self.is_live)
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in _STATE:
+            raise AttributeError(name)
+        found = getattr(self._source, name)
+        self._tape.note(name, found.name if isinstance(found, Condition) else found)
+        return found
+
+    def read(self, timeout_s: float) -> Frame | None:
+        """Return the next frame, as `Source.read` does, with the picture as it is kept."""
+        try:
+            frame = self._source.read(timeout_s)
+        except ImageError as error:
+            self._tape.note("frame", {"problem": str(error)})
+            raise
+        if frame is None:
+            self._tape.note("frame", None)
+            return None
+        jpeg = as_jpeg(frame.image)
+        number = self._keep(jpeg)
+        known = {key: value for key, value in asdict(replace(frame, image=None)).items() if key not in _UNPACKED}
+        position = frame.position and asdict(frame.position)
+        self._tape.note("frame", known | {"number": number, "position": position})
+        return replace(frame, image=decoded(jpeg))
+
+    def close(self) -> None:
+        """Close the source."""
+        self._source.close()
+
+
+class ReplayedSource:
+    """The source of a recorded flight: everything is read from its tape, and `picture` gives the frame of a number,
+    uint8."""
+
+    def __init__(self, tape: Tape, picture: Callable[[int], np.ndarray]) -> None:
+        self.is_live, self.total = tape.read("is_live", lambda: False), 0
+        self._tape, self._picture = tape, picture
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in _STATE:
+            raise AttributeError(name)
+        found = self._tape.read(name, lambda: None)
+        return Condition[found] if name == "condition" else found
+
+    def read(self, timeout_s: float) -> Frame | None:
+        """Return the next frame of the tape; None where none had come. Raises ImageError where one could not be
+        used."""
+        known = self._tape.read("frame", lambda: None)
+        if known is None:
+            return None
+        if problem := known.get("problem"):
+            raise ImageError(problem)
+        number, position = known.pop("number"), known.pop("position")
+        return Frame(image=self._picture(number), position=position and Position(**position), **known)
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+def as_jpeg(image: np.ndarray) -> bytes:
+    """Return a picture, uint8, (H, W) grey or (H, W, 3) BGR, as a JPEG."""
+    _, jpeg = cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, _QUALITY))
+    return jpeg.tobytes()

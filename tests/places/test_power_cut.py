@@ -1,0 +1,107 @@
+"""A power cut while a map is written: its write-ahead log ends at any byte, or what it should hold is zeros."""
+
+import random
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import map_writer
+import numpy as np
+import pytest
+from map_writer import SPEC, descriptor, frame, make_map
+
+from edgevpr.errors import MapError
+from edgevpr.places.mapfile import PlaceMap
+
+FIRST, PLACES = 2, 8  # of an earlier flight, and added to them
+HEADER, FRAME = 32, 24 + 4096  # of SQLite's write-ahead log: its header, and each page with its own
+
+
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory):
+    """A map as a program leaves it that is killed while it adds places: the file, and the log beside it."""
+    path = make_map(tmp_path_factory.mktemp("killed") / "killed.gpkg", FIRST)
+    words = [sys.executable, map_writer.__file__, str(path), str(FIRST)]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as writer:
+        for _ in range(PLACES):
+            writer.stdout.readline()
+        writer.kill()
+    return path
+
+
+def test_the_log_of_a_map_is_what_these_tests_take_it_for(killed):
+    log = killed.with_name("killed.gpkg-wal").read_bytes()
+    assert len(log) > HEADER + PLACES * FRAME
+    assert (len(log) - HEADER) % FRAME == 0
+
+
+def cuts(length: int) -> Iterator[int]:
+    """Every byte of the header, the bytes about every end of a page, and some in between."""
+    yield from range(HEADER + 2)
+    for end in range(HEADER + FRAME, length, FRAME):
+        yield from (end - 1, end, end + 1)
+    rng = random.Random(1)
+    yield from (rng.randrange(length) for _ in range(100))
+    yield length
+
+
+@pytest.mark.parametrize("rest", ["missing", "zeros"])
+def test_a_log_that_ends_anywhere_keeps_every_place_that_was_in_it_whole(killed, tmp_path, rest):
+    log = killed.with_name("killed.gpkg-wal").read_bytes()
+    kept = {}
+    for cut in sorted(set(cuts(len(log)))):
+        path = copied(killed, tmp_path / str(cut), log[:cut] + bytes(len(log) - cut if rest == "zeros" else 0))
+        kept[cut] = places_of(path)
+    assert list(kept.values()) == sorted(kept.values()), "what is longer holds no less"
+    assert kept[len(log)] >= FIRST + PLACES, "all that was confirmed"
+    assert kept[0] == FIRST
+
+
+def test_a_map_whose_log_was_cut_takes_new_places(killed, tmp_path):
+    log = killed.with_name("killed.gpkg-wal").read_bytes()
+    for cut in random.Random(2).sample(range(len(log)), 12):
+        path = copied(killed, tmp_path / str(cut), log[:cut])
+        held = places_of(shutil.copytree(path.parent, tmp_path / f"{cut}-seen") / path.name)
+        with PlaceMap.open_for_adding(path) as place_map:
+            place_map.add(frame(held), descriptor(held))
+        assert places_of(path) == held + 1
+
+
+def test_a_map_that_ends_anywhere_is_refused_or_shows_places_as_they_were(tmp_path):
+    whole = make_map(tmp_path / "whole.gpkg", PLACES).read_bytes()
+    rng = random.Random(3)
+    cuts = [*range(0, 100), *range(100, len(whole), 4096), *(rng.randrange(len(whole)) for _ in range(60))]
+    refused = shown = 0
+    for cut in cuts:
+        path = tmp_path / "cut.gpkg"
+        path.write_bytes(whole[:cut])
+        try:
+            with PlaceMap.open(path) as place_map:
+                for place in place_map.places():
+                    assert place.source_image == frame(place.place_id - 1).name
+        except MapError as error:
+            refused += str(path) in str(error)
+        else:
+            shown += 1
+    assert refused + shown == len(cuts), "a refusal names the file"
+    assert refused > 100
+
+
+def copied(killed: Path, folder: Path, log: bytes) -> Path:
+    folder.mkdir()
+    path = shutil.copy(killed, folder / killed.name)
+    path.with_name(f"{path.name}-wal").write_bytes(log)
+    return path
+
+
+def places_of(path: Path) -> int:
+    """How many places a map has, each as it was added."""
+    with PlaceMap.open(path) as place_map:
+        assert place_map.spec == SPEC
+        places = list(place_map.places())
+        assert [place.source_image for place in places] == [frame(number).name for number in range(len(places))]
+        for place in places:
+            np.testing.assert_array_equal(place_map.fine_part(place.place_id)[0], descriptor(place.place_id - 1).fine)
+        return len(places)

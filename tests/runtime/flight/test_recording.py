@@ -1,0 +1,168 @@
+"""The recording of a flight: what is kept, and how it ends before it harms."""
+
+import json
+import logging
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from fakes import FakeClock, FakeSource
+from full_disk import no_file_larger_than
+from pictures import textured
+
+from edgevpr.errors import EdgevprError, ImageError
+from edgevpr.frames.images import read_image
+from edgevpr.frames.taped import RecordedSource, ReplayedSource
+from edgevpr.replay.tape import Playback, read_tape
+from edgevpr.runtime.flight import recording as module
+from edgevpr.runtime.flight.recording import FRAMES, TAPE, Recording, frame_path, recordings
+
+
+def until(condition):
+    while not condition():
+        time.sleep(0.01)
+
+
+def notes(folder):
+    return list(read_tape(folder / TAPE))
+
+
+def test_what_is_read_and_noted_is_on_the_tape_in_its_order(tmp_path):
+    with Recording(tmp_path / "r", 100) as tape:
+        assert tape.read("one", lambda: 0.1 + 0.2) == 0.1 + 0.2
+        tape.note("two", [1, "a"], None)
+        tape.note("three")
+    assert tape.path == tmp_path / "r" / "flight-0001"
+    assert notes(tape.path) == [["one", 0.1 + 0.2], ["two", [1, "a"], None], ["three"]]
+
+
+@pytest.mark.parametrize("is_grey", [False, True])
+def test_a_flight_goes_on_with_the_picture_as_it_is_kept(tmp_path, is_grey):
+    pictures = [textured(number, 240, 320) for number in range(3)]
+    pictures = [np.ascontiguousarray(each[:, :, 0]) if each.ndim == 3 and is_grey else each for each in pictures]
+    clock = FakeClock()
+    with Recording(tmp_path, 100) as tape:
+        source = RecordedSource(FakeSource([*pictures, ImageError("it is torn")], clock), tape, tape.keep)
+        seen = [source.read(0.2) for _ in pictures]
+        with pytest.raises(ImageError):
+            source.read(0.2)
+        assert source.ended
+        state = source.state
+    again = ReplayedSource(Playback(iter(notes(tape.path))), lambda number: read_image(frame_path(tape.path, number)))
+    for frame in seen:
+        replayed = again.read(0.2)
+        assert np.array_equal(replayed.image, frame.image)
+        assert (replayed.name, replayed.t_mono_s) == (frame.name, frame.t_mono_s)
+    with pytest.raises(ImageError, match="it is torn"):
+        again.read(0.2)
+    assert again.ended
+    assert again.state == state
+
+
+def test_a_password_in_an_address_is_not_kept(tmp_path):
+    with Recording(tmp_path, 100) as tape:
+        tape.note("flight", {"uri": "rtsp://pilot:secret@camera/1"})
+    assert "secret" not in (tape.path / TAPE).read_text()
+
+
+def test_each_flight_has_a_folder_and_the_oldest_make_room(tmp_path):
+    for number in range(4):
+        with Recording(tmp_path, 10) as tape:
+            tape.keep(bytes(2_000_000))
+            tape.note("x")
+        assert tape.path.name == f"flight-{number + 1:04d}"
+    with Recording(tmp_path, 10):  # the half of 10 MB is to be free
+        until(lambda: len(recordings(tmp_path)) < 5)
+    assert [each.name for each in recordings(tmp_path)] == ["flight-0003", "flight-0004", "flight-0005"]
+
+
+def test_one_that_is_as_large_as_it_may_be_ends_and_says_so(tmp_path, caplog):
+    with caplog.at_level(logging.WARNING), Recording(tmp_path, 10) as tape:
+        for _ in range(4):
+            tape.keep(bytes(1_500_000))
+            tape.note("frame")
+            until(lambda: not tape._waiting)
+        until(lambda: tape.state)
+        tape.keep(b"no more")
+        tape.note("no more")
+    assert "as large as half of log.record_mb allows" in tape.state
+    assert sum("has ended" in each.message for each in caplog.records) == 1
+    assert ["no more"] not in notes(tape.path)
+    assert len(list((tape.path / FRAMES).iterdir())) <= 4
+
+
+def test_a_disk_that_is_too_slow_ends_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "WAITING_BYTES", 1000)
+    with Recording(tmp_path, 100) as tape:
+        tape.keep(bytes(2000))
+        tape.note("frame")
+        until(lambda: tape.state)
+    assert "too slow" in tape.state
+
+
+def test_a_full_disk_ends_it_and_nothing_else(tmp_path):
+    with Recording(tmp_path, 100) as tape:
+        tape.note("x")
+        until(lambda: not tape._waiting)
+        with no_file_larger_than(5000):
+            tape.keep(bytes(9000))
+            tape.note("frame")
+            until(lambda: tape.state)
+        tape.note("later")
+    assert "File too large" in tape.state
+    assert notes(tape.path) == [["x"]]
+
+
+def test_the_last_of_the_disk_is_left_to_logs_and_map(tmp_path, monkeypatch):
+    disk = os.statvfs(tmp_path)
+    monkeypatch.setattr(module, "SPARED_BYTES", disk.f_bavail * disk.f_frsize + 10**12)
+    with Recording(tmp_path, 100) as tape:
+        tape.note("x")
+        until(lambda: tape.state)
+    assert "MB are left on the disk" in tape.state
+
+
+def test_where_none_can_be_made_it_says_what_to_do(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(EdgevprError, match=r"leave `log\.record` out"):
+        Recording(tmp_path / "file", 100)
+    with pytest.raises(EdgevprError, match=r"leave `log\.record` out"):
+        Recording(tmp_path / "no" / "such", 100)
+
+
+def test_kill_9_costs_no_more_than_what_came_last(tmp_path):
+    script = (
+        "import sys, time\n"
+        "from edgevpr.runtime.flight.recording import Recording\n"
+        "tape = Recording(sys.argv[1], 100)\n"
+        "for number in range(10_000_000):\n"
+        "    tape.keep(b'x' * 100)\n"
+        "    tape.note('frame', number)\n"
+        "    time.sleep(0.001)\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", script, str(tmp_path)])
+    tape = tmp_path / "flight-0001" / TAPE
+    until(lambda: tape.exists() and tape.stat().st_size > 2000)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    kept = notes(tape.parent)
+    assert kept == [["frame", number] for number in range(len(kept))]
+    assert all(frame_path(tape.parent, number + 1).stat().st_size == 100 for number in range(len(kept)))
+
+
+def test_a_note_may_come_from_a_handler_of_signals(tmp_path):
+    with Recording(tmp_path, 100) as tape:
+        before = signal.signal(signal.SIGUSR1, lambda *_: tape.note("signal"))
+        try:
+            for number in range(200):
+                os.kill(os.getpid(), signal.SIGUSR1)
+                tape.note("loop", number)
+        finally:
+            signal.signal(signal.SIGUSR1, before)
+    found = [json.dumps(each) for each in notes(tape.path)]
+    assert found.count('["signal"]') == 200
+    assert [each for each in found if "loop" in each] == [f'["loop", {number}]' for number in range(200)]

@@ -1,0 +1,147 @@
+"""A flight read from the files that its log has become."""
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from edgevpr.errors import EdgevprError, UsageError
+from edgevpr.helpers.numbered import numbered
+from edgevpr.runtime.flight.flightlog import FlightLog
+from edgevpr.runtime.flight.wholeflight import flight_of
+
+PART_MB = 0.01
+
+
+@pytest.fixture
+def path(tmp_path) -> Path:
+    return tmp_path / "flight.jsonl"
+
+
+def fly(path: Path, numbers: range, **start) -> None:
+    with FlightLog(path, max_mb=4 * PART_MB) as log:
+        log.write("start", **start)
+        for n in numbers:
+            log.write("query", n=n, fill="x" * int(0.51e6 * PART_MB))
+        log.write("end")
+
+
+def numbers(lines) -> list[int]:
+    return [line["n"] for line in lines if line["kind"] == "query"]
+
+
+@pytest.fixture
+def flown(path) -> list[Path]:
+    """The files of two flights, of two and of four files with a query each."""
+    fly(path, range(2), version="1")
+    fly(path, range(100, 104), version="2")
+    files = [*numbered(path), path]
+    assert [each.name for each in files] == [*(f"flight-{n:04d}.jsonl" for n in range(1, 6)), "flight.jsonl"]
+    return files
+
+
+def test_the_newest_file_gives_the_whole_flight_with_one_start_line(path, flown):
+    whole = flight_of(path)
+    lines = list(whole)
+    assert [line["kind"] for line in lines] == ["start", *["query"] * 4, "end"]
+    assert (lines[0]["version"], "repeated" in lines[0]) == ("2", False)
+    assert numbers(lines) == [100, 101, 102, 103]
+    assert [each.path for each in whole.stretches] == flown[2:]
+    assert (whole.number, whole.flights, whole.missing) == (1, 1, None)
+    assert list(whole) == lines, "it can be read twice"
+
+
+def test_a_file_with_a_number_gives_the_flight_up_to_its_end(flown):
+    assert numbers(flight_of(flown[0])) == [0]
+    assert numbers(flight_of(flown[1])) == [0, 1]
+    assert numbers(flight_of(flown[4])) == [100, 101, 102]
+
+
+def test_a_link_is_followed_to_where_the_other_files_are(tmp_path, path, flown):
+    (tmp_path / "elsewhere").mkdir()
+    link = tmp_path / "elsewhere" / "log"
+    link.symlink_to(path)
+    assert numbers(flight_of(link)) == [100, 101, 102, 103]
+
+
+def test_a_file_that_is_missing_is_said_and_the_rest_is_read(path, flown):
+    flown[3].unlink()
+    whole = flight_of(path)
+    assert numbers(whole) == [100, 102, 103]
+    assert whole.missing == (f"Files of the flight that are missing before {path}: 1. The flight is read without them.")
+
+
+def test_the_last_file_alone_is_read_by_the_start_line_that_it_repeats(path, flown, tmp_path):
+    (tmp_path / "home").mkdir()
+    alone = Path(shutil.copy(path, tmp_path / "home" / "brought.jsonl"))
+    whole = flight_of(alone)
+    start, *rest = whole
+    assert (start["version"], start["repeated"]) == ("2", True)
+    assert numbers(rest) == [103]
+    assert "brought.jsonl: 3." in whole.missing
+
+
+def test_lines_that_a_pulled_battery_cut_are_left_out_of_every_file(path, flown):
+    for each in flown[2:5]:
+        os.truncate(each, each.stat().st_size - 10)
+    with open(path, "ab") as newest:
+        newest.write(b'{"kind": "query", "n": 10')
+    assert numbers(flight_of(path)) == [103]
+    assert flight_of(path).missing is None
+
+
+def test_the_last_of_several_flights_in_a_file_is_taken_unless_another_is_asked_for(path):
+    other = path.with_name("old")
+    for begin in (0, 10):
+        fly(path, range(begin, begin + 1), version=str(begin))
+        with open(other, "ab") as old:
+            old.write(path.read_bytes() + b'{"kind": "que\n')
+    assert numbers(flight_of(other)) == [10]
+    first = flight_of(other, 1)
+    assert (numbers(first), first.number, first.flights) == ([0], 1, 2)
+    for wrong in (0, 3):
+        with pytest.raises(UsageError, match="holds 2: give 1 to 2"):
+            flight_of(other, wrong)
+
+
+def test_a_flight_that_begins_in_a_file_of_another_is_found_there(path, flown):
+    """As where the folder could not be written for a while."""
+    files = [each.read_bytes() for each in flown]
+    flown[1].write_bytes(files[1] + files[2])
+    flown[2].unlink()
+    assert numbers(flight_of(path)) == [100, 101, 102, 103]
+    assert flight_of(path).missing is None
+    assert numbers(flight_of(flown[1], 1)) == [0, 1]
+
+
+def test_a_file_repeats_its_own_start_line_where_the_medium_came_back_as_another(path):
+    start = {"kind": "start", "time": "t", "t_mono_s": 1.0}
+    again = {**start, "repeated": True, "part": 2}
+    lines = [start, {"kind": "query", "n": 1}, again, {"kind": "query", "n": 2}]
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    whole = flight_of(path)
+    assert [line["kind"] for line in whole] == ["start", "query", "query"]
+    assert (whole.flights, whole.missing) == (1, None)
+    later = path.with_name("flight-0001.jsonl")
+    path.rename(later)
+    path.write_text(json.dumps({**again, "part": 3}) + '\n{"kind": "query", "n": 3}\n')
+    assert numbers(flight_of(path)) == [1, 2, 3]
+    assert flight_of(path).missing is None
+
+
+@pytest.mark.parametrize("part", [None, "2", True, -1, 1.5, [], 10**30])
+def test_a_part_of_no_sense_is_read_alone(path, part):
+    start = {"kind": "start", "repeated": True, "part": part}
+    path.write_text(json.dumps(start) + '\n{"kind": "query", "n": 1}\n')
+    assert numbers(flight_of(path)) == [1]
+
+
+def test_what_is_no_log_is_refused_in_a_sentence(tmp_path):
+    (tmp_path / "empty").touch()
+    with pytest.raises(EdgevprError, match="holds no line of a flight log"):
+        flight_of(tmp_path / "empty")
+    for missing in (tmp_path, tmp_path / "nothing", "/dev/zero"):
+        with pytest.raises(UsageError, match="there is no such flight log"):
+            flight_of(missing)

@@ -1,0 +1,298 @@
+"""A flight that a real process has recorded, with a real link, is flown again: to the byte, or with something else."""
+
+import json
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+
+import pytest
+import yaml
+from flight_process import start, wait_for
+from flights import PLACES, of_kind
+from mavlink_peers import Peer, UdpPort
+
+from edgevpr.cli.main import main
+from edgevpr.mavlink.wire import mavlink
+from edgevpr.replay.compare import compare
+from edgevpr.replay.replay import recorded, replay
+from edgevpr.runtime.flight.autopilot import ToAutopilot
+from edgevpr.runtime.flight.flightlog import read_log
+from edgevpr.runtime.flight.recording import TAPE, recordings
+from edgevpr.runtime.flight.tally import Tally
+
+QUICK = "--rate-hz", "15"
+
+
+def free_port():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@contextmanager
+def autopilot(vehicle="arduplane", *flags):
+    """A simulated flight controller as a process; gives its link."""
+    port = free_port()
+    command = ["-m", "edgevpr", "simulate", "autopilot", "--link", f"udpin:127.0.0.1:{port}", "--vehicle", vehicle]
+    process = subprocess.Popen([sys.executable, *command, *flags], stdout=subprocess.DEVNULL)
+    try:
+        yield f"udpout:127.0.0.1:{port}"
+    finally:
+        process.kill()
+        process.wait()
+
+
+@pytest.fixture
+def fly(recording, tmp_path):
+    """Start a recorded flight over the map's own pictures; its log is `tmp_path`/flight.jsonl."""
+
+    def started(*flags, place_map=None, pictures=None):
+        place_map = place_map or recording / "cohog.gpkg"
+        pictures = pictures or recording / "blind" / "images"
+        return start(place_map, pictures, tmp_path / "flight.jsonl", "--record", str(tmp_path / "recorded"), *flags)
+
+    return started
+
+
+def ended(process):
+    said = process.communicate(timeout=120)[1]
+    assert process.returncode in (0, -signal.SIGKILL), said
+
+
+def is_the_same(log, **how):
+    """Replay the flight of a log, and hold both against each other; give the lines of the replay."""
+    flight = recorded(log)
+    again = replay(flight, lambda done, total: None, **how)
+    lines = compare(flight.lines, again.lines)
+    assert lines.others == []
+    assert again.packets.others == []
+    assert lines.alike == len(again.lines) > 0
+    assert (again.packets.renumbered, again.guessed) == (0, 0)
+    return again, lines
+
+
+def test_a_flight_with_an_autopilot_is_the_same_to_the_byte(fly, tmp_path):
+    with autopilot() as link:
+        ended(fly("--link", link, *QUICK))
+    again, lines = is_the_same(tmp_path / "flight.jsonl")
+    assert again.why_ended is None
+    assert lines.after == 0
+    assert [line["kind"] for line in (again.lines[0], again.lines[-1])] == ["start", "end"]
+    assert len(of_kind(again.lines, "query")) == PLACES
+    sent = again.lines[-1]["mavlink"]["sent"]
+    assert again.packets.alike >= sum(sent.values()) > PLACES, "every packet was compared"
+
+
+@pytest.mark.parametrize(
+    ("vehicle", "flags"), [("px4-plane", ("--no-gps",)), ("arducopter", ("--no-gps",)), ("arduplane", ())]
+)
+def test_whatever_the_autopilot_and_its_channel(fly, tmp_path, vehicle, flags):
+    with autopilot(vehicle, *flags) as link:
+        ended(fly("--link", link, "--rate-hz", "4"))
+    again, _ = is_the_same(tmp_path / "flight.jsonl")
+    assert again.lines[-1]["mavlink"]["received"]["HEARTBEAT"] > 0
+
+
+def test_a_flight_without_a_link_too(fly, tmp_path):
+    ended(fly(*QUICK))
+    again, _ = is_the_same(tmp_path / "flight.jsonl")
+    assert again.packets.alike == 0
+
+
+def test_a_signal_in_mid_flight_and_a_configuration_read_again_are_replayed(fly, tmp_path):
+    log, config = tmp_path / "flight.jsonl", tmp_path / "c.yaml"
+    config.write_text("source: {rate_hz: 5}\n")
+    with autopilot() as link:
+        flight = fly("--link", link, "--config", str(config))
+        wait_for("query", log, flight)
+        config.write_text("source: {rate_hz: 7}\nmatch: {accept_precision: 0.99}\nbattery: {pack: 3S1000}\n")
+        flight.send_signal(signal.SIGHUP)
+        wait_for("reload", log, flight)
+        config.write_text("what: is this\n")
+        flight.send_signal(signal.SIGHUP)
+        while len(of_kind(read_log(log), "reload")) < 2:
+            time.sleep(0.02)
+        flight.send_signal(signal.SIGTERM)
+        ended(flight)
+    again, _ = is_the_same(log)
+    assert again.why_ended is None
+    first, second = of_kind(again.lines, "reload")
+    assert first["taken"] == {"match.accept_precision": 0.99, "source.rate_hz": 7.0}
+    assert first["refused"] == ["battery.pack"]
+    assert "unknown key" in second["problem"]
+
+
+def test_a_flight_that_was_killed_is_replayed_to_where_its_tape_ends(fly, tmp_path):
+    log = tmp_path / "flight.jsonl"
+    with autopilot() as link:
+        flight = fly("--link", link, "--rate-hz", "10")
+        while len(of_kind(read_log(log), "query") if log.exists() else ()) < 12:
+            assert flight.poll() is None
+            time.sleep(0.02)
+        flight.kill()
+        ended(flight)
+    again, _ = is_the_same(log)
+    assert again.why_ended == "the recording ends there"
+    assert len(of_kind(again.lines, "query")) >= 2, "what is half a second old is on the disk"
+    tape = recordings(tmp_path / "recorded")[-1] / TAPE
+    first, rest = tape.read_bytes().split(b"\n", 1)
+    for share in (0.1, 0.37, 0.6, 0.83):  # a power cut, at any byte
+        tape.write_bytes(first + b"\n" + rest[: round(share * len(rest))])
+        shorter, _ = is_the_same(log)
+        assert len(shorter.lines) <= len(again.lines)
+
+
+def test_a_flight_that_learns_is_replayed_in_a_copy_of_its_map(fly, recording, tmp_path):
+    place_map, part = tmp_path / "m.gpkg", tmp_path / "part"
+    shutil.copytree(recording / "seen", part)
+    for number in range(12, PLACES):
+        (part / "images" / f"{number:02d}.png").unlink()
+    built = ["map", "build", str(place_map), "--images", str(part / "images"), "--technique", "hog", "--no-calibrate"]
+    assert main([*built, "--param", "w1=64"]) == 0
+    ended(fly("--learn", *QUICK, place_map=place_map, pictures=recording / "seen" / "images"))
+    learnt = of_kind(read_log(tmp_path / "flight.jsonl"), "learnt")
+    assert learnt
+    before = place_map.read_bytes()
+    again, _ = is_the_same(tmp_path / "flight.jsonl")
+    assert [line["place"] for line in of_kind(again.lines, "learnt")] == [line["place"] for line in learnt]
+    assert place_map.read_bytes() == before, "the map itself is left alone"
+
+
+def test_a_new_map_is_learnt_again(fly, recording, tmp_path):
+    flags = "--learn", "--technique", "hog", *QUICK
+    ended(fly(*flags, place_map=tmp_path / "new.gpkg", pictures=recording / "seen" / "images"))
+    again, _ = is_the_same(tmp_path / "flight.jsonl")
+    assert len(of_kind(again.lines, "learnt")) == PLACES
+
+
+def test_signed_packets_and_the_link_to_the_ground_are_the_same_but_for_the_signature(fly, tmp_path):
+    key = tmp_path / "key"
+    key.write_bytes(bytes(range(32)))
+    key.chmod(0o600)
+    config = tmp_path / "c.yaml"
+    ground, flight_port = UdpPort(), UdpPort()
+    settings = {"signing_key": str(key), "ground": f"udpout:127.0.0.1:{ground.number}"}
+    config.write_text(yaml.safe_dump({"mavlink": settings | {"link": f"udpout:127.0.0.1:{flight_port.number}"}}))
+    flight = fly("--config", str(config), "--rate-hz", "5")
+    station = Peer(ground)
+    assert station.expect("HEARTBEAT").get_header().incompat_flags == mavlink.MAVLINK_IFLAG_SIGNED
+    unsigned = Peer(flight_port)
+    unsigned.expect("HEARTBEAT")
+    unsigned.heartbeat()
+    ended(flight)
+    ground.close()
+    flight_port.close()
+    again, _ = is_the_same(tmp_path / "flight.jsonl")
+    assert again.packets.alike > 0
+    assert again.lines[-1]["mavlink"]["refused_signatures"] == {"unsigned": 1}
+    tape = (recordings(tmp_path / "recorded")[-1] / TAPE).read_text()
+    assert bytes(range(32)).hex() not in tape
+
+
+def test_another_answer_of_a_technique_is_a_difference_that_is_told(fly, tmp_path, monkeypatch, capsys):
+    ended(fly(*QUICK))
+    log = str(tmp_path / "flight.jsonl")
+    assert main(["replay", log]) == 0
+    assert "0 differ" in capsys.readouterr().out
+    monkeypatch.setattr("edgevpr.runtime.recognise.recognition.round", lambda value, digits=0: 7.0, raising=False)
+    assert main(["replay", log]) == 1
+    said = capsys.readouterr().out
+    assert "score was" in said
+    assert main(["replay", log, "--json"]) == 1
+    found = json.loads(capsys.readouterr().out)
+    assert len(found["lines"]["others"]) == PLACES
+
+
+def test_code_that_says_and_asks_more_than_what_flew_is_told_apart_from_another_decision(
+    fly, tmp_path, monkeypatch, capsys
+):
+    with autopilot() as link:
+        ended(fly("--link", link, *QUICK))
+    told = Tally.tell
+
+    def tell(self, event):
+        told(self, event)
+        if self.queries == 5:
+            self.autopilot.compare_gps(3.0, False)
+            self.clock.mono_s()
+
+    monkeypatch.setattr(Tally, "tell", tell)
+    made = ToAutopilot.__init__
+
+    def make(self, *given, clock, **how):
+        made(self, *given, clock=clock, **how)
+        Tally.autopilot, Tally.clock = self, clock
+
+    monkeypatch.setattr(Tally, "autopilot", None, raising=False)
+    monkeypatch.setattr(Tally, "clock", None, raising=False)
+    monkeypatch.setattr(ToAutopilot, "__init__", make)
+    assert main(["replay", str(tmp_path / "flight.jsonl"), "--json"]) == 1
+    found = json.loads(capsys.readouterr().out)
+    assert found["guessed"] >= 2
+    assert found["packets"]["renumbered"] > 0
+    assert any("vpr_gps_m" in each for each in found["packets"]["others"])
+    kinds = {each["kind"] for each in found["lines"]["others"]}
+    assert kinds <= {"end"}, "every query ends as it did"
+
+
+def test_what_if_the_map_or_the_technique_were_another_or_more_precision_asked(fly, recording, tmp_path, capsys):
+    with autopilot() as link:
+        ended(fly("--link", link, *QUICK))
+    log, config = str(tmp_path / "flight.jsonl"), tmp_path / "what.yaml"
+    config.write_text("match: {min_score: 1.0}\n")
+    assert main(["replay", log, "--config", str(config), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["summary"]["queries"] == [PLACES, PLACES]
+    assert found["summary"]["accepted"] == [PLACES, 0]
+    config.write_text(f"technique: hog\nmap: {recording / 'hog.gpkg'}\n")
+    assert main(["replay", log, "--config", str(config)]) == 0
+    said = capsys.readouterr().out
+    assert f"accepted                     {PLACES}" in said
+    assert "queries end alike" in said
+    config.write_text("match: {accept_precission: 0.9}\n")
+    assert main(["replay", log, "--config", str(config)]) == 2
+    assert "did you mean `accept_precision`?" in capsys.readouterr().err
+
+
+def test_a_report_shows_the_frames_of_the_recording(fly, recording, tmp_path):
+    ended(fly(*QUICK))
+    log, page = str(tmp_path / "flight.jsonl"), tmp_path / "report.html"
+    assert main(["report", log, "--out", str(page)]) == 0
+    assert page.read_text().count("data:image/jpeg") >= 1
+    shutil.rmtree(tmp_path / "recorded")
+    assert main(["report", log, "--out", str(page)]) == 0
+    assert "data:image/jpeg" not in page.read_text()
+
+
+def test_what_is_missing_is_said(fly, recording, tmp_path, capsys):
+    log = tmp_path / "flight.jsonl"
+    assert main(["replay", str(log)]) == 2
+    assert "there is no such flight log" in capsys.readouterr().err
+    ended(start(recording / "cohog.gpkg", recording / "blind" / "images", log, "--rate-hz", "60"))
+    assert main(["replay", str(log)]) == 2
+    assert "was not recorded" in capsys.readouterr().err
+    log.unlink()
+    place_map = tmp_path / "m.gpkg"
+    shutil.copy(recording / "cohog.gpkg", place_map)
+    ended(fly(*QUICK, place_map=place_map))
+    place_map.rename(tmp_path / "elsewhere.gpkg")
+    assert main(["replay", str(log)]) == 2
+    assert "give it with --map" in capsys.readouterr().err
+    assert main(["replay", str(log), "--map", str(tmp_path / "elsewhere.gpkg")]) == 0
+    there = tmp_path / "there"
+    there.mkdir()
+    shutil.move(str(tmp_path / "recorded"), str(there))
+    shutil.move(str(log), str(there))
+    moved = str(there / log.name)
+    assert main(["replay", moved, "--map", str(tmp_path / "elsewhere.gpkg")]) == 0
+    (frame,) = (there / "recorded").glob("*/frames/000020.jpg")
+    frame.write_bytes(frame.read_bytes()[:100])
+    assert main(["replay", moved, "--map", str(tmp_path / "elsewhere.gpkg")]) == 0
+    assert "cut short" in capsys.readouterr().out
+    shutil.rmtree(there / "recorded")
+    assert main(["replay", moved]) == 2
+    assert "bring it there" in capsys.readouterr().err
