@@ -12,13 +12,13 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
 
 import json
 import shutil
-import subprocess
 import sys
 from importlib import metadata
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from arm64.userland import CPU, PYTHON, install, make_system, run
 from big_map import make_big_map
 from run_sets import made_by
 
@@ -31,7 +31,6 @@ HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "results"
 TOOLS = ("qemu-aarch64", "debootstrap", "gcc", "dpkg-deb")
 WHEELS = ("numpy", "opencv-python-headless", "psutil", "pyyaml")  # what the parts import
-PLATFORMS = ("manylinux2014_aarch64", "manylinux_2_17_aarch64", "manylinux_2_27_aarch64", "manylinux_2_28_aarch64")
 
 
 def main() -> None:
@@ -62,26 +61,17 @@ def main() -> None:
 
 def build(work: Path) -> None:
     """Make a Debian system for aarch64 with Python, the wheels that edgevpr imports, and the plug-in that counts."""
-    system, site = work / "system", work / "site"
-    packages = "python3,libsqlite3-0,libstdc++6"
-    mirror = ("--variant=minbase", f"--include={packages}", "bookworm", str(system))
-    run(["debootstrap", "--foreign", "--arch=arm64", *mirror])
-    for archive in sorted((system / "var/cache/apt/archives").glob("*.deb")):
-        run(["dpkg-deb", "-x", str(archive), str(system)])
-    versions = [f"{name}=={metadata.version(name)}" for name in WHEELS]
-    platforms = [f"--platform={name}" for name in PLATFORMS]
-    binary = ["--only-binary=:all:", "--no-deps", "--python-version=3.11", *platforms]
-    run([sys.executable, "-m", "pip", "install", "--quiet", f"--target={site}", *binary, *versions])
+    make_system(work / "system")
+    install(work / "site", "--no-deps", *(f"{name}=={metadata.version(name)}" for name in WHEELS))
     run(["gcc", "-shared", "-fPIC", "-O2", "-o", str(work / "count.so"), str(HERE / "arm64" / "count.c")])
 
 
 def count(work: Path, maps: list[str]) -> list[dict[str, Any]]:
     """Run the parts under emulation. Returns for each what it took: `part`, `instructions`, `bytes` loaded and stored,
     and `multiply_adds`."""
-    argv = ["qemu-aarch64", "-cpu", "cortex-a53", "-L", str(work / "system"), "-plugin", str(work / "count.so")]
-    argv += [str(work / "system/usr/bin/python3.11"), str(HERE / "arm64" / "work.py"), *maps]
-    variables = {**os.environ, "PYTHONPATH": f"{work / 'site'}:{HERE.parent}"}
-    done = run(argv, env=variables)
+    argv = ["qemu-aarch64", "-cpu", CPU, "-L", str(work / "system"), "-plugin", str(work / "count.so")]
+    argv += [str(work / f"system/usr/bin/python{PYTHON}"), str(HERE / "arm64" / "work.py"), *maps]
+    done = run(argv, {"PYTHONPATH": f"{work / 'site'}:{HERE.parent}"})
     marks = [[int(number) for number in line.split()] for line in done.stderr.splitlines() if line[:1].isdigit()]
     names = done.stdout.splitlines()
     if len(marks) != 2 * len(names):
@@ -91,14 +81,6 @@ def count(work: Path, maps: list[str]) -> list[dict[str, Any]]:
         instructions, moved, multiply_adds = (late - early for early, late in zip(before, after, strict=True))
         rows.append({"part": name, "instructions": instructions, "bytes": moved, "multiply_adds": multiply_adds})
     return rows
-
-
-def run(argv: list[str], env: dict[str, str] | None = None) -> subprocess.CompletedProcess:
-    """Run a command; its output ends the program where it fails."""
-    done = subprocess.run(argv, capture_output=True, text=True, env=env)
-    if done.returncode:
-        sys.exit(f"bench_arm64: {' '.join(argv[:4])} ... failed: {done.stdout[-2000:]}{done.stderr[-2000:]}")
-    return done
 
 
 def report(rows: list[dict[str, Any]], made: dict[str, Any]) -> str:

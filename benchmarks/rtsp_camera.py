@@ -23,6 +23,7 @@ class RtspCamera:
         self._viewer: socket.socket | None = None
         self._playing = False
         self._on = True
+        self.is_silent = False  # it stays connected, and hands nothing on
         self._thread = threading.Thread(target=self._serve)
         self._thread.start()
 
@@ -49,7 +50,7 @@ class RtspCamera:
                 end.close()
 
     def _hand_on(self, packet: bytes) -> None:
-        if self._viewer and self._playing:
+        if self._viewer and self._playing and not self.is_silent:
             self._viewer.sendall(b"$\x00" + len(packet).to_bytes(2, "big") + packet)
 
     def _answer(self, request: bytes) -> None:
@@ -68,7 +69,8 @@ class RtspCamera:
         }.get(method, "Range: npt=0-")
         answer = ["RTSP/1.0 200 OK", number, "Session: 1", headers, f"Content-Length: {len(body)}", "", body]
         self._viewer.sendall("\r\n".join(answer).encode())
-        self._playing = method == "PLAY"
+        if method in ("PLAY", "TEARDOWN"):  # every half minute a viewer asks for something only to keep the session
+            self._playing = method == "PLAY"
 
     def _let_viewer_go(self) -> None:
         if self._viewer:

@@ -1,0 +1,286 @@
+"""An hour of flight, looked at from outside: `make soak MINUTES=60` writes benchmarks/results/soak.md, soak.json and
+soak.png, and ends with code 1 where memory, descriptors or threads grow.
+
+python benchmarks/soak.py [--minutes M] [--every-s S] [--out FOLDER]
+
+A real `edgevpr run` flies with a camera that speaks RTSP, an autopilot over UDP, a second link, a status socket, a
+flight log that is limited to 1 MB and a tlog. Again and again the camera or the autopilot goes away and comes back, the
+second link's other end closes, readers of the status come and leave, and the configuration is read again.
+"""
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
+
+import argparse
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import psutil
+import yaml
+from rtsp_camera import free_port
+from run_sets import made_by
+from soak_page import Sample, Soak, verdict, write_page
+from soak_world import FOV_DEG, Autopilot, FilmCamera, make_world
+
+from edgevpr.errors import EdgevprError
+from edgevpr.runtime.flight.flightlog import read_log
+from edgevpr.runtime.service.statusreader import StatusReader
+
+RESULTS = Path(__file__).resolve().parent / "results"
+LOG_MB = 1.0
+_RADIUS_M = 110.0  # of the lap
+_CYCLE_S = 300.0  # in which everything happens once
+_AFTER = 0.06  # of a cycle: so long after its return what was away may still show
+_PATIENCE_S = 60.0
+_TURN_S = 0.1
+_LOOK_S = 3.0  # for a status, of which one comes every second
+
+
+@dataclass(frozen=True, slots=True)
+class Absence:
+    """Something that is away from `begin` to `end`, in parts of a cycle."""
+
+    name: str
+    begin: float
+    end: float
+    go: Callable[[], None]
+    come: Callable[[], None]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--minutes", type=float, default=60.0)
+    parser.add_argument("--every-s", type=float, default=5.0, help="from one look at the process to the next")
+    parser.add_argument("--out", type=Path, default=RESULTS)
+    args = parser.parse_args()
+    with TemporaryDirectory(prefix="edgevpr-soak-") as folder:
+        print("drawing the ground, the film and the map", flush=True)
+        soak = run(Path(folder), 60 * args.minutes, args.every_s)
+    broken = verdict(soak)
+    args.out.mkdir(parents=True, exist_ok=True)
+    write_page(args.out, soak, made_by())
+    for each in broken:
+        print(f"soak: {each}", file=sys.stderr)
+    sys.exit(1 if broken else 0)
+
+
+def run(folder: Path, lasts_s: float, every_s: float, radius_m: float = _RADIUS_M) -> Soak:
+    """Fly for so long and return what was seen. Raises RuntimeError where the flight does not start, or ends."""
+    world = make_world(folder, radius_m)
+    _edgevpr("map", "build", folder / "map.gpkg", "--images", world.places / "images",
+             "--camera", "nadir", "--fov-deg", FOV_DEG, "--technique", "cohog", "--no-calibrate")  # fmt: skip
+    with ExitStack() as stack:
+        camera = FilmCamera(world, folder)
+        stack.callback(camera.close)
+        port = free_port()
+        autopilot = Autopilot(f"udpin:127.0.0.1:{port}", world, camera.start_s)
+        stack.callback(autopilot.close)
+        ground = _Ground()
+        stack.callback(ground.close)
+        flight = Flight(folder, camera.uri, port, ground.port)
+        stack.callback(flight.end)
+        flight.wait_until_it_flies()
+        watch = _Watch(flight, ground, min(_CYCLE_S, lasts_s), every_s)
+        samples = watch.look_until(lasts_s, _absences(camera, autopilot, ground, flight))
+        code, said = flight.end()
+    ends = [line for line in read_log(flight.log) if line["kind"] == "end"]
+    return Soak(
+        samples=samples,
+        events=watch.events,
+        statuses=watch.statuses,
+        exit_code=code,
+        tracebacks=said.count("Traceback"),
+        warnings=sum(" WARNING " in line or "warning" in line.lower() for line in said.splitlines()),
+        log_limit_mb=LOG_MB,
+        end={name: value for name, value in (ends[-1] if ends else {}).items() if isinstance(value, int | float)},
+    )
+
+
+class Flight:
+    """`edgevpr run` as a process of its own, with its files in `folder`."""
+
+    def __init__(self, folder: Path, uri: str, port: int, ground_port: int) -> None:
+        self.log, self.tlog, self.socket = folder / "flight.jsonl", folder / "flight.tlog", folder / "status.sock"
+        self._config, self._rate_hz = folder / "config.yaml", 2.0
+        self._stderr = folder / "said.txt"
+        self._settings = {
+            "map": str(folder / "map.gpkg"),
+            "source": {"uri": uri, "camera": "nadir", "fov_deg": FOV_DEG, "rate_hz": self._rate_hz},
+            "mavlink": {"link": f"udpout:127.0.0.1:{port}", "ground": f"udpout:127.0.0.1:{ground_port}"},
+            "log": {"path": str(self.log), "max_mb": LOG_MB, "tlog": str(self.tlog)},
+            "status": {"socket": str(self.socket)},
+        }
+        self._config.write_text(yaml.safe_dump(self._settings))
+        with open(self._stderr, "w") as stderr:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "edgevpr", "run", "--config", self._config],
+                stdin=subprocess.DEVNULL,
+                stderr=stderr,
+            )
+
+    def wait_until_it_flies(self) -> None:
+        """Wait for the first query. Raises RuntimeError where none comes."""
+        give_up_s = time.monotonic() + _PATIENCE_S
+        while not (self.log.exists() and any(line["kind"] == "query" for line in read_log(self.log))):
+            if self.process.poll() is not None or time.monotonic() > give_up_s:
+                raise RuntimeError(f"the flight does not begin: {self._stderr.read_text()}")
+            time.sleep(0.05)
+
+    def reread(self) -> None:
+        """Change the rate in the configuration, and have it read again."""
+        self._rate_hz = 3.5 - self._rate_hz
+        self._settings["source"]["rate_hz"] = self._rate_hz
+        self._config.write_text(yaml.safe_dump(self._settings))
+        self.process.send_signal(signal.SIGHUP)
+
+    def end(self) -> tuple[int, str]:
+        """End the flight, and return its exit code and what it said."""
+        if self.process.poll() is None:
+            self.process.terminate()
+        return self.process.wait(_PATIENCE_S), self._stderr.read_text()
+
+
+class _Ground:
+    """The other end of the second link, which reads all it is sent, and closes and opens again at one port."""
+
+    def __init__(self) -> None:
+        self.port = free_port()
+        self.open()
+
+    def open(self) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind(("127.0.0.1", self.port))
+        self._socket.setblocking(False)
+
+    def read(self) -> None:
+        try:
+            while self._socket.recv(65_536):
+                pass
+        except OSError:  # there is no more, or it is closed
+            pass
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+class _Watch:
+    """Looks at the flight every few seconds, and lets things go away and come back. `events` counts these by name."""
+
+    def __init__(self, flight: Flight, ground: _Ground, cycle_s: float, every_s: float) -> None:
+        self.events: dict[str, int] = {}
+        self.statuses = 0
+        self._flight, self._ground, self._cycle_s, self._every_s = flight, ground, cycle_s, every_s
+        self._process = psutil.Process(flight.process.pid)
+        self._away: list[str] = []
+        self._returned_s = float("-inf")
+
+    def look_until(self, lasts_s: float, absences: list[Absence]) -> list[Sample]:
+        """Return a sample for each look. Raises RuntimeError where the flight ends before its time."""
+        timetable = _timetable(absences, self._cycle_s)
+        due_s, *step = next(timetable)
+        begin_s, samples = time.monotonic(), []
+        while (t_s := time.monotonic() - begin_s) < lasts_s:
+            while due_s <= t_s:  # all of it and in its order, however late
+                self._do(*step, t_s)
+                due_s, *step = next(timetable)
+            if t_s < len(samples) * self._every_s:
+                time.sleep(_TURN_S)
+                continue
+            samples.append(self._sample(t_s))
+            self._ground.read()
+            if self._away:  # else a reader that has just left would be counted while all is there
+                self._read_status()
+        for each in absences:
+            if each.name in self._away:
+                each.come()
+        return samples
+
+    def _do(self, goes: bool, each: Absence, t_s: float) -> None:
+        if goes:
+            each.go()
+            self._away.append(each.name)
+            self.events[each.name] = self.events.get(each.name, 0) + 1
+        else:
+            each.come()
+            self._away.remove(each.name)
+            self._returned_s = t_s
+
+    def _sample(self, t_s: float) -> Sample:
+        try:
+            with self._process.oneshot():
+                memory, cpu = self._process.memory_full_info(), self._process.cpu_times()
+                descriptors, threads = self._process.num_fds(), self._process.num_threads()
+        except psutil.Error as error:
+            raise RuntimeError(f"the flight has ended after {t_s:.0f} s: {self._flight.end()}") from error
+        return Sample(
+            t_s=round(t_s, 2),
+            rss_mb=memory.rss / 1e6,
+            pss_mb=memory.pss / 1e6,
+            uss_mb=memory.uss / 1e6,
+            descriptors=descriptors,
+            threads=threads,
+            cpu_s=cpu.user + cpu.system,
+            log_mb=sum(path.stat().st_size for path in self._flight.log.parent.glob("flight*.jsonl")) / 1e6,
+            tlog_mb=self._flight.tlog.stat().st_size / 1e6 if self._flight.tlog.exists() else 0.0,
+            away=", ".join(self._away),
+            is_calm=not self._away and t_s - self._returned_s >= _AFTER * self._cycle_s,
+        )
+
+    def _read_status(self) -> None:
+        """Come as a reader of the status, read one, and leave."""
+        try:
+            with StatusReader(self._flight.socket) as reader:
+                self.statuses += reader.read(_LOOK_S) is not None
+        except EdgevprError:  # counted as none
+            pass
+
+
+def _timetable(absences: list[Absence], cycle_s: float) -> Iterator[tuple[float, bool, Absence]]:
+    """Yield when who goes (else comes back), cycle after cycle."""
+    steps = [(each.begin, True, each) for each in absences] + [(each.end, False, each) for each in absences]
+    steps.sort(key=lambda step: step[0])
+    for cycle in count():
+        for part, goes, each in steps:
+            yield (cycle + part) * cycle_s, goes, each
+
+
+def _absences(camera: FilmCamera, autopilot: Autopilot, ground: _Ground, flight: Flight) -> list[Absence]:
+    mute: list[socket.socket] = []
+
+    def come_and_be_mute() -> None:
+        reader = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        mute.append(reader)
+        reader.connect(str(flight.socket))
+
+    def nothing() -> None:
+        pass
+
+    return [
+        Absence("configuration read again", 0.03, 0.06, flight.reread, nothing),
+        Absence("a reader that reads nothing", 0.10, 0.20, come_and_be_mute, lambda: mute.pop().close()),
+        Absence("camera pulled out", 0.27, 0.33, camera.pull_out, camera.plug_in),
+        Absence("autopilot killed", 0.42, 0.49, autopilot.kill, autopilot.start),
+        Absence("camera silent", 0.58, 0.63, lambda: camera.fall_silent(True), lambda: camera.fall_silent(False)),
+        Absence("autopilot frozen", 0.73, 0.78, lambda: autopilot.freeze(True), lambda: autopilot.freeze(False)),
+        Absence("ground station closed", 0.88, 0.92, ground.close, ground.open),
+    ]
+
+
+def _edgevpr(*arguments: object) -> None:
+    done = subprocess.run([sys.executable, "-m", "edgevpr", *map(str, arguments)], capture_output=True, text=True)
+    if done.returncode:
+        raise RuntimeError(f"edgevpr {arguments[0]} {arguments[1]} failed: {done.stderr}")
+
+
+if __name__ == "__main__":
+    main()
