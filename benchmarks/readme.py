@@ -1,7 +1,10 @@
-"""Put the figures of benchmarks/results/ into the README, between its two markers: no figure there is typed by hand."""
+"""Put the figures of benchmarks/results/ into docs/figures.md, and a few of them into the README, each between its two
+markers: no figure there is typed by hand.
+"""
 
 import json
 from pathlib import Path
+from typing import Any
 
 import sets_page
 
@@ -11,19 +14,42 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 RESULTS = REPOSITORY / "benchmarks" / "results"
 BEGIN, END = "<!-- figures: made by benchmarks/readme.py -->\n", "<!-- end of figures -->"
 FORMS = (" 8bit", " 1bit")
+SHORT = ("cohog", "cohog, exact", "cohog, thesis", "hog", "calc", "netvlad")
+JOINED = "aerial_joined"  # it repeats sets that were tuned on
 
 
 def main() -> None:
-    page = REPOSITORY / "README.md"
+    contents = read_sets(RESULTS)
+    put(REPOSITORY / "README.md", short(contents))
+    put(REPOSITORY / "docs" / "figures.md", f"{recall(contents)}\n\n{speed()}")
+
+
+def put(page: Path, figures: str) -> None:
+    """Put figures between the markers of a page."""
     before, _, rest = page.read_text(encoding="utf-8").partition(BEGIN)
     _, _, after = rest.partition(END)
-    page.write_text(f"{before}{BEGIN}\n{recall()}\n\n{speed()}\n\n{END}{after}", encoding="utf-8")
+    page.write_text(f"{before}{BEGIN}\n{figures}\n\n{END}{after}", encoding="utf-8")
 
 
-def recall() -> str:
+def read_sets(folder: Path) -> list[dict[str, Any]]:
+    """Read the results of all image sets in a folder."""
+    contents = [json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))]
+    return [content for content in contents if "techniques" in content]
+
+
+def short(contents: list[dict[str, Any]]) -> str:
+    """Recall@1 of a few techniques on the sets that had no say in a parameter."""
+    reported = [content for content in contents if content["use"] == "report" and content["set"] != JOINED]
+    return (
+        "Recall@1 on the sets marked *report*, made by `make results` (bytes: of a place in RAM; number of queries "
+        "after the\nuse of a set):\n\n"
+        f"{sets_page.overview(reported, lambda label: label in SHORT)}\n\n"
+        f"![Precision-recall curves of all techniques on all sets](benchmarks/results/{sets_page.CURVES})"
+    )
+
+
+def recall(contents: list[dict[str, Any]]) -> str:
     """Recall@1 of every technique on every set, then that of the forms, and what the rule of the flight let through."""
-    contents = [json.loads(path.read_text()) for path in sorted(RESULTS.glob("*.json"))]
-    contents = [content for content in contents if "techniques" in content]
     weights = {row["weights"] for content in contents for row in content["techniques"].values() if row["weights"]}
     by_flight = []
     for content in contents:
@@ -38,7 +64,7 @@ def recall() -> str:
         "The same vectors less the map's mean, a byte or a bit a number:\n\n"
         f"{sets_page.overview(contents, lambda label: label.endswith(FORMS))}\n\n"
         f"Weights in use: {'; '.join(sorted(weights))}.\n\n"
-        f"![Precision-recall curves of all techniques on all sets](benchmarks/results/{sets_page.CURVES})\n\n"
+        f"![Precision-recall curves of all techniques on all sets](../benchmarks/results/{sets_page.CURVES})\n\n"
         "Accepted as the place by the rule of the flight:\n\n" + "\n".join(by_flight)
     )
 

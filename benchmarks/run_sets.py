@@ -26,6 +26,7 @@ import sets_page
 import yaml
 
 from edgevpr.errors import EdgevprError, UsageError
+from edgevpr.evaluate import provenance
 from edgevpr.evaluate.dataset import load_dataset
 from edgevpr.evaluate.evaluate import compare, evaluate
 from edgevpr.helpers.progress import progress
@@ -217,7 +218,7 @@ def write_set(path: Path, folder: Path, wanted: list[Variant], commit: str) -> N
             **asdict(replace(result, technique=variant.label)),
             "encode_ram_mb": encode_ram_mb(variant.technique, chosen),
             "commit": commit,
-            "cpu": cpu_model(),
+            "cpu": provenance.cpu_model(),
         }
     in_order = [rows[variant.label] for variant in VARIANTS if variant.label in rows]
     for row, each in zip(in_order, compare(sets_page.result(row) for row in in_order), strict=True):
@@ -290,32 +291,17 @@ def made_by() -> dict[str, Any]:
 
 def commit_of() -> str:
     """The commit that is measured, and whether something has changed since."""
-
-    def git(*arguments: str) -> str:
-        done = subprocess.run(["git", "-C", str(REPOSITORY), *arguments], capture_output=True, text=True)
-        return done.stdout.strip()
-
-    changed = git("status", "--porcelain", "--", "edgevpr", "models")
-    return (git("rev-parse", "--short", "HEAD") or "unknown") + (" with changes" if changed else "")
+    return provenance.commit_of(REPOSITORY) or "unknown"
 
 
 def machine() -> dict[str, Any]:
     """Where the figures are made."""
     return {
-        "cpu": cpu_model(),
-        "cores": len(os.sched_getaffinity(0)),
-        "blas_threads": os.environ.get("OPENBLAS_NUM_THREADS", "all"),
+        **provenance.machine(),
         "python": platform.python_version(),
         "numpy": np.__version__,
         "opencv": cv2.__version__,
     }
-
-
-def cpu_model() -> str:
-    for line in Path("/proc/cpuinfo").read_text().splitlines():
-        if line.startswith(("model name", "Model")):
-            return line.partition(":")[2].strip()
-    return platform.machine()
 
 
 if __name__ == "__main__":

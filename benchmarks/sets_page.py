@@ -2,13 +2,12 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from edgevpr.evaluate import tables
 from edgevpr.evaluate.curves import plot
-from edgevpr.evaluate.evaluate import TechniqueResult
+from edgevpr.evaluate.evaluate import TechniqueResult, from_json
 from edgevpr.helpers.tables import markdown
 
 CURVES = "curves.png"
@@ -33,9 +32,7 @@ PUBLISHED = {
 
 def result(row: dict[str, Any]) -> TechniqueResult:
     """A row of a file as what it was. Older rows do not say how far away a wrong place was: it counts as far."""
-    known = {each.name for each in fields(TechniqueResult)}
-    row = {"accepted_elsewhere": row["accepted_wrong"], **row}
-    return TechniqueResult(**{key: value for key, value in row.items() if key in known})
+    return from_json({"accepted_elsewhere": row["accepted_wrong"], **row})
 
 
 def write(folder: Path, left_out: dict[str, str]) -> None:

@@ -1,0 +1,123 @@
+"""Changes of pictures by degrees, for `sweeps.py`: each sweep changes one thing, from nothing to far beyond what flies.
+
+A change of the camera is a homography over flat ground; one of the picture is made of its pixels.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from edgevpr.calibrate.changes import another_season
+
+ACROSS_DEG = 66.0  # of the camera that is supposed
+_FOG_GREY, _READ_NOISE = 200.0, 1.5
+_OF_WIDTH = 640  # blur is told in pixels of a picture of this width
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sweep:
+    """One thing that changes: `levels` from none on, in `unit`. `ahead` are those of a camera that looks ahead (None:
+    the same)."""
+
+    title: str
+    unit: str
+    levels: tuple[float, ...]
+    ahead: tuple[float, ...] | None = None
+
+    def of(self, camera: str) -> tuple[float, ...]:
+        return self.ahead if self.ahead is not None and camera == "forward" else self.levels
+
+
+SWEEPS = {
+    "yaw": Sweep(title="yaw", unit="degrees", levels=(0, 20, 45, 90, 135, 180), ahead=(0, 5, 10, 20, 30, 40)),
+    "pitch": Sweep(title="pitch", unit="degrees", levels=(0, 10, 20, 30, 40)),
+    "roll": Sweep(title="roll", unit="degrees", levels=(0, 10, 20, 30, 40)),
+    "height": Sweep(title="height (ahead: distance)", unit="times the map's", levels=(0.4, 0.5, 0.7, 1, 1.4, 2, 2.5)),
+    "shift": Sweep(title="shift", unit="of a picture", levels=(0, 0.2, 0.4, 0.6, 0.8)),
+    "dark": Sweep(title="darkening", unit="of the light is left", levels=(1, 0.35, 0.15, 0.06, 0.03)),
+    "fog": Sweep(title="fog", unit="of the picture is veil", levels=(0, 0.4, 0.7, 0.85, 0.95)),
+    "blur": Sweep(title="blur", unit="pixels of 640 (sigma)", levels=(0, 2, 4, 8, 13)),
+    "jpeg": Sweep(title="JPEG", unit="quality (100: as it is)", levels=(100, 25, 10, 5, 2)),
+    "hidden": Sweep(title="occlusion", unit="of the picture", levels=(0, 0.15, 0.3, 0.5, 0.7)),
+    "season": Sweep(title="season", unit="strength", levels=(0, 0.4, 0.7, 1, 1.3)),
+}
+NONE = {"height": 1, "dark": 1, "jpeg": 100}  # the level that changes nothing, where it is not 0
+OF_CAMERA = ("yaw", "pitch", "roll", "height", "shift")  # the others change the picture
+
+
+def view(camera: str, sweep: str, level: float, size: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
+    """Return the homography (3, 3) from a picture of this size (width, height) to that of the camera after the change.
+    The camera turns in its place; it shifts to a random direction, ahead to the left or right."""
+    turned, height, shift = {}, 1.0, np.zeros(2)
+    if sweep in ("yaw", "pitch", "roll"):
+        turned[sweep] = math.radians(level) * (1 if level == 180 else rng.choice((-1, 1)))
+    elif sweep == "height":
+        height = level
+    elif sweep == "shift":
+        towards = rng.uniform(0, 2 * math.pi) if camera == "nadir" else rng.choice((0, math.pi))
+        shift = level * np.array([math.cos(towards), math.sin(towards)]) * size
+    focal_px = size[0] / 2 / math.tan(math.radians(ACROSS_DEG / 2))
+    centre = (np.array(size) - 1) / 2
+    lens = np.array([[focal_px, 0, centre[0]], [0, focal_px, centre[1]], [0, 0, 1.0]])
+    # Axes of the lens: right, down the picture, where it looks.
+    axes = {"pitch": 0, "roll": 1, "yaw": 2} if camera == "nadir" else {"pitch": 0, "yaw": 1, "roll": 2}
+    turn = np.eye(3)
+    for name, angle in turned.items():
+        turn = turn @ cv2.Rodrigues(angle * np.eye(3)[axes[name]])[0]
+    onto = np.array([[1, 0, -shift[0] / focal_px], [0, 1, -shift[1] / focal_px], [0, 0, height]])
+    return lens @ turn @ onto @ np.linalg.inv(lens)
+
+
+def spoilt(sweep: str, level: float, image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return a picture after the change, uint8."""
+    if level == NONE.get(sweep, 0):
+        return image
+    return _SPOIL[sweep](image, level, rng)
+
+
+def _dark(image: np.ndarray, left: float, rng: np.random.Generator) -> np.ndarray:
+    return _bytes(left * image + _READ_NOISE * rng.normal(size=image.shape))
+
+
+def _fog(image: np.ndarray, veil: float, rng: np.random.Generator) -> np.ndarray:
+    return _bytes((1 - veil) * image + veil * _FOG_GREY + _READ_NOISE * rng.normal(size=image.shape))
+
+
+def _blur(image: np.ndarray, sigma: float, rng: np.random.Generator) -> np.ndarray:
+    return cv2.GaussianBlur(image, (0, 0), sigma * image.shape[1] / _OF_WIDTH)
+
+
+def _jpeg(image: np.ndarray, quality: float, rng: np.random.Generator) -> np.ndarray:
+    coded = cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, int(quality)))[1]
+    return cv2.imdecode(coded, cv2.IMREAD_UNCHANGED)
+
+
+def _hidden(image: np.ndarray, share: float, rng: np.random.Generator) -> np.ndarray:
+    """Hide a share behind one plain patch of the picture's shape."""
+    hidden = image.copy()
+    high, wide = (round(math.sqrt(share) * side) for side in image.shape[:2])
+    top, left = (rng.integers(0, side - own + 1) for side, own in zip(image.shape[:2], (high, wide), strict=True))
+    hidden[top : top + high, left : left + wide] = rng.integers(0, 256)
+    return hidden
+
+
+def _season(image: np.ndarray, strength: float, rng: np.random.Generator) -> np.ndarray:
+    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
+    return _bytes(255 * another_season(grey.astype(np.float32) / 255, rng, strength))
+
+
+def _bytes(image: np.ndarray) -> np.ndarray:
+    return np.clip(image, 0, 255).round().astype(np.uint8)
+
+
+_SPOIL: dict[str, Callable[[np.ndarray, float, np.random.Generator], np.ndarray]] = {
+    "dark": _dark,
+    "fog": _fog,
+    "blur": _blur,
+    "jpeg": _jpeg,
+    "hidden": _hidden,
+    "season": _season,
+}
