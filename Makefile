@@ -7,7 +7,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # Where this is set, each of the hundreds of processes that the tests start compiles edgevpr anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test lint results bench bench-arm64 hostile rig clean
+.PHONY: demo test lint results bench thesis bench-arm64 hostile rig service-faults soak test-arm64 sites sweeps clean
 
 demo: $(VENV)/installed
 	$(BIN)/edgevpr demo --out demo_out
@@ -29,21 +29,47 @@ results: $(VENV)/installed
 	$(BIN)/python benchmarks/from_orthophoto.py
 	$(BIN)/python benchmarks/flights.py
 	$(BIN)/python benchmarks/readme.py
+	$(BIN)/python benchmarks/thesis.py --page
+
+# One map out of many sites, up to ten thousand places, into benchmarks/results/. It goes on in sites_work/ (1 GB) where
+# it was interrupted.
+sites: $(VENV)/installed
+	$(BIN)/python benchmarks/sites.py
+
+# How far an aircraft may be off its map, one change at a time, into benchmarks/results/. It goes on in sweeps_work/.
+sweeps: $(VENV)/installed
+	$(BIN)/python benchmarks/sweeps.py
 
 # Speed and memory against the published way, into benchmarks/results/.
 bench: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[bench]'
 	$(BIN)/python benchmarks/bench.py
 	$(BIN)/python benchmarks/readme.py
+	$(BIN)/python benchmarks/thesis.py --page
+
+# The tables and figures of the thesis beside this project's, into docs/thesis.md: three minutes of one core. Uses the
+# figures of `results` and `bench`, and the sets of EDGEVPR_DATA; for staticity a detector in EDGEVPR_DETECTORS.
+thesis: $(VENV)/installed
+	$(BIN)/python benchmarks/thesis.py
 
 # What a query costs an ARM core, counted under emulation (as root; Debian's qemu-user, debootstrap and gcc), into
 # benchmarks/results/.
 bench-arm64: $(VENV)/installed
 	$(BIN)/python benchmarks/bench_arm64.py
 
+# edgevpr on an emulated ARM board: the core of the tests, the demonstration, and the same flights as here (as root;
+# Debian's qemu-user-static, debootstrap and gcc), into benchmarks/results/. The system is kept in ~/.cache.
+test-arm64: $(VENV)/installed
+	$(BIN)/python benchmarks/on_arm64.py
+
 # Everything that a hostile world does, from a seed, into benchmarks/results/.
 hostile: $(VENV)/installed
 	$(BIN)/python benchmarks/hostile.py
+
+# One long flight, of which memory, descriptors and threads may not grow, into benchmarks/results/.
+MINUTES ?= 60
+soak: $(VENV)/installed
+	$(BIN)/python benchmarks/soak.py --minutes $(MINUTES)
 
 # Ground stations' programs for the tests, without what their windows need (1 GB). Where they cannot be had, their tests
 # are skipped.
@@ -58,6 +84,11 @@ $(VENV)/clients/installed: $(VENV)/installed
 # benchmarks/results/: two and a half hours.
 rig: $(VENV)/installed
 	$(BIN)/python benchmarks/rig/rig.py --all
+
+# The faults of the service under a real systemd, on a Debian in QEMU (as root; Debian's debootstrap, qemu-system-x86 and
+# qemu-utils), into benchmarks/results/ and docs/faults.md. EDGEVPR_MACHINE names the folder that the machine is kept in.
+service-faults: $(VENV)/installed
+	$(BIN)/python benchmarks/systemd/service_faults.py
 
 clean:
 	rm -rf $(VENV) demo_out dist build
