@@ -115,9 +115,7 @@ class _Run:
 
     def take(self, pair: Pair) -> None:
         """Take the result of a pair from what is kept, or find out what is left to do for it."""
-        content = self._kept.get_json("pairs", pair.key)
-        if content is not None:
-            self.found[pair.of.name, pair.label] = from_kept(pair, content)
+        if self._take_kept(pair):
             return
         if pair.key in self.open:
             self.open[pair.key].append(pair)
@@ -140,6 +138,14 @@ class _Run:
         known.pairs.append(pair)
         if not known.left:
             self._ask(pair)
+
+    def _take_kept(self, pair: Pair) -> bool:
+        """Take what stands under the key of a pair, for all rows that share it; return whether anything does."""
+        if (content := self._kept.get_json("pairs", pair.key)) is None:
+            return False
+        for each in (*self.open.get(pair.key, ()), pair):
+            self.found[each.of.name, each.label] = from_kept(each, content)
+        return True
 
     def through(self, crew: Crew) -> Iterator[None]:
         """Have all jobs done; yield once for each picture that is done with."""
@@ -176,6 +182,9 @@ class _Run:
 
     def _ask(self, pair: Pair) -> None:
         missing = self._missing(pair)
+        if not missing:  # another run has asked them meanwhile
+            self._finish(pair)
+            return
         everything = [str(path) for path in in_order(pair.of.dataset)] if pair.is_in_order else None
         parts = [missing] if pair.is_in_order else _parts(missing)
         self._asked[pair.key] = len(parts)
@@ -206,11 +215,8 @@ class _Run:
         entries = [self._kept.get_json("answers", key) for key in keys]
         if any(entry is None for entry in entries):
             # Another run may have finished the row, and have no more use for its answers.
-            if (content := self._kept.get_json("pairs", pair.key)) is not None:
-                for each in self.open[pair.key]:
-                    self.found[each.of.name, each.label] = from_kept(each, content)
-                return
-            self._fail([pair], "answers are damaged or gone from the cache: run again, to ask them anew")
+            if not self._take_kept(pair):
+                self._fail([pair], "answers are damaged or gone from the cache: run again, to ask them anew")
             return
         answers: list[Answer] = [answer_from_kept(entry[0]) for entry in entries]
         times_s = [t_s for _, *both in entries for t_s in both]

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -14,6 +15,7 @@ from generated_sets import COHOG, HOG, make_set, without_costs
 from edgevpr.cli.main import main
 from edgevpr.evaluate.dataset import load_dataset
 from edgevpr.evaluate.evaluate import evaluate
+from edgevpr.evaluate.kept import Kept
 from edgevpr.evaluate.many import measure
 from edgevpr.evaluate.output import as_json
 from edgevpr.evaluate.plan import Plan, RowPlan, SetPlan
@@ -226,6 +228,24 @@ def test_answers_that_are_kept_are_not_asked_again(meadow, tmp_path):
     units = []
     measure(plan, tmp_path, 1, lambda items, total, label: units.append(total) or items)
     assert units in ([5 - len(before)], []), "nothing but what is missing"
+
+
+@pytest.mark.parametrize("is_finished", [True, False])
+def test_a_row_that_another_run_has_asked_meanwhile_is_not_lost(meadow, tmp_path, monkeypatch, is_finished):
+    rows = {name: ROWS[name] for name in ("cohog", "cohog, followed", "seqslam of 2")}
+    plan = plan_of(meadow, rows=rows)
+
+    def overtaken(items, total, label):
+        with monkeypatch.context() as patched:
+            if not is_finished:
+                patched.setattr(Kept, "drop", lambda *args: None)
+            measure(plan, tmp_path, 1, shown)
+        if not is_finished:
+            shutil.rmtree(tmp_path / "pairs")
+        return items
+
+    outcome = measure(plan, tmp_path, 1, overtaken)
+    assert ([each.label for each in outcome.found], outcome.failed) == (list(rows), {})
 
 
 def test_two_runs_at_once_do_not_harm_each_other(meadow, tmp_path):
