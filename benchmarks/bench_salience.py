@@ -21,8 +21,8 @@ from pathlib import Path
 import detectors
 import numpy as np
 from bench_scan import medians_s
-from hostile_pictures import DATA, camera_of
-from run_sets import made_by
+from hostile_pictures import camera_of
+from run_sets import DATA, made_by
 
 from edgevpr.evaluate import metrics
 from edgevpr.evaluate.dataset import Dataset, load_dataset

@@ -25,8 +25,8 @@ from pathlib import Path
 
 import numpy as np
 from confidence_rows import CONFIG, Row, frames_of, gather, kind_of_match, site_of, walk_over
-from hostile_pictures import DATA, camera_of
-from run_sets import RESULTS, TUNED_ON, made_by
+from hostile_pictures import camera_of
+from run_sets import DATA, RESULTS, TUNED_ON, made_by
 
 from edgevpr.calibrate.calibrate import LEFT_OUT, MIRRORED, THERE, Answer, adapted
 from edgevpr.calibrate.prior import Site, shipped_model

@@ -14,7 +14,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from hostile_pictures import DATA, camera_of
+from hostile_pictures import camera_of
+from run_sets import DATA
 
 from edgevpr.calibrate.calibrate import ask, asked_of
 from edgevpr.config import load_config

@@ -193,15 +193,14 @@ def main() -> int:
     parser.add_argument("--events", type=Path, metavar="CSV", help="write a line for each query and mode, too")
     parser.add_argument("--out", type=Path, default=run_sets.RESULTS)
     args = parser.parse_args()
-    data = Path(os.environ.get("EDGEVPR_DATA") or run_sets.REPOSITORY.parent / "shared" / "data")
-    run_sets.find_sets(data, [name for name in FLOWN if name != ROWS])
+    run_sets.find_sets(run_sets.DATA, [name for name in FLOWN if name != ROWS])
     modes, began_s = args.modes.split(","), time.monotonic()
     flights = [flight for flight in planned() if flight.site in args.sites.split(",")]
     with (
         tempfile.TemporaryDirectory(prefix="edgevpr-flights-") as work,
         ProcessPoolExecutor(len(os.sched_getaffinity(0))) as pool,
     ):
-        prepare = partial(flight_sites.prepare, data=data, work=Path(work))
+        prepare = partial(flight_sites.prepare, data=run_sets.DATA, work=Path(work))
         sites = {site.name: site for site in pool.map(prepare, FLOWN)}
         rows = []
         for flight, new in zip(flights, pool.map(partial(flown, sites=sites, modes=modes), flights), strict=True):

@@ -11,7 +11,6 @@ import argparse
 import csv
 import json
 import math
-import os
 import sys
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -19,7 +18,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from run_sets import FROM_THE_AIR, RESULTS, TUNED_ON, find_sets, made_by
+from run_sets import DATA, FROM_THE_AIR, RESULTS, TUNED_ON, find_sets, made_by
 
 from edgevpr.config import load_config
 from edgevpr.errors import EdgevprError
@@ -61,9 +60,7 @@ class Row:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "--data", type=Path, default=os.environ.get("EDGEVPR_DATA") or REPOSITORY.parent / "shared/data"
-    )
+    parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--out", type=Path, default=RESULTS)
     args = parser.parse_args()
     cv2.setNumThreads(1)

@@ -6,7 +6,6 @@ pictures of nothing, the set's own queries spoilt, and pictures by a camera that
 accepted. A spoilt picture that is recognised as its own place is no fault. Everything follows from a seed.
 """
 
-import os
 import tempfile
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -16,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from hostile_nothing import NOTHING, SIZES
 from hostile_spoilt import SPOILT
+from run_sets import DATA, FROM_THE_AIR
 
 from edgevpr.config import load_config
 from edgevpr.evaluate.dataset import Dataset, load_dataset
@@ -29,8 +29,6 @@ from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.techniques import create
 from edgevpr.types import Frame
 
-DATA = Path(os.environ.get("EDGEVPR_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data")
-NADIR = ("aerial_", "kite_")  # how the names of sets from the air begin
 OF_NOTHING, OTHER_CAMERA = "nothing: ", "other camera: "  # how kinds begin
 
 
@@ -86,7 +84,7 @@ def run(count: int, seed: int, data: Path = DATA, names: Iterable[str] | None = 
 
 
 def camera_of(name: str) -> str:
-    return "nadir" if name.startswith(NADIR) else "forward"
+    return "nadir" if name.startswith(FROM_THE_AIR) else "forward"
 
 
 def _counted(folder: Path, others: list[Path], count: int, seed: int) -> list[Row]:

@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-from hostile_pictures import DATA, camera_of
-from run_sets import RESULTS, made_by
+from hostile_pictures import camera_of
+from run_sets import DATA, RESULTS, made_by
 
 from edgevpr.evaluate.dataset import load_dataset
 from edgevpr.evaluate.evaluate import evaluate

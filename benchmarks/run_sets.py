@@ -13,6 +13,7 @@ import platform
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime, timezone
@@ -34,6 +35,7 @@ from edgevpr.techniques.networks.session import file_sha256
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 RESULTS = REPOSITORY / "benchmarks" / "results"
+DATA = Path(os.environ.get("EDGEVPR_DATA") or REPOSITORY.parent / "shared" / "data")
 TUNED_ON = ("corridor", "aerial_caliterra", "aerial_garfield28")
 FROM_THE_AIR = ("aerial_", "kite_")  # how the names of such sets begin
 
@@ -84,13 +86,13 @@ LEFT_OUT = {"grief_michigan_monthly": FIVE_PLACES, "grief_stromovka_monthly": FI
 
 
 def main(argv: list[str] | None = None) -> int:
-    beside = REPOSITORY.parent / "shared"
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, default=os.environ.get("EDGEVPR_DATA") or beside / "data")
+    parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--sets", metavar="A,B", help="names of sets, comma-separated (default: all)")
     parser.add_argument("--variants", metavar="A;B", help="rows of the tables, separated by semicolons (default: all)")
+    models = REPOSITORY.parent / "shared" / "models"
     parser.add_argument(
-        "--models", type=Path, default=beside / "models", help="a folder with the original weights: calc/model.onnx"
+        "--models", type=Path, default=models, help="a folder with the original weights: calc/model.onnx"
     )
     parser.add_argument("--out", type=Path, default=RESULTS)
     args = parser.parse_args(argv)
@@ -282,6 +284,26 @@ def spread(errors_m: list[float]) -> dict[str, float | int | None]:
         return {"count": 0, "median_m": None, "p90_m": None, "worst_m": None}
     median_m, p90_m, worst_m = (round(float(np.percentile(errors_m, share)), 1) for share in (50, 90, 100))
     return {"count": len(errors_m), "median_m": median_m, "p90_m": p90_m, "worst_m": worst_m}
+
+
+def parser_of(doc: str, work: str) -> argparse.ArgumentParser:
+    """Return the parser of a measurement that keeps what is done in the folder `work`."""
+    parser = argparse.ArgumentParser(description=doc.splitlines()[0])
+    parser.add_argument("--data", type=Path, default=DATA)
+    parser.add_argument("--work", type=Path, default=Path(work), help="folder of what is done")
+    parser.add_argument("--out", type=Path, default=RESULTS)
+    return parser
+
+
+def write_rows(
+    out: Path, name: str, rows: list[dict], page: Callable[[dict], str], draw: Callable[[Path, list[dict]], None]
+) -> None:
+    """Write what has been measured so far as NAME.json, and its page and picture as NAME.md and NAME.png."""
+    out.mkdir(parents=True, exist_ok=True)
+    content = {**made_by(), "tuned_on": list(TUNED_ON), "rows": rows}
+    (out / f"{name}.json").write_text(json.dumps(content, indent=1) + "\n")
+    (out / f"{name}.md").write_text(page(content))
+    draw(out / f"{name}.png", rows)
 
 
 def made_by() -> dict[str, Any]:

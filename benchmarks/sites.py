@@ -18,7 +18,6 @@ import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
 
-import argparse
 import json
 import subprocess
 import sys
@@ -31,7 +30,7 @@ import cv2
 import numpy as np
 import sites_page
 from foreign_places import MIRRORED, foreign
-from run_sets import FROM_THE_AIR, REPOSITORY, RESULTS, find_sets, join
+from run_sets import FROM_THE_AIR, find_sets, join, parser_of
 
 from edgevpr.config import load_config
 from edgevpr.errors import EdgevprError
@@ -91,12 +90,7 @@ class Row:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "--data", type=Path, default=os.environ.get("EDGEVPR_DATA") or REPOSITORY.parent / "shared/data"
-    )
-    parser.add_argument("--work", type=Path, default=Path("sites_work"), help="folder of the maps and of what is done")
-    parser.add_argument("--out", type=Path, default=RESULTS)
+    parser = parser_of(__doc__, "sites_work")
     parser.add_argument("--measure", nargs=3, metavar=("CAMERA", "PLACES", "HOW"), help="one map, in this process")
     args = parser.parse_args()
     cv2.setNumThreads(1)

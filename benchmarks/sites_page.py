@@ -1,10 +1,9 @@
 """Page and picture of `sites.py`: recall, what is accepted, times and memory as the map grows."""
 
-import json
 from pathlib import Path
 
 import numpy as np
-from run_sets import TUNED_ON, made_by
+from run_sets import write_rows
 
 from edgevpr.helpers.tables import markdown
 
@@ -13,11 +12,7 @@ TITLES = {"nadir": "Looking straight down", "forward": "Looking ahead"}
 
 def write(out: Path, rows: list[dict], text: str) -> None:
     """Write what has been measured so far as sites.json, sites.md and sites.png; `text` says how."""
-    out.mkdir(parents=True, exist_ok=True)
-    content = {**made_by(), "tuned_on": list(TUNED_ON), "rows": rows}
-    (out / "sites.json").write_text(json.dumps(content, indent=1) + "\n")
-    (out / "sites.md").write_text(_page(content, text))
-    _draw(out / "sites.png", rows)
+    write_rows(out, "sites", rows, lambda content: _page(content, text), _draw)
 
 
 def _page(content: dict, text: str) -> str:

@@ -22,7 +22,6 @@ import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
 
-import argparse
 import json
 import sys
 from collections.abc import Iterator
@@ -35,7 +34,7 @@ import sweeps_page
 from from_orthophoto import laid, mosaic_of
 from height_and_tilt import area, corners, cut, middle, through
 from hostile_pictures import camera_of
-from run_sets import REPOSITORY, RESULTS, find_sets
+from run_sets import find_sets, parser_of
 from sweep_changes import NONE, OF_CAMERA, SWEEPS, spoilt, view
 
 from edgevpr.config import load_config
@@ -103,13 +102,7 @@ class Shown:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "--data", type=Path, default=os.environ.get("EDGEVPR_DATA") or REPOSITORY.parent / "shared/data"
-    )
-    parser.add_argument("--work", type=Path, default=Path("sweeps_work"), help="folder of what is done")
-    parser.add_argument("--out", type=Path, default=RESULTS)
-    args = parser.parse_args()
+    args = parser_of(__doc__, "sweeps_work").parse_args()
     cv2.setNumThreads(1)
     args.work.mkdir(parents=True, exist_ok=True)
     found = []

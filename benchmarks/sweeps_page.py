@@ -1,9 +1,8 @@
 """Page and picture of `sweeps.py`."""
 
-import json
 from pathlib import Path
 
-from run_sets import TUNED_ON, made_by
+from run_sets import TUNED_ON, write_rows
 from sweep_changes import SWEEPS
 
 from edgevpr.helpers.tables import markdown
@@ -13,11 +12,7 @@ COLOURS = {"cohog": "tab:orange", "hog": "tab:blue", "netvlad": "tab:green", "ca
 
 def write(out: Path, found: list[dict], text: str) -> None:
     """Write what has been measured so far as sweeps.json, sweeps.md and sweeps.png; `text` says how."""
-    out.mkdir(parents=True, exist_ok=True)
-    content = {**made_by(), "tuned_on": list(TUNED_ON), "rows": found}
-    (out / "sweeps.json").write_text(json.dumps(content, indent=1) + "\n")
-    (out / "sweeps.md").write_text(_page(content, text))
-    _draw(out / "sweeps.png", found)
+    write_rows(out, "sweeps", found, lambda content: _page(content, text), _draw)
 
 
 def _page(content: dict, text: str) -> str:

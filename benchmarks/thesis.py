@@ -19,7 +19,7 @@ import thesis_memorable
 import thesis_page
 import thesis_pictures
 import thesis_sweep
-from run_sets import made_by
+from run_sets import DATA, made_by
 from thesis_values import read_results
 
 from edgevpr.errors import EdgevprError, UsageError
@@ -38,8 +38,7 @@ RADIUS_PICTURES = 20
 
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    beside = REPOSITORY.parent / "shared" / "data"
-    parser.add_argument("--data", type=Path, default=os.environ.get("EDGEVPR_DATA") or beside)
+    parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--page", action="store_true", help="measure nothing: page and pictures of what is there")
     args = parser.parse_args(argv)
     try:

@@ -23,8 +23,8 @@ from pathlib import Path
 
 import numpy as np
 from big_map import make_big_map
-from hostile_pictures import DATA, camera_of
-from run_sets import RESULTS, made_by
+from hostile_pictures import camera_of
+from run_sets import DATA, RESULTS, made_by
 
 from edgevpr.config import load_config
 from edgevpr.evaluate.dataset import Dataset, load_dataset

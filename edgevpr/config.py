@@ -3,7 +3,6 @@
 An unknown key, a wrong type or a value out of range raises ConfigError with one clear sentence.
 """
 
-import difflib
 import os
 import types
 import typing
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from edgevpr.errors import ConfigError
+from edgevpr.helpers.text import meant
 from edgevpr.resources import shipped
 from edgevpr.yamlfile import read_yaml
 
@@ -298,8 +298,7 @@ def _overlaid(base: dict[str, Any], over: dict[str, Any], where: str, prefix: st
 
 def _unknown(key: object, known: typing.Iterable[str], where: str, prefix: str) -> ConfigError:
     name = str(key)[:_SHOWN]
-    near = difflib.get_close_matches(name, list(known), n=1)
-    hint = f"did you mean `{near[0]}`?" if near else f"known: {', '.join(sorted(known))}"
+    hint = meant(name, known, f"known: {', '.join(sorted(known))}")
     return ConfigError(f"{where}: unknown key `{prefix}{name}` ({hint}).")
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from edgevpr.errors import EdgevprError
-from edgevpr.evaluate.provenance import file_sha256
+from edgevpr.helpers.files import sha256_of
 
 _MARK = b"edgevpr kept 1\n"
 _DIGEST = 32
@@ -79,7 +79,7 @@ class Kept:
             with tempfile.TemporaryDirectory(prefix=_UNFINISHED, dir=self.folder) as folder:
                 made = Path(folder) / "made"
                 write(made)
-                digest = file_sha256(made)
+                digest = sha256_of(made)
                 path = self._file(kind, digest)
                 path.parent.mkdir(parents=True, exist_ok=True)
                 os.replace(made, path)
@@ -93,7 +93,7 @@ class Kept:
             return None
         path = self._file(kind, digest)
         with suppress(OSError):
-            if file_sha256(path) == digest:
+            if sha256_of(path) == digest:
                 return path
         self.damaged += 1
         return None

@@ -3,13 +3,14 @@ an earlier run broke off."""
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
 from edgevpr.errors import ModelError
 from edgevpr.evaluate.asking import Answer, in_order
+from edgevpr.evaluate.evaluate import compare
 from edgevpr.evaluate.kept import Kept
 from edgevpr.evaluate.measured import (
     Measured,
@@ -74,7 +75,7 @@ def measure(plan: Plan, cache: str | Path, workers: int, progress: Shown) -> Out
     order = [(each.of.name, each.label) for each in pairs]
     return Outcome(
         sets=sets,
-        found=tuple(run.found[each] for each in order if each in run.found),
+        found=_compared([run.found[each] for each in order if each in run.found]),
         failed={
             each: run.failed[each]
             for each in ((of.name, row) for of in sets for row in plan.rows)
@@ -98,6 +99,16 @@ def _pairs(plan: Plan, sets: Iterable[OpenSet]) -> tuple[list[Pair], dict[tuple[
             except ModelError as error:  # a network that cannot be used stops no other row
                 failed[of.name, label] = str(error)
     return found, failed
+
+
+def _compared(found: list[Measured]) -> tuple[Measured, ...]:
+    """Fill in the PCU, which measures each row against the slowest encoder on its set."""
+    done = []
+    for name in dict.fromkeys(each.set_name for each in found):
+        of_set = [each for each in found if each.set_name == name]
+        results = compare(each.result for each in of_set)
+        done += [replace(each, result=result) for each, result in zip(of_set, results, strict=True)]
+    return tuple(done)
 
 
 class _Run:

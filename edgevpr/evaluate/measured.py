@@ -11,10 +11,11 @@ from edgevpr.evaluate.dataset import Dataset, Query
 from edgevpr.evaluate.evaluate import TechniqueResult, from_json, summary
 from edgevpr.evaluate.kept import key_of
 from edgevpr.evaluate.plan import RowPlan, SetPlan
-from edgevpr.evaluate.provenance import code_of_everything, commit_of, file_sha256, machine, versions
+from edgevpr.evaluate.provenance import code_of_everything, commit_of, machine, versions
 from edgevpr.evaluate.remembering import identity
 from edgevpr.frames.images import list_images
 from edgevpr.frames.positions import find_positions
+from edgevpr.helpers.files import sha256_of
 from edgevpr.places.sequence import length_of
 from edgevpr.types import StageCost
 
@@ -42,13 +43,13 @@ def open_set(name: str, plan: SetPlan) -> OpenSet:
     """Read a data set. Raises UsageError and SourceError for one that cannot be used."""
     dataset = plan.open()
     positions = find_positions(dataset.ref_dir)
-    hashes = [file_sha256(path) for path in list_images(dataset.ref_dir)]
+    hashes = [sha256_of(path) for path in list_images(dataset.ref_dir)]
     return OpenSet(
         name=name,
         plan=plan,
         dataset=dataset,
-        hashes_of_references=(*hashes, *dataset.references, file_sha256(positions) if positions else ""),
-        hashes_of_queries={path.name: file_sha256(path) for path in list_images(dataset.queries[0].path.parent)},
+        hashes_of_references=(*hashes, *dataset.references, sha256_of(positions) if positions else ""),
+        hashes_of_queries={path.name: sha256_of(path) for path in list_images(dataset.queries[0].path.parent)},
     )
 
 

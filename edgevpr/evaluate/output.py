@@ -4,12 +4,11 @@ import csv
 import io
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from edgevpr.evaluate import tables
-from edgevpr.evaluate.evaluate import compare
 from edgevpr.evaluate.many import Outcome
 from edgevpr.evaluate.measured import Measured
 from edgevpr.evaluate.page import page_of
@@ -23,7 +22,6 @@ _IN_JSON_ONLY = ("precision_recall", "ah_assumes", "parameters")
 
 def write_results(folder: Path, outcome: Outcome) -> None:
     """Write results.json, results.csv, results.md and index.html into a folder."""
-    outcome = replace(outcome, found=_compared(outcome.found))
     contents = {
         "results.json": json.dumps(as_json(outcome), indent=1) + "\n",
         "results.csv": _csv(outcome.found),
@@ -62,16 +60,6 @@ def as_json(outcome: Outcome) -> dict[str, Any]:
         ],
         "failed": [{"set": of, "row": row, "why": why} for (of, row), why in outcome.failed.items()],
     }
-
-
-def _compared(found: Sequence[Measured]) -> tuple[Measured, ...]:
-    """Fill in the PCU, which measures each row against the slowest encoder on its set."""
-    done = []
-    for name in dict.fromkeys(each.set_name for each in found):
-        of_set = [each for each in found if each.set_name == name]
-        results = compare(each.result for each in of_set)
-        done += [replace(each, result=result) for each, result in zip(of_set, results, strict=True)]
-    return tuple(done)
 
 
 def _csv(found: Sequence[Measured]) -> str:

@@ -1,6 +1,5 @@
 """Plan of a measurement, many sets by many rows: a YAML file with the sections `sets` and `rows`, read strictly."""
 
-import difflib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,6 +12,7 @@ from edgevpr.evaluate.asking import Asking
 from edgevpr.evaluate.dataset import Dataset, load_dataset
 from edgevpr.evaluate.layouts import of_positions, open_folder
 from edgevpr.evaluate.nearby import Nearness
+from edgevpr.helpers.text import meant
 from edgevpr.runtime.preflight.pick import camera_setting
 from edgevpr.yamlfile import read_yaml
 
@@ -160,6 +160,5 @@ def _below(base: Path, each: SetPlan) -> SetPlan:
 def _require_one_of(value: object, known: Iterable[str], what: str) -> None:
     names = list(known)
     if value not in names:
-        near = difflib.get_close_matches(str(value)[:80], names, n=1)
-        hint = f"did you mean `{near[0]}`?" if near else f"known: {', '.join(names) or 'none'}"
+        hint = meant(str(value)[:80], names, f"known: {', '.join(names) or 'none'}")
         raise ConfigError(f"{what} `{value!s:.80}` ({hint}).")

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import edgevpr
+from edgevpr.helpers.files import sha256_of
 from edgevpr.resources import shipped
 
 PACKAGE = Path(edgevpr.__file__).parent
@@ -80,20 +81,11 @@ def code_of_everything() -> str:
     return _hash([*PACKAGE.rglob("*.py"), *PACKAGE.rglob("*.json"), *shipped_files])
 
 
-def file_sha256(path: Path) -> str:
-    """Return the hash of a file."""
-    found = hashlib.sha256()
-    with open(path, "rb") as handle:
-        while block := handle.read(1 << 20):
-            found.update(block)
-    return found.hexdigest()
-
-
 def _hash(paths: list[Path]) -> str:
     found = hashlib.sha256(repr(sorted(versions().items(), key=str)).encode())
     for path in sorted({path for path in paths if path.is_file() and "__pycache__" not in path.parts}):
         found.update(path.as_posix().removeprefix(PACKAGE.parent.as_posix()).encode() + b"\0")
-        found.update(file_sha256(path).encode())
+        found.update(sha256_of(path).encode())
     return found.hexdigest()
 
 

@@ -11,7 +11,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TextIO
 
 _PR_SET_PDEATHSIG = 1  # prctl(2)
 
@@ -59,10 +59,15 @@ def serve_parent(work: Callable[[Any], Any]) -> None:
     """
     asked = json.load(sys.stdin)
     end_with_parent(asked["parent_pid"])
+    with open_answers() as answers:
+        json.dump(work(asked["job"]), answers)
+
+
+def open_answers() -> TextIO:
+    """Open what the parent reads from. What is printed from now on goes to stderr."""
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
-    with answers:
-        json.dump(work(asked["job"]), answers)
+    return answers
 
 
 def end_with_parent(parent_pid: int) -> None:

@@ -13,7 +13,7 @@ from types import TracebackType
 from typing import Any
 
 from edgevpr.errors import EdgevprError
-from edgevpr.helpers.child import end_with_parent
+from edgevpr.helpers.child import end_with_parent, open_answers
 
 
 class Crew:
@@ -97,8 +97,7 @@ def serve(work: Callable[[Any], Any]) -> None:
     """Do one job after another in a child, until the parent ends or says no more. What a library prints does not get
     into the answers."""
     end_with_parent(json.loads(sys.stdin.readline())["parent_pid"])
-    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)
+    answers = open_answers()
     for line in sys.stdin:
         answers.write(json.dumps(work(json.loads(line))) + "\n")
         answers.flush()

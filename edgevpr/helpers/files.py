@@ -2,8 +2,10 @@
 only where they are files, and no larger than expected."""
 
 import errno
+import hashlib
 import os
 import stat
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO, TypeVar
@@ -40,6 +42,15 @@ def read_file(path: str | Path, most_bytes: int) -> bytes:
         # Never more at once than the file has: Python makes room first for all that is asked for.
         size = os.fstat(handle.fileno()).st_size or min(most_bytes, _KERNEL_FILE_BYTES)
         return handle.read(size) or b""  # None: a file of the kernel that would have to be waited for
+
+
+def sha256_of(path: str | Path, most_bytes: int = sys.maxsize) -> str:
+    """Compute the SHA-256 of a regular file, 64 hexadecimal digits; raises OSError as `open_file` does."""
+    found = hashlib.sha256()
+    with open_file(path, most_bytes) as handle:
+        while block := handle.read(1 << 20):
+            found.update(block)
+    return found.hexdigest()
 
 
 def require_folder(path: Path) -> None:

@@ -7,7 +7,7 @@ T = TypeVar("T")
 
 
 class Tape(Protocol):
-    """Takes note of what comes in, or gives it back. All values are those of JSON."""
+    """Takes note of what comes in, or gives it back. All values are those of JSON, or bytes."""
 
     def read(self, kind: str, look: Callable[[], T]) -> T:
         """Return what `look` finds; or, of a flight that is run again, what it found then."""

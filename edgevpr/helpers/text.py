@@ -1,7 +1,10 @@
-"""Text of foreign origin made fit to be shown: control characters escaped, passwords left out."""
+"""Text of foreign origin made fit to be shown: control characters escaped, passwords left out, and names that are
+not known answered by those that are."""
 
 import os
 import re
+from collections.abc import Iterable
+from difflib import get_close_matches
 
 # user:password@ of an address. A password may hold `@` and, wrongly, `/`: all up to the last @ of the word is left out.
 # An address that was taken for a path has one `/` only.
@@ -33,6 +36,12 @@ def shown(text: str, keep: str = "") -> str:
 def decoded_name(name: str) -> str:
     """Return the name of a file as UTF-8 can hold it: bytes that are not UTF-8 become \\xNN."""
     return os.fsencode(name).decode("utf-8", "backslashreplace")
+
+
+def meant(name: str, known: Iterable[str], otherwise: str) -> str:
+    """Ask whether the most similar of the `known` names was meant; `otherwise` where none is similar."""
+    near = get_close_matches(name, list(known), n=1)
+    return f"did you mean `{near[0]}`?" if near else otherwise
 
 
 def _escape(each: str) -> str:

@@ -5,7 +5,6 @@ import select
 import socket
 import threading
 import time
-from base64 import b64encode
 from collections.abc import Callable, Collection
 from contextlib import AbstractContextManager, suppress
 
@@ -284,7 +283,7 @@ class Link:
                 beats = self._conversation.hear(data, self._turns.now_s(), line.transport.sender)
             finally:
                 verdicts = self._conversation.signing.take_verdicts()
-                step("heard", b64encode(data).decode(), line.transport.sender, verdicts)
+                step("heard", data, line.transport.sender, verdicts)
         if beats:
             line.transport.answer_sender()
 
@@ -294,7 +293,7 @@ class Link:
             self._note_departed(line, step)
             if not line.is_writing:
                 next_one = self._conversation.next_packet()
-                step("said", next_one and b64encode(next_one[0]).decode())
+                step("said", next_one and next_one[0])
                 if next_one is None:
                     return
                 line.put(*next_one)

@@ -1,12 +1,12 @@
 """The boards that edgevpr knows, one YAML file each in `profiles/`: what they have, draw, and may spend on edgevpr."""
 
-import difflib
 import os
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from edgevpr.config import BUDGET_MB, HIGHEST_RATE_HZ, LOWEST_RATE_HZ, bounded, build
 from edgevpr.errors import ConfigError
+from edgevpr.helpers.text import meant
 from edgevpr.power import machine, thermal
 from edgevpr.resources import shipped
 from edgevpr.yamlfile import read_yaml
@@ -91,10 +91,8 @@ def load_board(name: str, root: Path = Path("/")) -> Board:
                 "correct it."
             )
         return board
-    near = difflib.get_close_matches(name, ["this", *board_names()], n=1)
-    hint = (
-        f"did you mean `{near[0]}`?" if near else f"use this, {', '.join(board_names())}, or the path of a YAML file."
-    )
+    names = ["this", *board_names()]
+    hint = meant(name, names, f"use {', '.join(names)}, or the path of a YAML file.")
     raise ConfigError(f"There is no board `{name}`: {hint}")
 
 

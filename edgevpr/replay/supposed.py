@@ -67,9 +67,7 @@ class Supposed(Playback):
         return frame
 
     def _peek(self) -> list[Any] | None:
-        if not self._ahead and (note := next(self._notes, None)):
-            self._ahead.append(note)
-        return self._ahead[0] if self._ahead else None
+        return next(self._from(0), None)
 
     def _step(self) -> bool:
         """Go on by one note; return False at the end of the tape."""

@@ -1,6 +1,5 @@
 """The techniques, by name. The module of a technique is imported only when the technique is asked for."""
 
-import difflib
 import importlib
 import inspect
 from dataclasses import dataclass
@@ -9,6 +8,7 @@ from typing import Any
 
 from edgevpr.contract import Technique
 from edgevpr.errors import EdgevprError, UsageError
+from edgevpr.helpers.text import meant
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,8 +89,7 @@ def create(name: str, settings: dict[str, Any] | None = None) -> Technique:
     values = {}
     for key, value in (settings or {}).items():
         if key not in defaults:
-            near = difflib.get_close_matches(key, defaults, n=1)
-            hint = f"did you mean `{near[0]}`?" if near else f"it has {', '.join(defaults)}."
+            hint = meant(key, defaults, f"it has {', '.join(defaults)}.")
             raise UsageError(f"{name} has no parameter `{key}`: {hint}")
         kind = type(defaults[key])
         try:

@@ -120,6 +120,7 @@ def test_sets_by_flags_print_json(out, tmp_path, capsys):
     assert [(each["set"], each["row"]) for each in content["results"]] == [
         (name, row) for name in ("meadow", "other") for row in ("hog", "hog 8bit")
     ]
+    assert content["results"] == json.loads((tmp_path / "out" / "results.json").read_text())["results"]
 
 
 def test_what_could_not_be_measured_is_said_everywhere(tmp_path, capsys):

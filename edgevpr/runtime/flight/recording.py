@@ -15,6 +15,7 @@ import os
 import re
 import shutil
 import threading
+from base64 import b64encode
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
@@ -79,7 +80,7 @@ class Recording:
         """Take note of what has happened. May be called from any thread and from a handler of signals; it never
         blocks."""
         if self.state is None:
-            self._waiting.append(without_passwords(json.dumps([kind, *values])).encode() + b"\n")
+            self._waiting.append(without_passwords(json.dumps([kind, *values], default=_encoded)).encode() + b"\n")
 
     def keep(self, jpeg: bytes) -> int:
         """Keep a picture, and return its number."""
@@ -161,6 +162,11 @@ class Recording:
             shutil.rmtree(folder)
             del taken[folder]
             _log.info("the recording %s is deleted, to make room for this flight's", folder)
+
+
+def _encoded(data: bytes) -> str:
+    """Return bytes as JSON holds them."""
+    return b64encode(data).decode()
 
 
 def frame_path(folder: Path, number: int) -> Path:

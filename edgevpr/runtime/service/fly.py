@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from pathlib import Path
+from typing import TypeVar
 
 from edgevpr import __version__
 from edgevpr.config import Config
@@ -36,6 +37,8 @@ from edgevpr.runtime.recognise.opening import has_map
 from edgevpr.runtime.service.course import Aboard, World, fly_course, learning_of, recogniser_of
 
 _NEW_MAP_PLACES = 1000  # a technique picked for an empty map must be able to fly with so many
+
+T = TypeVar("T")
 
 _log = logging.getLogger(__name__)
 
@@ -90,18 +93,18 @@ def fly(config: Config, positions: Path | None = None, read_again: Callable[[], 
 
 
 def _recording(stack: ExitStack, config: Config, board: Board, is_reread: bool) -> Recording | None:
-    """Begin the recording, if there is to be one. A service, which may restart in the air, flies without one that
-    cannot be made."""
+    """Begin the recording, if there is to be one."""
     if config.log.record is None:
         return None
-    try:
+
+    def begun() -> Recording:
         recording = stack.enter_context(Recording(config.log.record, config.log.record_mb))
         if config.mapping.learn and config.map and has_map(Path(config.map)):
             recording.keep_map(Path(config.map))
-    except EdgevprError as error:
-        if "NOTIFY_SOCKET" not in os.environ:
-            raise
-        _log.warning("%s", error)
+        return recording
+
+    recording = _or_without(begun, None)
+    if recording is None:
         return None
     recording.note(
         "flight",
@@ -117,34 +120,30 @@ def _recording(stack: ExitStack, config: Config, board: Board, is_reread: bool) 
 
 
 def _tap(stack: ExitStack, config: Config) -> Tap:
-    """Open the tlog, if there is to be one, and return the call that takes its packets. A service, which may restart in
-    the air, flies without one that cannot be opened."""
+    """Open the tlog, if there is to be one, and return the call that takes its packets."""
     if config.log.tlog is None:
         return untapped
     if config.mavlink.link is None:
         _log.warning("there is no link, so there is no tlog either")
         return untapped
-    try:
-        return stack.enter_context(Tlog(config.log.tlog)).record
-    except EdgevprError as error:
-        if "NOTIFY_SOCKET" not in os.environ:
-            raise
-        _log.warning("%s", error)
-        return untapped
+    return _or_without(lambda: stack.enter_context(Tlog(config.log.tlog)).record, untapped)
 
 
 def _readers(config: Config) -> Readers:
-    """Open the status socket, if there is to be one. A service flies without one that cannot be opened."""
+    """Open the status socket, if there is to be one."""
     path = config.status.socket or usual_path()
-    if path is None:
-        return NoReaders()
+    return NoReaders() if path is None else _or_without(lambda: StatusSocket(path), NoReaders())
+
+
+def _or_without(opened: Callable[[], T], without: T) -> T:
+    """Return what is `opened`. A service, which may restart in the air, flies `without` what cannot be opened."""
     try:
-        return StatusSocket(path)
+        return opened()
     except EdgevprError as error:
         if "NOTIFY_SOCKET" not in os.environ:
             raise
         _log.warning("%s", error)
-        return NoReaders()
+        return without
 
 
 def _opened(config: Config, board: Board, clock: Clock, tape: Tape) -> Aboard:

@@ -3,7 +3,6 @@
 Every error in a card is reported when the card is read, not in flight.
 """
 
-import difflib
 import hashlib
 import json
 import re
@@ -14,6 +13,7 @@ from pathlib import Path
 from edgevpr.config import bounded, build
 from edgevpr.contract import TechniqueSpec
 from edgevpr.errors import ConfigError, ModelError
+from edgevpr.helpers.text import meant
 from edgevpr.resources import find_model, model_folders
 from edgevpr.yamlfile import read_yaml
 
@@ -169,11 +169,9 @@ def load_card(name: str) -> Card:
             return read_card(path)
         except ConfigError as error:  # one network cannot be used; the user's request is not wrong
             raise ModelError(str(error)) from error
-    near = difflib.get_close_matches(name, card_names(), n=1)
     known = ", ".join(card_names()) or "there are none yet"
     raise ModelError(
-        f"There is no model `{name}`: "
-        + (f"did you mean `{near[0]}`?" if near else f"use one of `edgevpr models list` ({known}).")
+        f"There is no model `{name}`: " + meant(name, card_names(), f"use one of `edgevpr models list` ({known}).")
     )
 
 
@@ -247,10 +245,8 @@ def head_parameters(card: Card) -> object | None:
     name = card.head.get("name")
     if not isinstance(name, str) or name not in HEADS:
         name = str(name)[:80]
-        near = difflib.get_close_matches(name, HEADS, n=1)
         raise ModelError(
-            f"{card.path}: there is no head `{name}`: "
-            + (f"did you mean `{near[0]}`?" if near else f"use {', '.join(HEADS)}, or null.")
+            f"{card.path}: there is no head `{name}`: " + meant(name, HEADS, f"use {', '.join(HEADS)}, or null.")
         )
     if card.outputs.features is None:
         raise ModelError(

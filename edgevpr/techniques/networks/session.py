@@ -3,7 +3,6 @@
 A model file is not trusted: it is run once before it may fly, and every result is checked.
 """
 
-import hashlib
 import os
 import threading
 from functools import cache
@@ -13,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from edgevpr.errors import ModelError, UsageError
-from edgevpr.helpers.files import open_file, read_file
+from edgevpr.helpers.files import read_file, sha256_of
 from edgevpr.techniques.networks.card import Card, load_card
 from edgevpr.techniques.networks.prepare import prepare, without_masked
 
@@ -79,15 +78,11 @@ def open_session(card: Card, outputs: list[str], threads: int = 1) -> Any:
 def file_sha256(path: Path) -> str:
     """Compute the SHA-256 of a model file, 64 hexadecimal digits. Raises ModelError if it cannot be read."""
     try:
-        with open_file(path, MAX_FILE_BYTES) as handle:
-            digest = hashlib.sha256()
-            while block := handle.read(1 << 20):
-                digest.update(block)
+        return sha256_of(path, MAX_FILE_BYTES)
     except OSError as error:
         raise ModelError(
             f"{path} cannot be read ({error.strerror}): put the weights there, or take the card away."
         ) from error
-    return digest.hexdigest()
 
 
 @cache
