@@ -13,7 +13,7 @@ leave two fifths of it.
 
 Where a view shows nothing it is black and masked, so no edge of it is taken for one of the world. A change of the
 picture starts from the view that is not turned. Techniques are opened as they fly; maps of `cohog` are refined and
-calibrated as `map build` does. The networks are those that edgevpr ships; `netvlad` is on the feature map of `calc`.
+calibrated as `map build` does. The networks run on the one that edgevpr ships, `calc`. `seqslam` needs a flight.
 
 What is measured stays in the folder --work, so that an interrupted run goes on.
 """
@@ -25,7 +25,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
 import json
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -37,6 +38,7 @@ from hostile_pictures import camera_of
 from run_sets import find_sets, parser_of
 from sweep_changes import NONE, OF_CAMERA, SWEEPS, spoilt, view
 
+from edgevpr import techniques
 from edgevpr.config import load_config
 from edgevpr.errors import EdgevprError
 from edgevpr.evaluate.dataset import load_dataset
@@ -54,7 +56,7 @@ from edgevpr.techniques import create
 from edgevpr.types import Frame, Vehicle
 
 SETS = ("aerial_swindale", "corridor")  # one that looks down, one that looks ahead
-TECHNIQUES = ("cohog", "netvlad", "hog")
+TECHNIQUES = tuple(name for name in techniques.names() if name != "seqslam")  # which asks with several pictures
 _MOST_ASKED = 24
 _LEAST_COVERED, _LEAST_SHOWN, _TOUCHING = 0.8, 0.7, 0.02
 
@@ -101,73 +103,95 @@ class Shown:
         return Levelled(frame.image, self.mask, UNKNOWN_VIEW)
 
 
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """A technique that is asked: its walk over a map, what it is shown, and the names of the places by their slots."""
+
+    walk: Recogniser
+    shown: Shown
+    names: tuple[str, ...]
+
+
+@dataclass(slots=True)
+class Found:
+    """The answers of a technique at one level."""
+
+    hits: list[bool] = field(default_factory=list)
+    accepted: int = 0
+    wrong: list[tuple[str, str]] = field(default_factory=list)
+
+
 def main() -> int:
     args = parser_of(__doc__, "sweeps_work").parse_args()
     cv2.setNumThreads(1)
     args.work.mkdir(parents=True, exist_ok=True)
     found = []
     try:
-        for technique in TECHNIQUES:
-            for folder in find_sets(args.data, list(SETS)):
-                found.append(_gathered(args.work / f"{folder.name}_{technique}.json", folder, technique))
-                sweeps_page.write(args.out, found, __doc__)
+        for folder in find_sets(args.data, list(SETS)):
+            found += _gathered(args.work / f"{folder.name}.json", folder)
+            sweeps_page.write(args.out, found, __doc__)
     except EdgevprError as error:
         print(f"sweeps: {error}", file=sys.stderr)
         return error.exit_code
     return 0
 
 
-def _gathered(path: Path, folder: Path, technique: str) -> dict:
-    """Return what a technique finds of a set: what the file has of it, and the levels that it lacks, written one by
+def _gathered(path: Path, folder: Path) -> list[dict]:
+    """Return what each technique finds of a set: what the file has of it, and the levels that it lacks, written one by
     one."""
-    found = {"set": folder.name, "camera": camera_of(folder.name), "technique": technique, "levels": []}
+    camera = camera_of(folder.name)
+    found = [{"set": folder.name, "camera": camera, "technique": name, "levels": []} for name in TECHNIQUES]
     if path.exists():
         found = json.loads(path.read_text())
-    there = {(level["sweep"], level["level"]): level for level in found["levels"]}
-    wanted = [(sweep, level) for sweep in SWEEPS for level in SWEEPS[sweep].of(found["camera"])]
-    for level in swept(folder, technique, [each for each in wanted if each not in there]):
-        there[level.sweep, level.level] = asdict(level)
-        found["levels"] = [there[each] for each in wanted if each in there]
+    wanted = [(sweep, level) for sweep in SWEEPS for level in SWEEPS[sweep].of(camera)]
+    for levels in swept(folder, wanted[len(found[0]["levels"]) :]):
+        for row, level in zip(found, levels, strict=True):
+            row["levels"].append(asdict(level))
         path.with_suffix(".new").write_text(json.dumps(found))
         path.with_suffix(".new").replace(path)
     return found
 
 
-def swept(folder: Path, name: str, wanted: list[tuple[str, float]]) -> Iterator[Level]:
-    """Ask in the map of a set, at the wanted levels of sweeps."""
+def swept(folder: Path, wanted: list[tuple[str, float]]) -> Iterator[list[Level]]:
+    """Ask in the maps of a set, at the wanted levels of sweeps; yield a level of each technique."""
     if not wanted:
         return
-    camera, config = camera_of(folder.name), load_config(None)
-    technique = create(name, {"camera": camera} if name == "cohog" else {})
-    meter, shown = meter_of(config, load_board("this")), Shown()
+    camera = camera_of(folder.name)
     starts = list(_over_mosaic(folder) if camera == "nadir" else _ahead(folder))
-    frames = all_frames(open_source(str(folder / "ref"), live=False))
-    with mapped(frames, technique, meter, folder / "ref") as (place_map, index):
-        walk = Recogniser(
-            technique=technique,
-            place_map=place_map,
-            index=index,
-            rule=accept_rule(technique, config.match, 1, calibration_of(place_map)),
-            meter=meter,
-            candidates=technique.candidates,
-            levelling=shown,
-        )
-        names = {place.place_id: place.source_image for place in place_map.places()}
-        in_order = [names[place_id] for place_id in index.place_ids.tolist()]
+    with ExitStack() as stack:
+        asked = [_opened(stack, folder, name, camera) for name in TECHNIQUES]
         unchanged = None
         for sweep, level in wanted:
             if level != NONE.get(sweep, 0):
-                yield _asked(walk, shown, in_order, starts, camera, sweep, level)
+                yield _asked(asked, starts, camera, sweep, level)
             else:
-                unchanged = unchanged or _asked(walk, shown, in_order, starts, camera, sweep, level)
-                yield replace(unchanged, sweep=sweep, level=level)
+                unchanged = unchanged or _asked(asked, starts, camera, sweep, level)
+                yield [replace(each, sweep=sweep, level=level) for each in unchanged]
 
 
-def _asked(
-    walk: Recogniser, shown: Shown, names: list[str], starts: list[Start], camera: str, sweep: str, level: float
-) -> Level:
-    """Ask for the place of every start, at one level of a sweep; every technique is asked the same."""
-    hits, shares, accepted, wrong = [], [], 0, []
+def _opened(stack: ExitStack, folder: Path, name: str, camera: str) -> Asked:
+    """Make the map of a technique, and open it as it flies."""
+    config, shown = load_config(None), Shown()
+    technique = create(name, {"camera": camera} if name == "cohog" else {})
+    meter = meter_of(config, load_board("this"))
+    frames = all_frames(open_source(str(folder / "ref"), live=False))
+    place_map, index = stack.enter_context(mapped(frames, technique, meter, folder / "ref"))
+    walk = Recogniser(
+        technique=technique,
+        place_map=place_map,
+        index=index,
+        rule=accept_rule(technique, config.match, 1, calibration_of(place_map)),
+        meter=meter,
+        candidates=technique.candidates,
+        levelling=shown,
+    )
+    names = {place.place_id: place.source_image for place in place_map.places()}
+    return Asked(walk=walk, shown=shown, names=tuple(names[place_id] for place_id in index.place_ids.tolist()))
+
+
+def _asked(asked: list[Asked], starts: list[Start], camera: str, sweep: str, level: float) -> list[Level]:
+    """Ask every technique for the place of every start, at one level of a sweep."""
+    shares, found = [], [Found() for _ in asked]
     for number, start in enumerate(starts):
         rng = np.random.default_rng((number, list(SWEEPS).index(sweep)))
         change = view(camera, sweep, level, start.size, rng) if sweep in OF_CAMERA else np.eye(3)
@@ -176,28 +200,32 @@ def _asked(
             continue
         if sweep not in OF_CAMERA:
             image = spoilt(sweep, level, image, rng)
-        shown.mask = None if mask.all() else mask
-        ignored = start.ignored | _overlapping(start, change @ start.onto)
-        event = walk.step(Frame(image=image, name=start.name, t_mono_s=0.0))
-        if event.failed:
-            raise EdgevprError(event.reason)
-        ranked = [names[slot] for slot in event.ranking.slots] if event.ranking else []
-        hits.append(next((place for place in ranked if place not in ignored), None) in start.right)
         shares.append(mask.mean())
-        accepted += event.accepted
-        if event.accepted and ranked[0] not in start.right | ignored:
-            wrong.append((start.name, ranked[0]))
-    return Level(
-        sweep=sweep,
-        level=level,
-        asked=len(hits),
-        shown=round(float(np.mean(shares)), 3) if hits else 0.0,
-        recall_at_1=round(float(np.mean(hits)), 4) if hits else None,
-        recall_at_1_interval=interval(np.array(hits)) if hits else None,
-        accepted=int(accepted),
-        accepted_wrong=len(wrong),
-        wrong=wrong,
-    )
+        ignored = start.ignored | _overlapping(start, change @ start.onto)
+        for each, of_it in zip(asked, found, strict=True):
+            each.shown.mask = None if mask.all() else mask
+            event = each.walk.step(Frame(image=image, name=start.name, t_mono_s=0.0))
+            if event.failed:
+                raise EdgevprError(event.reason)
+            ranked = [each.names[slot] for slot in event.ranking.slots] if event.ranking else []
+            of_it.hits.append(next((place for place in ranked if place not in ignored), None) in start.right)
+            of_it.accepted += event.accepted
+            if event.accepted and ranked[0] not in start.right | ignored:
+                of_it.wrong.append((start.name, ranked[0]))
+    return [
+        Level(
+            sweep=sweep,
+            level=level,
+            asked=len(shares),
+            shown=round(float(np.mean(shares)), 3) if shares else 0.0,
+            recall_at_1=round(float(np.mean(each.hits)), 4) if shares else None,
+            recall_at_1_interval=interval(np.array(each.hits)) if shares else None,
+            accepted=each.accepted,
+            accepted_wrong=len(each.wrong),
+            wrong=each.wrong,
+        )
+        for each in found
+    ]
 
 
 def seen(start: Start, onto: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -7,7 +7,18 @@ from sweep_changes import SWEEPS
 
 from edgevpr.helpers.tables import markdown
 
-COLOURS = {"cohog": "tab:orange", "hog": "tab:blue", "netvlad": "tab:green", "calc": "tab:purple"}
+COLOURS = {
+    "cohog": "tab:orange",
+    "hog": "tab:blue",
+    "calc": "tab:purple",
+    "alexnet": "tab:brown",
+    "amosnet": "tab:pink",
+    "hybridnet": "tab:grey",
+    "netvlad": "tab:green",
+    "rmac": "tab:olive",
+    "region_vlad": "tab:cyan",
+    "cross_region_bow": "black",
+}
 
 
 def write(out: Path, found: list[dict], text: str) -> None:
@@ -74,7 +85,7 @@ def _draw(path: Path, found: list[dict]) -> None:
         for axis in of_set[len(SWEEPS) :]:
             axis.set_visible(False)
     handles, labels = axes[0][0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=9, frameon=False)
+    figure.legend(handles, labels, loc="outside lower center", ncols=6, fontsize=9, frameon=False)
     figure.savefig(path, dpi=80)
     plt.close(figure)
 
@@ -84,7 +95,8 @@ def _curve(axis, row: dict, sweep: str) -> None:
     name, colour = row["technique"], COLOURS[row["technique"]]
     at = [level["level"] for level in levels]
     recall = [level["recall_at_1"] for level in levels]
-    axis.plot(at, recall, "o-", markersize=3, color=colour, label=f"{name}, recall@1")
+    width = 2 if name == "cohog" else 0.9
+    axis.plot(at, recall, "o-", markersize=1.5 * width, linewidth=width, color=colour, label=f"{name}, recall@1")
     if name == "cohog":
         right = [(level["accepted"] - level["accepted_wrong"]) / level["asked"] for level in levels]
         axis.plot(at, right, "--", color=colour, label="cohog, accepted and right")

@@ -178,7 +178,7 @@ def ended(trial: Trial) -> Row:
     row.told = trial.world.ground.told_since(begin_s)
     row.does = f"ends within {max(took_s):.1f} s (slowest of three), with the line `end` in the log"
     row.kept = "everything"
-    row.expect(max(took_s) < 5, "it ends by itself, before TimeoutStopSec")
+    row.expect(max(took_s) < 2, "it ends within 2 s")
     return row
 
 
