@@ -1,4 +1,8 @@
-"""Oriented gradient histograms over cells and blocks, shared by `hog` and `cohog`."""
+"""Oriented gradient histograms over cells and blocks, shared by `hog` and `cohog`.
+
+A map made on one processor flies on another, so all steps are rounded alike on all of them: products, sums and roots
+one by one. Fused steps of OpenCV, and products of matrices, would be rounded otherwise on each.
+"""
 
 import cv2
 import numpy as np
@@ -75,7 +79,7 @@ def oriented_cells(
 
 def _vote_by_angle(dx: np.ndarray, dy: np.ndarray, cell_px: int, bins: int, signed: bool) -> np.ndarray:
     """Vote for any number of orientations: `dx` and `dy` float32 (H, W) to (H/cell_px, W/cell_px, bins)."""
-    magnitude = cv2.magnitude(dx, dy)
+    magnitude, _ = _magnitude(dx, dy)
     at = np.arctan2(dy, dx)
     at *= np.float32(bins / (2 * np.pi if signed else np.pi))  # in bins; whole numbers are the centres of orientations
     low = np.floor(at)
@@ -104,9 +108,13 @@ def _vote_by_octant(dx: np.ndarray, dy: np.ndarray, cell_px: int, *_: object) ->
     across, along = np.abs(dx), np.abs(dy)
     u = across + along
     g = np.subtract(along, across, out=along)
-    m = cv2.magnitude(dx, dy, across)
-    below = cv2.addWeighted(m, _Q, u, 1, 1e-20)  # never 0
-    g *= cv2.addWeighted(m, _P, u, _R, 0, u)
+    m, spare = _magnitude(dx, dy, across)
+    below = np.multiply(m, _Q, out=spare)
+    below += u
+    below += 1e-20  # never 0
+    u *= _R
+    u += m * _P
+    g *= u
     g /= below
     size_g = np.abs(g, out=u)
     diagonal = np.subtract(m, size_g, out=m)
@@ -117,13 +125,12 @@ def _vote_by_octant(dx: np.ndarray, dy: np.ndarray, cell_px: int, *_: object) ->
     sign_y = np.bitwise_and(dy.view(np.uint32), _SIGN_BIT)
     height, width = dx.shape
     sums = np.empty((8, height // cell_px, width), np.float32)
-    one = np.ones(cell_px, np.float32)
     flipped = size_g.view(np.uint32)
 
     def add_up(at: int, plane: np.ndarray, flip: np.ndarray | None = None) -> None:
         if flip is not None:
             plane = np.bitwise_xor(plane.view(np.uint32), flip, out=flipped).view(np.float32)
-        np.matmul(one, plane.reshape(-1, cell_px, width), out=sums[at])
+        np.add.reduce(plane.reshape(-1, cell_px, width), axis=1, out=sums[at])
 
     add_up(0, twice_x)
     add_up(1, twice_x, sign_x)
@@ -133,8 +140,16 @@ def _vote_by_octant(dx: np.ndarray, dy: np.ndarray, cell_px: int, *_: object) ->
     add_up(5, diagonal, sign_x)
     add_up(6, diagonal, sign_y)
     add_up(7, diagonal, sign_x ^ sign_y)
-    votes = (sums.reshape(-1, cell_px) @ one).reshape(8, -1).T @ _ORIENTATIONS
-    return np.maximum(votes, 0, out=votes).reshape(height // cell_px, width // cell_px, 8)
+    of_cells = np.add.reduce(sums.reshape(8, 1, -1, cell_px), axis=3)
+    votes = np.add.reduce(of_cells * _ORIENTATIONS[:, :, None], axis=0)
+    return np.maximum(votes, 0, out=votes).T.reshape(height // cell_px, width // cell_px, 8)
+
+
+def _magnitude(dx: np.ndarray, dy: np.ndarray, out: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Return the length of each gradient, in `out` where that is given, and a plane to use again."""
+    squares, spare = np.multiply(dx, dx, out=out), dy * dy
+    squares += spare
+    return cv2.sqrt(squares, squares), spare
 
 
 def normalised_blocks(cells: np.ndarray) -> np.ndarray:
@@ -144,6 +159,6 @@ def normalised_blocks(cells: np.ndarray) -> np.ndarray:
     left, bottom right. A block without any gradient is all zeros.
     """
     blocks = np.concatenate([cells[:-1, :-1], cells[:-1, 1:], cells[1:, :-1], cells[1:, 1:]], axis=2)
-    length = np.sqrt(np.einsum("ijk,ijk->ij", blocks, blocks))
+    length = np.sqrt(np.add.reduce(blocks * blocks, axis=2))
     blocks /= np.maximum(length, 1e-6)[:, :, None]
     return blocks
