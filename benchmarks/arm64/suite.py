@@ -12,7 +12,6 @@ from tempfile import TemporaryDirectory
 CORE = (
     "tests/techniques",
     "tests/runtime/recognise",
-    "tests/runtime/flight",
     "tests/frames",
     "tests/places",
     "tests/belief",
@@ -23,9 +22,10 @@ CORE = (
     "tests/salience",
     "tests/helpers",
     "tests/mavlink",
-    "tests/runtime/preflight",
     "tests/test_tiny.py",
     "tests/test_yamlfile.py",
+    "tests/runtime/flight",
+    "tests/runtime/preflight",
 )
 _IN_REAL_TIME = "they fly in real time, for which emulation is too slow"
 _OF_COMMANDS = "they start many commands, each of which takes long to start under emulation"
