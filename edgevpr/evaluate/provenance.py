@@ -80,6 +80,12 @@ def code_of_everything() -> str:
     return _hash([*PACKAGE.rglob("*.py"), *PACKAGE.rglob("*.json"), *shipped_files])
 
 
+@cache
+def code_of_frames() -> str:
+    """Return the hash of all that takes the frames of a video: the room of the frames, and the version of PyAV."""
+    return _hash([*(PACKAGE / "frames").rglob("*.py")]) + f" av {_version('av')}"
+
+
 def file_sha256(path: Path) -> str:
     """Return the hash of a file."""
     found = hashlib.sha256()
