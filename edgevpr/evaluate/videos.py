@@ -73,8 +73,6 @@ class Pictures:
         tags: dict[str, GeoTag] = {}
         try:
             for frame in self.progress(_frames(source), source.total, f"{video.name}: pictures"):
-                if frame is None:
-                    continue
                 name = _file_name(frame)
                 tags[name] = GeoTag(
                     position=frame.position,
@@ -145,9 +143,10 @@ def _positions_beside(video: Path) -> Path:
     raise UsageError(f"{video} has no positions beside it: write {own.name} there ({_FORM}).")
 
 
-def _frames(source: Source) -> Iterator[Frame | None]:
+def _frames(source: Source) -> Iterator[Frame]:
     while not source.ended:
-        yield source.read(_READ_TIMEOUT_S)
+        if frame := source.read(_READ_TIMEOUT_S):
+            yield frame
 
 
 def _file_name(frame: Frame) -> str:
