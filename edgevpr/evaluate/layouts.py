@@ -59,11 +59,11 @@ def of_positions(
     """Make the data set of two folders of images, or videos, with positions; `pictures` as of `open_folder`. Raises
     UsageError where there are no positions, and what `pictures` raises."""
     given = Path(query), Path(ref)
-    query_dir, ref_dir = (pictures(each) for each in given)
-    queries, references = list_images(query_dir), list_images(ref_dir)
-    tags = _tags(query_dir, queries), _tags(ref_dir, references)
-    dataset = _dataset(queries, references, nearby(queries, references, tags, rule), ref_dir)
-    return replace(dataset, notes=tuple(_notes(given, (query_dir, ref_dir))))
+    # One side after the other: nobody waits for the pictures of a video to hear that the other side is not there.
+    folders, images = zip(*((folder, list_images(folder)) for folder in map(pictures, given)), strict=True)
+    tags = tuple(map(_tags, folders, images))
+    dataset = _dataset(*images, nearby(*images, tags, rule), folders[1])
+    return replace(dataset, notes=tuple(_notes(given, folders)))
 
 
 def _notes(given: Iterable[Path], folders: Iterable[Path]) -> Iterator[str]:

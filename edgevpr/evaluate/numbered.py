@@ -42,14 +42,9 @@ class Numbered:
         return Truth(found, dict.fromkeys(queries, str(self.path)))
 
 
-def is_numbered(path: Path) -> bool:
-    """Tell whether a ground truth of this name numbers its images."""
-    return path.suffix.lower() in _WHAT_IT_IS
-
-
 def truth_in(path: str | Path) -> Truth | Numbered:
     """Read a ground truth of any form. Raises UsageError for one that cannot be read."""
-    return read_numbered(path) if is_numbered(Path(path)) else read_truth(path)
+    return read_numbered(path) if Path(path).suffix.lower() in _WHAT_IT_IS else read_truth(path)
 
 
 def read_numbered(path: str | Path) -> Numbered:

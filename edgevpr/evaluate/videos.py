@@ -6,6 +6,7 @@ only video of its folder. `frames.track` says what stands in it.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from edgevpr.errors import EdgevprError, UsageError
@@ -59,13 +60,8 @@ class Pictures:
     def _taken(self, video: Path) -> Path:
         table = _positions_beside(video)
         key = key_of(_KIND, code_of_frames(), file_sha256(video), file_sha256(table), self.rate_hz)
-        if (folder := self.kept.get_folder(_KIND, key)) is None:
-
-            def take(made: Path) -> None:
-                self._take(video, table, made)
-
-            folder = self.kept.put_folder(_KIND, key, take)
-        return folder
+        found = self.kept.get_folder(_KIND, key)
+        return found or self.kept.put_folder(_KIND, key, partial(self._take, video, table))
 
     def _take(self, video: Path, table: Path, made: Path) -> None:
         """Write each frame that has a position as a picture without losses, and positions.csv of all frames."""
