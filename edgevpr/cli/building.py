@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 _WITHOUT_POSITIONS = (
     "no place has a position, and a map without positions sends no fixes: it only says which place is recognised. Give "
     "pictures with GPS in their EXIF data, or a positions.csv beside them (file,lat,lon[,alt,...], --positions); of a "
-    "video, cut it into pictures first"
+    "video, give --positions with time,lat,lon, in seconds from its first frame"
 )
 
 

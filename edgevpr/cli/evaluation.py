@@ -2,7 +2,9 @@
 
 import os
 import sys
+import tempfile
 from argparse import ArgumentTypeError, Namespace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +25,7 @@ from edgevpr.helpers.text import shown
 
 if TYPE_CHECKING:
     from edgevpr.evaluate.dataset import Dataset
-    from edgevpr.evaluate.plan import Plan
+    from edgevpr.evaluate.plan import Plan, SetPlan
 
 _MOST_WORKERS = 256
 
@@ -43,9 +45,20 @@ def add(commands: Any) -> None:
     )
     parser.add_argument("--workers", type=_count, metavar="N", help="with --out: processes at work (all cores)")
     parser.add_argument("--cache", metavar="FOLDER", help="with --out: where finished work is kept (OUT/cache)")
-    parser.add_argument("--query", metavar="DIR")
-    parser.add_argument("--ref", metavar="DIR")
-    parser.add_argument("--ground-truth", metavar="CSV", help="(default: right is what is near, by the positions)")
+    video = (
+        "a folder of images, or a video with its positions beside it (FLIGHT.mp4 and FLIGHT.csv: time,lat,lon[,...])"
+    )
+    parser.add_argument("--query", metavar="SOURCE", help=video)
+    parser.add_argument("--ref", metavar="SOURCE", help="the same, of the places to be found")
+    parser.add_argument(
+        "--rate-hz", type=positive, metavar="HZ", help="pictures a second of a video (default: every frame)"
+    )
+    parser.add_argument(
+        "--ground-truth",
+        metavar="FILE",
+        help="CSV; with --similarity also GT.npz or ground_truth_new.npy (default: right is what is near, by the "
+        "positions)",
+    )
     parser.add_argument("--within-m", type=positive, default=25.0, metavar="M", help="near is within so much (25)")
     parser.add_argument("--within-deg", type=positive, metavar="DEG", help="and with headings that differ by no more")
     parser.add_argument(
@@ -55,7 +68,8 @@ def add(commands: Any) -> None:
         "--similarity",
         nargs="+",
         metavar="FILE",
-        help="instead of techniques, measure stored similarities (.npy, .npz, .csv; a row for each query)",
+        help="instead of techniques, measure stored similarities (.npy, .npz, .csv; a row for each query; of --query "
+        "and --ref where they are given)",
     )
     parser.add_argument(
         "--form", default="float", metavar="A,B", help=f"of vectors, one row each: {', '.join(FORMS)} (float)"
@@ -99,6 +113,8 @@ def _measure_many(args: Namespace) -> int:
     out.mkdir(parents=True, exist_ok=True)
     outcome = measure(plan, args.cache or out / "cache", args.workers or len(os.sched_getaffinity(0)), progress)
     write_results(out, outcome)
+    for of in outcome.sets:
+        _say_notes(of.dataset)
     if args.json:
         print_json(as_json(outcome))
     else:
@@ -114,15 +130,15 @@ def _measure_many(args: Namespace) -> int:
 
 
 def _plan(args: Namespace) -> "Plan":
-    from edgevpr.evaluate.plan import RowPlan, SetPlan, of_flags, read_plan
+    from edgevpr.evaluate.plan import RowPlan, of_flags, read_plan
     from edgevpr.runtime.preflight.offers import offers
 
     if args.sets:
-        if args.data or args.query or args.ref:
-            raise UsageError("--sets names all sets: leave --data, --query and --ref out.")
+        if args.data or args.query or args.ref or args.rate_hz:
+            raise UsageError("--sets names all sets: leave --data, --query, --ref and --rate-hz out.")
         return read_plan(args.sets)
-    if not args.data:
-        raise UsageError("Name the data sets with --data, or a file of sets and rows with --sets.")
+    if not (args.data or (args.query and args.ref)):
+        raise UsageError("Name the data sets with --data or --query and --ref, or a file of sets and rows with --sets.")
     config, wanted, forms = config_of(args, args.config), _wanted(args), _forms(args)
     if config.salience.use:
         raise UsageError("--salience goes without --out: measure it on one set at a time.")
@@ -138,13 +154,23 @@ def _plan(args: Namespace) -> "Plan":
         )
         for offer in offers(wanted, forms, _settings(args, wanted))
     }
-    common = SetPlan(
+    return of_flags(args.data or (), rows, _set_of(args))
+
+
+def _set_of(args: Namespace) -> "SetPlan":
+    """Return how the flags say that sets are read, and which folders or videos they name themselves."""
+    from edgevpr.evaluate.plan import SetPlan
+
+    return SetPlan(
+        query=args.query,
+        ref=args.ref,
+        ground_truth=args.ground_truth,
         within_m=args.within_m,
         within_deg=args.within_deg,
         overlap=args.overlap,
         fov_deg=value_of(args, "source.fov_deg"),
+        rate_hz=args.rate_hz,
     )
-    return of_flags(args.data, rows, common)
 
 
 def _wanted(args: Namespace) -> list[str]:
@@ -163,43 +189,52 @@ def _forms(args: Namespace) -> list[str]:
     return forms
 
 
-def _dataset(args: Namespace) -> "Dataset":
-    from edgevpr.evaluate.dataset import load_dataset
-    from edgevpr.evaluate.layouts import of_positions, open_folder
-    from edgevpr.evaluate.nearby import Nearness
+def _dataset(args: Namespace, cache: str) -> "Dataset":
+    """Read the data set; the pictures of a video are taken into the folder `cache`."""
+    from edgevpr.evaluate.kept import Kept
+    from edgevpr.helpers.progress import progress
 
-    rule = Nearness(args.within_m, args.within_deg, args.overlap, value_of(args, "source.fov_deg"))
+    chosen = _set_of(args)
     if args.sets or args.workers or args.cache:
         raise UsageError("Name a folder for the results with --out.")
     if args.data:
         if len(args.data) > 1:
             raise UsageError("Several sets need a folder for the results: name it with --out.")
-        return open_folder(args.data[0], rule)
-    if not (args.query and args.ref):
+        chosen = replace(chosen, folder=args.data[0])
+    elif not (args.query and args.ref):
         raise UsageError("Name a data set with --data or --query and --ref, or stored similarities with --similarity.")
-    if args.ground_truth:
-        return load_dataset(args.query, args.ref, args.ground_truth)
-    return of_positions(args.query, args.ref, rule)
+    dataset = chosen.open(Kept(cache), progress)
+    _say_notes(dataset)
+    return dataset
+
+
+def _say_notes(dataset: "Dataset") -> None:
+    for note in dataset.notes:
+        print(f"edgevpr: {shown(note)}", file=sys.stderr)
 
 
 def _measure_similarities(args: Namespace) -> int:
     from dataclasses import asdict
 
     from edgevpr.evaluate.curves import plot
+    from edgevpr.evaluate.numbered import truth_in
     from edgevpr.evaluate.similarity import measure, read_similarities
     from edgevpr.evaluate.tables import quality_text
-    from edgevpr.evaluate.truth import read_truth
     from edgevpr.frames.images import list_images
     from edgevpr.helpers.figures import require_picture
     from edgevpr.helpers.text import decoded_name
+
+    def names_in(folder: str | None) -> list[str] | None:
+        return [decoded_name(path.name) for path in list_images(folder)] if folder else None
 
     if not args.ground_truth:
         raise UsageError("Name the ground truth of the stored similarities with --ground-truth.")
     if args.plot:
         require_picture(Path(args.plot))
-    truth = read_truth(args.ground_truth)
-    references = [decoded_name(path.name) for path in list_images(args.ref)] if args.ref else None
-    results = [measure(Path(file).stem, read_similarities(file), truth, references) for file in args.similarity]
+    truth, queries, references = truth_in(args.ground_truth), names_in(args.query), names_in(args.ref)
+    results = [
+        measure(Path(file).stem, read_similarities(file), truth, references, queries) for file in args.similarity
+    ]
     if args.plot:
         plot({Path(args.ground_truth).resolve().parent.name: results}, Path(args.plot))
     if args.json:
@@ -228,22 +263,23 @@ def _measure_techniques(args: Namespace) -> int:
     errors = {offer.label: each for offer, each in tried if isinstance(each, ModelError)}
     if len(errors) == len(tried):
         raise next(iter(errors.values()))
-    dataset = _dataset(args)
-    results = [
-        evaluation.evaluate(
-            offer.name,
-            dataset,
-            offer.settings,
-            match.candidates,
-            progress,
-            match.sequence,
-            gate,
-            args.exact,
-            args.follow,
-        )
-        for offer, _ in tried
-        if offer.label not in errors
-    ]
+    with tempfile.TemporaryDirectory(prefix="edgevpr-eval-") as cache:
+        dataset = _dataset(args, cache)
+        results = [
+            evaluation.evaluate(
+                offer.name,
+                dataset,
+                offer.settings,
+                match.candidates,
+                progress,
+                match.sequence,
+                gate,
+                args.exact,
+                args.follow,
+            )
+            for offer, _ in tried
+            if offer.label not in errors
+        ]
     results = evaluation.compare(results)
     if args.plot:
         plot({Path(args.data[0] if args.data else args.query).resolve().name: results}, Path(args.plot))

@@ -52,11 +52,12 @@ def add_recording(parser: ArgumentParser, required: bool = True) -> None:
 
 
 def add_positions(parser: ArgumentParser) -> None:
-    """Add the flag for the positions that go with a folder of images."""
+    """Add the flag for the positions that go with a folder of images or a video."""
     parser.add_argument(
         "--positions",
         metavar="CSV",
-        help="file,lat,lon[,alt,yaw_deg,roll_deg,pitch_deg,height_m,time] (default: beside the images)",
+        help="file,lat,lon[,alt,yaw_deg,roll_deg,pitch_deg,height_m,time] (default: beside the images); of a video "
+        "time,lat,lon[,...], in seconds from its first frame",
     )
 
 

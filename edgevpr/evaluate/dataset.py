@@ -22,11 +22,12 @@ class Query:
 @dataclass(frozen=True, slots=True)
 class Dataset:
     """A data set: its scored queries and the folder of its references. `references` are the names of all images of
-    `ref_dir`, in the order in which they are mapped."""
+    `ref_dir`, in the order in which they are mapped. `notes` say what of it is left out."""
 
     queries: tuple[Query, ...]
     ref_dir: Path
     references: tuple[str, ...]
+    notes: tuple[str, ...] = ()
 
 
 def load_dataset(query_dir: str | Path, ref_dir: str | Path, ground_truth: str | Path) -> Dataset:

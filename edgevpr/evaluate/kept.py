@@ -98,6 +98,40 @@ class Kept:
         self.damaged += 1
         return None
 
+    def put_folder(self, kind: str, key: str, write: Callable[[Path], None]) -> Path:
+        """Keep the files that `write` makes in a folder, and return where they are."""
+        try:
+            self._clear_unfinished()
+            with tempfile.TemporaryDirectory(prefix=_UNFINISHED, dir=self.folder) as folder:
+                made = Path(folder) / "made"
+                made.mkdir()
+                write(made)
+                digests = _digests(made)
+                path = self._file(kind, key_of(digests))
+                path.parent.mkdir(parents=True, exist_ok=True)
+                if not _holds(path, digests):
+                    if path.exists():
+                        os.replace(path, Path(folder) / "damaged")
+                    try:
+                        os.replace(made, path)
+                    except OSError:  # another program may have kept the same meanwhile
+                        if not _holds(path, digests):
+                            raise
+        except OSError as error:
+            raise self._full(error) from error
+        self.put_json(kind, key, digests)
+        return path
+
+    def get_folder(self, kind: str, key: str) -> Path | None:
+        """Return the path of a folder that is kept; None where it is not, or a file of it is damaged or gone."""
+        if (digests := self.get_json(kind, key)) is None:
+            return None
+        path = self._file(kind, key_of(digests))
+        if _holds(path, digests):
+            return path
+        self.damaged += 1
+        return None
+
     def drop(self, kind: str, key: str) -> None:
         """Forget something that is kept elsewhere now."""
         with suppress(OSError):
@@ -139,3 +173,15 @@ class Kept:
 
     def _path(self, kind: str, key: str) -> Path:
         return self.folder / kind / key[:2] / key
+
+
+def _digests(folder: Path) -> dict[str, str]:
+    return {path.name: sha256_of(path) for path in sorted(folder.iterdir())}
+
+
+def _holds(folder: Path, digests: dict[str, str]) -> bool:
+    """Tell whether a folder holds just the files of these hashes."""
+    try:
+        return _digests(folder) == digests
+    except OSError:
+        return False

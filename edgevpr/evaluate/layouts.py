@@ -7,20 +7,22 @@
   does not count. The first folder by name is the map's.
 * database/ and queries/, or images/test/ with both: file names like @EASTING@NORTHING@...jpg, metres of UTM (Pitts30k,
   GSV-Cities and others in that form); right is what is near.
-* query/ and ref/ with positions (positions.csv or EXIF): right is what is near.
+* query/ and ref/ with positions (positions.csv or EXIF): right is what is near. Either may be a video with positions
+  beside it, query.mp4 with query.csv, or a folder that holds one.
 """
 
-import pickle
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from edgevpr.errors import UsageError
 from edgevpr.evaluate.dataset import Dataset, Query, load_dataset
 from edgevpr.evaluate.nearby import Nearness, nearby
+from edgevpr.evaluate.numbered import Numbered, read_numbered
 from edgevpr.evaluate.truth import Judged
+from edgevpr.evaluate.videos import side_of, without_position
 from edgevpr.frames.exif import read_exif
 from edgevpr.frames.images import list_images
 from edgevpr.frames.positions import GeoTag, find_positions, read_positions
@@ -28,8 +30,9 @@ from edgevpr.frames.positions import GeoTag, find_positions, read_positions
 _FORMS = "query/, ref/ and ground_truth.csv; ground_truth_new.npy; GT.npz; database/ and queries/; or positions"
 
 
-def open_folder(folder: str | Path, rule: Nearness) -> Dataset:
-    """Read the data set in a folder, whatever its layout. Raises UsageError for one that is none of them, or does not
+def open_folder(folder: str | Path, rule: Nearness, pictures: Callable[[Path], Path] = Path) -> Dataset:
+    """Read the data set in a folder, whatever its layout. `pictures` finds the folder of pictures of a side that may be
+    a video (default: there are none). Raises UsageError for one that is none of them, or does not
     fit together, and SourceError for a folder without images."""
     folder = Path(folder)
     if not folder.is_dir():
@@ -38,53 +41,63 @@ def open_folder(folder: str | Path, rule: Nearness) -> Dataset:
     if (truth := folder / "ground_truth.csv").is_file():
         return load_dataset(query, ref, truth)
     if (numbers := folder / "ground_truth_new.npy").is_file():
-        return _of_numbers(query, ref, numbers)
+        return _of_numbers(folder, numbers)
     if (matrices := folder / "GT.npz").is_file():
         return _of_matrices(folder, matrices)
     for inner in (folder, folder / "test", folder / "images" / "test"):
         if (inner / "database").is_dir() and (inner / "queries").is_dir():
             return _of_utm(inner / "queries", inner / "database", rule)
-    if query.is_dir() and ref.is_dir():
-        return of_positions(query, ref, rule)
+    sides = [side_of(folder, name) for name in ("query", "ref")]
+    if all(sides):
+        return of_positions(*sides, rule, pictures)
     raise UsageError(f"{folder} is no data set that is known: it needs {_FORMS}.")
 
 
-def of_positions(query_dir: str | Path, ref_dir: str | Path, rule: Nearness) -> Dataset:
-    """Make the data set of two folders of images with positions. Raises UsageError where there are none."""
-    queries, references = list_images(query_dir), list_images(ref_dir)
-    tags = _tags(Path(query_dir), queries), _tags(Path(ref_dir), references)
-    return _dataset(queries, references, nearby(queries, references, tags, rule), Path(ref_dir))
+def of_positions(
+    query: str | Path, ref: str | Path, rule: Nearness, pictures: Callable[[Path], Path] = Path
+) -> Dataset:
+    """Make the data set of two folders of images, or videos, with positions; `pictures` as of `open_folder`. Raises
+    UsageError where there are no positions, and what `pictures` raises."""
+    given = Path(query), Path(ref)
+    # One side after the other: nobody waits for the pictures of a video to hear that the other side is not there.
+    folders, images = zip(*((folder, list_images(folder)) for folder in map(pictures, given)), strict=True)
+    tags = tuple(map(_tags, folders, images))
+    dataset = _dataset(*images, nearby(*images, tags, rule), folders[1])
+    return replace(dataset, notes=tuple(_notes(given, folders)))
 
 
-def _of_numbers(query_dir: Path, ref_dir: Path, path: Path) -> Dataset:
-    queries, references = list_images(query_dir), list_images(ref_dir)
-    judged = {}
-    for row in _objects(path):
-        number, right = row
-        judged[_named(queries, int(number), path)] = Judged(
-            frozenset(_named(references, int(each), path) for each in np.atleast_1d(right)), frozenset(), str(path)
-        )
-    return _dataset(queries, references, judged, ref_dir)
+def _notes(given: Iterable[Path], folders: Iterable[Path]) -> Iterator[str]:
+    for each, folder in zip(given, folders, strict=True):
+        if each != folder:
+            without, count = without_position(folder)
+            if without:
+                yield f"{each}: {without} of {count} frames have no position, and are left out"
+
+
+def _of_numbers(folder: Path, path: Path) -> Dataset:
+    query_dir, ref_dir = folder / "query", folder / "ref"
+    queries, references, numbered = list_images(query_dir), list_images(ref_dir), read_numbered(path)
+    for images, count in zip((references, queries), numbered.shape, strict=True):
+        if count > len(images):
+            raise UsageError(
+                f"{path} names image {count - 1} of {images[0].parent}, which has {len(images)}: bring all of them."
+            )
+    return _dataset(queries, references, _judged(numbered, queries, references), ref_dir)
 
 
 def _of_matrices(folder: Path, path: Path) -> Dataset:
     ref_dir, query_dir = _two_folders(folder)
-    queries, references = list_images(query_dir), list_images(ref_dir)
-    with np.load(path, allow_pickle=False) as stored:
-        hard, soft = (np.asarray(stored[key]).astype(bool) for key in ("GThard", "GTsoft"))
-    if hard.shape != (len(references), len(queries)) or soft.shape != hard.shape:
+    queries, references, numbered = list_images(query_dir), list_images(ref_dir), read_numbered(path)
+    if numbered.shape != (len(references), len(queries)):
         raise UsageError(
-            f"{path} judges {hard.shape} pairs, and there are {len(references)} images in {ref_dir} and "
+            f"{path} judges {numbered.shape} pairs, and there are {len(references)} images in {ref_dir} and "
             f"{len(queries)} in {query_dir}: the first folder by name must be that of the map."
         )
-    judged = {}
-    for column, query in enumerate(queries):
-        right, loose = (
-            frozenset(references[row].name for row in np.flatnonzero(each[:, column])) for each in (hard, soft)
-        )
-        if right:
-            judged[query.name] = Judged(right, loose - right, str(path))
-    return _dataset(queries, references, judged, ref_dir)
+    return _dataset(queries, references, _judged(numbered, queries, references), ref_dir)
+
+
+def _judged(numbered: Numbered, queries: list[Path], references: list[Path]) -> dict[str, Judged]:
+    return numbered.named([path.name for path in queries], [path.name for path in references]).scored
 
 
 def _of_utm(query_dir: Path, ref_dir: Path, rule: Nearness) -> Dataset:
@@ -122,14 +135,6 @@ def _tags(folder: Path, images: Iterable[Path]) -> dict[str, GeoTag]:
     return {path.name: known.get(path.name) or read_exif(path) for path in images}
 
 
-def _named(images: list[Path], number: int, path: Path) -> str:
-    if not 0 <= number < len(images):
-        raise UsageError(
-            f"{path} names image {number} of {images[0].parent}, which has {len(images)}: bring all of them."
-        )
-    return images[number].name
-
-
 def _utm_m(path: Path) -> tuple[float, float]:
     try:
         _, east, north, *_ = path.name.split("@")
@@ -138,31 +143,3 @@ def _utm_m(path: Path) -> tuple[float, float]:
         raise UsageError(
             f"{path}: its name does not say @EASTING@NORTHING@ in metres: rename it, or leave it out."
         ) from None
-
-
-class _NumbersOnly(pickle.Unpickler):
-    """Reads an array of lists of numbers, as NumPy stores it by pickle, and nothing that could run a program."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        if name in ("_reconstruct", "scalar") and module in ("numpy.core.multiarray", "numpy._core.multiarray"):
-            return getattr(np._core.multiarray, name)
-        if (module, name) in (("numpy", "ndarray"), ("numpy", "dtype")):
-            return getattr(np, name)
-        raise pickle.UnpicklingError(f"it holds {module}.{name}")
-
-
-def _objects(path: Path) -> np.ndarray:
-    """Read the array of objects in a .npy file."""
-    try:
-        with open(path, "rb") as handle:
-            version = np.lib.format.read_magic(handle)
-            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-            shape, _, dtype = read(handle)
-            if not dtype.hasobject:
-                raise ValueError("it holds no lists")
-            found = _NumbersOnly(handle).load()
-        if found.ndim != 2 or shape[1] != 2:
-            raise ValueError(f"its shape is {shape}, and (queries, 2) is meant")
-    except (OSError, ValueError, EOFError, IndexError, AttributeError, pickle.UnpicklingError) as error:
-        raise UsageError(f"{path} is no ground truth of VPR-Bench ({error}): bring the one of the data set.") from error
-    return found

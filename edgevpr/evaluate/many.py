@@ -60,7 +60,7 @@ def measure(plan: Plan, cache: str | Path, workers: int, progress: Shown) -> Out
     """Measure every row of a plan on every set. Raises EdgevprError for a set that cannot be read and for a full disk.
     A row whose technique, or a picture for it, cannot be used fails by itself."""
     kept = Kept(cache)
-    sets = tuple(open_set(name, each) for name, each in plan.sets.items())
+    sets = tuple(open_set(name, each, kept, progress) for name, each in plan.sets.items())
     run = _Run(kept, workers)
     pairs, failed = _pairs(plan, sets)
     run.failed |= failed

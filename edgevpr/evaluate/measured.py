@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from edgevpr.contract import Technique
-from edgevpr.evaluate.asking import Answer, rank_or_none, recall_curve
+from edgevpr.evaluate.asking import Answer, Progress, rank_or_none, recall_curve
 from edgevpr.evaluate.dataset import Dataset, Query
 from edgevpr.evaluate.evaluate import TechniqueResult, from_json, summary
-from edgevpr.evaluate.kept import key_of
+from edgevpr.evaluate.kept import Kept, key_of
 from edgevpr.evaluate.plan import RowPlan, SetPlan
 from edgevpr.evaluate.provenance import code_of_everything, commit_of, machine, versions
 from edgevpr.evaluate.remembering import identity
@@ -39,9 +39,9 @@ class OpenSet:
         return list_images(self.dataset.ref_dir)
 
 
-def open_set(name: str, plan: SetPlan) -> OpenSet:
-    """Read a data set. Raises UsageError and SourceError for one that cannot be used."""
-    dataset = plan.open()
+def open_set(name: str, plan: SetPlan, kept: Kept, progress: Progress) -> OpenSet:
+    """Read a data set; the pictures of a video are kept. Raises EdgevprError for one that cannot be used."""
+    dataset = plan.open(kept, progress)
     positions = find_positions(dataset.ref_dir)
     hashes = [sha256_of(path) for path in list_images(dataset.ref_dir)]
     return OpenSet(

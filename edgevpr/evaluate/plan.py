@@ -8,10 +8,12 @@ from typing import Any, TypeVar
 from edgevpr import techniques
 from edgevpr.config import FORMS, bounded, build
 from edgevpr.errors import ConfigError
-from edgevpr.evaluate.asking import Asking
+from edgevpr.evaluate.asking import Asking, Progress
 from edgevpr.evaluate.dataset import Dataset, load_dataset
+from edgevpr.evaluate.kept import Kept
 from edgevpr.evaluate.layouts import of_positions, open_folder
 from edgevpr.evaluate.nearby import Nearness
+from edgevpr.evaluate.videos import Pictures
 from edgevpr.helpers.text import meant
 from edgevpr.runtime.preflight.pick import camera_setting
 from edgevpr.yamlfile import read_yaml
@@ -26,9 +28,10 @@ def _bounded(low: float, high: float) -> Any:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SetPlan:
-    """A data set: a `folder` of any layout that is known, or the folders `query` and `ref`. Right is what
+    """A data set: a `folder` of any layout that is known, or the folders or videos `query` and `ref`. Right is what
     `ground_truth` names (a CSV, with `query` and `ref`) or the folder itself does, else what was taken near, as
-    `Nearness` says. `camera` looks straight down (nadir) or ahead (forward)."""
+    `Nearness` says. Of a video, `rate_hz` pictures a second are taken (None: every frame). `camera` looks straight down
+    (nadir) or ahead (forward)."""
 
     folder: str | None = None
     query: str | None = None
@@ -39,15 +42,18 @@ class SetPlan:
     within_deg: float | None = _bounded(0.1, 180)
     overlap: float | None = _bounded(0.001, 1)
     fov_deg: float | None = _bounded(5, 150)
+    rate_hz: float | None = _bounded(0.001, 1000)
 
-    def open(self) -> Dataset:
-        """Read the set. Raises UsageError and SourceError as `open_folder` does."""
+    def open(self, kept: Kept, progress: Progress) -> Dataset:
+        """Read the set; the pictures of a video are taken once, and kept. Raises UsageError and SourceError as
+        `open_folder` does, and EdgevprError as `videos.Pictures`."""
+        pictures = Pictures(kept, self.rate_hz, progress)
         rule = Nearness(self.within_m or Nearness().within_m, self.within_deg, self.overlap, self.fov_deg)
         if self.folder:
-            return open_folder(self.folder, rule)
+            return open_folder(self.folder, rule, pictures)
         if self.ground_truth:
             return load_dataset(self.query or "", self.ref or "", self.ground_truth)
-        return of_positions(self.query or "", self.ref or "", rule)
+        return of_positions(self.query or "", self.ref or "", rule, pictures)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -127,8 +133,11 @@ def checked(plan: Plan, where: str) -> Plan:
 
 def of_flags(folders: Sequence[str], chosen: dict[str, RowPlan], common: SetPlan) -> Plan:
     """Make the plan of folders named on the command line, each measured by the rows `chosen`. `common` says how all
-    sets are read. Sets are named by their folders."""
+    sets are read, and may name `query` and `ref` of a set of its own. Sets are named by their folders."""
     sets: dict[str, SetPlan] = {}
+    if common.query and common.ref:
+        query, ref = (str(Path(each).resolve()) for each in (common.query, common.ref))
+        sets[f"{Path(query).name} on {Path(ref).name}"] = replace(common, query=query, ref=ref)
     for folder in folders:
         path = Path(folder).resolve()
         name = path.name if path.name not in sets else str(path)

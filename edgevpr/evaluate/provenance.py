@@ -81,6 +81,12 @@ def code_of_everything() -> str:
     return _hash([*PACKAGE.rglob("*.py"), *PACKAGE.rglob("*.json"), *shipped_files])
 
 
+@cache
+def code_of_frames() -> str:
+    """Return the hash of all that takes the frames of a video: the room of the frames, and the version of PyAV."""
+    return _hash([*(PACKAGE / "frames").rglob("*.py")]) + f" av {_version('av')}"
+
+
 def _hash(paths: list[Path]) -> str:
     found = hashlib.sha256(repr(sorted(versions().items(), key=str)).encode())
     for path in sorted({path for path in paths if path.is_file() and "__pycache__" not in path.parts}):

@@ -14,6 +14,7 @@ import numpy as np
 
 from edgevpr.errors import UsageError
 from edgevpr.evaluate import metrics
+from edgevpr.evaluate.numbered import Numbered
 from edgevpr.evaluate.quality import Quality, figures
 from edgevpr.evaluate.truth import Truth
 from edgevpr.frames.images import counting_order
@@ -64,17 +65,29 @@ def read_similarities(path: str | Path) -> Similarities:
     return Similarities(scores, found.queries, found.references)
 
 
-def measure(label: str, found: Similarities, truth: Truth, references: Sequence[str] | None = None) -> Quality:
-    """Score similarities by a ground truth. Where the file names no queries, its rows are those of the ground truth, in
-    their order; where it names no references, they are `references`, else all that the ground truth names, in counting
-    order. Raises UsageError where that does not fit."""
-    queries = found.queries or tuple(truth.queries)
+def measure(
+    label: str,
+    found: Similarities,
+    truth: Truth | Numbered,
+    references: Sequence[str] | None = None,
+    queries: Sequence[str] | None = None,
+) -> Quality:
+    """Score similarities by a ground truth. Where the file names no queries, its rows are `queries`, else those of the
+    ground truth, in their order; where it names no references, they are `references`, else all that the ground truth
+    names, in counting order. The numbers of a ground truth count `queries` and `references`, else the names in the
+    file, else its rows and columns. Raises UsageError where that does not fit."""
+    listed = queries
+    if isinstance(truth, Numbered):
+        truth, references = _named(label, found, truth, references, queries)
+    elif listed and (missing := sorted(truth.scored.keys() - set(listed))):
+        raise UsageError(f"{label}: the ground truth names the query `{missing[0]}`, which is not in --query.")
+    queries = found.queries or listed or tuple(truth.queries)
     names = found.references or references or tuple(sorted(truth.named, key=counting_order))
     rows, columns = found.scores.shape
     if len(queries) != rows:
         raise UsageError(
-            f"{label} has scores of {rows} queries, and the ground truth names {len(queries)}: give the one that "
-            "belongs to it, or a file that names its queries."
+            f"{label} has scores of {rows} queries, and {'--query' if listed else 'the ground truth'} names "
+            f"{len(queries)}: give the one that belongs to it, or a file that names its queries."
         )
     if len(names) != columns:
         raise UsageError(
@@ -100,6 +113,40 @@ def measure(label: str, found: Similarities, truth: Truth, references: Sequence[
     return Quality(
         technique=label, queries=len(scores), references=columns, **figures(np.array(scores), np.array(ranks))
     )
+
+
+def _named(
+    label: str,
+    found: Similarities,
+    truth: Numbered,
+    references: Sequence[str] | None,
+    queries: Sequence[str] | None,
+) -> tuple[Truth, Sequence[str]]:
+    """Return a ground truth of numbers with names, and the names of the references in the order of the numbers."""
+    rows, columns = found.scores.shape
+    queries = queries or _in_order(label, found.queries, "queries", "--query") or tuple(map(str, range(rows)))
+    references = (
+        references or _in_order(label, found.references, "references", "--ref") or tuple(map(str, range(columns)))
+    )
+    count = len(references), len(queries)
+    fits = truth.shape == count if truth.is_whole else all(np.less_equal(truth.shape, count))
+    if not fits:
+        least = "" if truth.is_whole else "at least "
+        raise UsageError(
+            f"{label} is of {count[1]} queries and {count[0]} references, and {truth.path} numbers {least}"
+            f"{truth.shape[1]} and {truth.shape[0]}: give the one that belongs to it."
+        )
+    return truth.named(queries, references), references
+
+
+def _in_order(label: str, names: tuple[str, ...] | None, what: str, flag: str) -> tuple[str, ...] | None:
+    """Return the names of a file, which numbers can count where they stand in counting order."""
+    if names and list(names) != sorted(names, key=counting_order):
+        raise UsageError(
+            f"{label} does not name its {what} in the order in which a ground truth numbers them: name the folder of "
+            f"all of them with {flag}."
+        )
+    return names
 
 
 def _of_csv(path: Path) -> Similarities:

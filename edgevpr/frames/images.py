@@ -39,7 +39,7 @@ def list_images(folder: str | Path) -> list[Path]:
         raise SourceError(f"The folder {folder} does not exist: give the folder that holds the images.") from None
     except OSError as error:
         raise SourceError(f"{folder} cannot be listed ({error.strerror}): give a folder of images.") from error
-    images = [name for name in names if _is_image(name)]
+    images = [name for name in names if is_image(name)]
     if not images:
         inner = [path for path in map(folder.joinpath, sorted(names, key=counting_order)) if _holds_images(path)]
         advice = f"give {' or '.join(map(str, inner[:_NAMED]))}" if inner else "give the one that does"
@@ -81,6 +81,13 @@ def read_image(path: str | Path) -> np.ndarray:
     return image
 
 
+def write_png(path: Path, image: np.ndarray) -> None:
+    """Write a picture, uint8, (H, W, 3) BGR or (H, W) grey, without losses. Raises OSError where the disk does not take
+    it."""
+    _, png = cv2.imencode(".png", image)
+    path.write_bytes(png.tobytes())
+
+
 def _require_usual(path: str | Path, header: Header) -> None:
     if header.width * header.height > MAX_PIXELS:
         raise ImageError(
@@ -95,14 +102,15 @@ def _other_depth(path: str | Path, bits: int) -> ImageError:
     return ImageError(f"{path} has {bits} bits a channel; edgevpr reads 8-bit images: convert it first.")
 
 
-def _is_image(name: str) -> bool:
+def is_image(name: str) -> bool:
+    """Tell whether a file of this name is taken for an image."""
     # Files that begin with a dot are metadata of other systems (._IMG_1.jpg), not photographs.
     return name.lower().endswith(EXTENSIONS) and not name.startswith(".")
 
 
 def _holds_images(folder: Path) -> bool:
     try:
-        return any(_is_image(path.name) for path in folder.iterdir())
+        return any(is_image(path.name) for path in folder.iterdir())
     except OSError:
         return False  # no folder, or one that may not be listed
 

@@ -3,7 +3,7 @@
 import csv
 import io
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -54,12 +54,23 @@ def read_positions(csv_path: str | Path) -> dict[str, GeoTag]:
     return {row["file"]: tag_of(row, where) for where, row in rows_of(csv_path)}
 
 
-def rows_of(csv_path: str | Path) -> list[tuple[str, dict[str, str]]]:
+def write_positions(csv_path: str | Path, tags: Mapping[str, GeoTag]) -> None:
+    """Write a positions.csv that `read_positions` reads as the same tags, to the last bit."""
+    with open(csv_path, "w", encoding="utf-8", newline="") as handle:
+        table = csv.writer(handle)
+        table.writerow(("file", "lat", "lon", "alt", "yaw_deg", "roll_deg", "pitch_deg", "height_m", "time"))
+        for name, tag in tags.items():
+            at = tag.position
+            where = (at.lat_deg, at.lon_deg, at.alt_m) if at else (None, None, None)
+            table.writerow((name, *where, tag.heading_deg, tag.roll_deg, tag.pitch_deg, tag.height_m, tag.t_utc_s))
+
+
+def rows_of(csv_path: str | Path, needed: Sequence[str] = _NEEDED_COLUMNS) -> list[tuple[str, dict[str, str]]]:
     """Read the lines of a positions.csv: where each stands, for messages, and its values by the name of the column.
-    Raises UsageError as `read_positions`."""
+    Where the column `file` is `needed`, each line names another file. Raises UsageError as `read_positions`."""
     try:
         text = io.StringIO(read_file(csv_path, _MAX_FILE_BYTES).decode("utf-8-sig"), newline="")
-        return _read_rows(csv.reader(text, skipinitialspace=True), csv_path)
+        return _read_rows(csv.reader(text, skipinitialspace=True), csv_path, needed)
     except OSError as error:
         raise UsageError(f"{csv_path} cannot be read ({error.strerror}): give the path of a CSV file.") from error
     except (UnicodeDecodeError, csv.Error) as error:
@@ -89,12 +100,12 @@ def parse_time(text: str) -> float:
     return seconds
 
 
-def _read_rows(reader: Any, csv_path: str | Path) -> list[tuple[str, dict[str, str]]]:
+def _read_rows(reader: Any, csv_path: str | Path, needed: Sequence[str]) -> list[tuple[str, dict[str, str]]]:
     header = [name.strip().lower() for name in next(reader, [])]
-    missing = [name for name in _NEEDED_COLUMNS if name not in header]
+    missing = [name for name in needed if name not in header]
     if missing:
         raise UsageError(
-            f"{csv_path}, line 1 has no column `{missing[0]}`: it must name {', '.join(_NEEDED_COLUMNS)}, "
+            f"{csv_path}, line 1 has no column `{missing[0]}`: it must name {', '.join(needed)}, "
             "with commas between them."
         )
     if twice := [name for name in _COLUMNS if header.count(name) > 1]:
@@ -108,12 +119,13 @@ def _read_rows(reader: Any, csv_path: str | Path) -> list[tuple[str, dict[str, s
         if len(values) != len(header):
             raise UsageError(f"{where} has {len(values)} values; line 1 names {len(header)} columns: make them agree.")
         row = {name: value.strip() for name, value in zip(header, values, strict=True)}
-        name = row["file"]
-        if not name:
-            raise UsageError(f"{where} names no file: write the image's file name or delete the line.")
-        if name in lines:
-            raise UsageError(f"{where}: {name} stands in line {lines[name]} already: keep one of the two.")
-        lines[name] = reader.line_num
+        if "file" in needed:
+            name = row["file"]
+            if not name:
+                raise UsageError(f"{where} names no file: write the image's file name or delete the line.")
+            if name in lines:
+                raise UsageError(f"{where}: {name} stands in line {lines[name]} already: keep one of the two.")
+            lines[name] = reader.line_num
         rows.append((where, row))
     return rows
 

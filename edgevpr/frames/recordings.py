@@ -3,11 +3,13 @@
 from collections.abc import Callable, Collection
 from pathlib import Path
 
+import numpy as np
+
 from edgevpr.errors import ImageError, UsageError
 from edgevpr.frames.condition import Condition
 from edgevpr.frames.exif import read_exif
 from edgevpr.frames.images import list_images, read_image
-from edgevpr.frames.positions import find_positions, read_positions
+from edgevpr.frames.positions import GeoTag, find_positions, read_positions
 from edgevpr.frames.shot import Refusal
 from edgevpr.helpers.text import decoded_name
 from edgevpr.types import Frame
@@ -36,6 +38,21 @@ class Recording:
     @property
     def state(self) -> str:
         return "ended" if self.ended else "reading"
+
+
+def tagged(image: np.ndarray, name: str, t_mono_s: float, tag: GeoTag) -> Frame:
+    """Return a frame with all that its tag knows."""
+    return Frame(
+        image=image,
+        name=name,
+        t_mono_s=t_mono_s,
+        t_utc_s=tag.t_utc_s,
+        position=tag.position,
+        heading_deg=tag.heading_deg,
+        roll_deg=tag.roll_deg,
+        pitch_deg=tag.pitch_deg,
+        height_m=tag.height_m,
+    )
 
 
 class FolderSource(Recording):
@@ -77,17 +94,7 @@ class FolderSource(Recording):
             raise
         name = decoded_name(path.name)  # a map and a positions.csv hold UTF-8 only
         tag = self._tags.get(name) or read_exif(path)
-        return Frame(
-            image=image,
-            name=name,
-            t_mono_s=self._clock(),
-            t_utc_s=tag.t_utc_s,
-            position=tag.position,
-            heading_deg=tag.heading_deg,
-            roll_deg=tag.roll_deg,
-            pitch_deg=tag.pitch_deg,
-            height_m=tag.height_m,
-        )
+        return tagged(image, name, self._clock(), tag)
 
     def close(self) -> None:
         """Do nothing: no file is held open between images."""

@@ -77,13 +77,14 @@ def open_source(
     """Open the source that `uri` names. `live` allows cameras and streams, which never end.
 
     `step_s` is the least video time in seconds between two frames of a video file. `positions` is the positions.csv of
-    a folder of images; without it, the one in or beside the folder is used, else EXIF. Of a recording, the frames whose
+    a folder of images; without it, the one in or beside the folder is used, else EXIF. Of a video it is the table that
+    `track.read_track` reads; without it, its frames have no positions. Of a recording, the frames whose
     names are in `only` are read (None: all). A stream that is not there yet is waited for. Raises SourceError for a
     source that is unknown, missing or not allowed, and UsageError for positions that make no sense.
     """
     path = Path(uri)
-    if positions and not path.is_dir():
-        raise UsageError(f"{positions} can only place the images of a folder, and {uri} is none: leave it out.")
+    if positions and is_live(uri):
+        raise UsageError(f"{positions} can only place the pictures of a recording, and {uri} is none: leave it out.")
     if path.is_dir():
         return FolderSource(path, positions, clock, only)
     if is_live(uri):
@@ -94,9 +95,10 @@ def open_source(
         raise SourceError(f"There is nothing at `{uri}`: give {SOURCES}.")
     if path.name.lower().endswith(EXTENSIONS):
         raise SourceError(f"{uri} is a single image: give the folder that holds it.")
+    from edgevpr.frames.track import read_track
     from edgevpr.frames.video import VideoSource  # loads FFmpeg
 
-    return VideoSource(path, step_s or 0.0, clock, only)
+    return VideoSource(path, step_s or 0.0, clock, only, track=read_track(positions) if positions else None)
 
 
 def is_live(uri: str) -> bool:

@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING
 
 from edgevpr.errors import ImageError, SourceError
 from edgevpr.frames.decoding import WholePictures, open_pictures
-from edgevpr.frames.recordings import Recording
+from edgevpr.frames.positions import GeoTag
+from edgevpr.frames.recordings import Recording, tagged
 from edgevpr.frames.shot import Refusal
+from edgevpr.frames.track import Track
 from edgevpr.types import Frame
 
 if TYPE_CHECKING:
@@ -21,15 +23,24 @@ _CUT_S = 1.0  # so much may be missing at the end: other streams in the file las
 
 
 class VideoSource(Recording):
-    """The frames of a video file, at least `step_s` seconds of video time apart: the same frames in every run.
+    """The frames of a video file, at least `step_s` seconds of video time apart: the same frames in every run. `track`
+    says where each was taken (None: unknown).
 
     Damaged frames, and those predicted from them, are left out. `read` raises ImageError once for every stretch of
     them, and once for an end that is missing."""
 
-    def __init__(self, path: Path, step_s: float, clock: Callable[[], float], only: Collection[str] | None = None):
+    def __init__(
+        self,
+        path: Path,
+        step_s: float,
+        clock: Callable[[], float],
+        only: Collection[str] | None = None,
+        *,
+        track: Track | None = None,
+    ):
         super().__init__(only)
         self.ended = False
-        self._path, self._step_s, self._clock = path, step_s, clock
+        self._path, self._step_s, self._clock, self._track = path, step_s, clock, track
         whole = open_pictures(str(path), {})
         if whole is None:
             raise SourceError(f"{path} is not a video that can be decoded: give a video file or a folder of images.")
@@ -40,6 +51,8 @@ class VideoSource(Recording):
         frames = stream.frames or self._promised_s / self._frame_s
         self._promised_s = max(self._promised_s, stream.frames * self._frame_s)  # an AVI file says only this when cut
         self.total = math.ceil(frames * self._frame_s / max(step_s, self._frame_s))
+        if track and self._promised_s:
+            track.require_within(path, self._promised_s)
         self._ready: deque[VideoFrame] = deque()
         self._index, self._damaged = -1, 0
         self._t_s = -self._frame_s
@@ -57,7 +70,8 @@ class VideoSource(Recording):
                 self._t_due_s = self._t_s + self._step_s
                 name = f"frame {self._index:06d} t={self._t_s:.3f} s"
                 if self.is_wanted(name):
-                    return Frame(image=self._whole.pixels(picture), name=name, t_mono_s=self._clock())
+                    tag = self._track.tag_at(self._t_s) if self._track else GeoTag()
+                    return tagged(self._whole.pixels(picture), name, self._clock(), tag)
             if self._clock() >= deadline_s:
                 break
         return None

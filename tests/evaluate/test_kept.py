@@ -85,3 +85,24 @@ def test_a_folder_that_cannot_be_made_or_written_gets_a_sentence(tmp_path):
     (tmp_path / "cache" / "things").write_text("in the way")
     with pytest.raises(EdgevprError, match="all that is done stays"):
         kept.put("things", key_of("a"), b"content")
+
+
+def test_a_folder_is_kept_whole_and_what_is_damaged_gone_or_added_is_noticed(tmp_path):
+    kept, key = Kept(tmp_path), key_of("video")
+
+    def write(folder):
+        (folder / "a.png").write_bytes(b"a")
+        (folder / "b.png").write_bytes(b"b")
+
+    assert kept.get_folder("videos", key) is None
+    path = kept.put_folder("videos", key, write)
+    assert kept.get_folder("videos", key) == path
+    assert sorted(each.name for each in path.iterdir()) == ["a.png", "b.png"]
+    assert kept.put_folder("videos", key_of("same pictures"), write) == path
+    for harm in (lambda: (path / "a.png").write_bytes(b"x"), (path / "b.png").unlink, (path / "c.png").touch):
+        harm()
+        assert kept.get_folder("videos", key) is None
+        assert kept.put_folder("videos", key, write) == path
+        assert kept.get_folder("videos", key) == path
+    assert kept.damaged == 3
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["videos", "videos-files"]

@@ -43,6 +43,9 @@ def test_vpr_bench_has_numbers(tmp_path):
     np.save(tmp_path / "ground_truth_new.npy", truth, allow_pickle=True)
     dataset = open_folder(tmp_path, RULE)
     assert right_of(dataset) == {"0.jpg": ({"2.jpg", "9.jpg"}, set()), "10.jpg": ({"11.jpg"}, set())}
+    truth[0] = (0, [])
+    np.save(tmp_path / "ground_truth_new.npy", truth, allow_pickle=True)
+    assert list(right_of(open_folder(tmp_path, RULE))) == ["10.jpg"], "a query without a right reference is not scored"
     truth[1] = (2, [3])
     np.save(tmp_path / "ground_truth_new.npy", truth, allow_pickle=True)
     with pytest.raises(UsageError, match="image 3 of"):
@@ -76,6 +79,18 @@ def test_vpr_tutorial_has_matrices_and_what_is_soft_does_not_count(tmp_path):
     assert right_of(open_folder(tmp_path, RULE)) == {"x.jpg": ({"a.jpg"}, {"b.jpg"}), "y.jpg": ({"b.jpg"}, {"c.jpg"})}
     np.savez(tmp_path / "GT.npz", GThard=hard.T, GTsoft=soft.T)
     with pytest.raises(UsageError, match="the first folder by name must be that of the map"):
+        open_folder(tmp_path, RULE)
+
+
+@pytest.mark.parametrize("content", [b"", b"rubbish", {"GThard": np.eye(2)}, {"GThard": [[None]], "GTsoft": [[None]]}])
+def test_matrices_that_are_none_are_said(tmp_path, content):
+    pictures(tmp_path / "day", ["a.jpg", "b.jpg"])
+    pictures(tmp_path / "night", ["x.jpg", "y.jpg"])
+    if isinstance(content, bytes):
+        (tmp_path / "GT.npz").write_bytes(content)
+    else:
+        np.savez(tmp_path / "GT.npz", **content)
+    with pytest.raises(UsageError, match=r"is no GT\.npz of VPR_Tutorial"):
         open_folder(tmp_path, RULE)
 
 

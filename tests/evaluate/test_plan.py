@@ -4,7 +4,9 @@ import pytest
 from generated_sets import make_set
 
 from edgevpr.errors import UsageError
+from edgevpr.evaluate.kept import Kept
 from edgevpr.evaluate.plan import RowPlan, read_plan
+from edgevpr.helpers.progress import progress
 
 
 def plan(tmp_path, text):
@@ -26,7 +28,7 @@ def test_a_plan_names_sets_beside_its_file_and_rows(tmp_path):
         "rows:\n  fast: {technique: cohog, parameters: {w1: 208}, candidates: 5, follow: true}\n"
         "  byte: {technique: hog, form: 8bit, exact: true}\n",
     )
-    assert [len(each.open().queries) for each in found.sets.values()] == [5, 5]
+    assert [len(each.open(Kept(tmp_path / "cache"), progress).queries) for each in found.sets.values()] == [5, 5]
     assert found.rows["fast"].settings("nadir") == {"camera": "nadir", "w1": 208}
     assert found.rows["byte"].settings("nadir") == {"form": "8bit"}
     assert (found.rows["fast"].asking.candidates, found.rows["fast"].asking.follow) == (5, True)

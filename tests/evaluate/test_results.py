@@ -141,7 +141,7 @@ def test_what_could_not_be_measured_is_said_everywhere(tmp_path, capsys):
         (["--sets", "plan.yaml"], "Name a folder for the results with --out"),
         (["--data", "SET", "--workers", "2"], "Name a folder for the results with --out"),
         (["--out", "out"], "Name the data sets with --data"),
-        (["--sets", "plan.yaml", "--data", "SET", "--out", "out"], "leave --data, --query and --ref out"),
+        (["--sets", "plan.yaml", "--data", "SET", "--out", "out"], "leave --data, --query, --ref and --rate-hz out"),
         (["--sets", "gone.yaml", "--out", "out"], "gone.yaml cannot be read"),
         (["--data", "gone", "--out", "out"], "there is no such folder"),
         (["--data", "SET", "--out", "out", "--plot", "a.png"], "--plot goes without --out"),

@@ -6,7 +6,7 @@ import re
 import pytest
 
 from edgevpr.errors import UsageError
-from edgevpr.frames.positions import GeoTag, find_positions, parse_time, read_positions
+from edgevpr.frames.positions import GeoTag, find_positions, parse_time, read_positions, write_positions
 from edgevpr.types import Position
 
 HEADER = "file,split,lat,lon,alt,rel_alt,yaw_deg,time\n"
@@ -143,6 +143,14 @@ def test_positions_beside_a_relative_folder_are_found(tmp_path, monkeypatch):
     (tmp_path / "ref").mkdir()
     monkeypatch.chdir(tmp_path / "ref")
     assert find_positions(".") == tmp_path / "positions.csv"
+
+
+def test_positions_that_are_written_are_read_as_the_same(tmp_path):
+    at = Position(-35.123456789012345, 179.99999999999997, 612.3000000000001)
+    tags = {"a.png": GeoTag(position=at, heading_deg=0.1, roll_deg=-0.2, pitch_deg=1 / 3, height_m=80.0, t_utc_s=7.5)}
+    tags |= {"b, c.png": GeoTag(position=Position(1.0, 2.0)), "d.png": GeoTag()}
+    write_positions(tmp_path / "positions.csv", tags)
+    assert read_positions(tmp_path / "positions.csv") == tags
 
 
 def test_attitude_and_height_are_read(written):

@@ -125,8 +125,31 @@ def test_positions_that_cannot_be_meant_for_the_source_are_refused(folder, video
     (tmp_path / "other.csv").write_text("file,lat,lon\nb.jpg,3,4\n")
     with pytest.raises(UsageError, match=r"other\.csv names none of the images in"):
         open_source(str(folder), positions=tmp_path / "other.csv", live=False)
-    with pytest.raises(UsageError, match=r"other\.csv can only place the images of a folder"):
+    with pytest.raises(UsageError, match=r"other\.csv, line 1 has no column `time`: it must name time, lat, lon"):
         open_source(str(video), positions=tmp_path / "other.csv", live=False)
+    with pytest.raises(UsageError, match=r"other\.csv can only place the pictures of a recording"):
+        open_source("rtsp://127.0.0.1:5/x", positions=tmp_path / "other.csv", live=True)
+
+
+def test_frames_of_a_video_lie_where_the_table_says_between_its_lines(video, tmp_path):
+    table = tmp_path / "flight.csv"
+    table.write_text("time,lat,lon,yaw_deg,height_m\n0.5,47,8,350,50\n1.5,47.001,8,10,60\n")
+    frames = all_frames(open_source(str(video), positions=table, live=False))
+    assert len(frames) == len(SHADES)
+    placed = [frame for frame in frames if frame.position]
+    assert [placed[0].name, placed[-1].name] == ["frame 000005 t=0.500 s", "frame 000015 t=1.500 s"]
+    assert placed[5].position.lat_deg == pytest.approx(47.0005)
+    assert (placed[5].heading_deg, placed[5].height_m, placed[5].t_utc_s) == (0.0, 55.0, None)
+    step = all_frames(open_source(str(video), step_s=0.5, positions=table, live=False))
+    assert [frame.position for frame in step if frame.position] == [placed[at].position for at in (0, 5, 10)]
+
+
+@pytest.mark.parametrize("times", [("2026-06-23T16:31:59Z", "2026-06-23T16:32:04Z"), ("-9", "-3")])
+def test_positions_of_another_time_than_the_video_are_refused(video, tmp_path, times):
+    table = tmp_path / "flight.csv"
+    table.write_text("time,lat,lon\n" + "".join(f"{time},47,8\n" for time in times))
+    with pytest.raises(UsageError, match=r"flight\.avi lasts from 0 to 2\.5 s: write `time` in seconds from its first"):
+        open_source(str(video), positions=table, live=False)
 
 
 def test_a_wrong_positions_csv_is_found_out_before_the_first_image(folder):
