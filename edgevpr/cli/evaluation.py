@@ -4,6 +4,7 @@ import os
 import sys
 import tempfile
 from argparse import ArgumentTypeError, Namespace
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -109,6 +110,8 @@ def _measure_many(args: Namespace) -> int:
     if args.plot:
         raise UsageError("--plot goes without --out: the page in that folder has the curves.")
     plan = _plan(args)
+    for name, of in plan.sets.items():
+        _say_camera(name, ((row.technique, row.settings(of.camera)) for row in plan.rows.values()))
     out = Path(args.out)
     out.mkdir(parents=True, exist_ok=True)
     outcome = measure(plan, args.cache or out / "cache", args.workers or len(os.sched_getaffinity(0)), progress)
@@ -171,6 +174,18 @@ def _set_of(args: Namespace) -> "SetPlan":
         fov_deg=value_of(args, "source.fov_deg"),
         rate_hz=args.rate_hz,
     )
+
+
+def _say_camera(name: str, rows: Iterable[tuple[str, Mapping[str, Any]]]) -> None:
+    """Say that a set is taken for one that looks ahead, where nobody has said which way its camera looks."""
+    from edgevpr import techniques
+
+    if any("camera" in techniques.parameters(technique) and "camera" not in settings for technique, settings in rows):
+        print(
+            f"edgevpr: {shown(name)} is taken to look ahead: where its camera looks straight down, say "
+            "`--camera nadir` (`camera: nadir` in a file of sets)",
+            file=sys.stderr,
+        )
 
 
 def _wanted(args: Namespace) -> list[str]:
@@ -263,6 +278,7 @@ def _measure_techniques(args: Namespace) -> int:
     errors = {offer.label: each for offer, each in tried if isinstance(each, ModelError)}
     if len(errors) == len(tried):
         raise next(iter(errors.values()))
+    _say_camera("the set", ((offer.name, offer.settings) for offer, _ in tried))
     with tempfile.TemporaryDirectory(prefix="edgevpr-eval-") as cache:
         dataset = _dataset(args, cache)
         results = [

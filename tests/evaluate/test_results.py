@@ -163,3 +163,14 @@ def test_a_wrong_number_of_workers_is_refused(count, capsys):
     with pytest.raises(SystemExit):
         run("--data", "x", "--out", "y", "--workers", count)
     assert "give 1 to 256" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("flags", [[], ["--out", "results"]])
+def test_a_camera_that_nobody_has_named_is_said_to_look_ahead(tmp_path, monkeypatch, capsys, flags):
+    monkeypatch.chdir(tmp_path)
+    make_set(tmp_path / "meadow")
+    said = []
+    for more in ([], ["--camera", "nadir"], ["--param", "cohog.camera=forward"]):
+        assert run("--data", "meadow", "--techniques", "cohog", "--param", "cohog.w1=208", *flags, *more) == 0
+        said.append("is taken to look ahead: where its camera looks straight down" in capsys.readouterr().err)
+    assert said == [True, False, False]
