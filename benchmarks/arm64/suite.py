@@ -54,6 +54,7 @@ LEFT_OUT = {
     **dict.fromkeys(
         (
             "tests/test_on_arm64.py",
+            "tests/test_peers.py",
             "tests/test_rig.py",
             "tests/test_service_faults.py",
             "tests/test_sites_and_sweeps.py",

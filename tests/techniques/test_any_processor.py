@@ -88,7 +88,7 @@ def told_by(camera, **environment):
         text=True,
         check=True,
         cwd=Path(__file__).parent,
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2]), **environment},
+        env={**os.environ, **environment},
     )
     return done.stdout
 
