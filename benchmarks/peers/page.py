@@ -1,0 +1,140 @@
+"""The page of `peers.py`: benchmarks/results/peers.md."""
+
+from typing import Any
+
+import onnxruntime
+from run_sets import TUNED_ON
+
+from edgevpr.helpers.tables import markdown
+
+OURS = "cohog (edgevpr)"
+_COSTS = "t_e ms", "t_m ms", "B/place", "RAM MB", "import s"
+
+
+def write(found: dict[str, Any]) -> str:
+    """Return the page of all that was found."""
+    machine = found["machine"]
+    commits = sorted({row["commit"] for kind in ("rows", "networks") for row in found[kind].values()})
+    sets = list(dict.fromkeys(key.partition(": ")[0] for key in found["rows"]))
+    ways = list(dict.fromkeys(key.partition(": ")[2] for key in found["rows"]))
+    sections = "\n".join(_of_set(name, found["rows"]) for name in sets)
+    return f"""# Beside other ways
+
+Made by `make peers`, {found["date"]}, commit {", ".join(commits)}, {machine["cores"]} cores of {machine["cpu"]}, OpenCV
+{machine["opencv"]}, onnxruntime {onnxruntime.__version__}.
+
+Recall@1 on sets that had no say in `cohog`'s parameters (in brackets the queries). Looking down `cohog` is told so, and
+knows neither heading nor height. Every way has the same queries and the same references, in the sizes of the set.
+
+{_recalls(sets, ways, found["rows"])}
+
+{_READING}
+## Costs
+
+Times are those of the processor, on one thread, medians over the queries: `t_e` encodes a query, `t_m` matches it with
+all references. `B/place` is what the index takes in memory: for the published CoHOG and for the ratio tests that is the
+whole descriptor of every reference. {_kept(found["rows"])} `RAM` is the peak of the process above the bare interpreter,
+with the references in it; maps and words were made before, by another process. `import` are the seconds of the
+processor until the libraries are loaded. Words (bag of words, pydbow, VLAD) are learnt on the references of
+{", ".join(TUNED_ON[:-1])} and {TUNED_ON[-1]}. The 95 % are of recall@1: what other queries of the same kind would give.
+Of a set at most 200 queries are asked, evenly spaced.
+
+{sections}
+{_networks(found)}
+{_LEFT_OUT}"""
+
+
+def _recalls(sets: list[str], ways: list[str], rows: dict[str, Any]) -> str:
+    lines = []
+    for way in ways:
+        cells = [rows.get(f"{name}: {way}") for name in sets]
+        lines.append((way, *(f"{row['quality']['recall_at_1']:.2f}" if row else "-" for row in cells)))
+    queries = [next(row for key, row in rows.items() if key.startswith(f"{name}: "))["quality"] for name in sets]
+    return markdown(("way", *(f"{n} ({q['queries']})" for n, q in zip(sets, queries, strict=True))), lines)
+
+
+def _kept(rows: dict[str, Any]) -> str:
+    sizes = [row["file_bytes"] / 1e3 for row in rows.values() if "file_bytes" in row]
+    return (
+        f"`cohog` has besides {min(sizes):.0f} to {max(sizes):.0f} KB a place in its map file, of which a match reads "
+        "the places that it compares."
+    )
+
+
+def _of_set(name: str, rows: dict[str, Any]) -> str:
+    of_set = {key.partition(": ")[2]: row for key, row in rows.items() if key.startswith(f"{name}: ")}
+    lines = [
+        (
+            way,
+            f"{row['quality']['recall_at_1']:.3f}",
+            "{:.2f}-{:.2f}".format(*row["quality"]["recall_at_1_interval"]),
+            f"{row['quality']['recall_at_5']:.3f}",
+            f"{row['quality']['precision_at_100_recall']:.3f}",
+            f"{row['quality']['recall_at_100_precision']:.3f}",
+            f"{row['quality']['auc']:.3f}",
+            *_costs(row),
+        )
+        for way, row in of_set.items()
+    ]
+    titles = "way", "recall@1", "95 %", "@5", "P@100%R", "R@100%P", "AUC", *_COSTS
+    first = next(iter(of_set.values()))["quality"]
+    return f"### {name}\n\n{first['queries']} queries, {first['references']} references.\n\n{markdown(titles, lines)}\n"
+
+
+def _costs(row: dict[str, Any]) -> tuple[str, ...]:
+    return (
+        f"{row['t_encode_ms']:.1f}",
+        f"{row['t_match_ms']:.1f}",
+        f"{row['bytes']:,.0f}",
+        f"{row['ram_mb']:.0f}",
+        f"{row['import_s']:.2f}",
+    )
+
+
+def _networks(found: dict[str, Any]) -> str:
+    lines = [
+        (
+            name,
+            f"{row['length']:,}",
+            f"{row['parameters_m']:.1f}" if "parameters_m" in row else "-",
+            f"{row['gmacs']:.1f}" if "gmacs" in row else "-",
+            f"{row['file_mb']:.0f}",
+            f"{row['t_encode_ms']:,.0f}",
+            f"{row['t_match_ms']:.1f}",
+            f"{row['bytes']:,}",
+            f"{row['bytes_1bit']:,}",
+            f"{row['ram_mb']:.0f}",
+            f"{row['import_s'] + row['open_s']:.2f}",
+        )
+        for name, row in found["networks"].items()
+    ]
+    titles = "network", "numbers", "10^6 parameters", "10^9 MAC", "file MB", "t_e ms", "t_m ms", "B/place", "1bit"
+    return f"""## Modern networks
+
+By the recipes of [networks.md](../../docs/networks.md), run by edgevpr as techniques, one thread. **Their weights are
+random**: the weights of the authors could not be had here, so nothing is said of what they recognise. What they cost
+does not depend on what they have learnt. The published figures, on streets, are theirs to tell. `t_m` is the scan of
+1,000 places; `B/place` in half precision, and in the form of one bit a number. `calc`, which edgevpr ships, stands
+beside.
+
+{markdown((*titles, "RAM MB", "load s"), lines)}
+"""
+
+
+_READING = ""
+
+_LEFT_OUT = """## Looked at and left out
+
+On PyPI, for Python 3.11:
+
+* `dbow3py` 0.0.4: its source lacks the CMakeLists.txt that it is built with.
+* `pydbow3`, `hbst-python`, `imret`: no file for this Python. `libviper`: from Python 3.12 on. hloc: not there.
+* `vpr` 0.0.1: no place recognition, and its source lacks a file that it is installed with.
+* `patchnetvlad` 0.1.8: asks for a package `faiss` that has no file for this Python, and its weights come
+  from elsewhere.
+* `vprtempo` 1.1.10: trains a network for every map; needs torchvision, which beside a PyTorch without CUDA cannot be
+  imported from PyPI's file; and takes the n-th query for one of the n-th reference.
+* `usearch`, `hnswlib`: find neighbours among vectors, and make none of a picture. The row of FAISS stands for them.
+
+`pydbow` is the one that recognises places as it comes.
+"""
