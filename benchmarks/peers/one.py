@@ -12,7 +12,7 @@ processor. Of a set at most 200 queries are asked, evenly spaced.
 
 import json
 import pickle
-import resource
+import re
 import sys
 import time
 from collections.abc import Sequence
@@ -20,7 +20,6 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-_STARTED_MB = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
 MOST_QUERIES = 200
 _QUALITY = "recall", "precision_at", "auc", "queries", "references"
 _NETWORK_PICTURES, _NETWORK_PLACES, _SEED = 11, 1000, 1
@@ -62,7 +61,7 @@ def cohog(camera: str, folder: str, file: str) -> dict[str, Any]:
         walk = Walk(technique, place_map, index, meter_of(load_config(None), load_board("this")), asking=Asking())
         walk.warm_up(dataset.queries[0].path)
         found = list(answers(walk, dataset, lambda paths, count, label: paths))
-    ram_mb = _ram_mb()  # the figures of quality load SciPy, and a flight does not
+    ram_mb = _peak_mb() - _STARTED_MB  # the figures of quality load SciPy, and a flight does not
     result = summary(technique, len(dataset.references), found)
     return {
         "quality": _quality(asdict(result)),
@@ -116,7 +115,7 @@ def way(name: str, folder: str, file: str) -> dict[str, Any]:
         ranked = ranked[metrics.counting(ranked, ignored)]
         scores.append(row[ranked[0]])
         ranks.append(metrics.first_right(ranked, right))
-    ram_mb = _ram_mb()
+    ram_mb = _peak_mb() - _STARTED_MB
     quality = Quality(
         technique=name,
         queries=len(scores),
@@ -162,7 +161,7 @@ def network(name: str, folder: str) -> dict[str, Any]:
         technique.coarse_scores(asked, rows)
         t_match_s.append(time.process_time() - encoded_s)
         t_encode_s.append(encoded_s - begin_s)
-    ram_mb = _ram_mb()
+    ram_mb = _peak_mb() - _STARTED_MB
     return {
         "t_encode_ms": 1e3 * float(np.median(t_encode_s[1:])),  # the first one pays for what is made once
         "t_match_ms": 1e3 * float(np.median(t_match_s[1:])),
@@ -176,8 +175,10 @@ def network(name: str, folder: str) -> dict[str, Any]:
     }
 
 
-def _ram_mb() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3 - _STARTED_MB
+def _peak_mb() -> float:
+    """Return the highest resident memory of this process so far. What `getrusage` tells is at least that of the process
+    which started this one."""
+    return int(re.search(r"VmHWM:\s+(\d+)", Path("/proc/self/status").read_text())[1]) / 1e3
 
 
 def _dataset(folder: str) -> Any:
@@ -202,6 +203,8 @@ def main(words: Sequence[str]) -> None:
     work = {"map": make_map, "cohog": cohog, "learn": learn, "way": way, "network": network}
     print(json.dumps(work[words[0]](*words[1:])))
 
+
+_STARTED_MB = _peak_mb()  # of the bare interpreter: nothing large is imported yet
 
 if __name__ == "__main__":
     main(sys.argv[1:])

@@ -84,8 +84,11 @@ def main() -> int:
 
 def _cohog(folder: Path) -> Rows:
     camera, file = camera_of(folder.name), WORK / f"{folder.name}.gpkg"
-    file.unlink(missing_ok=True)
-    _one("map", camera, str(folder), str(file))
+    if not file.exists():
+        unfinished = file.with_name(f"unfinished_{file.name}")
+        unfinished.unlink(missing_ok=True)
+        _one("map", camera, str(folder), str(unfinished))
+        unfinished.rename(file)
     return _one("cohog", camera, str(folder), str(file))
 
 
