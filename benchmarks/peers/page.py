@@ -6,6 +6,7 @@ import onnxruntime
 from run_sets import TUNED_ON
 
 from edgevpr.helpers.tables import markdown
+from peers.ways import WAYS
 
 OURS = "cohog (edgevpr)"
 _COSTS = "t_e ms", "t_m ms", "B/place", "RAM MB", "import s"
@@ -15,8 +16,7 @@ def write(found: dict[str, Any]) -> str:
     """Return the page of all that was found."""
     machine = found["machine"]
     commits = sorted({row["commit"] for kind in ("rows", "networks") for row in found[kind].values()})
-    sets = list(dict.fromkeys(key.partition(": ")[0] for key in found["rows"]))
-    ways = list(dict.fromkeys(key.partition(": ")[2] for key in found["rows"]))
+    sets = sorted({key.partition(": ")[0] for key in found["rows"]})
     sections = "\n".join(_of_set(name, found["rows"]) for name in sets)
     return f"""# Beside other ways
 
@@ -26,7 +26,7 @@ Made by `make peers`, {found["date"]}, commit {", ".join(commits)}, {machine["co
 Recall@1 on sets that had no say in `cohog`'s parameters (in brackets the queries). Looking down `cohog` is told so, and
 knows neither heading nor height. Every way has the same queries and the same references, in the sizes of the set.
 
-{_recalls(sets, ways, found["rows"])}
+{_recalls(sets, found["rows"])}
 
 {_READING}
 ## Costs
@@ -44,9 +44,9 @@ Of a set at most 200 queries are asked, evenly spaced.
 {_LEFT_OUT}"""
 
 
-def _recalls(sets: list[str], ways: list[str], rows: dict[str, Any]) -> str:
+def _recalls(sets: list[str], rows: dict[str, Any]) -> str:
     lines = []
-    for way in ways:
+    for way in (OURS, *WAYS):
         cells = [rows.get(f"{name}: {way}") for name in sets]
         lines.append((way, *(f"{row['quality']['recall_at_1']:.2f}" if row else "-" for row in cells)))
     queries = [next(row for key, row in rows.items() if key.startswith(f"{name}: "))["quality"] for name in sets]
@@ -62,7 +62,7 @@ def _kept(rows: dict[str, Any]) -> str:
 
 
 def _of_set(name: str, rows: dict[str, Any]) -> str:
-    of_set = {key.partition(": ")[2]: row for key, row in rows.items() if key.startswith(f"{name}: ")}
+    of_set = {way: rows[key] for way in (OURS, *WAYS) if (key := f"{name}: {way}") in rows}
     lines = [
         (
             way,
