@@ -78,6 +78,7 @@ def main() -> int:
     measured("networks", "calc", lambda: _network("calc", folders[0]))
     for name, card in cards.items():
         measured("networks", name, lambda name=name, card=card: _modern(name, card, folders[0], args.torch))
+    measured("networks", "cosplace_int8", lambda: _in_8_bits("cosplace", folders[0]))
     (RESULTS / "peers.md").write_text(page.write({**by, **found}))
     return 0
 
@@ -105,6 +106,11 @@ def _modern(name: str, card: str, folder: Path, python: str) -> Rows:
     data = "--query", f"{folder}/query", "--ref", f"{folder}/ref", "--ground-truth", f"{folder}/ground_truth.csv"
     modern.edgevpr(WORK, "eval", *data, "--techniques", name, "--json")
     return {**size, **_network(name, folder)}
+
+
+def _in_8_bits(name: str, folder: Path) -> Rows:
+    modern.edgevpr(WORK, "models", "quantise", name, "--calibrate", f"{folder}/ref")
+    return _network(f"{name}_int8", folder)
 
 
 def _network(name: str, folder: Path) -> Rows:
