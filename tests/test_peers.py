@@ -111,6 +111,6 @@ def test_without_data_sets_it_says_so_and_writes_nothing(tmp_path):
         text=True,
     )
     assert done.returncode == 2
-    assert "name the right folder with --data or EDGEVPR_DATA" in done.stderr
+    assert "name the right folder with EDGEVPR_DATA" in done.stderr
     assert "Traceback" not in done.stderr
     assert result.stat().st_mtime_ns == before

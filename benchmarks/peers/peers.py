@@ -49,7 +49,7 @@ def main() -> int:
         folders = find_sets(DATA, args.sets.split(","))
         training = find_sets(DATA, list(TUNED_ON))
     except UsageError as error:
-        print(f"peers: {error}", file=sys.stderr)
+        print(f"peers: {str(error).replace('--data or ', '')}", file=sys.stderr)  # there is no such flag here
         return error.exit_code
     if args.again:
         shutil.rmtree(WORK, ignore_errors=True)
