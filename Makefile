@@ -7,7 +7,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # Where this is set, each of the hundreds of processes that the tests start compiles edgevpr anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test lint results bench thesis bench-arm64 hostile rig service-faults soak test-arm64 sites sweeps clean
+.PHONY: demo test lint results bench thesis bench-arm64 hostile rig service-faults soak test-arm64 sites sweeps peers clean
 
 demo: $(VENV)/installed
 	$(BIN)/edgevpr demo --out demo_out
@@ -39,6 +39,18 @@ sites: $(VENV)/installed
 # How far an aircraft may be off its map, one change at a time, into benchmarks/results/. It goes on in sweeps_work/.
 sweeps: $(VENV)/installed
 	$(BIN)/python benchmarks/sweeps.py
+
+# `cohog` beside other ways, into benchmarks/results/: forty minutes. It goes on in peers_work/ (700 MB) where it was
+# interrupted. What cannot be installed is left out; the modern networks are exported by a Python with torch and onnx.
+PEERS := faiss-cpu pydbow
+TORCH ?= $(BIN)/python
+peers: $(VENV)/installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[bench]'
+	@for each in $(PEERS); do \
+	    $(BIN)/python -m pip install --quiet --disable-pip-version-check --only-binary :all: $$each || \
+	        $(BIN)/python -m pip install --quiet --disable-pip-version-check $$each || echo "$$each: left out"; \
+	done
+	$(BIN)/python benchmarks/peers/peers.py --torch $(TORCH)
 
 # Speed and memory against the published way, into benchmarks/results/.
 bench: $(VENV)/installed

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 WORDS_ORB, WORDS_SIFT, FEATURES = 1000, 64, 500
+PYDBOW_EVERY = 8
 RATIO = 0.75
 _CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 20, 1e-3)
 SIDE_PX = 512
@@ -30,12 +31,13 @@ class Way:
 
 
 def published_cohog() -> Way:
-    """CoHOG as published (competitor.py)."""
+    """CoHOG as published (competitor.py), with the entropy of its authors' code: the one that the thesis prints finds
+    less."""
     import competitor
 
     def encode(grey: np.ndarray, _: Any) -> tuple[np.ndarray, np.ndarray]:
         square = cv2.resize(grey, (SIDE_PX, SIDE_PX), interpolation=cv2.INTER_AREA).astype(np.float32)
-        return competitor.encode(square, "filled_bins")
+        return competitor.encode(square, "shannon")
 
     def scores(asked: tuple[np.ndarray, np.ndarray], places: list[np.ndarray]) -> np.ndarray:
         regions, good = asked
@@ -51,12 +53,23 @@ def published_cohog() -> Way:
 
 
 def orb_with_ratio_test() -> Way:
-    """500 ORB features a picture, by brute force with the ratio test (Lowe 2004); the score is how many pass."""
-    orb, matcher = cv2.ORB_create(FEATURES), cv2.BFMatcher(cv2.NORM_HAMMING)
+    """500 ORB features a picture, by Hamming distance."""
+    return _ratio_test(cv2.ORB_create(FEATURES), cv2.NORM_HAMMING, np.zeros((0, 32), np.uint8))
+
+
+def sift_with_ratio_test() -> Way:
+    """500 SIFT features a picture, by Euclidean distance."""
+    return _ratio_test(cv2.SIFT_create(FEATURES), cv2.NORM_L2, np.zeros((0, 128), np.float32))
+
+
+def _ratio_test(detector: cv2.Feature2D, norm: int, none: np.ndarray) -> Way:
+    """Compare all features of two pictures, without a check of their geometry; the score is how many pass the ratio
+    test (Lowe 2004)."""
+    matcher = cv2.BFMatcher(norm)
 
     def encode(grey: np.ndarray, _: Any) -> np.ndarray:
-        found = orb.detectAndCompute(grey, None)[1]
-        return np.zeros((0, 32), np.uint8) if found is None else found
+        found = detector.detectAndCompute(grey, None)[1]
+        return none if found is None else found
 
     def passed(asked: np.ndarray, place: np.ndarray) -> int:
         if len(asked) < 2 or len(place) < 2:
@@ -103,6 +116,37 @@ def bag_of_orb_words() -> Way:
     )
 
 
+def pydbow_words() -> Way:
+    """DBoW (Galvez-Lopez and Tardos 2012) as the package pydbow has it, in Python: a tree of 10 x 10 x 10 words of 500
+    ORB features. Its k-means goes through them one by one, so it learns on every eighth picture."""
+    import dbow
+
+    def learn(pictures: Sequence[np.ndarray]) -> dbow.Vocabulary:
+        np.random.seed(0)  # the package draws from NumPy's own generator
+        return dbow.Vocabulary(pictures[::PYDBOW_EVERY], 10, 3)
+
+    def encode(grey: np.ndarray, words: dbow.Vocabulary) -> np.ndarray:
+        try:
+            counts = words.image_to_bow(grey).data
+        except TypeError:  # it does not expect a picture without features
+            return np.zeros(len(words.words))
+        return np.asarray(counts, float)
+
+    def scores(asked: np.ndarray, places: list[dbow.BoW]) -> np.ndarray:
+        if not asked.any():
+            return np.zeros(len(places))
+        asked = dbow.BoW(asked)
+        return np.array([asked.score(place) if place.data.any() else 0.0 for place in places])
+
+    return Way(
+        learn=learn,
+        encode=encode,
+        index=lambda found, _: [dbow.BoW(each) for each in found],
+        scores=scores,
+        nbytes=lambda places, count: sum(each.data.nbytes for each in places) / count,
+    )
+
+
 def sift_vlad() -> Way:
     """RootSIFT (Arandjelovic and Zisserman 2012) in a VLAD of 64 words with intra-normalisation (2013), by cosine."""
     sift = cv2.SIFT_create(FEATURES)
@@ -133,13 +177,14 @@ def sift_vlad() -> Way:
 
 
 def faiss_on_our_codes() -> Way:
-    """The place codes of edgevpr's `cohog`, 144 bytes, in FAISS's exhaustive binary index: one Hamming distance a
-    place, without the shifts that edgevpr tries."""
+    """The place codes of edgevpr's `cohog` looking ahead, 144 bytes, in FAISS's exhaustive binary index: one Hamming
+    distance a place, without the shifts that edgevpr tries, and nothing is compared in full."""
     import faiss
 
     from edgevpr.techniques import create
 
     technique = create("cohog", {"camera": "forward"})
+    faiss.omp_set_num_threads(1)  # its other threads wait by spinning, and that is counted
 
     def encode(grey: np.ndarray, _: Any) -> np.ndarray:
         return technique.encode(grey).coarse
@@ -172,7 +217,9 @@ def faiss_on_our_codes() -> Way:
 WAYS: dict[str, Callable[[], Way]] = {
     "CoHOG, published": published_cohog,
     "ORB, ratio test": orb_with_ratio_test,
+    "SIFT, ratio test": sift_with_ratio_test,
     "bag of ORB words": bag_of_orb_words,
+    "pydbow": pydbow_words,
     "SIFT-VLAD": sift_vlad,
     "FAISS on cohog's codes": faiss_on_our_codes,
 }
