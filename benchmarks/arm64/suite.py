@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+# What runs the code of compiled libraries: NumPy, SciPy, OpenCV, onnxruntime, PyAV, SQLite.
 CORE = (
     "tests/techniques",
     "tests/runtime/recognise",
@@ -16,24 +17,22 @@ CORE = (
     "tests/places",
     "tests/belief",
     "tests/navigation",
-    "tests/power",
     "tests/confidence",
     "tests/landmarks",
     "tests/salience",
-    "tests/helpers",
-    "tests/mavlink",
     "tests/test_tiny.py",
     "tests/test_yamlfile.py",
-    "tests/runtime/flight",
-    "tests/runtime/preflight",
 )
-_IN_REAL_TIME = "they fly in real time, for which emulation is too slow"
+_PURE = "pure Python, which is the same on every processor"
+_IN_REAL_TIME = "they fly in real time, for which emulation is too slow; the demonstration flies"
 _OF_COMMANDS = "they start many commands, each of which takes long to start under emulation"
 _ON_THE_GROUND = "not part of a flight"
 _OF_THE_SOURCE = "it looks at files of the repository, not at what they do"
 _OF_BENCHMARKS = "it tests programs that are not installed on a board"
 LEFT_OUT = {
     **dict.fromkeys(("tests/runtime/service", "tests/runtime/replay"), _IN_REAL_TIME),
+    **dict.fromkeys(("tests/helpers", "tests/mavlink", "tests/power", "tests/runtime/preflight"), _PURE),
+    "tests/runtime/flight": f"{_PURE}, or in real time, for which emulation is too slow; the demonstration flies",
     **dict.fromkeys(("tests/cli", "tests/test_hostile_inputs.py"), _OF_COMMANDS),
     **dict.fromkeys(
         (

@@ -12,7 +12,7 @@ from edgevpr.frames.shot import Capture, Refusal, Shot
 from edgevpr.types import Frame
 
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.5, 10.0
-_CLOSE_TIMEOUT_S = 1.0
+_CLOSE_TIMEOUT_S = 0.5
 _EXIT_TIMEOUT_S = 10.0  # longer than any time-out of a stream or camera
 _FROZEN_S, _FROZEN_PICTURES = 1.0, 3  # the second for a camera that takes less than three pictures a second
 _DAMAGED_S = 5.0  # longer than streams need to recover from a lost packet
@@ -53,7 +53,7 @@ class LiveSource:
     in time are counted in `dropped`, those that are not new and whole in `refused`, by their reason.
 
     Only the capture thread touches the capture, from opening to release: a call into a stream that hangs cannot be
-    interrupted. `close` waits one second, then leaves the thread to its time-out.
+    interrupted. `close` waits half a second, then leaves the thread to its time-out.
     """
 
     is_live = True
@@ -94,7 +94,7 @@ class LiveSource:
         return Frame(image=shot.pixels(), name=name, t_mono_s=shot.t_mono_s)
 
     def close(self) -> None:
-        """End the capture, within about a second."""
+        """End the capture, within about half a second."""
         self.ended = True
         self._closing.set()
         self._thread.join(_CLOSE_TIMEOUT_S)

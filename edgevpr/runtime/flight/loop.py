@@ -39,12 +39,12 @@ class StopNow(BaseException):
 
 
 class Stop:
-    """Signal handler that ends a flight. While a frame is recognised the flight ends at once, so that a long comparison
-    does not delay the end; otherwise it ends after the present turn of the loop."""
+    """Signal handler that ends a flight. While a frame is recognised, and before the flight begins, it ends at once, so
+    that a long comparison does not delay the end; otherwise it ends after the present turn of the loop."""
 
     def __init__(self, tape: Tape = NO_TAPE) -> None:
         self._tape = tape
-        self._asked = self._breakable = False
+        self._asked = self._breakable = self._begins = False
 
     @property
     def asked(self) -> bool:
@@ -53,10 +53,24 @@ class Stop:
 
     def __call__(self, *_: object) -> None:
         self._asked = True
+        if self._begins:
+            raise StopNow
         if self._breakable:
             self._breakable = False  # a second signal finds nothing more to break off
             self._tape.note("stopped")
             raise StopNow
+
+    @contextmanager
+    def beginning(self) -> Iterator[None]:
+        """Let a signal interrupt what a flight begins with, and one that has come before it. Nothing was flown that a
+        replay would have to come to."""
+        self._begins = True
+        try:
+            if self._asked:
+                raise StopNow
+            yield
+        finally:
+            self._begins = False
 
     @contextmanager
     def breaks_off(self) -> Iterator[None]:

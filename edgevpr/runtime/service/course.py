@@ -75,13 +75,13 @@ def fly_course(
     config: Config, board: Board, aboard: Aboard, world: World, *, stop: Stop, reread: Reread | None = None
 ) -> int:
     """Open links and source, fly, and write the last line of the log; return the exit code, 1 if any frame failed, else
-    0. Raises an EdgevprError where links or source cannot be opened."""
+    0. Raises an EdgevprError where links or source cannot be opened, and StopNow where it is to end before that."""
     recogniser, learner, flight_log, tape = aboard.recogniser, aboard.learner, world.flight_log, world.tape
     recogniser.meter = meter_of_queries(config, board, world.clock, tape)
     address, ground_address = parse_links(config.mavlink.link, config.mavlink.ground)
     with ExitStack() as stack:
-        smaller_forms = tuple(tape.read("forms", lambda: smaller_forms_of(config, recogniser, learner, aboard.load_s)))
-        with more_time_to_start():
+        with more_time_to_start(), stop.beginning():
+            forms = tape.read("forms", lambda: smaller_forms_of(config, recogniser, learner, aboard.load_s))
             found = Outlook(*tape.read("outlook", lambda: astuple(outlook(recogniser, config))))
         recogniser.candidates = found.candidates
         _say_start(config, recogniser, world, found)
@@ -116,7 +116,7 @@ def fly_course(
             learner=learner,
             reread=reread,
             fewer_candidates=() if config.match.candidates else trusted_candidates(recogniser.technique),
-            smaller_forms=smaller_forms,
+            smaller_forms=tuple(forms),
             clock=world.clock,
             meter=meter_of_flight(config, board, world.clock, tape),
             readers=world.readers,

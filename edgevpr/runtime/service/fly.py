@@ -26,7 +26,7 @@ from edgevpr.mavlink.wire import Tap, untapped
 from edgevpr.power.boards import Board, load_board
 from edgevpr.runtime.flight.clock import Clock, taped
 from edgevpr.runtime.flight.flightlog import FlightLog
-from edgevpr.runtime.flight.loop import Stop
+from edgevpr.runtime.flight.loop import Stop, StopNow
 from edgevpr.runtime.flight.recording import Recording
 from edgevpr.runtime.flight.reloading import Reread
 from edgevpr.runtime.flight.statussocket import NoReaders, Readers, StatusSocket, usual_path
@@ -89,7 +89,11 @@ def fly(config: Config, positions: Path | None = None, read_again: Callable[[], 
         )
         stop, reread = Stop(tape), Reread(read_again, tape) if read_again else None
         with _signals(stop, reread):
-            return fly_course(config, board, aboard, world, stop=stop, reread=reread)
+            try:
+                return fly_course(config, board, aboard, world, stop=stop, reread=reread)
+            except StopNow:
+                _log.info("stopped before the flight began")
+                return 0
 
 
 def _recording(stack: ExitStack, config: Config, board: Board, is_reread: bool) -> Recording | None:

@@ -63,6 +63,15 @@ def test_a_stop_while_others_are_told_lets_them_finish(recording, tmp_path, cloc
     assert stop.asked
 
 
+def test_a_stop_before_the_flight_begins_ends_it_at_once():
+    stop = Stop()
+    with pytest.raises(StopNow), stop.beginning():
+        stop()
+    with pytest.raises(StopNow), stop.beginning():
+        pytest.fail("it was stopped before")
+    stop()  # nothing is left to break off
+
+
 def test_a_frame_that_cannot_be_read_is_logged_and_the_next_is_recognised(recording, tmp_path, clock):
     flown = flight(recording, tmp_path, clock)
     pictures = [PICTURE, ImageError("1.png is cut short: copy it again."), PICTURE]

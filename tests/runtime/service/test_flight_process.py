@@ -18,6 +18,7 @@ from edgevpr.helpers.numbered import numbered
 from edgevpr.places.identity import identity_of
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.flight.flightlog import read_log
+from edgevpr.runtime.service import course
 
 
 @pytest.fixture
@@ -140,6 +141,29 @@ def test_a_signal_ends_the_flight_with_everything_flushed(fly, tmp_path, number)
     # By the flight's own clock, which other programs cannot hold up: the service manager waits two seconds.
     assert lines[-1]["t_mono_s"] - lines[0]["t_mono_s"] < 2 * lines[-1]["queries"] + 2.0
     assert lines[-1]["queries"] < PLACES
+
+
+def test_a_signal_ends_a_flight_that_has_not_begun(recording, tmp_path, monkeypatch, caplog):
+    """What a flight begins with takes half a minute on a slow board."""
+
+    def computing(*_):
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(60)
+        pytest.fail("it went on computing")
+
+    monkeypatch.setattr(course, "outlook", computing)
+    flags = (
+        "--map",
+        recording / "cohog.gpkg",
+        "--source",
+        recording / "seen" / "images",
+        "--log",
+        tmp_path / "f.jsonl",
+    )
+    with caplog.at_level("INFO"):
+        assert main(["run", *map(str, flags)]) == 0
+    assert "stopped before the flight began" in caplog.messages
+    assert list(read_log(tmp_path / "f.jsonl")) == []
 
 
 def test_a_long_query_is_broken_off_when_the_flight_is_to_end(recording, tmp_path):
