@@ -116,7 +116,7 @@ def uninstalled(trial: Trial) -> Row:
     row.expect(before[:2] == after[:2] and int(after[2]) >= int(before[2]), "map, log and configuration stay")
     row.expect(trial.log()[-1]["kind"] == "end", "the flight ends with its log flushed")
     row.expect(gone.count("No such file") == 3, f"program, unit and rules are gone ({gone})")
-    row.expect(trial.tried("pgrep -f 'edgevpr run'").code == 1, "nothing of it runs")
+    row.expect(trial.tried("pgrep -f '[e]dgevpr run'").code == 1, "nothing of it runs")
     row.told = trial.world.ground.told_since(begin_s)
     row.does = "stops it, and takes program, unit and udev rules away"
     row.kept, row.lost = "map, flight log, configuration and the user", "program, unit and rules"
