@@ -278,9 +278,9 @@ def _measure_techniques(args: Namespace) -> int:
     errors = {offer.label: each for offer, each in tried if isinstance(each, ModelError)}
     if len(errors) == len(tried):
         raise next(iter(errors.values()))
-    _say_camera("the set", ((offer.name, offer.settings) for offer, _ in tried))
     with tempfile.TemporaryDirectory(prefix="edgevpr-eval-") as cache:
         dataset = _dataset(args, cache)
+        _say_camera("the set", ((offer.name, offer.settings) for offer, _ in tried))
         results = [
             evaluation.evaluate(
                 offer.name,
