@@ -101,7 +101,7 @@ def _curve(axis, row: dict, sweep: str) -> None:
         right = [(level["accepted"] - level["accepted_wrong"]) / level["asked"] for level in levels]
         axis.plot(at, right, "--", color=colour, label="cohog, accepted and right")
         wrong = [level["accepted_wrong"] / level["asked"] or None for level in levels]
-        axis.plot(at, wrong, "x", color="red", markersize=4, label="cohog, accepted and wrong")
+        axis.plot(at, wrong, "x", color="red", markersize=5, zorder=9, label="cohog, accepted and wrong")
     if sweep in ("dark", "height"):
         axis.set_xscale("log")
         axis.set_xticks([level["level"] for level in levels][::2], [f"{level['level']:g}" for level in levels][::2])
