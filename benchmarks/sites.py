@@ -8,7 +8,7 @@ come in too; from there on only foreign ones do.
 
 Places have no positions: the confidence is the shipped one, and looking down landmarks tell which places show the same
 ground. Each map is asked in a process of its own, one thread. Times are of the processor. Beside that all places are
-compared in full, which no flight has time for: in small maps, for every third query ahead and every sixth looking down.
+compared in full, which no flight has time for: looking ahead, in the map of 200, for every third query.
 Looking down, a third of the foreign places is mirrored ground of the very sites; a map of others only stands beside.
 
 What is measured stays in the folder --work, so that an interrupted run goes on.
@@ -50,9 +50,8 @@ from edgevpr.types import Frame
 
 SIZES = (50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000)
 AHEAD = ("corridor", "grief_stromovka_seasons")  # the sets that look ahead and are large enough to be asked
-EXACT_UP_TO = {"nadir": 200, "forward": 1_000}
-EXACT_EVERY = {"nadir": 6, "forward": 3}  # queries
-UNLIKE, UNLIKE_SIZES = "unlike", (1_000, 5_000)
+EXACT_PLACES, EXACT_EVERY = 200, 3  # every third query
+UNLIKE, UNLIKE_PLACES = "unlike", 5_000
 _BESIDE = 2  # pictures, as where a map has no positions
 
 
@@ -120,14 +119,12 @@ def main() -> int:
 
 def planned(work: Path, data: Path) -> Iterator[tuple[str, int, str]]:
     """Yield what is to be measured; the map of all places is built before its camera's first."""
-    sizes = {}
     for camera in sites_page.TITLES:
         dataset, count = dataset_of(work, data, camera), _build(work, data, camera)
-        sizes[camera] = sorted({size for size in SIZES if size <= count} | {len(dataset.references)})
-        yield from ((camera, size, "flown") for size in sizes[camera])
-    yield from (("nadir", size, UNLIKE) for size in UNLIKE_SIZES)
-    for camera in reversed(sites_page.TITLES):
-        yield from ((camera, size, "exact") for size in sizes[camera] if size <= EXACT_UP_TO[camera])
+        sizes = sorted({size for size in SIZES if size <= count} | {len(dataset.references)})
+        yield from ((camera, size, "flown") for size in sizes)
+    yield "nadir", UNLIKE_PLACES, UNLIKE
+    yield "forward", EXACT_PLACES, "exact"
 
 
 def folders_of(data: Path, camera: str) -> list[Path]:
@@ -206,7 +203,7 @@ def measured(work: Path, data: Path, camera: str, count: int, how: str) -> Row:
         recogniser.candidates = None
     sites = [folder.name for folder in folders_of(data, camera)]
     hits, costs, wrong_by, accepted, beside, wrong = [], [], Counter(), 0, [], []
-    queries = dataset.queries[:: EXACT_EVERY[camera]] if how == "exact" else dataset.queries
+    queries = dataset.queries[::EXACT_EVERY] if how == "exact" else dataset.queries
     with recogniser.place_map as place_map:
         name_of = {place.place_id: place.source_image for place in place_map.places()}
         names = [name_of[place_id] for place_id in recogniser.index.place_ids.tolist()]
