@@ -22,7 +22,7 @@ from arm64.userland import CPU, PYTHON, install, make_system, run
 from big_map import make_big_map
 from run_sets import made_by
 
-from edgevpr.helpers.tables import markdown
+from edgevpr.core.tables import markdown
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.preflight import counted
 from edgevpr.techniques import create

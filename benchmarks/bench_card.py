@@ -19,7 +19,7 @@ from bench_encode import frames
 from bench_flight import forget_pages
 from big_map import make_big_map
 
-from edgevpr.helpers.tables import markdown
+from edgevpr.core.tables import markdown
 from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import compare, scan

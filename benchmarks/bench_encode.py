@@ -19,7 +19,7 @@ import competitor
 import cv2
 import numpy as np
 
-from edgevpr.simulate.scene import make_scene
+from edgevpr.lab.simulate.scene import make_scene
 from edgevpr.techniques import create
 
 DATA = Path(os.environ.get("EDGEVPR_DATA") or Path(__file__).resolve().parents[2] / "shared/data")

@@ -24,22 +24,22 @@ from bench_scan import medians_s
 from hostile_pictures import camera_of
 from run_sets import DATA, made_by
 
-from edgevpr.evaluate import metrics
-from edgevpr.evaluate.dataset import Dataset, load_dataset
+from edgevpr.core.figures import figure
+from edgevpr.core.progress import progress
+from edgevpr.core.tables import markdown
+from edgevpr.core.types import Frame, Place, Salience
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.opencv import cv2
-from edgevpr.helpers.figures import figure
-from edgevpr.helpers.progress import progress
-from edgevpr.helpers.tables import markdown
+from edgevpr.lab.evaluate import metrics
+from edgevpr.lab.evaluate.dataset import Dataset, load_dataset
+from edgevpr.lab.training import export_matchability
+from edgevpr.lab.training.labels import label_site, walk_over
+from edgevpr.lab.training.matchability import compared, fit, site_of
 from edgevpr.places.shrink import chosen
-from edgevpr.salience.detector import Detector, open_detector
-from edgevpr.salience.gate import Gate, Thresholds, worth_of
-from edgevpr.salience.maps import maps_of, scores_of
-from edgevpr.salience.memorability import Memorability, open_memorability
-from edgevpr.training import export_matchability
-from edgevpr.training.labels import label_site, walk_over
-from edgevpr.training.matchability import compared, fit, site_of
-from edgevpr.types import Frame, Place, Salience
+from edgevpr.runtime.recognise.detector import Detector, open_detector
+from edgevpr.runtime.recognise.memorability import Memorability, open_memorability
+from edgevpr.runtime.recognise.salience_gate import Gate, Thresholds, worth_of
+from edgevpr.runtime.recognise.salience_maps import maps_of, scores_of
 
 RESULTS = Path(__file__).resolve().parent / "results"
 TECHNIQUES = ("hog", "cohog", "calc", "netvlad")

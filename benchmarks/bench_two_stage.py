@@ -17,12 +17,12 @@ import numpy as np
 from bench_encode import frames, timed_s
 from big_map import make_big_map
 
-from edgevpr.contract import Technique
+from edgevpr.core.contract import Technique
+from edgevpr.core.types import Position
 from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import NOTHING, Expected, compare, scan
 from edgevpr.techniques import create
-from edgevpr.types import Position
 
 PLACES = 10_000
 TURNS = 9

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from edgevpr.helpers.tables import markdown
+from edgevpr.core.tables import markdown
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 BEFORE = "3b363dc"  # the last commit whose nadir maps held place codes

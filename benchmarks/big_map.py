@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from edgevpr.contract import PartSpec, TechniqueSpec
+from edgevpr.core.contract import PartSpec, TechniqueSpec
 from edgevpr.places import geopackage
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.techniques import placewords

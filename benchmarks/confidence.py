@@ -28,22 +28,22 @@ from confidence_rows import CONFIG, Row, frames_of, gather, kind_of_match, site_
 from hostile_pictures import camera_of
 from run_sets import DATA, RESULTS, TUNED_ON, made_by
 
-from edgevpr.calibrate.calibrate import LEFT_OUT, MIRRORED, THERE, Answer, adapted
-from edgevpr.calibrate.prior import Site, shipped_model
-from edgevpr.confidence.model import Model, as_json
-from edgevpr.confidence.stored import FEWEST_PLACES
-from edgevpr.evaluate.dataset import load_dataset
-from edgevpr.evaluate.evaluate import mapped
-from edgevpr.evaluate.metrics import roc_auc
+from edgevpr.core.tables import markdown
+from edgevpr.core.types import Frame
 from edgevpr.frames.images import list_images, read_image
-from edgevpr.helpers.tables import markdown
+from edgevpr.lab.evaluate.dataset import load_dataset
+from edgevpr.lab.evaluate.evaluate import mapped
+from edgevpr.lab.evaluate.metrics import roc_auc
+from edgevpr.mapmaking.calibrate import LEFT_OUT, MIRRORED, THERE, Answer, adapted
+from edgevpr.mapmaking.prior import Site, shipped_model
 from edgevpr.power.boards import load_board
+from edgevpr.runtime.recognise.confidence import Model, as_json
 from edgevpr.runtime.recognise.evidence import AHEAD, DOWN, DOWN_BARE, kind_of
 from edgevpr.runtime.recognise.follow import Follower
 from edgevpr.runtime.recognise.judge import Sureness, accept_rule
 from edgevpr.runtime.recognise.opening import meter_of
+from edgevpr.runtime.recognise.stored_confidence import FEWEST_PLACES
 from edgevpr.techniques import create
-from edgevpr.types import Frame
 
 PRECISIONS = (0.9, 0.99, 0.999)
 KINDS = {"forward": (AHEAD,), "nadir": (DOWN, DOWN_BARE)}

@@ -17,14 +17,15 @@ import numpy as np
 from hostile_pictures import camera_of
 from run_sets import DATA
 
-from edgevpr.calibrate.calibrate import ask, asked_of
-from edgevpr.config import load_config
-from edgevpr.contract import Technique
-from edgevpr.evaluate.dataset import Query, load_dataset
-from edgevpr.evaluate.evaluate import all_frames, mapped
+from edgevpr.core.config import load_config
+from edgevpr.core.contract import Technique
+from edgevpr.core.types import Frame
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.level import UNKNOWN_VIEW, Levelled
 from edgevpr.frames.source import open_source
+from edgevpr.lab.evaluate.dataset import Query, load_dataset
+from edgevpr.lab.evaluate.evaluate import all_frames, mapped
+from edgevpr.mapmaking.calibrate import ask, asked_of
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import elsewhere
@@ -34,7 +35,6 @@ from edgevpr.runtime.recognise.judge import AcceptRule, accept_rule
 from edgevpr.runtime.recognise.opening import meter_of
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.techniques import create
-from edgevpr.types import Frame
 
 CONFIG = load_config(None)
 # Sets of the same ground are one site.

@@ -10,12 +10,12 @@ import subprocess
 import sys
 from typing import Annotated
 
-from edgevpr.config import bounded, build
-from edgevpr.errors import ConfigError
+from edgevpr.core.config import bounded, build
+from edgevpr.core.errors import ConfigError
 
 STARTS = 7
 IMPORTS = {
-    "edgevpr.config": "import edgevpr.config",
+    "edgevpr.core.config": "import edgevpr.core.config",
     "msgspec": "import msgspec",
     "cattrs": "import cattrs",
     "pydantic": "from pydantic import TypeAdapter",
@@ -86,7 +86,7 @@ def with_pydantic(mapping: dict) -> None:
     Config.model_validate(mapping)
 
 
-READERS = {"edgevpr.config": with_own, "msgspec": with_msgspec, "cattrs": with_cattrs, "pydantic": with_pydantic}
+READERS = {"edgevpr.core.config": with_own, "msgspec": with_msgspec, "cattrs": with_cattrs, "pydantic": with_pydantic}
 
 
 def import_cost(statement: str) -> tuple[float, float]:

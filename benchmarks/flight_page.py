@@ -8,8 +8,8 @@ from flight_sites import Site
 from run_sets import TUNED_ON
 from where import honest, spread
 
-from edgevpr.frames.orthophoto import Orthophoto
-from edgevpr.helpers.tables import markdown
+from edgevpr.core.tables import markdown
+from edgevpr.mapmaking.orthophoto import Orthophoto
 
 Row = dict[str, object]
 _DRAWN = (

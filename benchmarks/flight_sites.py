@@ -14,11 +14,11 @@ import rasterio
 import run_sets
 from from_orthophoto import Ground, ground_of, laid, mosaic_of, write_tif
 
-from edgevpr.frames.orthophoto import Orthophoto
-from edgevpr.geodesy import moved, offset_m
-from edgevpr.simulate.camera import Camera, Light, Pose
-from edgevpr.simulate.rehearsal import seen_from
-from edgevpr.types import Position
+from edgevpr.core.geodesy import moved, offset_m
+from edgevpr.core.types import Position
+from edgevpr.lab.simulate.camera import Camera, Light, Pose
+from edgevpr.lab.simulate.rehearsal import seen_from
+from edgevpr.mapmaking.orthophoto import Orthophoto
 
 # Sets without positions, or too few of them: metres of a pixel and a place on the Earth are assumed.
 _ASSUMED = {

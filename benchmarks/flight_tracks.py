@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 from flight_sites import Site
 
-from edgevpr.frames.orthophoto import Orthophoto
-from edgevpr.geodesy import moved
-from edgevpr.simulate.camera import Camera, Light, Pose
-from edgevpr.simulate.flight import wander
-from edgevpr.simulate.rehearsal import seen_from
-from edgevpr.types import Vehicle
+from edgevpr.core.geodesy import moved
+from edgevpr.core.types import Vehicle
+from edgevpr.lab.simulate.camera import Camera, Light, Pose
+from edgevpr.lab.simulate.flight import wander
+from edgevpr.lab.simulate.rehearsal import seen_from
+from edgevpr.mapmaking.orthophoto import Orthophoto
 
 QUERIES = 40
 ON_THE_WAY = (

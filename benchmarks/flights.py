@@ -42,9 +42,10 @@ import run_sets
 from flight_page import draw, page, summary
 from flight_sites import ROWS, Site
 
-from edgevpr.config import load_config
-from edgevpr.contract import Technique
-from edgevpr.frames.orthophoto import Orthophoto
+from edgevpr.core.config import load_config
+from edgevpr.core.contract import Technique
+from edgevpr.core.types import Frame
+from edgevpr.mapmaking.orthophoto import Orthophoto
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.sequence import search_of
@@ -56,7 +57,6 @@ from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.opening import meter_of, open_recogniser
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
-from edgevpr.types import Frame
 
 _SEED = 2026
 _WRONG_OF_SIDE, _WRONG_SD, _FAR_OF_SIDE = 0.25, 3.0, 0.5

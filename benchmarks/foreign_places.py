@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
+from edgevpr.core.types import Frame
 from edgevpr.frames.images import list_images, read_image
-from edgevpr.simulate.camera import Camera, Light, Pose, lit, photograph
-from edgevpr.simulate.flight import SCENE_DEPTH_M, SCENE_WIDTH_M
-from edgevpr.simulate.scene import make_scene
-from edgevpr.types import Frame
+from edgevpr.lab.simulate.camera import Camera, Light, Pose, lit, photograph
+from edgevpr.lab.simulate.flight import SCENE_DEPTH_M, SCENE_WIDTH_M
+from edgevpr.lab.simulate.scene import make_scene
 
 MIRRORED, GENERATED, OTHER_SET = "mirrored", "generated", "other set"  # how names begin
 # Neither is the ground of a site that is asked for. grief_stromovka_monthly is: it is the park of the seasons.

@@ -22,10 +22,10 @@ import rasterio
 import run_sets
 from rasterio.warp import transform
 
+from edgevpr.core.geodesy import distance_m
+from edgevpr.core.tables import markdown
 from edgevpr.frames.images import read_image
 from edgevpr.frames.positions import read_positions
-from edgevpr.geodesy import distance_m
-from edgevpr.helpers.tables import markdown
 
 CASES = (
     ("aerial_caliterra", 64.0, 16.0),

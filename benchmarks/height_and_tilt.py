@@ -20,18 +20,18 @@ import cv2
 import numpy as np
 from run_sets import DATA, FROM_THE_AIR, RESULTS, TUNED_ON, find_sets, made_by
 
-from edgevpr.config import load_config
-from edgevpr.errors import EdgevprError
-from edgevpr.evaluate.dataset import Query, load_dataset
-from edgevpr.evaluate.evaluate import mapped
+from edgevpr.core.config import load_config
+from edgevpr.core.errors import EdgevprError
+from edgevpr.core.tables import markdown
+from edgevpr.core.types import Frame
 from edgevpr.frames.images import read_image
-from edgevpr.helpers.tables import markdown
+from edgevpr.lab.evaluate.dataset import Query, load_dataset
+from edgevpr.lab.evaluate.evaluate import mapped
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.opening import meter_of
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.techniques import create
-from edgevpr.types import Frame
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 RATIOS = (0.5, 0.59, 0.71, 0.84, 1.0, 1.19, 1.41, 1.68, 2.0)

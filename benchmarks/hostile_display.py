@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from edgevpr.frames.images import list_images
-from edgevpr.simulate.flight import fly_and_write
+from edgevpr.lab.simulate.flight import fly_and_write
 
 LABELS = ("BAT", "ALT", "SPD", "HOME", "GPS", "RSSI", "MODE", "TIME")
 SPOTS = ((20, 40), (480, 40), (20, 460), (480, 460), (260, 40), (20, 250), (500, 250), (260, 460))

@@ -19,12 +19,12 @@ from hostile_streams import Stream, streams
 from rtsp_camera import free_port
 
 from edgevpr.cli.main import main
+from edgevpr.core.types import Position
+from edgevpr.lab.simulate import camera as simulated
+from edgevpr.lab.simulate.autopilot import ReceivedFix, run_autopilot
+from edgevpr.lab.simulate.flight import Flight, to_metres, to_position, write_flight
+from edgevpr.lab.simulate.scene import make_scene
 from edgevpr.runtime.flight.flightlog import read_log
-from edgevpr.simulate import camera as simulated
-from edgevpr.simulate.autopilot import ReceivedFix, run_autopilot
-from edgevpr.simulate.flight import Flight, to_metres, to_position, write_flight
-from edgevpr.simulate.scene import make_scene
-from edgevpr.types import Position
 
 RATE_HZ = 40.0
 # As often as the machine can; few candidates and a coarse technique, so that it can often.

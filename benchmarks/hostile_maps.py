@@ -14,16 +14,16 @@ import cv2
 import numpy as np
 
 from edgevpr.cli.main import main
-from edgevpr.config import Config, load_config
-from edgevpr.errors import EdgevprError
+from edgevpr.core.config import Config, load_config
+from edgevpr.core.errors import EdgevprError
+from edgevpr.core.types import Frame, Position
+from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.geopackage import point_blob
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.recognise.mapping import build_map
 from edgevpr.runtime.recognise.opening import meter_of, open_learning, open_recogniser
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.techniques import create
-from edgevpr.types import Frame, Position
 
 _PLACES = 12
 _ASKED = (0, 5, 11)  # numbers of the pictures that each map is asked for

@@ -17,17 +17,17 @@ from hostile_nothing import NOTHING, SIZES
 from hostile_spoilt import SPOILT
 from run_sets import DATA, FROM_THE_AIR
 
-from edgevpr.config import load_config
-from edgevpr.evaluate.dataset import Dataset, load_dataset
+from edgevpr.core.config import load_config
+from edgevpr.core.types import Frame
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.source import open_source
+from edgevpr.lab.evaluate.dataset import Dataset, load_dataset
+from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.recognise.mapping import build_map
 from edgevpr.runtime.recognise.opening import meter_of, open_recogniser
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.techniques import create
-from edgevpr.types import Frame
 
 OF_NOTHING, OTHER_CAMERA = "nothing: ", "other camera: "  # how kinds begin
 

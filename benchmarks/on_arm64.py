@@ -46,7 +46,7 @@ import json, re, sys
 from collections import Counter
 from dataclasses import asdict, replace
 from edgevpr.runtime.flight.wholeflight import flight_of
-from edgevpr.simulate import demo
+from edgevpr.lab.simulate import demo
 def part_of(plan, *parts):
     return lambda seed: replace(plan(seed), poses=sum((plan(seed).poses[part] for part in parts), ()))
 demo.mapping_flight = part_of(demo.mapping_flight, slice(42, 56))

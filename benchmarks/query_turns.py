@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 from big_map import make_big_map
 
+from edgevpr.lab.simulate.scene import make_scene
 from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import NOTHING, Expected, compare, scan
-from edgevpr.simulate.scene import make_scene
 from edgevpr.techniques import create
 
 PLACES = 10_000

@@ -8,7 +8,7 @@ from typing import Any
 
 import sets_page
 
-from edgevpr.helpers.tables import markdown
+from edgevpr.core.tables import markdown
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 RESULTS = REPOSITORY / "benchmarks" / "results"

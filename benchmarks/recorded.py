@@ -24,13 +24,13 @@ import cv2
 from hostile_pictures import camera_of
 from run_sets import DATA, RESULTS, made_by
 
-from edgevpr.evaluate.dataset import load_dataset
-from edgevpr.evaluate.evaluate import evaluate
+from edgevpr.core.tables import markdown
 from edgevpr.frames.images import decoded, list_images, read_image
 from edgevpr.frames.taped import as_jpeg
-from edgevpr.helpers.tables import markdown
-from edgevpr.replay.compare import compare
-from edgevpr.replay.replay import recorded, replay
+from edgevpr.lab.evaluate.dataset import load_dataset
+from edgevpr.lab.evaluate.evaluate import evaluate
+from edgevpr.review.compare import compare
+from edgevpr.review.replay import recorded, replay
 
 SETS = "aerial_brighton", "aerial_swindale", "kite_ochota", "corridor"
 WIDTHS_PX = 320, 640, 1280

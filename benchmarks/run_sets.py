@@ -26,11 +26,11 @@ import numpy as np
 import sets_page
 import yaml
 
-from edgevpr.errors import EdgevprError, UsageError
-from edgevpr.evaluate import provenance
-from edgevpr.evaluate.dataset import load_dataset
-from edgevpr.evaluate.evaluate import compare, evaluate
-from edgevpr.helpers.progress import progress
+from edgevpr.core.errors import EdgevprError, UsageError
+from edgevpr.core.progress import progress
+from edgevpr.lab.evaluate import provenance
+from edgevpr.lab.evaluate.dataset import load_dataset
+from edgevpr.lab.evaluate.evaluate import compare, evaluate
 from edgevpr.techniques.networks.session import file_sha256
 
 REPOSITORY = Path(__file__).resolve().parents[1]

@@ -5,10 +5,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from edgevpr.evaluate import tables
-from edgevpr.evaluate.curves import plot
-from edgevpr.evaluate.evaluate import TechniqueResult, from_json
-from edgevpr.helpers.tables import markdown
+from edgevpr.core.tables import markdown
+from edgevpr.lab.evaluate import tables
+from edgevpr.lab.evaluate.curves import plot
+from edgevpr.lab.evaluate.evaluate import TechniqueResult, from_json
 
 CURVES = "curves.png"
 # What is drawn: the forms of a vector, and what is the same technique under other conditions, would hide the rest.

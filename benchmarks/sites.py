@@ -32,21 +32,21 @@ import sites_page
 from foreign_places import MIRRORED, foreign
 from run_sets import FROM_THE_AIR, find_sets, join, parser_of
 
-from edgevpr.config import load_config
-from edgevpr.errors import EdgevprError
-from edgevpr.evaluate.dataset import Dataset, Query, load_dataset
-from edgevpr.evaluate.evaluate import all_frames
-from edgevpr.evaluate.quality import interval
+from edgevpr.core.config import load_config
+from edgevpr.core.errors import EdgevprError
+from edgevpr.core.types import Frame
 from edgevpr.frames.images import read_image
 from edgevpr.frames.source import open_source
+from edgevpr.lab.evaluate.dataset import Dataset, Query, load_dataset
+from edgevpr.lab.evaluate.evaluate import all_frames
+from edgevpr.lab.evaluate.quality import interval
+from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.examine import examine
 from edgevpr.places.index import bytes_per_place
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.recognise.mapping import build_map
 from edgevpr.runtime.recognise.opening import meter_of, open_recogniser
 from edgevpr.techniques import create
-from edgevpr.types import Frame
 
 SIZES = (50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000)
 AHEAD = ("corridor", "grief_stromovka_seasons")  # the sets that look ahead and are large enough to be asked

@@ -32,9 +32,9 @@ from run_sets import made_by
 from soak_page import Sample, Soak, verdict, write_page
 from soak_world import FOV_DEG, Autopilot, FilmCamera, make_world
 
-from edgevpr.errors import EdgevprError
+from edgevpr.core.errors import EdgevprError
 from edgevpr.runtime.flight.flightlog import read_log
-from edgevpr.runtime.service.statusreader import StatusReader
+from edgevpr.runtime.flight.statusreader import StatusReader
 
 RESULTS = Path(__file__).resolve().parent / "results"
 LOG_MB = 1.0

@@ -18,13 +18,13 @@ import imageio_ffmpeg
 import numpy as np
 from rtsp_camera import RtspCamera, free_port
 
-from edgevpr.simulate.autopilot import serve
-from edgevpr.simulate.camera import Pose, lit, photograph
-from edgevpr.simulate.flight import SCENE_DEPTH_M, SCENE_WIDTH_M, Flight, later_flight, mapping_flight, write_flight
-from edgevpr.simulate.flightcontroller.controller import FlightController
-from edgevpr.simulate.flightcontroller.recorded import AlongTrack, Track, read_track, truth_at
-from edgevpr.simulate.flightcontroller.truth import Truth
-from edgevpr.simulate.scene import Scene, make_scene
+from edgevpr.lab.simulate.autopilot import serve
+from edgevpr.lab.simulate.camera import Pose, lit, photograph
+from edgevpr.lab.simulate.flight import SCENE_DEPTH_M, SCENE_WIDTH_M, Flight, later_flight, mapping_flight, write_flight
+from edgevpr.lab.simulate.flightcontroller.controller import FlightController
+from edgevpr.lab.simulate.flightcontroller.recorded import AlongTrack, Track, read_track, truth_at
+from edgevpr.lab.simulate.flightcontroller.truth import Truth
+from edgevpr.lab.simulate.scene import Scene, make_scene
 
 SEED = 1
 PICTURES_HZ = 8

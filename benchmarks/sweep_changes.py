@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from edgevpr.calibrate.changes import another_season
+from edgevpr.mapmaking.changes import another_season
 
 ACROSS_DEG = 66.0  # of the camera that is supposed
 _FOG_GREY, _READ_NOISE = 200.0, 1.5

@@ -39,21 +39,21 @@ from run_sets import find_sets, parser_of
 from sweep_changes import NONE, OF_CAMERA, SWEEPS, spoilt, view
 
 from edgevpr import techniques
-from edgevpr.config import load_config
-from edgevpr.errors import EdgevprError
-from edgevpr.evaluate.dataset import load_dataset
-from edgevpr.evaluate.evaluate import all_frames, mapped
-from edgevpr.evaluate.quality import interval
+from edgevpr.core.config import load_config
+from edgevpr.core.errors import EdgevprError
+from edgevpr.core.types import Frame, Vehicle
 from edgevpr.frames.images import read_image
 from edgevpr.frames.level import UNKNOWN_VIEW, Levelled
 from edgevpr.frames.source import open_source
+from edgevpr.lab.evaluate.dataset import load_dataset
+from edgevpr.lab.evaluate.evaluate import all_frames, mapped
+from edgevpr.lab.evaluate.quality import interval
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.calibrated import calibration_of
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.opening import meter_of
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.techniques import create
-from edgevpr.types import Frame, Vehicle
 
 SETS = ("aerial_swindale", "corridor")  # one that looks down, one that looks ahead
 TECHNIQUES = tuple(name for name in techniques.names() if name != "seqslam")  # which asks with several pictures

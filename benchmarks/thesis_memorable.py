@@ -8,17 +8,17 @@ from pathlib import Path
 import detectors
 import numpy as np
 
-from edgevpr.evaluate import metrics
-from edgevpr.evaluate.dataset import Dataset
+from edgevpr.core.progress import progress
+from edgevpr.core.types import Frame
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.opencv import cv2
-from edgevpr.helpers.progress import progress
-from edgevpr.salience.detector import Detector, open_detector
-from edgevpr.salience.maps import maps_of, scores_of
-from edgevpr.salience.memorability import Memorability, open_memorability
+from edgevpr.lab.evaluate import metrics
+from edgevpr.lab.evaluate.dataset import Dataset
+from edgevpr.lab.training.labels import walk_over
+from edgevpr.runtime.recognise.detector import Detector, open_detector
+from edgevpr.runtime.recognise.memorability import Memorability, open_memorability
+from edgevpr.runtime.recognise.salience_maps import maps_of, scores_of
 from edgevpr.techniques.entropy import filled_bins
-from edgevpr.training.labels import walk_over
-from edgevpr.types import Frame
 
 STEPS = tuple(round(0.05 * step, 2) for step in range(21))
 TECHNIQUES = ("amosnet", "region_vlad", "cohog")

@@ -10,7 +10,7 @@ from typing import Any
 
 import yaml
 
-from edgevpr.evaluate import metrics
+from edgevpr.lab.evaluate import metrics
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import queries_ah, rail_ah, stage_energy_j
 

@@ -26,26 +26,26 @@ from big_map import make_big_map
 from hostile_pictures import camera_of
 from run_sets import DATA, RESULTS, made_by
 
-from edgevpr.config import load_config
-from edgevpr.evaluate.dataset import Dataset, load_dataset
-from edgevpr.evaluate.evaluate import all_frames, mapped
+from edgevpr.core.config import load_config
+from edgevpr.core.tables import markdown
+from edgevpr.core.types import Frame
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.level import UNKNOWN_VIEW, Levelled
 from edgevpr.frames.source import open_source
-from edgevpr.helpers.tables import markdown
-from edgevpr.landmarks.agreement import CONFIRMED, Agreement
+from edgevpr.lab.evaluate.dataset import Dataset, load_dataset
+from edgevpr.lab.evaluate.evaluate import all_frames, mapped
+from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.index import bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Ranking
 from edgevpr.power.boards import load_board
+from edgevpr.runtime.recognise.agreement import CONFIRMED, Agreement
 from edgevpr.runtime.recognise.judge import accept_rule
-from edgevpr.runtime.recognise.mapping import build_map
 from edgevpr.runtime.recognise.opening import meter_of
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.runtime.recognise.verify import Verification
 from edgevpr.techniques import create
-from edgevpr.types import Frame
 
 LEAST_OVERLAP = 0.3
 WIDTH_PX = 640  # of the pictures that the truth was measured in

@@ -25,14 +25,14 @@ import cv2
 import numpy as np
 import run_sets
 
+from edgevpr.core.geodesy import moved, offset_m
+from edgevpr.core.tables import markdown
+from edgevpr.core.types import Place
 from edgevpr.frames.images import read_image
 from edgevpr.frames.positions import read_positions
-from edgevpr.geodesy import moved, offset_m
-from edgevpr.helpers.tables import markdown
+from edgevpr.lab.simulate.flight import fly_and_write
+from edgevpr.mapmaking.graph import Solved, Ties, solve
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.refine.graph import Solved, Ties, solve
-from edgevpr.simulate.flight import fly_and_write
-from edgevpr.types import Place
 
 SETS = ("aerial_caliterra", "aerial_garfield28", "aerial_swindale", "aerial_brighton")
 TUNED_ON = ("aerial_caliterra", "aerial_garfield28")

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from edgevpr.core.types import Frame, Receiver, Vehicle
 from edgevpr.frames.condition import Condition
 from edgevpr.mavlink.autopilots.channel import Channel
 from edgevpr.mavlink.link import LinkStats
@@ -20,7 +21,6 @@ from edgevpr.mavlink.reasons import State
 from edgevpr.mavlink.replies import Replies
 from edgevpr.mavlink.wishes import Wish, Wished
 from edgevpr.runtime.flight.clock import Clock
-from edgevpr.types import Frame, Receiver, Vehicle
 
 
 class FakeClock:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from edgevpr.types import Position
+from edgevpr.core.types import Position
 
 HOME = Position(50.0, 11.9)  # at the edge of UTM zone 32: grid north is 2.2 degrees off true north
 MARKS_M = ((0.0, 0.0), (25.0, 0.0), (0.0, 30.0), (-28.0, -22.0))  # east and north of HOME

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from edgevpr.confidence.model import Evidence
+from edgevpr.runtime.recognise.confidence import Evidence
 from edgevpr.runtime.recognise.evidence import OF_MAP
 from edgevpr.runtime.recognise.judge import AcceptRule, Sureness
 

@@ -9,17 +9,17 @@ from fakes import FakeCapture, FakeClock, FakeLink, FakeSource, vehicle_at
 from mavlink_peers import AutopilotThread, Peer, UdpPort, wait_until
 from pictures import textured
 
-from edgevpr.errors import ImageError
+from edgevpr.core.errors import ImageError
 from edgevpr.frames.condition import Condition
 from edgevpr.frames.live import Camera, LiveSource
 from edgevpr.frames.source import open_source
+from edgevpr.lab.simulate.flightcontroller.recorded import Track
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.link import Link, LinkStats
 from edgevpr.mavlink.messages import Fix, Health, Severity, status_text
 from edgevpr.mavlink.wire import mavlink
 from edgevpr.mavlink.wishes import Wish
 from edgevpr.runtime.flight.clock import Clock
-from edgevpr.simulate.flightcontroller.recorded import Track
 
 COUNT = 3
 

@@ -43,7 +43,7 @@ def test_every_module_and_nothing_else_travels(wheel):
     names = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
     code = {path.relative_to(ROOT).as_posix() for path in (ROOT / "edgevpr").rglob("*.py")}
     figures = {f"edgevpr/runtime/preflight/{name}.json" for name in ("accuracy", "counted")}
-    looks = {"edgevpr/report/page.css", "edgevpr/evaluate/page.css", "edgevpr/pages/common.css"}
+    looks = {"edgevpr/review/page.css", "edgevpr/lab/evaluate/page.css", "edgevpr/review/common.css"}
     assert {name for name in names if not name.startswith("edgevpr/shipped/")} == code | figures | looks
 
 
@@ -53,7 +53,7 @@ def test_what_is_installed_works_far_from_the_checkout(wheel, tmp_path):
     pip = [sys.executable, "-m", "pip", "install", "--no-deps", "--no-index", "--disable-pip-version-check"]
     subprocess.run([*pip, "--target", site, wheel], capture_output=True, check=True)
     script = (
-        "import edgevpr; from edgevpr.config import load_config; from edgevpr.power.boards import load_board\n"
+        "import edgevpr; from edgevpr.core.config import load_config; from edgevpr.power.boards import load_board\n"
         "from edgevpr.runtime.service.unit import render_unit\n"
         "print(edgevpr.__file__, load_config(None).battery.pack, 'MemoryMax=' in render_unit(load_board('rpi-5')))"
     )

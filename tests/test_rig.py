@@ -10,8 +10,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from edgevpr.simulate.camera import Pose
-from edgevpr.simulate.flight import ORIGIN, to_metres, to_position
+from edgevpr.lab.simulate.camera import Pose
+from edgevpr.lab.simulate.flight import ORIGIN, to_metres, to_position
 
 RIG = Path(__file__).parents[1] / "benchmarks" / "rig"
 

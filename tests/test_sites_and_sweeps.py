@@ -10,7 +10,7 @@ from foreign_places import GENERATED, MIRRORED, OTHER_SET, OTHER_SETS, foreign
 from sites import chosen, covering
 from sweep_changes import OF_CAMERA, SWEEPS, spoilt, view
 
-from edgevpr.evaluate.dataset import Dataset, Query
+from edgevpr.lab.evaluate.dataset import Dataset, Query
 
 SIZE = (320, 240)
 MIDDLE = (np.array(SIZE) - 1) / 2

@@ -3,7 +3,9 @@
 from fakes import FakeClock, FakeLink, FakeSource
 from pictures import textured
 
-from edgevpr.config import load_config
+from edgevpr.core.config import load_config
+from edgevpr.core.types import Frame, Position
+from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
@@ -13,11 +15,9 @@ from edgevpr.runtime.flight.flightlog import FlightLog, read_log
 from edgevpr.runtime.flight.loop import Stop
 from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.recognise.judge import accept_rule
-from edgevpr.runtime.recognise.mapping import build_map
 from edgevpr.runtime.recognise.opening import meter_of
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.techniques import create
-from edgevpr.types import Frame, Position
 
 
 def test_the_whole_walk(tmp_path):

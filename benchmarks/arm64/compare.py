@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from edgevpr.geodesy import distance_m
+from edgevpr.core.geodesy import distance_m
 
 _PART_DTYPES = {("nadir", "coarse"): "<u2"}  # words; all else are bytes
 EVERY = 6  # picture of the flight is asked for: a query takes seconds under emulation

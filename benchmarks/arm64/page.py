@@ -8,7 +8,7 @@ from arm64.compare import CAMERAS
 from arm64.glibc import RELEASES
 from arm64.suite import CORE, LEFT_OUT
 
-from edgevpr.helpers.tables import markdown
+from edgevpr.core.tables import markdown
 
 _OTHER = ("other_decision", "other_place", "other_refused", "other_words")  # columns of flights
 _NOT_PASSED = ("failed", "skipped")

@@ -15,7 +15,7 @@ from typing import Any
 
 from run_sets import REPOSITORY
 
-from edgevpr.errors import EdgevprError
+from edgevpr.core.errors import EdgevprError
 
 BENCHMARKS = REPOSITORY / "benchmarks"
 RECIPES = REPOSITORY / "docs" / "networks.md"

@@ -27,9 +27,9 @@ _NETWORK_PICTURES, _NETWORK_PLACES, _SEED = 11, 1000, 1
 
 def make_map(camera: str, folder: str, file: str) -> dict[str, Any]:
     """Make a map of the references of a set, as `edgevpr map build` does."""
-    from edgevpr.config import load_config
-    from edgevpr.evaluate import evaluate
+    from edgevpr.core.config import load_config
     from edgevpr.frames.source import open_source
+    from edgevpr.lab.evaluate import evaluate
     from edgevpr.power.boards import load_board
     from edgevpr.runtime.recognise.opening import meter_of
     from edgevpr.techniques import create
@@ -47,9 +47,9 @@ def cohog(camera: str, folder: str, file: str) -> dict[str, Any]:
     import cv2
     import numpy as np
 
-    from edgevpr.config import load_config
-    from edgevpr.evaluate.asking import Asking, Walk, answers
-    from edgevpr.evaluate.evaluate import opened, summary
+    from edgevpr.core.config import load_config
+    from edgevpr.lab.evaluate.asking import Asking, Walk, answers
+    from edgevpr.lab.evaluate.evaluate import opened, summary
     from edgevpr.power.boards import load_board
     from edgevpr.runtime.recognise.opening import meter_of
     from edgevpr.techniques import create
@@ -90,8 +90,8 @@ def way(name: str, folder: str, file: str) -> dict[str, Any]:
     import cv2
     import numpy as np
 
-    from edgevpr.evaluate import metrics
-    from edgevpr.evaluate.quality import Quality, figures
+    from edgevpr.lab.evaluate import metrics
+    from edgevpr.lab.evaluate.quality import Quality, figures
     from peers.ways import WAYS
 
     it = WAYS[name]()
@@ -182,7 +182,7 @@ def _peak_mb() -> float:
 
 
 def _dataset(folder: str) -> Any:
-    from edgevpr.evaluate.dataset import load_dataset
+    from edgevpr.lab.evaluate.dataset import load_dataset
 
     whole = load_dataset(f"{folder}/query", f"{folder}/ref", f"{folder}/ground_truth.csv")
     return replace(whole, queries=whole.queries[:: -(-len(whole.queries) // MOST_QUERIES)])

@@ -7,7 +7,7 @@ from typing import Any
 import onnxruntime
 from run_sets import TUNED_ON
 
-from edgevpr.helpers.tables import markdown
+from edgevpr.core.tables import markdown
 from peers.ways import WAYS
 
 OURS = "cohog (edgevpr)"

@@ -30,7 +30,7 @@ sys.path[:0] = [str(BENCHMARKS), str(BENCHMARKS.parent)]
 from hostile_pictures import DATA, camera_of  # noqa: E402
 from run_sets import REPOSITORY, RESULTS, TUNED_ON, find_sets, made_by  # noqa: E402
 
-from edgevpr.errors import EdgevprError, UsageError  # noqa: E402
+from edgevpr.core.errors import EdgevprError, UsageError  # noqa: E402
 from peers import modern, page  # noqa: E402
 from peers.ways import WAYS  # noqa: E402
 

@@ -18,7 +18,7 @@ import ground
 import numpy as np
 from truth import Truth
 
-from edgevpr.simulate.camera import Pose
+from edgevpr.lab.simulate.camera import Pose
 
 PICTURES_HZ = 5.0
 _LEAD_S = 0.08  # rendering takes 20 to 60 ms

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from edgevpr.lab.simulate.camera import Camera, Pose, ground_to_pixel
+from edgevpr.lab.simulate.flight import to_metres
 from edgevpr.runtime.flight.flightlog import read_log
-from edgevpr.simulate.camera import Camera, Pose, ground_to_pixel
-from edgevpr.simulate.flight import to_metres
 
 ROLL_DEG = ((0, 6), (6, 20), (20, 90))
 AFTER_S = (10, 30, 60, 120, 180, 240, 300)

@@ -9,9 +9,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from edgevpr.simulate.camera import Camera, Light, Pose, lit, photograph
-from edgevpr.simulate.flight import ORIGIN, to_position
-from edgevpr.simulate.scene import make_scene
+from edgevpr.lab.simulate.camera import Camera, Light, Pose, lit, photograph
+from edgevpr.lab.simulate.flight import ORIGIN, to_position
+from edgevpr.lab.simulate.scene import make_scene
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 WIDTH_M, DEPTH_M, METRES_PER_PIXEL, SEED = 1400.0, 1000.0, 0.2, 16

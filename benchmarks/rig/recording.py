@@ -6,8 +6,8 @@ from pathlib import Path
 
 from truth import Truth
 
+from edgevpr.lab.simulate.flight import to_metres
 from edgevpr.mavlink.wire import Message
-from edgevpr.simulate.flight import to_metres
 
 COLUMNS = (
     "t_s", "east_m", "north_m", "height_m", "roll_deg", "pitch_deg", "est_east_m", "est_north_m", "error_m",

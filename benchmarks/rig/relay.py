@@ -8,8 +8,8 @@ from pathlib import Path
 
 from truth import Truth
 
+from edgevpr.lab.simulate.flight import to_metres
 from edgevpr.mavlink.wire import Message, Receiver, mavlink
-from edgevpr.simulate.flight import to_metres
 
 COLUMNS = ("t_s", "kind", "age_s", "east_m", "north_m", "accuracy_m", "true_east_m", "true_north_m")
 Sent = tuple[float, float, float, float]  # age in seconds, east and north in metres, accuracy in metres

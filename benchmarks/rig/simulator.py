@@ -15,9 +15,9 @@ from pathlib import Path
 from ground import GROUND_ALT_M
 from link import STREAMS_HZ, Link, Listener
 
+from edgevpr.lab.simulate.camera import Pose
+from edgevpr.lab.simulate.flight import to_position
 from edgevpr.mavlink.wire import Message, mavlink
-from edgevpr.simulate.camera import Pose
-from edgevpr.simulate.flight import to_position
 
 VARIABLE = "EDGEVPR_ARDUPILOT"
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from ground import GROUND_ALT_M
 
+from edgevpr.lab.simulate.camera import Pose
+from edgevpr.lab.simulate.flight import to_metres
 from edgevpr.mavlink.wire import Message
-from edgevpr.simulate.camera import Pose
-from edgevpr.simulate.flight import to_metres
 
 _KEPT = 240  # states, six seconds: a fix is 5 s old at the most
 _AHEAD_S = 0.3  # the farthest that a state is carried on

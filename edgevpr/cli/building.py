@@ -23,14 +23,14 @@ from edgevpr.cli.shared import (
     print_json,
     watched,
 )  # fmt: skip
-from edgevpr.errors import EdgevprError, ImageError, UsageError
-from edgevpr.helpers.text import shown
+from edgevpr.core.errors import EdgevprError, ImageError, UsageError
+from edgevpr.core.text import shown
 
 if TYPE_CHECKING:
-    from edgevpr.contract import Technique
+    from edgevpr.core.contract import Technique
     from edgevpr.frames.source import Source
+    from edgevpr.mapmaking.refine import Refined
     from edgevpr.places.mapfile import PlaceMap
-    from edgevpr.refine.refine import Refined
 
 
 _WITHOUT_POSITIONS = (
@@ -75,14 +75,14 @@ def add(maps: Any) -> None:
 def map_build(args: Namespace) -> int:
     """Make a map of a recording, or continue one."""
     from edgevpr.frames.mask import mask_of
+    from edgevpr.mapmaking.gaps import Gaps
+    from edgevpr.mapmaking.mapping import build_map
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.places.mapfiles import map_path, remove
     from edgevpr.places.mapinfo import info_of
     from edgevpr.power.boards import load_board
     from edgevpr.runtime.preflight.pick import camera_setting, picked_technique
-    from edgevpr.runtime.recognise.gaps import Gaps
     from edgevpr.runtime.recognise.levelling import NoLevelling, levelling_of
-    from edgevpr.runtime.recognise.mapping import build_map
     from edgevpr.runtime.recognise.opening import gate_of, made_for, meter_of, say_other_mask, technique_of
 
     config = config_of(args, args.config)
@@ -213,7 +213,7 @@ def _refined(place_map: "PlaceMap", technique: "Technique", images: str | None) 
             "with `--camera nadir` can be refined."
         )
     try:
-        from edgevpr.refine.refine import refine
+        from edgevpr.mapmaking.refine import refine
     except ModuleNotFoundError as error:
         raise UsageError(
             f"Refining a map needs SciPy ({error}): install it on the machine that builds maps, with "

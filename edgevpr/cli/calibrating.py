@@ -17,17 +17,17 @@ from edgevpr.cli.shared import (
     read_to_end,
     watched,
 )  # fmt: skip
-from edgevpr.errors import EdgevprError, UsageError
+from edgevpr.core.errors import EdgevprError, UsageError
 
 if TYPE_CHECKING:
-    from edgevpr.confidence.stored import Calibration
-    from edgevpr.config import MatchConfig
-    from edgevpr.contract import Technique
+    from edgevpr.core.config import MatchConfig
+    from edgevpr.core.contract import Technique
+    from edgevpr.core.types import Frame
     from edgevpr.frames.mask import AnyMask
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.power.meter import QueryMeter
     from edgevpr.runtime.recognise.levelling import AnyLevelling
-    from edgevpr.types import Frame
+    from edgevpr.runtime.recognise.stored_confidence import Calibration
 
 
 def add(maps: Any) -> None:
@@ -89,7 +89,7 @@ def calibrated(
     """Calibrate an open map with the pictures that the flags name. Raises UsageError where that cannot be done, and
     where SciPy is missing."""
     try:
-        from edgevpr.calibrate.calibrate import calibrate
+        from edgevpr.mapmaking.calibrate import calibrate
     except ModuleNotFoundError as error:
         raise UsageError(
             f"Calibrating a map needs SciPy ({error}): install it on the machine that builds maps, with "

@@ -4,8 +4,8 @@ from argparse import Namespace
 from typing import Any
 
 from edgevpr.cli.shared import add_json, add_keys, command, config_of, print_json
-from edgevpr.errors import UsageError
-from edgevpr.helpers.text import shown
+from edgevpr.core.errors import UsageError
+from edgevpr.core.text import shown
 
 
 def add(commands: Any) -> None:
@@ -22,7 +22,7 @@ def run_doctor(args: Namespace) -> int:
     """Say what is fine, what is wrong, and what to change."""
     from dataclasses import asdict
 
-    from edgevpr.helpers.progress import waiting
+    from edgevpr.core.progress import waiting
     from edgevpr.mavlink.address import parse_link
     from edgevpr.runtime.service.doctor import doctor
     from edgevpr.runtime.service.finding import lines

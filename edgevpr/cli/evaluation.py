@@ -20,13 +20,13 @@ from edgevpr.cli.shared import (
     print_json,
     value_of,
 )
-from edgevpr.config import FORMS
-from edgevpr.errors import ModelError, UsageError
-from edgevpr.helpers.text import shown
+from edgevpr.core.config import FORMS
+from edgevpr.core.errors import ModelError, UsageError
+from edgevpr.core.text import shown
 
 if TYPE_CHECKING:
-    from edgevpr.evaluate.dataset import Dataset
-    from edgevpr.evaluate.plan import Plan, SetPlan
+    from edgevpr.lab.evaluate.dataset import Dataset
+    from edgevpr.lab.evaluate.plan import Plan, SetPlan
 
 _MOST_WORKERS = 256
 
@@ -102,10 +102,10 @@ def _count(text: str) -> int:
 
 def _measure_many(args: Namespace) -> int:
     """Measure many rows on many sets, with all that an earlier run has left."""
-    from edgevpr.evaluate.many import measure
-    from edgevpr.evaluate.output import as_json, write_results
-    from edgevpr.evaluate.tables import quality_text
-    from edgevpr.helpers.progress import progress
+    from edgevpr.core.progress import progress
+    from edgevpr.lab.evaluate.many import measure
+    from edgevpr.lab.evaluate.output import as_json, write_results
+    from edgevpr.lab.evaluate.tables import quality_text
 
     if args.plot:
         raise UsageError("--plot goes without --out: the page in that folder has the curves.")
@@ -133,7 +133,7 @@ def _measure_many(args: Namespace) -> int:
 
 
 def _plan(args: Namespace) -> "Plan":
-    from edgevpr.evaluate.plan import RowPlan, of_flags, read_plan
+    from edgevpr.lab.evaluate.plan import RowPlan, of_flags, read_plan
     from edgevpr.runtime.preflight.offers import offers
 
     if args.sets:
@@ -162,7 +162,7 @@ def _plan(args: Namespace) -> "Plan":
 
 def _set_of(args: Namespace) -> "SetPlan":
     """Return how the flags say that sets are read, and which folders or videos they name themselves."""
-    from edgevpr.evaluate.plan import SetPlan
+    from edgevpr.lab.evaluate.plan import SetPlan
 
     return SetPlan(
         query=args.query,
@@ -206,8 +206,8 @@ def _forms(args: Namespace) -> list[str]:
 
 def _dataset(args: Namespace, cache: str) -> "Dataset":
     """Read the data set; the pictures of a video are taken into the folder `cache`."""
-    from edgevpr.evaluate.kept import Kept
-    from edgevpr.helpers.progress import progress
+    from edgevpr.core.progress import progress
+    from edgevpr.lab.evaluate.kept import Kept
 
     chosen = _set_of(args)
     if args.sets or args.workers or args.cache:
@@ -231,13 +231,13 @@ def _say_notes(dataset: "Dataset") -> None:
 def _measure_similarities(args: Namespace) -> int:
     from dataclasses import asdict
 
-    from edgevpr.evaluate.curves import plot
-    from edgevpr.evaluate.numbered import truth_in
-    from edgevpr.evaluate.similarity import measure, read_similarities
-    from edgevpr.evaluate.tables import quality_text
+    from edgevpr.core.figures import require_picture
+    from edgevpr.core.text import decoded_name
     from edgevpr.frames.images import list_images
-    from edgevpr.helpers.figures import require_picture
-    from edgevpr.helpers.text import decoded_name
+    from edgevpr.lab.evaluate.curves import plot
+    from edgevpr.lab.evaluate.numbered import truth_in
+    from edgevpr.lab.evaluate.similarity import measure, read_similarities
+    from edgevpr.lab.evaluate.tables import quality_text
 
     def names_in(folder: str | None) -> list[str] | None:
         return [decoded_name(path.name) for path in list_images(folder)] if folder else None
@@ -260,11 +260,11 @@ def _measure_similarities(args: Namespace) -> int:
 
 
 def _measure_techniques(args: Namespace) -> int:
-    from edgevpr.evaluate import evaluate as evaluation
-    from edgevpr.evaluate.curves import plot
-    from edgevpr.evaluate.tables import results_text
-    from edgevpr.helpers.figures import require_picture
-    from edgevpr.helpers.progress import progress
+    from edgevpr.core.figures import require_picture
+    from edgevpr.core.progress import progress
+    from edgevpr.lab.evaluate import evaluate as evaluation
+    from edgevpr.lab.evaluate.curves import plot
+    from edgevpr.lab.evaluate.tables import results_text
     from edgevpr.runtime.preflight.offers import offers, usable
     from edgevpr.runtime.recognise.opening import gate_of
 

@@ -20,9 +20,9 @@ from edgevpr.cli.shared import (
     path_of,
     print_json,
 )  # fmt: skip
-from edgevpr.config import Config, with_logs_in
-from edgevpr.errors import ImageError, UsageError
-from edgevpr.helpers.text import shown
+from edgevpr.core.config import Config, with_logs_in
+from edgevpr.core.errors import ImageError, UsageError
+from edgevpr.core.text import shown
 
 _MATCHING_KEYS = (
     "board", "technique", "source.camera", "source.mask", "source.fov_deg", "source.up_deg",
@@ -75,8 +75,8 @@ def add(commands: Any) -> None:
 
 def run_match(args: Namespace) -> int:
     """Find the places of a recording in a map, and print a line for each image."""
+    from edgevpr.core.geodesy import distance_m
     from edgevpr.frames.source import open_source
-    from edgevpr.geodesy import distance_m
     from edgevpr.power.boards import load_board
     from edgevpr.runtime.recognise.opening import open_recogniser
     from edgevpr.runtime.recognise.recognition import fields_of
@@ -119,7 +119,7 @@ def run_match(args: Namespace) -> int:
 
 def run_flight(args: Namespace) -> int:
     """Fly with a configuration."""
-    from edgevpr.runtime.service.fly import fly
+    from edgevpr.runtime.flight.fly import fly
 
     def config() -> Config:
         return with_logs_in(config_of(args, args.config), os.environ.get("LOGS_DIRECTORY", ""))
@@ -129,7 +129,7 @@ def run_flight(args: Namespace) -> int:
 
 def run_check(args: Namespace) -> int:
     """Say whether a configuration would fly."""
-    from edgevpr.helpers.progress import waiting
+    from edgevpr.core.progress import waiting
     from edgevpr.runtime.service.check import check, learn_mask
     from edgevpr.runtime.service.finding import lines
 

@@ -23,9 +23,9 @@ from edgevpr.cli import (
     top,
 )
 from edgevpr.cli.screen import LineFormatter, guarded_output
-from edgevpr.config import require_sayable
-from edgevpr.errors import EdgevprError
-from edgevpr.helpers.text import shown
+from edgevpr.core.config import require_sayable
+from edgevpr.core.errors import EdgevprError
+from edgevpr.core.text import shown
 
 _GROUPS = (maps, flying, top, review, replaying, doctor, profile, salience, evaluation, simulation, networks)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from edgevpr.cli import building, calibrating
 from edgevpr.cli.shared import add_json, command, group, positive, print_json, watched
-from edgevpr.errors import UsageError
+from edgevpr.core.errors import UsageError
 
 if TYPE_CHECKING:
     from edgevpr.places.repair import MapCheck
@@ -50,12 +50,12 @@ def _number_of_places(text: str) -> int:
 
 def map_info(args: Namespace) -> int:
     """Say what a map holds."""
-    from edgevpr.confidence.stored import not_calibrated
     from edgevpr.places.index import bytes_per_place
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.places.mapinfo import info_of
     from edgevpr.runtime.recognise.calibrated import calibration_of
     from edgevpr.runtime.recognise.evidence import WITH_CONFIDENCE
+    from edgevpr.runtime.recognise.stored_confidence import not_calibrated
 
     with PlaceMap.open(args.map) as place_map:
         info, calibration = info_of(place_map), calibration_of(place_map)
@@ -176,7 +176,7 @@ def map_shrink(args: Namespace) -> int:
 
 def map_export(args: Namespace) -> int:
     """Write the places as GeoJSON."""
-    from edgevpr.helpers.files import require_folder, write_whole
+    from edgevpr.core.files import require_folder, write_whole
     from edgevpr.places.geojson import write_geojson
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.runtime.recognise.calibrated import calibration_of

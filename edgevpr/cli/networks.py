@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from edgevpr.cli.shared import add_json, command, exit_code, group, path_of, print_json
-from edgevpr.errors import EdgevprError, ImageError, ModelError, UsageError
-from edgevpr.helpers.text import shown
+from edgevpr.core.errors import EdgevprError, ImageError, ModelError, UsageError
+from edgevpr.core.text import shown
 
 if TYPE_CHECKING:
     from edgevpr.runtime.preflight.networks import Verified
@@ -80,7 +80,7 @@ def _add_models(models: Any) -> None:
 
 def train_calc(args: Namespace) -> int:
     """Train the CALC autoencoder, and print the result."""
-    from edgevpr.training import job
+    from edgevpr.lab.training import job
 
     unusable: list[ImageError] = []
     result = job.train_calc(args.images, Path(args.out), args.steps, args.seed, args.resume, unusable)
@@ -93,7 +93,7 @@ def train_calc(args: Namespace) -> int:
 
 def train_words(args: Namespace) -> int:
     """Learn the words that vlad, regions or bow count, and print the result."""
-    from edgevpr.training import words
+    from edgevpr.lab.training import words
 
     unusable: list[ImageError] = []
     result = words.train_words(
@@ -108,7 +108,7 @@ def train_words(args: Namespace) -> int:
 
 def train_ground(args: Namespace) -> int:
     """Learn the words of the ground, and print how well they fit."""
-    from edgevpr.training.ground import train_ground
+    from edgevpr.lab.training.ground import train_ground
 
     unusable: list[ImageError] = []
     result = train_ground(args.images, Path(args.out), args.seed, unusable)
@@ -130,7 +130,7 @@ def _learnt(args: Namespace, result: Any, said: str, unusable: list[ImageError])
 
 def train_matchability(args: Namespace) -> int:
     """Learn which pictures are found again, and print how well that is told on a site that was left out."""
-    from edgevpr.training.matchability_job import train_matchability
+    from edgevpr.lab.training.matchability_job import train_matchability
 
     result = train_matchability(args.data, args.nadir, Path(args.out), args.seed)
     if args.json:
@@ -147,7 +147,7 @@ def train_matchability(args: Namespace) -> int:
 
 def models_list(args: Namespace) -> int:
     """List every card, whether or not it can be used."""
-    from edgevpr.resources import model_folders
+    from edgevpr.core.resources import model_folders
     from edgevpr.runtime.preflight.networks import list_models
 
     found = list_models()
@@ -207,12 +207,12 @@ def models_add(args: Namespace) -> int:
 
 def models_quantise(args: Namespace) -> int:
     """Make a network of 8-bit integers, and print its costs and, with a data set, its recall, before and after."""
-    from edgevpr.evaluate.dataset import load_dataset
-    from edgevpr.evaluate.evaluate import evaluate as measured
-    from edgevpr.helpers.progress import progress
+    from edgevpr.core.progress import progress
+    from edgevpr.lab.evaluate.dataset import load_dataset
+    from edgevpr.lab.evaluate.evaluate import evaluate as measured
+    from edgevpr.lab.training.quantise import quantise
     from edgevpr.power.boards import load_board
     from edgevpr.runtime.preflight.networks import technique_with
-    from edgevpr.training.quantise import quantise
 
     data = (args.query, args.ref, args.ground_truth)
     if any(data) and not all(data):

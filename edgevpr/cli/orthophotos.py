@@ -5,10 +5,10 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Collection
 from typing import TYPE_CHECKING
 
-from edgevpr.errors import UsageError
+from edgevpr.core.errors import UsageError
 
 if TYPE_CHECKING:
-    from edgevpr.frames.cuttings import OrthophotoSource
+    from edgevpr.mapmaking.cuttings import OrthophotoSource
 
 TECHNIQUE = "cohog"
 _FLAGS = ("footprint_m", "spacing_m", "area", "margin_m")
@@ -59,10 +59,10 @@ def open_cuttings(args: Namespace, only: Collection[str] | None = None) -> "Orth
         raise UsageError("--orthophoto needs --footprint-m (ground along a picture's longest side) and --spacing-m.")
     if args.margin_m is not None and not (args.area and 0 <= args.margin_m < float("inf")):
         raise UsageError(f"--margin-m {args.margin_m:g}: give 0 or more, with --area.")
-    from edgevpr.frames.cuttings import OrthophotoSource
-    from edgevpr.frames.lattice import lattice_of
-    from edgevpr.frames.missions import read_area
-    from edgevpr.frames.orthophoto import Orthophoto  # loads GDAL, or says that it is missing
+    from edgevpr.mapmaking.cuttings import OrthophotoSource
+    from edgevpr.mapmaking.lattice import lattice_of
+    from edgevpr.mapmaking.missions import read_area
+    from edgevpr.mapmaking.orthophoto import Orthophoto  # loads GDAL, or says that it is missing
 
     area = read_area(args.area) if args.area else None
     margin_m = args.footprint_m if args.margin_m is None else args.margin_m

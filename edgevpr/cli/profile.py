@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from edgevpr.cli.shared import add_json, add_keys, command, print_json, value_of
-from edgevpr.errors import EdgevprError, UsageError
+from edgevpr.core.errors import EdgevprError, UsageError
 
 if TYPE_CHECKING:
     from edgevpr.power.boards import Board
@@ -50,8 +50,8 @@ def _add_plan(parser: ArgumentParser) -> None:
 
 def profile(args: Namespace) -> int:
     """Estimate all techniques for a flight, or list, detect or measure boards."""
-    from edgevpr.helpers.figures import require_picture
-    from edgevpr.helpers.progress import progress
+    from edgevpr.core.figures import require_picture
+    from edgevpr.core.progress import progress
     from edgevpr.power.boards import board_names, load_board
     from edgevpr.runtime.preflight.choose import require_technique
     from edgevpr.runtime.preflight.estimate import estimate
@@ -101,7 +101,7 @@ def profile(args: Namespace) -> int:
 def _plan(args: Namespace, board: "Board") -> "tuple[FlightPlan, str | None, tuple[Offer, ...]]":
     """Return the plan that is asked for, the technique of the map (None: no map), and the techniques to try."""
     from edgevpr import techniques
-    from edgevpr.config import load_config
+    from edgevpr.core.config import load_config
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.power.equations import parse_pack
     from edgevpr.runtime.preflight.estimate import FlightPlan
@@ -155,7 +155,7 @@ def _measure(args: Namespace, quiet: bool) -> int:
     """Measure this machine and keep the figures; with `quiet` an estimate follows, and the figures are not printed as
     JSON."""
     from edgevpr import techniques
-    from edgevpr.helpers.progress import progress
+    from edgevpr.core.progress import progress
     from edgevpr.power.boards import load_board
     from edgevpr.runtime.preflight import stored
     from edgevpr.runtime.preflight.offers import offers

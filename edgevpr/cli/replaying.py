@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from edgevpr.cli.shared import add_json, command, print_json
-from edgevpr.helpers.text import shown
+from edgevpr.core.text import shown
 
 if TYPE_CHECKING:
-    from edgevpr.replay.beside import Seen
-    from edgevpr.replay.compare import Difference
-    from edgevpr.replay.replay import Recorded, Replayed
+    from edgevpr.review.beside import Seen
+    from edgevpr.review.compare import Difference
+    from edgevpr.review.replay import Recorded, Replayed
 
 _SHOWN = 40  # differences
 
@@ -34,8 +34,8 @@ def add(commands: Any) -> None:
 
 def run_replay(args: Namespace) -> int:
     """Fly a recorded flight again."""
-    from edgevpr.helpers.progress import waiting
-    from edgevpr.replay.replay import recorded, replay, suppose
+    from edgevpr.core.progress import waiting
+    from edgevpr.review.replay import recorded, replay, suppose
 
     def say(done: int, total: int) -> None:
         waiting(f"replaying  {done}/{total}")
@@ -63,8 +63,8 @@ def _unheard(debug: bool) -> Iterator[None]:
 
 
 def _print_comparison(flight: "Recorded", again: "Replayed", as_json: bool) -> int:
-    from edgevpr.replay.compare import compare
-    from edgevpr.replay.packets import described
+    from edgevpr.review.compare import compare
+    from edgevpr.review.packets import described
 
     lines, packets = compare(flight.lines, again.lines), again.packets
     said = [
@@ -106,7 +106,7 @@ def _print_comparison(flight: "Recorded", again: "Replayed", as_json: bool) -> i
 
 
 def _print_beside(flight: "Recorded", again: "Replayed", as_json: bool) -> int:
-    from edgevpr.replay.beside import beside, table
+    from edgevpr.review.beside import beside, table
 
     pairs = beside(flight.lines, again.lines)
     rows = table(pairs)

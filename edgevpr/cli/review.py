@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from edgevpr.cli.shared import command
-from edgevpr.errors import MapError, UsageError
+from edgevpr.core.errors import MapError, UsageError
 
 if TYPE_CHECKING:
-    from edgevpr.report.flight import Flight
-    from edgevpr.report.ground import Ground
+    from edgevpr.review.flight import Flight
+    from edgevpr.review.ground import Ground
 
 _log = logging.getLogger(__name__)
 
@@ -47,9 +47,9 @@ def _number(text: str) -> int:
 
 def run_report(args: Namespace) -> int:
     """Make the page of a flight."""
-    from edgevpr.helpers.files import require_folder, write_whole
-    from edgevpr.report.page import page_of
-    from edgevpr.report.pictures import Album
+    from edgevpr.core.files import require_folder, write_whole
+    from edgevpr.review.page import page_of
+    from edgevpr.review.pictures import Album
     from edgevpr.runtime.flight.recording import frames_of, recording_of
 
     out = _out(args.out, args.log)
@@ -65,8 +65,8 @@ def run_report(args: Namespace) -> int:
 
 def run_export(args: Namespace) -> int:
     """Write what a flight found, for other programs."""
-    from edgevpr.helpers.files import require_folder, write_whole
-    from edgevpr.report.export import WRITERS, features_of
+    from edgevpr.core.files import require_folder, write_whole
+    from edgevpr.review.export import WRITERS, features_of
 
     form, target = next((name, given) for name in WRITERS if (given := getattr(args, name)) is not None)
     features = features_of(_read(args))
@@ -87,7 +87,7 @@ def run_export(args: Namespace) -> int:
 
 
 def _read(args: Namespace) -> "Flight":
-    from edgevpr.report.flight import read_flight
+    from edgevpr.review.flight import read_flight
 
     flight = read_flight(args.log, args.flight)
     if flight.missing:
@@ -104,7 +104,7 @@ def _out(target: str, log: str) -> Path:
 
 def _ground(given: str | None, flight: "Flight") -> "Ground":
     """Read the map that was given, or else that of the log, which need not be on this machine."""
-    from edgevpr.report.ground import Ground, read_ground
+    from edgevpr.review.ground import Ground, read_ground
 
     if given:
         return read_ground(given)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from edgevpr.cli.shared import add_json, command, config_of, print_json
-from edgevpr.errors import UsageError
+from edgevpr.core.errors import UsageError
 
 
 def add(commands: Any) -> None:
@@ -22,12 +22,12 @@ def add(commands: Any) -> None:
 
 def salience(args: Namespace) -> int:
     """Print the scores of a picture, and draw its maps."""
+    from edgevpr.core.files import require_folder, write_whole
     from edgevpr.frames.images import read_image
-    from edgevpr.helpers.files import require_folder, write_whole
     from edgevpr.runtime.recognise.opening import gate_of
-    from edgevpr.salience.gate import worth_of
-    from edgevpr.salience.maps import scores_of
-    from edgevpr.salience.picture import panels, png, said
+    from edgevpr.runtime.recognise.salience_gate import worth_of
+    from edgevpr.runtime.recognise.salience_maps import scores_of
+    from edgevpr.runtime.recognise.salience_picture import panels, png, said
 
     asked = {"salience.use": True, "salience.network": args.network, "salience.detector": args.detector}
     gate = gate_of(config_of(args, args.config, **asked).salience)

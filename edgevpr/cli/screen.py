@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from typing import TextIO
 
-from edgevpr.helpers.text import shown
+from edgevpr.core.text import shown
 
 _LAYOUT = "\n\r\t"  # what tables and progress lines are made with
 

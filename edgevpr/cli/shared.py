@@ -7,14 +7,14 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from edgevpr.config import Config, flagged_keys, load_config
-from edgevpr.errors import ImageError, UsageError
-from edgevpr.helpers.text import shown
+from edgevpr.core.config import Config, flagged_keys, load_config
+from edgevpr.core.errors import ImageError, UsageError
+from edgevpr.core.text import shown
 
 if TYPE_CHECKING:
+    from edgevpr.core.types import Frame
     from edgevpr.frames.source import Source
     from edgevpr.places.repair import Watch
-    from edgevpr.types import Frame
 
 _KEY = "key "  # begins the name under which argparse keeps the value of a flag that is a key of the configuration
 _READ_TIMEOUT_S = 1.0
@@ -109,7 +109,7 @@ def path_of(text: str | None) -> Path | None:
 def frames_of(source: "Source", label: str, unusable: list[ImageError]) -> "Iterator[Frame]":
     """Read every frame of a source that ends, and show progress. An image that cannot be used is reported, added to
     `unusable`, and left out."""
-    from edgevpr.helpers.progress import progress
+    from edgevpr.core.progress import progress
 
     frames = read_to_end(source, lambda error: leave_out(error, unusable))
     return (frame for frame in progress(frames, source.total, label) if frame is not None)
@@ -156,6 +156,6 @@ def positive(text: str) -> float:
 
 def watched(label: str) -> "Watch":
     """Return the function that passes things through, of which there are so many, and shows progress."""
-    from edgevpr.helpers.progress import progress
+    from edgevpr.core.progress import progress
 
     return lambda places, total: progress(places, total, label)

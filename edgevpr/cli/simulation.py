@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from edgevpr.cli.shared import add_json, add_parameters, command, group, parameters_of, print_json
-from edgevpr.errors import UsageError
+from edgevpr.core.errors import UsageError
 
-# Those of edgevpr.simulate.flightcontroller.controller, which is not loaded for a page of help.
+# Those of edgevpr.lab.simulate.flightcontroller.controller, which is not loaded for a page of help.
 _VEHICLES = ("arduplane", "arducopter", "ardurover", "px4-copter", "px4-plane")
 _PARAMETER = "GPS2_TYPE=14"  # an example
 
@@ -53,8 +53,8 @@ def add(commands: Any) -> None:
 
 def simulate_autopilot(args: Namespace) -> int:
     """Run a simulated flight controller, and print what it has received."""
-    from edgevpr.simulate.autopilot import run_autopilot
-    from edgevpr.simulate.flightcontroller.recorded import read_track
+    from edgevpr.lab.simulate.autopilot import run_autopilot
+    from edgevpr.lab.simulate.flightcontroller.recorded import read_track
 
     track = read_track(args.track) if args.track else None
     has_gps = track is not None and not args.no_gps
@@ -80,7 +80,7 @@ def simulate_flight(args: Namespace) -> int:
     if args.orthophoto is None:
         if said := [name for name in ("track", "light", *_NUMBERS) if getattr(args, name) is not None]:
             raise UsageError(f"--{said[0].replace('_', '-')} goes with --orthophoto: leave it out.")
-        from edgevpr.simulate.flight import fly_and_write
+        from edgevpr.lab.simulate.flight import fly_and_write
 
         print(fly_and_write(Path(args.out), args.which or "map", args.seed))
         return 0
@@ -101,10 +101,10 @@ _NUMBERS = {
 
 
 def _fly_over(args: Namespace) -> str:
-    from edgevpr.frames.orthophoto import Orthophoto  # loads GDAL, or says that it is missing
-    from edgevpr.helpers.progress import progress
-    from edgevpr.simulate.rehearsal import WEATHERS, none_written, write_rehearsal
-    from edgevpr.simulate.track import read_shots
+    from edgevpr.core.progress import progress
+    from edgevpr.lab.simulate.rehearsal import WEATHERS, none_written, write_rehearsal
+    from edgevpr.lab.simulate.track import read_shots
+    from edgevpr.mapmaking.orthophoto import Orthophoto  # loads GDAL, or says that it is missing
 
     numbers = {}
     for name, (usual, least, most) in _NUMBERS.items():
@@ -134,7 +134,7 @@ def _fly_over(args: Namespace) -> str:
 
 def run_demo(args: Namespace) -> int:
     """Run the demonstration, and print its summary."""
-    from edgevpr.simulate import demo
+    from edgevpr.lab.simulate import demo
 
     print(demo.run_demo(Path(args.out)))
     return 0

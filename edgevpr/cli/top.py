@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from edgevpr.cli.screen import erase_lines
 from edgevpr.cli.shared import add_json, command
-from edgevpr.errors import EdgevprError
-from edgevpr.helpers.text import printable
+from edgevpr.core.errors import EdgevprError
+from edgevpr.core.text import printable
 
 if TYPE_CHECKING:
     from edgevpr.runtime.flight.status import LinkState, Seen, Status
@@ -34,7 +34,7 @@ def add(commands: Any) -> None:
 
 def run_top(args: Namespace) -> int:
     """Show the status of a flight, until Ctrl-C."""
-    from edgevpr.runtime.service.statusreader import StatusReader
+    from edgevpr.runtime.flight.statusreader import StatusReader
 
     with StatusReader(args.socket) as reader:
         if args.once:

@@ -5,9 +5,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
+from edgevpr.core.types import Position
 from edgevpr.frames.positions import ALT_M, GeoTag, parse_time, position_or_none
 from edgevpr.frames.xmp import read_xmp
-from edgevpr.types import Position
 
 T = TypeVar("T")
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from edgevpr.errors import ImageError, SourceError
+from edgevpr.core.errors import ImageError, SourceError
+from edgevpr.core.files import read_file
 from edgevpr.frames.header import Header, read_header
 from edgevpr.frames.opencv import cv2
-from edgevpr.helpers.files import read_file
 
 EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm")
 MIN_SIDE_PX = 16

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from edgevpr.core.types import Frame, Vehicle
 from edgevpr.frames.opencv import cv2
-from edgevpr.types import Frame, Vehicle
 
 MOST_TILT_DEG = 45.0
 _MOST_OFF_DOWN_DEG = 85.0  # of a corner's ray: beyond it are the horizon and ground that fills no pixel

@@ -5,11 +5,11 @@ import contextlib
 import threading
 from collections.abc import Callable
 
+from edgevpr.core.types import Frame
 from edgevpr.frames.condition import Condition
 from edgevpr.frames.newness import Newness, coarse
 from edgevpr.frames.opencv import cv2
 from edgevpr.frames.shot import Capture, Refusal, Shot
-from edgevpr.types import Frame
 
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.5, 10.0
 _CLOSE_TIMEOUT_S = 0.5

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from edgevpr.contract import Descriptor, Technique
-from edgevpr.errors import ImageError, UsageError
+from edgevpr.core.contract import Descriptor, Technique
+from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.frames.images import read_image
 from edgevpr.frames.opencv import cv2
 

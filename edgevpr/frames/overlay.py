@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from edgevpr.errors import SourceError, UsageError
+from edgevpr.core.errors import SourceError, UsageError
+from edgevpr.core.files import write_whole
 from edgevpr.frames.mask import MOST_MASKED
 from edgevpr.frames.opencv import cv2
-from edgevpr.helpers.files import write_whole
 
 FEWEST_FRAMES = 20
 _LONGEST_SIDE_PX = 640

@@ -9,9 +9,9 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from edgevpr.errors import UsageError
-from edgevpr.helpers.files import read_file
-from edgevpr.types import Position
+from edgevpr.core.errors import UsageError
+from edgevpr.core.files import read_file
+from edgevpr.core.types import Position
 
 _NEEDED_COLUMNS = ("file", "lat", "lon")
 _COLUMNS = (

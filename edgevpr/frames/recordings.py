@@ -5,14 +5,14 @@ from pathlib import Path
 
 import numpy as np
 
-from edgevpr.errors import ImageError, UsageError
+from edgevpr.core.errors import ImageError, UsageError
+from edgevpr.core.text import decoded_name
+from edgevpr.core.types import Frame
 from edgevpr.frames.condition import Condition
 from edgevpr.frames.exif import read_exif
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.positions import GeoTag, find_positions, read_positions
 from edgevpr.frames.shot import Refusal
-from edgevpr.helpers.text import decoded_name
-from edgevpr.types import Frame
 
 
 class Recording:

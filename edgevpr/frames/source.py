@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Protocol
 from urllib.parse import urlsplit
 
-from edgevpr.config import SOURCES
-from edgevpr.errors import SourceError, UsageError
+from edgevpr.core.config import SOURCES
+from edgevpr.core.errors import SourceError, UsageError
+from edgevpr.core.types import Frame
 from edgevpr.frames.condition import Condition
 from edgevpr.frames.images import EXTENSIONS
 from edgevpr.frames.live import LiveSource, open_camera
 from edgevpr.frames.recordings import FolderSource
 from edgevpr.frames.shot import Capture
-from edgevpr.types import Frame
 
 _SCHEMES = ("rtsp", "rtsps", "udp", "tcp", "http", "https")
 _SCHEMES_THAT_NEED_A_PORT = ("udp", "tcp")

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from edgevpr.errors import ImageError
+from edgevpr.core.errors import ImageError
+from edgevpr.core.tape import Tape
+from edgevpr.core.types import Frame, Position
 from edgevpr.frames.condition import Condition
 from edgevpr.frames.images import decoded
 from edgevpr.frames.opencv import cv2
 from edgevpr.frames.source import Source
-from edgevpr.helpers.tape import Tape
-from edgevpr.types import Frame, Position
 
 _QUALITY = 95
 _UNPACKED = "image", "position", "pose"

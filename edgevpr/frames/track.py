@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from edgevpr.errors import UsageError
+from edgevpr.core.errors import UsageError
+from edgevpr.core.types import Position
 from edgevpr.frames.positions import GeoTag, rows_of, tag_of
-from edgevpr.types import Position
 
 NEEDED_COLUMNS = ("time", "lat", "lon")
 MOST_GAP_S = 5.0  # a straight line between fixes that lie further apart says where nobody was

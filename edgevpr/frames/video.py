@@ -6,13 +6,13 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from edgevpr.errors import ImageError, SourceError
+from edgevpr.core.errors import ImageError, SourceError
+from edgevpr.core.types import Frame
 from edgevpr.frames.decoding import WholePictures, open_pictures
 from edgevpr.frames.positions import GeoTag
 from edgevpr.frames.recordings import Recording, tagged
 from edgevpr.frames.shot import Refusal
 from edgevpr.frames.track import Track
-from edgevpr.types import Frame
 
 if TYPE_CHECKING:
     from av.video.frame import VideoFrame

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from edgevpr.errors import LinkAddressError
+from edgevpr.core.errors import LinkAddressError
 
 FORMS = "udpout:HOST:PORT, udpin:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD"
 BAUD_MIN, BAUD_MAX = 1200, 12_000_000

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 
+from edgevpr.core.types import Position, Vehicle
 from edgevpr.mavlink import messages, positions
 from edgevpr.mavlink.address import Sender
 from edgevpr.mavlink.answers import TRIED_AGAIN_AFTER_S, Answers
@@ -22,7 +23,6 @@ from edgevpr.mavlink.signing import NOT_SIGNING, NotSigning, Signing
 from edgevpr.mavlink.texts import Texts
 from edgevpr.mavlink.wire import Message, Receiver, Tap, mavlink, untapped
 from edgevpr.mavlink.wishes import Wishes
-from edgevpr.types import Position, Vehicle
 
 HEARTBEAT_S = 1.0
 STATE_S = 0.1  # ArduPilot calls a receiver unhealthy whose positions come more than 215 ms apart

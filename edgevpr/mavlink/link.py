@@ -8,8 +8,9 @@ import time
 from collections.abc import Callable, Collection
 from contextlib import AbstractContextManager, suppress
 
-from edgevpr.errors import LinkError
-from edgevpr.helpers.tape import NO_TAPE, Tape
+from edgevpr.core.errors import LinkError
+from edgevpr.core.tape import NO_TAPE, Tape
+from edgevpr.core.types import Position, Vehicle
 from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.autopilots.channel import Channel
 from edgevpr.mavlink.conversation import Conversation
@@ -23,7 +24,6 @@ from edgevpr.mavlink.transport import open_transport
 from edgevpr.mavlink.turns import Turns
 from edgevpr.mavlink.wire import Message, Tap, untapped
 from edgevpr.mavlink.wishes import Wish, Wished
-from edgevpr.types import Position, Vehicle
 
 TURN_S = 0.25  # longest sleep of the thread when nothing wakes it
 RETRY_FIRST_S, RETRY_MAX_S = 0.2, 2.0

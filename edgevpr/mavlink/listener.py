@@ -2,10 +2,10 @@
 
 from typing import Protocol
 
+from edgevpr.core.types import Vehicle
 from edgevpr.mavlink.attitude import Attitude
 from edgevpr.mavlink.autopilots.channel import Channel
 from edgevpr.mavlink.positions import State
-from edgevpr.types import Vehicle
 
 
 class Listener(Protocol):

@@ -5,9 +5,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from threading import Event, Lock
 
+from edgevpr.core.types import FIX_MAX_AGE_S
 from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.wire import Message
-from edgevpr.types import FIX_MAX_AGE_S
 
 MESSAGES_MAX = 64
 FIXES_MAX = 8

@@ -5,7 +5,8 @@ from collections import Counter
 from dataclasses import replace
 from typing import Any
 
-from edgevpr.geodesy import distance_m, moved
+from edgevpr.core.geodesy import distance_m, moved
+from edgevpr.core.types import Receiver, Vehicle
 from edgevpr.mavlink.address import Sender
 from edgevpr.mavlink.attitude import Attitudes, Heights
 from edgevpr.mavlink.autopilots.channel import Channel
@@ -16,7 +17,6 @@ from edgevpr.mavlink.listener import Listener, NoListener
 from edgevpr.mavlink.messages import AUTOPILOT, POSITION_FIX
 from edgevpr.mavlink.readiness import GPS_REPORTS, Readiness
 from edgevpr.mavlink.wire import Message, mavlink
-from edgevpr.types import Receiver, Vehicle
 
 GPS_GONE_AFTER_S = 2.5  # GPS reports come at least once a second, and one may be lost
 GPS_AGREES_WITHIN_M = 50.0  # at 25 m/s, with one or two seconds between the two reports

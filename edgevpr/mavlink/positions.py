@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from edgevpr.geodesy import offset_m
+from edgevpr.core.geodesy import offset_m
 from edgevpr.mavlink.autopilots.px4 import SENSOR_ID
 from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.wire import Message, mavlink

@@ -14,8 +14,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 
-from edgevpr.errors import ConfigError
-from edgevpr.helpers.files import open_file
+from edgevpr.core.errors import ConfigError
+from edgevpr.core.files import open_file
 from edgevpr.mavlink.timestamps import CROWDED, FUTURE, OLD, BorrowedTimeStamps, TimeStamps
 from edgevpr.mavlink.wire import Message, mavlink
 

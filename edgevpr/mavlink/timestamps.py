@@ -6,8 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from threading import Lock, Thread
 
-from edgevpr.errors import ConfigError
-from edgevpr.helpers.files import read_file, write_whole
+from edgevpr.core.errors import ConfigError
+from edgevpr.core.files import read_file, write_whole
 
 TICKS_S = 100_000  # a time stamp counts units of 10 microseconds since the beginning of 2015, UTC
 _EPOCH_S = 1_420_070_400

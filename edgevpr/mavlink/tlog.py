@@ -9,8 +9,8 @@ import time
 from pathlib import Path
 from typing import BinaryIO
 
-from edgevpr.errors import EdgevprError
-from edgevpr.helpers.appending import append, is_at, open_appending, set_aside, sync
+from edgevpr.core.appending import append, is_at, open_appending, set_aside, sync
+from edgevpr.core.errors import EdgevprError
 
 MOST_BYTES = 256_000_000  # of one file, days of a usual link; with the one before it there are at most twice as many
 SPARED_BYTES = 20_000_000  # of the disk, which are left to the flight log

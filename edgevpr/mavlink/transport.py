@@ -7,7 +7,7 @@ import errno
 import socket
 from typing import Protocol
 
-from edgevpr.errors import LinkAddressError, LinkError
+from edgevpr.core.errors import LinkAddressError, LinkError
 from edgevpr.mavlink.address import LinkAddress, Sender
 from edgevpr.mavlink.ports import SerialPort, TcpPort, UdpInPort, UdpOutPort
 

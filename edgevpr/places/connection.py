@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from edgevpr.contract import TechniqueSpec
-from edgevpr.errors import MapError, PlaceError
+from edgevpr.core.contract import TechniqueSpec
+from edgevpr.core.errors import MapError, PlaceError
 from edgevpr.places import geopackage, mapfiles, rows
 from edgevpr.places.mapspec import Stored, require_layer, spec_of, stored, write_spec
 from edgevpr.places.sqlite import (

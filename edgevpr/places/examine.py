@@ -4,7 +4,7 @@ import sqlite3
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from edgevpr.errors import PlaceError
+from edgevpr.core.errors import PlaceError
 from edgevpr.places import rows
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.rows import Content, Unreadable

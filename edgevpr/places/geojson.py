@@ -4,9 +4,9 @@ import json
 from collections.abc import Mapping
 from typing import TextIO
 
+from edgevpr.core.types import Place, Pose, Salience
 from edgevpr.places import geopackage
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.types import Place, Pose, Salience
 
 _LOW, _USUAL = "#e0b060", "#2060c0"
 # From hardly recognisable to surely, in five equal steps; red and blue are told apart by every eye.

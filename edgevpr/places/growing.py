@@ -5,12 +5,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from edgevpr.contract import Technique
-from edgevpr.errors import MapError
+from edgevpr.core.contract import Technique
+from edgevpr.core.errors import MapError
+from edgevpr.core.types import Position
 from edgevpr.places.index import CoarsePart, PlaceIndex, bytes_per_place, empty_index, fill, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.thin import best_places
-from edgevpr.types import Position
 
 _MOVED_AT_ONCE = 256
 

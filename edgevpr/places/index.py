@@ -7,12 +7,12 @@ from itertools import islice
 
 import numpy as np
 
-from edgevpr.contract import Technique, TechniqueSpec
-from edgevpr.errors import MapError
-from edgevpr.geodesy import distance_m
+from edgevpr.core.contract import Technique, TechniqueSpec
+from edgevpr.core.errors import MapError
+from edgevpr.core.geodesy import distance_m
+from edgevpr.core.types import Position
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.thin import best_places
-from edgevpr.types import Position
 
 _log = logging.getLogger(__name__)
 _BYTES_BESIDE_ROW = 8 + 8 + 8 + 2  # id, latitude, longitude, heading

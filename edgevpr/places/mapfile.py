@@ -13,14 +13,14 @@ from pathlib import Path
 
 import numpy as np
 
-from edgevpr.contract import Descriptor, TechniqueSpec
-from edgevpr.errors import MapError, PlaceError
+from edgevpr.core.contract import Descriptor, TechniqueSpec
+from edgevpr.core.errors import MapError, PlaceError
+from edgevpr.core.types import Frame, Place, Pose, Position, Salience
 from edgevpr.places import geopackage, mapspec, rows
 from edgevpr.places.connection import MapConnection
 from edgevpr.places.mapspec import differences, has_checksums, has_pose, has_salience, read_text, write_text
 from edgevpr.places.rows import Content, Point, Unreadable
 from edgevpr.places.sqlite import sentences
-from edgevpr.types import Frame, Place, Pose, Position, Salience
 
 _OTHERS = 0.05  # of the numbers of a coarse part
 _SAME_PICTURE = 0.01  # of the length of a coarse part: far more than rounding, far less than another picture

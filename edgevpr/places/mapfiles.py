@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from edgevpr.errors import MapBusyError, MapError, UsageError
+from edgevpr.core.errors import MapBusyError, MapError, UsageError
 
 _BESIDE = ("-wal", "-shm", "-journal")
 

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from edgevpr.contract import TechniqueSpec
+from edgevpr.core.contract import TechniqueSpec
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.sqlite import sentences
 

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from edgevpr import __version__
-from edgevpr.contract import PartSpec, TechniqueSpec
-from edgevpr.errors import MapError
+from edgevpr.core.contract import PartSpec, TechniqueSpec
+from edgevpr.core.errors import MapError
 from edgevpr.places import geopackage, rows
 from edgevpr.places.sqlite import is_of_one_row
 

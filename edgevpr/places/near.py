@@ -3,11 +3,11 @@
 import math
 import sqlite3
 
-from edgevpr.geodesy import EARTH_RADIUS_M, distance_m
+from edgevpr.core.geodesy import EARTH_RADIUS_M, distance_m
+from edgevpr.core.types import Position
 from edgevpr.places import geopackage
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.sqlite import sentences
-from edgevpr.types import Position
 
 _IN_BOX = """
 SELECT place_id, geom FROM rtree_places_geom JOIN places ON place_id = id

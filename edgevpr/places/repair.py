@@ -8,7 +8,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TypeVar
 
-from edgevpr.errors import MapError
+from edgevpr.core.errors import MapError
 from edgevpr.places import mapfiles
 from edgevpr.places.examine import Examined, examine, faults
 from edgevpr.places.mapfile import PlaceMap

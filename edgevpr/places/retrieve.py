@@ -8,14 +8,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from edgevpr.contract import Descriptor, FineMatch, Technique
-from edgevpr.errors import MapError, PlaceError
-from edgevpr.geodesy import distance_m
+from edgevpr.core.contract import Descriptor, FineMatch, Technique
+from edgevpr.core.errors import MapError, PlaceError
+from edgevpr.core.geodesy import distance_m
+from edgevpr.core.types import Candidate
 from edgevpr.places.candidates import Chosen, best_scanned, every_possible
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.visit import Seen, Visit, left_out, require_there
-from edgevpr.types import Candidate
 
 _NEIGHBOURS_WITHOUT_POSITION = 2
 _COMPARED_ELSEWHERE = 5

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgevpr.contract import PartSpec
+from edgevpr.core.contract import PartSpec
+from edgevpr.core.types import Frame, Place, Pose, Position, Salience
 from edgevpr.places import geopackage
 from edgevpr.places.sqlite import is_of_one_row
-from edgevpr.types import Frame, Place, Pose, Position, Salience
 
 CHECKSUMS = "geom_crc32, coarse_crc32, fine_crc32"
 NEW_CHECKSUMS = "pose_crc32, landmarks_crc32"  # of what maps of format 4 have

@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from edgevpr.contract import TechniqueSpec
+from edgevpr.core.contract import TechniqueSpec
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.retrieve import Ranking
 

@@ -4,12 +4,12 @@ from pathlib import Path
 
 import numpy as np
 
+from edgevpr.core.types import Place
 from edgevpr.places import mapfiles
 from edgevpr.places.examine import examine
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.sqlite import sentences
 from edgevpr.places.thin import best_places
-from edgevpr.types import Place
 
 _EMPTY_BYTES = 45_056  # of a map without places
 _LOW = 0.5  # of its worth is left to a place that was kept only to bound a gap

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from edgevpr.errors import MapBusyError, MapError
+from edgevpr.core.errors import MapBusyError, MapError
 from edgevpr.places.geopackage import point_or_none
 from edgevpr.places.mapfiles import beside
 

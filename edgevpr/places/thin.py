@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from edgevpr.geodesy import metres
+from edgevpr.core.geodesy import metres
 
 _BLOCK = 256  # places in a block; the least worth of each block is kept, so that the least of all is found quickly
 

@@ -18,8 +18,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from edgevpr.contract import Descriptor, FineMatch, Technique
-from edgevpr.errors import MapError, PlaceError
+from edgevpr.core.contract import Descriptor, FineMatch, Technique
+from edgevpr.core.errors import MapError, PlaceError
 from edgevpr.places.candidates import Chosen
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap

@@ -4,12 +4,12 @@ import os
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from edgevpr.config import BUDGET_MB, HIGHEST_RATE_HZ, LOWEST_RATE_HZ, bounded, build
-from edgevpr.errors import ConfigError
-from edgevpr.helpers.text import meant
+from edgevpr.core.config import BUDGET_MB, HIGHEST_RATE_HZ, LOWEST_RATE_HZ, bounded, build
+from edgevpr.core.errors import ConfigError
+from edgevpr.core.resources import shipped
+from edgevpr.core.text import meant
+from edgevpr.core.yamlfile import read_yaml
 from edgevpr.power import machine, thermal
-from edgevpr.resources import shipped
-from edgevpr.yamlfile import read_yaml
 
 _ANY_MACHINE = "generic-x86"
 _SAME_RAM = 1.02  # kernels keep some RAM for themselves, every version another amount

@@ -8,9 +8,9 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from edgevpr.core.types import StageCost
 from edgevpr.power.boards import Board
 from edgevpr.power.equations import marginal_energy_j
-from edgevpr.types import StageCost
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -7,7 +7,7 @@ different times do not add. Their energies do, as 5.6 says.
 import re
 from dataclasses import dataclass
 
-from edgevpr.errors import ConfigError
+from edgevpr.core.errors import ConfigError
 
 CPU_RAIL_V = 2.5  # the thesis's V: it counts the charge drawn from the CPU's rail
 _CELL_V = 3.7  # nominal voltage of a lithium-polymer cell

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import psutil
 
-from edgevpr.types import StageCost
+from edgevpr.core.types import StageCost
 
 _KEPT_WAITING = 0.15  # of busy time: a thread that did not run for longer was kept waiting (its own waits are shorter)
 

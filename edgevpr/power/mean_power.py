@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from edgevpr.errors import UsageError
+from edgevpr.core.errors import UsageError
 from edgevpr.power.powermeter import ABSURD_W, Meter, MeterError, PowerSample
 
 _GONE_AFTER = 3  # failures in a row: the meter is gone, and a mean from before would hide it

@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+from edgevpr.core.types import NO_COST, QueryCost, StageCost, Steps
 from edgevpr.power import machine
 from edgevpr.power.boards import Board
 from edgevpr.power.equations import Pack, marginal_energy_j, pack_ah, stage_energy_j
-from edgevpr.types import NO_COST, QueryCost, StageCost, Steps
 
 Clock = Callable[[], float]
 _PSS_EVERY_S = 20.0

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from edgevpr.errors import EdgevprError
+from edgevpr.core.errors import EdgevprError
 
 ABSURD_W = 1000.0  # no companion computer draws this: the reading is wrong (the bound of `full_w` in a profile)
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from edgevpr.contract import Technique
-from edgevpr.errors import EdgevprError, UsageError
-from edgevpr.helpers.text import meant
+from edgevpr.core.contract import Technique
+from edgevpr.core.errors import EdgevprError, UsageError
+from edgevpr.core.text import meant
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from edgevpr.errors import UsageError
+from edgevpr.core.errors import UsageError
 from edgevpr.techniques.heads.pooling import flatten
 from edgevpr.techniques.heads.projection import gaussian_projection
 from edgevpr.techniques.networks.session import open_backbone

@@ -12,7 +12,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from edgevpr.errors import UsageError
+from edgevpr.core.errors import UsageError
 from edgevpr.techniques.heads.pooling import pyramid
 from edgevpr.techniques.networks.session import open_backbone
 from edgevpr.techniques.vectors import VectorTechnique

@@ -17,8 +17,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from edgevpr.contract import Descriptor, FineMatch, PartSpec, Picture, TechniqueSpec, nearest_height
-from edgevpr.errors import UsageError
+from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, Picture, TechniqueSpec, nearest_height
+from edgevpr.core.errors import UsageError
 from edgevpr.techniques import placecode, placewords
 from edgevpr.techniques.alignment import align
 from edgevpr.techniques.displacement import displacement, share, support

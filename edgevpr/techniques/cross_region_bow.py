@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from edgevpr.contract import Descriptor, FineMatch, PartSpec
+from edgevpr.core.contract import Descriptor, FineMatch, PartSpec
 from edgevpr.techniques.heads.regions import describe, find_regions, from_bytes, mutual_score, to_bytes
 from edgevpr.techniques.heads.words import bag_of_words, load_words
 from edgevpr.techniques.region_vlad import region_backbone

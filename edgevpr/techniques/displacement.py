@@ -16,7 +16,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from edgevpr.contract import Support
+from edgevpr.core.contract import Support
 
 _ALONG = 3  # cells: near and far ground move by steps that differ by so much, where the camera looks ahead
 _RANKED = 4  # of so many regions one is ranked: ranks cost more than all the rest

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from edgevpr.errors import UsageError
+from edgevpr.core.errors import UsageError
 from edgevpr.techniques.gradients import grey_square, mask_square, normalised_blocks, oriented_cells
 from edgevpr.techniques.vectors import VectorTechnique
 

@@ -11,7 +11,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from edgevpr.errors import UsageError
+from edgevpr.core.errors import UsageError
 from edgevpr.techniques.heads import vlad
 from edgevpr.techniques.heads.words import load_words, whitened
 from edgevpr.techniques.networks.session import open_backbone

@@ -18,10 +18,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from edgevpr.errors import ModelError
-from edgevpr.helpers.files import read_file
-from edgevpr.helpers.npz import arrays_of
-from edgevpr.resources import find_model
+from edgevpr.core.errors import ModelError
+from edgevpr.core.files import read_file
+from edgevpr.core.npz import arrays_of
+from edgevpr.core.resources import find_model
 from edgevpr.techniques.patterns import slow_patterns
 
 DTYPE = "<u2"  # of a word

@@ -10,7 +10,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from edgevpr.errors import ModelError, UsageError
+from edgevpr.core.errors import ModelError, UsageError
 from edgevpr.techniques.heads import vlad
 from edgevpr.techniques.heads.regions import SMALLEST, describe, find_regions
 from edgevpr.techniques.heads.words import load_words

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from edgevpr.contract import Descriptor, FineMatch, PartSpec
+from edgevpr.core.contract import Descriptor, FineMatch, PartSpec
 from edgevpr.techniques.heads.regions import from_bytes, mutual_score, to_bytes
 from edgevpr.techniques.heads.rmac import aggregate, regional_vectors, square_regions
 from edgevpr.techniques.networks.session import open_backbone

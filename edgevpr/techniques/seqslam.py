@@ -10,8 +10,8 @@ import math
 import cv2
 import numpy as np
 
-from edgevpr.contract import Descriptor, PartSpec, TechniqueSpec
-from edgevpr.errors import UsageError
+from edgevpr.core.contract import Descriptor, PartSpec, TechniqueSpec
+from edgevpr.core.errors import UsageError
 
 _WINDOW = 10  # R_window of the paper: five places before and five after
 _GREYEST = 128  # a pixel as bright as the mean of its patch

@@ -10,9 +10,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from edgevpr.config import FORMS
-from edgevpr.contract import Descriptor, PartSpec, TechniqueSpec
-from edgevpr.errors import ModelError, UsageError
+from edgevpr.core.config import FORMS
+from edgevpr.core.contract import Descriptor, PartSpec, TechniqueSpec
+from edgevpr.core.errors import ModelError, UsageError
 from edgevpr.techniques.hamming import hamming
 
 # A margin that no match can reach. The margins of wrong matches are known for the weights that edgevpr ships. With

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from edgevpr.contract import Picture
+from edgevpr.core.contract import Picture
 from edgevpr.techniques.placewords import QUARTERS, turned_blocks
 
 # Each is about 1.4 times the one before: the votes of a view still agree where the height is 1.2 times off.

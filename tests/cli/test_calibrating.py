@@ -8,10 +8,10 @@ import cv2
 import pytest
 from pictures import textured
 
-from edgevpr.calibrate import calibrate
 from edgevpr.cli.main import main
-from edgevpr.confidence.stored import from_text
+from edgevpr.mapmaking import calibrate
 from edgevpr.places.mapfile import PlaceMap
+from edgevpr.runtime.recognise.stored_confidence import from_text
 
 PLACES = 8
 
@@ -96,7 +96,7 @@ def test_a_build_that_cannot_calibrate_says_why_and_is_whole(flight, tmp_path, c
     said = capsys.readouterr()
     assert f"edgevpr: the map is not calibrated: {tmp_path / 'small.gpkg'} has {PLACES} places" in said.err
     assert "expect:" not in said.out
-    monkeypatch.setitem(sys.modules, "edgevpr.calibrate.calibrate", None)  # as where SciPy is missing
+    monkeypatch.setitem(sys.modules, "edgevpr.mapmaking.calibrate", None)  # as where SciPy is missing
     assert built(tmp_path / "bare.gpkg", flight / "ref") == 0
     said = capsys.readouterr()
     assert "the map is not calibrated: Calibrating a map needs SciPy" in said.err

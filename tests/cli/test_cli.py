@@ -10,9 +10,9 @@ import pytest
 from pictures import textured
 
 from edgevpr.cli.main import main
+from edgevpr.core.types import StageCost
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.preflight import pick
-from edgevpr.types import StageCost
 
 
 @pytest.fixture(scope="module")

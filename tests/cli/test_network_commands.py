@@ -11,8 +11,8 @@ from pictures import textured
 from tiny_networks import write_network
 
 from edgevpr.cli.main import main
-from edgevpr.config import FORMS, load_config
-from edgevpr.errors import ConfigError, ModelError, UsageError
+from edgevpr.core.config import FORMS, load_config
+from edgevpr.core.errors import ConfigError, ModelError, UsageError
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.preflight import stored

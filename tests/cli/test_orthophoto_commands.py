@@ -12,10 +12,10 @@ pytest.importorskip("rasterio", reason="rasterio is not installed (pip install '
 import rasterio
 from rasters import HOME, textured_raster, write_raster
 
-from edgevpr.calibrate import calibrate
 from edgevpr.cli.main import main
+from edgevpr.core.geodesy import distance_m, moved
 from edgevpr.frames.positions import read_positions
-from edgevpr.geodesy import distance_m, moved
+from edgevpr.mapmaking import calibrate
 from edgevpr.places.mapfile import PlaceMap
 
 

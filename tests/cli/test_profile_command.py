@@ -8,14 +8,14 @@ import pytest
 
 from edgevpr import techniques
 from edgevpr.cli.main import main
+from edgevpr.core.resources import shipped
+from edgevpr.core.types import StageCost
 from edgevpr.power import machine, sensors, speed
 from edgevpr.power.boards import board_names, load_board
-from edgevpr.resources import shipped
 from edgevpr.runtime.preflight import accuracy
 from edgevpr.runtime.preflight import stored as measured
 from edgevpr.runtime.preflight.probe import TechniqueCosts
 from edgevpr.runtime.preflight.trial import Trial
-from edgevpr.types import StageCost
 
 COSTS = TechniqueCosts(
     encode=StageCost(0.1, 0.1),

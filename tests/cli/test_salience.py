@@ -10,7 +10,7 @@ pytest.importorskip("onnx", reason="the test networks are written with onnx (pip
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "salience"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "runtime/recognise"))
 from tiny_detectors import write_detector, write_memorability
 
 from edgevpr.cli.main import main

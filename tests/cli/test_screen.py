@@ -11,7 +11,7 @@ from pictures import textured
 
 from edgevpr.cli.main import main
 from edgevpr.cli.screen import LineFormatter
-from edgevpr.helpers.text import decoded_name, printable, shown, without_passwords
+from edgevpr.core.text import decoded_name, printable, shown, without_passwords
 
 REDDENING = "\x1b[31m.jpg"  # a name that would make all that follows red
 

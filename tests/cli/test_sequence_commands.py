@@ -7,7 +7,7 @@ import pytest
 from pictures import textured
 
 from edgevpr.cli.main import main
-from edgevpr.config import load_config
+from edgevpr.core.config import load_config
 from edgevpr.places.index import bytes_per_place
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board

@@ -6,10 +6,10 @@ import re
 import photographs
 import pytest
 
+from edgevpr.core.types import Position
 from edgevpr.frames.exif import read_exif
 from edgevpr.frames.images import read_image
 from edgevpr.frames.positions import GeoTag
-from edgevpr.types import Position
 
 pytest.importorskip("PIL", reason="the photographs with EXIF are made with Pillow")
 

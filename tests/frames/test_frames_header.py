@@ -14,7 +14,7 @@ import numpy as np
 import photographs
 import pytest
 
-from edgevpr.errors import ImageError
+from edgevpr.core.errors import ImageError
 from edgevpr.frames.header import Header, read_header
 from edgevpr.frames.images import MAX_PIXELS, read_image
 
@@ -110,7 +110,7 @@ def test_a_small_file_does_not_take_gigabytes(tmp_path):
     (tmp_path / "bomb.png").write_bytes(png(side, side, bytes(side + 1) * side))
     assert (tmp_path / "bomb.png").stat().st_size < 1_300_000
     code = (
-        "import sys\nfrom edgevpr.errors import ImageError\nfrom edgevpr.frames.images import read_image\n"
+        "import sys\nfrom edgevpr.core.errors import ImageError\nfrom edgevpr.frames.images import read_image\n"
         "try:\n    read_image(sys.argv[1])\nexcept ImageError as error:\n    print(error)"
     )
 

@@ -4,7 +4,7 @@ import numpy as np
 import photographs
 import pytest
 
-from edgevpr.errors import ImageError, SourceError
+from edgevpr.core.errors import ImageError, SourceError
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.opencv import cv2
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from fakes import FakeClock
 
-from edgevpr.errors import SourceError
+from edgevpr.core.errors import SourceError
 from edgevpr.frames import streams
 from edgevpr.frames.condition import Condition
 from edgevpr.frames.live import Camera, LiveSource, wait_before_reopening_s

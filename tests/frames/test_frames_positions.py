@@ -5,9 +5,9 @@ import re
 
 import pytest
 
-from edgevpr.errors import UsageError
+from edgevpr.core.errors import UsageError
+from edgevpr.core.types import Position
 from edgevpr.frames.positions import GeoTag, find_positions, parse_time, read_positions, write_positions
-from edgevpr.types import Position
 
 HEADER = "file,split,lat,lon,alt,rel_alt,yaw_deg,time\n"
 FIRST = "0000.jpg,ref,46.84260708,-91.99455989,198.309,39.8,46.0,2016:06:23 16:31:59\n"

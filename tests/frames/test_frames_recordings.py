@@ -10,9 +10,9 @@ import photographs
 import pytest
 from films import cut_in_half, film, overwrite_in_the_middle
 
-from edgevpr.errors import ImageError, SourceError, UsageError
+from edgevpr.core.errors import ImageError, SourceError, UsageError
+from edgevpr.core.types import Position
 from edgevpr.frames.source import open_source
-from edgevpr.types import Position
 
 RATE_HZ = 10
 SHADES = range(0, 250, 10)  # of the frames of the test video: 2.5 s

@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
+from edgevpr.core.types import Frame, Pose, Vehicle
 from edgevpr.frames.level import Lens, View, levelled
-from edgevpr.simulate.camera import Camera, Light, photograph
-from edgevpr.simulate.camera import Pose as CameraPose
-from edgevpr.types import Frame, Pose, Vehicle
+from edgevpr.lab.simulate.camera import Camera, Light, photograph
+from edgevpr.lab.simulate.camera import Pose as CameraPose
 
 CAMERA = Camera(noise_sigma=0)
 LENS = Lens(2 * math.degrees(math.atan(320 / CAMERA.focal_px)))

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from pictures import textured
 
-from edgevpr.errors import ImageError, UsageError
+from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.frames.mask import NoMask, encoded, mask_of, read_mask
 from edgevpr.techniques import create
 

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from edgevpr.errors import SourceError, UsageError
+from edgevpr.core.errors import SourceError, UsageError
 from edgevpr.frames.images import read_image
 from edgevpr.frames.mask import read_mask
 from edgevpr.frames.overlay import FEWEST_FRAMES, learn_overlay, require_png, write_mask

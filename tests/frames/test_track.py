@@ -2,10 +2,10 @@
 
 import pytest
 
-from edgevpr.errors import UsageError
+from edgevpr.core.errors import UsageError
+from edgevpr.core.types import Position
 from edgevpr.frames.positions import GeoTag
 from edgevpr.frames.track import read_track
-from edgevpr.types import Position
 
 
 @pytest.fixture

@@ -9,8 +9,8 @@ import time
 import tty
 from pathlib import Path
 
+from edgevpr.lab.simulate.autopilot import AutopilotSummary, run_autopilot
 from edgevpr.mavlink.wire import Receiver, mavlink
-from edgevpr.simulate.autopilot import AutopilotSummary, run_autopilot
 
 PATIENCE_S = 60.0  # a machine that does much else is slow, and not wrong
 

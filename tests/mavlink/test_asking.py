@@ -6,7 +6,7 @@ import pytest
 from answering_autopilot import AnsweringAutopilot, healthy_messages
 from mavlink_peers import SerialCable, free_port
 
-from edgevpr.errors import LinkAddressError, LinkError
+from edgevpr.core.errors import LinkAddressError, LinkError
 from edgevpr.mavlink import asking as module
 from edgevpr.mavlink import reading
 from edgevpr.mavlink.address import LinkAddress, parse_link

@@ -6,6 +6,7 @@ import pytest
 from fakes import FakeClock
 from mavlink_peers import Peer, UdpPort, wait_until
 
+from edgevpr.core.types import Position
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.autopilots import ardupilot, px4
 from edgevpr.mavlink.autopilots.channel import Asked, Channel, Kind, kind_of
@@ -13,7 +14,6 @@ from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.listener import NoListener
 from edgevpr.mavlink.positions import State
 from edgevpr.mavlink.wire import mavlink
-from edgevpr.types import Position
 
 ARDUPILOT, PX4 = mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, mavlink.MAV_AUTOPILOT_PX4
 STATE = State(

@@ -6,7 +6,7 @@ import pytest
 from fakes import FakeClock
 from mavlink_peers import Peer, UdpPort, free_port, wait_until
 
-from edgevpr.errors import LinkAddressError
+from edgevpr.core.errors import LinkAddressError
 from edgevpr.mavlink.address import LinkAddress, parse_link, parse_links
 from edgevpr.mavlink.ground import GroundLink
 from edgevpr.mavlink.link import Link

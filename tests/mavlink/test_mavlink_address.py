@@ -3,7 +3,7 @@ import socket
 import pytest
 
 from edgevpr.cli.main import main
-from edgevpr.errors import LinkAddressError, LinkError
+from edgevpr.core.errors import LinkAddressError, LinkError
 from edgevpr.mavlink.address import LinkAddress, parse_link
 from edgevpr.mavlink.transport import open_transport
 

@@ -12,7 +12,7 @@ import pytest
 from fakes import FakeClock
 from mavlink_peers import Peer, TcpServer, UdpPort, free_port, wait_until
 
-from edgevpr.errors import LinkError
+from edgevpr.core.errors import LinkError
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Fix, Health, Severity, place_match, query_figures, status_text

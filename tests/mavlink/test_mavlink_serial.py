@@ -10,7 +10,7 @@ import pytest
 from fakes import FakeClock
 from mavlink_peers import AutopilotThread, SerialCable, wait_until
 
-from edgevpr.errors import LinkError
+from edgevpr.core.errors import LinkError
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Fix, Severity, status_text

@@ -10,7 +10,7 @@ import pytest
 from fakes import FakeClock
 from mavlink_peers import Peer, UdpPort, free_port, wait_until
 
-from edgevpr.errors import ConfigError
+from edgevpr.core.errors import ConfigError
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.conversation import Conversation
 from edgevpr.mavlink.link import Link

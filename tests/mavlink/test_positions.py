@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from edgevpr.geodesy import moved
+from edgevpr.core.geodesy import moved
 from edgevpr.mavlink.autopilots.px4 import SENSOR_ID
 from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.positions import State, gps_input, odometry, position_sensor

@@ -7,7 +7,7 @@ import pytest
 from fakes import FakeClock
 from mavlink_peers import wait_until
 
-from edgevpr.errors import ConfigError
+from edgevpr.core.errors import ConfigError
 from edgevpr.mavlink.timestamps import OLD, TICKS_S, BorrowedTimeStamps, TimeStamps
 
 STREAM = (7, 1, 0)

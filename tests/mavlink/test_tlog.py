@@ -15,7 +15,7 @@ from fakes import FakeClock
 from full_disk import no_file_larger_than
 from mavlink_peers import Peer, TcpServer, UdpPort, free_port, wait_until
 
-from edgevpr.errors import EdgevprError
+from edgevpr.core.errors import EdgevprError
 from edgevpr.mavlink import messages, tlog
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.line import Line

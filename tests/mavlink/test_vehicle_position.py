@@ -6,11 +6,11 @@ import pytest
 from fakes import FakeClock
 from mavlink_peers import Peer, UdpPort, wait_until
 
-from edgevpr.geodesy import offset_m
+from edgevpr.core.geodesy import offset_m
+from edgevpr.core.types import Vehicle
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.wire import mavlink
-from edgevpr.types import Vehicle
 
 
 @pytest.fixture

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from edgevpr.contract import Descriptor, PartSpec, TechniqueSpec
+from edgevpr.core.contract import Descriptor, PartSpec, TechniqueSpec
+from edgevpr.core.types import Frame, Position
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.types import Frame, Position
 
 SPEC = TechniqueSpec(name="test", parameters={"seed": 1}, coarse=PartSpec((64,), "<f2"), fine=PartSpec((40, 32), "<f4"))
 

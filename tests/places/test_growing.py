@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from ranking import rank
 
-from edgevpr.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
-from edgevpr.errors import MapError
+from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
+from edgevpr.core.errors import MapError
+from edgevpr.core.types import Frame, Position
 from edgevpr.places.growing import GrowingIndex
 from edgevpr.places.index import bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.techniques import create
-from edgevpr.types import Frame, Position
 
 
 class Signs:

@@ -18,14 +18,14 @@ import pytest
 from full_disk import no_file_larger_than
 from map_writer import SPEC, descriptor, frame, make_map
 
-from edgevpr.errors import MapBusyError, MapError, UsageError
+from edgevpr.core.errors import MapBusyError, MapError, UsageError
+from edgevpr.core.types import Position
 from edgevpr.places.examine import absorb, examine
 from edgevpr.places.geopackage import point_blob
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapinfo import info_of
 from edgevpr.places.near import index_positions, nearest_m
 from edgevpr.places.rows import LANDMARKS, POSE, SALIENCE, readable
-from edgevpr.types import Position
 
 PLACES = 40
 

@@ -6,11 +6,11 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from edgevpr.contract import Descriptor, PartSpec, TechniqueSpec
+from edgevpr.core.contract import Descriptor, PartSpec, TechniqueSpec
+from edgevpr.core.types import Frame, Position
 from edgevpr.places.identity import MapIdentity, identity_of
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.sqlite import connect
-from edgevpr.types import Frame, Position
 
 SPEC = TechniqueSpec(name="x", parameters={}, coarse=PartSpec((4,), "<f4"), fine=PartSpec((8,), "|u1"))
 

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from ranking import rank
 
-from edgevpr.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
-from edgevpr.errors import MapError
+from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
+from edgevpr.core.errors import MapError
+from edgevpr.core.types import Frame, Position
 from edgevpr.places.index import bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import best_scanned, elsewhere, margin, named
-from edgevpr.types import Frame, Position
 
 
 class Ruler:

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from ranking import rank
 
-from edgevpr.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
-from edgevpr.errors import MapError, PlaceError
-from edgevpr.evaluate.dataset import load_dataset
+from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
+from edgevpr.core.errors import MapError, PlaceError
+from edgevpr.core.types import Frame, Position
 from edgevpr.frames.images import read_image
+from edgevpr.lab.evaluate.dataset import load_dataset
 from edgevpr.places.geopackage import point_blob
 from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
@@ -20,7 +21,6 @@ from edgevpr.places.retrieve import margin, named
 from edgevpr.places.sequence import Alone
 from edgevpr.runtime.recognise.judge import AcceptRule, judge
 from edgevpr.techniques import create
-from edgevpr.types import Frame, Position
 
 RULE = AcceptRule(min_score=0.1, min_margin=0.1, neighbour_m=20.0)
 

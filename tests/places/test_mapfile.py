@@ -18,8 +18,9 @@ import numpy as np
 import pytest
 from map_writer import SPEC, descriptor, frame, make_map
 
-from edgevpr.contract import PartSpec
-from edgevpr.errors import MapError, PlaceError
+from edgevpr.core.contract import PartSpec
+from edgevpr.core.errors import MapError, PlaceError
+from edgevpr.core.types import Position
 from edgevpr.places.examine import absorb
 from edgevpr.places.geojson import write_geojson
 from edgevpr.places.geopackage import point_blob
@@ -28,7 +29,6 @@ from edgevpr.places.mapinfo import info_of
 from edgevpr.places.near import index_positions, nearest_m
 from edgevpr.places.repair import repair
 from edgevpr.places.shrink import shrink
-from edgevpr.types import Position
 
 
 @pytest.fixture(scope="module")

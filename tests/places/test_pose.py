@@ -6,10 +6,10 @@ import sqlite3
 import pytest
 from test_mapfile import SPEC, descriptor, frame
 
-from edgevpr.errors import PlaceError
+from edgevpr.core.errors import PlaceError
+from edgevpr.core.types import Pose, Position
 from edgevpr.places.examine import absorb, examine
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.types import Pose, Position
 
 POSE = Pose(up_deg=271.5, footprint_m=66.0, covariance_m2=(4.0, -1.0, 2.25), recorded=Position(50.1, 8.2))
 LANDMARKS = bytes(range(200))

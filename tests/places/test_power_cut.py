@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from map_writer import SPEC, descriptor, frame, make_map
 
-from edgevpr.errors import MapError
+from edgevpr.core.errors import MapError
 from edgevpr.places.mapfile import PlaceMap
 
 FIRST, PLACES = 2, 8  # of an earlier flight, and added to them

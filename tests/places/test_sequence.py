@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from map_writer import SPEC
 
-from edgevpr.contract import FineMatch
+from edgevpr.core.contract import FineMatch
 from edgevpr.places.index import PlaceIndex, empty_index
 from edgevpr.places.retrieve import Ranking
 from edgevpr.places.sequence import FOLLOWED_SPEEDS, SequenceSearch, bytes_beside_place, length_of, trajectories

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from edgevpr.contract import FineMatch
+from edgevpr.core.contract import FineMatch
 from edgevpr.places.retrieve import Ranking, together
 
 

@@ -4,9 +4,9 @@ import os
 
 import pytest
 
-from edgevpr.errors import ConfigError
+from edgevpr.core.errors import ConfigError
+from edgevpr.core.resources import shipped
 from edgevpr.power.boards import board_names, load_board
-from edgevpr.resources import shipped
 
 PROFILE = (shipped("profiles") / "rpi-4b.yaml").read_text()
 

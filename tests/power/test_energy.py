@@ -5,10 +5,10 @@ import time
 
 import pytest
 
+from edgevpr.core.types import StageCost
 from edgevpr.power.boards import load_board
 from edgevpr.power.energy import RunningEnergy
 from edgevpr.power.meter import stage
-from edgevpr.types import StageCost
 
 PI4 = load_board("rpi-4b")  # 2.29 W idle, 6.82 W full, 4 cores
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from edgevpr.errors import ConfigError
+from edgevpr.core.errors import ConfigError
 from edgevpr.power import equations
 from edgevpr.power.equations import Pack, parse_pack
 

@@ -8,8 +8,8 @@ import time
 import pytest
 from fakes import FakeClock
 
+from edgevpr.core.types import StageCost
 from edgevpr.power.load import OwnLoad, cpu_spent_s, machine_load
-from edgevpr.types import StageCost
 
 
 def test_a_busy_core_is_seen():

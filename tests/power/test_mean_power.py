@@ -2,7 +2,7 @@
 
 import pytest
 
-from edgevpr.errors import UsageError
+from edgevpr.core.errors import UsageError
 from edgevpr.power.mean_power import mean_power
 from edgevpr.power.powermeter import Meter, MeterError
 

@@ -5,10 +5,10 @@ import time
 
 import pytest
 
+from edgevpr.core.types import NO_COST, StageCost
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import Pack, parse_pack
 from edgevpr.power.meter import OwnMemory, QueryMeter, query_cost, stage
-from edgevpr.types import NO_COST, StageCost
 
 
 def clock(*readings):

@@ -7,14 +7,14 @@ from collections import deque
 import numpy as np
 from fakes import vehicle_at
 
-from edgevpr.contract import FineMatch
+from edgevpr.core.contract import FineMatch
+from edgevpr.core.geodesy import moved, offset_m
+from edgevpr.core.types import Candidate, Frame, Place, Position, QueryCost, Receiver, Steps, Vehicle
 from edgevpr.frames.level import Levelled, View
-from edgevpr.geodesy import moved, offset_m
 from edgevpr.mavlink.attitude import Attitude
 from edgevpr.runtime.flight.navigator import Advice, Navigator
 from edgevpr.runtime.recognise.locate import Located
 from edgevpr.runtime.recognise.recognition import Recognition
-from edgevpr.types import Candidate, Frame, Place, Position, QueryCost, Receiver, Steps, Vehicle
 
 HOME = 47.0, 8.0
 GPS_SD_M = 1.0

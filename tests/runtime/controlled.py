@@ -9,8 +9,12 @@ from air import match_at
 from fakes import FakeClock
 from mavlink_peers import wait_until
 
-from edgevpr.config import SourceSetsConfig
-from edgevpr.geodesy import moved
+from edgevpr.core.config import SourceSetsConfig
+from edgevpr.core.geodesy import moved
+from edgevpr.core.types import Position
+from edgevpr.lab.simulate.flight import ORIGIN
+from edgevpr.lab.simulate.flightcontroller.controller import FlightController
+from edgevpr.lab.simulate.flightcontroller.freeflight import FreeFlight
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Health
@@ -19,10 +23,6 @@ from edgevpr.power.load import MachineLoad
 from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.navigator import Muted, Navigator
 from edgevpr.runtime.flight.sourcesets import SourceSets
-from edgevpr.simulate.flight import ORIGIN
-from edgevpr.simulate.flightcontroller.controller import FlightController
-from edgevpr.simulate.flightcontroller.freeflight import FreeFlight
-from edgevpr.types import Position
 
 STEP_S = 0.025
 FIX_SD_M = 1.0

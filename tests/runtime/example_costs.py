@@ -1,7 +1,7 @@
 """Costs in round figures of the size of cohog (exact matching of many regions) and of hog (a long vector in RAM)."""
 
+from edgevpr.core.types import StageCost
 from edgevpr.runtime.preflight.probe import TechniqueCosts
-from edgevpr.types import StageCost
 
 REGIONS = TechniqueCosts(
     encode=StageCost(0.1, 0.1),

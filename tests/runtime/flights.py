@@ -4,7 +4,7 @@ from pathlib import Path
 
 from fakes import FakeClock, FakeLink, FakeSource
 
-from edgevpr.config import Config, load_config
+from edgevpr.core.config import Config, load_config
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import parse_pack
 from edgevpr.power.meter import QueryMeter

@@ -9,9 +9,9 @@ from pictures import textured
 from tiny_networks import write_card, write_network
 
 from edgevpr import techniques
-from edgevpr.errors import ModelError
-from edgevpr.evaluate.dataset import load_dataset
-from edgevpr.evaluate.evaluate import evaluate
+from edgevpr.core.errors import ModelError
+from edgevpr.lab.evaluate.dataset import load_dataset
+from edgevpr.lab.evaluate.evaluate import evaluate
 
 SHARED = Path(__file__).resolve().parents[3] / "shared"
 DATA = Path(os.environ.get("EDGEVPR_DATA") or SHARED / "data")

@@ -6,7 +6,7 @@ from pictures import textured
 from tiny_networks import CARD, FEATURES, write_card, write_network
 
 from edgevpr import techniques
-from edgevpr.errors import ModelError, UsageError
+from edgevpr.core.errors import ModelError, UsageError
 from edgevpr.techniques.heads import pooling, projection, rmac
 from edgevpr.techniques.networks.session import open_backbone
 

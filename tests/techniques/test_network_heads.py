@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pictures import textured
 
-from edgevpr.errors import ModelError, UsageError
+from edgevpr.core.errors import ModelError, UsageError
 from edgevpr.techniques import create
 from edgevpr.techniques.heads.regions import describe, find_regions
 from edgevpr.techniques.heads.vlad import local_descriptors

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from edgevpr.errors import ModelError, UsageError
+from edgevpr.core.errors import ModelError, UsageError
 from edgevpr.techniques import placewords
 from edgevpr.techniques.cohog import CoHog
 from edgevpr.techniques.gradients import normalised_blocks, oriented_cells

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pictures import textured
 
-from edgevpr.errors import UsageError
+from edgevpr.core.errors import UsageError
 from edgevpr.techniques.seqslam import SeqSlam, enhanced
 
 

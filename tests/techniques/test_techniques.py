@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pictures import textured
 
-from edgevpr.errors import UsageError
+from edgevpr.core.errors import UsageError
 from edgevpr.techniques import create, names
 
 

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from edgevpr.contract import nearest_height
+from edgevpr.core.contract import nearest_height
 from edgevpr.techniques import create
 from edgevpr.techniques.views import HEIGHT_RATIOS, ROTATIONS, cells_along, hypothesis
 

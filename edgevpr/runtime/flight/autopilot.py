@@ -5,7 +5,8 @@ from collections.abc import Collection
 from dataclasses import replace
 from enum import Enum, auto
 
-from edgevpr.config import SourceSetsConfig
+from edgevpr.core.config import SourceSetsConfig
+from edgevpr.core.types import FixReport, Vehicle
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.outbox import Sending
@@ -18,7 +19,6 @@ from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.flight.sourcesets import SourceSets
 from edgevpr.runtime.flight.status import LinkState
 from edgevpr.runtime.recognise.recognition import Recognition
-from edgevpr.types import FixReport, Vehicle
 
 # Where an autopilot listens, a fix leaves within a fraction of a millisecond. The loop waits for that, at most so long,
 # so that the log can tell what became of the fix.

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import partial
 
-from edgevpr.helpers.tape import Tape
+from edgevpr.core.tape import Tape
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgevpr.navigation.navigation import Expected
+from edgevpr.runtime.flight.navigation import Expected
 from edgevpr.runtime.recognise.locate import in_sd
 
 # In standard deviations of both together. A right fix is farther off than the first once in 3000 times; a second right

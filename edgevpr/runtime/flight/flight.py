@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 from typing import Any
 
-from edgevpr.config import Config
+from edgevpr.core.config import Config
+from edgevpr.core.tape import NO_TAPE
 from edgevpr.frames.source import Source
-from edgevpr.helpers.tape import NO_TAPE
 from edgevpr.runtime.flight.autopilot import Autopilot
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.commands import Commands

@@ -11,10 +11,10 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from edgevpr.errors import EdgevprError
-from edgevpr.helpers.appending import append, is_at, sync, sync_folder
-from edgevpr.helpers.jsonline import json_line
-from edgevpr.helpers.tape import NO_TAPE, Tape
+from edgevpr.core.appending import append, is_at, sync, sync_folder
+from edgevpr.core.errors import EdgevprError
+from edgevpr.core.jsonline import json_line
+from edgevpr.core.tape import NO_TAPE, Tape
 from edgevpr.runtime.flight.logfiles import LogFiles, identity, size_of
 
 _log = logging.getLogger(__name__)

@@ -3,7 +3,7 @@
 import logging
 from dataclasses import asdict
 
-from edgevpr.config import Config
+from edgevpr.core.config import Config
 from edgevpr.runtime.flight.autopilot import Autopilot, Mood
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.flightlog import FlightLog

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgevpr.geodesy import offset_m
-from edgevpr.navigation.navigation import worst_sd
+from edgevpr.core.geodesy import offset_m
+from edgevpr.core.types import Vehicle
+from edgevpr.runtime.flight.navigation import worst_sd
 from edgevpr.runtime.recognise.locate import in_sd, matrix_of
 from edgevpr.runtime.recognise.recognition import Recognition
-from edgevpr.types import Vehicle
 
 # Standard deviations of both. What is wrong with map and receiver stays for minutes, so a second look takes nothing off
 # it: of 3000 flights one map is so far off. With 5 m of the map, that is 23 m for good matches and a good receiver.

@@ -7,8 +7,8 @@ import stat
 from pathlib import Path
 from typing import BinaryIO
 
-from edgevpr.helpers import numbered
-from edgevpr.helpers.appending import open_appending, try_lock
+from edgevpr.core import numbered
+from edgevpr.core.appending import open_appending, try_lock
 
 _PARTS = 4  # of `max_mb`: the file that is written, and three for those that are set aside
 

@@ -6,9 +6,10 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import Protocol
 
-from edgevpr.errors import ImageError
+from edgevpr.core.errors import ImageError
+from edgevpr.core.tape import NO_TAPE, Tape
+from edgevpr.core.types import Frame, StageCost
 from edgevpr.frames.source import Source
-from edgevpr.helpers.tape import NO_TAPE, Tape
 from edgevpr.runtime.flight.autopilot import Autopilot
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.commands import Commands
@@ -19,7 +20,6 @@ from edgevpr.runtime.flight.reloading import NoReloading, Reloading
 from edgevpr.runtime.flight.vitals import Vitals
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
-from edgevpr.types import Frame, StageCost
 
 _TURN_S = 0.2  # the loop turns at least this often, with or without frames
 

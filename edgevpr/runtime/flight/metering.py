@@ -5,8 +5,9 @@ from contextlib import contextmanager
 from dataclasses import asdict, astuple
 from typing import Any
 
-from edgevpr.config import Config
-from edgevpr.helpers.tape import NO_TAPE, Tape
+from edgevpr.core.config import Config
+from edgevpr.core.tape import NO_TAPE, Tape
+from edgevpr.core.types import StageCost
 from edgevpr.power.boards import Board
 from edgevpr.power.energy import RunningEnergy
 from edgevpr.power.equations import Pack, marginal_energy_j, pack_ah, parse_pack
@@ -17,7 +18,6 @@ from edgevpr.power.thermal import ThermalState, ThermalWatch, limit_c
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.governor import Reading
 from edgevpr.runtime.recognise.recognition import Recognition
-from edgevpr.types import StageCost
 
 
 class FlightMeter:

@@ -10,19 +10,19 @@ from threading import Lock
 
 import numpy as np
 
-from edgevpr.geodesy import distance_m, moved
+from edgevpr.core.geodesy import distance_m, moved
+from edgevpr.core.types import Vehicle
 from edgevpr.mavlink.attitude import Attitude
 from edgevpr.mavlink.autopilots.channel import Channel
 from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.positions import State
-from edgevpr.navigation.filter import INERTIAL, RECKONED
-from edgevpr.navigation.navigation import Estimate, Navigation, reckons_by_gps
-from edgevpr.navigation.path import over_ground
-from edgevpr.navigation.slew import Slew
 from edgevpr.runtime.flight.consistency import Consistency, Seen
+from edgevpr.runtime.flight.filter import INERTIAL, RECKONED
+from edgevpr.runtime.flight.navigation import Estimate, Navigation, reckons_by_gps
+from edgevpr.runtime.flight.path import over_ground
+from edgevpr.runtime.flight.slew import Slew
 from edgevpr.runtime.recognise.locate import matrix_of
 from edgevpr.runtime.recognise.recognition import Recognition
-from edgevpr.types import Vehicle
 
 # What comes on top of what a fix knows of itself: the attitude is known to half a degree, and the time of a frame to
 # some hundredths of a second.

@@ -22,9 +22,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
-from edgevpr.errors import EdgevprError
-from edgevpr.helpers.appending import append, open_appending, sync
-from edgevpr.helpers.text import without_passwords
+from edgevpr.core.appending import append, open_appending, sync
+from edgevpr.core.errors import EdgevprError
+from edgevpr.core.text import without_passwords
 
 TAPE, FRAMES, MAP = "tape.jsonl", "frames", "map.gpkg"
 SPARED_BYTES = 100_000_000  # of the disk, which are left to logs and map

@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
 from typing import Any
 
-from edgevpr.config import Config, build
-from edgevpr.errors import ConfigError, EdgevprError
-from edgevpr.helpers.tape import NO_TAPE, Tape
+from edgevpr.core.config import Config, build
+from edgevpr.core.errors import ConfigError, EdgevprError
+from edgevpr.core.tape import NO_TAPE, Tape
 from edgevpr.runtime.flight.flightlog import FlightLog
 
 # Neither opens anything anew, nor decides who is told what.

@@ -2,7 +2,7 @@
 
 import math
 
-from edgevpr.config import SourceSetsConfig
+from edgevpr.core.config import SourceSetsConfig
 
 _GOOD_FOR_S = 10.0  # before GPS is asked for again
 

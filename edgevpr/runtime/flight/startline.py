@@ -7,9 +7,9 @@ from dataclasses import asdict
 from typing import Any
 
 from edgevpr import __version__
-from edgevpr.config import Config
-from edgevpr.contract import TechniqueSpec
-from edgevpr.errors import MapError
+from edgevpr.core.config import Config
+from edgevpr.core.contract import TechniqueSpec
+from edgevpr.core.errors import MapError
 from edgevpr.places.identity import MapIdentity, identity_of
 from edgevpr.places.mapfile import PlaceMap
 

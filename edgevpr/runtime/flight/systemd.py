@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from edgevpr.helpers.text import shown
+from edgevpr.core.text import shown
 from edgevpr.power.load import cpu_spent_s
 
 _SEND_TIMEOUT_S = 0.5

@@ -10,13 +10,13 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from edgevpr import techniques
-from edgevpr.config import LOWEST_RATE_HZ
-from edgevpr.errors import ConfigError, UsageError
+from edgevpr.core.config import LOWEST_RATE_HZ
+from edgevpr.core.errors import ConfigError, UsageError
+from edgevpr.core.types import FIX_MAX_AGE_S
 from edgevpr.power.boards import Board
 from edgevpr.runtime.preflight import accuracy
 from edgevpr.runtime.preflight.accuracy import Accuracy
 from edgevpr.runtime.preflight.probe import TechniqueCosts
-from edgevpr.types import FIX_MAX_AGE_S
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -6,7 +6,7 @@
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
-from edgevpr.errors import UsageError
+from edgevpr.core.errors import UsageError
 from edgevpr.power.boards import Board
 from edgevpr.power.equations import Pack, endurance_min, pack_ah, queries_ah
 from edgevpr.power.meter import query_cost

@@ -12,17 +12,17 @@ from pathlib import Path
 import numpy as np
 
 from edgevpr import techniques
-from edgevpr.config import build
-from edgevpr.errors import EdgevprError, ModelError
-from edgevpr.helpers.child import ask_child, last_line, serve_parent
-from edgevpr.helpers.files import read_file, write_whole
+from edgevpr.core.child import ask_child, last_line, serve_parent
+from edgevpr.core.config import build
+from edgevpr.core.errors import EdgevprError, ModelError
+from edgevpr.core.files import read_file, write_whole
+from edgevpr.core.resources import own_models
+from edgevpr.core.yamlfile import MAX_FILE_BYTES, read_yaml
 from edgevpr.power.machine import rss_mb
-from edgevpr.resources import own_models
-from edgevpr.salience.detector import detector_of
-from edgevpr.salience.memorability import CROPS, memorability_of
+from edgevpr.runtime.recognise.detector import detector_of
+from edgevpr.runtime.recognise.memorability import CROPS, memorability_of
 from edgevpr.techniques.networks.card import Card, card_names, load_card, read_card
 from edgevpr.techniques.networks.session import Backbone, backbone_of, file_sha256, import_onnxruntime
-from edgevpr.yamlfile import MAX_FILE_BYTES, read_yaml
 
 _ROUNDS = 10
 _FRAME = (480, 640)

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from edgevpr import techniques
-from edgevpr.config import FORMS
-from edgevpr.contract import Technique
-from edgevpr.errors import ModelError
+from edgevpr.core.config import FORMS
+from edgevpr.core.contract import Technique
+from edgevpr.core.errors import ModelError
 from edgevpr.power.boards import Board
 from edgevpr.runtime.recognise.opening import made_for
 from edgevpr.techniques import labelled

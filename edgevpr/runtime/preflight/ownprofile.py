@@ -4,8 +4,8 @@ import sys
 from datetime import datetime
 from pathlib import Path
 
-from edgevpr.errors import EdgevprError, UsageError
-from edgevpr.helpers.files import require_folder, write_whole
+from edgevpr.core.errors import EdgevprError, UsageError
+from edgevpr.core.files import require_folder, write_whole
 from edgevpr.power.boards import MachineSpeed
 
 _ENDINGS = (".yaml", ".yml")

@@ -5,9 +5,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from edgevpr import techniques
-from edgevpr.config import Config
-from edgevpr.contract import Technique
-from edgevpr.errors import MapError, ModelError, UsageError
+from edgevpr.core.config import Config
+from edgevpr.core.contract import Technique
+from edgevpr.core.errors import MapError, ModelError, UsageError
 from edgevpr.places.index import bytes_per_place
 from edgevpr.places.sequence import bytes_beside_place
 from edgevpr.power.boards import Board, load_board

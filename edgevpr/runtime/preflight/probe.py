@@ -12,8 +12,9 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from edgevpr.contract import Technique
-from edgevpr.errors import ModelError
+from edgevpr.core.contract import Technique
+from edgevpr.core.errors import ModelError
+from edgevpr.core.types import NO_COST, Frame, StageCost, Steps
 from edgevpr.places.index import PlaceIndex, bytes_per_place, empty_index, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.rows import MOST_LANDMARK_BYTES
@@ -25,7 +26,6 @@ from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.judge import AcceptRule
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
-from edgevpr.types import NO_COST, Frame, StageCost, Steps
 
 _PICTURES = 2
 _PLACES = 6

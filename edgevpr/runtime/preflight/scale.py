@@ -3,12 +3,12 @@ were counted; memory unchanged."""
 
 from dataclasses import asdict, dataclass, replace
 
+from edgevpr.core.types import StageCost
 from edgevpr.power.boards import Board, MachineSpeed
 from edgevpr.power.speed import REFERENCE_PASSES_HZ, REFERENCE_PRODUCTS_HZ
 from edgevpr.runtime.preflight import counted
 from edgevpr.runtime.preflight.counted import Work
 from edgevpr.runtime.preflight.probe import TechniqueCosts
-from edgevpr.types import StageCost
 
 # Share of a single thread's score, for boards whose products have not been measured: that of the Raspberry Pi 4, the
 # lowest that is known (Pi 5: 0.21), so that the estimate does not promise too much.

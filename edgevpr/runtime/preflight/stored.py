@@ -18,13 +18,13 @@ from pathlib import Path
 from typing import Any
 
 from edgevpr import techniques
-from edgevpr.config import build
-from edgevpr.errors import ConfigError, EdgevprError, UsageError
+from edgevpr.core.config import build
+from edgevpr.core.errors import ConfigError, EdgevprError, UsageError
+from edgevpr.core.files import read_file, require_folder, write_whole
+from edgevpr.core.resources import own_folder
 from edgevpr.frames.images import list_images, read_image
-from edgevpr.helpers.files import read_file, require_folder, write_whole
 from edgevpr.power import machine
 from edgevpr.power.boards import Board, MachineSpeed
-from edgevpr.resources import own_folder
 from edgevpr.runtime.preflight.offers import Offer
 from edgevpr.runtime.preflight.scale import is_same
 from edgevpr.runtime.preflight.trial import Trial, model_of, trial_of, try_each

@@ -11,14 +11,14 @@ from pathlib import Path
 from typing import Any
 
 from edgevpr import techniques
-from edgevpr.errors import EdgevprError
+from edgevpr.core.child import Ended, ask_child, last_line, serve_parent
+from edgevpr.core.errors import EdgevprError
+from edgevpr.core.types import StageCost
 from edgevpr.frames.images import read_image
-from edgevpr.helpers.child import Ended, ask_child, last_line, serve_parent
 from edgevpr.runtime.preflight.offers import Offer
 from edgevpr.runtime.preflight.probe import TechniqueCosts, noise, probe
 from edgevpr.runtime.recognise.opening import made_with
 from edgevpr.techniques.networks.card import load_card, weights_of
-from edgevpr.types import StageCost
 
 _TRIED_S = 1.0  # pictures are tried again for so long: a flight that begins has no such time
 _LIMIT_S = 900.0  # ten times what the slowest technique takes on the slowest board

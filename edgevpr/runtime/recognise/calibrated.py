@@ -2,10 +2,10 @@
 
 import logging
 
-from edgevpr.confidence.stored import Calibration, from_text
-from edgevpr.errors import MapError
+from edgevpr.core.errors import MapError
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.recognise.evidence import require_usable
+from edgevpr.runtime.recognise.stored_confidence import Calibration, from_text
 
 _log = logging.getLogger(__name__)
 

@@ -18,11 +18,11 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from edgevpr.confidence.model import Model
-from edgevpr.contract import TechniqueSpec
-from edgevpr.landmarks.agreement import Agreement
+from edgevpr.core.contract import TechniqueSpec
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.retrieve import Ranking, elsewhere
+from edgevpr.runtime.recognise.agreement import Agreement
+from edgevpr.runtime.recognise.confidence import Model
 
 AHEAD, DOWN, DOWN_BARE = "ahead", "down", "down_bare"
 _LOOKING_DOWN = {DOWN: ("agree", "lead", "coverage", "landmarks"), DOWN_BARE: ("agree", "lead", "coverage")}

@@ -11,18 +11,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgevpr.belief.belief import Belief, Posterior
-from edgevpr.belief.motion import Moved, moved
-from edgevpr.belief.seen import Ground, Seen
-from edgevpr.contract import FineMatch
-from edgevpr.geodesy import moved as moved_by
-from edgevpr.geodesy import offset_m
+from edgevpr.core.contract import FineMatch
+from edgevpr.core.geodesy import moved as moved_by
+from edgevpr.core.geodesy import offset_m
+from edgevpr.core.types import Frame, Position, Vehicle
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Ranking
+from edgevpr.runtime.recognise.belief import Belief, Posterior
 from edgevpr.runtime.recognise.judge import Sureness
 from edgevpr.runtime.recognise.locate import Located, matrix_of
-from edgevpr.types import Frame, Position, Vehicle
+from edgevpr.runtime.recognise.motion import Moved, moved
+from edgevpr.runtime.recognise.seen import Ground, Seen
 
 # Chosen on corridor, aerial_caliterra and aerial_garfield28.
 _SHARPNESS = 10.0  # of two places, how much more likely is the one with more votes: the power of the ratio

@@ -4,7 +4,7 @@ Screens without a signal, displays on a dark ground, bare sky, a covered lens: s
 information. The share of regions that agree on a place is then the share of a few, and reaches any limit by chance.
 """
 
-from edgevpr.contract import Descriptor
+from edgevpr.core.contract import Descriptor
 
 
 def says_nothing(query: Descriptor, min_quality: float) -> str | None:

@@ -7,11 +7,11 @@ position false. A query that is not accepted with hints is therefore followed by
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from edgevpr.contract import nearest_height
-from edgevpr.geodesy import distance_m
+from edgevpr.core.contract import nearest_height
+from edgevpr.core.geodesy import distance_m
+from edgevpr.core.types import Candidate, Frame, Position, Vehicle
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.retrieve import Expected
-from edgevpr.types import Candidate, Frame, Position, Vehicle
 
 _FIX_GOOD_FOR_S = 60.0
 

@@ -6,16 +6,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgevpr.confidence.model import Evidence, Model, prior
-from edgevpr.confidence.stored import Calibration
-from edgevpr.config import MatchConfig
-from edgevpr.contract import FineMatch, Technique
-from edgevpr.landmarks.agreement import Agreement
+from edgevpr.core.config import MatchConfig
+from edgevpr.core.contract import FineMatch, Technique
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.retrieve import Ranking, elsewhere, margin
 from edgevpr.places.sequence import Search, SequenceSearch
+from edgevpr.runtime.recognise.agreement import Agreement
+from edgevpr.runtime.recognise.confidence import Evidence, Model, prior
 from edgevpr.runtime.recognise.evidence import kind_of, kinds_of, said
 from edgevpr.runtime.recognise.locate import Located
+from edgevpr.runtime.recognise.stored_confidence import Calibration
 
 NEW_FOR_S = 30.0  # seconds; a place learnt so recently only repeats what the autopilot has just said
 

@@ -13,13 +13,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from edgevpr.config import Config
-from edgevpr.errors import MapBusyError, MapError, PlaceError, UsageError
+from edgevpr.core.config import Config
+from edgevpr.core.errors import MapBusyError, MapError, PlaceError, UsageError
+from edgevpr.core.geodesy import distance_m
+from edgevpr.core.types import Frame, Place, Position, Vehicle
 from edgevpr.frames.exif import read_exif
 from edgevpr.frames.images import list_images
 from edgevpr.frames.level import View
 from edgevpr.frames.positions import find_positions
-from edgevpr.geodesy import distance_m
 from edgevpr.places.growing import GrowingIndex
 from edgevpr.places.near import nearest_m
 from edgevpr.places.retrieve import named
@@ -28,7 +29,6 @@ from edgevpr.runtime.recognise.levelling import GPS_SD_M, laid
 from edgevpr.runtime.recognise.locate import HEARD, as_learnt, located
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
-from edgevpr.types import Frame, Place, Position, Vehicle
 
 # After a fix that the autopilot took, or perhaps took: so long its position may be only that fix. One that it refused
 # has no echo. That of the frame itself has none either: the position was heard before it.

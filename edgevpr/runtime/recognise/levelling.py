@@ -8,12 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from edgevpr.config import SourceConfig
-from edgevpr.contract import Technique
+from edgevpr.core.config import SourceConfig
+from edgevpr.core.contract import Technique
+from edgevpr.core.geodesy import axes_of, moved
+from edgevpr.core.types import Frame, Pose, Position, Vehicle
 from edgevpr.frames.level import UNKNOWN_VIEW, Lens, Levelled, View, leaning, levelled
 from edgevpr.frames.source import is_live
-from edgevpr.geodesy import axes_of, moved
-from edgevpr.types import Frame, Pose, Position, Vehicle
 
 GPS_SD_M = 5.0  # of one axis of a recorded position, as long as nothing better is known
 # Of the footprint: so far from the middle of the picture is the point under an aircraft that tilts by 3 degrees. Chosen

@@ -13,12 +13,12 @@ from itertools import compress
 
 import numpy as np
 
-from edgevpr.contract import FineMatch
+from edgevpr.core.contract import FineMatch
+from edgevpr.core.geodesy import axes_of, moved, offset_m
+from edgevpr.core.types import Candidate, Place, Pose, Position
 from edgevpr.frames.level import UNKNOWN_VIEW, View
-from edgevpr.geodesy import axes_of, moved, offset_m
-from edgevpr.landmarks.agreement import CONFIRMED, Agreement
+from edgevpr.runtime.recognise.agreement import CONFIRMED, Agreement
 from edgevpr.runtime.recognise.levelling import UNTOLD_TILT
-from edgevpr.types import Candidate, Place, Pose, Position
 
 # Chosen on aerial_caliterra and aerial_garfield28. Standard deviations of one axis of a step, as shares of the longest
 # side, that come on top of what a match knows of its own: tilt and relief move parts of a picture by different steps.

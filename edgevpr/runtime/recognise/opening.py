@@ -6,9 +6,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from edgevpr import techniques
-from edgevpr.config import Config, SalienceConfig
-from edgevpr.contract import Technique
-from edgevpr.errors import ConfigError, MapError, UsageError
+from edgevpr.core.config import Config, SalienceConfig
+from edgevpr.core.contract import Technique
+from edgevpr.core.errors import ConfigError, MapError, UsageError
 from edgevpr.frames.mask import AnyMask, mask_of
 from edgevpr.frames.source import is_live
 from edgevpr.places.growing import GrowingIndex
@@ -21,15 +21,15 @@ from edgevpr.power.boards import Board
 from edgevpr.power.equations import parse_pack
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.calibrated import calibration_of
+from edgevpr.runtime.recognise.detector import open_detector
 from edgevpr.runtime.recognise.evidence import kinds_of
 from edgevpr.runtime.recognise.follow import Follower, NoFollower
 from edgevpr.runtime.recognise.hints import Prior
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.levelling import levelling_of
+from edgevpr.runtime.recognise.memorability import open_memorability
 from edgevpr.runtime.recognise.recogniser import Recogniser
-from edgevpr.salience.detector import open_detector
-from edgevpr.salience.gate import MOST_ENTROPY, Gate, NoGate, Thresholds
-from edgevpr.salience.memorability import open_memorability
+from edgevpr.runtime.recognise.salience_gate import MOST_ENTROPY, Gate, NoGate, Thresholds
 
 _WAIT_S = 0.05  # in flight, for another program that writes to the map: the next query is better than a late one
 _log = logging.getLogger(__name__)

@@ -9,15 +9,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 
-from edgevpr.contract import Descriptor, Technique
-from edgevpr.errors import EdgevprError, MapError, PlaceError
+from edgevpr.core.contract import Descriptor, Technique
+from edgevpr.core.errors import EdgevprError, MapError, PlaceError
+from edgevpr.core.types import Candidate, Frame, Vehicle
 from edgevpr.frames.mask import AnyMask, NoMask, encoded
-from edgevpr.landmarks.agreement import Agreement
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Expected, Ranking, compare, named, scan, together
 from edgevpr.places.sequence import Alone, Search
 from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.recognise.agreement import Agreement
 from edgevpr.runtime.recognise.evidence import evidence_ahead, evidence_down
 from edgevpr.runtime.recognise.follow import Followed, Follower, NoFollower
 from edgevpr.runtime.recognise.gate import says_nothing
@@ -26,9 +27,8 @@ from edgevpr.runtime.recognise.judge import NEW_FOR_S, AcceptRule, Verdict, is_h
 from edgevpr.runtime.recognise.levelling import AnyLevelling, NoLevelling, seen_as
 from edgevpr.runtime.recognise.locate import HEARD, Located, at_place, located
 from edgevpr.runtime.recognise.recognition import Recognition
+from edgevpr.runtime.recognise.salience_gate import Gate, NoGate
 from edgevpr.runtime.recognise.verify import Verification, landmarks_of
-from edgevpr.salience.gate import Gate, NoGate
-from edgevpr.types import Candidate, Frame, Vehicle
 
 _log = logging.getLogger(__name__)
 _OF_CANDIDATES = 0.4  # are compared from each height but the first

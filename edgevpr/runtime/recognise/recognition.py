@@ -3,15 +3,15 @@
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from edgevpr.contract import Descriptor
+from edgevpr.core.contract import Descriptor
+from edgevpr.core.types import Candidate, FixReport, Frame, Position, QueryCost, Steps, Vehicle
 from edgevpr.frames.level import UNKNOWN_VIEW, Levelled, View
-from edgevpr.landmarks.agreement import Agreement
 from edgevpr.places.retrieve import Ranking
+from edgevpr.runtime.recognise.agreement import Agreement
 from edgevpr.runtime.recognise.follow import Followed
 from edgevpr.runtime.recognise.hints import Hints
 from edgevpr.runtime.recognise.locate import Located
-from edgevpr.salience.gate import Worth
-from edgevpr.types import Candidate, FixReport, Frame, Position, QueryCost, Steps, Vehicle
+from edgevpr.runtime.recognise.salience_gate import Worth
 
 _OF_THE_BEST = ("place", "reference_image", "score", "position", "shift_cells", "covariance_cells2", "rotation_deg")
 

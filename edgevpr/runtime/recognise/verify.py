@@ -7,14 +7,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from edgevpr.contract import FineMatch, Technique, TechniqueSpec
-from edgevpr.errors import PlaceError
+from edgevpr.core.contract import FineMatch, Technique, TechniqueSpec
+from edgevpr.core.errors import PlaceError
 from edgevpr.frames.level import Levelled
-from edgevpr.landmarks.agreement import CONFIRMED, Agreement, Expected, agreement, held_against, onto
-from edgevpr.landmarks.landmarks import OF_PLACE, OF_QUERY, Landmarks, describe, packed, unpacked
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Ranking, elsewhere
+from edgevpr.runtime.recognise.agreement import CONFIRMED, Agreement, Expected, agreement, held_against, onto
+from edgevpr.runtime.recognise.landmarks import OF_PLACE, OF_QUERY, Landmarks, describe, packed, unpacked
 
 _MAY_BE_THE_SAME = 12  # places; on kite_ochota, which has no positions, as many as overlap
 

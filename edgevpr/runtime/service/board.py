@@ -10,8 +10,8 @@ import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from edgevpr.config import Config
-from edgevpr.errors import UsageError
+from edgevpr.core.config import Config
+from edgevpr.core.errors import UsageError
 from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.tlog import SPARED_BYTES
 from edgevpr.places.mapfiles import map_path

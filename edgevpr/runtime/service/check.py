@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from edgevpr.confidence.stored import not_calibrated
-from edgevpr.config import Config, load_config
-from edgevpr.errors import EdgevprError, ImageError, LinkError, MapError, SourceError, UsageError
+from edgevpr.core.config import Config, load_config
+from edgevpr.core.errors import EdgevprError, ImageError, LinkError, MapError, SourceError, UsageError
+from edgevpr.core.files import require_folder
+from edgevpr.core.types import FIX_MAX_AGE_S
 from edgevpr.frames.condition import Condition
 from edgevpr.frames.overlay import FEWEST_FRAMES, learn_overlay, require_png, write_mask
 from edgevpr.frames.source import Source, open_source
-from edgevpr.helpers.files import require_folder
 from edgevpr.mavlink.address import LinkAddress, parse_links
 from edgevpr.mavlink.asking import Asking
 from edgevpr.mavlink.signing import open_signing_to_ask
@@ -29,11 +29,11 @@ from edgevpr.runtime.preflight.pick import outlook
 from edgevpr.runtime.recognise.calibrated import calibration_of
 from edgevpr.runtime.recognise.learn import check_positions
 from edgevpr.runtime.recognise.opening import open_recogniser
+from edgevpr.runtime.recognise.stored_confidence import not_calibrated
 from edgevpr.runtime.service import px4
 from edgevpr.runtime.service.board import log_findings
 from edgevpr.runtime.service.doctor import plan_of, silence
 from edgevpr.runtime.service.finding import Finding, looked_at
-from edgevpr.types import FIX_MAX_AGE_S
 
 _FRAME_WAIT_S = 15.0  # longer than any source takes to say that it is lost
 _WITHOUT_FRAMES = (Condition.LOST, Condition.FROZEN, Condition.DAMAGED)

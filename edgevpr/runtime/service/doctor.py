@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
-from edgevpr.config import Config
-from edgevpr.errors import LinkAddressError, LinkError
+from edgevpr.core.config import Config
+from edgevpr.core.errors import LinkAddressError, LinkError
 from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.asking import Asking
 from edgevpr.mavlink.reading import Reading, read_autopilot

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from edgevpr.errors import EdgevprError
+from edgevpr.core.errors import EdgevprError
 
 
 @dataclass(frozen=True, slots=True)

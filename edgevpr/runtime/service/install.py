@@ -11,11 +11,11 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from edgevpr.config import load_config
-from edgevpr.errors import EdgevprError, UsageError
-from edgevpr.helpers.files import write_whole
+from edgevpr.core.config import load_config
+from edgevpr.core.errors import EdgevprError, UsageError
+from edgevpr.core.files import write_whole
+from edgevpr.core.resources import shipped
 from edgevpr.power.boards import load_board
-from edgevpr.resources import shipped
 from edgevpr.runtime.service.program import NAME, VENV, program_steps, remove_program
 from edgevpr.runtime.service.steps import Step, command, walk
 from edgevpr.runtime.service.unit import HIDDEN_FROM_THE_SERVICE, render_unit

@@ -8,8 +8,8 @@ from importlib import metadata
 from pathlib import Path
 
 import edgevpr
-from edgevpr.errors import EdgevprError
-from edgevpr.resources import shipped
+from edgevpr.core.errors import EdgevprError
+from edgevpr.core.resources import shipped
 
 _SHIPPED = ("profiles", "models", "deploy")
 _OF_ONE_INSTALLATION = {"RECORD", "INSTALLER", "REQUESTED", "direct_url.json"}

@@ -11,8 +11,8 @@ from importlib import metadata, util
 from pathlib import Path
 
 from edgevpr import __version__
-from edgevpr.errors import EdgevprError
-from edgevpr.resources import shipped
+from edgevpr.core.errors import EdgevprError
+from edgevpr.core.resources import shipped
 from edgevpr.runtime.service import ownwheel
 from edgevpr.runtime.service.steps import Step, command
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from edgevpr.errors import EdgevprError
+from edgevpr.core.errors import EdgevprError
 
 _AGAIN = "correct that and run it again: what is done stays"
 

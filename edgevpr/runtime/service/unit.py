@@ -3,10 +3,10 @@
 import re
 from pathlib import Path
 
-from edgevpr.errors import UsageError
-from edgevpr.helpers.text import printable
+from edgevpr.core.errors import UsageError
+from edgevpr.core.resources import shipped
+from edgevpr.core.text import printable
 from edgevpr.power.boards import Board
-from edgevpr.resources import shipped
 
 # ProtectHome and PrivateTmp put empty folders in their place.
 HIDDEN_FROM_THE_SERVICE = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from edgevpr.errors import ModelError
+from edgevpr.core.errors import ModelError
 
 
 def flatten(features: np.ndarray) -> np.ndarray:

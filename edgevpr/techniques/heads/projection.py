@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgevpr.errors import ModelError
+from edgevpr.core.errors import ModelError
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from edgevpr.errors import ModelError
+from edgevpr.core.errors import ModelError
 from edgevpr.techniques.heads.vlad import unit
 
 _OVERLAP = 0.4  # wanted, of neighbouring regions (section 3.2)

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgevpr.errors import ModelError
-from edgevpr.helpers.files import read_file
-from edgevpr.helpers.npz import arrays_of
-from edgevpr.resources import find_model
+from edgevpr.core.errors import ModelError
+from edgevpr.core.files import read_file
+from edgevpr.core.npz import arrays_of
+from edgevpr.core.resources import find_model
 from edgevpr.techniques.heads.vlad import nearest, unit
 from edgevpr.techniques.networks.card import load_card
 

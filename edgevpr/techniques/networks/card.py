@@ -10,12 +10,12 @@ from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
 
-from edgevpr.config import bounded, build
-from edgevpr.contract import TechniqueSpec
-from edgevpr.errors import ConfigError, ModelError
-from edgevpr.helpers.text import meant
-from edgevpr.resources import find_model, model_folders
-from edgevpr.yamlfile import read_yaml
+from edgevpr.core.config import bounded, build
+from edgevpr.core.contract import TechniqueSpec
+from edgevpr.core.errors import ConfigError, ModelError
+from edgevpr.core.resources import find_model, model_folders
+from edgevpr.core.text import meant
+from edgevpr.core.yamlfile import read_yaml
 
 SIMILARITIES = ("cosine", "l1", "l2")
 _ADDED_LATER = ("pad", "boxes", "memorability")

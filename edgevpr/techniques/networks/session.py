@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from edgevpr.errors import ModelError, UsageError
-from edgevpr.helpers.files import read_file, sha256_of
+from edgevpr.core.errors import ModelError, UsageError
+from edgevpr.core.files import read_file, sha256_of
 from edgevpr.techniques.networks.card import Card, load_card
 from edgevpr.techniques.networks.prepare import prepare, without_masked
 

@@ -6,8 +6,9 @@ from flights import STEP_DEG, Flight, of_kind
 from mavlink_peers import Peer, UdpPort, wait_until
 from pictures import textured
 
-from edgevpr.contract import FineMatch
-from edgevpr.geodesy import distance_m, moved
+from edgevpr.core.contract import FineMatch
+from edgevpr.core.geodesy import distance_m, moved
+from edgevpr.core.types import Candidate, Frame, Place, Position, QueryCost, Steps
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.wire import mavlink
@@ -16,7 +17,6 @@ from edgevpr.runtime.flight.autopilot import DRY_RUN
 from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.recognise.locate import Located
 from edgevpr.runtime.recognise.recognition import Recognition
-from edgevpr.types import Candidate, Frame, Place, Position, QueryCost, Steps
 
 NO_COST = QueryCost(
     t_encode_s=0, t_match_s=0, u_encode=0, u_match=0, cpu_s=0, rss_mb=0, used_mah=0, marginal_mah=0

@@ -16,17 +16,17 @@ import pytest
 from fakes import FakeClock
 from full_disk import no_file_larger_than
 
-from edgevpr.config import load_config
-from edgevpr.contract import PartSpec, TechniqueSpec
-from edgevpr.errors import EdgevprError
-from edgevpr.helpers.numbered import numbered
+from edgevpr.core.config import load_config
+from edgevpr.core.contract import PartSpec, TechniqueSpec
+from edgevpr.core.errors import EdgevprError
+from edgevpr.core.numbered import numbered
+from edgevpr.core.types import Position, QueryCost, Steps
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log
 from edgevpr.runtime.flight.startline import start_fields
 from edgevpr.runtime.flight.wholeflight import flight_of
 from edgevpr.runtime.recognise.locate import at_place
 from edgevpr.runtime.recognise.recognition import Recognition
-from edgevpr.types import Position, QueryCost, Steps
 
 COST = QueryCost(
     t_encode_s=0.01,

@@ -7,18 +7,18 @@ from fakes import FakeClock, FakeLink, FakeSource
 from flights import Flight, flight_meter, of_kind
 from pictures import textured
 
-from edgevpr.config import load_config
-from edgevpr.errors import MapError
+from edgevpr.core.config import load_config
+from edgevpr.core.errors import MapError
+from edgevpr.core.resources import shipped
 from edgevpr.places.index import bytes_per_place, load_index
 from edgevpr.power.boards import load_board
-from edgevpr.resources import shipped
 from edgevpr.runtime.flight import vitals
+from edgevpr.runtime.flight.course import smaller_forms_of
 from edgevpr.runtime.flight.governor import Reading
 from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.preflight import accuracy
 from edgevpr.runtime.recognise.opening import open_learning, open_recogniser
 from edgevpr.runtime.recognise.recogniser import Recogniser
-from edgevpr.runtime.service.course import smaller_forms_of
 
 TURN_S = 4.0  # more than the governor's patience: each reading can bring a change
 CALM = Reading(cpu_share=0.01, late_share=0.0, rss_mb=100.0, temperature_c=40.0, throttled=False)

@@ -8,14 +8,14 @@ from flights import STEP_DEG, Flight, of_kind
 from pictures import textured
 
 from edgevpr.cli.main import main
-from edgevpr.config import load_config
+from edgevpr.core.config import load_config
+from edgevpr.core.types import Frame, Position
+from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.flight.flightlog import read_log
-from edgevpr.runtime.recognise.mapping import build_map
 from edgevpr.runtime.recognise.opening import meter_of
 from edgevpr.techniques import create
-from edgevpr.types import Frame, Position
 
 SIDE_PX = 256
 PLACES = 8

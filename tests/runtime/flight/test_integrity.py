@@ -8,15 +8,15 @@ import pytest
 from air import GPS_SD_M, HOME, Air, lengths, match_at
 from fakes import FakeClock, FakeLink, vehicle_at
 
+from edgevpr.core.geodesy import moved
+from edgevpr.core.types import Position, Receiver
 from edgevpr.frames.level import View
-from edgevpr.geodesy import moved
 from edgevpr.mavlink.autopilots.channel import Channel
 from edgevpr.runtime.flight.autopilot import NoAutopilot, ToAutopilot
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log
 from edgevpr.runtime.flight.gpswatch import GpsWatch
 from edgevpr.runtime.flight.integrity import Integrity
 from edgevpr.runtime.flight.navigator import Advice, Navigator
-from edgevpr.types import Position, Receiver
 
 MAP_SD_M = 5.0
 AWAY = np.array([0.6, 0.8])

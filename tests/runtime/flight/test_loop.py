@@ -5,7 +5,7 @@ from fakes import FakeClock, FakeLink, FakeSource
 from flights import Flight, of_kind
 from pictures import textured
 
-from edgevpr.errors import ImageError
+from edgevpr.core.errors import ImageError
 from edgevpr.runtime.flight.loop import Stop, StopNow
 from edgevpr.runtime.flight.pace import Pace
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from air import Air, lengths
 
+from edgevpr.core.geodesy import distance_m
 from edgevpr.frames.level import View
-from edgevpr.geodesy import distance_m
 from edgevpr.mavlink.autopilots.channel import Channel
 from edgevpr.runtime.flight import navigator
 from edgevpr.runtime.flight.navigator import Muted, Navigator

@@ -14,10 +14,10 @@ from fakes import FakeClock, FakeSource
 from full_disk import no_file_larger_than
 from pictures import textured
 
-from edgevpr.errors import EdgevprError, ImageError
+from edgevpr.core.errors import EdgevprError, ImageError
 from edgevpr.frames.images import read_image
 from edgevpr.frames.taped import RecordedSource, ReplayedSource
-from edgevpr.replay.tape import Playback, read_tape
+from edgevpr.review.tape import Playback, read_tape
 from edgevpr.runtime.flight import recording as module
 from edgevpr.runtime.flight.recording import FRAMES, TAPE, Recording, frame_path, recordings
 

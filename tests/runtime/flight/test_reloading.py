@@ -10,7 +10,7 @@ from flight_process import start, wait_for
 from flights import Flight, of_kind
 from pictures import textured
 
-from edgevpr.config import load_config
+from edgevpr.core.config import load_config
 from edgevpr.runtime.flight.flightlog import read_log
 from edgevpr.runtime.flight.governor import Governor, Limits, Reading, Setting, steps
 from edgevpr.runtime.flight.reloading import Reread

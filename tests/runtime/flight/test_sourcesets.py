@@ -5,7 +5,7 @@ from air import Air
 from controlled import LOAD, Controlled
 from fakes import FakeClock, FakeLink
 
-from edgevpr.config import SourceSetsConfig
+from edgevpr.core.config import SourceSetsConfig
 from edgevpr.mavlink.autopilots.channel import Channel
 from edgevpr.mavlink.messages import Health
 from edgevpr.mavlink.wire import mavlink

@@ -12,7 +12,7 @@ from dataclasses import asdict, replace
 import pytest
 from statuses import STATUS
 
-from edgevpr.errors import EdgevprError
+from edgevpr.core.errors import EdgevprError
 from edgevpr.runtime.flight.statussocket import StatusSocket, usual_path
 
 

@@ -9,9 +9,9 @@ from pictures import textured
 from tiny_networks import CARD, write_network
 
 from edgevpr.cli.main import main
-from edgevpr.config import load_config
+from edgevpr.core.config import load_config
 from edgevpr.runtime.flight.flightlog import read_log
-from edgevpr.runtime.service.fly import fly
+from edgevpr.runtime.flight.fly import fly
 
 
 @pytest.fixture

@@ -7,14 +7,14 @@ import pytest
 
 pytest.importorskip("matplotlib", reason="pictures need matplotlib")
 
-from edgevpr.helpers.figures import figure
+from edgevpr.core.figures import figure
+from edgevpr.core.types import StageCost
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import parse_pack
 from edgevpr.runtime.preflight import chart
 from edgevpr.runtime.preflight.estimate import FlightPlan, estimate
 from edgevpr.runtime.preflight.probe import TechniqueCosts
 from edgevpr.runtime.preflight.trial import Trial
-from edgevpr.types import StageCost
 
 PI = load_board("rpi-4b")
 COSTS = TechniqueCosts(

@@ -10,8 +10,9 @@ import pytest
 from example_costs import REGIONS, VECTOR
 
 from edgevpr import techniques
-from edgevpr.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
-from edgevpr.errors import ConfigError, ModelError, UsageError
+from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
+from edgevpr.core.errors import ConfigError, ModelError, UsageError
+from edgevpr.core.types import StageCost
 from edgevpr.power import machine
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.preflight import accuracy, pick
@@ -19,7 +20,6 @@ from edgevpr.runtime.preflight import choose as choosing
 from edgevpr.runtime.preflight.choose import Demand, best, fit, front, options, preferred, require_best
 from edgevpr.runtime.preflight.probe import TechniqueCosts, noise, probe
 from edgevpr.runtime.preflight.scale import on_board
-from edgevpr.types import StageCost
 
 COSTS = {"regions": REGIONS, "vector": VECTOR}
 

@@ -5,7 +5,8 @@ from dataclasses import asdict, replace
 
 import pytest
 
-from edgevpr.errors import UsageError
+from edgevpr.core.errors import UsageError
+from edgevpr.core.types import StageCost
 from edgevpr.power.boards import MachineSpeed, load_board
 from edgevpr.power.equations import parse_pack
 from edgevpr.runtime.preflight import accuracy
@@ -13,7 +14,6 @@ from edgevpr.runtime.preflight.estimate import FlightPlan
 from edgevpr.runtime.preflight.estimate import estimate as estimate_of
 from edgevpr.runtime.preflight.probe import TechniqueCosts
 from edgevpr.runtime.preflight.trial import Trial
-from edgevpr.types import StageCost
 
 COSTS = {
     "regions": TechniqueCosts(

@@ -7,12 +7,12 @@ from example_costs import REGIONS
 from example_costs import VECTOR as ONE_CORE_VECTOR
 
 from edgevpr import techniques
+from edgevpr.core.types import StageCost
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import parse_pack
 from edgevpr.runtime.preflight.estimate import FlightPlan, estimate
 from edgevpr.runtime.preflight.estimate_text import format_table
 from edgevpr.runtime.preflight.trial import Trial
-from edgevpr.types import StageCost
 
 ZERO, HERE = load_board("rpi-zero-2w"), load_board("generic-x86")
 PLAN = FlightPlan(

@@ -15,8 +15,8 @@ import pytest
 from tiny_networks import CARD, write_card, write_network
 
 from edgevpr.cli.main import main
-from edgevpr.errors import EdgevprError, ModelError
-from edgevpr.helpers import child
+from edgevpr.core import child
+from edgevpr.core.errors import EdgevprError, ModelError
 from edgevpr.runtime.preflight.networks import add, list_models, technique_with, verify, verify_here
 from edgevpr.techniques.networks import session
 from edgevpr.techniques.networks.card import load_card

@@ -5,12 +5,12 @@ from dataclasses import replace
 import pytest
 from example_costs import REGIONS
 
-from edgevpr.config import load_config
+from edgevpr.core.config import load_config
+from edgevpr.core.types import StageCost
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.preflight import pick
 from edgevpr.runtime.preflight.pick import outlook, trusted_candidates
 from edgevpr.runtime.recognise.opening import open_recogniser
-from edgevpr.types import StageCost
 
 COSTS = replace(REGIONS, match_per_place=StageCost(0.01, 0.01), candidates=42)
 

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from edgevpr.errors import EdgevprError, UsageError
+from edgevpr.core.errors import EdgevprError, UsageError
 from edgevpr.power import calibrate, sensors
 from edgevpr.power.boards import MachineSpeed, load_board
 from edgevpr.power.powermeter import Meter, MeterError

@@ -8,11 +8,11 @@ import example_costs
 import pytest
 from example_costs import VECTOR
 
+from edgevpr.core.types import StageCost
 from edgevpr.power.boards import MachineSpeed, load_board
 from edgevpr.power.speed import REFERENCE_PASSES_HZ
 from edgevpr.runtime.preflight import counted
 from edgevpr.runtime.preflight.scale import UNKNOWN_PRODUCTS, Ratios, is_same, on_board, ratios
-from edgevpr.types import StageCost
 
 REGIONS = replace(example_costs.REGIONS, candidates=40, scan_per_place=StageCost(1e-6, 1e-6))
 HERE, PI = load_board("generic-x86"), load_board("rpi-4b")

@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from edgevpr.errors import EdgevprError, ImageError, SourceError, UsageError
+from edgevpr.core.errors import EdgevprError, ImageError, SourceError, UsageError
+from edgevpr.core.types import StageCost
 from edgevpr.power.boards import MachineSpeed, load_board
 from edgevpr.runtime.preflight import stored as measured
 from edgevpr.runtime.preflight import trial
@@ -24,7 +25,6 @@ from edgevpr.runtime.preflight.stored import (
 )
 from edgevpr.runtime.preflight.stored_text import format_stored
 from edgevpr.runtime.preflight.trial import Trial
-from edgevpr.types import StageCost
 
 COSTS = TechniqueCosts(
     encode=StageCost(0.1, 0.2),

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from edgevpr.helpers import child
+from edgevpr.core import child
 from edgevpr.runtime.preflight import trial as trying
 from edgevpr.runtime.preflight.offers import Offer, offers
 from edgevpr.runtime.preflight.trial import Trial, model_of, trial_of, try_each

@@ -11,18 +11,18 @@ import pytest
 from fakes import FakeClock
 from pictures import textured
 
-from edgevpr.confidence.model import prior
-from edgevpr.confidence.stored import Calibration, as_text
-from edgevpr.config import load_config
+from edgevpr.core.config import load_config
+from edgevpr.core.types import Frame, Position
+from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import Pack
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.calibrated import calibration_of
-from edgevpr.runtime.recognise.mapping import build_map
+from edgevpr.runtime.recognise.confidence import prior
 from edgevpr.runtime.recognise.opening import open_recogniser
+from edgevpr.runtime.recognise.stored_confidence import Calibration, as_text
 from edgevpr.techniques import create
-from edgevpr.types import Frame, Position
 
 OWN = replace(prior("ahead"), made_of="this map")
 FOUND = Calibration(models={"ahead": OWN}, made="2026-05-01", asked=9, precision=0.99, accepted=1.0, accepted_wrong=0)

@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edgevpr.confidence.model import prior
-from edgevpr.contract import FineMatch, PartSpec, Support, TechniqueSpec
-from edgevpr.landmarks.agreement import Agreement
+from edgevpr.core.contract import FineMatch, PartSpec, Support, TechniqueSpec
 from edgevpr.places.index import empty_index
 from edgevpr.places.retrieve import Ranking
+from edgevpr.runtime.recognise.agreement import Agreement
+from edgevpr.runtime.recognise.confidence import prior
 from edgevpr.runtime.recognise.evidence import (
     AHEAD,
     DOWN,

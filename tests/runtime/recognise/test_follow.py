@@ -7,14 +7,14 @@ import pytest
 from fakes import vehicle_at
 from sureness import told
 
-from edgevpr.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
-from edgevpr.geodesy import distance_m, moved
+from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
+from edgevpr.core.geodesy import distance_m, moved
+from edgevpr.core.types import Frame, Pose, Position
 from edgevpr.places.index import PlaceIndex, empty_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Ranking
 from edgevpr.runtime.recognise.follow import Follower, NoFollower
 from edgevpr.runtime.recognise.locate import Located
-from edgevpr.types import Frame, Pose, Position
 
 PLACES, SPACING_M, FOOTPRINT_M = 150, 20.0, 80.0
 STRIDE = 3  # places from look to look, at one a second: each look is of new ground

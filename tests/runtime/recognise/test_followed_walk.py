@@ -10,7 +10,9 @@ from fakes import FakeClock
 from pictures import textured
 from sureness import sure_rule
 
-from edgevpr.config import load_config
+from edgevpr.core.config import load_config
+from edgevpr.core.types import Frame, Position
+from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
@@ -18,11 +20,9 @@ from edgevpr.power.equations import Pack
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.follow import Follower
 from edgevpr.runtime.recognise.judge import accept_rule
-from edgevpr.runtime.recognise.mapping import build_map
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import fields_of
 from edgevpr.techniques import create
-from edgevpr.types import Frame, Position
 
 PLACES, STRIDE = 40, 3
 TWICE = 20, 36  # both places show the same picture

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from edgevpr.core.types import Frame, Position, Salience
+from edgevpr.mapmaking.gaps import Gaps
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import Pack
 from edgevpr.power.meter import QueryMeter
-from edgevpr.runtime.recognise.gaps import Gaps
 from edgevpr.runtime.recognise.recognition import Recognition
-from edgevpr.salience.gate import Worth
-from edgevpr.types import Frame, Position, Salience
+from edgevpr.runtime.recognise.salience_gate import Worth
 
 NORTH_M = 1 / 111_195  # degrees
 

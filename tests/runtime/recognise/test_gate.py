@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from pictures import textured
 
-from edgevpr.config import load_config
-from edgevpr.contract import Descriptor
+from edgevpr.core.config import load_config
+from edgevpr.core.contract import Descriptor
+from edgevpr.core.types import NO_COST, Frame
+from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.gate import says_nothing
-from edgevpr.runtime.recognise.mapping import build_map
 from edgevpr.runtime.recognise.opening import meter_of, open_recogniser
 from edgevpr.techniques import create
-from edgevpr.types import NO_COST, Frame
 
 PLACES = 6
 

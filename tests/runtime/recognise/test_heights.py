@@ -4,17 +4,17 @@ import cv2
 import pytest
 from pictures import textured
 
-from edgevpr.config import load_config
+from edgevpr.core.config import load_config
+from edgevpr.core.types import Frame, Position
+from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.hints import Prior
 from edgevpr.runtime.recognise.judge import accept_rule
-from edgevpr.runtime.recognise.mapping import build_map
 from edgevpr.runtime.recognise.opening import meter_of
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.techniques import create
-from edgevpr.types import Frame, Position
 
 PLACES = 4
 

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from edgevpr.contract import FineMatch
+from edgevpr.core.contract import FineMatch
+from edgevpr.core.types import Candidate, Place, Position, Vehicle
 from edgevpr.places.index import PlaceIndex
 from edgevpr.runtime.recognise.hints import (
     Hints,
@@ -16,7 +17,6 @@ from edgevpr.runtime.recognise.hints import (
     reach,
     use_next,
 )
-from edgevpr.types import Candidate, Place, Position, Vehicle
 
 HOME = Position(50.0, 8.0)
 WITHIN_DEG = 22.5

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from sureness import NEEDED, sure_rule
 
-from edgevpr.config import load_config
-from edgevpr.contract import FineMatch, PartSpec, TechniqueSpec
-from edgevpr.landmarks.agreement import Agreement
+from edgevpr.core.config import load_config
+from edgevpr.core.contract import FineMatch, PartSpec, TechniqueSpec
 from edgevpr.places.index import empty_index
 from edgevpr.places.retrieve import Ranking
 from edgevpr.places.sequence import Alone, SequenceSearch
+from edgevpr.runtime.recognise.agreement import Agreement
 from edgevpr.runtime.recognise.evidence import AHEAD, DOWN, DOWN_BARE, OF_MAP, OF_PLACE
 from edgevpr.runtime.recognise.judge import AcceptRule, accept_rule, judge
 from edgevpr.techniques import create

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from edgevpr.config import load_config
-from edgevpr.contract import PartSpec, TechniqueSpec
+from edgevpr.core.config import load_config
+from edgevpr.core.contract import PartSpec, TechniqueSpec
 from edgevpr.places.index import empty_index
 from edgevpr.places.retrieve import Ranking
 from edgevpr.places.sequence import SequenceSearch

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from fakes import FakeClock, vehicle_at
 
-from edgevpr.config import load_config
-from edgevpr.contract import Descriptor
-from edgevpr.errors import MapError, UsageError
+from edgevpr.core.config import load_config
+from edgevpr.core.contract import Descriptor
+from edgevpr.core.errors import MapError, UsageError
+from edgevpr.core.types import Frame, Position, QueryCost, Steps
 from edgevpr.frames.level import UNKNOWN_VIEW, Levelled, View
 from edgevpr.places.growing import GrowingIndex
 from edgevpr.places.mapfile import PlaceMap
@@ -22,7 +23,6 @@ from edgevpr.runtime.recognise.opening import meter_of
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.techniques import create
-from edgevpr.types import Frame, Position, QueryCost, Steps
 
 TECHNIQUE = create("hog", {"w1": 32})
 SPACING_M = 10.0

@@ -9,22 +9,22 @@ import numpy as np
 import pytest
 from fakes import vehicle_at
 
-from edgevpr.config import load_config
+from edgevpr.core.config import load_config
+from edgevpr.core.geodesy import offset_m
+from edgevpr.core.types import Frame, Position
 from edgevpr.frames.level import UNKNOWN_VIEW, Lens, View
 from edgevpr.frames.mask import Mask
-from edgevpr.geodesy import offset_m
+from edgevpr.lab.simulate.camera import Camera, Light, Pose, ground_to_pixel, photograph
+from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.hints import Prior
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.levelling import Leaning, Levelling, NoLevelling, laid, levelling_of
-from edgevpr.runtime.recognise.mapping import build_map
 from edgevpr.runtime.recognise.opening import meter_of
 from edgevpr.runtime.recognise.recogniser import Recogniser
-from edgevpr.simulate.camera import Camera, Light, Pose, ground_to_pixel, photograph
 from edgevpr.techniques import create
-from edgevpr.types import Frame, Position
 
 CAMERA = Camera(noise_sigma=0)
 LENS = Lens(2 * math.degrees(math.atan(320 / CAMERA.focal_px)))

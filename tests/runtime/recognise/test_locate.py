@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from edgevpr.contract import FineMatch
+from edgevpr.core.contract import FineMatch
+from edgevpr.core.geodesy import metres, moved
+from edgevpr.core.types import Candidate, Place, Pose, Position
 from edgevpr.frames.level import View
-from edgevpr.geodesy import metres, moved
-from edgevpr.landmarks.agreement import Agreement
+from edgevpr.runtime.recognise.agreement import Agreement
 from edgevpr.runtime.recognise.locate import as_learnt, at_place, located
-from edgevpr.types import Candidate, Place, Pose, Position
 
 ORIGIN = Position(50.0, 8.0, 120.0)
 CELLS, FOOTPRINT_M = 32, 64.0

@@ -10,19 +10,20 @@ import pytest
 from fakes import FakeClock
 from pictures import textured
 
-from edgevpr.config import load_config
-from edgevpr.errors import MapError, ModelError
+from edgevpr.core.config import load_config
+from edgevpr.core.errors import MapError, ModelError
+from edgevpr.core.types import Frame, Position
+from edgevpr.mapmaking import mapping
+from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import Pack
 from edgevpr.power.meter import QueryMeter
-from edgevpr.runtime.recognise import hints, judge, learn, mapping, opening, recogniser, recognition
+from edgevpr.runtime.recognise import hints, judge, learn, opening, recogniser, recognition
 from edgevpr.runtime.recognise.judge import AcceptRule
-from edgevpr.runtime.recognise.mapping import build_map
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.techniques import create
-from edgevpr.types import Frame, Position
 
 PLACES = 6
 RULE = AcceptRule(min_score=0.07, min_margin=0.03, neighbour_m=50.0)

@@ -14,8 +14,9 @@ import pytest
 from fakes import FakeClock
 from sureness import landmarks_count, sure_rule
 
+from edgevpr.core.types import Frame, Position
 from edgevpr.frames.mask import Mask
-from edgevpr.landmarks.landmarks import describe, packed, unpacked
+from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.growing import GrowingIndex
 from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
@@ -25,13 +26,12 @@ from edgevpr.power.boards import load_board
 from edgevpr.power.equations import Pack
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.judge import AcceptRule
+from edgevpr.runtime.recognise.landmarks import describe, packed, unpacked
 from edgevpr.runtime.recognise.learn import Learner
-from edgevpr.runtime.recognise.mapping import build_map
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import fields_of
 from edgevpr.runtime.recognise.verify import Verification
 from edgevpr.techniques import create
-from edgevpr.types import Frame, Position
 
 PLACES = 4
 RULE = AcceptRule(min_score=0.08, min_margin=0.03, neighbour_m=50.0)

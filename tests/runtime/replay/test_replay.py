@@ -17,8 +17,8 @@ from mavlink_peers import Peer, UdpPort
 
 from edgevpr.cli.main import main
 from edgevpr.mavlink.wire import mavlink
-from edgevpr.replay.compare import compare
-from edgevpr.replay.replay import recorded, replay
+from edgevpr.review.compare import compare
+from edgevpr.review.replay import recorded, replay
 from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.flightlog import read_log
 from edgevpr.runtime.flight.recording import TAPE, recordings

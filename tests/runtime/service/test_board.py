@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from edgevpr.config import Config, load_config
+from edgevpr.core.config import Config, load_config
 from edgevpr.mavlink.address import parse_link
 from edgevpr.runtime.service.board import board_findings, bytecode, device, python
 

@@ -16,11 +16,11 @@ from mavlink_peers import AutopilotThread
 from pictures import textured
 
 from edgevpr import techniques
+from edgevpr.core.types import Frame, StageCost
 from edgevpr.mavlink.address import parse_link
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.preflight import pick
 from edgevpr.runtime.service.check import Finding, check
-from edgevpr.types import Frame, StageCost
 
 ITEMS = ["configuration", "board", "battery", "map", "source", "link", "log"]
 

@@ -5,14 +5,14 @@ from contextlib import ExitStack, closing
 import pytest
 from mavlink_peers import Peer, UdpPort, wait_until
 
-from edgevpr.config import load_config
-from edgevpr.errors import ConfigError
+from edgevpr.core.config import load_config
+from edgevpr.core.errors import ConfigError
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.signing import NOT_SIGNING, open_signing
+from edgevpr.runtime.flight import course
 from edgevpr.runtime.flight.navigator import Navigator
-from edgevpr.runtime.service import course
 
 
 def test_the_keys_of_the_configuration_reach_the_link():

@@ -4,8 +4,8 @@ import pytest
 from flights import of_kind
 
 from edgevpr.cli.main import main
-from edgevpr.config import load_config
-from edgevpr.errors import ConfigError
+from edgevpr.core.config import load_config
+from edgevpr.core.errors import ConfigError
 from edgevpr.runtime.flight.flightlog import read_log
 
 

@@ -7,7 +7,7 @@ pytest.importorskip("imageio_ffmpeg", reason="the cameras need ffmpeg (pip insta
 import hostile_flights
 from hostile_flights import RATE_HZ, behind_s, place_of
 
-from edgevpr.simulate.autopilot import ReceivedFix
+from edgevpr.lab.simulate.autopilot import ReceivedFix
 
 STREAM = "MJPEG over HTTP, truncated"
 

@@ -13,7 +13,7 @@ import pytest
 
 from edgevpr import __version__
 from edgevpr.cli.main import main
-from edgevpr.errors import ConfigError, EdgevprError, UsageError
+from edgevpr.core.errors import ConfigError, EdgevprError, UsageError
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.service import program
 from edgevpr.runtime.service.install import install, require_system, uninstall
@@ -166,7 +166,7 @@ def test_a_dry_run_says_what_the_run_before_the_first_said(installed_root, syste
         ("etc/udev/rules.d/99-edgevpr.rules", "udev rules"),
         ("etc/systemd/system/edgevpr.service", "unit"),
         ("opt/edgevpr/bin/edgevpr", "edgevpr "),
-        ("opt/edgevpr/lib/*/site-packages/edgevpr/config.py", "edgevpr "),
+        ("opt/edgevpr/lib/*/site-packages/edgevpr/core/config.py", "edgevpr "),
         ("opt/edgevpr/lib/*/site-packages/edgevpr-*/RECORD", "edgevpr "),
         ("opt/edgevpr/lib/*/site-packages/tiny_one-1.0.dist-info/RECORD", "packages"),
         ("opt/edgevpr/lib/*/site-packages/edgevpr/__pycache__/config.*.pyc", "compiled bytecode"),
@@ -294,7 +294,7 @@ def test_a_file_that_cannot_be_written_is_one_sentence_and_the_next_run_goes_on(
     """A limit of the size of files stands for a full disk."""
     script = (
         "import resource, sys; from pathlib import Path\n"
-        "from edgevpr.errors import EdgevprError; from edgevpr.runtime.service.install import install\n"
+        "from edgevpr.core.errors import EdgevprError; from edgevpr.runtime.service.install import install\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (100, resource.RLIM_INFINITY))\n"
         f"try: install(None, False, lambda _: None, Path({str(system)!r}))\n"
         "except EdgevprError as error: sys.exit(str(error))\n"

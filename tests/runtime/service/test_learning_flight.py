@@ -12,13 +12,13 @@ from flight_process import start, wait_for
 from flights import PLACES, STEP_DEG, Flight, of_kind
 
 from edgevpr.cli.main import main
+from edgevpr.core.geodesy import distance_m
 from edgevpr.frames.positions import read_positions
 from edgevpr.frames.source import open_source
-from edgevpr.geodesy import distance_m
+from edgevpr.lab.simulate.flight import SCENE_DEPTH_M, SCENE_WIDTH_M, later_flight, mapping_flight, write_flight
+from edgevpr.lab.simulate.scene import make_scene
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.flight.flightlog import read_log
-from edgevpr.simulate.flight import SCENE_DEPTH_M, SCENE_WIDTH_M, later_flight, mapping_flight, write_flight
-from edgevpr.simulate.scene import make_scene
 
 QUICK = ("--learn", "--technique", "hog", "--rate-hz", "60")
 

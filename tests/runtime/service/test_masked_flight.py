@@ -6,11 +6,11 @@ import pytest
 from pictures import textured
 
 from edgevpr.cli.main import main
-from edgevpr.config import load_config
+from edgevpr.core.config import load_config
+from edgevpr.core.types import Frame
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.opening import open_recogniser
-from edgevpr.types import Frame
 
 PLACES = 24
 

@@ -17,7 +17,7 @@ from flight_process import start, wait_for
 
 from edgevpr.cli.main import main
 from edgevpr.runtime.flight.flightlog import read_log
-from edgevpr.runtime.service.statusreader import StatusReader
+from edgevpr.runtime.flight.statusreader import StatusReader
 
 PATIENCE_S = 60.0
 

@@ -9,9 +9,9 @@ from dataclasses import asdict, replace
 import pytest
 from statuses import STATUS
 
-from edgevpr.errors import EdgevprError
+from edgevpr.core.errors import EdgevprError
+from edgevpr.runtime.flight.statusreader import StatusReader
 from edgevpr.runtime.flight.statussocket import StatusSocket
-from edgevpr.runtime.service.statusreader import StatusReader
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from edgevpr.errors import UsageError
+from edgevpr.core.errors import UsageError
 from edgevpr.power.boards import board_names, load_board
 from edgevpr.runtime.service import unit as unit_text
 from edgevpr.runtime.service.unit import render_unit

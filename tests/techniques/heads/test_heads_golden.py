@@ -4,7 +4,7 @@ import literal_heads as literal
 import numpy as np
 import pytest
 
-from edgevpr.errors import ModelError
+from edgevpr.core.errors import ModelError
 from edgevpr.techniques.heads import pooling, projection, regions, rmac, vlad
 
 

@@ -7,7 +7,7 @@ import literal_heads as literal
 import numpy as np
 import pytest
 
-from edgevpr.errors import ModelError
+from edgevpr.core.errors import ModelError
 from edgevpr.techniques.heads import words
 
 CARD = """

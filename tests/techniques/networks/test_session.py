@@ -9,7 +9,7 @@ import pytest
 from pictures import textured
 from tiny_networks import CARD, FEATURES, HEIGHT, WIDTH, write_card, write_network
 
-from edgevpr.errors import ModelError, UsageError
+from edgevpr.core.errors import ModelError, UsageError
 from edgevpr.techniques.networks import session
 from edgevpr.techniques.networks.session import open_backbone
 

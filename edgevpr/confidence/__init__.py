@@ -1,1 +1,0 @@
-"""Confidence: from the evidence of a match to the probability that it is right."""

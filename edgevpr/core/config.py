@@ -1,0 +1,346 @@
+"""The configuration, and the strict making of frozen dataclasses from the mappings of a YAML file.
+
+An unknown key, a wrong type or a value out of range raises ConfigError with one clear sentence.
+"""
+
+import os
+import types
+import typing
+from collections.abc import Iterator
+from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+from edgevpr.core.errors import ConfigError
+from edgevpr.core.resources import shipped
+from edgevpr.core.text import meant
+from edgevpr.core.yamlfile import read_yaml
+
+FORMS = ("float", "8bit", "1bit")  # of a vector in RAM, each smaller than the one before: see techniques.vectors
+LOWEST_RATE_HZ, HIGHEST_RATE_HZ = 0.01, 60.0  # of queries
+BUDGET_MB = (1, 65_536)  # of the index in RAM
+SOURCES = (
+    "a folder of images, a video file, a camera (/dev/video0) or a stream (rtsp://, udp://, tcp://, http://, FILE.sdp)"
+)
+
+_SHOWN = 80  # characters of a wrong value in a message
+
+T = TypeVar("T")
+_WORDS = {
+    float: "a number",
+    int: "a whole number",
+    str: "a text",
+    bool: "true or false",
+    list: "a list",
+    dict: "a section",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Flag:
+    """A key of the configuration as a command-line flag: its names, the placeholder of its value in the help, the help
+    text, and the allowed values (empty: any). The type and the range of the value belong to the key."""
+
+    names: tuple[str, ...]
+    metavar: str | None
+    text: str
+    choices: tuple[str, ...] = ()
+
+
+def keyed(flag: Flag | None = None, sets: bool = True) -> Any:
+    """Make a dataclass field that may be a flag. The flag of a key that is true or false takes no value: it `sets`
+    one."""
+    return field(metadata={"flag": flag, "sets": sets})
+
+
+def bounded(low: float, high: float, flag: Flag | None = None) -> Any:
+    """Make a dataclass field whose value, unless it is None, must lie in low..high, and that may be a flag."""
+    return field(metadata={"range": (low, high), "flag": flag})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SourceConfig:
+    uri: str | None = keyed(Flag(("--images", "--source"), "SOURCE", SOURCES))
+    camera: str | None = keyed(
+        Flag(
+            ("--camera",),
+            None,
+            "straight down, or ahead (default: the map's; a new map's is forward)",
+            choices=("nadir", "forward"),
+        )
+    )
+    rate_hz: float | None = bounded(
+        LOWEST_RATE_HZ, HIGHEST_RATE_HZ, Flag(("--rate-hz",), "HZ", "queries a second (default: the board's)")
+    )
+    mask: str | None = keyed(Flag(("--mask",), "PNG", "black where frames show a display and no ground"))
+    fov_deg: float | None = bounded(
+        5, 150, Flag(("--fov-deg",), "DEG", "field of view across the longest side of the picture")
+    )
+    up_deg: float = bounded(
+        0, 360, Flag(("--up-deg",), "DEG", "where the top of the picture points while the nose points north (0)")
+    )
+    gimbal: bool = field()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MatchConfig:
+    matching: str | None = keyed(
+        Flag(("--matching",), None, "how cohog scores (displacement)", choices=("displacement", "thesis"))
+    )
+    form: str | None = keyed(
+        Flag(
+            ("--form",),
+            None,
+            "what a number of a vector takes in RAM: half precision, a byte or a bit (float)",
+            choices=FORMS,
+        )
+    )
+    candidates: int | None = bounded(1, 1_000_000, Flag(("--candidates",), "N", "places compared (the technique's)"))
+    follow: bool = field()
+    sequence: int | None = bounded(1, 100, Flag(("--sequence",), "N", "queries matched together (the technique's)"))
+    accept_precision: float = bounded(
+        0.5, 0.999999, Flag(("--accept-precision",), "P", "share of the accepted matches that is to be right (0.999)")
+    )
+    min_score: float | None = bounded(0, 1, Flag(("--min-score",), "S", "accept from this score on"))
+    min_margin: float | None = bounded(
+        0, 1, Flag(("--min-margin",), "M", "accept when this far ahead of a place elsewhere")
+    )
+    verify: bool = field()
+    neighbour_m: float = bounded(0, 10_000)
+    reach_m_s: float | None = bounded(
+        0.1, 100, Flag(("--reach-m-s",), "V", "look only where this speed can have led (default: everywhere)")
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class MemoryConfig:
+    budget_mb: float | None = bounded(
+        *BUDGET_MB, Flag(("--budget-mb",), "MB", "limit of the index in RAM (default: the board's)")
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class MappingConfig:
+    learn: bool = keyed(
+        Flag(
+            ("--learn",),
+            None,
+            "add to the map what it does not know, or make a new one, by the flight controller's position",
+        )
+    )
+    spacing_m: float = bounded(1, 1000)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SalienceConfig:
+    use: bool = keyed(Flag(("--salience",), None, "keep, and ask for, only what is worth remembering"))
+    memorability: float = bounded(0, 1)
+    staticity: float = bounded(0, 1)
+    entropy: float = bounded(0, 1)
+    network: str | None = field()
+    detector: str | None = field()
+    detect_every: int = bounded(1, 1000)
+    footprint_m: float | None = bounded(1, 10_000)
+    gap_frames: int = bounded(1, 10_000)
+    gap_m: float = bounded(1, 100_000)
+
+
+@dataclass(frozen=True, slots=True)
+class SourceSetsConfig:
+    gps: int | None = bounded(1, 3)
+    no_gps: int | None = bounded(1, 3)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MavlinkConfig:
+    link: str | None = keyed(
+        Flag(("--link",), "URL", "udpout:HOST:PORT, udpin:HOST:PORT, tcp:HOST:PORT, serial:DEV:BAUD")
+    )
+    component_id: int = bounded(1, 255)
+    system_id: int | None = bounded(1, 255)
+    send_fixes: bool = keyed(
+        Flag(("--dry-run",), None, "send no position fix: decide, log and tell all else as in a flight"), sets=False
+    )
+    max_fix_age_s: float = bounded(0.1, 5)
+    min_accuracy_m: float = bounded(1, 10_000)
+    source_sets: SourceSetsConfig
+    set_origin: bool = field()
+    ground: str | None = field()
+    signing_key: str | None = field()
+    signing_state: str | None = field()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LogConfig:
+    path: str | None = keyed(Flag(("--log",), "FILE", "flight log, JSON lines"))
+    tlog: str | None = keyed(Flag(("--tlog",), "FILE", "every packet of the link, for mavlogdump and ground stations"))
+    max_mb: float | None = bounded(1, 1_000_000)
+    record: str | None = keyed(Flag(("--record",), "FOLDER", "frames and all else that `edgevpr replay` needs"))
+    record_mb: float = bounded(10, 1_000_000)
+
+
+@dataclass(frozen=True, slots=True)
+class StatusConfig:
+    socket: str | None = field()
+
+
+@dataclass(frozen=True, slots=True)
+class BatteryConfig:
+    pack: str = keyed(Flag(("--battery",), "PACK", "cells and capacity of the pack, e.g. 4S5200"))
+    regulator_efficiency: float = bounded(0.1, 1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Config:
+    """The whole configuration; `deploy/config.yaml` documents every key and holds every default."""
+
+    board: str = keyed(Flag(("--board",), "NAME", "hardware profile (default: this machine)"))
+    map: str | None = keyed(Flag(("--map",), "MAP", "the place map"))
+    technique: str | None = keyed(Flag(("--technique",), "NAME", "insist on this technique"))
+    source: SourceConfig
+    match: MatchConfig
+    memory: MemoryConfig
+    mapping: MappingConfig
+    salience: SalienceConfig
+    mavlink: MavlinkConfig
+    log: LogConfig
+    status: StatusConfig
+    battery: BatteryConfig
+
+
+@dataclass(frozen=True, slots=True)
+class Key:
+    """A key of the configuration that is also a flag: its dotted name, the type of its value (None apart), its flag,
+    and what the flag `sets` where that is true or false."""
+
+    name: str
+    kind: type
+    flag: Flag
+    sets: bool
+
+
+def flagged_keys(cls: type = Config, prefix: str = "") -> Iterator[Key]:
+    """Yield every key of the configuration that is also a flag, in the order of the fields."""
+    hints = typing.get_type_hints(cls)
+    for each in fields(cls):
+        kind = _kind(hints[each.name])
+        if is_dataclass(kind):
+            yield from flagged_keys(kind, f"{prefix}{each.name}.")
+        elif each.metadata.get("flag"):
+            yield Key(prefix + each.name, kind, each.metadata["flag"], each.metadata.get("sets", True))
+
+
+def load_config(path: str | Path | None, overrides: dict[str, Any] | None = None) -> Config:
+    """Load the defaults, then the user's file, then `overrides` ({"source.rate_hz": 2.0}; None values are left out).
+
+    Each of these replaces values of the ones before. Raises ConfigError with the file, the key and what to do.
+    """
+    defaults_path = shipped("deploy") / "config.yaml"
+    merged = read_yaml(defaults_path)
+    if path is not None:
+        merged = _overlaid(merged, read_yaml(path), str(path), "")
+    for dotted, value in (overrides or {}).items():
+        if value is not None:
+            *sections, key = dotted.split(".")
+            target = merged
+            for section in sections:
+                target = target[section]
+            target[key] = value
+    return build(Config, merged, str(path or "the command line"))
+
+
+def changed_config(config: Config, path: str | Path) -> Config:
+    """Return a configuration with the keys of a YAML file in place of its own. Raises ConfigError."""
+    return build(Config, _overlaid(asdict(config), read_yaml(path), str(path), ""), str(path))
+
+
+def with_logs_in(config: Config, folder: str) -> Config:
+    """Return a configuration in which the relative paths of all that a flight writes about itself are meant from a
+    folder."""
+    log = config.log
+    named = {"path": log.path, "tlog": log.tlog, "record": log.record}
+    return replace(
+        config, log=replace(log, **{key: path and os.path.join(folder, path) for key, path in named.items()})
+    )
+
+
+def build(cls: type[T], mapping: dict[str, Any], where: str, prefix: str = "") -> T:
+    """Build the frozen dataclass `cls` from a mapping, strictly. `where` names the file in messages.
+
+    Raises ConfigError for a key that is unknown or missing, and for a value of a wrong type or out of range.
+    """
+    hints = typing.get_type_hints(cls)
+    known = {f.name: f for f in fields(cls)}  # type: ignore[arg-type]
+    for key in mapping:
+        if key not in known:
+            raise _unknown(key, known, where, prefix)
+    values = {}
+    for name, spec in known.items():
+        if name in mapping:
+            values[name] = _converted(mapping[name], hints[name], spec.metadata.get("range"), where, prefix + name)
+        elif spec.default is MISSING and spec.default_factory is MISSING:
+            raise ConfigError(f"{where}: the key `{prefix}{name}` is missing: add it.")
+    return cls(**values)
+
+
+def _overlaid(base: dict[str, Any], over: dict[str, Any], where: str, prefix: str) -> dict[str, Any]:
+    merged = dict(base)
+    for key, value in over.items():
+        if key not in base:
+            raise _unknown(key, base, where, prefix)
+        if isinstance(base[key], dict):
+            if not isinstance(value, dict):
+                raise ConfigError(f"{where}: `{prefix}{key}` is a section: write its keys below it, indented.")
+            value = _overlaid(base[key], value, where, f"{prefix}{key}.")
+        merged[key] = value
+    return merged
+
+
+def _unknown(key: object, known: typing.Iterable[str], where: str, prefix: str) -> ConfigError:
+    name = str(key)[:_SHOWN]
+    hint = meant(name, known, f"known: {', '.join(sorted(known))}")
+    return ConfigError(f"{where}: unknown key `{prefix}{name}` ({hint}).")
+
+
+def _converted(value: Any, hint: Any, limits: tuple[float, float] | None, where: str, key: str) -> Any:
+    wanted = _kind(hint)
+    if value is None:
+        if wanted is not hint:
+            return None
+        raise ConfigError(f"{where}: `{key}` has no value: write one.")
+    if is_dataclass(wanted):
+        if not isinstance(value, dict):
+            raise ConfigError(f"{where}: `{key}` is a section: write its keys below it, indented.")
+        return build(wanted, value, where, f"{key}.")  # type: ignore[arg-type]
+    if wanted is float and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value)
+    if isinstance(value, str):
+        require_sayable(value, f"{where}: `{key}`")
+    if not isinstance(value, wanted) or (isinstance(value, bool) and wanted is not bool):
+        word = _WORDS.get(wanted, str(wanted))
+        raise ConfigError(f"{where}: `{key}` must be {word}, not {_shortened(value)}.")
+    if limits and not limits[0] <= value <= limits[1]:
+        raise ConfigError(f"{where}: `{key}` is {value:g}; it must be between {limits[0]:g} and {limits[1]:g}.")
+    return value
+
+
+def require_sayable(text: str, what: str) -> None:
+    """Check that a text can be the name of a file; raises ConfigError for one with NUL or half a character (a lone
+    surrogate), which no file has and no output takes. `what` begins the sentence."""
+    try:
+        os.fsencode(text)
+    except UnicodeEncodeError:
+        raise ConfigError(f"{what} holds half a character ({text!a:.60}): write it anew.") from None
+    if "\0" in text:
+        raise ConfigError(f"{what} holds a NUL character ({text!a:.60}): write it anew.")
+
+
+def _shortened(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= _SHOWN else text[:_SHOWN] + "..."
+
+
+def _kind(hint: Any) -> Any:
+    """Return the type of a value without its None: float for `float | None`, and for float."""
+    options = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+    return next(option for option in options if option is not type(None))

@@ -1,0 +1,93 @@
+"""YAML files of foreign origin: the owner of PyYAML. Read without aliases and within limits of size, depth and digits,
+so that no file takes more than its own length in time and memory; a key that stands there twice is an error."""
+
+from copy import deepcopy
+from functools import cache, lru_cache
+from pathlib import Path
+from typing import Any
+
+from edgevpr.core.errors import ConfigError
+from edgevpr.core.files import read_file
+
+MAX_FILE_BYTES = 100_000  # the longest shipped file has 6,000; PyYAML reads some 100,000 a second
+_MOST_LEVELS = 20
+_LARGEST_NUMBER = 2**63
+_MERGE = "tag:yaml.org,2002:merge"
+
+
+def read_yaml(path: str | Path) -> dict[str, Any]:
+    """Read a YAML mapping; raises ConfigError for a file that is missing, unreadable, too large or not a mapping, for a
+    key that stands there twice, and for aliases (`*name`, `<<`), which can multiply a small file without end."""
+    import yaml  # not at the top: the command line lists its flags without it
+
+    try:
+        content = deepcopy(_content(read_file(path, MAX_FILE_BYTES).decode("utf-8-sig")))
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be read ({error.strerror}): give the path of a YAML file.") from error
+    except (yaml.YAMLError, ValueError, OverflowError) as error:  # an impossible date is a ValueError
+        mark = getattr(error, "problem_mark", None)
+        where = f", line {mark.line + 1}" if mark else ""
+        problem = getattr(error, "problem", None) or str(error)
+        raise ConfigError(f"{path}{where} is not valid YAML ({problem}): correct it there.") from error
+    if content is None:
+        return {}
+    if not isinstance(content, dict):
+        raise ConfigError(f"{path} must hold `key: value` lines, not {type(content).__name__}.")
+    return content
+
+
+# Commands read some files several times, all boards above all, and PyYAML takes 3 to 8 ms for each on a workstation.
+@lru_cache(maxsize=32)
+def _content(text: str) -> Any:
+    """Return what a YAML text holds, the same object each time. Raises yaml.YAMLError, ValueError, OverflowError."""
+    import yaml
+
+    return yaml.load(text, _loader())
+
+
+@cache
+def _loader() -> type:
+    """Make PyYAML's safe loader strict. A function, because PyYAML is imported with the first file."""
+    import yaml
+
+    class StrictLoader(yaml.SafeLoader):
+        """Reads what a person would write in a configuration, and nothing else."""
+
+        levels = 0
+
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            event = self.peek_event()
+            if isinstance(event, yaml.AliasEvent):
+                raise _problem(f"the alias `*{event.anchor}`: write its value out", event.start_mark)
+            if self.levels > _MOST_LEVELS:
+                raise _problem(f"more than {_MOST_LEVELS} levels", event.start_mark)
+            self.levels += 1
+            try:
+                return super().compose_node(parent, index)
+            finally:
+                self.levels -= 1
+
+        def construct_mapping(self, node: Any, deep: bool = False) -> dict:
+            lines: dict[str, int] = {}
+            for key, _ in node.value:
+                if key.tag == _MERGE:
+                    raise _problem("the merge `<<`: write its keys out", key.start_mark)
+                if isinstance(key, yaml.ScalarNode):
+                    if key.value in lines:
+                        said = f"the key `{key.value}` stands in line {lines[key.value]} already"
+                        raise _problem(said, key.start_mark)
+                    lines[key.value] = key.start_mark.line + 1
+            return super().construct_mapping(node, deep)
+
+        def construct_yaml_int(self, node: Any) -> int:
+            value = super().construct_yaml_int(node)
+            if abs(value) > _LARGEST_NUMBER:
+                raise _problem("a number of too many digits", node.start_mark)
+            return value
+
+    def _problem(said: str, mark: Any) -> yaml.YAMLError:
+        return yaml.constructor.ConstructorError(None, None, said, mark)
+
+    # PyYAML looks constructors up by tag, not by name.
+    StrictLoader.add_constructor("tag:yaml.org,2002:int", StrictLoader.construct_yaml_int)
+    return StrictLoader

@@ -1,0 +1,169 @@
+"""The queries of a data set, asked one by one by the code that flies, and what each answer is worth."""
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from edgevpr.core.config import load_config
+from edgevpr.core.contract import Technique
+from edgevpr.core.errors import ModelError
+from edgevpr.core.types import Frame, StageCost
+from edgevpr.frames.images import list_images, read_image
+from edgevpr.lab.evaluate import metrics
+from edgevpr.lab.evaluate.dataset import Dataset, Query
+from edgevpr.places.index import PlaceIndex
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.retrieve import Ranking, elsewhere
+from edgevpr.places.sequence import length_of, search_of
+from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.recognise.calibrated import calibration_of
+from edgevpr.runtime.recognise.follow import Follower
+from edgevpr.runtime.recognise.judge import accept_rule
+from edgevpr.runtime.recognise.recogniser import Recogniser
+from edgevpr.runtime.recognise.recognition import Recognition
+from edgevpr.runtime.recognise.salience_gate import Gate, NoGate
+
+T = TypeVar("T")
+Progress = Callable[[Iterable[T], int, str], Iterable[T]]
+_NOTHING_FOUND = Ranking(np.empty(0, np.intp), np.empty(0, np.float32), {})  # a picture that says nothing
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Asking:
+    """Manner of asking: `candidates` places are compared (None: the technique's own number, as it flies); with `exact`
+    all are, and the scan chooses none. `sequence` queries are matched together, in the order of their names
+    (None: the technique's own number); with `follow` they are followed as those of one flight."""
+
+    candidates: int | None = None
+    sequence: int | None = None
+    exact: bool = False
+    follow: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Answer:
+    """The answer to one query: the reference that was `found`, its score and the rank of the first right one (from 0,
+    infinite: there is none), all among the references that count. `accepted`: the flight would have accepted the match;
+    `accepted_wrong`: it would have, and the match is wrong; `accepted_elsewhere`: and not beside a right one either.
+    `discarded`: the query was not memorable. `encoding` and `matching` are the costs of the two stages."""
+
+    query: str
+    found: str | None
+    score: float
+    first_right: float
+    accepted: bool
+    accepted_wrong: bool
+    accepted_elsewhere: bool
+    discarded: bool
+    encoding: StageCost
+    matching: StageCost
+
+    @property
+    def is_right(self) -> bool:
+        """True where the best match is right."""
+        return self.first_right == 0
+
+
+class Walk:
+    """A recogniser that is ready to be asked, and how it is asked. `length` queries are matched together, and where
+    `is_in_order` an answer depends on the queries before it."""
+
+    def __init__(
+        self,
+        technique: Technique,
+        place_map: PlaceMap,
+        index: PlaceIndex,
+        meter: QueryMeter,
+        *,
+        asking: Asking,
+        gate: Gate | NoGate | None = None,
+    ) -> None:
+        gate = gate or NoGate()
+        self.length = length_of(technique.spec, asking.sequence)
+        rule = accept_rule(technique, load_config(None).match, self.length, calibration_of(place_map))
+        follows = asking.follow and self.length == 1 and rule.sure is not None
+        self.is_in_order = self.length > 1 or follows
+
+        def recogniser(length: int, follows: bool) -> Recogniser:
+            return Recogniser(
+                technique=technique,
+                place_map=place_map,
+                index=index,
+                rule=rule,
+                meter=meter,
+                candidates=None if asking.exact else asking.candidates or technique.candidates,
+                search=search_of(length),
+                gate=gate,
+                follower=Follower(place_map, fastest_m_s=None, is_live=False) if follows else None,
+            )
+
+        self._once, self._gate = recogniser(1, False), gate
+        self.recogniser = recogniser(self.length, follows)
+
+    def warm_up(self, path: Path) -> None:
+        """Ask a query that is not counted: the first one pays for lazy imports, tables and a cold disk."""
+        asked(self._once, path)
+        self._gate.forget()
+
+
+def in_order(dataset: Dataset) -> list[Path]:
+    """Return all pictures of the folder of the queries: those that are not scored are part of a sequence as well."""
+    return list_images(dataset.queries[0].path.parent)
+
+
+def answer_of(event: Recognition, query: Query, references: Sequence[str], index: PlaceIndex) -> Answer:
+    """Judge what was recognised. `references` are the names of all places, in the order in which they were mapped."""
+    discarded = event.worth is not None and event.worth.reason is not None
+    ranking = (None if discarded else event.ranking) or _NOTHING_FOUND
+    # Slots of the index follow the order of mapping, which is that of the references' names.
+    right = np.array([name in query.right for name in references])
+    ignored = np.array([name in query.ignored for name in references])
+    at = metrics.counting(ranking.slots, ignored)
+    wrong = event.accepted and not (right | ignored)[ranking.slots[0]]
+    away = wrong and elsewhere(index, ranking.slots[0], np.flatnonzero(right | ignored), 0.0).all()
+    return Answer(
+        query=query.path.name,
+        found=references[ranking.slots[at[0]]] if len(at) else None,
+        score=float(ranking.scores[at[0]]) if len(at) else 0.0,
+        first_right=metrics.first_right(ranking.slots[at], right),
+        accepted=event.accepted,
+        accepted_wrong=bool(wrong),
+        accepted_elsewhere=bool(away),
+        discarded=discarded,
+        encoding=event.steps.encoding,
+        matching=event.steps.match,
+    )
+
+
+def answers(walk: Walk, dataset: Dataset, progress: Progress) -> Iterator[Answer]:
+    """Ask all queries of a data set, and yield the answers of those that are scored."""
+    recogniser = walk.recogniser
+    scored = {query.path.name: query for query in dataset.queries}
+    paths = in_order(dataset) if walk.is_in_order else [query.path for query in dataset.queries]
+    for path in progress(paths, len(paths), f"{recogniser.technique.spec.name}: queries"):
+        event = asked(recogniser, path)
+        if query := scored.get(path.name):
+            yield answer_of(event, query, dataset.references, recogniser.index)
+
+
+def asked(recogniser: Recogniser, path: Path) -> Recognition:
+    """Recognise one image. A failure ends the evaluation (ModelError): a set with holes measures nothing."""
+    event = recogniser.step(Frame(image=read_image(path), name=path.name, t_mono_s=0.0))  # a folder has no gaps
+    if event.failed:
+        raise ModelError(event.reason)
+    return event
+
+
+def recall_curve(answers: Sequence[Answer], most: int) -> tuple[float, ...]:
+    """Return recall@K for K from 1 to `most`."""
+    ranks = np.array([each.first_right for each in answers])
+    return tuple(metrics.recall_at(k, ranks) for k in range(1, most + 1))
+
+
+def rank_or_none(rank: float) -> int | None:
+    """Return a rank as JSON can hold it: None where there is no right reference."""
+    return None if math.isinf(rank) else int(rank)

@@ -1,0 +1,238 @@
+"""Measurement of a technique on a data set by the code that flies: map file, index, retrieval, stage meter."""
+
+import tempfile
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from edgevpr.core.config import load_config
+from edgevpr.core.contract import Technique
+from edgevpr.core.errors import UsageError
+from edgevpr.core.types import NO_COST, Frame, StageCost
+from edgevpr.frames.source import Source, open_source
+from edgevpr.lab.evaluate import metrics
+from edgevpr.lab.evaluate.asking import Answer, Asking, Progress, Walk, answers
+from edgevpr.lab.evaluate.dataset import Dataset
+from edgevpr.lab.evaluate.quality import Quality, figures
+from edgevpr.mapmaking.mapping import build_map
+from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.power.boards import load_board
+from edgevpr.power.equations import pack_ah, parse_pack, queries_ah, rail_ah, stage_energy_j
+from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.recognise.evidence import kinds_of
+from edgevpr.runtime.recognise.opening import meter_of
+from edgevpr.runtime.recognise.salience_gate import Gate, NoGate
+from edgevpr.techniques import create, labelled
+from edgevpr.techniques.networks.card import weights_of
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TechniqueResult(Quality):
+    """Result of a technique (in one form) on a data set: its quality, its weights and its cost.
+
+    Times are means over the queries: `t_match_s` is for all references, `t_match_per_ref_s` for one. `u_encode` and
+    `u_match` are shares of all cores over those times (5.1). A place takes `descriptor_bytes` in RAM, and its fine part
+    `fine_bytes` on disk. `ah_total` (5.7) is drawn from the pack, `ah_total_cpu_rail` from the thesis's rail of 2.5 V,
+    both for all queries; `ah_assumes` names board, pack and efficiency. `accepted` queries would have moved the
+    aircraft by the technique's own rule, `accepted_wrong` of them to a wrong place, `accepted_elsewhere` of these to
+    one that is no neighbour of a right place (see `places.retrieve.elsewhere`). `pcu` depends on all techniques that
+    are compared: `compare` fills it in, with the `t_encode_max_s` it used. `sequence` is the
+    number of queries that were matched together. `discarded` queries were not memorable, and count as missed.
+    """
+
+    parameters: dict[str, int | float | str]
+    accepted: int
+    accepted_wrong: int
+    accepted_elsewhere: int
+    t_encode_s: float
+    t_match_s: float
+    t_match_per_ref_s: float
+    descriptor_bytes: int
+    fine_bytes: int
+    u_encode: float
+    u_match: float
+    ah_total: float
+    ah_total_cpu_rail: float
+    ah_assumes: str
+    sequence: int = 1
+    discarded: int = 0
+    weights: str | None = None
+    pcu: float | None = None
+    t_encode_max_s: float | None = None
+
+
+def evaluate(
+    technique_name: str,
+    dataset: Dataset,
+    parameters: dict[str, Any] | None = None,
+    candidates: int | None = None,
+    progress: Progress = lambda items, total, label: items,
+    sequence: int | None = None,
+    gate: Gate | NoGate | None = None,
+    exact: bool = False,
+    follow: bool = False,
+) -> TechniqueResult:
+    """Map the references, ask every query, and score the answers. `candidates` places are compared (None: the
+    technique's own number, as it flies); with `exact` all are, and the scan chooses none. `sequence` queries are
+    matched together, in the order of their names (None: the technique's own number); with `follow` they are followed as
+    those of one flight. `gate` discards queries; the map has all references, as in the thesis (3.3).
+
+    Raises UsageError for an unknown technique or parameter, ImageError for an image that cannot be used, MapError if
+    the temporary map cannot be written, and ModelError for a network that cannot be used or a query that fails.
+    """
+    technique, gate = create(technique_name, parameters), gate or NoGate()
+    config = load_config(None)
+    meter = meter_of(config, load_board("this"))
+    source = open_source(str(dataset.ref_dir), live=False)
+    frames = progress(all_frames(source), source.total, f"{technique_name}: references")
+    with mapped(frames, technique, meter, dataset.ref_dir) as (place_map, index):
+        asking = Asking(candidates=candidates, sequence=sequence, exact=exact, follow=follow)
+        walk = Walk(technique, place_map, index, meter, asking=asking, gate=gate)
+        walk.warm_up(dataset.queries[0].path)
+        found = list(answers(walk, dataset, progress))
+    return replace(summary(technique, len(dataset.references), found), sequence=walk.length)
+
+
+@contextmanager
+def mapped(
+    frames: Iterable[Frame], technique: Technique, meter: QueryMeter, images: Path | None = None
+) -> Iterator[tuple[PlaceMap, PlaceIndex]]:
+    """Map frames in a temporary folder, refine and calibrate the map as `map build` does. Give it, open to read, and
+    an index with all its places. `images` is the folder that the frames come from."""
+    with tempfile.TemporaryDirectory(prefix="edgevpr-eval-") as folder:
+        path = Path(folder) / "references.gpkg"
+        make_map(path, frames, technique, meter, images)
+        with opened(path, technique) as (place_map, index):
+            yield place_map, index
+
+
+def make_map(
+    path: Path,
+    frames: Iterable[Frame],
+    technique: Technique,
+    meter: QueryMeter,
+    images: Path | None,
+    encoder: Technique | None = None,
+) -> None:
+    """Map frames in a new file, refine and calibrate the map as `map build` does. `encoder` makes the places (None: the
+    technique)."""
+    with PlaceMap.create(path, technique.spec) as place_map:
+        build_map(frames, encoder or technique, place_map, meter)
+        _refine(place_map, technique, images)
+        _calibrate(place_map, technique, meter, images)
+
+
+@contextmanager
+def opened(path: Path, technique: Technique) -> Iterator[tuple[PlaceMap, PlaceIndex]]:
+    """Give a map, open to read, and an index with all its places."""
+    with PlaceMap.open(path) as place_map:
+        yield place_map, load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
+
+
+def _refine(place_map: PlaceMap, technique: Technique, images: Path | None) -> None:
+    if technique.spec.cells is None:
+        return
+    try:
+        from edgevpr.mapmaking.refine import refine
+    except ModuleNotFoundError:  # without SciPy, the maps of this machine are not refined either
+        return
+    refine(place_map, technique, lambda pairs, total: pairs, images)
+
+
+def _calibrate(place_map: PlaceMap, technique: Technique, meter: QueryMeter, images: Path | None) -> None:
+    if images is None or not kinds_of(technique.spec):
+        return
+    try:
+        from edgevpr.mapmaking.calibrate import calibrate
+    except ModuleNotFoundError:  # without SciPy
+        return
+
+    def pictures(names: Collection[str]) -> Iterator[Frame]:
+        return all_frames(open_source(str(images), live=False, only=names))
+
+    with suppress(UsageError):  # too small a map, or one whose pictures cannot tell: it flies with the shipped model
+        calibrate(technique, place_map, load_config(None).match, meter, pictures, lambda frames, total: frames)
+
+
+def compare(results: Iterable[TechniqueResult]) -> list[TechniqueResult]:
+    """Fill in the PCU, which measures each technique against the slowest encoder among them."""
+    results = list(results)
+    slowest_s = max(result.t_encode_s for result in results)
+    return [
+        replace(
+            result,
+            pcu=metrics.pcu(result.precision_at_100_recall, result.t_encode_s, slowest_s),
+            t_encode_max_s=slowest_s,
+        )
+        for result in results
+    ]
+
+
+def as_json(results: Iterable[TechniqueResult]) -> dict[str, Any]:
+    """Return {"techniques": {name: every field of its result}}, for `json.dump`."""
+    return {"techniques": {result.technique: asdict(result) for result in results}}
+
+
+def from_json(row: dict[str, Any]) -> TechniqueResult:
+    """Return a result that JSON has held, whatever stands beside it."""
+    known = {each.name: row[each.name] for each in fields(TechniqueResult) if each.name in row}
+    for name, value in known.items():
+        if name.endswith("_interval") and value:
+            known[name] = tuple(value)
+    return TechniqueResult(**{**known, "precision_recall": tuple(map(tuple, known["precision_recall"]))})
+
+
+def all_frames(source: Source) -> Iterator[Frame]:
+    """Yield all frames of a folder. Raises ImageError for the first that cannot be used: a set with holes measures
+    nothing."""
+    while not source.ended:
+        yield source.read(timeout_s=0)
+
+
+def summary(technique: Technique, references: int, answers: Sequence[Answer]) -> TechniqueResult:
+    """Return the result of a technique from its answers to all queries; `sequence` and the PCU are those of nobody."""
+    queries = len(answers)
+    scores = np.array([answer.score for answer in answers])
+    ranks = np.array([answer.first_right for answer in answers])
+    config = load_config(None)
+    board, pack, efficiency = load_board("this"), parse_pack(config.battery.pack), config.battery.regulator_efficiency
+    encoding, matching = _total(answer.encoding for answer in answers), _total(answer.matching for answer in answers)
+    t_encode_s, t_match_s = encoding.wall_s / queries, matching.wall_s / queries
+    u_encode, u_match = encoding.utilisation(board.cores), matching.utilisation(board.cores)
+    query_j = stage_energy_j(board.idle_w, board.full_w, u_encode, t_encode_s)
+    query_j += stage_energy_j(board.idle_w, board.full_w, u_match, t_match_s)
+
+    return TechniqueResult(
+        technique=labelled(technique.spec.name, technique.spec.form),
+        weights=weights_of(technique.spec),
+        parameters=technique.spec.parameters,
+        queries=queries,
+        references=references,
+        **figures(scores, ranks),
+        accepted=sum(answer.accepted for answer in answers),
+        accepted_wrong=sum(answer.accepted_wrong for answer in answers),
+        accepted_elsewhere=sum(answer.accepted_elsewhere for answer in answers),
+        discarded=sum(answer.discarded for answer in answers),
+        t_encode_s=t_encode_s,
+        t_match_s=t_match_s,
+        t_match_per_ref_s=t_match_s / references,
+        descriptor_bytes=technique.spec.row.nbytes,
+        fine_bytes=technique.spec.fine.nbytes if technique.spec.fine else 0,
+        u_encode=u_encode,
+        u_match=u_match,
+        ah_total=queries_ah(queries, pack_ah(query_j, pack, efficiency)),
+        ah_total_cpu_rail=queries_ah(queries, rail_ah(query_j)),
+        ah_assumes=(
+            f"{board.title}, {board.idle_w:g} W idle and {board.full_w:g} W at full load ({board.source}), "
+            f"pack {config.battery.pack}, regulator efficiency {efficiency:g}"
+        ),
+    )
+
+
+def _total(costs: Iterable[StageCost]) -> StageCost:
+    return sum(costs, start=NO_COST)

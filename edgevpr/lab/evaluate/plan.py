@@ -1,0 +1,173 @@
+"""Plan of a measurement, many sets by many rows: a YAML file with the sections `sets` and `rows`, read strictly."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+from edgevpr import techniques
+from edgevpr.core.config import FORMS, bounded, build
+from edgevpr.core.errors import ConfigError
+from edgevpr.core.text import meant
+from edgevpr.core.yamlfile import read_yaml
+from edgevpr.lab.evaluate.asking import Asking, Progress
+from edgevpr.lab.evaluate.dataset import Dataset, load_dataset
+from edgevpr.lab.evaluate.kept import Kept
+from edgevpr.lab.evaluate.layouts import of_positions, open_folder
+from edgevpr.lab.evaluate.nearby import Nearness
+from edgevpr.lab.evaluate.videos import Pictures
+from edgevpr.runtime.preflight.pick import camera_setting
+
+CAMERAS = ("nadir", "forward")
+T = TypeVar("T")
+
+
+def _bounded(low: float, high: float) -> Any:
+    return field(default=None, metadata=bounded(low, high).metadata)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetPlan:
+    """A data set: a `folder` of any layout that is known, or the folders or videos `query` and `ref`. Right is what
+    `ground_truth` names (a CSV, with `query` and `ref`) or the folder itself does, else what was taken near, as
+    `Nearness` says. Of a video, `rate_hz` pictures a second are taken (None: every frame). `camera` looks straight down
+    (nadir) or ahead (forward)."""
+
+    folder: str | None = None
+    query: str | None = None
+    ref: str | None = None
+    ground_truth: str | None = None
+    camera: str | None = None
+    within_m: float | None = _bounded(0.01, 1_000_000)
+    within_deg: float | None = _bounded(0.1, 180)
+    overlap: float | None = _bounded(0.001, 1)
+    fov_deg: float | None = _bounded(5, 150)
+    rate_hz: float | None = _bounded(0.001, 1000)
+
+    def open(self, kept: Kept, progress: Progress) -> Dataset:
+        """Read the set; the pictures of a video are taken once, and kept. Raises UsageError and SourceError as
+        `open_folder` does, and EdgevprError as `videos.Pictures`."""
+        pictures = Pictures(kept, self.rate_hz, progress)
+        rule = Nearness(self.within_m or Nearness().within_m, self.within_deg, self.overlap, self.fov_deg)
+        if self.folder:
+            return open_folder(self.folder, rule, pictures)
+        if self.ground_truth:
+            return load_dataset(self.query or "", self.ref or "", self.ground_truth)
+        return of_positions(self.query or "", self.ref or "", rule, pictures)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RowPlan:
+    """A row of the tables: a technique with its parameters and, where it has forms, the form of its vectors, and how it
+    is asked (see `Asking`)."""
+
+    technique: str
+    parameters: dict = field(default_factory=dict)
+    form: str | None = None
+    candidates: int | None = _bounded(1, 1_000_000)
+    sequence: int | None = _bounded(1, 100)
+    exact: bool = False
+    follow: bool = False
+
+    @property
+    def asking(self) -> Asking:
+        """The manner of asking."""
+        return Asking(candidates=self.candidates, sequence=self.sequence, exact=self.exact, follow=self.follow)
+
+    def settings(self, camera: str | None) -> dict[str, Any]:
+        """Return the settings of the technique on a set whose `camera` is known, or not (None). A parameter of the row
+        comes before that."""
+        form = {"form": self.form} if self.form else {}
+        return {**camera_setting(self.technique, camera), **self.parameters, **form}
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """All that is measured: every row on every set, each by its name."""
+
+    sets: dict[str, SetPlan]
+    rows: dict[str, RowPlan]
+
+
+def read_plan(path: str | Path) -> Plan:
+    """Read a plan. A path in it that is not absolute begins at the folder of the file. Raises ConfigError with file,
+    key and what to do, and UsageError for a technique or parameter that there is not."""
+    content, where = read_yaml(path), str(path)
+    for key in content:
+        _require_one_of(key, ("sets", "rows"), f"{where}: unknown section")
+    sections = {key: _sections(content, key, where) for key in ("sets", "rows")}
+    sets = {name: build(SetPlan, each, where, f"sets.{name}.") for name, each in sections["sets"].items()}
+    rows = {name: build(RowPlan, each, where, f"rows.{name}.") for name, each in sections["rows"].items()}
+    return checked(Plan({name: _below(Path(path).parent, each) for name, each in sets.items()}, rows), where)
+
+
+def checked(plan: Plan, where: str) -> Plan:
+    """Return a plan that can be measured. Raises ConfigError for one that cannot, and UsageError for a technique or a
+    parameter that there is not."""
+    for name, each in plan.sets.items():
+        if bool(each.folder) == bool(each.query and each.ref) or (each.folder and (each.query or each.ref)):
+            raise ConfigError(f"{where}: the set `{name}` needs either `folder`, or `query` and `ref`: name them.")
+        if each.folder and each.ground_truth:
+            raise ConfigError(
+                f"{where}: `sets.{name}.ground_truth` goes with `query` and `ref`: a folder has its own; leave it out."
+            )
+        if each.camera is not None:
+            _require_one_of(each.camera, CAMERAS, f"{where}: `sets.{name}.camera` is")
+    for name, row in plan.rows.items():
+        _require_one_of(row.technique, techniques.names(), f"{where}: `rows.{name}.technique` is")
+        known = techniques.parameters(row.technique)
+        for key, value in row.parameters.items():
+            if not isinstance(key, str) or isinstance(value, bool) or not isinstance(value, str | int | float):
+                raise ConfigError(
+                    f"{where}: `rows.{name}.parameters` has `{key!s:.80}: {value!r:.80}`: write a number or a word."
+                )
+            _require_one_of(key, known, f"{where}: `rows.{name}.parameters` has")
+        if row.form is not None:
+            _require_one_of(row.form, FORMS, f"{where}: `rows.{name}.form` is")
+            if "form" not in known:
+                raise ConfigError(f"{where}: {row.technique} has one form only: leave `rows.{name}.form` out.")
+            if "form" in row.parameters:
+                raise ConfigError(f"{where}: `rows.{name}` has its form twice: leave it out of the parameters.")
+    return plan
+
+
+def of_flags(folders: Sequence[str], chosen: dict[str, RowPlan], common: SetPlan) -> Plan:
+    """Make the plan of folders named on the command line, each measured by the rows `chosen`. `common` says how all
+    sets are read, and may name `query` and `ref` of a set of its own. Sets are named by their folders."""
+    sets: dict[str, SetPlan] = {}
+    if common.query and common.ref:
+        query, ref = (str(Path(each).resolve()) for each in (common.query, common.ref))
+        sets[f"{Path(query).name} on {Path(ref).name}"] = replace(common, query=query, ref=ref)
+    for folder in folders:
+        path = Path(folder).resolve()
+        name = path.name if path.name not in sets else str(path)
+        sets[name] = replace(common, folder=str(path))
+    return checked(Plan(sets, chosen), "the command line")
+
+
+def _sections(content: dict[str, Any], key: str, where: str) -> dict[str, dict[str, Any]]:
+    section = content.get(key)
+    if not isinstance(section, dict) or not section:
+        raise ConfigError(f"{where}: the section `{key}` is missing or empty: name at least one below it, indented.")
+    for name, each in section.items():
+        if not isinstance(name, str) or not name.strip():
+            raise ConfigError(f"{where}: `{key}` has the name {name!r:.80}: write a word, in quotes if it is a number.")
+        if not isinstance(each, dict):
+            raise ConfigError(f"{where}: `{key}.{name}` is a section: write its keys below it, indented.")
+    return section
+
+
+def _below(base: Path, each: SetPlan) -> SetPlan:
+    def at(path: str | None) -> str | None:
+        return None if path is None else str(base / path)
+
+    return replace(
+        each, folder=at(each.folder), query=at(each.query), ref=at(each.ref), ground_truth=at(each.ground_truth)
+    )
+
+
+def _require_one_of(value: object, known: Iterable[str], what: str) -> None:
+    names = list(known)
+    if value not in names:
+        hint = meant(str(value)[:80], names, f"known: {', '.join(names) or 'none'}")
+        raise ConfigError(f"{what} `{value!s:.80}` ({hint}).")

@@ -1,0 +1,194 @@
+"""A simulated flight controller, as strict as the real thing: the other end of a link, for tests and demonstrations."""
+
+import json
+import logging
+import select
+import signal
+import threading
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from types import MappingProxyType
+
+from edgevpr.core.errors import LinkError
+from edgevpr.lab.simulate.flightcontroller.controller import STEP_S, FlightController, ReceivedFix
+from edgevpr.lab.simulate.flightcontroller.recorded import AlongTrack, Nowhere, Track
+from edgevpr.mavlink.address import parse_link
+from edgevpr.mavlink.messages import AUTOPILOT
+from edgevpr.mavlink.transport import Transport, open_transport
+from edgevpr.mavlink.wire import Message, Receiver, mavlink
+
+DEFAULT_VEHICLE = "arduplane"
+_QUESTIONS = {"HEARTBEAT", "PARAM_REQUEST_LIST", "PARAM_REQUEST_READ", "PING", "TIMESYNC"}
+_WAITING_BYTES = 65_536  # of a line that takes none: what is said beyond that is lost
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AutopilotSummary:
+    """Everything that the simulated flight controller received. Senders are written "system/component". A fix that is
+    `failed` came at a time when none is taken, as with GPS; one that is `denied` has the wrong form."""
+
+    messages: dict[str, int]
+    messages_by_sender: dict[str, dict[str, int]]
+    companion: str | None  # the last onboard computer heard
+    fixes_accepted: int
+    fixes_failed: int
+    fixes_denied: int
+    fixes: tuple[ReceivedFix, ...]
+    lost_packets: int
+    bad_bytes: int
+
+    def to_json(self) -> str:
+        return json.dumps(asdict(self))
+
+    def __str__(self) -> str:
+        counts = ", ".join(f"{name} {count}" for name, count in sorted(self.messages.items())) or "none"
+        return (
+            f"companion: {self.companion or 'not heard'}\n"
+            f"messages:  {counts}\n"
+            f"fixes:     {self.fixes_accepted} accepted, {self.fixes_failed} failed, {self.fixes_denied} denied\n"
+            f"line:      {self.lost_packets} packets lost, {self.bad_bytes} bad bytes"
+        )
+
+
+def run_autopilot(
+    link_url: str,
+    duration_s: float | None = None,
+    stop: threading.Event | None = None,
+    *,
+    system_id: int = 1,
+    track: Track | None = None,
+    vehicle: str = DEFAULT_VEHICLE,
+    gps: bool = False,
+    parameters: Mapping[str, str] = MappingProxyType({}),
+) -> AutopilotSummary:
+    """Act as a flight controller at `link_url` until the time is up, `stop` is set, a signal comes or the line is cut.
+
+    With a `track` it flies along the track from the moment a companion first says more than a question, as a flight
+    does and `check` and `doctor` do not, and stays where the track ends; without, it flies nobody knows where, and
+    tells no position. With `gps` it takes no fix. Its time of day is that of this machine; `parameters` are set before
+    it starts. Raises LinkError where the link cannot be opened, UsageError for an unknown vehicle or parameter, and for
+    a value that a parameter cannot have.
+    """
+    motion = AlongTrack(track) if track else Nowhere()
+    controller = FlightController(vehicle, motion, gps=gps, system_id=system_id, start_utc_s=time.time())
+    for name, text in parameters.items():
+        controller.brain.parameters.set_written(name, text)
+    return serve(controller, link_url, duration_s, stop)
+
+
+def serve(
+    controller: FlightController,
+    link_url: str,
+    duration_s: float | None = None,
+    stop: threading.Event | None = None,
+    *,
+    speedup: float = 1.0,
+) -> AutopilotSummary:
+    """Let a flight controller talk at `link_url`, as `run_autopilot` does. Its clock runs `speedup` times as fast."""
+    stop = stop or threading.Event()
+    address = parse_link(link_url)
+    try:
+        transport = open_transport(address)
+    except OSError as error:
+        raise LinkError(f"{address}: it cannot be opened ({error.strerror or error}): is the other end up?") from error
+    log.info("%s is up at %s", controller, address)
+    port = _Port(transport, controller, speedup)
+    with _set_by_signals(stop):
+        try:
+            port.run(lambda t_s: stop.is_set() or (duration_s is not None and t_s >= duration_s))
+        except OSError as error:
+            log.warning("%s was lost (%s)", address, error)
+        finally:
+            transport.close()
+    return port.summary()
+
+
+class _Port:
+    """The link of a flight controller, and the count of what comes over it."""
+
+    def __init__(self, transport: Transport, controller: FlightController, speedup: float) -> None:
+        self._transport, self._controller, self._speedup = transport, controller, speedup
+        self._packer = mavlink.MAVLink(None, srcSystem=controller.system_id, srcComponent=AUTOPILOT)
+        self._receiver = Receiver()
+        self._by_sender: defaultdict[str, Counter[str]] = defaultdict(Counter)
+        self._companion: str | None = None
+        self._next_seq: dict[str, int] = {}
+        self._lost_packets = 0
+        self._waiting = b""
+
+    def run(self, ended: Callable[[float], bool]) -> None:
+        start_s = time.monotonic()
+        while not ended(t_s := time.monotonic() - start_s):
+            self._say(self._controller.advance(t_s * self._speedup))
+            readable, _, _ = select.select([self._transport], [], [], STEP_S / self._speedup)
+            if readable:
+                for message in self._receiver.feed(self._transport.read()):
+                    self._take(message)
+                    self._say(self._controller.hear(message))
+
+    def summary(self) -> AutopilotSummary:
+        answers = Counter(self._controller.answers)
+        accepted, denied = answers[mavlink.MAV_RESULT_ACCEPTED], answers[mavlink.MAV_RESULT_DENIED]
+        return AutopilotSummary(
+            messages=dict(self._receiver.received),
+            messages_by_sender={sender: dict(counts) for sender, counts in self._by_sender.items()},
+            companion=self._companion,
+            fixes_accepted=accepted,
+            fixes_failed=answers.total() - accepted - denied,
+            fixes_denied=denied,
+            fixes=tuple(self._controller.fixes),
+            lost_packets=self._lost_packets,
+            bad_bytes=self._receiver.bad_bytes,
+        )
+
+    def _take(self, message: Message) -> None:
+        """Count a message, and answer from now on to the companion that it comes from, else to whoever is heard."""
+        sender = f"{message.get_srcSystem()}/{message.get_srcComponent()}"
+        self._by_sender[sender][message.get_type()] += 1
+        self._lost_packets += (message.get_seq() - self._next_seq.get(sender, message.get_seq())) % 256
+        self._next_seq[sender] = (message.get_seq() + 1) % 256
+        if sender == self._companion and not _is_question(message):
+            self._controller.begin()
+        if message.get_type() != "HEARTBEAT":
+            return
+        if message.type == mavlink.MAV_TYPE_ONBOARD_CONTROLLER:
+            self._companion = sender
+            self._transport.answer_sender()
+        elif self._companion is None:
+            self._transport.answer_sender()
+
+    def _say(self, messages: list[Message]) -> None:
+        if not self._transport.connected:
+            return
+        for message in messages:
+            packet = message.pack(self._packer)
+            self._packer.seq = (self._packer.seq + 1) % 256
+            if len(self._waiting) < _WAITING_BYTES:
+                data = self._waiting + packet
+                self._waiting = data[self._transport.write(data) :]
+
+
+def _is_question(message: Message) -> bool:
+    """Tell whether a message only asks, and neither tells nor sets anything."""
+    if message.get_type() in ("COMMAND_INT", "COMMAND_LONG"):
+        return message.command == mavlink.MAV_CMD_REQUEST_MESSAGE
+    return message.get_type() in _QUESTIONS
+
+
+@contextmanager
+def _set_by_signals(stop: threading.Event) -> Iterator[None]:
+    """Let SIGTERM and SIGINT set `stop`, where this is the main thread (no other may handle signals)."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,187 @@
+"""A piece of farmland seen from above, generated from a seed, in place of a real site to fly over."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from edgevpr.lab.simulate.brush import BASE_CM, Canvas, crown, noise, roof, smooth_step, stand
+from edgevpr.lab.simulate.fields import DRY, GRASS, LUSH, MUD, paint_field
+from edgevpr.lab.simulate.layout import Bend, parcels, winding
+
+# Colours under even white light, BGR.
+_GRAVEL, _ASPHALT, _WATER, _STONE = (160, 178, 190), (120, 122, 122), (50, 56, 46), (150, 154, 156)
+_ROOFS = ((62, 78, 142), (58, 68, 104), (112, 104, 98), (190, 186, 180), (150, 148, 132), (88, 104, 150))
+# Along and beside the road from the middle of the yard, length, width (metres), quarter turns of the ridge.
+_BUILDINGS = ((-9, 8, 17, 8.5, 0), (8, 9, 12, 7, 0), (10, -6, 18, 8, 1), (-8, -8, 11, 7.5, 0), (-16, -1, 5, 4, 0))
+_LEAVES = np.array([(42, 84, 62), (36, 72, 50), (50, 100, 84), (60, 106, 98), (46, 76, 68)], float)
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """The ground without light: `albedo` uint8 (H, W, 3) BGR, `height_cm` uint16 (H, W) over a common level; north is
+    up and the south-west corner is the point 0 m east, 0 m north."""
+
+    albedo: np.ndarray
+    height_cm: np.ndarray
+    metres_per_pixel: float
+
+    @property
+    def width_m(self) -> float:
+        return self.height_cm.shape[1] * self.metres_per_pixel
+
+    @property
+    def depth_m(self) -> float:
+        return self.height_cm.shape[0] * self.metres_per_pixel
+
+
+def make_scene(seed: int, width_m: float, depth_m: float, metres_per_pixel: float = 0.16) -> Scene:
+    """Generate a scene: fields, hedges, woods, a river, a road, lanes and farms. The same seed gives the same scene."""
+    rng = np.random.default_rng(seed)
+    shape = round(depth_m / metres_per_pixel), round(width_m / metres_per_pixel)
+    canvas = Canvas(np.full((*shape, 3), GRASS, np.uint8), np.full(shape, BASE_CM, np.uint16), metres_per_pixel)
+    river_m = winding(rng, (width_m * 0.55, depth_m * 1.1), (width_m * 0.45, -depth_m * 0.1), 30)
+    road_m = winding(rng, (-width_m * 0.1, depth_m * 0.42), (width_m * 1.1, depth_m * 0.60), 14)
+    bend = Bend(rng, width_m, depth_m, by_m=2.5)
+    trees: list[np.ndarray] = []  # (N, 4): east, north, radius and top in metres
+
+    fields, cuts = parcels(rng, width_m, depth_m, field_m2=7500)
+    for field_m in fields:
+        trees.append(paint_field(rng, canvas, bend(field_m, closed=True)))
+    for level, cut_m in cuts:
+        trees.append(_border(rng, canvas, bend(cut_m, closed=False), level))
+    trees.append(_river(rng, canvas, river_m))
+    _road(rng, canvas, road_m)
+    yards_m = _farms(rng, canvas, road_m, river_m)
+    _mottle(rng, canvas)
+    _plant(rng, canvas, np.concatenate(trees), keep_off_m=((road_m, 4.0), (river_m, 7.0), (yards_m, 19.0)))
+    return Scene(canvas.albedo, canvas.height_cm, metres_per_pixel)
+
+
+def _border(rng: np.random.Generator, canvas: Canvas, line_m: np.ndarray, level: int) -> np.ndarray:
+    """Paint the border of two fields: a lane between large pieces of land, else a hedge, a wall or a grass strip.
+    Returns its trees."""
+    box = canvas.box(line_m, 5.0)
+    if canvas.height_cm[box].size == 0:
+        return np.empty((0, 4))
+    away_m = canvas.distance_m(box, line_m)
+    verge = smooth_step(away_m + 0.4 * noise(rng, away_m.shape, 25, 2), 3.4, 1.8)
+    canvas.paint(box, verge * 0.8, DRY if rng.random() < 0.5 else LUSH)
+    canvas.height_cm[box] = np.where(verge > 0.5, BASE_CM, canvas.height_cm[box])
+    kind = "lane" if level <= 1 else rng.choice(["hedge", "wall", "strip"], p=[0.6, 0.15, 0.25])
+    if kind == "lane":
+        canvas.paint(box, smooth_step(away_m, 1.9, 1.4), MUD)
+        canvas.paint(box, smooth_step(np.abs(away_m - 0.85), 0.5, 0.2), _GRAVEL)
+    if kind == "wall":
+        wall = smooth_step(away_m, 0.6, 0.4)
+        canvas.paint(box, wall, _STONE)
+        canvas.height_cm[box] = np.where(wall > 0.5, BASE_CM + 130, canvas.height_cm[box])
+    if kind == "strip" or (kind in ("lane", "wall") and rng.random() < 0.6):
+        return _along(rng, line_m, step_m=26, spread_m=1.5 if kind == "strip" else 4.5, radius_m=2.6)
+    if kind == "hedge":
+        shrubs = _along(rng, line_m, step_m=1.3, spread_m=0.35, radius_m=1.25)
+        gaps = np.sin(np.arange(len(shrubs)) * rng.uniform(0.05, 0.2) + rng.uniform(0, 6)) > -0.85
+        return np.concatenate((shrubs[gaps], _along(rng, line_m, step_m=22, spread_m=0.8, radius_m=2.9)))
+    return np.empty((0, 4))
+
+
+def _along(rng: np.random.Generator, line_m: np.ndarray, step_m: float, spread_m: float, radius_m: float) -> np.ndarray:
+    """Place trees along a line, (N, 4) metres: east, north, radius, top."""
+    run_m = np.concatenate(([0], np.cumsum(np.hypot(*np.diff(line_m, axis=0).T))))
+    at_m = np.arange(rng.uniform(0, step_m), run_m[-1], step_m)
+    at_m += rng.normal(0, step_m * 0.25, len(at_m))
+    points = np.column_stack([np.interp(at_m, run_m, line_m[:, axis]) for axis in (0, 1)])
+    points += rng.normal(0, spread_m, points.shape)
+    radius = radius_m * rng.uniform(0.6, 1.35, len(points))
+    return np.column_stack((points, radius, radius * rng.uniform(1.4, 2.2, len(points))))
+
+
+def _river(rng: np.random.Generator, canvas: Canvas, line_m: np.ndarray) -> np.ndarray:
+    box = canvas.box(line_m, 24.0)
+    shape = canvas.height_cm[box].shape
+    wide, fine = noise(rng, shape, 40 / canvas.metres_per_pixel, 2), noise(rng, shape, 5 / canvas.metres_per_pixel)
+    away_m = canvas.distance_m(box, line_m) + 1.3 * wide + 0.5 * fine
+    canvas.paint(box, 0.85 * smooth_step(away_m, 15, 9), LUSH)
+    canvas.paint(box, smooth_step(away_m, 7.2, 6.2) * smooth_step(fine, -3, 1), _GRAVEL)
+    bars = smooth_step(wide + 0.3 * fine, 1.2, 1.5) * smooth_step(away_m, 1.0, 2.5)
+    water = smooth_step(away_m, 5.6, 5.0) * (1 - bars)
+    canvas.paint(box, water, _WATER)
+    canvas.paint(box, water * (0.15 * smooth_step(away_m, 2, 5.5) + 0.08 * smooth_step(fine, 0, 2)), _STONE)
+    bank = smooth_step(away_m, 12.5, 9)
+    level_cm = BASE_CM + bank * 12 * fine - 170 * smooth_step(away_m, 8.5, 5.5)
+    canvas.height_cm[box] = np.where(bank > 0, np.clip(level_cm, 0, None), canvas.height_cm[box])
+    beside = np.gradient(line_m, axis=0)[:, ::-1] * (-1, 1) / np.hypot(*np.gradient(line_m, axis=0).T)[:, None]
+    return np.concatenate([_along(rng, line_m + side * 11 * beside, 8.0, 2.5, 2.6) for side in (-1, 1)])
+
+
+def _road(rng: np.random.Generator, canvas: Canvas, line_m: np.ndarray) -> None:
+    box = canvas.box(line_m, 7.0)
+    away_m = canvas.distance_m(box, line_m)
+    worn = noise(rng, away_m.shape, 12 / canvas.metres_per_pixel)
+    canvas.paint(box, 0.9 * smooth_step(away_m + 0.3 * worn, 5.5, 4.2), DRY)
+    canvas.paint(box, smooth_step(away_m, 2.95, 2.75), _ASPHALT)
+    canvas.paint(box, 0.3 * smooth_step(away_m, 2.95, 2.75) * smooth_step(worn, -1, 2), _STONE)
+    canvas.paint(box, 0.3 * smooth_step(np.abs(away_m - 1.3), 0.7, 0.2), (146, 148, 150))
+    canvas.paint(box, 0.7 * smooth_step(np.abs(away_m - 2.5), 0.14, 0.06), (215, 220, 222))
+    canvas.height_cm[box] = np.where(away_m < 4.2, BASE_CM + 20, canvas.height_cm[box])
+
+
+def _farms(rng: np.random.Generator, canvas: Canvas, road_m: np.ndarray, river_m: np.ndarray) -> np.ndarray:
+    """Paint farms beside the road, away from the river; return the middles of their yards, (N, 2) metres."""
+    yards = []
+    for at in range(18, len(road_m) - 18, 13):
+        ahead = road_m[at + 1] - road_m[at]
+        turn_rad = float(np.arctan2(ahead[1], ahead[0])) + rng.normal(0, 0.12)
+        along, beside = np.array([np.cos(turn_rad), np.sin(turn_rad)]), np.array([-np.sin(turn_rad), np.cos(turn_rad)])
+        middle = road_m[at] + beside * rng.choice([-1, 1]) * 24 + along * rng.normal(0, 4)
+        if np.hypot(*(river_m - middle).T).min() > 42 and rng.random() < 0.7:
+            _farm(rng, canvas, middle, turn_rad, along, beside)
+            yards.append(middle)
+    return np.array(yards).reshape(-1, 2)
+
+
+def _farm(rng: np.random.Generator, canvas: Canvas, middle, turn_rad: float, along, beside) -> None:
+    """Paint a yard with ragged edges, buildings around it and vehicles on it."""
+    yard = np.array([middle + a * along * 19 + b * beside * 17 for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))])
+    box = canvas.box(yard, 4.0)
+    cover = canvas.polygon(box, yard)
+    ragged = smooth_step(cv2.GaussianBlur(cover, (0, 0), 8) + 0.16 * noise(rng, cover.shape, 30), 0.42, 0.58)
+    canvas.paint(box, ragged, np.array(_GRAVEL if rng.random() < 0.6 else MUD) * rng.uniform(0.8, 0.95))
+    canvas.height_cm[box] = np.where(ragged > 0.3, BASE_CM, canvas.height_cm[box])
+    for u_m, v_m, length_m, width_m, quarter_turns in _BUILDINGS:
+        if rng.random() < 0.8:
+            centre = middle + (u_m + rng.normal(0, 1)) * along + (v_m + rng.normal(0, 1)) * beside
+            size_m = np.array((length_m, width_m)) * rng.uniform(0.8, 1.25, 2)
+            colour = np.array(_ROOFS[rng.integers(len(_ROOFS))]) * rng.uniform(0.85, 1.1)
+            roof(canvas, centre, *size_m, turn_rad + quarter_turns * np.pi / 2, rng.uniform(2.6, 5), colour)
+    for _ in range(rng.integers(2, 7)):
+        centre = middle + rng.uniform(-14, 14) * along + rng.uniform(-2, 3) * beside
+        colour = rng.uniform(60, 225) * rng.uniform(0.6, 1.2, 3)
+        roof(canvas, centre, 4.3, 1.9, turn_rad + rng.integers(2) * np.pi / 2 + rng.normal(0, 0.2), 1.4, colour)
+
+
+def _mottle(rng: np.random.Generator, canvas: Canvas) -> None:
+    """Vary the brightness of the ground at 60 m, at a few metres, and from pixel to pixel: ground is never of one
+    colour."""
+    for share, bump_m in ((0.06, 60.0), (0.07, 5.0), (0.08, 1.0)):
+        bump_px = max(bump_m / canvas.metres_per_pixel, 2.0)
+        coarse = max(2, int(bump_px / 8))
+        change = noise(rng, (canvas.shape[0] // coarse + 1, canvas.shape[1] // coarse + 1), bump_px / coarse, 3)
+        change = np.clip(128 * (1 + share * change), 0, 255).astype(np.uint8)
+        change = cv2.resize(change, canvas.shape[::-1], interpolation=cv2.INTER_LINEAR)
+        for channel in range(3):
+            canvas.albedo[..., channel] = cv2.multiply(canvas.albedo[..., channel], change, scale=1 / 128)
+
+
+def _plant(rng: np.random.Generator, canvas: Canvas, trees: np.ndarray, keep_off_m) -> None:
+    """Set the trees, (N, 4) east, north, radius, top, except near the lines (or points) of `keep_off_m`."""
+    for line_m, clear_m in keep_off_m:
+        gap_m = np.hypot(*(trees[:, None, :2] - line_m[None]).T).T
+        trees = trees[(gap_m > clear_m).all(axis=1)]
+    domes: dict[int, list[np.ndarray]] = {}
+    for east_m, north_m, radius_m, top_m in trees:
+        radius_px = max(2, round(radius_m / canvas.metres_per_pixel))
+        if radius_px not in domes:
+            domes[radius_px] = [crown(rng, radius_px) for _ in range(4)]
+        colour = _LEAVES[rng.integers(len(_LEAVES))] * rng.uniform(0.8, 1.2)
+        stand(canvas, domes[radius_px][rng.integers(4)], (east_m, north_m), top_m, colour)

@@ -1,0 +1,124 @@
+"""Training pairs of CALC: a changed view of a picture as input, the gradients of the unchanged view as target.
+
+Merrill and Huang 2018, section III. In the paper the corners of a view are moved at random. Here more is random,
+because a flight has thousands of pictures and not millions. The view itself is a random part of the picture, mirrored
+half of the time. Corners move outwards as well as inwards, so that the changed view is not always zoomed. Light falls
+unevenly, which histogram equalisation (part of the network's input here as in flight) cannot undo.
+"""
+
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from edgevpr.core.errors import ImageError, UsageError
+from edgevpr.core.progress import progress
+from edgevpr.core.text import shown
+from edgevpr.frames.images import list_images, read_image
+from edgevpr.frames.opencv import cv2
+from edgevpr.techniques.gradients import normalised_blocks, oriented_cells
+
+HEIGHT, WIDTH = 120, 160  # of the network's input
+MIN_PICTURES = 16
+_CELL_PX = 8
+_ORIENTATIONS = 9
+# 14 x 19 blocks of 2x2 cells. The paper's 3648 values are OpenCV's HOG of 2 orientations in windows of two blocks that
+# overlap, so that most blocks are in it twice. Here each block is in once, with the 9 orientations of Dalal and Triggs.
+TARGET_LENGTH = (HEIGHT // _CELL_PX - 1) * (WIDTH // _CELL_PX - 1) * 4 * _ORIENTATIONS
+_LONGEST_READ_PX = 640  # larger pictures only fill memory: no network here uses more
+_LONGEST_LEARNT_PX = 320  # twice the network's input: enough for a part of a picture
+_SMALLEST_PART = 0.85
+_CORNER_MOVES = 0.1  # of the sides of the view
+_LIGHT_VARIES = 0.5  # standard deviation of the logarithm of the light over the view
+_NOISE = 2.0  # largest standard deviation, in grey levels
+
+
+def read_pictures(
+    folders: Sequence[str | Path], label: str, unusable: list[ImageError] | None = None
+) -> Iterator[np.ndarray]:
+    """Yield each image of `folders`, uint8 grey or BGR, the longer side at most 640 pixels, and print the progress
+    under `label`. Images that cannot be used are printed to stderr and added to `unusable` (None: that was done
+    before).
+
+    Raises SourceError for a folder that is missing or holds no images.
+    """
+    paths = [path for folder in folders for path in list_images(folder)]
+    for path in progress(paths, len(paths), label):
+        try:
+            yield _at_most(read_image(path), _LONGEST_READ_PX)
+        except ImageError as error:
+            if unusable is not None:
+                print(f"edgevpr: {shown(str(error))}", file=sys.stderr)
+                unusable.append(error)
+
+
+def small_grey(image: np.ndarray) -> np.ndarray:
+    """Convert a uint8 image to the form that `batch` takes: uint8 grey, the longer side at most 320 pixels."""
+    grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    return _at_most(grey, _LONGEST_LEARNT_PX)
+
+
+def _at_most(image: np.ndarray, longest_px: int) -> np.ndarray:
+    shrink = longest_px / max(image.shape[:2])
+    return cv2.resize(image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA) if shrink < 1 else image
+
+
+def require_enough(pictures: Sequence[np.ndarray]) -> None:
+    """Raise UsageError for too few pictures to learn from."""
+    if len(pictures) < MIN_PICTURES:
+        raise UsageError(
+            f"{len(pictures)} usable images are too few to learn from: give folders with {MIN_PICTURES} at the very "
+            "least, better thousands, of the kind of ground that will be flown over."
+        )
+
+
+def batch(pictures: Sequence[np.ndarray], size: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return `size` inputs, float32 (size, 1, 120, 160) in 0..1, and their targets, float32 (size, TARGET_LENGTH)."""
+    inputs = np.empty((size, 1, HEIGHT, WIDTH), np.float32)
+    targets = np.empty((size, TARGET_LENGTH), np.float32)
+    for row in range(size):
+        sight, changed = two_sights(pictures[rng.integers(len(pictures))], rng)
+        inputs[row, 0] = cv2.equalizeHist(changed)
+        targets[row] = gradients_of(sight)
+    inputs /= 255
+    return inputs, targets
+
+
+def gradients_of(sight: np.ndarray) -> np.ndarray:
+    """Compute the target, the HOG of a view: uint8 (120, 160) to float32 (TARGET_LENGTH,) in 0..1. Cells are 8x8
+    pixels, blocks 2x2 cells with a stride of one cell, orientations 9 over 180 degrees."""
+    return normalised_blocks(oriented_cells(sight, _CELL_PX, _ORIENTATIONS, signed=False)).ravel()
+
+
+def two_sights(picture: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return a random part of a grey picture as uint8 (120, 160), and the same ground from elsewhere in other light."""
+    height, width = picture.shape
+    largest = min(width / WIDTH, height / HEIGHT)
+    scale = largest * rng.uniform(_SMALLEST_PART, 1)
+    size = np.array([WIDTH, HEIGHT]) * scale
+    corner = rng.uniform(0, 1, 2) * (np.array([width, height]) - size)
+    corners = corner + np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * size
+    if rng.random() < 0.5:
+        corners = corners[[1, 0, 3, 2]]
+    moved = corners + rng.uniform(-_CORNER_MOVES, _CORNER_MOVES, (4, 2)) * size
+    return _seen(picture, corners), _relit(_seen(picture, moved), rng)
+
+
+def _seen(picture: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    frame = np.array([[0, 0], [WIDTH, 0], [WIDTH, HEIGHT], [0, HEIGHT]], np.float32)
+    to_frame = cv2.getPerspectiveTransform(corners.astype(np.float32), frame)
+    return cv2.warpPerspective(
+        picture, to_frame, (WIDTH, HEIGHT), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101
+    )
+
+
+def _relit(sight: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Change the light of a view: another gamma, mostly darker, light that varies over the view (shadows of clouds),
+    and noise of the sensor."""
+    light = rng.normal(0, _LIGHT_VARIES * rng.random(), (3, 4)).astype(np.float32)
+    light = np.exp(cv2.resize(light, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC))
+    changed = (sight / np.float32(255)) ** np.float32(rng.uniform(0.6, 1.6))
+    changed *= light * np.float32(255 * rng.uniform(0.5, 1.1))
+    changed += rng.standard_normal(changed.shape, np.float32) * np.float32(rng.uniform(0, _NOISE))
+    return np.clip(changed, 0, 255).astype(np.uint8)

@@ -1,0 +1,82 @@
+"""An orthophoto as a source of frames: a picture of the ground around each place of a grid, as a camera that looks
+straight down, with the nose to the north, would take it."""
+
+from collections.abc import Callable, Collection
+
+from edgevpr.core.errors import ImageError
+from edgevpr.core.text import decoded_name
+from edgevpr.core.types import Frame, Pose, Position
+from edgevpr.frames.recordings import Recording
+from edgevpr.frames.shot import Refusal
+from edgevpr.mapmaking.lattice import Lattice
+from edgevpr.mapmaking.orthophoto import Orthophoto
+
+SIDE_PX = 512
+MOST_WITHOUT_DATA = 0.1
+_GEO_REFERENCE_M = 1.0  # standard deviation of where the orthophoto says that a thing is, in each direction
+
+
+class OrthophotoSource(Recording):
+    """A frame for each place of a grid, but for those of which more than a tenth is without data; `without_data` counts
+    these."""
+
+    def __init__(
+        self,
+        orthophoto: Orthophoto,
+        lattice: Lattice,
+        footprint_m: float,
+        clock: Callable[[], float],
+        *,
+        only: Collection[str] | None = None,
+    ) -> None:
+        super().__init__(only)
+        self._orthophoto, self._lattice, self._footprint_m, self._clock = orthophoto, lattice, footprint_m, clock
+        self.total = len(lattice)
+        self.without_data = 0
+        self._read = 0
+        variance_m2 = _GEO_REFERENCE_M**2 + (orthophoto.resolution_m / 2) ** 2
+        self._pose = Pose(
+            up_deg=0.0, footprint_m=footprint_m, covariance_m2=(variance_m2, 0.0, variance_m2), is_surveyed=True
+        )
+
+    @property
+    def ended(self) -> bool:
+        return self._read == self.total
+
+    def read(self, timeout_s: float) -> Frame | None:
+        """Return the picture of the next place, None where it has too little data. Raises ImageError for a damaged part
+        of the file; the next call goes on with the place after it."""
+        if self.ended:
+            return None
+        lattice, at = self._lattice, self._read
+        row, column = map(_numbered, (lattice.rows[at], lattice.columns[at]), lattice.shape)
+        self._read += 1
+        name = f"{decoded_name(self._orthophoto.path.name)}_r{row}_c{column}"
+        if not self.is_wanted(name):
+            return None
+        position = Position(float(lattice.lat_deg[at]), float(lattice.lon_deg[at]))
+        try:
+            image, valid = self._orthophoto.cut(position, self._footprint_m, SIDE_PX)
+        except ImageError:
+            self.refused[Refusal.DAMAGED.value] += 1
+            raise
+        if valid.mean() < 1 - MOST_WITHOUT_DATA:
+            self.without_data += 1
+            return None
+        return Frame(
+            image=image,
+            name=name,
+            t_mono_s=self._clock(),
+            position=position,
+            heading_deg=0.0,
+            pose=self._pose,
+        )
+
+    def close(self) -> None:
+        """Close the orthophoto."""
+        self._orthophoto.close()
+
+
+def _numbered(number: int, count: int) -> str:
+    """Write a number of 0..count - 1 so that names sort in its order."""
+    return str(number).zfill(max(3, len(str(count - 1))))

@@ -1,0 +1,171 @@
+"""Areas and paths as ground stations keep them: waypoint files, plans of QGroundControl, GeoJSON."""
+
+import json
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from edgevpr.core.errors import UsageError
+from edgevpr.core.files import read_file
+
+_MAX_FILE_BYTES = 50_000_000
+_WAYPOINT_COLUMNS = 12
+# The MAV_CMDs that an aircraft flies to: waypoint, loiter (unlimited, turns, time, to altitude), land, take off,
+# spline, and take off and land of a VTOL. Others, such as the region of interest, have a position and are not flown to.
+_FLOWN_TO = {16, 17, 18, 19, 21, 22, 31, 82, 84, 85}
+_OVER_GROUND = {3, 6, 10, 11}  # MAV_FRAMEs whose altitude is over home or the terrain
+
+Ring = list[tuple[float, float]]
+
+
+@dataclass(frozen=True, slots=True)
+class Waypoint:
+    """A point of a path, degrees, and its height in metres over home or the ground (None: not told)."""
+
+    lat_deg: float
+    lon_deg: float
+    height_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Area:
+    """The ground that a file names: polygons, each as rings (the outline, then holes) of points (lat, lon) in degrees,
+    and paths of waypoints."""
+
+    polygons: tuple[tuple[Ring, ...], ...]
+    paths: tuple[tuple[Waypoint, ...], ...]
+
+    @property
+    def extent_deg(self) -> tuple[float, float, float, float]:
+        """The area's south, west, north and east."""
+        points = [(way.lat_deg, way.lon_deg) for path in self.paths for way in path]
+        points += [point for rings in self.polygons for ring in rings for point in ring]
+        lat_deg, lon_deg = zip(*points, strict=True)
+        return min(lat_deg), min(lon_deg), max(lat_deg), max(lon_deg)
+
+
+def read_area(path: str | Path) -> Area:
+    """Read a waypoint file (QGC WPL 110), a .plan of QGroundControl, or GeoJSON in degrees. Raises UsageError for a
+    file that is none of them, holds no position, or has one beyond the globe."""
+    try:
+        text = read_file(path, _MAX_FILE_BYTES).decode("utf-8-sig")
+    except OSError as error:
+        raise UsageError(f"{path} cannot be read ({error.strerror}): give a mission file or GeoJSON.") from error
+    except UnicodeDecodeError:
+        raise _foreign(path) from None
+    try:
+        area = _of_lines(text.splitlines()) if text.startswith("QGC WPL") else _of_json(json.loads(text))
+    except (ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError):
+        raise _foreign(path) from None
+    if not area.polygons and not area.paths:
+        raise UsageError(f"{path} holds no polygon and no position to fly to: save the mission or the area again.")
+    south, west, north, east = area.extent_deg
+    if not (-90 <= south <= north <= 90 and -180 <= west <= east <= 180):
+        raise UsageError(f"{path} has positions beyond the globe: they must be degrees of WGS-84.")
+    return area
+
+
+def _foreign(path: str | Path) -> UsageError:
+    return UsageError(
+        f"{path} is no waypoint file (QGC WPL 110), no .plan of QGroundControl and no GeoJSON that can be understood: "
+        "save it again."
+    )
+
+
+def _of_lines(lines: list[str]) -> Area:
+    """Read a waypoint file: index, current, frame, command, four parameters, lat, lon, alt, autocontinue."""
+    path = []
+    for line in lines[1:]:
+        values = line.split()
+        if values and len(values) != _WAYPOINT_COLUMNS:
+            raise ValueError
+        if values:
+            path += _waypoint(int(values[3]), int(values[2]), *map(_finite, values[8:11]))
+    return Area((), (tuple(path),) if path else ())
+
+
+def _waypoint(command: int, frame: int, lat_deg: float, lon_deg: float, alt_m: float) -> list[Waypoint]:
+    """Return the waypoint of an item of a mission; none for one that is not flown to, or is where the aircraft is."""
+    if command not in _FLOWN_TO or lat_deg == lon_deg == 0:
+        return []
+    # Home and a landing are at no height: a picture is taken from the height of the waypoint before or after.
+    return [Waypoint(lat_deg, lon_deg, alt_m if frame in _OVER_GROUND and alt_m > 0 else None)]
+
+
+def _of_json(said: Any) -> Area:
+    if said.get("fileType") == "Plan":
+        return _of_plan(said["mission"]["items"])
+    polygons: list[tuple[Ring, ...]] = []
+    paths: list[tuple[Waypoint, ...]] = []
+    for geometry in _geometries(said):
+        within = geometry["coordinates"]
+        if geometry["type"] in ("Polygon", "MultiPolygon"):
+            each_polygon = within if geometry["type"] == "MultiPolygon" else [within]
+            polygons += [tuple(_ring(ring) for ring in rings) for rings in each_polygon]
+        else:
+            paths += [tuple(Waypoint(*_lat_lon(point)) for point in line) for line in _LINES[geometry["type"]](within)]
+    return Area(tuple(rings for rings in polygons if rings), tuple(path for path in paths if path))
+
+
+# The lines of each kind of geometry that is no polygon; a point is a line of one.
+_LINES: dict[str, Callable[[list], list]] = {
+    "Point": lambda point: [[point]],
+    "MultiPoint": lambda points: [[point] for point in points],
+    "LineString": lambda line: [line],
+    "MultiLineString": lambda lines: lines,
+}
+
+
+def _geometries(said: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """Yield the plain geometries of any object of GeoJSON."""
+    if said["type"] == "FeatureCollection":
+        for feature in said["features"]:
+            yield from _geometries(feature)
+    elif said["type"] == "Feature":
+        if said["geometry"]:
+            yield from _geometries(said["geometry"])
+    elif said["type"] == "GeometryCollection":
+        for geometry in said["geometries"]:
+            yield from _geometries(geometry)
+    else:
+        yield said
+
+
+def _lat_lon(point: list[float]) -> tuple[float, float]:
+    """Return the point of GeoJSON, which writes longitude first."""
+    return _finite(point[1]), _finite(point[0])
+
+
+def _ring(points: list[list[float]]) -> Ring:
+    if len(points) < 4:
+        raise ValueError
+    return [_lat_lon(point) for point in points]
+
+
+def _of_plan(items: list[dict[str, Any]]) -> Area:
+    """Read the items of a plan: simple ones, and surveys and corridors, whose way is written out beside their shape."""
+    path: list[Waypoint] = []
+    polygons: list[tuple[Ring, ...]] = []
+    for item in items:
+        if item["type"] == "SimpleItem":
+            path += _waypoint(int(item["command"]), int(item["frame"]), *_numbers(item["params"][4:7]))
+            continue
+        style = item.get("TransectStyleComplexItem", {})
+        height_m = style.get("CameraCalc", {}).get("DistanceToSurface")
+        path += [Waypoint(*_numbers(point[:2]), height_m) for point in style.get("VisualTransectPoints", ())]
+        if corners := [tuple(_numbers(point[:2])) for point in item.get("polygon", ())]:
+            polygons.append(([*corners, corners[0]],))
+    return Area(tuple(polygons), (tuple(path),) if path else ())
+
+
+def _numbers(values: list[Any]) -> list[float]:
+    """Return numbers of a plan, which writes null for those that it leaves to the autopilot."""
+    return [_finite(value or 0) for value in values]
+
+
+def _finite(value: float) -> float:
+    if not math.isfinite(number := float(value)):
+        raise ValueError
+    return number

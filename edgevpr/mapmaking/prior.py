@@ -1,0 +1,97 @@
+"""The shipped model of confidence, fitted to the matches of many sites."""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from datetime import date
+
+import numpy as np
+
+from edgevpr.mapmaking.calibrate import Answer, adapted
+from edgevpr.mapmaking.fit import fitted, matrix, nothing_known, tail_of
+from edgevpr.runtime.recognise.confidence import Evidence, Logistic, Model, Scale, Tail
+from edgevpr.runtime.recognise.evidence import OF_MAP, OF_PLACE
+
+_PULL = 0.3
+# Parts of the wrong matches that are the tail.
+_TAIL_OFF_MAP, _TAIL_OFF_PLACE = 0.02, 0.1
+_FEWEST_WRONG = 20
+_EACH = 100.0  # the weight of the right, and of the wrong, matches of a map
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Site:
+    """Evidence of one site, by its map: that of real queries, and the `answers` to changed pictures of its own.
+    `own` are queries of the site with whether their match is right, `foreign` queries of other sites."""
+
+    name: str
+    own: Sequence[tuple[Evidence, bool]]
+    foreign: Sequence[Evidence]
+    answers: Sequence[Answer]
+
+
+def shipped_model(kind: str, sites: Sequence[Site], made_of: str) -> Model:
+    """Fit the model of one kind of evidence to these sites, each as important as any other."""
+    of_map = _regression(
+        OF_MAP[kind],
+        [([evidence for evidence, right in site.own if right], True) for site in sites]
+        + [(site.foreign, False) for site in sites],
+    )
+    of_place = _regression(
+        OF_PLACE[kind],
+        [
+            ([evidence for evidence, each in site.own if each == right], right)
+            for site in sites
+            for right in (True, False)
+        ]
+        + [
+            ([answer.evidence for answer in site.answers if answer.right == right], right)
+            for site in sites
+            for right in (True, False)
+        ],
+    )
+    unknown = Scale(Tail(0.0, 1.0, 1.0), Tail(0.0, 1.0, 1.0), 1.0, 0.0)
+    today = date.today().isoformat()
+    model = Model(of_map=of_map, of_place=of_place, scale=unknown, made=today, made_of=made_of)
+    bare = [(site, model) for site in sites]
+    own = [(site, adapted(model, site.answers, site.name)) for site in sites if site.answers]
+    return replace(model, scale=_scale(bare), adapted_scale=_scale(own) if own else None)
+
+
+def _regression(names: Sequence[str], groups: Iterable[tuple[Sequence[Evidence], bool]]) -> Logistic:
+    groups = [(rows, right) for rows, right in groups if len(rows)]
+    rows = [row for group, _ in groups for row in group]
+    right = np.concatenate([np.full(len(group), each) for group, each in groups])
+    weights = np.concatenate([np.full(len(group), _EACH / len(group)) for group, _ in groups])
+    scales = np.maximum(matrix(rows, names).std(0), 1e-3)
+    return fitted(nothing_known(names, scales), rows, right, weights, _PULL * len(groups))
+
+
+def _scale(sites: Sequence[tuple[Site, Model]]) -> Scale:
+    """Return what the logits mean that models give at their sites."""
+    off_map = _tail(
+        [[model.of_map.logit(each) for each in site.foreign] for site, model in sites],
+        [len(site.foreign) for site, _ in sites],
+        _TAIL_OFF_MAP,
+    )
+    wrong = [[model.of_place.logit(evidence) for evidence, right in site.own if not right] for site, model in sites]
+    counts = [len(site.own) for site, _ in sites]
+    if sum(map(len, wrong)) < _FEWEST_WRONG:  # ground of other sites stands in for ground that looks alike
+        wrong = [[model.of_place.logit(each) for each in site.foreign] for site, model in sites]
+        counts = [len(site.foreign) for site, _ in sites]
+    scale = Scale(off_map, _tail(wrong, counts, _TAIL_OFF_PLACE), 1.0, 0.0)
+    rows, right, weights = [], [], []
+    for site, model in sites:
+        model = replace(model, scale=scale)
+        for group in (site.own, [(evidence, False) for evidence in site.foreign]):
+            rows += [{"log_chance": -math.log(max(model.chance(evidence), 1e-15))} for evidence, _ in group]
+            right += [each for _, each in group]
+            weights += [_EACH / len(group)] * len(group)
+    line = fitted(Logistic(("log_chance",), (1.0,), (1.0,), 0.0), rows, np.array(right), np.array(weights), _PULL)
+    return replace(scale, slope=line.weights[0], offset=line.bias)
+
+
+def _tail(logits: Sequence[Sequence[float]], counts: Sequence[int], part: float) -> Tail:
+    """Fit the tail of the wrong matches of sites, which have these `counts` of matches; each site counts the same."""
+    shares = [np.full(len(of_site), 1 / (count * len(logits))) for of_site, count in zip(logits, counts, strict=True)]
+    return tail_of(np.concatenate([np.array(each, float) for each in logits]), np.concatenate(shares), part)

@@ -1,0 +1,268 @@
+"""A flight as its log tells it, in values that are small and sure."""
+
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+from edgevpr.core.geodesy import distance_m, moved
+from edgevpr.review.values import Point, number, point, text, value
+from edgevpr.runtime.flight.wholeflight import flight_of
+
+_FRESH_S = 1.0  # an older report of the autopilot says nothing of a frame
+_CONTINUOUS = "taken into the continuous position"  # which is sent all the time and not answered
+_SAYING = ("said", "state", "problem", "why")  # the field of a line that people read, the first that is there
+
+
+class Outcome(Enum):
+    """Fate of a fix, in the words of the page."""
+
+    TAKEN = "fix taken"
+    REFUSED = "fix refused"
+    UNANSWERED = "fix not answered"
+    CONTINUOUS = "in continuous position"
+    KEPT = "fix not sent"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fix:
+    """The fix of a query: `outcome`, `why` it was not sent or not taken, the position that it says (None: there was
+    nothing to send), and how long the answer took."""
+
+    outcome: Outcome
+    why: str | None
+    at: Point | None
+    accuracy_m: float | None
+    latency_ms: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Query:
+    """One query, `t_s` seconds after the start. `at` is the position of an accepted match, `place_at` that of the place
+    found, `autopilot_at` and `gps_at` where autopilot and receiver say that the aircraft was when the frame was taken,
+    and `off_m` is from there to the match: from the autopilot that has GPS, else from the receiver. `cores` are those
+    that the process kept busy since the query before. None is unknown, of whatever it is."""
+
+    name: str
+    t_s: float
+    time: str
+    accepted: bool
+    reason: str
+    confidence: float | None
+    score: float | None
+    place: int | None
+    reference_image: str | None
+    at: Point | None
+    accuracy_m: float | None
+    place_at: Point | None
+    autopilot_at: Point | None
+    gps_at: Point | None
+    off_m: float | None
+    fix: Fix | None
+    wall_ms: float | None
+    latency_ms: float | None
+    cores: float | None
+    rss_mb: float | None
+    temperature_c: float | None
+    used_mah: float | None
+    has_link: bool | None
+
+
+@dataclass(frozen=True, slots=True)
+class Remark:
+    """A line that says something in words: `kind` of the line, and the words."""
+
+    t_s: float
+    kind: str
+    said: str
+
+
+@dataclass(slots=True, kw_only=True)
+class Flight:
+    """One flight of a log: `number` of `flights` in it. `start` and `end` are the first and the last line ({}: it lacks
+    one). `unusable` are the times of frames that never became queries, `learnt` the positions of new places. `missing`
+    is a sentence about files of the flight that are not there (None: none)."""
+
+    path: Path
+    number: int
+    flights: int = 0
+    start: dict[str, Any] = field(default_factory=dict)
+    end: dict[str, Any] = field(default_factory=dict)
+    queries: list[Query] = field(default_factory=list)
+    remarks: list[Remark] = field(default_factory=list)
+    unusable: list[float] = field(default_factory=list)
+    learnt: list[Point] = field(default_factory=list)
+    missing: str | None = None
+    span_s: float = 0.0
+
+    @property
+    def map_path(self) -> str | None:
+        """The map, as the first line names it."""
+        return text(self.start, "map")
+
+    @property
+    def recording(self) -> str | None:
+        """The folder of its recording, as the first line names it."""
+        return text(self.start, "recording")
+
+
+def read_flight(path: str | Path, number: int | None = None) -> Flight:
+    """Read one flight of a log, with the files before it where it is one of several (see `wholeflight.flight_of`, also
+    for what is raised): the last flight in the file unless its `number` (1, 2, ...) is given."""
+    lines = flight_of(path, number)
+    flight = Flight(path=lines.path, number=lines.number, flights=lines.flights, missing=lines.missing)
+    if lines.missing:
+        flight.remarks.append(Remark(0.0, "missing", lines.missing))
+    reading = _Reading(flight)
+    for line in lines:
+        reading.read(line["kind"], line)
+    return flight
+
+
+class _Reading:
+    """Reads the lines of one flight in their order."""
+
+    def __init__(self, flight: Flight) -> None:
+        self.flight = flight
+        self._at: dict[str, int] = {}  # the number of a query by its name
+        self._cpu_s = self._elapsed_s = 0.0
+        self._start_s: float | None = None
+
+    def read(self, kind: str, line: dict[str, Any]) -> None:
+        """Read a line."""
+        flight, t_s = self.flight, self._since_start(number(line, "t_mono_s"))
+        flight.span_s = max(flight.span_s, t_s)
+        if kind == "start":
+            flight.start = line
+        elif kind == "end":
+            flight.end = line
+        elif kind == "query":
+            self._take_answer(line, "last_fix", "answer")
+            self._at[text(line, "query") or ""] = len(flight.queries)
+            flight.queries.append(self._query(line, t_s))
+        elif kind == "answer":
+            self._take_answer({"answer": line}, "answer", "result")
+        elif kind == "unusable":
+            flight.unusable.append(t_s)
+        elif kind == "learnt":
+            flight.learnt += filter(None, [point(line, "position")])
+        else:
+            flight.remarks.append(Remark(t_s, kind, _said(line)))
+
+    def _since_start(self, t_mono_s: float | None) -> float:
+        """Return the seconds since the first line that has a time; of a line without, those of the latest before it."""
+        if t_mono_s is None:
+            return self.flight.span_s
+        if self._start_s is None:
+            self._start_s = t_mono_s
+        return max(0.0, t_mono_s - self._start_s)
+
+    def _take_answer(self, line: dict[str, Any], key: str, answer: str) -> None:
+        """Add to an earlier query what became of its fix since."""
+        at, told = self._at.get(text(line, key, "query") or ""), value(line, key)
+        if at is None or not isinstance(told, dict):
+            return
+        query = self.flight.queries[at]
+        if query.fix is None or (query.fix.outcome is not Outcome.UNANSWERED and key == "last_fix"):
+            return  # its line of kind "answer" knows more
+        fix = replace(
+            query.fix,
+            outcome=_outcome(told, told.get(answer)),
+            why=text(told, "why") or query.fix.why,
+            latency_ms=number(told, "latency_ms") or query.fix.latency_ms,
+        )
+        self.flight.queries[at] = replace(query, fix=fix)
+
+    def _query(self, line: dict[str, Any], t_s: float) -> Query:
+        t_mono_s = number(line, "t_frame_s")
+        accepted = line.get("accepted") is True
+        at = point(line, "located") or point(line, "position") if accepted else None
+        gps_at = None if t_mono_s is None else _gps_at(line, t_mono_s)
+        costs = number(line, "costs", "t_encode_s"), number(line, "costs", "t_match_s")
+        place = number(line, "place")
+        heard_s = number(line, "vehicle", "t_heard_s")
+        is_heard = None not in (heard_s, t_mono_s) and abs(t_mono_s - heard_s) <= _FRESH_S
+        autopilot_at = point(line, "vehicle") if is_heard else None
+        # An autopilot that has GPS knows by how much its receiver lags: at 20 m/s that is metres.
+        truth = autopilot_at if gps_at and value(line, "vehicle", "has_gps") is True else gps_at
+        latency_s = number(line, "totals", "latency_s")
+        return Query(
+            name=text(line, "query") or "",
+            t_s=t_s if t_mono_s is None else self._since_start(t_mono_s),
+            time=text(line, "time") or "",
+            accepted=accepted,
+            reason=text(line, "reason") or "no reason is given",
+            confidence=_confidence(line),
+            score=number(line, "score"),
+            place=None if place is None else int(place),
+            reference_image=text(line, "reference_image"),
+            at=at,
+            accuracy_m=number(line, "accuracy_m"),
+            place_at=point(line, "position"),
+            autopilot_at=autopilot_at,
+            gps_at=gps_at,
+            off_m=float(distance_m(*truth, *at)) if truth and at else None,
+            fix=_fix(line),
+            wall_ms=None if None in costs else 1e3 * sum(costs),
+            latency_ms=None if latency_s is None else 1e3 * latency_s,
+            cores=self._cores(line),
+            rss_mb=number(line, "costs", "rss_mb"),
+            temperature_c=number(line, "board", "temperature_c"),
+            used_mah=number(line, "totals", "used_mah"),
+            has_link=is_heard if "vehicle" in line else None,
+        )
+
+    def _cores(self, line: dict[str, Any]) -> float | None:
+        cpu_s, elapsed_s = number(line, "totals", "process_cpu_s"), number(line, "totals", "elapsed_s")
+        if cpu_s is None or elapsed_s is None or elapsed_s <= self._elapsed_s:
+            return None
+        busy = (cpu_s - self._cpu_s) / (elapsed_s - self._elapsed_s)
+        self._cpu_s, self._elapsed_s = cpu_s, elapsed_s
+        return max(0.0, busy)
+
+
+def _confidence(line: dict[str, Any]) -> float | None:
+    """Return the confidence by which a match was judged: its own, or that of the flight so far where it is higher."""
+    known = number(line, "confidence"), number(line, "followed", "confidence")
+    return max((each for each in known if each is not None), default=None)
+
+
+def _fix(line: dict[str, Any]) -> Fix | None:
+    told = value(line, "fix")
+    if not isinstance(told, dict):
+        return None
+    return Fix(
+        outcome=_outcome(told, told.get("answer")),
+        why=text(told, "why"),
+        at=point(told),
+        accuracy_m=number(told, "accuracy_m"),
+    )
+
+
+def _outcome(told: dict[str, Any], answer: object) -> Outcome:
+    if told.get("sent") is False:
+        return Outcome.CONTINUOUS if told.get("why") == _CONTINUOUS else Outcome.KEPT
+    if answer is None:
+        return Outcome.UNANSWERED
+    return Outcome.TAKEN if answer == "ACCEPTED" else Outcome.REFUSED
+
+
+def _gps_at(line: dict[str, Any], t_mono_s: float) -> Point | None:
+    """Return where the receiver was when the frame was taken: its newest position, moved on by the velocity."""
+    at, t_s = point(line, "vehicle", "gps"), number(line, "vehicle", "gps", "t_s")
+    if at is None or t_s is None or abs(t_mono_s - t_s) > _FRESH_S:
+        return None
+    match value(line, "vehicle", "velocity_m_s"):
+        case [int() | float() as east_m_s, int() | float() as north_m_s]:
+            return moved(*at, (t_mono_s - t_s) * east_m_s, (t_mono_s - t_s) * north_m_s)
+    return at
+
+
+def _said(line: dict[str, Any]) -> str:
+    said = next((each for key in _SAYING if (each := text(line, key))), None)
+    before, after = line.get("from"), line.get("to")  # of the governor
+    if said and isinstance(before, dict) and isinstance(after, dict):
+        changed = [f"{key} {before.get(key)} to {each}" for key, each in after.items() if before.get(key) != each]
+        return ": ".join(filter(None, (", ".join(changed), said)))
+    others = {"kind", "time", "t_mono_s"}
+    return said or ", ".join(f"{key} {each}" for key, each in line.items() if key not in others)

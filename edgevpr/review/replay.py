@@ -1,0 +1,177 @@
+"""A recorded flight, flown again by the same code with the same clocks, frames and messages."""
+
+import logging
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from edgevpr.core.config import Config, build, changed_config
+from edgevpr.core.errors import EdgevprError, ImageError, UsageError
+from edgevpr.core.tape import Tape
+from edgevpr.frames.images import read_image
+from edgevpr.frames.taped import ReplayedSource
+from edgevpr.mavlink.signing import NOT_SIGNING
+from edgevpr.mavlink.wire import untapped
+from edgevpr.power.boards import Board
+from edgevpr.review.compare import Line
+from edgevpr.review.links import ReplayedGround, ReplayedLink, ReplayedSigning
+from edgevpr.review.packets import Packets
+from edgevpr.review.supposed import Supposed, SupposedGround, SupposedLink
+from edgevpr.review.tape import Playback, TapeEnded, read_tape
+from edgevpr.runtime.flight.clock import Clock, taped
+from edgevpr.runtime.flight.course import Aboard, World, fly_course, learning_of, recogniser_of
+from edgevpr.runtime.flight.flightlog import FlightLog, read_log
+from edgevpr.runtime.flight.loop import Stop
+from edgevpr.runtime.flight.recording import FRAMES, MAP, TAPE, frame_path, recording_of
+from edgevpr.runtime.flight.reloading import Reread
+from edgevpr.runtime.flight.statussocket import NoReaders
+from edgevpr.runtime.flight.wholeflight import flight_of
+
+Say = Callable[[int, int], None]  # told of the frames so far, and of all
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """A recorded flight: the lines of its log, and the folder of its recording."""
+
+    lines: list[Line]
+    folder: Path
+
+
+@dataclass(frozen=True, slots=True)
+class Replayed:
+    """Result of a replay: the lines of its log, the comparison of the packets, why it has ended before the flight
+    (None: it has not), and how many answers had to be guessed, since the code asks something else than it did then."""
+
+    lines: list[Line]
+    packets: Packets
+    why_ended: str | None
+    guessed: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Kinds:
+    """The kinds of the two links."""
+
+    link: type[ReplayedLink]
+    ground: type[ReplayedGround]
+
+
+def recorded(log: str | Path) -> Recorded:
+    """Find the last flight of a log, and its recording: where the log says, or in a folder of that name beside it.
+    Raises UsageError where there is none, and EdgevprError for a file without a line of a flight."""
+    whole = flight_of(log)
+    if whole.missing:
+        _log.warning("%s", whole.missing)
+    lines = list(whole)
+    said = lines[0].get("recording") if lines else None
+    if not said:
+        raise UsageError(f"{log}: its last flight was not recorded: fly with `log: {{record: FOLDER}}`.")
+    folder = recording_of(said, log)
+    if folder is None:
+        raise UsageError(f"{log}: its recording is neither at {said} nor beside the log: bring it there.")
+    return Recorded(lines, folder)
+
+
+def replay(flight: Recorded, say: Say, place_map: str | None = None) -> Replayed:
+    """Fly a recorded flight again. `place_map` is its map, where that is not where it was. Raises an EdgevprError where
+    recording or map cannot be opened."""
+    notes, header = _opened(flight)
+    config = build(Config, header["config"], str(flight.folder))
+    playback = Playback(notes)
+    kinds = _Kinds(ReplayedLink, ReplayedGround)
+    return _flown(flight, header, config, place_map or config.map, playback, kinds, lambda seconds: None, say)
+
+
+def suppose(flight: Recorded, say: Say, changes: Path, place_map: str | None = None) -> Replayed:
+    """Fly with the frames and messages of a recorded flight, and with the keys of a YAML file in place of those that it
+    had. Raises the same."""
+    notes, header = _opened(flight)
+    config = changed_config(build(Config, header["config"], str(flight.folder)), changes)
+    supposed = Supposed(notes)
+    kinds = _Kinds(SupposedLink, SupposedGround)
+    return _flown(flight, header, config, place_map or config.map, supposed, kinds, supposed.sleep, say)
+
+
+def _opened(flight: Recorded) -> tuple[Iterator[list[Any]], dict[str, Any]]:
+    notes = read_tape(flight.folder / TAPE)
+    note = next(notes, None)
+    if not (note and note[0] == "flight" and isinstance(note[1], dict)):
+        raise EdgevprError(
+            f"{flight.folder / TAPE} is no tape of a flight, or was cut in its first line: nothing can be replayed."
+        )
+    return notes, note[1]
+
+
+def _flown(
+    flight: Recorded,
+    header: dict[str, Any],
+    config: Config,
+    map_path: str | None,
+    playback: Playback,
+    kinds: _Kinds,
+    sleep: Callable[[float], None],
+    say: Say,
+) -> Replayed:
+    board, why_ended = build(Board, header["board"], "the board of the flight"), None
+    with TemporaryDirectory(prefix="edgevpr-replay-") as temporary, ExitStack() as stack:
+        log = Path(temporary) / "flight.jsonl" if config.log.path else None
+        clock = taped(Clock(sleep=sleep), playback)
+        try:
+            aboard = _aboard(flight.folder, Path(temporary), replace(config, map=map_path), board, playback)
+            stack.callback(aboard.recogniser.place_map.close)
+            with FlightLog(log, clock.mono_s, clock.utc_s, tape=playback) as flight_log:
+                world = World(
+                    tape=playback,
+                    clock=clock,
+                    flight_log=flight_log,
+                    readers=NoReaders(),
+                    open_source=lambda step_s: ReplayedSource(playback, _pictures_of(flight.folder, say)),
+                    link=kinds.link,
+                    ground=kinds.ground,
+                    signing=ReplayedSigning() if config.mavlink.signing_key else NOT_SIGNING,
+                    tap=untapped,
+                    recording=header["recording"],
+                )
+                reread = Reread(lambda: config, playback) if header["is_reread"] else None
+                fly_course(config, board, aboard, world, stop=Stop(playback), reread=reread)
+        except TapeEnded as end:
+            why_ended = str(end) or "the recording ends there"
+        return Replayed(list(read_log(log)) if log else [], playback.packets, why_ended, playback.guessed)
+
+
+def _pictures_of(folder: Path, say: Say) -> Callable[[int], np.ndarray]:
+    """Return the function that reads the frame of a number. It raises TapeEnded for one that a power cut has cost."""
+    total = sum(1 for _ in (folder / FRAMES).iterdir())
+
+    def picture(number: int) -> np.ndarray:
+        say(number, total)
+        try:
+            return read_image(frame_path(folder, number))
+        except ImageError as error:
+            raise TapeEnded(str(error)) from None
+
+    return picture
+
+
+def _aboard(folder: Path, temporary: Path, config: Config, board: Board, tape: Tape) -> Aboard:
+    """Open what recognised in a flight; one that learnt gets a copy of its map, as it was."""
+    clock = taped(Clock(), tape)
+    name, cannot_learn = tape.read("picked", str), tape.read("cannot_learn", str)
+    if not config.mapping.learn or cannot_learn:
+        if config.map and not Path(config.map).exists():
+            raise UsageError(f"{config.map}, the map of the flight, is not there: give it with --map.")
+        return Aboard(recogniser=recogniser_of(config, board), learner=None, cannot_learn=cannot_learn, load_s=0.0)
+    copy = temporary / MAP
+    if (folder / MAP).is_file():
+        shutil.copyfile(folder / MAP, copy)
+    recogniser, learner = learning_of(replace(config, map=str(copy)), board, name, clock)
+    return Aboard(recogniser=recogniser, learner=learner, cannot_learn=None, load_s=0.0)

@@ -1,0 +1,164 @@
+"""The position of the aircraft at any moment, by its path and the filter of the path's errors."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from edgevpr.core.geodesy import moved, offset_m
+from edgevpr.core.types import Position, Vehicle
+from edgevpr.runtime.flight.filter import INERTIAL, RECKONED, Drift, Filter
+from edgevpr.runtime.flight.path import Path, Point
+
+_GPS_EVERY_S = 1.0
+_GPS_NEW_S = 0.7  # reports come five times a second; when they stay away, the autopilot has begun to reckon
+# The errors of GPS are alike from one second to the next: a position is heard as one of twice its deviation.
+_GPS_ALIKE = 2.0
+_GPS_VELOCITY_SD = 0.3  # m/s
+_UNKNOWN_M = 1e4
+_ANY_M_S = 10.0  # of an aircraft of which only a fix is known
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Estimate:
+    """Position and velocity (m/s, east and north) of the aircraft at `t_s`, with standard deviations of one axis along
+    the worst direction."""
+
+    t_s: float
+    position: Position
+    velocity_m_s: tuple[float, float]
+    accuracy_m: float
+    speed_accuracy_m_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """A fix as the navigation expects it: metres (2,) beside the path, with their covariance (2, 2), without that of
+    the fix; and the point of the path, metres (2,)."""
+
+    off_m: np.ndarray
+    covariance_m2: np.ndarray
+    path_m: np.ndarray
+
+
+class Navigation:
+    """The position by the autopilot's motion and our fixes. `drift` says how the path is made: of the autopilot's
+    velocity (`RECKONED`) or of accelerations (`INERTIAL`). `map_sd_m` is the standard deviation of one axis of what all
+    fixes have in common. `has_gps`: at the last report, the autopilot's position was one by GPS."""
+
+    def __init__(self, drift: Drift, map_sd_m: float) -> None:
+        self._drift = drift
+        self._path, self._filter = Path(), Filter(drift, map_sd_m)
+        self._origin: Position | None = None
+        self.has_gps, self._gps_s, self._fixed_s = False, -math.inf, -math.inf
+
+    @property
+    def fixed_s(self) -> float:
+        """Time of the last fix, or of the last position by GPS; -inf where there was none."""
+        return max(self._fixed_s, self._gps_s)
+
+    def hear_vehicle(self, vehicle: Vehicle, believes_gps: bool = True) -> None:
+        """Take in a report of the autopilot; one without velocity says nothing. `believes_gps`: where it has GPS, its
+        position is heard too."""
+        if vehicle.velocity_m_s is None:
+            return
+        had_gps, self.has_gps = self.has_gps, reckons_by_gps(vehicle) and believes_gps
+        if self._drift is RECKONED and vehicle.position_sd_m is None:
+            self._origin = None  # it does not know its position any more, and its velocity least of all
+            return
+        velocity_m_s, t_s = np.array(vehicle.velocity_m_s), vehicle.t_heard_s
+        if self._origin is None or self._path.is_broken:
+            if vehicle.position_sd_m is not None:
+                here = Position(vehicle.lat_deg, vehicle.lon_deg)
+                self._start(here, vehicle.position_sd_m, velocity_m_s, t_s, self._drift.velocity_sd)
+            return
+        if self._drift is RECKONED:
+            self._filter.go_on(self._path.fly(t_s, velocity_m_s))
+        if had_gps and not self.has_gps:
+            self._filter.lose_gps()
+        here = self._path.at(t_s)
+        if here is None:
+            return
+        if self.has_gps and t_s - self._gps_s >= _GPS_EVERY_S:
+            self._gps_s = t_s
+            off_m = self._from_origin(vehicle.lat_deg, vehicle.lon_deg) - here.at_m
+            sd_m = _GPS_ALIKE * (vehicle.position_sd_m or _UNKNOWN_M)
+            self._filter.hear_gps(off_m, sd_m, velocity_m_s - here.velocity_m_s, _GPS_VELOCITY_SD)
+
+    def hear_acceleration(self, t_s: float, acceleration_m_s2: np.ndarray) -> None:
+        """Take in a mean acceleration (2,) over the ground since the last one."""
+        if self._origin and self._drift is INERTIAL and not self._path.is_broken:
+            self._filter.go_on(self._path.accelerate(t_s, acceleration_m_s2))
+
+    def expected(self, t_s: float) -> Expected | None:
+        """Return what a fix of a frame taken at `t_s` is expected to say; None where nothing is known of that time."""
+        there = self._there(t_s)
+        if there is None:
+            return None
+        off_m, covariance_m2 = self._filter.expected_fix(self._path.now.t_s - t_s)
+        return Expected(off_m, covariance_m2, there.at_m)
+
+    def beside(self, position: Position, expected: Expected) -> np.ndarray:
+        """Return by how many metres (2,) a position lies beside the path."""
+        return self._from_origin(position.lat_deg, position.lon_deg) - expected.path_m
+
+    def hear_fix(self, off_m: np.ndarray, covariance_m2: np.ndarray, t_s: float, is_against: bool = False) -> None:
+        """Take in a fix that lies `off_m` (2,) beside the path, of a frame taken at `t_s`, with its covariance (2, 2).
+        `is_against`: it contradicts what was believed, and is believed all the same."""
+        age_s = self._path.now.t_s - t_s
+        hear = self._filter.trust_fix if is_against else self._filter.hear_fix
+        hear(off_m, covariance_m2, age_s)
+        self._fixed_s = max(self._fixed_s, t_s)
+
+    def begin(self, position: Position, sd_m: float, t_s: float, now_s: float) -> None:
+        """Begin with a fix of a frame taken at `t_s`, where nothing was known of the position before, nor of how fast
+        the aircraft is."""
+        if self._drift is INERTIAL:
+            sd_m = math.hypot(sd_m, _ANY_M_S * (now_s - t_s))
+            self._start(position, sd_m, np.zeros(2), now_s, _ANY_M_S)
+            self._fixed_s = t_s
+
+    def at(self, t_s: float) -> Estimate | None:
+        """Return where the aircraft is, or was, at a time; None where that is not known."""
+        there = self._there(t_s)
+        if there is None:
+            return None
+        off_m, off_m_s, covariance = self._filter.errors(self._path.now.t_s - t_s)
+        at_m = there.at_m + off_m
+        velocity_m_s = there.velocity_m_s + off_m_s
+        return Estimate(
+            t_s=t_s,
+            position=Position(*moved(self._origin.lat_deg, self._origin.lon_deg, *at_m.tolist())),
+            velocity_m_s=(float(velocity_m_s[0]), float(velocity_m_s[1])),
+            accuracy_m=worst_sd(covariance[:2, :2]),
+            speed_accuracy_m_s=worst_sd(covariance[2:, 2:]),
+        )
+
+    def path_drift_m_s(self) -> tuple[float, float]:
+        """Return how fast the aircraft leaves its path, east and north: for an autopilot that reckons, how fast its
+        error grows."""
+        _, off_m_s, _ = self._filter.errors(0.0)
+        return float(off_m_s[0]), float(off_m_s[1])
+
+    def _start(
+        self, position: Position, sd_m: float, velocity_m_s: np.ndarray, t_s: float, velocity_sd_m_s: float
+    ) -> None:
+        self._origin = position
+        self._path.start(t_s, velocity_m_s)
+        self._filter.start(np.zeros(2), sd_m, velocity_sd_m_s)
+
+    def _there(self, t_s: float) -> Point | None:
+        return None if self._origin is None or self._path.is_broken else self._path.at(t_s)
+
+    def _from_origin(self, lat_deg: float, lon_deg: float) -> np.ndarray:
+        return np.array(offset_m(self._origin.lat_deg, self._origin.lon_deg, lat_deg, lon_deg))
+
+
+def reckons_by_gps(vehicle: Vehicle) -> bool:
+    """Tell whether a reported position is one by GPS: has a receiver, near it, a position that is still new."""
+    return vehicle.has_gps and vehicle.gps is not None and vehicle.t_heard_s - vehicle.gps.t_s <= _GPS_NEW_S
+
+
+def worst_sd(covariance: np.ndarray) -> float:
+    """Return the standard deviation along the worst direction of a covariance (2, 2)."""
+    return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))

@@ -1,0 +1,146 @@
+"""The gate: keeps the frames that are memorable, static and full of information (thesis 3.2.4).
+
+The threshold of entropy is meant for the light of day. In a night or a fog all frames have less, and the best of them
+are as good a choice as ever. So a frame lacks entropy only if it has less than the threshold *and* less than is usual
+in this light (the thesis's threshold is constant). What is usual is told by the upper half of the frames before: a
+long stretch of sky or water changes the other half, and is no change of light. Before so much is known, half of the
+threshold is enough.
+
+Where none of 20 frames passes, all thresholds are lowered (thesis 3.4.8).
+"""
+
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from edgevpr.core.types import Salience
+from edgevpr.runtime.recognise.detector import Detector
+from edgevpr.runtime.recognise.memorability import Memorability
+from edgevpr.runtime.recognise.salience_maps import Maps, maps_of, scores_of
+
+MOST_ENTROPY = float(np.log2(81) / 8)  # of a disc of 81 pixels: as many intensities at most
+GAP_FRAMES = 20
+STEP = 0.03
+_TO_KNOW, _REMEMBERED = 8, 100  # frames
+# As far below the 75th percentile of a normal distribution as so many steps to the 90th, there are a tenth of all.
+_STEPS_BELOW = 3.2
+_LEAST_STEP = 0.005
+
+
+@dataclass(frozen=True, slots=True)
+class Thresholds:
+    """Least MS, SS and ES of a frame that is kept, each 0..1; 0: the criterion is off."""
+
+    memorability: float = 0.0
+    staticity: float = 0.0
+    entropy: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Worth:
+    """Judgement of a frame: its scores, how far the worst of them is below its threshold (0: it passes), which one that
+    is and a sentence about it (None: the frame passes)."""
+
+    salience: Salience
+    short_by: float = 0.0
+    lacks: str | None = None
+    reason: str | None = None
+
+
+class NoGate:
+    """The gate that lets every frame pass and looks at none."""
+
+    def look(self, image: np.ndarray) -> None:
+        """Say nothing of a frame."""
+
+    def forget(self) -> None:
+        """Remember nothing."""
+
+
+class Gate:
+    """Looks at one frame of a flight after the other.
+
+    `memorability` and `detector` are None where their criterion is off. The detector looks at every k-th frame only
+    (`detect_every`), and what it has found holds until the next; `footprint_m` is the width of the ground in a frame
+    (see `Detector`).
+    """
+
+    def __init__(
+        self,
+        thresholds: Thresholds,
+        memorability: Memorability | None = None,
+        detector: Detector | None = None,
+        *,
+        detect_every: int = 1,
+        footprint_m: float | None = None,
+    ) -> None:
+        self.thresholds, self._memorability, self._detector = thresholds, memorability, detector
+        self._detect_every, self._footprint_m = detect_every, footprint_m
+        self._entropies: deque[float] = deque(maxlen=_REMEMBERED)
+        self._until_detection = 0
+        self._static: np.ndarray | None = None
+
+    def look(self, image: np.ndarray) -> Worth:
+        """Tell what a frame, uint8 (H, W[, 3]), is worth. Raises ModelError for a network that cannot be used."""
+        return self.worth(self.maps(image))
+
+    def maps(self, image: np.ndarray) -> Maps:
+        """Compute the maps of a frame. Raises ModelError as `look` does."""
+        return maps_of(image, self._memorability, self._is_static(image))
+
+    def worth(self, maps: Maps) -> Worth:
+        """Tell what the frame of these maps is worth."""
+        scores = scores_of(maps)
+        self._entropies.append(scores.entropy)
+        usual = usual_entropy(self._entropies)
+        # The first frames of a flight at night: their light is not known yet, and a picture of nothing has none at all.
+        return worth_of(scores, self.thresholds, self.thresholds.entropy / 2 if usual is None else usual)
+
+    def forget(self) -> None:
+        """Begin another flight: nothing is known of its light, nor of what moves there."""
+        self._entropies.clear()
+        self._until_detection, self._static = 0, None
+
+    def _is_static(self, image: np.ndarray) -> np.ndarray | None:
+        if self._detector is None:
+            return None
+        if self._until_detection == 0 or self._static is None or self._static.shape != image.shape[:2]:
+            self._static, self._until_detection = None, self._detect_every
+            self._static = self._detector.is_static(image, self._footprint_m)
+        self._until_detection -= 1
+        return self._static
+
+
+def usual_entropy(entropies: Iterable[float]) -> float | None:
+    """Return the least entropy that is usual among these frames: a tenth have less, where they are alike. None: of
+    fewer than 8 nothing is known."""
+    entropies = list(entropies)
+    if len(entropies) < _TO_KNOW:
+        return None
+    middle, high = np.percentile(entropies, (75, 90))
+    return float(middle - _STEPS_BELOW * max(high - middle, _LEAST_STEP))
+
+
+def worth_of(salience: Salience, thresholds: Thresholds, usual: float = 1.0) -> Worth:
+    """Hold the scores of a frame against the thresholds. Entropy need not be above what is `usual` in this light. A
+    score that was not looked at is not asked for."""
+    least = {
+        "memorability": thresholds.memorability,
+        "staticity": thresholds.staticity,
+        "entropy": min(thresholds.entropy, usual),
+    }
+    known = salience.scores
+    short = {name: least[name] - score for name, score in known.items() if least[name] > 0 and score is not None}
+    worst = max(short, key=short.get, default=None)
+    if worst is None or short[worst] <= 0:
+        return Worth(salience)
+    reason = f"not memorable: {worst} {known[worst]:.2f}, {least[worst]:.2f} needed"
+    return Worth(salience, short[worst], worst, reason)
+
+
+def best_of(shortfalls: list[float]) -> list[bool]:
+    """Lower all thresholds in steps of 0.03 until some of these frames pass; tell which do then."""
+    steps = np.ceil(np.round(np.array(shortfalls) / STEP, 6))
+    return (steps == steps.min()).tolist()

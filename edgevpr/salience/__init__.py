@@ -1,1 +1,0 @@
-"""Memorable maps: which frames are worth remembering (thesis, chapter 3)."""

@@ -1,0 +1,75 @@
+"""Progress on a terminal (a real pty) and into a file."""
+
+import io
+import os
+
+from fakes import FakeClock
+
+from edgevpr.core.progress import progress, waiting
+
+
+def test_a_file_gets_a_line_for_every_tenth():
+    out = io.StringIO()
+    assert list(progress(range(200), 200, "cohog: queries", out)) == list(range(200))
+    lines = out.getvalue().splitlines()
+    assert len(lines) == 11
+    assert lines[0] == "cohog: queries  1/200  0 %"
+    assert lines[-1] == "cohog: queries  200/200  100 %"
+
+
+def test_a_terminal_sees_one_line_redrawn():
+    reader, writer = os.openpty()
+    with os.fdopen(writer, "w") as terminal:
+        assert list(progress("abcd", 4, "map", terminal)) == list("abcd")
+        drawn = ""
+        while "\n" not in drawn:  # a terminal passes on what it has: perhaps not all at once
+            drawn += os.read(reader, 4096).decode()
+    os.close(reader)
+    assert drawn.split("\r")[:4] == ["map  1/4  25 %", "map  2/4  50 %", "map  3/4  75 %", "map  4/4  100 %"]
+    assert drawn.count("\n") == 1
+
+
+def test_nothing_to_do_writes_nothing():
+    out = io.StringIO()
+    assert list(progress([], 0, "map", out)) == []
+    assert out.getvalue() == ""
+
+
+def test_without_a_total_a_file_gets_a_line_for_every_hundred():
+    out = io.StringIO()
+    assert len(list(progress(range(250), 0, "video", out))) == 250
+    assert out.getvalue().splitlines() == ["video  1", "video  100", "video  200"]
+
+
+def test_a_terminal_sees_what_is_waited_for_until_it_is_over():
+    reader, writer = os.openpty()
+    with os.fdopen(writer, "w") as terminal:
+        for text in ("waiting for the source", "for the link", ""):
+            waiting(text, terminal)
+        drawn = ""
+        while drawn.count("\r") < 3:
+            drawn += os.read(reader, 4096).decode()
+    os.close(reader)
+    assert [line.rstrip() for line in drawn.split("\r")] == ["waiting for the source", "for the link", "", ""]
+    assert {len(line) for line in drawn.split("\r")[:3]} == {79}
+
+
+def test_a_file_is_not_told_what_is_waited_for():
+    out = io.StringIO()
+    waiting("waiting for the source", out)
+    assert out.getvalue() == ""
+
+
+def test_the_time_that_is_left_is_told_once_it_can_be_known():
+    out, clock = io.StringIO(), FakeClock()
+
+    def slow():
+        for each in range(40):
+            clock.now_s += 20.0
+            yield each
+
+    list(progress(slow(), 40, "sets", out, clock))
+    lines = out.getvalue().splitlines()
+    assert lines[0] == "sets  1/40  2 %, 13 min left"
+    assert lines[-2] == "sets  36/40  90 %, 80 s left"
+    assert lines[-1] == "sets  40/40  100 %"

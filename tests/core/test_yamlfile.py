@@ -1,0 +1,127 @@
+"""YAML of a hostile user: one sentence with file and line, no more time and memory than the file is long."""
+
+import os
+import resource
+import subprocess
+import sys
+
+import pytest
+
+from edgevpr.core.config import load_config
+from edgevpr.core.errors import ConfigError
+from edgevpr.core.yamlfile import MAX_FILE_BYTES, read_yaml
+
+LAUGHS = "a: &a [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"{after}: &{after} [{', '.join([f'*{before}'] * 10)}]\n"
+    for before, after in zip("abcdefgh", "bcdefghi", strict=True)
+)
+MERGES = "a: &a {x0: 1}\n" + "".join(
+    f"{after}: &{after}\n" + f"  <<: [{', '.join([f'*{before}'] * 10)}]\n"
+    for before, after in zip("abcdefgh", "bcdefghi", strict=True)
+)
+
+
+@pytest.fixture
+def refused(tmp_path):
+    """The sentence with which a file is refused."""
+
+    def refuse(content: str | bytes, read=read_yaml) -> str:
+        path = tmp_path / "config.yaml"
+        path.write_bytes(content if isinstance(content, bytes) else content.encode("utf-8", "surrogatepass"))
+        with pytest.raises(ConfigError) as raised:
+            read(path)
+        said = str(raised.value)
+        assert said.startswith(str(path))
+        assert len(said) < len(str(path)) + 400
+        assert "\n" not in said
+        return said
+
+    return refuse
+
+
+def test_a_section_that_stands_there_twice_is_named_with_both_lines(refused):
+    said = refused("source: {uri: a}\nmap: m.gpkg\nsource: {uri: b}\n")
+    assert "config.yaml, line 3 is not valid YAML (the key `source` stands in line 1 already)" in said
+    assert "line 2" in refused("source:\n  {uri: a, rate_hz: 1, uri: b}\n")
+    assert "line 4" in refused('match:\n  min_score: 0.5\n  form: float\n  "min_score": 0.6\n')
+
+
+@pytest.mark.parametrize("content", [LAUGHS, MERGES, "a: &a {b: *a}\n"])
+def test_aliases_are_refused_before_they_multiply(content, refused):
+    assert "the alias `*a`: write its value out" in refused(content)
+
+
+def test_a_merge_is_refused_even_without_an_alias(refused):
+    assert "line 2 is not valid YAML (the merge `<<`" in refused("source:\n  <<: {uri: a}\n")
+
+
+@pytest.mark.parametrize("level", ["[", "{a: ", "- ", "? "])
+def test_deep_nesting_is_refused(level, refused):
+    assert "more than 20 levels" in refused(level * (MAX_FILE_BYTES // len(level) - 1))
+
+
+@pytest.mark.parametrize(
+    ("number", "says"),
+    [
+        ("9" * 400, "a number of too many digits"),
+        ("9" * 5000, "is not valid YAML"),  # which Python itself refuses
+        ("0x" + "f" * 5000, "a number of too many digits"),
+        ("-1" + ":59" * 400, "a number of too many digits"),
+        ("1" + "0" * 30 + ".0", "it must be between"),
+        ("1.0e+400", "`source.rate_hz` is inf; it must be between"),
+        (".nan", "`source.rate_hz` is nan; it must be between"),
+    ],
+)
+def test_a_number_of_hundreds_of_digits_is_refused(number, says, refused):
+    assert says in refused(f"source: {{rate_hz: {number}}}\n", load_config)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (r'"a\0b"', "`map` holds a NUL character"),
+        (r'"\ud800"', "`map` holds half a character"),
+        ("[" + "x, " * 9000 + "x]", "`map` must be a text, not ['x', 'x'"),
+        ("2001-02-30", "is not valid YAML"),
+        ("!!python/object/apply:os.system [id]", "is not valid YAML"),
+    ],
+)
+def test_a_text_that_no_file_can_be_called_is_refused(text, says, refused):
+    assert says in refused(f"map: {text}\n", load_config)
+
+
+def test_a_key_as_long_as_the_file_is_not_repeated_in_full(refused):
+    assert "unknown key `kkkk" in refused("? " + "k" * 50_000 + "\n: 1\n", load_config)
+
+
+def test_a_file_too_long_to_be_a_configuration_is_not_read(refused):
+    assert "cannot be read (it has 0.1 MB" in refused("# " + "x" * MAX_FILE_BYTES)
+
+
+def test_who_changes_what_was_read_changes_it_for_nobody_else(tmp_path):
+    path = tmp_path / "c.yaml"
+    path.write_text("source: {uri: a}\n")
+    read_yaml(path)["source"]["uri"] = "b"
+    assert read_yaml(path) == {"source": {"uri": "a"}}
+    path.write_text("source: {uri: c}\n")
+    assert read_yaml(path) == {"source": {"uri": "c"}}
+
+
+def test_pipes_and_devices_are_not_read(tmp_path):
+    os.mkfifo(tmp_path / "c.yaml")
+    for path in (tmp_path / "c.yaml", "/dev/zero"):
+        with pytest.raises(ConfigError, match=r"cannot be read \(it is a pipe or a device"):
+            read_yaml(path)
+
+
+def test_the_same_holds_for_the_command_in_little_memory(tmp_path):
+    (tmp_path / "laughs.yaml").write_text(LAUGHS)
+
+    def limit():
+        resource.setrlimit(resource.RLIMIT_AS, (1_000_000_000, 1_000_000_000))
+
+    argv = [sys.executable, "-m", "edgevpr", "run", "--config", tmp_path / "laughs.yaml"]
+    done = subprocess.run(argv, capture_output=True, text=True, preexec_fn=limit, timeout=60)
+    assert done.returncode == 2
+    assert "the alias `*a`" in done.stderr
+    assert "Traceback" not in done.stderr

@@ -1,0 +1,124 @@
+"""The whole measurement on a small generated set, and the tables."""
+
+import io
+import json
+
+import cv2
+import pytest
+from pictures import textured
+
+from edgevpr.core.errors import ImageError, UsageError
+from edgevpr.core.progress import progress
+from edgevpr.core.tables import markdown
+from edgevpr.lab.evaluate.dataset import load_dataset
+from edgevpr.lab.evaluate.evaluate import as_json, compare, evaluate
+from edgevpr.lab.evaluate.tables import results_text
+
+HOG = {"w1": 64}
+COHOG = {"w1": 208}
+KEYS = (
+    "recall_at_1", "recall_at_5", "recall_at_10", "precision_at_100_recall", "auc", "ep", "pcu", "t_encode_s",
+    "t_match_s", "t_match_per_ref_s", "descriptor_bytes", "u_encode", "u_match", "ah_total",
+)  # fmt: skip
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Eight places; each query is its place, darker. The last query's truth is wrong on purpose."""
+    lines = ["query_file,ref_files,ref_files_loose"]
+    for split in ("query", "ref"):
+        (tmp_path / split).mkdir()
+    for place in range(8):
+        picture = textured(place)
+        cv2.imwrite(str(tmp_path / "ref" / f"r{place}.png"), picture)
+        cv2.imwrite(str(tmp_path / "query" / f"q{place}.png"), picture // 2)
+        lines.append(f"q{place}.png,r{place if place < 7 else 0}.png,")
+    (tmp_path / "truth.csv").write_text("\n".join(lines))
+    return tmp_path
+
+
+def load(folder):
+    return load_dataset(folder / "query", folder / "ref", folder / "truth.csv")
+
+
+@pytest.mark.parametrize(("name", "parameters"), [("hog", HOG), ("cohog", COHOG)])
+def test_recall_costs_and_sizes_of_a_technique(folder, name, parameters):
+    (result,) = compare([evaluate(name, load(folder), parameters)])
+    assert (result.queries, result.references) == (8, 8)
+    assert result.recall_at_1 == 7 / 8
+    assert result.recall_at_10 == 1
+    assert result.precision_at_100_recall >= result.recall_at_1
+    assert result.pcu == pytest.approx(result.precision_at_100_recall)  # the slowest of one
+    assert (result.accepted, result.accepted_wrong, result.accepted_elsewhere) == (8, 1, 1)
+    assert result.t_encode_s > 0
+    assert result.t_match_per_ref_s == pytest.approx(result.t_match_s / 8)
+    assert 0 < result.u_encode <= 1
+    assert result.ah_total > 0
+    assert result.ah_total_cpu_rail > result.ah_total  # the rail's voltage is lower than the pack's
+    assert "4S5200" in result.ah_assumes
+    sizes = {"hog": (7 * 7 * 36 * 2, 0), "cohog": (144, 144 * 32)}
+    assert (result.descriptor_bytes, result.fine_bytes) == sizes[name]
+
+
+def test_a_loose_reference_is_passed_over_and_the_next_one_counts(folder):
+    # The only query looks exactly like r0, which is neither right nor wrong; r1 would be wrong, all others right.
+    others = " ".join(f"r{place}.png" for place in range(2, 8))
+    (folder / "truth.csv").write_text(f"query_file,ref_files,ref_files_loose\nq0.png,{others},r0.png {others}\n")
+    cv2.imwrite(str(folder / "ref" / "r2.png"), cv2.blur(textured(0), (3, 3)))
+    result = evaluate("hog", load(folder), HOG)
+    assert result.recall_at_1 == 1
+    assert (result.accepted, result.accepted_wrong) == (1, 0)
+
+
+def test_json_has_every_promised_key_and_survives_a_round_trip(folder):
+    results = compare([evaluate("hog", load(folder), HOG), evaluate("cohog", load(folder), COHOG)])
+    read_back = json.loads(json.dumps(as_json(results), allow_nan=False))
+    assert list(read_back["techniques"]) == ["hog", "cohog"]
+    for technique in read_back["techniques"].values():
+        assert all(isinstance(technique[key], int | float) for key in KEYS)
+        assert technique["t_encode_max_s"] == max(result.t_encode_s for result in results)
+
+
+def test_a_broken_image_stops_the_measurement(folder):
+    dataset = load(folder)
+    (folder / "ref" / "r3.png").write_bytes(b"no image")
+    with pytest.raises(ImageError, match=r"r3\.png"):
+        evaluate("hog", dataset, HOG)
+
+
+def test_an_unknown_technique_or_parameter_is_refused(folder):
+    with pytest.raises(UsageError, match="hogg"):
+        evaluate("hogg", load(folder))
+    with pytest.raises(UsageError, match="bins"):
+        evaluate("hog", load(folder), {"binz": 9})
+
+
+def test_progress_is_shown_for_references_and_queries(folder):
+    out = io.StringIO()
+    evaluate("hog", load(folder), HOG, None, lambda items, total, label: progress(items, total, label, out))
+    assert "hog: references  8/8  100 %" in out.getvalue()
+    assert "hog: queries  8/8  100 %" in out.getvalue()
+
+
+def test_the_text_tables_line_up_and_name_what_their_figures_rest_on(folder):
+    printed = results_text(compare([evaluate("hog", load(folder), HOG)]))
+    *tables, notes = printed.split("\n\n")
+    assert len(tables) == 3
+    for table in tables:
+        head, row = table.splitlines()
+        assert len(head) == len(row) <= 120
+    found, _, paid = tables
+    assert found.splitlines()[1].split()[:2] == ["hog", "0.875"]
+    assert "3528" in paid  # 7 x 7 blocks of 36 values, 2 bytes each
+    assert "8 queries scored against 8 references" in notes
+    assert "t_e,max" in notes
+
+
+def test_a_markdown_table_has_a_cell_for_every_heading():
+    lines = markdown(("set", "recall"), [["corridor", "0.66"], ["park", "0.2"]]).splitlines()
+    assert lines == ["| set | recall |", "| --- | ---: |", "| corridor | 0.66 |", "| park | 0.2 |"]
+
+
+def test_columns_of_text_in_a_markdown_table_are_flush_left():
+    lines = markdown(("fault", "kept", "s"), [["power cut", "the log", "2"]], left=2).splitlines()
+    assert lines[1] == "| --- | --- | ---: |"

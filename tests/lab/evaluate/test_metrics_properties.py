@@ -1,0 +1,93 @@
+"""The figures of quality for any scores at all, with ties, one query, none right, all right; and by scikit-learn."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from edgevpr.lab.evaluate import metrics
+from edgevpr.lab.evaluate.quality import figures, interval
+
+pytest.importorskip("sklearn")
+from sklearn.metrics import auc, precision_recall_curve, roc_auc_score
+
+# Few distinct scores, so that ties are usual; and the rank of the first right one, infinite where there is none.
+QUERIES = st.lists(
+    st.tuples(st.integers(-3, 3), st.sampled_from([0.0, 1.0, 4.0, 7.0, 30.0, float("inf")])), min_size=1, max_size=60
+)
+
+
+def arrays(queries):
+    scores, ranks = (np.array(column, float) for column in zip(*queries, strict=True))
+    return scores, ranks
+
+
+@settings(deadline=None)
+@given(QUERIES)
+def test_every_figure_is_a_share_and_they_fit_each_other(queries):
+    scores, ranks = arrays(queries)
+    found, right = figures(scores, ranks), ranks == 0
+    shares = [value for key, value in found.items() if isinstance(value, float)]
+    assert all(0 <= share <= 1 for share in shares)
+    assert found["recall_at_1"] <= found["recall_at_5"] <= found["recall_at_10"]
+    assert found["recall_at_1"] == right.mean()
+    assert found["auc"] <= found["auc_from_zero"] + 1e-12
+    if right.any():
+        assert found["precision_at_100_recall"] >= found["recall_at_1"] - 1e-12
+    else:
+        assert found["auc"] == found["recall_at_100_precision"] == 0
+    if right.all():
+        assert found["precision_at_100_recall"] == found["recall_at_100_precision"] == found["auc_from_zero"] == 1
+    assert (found["roc_auc"] is None) == (right.all() or not right.any())
+
+
+@settings(deadline=None)
+@given(QUERIES)
+def test_they_depend_on_the_order_of_the_scores_alone(queries):
+    scores, ranks = arrays(queries)
+    found = figures(scores, ranks)
+    assert figures(np.exp(scores), ranks) == found
+    turned = np.random.default_rng(len(queries)).permutation(len(scores))
+    assert figures(scores[turned], ranks[turned])["precision_recall"] == found["precision_recall"]
+
+
+@settings(deadline=None)
+@given(QUERIES)
+def test_scikit_learn_says_the_same(queries):
+    scores, ranks = arrays(queries)
+    right = ranks == 0
+    if not right.any():
+        return
+    precision, recall = metrics.precision_recall(scores, right)
+    theirs = precision_recall_curve(right, scores)
+    ours = np.column_stack([precision, recall])
+    assert np.allclose(ours, np.column_stack([theirs[0][-2::-1], theirs[1][-2::-1]])[: len(ours)])
+    assert metrics.auc_from_zero(precision, recall) == pytest.approx(auc(theirs[1], theirs[0]), abs=1e-12)
+    if not right.all():
+        assert metrics.roc_auc(scores, right) == pytest.approx(roc_auc_score(right, scores), abs=1e-12)
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(1, 300), st.floats(0, 1))
+def test_an_interval_holds_the_share_and_is_the_same_every_time(count, share):
+    hits = np.arange(count) < round(share * count)
+    low, high = interval(hits)
+    assert 0 <= low <= hits.mean() <= high <= 1
+    assert interval(hits) == (low, high)
+
+
+def test_more_queries_make_an_interval_narrower_and_all_right_of_few_is_not_all_right():
+    few, many = np.arange(43) < 42, np.arange(4300) < 4200
+    assert np.ptp(interval(few)) > 5 * np.ptp(interval(many))
+    low, high = interval(np.ones(43, bool))
+    assert high == 1.0
+    assert low == pytest.approx(0.918, abs=1e-3), "Clopper and Pearson"
+
+
+def test_an_interval_covers_what_the_queries_were_drawn_from():
+    random = np.random.default_rng(5)
+    covered = 0
+    for _ in range(200):
+        low, high = interval(random.random(100) < 0.8)
+        covered += low <= 0.8 <= high
+    assert covered > 0.88 * 200

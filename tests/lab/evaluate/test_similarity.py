@@ -1,0 +1,268 @@
+"""Stored similarities are measured without any image, and come out as published."""
+
+import csv
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edgevpr.cli.main import main
+from edgevpr.core.errors import UsageError
+from edgevpr.lab.evaluate.similarity import measure, read_similarities
+from edgevpr.lab.evaluate.truth import read_truth
+
+_DATA = Path(os.environ.get("EDGEVPR_DATA") or Path(__file__).parents[4] / "shared" / "data")
+_PUBLISHED = _DATA / "vprbench_precomputed"
+TRUTH = "query_file,ref_files,ref_files_loose,status\nq2,r2,r10,ok\nq1,r1 r2,,ok\nq3,r1,,moved\n"
+SCORES = np.array([[0.1, 0.2, 0.9], [0.7, 0.3, 0.2], [0.5, 0.5, 0.5]])  # of q2, q1, q3 with r1, r2, r10
+
+
+@pytest.fixture
+def truth(tmp_path):
+    path = tmp_path / "truth.csv"
+    path.write_text(TRUTH)
+    return path
+
+
+def test_eight_published_matrices_come_out_as_published(capsys):
+    if not _PUBLISHED.is_dir():
+        pytest.skip("the published matrices are not here")
+    with open(_PUBLISHED / "corridor_figures.csv") as handle:
+        published = {row.pop("technique"): row for row in csv.DictReader(handle)}
+    files = [str(_PUBLISHED / f"corridor_{name}.npy") for name in published]
+    truth = str(_DATA / "corridor" / "ground_truth.csv")
+    assert main(["eval", "--similarity", *files, "--ground-truth", truth, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)["similarities"]
+    ours = {"auc_eq_2_3": "auc", "auc_scikit_learn": "auc_from_zero"}
+    assert len(found) == 8
+    for name, row in published.items():
+        for figure, value in row.items():
+            if not figure.startswith("t_"):
+                assert found[f"corridor_{name}"][ours.get(figure, figure)] == pytest.approx(float(value), abs=5e-4)
+        low, high = found[f"corridor_{name}"]["recall_at_1_interval"]
+        assert low < found[f"corridor_{name}"]["recall_at_1"] < high
+
+
+def test_every_form_says_the_same_and_loose_hits_and_what_is_not_ok_do_not_count(tmp_path, truth):
+    np.save(tmp_path / "a.npy", SCORES)
+    names = {"queries": ["q1", "q2", "q3"], "references": ["r10", "r2", "r1"]}
+    turned = SCORES[[1, 0, 2]][:, [2, 1, 0]]
+    np.savez(tmp_path / "b.npz", similarity=turned, **names)
+    lines = [
+        ",r10,r2,r1",
+        *(f"{q}," + ",".join(map(str, row)) for q, row in zip(names["queries"], turned, strict=True)),
+    ]
+    (tmp_path / "c.csv").write_text("\n".join(lines))
+    (tmp_path / "d.csv").write_text("\n".join(",".join(map(str, row)) for row in SCORES))
+    for name in ("a.npy", "b.npz", "c.csv", "d.csv"):
+        found = measure(name, read_similarities(tmp_path / name), read_truth(truth))
+        assert (found.queries, found.references, found.recall_at_1) == (2, 3, 1.0), name
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (np.zeros((2, 3)), "scores of 2 queries, and the ground truth names 3"),
+        (np.zeros((3, 4)), "name the folder of all of them with --ref"),
+        (np.zeros(3), "a row for each query"),
+        (np.full((3, 3), np.nan), "give each pair a score"),
+        (np.array([["a", "b"]]), "a row for each query"),
+        (np.array([[None]]), "holds no similarities"),
+        (b"rubbish", "holds no similarities"),
+        (b"", "holds no similarities"),
+    ],
+)
+def test_what_does_not_fit_is_said_in_a_sentence(tmp_path, truth, capsys, content, said):
+    path = tmp_path / "a.npy"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        np.save(path, content, allow_pickle=True)
+    assert main(["eval", "--similarity", str(path), "--ground-truth", str(truth)]) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
+
+
+def test_names_that_do_not_fit_are_refused(tmp_path, truth):
+    np.savez(tmp_path / "a.npz", similarity=SCORES, queries=["q1", "q2", "q2"], references=["r1", "r2", "r10"])
+    with pytest.raises(UsageError, match="name each once"):
+        read_similarities(tmp_path / "a.npz")
+    np.savez(tmp_path / "b.npz", similarity=SCORES, queries=["q1", "q2", "q3"], references=["r1", "r3", "r10"])
+    with pytest.raises(UsageError, match="`r2`, of which there are no scores"):
+        measure("b", read_similarities(tmp_path / "b.npz"), read_truth(truth))
+
+
+def test_without_images_and_without_similarities_it_says_what_to_give(truth, capsys):
+    assert main(["eval", "--ground-truth", str(truth)]) == 2
+    assert "--similarity" in capsys.readouterr().err
+
+
+class Judgement:
+    """A ground truth over generated names, right and soft, bool (references, queries); the first query has no right
+    reference, and the best match of the third is soft only."""
+
+    def __init__(self, seed, references=9, queries=12):
+        rng = np.random.default_rng(seed)
+        self.hard = rng.random((references, queries)) < 0.25
+        self.hard[rng.integers(references, size=queries), np.arange(queries)] = True
+        self.hard[:, 0] = False
+        self.soft = self.hard | (rng.random(self.hard.shape) < 0.2)
+        self.soft[3, 0] = True
+        self.hard[[5, 6], 2], self.soft[[5, 6], 2] = (False, True), True
+        self.scores = rng.random((queries, references)) + 0.5 * self.hard.T
+        self.scores[2, 5], self.scores[2, 6] = 4, 3
+        self.queries = [f"q{number}.jpg" for number in range(queries)]
+        self.references = [f"r{number}.jpg" for number in range(references)]
+
+    def csv(self, path, soft=True):
+        rows = ["query_file,ref_files,ref_files_loose,status"]
+        for column, query in enumerate(self.queries):
+            right, loose = (
+                " ".join(self.references[row] for row in np.flatnonzero(each[:, column]))
+                for each in (self.hard, self.soft)
+            )
+            rows.append(f"{query},{right},{loose if soft else ''},{'ok' if right else 'unsure'}")
+        path.write_text("\n".join(rows))
+        return path
+
+    def npz(self, path):
+        np.savez(path, GThard=self.hard, GTsoft=self.soft.astype(np.uint8))
+        return path
+
+    def npy(self, path):
+        rows = np.empty((len(self.queries), 2), object)
+        for column in range(len(rows)):
+            rows[column] = column, np.flatnonzero(self.hard[:, column])
+        np.save(path, rows[::-1], allow_pickle=True)
+        return path
+
+    def folders(self, path):
+        for folder, names in (("query", self.queries), ("ref", self.references)):
+            (path / folder).mkdir()
+            for name in names:
+                (path / folder / name).touch()
+        return "--query", path / "query", "--ref", path / "ref"
+
+
+def scored(capsys, similarity, truth, *more):
+    assert main(["eval", "--json", "--similarity", str(similarity), "--ground-truth", str(truth), *map(str, more)]) == 0
+    (found,) = json.loads(capsys.readouterr().out)["similarities"].values()
+    return {key: value for key, value in found.items() if key != "technique"}
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_ground_truth_of_numbers_scores_as_the_same_in_names(seed, tmp_path, capsys):
+    judgement = Judgement(seed)
+    np.save(tmp_path / "plain.npy", judgement.scores)
+    names = {"queries": judgement.queries, "references": judgement.references}
+    np.savez(tmp_path / "named.npz", similarity=judgement.scores, **names)
+    turned = np.random.default_rng(seed)
+    rows, columns = turned.permutation(len(judgement.queries)), turned.permutation(len(judgement.references))
+    np.savez(
+        tmp_path / "turned.npz",
+        similarity=judgement.scores[rows][:, columns],
+        queries=np.array(judgement.queries)[rows],
+        references=np.array(judgement.references)[columns],
+    )
+    folders = judgement.folders(tmp_path)
+    for truth, soft in (
+        (judgement.npz(tmp_path / "GT.npz"), True),
+        (judgement.npy(tmp_path / "ground_truth_new.npy"), False),
+    ):
+        expected = scored(capsys, tmp_path / "named.npz", judgement.csv(tmp_path / "truth.csv", soft))
+        assert expected["queries"] == len(judgement.queries) - 1
+        assert scored(capsys, tmp_path / "plain.npy", truth) == expected, "no image and no name"
+        assert scored(capsys, tmp_path / "named.npz", truth) == expected
+        assert scored(capsys, tmp_path / "plain.npy", truth, *folders) == expected
+        of_turned = scored(capsys, tmp_path / "turned.npz", tmp_path / "truth.csv")
+        assert scored(capsys, tmp_path / "turned.npz", truth, *folders) == of_turned
+        assert of_turned["recall_at_1"] == expected["recall_at_1"]
+        assert scored(capsys, tmp_path / "plain.npy", tmp_path / "truth.csv", *folders) == expected
+        assert main(["eval", "--similarity", str(tmp_path / "turned.npz"), "--ground-truth", str(truth)]) == 2
+        assert "name the folder of all of them with --query" in capsys.readouterr().err
+    softly = scored(capsys, tmp_path / "plain.npy", tmp_path / "GT.npz")
+    assert softly["recall_at_1"] > expected["recall_at_1"], "what is soft counts neither way"
+
+
+def test_published_matrices_score_the_same_by_the_numbers_of_their_ground_truth(tmp_path, capsys):
+    if not _PUBLISHED.is_dir():
+        pytest.skip("the published matrices are not here")
+    corridor = _DATA / "corridor"
+    queries, references = (sorted(path.name for path in (corridor / part).iterdir()) for part in ("query", "ref"))
+    truth = read_truth(corridor / "ground_truth.csv").scored
+    hard = np.array([[ref in truth[query].right for query in queries] for ref in references])
+    soft = np.array([[ref in truth[query].ignored for query in queries] for ref in references])
+    np.savez(tmp_path / "GT.npz", GThard=hard, GTsoft=hard | soft)
+    rows = np.empty((len(queries), 2), object)
+    for number in range(len(rows)):
+        rows[number] = number, np.flatnonzero(hard[:, number]).tolist()
+    np.save(tmp_path / "ground_truth_new.npy", rows, allow_pickle=True)
+    assert not soft.any()
+    for name in ("CoHOG", "HOG", "NetVLAD"):
+        matrix = _PUBLISHED / f"corridor_{name}.npy"
+        expected = scored(capsys, matrix, corridor / "ground_truth.csv")
+        assert scored(capsys, matrix, tmp_path / "GT.npz") == expected
+        assert scored(capsys, matrix, tmp_path / "ground_truth_new.npy") == expected
+
+
+def rows_of(*rows):
+    found = np.empty((len(rows), 2), object)
+    for number, row in enumerate(rows):
+        found[number] = row
+    return found
+
+
+EYE = np.eye(3, dtype=bool)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("GT.npz", {"GThard": EYE[:2], "GTsoft": EYE[:2]}, "is of 3 queries and 3 references, and"),
+        ("GT.npz", {"GThard": EYE}, "it has no `GTsoft`"),
+        ("GT.npz", {"GThard": EYE, "GTsoft": EYE[:2]}, "GThard is bool (3, 3) and GTsoft bool (2, 3)"),
+        ("GT.npz", {"GThard": EYE.astype(str), "GTsoft": EYE}, "is no GT.npz of VPR_Tutorial"),
+        ("GT.npz", {"GThard": EYE[0], "GTsoft": EYE[0]}, "is no GT.npz of VPR_Tutorial"),
+        ("GT.npz", {"GThard": np.array([[None]]), "GTsoft": EYE}, "is no GT.npz of VPR_Tutorial"),
+        ("GT.npz", {"GThard": EYE & False, "GTsoft": EYE}, "scores none of its queries"),
+        ("GT.npz", b"rubbish", "is no GT.npz of VPR_Tutorial"),
+        ("GT.npz", None, "cannot be read (No such file"),
+        ("new.npy", rows_of((0, [3])), "numbers at least 1 and 4"),
+        ("new.npy", rows_of((3, [0])), "numbers at least 4 and 1"),
+        ("new.npy", rows_of((0, [-1])), "it names image [-1]"),
+        ("new.npy", rows_of((0, [0.5])), "it names image [0.5]"),
+        ("new.npy", rows_of((0, ["a"])), "is no ground truth of VPR-Bench"),
+        ("new.npy", rows_of(([0, 1], [1])), "is no ground truth of VPR-Bench"),
+        ("new.npy", rows_of((0, [1]), (0, [2])), "it has two rows of query 0"),
+        ("new.npy", np.eye(2), "it holds no lists"),
+        ("new.npy", b"", "is no ground truth of VPR-Bench"),
+        ("new.npy", None, "cannot be read (No such file"),
+    ],
+)
+def test_numbers_that_do_not_fit_are_said_in_a_sentence(name, content, said, tmp_path, capsys):
+    np.save(tmp_path / "scores.npy", SCORES)
+    path = tmp_path / name
+    if isinstance(content, dict):
+        np.savez(path, **content)
+    elif isinstance(content, bytes):
+        path.write_bytes(content)
+    elif content is not None:
+        np.save(path, content, allow_pickle=True)
+    assert main(["eval", "--similarity", str(tmp_path / "scores.npy"), "--ground-truth", str(path)]) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
+
+
+def test_a_query_of_the_ground_truth_that_is_not_in_the_folder_is_said(tmp_path, truth, capsys):
+    np.save(tmp_path / "a.npy", SCORES)
+    for folder, names in (("query", ["q1.jpg", "q2", "q3"]), ("ref", ["r1", "r2", "r10"])):
+        (tmp_path / folder).mkdir()
+        for name in names:
+            (tmp_path / folder / f"{name}.jpg").touch()
+    command = ["eval", "--similarity", str(tmp_path / "a.npy"), "--ground-truth", str(truth)]
+    assert main([*command, "--query", str(tmp_path / "query")]) == 2
+    assert "names the query `q1`, which is not in --query" in capsys.readouterr().err

@@ -1,0 +1,312 @@
+"""Flights on video with their positions are a data set like folders of pictures, and give the same figures."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import pytest
+from films import cut_in_half, film_of, overwrite_in_the_middle
+from full_disk import no_file_larger_than
+from generated_sets import without_costs
+from pictures import textured
+
+from edgevpr.cli.main import main
+from edgevpr.core.errors import EdgevprError, UsageError
+from edgevpr.core.geodesy import moved
+from edgevpr.lab.evaluate.kept import Kept
+from edgevpr.lab.evaluate.layouts import of_positions, open_folder
+from edgevpr.lab.evaluate.nearby import Nearness
+from edgevpr.lab.evaluate.videos import Pictures
+
+PLACES, RATE_HZ, APART_M = 6, 2, 30
+HOG = ("--techniques", "hog", "--param", "hog.w1=64")
+RULES = [
+    Nearness(within_m=20),
+    Nearness(within_m=50),
+    Nearness(within_m=50, within_deg=15),
+    Nearness(within_m=100, overlap=0.6, fov_deg=70),
+]
+
+
+def shown(items, total, label):
+    return items
+
+
+class Flight:
+    """Places 30 m apart on a line to the north, as a folder of pictures and as pictures for a video. The camera turns
+    by 10 degrees from picture to picture."""
+
+    def __init__(self, folder, name, first=0, beyond_m=0.0, darker=1):
+        self.name, self.pictures = name, []
+        self.places = folder / "pictures" / name
+        self.places.mkdir(parents=True)
+        rows, self.times = ["file,lat,lon,yaw_deg,height_m"], ["time,lat,lon,yaw_deg,height_m"]
+        for number in range(PLACES):
+            place = first + number
+            picture = cv2.cvtColor(textured(place) // darker, cv2.COLOR_GRAY2BGR)
+            lat_deg, lon_deg = moved(47.0, 8.0, 0.0, place * APART_M + beyond_m)
+            cv2.imwrite(str(self.places / f"{name}{number}.png"), picture)
+            rows.append(f"{name}{number}.png,{lat_deg!r},{lon_deg!r},{10 * place},50")
+            self.times.append(f"{number / RATE_HZ},{lat_deg!r},{lon_deg!r},{10 * place},50")
+            self.pictures.append(picture)
+        (self.places / "positions.csv").write_text("\n".join(rows))
+
+    def film(self, video, table=None, *coding):
+        """Film the flight, with its positions beside it, and return the path."""
+        film_of(video, self.pictures, RATE_HZ, *coding)
+        (table or video.with_suffix(".csv")).write_text("\n".join(self.times))
+        return video
+
+
+@pytest.fixture
+def mapping(tmp_path):
+    return Flight(tmp_path, "ref")
+
+
+@pytest.fixture
+def later(tmp_path):
+    return Flight(tmp_path, "query", first=1, beyond_m=11.0, darker=2)
+
+
+@pytest.fixture
+def films(tmp_path, mapping, later):
+    """Both flights as videos without losses: later.mkv and mapping.mkv with their tables."""
+    return later.film(tmp_path / "later.mkv"), mapping.film(tmp_path / "mapping.mkv")
+
+
+def measured(capsys, *arguments):
+    assert main(["eval", *HOG, "--json", *map(str, arguments)]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def quality(found):
+    (row,) = found["techniques"].values()
+    return {key: value for key, value in row.items() if not key.startswith(("t_", "u_", "ah_", "pcu"))}
+
+
+def numbers(dataset):
+    """Which references are right for which queries, by the numbers of the pictures."""
+    names = [path.name for path in sorted(dataset.queries[0].path.parent.glob("*.png"))]
+    return {
+        names.index(query.path.name): {dataset.references.index(each) for each in query.right}
+        for query in dataset.queries
+    }
+
+
+def test_videos_give_the_figures_of_the_folders_of_their_pictures(films, mapping, later, capsys):
+    flags = "--within-m", "20"
+    of_folders = measured(capsys, "--query", later.places, "--ref", mapping.places, *flags)
+    of_videos = measured(capsys, "--query", films[0], "--ref", films[1], *flags)
+    assert quality(of_videos) == quality(of_folders)
+    assert quality(of_videos)["queries"] == PLACES - 1, "one lies beyond the map"
+    mixed = measured(capsys, "--query", films[0], "--ref", mapping.places, *flags)
+    assert quality(mixed) == quality(of_folders)
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_what_is_right_is_the_same_by_distance_heading_and_ground_in_common(rule, films, mapping, later, tmp_path):
+    pictures = Pictures(Kept(tmp_path / "cache"), None, shown)
+    of_videos = numbers(of_positions(*films, rule, pictures))
+    assert of_videos == numbers(of_positions(later.places, mapping.places, rule))
+    assert of_videos
+
+
+def test_the_layouts_of_a_folder(tmp_path, mapping, later):
+    pictures = Pictures(Kept(tmp_path / "cache"), None, shown)
+    for name in ("beside", "inside", "both"):
+        (tmp_path / name).mkdir()
+    later.film(tmp_path / "beside" / "query.MKV", tmp_path / "beside" / "query.csv")
+    mapping.film(tmp_path / "beside" / "ref.mkv")
+    for each in (later, mapping):
+        (tmp_path / "inside" / each.name).mkdir()
+        video = tmp_path / "inside" / each.name / "DJI_0001.mkv"
+        each.film(video, video.parent / "positions.csv")
+    later.film(tmp_path / "both" / "query.mkv")
+    mapping.places.rename(tmp_path / "both" / "ref")
+    found = [numbers(open_folder(tmp_path / name, RULES[0], pictures)) for name in ("beside", "inside", "both")]
+    assert found[0] == found[1] == found[2] == {0: {1, 2}, 1: {2, 3}, 2: {3, 4}, 3: {4, 5}, 4: {5}}
+
+
+def test_pictures_a_second_are_as_many_as_asked_for(films, tmp_path, capsys):
+    found = measured(capsys, "--query", films[0], "--ref", films[1], "--rate-hz", "1")
+    row = quality(found)
+    assert (row["queries"], row["references"]) == (2, 3)
+
+
+def test_many_sets_take_the_pictures_once_and_whatever_decides_them_takes_them_anew(films, tmp_path, capsys):
+    out, cache = tmp_path / "out", tmp_path / "out" / "cache"
+
+    def run(*more):
+        found = measured(
+            capsys, "--query", films[0], "--ref", films[1], "--within-m", "20", "--out", out, "--workers", "2", *more
+        )
+        assert found["failed"] == []
+        return found
+
+    def taken():
+        return {path: path.stat().st_mtime_ns for path in (cache / "videos-files").rglob("*.png")}
+
+    first = run()
+    assert list(first["sets"]) == ["later.mkv on mapping.mkv"]
+    before = taken()
+    assert len(before) == 2 * PLACES
+    assert without_costs(run()) == without_costs(first)
+    assert taken() == before
+
+    spoilt = next(iter(before))
+    spoilt.write_bytes(spoilt.read_bytes()[:-1])
+    assert without_costs(run()) == without_costs(first)
+    assert set(taken()) == set(before)
+
+    assert run("--rate-hz", "1")["results"][0]["references"] == 3
+    assert len(taken()) == 2 * PLACES + 2 * 3
+    table = films[1].with_suffix(".csv")
+    table.write_text(table.read_text().replace("\n0.0,47.0,", "\n0.0,46.0,"))
+    assert run()["results"][0]["references"] == PLACES
+    assert len(taken()) == 3 * PLACES + 2 * 3
+
+
+def test_a_plan_names_videos_beside_its_file(films, tmp_path, capsys):
+    plan = tmp_path / "sets.yaml"
+    plan.write_text(
+        "sets:\n  fast: {query: later.mkv, ref: mapping.mkv, within_m: 20}\n"
+        "  slow: {query: later.mkv, ref: mapping.mkv, rate_hz: 1}\nrows:\n"
+        "  hog: {technique: hog, parameters: {w1: 64}}\n"
+    )
+    assert main(["eval", "--sets", str(plan), "--out", str(tmp_path / "out"), "--workers", "1", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)["results"]
+    assert [(row["set"], row["queries"], row["references"]) for row in found] == [
+        ("fast", PLACES - 1, PLACES),
+        ("slow", 2, 3),
+    ]
+
+
+def test_without_a_folder_for_the_results_nothing_is_left(films, tmp_path, capsys, monkeypatch):
+    (tmp_path / "tmp").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "tmp"))
+    before = sorted(tmp_path.rglob("*"))
+    measured(capsys, "--query", films[0], "--ref", films[1], "--within-m", "20")
+    films[0].write_bytes(films[0].read_bytes()[:-20_000])
+    assert main(["eval", *HOG, "--query", str(films[0]), "--ref", str(films[1])]) == 1
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_frames_without_a_position_are_left_out_and_said(films, capsys):
+    table = films[0].with_suffix(".csv")
+    header, _, *rest = table.read_text().splitlines()
+    table.write_text("\n".join([header, *rest]))
+    assert main(["eval", *HOG, "--query", str(films[0]), "--ref", str(films[1])]) == 0
+    said = capsys.readouterr()
+    assert f"{films[0]}: 1 of 6 frames have no position, and are left out" in said.err
+    assert "4 queries scored against 6 references" in said.out
+
+
+def without_table(video):
+    video.with_suffix(".csv").unlink()
+
+
+def other_time(video):
+    video.with_suffix(".csv").write_text("time,lat,lon\n2026-02-14T06:10:00Z,47,8\n2026-02-14T06:10:05Z,47,8\n")
+
+
+def wide_gap(video):
+    video.with_suffix(".csv").write_text("time,lat,lon\n-10,47,8\n10,47,8\n")
+
+
+def table_of_files(video):
+    video.with_suffix(".csv").write_text("file,lat,lon\na.jpg,47,8\n")
+
+
+def bad_bytes(video):
+    coding = "-c:v", "libx264", "-bf", "0", "-sc_threshold", "0"
+    film_of(video, [cv2.cvtColor(textured(at), cv2.COLOR_GRAY2BGR) for at in range(PLACES)], RATE_HZ, "-y", *coding)
+    overwrite_in_the_middle(video)
+
+
+def no_video(video):
+    video.write_text("not a video")
+
+
+def gone(video):
+    video.unlink()
+
+
+@pytest.mark.parametrize("out", [False, True])
+@pytest.mark.parametrize(
+    ("harm", "code", "said"),
+    [
+        (without_table, 2, "later.mkv has no positions beside it: write later.csv there (time,lat,lon[,"),
+        (other_time, 2, "later.mkv lasts from 0 to 3.0 s: write `time` in seconds from its first frame"),
+        (wide_gap, 2, "later.csv that are at most 5 s apart"),
+        (table_of_files, 2, "line 1 has no column `time`"),
+        (no_video, 1, "later.mkv is not a video that can be decoded"),
+        (gone, 1, "later.mkv does not exist"),
+        (bad_bytes, 1, "cannot be used, being damaged"),
+        (cut_in_half, 1, "copy the video again"),
+    ],
+)
+def test_what_cannot_be_used_is_said_in_one_sentence(harm, code, said, out, films, tmp_path, capsys):
+    harm(films[0])
+    more = ["--out", str(tmp_path / "out"), "--workers", "1"] if out else []
+    assert main(["eval", *HOG, "--query", str(films[0]), "--ref", str(films[1]), *more]) == code
+    lines = [line for line in capsys.readouterr().err.splitlines() if ": pictures  " not in line]
+    assert len(lines) == 1
+    assert said in lines[0]
+
+
+def test_two_videos_in_one_folder_and_a_common_table_of_two_are_refused(films, tmp_path):
+    pictures = Pictures(Kept(tmp_path / "cache"), None, shown)
+    with pytest.raises(UsageError, match=r"holds 2 videos \(later\.mkv, mapping\.mkv\): keep one"):
+        pictures(tmp_path)
+    films[0].with_suffix(".csv").rename(tmp_path / "positions.csv")
+    with pytest.raises(UsageError, match="has no positions beside it"):
+        pictures(films[0])
+    films[1].unlink()
+    assert len(list(pictures(films[0]).glob("*.png"))) == PLACES
+    (tmp_path / "later.mp4").touch()
+    films[0].rename(tmp_path / "query.mkv")
+    (tmp_path / "later.mp4").rename(tmp_path / "query.mp4")
+    with pytest.raises(UsageError, match=r"holds query\.mkv and query\.mp4: keep one of them"):
+        open_folder(tmp_path, RULES[0], pictures)
+
+
+def test_a_full_disk_is_said_and_leaves_nothing_half_taken(films, tmp_path):
+    kept = Kept(tmp_path / "cache")
+    with (
+        no_file_larger_than(2000),
+        pytest.raises(EdgevprError, match=r"later\.mkv .*make room, take fewer with --rate"),
+    ):
+        Pictures(kept, None, shown)(films[0])
+    assert list(kept.folder.iterdir()) == []
+    assert len(list(Pictures(kept, None, shown)(films[0]).glob("*.png"))) == PLACES
+
+
+def test_killed_while_pictures_are_taken_it_goes_on_with_the_next_run(films, tmp_path):
+    """As after a power cut: what is half taken is never believed."""
+    cache = tmp_path / "cache"
+    code = (
+        "import os, signal, sys\nfrom pathlib import Path\nfrom edgevpr.lab.evaluate import videos\n"
+        "from edgevpr.lab.evaluate.kept import Kept\nwrite = videos.write_png\n"
+        "def dying(path, image):\n    write(path, image)\n"
+        "    '3' in path.name and os.kill(os.getpid(), signal.SIGKILL)\n"
+        "videos.write_png = dying\n"
+        "videos.Pictures(Kept(sys.argv[1]), None, lambda items, total, label: items)(Path(sys.argv[2]))\n"
+    )
+    root = Path(__file__).parents[3]
+    environment = {**os.environ, "PYTHONPATH": str(root)}
+    done = subprocess.run([sys.executable, "-c", code, str(cache), str(films[0])], env=environment)
+    assert done.returncode == -signal.SIGKILL
+    assert not (cache / "videos").exists()
+    assert len(list(Pictures(Kept(cache), None, shown)(films[0]).glob("*.png"))) == PLACES
+
+
+def test_as_a_camera_films_it_the_places_are_still_found(tmp_path, mapping, later, capsys):
+    """With losses, as MPEG-4 in an MP4 file."""
+    coding = "-c:v", "libx264", "-crf", "18", "-pix_fmt", "yuv420p"
+    videos = [each.film(tmp_path / f"{each.name}.mp4", None, *coding) for each in (later, mapping)]
+    found = measured(capsys, "--query", videos[0], "--ref", videos[1], "--within-m", "20")
+    assert quality(found)["recall_at_1"] >= 5 / 6

@@ -1,0 +1,57 @@
+"""The demonstration on a small landscape: real processes, a real link, a real picture."""
+
+import sys
+from dataclasses import replace
+from functools import partial
+
+import cv2
+import pytest
+
+from edgevpr.core.errors import EdgevprError
+from edgevpr.lab.simulate import demo
+from edgevpr.lab.simulate.flight import later_flight, mapping_flight
+from edgevpr.lab.simulate.scene import make_scene
+
+
+@pytest.fixture
+def small(monkeypatch):
+    monkeypatch.setattr(demo, "make_scene", partial(make_scene, metres_per_pixel=0.5))
+    for name, flight in (("mapping_flight", mapping_flight), ("later_flight", later_flight)):
+        monkeypatch.setattr(demo, name, lambda seed, flight=flight: replace(flight(seed), poses=flight(seed).poses[:6]))
+
+
+def test_the_demo_maps_flies_tells_and_draws(small, tmp_path):
+    pytest.importorskip("matplotlib")
+    for left_over in ("map.gpkg", "map.gpkg-wal", "flight.jsonl", "demo.png"):
+        (tmp_path / left_over).write_text('{"kind": "query"}\n')
+    summary = demo.run_demo(tmp_path)
+    assert summary.places == 6
+    assert summary.outcome.queries == 6
+    assert summary.fixes_accepted == summary.outcome.accepted
+    assert {"HEARTBEAT", "NAMED_VALUE_FLOAT"} <= set(summary.messages)
+    assert summary.costs["cpu_s"] > 0
+    picture = cv2.imread(str(summary.picture))
+    assert picture.shape == (1080, 1920, 3)
+    assert picture.std() > 20
+    assert "recall@1" in str(summary)
+
+
+def test_a_command_that_fails_is_named_and_nothing_is_left_running(small, tmp_path, monkeypatch):
+    pytest.importorskip("matplotlib")
+    started = []
+    popen = demo.subprocess.Popen
+    monkeypatch.setattr(demo.subprocess, "Popen", lambda *a, **k: started.append(popen(*a, **k)) or started[-1])
+    monkeypatch.setattr(demo, "_RATE_HZ", "often")
+    with pytest.raises(EdgevprError, match=r"edgevpr run .* ended with exit code 2"):
+        demo.run_demo(tmp_path / "out")
+    assert len(started) == 3
+    assert all(process.poll() is not None for process in started)
+
+
+def test_without_matplotlib_one_sentence_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.delitem(sys.modules, "edgevpr.lab.simulate.picture", raising=False)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    monkeypatch.setitem(sys.modules, "matplotlib.axes", None)
+    with pytest.raises(EdgevprError, match=r"pip install 'edgevpr\[plots\]'"):
+        demo.run_demo(tmp_path / "out")
+    assert not (tmp_path / "out").exists()

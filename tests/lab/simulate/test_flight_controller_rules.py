@@ -1,0 +1,330 @@
+"""Rules of the simulated flight controllers that the contract with a real ArduPilot does not fly through, and PX4's."""
+
+import math
+
+import pytest
+
+from edgevpr.core.errors import UsageError
+from edgevpr.core.geodesy import distance_m
+from edgevpr.lab.simulate.flight import ORIGIN
+from edgevpr.lab.simulate.flightcontroller.controller import VEHICLES, FlightController
+from edgevpr.lab.simulate.flightcontroller.freeflight import FreeFlight
+from edgevpr.lab.simulate.flightcontroller.recorded import Nowhere
+from edgevpr.mavlink import messages
+from edgevpr.mavlink.messages import Fix
+from edgevpr.mavlink.wire import mavlink
+
+ACCEPTED, DENIED, FAILED = (getattr(mavlink, f"MAV_RESULT_{name}") for name in ("ACCEPTED", "DENIED", "FAILED"))
+NOT_NOW, UNSUPPORTED = mavlink.MAV_RESULT_TEMPORARILY_REJECTED, mavlink.MAV_RESULT_UNSUPPORTED
+GUIDED, LAND = 4, 9
+
+
+class Flown:
+    """A vehicle in the air with GPS, and the texts that it has sent."""
+
+    def __init__(self, vehicle: str, **parameters: float) -> None:
+        self.kind = vehicle.removeprefix("ardu").removeprefix("px4-")
+        self.motion = FreeFlight(self.kind, ORIGIN)
+        self.controller = FlightController(vehicle, self.motion, gps=True)
+        self.texts, self.said = [], []
+        self.now_s = 0.0
+        for name, value in parameters.items():
+            self.controller.set(name, value)
+
+    def wait(self, seconds: float) -> "Flown":
+        self.now_s += seconds
+        self.said = self.controller.advance(self.now_s)
+        self.texts += [each.text for each in self.said if each.get_type() == "STATUSTEXT"]
+        return self
+
+    def in_air(self) -> "Flown":
+        self.wait(10)
+        self.controller.brain.set_mode({"copter": GUIDED, "plane": 13, "rover": 15}[self.kind])
+        self.controller.brain.arm(True)
+        self.motion.take_off(30)
+        return self.wait(30)
+
+    def tell(self, message):
+        """Send a message; return the answers."""
+        return self.controller.hear(message)
+
+    def command(self, number: int, *values: float) -> int:
+        padded = [*values, *[0] * (7 - len(values))]
+        return self.tell(mavlink.MAVLink_command_long_message(1, 1, number, 0, *padded))[0].result
+
+    def fix(self, north_m: float = 0.0, age_s: float = 0.0, **changes: float) -> int:
+        """Send a fix so far north of the truth."""
+        place = self.truth
+        here = Fix(place.lat_deg + north_m / 111_195, place.lon_deg, 5.0, self.now_s - age_s)
+        command = messages.position_fix(here, self.now_s, target_system=1)
+        for field, value in changes.items():
+            setattr(command, field, value)
+        return self.tell(command)[0].result
+
+    @property
+    def truth(self):
+        return self.controller._truth
+
+    @property
+    def error_m(self) -> float:
+        return self.controller.error_m
+
+    @property
+    def flags(self) -> int:
+        return self.controller.brain.flags(self.now_s)
+
+
+def lost(vehicle: str, wind_m_s: float = 6.0, **parameters: float) -> Flown:
+    """Return a vehicle that has just lost GPS, in a wind that it does not know."""
+    flown = Flown(vehicle, **parameters).in_air()
+    flown.controller.set("SIM_GPS1_ENABLE", 0)
+    flown.controller.set("SIM_WIND_SPD", wind_m_s)
+    return flown
+
+
+@pytest.mark.parametrize(
+    ("changes", "result"),
+    [
+        ({}, ACCEPTED),
+        ({"frame": mavlink.MAV_FRAME_GLOBAL_INT}, ACCEPTED),
+        ({"frame": mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT}, DENIED),
+        ({"z": 0.0}, DENIED),
+        ({"param3": 0.0}, ACCEPTED),
+        ({"param3": math.nan}, ACCEPTED),
+        ({"command": 31_000}, UNSUPPORTED),
+    ],
+)
+def test_ardupilot_judges_a_command_by_its_form(changes, result):
+    controller = FlightController("arduplane", Nowhere(), gps=False)
+    command = messages.position_fix(Fix(50.0, 14.0, 25.0, 0.0), 0.5, target_system=1)
+    for field, value in changes.items():
+        setattr(command, field, value)
+    assert controller.hear(command)[0].result == result
+
+
+@pytest.mark.parametrize("vehicle", VEHICLES)
+def test_none_takes_a_fix_while_it_has_gps(vehicle):
+    flown = Flown(vehicle).in_air()
+    assert flown.fix() in (FAILED, NOT_NOW)
+    assert flown.error_m < 0.1
+
+
+def test_ardupilot_fails_a_fix_for_a_second_after_the_loss_and_before_it_has_an_origin():
+    assert Flown("arduplane", SIM_GPS1_ENABLE=0).wait(20).fix() == FAILED
+    flown = lost("arduplane")
+    flown.wait(0.5)
+    assert flown.fix() == FAILED
+    flown.wait(1)
+    assert flown.fix() == ACCEPTED
+
+
+def test_a_plane_drifts_with_the_wind_that_it_does_not_know_only():
+    known = Flown("arduplane", SIM_WIND_SPD=6).in_air()
+    known.wait(30)
+    known.controller.set("SIM_GPS1_ENABLE", 0)
+    assert known.wait(60).error_m < 10
+    unknown = lost("arduplane").wait(150)
+    assert unknown.error_m == pytest.approx(767, rel=0.05)
+    assert unknown.truth.roll_deg > 20, "it circles"
+    assert unknown.controller.brain.is_armed
+
+
+def test_ardupilot_brings_a_fix_forward_by_five_seconds_at_the_most():
+    flown = lost("ardurover", wind_m_s=0).wait(3)
+    flown.motion.fly(10j, flown.now_s)
+    flown.wait(2)
+    assert flown.fix(north_m=-20, age_s=2.0) == ACCEPTED
+    assert flown.error_m < 1.5
+    flown.motion.fly(10j, flown.now_s)
+    assert flown.wait(2).fix(north_m=-80, age_s=8.0) == ACCEPTED
+    assert flown.error_m == pytest.approx(30, abs=3)
+
+
+@pytest.mark.parametrize("vehicle", ["arducopter", "ardurover"])
+def test_without_any_aid_ardupilot_loses_the_position_after_seven_seconds_and_aiding_after_fifteen(vehicle):
+    flown = lost(vehicle)
+    flown.motion.fly(1j, flown.now_s)
+    has_position = mavlink.EKF_POS_HORIZ_REL | mavlink.EKF_POS_HORIZ_ABS
+    assert flown.wait(6).flags & has_position
+    assert flown.fix() == ACCEPTED
+    assert not flown.wait(2).flags & has_position, "the fix did not prevent it"
+    flown.wait(2)
+    assert flown.controller.brain.mode == (LAND if vehicle == "arducopter" else 4)
+    assert "EKF variance" in flown.texts
+    assert flown.fix() == ACCEPTED
+    flown.wait(6)
+    assert flown.flags & mavlink.EKF_CONST_POS_MODE
+    assert flown.fix() == FAILED
+    assert "GLOBAL_POSITION_INT" not in {each.get_type() for each in flown.said}, "nobody has asked for it"
+
+
+def test_a_copter_that_has_landed_disarms():
+    flown = lost("arducopter").wait(120)
+    assert flown.truth.height_m == 0
+    assert not flown.controller.brain.is_armed
+
+
+def test_gps_that_comes_back_ends_the_failsafe():
+    flown = lost("arducopter").wait(20)
+    flown.controller.set("SIM_GPS1_ENABLE", 1)
+    flown.wait(10)
+    assert "EKF Failsafe Cleared" in flown.texts
+    assert flown.flags & mavlink.EKF_POS_HORIZ_ABS
+
+
+def odometry(north_m: float, frame: int = 20, quality: int = 0):
+    return mavlink.MAVLink_odometry_message(
+        0, frame, 12, north_m, 0, 0, [1, 0, 0, 0], 0, 0, 0, 0, 0, 0, [0.01] * 21, [0.01] * 21, quality=quality
+    )
+
+
+def test_a_copter_flies_by_odometry_without_any_gps():
+    flown = Flown("arducopter", SIM_GPS1_ENABLE=0, VISO_TYPE=1, EK3_SRC1_POSXY=6, VISO_QUAL_MIN=10).wait(1)
+    assert flown.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1) == FAILED
+    origin = mavlink.MAVLink_set_gps_global_origin_message(1, round(ORIGIN.lat_deg * 1e7), 1491652300, 584_000)
+    assert [each.get_type() for each in flown.tell(origin)] == ["GPS_GLOBAL_ORIGIN"]
+    assert flown.tell(origin) == [], "it is set once"
+    for message in (odometry(0, frame=1), odometry(0, quality=5)):
+        for _ in range(200):
+            flown.tell(message)
+            flown.wait(0.1)
+        assert flown.flags & mavlink.EKF_CONST_POS_MODE, "the wrong frame, or too poor"
+    for _ in range(100):
+        flown.tell(odometry(0, quality=50))
+        flown.wait(0.1)
+    assert flown.flags & mavlink.EKF_POS_HORIZ_ABS
+    assert flown.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1) == ACCEPTED
+    flown.wait(0.5)
+    assert flown.controller.brain.why_not_arm(flown.now_s) == "VisOdom: not healthy"
+
+
+def test_a_source_set_is_chosen_by_command():
+    flown = Flown("arducopter", VISO_TYPE=1, EK3_SRC2_POSXY=6).in_air()
+    assert flown.command(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, 4) == DENIED
+    assert flown.command(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, 2) == ACCEPTED
+    flown.wait(9)
+    assert flown.controller.brain.mode == LAND, "nothing comes on that one"
+    assert Flown("px4-copter").command(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, 2) == UNSUPPORTED
+
+
+@pytest.mark.parametrize(("rate_hz", "is_healthy"), [(10, True), (8, True), (4, False)])
+def test_a_second_gps_has_to_report_often_enough(rate_hz, is_healthy):
+    flown = Flown("arducopter", GPS2_TYPE=14).wait(10)
+    for _ in range(10 * rate_hz):
+        flown.tell(mavlink.MAVLink_gps_input_message(0, 1, 0, 0, 0, 3, 0, 0, 0, 1, 1, 0, 0, 0, 1, 1, 1, 12))
+        flown.wait(1 / rate_hz)
+    assert flown.controller.brain.receivers.second.is_healthy == is_healthy
+    flown.wait(5)
+    assert flown.controller.brain.receivers.second.fix_type == 1
+
+
+def test_px4_takes_a_fix_while_it_reckons_and_names_no_frame():
+    flown = lost("px4-plane").wait(0.5)
+    assert flown.fix() == NOT_NOW
+    assert flown.wait(60).error_m > 200
+    assert flown.fix(frame=mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT, param1=math.nan, param3=math.nan) == ACCEPTED
+    assert flown.error_m < 1
+    assert flown.controller.brain.reckoning.sd_m == 50, "where the sender says none"
+    assert flown.fix(param2=math.nan) == NOT_NOW
+    assert flown.fix(x=1_000_000_000) == FAILED
+
+
+def test_px4_on_the_ground_without_gps_starts_from_a_fix():
+    flown = Flown("px4-copter", SIM_GPS1_ENABLE=0).wait(5)
+    assert flown.flags & mavlink.ESTIMATOR_CONST_POS_MODE
+    assert flown.fix() == ACCEPTED
+    flown.wait(0.5)
+    assert flown.flags & mavlink.ESTIMATOR_POS_HORIZ_ABS
+    assert "GLOBAL_POSITION_INT" in {each.get_type() for each in flown.said}, "streams that come by themselves"
+
+
+def test_a_px4_copter_without_any_aid_lands_after_five_seconds():
+    flown = lost("px4-copter").wait(4)
+    assert flown.flags & mavlink.ESTIMATOR_POS_HORIZ_ABS
+    assert not flown.wait(3).flags & mavlink.ESTIMATOR_POS_HORIZ_ABS
+    assert any("Failsafe" in text for text in flown.texts)
+
+
+def sensed(flown: Flown, north_m: float = 0.0, eph_m: float = 5.0, number: int = 1):
+    return mavlink.MAVLink_global_position_sensor_message(
+        target_system=1,
+        target_component=1,
+        id=number,
+        time_usec=0,
+        processing_time=0,
+        source=2,
+        flags=0,
+        lat=round((flown.truth.lat_deg + north_m / 111_195) * 1e7),
+        lon=round(flown.truth.lon_deg * 1e7),
+        alt_ellipsoid=600.0,
+        alt=600.0,
+        eph=eph_m,
+        epv=5.0,
+    )
+
+
+def test_px4_fuses_message_296():
+    flown = lost("px4-copter").wait(0.5)
+    for _ in range(60):
+        flown.tell(sensed(flown))
+        flown.wait(0.5)
+    assert flown.error_m < 5
+    assert flown.flags & mavlink.ESTIMATOR_POS_HORIZ_ABS, "no failsafe"
+    assert flown.fix() == NOT_NOW, "it does not reckon"
+    for _ in range(14):
+        flown.tell(sensed(flown, eph_m=0.0))
+        flown.tell(sensed(flown, number=2))  # of another slot
+        flown.wait(0.5)
+    assert not flown.flags & mavlink.ESTIMATOR_POS_HORIZ_ABS
+
+
+def test_px4_follows_a_jump_of_message_296_after_seven_seconds():
+    flown = lost("px4-plane", wind_m_s=0).wait(2)
+    for _ in range(10):
+        flown.tell(sensed(flown, eph_m=1.0))
+        flown.wait(1)
+    for second in range(12):
+        flown.tell(sensed(flown, north_m=300.0, eph_m=1.0))
+        flown.wait(1)
+        if second < 5:
+            assert flown.error_m < 30
+    assert flown.error_m == pytest.approx(300, abs=30)
+
+
+def test_px4_says_integers_byte_by_byte():
+    flown = Flown("px4-copter")
+    read = mavlink.MAVLink_param_request_read_message(1, 1, b"SER_TEL2_BAUD", -1)
+    (said,) = flown.tell(read)
+    assert said.param_type == mavlink.MAV_PARAM_TYPE_INT32
+    assert said.param_value == pytest.approx(921_600 * 2**-149), "the bits of the integer"
+    listed = flown.tell(mavlink.MAVLink_param_request_list_message(1, 1))
+    assert {each.param_id for each in listed} >= {"EKF2_AGP0_CTRL", "SIM_GPS1_ENABLE"}
+    assert [each.param_index for each in listed] == list(range(listed[0].param_count))
+
+
+def test_a_ping_is_answered_by_px4():
+    ping = mavlink.MAVLink_ping_message(1, 7, 0, 0)
+    assert [each.seq for each in Flown("px4-copter").tell(ping)] == [7]
+
+
+def test_a_velocity_is_flown_by_a_copter_while_it_is_told():
+    flown = Flown("arducopter").in_air()
+    before = flown.truth
+    only_velocity = 0b0000111111000111
+    flown.tell(
+        mavlink.MAVLink_set_position_target_local_ned_message(0, 1, 1, 1, only_velocity, *[0] * 3, 0, 6, *[0] * 6)
+    )
+    flown.wait(10)
+    gone_m = distance_m(before.lat_deg, before.lon_deg, flown.truth.lat_deg, flown.truth.lon_deg)
+    assert gone_m == pytest.approx(18, abs=1), "three seconds"
+
+
+def test_an_unknown_vehicle_is_refused_in_a_sentence():
+    with pytest.raises(UsageError, match="arducopter"):
+        FlightController("balloon", Nowhere(), gps=False)
+
+
+def test_what_is_for_another_is_not_answered():
+    flown = Flown("arducopter")
+    assert flown.tell(mavlink.MAVLink_command_long_message(2, 1, 512, 0, 148, 0, 0, 0, 0, 0, 0)) == []
+    assert flown.tell(mavlink.MAVLink_command_long_message(1, 197, 512, 0, 148, 0, 0, 0, 0, 0, 0)) == []

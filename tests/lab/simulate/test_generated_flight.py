@@ -1,0 +1,120 @@
+"""The two flights, what is written of them, and how answers are judged."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import cv2
+import numpy as np
+import pytest
+
+from edgevpr.core.geodesy import distance_m
+from edgevpr.frames.positions import read_positions
+from edgevpr.lab.simulate.camera import ground_to_pixel
+from edgevpr.lab.simulate.flight import (
+    SCENE_DEPTH_M,
+    SCENE_WIDTH_M,
+    Flight,
+    later_flight,
+    mapping_flight,
+    to_metres,
+    write_flight,
+)
+from edgevpr.lab.simulate.outcome import outcome, read_answers
+from edgevpr.lab.simulate.scene import make_scene
+from edgevpr.runtime.flight.flightlog import FlightLog
+
+
+def first_frames(flight: Flight, count: int) -> Flight:
+    return replace(flight, poses=flight.poses[:count])
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make_scene(1, SCENE_WIDTH_M, SCENE_DEPTH_M, metres_per_pixel=1.0)
+
+
+@pytest.mark.parametrize("flight", [mapping_flight(1), later_flight(1), later_flight(9)])
+def test_every_picture_shows_the_scene_and_nothing_beyond_its_edge(flight):
+    camera = flight.camera
+    corners = np.array([[(0, 0), (camera.width, 0), (camera.width, camera.height), (0, camera.height)]], float)
+    for pose in flight.poses:
+        ground = cv2.perspectiveTransform(corners, np.linalg.inv(ground_to_pixel(pose, camera)))[0]
+        assert (ground >= 0).all()
+        assert (ground <= (SCENE_WIDTH_M, SCENE_DEPTH_M)).all()
+
+
+def test_the_later_flight_comes_back_from_elsewhere_and_leaves_the_map():
+    places, queries = mapping_flight(1).poses, later_flight(1).poses
+    assert len(places) == 70
+    assert 38 <= len(queries) <= 42
+    nearest = [
+        min(places, key=lambda place: np.hypot(place.east_m - query.east_m, place.north_m - query.north_m))
+        for query in queries
+    ]
+    away_m = [np.hypot(p.east_m - q.east_m, p.north_m - q.north_m) for p, q in zip(nearest, queries, strict=True)]
+    over = [i for i in range(len(queries)) if away_m[i] < 25]
+    assert len(over) >= 28
+    assert sum(way > 100 for way in away_m) >= 6, "no ground in common with any place"
+    assert max(abs(queries[i].north_m - nearest[i].north_m) for i in over) > 5
+    assert max(abs(queries[i].height_m / nearest[i].height_m - 1) for i in over) > 0.06
+    turned_deg = [abs((queries[i].heading_deg - nearest[i].heading_deg + 180) % 360 - 180) for i in over]
+    assert 6 < max(turned_deg) < 13
+
+
+def test_positions_come_back_to_a_decimetre(tmp_path, scene):
+    flight = first_frames(mapping_flight(1), 17)
+    names = list(write_flight(tmp_path, scene, flight))
+    tags = read_positions(tmp_path / "positions.csv")
+    assert list(tags) == names == sorted(path.name for path in (tmp_path / "images").iterdir())
+    for pose, tag in zip(flight.poses, tags.values(), strict=True):
+        assert to_metres(tag.position.lat_deg, tag.position.lon_deg) == pytest.approx(
+            (pose.east_m, pose.north_m), abs=0.1
+        )
+        assert tag.heading_deg == pytest.approx(pose.heading_deg % 360, abs=0.01)
+    for (one, tag), (other, other_tag) in pairwise(zip(flight.poses, tags.values(), strict=True)):
+        here, there = tag.position, other_tag.position
+        flown_m = distance_m(here.lat_deg, here.lon_deg, there.lat_deg, there.lon_deg)
+        assert flown_m == pytest.approx(np.hypot(one.east_m - other.east_m, one.north_m - other.north_m), abs=0.1)
+        assert other_tag.t_utc_s - tag.t_utc_s == flight.interval_s
+
+
+def test_a_flight_is_the_same_each_time_it_is_flown(tmp_path, scene):
+    for folder in ("one", "two"):
+        list(write_flight(tmp_path / folder, scene, first_frames(later_flight(4), 2)))
+    one, two = ((tmp_path / folder / "images" / "frame_0001.jpg").read_bytes() for folder in ("one", "two"))
+    assert one == two
+    assert cv2.imdecode(np.frombuffer(one, np.uint8), cv2.IMREAD_COLOR).shape == (480, 640, 3)
+
+
+def test_answers_are_judged_by_the_true_positions(tmp_path):
+    for folder, rows in (
+        ("map", ("p0,50.0,8.0", "p1,50.001,8.0")),
+        ("query", ("q0,50.0001,8.0", "q1,50.001,8.0", "q2,50.01,8.0")),
+    ):
+        (tmp_path / folder / "images").mkdir(parents=True)
+        (tmp_path / folder / "positions.csv").write_text("\n".join(["file,lat,lon", *rows]))
+    said = (("q0", "p0", 50.00005), ("q1", "p0", 50.0002), ("q2", "p1", None))
+    with FlightLog(tmp_path / "log.jsonl") as log:
+        log.write("start")
+        for query, place, fix_deg in said:
+            located = fix_deg and {"lat_deg": fix_deg, "lon_deg": 8.0}
+            accepted = fix_deg is not None
+            log.write("query", query=query, reference_image=place, score=0.9, accepted=accepted, located=located)
+        log.write("end")
+    answers = read_answers(tmp_path / "log.jsonl", tmp_path / "map" / "images", tmp_path / "query" / "images")
+    assert [(answer.on_map, answer.right) for answer in answers] == [(True, True), (True, False), (False, False)]
+    assert answers[0].error_m == pytest.approx(11.12, abs=0.01)
+    got = outcome(answers)
+    assert (got.queries, got.on_map, got.accepted, got.accepted_wrong, got.off_map_rejected) == (3, 2, 2, 1, 1)
+    assert got.recall_at_1 == 0.5
+    assert [answer.fix_off_m for answer in answers] == [
+        pytest.approx(5.56, abs=0.01),
+        pytest.approx(88.96, abs=0.1),
+        None,
+    ]
+    assert got.error_max_m == pytest.approx(88.96, abs=0.1)
+    assert got.error_median_m == pytest.approx((5.56 + 88.96) / 2, abs=0.1)
+
+
+def test_a_flight_without_an_accepted_match_has_no_error(tmp_path):
+    assert np.isnan(outcome([]).error_median_m)

@@ -1,0 +1,302 @@
+"""The simulated flight controller: strict, and honest about what it saw."""
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+from mavlink_peers import AutopilotThread, Peer, UdpPort, free_port, wait_until
+
+from edgevpr.cli.main import main
+from edgevpr.cli.simulation import _VEHICLES
+from edgevpr.core.errors import LinkError, UsageError
+from edgevpr.lab.simulate.autopilot import run_autopilot, serve
+from edgevpr.lab.simulate.flight import ORIGIN
+from edgevpr.lab.simulate.flightcontroller.controller import VEHICLES, FlightController
+from edgevpr.lab.simulate.flightcontroller.freeflight import FreeFlight
+from edgevpr.lab.simulate.flightcontroller.recorded import Nowhere, Track, read_track, truth_at
+from edgevpr.mavlink import messages, reading
+from edgevpr.mavlink.address import parse_link
+from edgevpr.mavlink.asking import Asking
+from edgevpr.mavlink.link import Link
+from edgevpr.mavlink.messages import Fix, Health
+from edgevpr.mavlink.wire import mavlink
+
+
+def a_fix(**changes):
+    command = messages.position_fix(Fix(50.0, 14.0, 25.0, 0.0), 0.5, target_system=1)
+    for field, value in changes.items():
+        setattr(command, field, value)
+    return command
+
+
+def test_it_answers_counts_and_remembers():
+    number = free_port()
+    port = UdpPort(number)
+    companion = Peer(port)
+    autopilot = AutopilotThread(f"udpout:127.0.0.1:{number}")
+    heartbeat = companion.expect("HEARTBEAT")
+
+    def send(message):
+        companion.send(message, component_id=197)
+
+    send(messages.heartbeat(Health.ACTIVE))
+    port.send(b"noise")
+    assert (heartbeat.get_srcSystem(), heartbeat.get_srcComponent()) == (1, 1)
+    assert heartbeat.autopilot == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
+    results = []
+    for command in (a_fix(x=501234567), a_fix(z=3.0), a_fix(command=31_000)):
+        send(command)
+        results.append(companion.expect("COMMAND_ACK").result)
+    assert results == [mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_DENIED, mavlink.MAV_RESULT_UNSUPPORTED]
+    send(a_fix(target_system=2))  # for another vehicle: no answer
+    companion.lose(3, component_id=197)
+    send(a_fix(x=501234568))
+    assert companion.expect("COMMAND_ACK").result == mavlink.MAV_RESULT_ACCEPTED
+    assert not companion.seen
+    summary = autopilot.finish()
+    port.close()
+    assert summary.companion == "1/197"
+    assert [(fix.lat_deg, fix.lon_deg, fix.accuracy_m) for fix in summary.fixes] == [
+        (50.1234567, 14.0, 25.0),
+        (50.1234568, 14.0, 25.0),
+    ]
+    assert (summary.fixes_accepted, summary.fixes_denied) == (2, 1)
+    assert summary.messages["COMMAND_INT"] == summary.messages_by_sender["1/197"]["COMMAND_INT"] == 5
+    assert (summary.lost_packets, summary.bad_bytes) == (3, 5)
+    assert json.loads(summary.to_json())["fixes"][0]["lat_deg"] == 50.1234567
+    assert "2 accepted, 0 failed, 1 denied" in str(summary)
+
+
+def test_it_is_a_process_that_ends_well_on_sigterm_and_says_what_it_saw():
+    number = free_port()
+    code = (
+        f"from edgevpr.lab.simulate.autopilot import run_autopilot as r; print(r('udpin:127.0.0.1:{number}').to_json())"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    with Link(parse_link(f"udpout:127.0.0.1:{number}")) as link:
+        link.set_health(Health.ACTIVE)
+        wait_until(lambda: link.stats().autopilot_heard, "the other process")
+        link.send_fix(Fix(50.1234567, 14.0, 25.0, time.monotonic()))
+        link.send(*messages.place_match(time.monotonic(), 3, 0.5))
+        wait_until(lambda: link.stats().acks == {"ACCEPTED": 1})
+        wait_until(lambda: link.stats().sent.get("NAMED_VALUE_FLOAT") == 1)
+    process.send_signal(signal.SIGTERM)
+    said, _ = process.communicate(timeout=60)
+    assert process.returncode == 0
+    summary = json.loads(said)
+    assert summary["fixes_accepted"] == 1
+    assert {"HEARTBEAT", "COMMAND_INT", "NAMED_VALUE_INT", "NAMED_VALUE_FLOAT"} <= set(summary["messages"])
+    assert (summary["lost_packets"], summary["bad_bytes"]) == (0, 0)
+
+
+def test_it_flies_along_a_track_from_when_a_companion_is_heard(tmp_path):
+    csv = tmp_path / "positions.csv"
+    rows = [
+        "b.jpg,50.002,8.0,110,90,2026-02-14T00:30:00.4Z",
+        "a.jpg,50.000,8.0,100,0,2026-02-14T00:30:00Z",
+        "c.jpg,,,,,",
+    ]
+    csv.write_text("\n".join(["file,lat,lon,alt,yaw_deg,time", *rows]))
+    number = free_port()
+    with Link(parse_link(f"udpin:127.0.0.1:{number}")) as link:
+        link.want_position()
+        autopilot = AutopilotThread(f"udpout:127.0.0.1:{number}", track=read_track(csv))
+        seen = []
+
+        def at_the_end():
+            position = link.vehicle()
+            if position and (not seen or position.t_heard_s != seen[-1].t_heard_s):
+                seen.append(position)
+            return len(seen) > 3 and seen[-1].lat_deg == seen[-2].lat_deg
+
+        wait_until(at_the_end, "the end of the track")
+        autopilot.finish()
+    north = [position.lat_deg for position in seen]
+    assert north == sorted(north)
+    assert len(set(north)) >= 2, "on the way, too"
+    assert (seen[-1].lat_deg, seen[-1].lon_deg, seen[-1].alt_m, seen[-1].heading_deg) == (50.002, 8.0, 110.0, 90.0)
+    assert seen[0].heading_deg in (0.0, 90.0)
+    east_m_s, north_m_s = seen[-1].velocity_m_s
+    assert (east_m_s, north_m_s) == (0.0, 0.0), "it stays where the track ends"
+
+
+def test_questions_do_not_start_the_track_and_whatever_a_flight_says_does(monkeypatch):
+    monkeypatch.setattr(reading, "LISTEN_S", 0.2)
+    track = Track(
+        t_s=np.array([0.0, 0.1]),
+        lat_deg=np.array([50.0, 50.1]),
+        lon_deg=np.array([8.0, 8.0]),
+        alt_m=np.zeros(2),
+        heading_deg=np.full(2, np.nan),
+    )
+    link = f"127.0.0.1:{free_port()}"
+    autopilot = AutopilotThread(f"udpin:{link}", track=track, vehicle="px4-copter", gps=True)
+    try:
+        with Asking(parse_link(f"udpout:{link}")) as asking:
+            assert reading.read_autopilot(asking, {"px4": ("EKF2_AGP0_CTRL",)}).parameters == {"EKF2_AGP0_CTRL": 1}
+            there = asking.message(mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT)
+        assert there.lat / 1e7 == 50.0
+        with Link(parse_link(f"udpout:{link}")) as flight:
+            wait_until(lambda: flight.stats().autopilot_heard)
+            flight.send(*messages.place_match(time.monotonic(), 3, 0.5))
+            wait_until(lambda: (vehicle := flight.vehicle()) and vehicle.lat_deg == 50.1, "the end of the track")
+    finally:
+        autopilot.finish()
+
+
+def test_it_says_how_fast_it_flies_along_the_track():
+    track = Track(
+        t_s=np.array([0.0, 10.0, 20.0, 21.0]),
+        lat_deg=np.array([50.0, 50.001, 50.001, 51.0]),
+        lon_deg=np.array([8.0, 8.0, 8.001, 8.0]),
+        alt_m=np.zeros(4),
+        heading_deg=np.full(4, np.nan),
+    )
+    velocities = [truth_at(track, t_s).velocity_m_s for t_s in (0.0, 5.0, 15.0, 20.5, 30.0)]
+    expected = [11.12j, 11.12j, 7.15 + 0j, -71.47 + 327j, 0j]
+    assert [each.real for each in velocities] == pytest.approx([each.real for each in expected], abs=0.01)
+    assert [each.imag for each in velocities] == pytest.approx([each.imag for each in expected], abs=0.01), (
+        "north first"
+    )
+
+
+def test_it_says_how_it_hangs_in_the_air_where_the_track_knows(tmp_path):
+    csv = tmp_path / "positions.csv"
+    csv.write_text(
+        "file,lat,lon,alt,rel_alt,yaw_deg,roll_deg,pitch_deg,time\n"
+        "a.jpg,50.000,8.0,100,80.5,300,-12,7,2026-02-14T00:30:00Z\n"
+    )
+    number = free_port()
+    with Link(parse_link(f"udpin:127.0.0.1:{number}")) as link:
+        link.want_position()
+        autopilot = AutopilotThread(f"udpout:127.0.0.1:{number}", track=read_track(csv))
+
+        def with_attitude():
+            vehicle = link.vehicle_at(time.monotonic())
+            return vehicle if vehicle and vehicle.roll_deg is not None else None
+
+        seen = wait_until(with_attitude)
+        autopilot.finish()
+    assert (seen.roll_deg, seen.pitch_deg, seen.heading_deg) == pytest.approx((-12, 7, 300), abs=1e-3)
+    assert seen.height_m == 80.5
+
+
+def test_a_track_without_times_is_refused(tmp_path):
+    (tmp_path / "p.csv").write_text("file,lat,lon\na.jpg,50,8\n")
+    with pytest.raises(UsageError, match="lat, lon and time"):
+        read_track(tmp_path / "p.csv")
+
+
+def test_it_ends_when_its_time_is_up():
+    summary = run_autopilot(f"udpin:127.0.0.1:{free_port()}", duration_s=0.1)
+    assert (summary.messages, summary.companion, summary.fixes) == ({}, None, ())
+    assert "not heard" in str(summary)
+
+
+@pytest.mark.parametrize("link", ["tcp:127.0.0.1:{}", "serial:/dev/no-such-device:{}"])
+def test_a_link_that_cannot_be_opened_is_one_sentence(link):
+    with pytest.raises(LinkError, match="cannot be opened"):
+        run_autopilot(link.format(free_port(socket.SOCK_STREAM)))
+
+
+def test_gps_is_switched_off_by_a_parameter_and_the_clock_may_run_fast():
+    number = free_port()
+    companion = Peer(UdpPort(number))
+    controller = FlightController("arducopter", FreeFlight("copter", ORIGIN), gps=True)
+    stop = threading.Event()
+    served = threading.Thread(
+        target=serve, args=(controller, f"udpout:127.0.0.1:{number}", None, stop), kwargs={"speedup": 100.0}
+    )
+    served.start()
+    try:
+        companion.expect_text("EKF3 IMU0 is using GPS")
+        for number, *values in ((176, 1, 4), (400, 1), (22, 0, 0, 0, 0, 0, 0, 30)):  # GUIDED, arm, take off
+            values += [0] * (7 - len(values))
+            companion.send(mavlink.MAVLink_command_long_message(1, 1, number, 0, *values), component_id=197)
+            assert companion.expect("COMMAND_ACK").result == mavlink.MAV_RESULT_ACCEPTED
+        companion.send(mavlink.MAVLink_param_set_message(1, 1, b"SIM_GPS1_ENABLE", 0, 9), component_id=197)
+        assert companion.expect("PARAM_VALUE").param_value == 0
+        companion.expect_text("EKF Failsafe: changed to LAND Mode")
+        companion.expect_text("EKF3 IMU0 stopped aiding")
+    finally:
+        stop.set()
+        served.join()
+        companion.port.close()
+
+
+@pytest.mark.parametrize("vehicle", ["arduplane", "px4-copter"])
+def test_it_tells_the_time_of_this_machine(vehicle):
+    number = free_port()
+    companion = Peer(UdpPort(number))
+    before_s = time.time()
+    autopilot = AutopilotThread(f"udpout:127.0.0.1:{number}", vehicle=vehicle)
+    try:
+        companion.expect("HEARTBEAT")
+        companion.send(messages.message_request(1, mavlink.MAVLINK_MSG_ID_SYSTEM_TIME), component_id=197)
+        told_s = companion.expect("SYSTEM_TIME").time_unix_usec / 1e6
+    finally:
+        autopilot.finish()
+        companion.port.close()
+    assert before_s <= told_s <= time.time()
+
+
+def test_without_a_machine_its_clock_is_handed_in():
+    controller = FlightController("arduplane", Nowhere(), gps=False, start_utc_s=1_000.0)
+    controller.advance(5.0)
+    asked = messages.message_request(1, mavlink.MAVLINK_MSG_ID_SYSTEM_TIME)
+    told = next(each for each in controller.hear(asked) if each.get_type() == "SYSTEM_TIME")
+    assert told.time_unix_usec / 1e6 == pytest.approx(1_005.0, abs=0.05)
+
+
+def test_the_command_says_what_is_up_and_sets_parameters():
+    number = free_port()
+    link = f"udpin:127.0.0.1:{number}"
+    command = ["simulate", "autopilot", "--vehicle", "arducopter", "--param", "GPS2_TYPE=14", "--link", link, "--json"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "edgevpr", *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    try:
+        said = process.stderr.readline()
+        with Asking(parse_link(f"udpout:127.0.0.1:{number}")) as asking:
+            assert asking.heartbeat().type == mavlink.MAV_TYPE_QUADROTOR
+            assert asking.parameters(["GPS2_TYPE"], bytewise=False) == {"GPS2_TYPE": 14}
+        process.terminate()
+        printed, more = process.communicate(timeout=60)
+    finally:
+        process.kill()
+        process.wait()
+    assert said == f"edgevpr: a simulated arducopter that has lost GPS, system 1, is up at {link}\n"
+    assert more == ""
+    assert json.loads(printed)["companion"] == "1/197"
+
+
+@pytest.mark.parametrize(
+    ("written", "sentence"),
+    [
+        ("GPS2_TIPE=14", "no parameter GPS2_TIPE: did you mean GPS2_TYPE?"),
+        ("gps2_type=14", "did you mean GPS2_TYPE?"),
+        ("XYZ=1", "it has AHRS_EKF_TYPE, "),
+        ("GPS2_TYPE=1.5", "its value is a whole number"),
+        ("GPS2_TYPE=99999999999", "its value is a whole number"),
+        ("SIM_WIND_SPD=nan", "its value is a number"),
+        ("SIM_WIND_SPD=fast", "its value is a number"),
+        ("GPS2_TYPE", "write KEY=VALUE, e.g. GPS2_TYPE=14."),
+    ],
+)
+def test_a_parameter_that_makes_no_sense_is_one_sentence(written, sentence, capsys):
+    link = f"udpin:127.0.0.1:{free_port()}"
+    assert main(["simulate", "autopilot", "--link", link, "--param", written]) == 2
+    printed, said = capsys.readouterr()
+    assert printed == ""
+    assert sentence in said
+    assert said.count("\n") == 1
+
+
+def test_the_command_line_knows_every_vehicle():
+    assert set(_VEHICLES) == set(VEHICLES)

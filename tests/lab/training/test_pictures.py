@@ -1,0 +1,91 @@
+import numpy as np
+import pytest
+from pictures_on_disk import write_pictures
+
+from edgevpr.core.errors import ImageError, SourceError, UsageError
+from edgevpr.frames.opencv import cv2
+from edgevpr.lab.training.pictures import (
+    TARGET_LENGTH,
+    batch,
+    gradients_of,
+    read_pictures,
+    require_enough,
+    small_grey,
+    two_sights,
+)
+from edgevpr.techniques.gradients import normalised_blocks, oriented_cells
+
+
+@pytest.fixture
+def picture():
+    coarse = np.random.default_rng(3).integers(0, 256, (12, 16), np.uint8)
+    return cv2.resize(coarse, (320, 240), interpolation=cv2.INTER_CUBIC)
+
+
+def test_a_batch_has_the_form_the_network_takes(picture):
+    inputs, targets = batch([picture], 3, np.random.default_rng(1))
+    assert inputs.shape == (3, 1, 120, 160)
+    assert targets.shape == (3, TARGET_LENGTH)
+    assert inputs.dtype == targets.dtype == np.float32
+    assert inputs.min() >= 0
+    assert inputs.max() == 1  # equalised: the brightest pixel is white
+    assert targets.min() >= 0
+    assert targets.max() <= 1
+
+
+def test_a_batch_follows_from_the_generator_alone(picture):
+    first, again, other = (batch([picture], 2, np.random.default_rng(seed)) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first[0], again[0])
+    np.testing.assert_allclose(first[1], again[1], atol=1e-6)
+    assert (first[0] != other[0]).any()
+
+
+def test_the_target_is_the_hog_of_the_unchanged_sight(picture):
+    sight, _ = two_sights(picture, np.random.default_rng(1))
+    cells = oriented_cells(sight, 8, 9, signed=False)
+    np.testing.assert_allclose(gradients_of(sight), normalised_blocks(cells).ravel(), atol=1e-6)
+
+
+def test_both_sights_show_the_same_ground(picture):
+    """The changed sight correlates with its own original, and much less with others."""
+    rng = np.random.default_rng(5)
+    pairs = [two_sights(picture, rng) for _ in range(24)]
+    flat = [np.stack([cv2.equalizeHist(sight).ravel() for sight in sights]) for sights in zip(*pairs, strict=True)]
+    correlation = np.corrcoef(*flat)[:24, 24:]
+    own = np.diag(correlation)
+    assert own.mean() > np.median(correlation) + 0.3
+    assert (own < 0.9999).all()  # and is changed
+
+
+def test_a_portrait_picture_fills_the_sight(picture):
+    sight, changed = two_sights(np.ascontiguousarray(picture.T), np.random.default_rng(1))
+    assert sight.shape == changed.shape == (120, 160)
+
+
+def test_what_cannot_be_read_is_left_out_and_said(tmp_path, capsys):
+    folder = write_pictures(tmp_path / "a", 3)
+    (folder / "broken.jpg").write_bytes(b"\xff\xd8\xff nothing")
+    unusable: list[ImageError] = []
+    pictures = list(read_pictures([folder], "reading", unusable))
+    assert len(pictures) == 3
+    assert len(unusable) == 1
+    assert "broken.jpg" in capsys.readouterr().err
+
+
+def test_pictures_are_made_small_enough_to_keep(tmp_path):
+    folder = tmp_path / "large"
+    folder.mkdir()
+    cv2.imwrite(str(folder / "1.png"), np.zeros((900, 1600, 3), np.uint8))
+    (read,) = read_pictures([folder], "reading")
+    assert read.shape == (360, 640, 3)
+    assert small_grey(read).shape == (180, 320)
+
+
+def test_a_folder_without_images_is_refused(tmp_path):
+    with pytest.raises(SourceError, match="holds no images"):
+        list(read_pictures([tmp_path], "reading"))
+
+
+def test_too_few_pictures_are_refused(picture):
+    with pytest.raises(UsageError, match="3 usable images are too few"):
+        require_enough([picture] * 3)

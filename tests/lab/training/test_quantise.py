@@ -1,0 +1,69 @@
+"""A network in 8-bit integers: nearly the same numbers from a smaller file."""
+
+import builtins
+import json
+
+import numpy as np
+import pytest
+from pictures import textured
+from pictures_on_disk import write_pictures
+from tiny_networks import write_network
+
+from edgevpr.cli.main import main
+from edgevpr.core.errors import ModelError, SourceError
+from edgevpr.lab.training.quantise import quantise
+from edgevpr.runtime.preflight.networks import verify_here
+from edgevpr.techniques.networks.session import open_backbone
+
+
+@pytest.fixture
+def models(models, monkeypatch):
+    monkeypatch.setattr("edgevpr.lab.training.quantise.verify", verify_here)
+    return models
+
+
+def test_the_integers_give_nearly_the_same_descriptor(models, tmp_path):
+    write_network(models, "mine")
+    result = quantise("mine", write_pictures(tmp_path / "pictures", 8))
+    assert result.images == 8
+    assert result.card == str(models / "mine_int8.yaml")
+    assert (result.before.shapes, result.after.name) == (result.after.shapes, "mine_int8")
+    for output in ("descriptor", "features"):
+        exact = open_backbone("mine", output).run(textured(1)).ravel()
+        rough = open_backbone("mine_int8", output).run(textured(1)).ravel()
+        assert (exact != rough).any()
+        assert exact @ rough / np.linalg.norm(exact) / np.linalg.norm(rough) > 0.99
+
+
+def test_recall_before_and_after_on_a_set(models, tmp_path, capsys):
+    write_network(models, "mine")
+    folder = write_pictures(tmp_path / "pictures", 6)
+    truth = tmp_path / "truth.csv"
+    truth.write_text("query_file,ref_files\n" + "".join(f"{n}.jpg,{n}.jpg\n" for n in range(6)))
+    flags = ["--query", str(folder), "--ref", str(folder), "--ground-truth", str(truth)]
+    command = ["models", "quantise", "mine", "--calibrate", str(folder)]
+    assert main([*command, *flags, "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["recall_at_1"] == {"mine": 1.0, "mine_int8": 1.0}
+    assert said["after"]["file_mb"] > 0
+    assert main([*command, "--query", str(folder)]) == 2
+    assert "Recall needs all of --query, --ref and --ground-truth" in capsys.readouterr().err
+
+
+def test_no_images_and_no_onnx_are_one_sentence(models, tmp_path, monkeypatch):
+    write_network(models, "mine")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(SourceError, match="empty"):
+        quantise("mine", tmp_path / "empty")
+    pictures = write_pictures(tmp_path / "pictures", 2)
+    imported = builtins.__import__
+
+    def without_onnx(name, *args, **kwargs):
+        if name == "onnx":
+            raise ImportError("No module named 'onnx'")
+        return imported(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", without_onnx)
+    with pytest.raises(ModelError, match=r"needs the package `onnx` .*edgevpr\[train\]"):
+        quantise("mine", pictures)
+    assert not (models / "mine_int8.yaml").exists()

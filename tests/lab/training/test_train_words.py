@@ -1,0 +1,116 @@
+"""Words are learnt with NumPy and onnxruntime alone, on the network that edgevpr ships."""
+
+import shutil
+
+import numpy as np
+import pytest
+from pictures_on_disk import write_pictures
+
+from edgevpr import techniques
+from edgevpr.cli.main import main
+from edgevpr.core.resources import shipped
+from edgevpr.lab.training import words as training_words
+from edgevpr.lab.training.pictures import read_pictures
+from edgevpr.techniques.heads import vlad
+from edgevpr.techniques.heads.words import load_words, whitened
+from edgevpr.techniques.networks.session import open_backbone
+
+
+@pytest.fixture(autouse=True)
+def own_models(tmp_path, monkeypatch):
+    """The backbone alone, so that no shipped words are found."""
+    models = tmp_path / "models"
+    models.mkdir()
+    for name in ("calc.onnx", "calc.yaml"):
+        shutil.copy(shipped("models") / name, models / name.replace("calc.yaml", "mine.yaml"))
+    monkeypatch.setenv("EDGEVPR_MODELS", str(models))
+    monkeypatch.setattr(training_words, "_POINTS", 2000)
+    return models
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return write_pictures(tmp_path / "pictures", 12)
+
+
+def train(folder, *more):
+    return main(["train", "words", "--images", str(folder), "--model", "mine", *more])
+
+
+@pytest.mark.parametrize(("kind", "technique"), [("vlad", "netvlad"), ("regions", "region_vlad")])
+def test_words_make_the_technique_work(kind, technique, folder, own_models):
+    assert train(folder, "--kind", kind, "--count", "8") == 0
+    made = techniques.create(technique, {"model": "mine", "words": 8})
+    (picture, *_) = read_pictures([folder], "reading")
+    vector = made.encode(picture).coarse.astype(np.float32)
+    assert vector.shape == (8 * 128,)
+    assert np.linalg.norm(vector) == pytest.approx(1, abs=1e-3)
+
+
+def test_words_of_regions_make_cross_region_bow_work(folder):
+    assert train(folder, "--kind", "bow", "--count", "50") == 0
+    made = techniques.create("cross_region_bow", {"model": "mine", "words": 50})
+    (picture, *_) = read_pictures([folder], "reading")
+    assert made.encode(picture).coarse.shape == (50,)
+
+
+def test_the_same_pictures_give_the_same_file(folder, own_models, tmp_path):
+    for out in ("a", "b"):
+        assert train(folder, "--kind", "vlad", "--count", "8", "--whiten", "6", "--out", str(tmp_path / out)) == 0
+    first, again = ((tmp_path / out / "mine_vlad8.npz").read_bytes() for out in ("a", "b"))
+    assert first == again
+
+
+def test_words_lie_among_the_descriptors(folder):
+    """Each descriptor is nearer to its word than to the mean of all, by far."""
+    assert train(folder, "--kind", "vlad", "--count", "16") == 0
+    words = load_words("mine", "vlad", 16).words
+    backbone = open_backbone("mine", "features")
+    local = np.concatenate([vlad.local_descriptors(backbone.run(p)) for p in read_pictures([folder], "reading")])
+    to_word = np.square(local - words[vlad.nearest(local, words)]).sum(axis=1).mean()
+    assert to_word < 0.6 * np.square(local - local.mean(axis=0)).sum(axis=1).mean()
+    assert len(np.unique(vlad.nearest(local, words))) == 16
+
+
+def test_whitened_vectors_of_the_pictures_learnt_from_are_uncorrelated_and_alike_in_size(folder):
+    assert train(folder, "--kind", "vlad", "--count", "8", "--whiten", "6") == 0
+    words = load_words("mine", "vlad", 8)
+    backbone = open_backbone("mine", "features")
+    sharpness = vlad.sharpness(words.words)
+    rows = []
+    for picture in read_pictures([folder], "reading"):
+        local = vlad.local_descriptors(backbone.run(picture))
+        residuals = vlad.residuals(local, words.words, vlad.soft_weights(local, words.words, sharpness))
+        vector = vlad.intra_normalised(residuals)
+        assert np.linalg.norm(whitened(vector, words)) == pytest.approx(1, abs=1e-5)
+        rows.append(words.scale * (words.whitening.astype(np.float32) @ (vector - words.mean)))
+    covariance = np.cov(np.array(rows).T, bias=True)
+    np.testing.assert_allclose(covariance, np.eye(6), atol=0.05)
+
+
+def test_what_makes_no_sense_is_refused(folder, own_models, capsys):
+    for arguments, part in (
+        (("--kind", "vlad", "--count", "1"), "at least 2 words"),
+        (("--kind", "bow", "--count", "8", "--whiten", "4"), "--whiten is for --kind vlad"),
+        (("--kind", "vlad", "--count", "8", "--whiten", "12"), "needs more than 12 usable images"),
+        (("--kind", "vlad", "--count", "5000"), "too few for 5000 words"),
+    ):
+        assert train(folder, *arguments) == 2
+        assert part in capsys.readouterr().err
+    (own_models / "mine_vlad8.npz").write_bytes(b"")
+    assert train(folder, "--kind", "vlad", "--count", "8") == 2
+    assert "is there already" in capsys.readouterr().err
+
+
+def test_a_whitening_of_pictures_that_are_all_alike_is_refused(folder, own_models, capsys):
+    first, *others = sorted(folder.iterdir())
+    for other in others:
+        shutil.copyfile(first, other)
+    assert train(folder, "--kind", "vlad", "--count", "8", "--whiten", "6") == 2
+    assert "The images are all alike" in capsys.readouterr().err
+    assert not list(own_models.glob("*.npz*"))
+
+
+def test_an_unknown_model_is_refused(folder, capsys):
+    assert main(["train", "words", "--images", str(folder), "--model", "mina", "--kind", "vlad", "--count", "8"]) == 1
+    assert "There is no model `mina`" in capsys.readouterr().err

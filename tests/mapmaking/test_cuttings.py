@@ -1,0 +1,214 @@
+"""The places cut from an orthophoto: their grid, what is left out, what a frame says, and the memory it takes."""
+
+import subprocess
+import sys
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rasterio", reason="rasterio is not installed (pip install 'edgevpr[maps]')")
+
+import rasterio
+from rasterio.windows import Window
+from rasters import HOME, grid, ground_m, marked_raster, textured_raster, write_raster
+
+from edgevpr.core.errors import UsageError
+from edgevpr.core.geodesy import moved
+from edgevpr.mapmaking.cuttings import SIDE_PX, OrthophotoSource
+from edgevpr.mapmaking.lattice import lattice_of
+from edgevpr.mapmaking.missions import Area, Waypoint
+from edgevpr.mapmaking.orthophoto import Orthophoto
+
+
+def frames_of(source: OrthophotoSource) -> list:
+    frames = []
+    while not source.ended:
+        frames.append(source.read(1.0))
+    return [frame for frame in frames if frame is not None]
+
+
+def source_of(path, footprint_m, spacing_m, area=None, margin_m=0.0, only=None) -> OrthophotoSource:
+    orthophoto = Orthophoto(path)
+    lattice = lattice_of(orthophoto, footprint_m, spacing_m, area, margin_m)
+    return OrthophotoSource(orthophoto, lattice, footprint_m, float, only=only)
+
+
+def off_m(lattice) -> np.ndarray:
+    """Metres east and north of HOME, (N, 2)."""
+    return np.column_stack(ground_m(lattice.lat_deg, lattice.lon_deg))
+
+
+def waypoint(east_m: float, north_m: float) -> Waypoint:
+    return Waypoint(*moved(HOME.lat_deg, HOME.lon_deg, east_m, north_m))
+
+
+def ring(points_m) -> list[tuple[float, float]]:
+    return [moved(HOME.lat_deg, HOME.lon_deg, *point) for point in (*points_m, points_m[0])]
+
+
+@pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:4326", "EPSG:3857"])
+def test_places_lie_on_a_grid_of_metres_in_rows_from_the_north(tmp_path, crs):
+    path = marked_raster(tmp_path / "o.tif", crs, pixel_m=0.5, side_px=400)
+    lattice = lattice_of(Orthophoto(path), 80.0, 20.0)
+    points_m = off_m(lattice).reshape(*lattice.shape, 2)
+    assert min(lattice.shape) >= 3
+    np.testing.assert_allclose(np.diff(points_m[..., 0], axis=1), 20, atol=0.01)
+    np.testing.assert_allclose(np.diff(points_m[..., 1], axis=0), -20, atol=0.01)
+    assert points_m.reshape(-1, 2).mean(axis=0) == pytest.approx((0, 0), abs=0.5)
+    assert len(lattice) == np.prod(lattice.shape)
+
+
+def test_a_frame_says_where_it_lies_and_how_large_it_is(tmp_path):
+    source = source_of(marked_raster(tmp_path / "o.tif", pixel_m=0.5, side_px=400), 80.0, 60.0)
+    frames = frames_of(source)
+    assert source.total == 9 == len(frames)
+    assert (source.is_live, source.dropped, source.state, source.read(0)) == (False, None, "ended", None)
+    assert [frame.name for frame in frames[:4]] == [f"o.tif_r00{at // 3}_c00{at % 3}" for at in range(4)]
+    middle = frames[4]
+    assert middle.image.shape == (SIDE_PX, SIDE_PX, 3)
+    assert ground_m(middle.position.lat_deg, middle.position.lon_deg) == pytest.approx((0, 0), abs=0.5)
+    assert middle.heading_deg == middle.pose.up_deg == 0
+    assert middle.pose.footprint_m == 80
+    assert middle.pose.is_surveyed
+    assert middle.pose.covariance_m2 == pytest.approx((1 + 0.25**2, 0, 1 + 0.25**2), rel=1e-3)
+    # The mark at HOME lies where the place says that it must.
+    east_m, north_m = ground_m(middle.position.lat_deg, middle.position.lon_deg)
+    column, row = (SIDE_PX / 2 - east_m / 80 * SIDE_PX, SIDE_PX / 2 + north_m / 80 * SIDE_PX)
+    near = middle.image[int(row) - 30 : int(row) + 30, int(column) - 30 : int(column) + 30, 2].astype(float) - 60
+    assert np.average(np.arange(60), weights=near.sum(axis=0)) + int(column) - 30 == pytest.approx(
+        column - 0.5, abs=0.3
+    )
+    assert np.average(np.arange(60), weights=near.sum(axis=1)) + int(row) - 30 == pytest.approx(row - 0.5, abs=0.3)
+
+
+def test_places_without_data_are_left_out_and_counted(tmp_path):
+    to_crs, _, _ = grid("EPSG:32632", 0.5, 400)
+    picture = np.full((1, 400, 400), 90, np.uint8)
+    picture[..., :150] = 0
+    source = source_of(write_raster(tmp_path / "o.tif", picture, "EPSG:32632", to_crs, nodata=0), 60.0, 20.0)
+    kept = frames_of(source)
+    assert 0 < len(kept) < source.total
+    assert source.without_data == source.total - len(kept)
+    east_m = [ground_m(frame.position.lat_deg, frame.position.lon_deg)[0] for frame in kept]
+    assert min(east_m) >= -25 + 30 - 6 - 3  # the data begins 25 m west; a tenth of 60 m may lie beyond, and grid north
+
+    turned = source_of(marked_raster(tmp_path / "turned.tif", turned_deg=45), 40.0, 20.0)
+    assert 0.3 < len(frames_of(turned)) / turned.total < 0.7
+
+
+def test_an_area_keeps_what_lies_in_its_polygons_but_not_in_their_holes(tmp_path):
+    path = marked_raster(tmp_path / "o.tif", pixel_m=0.5, side_px=800)
+    outline = ring([(-100, -80), (100, -80), (100, 60), (-100, 60)])
+    hole = ring([(-30, -30), (30, -30), (30, 30), (-30, 30)])
+    points_m = off_m(lattice_of(Orthophoto(path), 40.0, 10.0, Area(((outline, hole),), ())))
+    assert len(points_m) > 150
+    assert (points_m.min(axis=0) >= (-100.1, -80.1)).all()
+    assert (points_m.max(axis=0) <= (100.1, 60.1)).all()
+    assert (abs(points_m) >= 29.5).any(axis=1).all()
+    assert np.ptp(points_m[:, 0]) > 180
+
+
+def test_an_area_keeps_what_lies_near_its_path(tmp_path):
+    path = marked_raster(tmp_path / "o.tif", pixel_m=0.5, side_px=800)
+    way = Area((), ((waypoint(-100, -50), waypoint(50, 100), waypoint(50, 150)), (waypoint(100, -100),)))
+    points_m = off_m(lattice_of(Orthophoto(path), 40.0, 5.0, way, 25.0))
+    ends_m = np.array([(-100, -50), (50, 100), (50, 150)], float)
+    away_m = np.hypot(*(points_m - (100, -100)).T)
+    for begin, end in pairwise(ends_m):
+        step = end - begin
+        share = np.clip((points_m - begin) @ step / (step @ step), 0, 1)
+        away_m = np.minimum(away_m, np.hypot(*(points_m - begin - share[:, None] * step).T))
+    assert away_m.max() == pytest.approx(25, abs=2)
+    assert len(points_m) == pytest.approx((np.hypot(150, 150) + 50) * 2 + 3 * 25 * np.pi, rel=0.1)  # 25 m2 each
+
+
+@pytest.mark.parametrize(
+    ("footprint_m", "spacing_m", "said"),
+    [
+        (0, 20, "--footprint-m is 0"),
+        (-5, 20, "--footprint-m is -5"),
+        (float("nan"), 20, "--footprint-m is nan"),
+        (500, 20, "--footprint-m is 500, and .* is 16. m by 16. m"),
+        (80, 0, "--spacing-m is 0"),
+        (80, 1000, "--spacing-m is 1000"),
+        (80, 0.01, "give --spacing-m 1, or an --area"),
+    ],
+)
+def test_a_grid_that_makes_no_sense_is_refused(tmp_path, footprint_m, spacing_m, said):
+    orthophoto = Orthophoto(marked_raster(tmp_path / "o.tif"))
+    with pytest.raises(UsageError, match=said):
+        lattice_of(orthophoto, footprint_m, spacing_m)
+
+
+def test_an_area_elsewhere_is_refused_with_both_extents(tmp_path):
+    orthophoto = Orthophoto(marked_raster(tmp_path / "o.tif"))
+    for way in (Waypoint(-35.36, 149.16), waypoint(3000, 0)):
+        with pytest.raises(UsageError, match=r"does not touch .* north, .* east, the orthophoto at 49\.99.* east\.$"):
+            lattice_of(orthophoto, 40.0, 10.0, Area((), ((way,),)), 40.0)
+    for off_m in (15.5, 4.0):  # between places, and so near to a row that its box holds one of either
+        with pytest.raises(UsageError, match="No place of a grid of 10 m"):
+            lattice_of(orthophoto, 40.0, 10.0, Area((), ((waypoint(off_m, 15.5),),)), 0.5)
+
+
+def test_an_area_takes_places_of_the_same_grid_under_the_same_names(tmp_path):
+    path = marked_raster(tmp_path / "o.tif", pixel_m=0.5, side_px=400)
+    every = {frame.name: frame.position for frame in frames_of(source_of(path, 80.0, 20.0))}
+    some = frames_of(source_of(path, 80.0, 20.0, Area((), ((waypoint(-10, 20), waypoint(50, 20)),)), 12.0))
+    assert 2 <= len(some) < len(every)
+    for frame in some:
+        there = every[frame.name]
+        assert (frame.position.lat_deg, frame.position.lon_deg) == pytest.approx(
+            (there.lat_deg, there.lon_deg), abs=1e-8
+        )
+
+
+_PEAK = """
+import resource, sys
+from edgevpr.mapmaking.cuttings import OrthophotoSource
+from edgevpr.mapmaking.lattice import lattice_of
+from edgevpr.mapmaking.orthophoto import Orthophoto
+orthophoto = Orthophoto(sys.argv[1])
+source = OrthophotoSource(orthophoto, lattice_of(orthophoto, 100.0, float(sys.argv[2])), 100.0, float)
+frames = sum(source.read(1.0) is not None for _ in range(source.total))
+print(frames, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)
+"""
+
+
+def test_a_large_file_takes_no_more_memory_than_a_small_one(tmp_path):
+    small, large = textured_raster(tmp_path / "small.tif"), tmp_path / "large.tif"
+    side_px, part = 30_000, np.random.default_rng(1).integers(50, 200, (1, 30, 30)).astype(np.uint8)
+    block = np.kron(part, np.ones((1, 20, 20), np.uint8))
+    to_crs, _, _ = grid("EPSG:32632", 0.5, 8)
+    shape = {"width": side_px, "height": side_px, "count": 1, "dtype": "uint8"}
+    with rasterio.open(
+        large,
+        "w",
+        driver="GTiff",
+        crs="EPSG:32632",
+        transform=to_crs,
+        tiled=True,
+        compress="deflate",
+        zlevel=1,
+        **shape,
+    ) as out:
+        for row in range(0, side_px, 600):  # 900 MB, each in its window
+            out.write(np.tile(block, (1, 1, side_px // 600)), window=Window(0, row, side_px, 600))
+    peaks_mb = []
+    for path, spacing_m in ((small, 50.0), (large, 2900.0)):
+        done = subprocess.run(
+            [sys.executable, "-c", _PEAK, str(path), str(spacing_m)], capture_output=True, text=True, check=True
+        )
+        frames, peak_mb = map(int, done.stdout.split())
+        assert frames >= 25
+        peaks_mb.append(peak_mb)
+    assert peaks_mb[1] < peaks_mb[0] + 80, "GDAL keeps 64 MB of blocks, whatever the file"
+
+
+def test_only_the_places_that_are_asked_for_are_cut(tmp_path):
+    path = marked_raster(tmp_path / "o.tif", pixel_m=0.5, side_px=400)
+    whole = frames_of(source_of(path, 80.0, 20.0))
+    asked = [whole[4], whole[2]]
+    cut = frames_of(source_of(path, 80.0, 20.0, only=[each.name for each in asked]))
+    assert [each.name for each in cut] == sorted(each.name for each in asked)
+    assert np.array_equal(cut[0].image, whole[2].image)

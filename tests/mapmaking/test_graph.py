@@ -1,0 +1,142 @@
+"""The pose graph: positions, directions and footprints from ties and recorded positions, on flights that are known."""
+
+import numpy as np
+import pytest
+
+from edgevpr.mapmaking.graph import Ties, solve
+
+FOOTPRINT_M, SPACING_M = 60.0, 15.0
+STEP_SD, TURN_SD, RECORDED_SD_M = 0.01, 0.03, 8.0
+
+
+def flight(legs=5, a_leg=12, seed=0):
+    """Return positions complex (N,) and logs of pictures along parallel legs, flown to and fro."""
+    rng = np.random.default_rng(seed)
+    east, north = np.meshgrid(np.arange(a_leg) * SPACING_M, np.arange(legs) * 2 * SPACING_M)
+    east[1::2] = east[1::2, ::-1]
+    position = (east + 1j * north).ravel()
+    up_deg = np.repeat(np.where(np.arange(legs) % 2, 270.0, 90.0), a_leg) + rng.normal(0, 5, legs * a_leg)
+    return position, np.log(FOOTPRINT_M * rng.uniform(0.9, 1.1, len(position))) - 1j * np.radians(up_deg)
+
+
+def ties_of(position, log, seed=0, wrong=0.0, within=0.6):
+    """Return noisy ties of all pairs that overlap; a share of them is wrong."""
+    rng = np.random.default_rng((seed, 1))
+    away = abs(position[:, None] - position)
+    query, place = np.nonzero(np.tril(away < within * FOOTPRINT_M, -1))
+
+    def noise(sd):
+        return sd * (rng.normal(size=len(query)) + 1j * rng.normal(size=len(query)))
+
+    step = (position[query] - position[place]) * np.exp(-log[place]) + noise(STEP_SD)
+    turn = log[query] - log[place] + noise(TURN_SD)
+    lies = rng.random(len(query)) < wrong
+    step[lies] = rng.uniform(-0.5, 0.5, lies.sum()) + 1j * rng.uniform(-0.5, 0.5, lies.sum())
+    turn[lies] = 1j * rng.uniform(-np.pi, np.pi, lies.sum())
+    step_sd, turn_sd = np.full(len(query), STEP_SD), np.full(len(query), TURN_SD)
+    return Ties(query=query, place=place, step=step, turn=turn, step_sd=step_sd, turn_sd=turn_sd), lies
+
+
+def recorded_of(position, seed=0, sd_m=RECORDED_SD_M):
+    rng = np.random.default_rng((seed, 2))
+    return position + sd_m * (rng.normal(size=len(position)) + 1j * rng.normal(size=len(position)))
+
+
+def unknown(position):
+    return np.full(len(position), np.nan)
+
+
+def rms(values):
+    return float(np.sqrt(np.mean(abs(values) ** 2) / 2))
+
+
+def off(solved, position, log):
+    """Errors of positions, m, and of logs; the imaginary part of a log is an angle."""
+    turned = solved.log - log
+    return solved.position - position, turned.real + 1j * ((turned.imag + np.pi) % (2 * np.pi) - np.pi)
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.2])
+def test_noisy_positions_become_exact_by_ties_and_wrong_ties_are_named(wrong):
+    position, log = flight()
+    ties, lies = ties_of(position, log, wrong=wrong)
+    solved = solve(recorded_of(position), unknown(position), ties)
+    off_m, turned = off(solved, position, log)
+    assert rms(off_m) < RECORDED_SD_M / 3
+    assert rms(off_m - off_m.mean()) < RECORDED_SD_M / 4
+    assert rms(turned) < 0.06
+    assert not solved.ties_count[lies].any()
+    assert solved.ties_count[~lies].mean() > 0.97
+    assert solved.recorded_sd_m == pytest.approx(RECORDED_SD_M, rel=0.25)
+    assert solved.times == pytest.approx(1, rel=0.4)
+
+
+def test_covariances_are_those_of_the_errors():
+    position, log = flight(legs=3, a_leg=8)
+    far, turned = [], []
+    for seed in range(30):
+        ties, _ = ties_of(position, log, seed)
+        solved = solve(recorded_of(position, seed), unknown(position), ties)
+        off_m, off_log = off(solved, position, log)
+        far.append(off_m / np.sqrt(solved.position_var / 2))
+        turned.append(off_log / np.sqrt(solved.log_var / 2))
+    for each in (far, turned):
+        one_axis = np.concatenate([np.real(each).ravel(), np.imag(each).ravel()])
+        assert np.mean(abs(one_axis) < 1) == pytest.approx(0.68, abs=0.08)
+        assert np.mean(abs(one_axis) < 2) == pytest.approx(0.95, abs=0.03)
+
+
+def test_a_glitch_of_the_receiver_contradicts_the_pictures():
+    position, log = flight()
+    ties, _ = ties_of(position, log)
+    recorded = recorded_of(position, sd_m=2.0)
+    recorded[17] += 300
+    recorded[40] -= 150j
+    solved = solve(recorded, unknown(position), ties)
+    assert np.flatnonzero(~solved.recorded_counts).tolist() == [17, 40]
+    assert rms(off(solved, position, log)[0]) < 2
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_few_places_are_solved_without_a_fault(count):
+    position, log = flight(legs=1, a_leg=count)
+    ties, _ = ties_of(position, log)
+    solved = solve(recorded_of(position), unknown(position), ties)
+    assert np.isfinite(solved.position).all()
+    assert (solved.log_var > 0.01).all(), "so few positions say little about direction and scale"
+
+
+def test_places_without_ties_stay_where_they_were_recorded():
+    position, log = flight(legs=2, a_leg=6)
+    apart = np.concatenate([position, position + 5000])
+    ties, _ = ties_of(position, log)
+    recorded = recorded_of(apart)
+    solved = solve(recorded, unknown(apart), ties)
+    np.testing.assert_allclose(solved.position[len(position) :], recorded[len(position) :], atol=0.01)
+    assert (solved.log_var[len(position) :] > 1).all()
+    assert len(np.unique(solved.component)) == 1 + len(position)
+
+
+def test_places_in_one_line_are_turned_and_scaled():
+    position, log = flight(legs=1, a_leg=30)
+    ties, _ = ties_of(position, log)
+    solved = solve(recorded_of(position, sd_m=3.0), unknown(position), ties)
+    assert rms(off(solved, position, log)[1]) < 0.05
+
+
+def test_places_that_are_all_recorded_at_one_point_do_not_break_it():
+    position, log = flight(legs=2, a_leg=5)
+    ties, _ = ties_of(position, log)
+    solved = solve(np.zeros(len(position), complex), unknown(position), ties)
+    assert np.isfinite(solved.position).all()
+    assert np.isfinite(solved.log).all()
+
+
+def test_what_is_surveyed_holds_the_others():
+    position, log = flight()
+    ties, _ = ties_of(position, log)
+    recorded, known_sd_m, known = recorded_of(position), unknown(position), np.full(len(position), np.nan + 0j)
+    recorded[:20], known_sd_m[:20], known[:20] = position[:20], 0.5, log[:20]
+    solved = solve(recorded, known_sd_m, ties, known)
+    assert rms(off(solved, position, log)[0][:20]) < 0.5
+    assert rms(off(solved, position, log)[0]) < 2.0

@@ -1,0 +1,182 @@
+"""Calibration of small maps: what they are asked, what is believed, and what the map keeps of it."""
+
+from collections import Counter
+
+import cv2
+import numpy as np
+import pytest
+from fakes import FakeClock
+from pictures import textured
+
+from edgevpr.core.config import load_config
+from edgevpr.core.errors import UsageError
+from edgevpr.core.types import Frame, Position
+from edgevpr.frames.level import UNKNOWN_VIEW, Lens, Levelled
+from edgevpr.frames.mask import Mask
+from edgevpr.mapmaking import calibrate as calibrating
+from edgevpr.mapmaking.calibrate import LEFT_OUT, MIRRORED, THERE, ask, calibrate
+from edgevpr.mapmaking.mapping import build_map
+from edgevpr.places.index import load_index
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.power.boards import load_board
+from edgevpr.power.equations import Pack
+from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.recognise.judge import accept_rule
+from edgevpr.runtime.recognise.levelling import Levelling
+from edgevpr.runtime.recognise.stored_confidence import from_text
+from edgevpr.techniques import create
+
+PLACES = 8
+CONFIG = load_config(None).match
+AHEAD = create("cohog", {"w1": 208})
+
+
+def frame(number, **more):
+    position = Position(50 + 0.002 * number, 8.0)
+    return Frame(image=textured(number, 240, 320), name=f"{number}.png", t_mono_s=0.0, position=position, **more)
+
+
+def meter():
+    clock = FakeClock()
+    return QueryMeter(load_board("rpi-4b"), Pack(4, 5200), 0.85, wall_clock=clock, cpu_clock=clock.clock.process_cpu_s)
+
+
+def at_hand(*frames):
+    """Give the frames of these names, and remember which were asked for."""
+    asked = []
+
+    def pictures(names):
+        asked.extend(names)
+        return [each for each in frames if each.name in names]
+
+    return pictures, asked
+
+
+@pytest.fixture(autouse=True)
+def few(monkeypatch):
+    """A map of few places is enough, and few questions."""
+    monkeypatch.setattr(calibrating, "FEWEST_PLACES", PLACES)
+    monkeypatch.setattr(calibrating, "asked_of", lambda technique: 2 * PLACES)
+
+
+@pytest.fixture
+def place_map(tmp_path):
+    with PlaceMap.create(tmp_path / "m.gpkg", AHEAD.spec) as place_map:
+        build_map(map(frame, range(PLACES)), AHEAD, place_map, meter())
+        yield place_map
+
+
+def calibrated(place_map, pictures, technique=AHEAD, **more):
+    return calibrate(technique, place_map, CONFIG, meter(), pictures, lambda frames, total: frames, **more)
+
+
+def test_a_map_is_asked_for_each_picture_in_three_ways(place_map):
+    index, rule = load_index(place_map, AHEAD, 10**6), accept_rule(AHEAD, CONFIG)
+    pictures = [(number + 1, Levelled(frame(number).image, None, UNKNOWN_VIEW)) for number in range(3)]
+    answers = list(ask(AHEAD, place_map, index, rule, meter(), [*pictures, (99, pictures[0][1])]))
+    assert Counter(each.way for each in answers) == {THERE: 3, LEFT_OUT: 3, MIRRORED: 3}
+    assert [each.place_id for each in answers] == [1, 1, 1, 2, 2, 2, 3, 3, 3]
+    assert all(each.right for each in answers if each.way == THERE)
+    assert not any(each.right for each in answers if each.way != THERE)
+    again = list(ask(AHEAD, place_map, index, rule, meter(), pictures))
+    assert again == answers
+    assert list(ask(AHEAD, place_map, index, rule, meter(), pictures, seed=1)) != answers
+
+
+def test_a_picture_that_says_nothing_is_an_answer_without_evidence(place_map):
+    index, rule = load_index(place_map, AHEAD, 10**6), accept_rule(AHEAD, CONFIG)
+    shown = np.zeros((240, 320), bool)
+    answers = list(ask(AHEAD, place_map, index, rule, meter(), [(1, Levelled(frame(0).image, shown, UNKNOWN_VIEW))]))
+    assert [(each.right, each.evidence) for each in answers] == [(False, None)] * 3
+
+
+def test_a_calibration_is_kept_in_the_map(place_map):
+    pictures, asked = at_hand(*map(frame, range(PLACES)))
+    found = calibrated(place_map, pictures)
+    assert from_text(place_map.calibration) == found
+    assert sorted(asked) == sorted(2 * [f"{number}.png" for number in range(PLACES)])
+    assert (found.asked, found.precision) == (2 * PLACES, CONFIG.accept_precision)
+    assert sorted(found.recognisable) == list(range(1, PLACES + 1))
+    assert list(found.models) == ["ahead"]
+    assert 0 <= found.accepted <= 1
+
+
+def test_pictures_of_the_same_names_that_show_something_else_are_not_believed(place_map):
+    others = [Frame(image=textured(50 + n, 240, 320), name=f"{n}.png", t_mono_s=0.0) for n in range(PLACES)]
+    with pytest.raises(UsageError, match=f"pictures of 0 places are at hand, and those of {PLACES} are needed"):
+        calibrated(place_map, at_hand(*others)[0])
+    with pytest.raises(UsageError, match="pictures of 7 places are at hand"):
+        calibrated(place_map, at_hand(*map(frame, range(1, PLACES)))[0])
+    assert place_map.calibration is None
+
+
+def test_of_two_places_with_a_picture_of_one_name_each_has_its_own(place_map):
+    again = [Frame(image=textured(50 + n, 240, 320), name=f"{n}.png", t_mono_s=0.0) for n in range(PLACES)]
+    build_map(again, AHEAD, place_map, meter())
+    found = calibrated(place_map, at_hand(*again)[0])
+    assert sorted(found.recognisable) == list(range(PLACES + 1, 2 * PLACES + 1))
+
+
+def test_a_map_that_is_too_small_and_a_technique_without_confidence_are_refused(place_map, tmp_path, monkeypatch):
+    monkeypatch.setattr(calibrating, "FEWEST_PLACES", PLACES + 1)
+    with pytest.raises(UsageError, match=f"has {PLACES} places, and {PLACES + 1} are needed"):
+        calibrated(place_map, at_hand()[0])
+    hog = create("hog")
+    with (
+        PlaceMap.create(tmp_path / "hog.gpkg", hog.spec) as other,
+        pytest.raises(UsageError, match="judged by score and margin"),
+    ):
+        calibrated(other, at_hand()[0], hog)
+
+
+def test_a_place_that_cannot_be_read_is_not_asked_for(place_map):
+    with place_map.transaction():
+        place_map.db.execute("UPDATE places SET coarse = x'00' WHERE place_id = 3")
+    build_map([frame(20)], AHEAD, place_map, meter())
+    found = calibrated(place_map, at_hand(*map(frame, (*range(PLACES), 20)))[0])
+    assert sorted(found.recognisable) == [1, 2, 4, 5, 6, 7, 8, 9]
+
+
+def test_the_mask_of_the_map_holds_for_its_pictures(tmp_path):
+    allowed = np.ones((240, 320), bool)
+    allowed[:60] = allowed[190:] = False
+    mask = Mask(allowed, sha256="display")
+    with PlaceMap.create(tmp_path / "m.gpkg", AHEAD.spec) as place_map:
+        build_map(map(frame, range(PLACES)), AHEAD, place_map, meter(), mask=mask)
+        pictures, _ = at_hand(*map(frame, range(PLACES)))
+        with pytest.raises(UsageError, match="with the same camera and mask"):
+            calibrated(place_map, pictures)
+        assert calibrated(place_map, pictures, mask=mask).asked == 2 * PLACES
+
+
+def test_pictures_are_levelled_as_those_of_the_map(tmp_path, monkeypatch):
+    monkeypatch.setattr(calibrating, "asked_of", lambda technique: PLACES)
+    down = create("cohog", {"camera": "nadir", "w1": 256})
+    tilted = [frame(number, roll_deg=8.0, pitch_deg=-6.0, heading_deg=40.0, height_m=90.0) for number in range(PLACES)]
+
+    def levelling():
+        return Levelling(Lens(60.0), below=True, is_live=False)
+
+    with PlaceMap.create(tmp_path / "m.gpkg", down.spec) as place_map:
+        build_map(tilted, down, place_map, meter(), levelling=levelling())
+        with pytest.raises(UsageError, match="pictures of 0 places are at hand"):
+            calibrated(place_map, at_hand(*tilted)[0], down)
+        found = calibrated(place_map, at_hand(*tilted)[0], down, levelling=levelling())
+    assert (found.asked, len(found.recognisable)) == (PLACES, PLACES)
+
+
+def test_a_map_that_looks_alike_everywhere_says_so(tmp_path):
+    """Water: the same few faint waves on every picture."""
+    waves = cv2.GaussianBlur(np.random.default_rng(1).normal(size=(240, 320)), (0, 0), 2)
+    waves = cv2.normalize(waves, None, 90, 130, cv2.NORM_MINMAX)
+
+    def water(number):
+        noise = np.random.default_rng(number).normal(0, 2, (240, 320))
+        image = np.clip(waves + noise, 0, 255).astype(np.uint8)
+        return Frame(image=image, name=f"{number}.png", t_mono_s=0.0, position=Position(50 + 0.002 * number, 8.0))
+
+    with PlaceMap.create(tmp_path / "m.gpkg", AHEAD.spec) as place_map:
+        build_map(map(water, range(PLACES)), AHEAD, place_map, meter())
+        found = calibrated(place_map, at_hand(*map(water, range(PLACES)))[0])
+    assert found.looks_alike
+    assert found.accepted < 0.3

@@ -1,0 +1,115 @@
+"""Areas and paths of mission files and GeoJSON."""
+
+import json
+
+import pytest
+
+from edgevpr.core.errors import UsageError
+from edgevpr.mapmaking.missions import Waypoint, read_area
+
+WAYPOINTS = """QGC WPL 110
+0\t1\t0\t16\t0\t0\t0\t0\t50.001\t11.9\t584.0\t1
+1\t0\t3\t22\t0\t0\t0\t0\t0\t0\t60.0\t1
+2\t0\t3\t16\t0\t0\t0\t0\t50.002\t11.901\t60.0\t1
+3\t0\t3\t201\t0\t0\t0\t0\t51\t12\t0\t1
+4\t0\t10\t82\t0\t0\t0\t0\t50.003\t11.903\t70.0\t1
+5\t0\t0\t20\t0\t0\t0\t0\t0\t0\t0\t1
+"""
+RING = [[11.9, 50.0], [11.91, 50.0], [11.91, 50.01], [11.9, 50.0]]
+ITEMS = [
+    {"type": "SimpleItem", "command": 22, "frame": 3, "params": [0, 0, 0, None, 50.0, 11.9, 50]},
+    {"type": "SimpleItem", "command": 530, "frame": 2, "params": [0, 2, None, None, None, None, None]},
+    {
+        "type": "ComplexItem",
+        "complexItemType": "survey",
+        "polygon": [[50.0, 11.9], [50.01, 11.9], [50.01, 11.91]],
+        "TransectStyleComplexItem": {
+            "CameraCalc": {"DistanceToSurface": 80},
+            "VisualTransectPoints": [[50.001, 11.9], [50.009, 11.9]],
+        },
+    },
+]
+
+
+def written(tmp_path, said):
+    path = tmp_path / "area"
+    path.write_text(said if isinstance(said, str) else json.dumps(said))
+    return path
+
+
+def test_a_waypoint_file_gives_what_is_flown_to_and_nothing_else(tmp_path):
+    area = read_area(written(tmp_path, WAYPOINTS))
+    assert area.polygons == ()
+    assert area.paths == ((Waypoint(50.001, 11.9), Waypoint(50.002, 11.901, 60.0), Waypoint(50.003, 11.903, 70.0)),)
+    assert area.extent_deg == (50.001, 11.9, 50.003, 11.903)
+
+
+def test_a_plan_gives_its_waypoints_and_its_survey(tmp_path):
+    area = read_area(written(tmp_path, {"fileType": "Plan", "mission": {"items": ITEMS}}))
+    assert area.paths == ((Waypoint(50.0, 11.9, 50.0), Waypoint(50.001, 11.9, 80), Waypoint(50.009, 11.9, 80)),)
+    assert area.polygons == (([(50.0, 11.9), (50.01, 11.9), (50.01, 11.91), (50.0, 11.9)],),)
+
+
+@pytest.mark.parametrize(
+    ("kind", "within", "polygons", "points"),
+    [
+        ("Polygon", [RING], 1, []),
+        ("MultiPolygon", [[RING], [RING, RING]], 2, []),
+        ("Point", [11.9, 50.0], 0, [1]),
+        ("MultiPoint", [[11.9, 50.0], [11.9, 50.1]], 0, [1, 1]),
+        ("LineString", [[11.9, 50.0], [11.9, 50.1, 300.0]], 0, [2]),
+        ("MultiLineString", [[[11.9, 50.0], [11.9, 50.1]], [[11.9, 50.0], [11.9, 50.1]]], 0, [2, 2]),
+    ],
+)
+def test_every_geometry_of_geojson_is_read_however_it_is_wrapped(tmp_path, kind, within, polygons, points):
+    geometry = {"type": kind, "coordinates": within}
+    feature = {"type": "Feature", "properties": {}, "geometry": geometry}
+    nothing = {"type": "Feature", "properties": {}, "geometry": None}
+    collection = {"type": "GeometryCollection", "geometries": [geometry]}
+    for said in (geometry, feature, {"type": "FeatureCollection", "features": [feature, nothing]}, collection):
+        area = read_area(written(tmp_path, said))
+        assert len(area.polygons) == polygons
+        assert [len(path) for path in area.paths] == points
+        south, west, _, _ = area.extent_deg
+        assert (south, west) == (50.0, 11.9)
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        "",
+        "file,lat,lon",
+        "QGC WPL 110\n0 1 0",
+        "QGC WPL 110\n0 1 0 16 0 0 0 0 x 11 0 1",
+        "QGC WPL 110\n0 1 0 16 0 0 0 0 nan 11 0 1",
+        "[]",
+        "[" * 100_000,
+        '{"type": "Topology"}',
+        '{"fileType": "Plan"}',
+        '{"fileType": "Plan", "mission": {"items": [{}]}}',
+        '{"type": "Polygon", "coordinates": [[[11, 50], [12, 50]]]}',
+        '{"type": "Point", "coordinates": [NaN, 50]}',
+        '{"type": "Point", "coordinates": [1' + 400 * "0" + ", 50]}",
+        '{"type": "Point", "coordinates": 3}',
+    ],
+)
+def test_what_cannot_be_understood_is_said_in_a_sentence(tmp_path, said):
+    with pytest.raises(UsageError, match=r"save it again\.$"):
+        read_area(written(tmp_path, said))
+
+
+def test_an_empty_area_one_beyond_the_globe_and_a_foreign_file_are_refused(tmp_path):
+    for empty in (
+        "QGC WPL 110\n",
+        {"type": "FeatureCollection", "features": []},
+        {"type": "Polygon", "coordinates": []},
+    ):
+        with pytest.raises(UsageError, match="no polygon and no position"):
+            read_area(written(tmp_path, empty))
+    with pytest.raises(UsageError, match="beyond the globe"):
+        read_area(written(tmp_path, {"type": "Point", "coordinates": [707819, 5542661]}))
+    (tmp_path / "picture").write_bytes(b"\xff\xd8\xff\xe0")
+    with pytest.raises(UsageError, match="save it again"):
+        read_area(tmp_path / "picture")
+    with pytest.raises(UsageError, match="cannot be read"):
+        read_area(tmp_path / "missing")

@@ -1,0 +1,277 @@
+"""Squares cut out of orthophotos of every kind: what is where, to a fraction of a pixel, and what is refused."""
+
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+
+pytest.importorskip("rasterio", reason="rasterio is not installed (pip install 'edgevpr[maps]')")
+
+import rasterio
+from rasters import HOME, MARKS_M, grid, in_crs, marked, marked_raster, write_raster
+
+from edgevpr.core.errors import ImageError, SourceError
+from edgevpr.mapmaking.orthophoto import Orthophoto
+
+FOOTPRINT_M, SIDE_PX = 80.0, 400
+PIXEL_M = FOOTPRINT_M / SIDE_PX
+
+
+def cut(path, footprint_m=FOOTPRINT_M, at=HOME):
+    orthophoto = Orthophoto(path)
+    picture, valid = orthophoto.cut(at, footprint_m, SIDE_PX)
+    orthophoto.close()
+    return picture, valid
+
+
+def require_marks(picture: np.ndarray, footprint_m: float = FOOTPRINT_M, within_px: float = 0.1) -> None:
+    """Hold the middle of each mark against where it must be: north is up, and metres are those of the ground."""
+    pixel_m = footprint_m / SIDE_PX
+    bright = picture[..., 2].astype(float)
+    bright = np.clip(bright - np.median(bright) - 8, 0, None)
+    rows, columns = np.indices(bright.shape)
+    for east_m, north_m in MARKS_M:
+        column, row = SIDE_PX / 2 - 0.5 + east_m / pixel_m, SIDE_PX / 2 - 0.5 - north_m / pixel_m
+        weight = bright * (np.hypot(columns - column, rows - row) < 7 / pixel_m)
+        found = (columns * weight).sum() / weight.sum(), (rows * weight).sum() / weight.sum()
+        assert found == pytest.approx((column, row), abs=within_px), (east_m, north_m)
+
+
+@pytest.mark.parametrize(
+    ("crs", "turned_deg"),
+    [
+        ("EPSG:32632", 0),
+        ("EPSG:32632", 37),
+        ("EPSG:4326", 0),
+        ("EPSG:3857", 0),
+        ("EPSG:3857", 200),
+        ("EPSG:31468", 0),  # another datum, 130 m off
+        ("+proj=tmerc +lat_0=50 +lon_0=9 +datum=WGS84 +units=us-ft", 0),
+    ],
+)
+def test_a_place_is_where_it_must_be_with_true_north_up(tmp_path, crs, turned_deg):
+    picture, valid = cut(marked_raster(tmp_path / "o.tif", crs, turned_deg=turned_deg, side_px=720))
+    assert picture.shape == (SIDE_PX, SIDE_PX, 3)
+    assert picture.dtype == np.uint8
+    assert valid.all()
+    require_marks(picture)
+    assert picture[..., 2].mean() > 1.1 * picture[..., 0].mean(), "red comes last"
+
+
+def test_longitudes_may_count_from_0_to_360(tmp_path):
+    path = marked_raster(tmp_path / "o.tif", "EPSG:4326", side_px=720)
+    with rasterio.open(path, "r+") as data:
+        there = data.transform
+        data.transform = rasterio.Affine(there.a, there.b, there.c + 360, there.d, there.e, there.f)
+    picture, valid = cut(path)
+    assert valid.all()
+    require_marks(picture)
+    assert Orthophoto(path).extent_deg[1] == pytest.approx(11.9, abs=0.01)
+
+
+@pytest.mark.parametrize("pixel_m", [0.05, 0.07, 0.45])
+def test_pixels_much_finer_or_coarser_than_the_picture_are_averaged_and_in_place(tmp_path, pixel_m):
+    path = marked_raster(tmp_path / "o.tif", pixel_m=pixel_m, side_px=int(84 / pixel_m))
+    picture, valid = cut(path)
+    assert valid.all()
+    require_marks(picture, within_px=0.2)
+
+
+def test_fine_stripes_become_grey_and_no_pattern(tmp_path):
+    to_crs, _, _ = grid("EPSG:32632", 0.02, 8)
+    stripes = np.zeros((1, 4000, 4000), np.uint8)
+    stripes[:, :, ::2] = 200
+    picture, _ = cut(write_raster(tmp_path / "o.tif", stripes, "EPSG:32632", to_crs), 30.0, at_middle(to_crs, 4000))
+    assert abs(picture.astype(int) - 100).max() <= 3
+
+
+def at_middle(to_crs, side_px):
+    from rasterio.warp import transform
+
+    from edgevpr.core.types import Position
+
+    x, y = in_crs(to_crs, side_px / 2, side_px / 2)
+    (lon_deg,), (lat_deg,) = transform("EPSG:32632", "EPSG:4326", [x], [y])
+    return Position(lat_deg, lon_deg)
+
+
+def test_what_lies_beyond_the_edge_has_no_data(tmp_path):
+    path = marked_raster(tmp_path / "o.tif")  # 160 m wide
+    orthophoto = Orthophoto(path)
+    _, valid = orthophoto.cut(HOME, 320.0, SIDE_PX)
+    assert valid.mean() == pytest.approx(0.25, abs=0.01)
+    picture, valid = orthophoto.cut(type(HOME)(50.1, 11.9), 80.0, SIDE_PX)
+    assert not valid.any()
+    assert not picture.any()
+    south, west, north, east = orthophoto.extent_deg
+    assert south < 50 < north
+    assert west < 11.9 < east
+    assert orthophoto.resolution_m == pytest.approx(0.25, rel=0.01)
+
+
+def spread(kind: str, bright: np.ndarray) -> tuple[np.ndarray, dict]:
+    """The marks in another form of file, with the west half of the ground without data where the form can say so."""
+    byte = bright.astype(np.uint8)
+    known = np.full(byte.shape, 255, np.uint8)
+    known[:, : byte.shape[1] // 2 - 20] = 0
+    empty = np.where(known, byte, 0)
+    return {
+        "grey": (byte[None], {}),
+        "16 bits": (np.stack([bright * 40 + 500] * 3).astype(np.uint16), {}),
+        "alpha": (np.stack((byte, byte, byte, known)), {"photometric": "RGB", "alpha": "yes"}),
+        "grey and alpha": (np.stack((byte, known)), {"alpha": "yes"}),
+        "16 bits and alpha": (
+            np.stack((bright * 40, bright * 40, bright * 40, known * 257.0)).astype(np.uint16),
+            {"photometric": "RGB", "alpha": "yes"},
+        ),
+        "near infrared": (np.stack((byte, byte, byte, 255 - byte)), {"photometric": "RGB", "alpha": "no"}),
+        "nodata": (np.stack([empty] * 3), {"nodata": 0}),
+    }[kind]
+
+
+@pytest.mark.parametrize(
+    "kind", ["grey", "16 bits", "alpha", "grey and alpha", "16 bits and alpha", "near infrared", "nodata"]
+)
+def test_every_form_of_file_is_read(tmp_path, kind):
+    to_crs, east_m, north_m = grid("EPSG:32632", 0.25, 640)
+    bands, profile = spread(kind, marked(east_m, north_m))
+    picture, valid = cut(write_raster(tmp_path / "o.tif", bands, "EPSG:32632", to_crs, **profile))
+    assert picture.shape == (SIDE_PX, SIDE_PX, 3)
+    if "alpha" in kind or kind == "nodata":
+        assert valid[:, SIDE_PX // 2 :].all()
+        assert not valid[:, : SIDE_PX // 4].any()
+        assert valid.mean() == pytest.approx(0.5 + 5 / 80, abs=0.02)
+        unknown = picture[~valid]
+        assert (unknown == unknown[0]).all(), "what is not known has one colour"
+    else:
+        assert valid.all()
+        require_marks(picture)
+    if kind.startswith("16"):
+        assert picture[valid].max() > 200, "16 bits fill the range of 8"
+
+
+def test_a_file_of_16_bits_has_one_scale_everywhere(tmp_path):
+    to_crs, east_m, _ = grid("EPSG:32632", 0.25, 640)
+    bands = (1000 + 50 * east_m + 2000 * (east_m > 60)).astype(np.uint16)[None]
+    path = write_raster(tmp_path / "o.tif", bands, "EPSG:32632", to_crs)
+    orthophoto = Orthophoto(path)
+    wide, _ = orthophoto.cut(HOME, 80.0, SIDE_PX)
+    narrow, _ = orthophoto.cut(HOME, 20.0, SIDE_PX)
+    middle = slice(3 * SIDE_PX // 8, 5 * SIDE_PX // 8)
+    assert wide[middle, middle].mean() == pytest.approx(narrow.mean(), abs=1.5)
+
+
+def test_overviews_change_nothing_but_the_speed(tmp_path):
+    path = marked_raster(tmp_path / "o.tif", pixel_m=0.05, side_px=2000)
+    shutil.copy(path, tmp_path / "with.tif")
+    with rasterio.open(tmp_path / "with.tif", "r+") as data:
+        data.build_overviews([2, 4, 8], rasterio.enums.Resampling.average)
+    plain, _ = cut(path)
+    other, _ = cut(tmp_path / "with.tif")
+    assert np.abs(plain.astype(int) - other).max() <= 2
+
+
+def tiles(folder, zoom, side_px=256, end="png", skip=()):
+    """Write the marks as map tiles around HOME; return the folder."""
+    half_world_m, tile_m = 20037508.342789244, 2 * 20037508.342789244 / 2**zoom
+    from rasterio.warp import transform
+    from rasters import ground_m
+
+    (x,), (y,) = transform("EPSG:4326", "EPSG:3857", [HOME.lon_deg], [HOME.lat_deg])
+    middle = int((x + half_world_m) / tile_m), int((half_world_m - y) / tile_m)
+    for column in range(middle[0] - 2, middle[0] + 3):
+        for row in range(middle[1] - 2, middle[1] + 3):
+            if (column - middle[0], row - middle[1]) in skip:
+                continue
+            at = (np.arange(side_px) + 0.5) / side_px
+            x_m, y_m = np.meshgrid((column + at) * tile_m - half_world_m, half_world_m - (row + at) * tile_m)
+            lon_deg, lat_deg = transform("EPSG:3857", "EPSG:4326", x_m.ravel(), y_m.ravel())
+            bright = marked(*(each.reshape(x_m.shape) for each in ground_m(lat_deg, lon_deg))).astype(np.uint8)
+            path = folder / str(zoom) / str(column) / f"{row}.{end}"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(path), np.dstack((bright * 0.8, bright * 0.9, bright)).astype(np.uint8))
+    return folder
+
+
+@pytest.mark.parametrize(("zoom", "side_px", "end"), [(19, 256, "png"), (18, 512, "png"), (20, 128, "jpg")])
+def test_a_folder_of_tiles_is_read_at_its_highest_zoom(tmp_path, zoom, side_px, end):
+    folder = tiles(tmp_path, zoom, side_px, end)
+    (folder / str(zoom - 3) / "1").mkdir(parents=True)
+    shutil.copy(next((folder / str(zoom)).glob("*/*")), folder / str(zoom - 3) / "1" / "1.png")
+    if zoom == 20:
+        picture, valid = cut(folder, 40.0)
+        assert picture.max() > 150
+    else:
+        picture, valid = cut(folder)
+        require_marks(picture)
+    assert valid.all()
+
+
+def test_a_tile_that_is_missing_or_damaged_is_a_hole(tmp_path):
+    folder = tiles(tmp_path, 19, skip=[(0, 0)])
+    _, valid = cut(folder)
+    assert 0.3 < valid.mean() < 0.9
+    for path in sorted((folder / "19").glob("*/*"))[::2]:
+        path.write_bytes(b"not a picture")
+    _, fewer = cut(folder)
+    assert fewer.mean() < valid.mean()
+
+
+def test_an_mbtiles_file_is_read(tmp_path):
+    import rasterio.shutil
+
+    source = marked_raster(tmp_path / "o.tif", "EPSG:3857")
+    path = tmp_path / "o.mbtiles"
+    rasterio.shutil.copy(source, path, driver="MBTILES", TILE_FORMAT="PNG")
+    picture, valid = cut(path)
+    assert valid.all()
+    require_marks(picture, within_px=0.5)  # it was resampled to the zoom
+
+
+def refused(path) -> str:
+    with pytest.raises(SourceError) as caught:
+        Orthophoto(path)
+    assert str(caught.value).endswith(".")
+    return str(caught.value)
+
+
+def test_what_is_no_orthophoto_is_refused_in_a_sentence(tmp_path):
+    to_crs, east_m, north_m = grid("EPSG:32632", 1.0, 64)
+    bright = marked(east_m, north_m)
+    byte = bright.astype(np.uint8)[None]
+    assert "There is no orthophoto" in refused(tmp_path / "missing.tif")
+    assert "holds no map tiles" in refused(tmp_path)
+    (tmp_path / "notes.tif").write_text("not a raster")
+    assert "cannot be opened" in refused(tmp_path / "notes.tif")
+    no_crs = write_raster(tmp_path / "a.tif", byte, None, to_crs)
+    assert "no geo-reference" in refused(no_crs)
+    no_place = write_raster(tmp_path / "b.tif", byte, "EPSG:32632", rasterio.Affine.identity())
+    assert "no geo-reference" in refused(no_place)
+    heights = write_raster(tmp_path / "c.tif", bright[None].astype(np.float32), "EPSG:32632", to_crs)
+    assert "float32" in refused(heights)
+    assert "no picture" in refused(heights)
+    local = write_raster(tmp_path / "d.tif", byte, 'LOCAL_CS["site",UNIT["metre",1]]', to_crs)
+    assert "cannot be brought to latitude" in refused(local)
+    palette = write_raster(tmp_path / "e.tif", byte, "EPSG:32632", to_crs, photometric="palette")
+    with rasterio.open(palette, "r+") as data:
+        data.write_colormap(1, {number: (number, 0, 0, 255) for number in range(256)})
+    assert "palette" in refused(palette)
+
+
+def test_a_file_that_ends_early_is_no_crash(tmp_path):
+    path = marked_raster(tmp_path / "o.tif")
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    with pytest.raises(ImageError, match="copy the file again"):
+        Orthophoto(path).cut(HOME, 120.0, SIDE_PX)
+
+
+def test_the_edge_of_the_data_draws_no_dark_line(tmp_path):
+    to_crs, _, _ = grid("EPSG:32632", 0.13, 800)
+    picture = np.full((1, 800, 800), 150, np.uint8)
+    picture[..., :400] = 0
+    path = write_raster(tmp_path / "o.tif", picture, "EPSG:32632", to_crs, nodata=0)
+    cut_out, valid = cut(path)
+    assert 0.4 < valid.mean() < 0.6
+    assert cut_out.min() >= 145

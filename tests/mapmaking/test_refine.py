@@ -1,0 +1,301 @@
+"""A map that refines itself: pictures of a generated flight, whose true positions are known, with noisy ones
+recorded."""
+
+import csv
+import dataclasses
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+
+from edgevpr.cli.main import main
+from edgevpr.core.errors import MapError
+from edgevpr.core.geodesy import distance_m, metres, moved
+from edgevpr.core.types import Frame, Position
+from edgevpr.lab.simulate.camera import Camera, lit, photograph
+from edgevpr.lab.simulate.flight import mapping_flight, to_position
+from edgevpr.lab.simulate.scene import make_scene
+from edgevpr.mapmaking.refine import refine
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.mapinfo import info_of
+from edgevpr.runtime.recognise.opening import technique_of
+
+NOISE_M, GLITCH_M = 5.0, 250.0
+FOOTPRINT_M = 80.0 * 640 / 493  # of the generated camera
+EVERY, LEGS = 1, 2  # pictures of the two first legs
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory):
+    """A folder of pictures of two legs, their true poses, and noisy positions of which one is a glitch."""
+    folder = tmp_path_factory.mktemp("flown")
+    (folder / "images").mkdir()
+    flight, rng = mapping_flight(7), np.random.default_rng(7)
+    scene = make_scene(7, 420.0, 220.0)
+    ground = lit(scene, flight.light, flight.seed)
+    poses = flight.poses[: 14 * LEGS : EVERY]
+    with open(folder / "positions.csv", "w", newline="") as handle:
+        table = csv.writer(handle)
+        table.writerow(("file", "lat", "lon"))
+        for number, pose in enumerate(poses):
+            shot = photograph(ground, scene.metres_per_pixel, pose, Camera(), flight.light, rng)
+            cv2.imwrite(str(folder / "images" / f"{number:03d}.jpg"), shot)
+            true, (east_m, north_m) = to_position(pose), rng.normal(0, NOISE_M, 2)
+            east_m += GLITCH_M if number == 9 else 0.0
+            lat_deg, lon_deg = moved(true.lat_deg, true.lon_deg, east_m, north_m)
+            table.writerow((f"{number:03d}.jpg", f"{lat_deg:.8f}", f"{lon_deg:.8f}"))
+    return folder, poses
+
+
+@pytest.fixture(scope="module")
+def built(flown, tmp_path_factory):
+    """A map of them, not refined."""
+    path = tmp_path_factory.mktemp("built") / "m.gpkg"
+    flags = ["--images", str(flown[0] / "images"), "--technique", "cohog", "--camera", "nadir", "--no-refine"]
+    assert main(["map", "build", str(path), *flags]) == 0
+    return path
+
+
+@pytest.fixture
+def map_path(built, tmp_path):
+    return shutil.copy(built, tmp_path / "m.gpkg")
+
+
+def errors_m(place_map, poses):
+    """How far each place is from where it was taken, and its direction from that of the camera, in degrees."""
+    off_m, turned_deg = [], []
+    for place, pose in zip(place_map.places(), poses, strict=True):
+        true = to_position(pose)
+        here = place.position
+        off_m.append(float(distance_m(here.lat_deg, here.lon_deg, true.lat_deg, true.lon_deg)))
+        if place.pose:
+            turned_deg.append((place.pose.up_deg - pose.heading_deg + 180) % 360 - 180)
+    return np.array(off_m), np.array(turned_deg)
+
+
+def test_pictures_say_where_they_lie(flown, map_path, capsys):
+    _, poses = flown
+    with PlaceMap.open(map_path) as place_map:
+        before_m, _ = errors_m(place_map, poses)
+    assert main(["map", "refine", str(map_path), "--json"]) == 0
+    refined = json.loads(capsys.readouterr().out)
+    assert refined["refined"] == len(poses)
+    ((place_id, image, off_m),) = refined["contradictory"]
+    assert (place_id, image) == (10, "009.jpg")
+    assert off_m == pytest.approx(GLITCH_M, abs=25)
+    with PlaceMap.open(map_path) as place_map:
+        after_m, turned_deg = errors_m(place_map, poses)
+        footprints_m = np.array([place.pose.footprint_m for place in place_map.places()])
+        info = info_of(place_map)
+        recorded = [place.pose.recorded for place in place_map.places()]
+    assert np.median(after_m) < np.median(before_m) / 2
+    assert after_m.max() < 10
+    assert abs(turned_deg).max() < 8
+    assert abs(footprints_m / FOOTPRINT_M - 1).max() < 0.15
+    assert (info.with_pose, info.footprint_m) == (len(poses), pytest.approx(FOOTPRINT_M, rel=0.1))
+    assert 0.5 < info.position_sd_m < 6
+    with PlaceMap.open(map_path) as place_map:
+        assert len(recorded) == len(place_map)
+        assert refined["moved_m"] > 1
+
+
+def test_refining_again_begins_with_what_was_recorded(map_path, capsys):
+    def positions():
+        with PlaceMap.open(map_path) as place_map:
+            return [(place.position, place.pose) for place in place_map.places()]
+
+    main(["map", "refine", str(map_path)])
+    first = positions()
+    main(["map", "refine", str(map_path)])
+    assert positions() == first
+    said = capsys.readouterr().out
+    assert "28 of 28 places refined" in said
+    assert "amiss       place 10 (009.jpg): recorded 2" in said
+
+
+def test_a_fix_is_finer_than_the_places(flown, map_path, tmp_path, capsys):
+    """Pictures between the places: half a step beside each, turned and a little higher."""
+    folder, poses = flown
+    flight, rng = mapping_flight(7), np.random.default_rng(8)
+    scene = make_scene(7, 420.0, 220.0)
+    ground = lit(scene, flight.light, flight.seed)
+    (tmp_path / "asked").mkdir()
+    asked = [
+        dataclasses.replace(
+            pose, east_m=pose.east_m + 9, north_m=pose.north_m + 6, heading_deg=pose.heading_deg + 25, height_m=86.0,
+            roll_deg=0.0, pitch_deg=0.0,
+        )
+        for pose in poses[2:12:2]
+    ]  # fmt: skip
+    for number, pose in enumerate(asked):
+        shot = photograph(ground, scene.metres_per_pixel, pose, Camera(), flight.light, rng)
+        cv2.imwrite(str(tmp_path / "asked" / f"{number}.jpg"), shot)
+    main(["map", "refine", str(map_path), "--images", str(folder / "images")])
+    with PlaceMap.open(map_path) as place_map:
+        offsets = []
+        for place, pose in zip(place_map.places(), poses, strict=True):
+            true = to_position(pose)
+            offsets.append(_metres(true, place.position))
+    common = np.mean(offsets, axis=0)  # what is left of the noise of all positions together
+    capsys.readouterr()
+    assert main(["match", str(map_path), "--images", str(tmp_path / "asked"), "--json"]) == 0
+    events = json.loads(capsys.readouterr().out)
+    for event, pose in zip(events, asked, strict=True):
+        assert event["accepted"], event["reason"]
+        where = event["located"]
+        off_m = _metres(to_position(pose), Position(where["lat_deg"], where["lon_deg"])) - common
+        assert np.hypot(*off_m) < 4
+        assert abs((where["heading_deg"] - pose.heading_deg + 180) % 360 - 180) < 8
+        assert where["height_ratio"] == pytest.approx(86 / 80, abs=0.08)
+        assert event["accuracy_m"] < 12, event
+
+
+def _metres(one, other):
+    lat_deg, lon_deg = np.array([(each.lat_deg, each.lon_deg) for each in (one, other)]).T
+    east_m, north_m = metres(lat_deg, lon_deg)
+    return np.array([east_m[1], north_m[1]])
+
+
+def test_a_build_refines_what_it_has_made(flown, tmp_path, capsys):
+    path = tmp_path / "m.gpkg"
+    flags = ["--images", str(flown[0] / "images"), "--technique", "cohog", "--camera", "nadir"]
+    assert main(["map", "build", str(path), *flags]) == 0
+    assert "28 of 28 places refined" in capsys.readouterr().out
+    exported = tmp_path / "m.geojson"
+    assert main(["map", "export", str(path), "--geojson", str(exported)]) == 0
+    properties = json.loads(exported.read_text())["features"][3]["properties"]
+    assert properties["footprint_m"] == pytest.approx(FOOTPRINT_M, rel=0.15)
+    assert len(properties["covariance_m2"]) == 3
+    assert properties["recorded"] is not None
+    capsys.readouterr()
+    assert main(["map", "info", str(path)]) == 0
+    assert "pose        of 28 places" in capsys.readouterr().out
+
+
+def some_of(built, path, numbers, position=lambda number, place: place.position):
+    """A map of some places of another, in this order, at other positions."""
+    with PlaceMap.open(built) as there, PlaceMap.create(path, there.spec) as place_map:
+        technique = technique_of(there)
+        for place in there.places(numbers):
+            fine, _ = there.fine_part(place.place_id)
+            (coarse,) = (part for place_id, *_, part in there.coarse_parts() if place_id == place.place_id)
+            frame = Frame(
+                image=np.zeros((8, 8), np.uint8),
+                name=place.source_image,
+                t_mono_s=0.0,
+                position=position(place.place_id, place),
+            )
+            descriptor = technique.encode(np.zeros((64, 64), np.uint8))
+            descriptor = dataclasses.replace(descriptor, coarse=coarse, fine=fine)
+            place_map.add(frame, descriptor, landmarks=there.landmarks_of(place.place_id))
+    return path
+
+
+def refined_of(path, images=None):
+    with PlaceMap.open_for_adding(path) as place_map:
+        technique = technique_of(place_map)
+        return refine(place_map, technique, lambda pairs, total: pairs, images), list(place_map.places())
+
+
+@pytest.mark.parametrize(
+    ("numbers", "position", "refined", "without_position"),
+    [
+        ([1], None, 0, 0),  # one place
+        ([1, 2, 3], None, 0, 0),  # too few to tell the scale
+        (range(1, 9), None, 8, 0),  # in one line
+        ([1, 7, 13, 28], None, 0, 0),  # that do not overlap
+        (range(1, 9), lambda number, place: None, 0, 8),  # without positions
+        (range(1, 9), lambda number, place: Position(50.0, 8.0), 0, 0),  # all recorded at one point
+        (range(1, 9), lambda number, place: None if number % 2 else place.position, 4, 4),
+    ],
+)
+def test_maps_of_any_kind_are_refined_as_far_as_they_can_be(
+    built, tmp_path, numbers, position, refined, without_position
+):
+    path = some_of(built, tmp_path / "m.gpkg", numbers, *([position] if position else []))
+    with PlaceMap.open(path) as place_map:
+        before = [place.position for place in place_map.places()]
+    found, places = refined_of(path)
+    assert (found.places, found.refined, found.without_position) == (len(before), refined, without_position)
+    assert found.not_tied == len(before) - refined - without_position
+    for place, was in zip(places, before, strict=True):
+        if place.pose is None and was is not None:
+            assert place.position == was, "a place that is not tied stays"
+
+
+def test_places_of_a_surveyed_picture_stay(built, tmp_path):
+    from edgevpr.core.types import Pose
+
+    with PlaceMap.open(built) as there, PlaceMap.create(tmp_path / "m.gpkg", there.spec) as place_map:
+        lies = Pose(up_deg=0.0, footprint_m=80.0, covariance_m2=(1.0, 0.0, 1.0), is_surveyed=True)
+        (first, *_) = there.places([1])
+        descriptor = technique_of(there).encode(np.zeros((64, 64), np.uint8))
+        frame = Frame(image=np.zeros((8, 8), np.uint8), name="1", t_mono_s=0.0, position=first.position, pose=lies)
+        place_map.add(frame, descriptor)
+    found, (place,) = refined_of(tmp_path / "m.gpkg")
+    assert (found.surveyed, found.refined, found.not_tied) == (1, 0, 0)
+    assert place.pose == lies
+
+
+def test_what_cannot_be_refined_says_why(tmp_path, flown, map_path, capsys):
+    path = tmp_path / "hog.gpkg"
+    assert main(["map", "build", str(path), "--images", str(flown[0] / "images"), "--technique", "hog"]) == 0
+    assert "refined, by" not in capsys.readouterr().out, "a map of another kind is built as it was"
+    assert main(["map", "refine", str(path)]) == 2
+    assert "only `cohog` with `--camera nadir` can be refined" in capsys.readouterr().err
+
+
+def test_a_map_of_an_older_format_says_how_to_renew_it(map_path):
+    with PlaceMap.open_for_adding(map_path) as place_map:
+        place_map.has_pose = False
+        with pytest.raises(MapError, match="map merge NEW OLD"):
+            refine(place_map, technique_of(place_map), lambda pairs, total: pairs)
+
+
+def test_a_place_that_cannot_be_read_is_left_alone(map_path):
+    import sqlite3
+
+    with sqlite3.connect(map_path) as db:
+        db.execute("UPDATE places SET landmarks = x'00' WHERE place_id = 3")
+        db.execute("UPDATE places SET up_deg = 5, pose_crc32 = 1 WHERE place_id = 5")
+    db.close()
+    with PlaceMap.open_for_adding(map_path) as place_map:
+        found = refine(place_map, technique_of(place_map), lambda pairs, total: pairs)
+    assert found.places == 27
+    assert found.refined >= 25
+
+
+def test_what_is_learnt_beside_refined_places_lies_by_them(flown, map_path):
+    from edgevpr.core.config import load_config
+    from edgevpr.power.boards import load_board
+    from edgevpr.runtime.recognise.learn import Learner
+    from edgevpr.runtime.recognise.opening import open_learning
+
+    folder, poses = flown
+    assert main(["map", "refine", str(map_path), "--images", str(folder / "images")]) == 0
+    flight, rng = mapping_flight(7), np.random.default_rng(9)
+    scene = make_scene(7, 420.0, 220.0)
+    ground = lit(scene, flight.light, flight.seed)
+    seen = dataclasses.replace(poses[5], east_m=poses[5].east_m + 10, heading_deg=140.0, height_m=90.0)
+    shot = photograph(ground, scene.metres_per_pixel, seen, Camera(), flight.light, rng)
+    true = to_position(seen)
+    noisy = Position(*moved(true.lat_deg, true.lon_deg, 6.0, -4.0), true.alt_m)
+    # Each picture counts alone: a flight that is followed would not learn the second one at all.
+    config = load_config(None, {"map": str(map_path), "match.follow": False})
+    recogniser, growing = open_learning(config, load_board("this"), None)
+    with recogniser.place_map:
+        learner = Learner(recogniser, growing, spacing_m=5.0, gap_m=100.0)
+        place = learner.learn(recogniser.step(Frame(image=shot, name="new", t_mono_s=1.0, position=noisy)))
+        far = Position(*moved(true.lat_deg, true.lon_deg, 90.0, 0.0))
+        contradicted = learner.learn(recogniser.step(Frame(image=shot, name="far", t_mono_s=99.0, position=far)))
+    assert abs((place.pose.up_deg - 140 + 180) % 360 - 180) < 8
+    assert place.pose.footprint_m == pytest.approx(FOOTPRINT_M * 90 / 80, rel=0.15)
+    assert place.pose.recorded == Position(noisy.lat_deg, noisy.lon_deg)
+    off_m = distance_m(true.lat_deg, true.lon_deg, place.position.lat_deg, place.position.lon_deg)
+    assert off_m < np.hypot(6, 4)
+    assert contradicted.pose is None, "the pictures and the position contradict each other"
+    assert contradicted.position == far
+    with PlaceMap.open(map_path) as place_map:
+        assert [each.pose for each in place_map.places([place.place_id])] == [place.pose]

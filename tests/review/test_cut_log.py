@@ -1,0 +1,60 @@
+"""The log of a flight that ended with the battery: cut at any byte, it is still a page and points."""
+
+import io
+import json
+
+import pytest
+from logs import query, write_log
+
+from edgevpr.cli.main import main
+from edgevpr.core.errors import EdgevprError
+from edgevpr.review.export import features_of, write_csv, write_geojson, write_kml
+from edgevpr.review.flight import read_flight
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    """A log of three queries, as short as one can be."""
+    folder = tmp_path_factory.mktemp("logs")
+    located = {"lat_deg": -33.5, "lon_deg": 151.25}
+    return write_log(folder / "whole.jsonl", *(("query", query(name, located=located)) for name in "abc"))
+
+
+def test_a_log_that_was_cut_at_any_byte_is_read_and_exported_up_to_its_last_whole_line(log, tmp_path):
+    whole, cut_log = log.read_bytes(), tmp_path / "cut.jsonl"
+    ends = [place for place, byte in enumerate(whole) if byte == ord("\n")]
+    is_query = [json.loads(line)["kind"] == "query" for line in whole.splitlines()]
+    for cut in range(len(whole) + 1):
+        cut_log.write_bytes(whole[:cut])
+        there = sum(end <= cut for end in ends)  # the end of the last line may be missing
+        if not there:
+            with pytest.raises(EdgevprError, match=r"cut\.jsonl"):
+                read_flight(cut_log)
+            continue
+        flight = read_flight(cut_log)
+        assert len(flight.queries) == sum(is_query[:there])
+        features = features_of(flight)
+        for write in (write_csv, write_geojson, write_kml):
+            write(features, written := io.StringIO())
+            assert written.getvalue()
+        assert [each for each in features if each.kind == "match"] or not flight.queries
+
+
+def test_every_command_after_the_flight_takes_a_log_that_was_cut_in_a_line(log, tmp_path, capsys):
+    whole, cut_log = log.read_bytes(), tmp_path / "cut.jsonl"
+    ends = [place for place, byte in enumerate(whole) if byte == ord("\n")]
+    for number, end in enumerate(ends[1:], 1):
+        cut_log.write_bytes(whole[: (ends[number - 1] + end) // 2])
+        assert main(["report", str(cut_log), "--out", str(tmp_path / "page.html")]) == 0
+        assert main(["export", str(cut_log), "--geojson", str(tmp_path / "points.json")]) == 0
+        json.loads((tmp_path / "points.json").read_text())
+    said = capsys.readouterr()
+    assert "Traceback" not in said.err
+    assert "3 queries" in said.out
+
+
+def test_a_log_of_which_no_line_is_whole_is_refused_in_a_sentence(log, tmp_path, capsys):
+    (tmp_path / "cut.jsonl").write_bytes(log.read_bytes()[:40])
+    assert main(["report", str(tmp_path / "cut.jsonl"), "--out", str(tmp_path / "page.html")]) == 1
+    assert "cut.jsonl" in capsys.readouterr().err
+    assert not (tmp_path / "page.html").exists()

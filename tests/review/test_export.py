@@ -1,0 +1,62 @@
+"""The points of a flight for other programs."""
+
+import csv
+import io
+import json
+from collections import Counter
+from xml.etree import ElementTree
+
+from logs import query, write_log
+
+from edgevpr.review.export import features_of, write_csv, write_geojson, write_kml
+from edgevpr.review.flight import read_flight
+
+KML = "{http://www.opengis.net/kml/2.2}"
+
+
+def written(write, features):
+    out = io.StringIO()
+    write(features, out)
+    return out.getvalue()
+
+
+def test_every_form_has_the_same_points(flown):
+    features = features_of(read_flight(flown / "flight.jsonl"))
+    kinds = Counter(each.kind for each in features)
+    assert kinds["match"] == kinds["place"] == 8
+    assert kinds["autopilot"] == kinds["gps"] == 10
+    assert kinds["fix"] > 0
+    collection = json.loads(written(write_geojson, features))
+    rows = list(csv.DictReader(io.StringIO(written(write_csv, features))))
+    folders = ElementTree.fromstring(written(write_kml, features)).iter(f"{KML}Folder")
+    marks = {folder.find(f"{KML}name").text: len(folder.findall(f"{KML}Placemark")) for folder in folders}
+    assert Counter(each["properties"]["kind"] for each in collection["features"]) == kinds
+    assert Counter(row["kind"] for row in rows) == kinds
+    assert marks == kinds
+
+
+def test_a_match_says_where_it_is_and_what_is_known_of_it(tmp_path):
+    located = {"lat_deg": -33.5, "lon_deg": 151.25}
+    flight = read_flight(write_log(tmp_path / "log", ("query", query("a", located=located))))
+    match = json.loads(written(write_geojson, features_of(flight)))["features"][0]
+    assert match["geometry"] == {"type": "Point", "coordinates": [151.25, -33.5]}
+    assert match["properties"].items() >= {"kind": "match", "query": "a", "place": 3, "accuracy_m": 2.0}.items()
+    kml = ElementTree.fromstring(written(write_kml, features_of(flight)))
+    assert kml.find(f".//{KML}coordinates").text == "151.25000000,-33.50000000"
+
+
+def test_names_that_no_xml_can_have_are_written(tmp_path):
+    name = 'a\x00\x1b<b>&"\ud800'
+    features = features_of(read_flight(write_log(tmp_path / "log", ("query", query(name)))))
+    kml = ElementTree.fromstring(written(write_kml, features).encode("utf-8"))
+    assert "<b>&" in kml.find(f".//{KML}Placemark/{KML}name").text
+    assert json.loads(written(write_geojson, features))["features"][0]["properties"]["query"] == name
+
+
+def test_a_flight_without_positions_has_no_points(tmp_path):
+    nowhere = query("a", located=None, position=None, fix=None)
+    features = features_of(read_flight(write_log(tmp_path / "log", ("query", nowhere))))
+    assert features == []
+    assert json.loads(written(write_geojson, features))["features"] == []
+    assert written(write_csv, features) == "kind,lat_deg,lon_deg\n"
+    ElementTree.fromstring(written(write_kml, features))

@@ -1,0 +1,145 @@
+"""A flight as its log tells it."""
+
+import json
+
+import pytest
+from logs import query, write_log
+
+from edgevpr.core.errors import EdgevprError, UsageError
+from edgevpr.core.numbered import numbered
+from edgevpr.review.flight import Outcome, read_flight
+from edgevpr.runtime.flight.flightlog import FlightLog
+
+
+def outcomes(flight):
+    return [each.fix.outcome for each in flight.queries]
+
+
+def test_a_real_flight_is_read(flown):
+    flight = read_flight(flown / "flight.jsonl")
+    assert [each.name for each in flight.queries] == [f"{number:02d}.png" for number in range(10)]
+    assert [each.accepted for each in flight.queries] == [True] * 8 + [False] * 2
+    assert flight.map_path == str(flown / "map.gpkg")
+    first = flight.queries[0]
+    assert first.at == pytest.approx((50.0, 8.0), abs=1e-5)
+    assert first.autopilot_at == pytest.approx((50.0, 8.0), abs=1e-5)
+    assert first.off_m == pytest.approx(90, abs=2), "the receiver is beside the map"
+    assert first.has_link
+    assert first.fix.outcome is Outcome.TAKEN
+    assert flight.end
+
+
+def test_an_answer_that_comes_later_says_what_became_of_the_fix(tmp_path):
+    lines = [("query", query(name)) for name in ("a", "b", "c", "d")]
+    answers = [
+        ("answer", {"query": "a", "sent": True, "result": "ACCEPTED", "why": None, "latency_ms": 12.5}),
+        ("answer", {"query": "b", "sent": True, "result": "DENIED", "why": "denied", "latency_ms": 3.0}),
+        ("answer", {"query": "c", "sent": False, "result": None, "why": "too late", "latency_ms": None}),
+    ]
+    flight = read_flight(write_log(tmp_path / "log", *lines, *answers))
+    assert outcomes(flight) == [Outcome.TAKEN, Outcome.REFUSED, Outcome.KEPT, Outcome.UNANSWERED]
+    assert [each.fix.latency_ms for each in flight.queries] == [12.5, 3.0, None, None]
+    assert flight.queries[1].fix.why == "denied"
+
+
+def test_the_next_query_knows_of_an_answer_too(tmp_path):
+    later = query("b", last_fix=query("a")["fix"] | {"answer": "FAILED"})
+    flight = read_flight(write_log(tmp_path / "log", ("query", query("a")), ("query", later)))
+    assert outcomes(flight) == [Outcome.REFUSED, Outcome.UNANSWERED]
+
+
+def test_the_last_of_several_flights_is_taken_unless_another_is_asked_for(tmp_path):
+    log, newer = write_log(tmp_path / "log", ("query", query("a")), end=False), tmp_path / "newer"
+    write_log(newer, ("query", query("b")), ("query", query("c")))
+    with open(log, "ab") as handle:
+        handle.write(newer.read_bytes())
+    assert [each.name for each in read_flight(log).queries] == ["b", "c"]
+    first = read_flight(log, 1)
+    assert ([each.name for each in first.queries], first.end, first.flights) == (["a"], {}, 2)
+    with pytest.raises(UsageError, match="holds 2: give 1 to 2"):
+        read_flight(log, 3)
+
+
+def test_a_flight_of_several_files_is_read_whole_and_what_is_missing_is_a_remark(tmp_path):
+    path = tmp_path / "flight.jsonl"
+    with FlightLog(path, max_mb=0.02) as log:
+        log.write("start", map="m.gpkg", t_mono_s=1000.0)
+        for second in range(1, 5):
+            fields = query(str(second), reason="x" * 3000) | {"t_mono_s": 1000.0 + second}
+            log.write("query", **fields)
+            log.write("camera", t_mono_s=1000.5 + second, said="camera shows nothing")
+    flight = read_flight(path)
+    assert [each.name for each in flight.queries] == ["1", "2", "3", "4"]
+    assert [each.t_s for each in flight.queries] == [1.0, 2.0, 3.0, 4.0]
+    assert len(flight.remarks) == 4
+    assert "repeated" not in flight.start
+    first, *_ = numbered(path)
+    first.unlink()
+    flight = read_flight(path)
+    assert (flight.map_path, flight.start["repeated"]) == ("m.gpkg", True)
+    assert flight.remarks[0].said == flight.missing
+    assert "flight.jsonl: 1." in flight.missing
+    assert 0 < len(flight.queries) < 4
+
+
+@pytest.mark.parametrize("rest", [b'{"kind": "que', b"\xff\xfe{", b"[" * 100_000, b"{}\n[]\nnull\n3"])
+def test_a_line_that_was_cut_or_is_none_is_left_out(tmp_path, rest):
+    log = write_log(tmp_path / "log", ("query", query("a")), end=False)
+    with open(log, "ab") as handle:
+        handle.write(rest)
+    assert [each.name for each in read_flight(log).queries] == ["a"]
+
+
+def test_a_log_without_a_first_line_is_a_flight(tmp_path):
+    log = tmp_path / "log"
+    log.write_text(json.dumps({"kind": "query", "t_mono_s": 5.0} | query("a")) + "\n")
+    flight = read_flight(log)
+    assert (flight.start, len(flight.queries), flight.flights) == ({}, 1, 1)
+
+
+def test_values_of_a_wrong_type_are_unknown(tmp_path):
+    wrong = {
+        "located": {"lat_deg": 95.0, "lon_deg": 8.0},
+        "position": [1, 2],
+        "confidence": "high",
+        "costs": 3,
+        "totals": {"used_mah": 10**400},
+        "board": None,
+        "vehicle": {"lat_deg": True, "lon_deg": 8.0, "t_heard_s": None, "gps": "none"},
+        "reason": 7,
+        "place": 1e300,
+        "fix": "sent",
+    }
+    log = tmp_path / "log"
+    log.write_text(json.dumps({"kind": "query", "t_mono_s": 5.0} | query("a", **wrong)) + "\n")
+    (only,) = read_flight(log).queries
+    known = only.at, only.confidence, only.used_mah, only.autopilot_at, only.gps_at, only.place, only.fix
+    assert known == (None,) * 7
+
+
+def test_lines_of_note_are_kept_in_their_words(tmp_path):
+    lines = [
+        ("camera", {"said": "camera shows nothing"}),
+        ("gap", {"lost_lines": 3}),
+        ("unusable", {"problem": "cut short"}),
+        ("command", {"wish": "PAUSE", "said": "paused"}),
+        ("governor", {"from": {"rate_hz": 2, "form": "bits"}, "to": {"rate_hz": 1, "form": "bits"}, "why": "too hot"}),
+    ]
+    flight = read_flight(write_log(tmp_path / "log", *lines))
+    told = [(each.t_s, each.kind, each.said) for each in flight.remarks]
+    assert told == [
+        (1, "camera", "camera shows nothing"),
+        (2, "gap", "lost_lines 3"),
+        (4, "command", "paused"),
+        (5, "governor", "rate_hz 2 to 1: too hot"),
+    ]
+    assert flight.unusable == [3]
+
+
+def test_what_is_no_log_is_refused_in_a_sentence(tmp_path):
+    (tmp_path / "empty").touch()
+    with pytest.raises(EdgevprError, match="holds no line of a flight log"):
+        read_flight(tmp_path / "empty")
+    for missing in (tmp_path, tmp_path / "nothing", "/dev/zero"):
+        with pytest.raises(UsageError, match="there is no such flight log"):
+            read_flight(missing)

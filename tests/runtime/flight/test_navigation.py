@@ -1,0 +1,166 @@
+"""Navigation between fixes: with a true flight beside it, how wrong it is, and whether it knows."""
+
+import math
+
+import numpy as np
+import pytest
+from fakes import vehicle_at
+
+from edgevpr.core.geodesy import distance_m, moved, offset_m
+from edgevpr.core.types import Position
+from edgevpr.runtime.flight.filter import INERTIAL, RECKONED
+from edgevpr.runtime.flight.navigation import Navigation
+from edgevpr.runtime.flight.slew import Slew
+
+HOME = 47.0, 8.0
+STEP_S = 0.02
+
+
+class Flown:
+    """A flight in a wide circle whose autopilot has GPS until `loss_s`, then reckons with a wind that it does not know;
+    fixes of a standard deviation of `fix_sd_m` come once a second and are `late_s` late."""
+
+    def __init__(self, drift, *, wind=(0.0, 0.0), bias=(0.0, 0.0), map_off=(0.0, 0.0), fix_sd_m=2.0, late_s=0.4):
+        self.navigation = Navigation(drift, 5.0 if any(map_off) else 1.0)
+        self.rng = np.random.default_rng(7)
+        self.wind, self.bias, self.map_off = map(np.array, (wind, bias, map_off))
+        self.fix_sd_m, self.late_steps = fix_sd_m, round(late_s / STEP_S)
+        self.at_m, self.reckoned_m, self.step = np.zeros(2), np.zeros(2), 0
+        self.way = [self.at_m]
+        self.is_inertial = drift is INERTIAL
+
+    @property
+    def t_s(self):
+        return self.step * STEP_S
+
+    def velocity(self, t_s):
+        return 12 * np.array([math.sin(t_s / 20), math.cos(t_s / 20)])
+
+    def fly(self, seconds, *, has_gps=False, fixes=True):
+        """Fly on; return the errors of the navigation (N, 2) and what it says they are (N,), once a second."""
+        errors_m, said_m = [], []
+        for _ in range(round(seconds / STEP_S)):
+            self.step += 1
+            before, velocity = self.velocity(self.t_s - STEP_S), self.velocity(self.t_s)
+            self.at_m = self.at_m + STEP_S * (before + velocity) / 2
+            self.way.append(self.at_m)
+            self.reckoned_m = self.at_m if has_gps else self.reckoned_m + STEP_S * (velocity - self.wind)
+            if self.is_inertial:
+                felt = (velocity - before) / STEP_S + self.bias + self.rng.normal(0, 0.2, 2)
+                self.navigation.hear_acceleration(self.t_s, felt)
+            if self.step % 5 == 0:
+                said = {"has_gps": has_gps, "position_sd_m": 0.5 if has_gps else 20.0}
+                speed = tuple(velocity if has_gps else velocity - self.wind)
+                here = moved(*HOME, *self.reckoned_m)
+                self.navigation.hear_vehicle(vehicle_at(*here, self.t_s, velocity_m_s=speed, **said))
+            if self.step % 50 == 0 and self.step > self.late_steps:
+                if fixes:
+                    self.fix()
+                here = self.navigation.at(self.t_s)
+                off_m = offset_m(*HOME, here.position.lat_deg, here.position.lon_deg)
+                errors_m.append(np.array(off_m) - self.at_m)
+                said_m.append(here.accuracy_m)
+        return np.array(errors_m), np.array(said_m)
+
+    def fix(self, off_m=(0.0, 0.0), is_against=False):
+        t_s = (self.step - self.late_steps) * STEP_S
+        seen = self.way[self.step - self.late_steps] + self.map_off + self.rng.normal(0, self.fix_sd_m, 2) + off_m
+        expected = self.navigation.expected(t_s)
+        off = self.navigation.beside(Position(*moved(*HOME, *seen)), expected)
+        self.navigation.hear_fix(off, self.fix_sd_m**2 * np.eye(2), t_s, is_against)
+
+
+def lengths(errors_m):
+    return np.hypot(*errors_m.T)
+
+
+@pytest.mark.parametrize(
+    ("drift", "wrong"), [(RECKONED, {}), (RECKONED, {"wind": (6.0, 0.0)}), (INERTIAL, {"bias": (0.08, -0.05)})]
+)
+def test_fixes_hold_the_position_and_what_it_says_of_itself_is_true(drift, wrong):
+    flown = Flown(drift, **wrong)
+    flown.fly(60, has_gps=True)
+    errors_m, said_m = flown.fly(200)
+    assert np.median(lengths(errors_m)) < 2.0
+    assert lengths(errors_m).max() < 8.0
+    assert 0.58 <= (abs(errors_m) < said_m[:, None]).mean() <= 0.85
+    assert (abs(errors_m) < 2 * said_m[:, None]).mean() >= 0.9
+
+
+def test_without_fixes_it_knows_that_it_knows_less_and_less():
+    flown = Flown(RECKONED, wind=(2.0, 0.0))
+    flown.fly(20, has_gps=True)
+    errors_m, said_m = flown.fly(60, fixes=False)
+    assert all(np.diff(said_m) > 0)
+    assert (abs(errors_m) < 2 * said_m[:, None]).all()
+
+
+def test_a_wind_that_fixes_have_shown_carries_on_without_them():
+    flown = Flown(RECKONED, wind=(6.0, 0.0))
+    flown.fly(20, has_gps=True)
+    flown.fly(60)
+    assert flown.navigation.path_drift_m_s() == pytest.approx((6.0, 0.0), abs=1.0)
+    errors_m, said_m = flown.fly(10, fixes=False)
+    assert lengths(errors_m).max() < 12.0, "where 60 m have been added to the way"
+    assert (abs(errors_m) < 2.5 * said_m[:, None]).all()
+
+
+def test_what_all_fixes_are_off_by_is_learnt_while_there_is_gps():
+    flown = Flown(RECKONED, map_off=(4.0, -3.0))
+    flown.fly(120, has_gps=True)
+    errors_m, _ = flown.fly(60)
+    assert np.median(lengths(errors_m)) < 2.5, "and not 5 m"
+
+
+def test_one_that_is_believed_against_all_replaces_what_was_known():
+    flown = Flown(RECKONED)
+    flown.fly(20, has_gps=True)
+    flown.fix((300.0, 0.0), is_against=True)
+    here = flown.navigation.at(flown.t_s)
+    east_m, north_m = flown.at_m
+    truth = moved(*HOME, east_m + 300.0, north_m)
+    assert distance_m(here.position.lat_deg, here.position.lon_deg, *truth) < 8
+
+
+def test_a_silence_ends_what_is_known_until_the_vehicle_is_heard_with_a_position_again():
+    flown = Flown(RECKONED)
+    flown.fly(10, has_gps=True)
+    flown.step += 200
+    for _ in range(2):
+        flown.navigation.hear_vehicle(vehicle_at(*HOME, flown.t_s, velocity_m_s=(0.0, 0.0), position_sd_m=None))
+        assert flown.navigation.at(flown.t_s) is None
+        assert flown.navigation.expected(flown.t_s) is None
+    flown.navigation.hear_vehicle(vehicle_at(*HOME, flown.t_s, velocity_m_s=(0.0, 0.0), position_sd_m=30.0))
+    assert flown.navigation.at(flown.t_s).accuracy_m == pytest.approx(30.0)
+
+
+def test_by_accelerations_alone_it_begins_with_a_fix():
+    flown = Flown(INERTIAL)
+    assert flown.navigation.at(0.0) is None
+    flown.navigation.begin(Position(*HOME), 3.0, -1.0, 0.0)
+    assert flown.navigation.at(0.0).accuracy_m > 10, "nobody knows how fast it was"
+    errors_m, _ = flown.fly(60)
+    assert lengths(errors_m)[-20:].max() < 6.0
+
+
+def test_a_slewed_position_follows_at_once_and_catches_up_with_a_jump_slowly():
+    flown = Flown(RECKONED)
+    slew = Slew()
+    flown.fly(10, has_gps=True)
+    behind_m = [slew.followed(flown.navigation.at(flown.t_s))[2] for _ in range(2)]
+    assert behind_m == [0.0, 0.0]
+    flown.fix((30.0, 0.0), is_against=True)
+    last, steps_m, behind_m = None, [], []
+    for _ in range(150):
+        flown.fly(0.1, fixes=False)
+        here = flown.navigation.at(flown.t_s)
+        lat_deg, lon_deg, behind = slew.followed(here)
+        behind_m.append(behind)
+        if last:
+            steps_m.append(float(distance_m(*last, lat_deg, lon_deg)))
+        last = lat_deg, lon_deg
+    assert behind_m[0] > 20
+    assert behind_m[-1] == pytest.approx(0.0, abs=0.2)
+    assert max(steps_m) < 0.1 * (12 + 2 + 3), "its own speed, the catching up, and what the filter thinks of the speed"
+    slew.forget()
+    assert slew.followed(flown.navigation.at(flown.t_s))[2] == 0.0

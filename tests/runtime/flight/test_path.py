@@ -1,0 +1,75 @@
+"""A path: velocities or accelerations summed up, at any time of the last seconds."""
+
+import math
+
+import numpy as np
+import pytest
+
+from edgevpr.runtime.flight.path import KEPT_S, Path, over_ground
+
+
+def circled(t_s):
+    """Position and velocity on a circle of 100 m at 10 m/s."""
+    turn = t_s / 10
+    return 100 * np.array([math.sin(turn), 1 - math.cos(turn)]), 10 * np.array([math.cos(turn), math.sin(turn)])
+
+
+def test_velocities_add_up_to_the_way_that_was_flown():
+    path = Path()
+    path.start(0.0, circled(0.0)[1])
+    for step in range(1, 301):
+        assert path.fly(step / 10, circled(step / 10)[1]) == pytest.approx(0.1)
+    at_m, velocity_m_s = circled(30.0)
+    assert np.allclose(path.now.at_m, at_m, atol=0.05)
+    assert np.allclose(path.now.velocity_m_s, velocity_m_s)
+    between = path.at(27.34)
+    assert np.allclose(between.at_m, circled(27.34)[0], atol=0.05)
+    assert np.allclose(between.velocity_m_s, circled(27.34)[1], atol=0.05)
+
+
+def test_accelerations_add_up_to_velocity_and_way():
+    path = Path()
+    path.start(0.0, (3.0, 0.0))
+    for step in range(1, 101):
+        path.accelerate(step / 50, (0.0, 2.0))
+    assert np.allclose(path.now.velocity_m_s, (3.0, 4.0))
+    assert np.allclose(path.now.at_m, (6.0, 4.0))
+
+
+def test_only_the_last_seconds_are_kept_and_beyond_the_end_the_velocity_goes_on():
+    path = Path()
+    assert path.at(0.0) is None
+    path.start(0.0, (1.0, 0.0))
+    for step in range(1, 2001):
+        path.fly(step / 10, (1.0, 0.0))
+    assert path.at(200.0 - 2 * KEPT_S - 0.2) is None
+    assert np.allclose(path.at(200.0 - KEPT_S + 0.1).at_m, (200.0 - KEPT_S + 0.1, 0))
+    assert np.allclose(path.at(200.9).at_m, (200.9, 0))
+    assert path.at(201.1) is None
+
+
+def test_a_silence_breaks_a_path_until_it_is_started_again():
+    path = Path()
+    path.start(0.0, (1.0, 0.0))
+    path.fly(0.9, (1.0, 0.0))
+    assert not path.is_broken
+    assert path.fly(0.9, (1.0, 0.0)) == path.fly(0.5, (1.0, 0.0)) == 0.0, "no time has passed"
+    path.fly(2.5, (1.0, 0.0))
+    assert path.is_broken
+    path.start(3.0, (1.0, 0.0))
+    assert not path.is_broken
+
+
+@pytest.mark.parametrize("yaw_deg", [0.0, 77.0, -160.0])
+@pytest.mark.parametrize(("roll_deg", "pitch_deg"), [(0.0, 0.0), (30.0, 0.0), (0.0, -20.0), (-35.0, 12.0)])
+def test_what_accelerometers_feel_without_gravity_is_the_acceleration_over_the_ground(roll_deg, pitch_deg, yaw_deg):
+    roll, pitch, yaw = map(math.radians, (roll_deg, pitch_deg, yaw_deg))
+    about = {
+        "x": [[1, 0, 0], [0, math.cos(roll), -math.sin(roll)], [0, math.sin(roll), math.cos(roll)]],
+        "y": [[math.cos(pitch), 0, math.sin(pitch)], [0, 1, 0], [-math.sin(pitch), 0, math.cos(pitch)]],
+        "z": [[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0], [0, 0, 1]],
+    }
+    earth_from_body = np.array(about["z"]) @ about["y"] @ about["x"]
+    north, east, down = 1.2, -0.7, 0.3
+    felt = earth_from_body.T @ (np.array([north, east, down]) - [0, 0, 9.81])
+    assert np.allclose(over_ground(tuple(felt), roll_deg, pitch_deg, yaw_deg), (east, north))

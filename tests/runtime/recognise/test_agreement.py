@@ -1,0 +1,155 @@
+"""Agreement: its signs are those of a match of `cohog`, and pictures of other ground do not agree."""
+
+import cv2
+import numpy as np
+import pytest
+from pictures import textured
+
+from edgevpr.runtime.recognise.agreement import CONFIRMED, PROVEN, Expected, agreement, held_against, onto
+from edgevpr.runtime.recognise.landmarks import OF_QUERY, Landmarks, describe, packed, unpacked
+from edgevpr.techniques import create
+
+WIDE, HIGH = 640, 480
+
+
+@pytest.fixture(scope="module")
+def landscape():
+    """Ground with patches of all sizes, from which pictures are cut."""
+    rng = np.random.default_rng(7)
+    ground = sum(
+        cv2.normalize(cv2.GaussianBlur(rng.normal(size=(1200, 1600)), (0, 0), size), None, -1, 1, cv2.NORM_MINMAX)
+        for size in (2, 4, 8, 16)
+    )
+    return cv2.normalize(ground, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+
+
+def cut(landscape, x, y, up_deg=0.0, scale=1.0):
+    """A picture whose middle is at (x, y) of the landscape, from a camera that is turned clockwise by `up_deg` and
+    `scale` times as high."""
+    turn = np.deg2rad(up_deg)
+    # A pixel right in the picture is one right in the landscape, turned clockwise with the camera.
+    a, b = scale * np.cos(turn), scale * np.sin(turn)
+    middle = (WIDE - 1) / 2, (HIGH - 1) / 2
+    to_landscape = np.array(
+        [[a, -b, x - a * middle[0] + b * middle[1]], [b, a, y - b * middle[0] - a * middle[1]]], np.float64
+    )
+    return cv2.warpAffine(landscape, to_landscape, (WIDE, HIGH), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+
+
+def asked(image):
+    return describe(image, most=OF_QUERY)
+
+
+def kept(image):
+    return unpacked(packed(describe(image)))
+
+
+@pytest.mark.parametrize(
+    ("right_px", "down_px", "turned_deg", "scale"),
+    [(80, 0, 0, 1.0), (0, -60, 0, 1.0), (40, 30, 30, 1.0), (-50, 20, 315, 1.15), (10, -40, 180, 0.85)],
+)
+def test_the_signs_are_those_of_a_match_of_cohog(landscape, right_px, down_px, turned_deg, scale):
+    """The query's middle lies right of the place's by `right_px`, and below it by `down_px`."""
+    place = cut(landscape, 800, 600)
+    query = cut(landscape, 800 + right_px, 600 + down_px, turned_deg, scale)
+    found = agreement(asked(query), kept(place))
+    assert found.inliers >= PROVEN
+    assert np.array(found.shift_share) * WIDE == pytest.approx((right_px, down_px), abs=2)
+    assert abs((found.rotation_deg - turned_deg + 180) % 360 - 180) < 1
+    assert found.scale == pytest.approx(scale, rel=0.02)
+
+    cohog = create("cohog", {"camera": "nadir"})
+    match = cohog.match(cohog.encode(query), cohog.encode(place).fine)
+    assert abs((match.rotation_deg - turned_deg + 180) % 360 - 180) < 1
+    assert np.array(match.shift_cells) / 32 == pytest.approx(found.shift_share, abs=1.5 / 32)
+
+    expected = Expected((match.shift_cells[0] / 32, match.shift_cells[1] / 32), match.rotation_deg)
+    guided = held_against(asked(query), kept(place), expected)
+    assert guided.is_expected
+    assert guided.inliers >= PROVEN
+    assert guided.shift_share == pytest.approx(found.shift_share, abs=0.005)
+
+
+def test_the_covariance_holds_what_is_off(landscape):
+    query, place = cut(landscape, 860, 560, 20), cut(landscape, 800, 600)
+    found = agreement(asked(query), kept(place))
+    var_x, _, var_y = found.covariance_share2
+    off = np.array(found.shift_share) - (60 / WIDE, -40 / WIDE)
+    assert off @ off < 9 * (var_x + var_y) < 9 * 2 * (20 / WIDE) ** 2
+
+
+def test_landmarks_that_lie_otherwise_than_expected_are_not_taken_for_what_is(landscape):
+    query, place = asked(cut(landscape, 860, 560)), kept(cut(landscape, 800, 600))
+    wrong = Expected((-0.2, 0.1), 90.0)
+    assert agreement(query, place, wrong).inliers < CONFIRMED
+    found = held_against(query, place, wrong)
+    assert not found.is_expected
+    assert np.array(found.shift_share) * WIDE == pytest.approx((60, -40), abs=2)
+
+
+def test_what_stands_still_may_be_a_display(landscape):
+    place = cut(landscape, 800, 600)
+    assert agreement(asked(place), kept(place)).is_at_rest
+    assert not agreement(asked(cut(landscape, 830, 600)), kept(place)).is_at_rest
+
+
+def test_the_same_two_pictures_always_agree_alike(landscape):
+    query, place = asked(cut(landscape, 860, 560, 20)), kept(cut(landscape, 800, 600))
+    assert len({agreement(query, place) for _ in range(3)}) == 1
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_pictures_of_other_ground_do_not_agree(landscape, seed):
+    other = textured(100 + seed, HIGH, WIDE)
+    expected = Expected((0.05 * (seed % 3), -0.05), 15.0 * seed)
+    found = held_against(asked(other), kept(cut(landscape, 800, 600)), expected)
+    assert found.inliers < CONFIRMED
+    assert found.is_expected
+
+
+def test_a_pattern_that_repeats_itself_raises_nothing():
+    board = np.kron(np.indices((24, 32)).sum(axis=0) % 2, np.ones((20, 20))).astype(np.uint8) * 255
+    for expected in (None, Expected((0.03, 0.0), 0.0), Expected((0.0, 0.0), 45.0, 1.2)):
+        assert agreement(asked(board), kept(board), expected).inliers >= 0
+
+
+def test_pictures_with_hardly_any_landmarks_do_not_agree(landscape):
+    place = kept(cut(landscape, 800, 600))
+    for count in range(4):
+        few = Landmarks(place.points[:count], place.angle_deg[:count], place.size[:count], place.bits[:count])
+        assert agreement(few, place).inliers <= count
+        assert agreement(place, few, Expected((0.0, 0.0), 0.0)).inliers <= count
+
+
+def test_landmarks_all_on_one_spot_do_not_agree(landscape):
+    """What a damaged map may hold."""
+    place = kept(cut(landscape, 800, 600))
+    heap = Landmarks(np.zeros_like(place.points), place.angle_deg, np.zeros_like(place.size), place.bits)
+    for expected in (None, Expected((0.0, 0.0), 0.0)):
+        assert agreement(asked(cut(landscape, 800, 600)), heap, expected).inliers < CONFIRMED
+        assert agreement(heap, place, expected).inliers < CONFIRMED
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        ((840, 600, 0, 1.0), (760, 580, 0, 1.0)),
+        ((840, 600, 40, 1.0), (760, 620, 300, 1.0)),
+        ((830, 580, 20, 1.2), (790, 620, 90, 0.9)),
+    ],
+)
+def test_how_two_places_lie_on_each_other_follows_from_one_query_on_both(landscape, one, other):
+    query = asked(cut(landscape, 800, 600, 10))
+    first, second = cut(landscape, *one), cut(landscape, *other)
+    ways = []
+    for place in (first, second):
+        found = agreement(query, kept(place))
+        ways.append(Expected(found.shift_share, found.rotation_deg, found.scale))
+    truth, told = agreement(asked(first), kept(second)), onto(*ways)
+    assert truth.inliers >= PROVEN
+    assert told.shift_share == pytest.approx(truth.shift_share, abs=0.01)
+    assert abs((told.rotation_deg - truth.rotation_deg + 180) % 360 - 180) < 1.5
+    assert told.scale == pytest.approx(truth.scale, rel=0.03)
+    assert agreement(kept(first), kept(second), told).inliers >= CONFIRMED
+    unscaled = onto(Expected(ways[0].shift_share, ways[0].rotation_deg), ways[1])
+    assert unscaled.scale is None, "where one height is unknown, that of both is"

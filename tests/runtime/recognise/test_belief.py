@@ -1,0 +1,339 @@
+"""The belief of a flight: what one query says, what a history adds, and what it must never add."""
+
+import numpy as np
+import pytest
+
+from edgevpr.runtime.recognise.belief import MOST, Belief
+from edgevpr.runtime.recognise.motion import moved
+from edgevpr.runtime.recognise.seen import Ground, Seen
+
+PLACES, SPACING_M = 100, 20.0
+IN_ORDER = Ground(spacing=1.0, near=2.0, is_ordinal=True)
+IN_METRES = Ground(spacing=SPACING_M, near=30.0)
+STEP = moved(1.0, 1.0, 3.0)  # within three places of the query before
+SURE = 0.999
+
+
+def seen(at, p, sd=0.5, heading_deg=np.nan):
+    """Evidence for positions `at` (K, 2), or (K,) in a map of places in order."""
+    at = np.asarray(at, float)
+    at = np.column_stack([at, np.zeros(len(at))]) if at.ndim == 1 else at
+    return Seen(
+        p=np.asarray(p, float),
+        at=at,
+        covariance=np.tile(sd**2 * np.eye(2), (len(at), 1, 1)),
+        heading_deg=np.full(len(at), heading_deg),
+    )
+
+
+def view_of(place, rng, p=0.8, clutter=8):
+    """What a query over a place says: it and its neighbours, and some places elsewhere."""
+    near = round(place) + np.array([-1, 0, 1])
+    near = near[(near >= 0) & (near < PLACES)]
+    elsewhere = rng.choice(PLACES, clutter, replace=False)
+    shares = np.exp(-abs(near - place))
+    weak = rng.random(clutter)
+    return seen([*near, *elsewhere], [*(p * shares / shares.sum()), *(0.5 * (1 - p) * weak / weak.sum())])
+
+
+def view_of_nothing(rng, clutter=10):
+    """What a query over ground that is not in the map says: a little of everything."""
+    p = rng.random(clutter) * rng.choice([0.05, 0.2])
+    return seen(rng.choice(PLACES, clutter, replace=False), p / clutter)
+
+
+def fly(belief, places, rng, p=0.8):
+    return [belief.update(view_of(place, rng, p), STEP, PLACES) for place in places]
+
+
+def is_at(posterior, place):
+    return posterior.estimate is not None and abs(posterior.estimate.at[0] - place) <= 2
+
+
+@pytest.mark.parametrize("ground", [IN_ORDER, IN_METRES])
+@pytest.mark.parametrize("total", [0.0, 0.2, 0.9, 0.999])
+def test_a_query_without_history_is_believed_as_it_stands(ground, total):
+    rng = np.random.default_rng(1)
+    p = rng.random(40)
+    query = seen(rng.uniform(0, 2000, (40, 2)), total * p / p.sum())
+    posterior = Belief(ground).update(query, STEP, 3000)
+    np.testing.assert_allclose(posterior.p, query.p, atol=1e-12)
+    assert posterior.lost == pytest.approx(1 - total)
+
+
+@pytest.mark.parametrize("start", ["lost", "known"])
+def test_one_query_says_no_more_than_it_says_alone_where_it_fits_no_history(start):
+    rng, belief = np.random.default_rng(1), Belief(IN_ORDER)
+    for n in range(10):
+        belief.update(view_of_nothing(rng) if start == "lost" else view_of(10 + n, rng), STEP, PLACES)
+    assert belief.update(seen([80], [0.9]), STEP, PLACES).mass < 0.9
+
+
+@pytest.mark.parametrize("speed", [0.5, 1, 2, -0.5, -1, -2])
+def test_queries_that_fit_each_other_say_more_than_each_alone(speed):
+    places = (20 if speed > 0 else 80) + speed * np.arange(25)
+    posteriors = fly(Belief(IN_ORDER), places, np.random.default_rng(2))
+    assert max(each.mass for each in posteriors) >= SURE
+    assert all(each.mass > 0.99 for each in posteriors[12:])
+    assert all(is_at(each, place) for each, place in zip(posteriors, places, strict=True))
+    assert posteriors[0].mass < 0.85
+
+
+def test_stops_and_a_turn_back_do_not_lose_it():
+    places = [*range(20, 40), *[39] * 10, *range(39, 20, -1)]
+    posteriors = fly(Belief(IN_ORDER), places, np.random.default_rng(3), p=0.95)
+    assert all(is_at(each, place) for each, place in zip(posteriors, places, strict=True))
+    assert all(each.mass > 0.9 for each in posteriors[3:])
+
+
+def test_between_two_places_that_look_alike_the_way_there_decides():
+    belief = Belief(IN_ORDER)
+    for n in range(12):
+        before, after = belief.update(seen([10 + n], [0.8]), STEP, PLACES), None
+    for n in range(12, 15):
+        after = belief.update(seen([10 + n, 70 + n], [0.48, 0.48]), STEP, PLACES)
+    assert before.mass > 0.99
+    assert after.mass > 0.99
+    assert is_at(after, 24)
+
+
+def test_it_recovers_from_a_jump_within_ten_queries():
+    rng, belief = np.random.default_rng(4), Belief(IN_ORDER)
+    fly(belief, range(10, 30), rng)
+    posteriors = fly(belief, range(70, 80), rng, p=0.9)
+    wrong = [each for each, place in zip(posteriors, range(70, 80), strict=True) if not is_at(each, place)]
+    assert all(each.mass < SURE for each in wrong)
+    assert posteriors[-1].mass >= SURE
+    assert is_at(posteriors[-1], 79)
+
+
+def test_it_is_lost_within_five_queries_after_leaving_the_map():
+    rng, belief = np.random.default_rng(5), Belief(IN_ORDER)
+    assert fly(belief, range(10, 40), rng)[-1].mass >= SURE
+    away = [belief.update(view_of_nothing(rng), STEP, PLACES) for _ in range(40)]
+    assert max(each.mass for each in away) < SURE
+    assert all(each.lost > 0.5 for each in away[4:])
+    back = fly(belief, range(60, 70), rng, p=0.9)
+    assert back[-1].mass >= SURE
+    assert is_at(back[-1], 69)
+
+
+@pytest.mark.parametrize("p", [0.3, 0.6, 0.9])
+def test_a_hover_over_what_looks_alike_says_what_one_look_says(p):
+    belief = Belief(IN_ORDER)
+    masses = [belief.update(seen([50], [p]), STEP, PLACES).mass for _ in range(300)]
+    assert max(masses) <= p + 1e-9
+
+
+@pytest.mark.parametrize("ground", [IN_ORDER, IN_METRES])
+@pytest.mark.parametrize("p", [0.9, 0.9999])
+def test_a_hover_does_not_wear_out_what_is_known(ground, p):
+    belief = Belief(ground)
+    for _ in range(300):
+        posterior = belief.update(seen([50], [p]), STEP, PLACES)
+        assert p - 0.1 < posterior.mass <= p + 1e-9
+    assert posterior.p[0] > 0.6
+
+
+@pytest.mark.parametrize("ground", [IN_ORDER, IN_METRES])
+def test_a_hover_whose_looks_differ_is_no_flight_either(ground):
+    rng, belief = np.random.default_rng(13), Belief(ground)
+    for _ in range(300):
+        posterior = belief.update(seen([50, 80], [rng.uniform(0.3, 0.9), 0.05]), STEP, PLACES)
+        assert posterior.mass < 0.93
+
+
+def test_during_a_hover_the_newest_look_replaces_the_one_before():
+    belief = Belief(IN_ORDER)
+    for p in (0.9, 0.2, 0.6):
+        mass = belief.update(seen([50], [p]), STEP, PLACES).mass
+    assert 0.2 < mass < 0.65
+    assert belief.update(seen([50], [0.1]), STEP, PLACES).mass < 0.35
+
+
+def test_during_a_hover_a_likelier_place_does_not_win_by_repetition():
+    belief = Belief(IN_ORDER)
+    masses = [belief.update(seen([20, 80], [0.55, 0.4]), STEP, PLACES).mass for _ in range(50)]
+    assert max(masses) < 0.6
+
+
+def test_a_hover_whose_best_place_changes_with_its_neighbours_is_no_flight():
+    rng, belief = np.random.default_rng(6), Belief(IN_ORDER)
+    masses = [belief.update(seen([50 + rng.integers(-1, 2)], [0.9]), STEP, PLACES).mass for _ in range(100)]
+    assert max(masses) < SURE
+
+
+@pytest.mark.parametrize("p", [0.05, 0.2, 0.4])
+@pytest.mark.parametrize("places", [100, 10_000])
+def test_foreign_ground_that_is_a_little_like_the_map_all_the_way_is_not_believed(p, places):
+    belief = Belief(IN_ORDER)
+    masses = [belief.update(seen([10 + n], [p]), STEP, places).mass for n in range(80)]
+    assert max(masses) < SURE
+
+
+def test_a_picture_that_says_nothing_only_lets_time_pass():
+    rng, belief = np.random.default_rng(7), Belief(IN_ORDER)
+    known = fly(belief, range(10, 30), rng)[-1]
+    dark = belief.update(None, STEP, PLACES)
+    assert known.mass > dark.mass > 0.9
+    assert len(dark.p) == 0
+    assert Belief(IN_ORDER).update(None, STEP, PLACES).lost == 1
+
+
+def over(track_m, belief, odometry, p=0.8):
+    """Fly over a track (N, 2) in metres; `odometry` makes what it reports from each true step."""
+    posteriors = []
+    for n, at in enumerate(track_m):
+        said = odometry(at - track_m[n - 1]) if n else None
+        beside = at + np.array([300.0 * np.cos(7 * n), 300.0 * np.sin(7 * n)])
+        query = seen([at, beside], [p, (1 - p) / 2], sd=4.0, heading_deg=350.0 if n % 2 else 10.0)
+        posteriors.append(belief.update(query, moved(1.0, 1.0, 40.0, said), PLACES))
+    return posteriors
+
+
+LIES = {
+    "none": lambda step: None,
+    "true": tuple,
+    "twice": lambda step: tuple(2 * step),
+    "half": lambda step: tuple(step / 2),
+    "stopped": lambda step: (0.0, 0.0),
+    "NaN": lambda step: (np.nan, np.nan),
+    "infinite": lambda step: (np.inf, 0.0),
+    "jumps": lambda step: (1e6, -1e6),
+}
+
+
+@pytest.mark.parametrize("odometry", LIES.values(), ids=LIES)
+@pytest.mark.parametrize("speed_m", [5.0, 20.0, 40.0])
+def test_odometry_helps_and_its_lies_do_not_mislead(odometry, speed_m):
+    track_m = speed_m * np.column_stack([np.arange(30), 0.3 * np.arange(30)])
+    posteriors = over(track_m, Belief(IN_METRES), odometry)
+    off_m = [np.hypot(*(each.estimate.at - at)) for each, at in zip(posteriors, track_m, strict=True)]
+    assert max(off_m) < SPACING_M
+    assert posteriors[-1].mass > 0.99
+    assert posteriors[-1].lost < 0.01
+
+
+def test_heading_and_covariance_are_those_of_what_is_near():
+    track_m = 20.0 * np.column_stack([np.arange(10), np.arange(10)])
+    estimate = over(track_m, Belief(IN_METRES), tuple)[-1].estimate
+    assert estimate.heading_deg == pytest.approx(350, abs=1)
+    sd_m = np.sqrt(np.linalg.eigvalsh(estimate.covariance))
+    assert 2 < sd_m[0] <= sd_m[1] < 15
+    assert Belief(IN_ORDER).update(seen([3], [0.5]), STEP, 9).estimate.heading_deg is None
+
+
+def test_tracks_that_cross_are_told_apart():
+    places_m = 20.0 * np.array([[n, 0] for n in range(-10, 11)] + [[0, n] for n in range(-10, 11)])
+    belief, by = Belief(IN_METRES), moved(1.0, 1.0, 40.0, (0.0, 20.0))
+    for n in range(21):
+        # The other track looks the same, place for place.
+        posterior = belief.update(seen(places_m[[n, 21 + n]], [0.4, 0.55], sd=4.0), by, len(places_m))
+    np.testing.assert_allclose(posterior.estimate.at, [0, 200], atol=5)
+    assert posterior.mass > 0.99
+
+
+@pytest.mark.parametrize("elapsed_s", [-5.0, 0.0, float("nan"), float("inf"), 1e12, None])
+def test_a_clock_that_goes_back_or_jumps_does_not_mislead(elapsed_s):
+    rng, belief = np.random.default_rng(8), Belief(IN_ORDER)
+    fly(belief, range(10, 30), rng)
+    after = belief.update(view_of(30, rng), moved(elapsed_s, 1.0, 3.0), PLACES)
+    assert after.mass < SURE or is_at(after, 30)
+    posteriors = fly(belief, range(31, 41), rng, p=0.9)
+    assert posteriors[-1].mass >= SURE
+    assert is_at(posteriors[-1], 40)
+
+
+def test_after_a_long_gap_it_may_be_anywhere():
+    rng, belief = np.random.default_rng(9), Belief(IN_ORDER)
+    fly(belief, range(10, 30), rng)
+    after = belief.update(seen([90], [0.8]), moved(600.0, 1.0, 3.0), PLACES)
+    assert is_at(after, 90)
+    assert after.mass > 0.7
+
+
+def test_a_map_may_grow_meanwhile():
+    rng, belief = np.random.default_rng(10), Belief(IN_ORDER)
+    posteriors = [belief.update(view_of(place, rng), STEP, 40 + 30 * place) for place in range(10, 30)]
+    assert posteriors[-1].mass >= SURE
+    assert is_at(posteriors[-1], 29)
+
+
+def test_a_map_of_one_place():
+    belief = Belief(IN_ORDER)
+    assert belief.update(seen([0], [0.9]), STEP, 1).mass == pytest.approx(0.9)
+    assert [belief.update(seen([0], [0.01]), STEP, 1).mass for _ in range(3)][-1] < 0.1
+    assert all(belief.update(seen([0], [0.9]), STEP, 1).mass < 0.95 for _ in range(50))
+
+
+def test_where_all_places_look_the_same_none_is_believed():
+    belief = Belief(IN_ORDER)
+    for _ in range(60):
+        posterior = belief.update(seen(np.arange(50), np.full(50, 0.98 / 50)), STEP, 50)
+        assert posterior.mass < 0.6
+
+
+BAD = {
+    "NaN": (np.nan, np.nan, np.nan),
+    "infinite": (np.inf, np.inf, np.inf),
+    "huge": (1e300, 1e300, 1e300),
+    "negative": (-1.0, 0.0, -1.0),
+    "sure beyond 1": (3.0, 50.0, 1.0),
+    "without room": (0.5, 50.0, 0.0),
+    "tiny": (1e-320, 50.0, 1e-300),
+}
+
+
+@pytest.mark.parametrize("bad", BAD.values(), ids=BAD)
+def test_numbers_that_make_no_sense_pass(bad):
+    rng, (p, at, variance) = np.random.default_rng(11), bad
+    belief = Belief(IN_METRES)
+    for n in range(20):
+        query = Seen(
+            p=np.array([0.5, p]),
+            at=np.array([[20.0 * n, 0.0], [at, at]]),
+            covariance=np.array([25 * np.eye(2), np.full((2, 2), variance)]),
+            heading_deg=np.array([p, at]),
+        )
+        posterior = belief.update(query, STEP if rng.random() < 0.5 else moved(1.0, 1.0, 30.0, (p, at)), 50)
+        estimate = posterior.estimate
+        assert all(np.isfinite(each).all() for each in (posterior.p, posterior.lost, estimate.at, estimate.covariance))
+        assert 0 <= posterior.lost <= 1
+        assert 0 <= posterior.mass <= 1 + 1e-9
+        assert np.linalg.eigvalsh(estimate.covariance)[0] > 0
+
+
+def test_memory_is_bounded_whatever_the_map_and_the_flight():
+    rng, belief = np.random.default_rng(12), Belief(IN_METRES)
+    for _ in range(100):
+        count = int(rng.integers(0, 300))
+        query = seen(rng.uniform(-1e4, 1e4, (count, 2)), rng.random(count) / 300, sd=5.0)
+        posterior = belief.update(query, moved(1.0, 1.0, 30.0), 10_000)
+        assert len(posterior.p) == count
+        assert posterior.p.sum() + posterior.lost <= 1 + 1e-9
+    assert belief.nbytes <= MOST * 14 * 8
+
+
+def some(rng, count, scale):
+    """Any evidence at all, a tenth of it spoilt."""
+    p = rng.random(count) ** rng.choice([1, 30])
+    at = rng.normal(size=(count, 2)) * scale + rng.choice([0, 1e6])
+    root = rng.normal(size=(count, 2, 2)) * rng.choice([0, 1e-6, 1, 1e10])
+    covariance = root @ root.transpose(0, 2, 1)
+    for each in (p, at, covariance):
+        if each.size and rng.random() < 0.1:
+            each.flat[rng.integers(each.size)] = rng.choice([np.nan, np.inf, -np.inf, 1e300, -1])
+    return Seen(p=p, at=at, covariance=covariance, heading_deg=rng.choice([np.nan, 10, np.inf], count))
+
+
+@pytest.mark.parametrize("ground", [IN_ORDER, IN_METRES])
+@pytest.mark.parametrize("places", [1, 1000, 10**6])
+def test_any_numbers_at_all_pass(ground, places):
+    rng, belief = np.random.default_rng(places), Belief(ground)
+    for _ in range(200):
+        query = some(rng, int(rng.integers(0, 60)), rng.choice([0, 1, 100, 1e7]))
+        velocity = rng.choice([0, 1, -3, np.nan, 1e9, np.inf], 2).tolist()
+        elapsed_s = float(rng.choice([1, 1e-9, -1, np.nan, 1e6, 1e12]))
+        posterior = belief.update(query, moved(elapsed_s, 1.0, float(rng.choice([3, 1e5])), tuple(velocity)), places)
+        assert np.isfinite([*posterior.p, posterior.lost, posterior.mass]).all()
+        assert posterior.estimate is None or np.linalg.eigvalsh(posterior.estimate.covariance)[0] > 0

@@ -1,0 +1,74 @@
+"""Staticity: boxes of detectors as a mask over the picture."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("onnx", reason="the test networks are written with onnx (pip install onnx)")
+
+from tiny_detectors import CELLS, write_detector
+
+from edgevpr.core.errors import ModelError
+from edgevpr.runtime.recognise.detector import open_detector
+
+PICTURE = np.full((128, 256), 90, np.uint8)
+
+
+@pytest.fixture
+def opened(tmp_path, monkeypatch):
+    monkeypatch.setenv("EDGEVPR_MODELS", str(tmp_path))
+
+    def open_it(*args, **kwargs):
+        write_detector(tmp_path, *args, **kwargs)
+        return open_detector("tiny")
+
+    return open_it
+
+
+def test_only_the_boxes_of_dynamic_classes_are_taken_out(opened):
+    static = opened([(16, 8, 32, 24, 2), (40, 40, 60, 60, 3)]).is_static(PICTURE)
+    wanted = np.ones_like(static)
+    wanted[16:48, 64:128] = False  # the picture is twice as high and four times as wide as the input
+    assert np.array_equal(static, wanted)
+
+
+def test_a_padded_picture_has_its_boxes_where_they_are(opened):
+    static = opened([(16, 8, 32, 24, 0)], pad=114).is_static(PICTURE)  # 64 x 32 of the input show the picture
+    wanted = np.ones_like(static)
+    wanted[32:96, 64:128] = False
+    assert np.array_equal(static, wanted)
+
+
+def test_boxes_that_reach_beyond_the_picture_are_clipped(opened):
+    static = opened([(-500, -500, 32, 32, 2), (60, 60, 900, 900, 2), (-90, -90, -80, -80, 2)]).is_static(PICTURE)
+    assert not static[:64, :128].any()
+    assert not static[120:, 240:].any()
+    assert static[64:120].all()
+    assert static[:64, 128:].all()
+
+
+def test_a_wide_view_is_looked_at_in_tiles_and_what_is_too_long_to_move_counts_as_ground(opened):
+    detector = opened([(16, 16, 32, 32, 2)])
+    assert [detector.tiles(width_m) for width_m in (None, 5, 12, 20, 30, 4000)] == [1, 1, 1, 2, 3, 4]
+    static = detector.is_static(PICTURE, 20.0)
+    assert not static[:64, :128].all()  # found in every tile
+    assert not static[64:, 128:].all()
+    assert detector.is_static(PICTURE, 400.0).all()  # a box would be 30 m long
+
+
+@pytest.mark.parametrize(
+    ("raw", "complaint"),
+    [
+        (np.full((1, CELLS, 9), np.nan, np.float32), "not finite"),
+        (np.zeros((1, CELLS, 6), np.float32), "not those of a `yolox` detector"),
+        (np.zeros((1, 7, 9), np.float32), "not those of a `yolox` detector"),
+    ],
+)
+def test_a_detector_that_cannot_be_used_is_refused_in_one_sentence(opened, raw, complaint):
+    with pytest.raises(ModelError, match=complaint) as refused:
+        opened(raw=raw)
+    assert "\n" not in str(refused.value)
+
+
+def test_the_card_of_another_network_is_no_detector(monkeypatch):
+    with pytest.raises(ModelError, match="is of no detector"):
+        open_detector("calc")

@@ -1,0 +1,89 @@
+"""Landmarks: where they lie, what they are packed into, and pictures that have none."""
+
+import numpy as np
+import pytest
+from pictures import textured
+
+from edgevpr.places.rows import MOST_LANDMARK_BYTES
+from edgevpr.runtime.recognise.landmarks import OF_PLACE, OF_QUERY, describe, packed, unpacked
+
+
+@pytest.fixture(scope="module")
+def ground():
+    return textured(1, 480, 640)
+
+
+def test_they_are_spread_over_the_picture_and_lie_about_its_middle(ground):
+    found = describe(ground)
+    assert 100 < len(found) <= OF_PLACE < len(describe(ground, most=OF_QUERY))
+    assert (np.abs(found.points) <= (0.5, 0.375)).all()
+    for side in (found.points[:, 0] < 0, found.points[:, 0] > 0, found.points[:, 1] < 0, found.points[:, 1] > 0):
+        assert np.mean(side) > 0.2
+    at_px = found.points * 640 + (319.5, 239.5)
+    assert len(np.unique(np.rint(at_px / 3), axis=0)) == len(found), "a corner counts once, on whatever level"
+
+
+def test_the_number_of_pixels_of_a_camera_does_not_matter(ground):
+    small = describe(np.ascontiguousarray(ground.repeat(2, axis=0).repeat(2, axis=1)))
+    one = {tuple(point) for point in np.rint(describe(ground).points * 100).tolist()}
+    other = {tuple(point) for point in np.rint(small.points * 100).tolist()}
+    assert len(one & other) > 0.6 * len(one)
+
+
+def test_none_touches_what_the_mask_leaves_out(ground):
+    mask = np.ones(ground.shape, bool)
+    mask[:, 300:] = False
+    found = describe(ground, mask)
+    assert len(found) > 30
+    assert found.points[:, 0].max() * 640 + 319.5 < 300 - 15
+
+
+def test_they_come_back_as_they_were_packed_and_fit_into_a_place(ground):
+    found = describe(ground)
+    blob = packed(found)
+    assert len(blob) <= MOST_LANDMARK_BYTES
+    again = unpacked(blob)
+    assert again.points == pytest.approx(found.points, abs=1e-5)
+    assert again.size == pytest.approx(found.size, abs=6e-4)
+    assert np.abs((again.angle_deg - found.angle_deg + 180) % 360 - 180).max() < 0.71
+    assert (again.bits == found.bits).all()
+
+
+def test_a_place_without_landmarks_is_packed_too():
+    assert len(unpacked(packed(describe(np.zeros((48, 64), np.uint8))))) == 0
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda blob: b"",
+        lambda blob: blob[:2],
+        lambda blob: blob[:-1],
+        lambda blob: blob + b"x",
+        lambda blob: b"\x09" + blob[1:],
+    ],
+    ids=["empty", "short header", "cut", "longer", "newer form"],
+)
+def test_what_is_damaged_is_said_to_be(ground, spoil):
+    with pytest.raises(ValueError, match="its landmarks"):
+        unpacked(spoil(packed(describe(ground))))
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        np.zeros((1, 1), np.uint8),
+        np.zeros((1, 640), np.uint8),
+        np.full((3, 2, 3), 255, np.uint8),
+        np.full((480, 640), 127, np.uint8),
+        np.zeros((480, 640, 3), np.uint8),
+    ],
+    ids=["one pixel", "a line", "tiny", "flat", "black"],
+)
+def test_a_picture_without_corners_has_none(image):
+    found = describe(image)
+    assert (len(found), found.points.shape, found.bits.shape) == (0, (0, 2), (0, 32))
+
+
+def test_a_picture_that_is_masked_as_a_whole_has_none(ground):
+    assert len(describe(ground, np.zeros(ground.shape, bool))) == 0

@@ -1,0 +1,158 @@
+"""The three maps, their scores, and what passes the gate."""
+
+import numpy as np
+import pytest
+
+from edgevpr.core.types import Salience
+from edgevpr.frames.opencv import cv2
+from edgevpr.runtime.recognise.salience_gate import MOST_ENTROPY, Gate, Thresholds, best_of, worth_of
+from edgevpr.runtime.recognise.salience_maps import Maps, maps_of, scores_of
+
+RNG = np.random.default_rng(5)
+
+
+class Half:
+    """A network that finds the left of a picture memorable."""
+
+    def matrix(self, image):
+        return np.repeat(np.array([[1.0, 1.0, 0.5, 0.0, 0.0]], np.float32), 5, axis=0)
+
+
+def texture(height=120, width=160, spread=40.0, middle=128.0):
+    fine = cv2.GaussianBlur(RNG.normal(0, 1, (height, width)), (0, 0), 1.5)
+    return np.clip(middle + spread * fine / fine.std(), 0, 255).astype(np.uint8)
+
+
+def literal_entropy(grey, radius=5):
+    """The algorithm printed in thesis 3.2.3, disc by disc."""
+    height, width = grey.shape
+    entropy = np.zeros(grey.shape)
+    for y in range(height):
+        for x in range(width):
+            bins = {
+                grey[v, u]
+                for v in range(max(0, y - radius), min(height, y + radius + 1))
+                for u in range(max(0, x - radius), min(width, x + radius + 1))
+                if (v - y) ** 2 + (u - x) ** 2 <= radius**2
+            }
+            entropy[y, x] = np.log2(len(bins)) / 8
+    return entropy
+
+
+def test_the_entropy_map_is_that_of_the_thesis():
+    grey = texture(40, 50)
+    assert maps_of(grey, None, None).entropy == pytest.approx(literal_entropy(grey), abs=1e-6)
+
+
+def test_scores_are_means_over_the_whole_picture_and_masked_pixels_count_as_nothing():
+    picture = texture()
+    static = np.ones(picture.shape, bool)
+    static[:, 120:] = False
+    maps = maps_of(picture, Half(), static)
+    scores = scores_of(maps)
+    assert scores.staticity == pytest.approx(0.75)
+    assert scores.memorability == pytest.approx(maps.memorability[:, :120].sum() / picture.size, abs=1e-6)
+    assert scores.entropy == pytest.approx(maps.entropy[:, :120].sum() / picture.size, abs=1e-6)
+    alone = scores_of(maps_of(picture, None, None))
+    assert (alone.memorability, alone.staticity) == (None, None)
+    assert alone.entropy > scores.entropy
+
+
+def test_between_the_crops_the_memorability_is_interpolated():
+    across = maps_of(texture(), Half(), None).memorability[60]
+    assert np.all(np.diff(across) <= 1e-6)
+    assert (across[16], across[80], across[-16]) == pytest.approx((1.0, 0.5, 0.0), abs=0.02)
+
+
+def test_a_large_picture_and_one_of_a_single_pixel_have_maps():
+    assert max(maps_of(np.zeros((900, 1200, 3), np.uint8), Half(), None).entropy.shape) == 320
+    assert maps_of(np.zeros((1, 700), np.uint8), None, None).entropy.shape == (1, 320)
+    assert scores_of(maps_of(np.zeros((1, 1), np.uint8), None, None)).entropy == 0
+
+
+def test_no_picture_has_more_entropy_than_its_disc_has_pixels():
+    assert scores_of(maps_of(RNG.integers(0, 256, (200, 200), np.uint8), None, None)).entropy < MOST_ENTROPY < 0.793
+
+
+@pytest.mark.parametrize(
+    ("thresholds", "lacks"),
+    [
+        (Thresholds(0.5, 0.6, 0.4), None),
+        (Thresholds(0.51, 0.6, 0.4), "memorability"),
+        (Thresholds(0.5, 0.95, 0.4), "staticity"),
+        (Thresholds(0.5, 0.6, 0.7), "entropy"),
+        (Thresholds(0.51, 0.95, 0.7), "entropy"),  # the one that is farthest below
+        (Thresholds(0, 0, 0), None),
+    ],
+)
+def test_all_criteria_that_are_on_must_hold(thresholds, lacks):
+    worth = worth_of(Salience(0.5, 0.9, 0.5), thresholds)
+    assert worth.lacks == lacks
+    assert (worth.reason is None) == (lacks is None) == (worth.short_by == 0)
+
+
+def test_a_score_that_was_not_looked_at_is_not_asked_for():
+    assert worth_of(Salience(None, None, 0.5), Thresholds(0.9, 0.9, 0.4)).reason is None
+
+
+def test_in_bad_light_less_entropy_is_asked_for():
+    day = [texture() for _ in range(40)]
+    night = [(picture * 0.04).astype(np.uint8) for picture in day]
+    by_day, at_night = Gate(Thresholds(entropy=0.4)), Gate(Thresholds(entropy=0.4))
+    assert all(by_day.look(picture).reason is None for picture in day)
+    passed = [at_night.look(picture).reason is None for picture in night]
+    assert sum(passed) >= 36
+    assert at_night.look(np.full((120, 160), 3, np.uint8)).lacks == "entropy"
+
+
+def test_while_nothing_is_known_of_the_light_half_of_the_threshold_is_enough():
+    gate = Gate(Thresholds(entropy=0.4))
+    little = texture()
+    while not 0.2 < scores_of(maps_of(little, None, None)).entropy < 0.4:
+        little = (little * 0.8).astype(np.uint8)
+    assert [gate.look(little).reason for _ in range(4)] == [None] * 4
+    assert all(gate.look(np.full((120, 160), 3, np.uint8)).lacks == "entropy" for _ in range(3))
+
+
+def test_a_long_stretch_without_information_does_not_become_usual():
+    gate = Gate(Thresholds(entropy=0.4))
+    for _ in range(30):
+        assert gate.look(texture()).reason is None
+    empty = np.full((120, 160), 77, np.uint8)
+    assert all(gate.look(empty).lacks == "entropy" for _ in range(70))
+
+
+def test_a_picture_of_one_colour_passes_no_gate_of_entropy():
+    gate = Gate(Thresholds(entropy=0.4))
+    for _ in range(12):
+        gate.look(texture())
+    assert gate.look(np.full((120, 160), 77, np.uint8)).lacks == "entropy"
+
+
+def test_the_detector_looks_at_every_kth_frame_only():
+    class Counting:
+        looks = 0
+
+        def is_static(self, image, footprint_m):
+            self.looks += 1
+            return np.ones(image.shape[:2], bool)
+
+    detector = Counting()
+    gate = Gate(Thresholds(staticity=0.6), detector=detector, detect_every=4)
+    for _ in range(9):
+        gate.look(texture())
+    assert detector.looks == 3
+    gate.look(texture(60, 80))  # of another size: what was found does not fit it
+    assert detector.looks == 4
+
+
+def test_lowering_the_thresholds_step_by_step_lets_the_best_pass():
+    assert best_of([0.05, 0.031, 0.2, 0.059]) == [True, True, False, True]  # two steps of 0.03
+    assert best_of([0.03]) == [True]
+    assert best_of([0.5, 0.02, 0.03, 0.031]) == [False, True, True, False]
+
+
+def test_maps_are_of_one_size():
+    maps = maps_of(texture(300, 500), Half(), np.ones((300, 500), bool))
+    assert isinstance(maps, Maps)
+    assert maps.memorability.shape == maps.is_static.shape == maps.entropy.shape == (192, 320)
