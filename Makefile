@@ -7,13 +7,17 @@ export OPENBLAS_NUM_THREADS ?= 1
 # Where this is set, each of the hundreds of processes that the tests start compiles edgevpr anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test lint results bench thesis bench-arm64 hostile rig service-faults soak test-arm64 sites sweeps peers clean
+.PHONY: demo test test-fast lint results bench thesis bench-arm64 hostile rig service-faults soak test-arm64 sites sweeps peers clean
 
 demo: $(VENV)/installed
 	$(BIN)/edgevpr demo --out demo_out
 
 test: $(VENV)/installed $(VENV)/clients/installed lint
 	$(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder
+
+# What needs no process, no network and no clock: under a minute.
+test-fast: $(VENV)/installed
+	$(BIN)/python -m pytest -n 2 -m "not process and not network and not slow and not data"
 
 lint: $(VENV)/installed
 	$(BIN)/ruff check .
