@@ -102,7 +102,7 @@ rig: $(VENV)/installed
 	$(BIN)/python benchmarks/rig/rig.py --all
 
 # The faults of the service under a real systemd, on a Debian in QEMU (as root; Debian's debootstrap, qemu-system-x86 and
-# qemu-utils), into benchmarks/results/ and docs/faults.md. EDGEVPR_MACHINE names the folder that the machine is kept in.
+# qemu-utils), into benchmarks/results/ and docs/explanation/faults.md. EDGEVPR_MACHINE names the folder that the machine is kept in.
 service-faults: $(VENV)/installed
 	$(BIN)/python benchmarks/systemd/service_faults.py
 

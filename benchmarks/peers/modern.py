@@ -1,4 +1,4 @@
-"""Modern networks in edgevpr, by the recipes and cards of docs/networks.md, with random weights.
+"""Modern networks in edgevpr, by the recipes and cards of docs/how-to/modern-networks.md, with random weights.
 
 The weights of the authors cannot be had everywhere; what a network costs does not depend on them. Each recipe is gone
 through as a user would: the architecture is exported as ONNX, `edgevpr models add` tries and adds it with the card that
@@ -18,7 +18,7 @@ from run_sets import REPOSITORY
 from edgevpr.core.errors import EdgevprError
 
 BENCHMARKS = REPOSITORY / "benchmarks"
-RECIPES = REPOSITORY / "docs" / "networks.md"
+RECIPES = REPOSITORY / "docs/how-to/modern-networks.md"
 _CARD = re.compile(r"^`(\w+)\.yaml`:\n\n((?:    .+\n)+)", re.MULTILINE)
 
 

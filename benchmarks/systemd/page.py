@@ -1,4 +1,4 @@
-"""The pages of what was measured: benchmarks/results/service_faults.md, and the table in docs/faults.md."""
+"""The pages of what was measured: benchmarks/results/service_faults.md, and the table in docs/explanation/faults.md."""
 
 from collections.abc import Collection
 from typing import Any
@@ -21,7 +21,7 @@ def write_page(measured: dict[str, Any], faults: Collection[str]) -> None:
         f"{', '.join(sorted(dates))}, commit {', '.join(sorted(commits))}, {made[-1]['machine']['cpu']}.\n\n"
         f"{_machine(measured['machine'])}\n\n{found}\n"
     )
-    document = REPOSITORY / "docs/faults.md"
+    document = REPOSITORY / "docs/explanation/faults.md"
     text = document.read_text()
     head, rest = text.split(_BEGIN)
     document.write_text(f"{head}{_BEGIN}\n{found}\n\n{_END}{rest.split(_END)[1]}")

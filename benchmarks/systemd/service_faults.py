@@ -1,5 +1,5 @@
 """The faults of the service under a real systemd: `make service-faults` writes benchmarks/results/service_faults.json
-and .md, and the table of docs/faults.md.
+and .md, and the table of docs/explanation/faults.md.
 
 python benchmarks/systemd/service_faults.py [--only NAME,NAME] [--report]
 

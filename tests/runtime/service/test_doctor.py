@@ -284,7 +284,7 @@ def test_a_px4_that_is_told_too_rarely_would_keep_no_position():
 
 
 def test_the_page_of_px4_names_the_same_silence():
-    page = " ".join((Path(__file__).parents[3] / "docs/px4.md").read_text().split())
+    page = " ".join((Path(__file__).parents[3] / "docs/how-to/px4.md").read_text().split())
     silence_s = re.search(r"PX4 stops using positions after (\d+) s of silence", page)[1]
     assert f"PX4 drops positions after {silence_s} s of silence" in px4.rarity(1.0)
     assert px4.is_too_rare(float(silence_s))
@@ -341,7 +341,7 @@ def test_a_silent_line_is_explained_by_what_arrives():
 
 
 def test_the_pages_of_the_vehicles_name_what_is_told_to_change():
-    docs = Path(__file__).parents[3] / "docs"
+    docs = Path(__file__).parents[3] / "docs/how-to"
     copter, px4_page = (docs / "ardupilot-copter.md").read_text(), (docs / "px4.md").read_text()
     bare = with_parameters(replace(COPTER, parameters=PLAIN), GPS_AUTO_SWITCH=0)
     for parameter, value in (change.split("=") for change in wrong(bare)["channel"]):
