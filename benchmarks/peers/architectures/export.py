@@ -1,4 +1,4 @@
-"""Export an architecture with random weights as ONNX, as docs/how-to/modern-networks.md exports the real one: prints JSON.
+"""Export an architecture with random weights as ONNX, as docs/how-to/modern-networks.md does: prints JSON.
 
 python -m peers.architectures.export NAME FILE.onnx
 """
