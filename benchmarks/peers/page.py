@@ -127,8 +127,9 @@ def _networks(found: dict[str, Any]) -> str:
     ours_ms = median(row["t_encode_ms"] for key, row in found["rows"].items() if key.endswith(OURS))
     times = [round(row["t_encode_ms"] / ours_ms) for name, row in found["networks"].items() if name != "calc"]
     text = (
-        "By the recipes of [modern networks](../../docs/how-to/modern-networks.md), run by edgevpr as "
-        "techniques, one thread. **Their weights are random**: the weights of the authors could not be had here, so nothing is said of what they "
+        "By the recipes of [modern networks](../../docs/how-to/modern-networks.md), run by edgevpr as techniques, one "
+        "thread. **Their weights are random**: the weights of the authors could not be had here, so nothing is said of "
+        "what they "
         "recognise. What they cost does not depend on what they have learnt. `t_m` is the scan of 1,000 places; "
         "`B/place` in half precision, and in the form of one bit a number; `cosplace_int8` is by `edgevpr models "
         "quantise`. `calc`, which edgevpr ships, stands beside. Against the "
