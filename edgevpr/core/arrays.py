@@ -1,0 +1,38 @@
+"""Names of the kinds of arrays that functions take and return. What an array holds, and its shape, a docstring says.
+
+`Floats` stands for float32 and float64 alike, where a function cares for the numbers and not for their width;
+`Singles` and `Doubles` where the width is part of a format or of a memory budget.
+
+An array whose dtype is only known when the program runs, such as a part of a descriptor, is an `Array`.
+"""
+
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Array", "Bools", "Bytes", "Covariance", "Doubles", "Floats", "Image", "Ints", "LatLon", "Mask", "Singles"]
+
+Array: TypeAlias = NDArray[Any]
+Floats: TypeAlias = NDArray[np.floating[Any]]
+Singles: TypeAlias = NDArray[np.float32]
+Doubles: TypeAlias = NDArray[np.float64]
+Bools: TypeAlias = NDArray[np.bool_]
+
+# Numbers of things: slots of an index, ids of places, regions of a picture.
+Ints: TypeAlias = NDArray[np.integer[Any]]
+
+# Packed bits, and what is read from a file as it stands there.
+Bytes: TypeAlias = NDArray[np.uint8]
+
+# uint8, (H, W) grey or (H, W, 3) blue, green, red.
+Image: TypeAlias = NDArray[np.uint8]
+
+# bool, (H, W): False where a picture shows something that is not ground, such as a display drawn over it.
+Mask: TypeAlias = NDArray[np.bool_]
+
+# A point (lat_deg, lon_deg) in degrees of WGS 84, without an altitude.
+LatLon: TypeAlias = tuple[float, float]
+
+# A covariance on the ground or on a picture: variance along the first axis, covariance, variance along the second.
+Covariance: TypeAlias = tuple[float, float, float]
