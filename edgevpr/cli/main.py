@@ -49,7 +49,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _run(argv: list[str]) -> int:
-    args = _parser().parse_args(argv)
+    args = command_line().parse_args(argv)
     # Set before NumPy is imported: its products are small here, and more threads make them slower and cost more.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     handler = logging.StreamHandler(sys.stderr)
@@ -84,7 +84,8 @@ def _failed(args: argparse.Namespace, error: Exception, sentence: str, exit_code
 
 
 @cache  # two thirds of a short command, where one process runs many
-def _parser() -> argparse.ArgumentParser:
+def command_line() -> argparse.ArgumentParser:
+    """Return the parser of the whole command line."""
     parser = argparse.ArgumentParser(
         prog="edgevpr", description="Visual place recognition for the companion computer of a small drone."
     )

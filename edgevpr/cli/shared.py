@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from edgevpr.core.config import Config, flagged_keys, load_config
+from edgevpr.core.config import Config, keys_of, load_config
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.text import shown
 
@@ -69,10 +69,10 @@ def add_parameters(parser: ArgumentParser, text: str, form: str = "KEY=VALUE") -
 def add_keys(parser: ArgumentParser, *names: str, **texts: str) -> None:
     """Add the flags of the named keys of the configuration, or of all keys where none is named. `texts`, by the last
     part of a key's name, replace the help of some."""
-    for key in flagged_keys():
-        if names and key.name not in names:
-            continue
+    for key in keys_of():
         flag = key.flag
+        if flag is None or (names and key.name not in names):
+            continue
         text = texts.get(key.name.rpartition(".")[2], flag.text)
         if key.kind is bool:
             parser.add_argument(*flag.names, dest=_KEY + key.name, action="store_const", const=key.sets, help=text)

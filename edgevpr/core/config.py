@@ -210,24 +210,26 @@ class Config:
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """A key of the configuration that is also a flag: its dotted name, the type of its value (None apart), its flag,
-    and what the flag `sets` where that is true or false."""
+    """A key of the configuration: its dotted name, the type of its value (None apart), its lowest and highest value,
+    its command-line flag, and what the flag `sets` where that is true or false."""
 
     name: str
     kind: type
-    flag: Flag
+    limits: tuple[float, float] | None
+    flag: Flag | None
     sets: bool
 
 
-def flagged_keys(cls: type = Config, prefix: str = "") -> Iterator[Key]:
-    """Yield every key of the configuration that is also a flag, in the order of the fields."""
+def keys_of(cls: type = Config, prefix: str = "") -> Iterator[Key]:
+    """Yield every key of the configuration in the order of the fields."""
     hints = typing.get_type_hints(cls)
     for each in fields(cls):
         kind = _kind(hints[each.name])
         if is_dataclass(kind):
-            yield from flagged_keys(kind, f"{prefix}{each.name}.")
-        elif each.metadata.get("flag"):
-            yield Key(prefix + each.name, kind, each.metadata["flag"], each.metadata.get("sets", True))
+            yield from keys_of(kind, f"{prefix}{each.name}.")
+        else:
+            known = each.metadata
+            yield Key(prefix + each.name, kind, known.get("range"), known.get("flag"), known.get("sets", True))
 
 
 def load_config(path: str | Path | None, overrides: dict[str, Any] | None = None) -> Config:
