@@ -1,0 +1,147 @@
+"""What the site holds beside the pages of this folder: pages that stand elsewhere in the repository, and the reference
+of the configuration and of the command line, both made from the code.
+
+A link between two files of the repository stays one between two pages of the site; one to a file that is no page leads
+to the repository.
+"""
+
+import argparse
+import posixpath
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
+
+from edgevpr.cli.main import command_line
+from edgevpr.core.config import Config, keys_of
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS = "benchmarks/results"
+PAGES = {
+    "ARCHITECTURE.md": "explanation/architecture.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "CHANGELOG.md": "changelog.md",
+    "deploy/README.md": "how-to/install-the-service.md",
+    "models/README.md": "reference/networks.md",
+}
+LINK = re.compile(r"\]\((?!https?:|mailto:|#)([^)\s#]+)(#[^)\s]*)?\)")
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the pages that are no files of the documents' folder."""
+    for source, page in (PAGES | results()).items():
+        files.append(File.generated(config, page, abs_src_path=str(ROOT / source)))
+    files.append(File.generated(config, "results/index.md", content=contents_of_results()))
+    files.append(File.generated(config, "reference/configuration.md", content=configuration()))
+    files.append(File.generated(config, "reference/command-line.md", content=commands()))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Turn links between files of the repository into links between pages of the site."""
+    of_page = {page: source for source, page in (PAGES | results()).items()}
+    source = of_page.get(page.file.src_uri, f"docs/{page.file.src_uri}")
+
+    def linked(link: re.Match[str]) -> str:
+        target = posixpath.normpath(posixpath.join(posixpath.dirname(source), link[1]))
+        shown = PAGES.get(target) or results().get(target)
+        if target == RESULTS:
+            shown = "results/index.md"
+        if target.startswith("docs/"):
+            shown = target.removeprefix("docs/")
+        if shown is None:
+            if not (ROOT / target).exists():
+                raise FileNotFoundError(f"{source}: {link[1]} is not there")
+            return f"]({config.repo_url}/blob/main/{target}{link[2] or ''})"
+        return f"]({posixpath.relpath(shown, posixpath.dirname(page.file.src_uri) or '.')}{link[2] or ''})"
+
+    return LINK.sub(linked, markdown)
+
+
+def results() -> dict[str, str]:
+    """Return the page (or picture) of the site for every page and picture of the results."""
+    kinds = (".md", ".png", ".jpg", ".webp")
+    found = sorted(path.name for path in (ROOT / RESULTS).iterdir() if path.suffix in kinds)
+    return {f"{RESULTS}/{name}": f"results/{name}" for name in found}
+
+
+def contents_of_results() -> str:
+    """Return a page that lists the pages of results by their titles."""
+    lines = ["# All results", "", "Each page names the command and the machine that made it.", ""]
+    for source, page in results().items():
+        if source.endswith(".md"):
+            title = re.search(r"^# (.+)$", (ROOT / source).read_text("utf-8"), re.M)
+            lines.append(f"* [{title[1] if title else page}]({posixpath.basename(page)})")
+    return "\n".join(lines) + "\n"
+
+
+def configuration() -> str:
+    """Return the page of the configuration: its text is that of `deploy/config.yaml`, its types are the code's."""
+    lines = ["# Configuration", "", "Made from `deploy/config.yaml` and `edgevpr/core/config.py`."]
+    text, comment, section = (ROOT / "deploy/config.yaml").read_text("utf-8"), [], ""
+    keys = {key.name: key for key in keys_of(Config)}
+    for line in text.splitlines():
+        if found := re.match(r"( *)# ?(.*)", line):
+            comment.append(found[2])
+            continue
+        if found := re.match(r"( *)(\w+): *(.*)", line):
+            name = f"{section}.{found[2]}" if found[1] else found[2]
+            if not found[3]:
+                section = found[2]
+                lines += ["", f"## {section}", "", *comment]
+            else:
+                lines += ["", f"### `{name}`", "", *details(keys[name], found[3]), "", *comment]
+        elif comment and not line.strip():
+            lines += ["", *comment]
+        comment = []
+    return "\n".join(lines) + "\n"
+
+
+def details(key: Any, default: str) -> Iterator[str]:
+    """Yield what the code knows of a key: type, default, limits and flag."""
+    facts = [f"{key.kind.__name__}", f"default `{default}`"]
+    if key.limits:
+        facts.append(f"{key.limits[0]:g} to {key.limits[1]:g}")
+    if key.flag:
+        facts.append(f"flag {', '.join(f'`{name}`' for name in key.flag.names)}")
+    yield f"*{'; '.join(facts)}*"
+
+
+def commands() -> str:
+    """Return the page of the command line: every command with its usage and its flags."""
+    lines = ["# Command line", "", "Made from the program's own help. `--debug` shows the traceback of an error.", ""]
+    for parser in parsers(command_line()):
+        lines += [f"## {parser.prog}", "", parser.description or "", ""]
+        lines += ["```text", re.sub(r"^usage: ", "", parser.format_usage()).rstrip(), "```", ""]
+        rows = [(named(each), each.help) for each in parser._actions if each.help not in (None, argparse.SUPPRESS)]
+        rows = [(name, text) for name, text in rows if name and not name.startswith("`-h`")]
+        if rows:
+            lines += ["| argument | meaning |", "|---|---|"]
+            lines += [f"| {name} | {str(text).replace('|', '&#124;')} |" for name, text in rows]
+            lines.append("")
+    return "\n".join(lines)
+
+
+def parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+    """Yield a parser's commands, each before its own, but not those that only hold others."""
+    inner = [each for each in parser._actions if isinstance(each, argparse._SubParsersAction)]
+    if not inner:
+        yield parser
+    for each in inner:
+        for command in each.choices.values():
+            yield from parsers(command)
+
+
+def named(action: argparse.Action) -> str:
+    """Return how an argument is written: its flags and its placeholder."""
+    if isinstance(action, argparse._SubParsersAction):
+        return ""
+    placeholder = action.metavar or (action.choices and "{" + ",".join(map(str, action.choices)) + "}")
+    value = "" if action.nargs == 0 else f" {placeholder or action.dest.upper()}"
+    if not action.option_strings:
+        return f"`{placeholder or action.dest}`"
+    return ", ".join(f"`{flag}{value}`" for flag in action.option_strings)
