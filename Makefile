@@ -7,7 +7,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # Where this is set, each of the hundreds of processes that the tests start compiles edgevpr anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-fast lint results bench thesis bench-arm64 hostile rig service-faults soak test-arm64 sites sweeps peers clean
+.PHONY: demo test test-fast test-benchmarks lint results bench thesis bench-arm64 hostile rig service-faults soak test-arm64 sites sweeps peers clean
 
 demo: $(VENV)/installed
 	$(BIN)/edgevpr demo --out demo_out
@@ -18,6 +18,10 @@ test: $(VENV)/installed $(VENV)/clients/installed lint
 # What needs no process, no network and no clock: under a minute.
 test-fast: $(VENV)/installed
 	$(BIN)/python -m pytest -n 2 -m "not process and not network and not slow and not data"
+
+# What of benchmarks/ needs neither an emulator nor a simulator; not part of `make test`.
+test-benchmarks: $(VENV)/installed
+	$(BIN)/python -m pytest -n 2 -o pythonpath="benchmarks tests" benchmarks/tests
 
 lint: $(VENV)/installed
 	$(BIN)/ruff check .

@@ -18,7 +18,6 @@ import bench_flight
 import bench_match
 import bench_scan
 import bench_two_stage
-import beside_before
 from run_sets import made_by
 
 RESULTS = Path(__file__).resolve().parent / "results"
@@ -32,7 +31,6 @@ def main() -> None:
         "encode": bench_encode.rows,
         "match": lambda: [bench_match.row()],
         "two_stage": bench_two_stage.rows,
-        "before": beside_before.rows,
         "card": bench_card.rows,
         "binary_scan": bench_scan.binary_rows,
         "growth": bench_scan.growth_rows,
@@ -104,11 +102,6 @@ The published way is written plainly in `benchmarks/competitor.py`; the floor is
 ## A query over 10 000 places
 
 {bench_two_stage.table(measured["two_stage"])}
-
-Beside the same queries as edgevpr was before its scan looked for words (commit {beside_before.BEFORE}), turn by turn in
-one run, each version in a process of its own:
-
-{beside_before.table(measured["before"])}
 
 ## Reading from a card
 

@@ -8,6 +8,8 @@ thousandths; times do not.
 
 import os
 
+import base  # noqa: F401
+
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
 
 import json

@@ -7,6 +7,8 @@ the measurement.
 
 import os
 
+import base  # noqa: F401
+
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
 
 from collections.abc import Iterator

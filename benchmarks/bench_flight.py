@@ -17,6 +17,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import base  # noqa: F401
 import numpy as np
 from big_map import file_bytes, make_big_map
 from flight_process import cpu_s, start, wait_for, watch_memory, write_frames

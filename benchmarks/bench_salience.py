@@ -9,6 +9,8 @@ salience.md and salience_budget.png into benchmarks/results/.
 
 import os
 
+import base  # noqa: F401
+
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
 
 import argparse

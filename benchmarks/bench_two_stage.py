@@ -5,6 +5,8 @@ map is generated, its content random.
 
 import os
 
+import base  # noqa: F401
+
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
 
 import statistics

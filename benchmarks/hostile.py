@@ -15,7 +15,8 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
-import bench_streams
+import base  # noqa: F401
+import damaged_streams
 import hostile_bytes
 import hostile_flights
 import hostile_inputs
@@ -31,7 +32,7 @@ RESULTS = Path(__file__).resolve().parent / "results"
 # name: (title, how it is run, usual count: of the pictures of each stream, of each set of pictures, kind of packet or
 # input, and in all of maps and of kills of each kind; of `bytes`, ten times as many bytes)
 PARTS = {
-    "streams": ("Streams: pictures that are cut, corrupted, lost or frozen", bench_streams.run, 240),
+    "streams": ("Streams: pictures that are cut, corrupted, lost or frozen", damaged_streams.run, 240),
     "flights": ("Flights behind such streams: how much older than claimed a picture was", hostile_flights.run, 800),
     "pictures": ("Pictures that say nothing, and those of the other camera", hostile_pictures.run_in_groups, 276),
     "maps": ("Maps that are damaged", hostile_maps.run, 200),

@@ -12,10 +12,10 @@ from datetime import datetime, timezone
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import base  # noqa: F401
 import numpy as np
+from damaged_streams import Camera, Film, Stream, streams
 from flight_process import start, wait_for
-from hostile_cameras import Camera, Film
-from hostile_streams import Stream, streams
 from rtsp_camera import free_port
 
 from edgevpr.cli.main import main

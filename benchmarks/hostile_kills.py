@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import base  # noqa: F401
 from flight_process import start, write_frames
 
 from edgevpr.places.mapfile import PlaceMap

@@ -12,9 +12,9 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import base  # noqa: F401
 import numpy as np
-from hostile_nothing import NOTHING, SIZES
-from hostile_spoilt import SPOILT
+from pictures_of_nothing import SPOILT, pictures, spoilt
 from run_sets import DATA, FROM_THE_AIR
 
 from edgevpr.core.config import load_config
@@ -30,24 +30,6 @@ from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.techniques import create
 
 OF_NOTHING, OTHER_CAMERA = "nothing: ", "other camera: "  # how kinds begin
-
-
-def pictures(seed: int, count: int | None = None) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield `count` pictures of nothing real (None: endlessly): the kind, and uint8 (H, W, 3) BGR. All kinds take
-    turns."""
-    number = 0
-    while count is None or number < count:
-        kind = list(NOTHING)[number % len(NOTHING)]
-        rng = np.random.default_rng((seed, number))
-        height, width = SIZES[rng.integers(len(SIZES))]
-        yield kind, NOTHING[kind](rng, height, width)
-        number += 1
-
-
-def spoilt(seed: int, picture: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield a real picture once in every way that hides most of it: the kind, and a uint8 picture."""
-    for number, (kind, spoil) in enumerate(SPOILT.items()):
-        yield kind, spoil(np.random.default_rng((seed, number)), picture)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

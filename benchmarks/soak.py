@@ -10,6 +10,8 @@ second link's other end closes, readers of the status come and leave, and the co
 
 import os
 
+import base  # noqa: F401
+
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
 
 import argparse

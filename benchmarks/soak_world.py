@@ -14,6 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import base  # noqa: F401
 import imageio_ffmpeg
 import numpy as np
 from rtsp_camera import RtspCamera, free_port

@@ -5,6 +5,7 @@ does to the AUC; and how the entropy of a picture depends on the radius of its d
 from collections.abc import Sequence
 from pathlib import Path
 
+import base  # noqa: F401
 import detectors
 import numpy as np
 

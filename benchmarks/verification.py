@@ -9,6 +9,8 @@ of no place of the map, and whatever is confirmed of them is wrong. Truth is pai
 
 import os
 
+import base  # noqa: F401
+
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
 
 import argparse

@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("imageio_ffmpeg", reason="the cameras need ffmpeg (pip install imageio-ffmpeg)")
 
-import bench_streams
+import damaged_streams
 import numbered_pictures
 
 from edgevpr.frames import streams
@@ -31,7 +31,7 @@ def rows():
     names = (*WHOLE, *CUT, CORRUPTED, *LOSSY)
     with pytest.MonkeyPatch.context() as patch, ThreadPoolExecutor(4) as pool:
         patch.setattr(streams, "READ_TIMEOUT_S", 1.5)
-        found = pool.map(lambda name: bench_streams.run(PICTURES, 1, only=name.__eq__, rate_hz=RATE_HZ), names)
+        found = pool.map(lambda name: damaged_streams.run(PICTURES, 1, only=name.__eq__, rate_hz=RATE_HZ), names)
         return {row.stream: row for (row,) in found}
 
 
@@ -76,7 +76,7 @@ def test_of_a_stream_that_loses_packets_nothing_old_or_broken_is_delivered(strea
 
 def test_where_decoding_is_too_slow_for_a_stream_pictures_are_left_out_and_none_is_old():
     """Each takes twice as long as the stream has for it: one would be 1.5 s behind after 3 s."""
-    (slow,) = bench_streams.run(80, 1, only="MJPEG over HTTP, whole, decoded too slowly".__eq__, rate_hz=RATE_HZ)
+    (slow,) = damaged_streams.run(80, 1, only="MJPEG over HTTP, whole, decoded too slowly".__eq__, rate_hz=RATE_HZ)
     assert (slow.old, slow.broken) == (0, 0)
     assert slow.refused["late"] > 80
     assert slow.delivered > 40

@@ -1,53 +1,13 @@
-"""The hostile pictures asked in the maps of real image sets, in short; and eval and match of pictures that say
-nothing."""
-
-import os
-from pathlib import Path
+"""Evaluation and match of pictures that say nothing."""
 
 import cv2
-import hostile_pictures
 import numpy as np
 import pytest
 from pictures import textured
 
 from edgevpr.cli.main import main
-from edgevpr.core.types import Frame
-from edgevpr.frames.images import read_image
 from edgevpr.lab.evaluate.dataset import load_dataset
 from edgevpr.lab.evaluate.evaluate import evaluate
-
-DATA = Path(os.environ.get("EDGEVPR_DATA") or Path(__file__).resolve().parents[4] / "shared" / "data")
-# Views ahead that were accepted as places of maps made looking down, when only score and margin were asked.
-AHEAD = {
-    "aerial_brighton": [f"nordland_tiny/query/{number}.png" for number in ("0216", "0222", "0291", "0324", "0330")]
-    + ["grief_stromovka_seasons/query/0055.jpg", "grief_stromovka_seasons/ref/0035.jpg"],
-}
-needs_sets = pytest.mark.skipif(not DATA.is_dir(), reason="the image sets of ../shared/data are not there")
-
-
-@needs_sets
-@pytest.mark.parametrize("name", AHEAD)
-def test_a_map_made_looking_down_knows_that_a_view_ahead_is_none_of_its_places(name, tmp_path):
-    recogniser = hostile_pictures.mapped(DATA / name, tmp_path)
-    with recogniser.place_map:
-        pictures = [Frame(image=read_image(DATA / path), name=path, t_mono_s=0.0) for path in AHEAD[name]]
-        events = [recogniser.step(picture) for picture in pictures]
-        assert not any(event.accepted for event in events)
-        own = next((DATA / name / "query").glob("*.jp*g"), None) or next((DATA / name / "query").glob("*.JP*G"))
-        assert recogniser.step(Frame(image=read_image(own), name="own", t_mono_s=0.0)).accepted
-
-
-@needs_sets
-def test_a_run_counts_every_kind_and_nothing_wrong_is_accepted():
-    rows = hostile_pictures.run(count=2, seed=31, names=["corridor"])
-    kinds = [row.kind for row in rows]
-    assert kinds[:2] == ["nothing: no signal: bars", "nothing: no signal: blue"]
-    assert "out of focus" in kinds
-    assert kinds[-1].startswith("other camera: ")
-    assert sum(row.tried for row in rows) == 2 + 11 + 2
-    assert {(row.set, row.camera) for row in rows} == {("corridor", "forward")}
-    assert sum(row.accepted_wrong for row in rows) == 0
-    assert rows == hostile_pictures.run(count=2, seed=31, names=["corridor"])
 
 
 @pytest.fixture

@@ -3,8 +3,8 @@
 import math
 
 import cv2
-import hostile_pictures
 import numpy as np
+import pictures_of_nothing
 import pytest
 from pictures import textured
 
@@ -63,7 +63,7 @@ def test_what_says_nothing_is_not_searched_for(walk):
 
 
 def test_no_picture_of_nothing_real_is_accepted(walk):
-    for kind, picture in hostile_pictures.pictures(seed=9000, count=23):
+    for kind, picture in pictures_of_nothing.pictures(seed=9000, count=23):
         event = walk.step(frame(picture, kind))
         assert not event.accepted, f"{kind}: {event.reason}"
 
@@ -71,7 +71,7 @@ def test_no_picture_of_nothing_real_is_accepted(walk):
 def test_a_picture_that_hides_most_of_a_place_is_that_place_or_none(walk):
     recognised = 0
     for number in (2, 5):
-        for kind, picture in hostile_pictures.spoilt(9000 + number, textured(number, 240, 320)):
+        for kind, picture in pictures_of_nothing.spoilt(9000 + number, textured(number, 240, 320)):
             event = walk.step(frame(picture, kind))
             assert not event.accepted or event.best.place.source_image == f"{number}.png", kind
             recognised += event.accepted
@@ -79,7 +79,7 @@ def test_a_picture_that_hides_most_of_a_place_is_that_place_or_none(walk):
 
 
 def test_the_same_seed_makes_the_same_pictures():
-    one, other = (list(hostile_pictures.pictures(seed=5, count=23)) for _ in range(2))
+    one, other = (list(pictures_of_nothing.pictures(seed=5, count=23)) for _ in range(2))
     assert [kind for kind, _ in one] == [kind for kind, _ in other]
     assert all(np.array_equal(a, b) for (_, a), (_, b) in zip(one, other, strict=True))
     assert len({kind for kind, _ in one}) == 23

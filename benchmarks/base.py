@@ -1,0 +1,169 @@
+"""Shared by all benchmarks: where images and results lie, who made a figure, and tables, pages and pictures of rows."""
+
+import json
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from edgevpr.core.errors import EdgevprError, UsageError
+from edgevpr.core.figures import figure
+from edgevpr.core.tables import markdown
+from edgevpr.lab.evaluate import provenance
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+sys.path.append(str(REPOSITORY / "tests"))  # the tests' tools: cameras on loopback, large maps, flights as processes
+RESULTS = REPOSITORY / "benchmarks" / "results"
+DATA = Path(os.environ.get("EDGEVPR_DATA") or REPOSITORY.parent / "shared" / "data")
+TUNED_ON = ("corridor", "aerial_caliterra", "aerial_garfield28")
+FROM_THE_AIR = ("aerial_", "kite_")  # how the names of such sets begin
+Row = dict[str, Any]
+
+
+def run(main: Callable[[], object]) -> None:
+    """Run a script on one thread of NumPy's library, whose number is read when NumPy is loaded. What edgevpr cannot do
+    ends it with a sentence."""
+    if "OPENBLAS_NUM_THREADS" not in os.environ:
+        os.environ["OPENBLAS_NUM_THREADS"] = "1"
+        os.execv(sys.executable, sys.orig_argv)
+    cv2.setNumThreads(1)
+    try:
+        sys.exit(main())
+    except EdgevprError as error:
+        print(f"{Path(sys.argv[0]).stem}: {error}", file=sys.stderr)
+        sys.exit(error.exit_code)
+
+
+def made_by() -> Row:
+    """Return the date, the commit and the machine of a measurement."""
+    versions = {"python": platform.python_version(), "numpy": np.__version__, "opencv": cv2.__version__}
+    return {"date": provenance.today(), "commit": commit(), "machine": {**provenance.machine(), **versions}}
+
+
+def commit() -> str:
+    """Return the commit that is measured, and whether something has changed since."""
+    return provenance.commit_of(REPOSITORY) or "unknown"
+
+
+def read(name: str, folder: Path = RESULTS) -> Row:
+    """Return the content of NAME.json; {} where it is not there."""
+    path = folder / f"{name}.json"
+    return json.loads(path.read_text()) if path.exists() else {}
+
+
+def write(name: str, found: Row, page: str, folder: Path = RESULTS) -> None:
+    """Write NAME.json and NAME.md."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f"{name}.json").write_text(json.dumps(rounded(found), indent=1) + "\n")
+    (folder / f"{name}.md").write_text(page.strip() + "\n")
+
+
+def rounded(value: Any) -> Any:
+    """Return JSON content with at most six significant digits: no page shows more."""
+    if isinstance(value, float):
+        return float(f"{value:.6g}")
+    if isinstance(value, Mapping):
+        return {key: rounded(each) for key, each in value.items()}
+    return [rounded(each) for each in value] if isinstance(value, list | tuple) else value
+
+
+def made_line(found: Row, command: str) -> str:
+    """Return the sentence that ends a page."""
+    return f"Commit {found['commit']}, {found['date']}, {found['machine']['cpu']}. Made by `{command}`."
+
+
+def told(doc: str, until: str | None = None) -> str:
+    """Return the docstring of a script for its page: without its first line, and without what follows `until`."""
+    text = doc.partition("\n\n")[2]
+    return (text.partition(until)[0] if until else text).strip()
+
+
+def table(rows: Iterable[Mapping[str, Any]], columns: Mapping[str, str], left: int = 1) -> str:
+    """Return rows as a Markdown table. A column is its heading and a template such as "{error[median_m]:.1f}"; what a
+    row lacks, or has as None, is "-"."""
+    return markdown(list(columns), [[cell(each, row) for each in columns.values()] for row in rows], left)
+
+
+def cell(template: str, row: Mapping[str, Any]) -> str:
+    """Fill in a template of `table`."""
+    try:
+        text = template.format_map(row)
+    except (KeyError, IndexError, TypeError):
+        return "-"
+    return "-" if "None" in text else text
+
+
+def use_of(name: str) -> str:
+    """Return whether parameters were chosen with a set (`tune`), or its figures are only reported (`report`)."""
+    return "tune" if name in TUNED_ON else "report"
+
+
+def camera_of(name: str) -> str:
+    """Return the way the camera of a set looks."""
+    return "nadir" if name.startswith(FROM_THE_AIR) else "forward"
+
+
+def find_sets(data: Path = DATA, names: Iterable[str] | None = None, camera: str | None = None) -> list[Path]:
+    """Return the folders of `data` that have a ground truth: all, those named, or those of a camera. Raises UsageError
+    where one is missing."""
+    found = {path.parent.name: path.parent for path in sorted(data.glob("*/ground_truth.csv"))}
+    wanted = list(found) if names is None else list(names)
+    missing = [name for name in wanted if name not in found]
+    if missing or not found:
+        what = f"no set `{missing[0]}`" if missing else "no image sets (folders with a ground_truth.csv)"
+        raise UsageError(f"There are {what} in {data}: name the right folder with EDGEVPR_DATA.")
+    return [folder for name, folder in found.items() if name in wanted and camera in (None, camera_of(name))]
+
+
+def edgevpr(*arguments: object) -> Any:
+    """Return what a command of edgevpr prints as JSON, by `--json`. Raises EdgevprError where it fails."""
+    words = [sys.executable, "-m", "edgevpr", *map(str, arguments), "--json"]
+    done = subprocess.run(words, stdout=subprocess.PIPE, text=True)
+    if done.returncode:
+        raise EdgevprError(f"`{' '.join(words[2:])}` failed (see above): correct what it names.")
+    return json.loads(done.stdout)
+
+
+def panels(wide_in: float, high_in: float, count: int, rows: int = 1, **shared: Any) -> tuple[Any, list[Any]]:
+    """Return a figure of so many inches with `count` panels in `rows`, each with a grid, and its axes."""
+    drawn = figure(wide_in, high_in)
+    axes = list(drawn.subplots(rows, -(-count // rows), squeeze=False, **shared).ravel())
+    for each in axes[:count]:
+        each.grid(alpha=0.3)
+        each.tick_params(labelsize=8)
+    for each in axes[count:]:
+        each.set_visible(False)
+    return drawn, axes[:count]
+
+
+def save(drawn: Any, path: Path, dpi: int = 80) -> None:
+    """Save a figure in few bytes: as JPEG, or as PNG of 64 colours."""
+    drawn.savefig(path, dpi=dpi)
+    if path.suffix == ".png":
+        from PIL import Image
+
+        Image.open(path).convert("RGB").quantize(64).save(path, optimize=True)
+
+
+def kept(path: Path, measure: Callable[[], Any]) -> Any:
+    """Return what a file of `path` has; where it is not there, measure it and keep it: an interrupted run goes on."""
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        unfinished = path.with_name(f"{path.name}.unfinished")
+        unfinished.write_text(json.dumps(measure()))
+        unfinished.replace(path)
+    return json.loads(path.read_text())
+
+
+def groups(rows: Iterable[Row], key: Callable[[Row], Any]) -> Iterator[tuple[Any, list[Row]]]:
+    """Yield rows by what `key` says of them, in the order of their first ones."""
+    found: dict[Any, list[Row]] = {}
+    for row in rows:
+        found.setdefault(key(row), []).append(row)
+    yield from found.items()
