@@ -10,14 +10,13 @@ import posixpath
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 from edgevpr.cli.main import command_line
-from edgevpr.core.config import Config, keys_of
+from edgevpr.core.config import Config, Key, keys_of
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = "benchmarks/results"
@@ -28,6 +27,7 @@ PAGES = {
     "deploy/README.md": "how-to/install-the-service.md",
     "models/README.md": "reference/networks.md",
 }
+KINDS = {str: "text", float: "number", int: "whole number", bool: "true or false"}
 LINK = re.compile(r"\]\((?!https?:|mailto:|#)([^)\s#]+)(#[^)\s]*)?\)")
 
 
@@ -94,21 +94,22 @@ def configuration() -> str:
                 section = found[2]
                 lines += ["", f"## {section}", "", *comment]
             else:
-                lines += ["", f"### `{name}`", "", *details(keys[name], found[3]), "", *comment]
+                facts = [details(key, found[3]) for key in keys.values() if f"{key.name}.".startswith(f"{name}.")]
+                lines += ["", f"### `{name}`", "", *facts, "", *comment]
         elif comment and not line.strip():
             lines += ["", *comment]
         comment = []
     return "\n".join(lines) + "\n"
 
 
-def details(key: Any, default: str) -> Iterator[str]:
-    """Yield what the code knows of a key: type, default, limits and flag."""
-    facts = [f"{key.kind.__name__}", f"default `{default}`"]
+def details(key: Key, default: str) -> str:
+    """Return what the code knows of a key: type, default, limits and flag."""
+    facts = [KINDS[key.kind], f"default `{default}`"]
     if key.limits:
         facts.append(f"{key.limits[0]:g} to {key.limits[1]:g}")
     if key.flag:
         facts.append(f"flag {', '.join(f'`{name}`' for name in key.flag.names)}")
-    yield f"*{'; '.join(facts)}*"
+    return f"*{'; '.join(facts)}*"
 
 
 def commands() -> str:
