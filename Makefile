@@ -36,7 +36,7 @@ results: $(VENV)/installed
 	$(BIN)/python benchmarks/verification.py
 	$(BIN)/python benchmarks/from_orthophoto.py
 	$(BIN)/python benchmarks/flights.py
-	$(BIN)/python benchmarks/readme.py
+	$(BIN)/python benchmarks/figures_page.py
 	$(BIN)/python benchmarks/thesis.py --page
 
 # One map out of many sites, up to ten thousand places, into benchmarks/results/. It goes on in sites_work/ (1 GB) where
@@ -64,7 +64,7 @@ peers: $(VENV)/installed
 bench: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[bench]'
 	$(BIN)/python benchmarks/bench.py
-	$(BIN)/python benchmarks/readme.py
+	$(BIN)/python benchmarks/figures_page.py
 	$(BIN)/python benchmarks/thesis.py --page
 
 # The tables and figures of the thesis beside this project's, into docs/thesis.md: three minutes of one core. Uses the

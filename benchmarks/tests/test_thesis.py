@@ -3,9 +3,9 @@
 import math
 from pathlib import Path
 
+import figures_page
 import numpy as np
 import pytest
-import readme
 import thesis
 import thesis_memorable
 import thesis_page
@@ -15,7 +15,7 @@ from pictures import textured
 
 from edgevpr.techniques import create
 
-REPOSITORY = Path(readme.__file__).parents[1]
+REPOSITORY = Path(figures_page.__file__).parents[1]
 
 
 @pytest.mark.parametrize(
@@ -81,21 +81,14 @@ def test_without_the_sets_there_is_a_sentence(tmp_path, capsys):
 
 def test_the_page_is_what_the_results_say():
     page = (REPOSITORY / "docs" / "thesis.md").read_text(encoding="utf-8")
-    said = thesis_page.page(thesis_values.read_results(readme.RESULTS))
+    said = thesis_page.page(thesis_values.read_results(figures_page.RESULTS))
     assert page == said, "results have changed since: run `python benchmarks/thesis.py --page`"
 
 
-def test_the_figures_of_the_readme_are_what_the_results_say(tmp_path):
-    contents = readme.read_sets(readme.RESULTS)
-    pages = {
-        REPOSITORY / "README.md": readme.short(contents),
-        REPOSITORY / "docs" / "figures.md": f"{readme.recall(contents)}\n\n{readme.speed()}",
-    }
-    for page, figures in pages.items():
-        copy = tmp_path / page.name
-        copy.write_text(page.read_text(encoding="utf-8"), encoding="utf-8")
-        readme.put(copy, figures)
-        assert copy.read_text(encoding="utf-8") == page.read_text(encoding="utf-8"), "run `python benchmarks/readme.py`"
-        assert page.read_text(encoding="utf-8").count(readme.BEGIN) == 1
-    rows = readme.short(contents).split("\n| ")[3:]
-    assert [row.split(" | ")[0] for row in rows] == ["cohog", "cohog, exact", "cohog, thesis", "hog", "calc", "netvlad"]
+def test_the_page_of_figures_is_what_the_results_say(tmp_path):
+    page = REPOSITORY / "docs" / "figures.md"
+    copy = tmp_path / page.name
+    copy.write_bytes(page.read_bytes())
+    contents = figures_page.read_sets(figures_page.RESULTS)
+    figures_page.put(copy, f"{figures_page.recall(contents)}\n\n{figures_page.speed()}")
+    assert copy.read_bytes() == page.read_bytes(), "run `python benchmarks/figures_page.py`"

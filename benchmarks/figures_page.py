@@ -1,5 +1,5 @@
-"""Put the figures of benchmarks/results/ into docs/figures.md, and a few of them into the README, each between its two
-markers: no figure there is typed by hand.
+"""Put the figures of benchmarks/results/ into docs/figures.md, between its two markers: no figure there is typed by
+hand.
 """
 
 import json
@@ -12,15 +12,12 @@ from edgevpr.core.tables import markdown
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 RESULTS = REPOSITORY / "benchmarks" / "results"
-BEGIN, END = "<!-- figures: made by benchmarks/readme.py -->\n", "<!-- end of figures -->"
+BEGIN, END = "<!-- figures: made by benchmarks/figures_page.py -->\n", "<!-- end of figures -->"
 FORMS = (" 8bit", " 1bit")
-SHORT = ("cohog", "cohog, exact", "cohog, thesis", "hog", "calc", "netvlad")
-JOINED = "aerial_joined"  # it repeats sets that were tuned on
 
 
 def main() -> None:
     contents = read_sets(RESULTS)
-    put(REPOSITORY / "README.md", short(contents))
     put(REPOSITORY / "docs" / "figures.md", f"{recall(contents)}\n\n{speed()}")
 
 
@@ -35,17 +32,6 @@ def read_sets(folder: Path) -> list[dict[str, Any]]:
     """Read the results of all image sets in a folder."""
     contents = [json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))]
     return [content for content in contents if "techniques" in content]
-
-
-def short(contents: list[dict[str, Any]]) -> str:
-    """Recall@1 of a few techniques on the sets that had no say in a parameter."""
-    reported = [content for content in contents if content["use"] == "report" and content["set"] != JOINED]
-    return (
-        "Recall@1 on the sets marked *report*, made by `make results` (bytes: of a place in RAM; number of queries "
-        "after the\nuse of a set):\n\n"
-        f"{sets_page.overview(reported, lambda label: label in SHORT)}\n\n"
-        f"![Precision-recall curves of all techniques on all sets](benchmarks/results/{sets_page.CURVES})"
-    )
 
 
 def recall(contents: list[dict[str, Any]]) -> str:
