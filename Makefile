@@ -7,12 +7,12 @@ export OPENBLAS_NUM_THREADS ?= 1
 # Where this is set, each of the hundreds of processes that the tests start compiles edgevpr anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-fast test-benchmarks lint results bench thesis bench-arm64 hostile rig service-faults soak test-arm64 sites sweeps peers clean
+.PHONY: demo test test-fast test-benchmarks docs package lint results bench thesis bench-arm64 hostile rig service-faults soak test-arm64 sites sweeps peers clean
 
 demo: $(VENV)/installed
 	$(BIN)/edgevpr demo --out demo_out
 
-test: $(VENV)/installed $(VENV)/clients/installed lint
+test: $(VENV)/installed $(VENV)/clients/installed lint docs
 	$(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder
 
 # What needs no process, no network and no clock: under a minute.
@@ -22,6 +22,16 @@ test-fast: $(VENV)/installed
 # What of benchmarks/ needs neither an emulator nor a simulator; not part of `make test`.
 test-benchmarks: $(VENV)/installed
 	$(BIN)/python -m pytest -n 2 -o pythonpath="benchmarks tests" benchmarks/tests
+
+# The documents as a site, in site/: every link must lead somewhere.
+docs: $(VENV)/installed
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
+
+# A wheel and an sdist that could be published, in dist/.
+package: $(VENV)/installed
+	rm -rf dist
+	$(BIN)/python -m build --outdir dist
+	$(BIN)/twine check --strict dist/*
 
 lint: $(VENV)/installed
 	$(BIN)/ruff check .
@@ -111,7 +121,7 @@ service-faults: $(VENV)/installed
 	$(BIN)/python benchmarks/systemd/service_faults.py
 
 clean:
-	rm -rf $(VENV) demo_out dist build
+	rm -rf $(VENV) demo_out dist build site
 
 $(VENV)/installed: pyproject.toml
 	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(None if (3, 10) <= v < (3, 14) else "edgevpr needs Python 3.10 to 3.13, this is %d.%d: make PYTHON=python3.11" % v)'
