@@ -143,12 +143,16 @@ def panels(wide_in: float, high_in: float, count: int, rows: int = 1, **shared: 
 
 
 def save(drawn: Any, path: Path, dpi: int = 80) -> None:
-    """Save a figure in few bytes: as JPEG, or as PNG of 64 colours."""
+    """Save a figure as a picture of few bytes."""
     drawn.savefig(path, dpi=dpi)
-    if path.suffix == ".png":
-        from PIL import Image
+    shrink(path)
 
-        Image.open(path).convert("RGB").quantize(64).save(path, optimize=True)
+
+def shrink(path: Path) -> None:
+    """Reduce a PNG to 64 colours."""
+    from PIL import Image
+
+    Image.open(path).convert("RGB").quantize(64, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
 def kept(path: Path, measure: Callable[[], Any]) -> Any:

@@ -4,88 +4,87 @@ Figures of competitors stand beside ours from the same, interleaved run: on a bu
 not.
 """
 
-import os
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
-
-import json
-from dataclasses import asdict
-from pathlib import Path
-
-import bench_card
-import bench_encode
+import base
 import bench_flight
-import bench_match
-import bench_scan
-import bench_two_stage
-from run_sets import made_by
+import bench_stages
+from base import RESULTS, Row
 
-RESULTS = Path(__file__).resolve().parent / "results"
+COLUMNS = {
+    "encode": {
+        "encode `cohog`": "{entropy}",
+        "edgevpr ms": "{ours_ms:.2f}",
+        "published way ms": "{competitor_ms:.1f}",
+        "ratio": "{ratio:.1f}",
+        "floor ms": "{floor_ms:.2f}",
+        "times the floor": "{times_floor:.1f}",
+        "largest difference of a descriptor value": "{worst_difference:.1e}",
+        "good regions that differ": "{good_differing}",
+    },
+    "match": {
+        "compare one place": "{references} references",
+        "edgevpr with vote ms": "{ours_ms:.2f}",
+        "published way, no vote, ms": "{competitor_ms:.2f}",
+        "ratio": "{ratio:.2f}",
+        "bare product ms": "{product_ms:.2f}",
+        "times the product": "{times_product:.2f}",
+    },
+    "two_stage": {
+        "a query, 10 000 places": "{camera}",
+        "candidates": "{candidates}",
+        "encode ms": "{encode_ms:.1f}",
+        "whole query ms": "{two_stage_ms:.0f}",
+        "exact over all s": "{exact_s:.1f}",
+        "ratio": "{ratio:.0f}",
+        "bytes a place in RAM": "{bytes_per_place}",
+    },
+    "growth": {
+        "places": "{places}",
+        "rotations": "{rotations}",
+        "bytes a place": "{place_bytes}",
+        "scan ms": "{t_scan_ms:.1f}",
+        "RAM MB": "{index_mb:.2f}",
+    },
+    "flight": {
+        "`edgevpr run`, cohog, 10 000 places": "{what}",
+        "measured": "{value:.3g} {unit}",
+        "target": "< {target:g} {unit}",
+    },
+}
 
 
 def main() -> None:
-    RESULTS.mkdir(exist_ok=True)
-    made = made_by()
-    measured = {}
-    for name, measure in {
-        "encode": bench_encode.rows,
-        "match": lambda: [bench_match.row()],
-        "two_stage": bench_two_stage.rows,
-        "card": bench_card.rows,
-        "binary_scan": bench_scan.binary_rows,
-        "growth": bench_scan.growth_rows,
-        "flight": bench_flight.rows,
-    }.items():
+    found = base.made_by()
+    for name, rows in {**bench_stages.ROWS, "flight": bench_flight.rows}.items():
         print(f"measuring: {name}", flush=True)
-        measured[name] = measure()
-    plain = {name: [row if isinstance(row, dict) else asdict(row) for row in rows] for name, rows in measured.items()}
-    (RESULTS / "bench.json").write_text(json.dumps({**made, **plain}, indent=2) + "\n")
-    plot_growth(measured["growth"], RESULTS / "growth.png")
-    page = report(measured, made)
-    (RESULTS / "bench.md").write_text(page)
-    print(page)
+        found[name] = list(rows())
+    base.write("bench", found, page(found))
+    draw(found["growth"])
+    print(page(found))
 
 
-def plot_growth(rows: list[dict], path: Path) -> None:
-    """Time of a query's scan and memory of the index against the number of places, both logarithmic."""
-    import matplotlib.pyplot as plt
-
-    figure, (time_axes, ram_axes) = plt.subplots(1, 2, figsize=(10, 4.2), layout="constrained")
-    for rotations, colour in ((1, "tab:blue"), (24, "tab:orange")):
-        these = [row for row in rows if row["rotations"] == rotations]
+def draw(rows: list[Row]) -> None:
+    """Draw time of a query's scan and memory of the index against the number of places, both logarithmic."""
+    drawn, (time_axes, ram_axes) = base.panels(10, 4.2, 2)
+    for label, these in base.groups(rows, lambda row: "camera ahead" if row["rotations"] == 1 else "straight down"):
         places, scan_ms = [row["places"] for row in these], [row["t_scan_ms"] for row in these]
-        label = "camera ahead" if rotations == 1 else "straight down"
-        time_axes.loglog(places, scan_ms, "o-", color=colour, label=label)
-        linear_ms = [scan_ms[-1] * count / places[-1] for count in places]
-        time_axes.loglog(places, linear_ms, ":", color=colour, alpha=0.6)
+        (line,) = time_axes.loglog(places, scan_ms, "o-", label=label)
+        time_axes.loglog(places, [scan_ms[-1] * count / places[-1] for count in places], ":", color=line.get_color())
         each = f"{label}: {these[0]['place_bytes']} bytes a place"
-        ram_axes.loglog(places, [row["index_mb"] for row in these], "o-", color=colour, label=each)
+        ram_axes.loglog(places, [row["index_mb"] for row in these], "o-", label=each)
     time_axes.set(xlabel="places", ylabel="scan of all places, ms", title="time of the scan (dotted: linear)")
     ram_axes.set(xlabel="places", ylabel="in RAM, MB", title="memory of the places")
     for axes in (time_axes, ram_axes):
         axes.legend(frameon=False)
-        axes.grid(alpha=0.3, which="both")
-        axes.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
+    base.save(drawn, RESULTS / "growth.png")
 
 
-def report(measured: dict, made: dict) -> str:
-    """The page for people."""
-    ran_on = made["machine"]
-    binary = "\n".join(
-        f"| {row['what']} | {row['t_ms']:.2f} | {row['gb_per_s']:.1f} | {row['of_byte_sum']:.0%} "
-        f"| {row['of_word_sum']:.0%} |"
-        for row in measured["binary_scan"]
-    )
-    growth = "\n".join(
-        f"| {row['places']} | {row['rotations']} | {row['place_bytes']} | {row['t_scan_ms']:.1f} "
-        f"| {row['index_mb']:.2f} |"
-        for row in measured["growth"]
-    )
+def page(found: Row) -> str:
+    """Return the page for people."""
+    ran_on = found["machine"]
+    tables = {name: base.table(found[name], columns) for name, columns in COLUMNS.items()}
     return f"""# Speed and memory
 
-Made by `make bench` on {made["date"]}, commit {made["commit"]}.
+Made by `make bench` on {found["date"]}, commit {found["commit"]}.
 Machine: {ran_on["cpu"]}, {ran_on["cores"]} cores; one thread; Python {ran_on["python"]}, NumPy {ran_on["numpy"]},
 OpenCV {ran_on["opencv"]}. Medians; ratios are taken turn by turn in one interleaved run.
 
@@ -93,42 +92,27 @@ OpenCV {ran_on["opencv"]}. Medians; ratios are taken turn by turn in one interle
 
 The published way is written plainly in `benchmarks/competitor.py`; the floor is the resize and two Sobel passes alone.
 
-{bench_encode.table(measured["encode"])}
+{tables["encode"]}
 
 ## Comparing one place in full
 
-{bench_match.table(measured["match"][0])}
+{tables["match"]}
 
 ## A query over 10 000 places
 
-{bench_two_stage.table(measured["two_stage"])}
-
-## Reading from a card
-
-What one query reads of a map of 10 000 places that is not in the page cache, and what that takes beside the query
-itself on a card of {bench_card.CARD_MB_PER_S:g} MB/s:
-
-{bench_card.table(measured["card"])}
-
-## Scan of binary vectors, 100 000 x 512 bits
-
-| what | ms | GB/s | of the sum of bytes | of the sum of 64-bit words |
-|---|---|---|---|---|
-{binary}
+{tables["two_stage"]}
 
 ## Growth of the scan
 
-| places | rotations | bytes a place | scan ms | RAM MB |
-|---|---|---|---|---|
-{growth}
+{tables["growth"]}
 
 ![growth](growth.png)
 
 ## The whole program
 
-{bench_flight.table(measured["flight"])}
+{tables["flight"]}
 """
 
 
 if __name__ == "__main__":
-    main()
+    base.run(main)

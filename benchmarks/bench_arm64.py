@@ -6,13 +6,8 @@ It needs Debian's packages qemu-user, debootstrap and gcc, and the registries of
 thousandths; times do not.
 """
 
-import os
-
-import base  # noqa: F401
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
-
 import json
+import os
 import shutil
 import sys
 from importlib import metadata
@@ -20,19 +15,26 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import base
 from arm64.userland import CPU, PYTHON, install, make_system, run
 from big_map import make_big_map
-from run_sets import made_by
 
-from edgevpr.core.tables import markdown
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.preflight import counted
 from edgevpr.techniques import create
 
 HERE = Path(__file__).resolve().parent
-RESULTS = HERE / "results"
 TOOLS = ("qemu-aarch64", "debootstrap", "gcc", "dpkg-deb")
 WHEELS = ("numpy", "opencv-python-headless", "psutil", "pyyaml")  # what the parts import
+_COLUMNS = {
+    "part": "{part}",
+    "million instructions": "{millions:.2f}",
+    "MB moved": "{mb:.1f}",
+    "million multiply-adds": "{million_madds:.1f}",
+    "calls": "{calls}",
+    "ms here": "{here_ms:.2f}",
+    "s on Zero 2 W": "{zero_s:.3f}",
+}
 
 
 def main() -> None:
@@ -43,22 +45,16 @@ def main() -> None:
         work = Path(folder)
         print("building an aarch64 system", flush=True)
         build(work)
-        maps = []
-        for camera in ("forward", "nadir"):
-            maps.append(str(work / f"{camera}.gpkg"))
-            make_big_map(Path(maps[-1]), create("cohog", {"camera": camera}).spec, counted.LARGE)
+        maps = [str(work / f"{camera}.gpkg") for camera in ("forward", "nadir")]
+        for path in maps:
+            make_big_map(Path(path), create("cohog", {"camera": Path(path).stem}).spec, counted.LARGE)
         print("counting", flush=True)
         rows = count(work, maps)
         here = json.loads(run([sys.executable, str(HERE / "arm64" / "work.py"), "--here", *maps]).stdout)
-    for row in rows:
-        row.update(here[row["part"]])
-    made = made_by()
-    (RESULTS / "arm64.json").write_text(json.dumps({**made, "parts": rows}, indent=1) + "\n")
+    found = {**base.made_by(), "parts": [row | here[row["part"]] for row in rows]}
     figures = counted.figures({row["part"]: row["instructions"] for row in rows})
     counted.PATH.write_text(json.dumps(figures, indent=1) + "\n")
-    page = report(rows, made)
-    (RESULTS / "arm64.md").write_text(page)
-    print(page)
+    base.write("arm64", found, page(found))
 
 
 def build(work: Path) -> None:
@@ -85,33 +81,26 @@ def count(work: Path, maps: list[str]) -> list[dict[str, Any]]:
     return rows
 
 
-def report(rows: list[dict[str, Any]], made: dict[str, Any]) -> str:
-    """The page for people."""
-    machine, mips = made["machine"], load_board("rpi-zero-2w").benchmark_score.arm64_mips
-    lines = [
-        [
-            row["part"],
-            f"{row['instructions'] / 1e6:.2f}",
-            f"{row['bytes'] / 1e6:.1f}",
-            f"{row['multiply_adds'] / 1e6:.1f}",
-            f"{row['calls']}",
-            f"{row['here_ms']:.2f}",
-            f"{row['instructions'] / 1e6 / mips:.3f}",
-        ]
-        for row in rows
+def page(found: dict[str, Any]) -> str:
+    """Return the page for people."""
+    machine, mips = found["machine"], load_board("rpi-zero-2w").benchmark_score.arm64_mips
+    rows = [
+        row
+        | {"millions": row["instructions"] / 1e6, "mb": row["bytes"] / 1e6, "million_madds": row["multiply_adds"] / 1e6}
+        | {"zero_s": row["instructions"] / 1e6 / mips}
+        for row in found["parts"]
     ]
-    heads = ("part", "million instructions", "MB moved", "million multiply-adds", "calls", "ms here", "s on Zero 2 W")
     return f"""# What a query costs an ARM core
 
-Made by `make bench-arm64` on {made["date"]}, commit {made["commit"]}: {counted.LARGE} places, and a picture in which
+Made by `make bench-arm64` on {found["date"]}, commit {found["commit"]}: {counted.LARGE} places, and a picture in which
 nearly every region is good. Counted while QEMU ran a Cortex-A53, with NumPy {machine["numpy"]} and OpenCV
 {machine["opencv"]} for aarch64. MB moved are all loads and stores, most of them from caches. Multiply-adds are those of
 vector instructions. Calls are of compiled functions, by Python. Times here are the quickest on an {machine["cpu"]}, one
 thread. The last column divides by the {mips:g} million instructions a second of `profiles/rpi-zero-2w.yaml`.
 
-{markdown(heads, lines)}
+{base.table(rows, _COLUMNS)}
 """
 
 
 if __name__ == "__main__":
-    main()
+    base.run(main)

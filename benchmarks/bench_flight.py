@@ -8,18 +8,18 @@ aircraft it lies between the figure shown and RSS.
 
 import json
 import os
-import shutil
 import statistics
 import subprocess
 import sys
 import time
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import base  # noqa: F401
 import numpy as np
-from big_map import file_bytes, make_big_map
+from base import Row
+from big_map import make_big_map
 from flight_process import cpu_s, start, wait_for, watch_memory, write_frames
 
 from edgevpr.power.boards import load_board
@@ -38,35 +38,20 @@ MEASURED = 200
 STEPS = ("encode", "scan", "compare")
 IDLE_S = 10.0
 SETTLE_S = 2.0
-SPARE_BYTES = 10**9
 NOBODY = "rtsp://127.0.0.1:9/nobody"
 FLAGS = ["--link", "udpout:127.0.0.1:9"]
 NEVER_IMPORTED = ["onnxruntime", "matplotlib"]
 
 
-@dataclass(frozen=True, slots=True)
-class FlightRow:
-    """One line of the table; `target` is the most that `value` may be, None where none was set."""
-
-    what: str
-    value: float
-    unit: str
-    target: float | None
+def row_of(what: str, value: float, unit: str, target: float | None) -> Row:
+    """Return one line of the table; `target` is the most that `value` may be, None where none was set."""
+    return {"what": what, "value": value, "unit": unit, "target": target}
 
 
-def why_not(folder: Path) -> str | None:
-    """Why the map cannot be made in `folder`, None where it can."""
-    needed = file_bytes(create("cohog").spec, PLACES) + SPARE_BYTES
-    free = shutil.disk_usage(folder).free
-    return f"{folder} has {free / 1e9:.1f} GB free and {needed / 1e9:.1f} are needed" if free < needed else None
-
-
-def rows() -> list[FlightRow]:
-    """Make the map in a temporary folder, fly, look. Raises OSError where the disk has no room."""
+def rows() -> list[Row]:
+    """Make the map in a temporary folder, fly, look."""
     with TemporaryDirectory() as name:
         folder = Path(name)
-        if reason := why_not(folder):
-            raise OSError(reason)
         place_map, frames = folder / "big.gpkg", folder / "frames"
         make_big_map(place_map, create("cohog").spec, PLACES)
         write_frames(frames, FRAMES)
@@ -80,7 +65,7 @@ def rows() -> list[FlightRow]:
         ]
 
 
-def memory_rows(place_map: Path, frames: Path, folder: Path) -> list[FlightRow]:
+def memory_rows(place_map: Path, frames: Path, folder: Path) -> list[Row]:
     """The most that a flight of `FRAMES` queries takes."""
     flight = start(place_map, frames, folder / "memory.jsonl", *FLAGS, "--rate-hz", "10")
     largest, mapped = watch_memory(flight)
@@ -88,12 +73,12 @@ def memory_rows(place_map: Path, frames: Path, folder: Path) -> list[FlightRow]:
     for name in NEVER_IMPORTED:
         assert name not in mapped, f"{name} was imported"
     return [
-        FlightRow("peak RSS (VmHWM)", largest["VmHWM"], "MB", 130.0),
-        FlightRow("peak PSS", largest["Pss"], "MB", None),
+        row_of("peak RSS (VmHWM)", largest["VmHWM"], "MB", 130.0),
+        row_of("peak PSS", largest["Pss"], "MB", None),
     ]
 
 
-def metering_row(log: Path) -> FlightRow:
+def metering_row(log: Path) -> Row:
     """The CPU time that measuring takes, of that of a query (the median of the flight in `log`), at a query a second:
     stages, memory, charge and heat, and their part of the log's line.
 
@@ -123,19 +108,19 @@ def metering_row(log: Path) -> FlightRow:
         meter.reading()
         taken_s.append(time.process_time() - begin_s)
     meter.close()
-    return FlightRow("metering, of a query", 100 * statistics.mean(taken_s) / query_s, "%", 1.0)
+    return row_of("metering, of a query", 100 * statistics.mean(taken_s) / query_s, "%", 1.0)
 
 
-def accounted_row(log: Path) -> FlightRow:
+def accounted_row(log: Path) -> Row:
     """The share of the CPU time of the process that is some stage of a query, once the flight in `log` has begun: the
     rest is the log, the link and the loop."""
     lines = list(read_log(log))
     queries = [line for line in lines if line["kind"] == "query"]
     in_queries_s = sum(line["costs"]["cpu_s"] + line["reading"]["cpu_s"] for line in queries)
-    return FlightRow("CPU time that is a stage of a query", 100 * in_queries_s / lines[-1]["process_cpu_s"], "%", None)
+    return row_of("CPU time that is a stage of a query", 100 * in_queries_s / lines[-1]["process_cpu_s"], "%", None)
 
 
-def start_rows(place_map: Path, frames: Path, folder: Path) -> list[FlightRow]:
+def start_rows(place_map: Path, frames: Path, folder: Path) -> list[Row]:
     """From the start of the process to the first answer in its log, median of `STARTS`."""
     warm_s = [start_s(place_map, frames, folder) for _ in range(STARTS)]
     cold_s = []
@@ -143,18 +128,18 @@ def start_rows(place_map: Path, frames: Path, folder: Path) -> list[FlightRow]:
         forget_pages(place_map)
         cold_s.append(start_s(place_map, frames, folder))
     return [
-        FlightRow("start to first match", statistics.median(warm_s), "s", 2.0),
-        FlightRow("... with the map not in the page cache", statistics.median(cold_s), "s", 2.0),
+        row_of("start to first match", statistics.median(warm_s), "s", 2.0),
+        row_of("... with the map not in the page cache", statistics.median(cold_s), "s", 2.0),
     ]
 
 
-def idle_rows(place_map: Path, frames: Path, folder: Path) -> list[FlightRow]:
+def idle_rows(place_map: Path, frames: Path, folder: Path) -> list[Row]:
     """CPU-seconds a second without frames, in percent of one core."""
     absent = idle_share(place_map, NOBODY, folder / "absent.jsonl", until="start")
     waiting = idle_share(place_map, frames, folder / "waiting.jsonl", "--rate-hz", "0.01", until="query")
     return [
-        FlightRow("idle CPU, stream not there", 100 * absent, "% of a core", 2.0),
-        FlightRow("idle CPU, between two frames", 100 * waiting, "% of a core", 2.0),
+        row_of("idle CPU, stream not there", 100 * absent, "% of a core", 2.0),
+        row_of("idle CPU, between two frames", 100 * waiting, "% of a core", 2.0),
     ]
 
 
@@ -189,21 +174,8 @@ def forget_pages(path: Path) -> None:
 
 
 def finished(flight: subprocess.Popen) -> int:
-    """The exit code; what a flight that failed has said goes to standard error."""
+    """Return the exit code; what a flight that failed has said goes to standard error."""
     said = flight.communicate(timeout=60)[1]
     if flight.returncode:
         print(said, file=sys.stderr)
     return flight.returncode
-
-
-def table(results: list[FlightRow]) -> str:
-    """The results as a Markdown table."""
-    lines = [f"| `edgevpr run`, cohog, {PLACES} places | measured | target |", "|---|---|---|"]
-    for row in results:
-        target = "" if row.target is None else f"< {row.target:g} {row.unit}"
-        lines.append(f"| {row.what} | {row.value:.3g} {row.unit} | {target} |")
-    return "\n".join(lines)
-
-
-if __name__ == "__main__":
-    print(table(rows()))

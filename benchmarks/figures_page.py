@@ -2,22 +2,21 @@
 hand.
 """
 
-import json
 from pathlib import Path
 from typing import Any
 
+import base
 import sets_page
+from base import REPOSITORY, RESULTS
 
 from edgevpr.core.tables import markdown
 
-REPOSITORY = Path(__file__).resolve().parents[1]
-RESULTS = REPOSITORY / "benchmarks" / "results"
 BEGIN, END = "<!-- figures: made by benchmarks/figures_page.py -->\n", "<!-- end of figures -->"
 FORMS = (" 8bit", " 1bit")
 
 
 def main() -> None:
-    contents = read_sets(RESULTS)
+    contents = sets_page.read_sets(RESULTS)
     put(REPOSITORY / "docs" / "figures.md", f"{recall(contents)}\n\n{speed()}")
 
 
@@ -28,22 +27,14 @@ def put(page: Path, figures: str) -> None:
     page.write_text(f"{before}{BEGIN}\n{figures}\n\n{END}{after}", encoding="utf-8")
 
 
-def read_sets(folder: Path) -> list[dict[str, Any]]:
-    """Read the results of all image sets in a folder."""
-    contents = [json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))]
-    return [content for content in contents if "techniques" in content]
-
-
 def recall(contents: list[dict[str, Any]]) -> str:
     """Recall@1 of every technique on every set, then that of the forms, and what the rule of the flight let through."""
     weights = {row["weights"] for content in contents for row in content["techniques"].values() if row["weights"]}
     by_flight = []
     for content in contents:
         name = "cohog" if "cohog" in content["techniques"] else "hog"
-        flown = content["techniques"][name]
-        by_flight.append(
-            f"* {content['set']}: `{name}`, {flown['accepted']} of {flown['queries']}, {flown['accepted_wrong']} wrong"
-        )
+        said = "* {set}: `{name}`, {accepted} of {queries}, {accepted_wrong} wrong"
+        by_flight.append(said.format(set=content["set"], name=name, **content["techniques"][name]))
     return (
         "Recall@1, made by `make results` (bytes: of a place in RAM; number of queries after the use of a set):\n\n"
         f"{sets_page.overview(contents, lambda label: not label.endswith(FORMS))}\n\n"
@@ -57,7 +48,7 @@ def recall(contents: list[dict[str, Any]]) -> str:
 
 def speed() -> str:
     """The figures of `make bench` that a builder asks for."""
-    content = json.loads((RESULTS / "bench.json").read_text())
+    content = base.read("bench")
     machine = content["machine"]
     rows = [
         [f"encode a frame ({row['entropy']})", f"{row['ours_ms']:.1f} ms", f"{row['ratio']:.1f}x the published way"]
@@ -78,4 +69,4 @@ def speed() -> str:
 
 
 if __name__ == "__main__":
-    main()
+    base.run(main)

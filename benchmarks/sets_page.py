@@ -5,6 +5,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import base
+
 from edgevpr.core.tables import markdown
 from edgevpr.lab.evaluate import tables
 from edgevpr.lab.evaluate.curves import plot
@@ -35,13 +37,19 @@ def result(row: dict[str, Any]) -> TechniqueResult:
     return from_json({"accepted_elsewhere": row["accepted_wrong"], **row})
 
 
+def read_sets(folder: Path) -> list[dict[str, Any]]:
+    """Read the results of all image sets in a folder."""
+    contents = [json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))]
+    return [content for content in contents if "techniques" in content]
+
+
 def write(folder: Path, left_out: dict[str, str]) -> None:
     """Sum up all files of `folder`; `left_out` says of sets that are not there why."""
-    contents = [json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))]
-    contents = [content for content in contents if "techniques" in content]
+    contents = read_sets(folder)
     results = {content["set"]: [result(row) for row in content["techniques"].values()] for content in contents}
     drawn = {name: [each for each in rows if not each.technique.endswith(_NOT_DRAWN)] for name, rows in results.items()}
     plot(drawn, folder / CURVES)
+    base.shrink(folder / CURVES)
     (folder / "sets.md").write_text(_page(contents, results, left_out))
 
 
@@ -126,8 +134,7 @@ Weights in use:
                 content["set"],
                 technique,
                 str(errors["queries"]),
-                _metres(errors["best_match"]),
-                _metres(errors["accepted"]),
+                *(_metres(errors[of]) for of in ("best_match", "accepted")),
             ]
             for content in contents
             for technique, errors in content.get("positions", {}).items()
@@ -170,13 +177,8 @@ def overview(contents: list[dict[str, Any]], wanted: Callable[[str], bool] = lam
     for label in filter(wanted, dict.fromkeys(label for content in contents for label in content["techniques"])):
         found = [content["techniques"].get(label) for content in contents]
         sizes = sorted({row["descriptor_bytes"] for row in found if row})  # those of cohog differ by camera
-        rows.append(
-            [
-                label,
-                " or ".join(map(str, sizes)),
-                *("-" if row is None else f"{row['recall_at_1']:.2f}" for row in found),
-            ]
-        )
+        recalls = ("-" if row is None else f"{row['recall_at_1']:.2f}" for row in found)
+        rows.append([label, " or ".join(map(str, sizes)), *recalls])
     heads = [f"{content['set']} ({content['use']}, {_rows(content)[0]['queries']})" for content in contents]
     return markdown(("technique", "RAM B/place", *heads), rows)
 

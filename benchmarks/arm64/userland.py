@@ -8,7 +8,10 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 HERE = Path(__file__).resolve().parent
 RELEASE = "bookworm"  # glibc 2.36, Python 3.11: that of Raspberry Pi OS 12
@@ -57,14 +60,42 @@ def make_launcher(system: Path, qemu: str) -> Path:
 
 def install(site: Path, *what: str) -> None:
     """Unpack wheels for aarch64 into a folder: arguments of `pip install`, such as names or `-r FILE`."""
-    run([sys.executable, "-m", "pip", "install", "--quiet", f"--target={site}", *tags("aarch64", PYTHON), *what])
-
-
-def tags(machine: str, python: str) -> list[str]:
-    """Return the arguments that have pip choose wheels for another machine and Python."""
     names = [*(f"manylinux_{each}" for each in _GLIBC), "manylinux2014"]
-    platforms = [f"--platform={name}_{machine}" for name in names]
-    return ["--only-binary=:all:", "--implementation=cp", f"--python-version={python}", *platforms]
+    tags = ["--only-binary=:all:", "--implementation=cp", f"--python-version={PYTHON}"]
+    tags += [f"--platform={name}_aarch64" for name in names]
+    run([sys.executable, "-m", "pip", "install", "--quiet", f"--target={site}", *tags, *what])
+
+
+@dataclass(frozen=True, slots=True)
+class Arm:
+    """The emulated Python, the folders of its wheels (the lock's, the tests', edgevpr's own), a folder to work in, and
+    this machine's FFmpeg, which only makes films for tests."""
+
+    python: Path
+    locked: Path
+    tools: Path
+    own: Path
+    work: Path
+    ffmpeg: str
+
+    @property
+    def env(self) -> dict[str, str]:
+        """The variables of a program that uses all of them."""
+        paths = os.pathsep.join(map(str, (self.own, self.locked, self.tools)))
+        return {**os.environ, "PYTHONPATH": paths, "IMAGEIO_FFMPEG_EXE": self.ffmpeg}
+
+    def edgevpr(self, *arguments: object) -> str:
+        """Run edgevpr under emulation; return what it prints."""
+        return run([str(self.python), "-m", "edgevpr", *map(str, arguments)], self.env).stdout
+
+
+def versions(arm: Arm, qemu: str) -> dict[str, Any]:
+    """Return what the emulated system is made of."""
+    asked = "import platform; print(platform.machine(), platform.python_version(), platform.libc_ver()[1])"
+    machine, python, libc = run([str(arm.python), "-c", asked], arm.env).stdout.split()
+    packages = {each.metadata["Name"]: each.version for each in metadata.distributions(path=[str(arm.locked)])}
+    told = {"processor": machine, "cpu": CPU, "qemu": run([qemu, "--version"]).stdout.split("\n")[0]}
+    return {**told, "release": RELEASE, "python": python, "glibc": libc, "packages": dict(sorted(packages.items()))}
 
 
 def run(argv: Sequence[str], env: Mapping[str, str] | None = None) -> subprocess.CompletedProcess:

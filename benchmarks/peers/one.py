@@ -1,10 +1,9 @@
 """One piece of work of `peers.py`, in a process of its own, so that its memory is its own: prints JSON.
 
-python -m peers.one map CAMERA SET FILE
-python -m peers.one cohog CAMERA SET FILE
-python -m peers.one learn WAY FILE SET ...
-python -m peers.one way WAY SET FILE
-python -m peers.one network NAME SET
+python one.py map CAMERA SET FILE
+python one.py cohog CAMERA SET FILE
+python one.py learn WAY FILE SET ...
+python one.py way WAY SET FILE
 
 Maps and words are made beforehand and come from a FILE: what is measured is a flight with them. Times are of the
 processor. Of a set at most 200 queries are asked, evenly spaced.
@@ -15,14 +14,12 @@ import pickle
 import re
 import sys
 import time
-from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 MOST_QUERIES = 200
 _QUALITY = "recall", "precision_at", "auc", "queries", "references"
-_NETWORK_PICTURES, _NETWORK_PLACES, _SEED = 11, 1000, 1
 
 
 def make_map(camera: str, folder: str, file: str) -> dict[str, Any]:
@@ -38,7 +35,7 @@ def make_map(camera: str, folder: str, file: str) -> dict[str, Any]:
     meter = meter_of(load_config(None), load_board("this"))
     frames = evaluate.all_frames(open_source(str(images), live=False))
     evaluate.make_map(Path(file), frames, create("cohog", {"camera": camera}), meter, images)
-    return {"bytes": Path(file).stat().st_size}
+    return {}
 
 
 def cohog(camera: str, folder: str, file: str) -> dict[str, Any]:
@@ -76,11 +73,10 @@ def cohog(camera: str, folder: str, file: str) -> dict[str, Any]:
 
 def learn(name: str, file: str, *folders: str) -> dict[str, Any]:
     """Learn the words of a way on the references of these sets."""
-    from edgevpr.frames.images import list_images
-    from peers.ways import WAYS
+    from ways import WAYS
 
-    known = WAYS[name]().learn([_grey(path) for folder in folders for path in list_images(Path(folder) / "ref")])
-    Path(file).write_bytes(pickle.dumps(known))
+    paths = [path for folder in folders for path in sorted((Path(folder) / "ref").iterdir())]
+    Path(file).write_bytes(pickle.dumps(WAYS[name]().learn([_grey(path) for path in paths])))
     return {}
 
 
@@ -89,87 +85,37 @@ def way(name: str, folder: str, file: str) -> dict[str, Any]:
     begin_s = time.process_time()
     import cv2
     import numpy as np
+    from ways import WAYS
 
     from edgevpr.lab.evaluate import metrics
-    from edgevpr.lab.evaluate.quality import Quality, figures
-    from peers.ways import WAYS
+    from edgevpr.lab.evaluate.quality import figures
 
     it = WAYS[name]()
     import_s = time.process_time() - begin_s
     cv2.setNumThreads(1)
     dataset, known = _dataset(folder), pickle.loads(Path(file).read_bytes())
-    places = [it.encode(_grey(dataset.ref_dir / each), known) for each in dataset.references]
-    index = it.index(places, known)
-    scores, ranks, t_encode_s, t_match_s = [], [], [], []
+    index = it.index([it.encode(_grey(dataset.ref_dir / each), known) for each in dataset.references], known)
+    scores, ranks, times_ms = [], [], []
     for query in dataset.queries:
         picture = _grey(query.path)
         begin_s = time.process_time()
         asked = it.encode(picture, known)
         encoded_s = time.process_time()
         row = it.scores(asked, index)
-        t_match_s.append(time.process_time() - encoded_s)
-        t_encode_s.append(encoded_s - begin_s)
+        times_ms.append((1e3 * (encoded_s - begin_s), 1e3 * (time.process_time() - encoded_s)))
         right = np.array([each in query.right for each in dataset.references])
-        ignored = np.array([each in query.ignored for each in dataset.references])
         ranked = np.argsort(-row, kind="stable")
-        ranked = ranked[metrics.counting(ranked, ignored)]
+        ranked = ranked[metrics.counting(ranked, np.array([each in query.ignored for each in dataset.references]))]
         scores.append(row[ranked[0]])
         ranks.append(metrics.first_right(ranked, right))
     ram_mb = _peak_mb() - _STARTED_MB
-    quality = Quality(
-        technique=name,
-        queries=len(scores),
-        references=len(dataset.references),
-        **figures(np.array(scores), np.array(ranks)),
-    )
+    quality = {"queries": len(scores), "references": len(dataset.references)}
+    t_encode_ms, t_match_ms = np.median(times_ms, axis=0).tolist()
     return {
-        "quality": _quality(asdict(quality)),
-        "t_encode_ms": 1e3 * float(np.median(t_encode_s)),
-        "t_match_ms": 1e3 * float(np.median(t_match_s)),
+        "quality": _quality(quality | figures(np.array(scores), np.array(ranks))),
+        "t_encode_ms": t_encode_ms,
+        "t_match_ms": t_match_ms,
         "bytes": float(it.nbytes(index, len(dataset.references))),
-        "ram_mb": ram_mb,
-        "import_s": import_s,
-    }
-
-
-def network(name: str, folder: str) -> dict[str, Any]:
-    """Measure the network of a card, on pictures of a set, against 1,000 places of any content."""
-    begin_s = time.process_time()
-    import cv2
-    import numpy as np
-
-    from edgevpr.frames.images import list_images, read_image
-    from edgevpr.techniques import create
-    from edgevpr.techniques.networks.card import load_card
-    from edgevpr.techniques.networks.session import import_onnxruntime
-
-    import_onnxruntime()
-    import_s = time.process_time() - begin_s
-    cv2.setNumThreads(1)
-    begin_s = time.process_time()
-    technique = create(name)
-    open_s = time.process_time() - begin_s
-    rng, rows = np.random.default_rng(_SEED), np.empty((_NETWORK_PLACES, *technique.spec.coarse.shape), np.float16)
-    for row in rows:
-        row[:] = rng.normal(size=row.shape)
-    t_encode_s, t_match_s = [], []
-    for path in list_images(Path(folder) / "ref")[:_NETWORK_PICTURES]:
-        picture = read_image(path)
-        begin_s = time.process_time()
-        asked = technique.encode(picture)
-        encoded_s = time.process_time()
-        technique.coarse_scores(asked, rows)
-        t_match_s.append(time.process_time() - encoded_s)
-        t_encode_s.append(encoded_s - begin_s)
-    ram_mb = _peak_mb() - _STARTED_MB
-    return {
-        "t_encode_ms": 1e3 * float(np.median(t_encode_s[1:])),  # the first one pays for what is made once
-        "t_match_ms": 1e3 * float(np.median(t_match_s[1:])),
-        "bytes": technique.spec.row.nbytes,
-        "length": technique.spec.coarse.shape[0],
-        "file_mb": load_card(name).file_path.stat().st_size / 1e6,
-        "bytes_1bit": create(name, {"form": "1bit"}).spec.row.nbytes,
-        "open_s": open_s,
         "ram_mb": ram_mb,
         "import_s": import_s,
     }
@@ -198,13 +144,8 @@ def _quality(found: dict[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in found.items() if key.startswith(_QUALITY)}
 
 
-def main(words: Sequence[str]) -> None:
-    """Do the work that is named, and print what it returns."""
-    work = {"map": make_map, "cohog": cohog, "learn": learn, "way": way, "network": network}
-    print(json.dumps(work[words[0]](*words[1:])))
-
-
 _STARTED_MB = _peak_mb()  # of the bare interpreter: nothing large is imported yet
+_WORK = {"map": make_map, "cohog": cohog, "learn": learn, "way": way}
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    print(json.dumps(_WORK[sys.argv[1]](*sys.argv[2:])))

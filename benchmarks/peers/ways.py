@@ -5,8 +5,10 @@ one of all references, and `scores` gives every reference a score, higher is mor
 grey.
 """
 
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -33,6 +35,7 @@ class Way:
 def published_cohog() -> Way:
     """CoHOG as published (competitor.py), with the entropy of its authors' code: the one that the thesis prints finds
     less."""
+    sys.path.append(str(Path(__file__).parents[1]))
     import competitor
 
     def encode(grey: np.ndarray, _: Any) -> tuple[np.ndarray, np.ndarray]:

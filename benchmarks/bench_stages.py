@@ -1,0 +1,199 @@
+"""The stages of a query of `cohog`, each beside the published way (competitor.py) or the least that any way has to do.
+
+What is compared takes turns on the same pictures, on one thread, so that whatever else the machine does hits all of it;
+ratios are taken turn by turn. Frames, 640x480 grey, come from the generated scene and, where they are at hand, from
+image sets. Large maps are generated, their content random.
+"""
+
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import base
+import competitor
+import cv2
+import numpy as np
+from base import DATA, Row
+from big_map import make_big_map
+
+from edgevpr.core.contract import Technique
+from edgevpr.core.types import Position
+from edgevpr.lab.simulate.scene import make_scene
+from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.retrieve import NOTHING, Expected, compare, scan
+from edgevpr.techniques import create, placecode, placewords
+
+PLACES = 10_000
+REACH_M = 300.0
+FRAME, SIDE_PX, FRAMES_A_SET = (640, 480), 512, 2  # width and height of a frame; of the square it is laid into
+ENCODE_TURNS, MATCH_TURNS, QUERY_TURNS, REFERENCES = 10, 15, 9, 60
+GROWTH = (1_000, 3_000, 10_000, 30_000, 100_000)
+
+
+def frames() -> list[np.ndarray]:
+    """Return generated frames and real ones, uint8 (480, 640)."""
+    ground = cv2.cvtColor(make_scene(seed=3, width_m=220, depth_m=170).albedo, cv2.COLOR_BGR2GRAY)
+    found = [ground[top : top + FRAME[1], left : left + FRAME[0]] for top, left in ((100, 100), (500, 600))]
+    for folder in sorted(DATA.glob("*/query")):
+        paths = sorted(folder.iterdir())
+        images = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in paths[:: -(-len(paths) // FRAMES_A_SET)]]
+        large_enough = [image for image in images if image is not None and min(image.shape) >= 100]
+        found += [cv2.resize(image, FRAME, interpolation=cv2.INTER_AREA) for image in large_enough]
+    return found
+
+
+def timed_s(function: Callable, *arguments: object) -> float:
+    """Return the wall time of a call right after another: the first pays for the caches and the memory that the others
+    left."""
+    function(*arguments)
+    start = time.perf_counter()
+    function(*arguments)
+    return time.perf_counter() - start
+
+
+def encode_rows() -> Iterator[Row]:
+    """Encode each frame with both definitions of entropy: ours, the published way, and the floor, which is the resize
+    to 512x512 and two 3x3 Sobel passes. `good_differing` blocks are good for one of the two only."""
+    for entropy in ("shannon", "filled_bins"):
+        technique, times_s, worst, differing = create("cohog", {"entropy": entropy}), [], 0.0, 0
+
+        def published(picture: np.ndarray, entropy: str = entropy) -> tuple[np.ndarray, np.ndarray]:
+            scaled = cv2.resize(picture.astype(np.float32), (SIDE_PX, SIDE_PX), interpolation=cv2.INTER_LINEAR)
+            return competitor.encode(scaled, entropy)
+
+        for picture in frames():
+            ours, theirs = technique.encode(picture), published(picture)
+            worst = max(worst, float(np.abs(ours.regions - theirs[0]).max()))
+            differing += int((ours.good != theirs[1]).sum())
+            ways = technique.encode, published, _floor
+            times_s += [[timed_s(way, picture) for way in ways] for _ in range(ENCODE_TURNS)]
+        yield {"entropy": entropy, **_beside(times_s, "floor"), "worst_difference": worst, "good_differing": differing}
+
+
+def _floor(picture: np.ndarray) -> None:
+    grey = cv2.resize(picture, (SIDE_PX, SIDE_PX), interpolation=cv2.INTER_LINEAR)
+    cv2.Sobel(grey, cv2.CV_32F, 1, 0)
+    cv2.Sobel(grey, cv2.CV_32F, 0, 1)
+
+
+def _beside(times_s: list[list[float]], least: str) -> Row:
+    """Return medians of turns: ours, the published way and the least, and the ratios of each turn."""
+    ours_s, theirs_s, least_s = np.array(times_s).T
+    ours_ms, competitor_ms, least_ms = (1000 * np.median(times_s, axis=0)).tolist()
+    ratio, times_least = float(np.median(theirs_s / ours_s)), float(np.median(ours_s / least_s))
+    times = {"ours_ms": ours_ms, "competitor_ms": competitor_ms, "ratio": ratio}
+    return times | {f"{least}_ms": least_ms, f"times_{least}": times_least}
+
+
+def match_rows() -> Iterator[Row]:
+    """Compare one place in full: ours with the displacement vote, the published way without it, and the bare float32
+    product of the same size. Each reference is another picture, as in a map."""
+    technique, pictures = create("cohog"), frames()
+    # Shifted copies stand in where there are too few pictures: the time does not depend on what they show.
+    places = [technique.encode(np.roll(pictures[at % len(pictures)], at)) for at in range(REFERENCES)]
+    query = technique.encode(pictures[0])
+    asking = query.regions[query.good]
+    exact, single = [place.regions.astype(np.float64) for place in places], [place.regions for place in places]
+    ways = (
+        lambda: [technique.match(query, place.fine, None) for place in places],
+        lambda: competitor.match(query.regions.astype(np.float64), query.good, exact),
+        lambda: [asking @ reference.T for reference in single],
+    )
+    times_s = [[timed_s(way) / REFERENCES for way in ways] for _ in range(MATCH_TURNS)]
+    yield {"references": REFERENCES, **_beside(times_s, "product")}
+
+
+@contextmanager
+def opened(camera: str) -> Iterator[tuple[Technique, PlaceMap, PlaceIndex]]:
+    """Make and open a large map."""
+    technique = create("cohog", {"camera": camera})
+    with TemporaryDirectory() as folder:
+        make_big_map(Path(folder) / "big.gpkg", technique.spec, PLACES)
+        with PlaceMap.open(Path(folder) / "big.gpkg") as place_map:
+            yield technique, place_map, load_index(place_map, technique, 100_000_000)
+
+
+def query_rows() -> Iterator[Row]:
+    """Ask one query, encoding included, in a large map: the scan and the vote over the best places, looking ahead
+    against the vote over all (`exact_s`); looking down with what may be known beforehand, which `beside` tells."""
+    with opened("forward") as large:
+        yield _query(large, "forward", "", NOTHING)
+    with opened("nadir") as large:
+        index = large[2]
+        # A map as it is flown, on parallel legs to and fro, with some sway.
+        rng = np.random.default_rng(0)
+        turned_deg = (rng.choice([0, 180], len(index)) + rng.normal(0, 5, len(index))) % 360
+        near = index.within(Position(float(index.lat_deg.mean()), float(index.lon_deg.mean())), REACH_M)
+        in_reach = f"{np.count_nonzero(near)} places within {REACH_M:.0f} m"
+        yield _query(large, "nadir", "24 rotations", NOTHING)
+        yield _query(large, "nadir, heading known", "3 rotations", Expected(turned_deg=turned_deg))
+        yield _query(large, "nadir, in reach", in_reach, Expected(in_reach=near))
+        yield _query(large, "nadir, both", f"{in_reach}, 3 rotations", Expected(near, turned_deg))
+
+
+def _query(large: tuple[Technique, PlaceMap, PlaceIndex], camera: str, beside: str, expected: Expected) -> Row:
+    (technique, place_map, index), picture = large, frames()[0]
+
+    def query(candidates: int | None) -> None:
+        asked = technique.encode(picture)
+        scanned = scan(technique, asked, index, expected)
+        compare(technique, asked, scanned, place_map, index, candidates=candidates, expected=expected)
+
+    query(technique.candidates)
+    encode_s = statistics.median(timed_s(technique.encode, picture) for _ in range(QUERY_TURNS))
+    two_stage_s, exact_s = [], []
+    for turn in range(QUERY_TURNS):
+        two_stage_s.append(timed_s(query, technique.candidates))
+        if camera == "forward" and turn % 3 == 0:
+            exact_s.append(timed_s(query, None))
+    two_stage, exact = statistics.median(two_stage_s), statistics.median(exact_s) if exact_s else None
+    return {
+        "camera": camera,
+        "beside": beside,
+        "candidates": technique.candidates,
+        "encode_ms": 1000 * encode_s,
+        "two_stage_ms": 1000 * two_stage,
+        "exact_s": exact,  # None where it would take minutes
+        "ratio": exact / two_stage if exact else None,
+        "bytes_per_place": bytes_per_place(technique.spec),
+    }
+
+
+def growth_rows() -> Iterator[Row]:
+    """Scan maps of more and more places: place codes ahead, words looking down (24 rotations). The query's own part
+    does not grow, and stands apart as `t_query_ms`."""
+    rng = np.random.default_rng(0)
+    blocks = rng.random((31, 31, 32), dtype=np.float32)
+    mean = rng.random((placecode.SIDE, placecode.SIDE, 8), dtype=np.float32)
+    patterns = rng.normal(size=(700, 20)).astype(np.float32)
+    numbers = np.sort(rng.permutation(31 * 31)[:700])
+
+    def ask_ahead() -> object:
+        return placecode.hypotheses(*placecode.seen_grid(blocks, np.ones((31, 31), bool)), mean)
+
+    def ask_down() -> object:
+        asking = dict.fromkeys(range(6), (patterns, numbers))
+        return placewords.of_query(placewords.load("ground_words"), asking, 6, (31, 31))
+
+    for rotations, ask, scan_all, side, most, dtype in (
+        (1, ask_ahead, placecode.scan_ahead, placecode.SIDE, 256, np.uint8),
+        (24, ask_down, placewords.scan, placewords.SIDE, 1024, np.uint16),
+    ):
+        asked = ask()
+        for count in GROWTH:
+            there, rounds = rng.integers(0, most, (count, side**2), dtype=dtype), 2_000_000 // (count * rotations)
+            times_s = [(timed_s(ask), timed_s(scan_all, asked, there)) for _ in range(max(1, min(20, rounds)))]
+            t_query_s, t_scan_s = np.median(times_s, axis=0)
+            row = {"places": count, "rotations": rotations, "place_bytes": there.nbytes // count}
+            yield row | {"t_query_ms": 1e3 * t_query_s, "t_scan_ms": 1e3 * t_scan_s, "index_mb": there.nbytes / 1e6}
+
+
+ROWS = {"encode": encode_rows, "match": match_rows, "two_stage": query_rows, "growth": growth_rows}
+
+
+if __name__ == "__main__":
+    base.run(lambda: [print(row) for rows in ROWS.values() for row in rows()])

@@ -1,0 +1,86 @@
+"""Walks over maps of image sets, as a flight, an evaluation or a calibration has them, for the benchmarks."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import base
+import numpy as np
+
+from edgevpr.core.config import Config, load_config
+from edgevpr.core.contract import Technique
+from edgevpr.core.types import Frame
+from edgevpr.frames.images import read_image
+from edgevpr.frames.source import open_source
+from edgevpr.lab.evaluate.dataset import Dataset, load_dataset
+from edgevpr.lab.evaluate.evaluate import all_frames, mapped
+from edgevpr.places.index import PlaceIndex
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.power.boards import load_board
+from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.recognise.calibrated import calibration_of
+from edgevpr.runtime.recognise.judge import accept_rule
+from edgevpr.runtime.recognise.opening import meter_of
+from edgevpr.runtime.recognise.recogniser import Recogniser
+from edgevpr.runtime.recognise.recognition import Recognition
+from edgevpr.techniques import create
+
+
+def dataset_of(folder: Path) -> Dataset:
+    return load_dataset(folder / "query", folder / "ref", folder / "ground_truth.csv")
+
+
+def config() -> Config:
+    """Return the configuration that nobody has changed."""
+    return load_config(None)
+
+
+def meter() -> QueryMeter:
+    return meter_of(config(), load_board("this"))
+
+
+def frames_of(folder: Path) -> Iterator[Frame]:
+    """Yield the pictures of a folder, with their positions."""
+    return all_frames(open_source(str(folder), live=False))
+
+
+def frame(image: np.ndarray | Path, name: str | None = None, t_s: float = 0.0) -> Frame:
+    """Make a frame of a picture, or of the picture in a file."""
+    if isinstance(image, Path):
+        return Frame(image=read_image(image), name=name or image.name, t_mono_s=t_s)
+    return Frame(image=image, name=name or "", t_mono_s=t_s)
+
+
+def cohog(camera: str) -> Technique:
+    return create("cohog", {"camera": camera})
+
+
+@contextmanager
+def map_of(folder: Path, technique: Technique | None = None) -> Iterator[tuple[PlaceMap, PlaceIndex, Technique]]:
+    """Map the references of a set as `map build` does, by `cohog` unless another technique is named."""
+    technique = technique or cohog(base.camera_of(folder.name))
+    with mapped(frames_of(folder / "ref"), technique, meter(), folder / "ref") as (place_map, index):
+        yield place_map, index, technique
+
+
+def walk(place_map: PlaceMap, index: PlaceIndex, technique: Technique, **more: Any) -> Recogniser:
+    """Return a walk over a map with the technique's own number of candidates; `more` is anything else of a
+    `Recogniser`, such as another `rule` than that of the map."""
+    more.setdefault("rule", accept_rule(technique, config().match, 1, calibration_of(place_map)))
+    parts = {"technique": technique, "place_map": place_map, "index": index, "meter": meter()}
+    return Recogniser(**parts, candidates=technique.candidates, **more)
+
+
+def ranked(event: Recognition, names: list[str] | tuple[str, ...]) -> list[str]:
+    """Return the names of the places that a query found, best first, by the names of the slots. Raises EdgevprError
+    where it failed."""
+    if event.failed:
+        raise base.EdgevprError(event.reason)
+    return [names[slot] for slot in event.ranking.slots] if event.ranking else []
+
+
+def names_of(place_map: PlaceMap, index: PlaceIndex) -> list[str]:
+    """Return the names of the pictures of the places, by slot."""
+    names = {place.place_id: place.source_image for place in place_map.places()}
+    return [names[place_id] for place_id in index.place_ids.tolist()]
