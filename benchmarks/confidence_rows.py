@@ -23,7 +23,7 @@ from edgevpr.core.types import Frame
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.level import UNKNOWN_VIEW, Levelled
 from edgevpr.frames.source import open_source
-from edgevpr.lab.evaluate.dataset import Query, load_dataset
+from edgevpr.lab.evaluate.dataset import ScoredQuery, load_dataset
 from edgevpr.lab.evaluate.evaluate import all_frames, mapped
 from edgevpr.mapmaking.calibrate import ask, asked_of
 from edgevpr.places.index import PlaceIndex
@@ -148,7 +148,7 @@ def walk_over(
     )
 
 
-def kind_of_match(found: str, query: Query | None, references: Sequence[str], index: PlaceIndex) -> str:
+def kind_of_match(found: str, query: ScoredQuery | None, references: Sequence[str], index: PlaceIndex) -> str:
     """Return what a best place is to a query (None: one of another site): right, ignored, beside a right one, wrong, or
     foreign."""
     if query is None:

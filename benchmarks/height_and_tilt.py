@@ -25,7 +25,7 @@ from edgevpr.core.errors import EdgevprError
 from edgevpr.core.tables import markdown
 from edgevpr.core.types import Frame
 from edgevpr.frames.images import read_image
-from edgevpr.lab.evaluate.dataset import Query, load_dataset
+from edgevpr.lab.evaluate.dataset import ScoredQuery, load_dataset
 from edgevpr.lab.evaluate.evaluate import mapped
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.judge import accept_rule
@@ -173,7 +173,7 @@ def taken(image: np.ndarray, view: np.ndarray) -> np.ndarray:
     return cv2.warpPerspective(image, view, image.shape[1::-1], borderMode=cv2.BORDER_REFLECT_101)
 
 
-def truth_of(query: Query, image, view, references, nearer, lies) -> tuple[dict, set[str]]:
+def truth_of(query: ScoredQuery, image, view, references, nearer, lies) -> tuple[dict, set[str]]:
     """Of each place that the query was registered with and overlaps: the share of the smaller picture that both show,
     and the homography from the query as taken. Also the places of which it is not known."""
     ground = cut(through(np.linalg.inv(view), corners(image)), corners(image))

@@ -25,6 +25,7 @@ import yaml
 from edgevpr.core.errors import UsageError
 from edgevpr.core.progress import progress
 from edgevpr.lab.evaluate import provenance
+from edgevpr.lab.evaluate.asking import MatchOptions
 from edgevpr.lab.evaluate.dataset import load_dataset
 from edgevpr.lab.evaluate.evaluate import compare, evaluate
 from edgevpr.runtime.preflight.accuracy import PATH as ACCURACY
@@ -165,8 +166,10 @@ def write_set(path: Path, folder: Path, wanted: list[Variant]) -> None:
             return progress(items, total, f"{folder.name}, {variant.label}, {label.partition(': ')[2]}")
 
         chosen = settings(variant, folder)
-        ways = {"exact": variant.exact, "follow": variant.follow}
-        result = evaluate(variant.technique, dataset, chosen, variant.candidates, shown, variant.sequence, **ways)
+        options = MatchOptions(
+            candidates=variant.candidates, sequence=variant.sequence, exact=variant.exact, follow=variant.follow
+        )
+        result = evaluate(variant.technique, dataset, chosen, options, shown)
         rows[variant.label] = asdict(replace(result, technique=variant.label)) | {
             "encode_ram_mb": encode_ram_mb(variant.technique, chosen),
             "commit": base.commit(),

@@ -37,9 +37,9 @@ from edgevpr.core.errors import EdgevprError
 from edgevpr.core.types import Frame
 from edgevpr.frames.images import read_image
 from edgevpr.frames.source import open_source
-from edgevpr.lab.evaluate.dataset import Dataset, Query, load_dataset
+from edgevpr.lab.evaluate.dataset import Dataset, ScoredQuery, load_dataset
 from edgevpr.lab.evaluate.evaluate import all_frames
-from edgevpr.lab.evaluate.quality import interval
+from edgevpr.lab.evaluate.metrics import interval
 from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.examine import examine
 from edgevpr.places.index import bytes_per_place
@@ -253,7 +253,7 @@ def measured(work: Path, data: Path, camera: str, count: int, how: str) -> Row:
     return row
 
 
-def _is_beside(place: str, query: Query, dataset: Dataset) -> bool:
+def _is_beside(place: str, query: ScoredQuery, dataset: Dataset) -> bool:
     """Tell whether a place is at most two pictures before or after one that is right, in the order of the site."""
     if place not in dataset.references:
         return False

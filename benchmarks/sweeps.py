@@ -47,7 +47,7 @@ from edgevpr.frames.level import UNKNOWN_VIEW, Levelled
 from edgevpr.frames.source import open_source
 from edgevpr.lab.evaluate.dataset import load_dataset
 from edgevpr.lab.evaluate.evaluate import all_frames, mapped
-from edgevpr.lab.evaluate.quality import interval
+from edgevpr.lab.evaluate.metrics import interval
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.calibrated import calibration_of
 from edgevpr.runtime.recognise.judge import accept_rule

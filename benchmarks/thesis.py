@@ -24,9 +24,8 @@ from thesis_values import read_results
 
 from edgevpr.core.errors import EdgevprError, UsageError
 from edgevpr.frames.opencv import cv2
-from edgevpr.lab.evaluate.dataset import Dataset, load_dataset
+from edgevpr.lab.evaluate.dataset import Dataset, load_dataset, read_truth
 from edgevpr.lab.evaluate.similarity import measure, read_similarities
-from edgevpr.lab.evaluate.truth import read_truth
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 RESULTS = REPOSITORY / "benchmarks" / "results"

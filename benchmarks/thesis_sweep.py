@@ -14,7 +14,7 @@ from edgevpr.core.progress import progress
 from edgevpr.frames.images import read_image
 from edgevpr.lab.evaluate import metrics
 from edgevpr.lab.evaluate.dataset import Dataset
-from edgevpr.lab.evaluate.quality import figures
+from edgevpr.lab.evaluate.metrics import figures
 from edgevpr.techniques.displacement import share
 from edgevpr.techniques.entropy import block_means, filled_bins, good_blocks, shannon
 from edgevpr.techniques.gradients import grey_square, levels, normalised_blocks, oriented_cells

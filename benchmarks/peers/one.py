@@ -24,17 +24,13 @@ _QUALITY = "recall", "precision_at", "auc", "queries", "references"
 
 def make_map(camera: str, folder: str, file: str) -> dict[str, Any]:
     """Make a map of the references of a set, as `edgevpr map build` does."""
-    from edgevpr.core.config import load_config
     from edgevpr.frames.source import open_source
     from edgevpr.lab.evaluate import evaluate
-    from edgevpr.power.boards import load_board
-    from edgevpr.runtime.recognise.opening import meter_of
     from edgevpr.techniques import create
 
     images = Path(folder) / "ref"
-    meter = meter_of(load_config(None), load_board("this"))
     frames = evaluate.all_frames(open_source(str(images), live=False))
-    evaluate.make_map(Path(file), frames, create("cohog", {"camera": camera}), meter, images)
+    evaluate.make_map(Path(file), frames, create("cohog", {"camera": camera}), images)
     return {}
 
 
@@ -44,18 +40,15 @@ def cohog(camera: str, folder: str, file: str) -> dict[str, Any]:
     import cv2
     import numpy as np
 
-    from edgevpr.core.config import load_config
-    from edgevpr.lab.evaluate.asking import Asking, Walk, answers
-    from edgevpr.lab.evaluate.evaluate import opened, summary
-    from edgevpr.power.boards import load_board
-    from edgevpr.runtime.recognise.opening import meter_of
+    from edgevpr.lab.evaluate.asking import MatchOptions, Walk, answers
+    from edgevpr.lab.evaluate.evaluate import opened, own_meter, summary
     from edgevpr.techniques import create
 
     import_s = time.process_time() - begin_s
     cv2.setNumThreads(1)
     dataset, technique = _dataset(folder), create("cohog", {"camera": camera})
     with opened(Path(file), technique) as (place_map, index):
-        walk = Walk(technique, place_map, index, meter_of(load_config(None), load_board("this")), asking=Asking())
+        walk = Walk(technique, place_map, index, own_meter(), options=MatchOptions())
         walk.warm_up(dataset.queries[0].path)
         found = list(answers(walk, dataset, lambda paths, count, label: paths))
     ram_mb = _peak_mb() - _STARTED_MB  # the figures of quality load SciPy, and a flight does not
@@ -88,7 +81,7 @@ def way(name: str, folder: str, file: str) -> dict[str, Any]:
     from ways import WAYS
 
     from edgevpr.lab.evaluate import metrics
-    from edgevpr.lab.evaluate.quality import figures
+    from edgevpr.lab.evaluate.metrics import figures
 
     it = WAYS[name]()
     import_s = time.process_time() - begin_s

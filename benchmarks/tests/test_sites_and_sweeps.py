@@ -10,7 +10,7 @@ from foreign_places import GENERATED, MIRRORED, OTHER_SET, OTHER_SETS, foreign
 from sites import chosen, covering
 from sweep_changes import OF_CAMERA, SWEEPS, spoilt, view
 
-from edgevpr.lab.evaluate.dataset import Dataset, Query
+from edgevpr.lab.evaluate.dataset import Dataset, ScoredQuery
 
 SIZE = (320, 240)
 MIDDLE = (np.array(SIZE) - 1) / 2
@@ -31,7 +31,7 @@ def seen_at(homography: np.ndarray, point) -> np.ndarray:
 def test_every_query_has_a_right_place_in_the_smallest_map_and_maps_are_nested():
     wanted = [frozenset("ab"), frozenset("bc"), frozenset("d")]
     assert set(covering(wanted)) == {"b", "d"}
-    queries = tuple(Query(Path("q.jpg"), right, frozenset()) for right in wanted)
+    queries = tuple(ScoredQuery(Path("q.jpg"), right, frozenset()) for right in wanted)
     dataset = Dataset(queries, Path(), tuple("abcd"))
     names = [*"abcd", *(f"generated/{number}" for number in range(6))]
     maps = [chosen(dataset, names, count) for count in (2, 3, 4, 7, 10)]

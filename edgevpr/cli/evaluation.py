@@ -26,7 +26,7 @@ from edgevpr.core.text import shown
 
 if TYPE_CHECKING:
     from edgevpr.lab.evaluate.dataset import Dataset
-    from edgevpr.lab.evaluate.plan import Plan, SetPlan
+    from edgevpr.lab.evaluate.plan import EvaluationPlan, SetPlan
 
 _MOST_WORKERS = 256
 
@@ -124,15 +124,13 @@ def _measure_many(args: Namespace) -> int:
         for of in outcome.sets:
             if results := [each.result for each in outcome.found if each.set_name == of.name]:
                 print(f"{shown(of.name)}\n\n{quality_text(results)}\n")
-        print(f"{out / 'index.html'}: look at it. The cache holds {outcome.cache_bytes / 1e6:,.1f} MB.")
-    if outcome.damaged:
-        print(f"edgevpr: {outcome.damaged} entries of the cache were damaged, and were made anew", file=sys.stderr)
+        print(f"{out / 'index.html'}: look at it.")
     for (name, row), why in outcome.failed.items():
         print(f"edgevpr: {shown(f'{name}, {row} was not measured: {why}')}", file=sys.stderr)
     return 1 if outcome.failed else 0
 
 
-def _plan(args: Namespace) -> "Plan":
+def _plan(args: Namespace) -> "EvaluationPlan":
     from edgevpr.lab.evaluate.plan import RowPlan, of_flags, read_plan
     from edgevpr.runtime.preflight.offers import offers
 
@@ -207,7 +205,7 @@ def _forms(args: Namespace) -> list[str]:
 def _dataset(args: Namespace, cache: str) -> "Dataset":
     """Read the data set; the pictures of a video are taken into the folder `cache`."""
     from edgevpr.core.progress import progress
-    from edgevpr.lab.evaluate.kept import Kept
+    from edgevpr.lab.evaluate.cache import Cache
 
     chosen = _set_of(args)
     if args.sets or args.workers or args.cache:
@@ -218,7 +216,7 @@ def _dataset(args: Namespace, cache: str) -> "Dataset":
         chosen = replace(chosen, folder=args.data[0])
     elif not (args.query and args.ref):
         raise UsageError("Name a data set with --data or --query and --ref, or stored similarities with --similarity.")
-    dataset = chosen.open(Kept(cache), progress)
+    dataset = chosen.open(Cache(cache), progress)
     _say_notes(dataset)
     return dataset
 
@@ -263,6 +261,7 @@ def _measure_techniques(args: Namespace) -> int:
     from edgevpr.core.figures import require_picture
     from edgevpr.core.progress import progress
     from edgevpr.lab.evaluate import evaluate as evaluation
+    from edgevpr.lab.evaluate.asking import MatchOptions
     from edgevpr.lab.evaluate.curves import plot
     from edgevpr.lab.evaluate.tables import results_text
     from edgevpr.runtime.preflight.offers import offers, usable
@@ -270,7 +269,10 @@ def _measure_techniques(args: Namespace) -> int:
 
     wanted, forms = _wanted(args), _forms(args)
     config = config_of(args, args.config)
-    match, gate = config.match, gate_of(config.salience)
+    options = MatchOptions(
+        candidates=config.match.candidates, sequence=config.match.sequence, exact=args.exact, follow=args.follow
+    )
+    gate = gate_of(config.salience)
     if args.plot:
         require_picture(Path(args.plot))
     # A wrong setting is reported before the first hour of work; a network that cannot be used stops no other.
@@ -282,17 +284,7 @@ def _measure_techniques(args: Namespace) -> int:
         dataset = _dataset(args, cache)
         _say_camera("the set", ((offer.name, offer.settings) for offer, _ in tried))
         results = [
-            evaluation.evaluate(
-                offer.name,
-                dataset,
-                offer.settings,
-                match.candidates,
-                progress,
-                match.sequence,
-                gate,
-                args.exact,
-                args.follow,
-            )
+            evaluation.evaluate(offer.name, dataset, offer.settings, options, progress, gate)
             for offer, _ in tried
             if offer.label not in errors
         ]

@@ -343,6 +343,7 @@ def _shortened(value: Any) -> str:
 
 
 def _kind(hint: Any) -> Any:
-    """Return the type of a value without its None: float for `float | None`, and for float."""
+    """Return the type of a value without its None: float for `float | None`, dict for `dict[str, Any]`."""
     options = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
-    return next(option for option in options if option is not type(None))
+    kind = next(option for option in options if option is not type(None))
+    return typing.get_origin(kind) or kind

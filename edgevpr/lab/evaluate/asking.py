@@ -1,20 +1,19 @@
 """The queries of a data set, asked one by one by the code that flies, and what each answer is worth."""
 
-import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
-from edgevpr.core.config import load_config
+from edgevpr.core.config import bounded, load_config
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import ModelError
 from edgevpr.core.types import Frame, StageCost
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.lab.evaluate import metrics
-from edgevpr.lab.evaluate.dataset import Dataset, Query
+from edgevpr.lab.evaluate.dataset import Dataset, ScoredQuery
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Ranking, elsewhere
@@ -32,20 +31,25 @@ Progress = Callable[[Iterable[T], int, str], Iterable[T]]
 _NOTHING_FOUND = Ranking(np.empty(0, np.intp), np.empty(0, np.float32), {})  # a picture that says nothing
 
 
+def optional(low: float, high: float) -> Any:
+    """Make a field that is None unless it is given, and then lies in low..high."""
+    return field(default=None, metadata=bounded(low, high).metadata)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Asking:
-    """Manner of asking: `candidates` places are compared (None: the technique's own number, as it flies); with `exact`
-    all are, and the scan chooses none. `sequence` queries are matched together, in the order of their names
+class MatchOptions:
+    """Manner of matching: `candidates` places are compared (None: the technique's own number, as it flies); with
+    `exact` all are, and the scan chooses none. `sequence` queries are matched together, in the order of their names
     (None: the technique's own number); with `follow` they are followed as those of one flight."""
 
-    candidates: int | None = None
-    sequence: int | None = None
+    candidates: int | None = optional(1, 1_000_000)
+    sequence: int | None = optional(1, 100)
     exact: bool = False
     follow: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Answer:
+class QueryAnswer:
     """The answer to one query: the reference that was `found`, its score and the rank of the first right one (from 0,
     infinite: there is none), all among the references that count. `accepted`: the flight would have accepted the match;
     `accepted_wrong`: it would have, and the match is wrong; `accepted_elsewhere`: and not beside a right one either.
@@ -79,13 +83,13 @@ class Walk:
         index: PlaceIndex,
         meter: QueryMeter,
         *,
-        asking: Asking,
+        options: MatchOptions,
         gate: Gate | NoGate | None = None,
     ) -> None:
         gate = gate or NoGate()
-        self.length = length_of(technique.spec, asking.sequence)
+        self.length = length_of(technique.spec, options.sequence)
         rule = accept_rule(technique, load_config(None).match, self.length, calibration_of(place_map))
-        follows = asking.follow and self.length == 1 and rule.sure is not None
+        follows = options.follow and self.length == 1 and rule.sure is not None
         self.is_in_order = self.length > 1 or follows
 
         def recogniser(length: int, follows: bool) -> Recogniser:
@@ -95,7 +99,7 @@ class Walk:
                 index=index,
                 rule=rule,
                 meter=meter,
-                candidates=None if asking.exact else asking.candidates or technique.candidates,
+                candidates=None if options.exact else options.candidates or technique.candidates,
                 search=search_of(length),
                 gate=gate,
                 follower=Follower(place_map, fastest_m_s=None, is_live=False) if follows else None,
@@ -110,12 +114,7 @@ class Walk:
         self._gate.forget()
 
 
-def in_order(dataset: Dataset) -> list[Path]:
-    """Return all pictures of the folder of the queries: those that are not scored are part of a sequence as well."""
-    return list_images(dataset.queries[0].path.parent)
-
-
-def answer_of(event: Recognition, query: Query, references: Sequence[str], index: PlaceIndex) -> Answer:
+def answer_of(event: Recognition, query: ScoredQuery, references: Sequence[str], index: PlaceIndex) -> QueryAnswer:
     """Judge what was recognised. `references` are the names of all places, in the order in which they were mapped."""
     discarded = event.worth is not None and event.worth.reason is not None
     ranking = (None if discarded else event.ranking) or _NOTHING_FOUND
@@ -125,7 +124,7 @@ def answer_of(event: Recognition, query: Query, references: Sequence[str], index
     at = metrics.counting(ranking.slots, ignored)
     wrong = event.accepted and not (right | ignored)[ranking.slots[0]]
     away = wrong and elsewhere(index, ranking.slots[0], np.flatnonzero(right | ignored), 0.0).all()
-    return Answer(
+    return QueryAnswer(
         query=query.path.name,
         found=references[ranking.slots[at[0]]] if len(at) else None,
         score=float(ranking.scores[at[0]]) if len(at) else 0.0,
@@ -139,11 +138,13 @@ def answer_of(event: Recognition, query: Query, references: Sequence[str], index
     )
 
 
-def answers(walk: Walk, dataset: Dataset, progress: Progress) -> Iterator[Answer]:
+def answers(walk: Walk, dataset: Dataset, progress: Progress[Path]) -> Iterator[QueryAnswer]:
     """Ask all queries of a data set, and yield the answers of those that are scored."""
     recogniser = walk.recogniser
     scored = {query.path.name: query for query in dataset.queries}
-    paths = in_order(dataset) if walk.is_in_order else [query.path for query in dataset.queries]
+    paths = [query.path for query in dataset.queries]
+    if walk.is_in_order:  # those that are not scored are part of a sequence as well
+        paths = list_images(paths[0].parent)
     for path in progress(paths, len(paths), f"{recogniser.technique.spec.name}: queries"):
         event = asked(recogniser, path)
         if query := scored.get(path.name):
@@ -156,14 +157,3 @@ def asked(recogniser: Recogniser, path: Path) -> Recognition:
     if event.failed:
         raise ModelError(event.reason)
     return event
-
-
-def recall_curve(answers: Sequence[Answer], most: int) -> tuple[float, ...]:
-    """Return recall@K for K from 1 to `most`."""
-    ranks = np.array([each.first_right for each in answers])
-    return tuple(metrics.recall_at(k, ranks) for k in range(1, most + 1))
-
-
-def rank_or_none(rank: float) -> int | None:
-    """Return a rank as JSON can hold it: None where there is no right reference."""
-    return None if math.isinf(rank) else int(rank)

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from edgevpr.core.figures import figure
-from edgevpr.lab.evaluate.quality import Quality
+from edgevpr.lab.evaluate.metrics import Quality
 
 _PANELS_A_ROW = 3
 # More than ten colours cannot be told apart: after ten curves the line style changes.

@@ -1,16 +1,50 @@
 """A data set: a folder of queries, a folder of references, and a ground truth that says which references are right."""
 
+import csv
+import io
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from edgevpr.core.errors import UsageError
+from edgevpr.core.files import read_file
 from edgevpr.core.text import decoded_name
 from edgevpr.frames.images import list_images
-from edgevpr.lab.evaluate.truth import read_truth
+
+_COLUMNS = ("query_file", "ref_files", "ref_files_loose", "status")
+_MAX_FILE_BYTES = 100_000_000  # a million queries
 
 
 @dataclass(frozen=True, slots=True)
-class Query:
+class Judged:
+    """The references that are `right` for a query; a match in `ignored` is neither right nor wrong. `where` it stands
+    in the file, for messages."""
+
+    right: frozenset[str]
+    ignored: frozenset[str]
+    where: str
+
+
+@dataclass(frozen=True, slots=True)
+class GroundTruth:
+    """A ground truth: of every query its name, in the order of the file, and None where it is not scored."""
+
+    queries: dict[str, Judged | None]
+    places: dict[str, str]  # where each query stands in the file, for messages
+
+    @property
+    def scored(self) -> dict[str, Judged]:
+        """The queries that are scored."""
+        return {name: judged for name, judged in self.queries.items() if judged}
+
+    @property
+    def named(self) -> frozenset[str]:
+        """All references that it names for queries that are scored."""
+        return frozenset().union(*(judged.right | judged.ignored for judged in self.scored.values()))
+
+
+@dataclass(frozen=True, slots=True)
+class ScoredQuery:
     """A query that is scored: `right` are file names of references that count as correct; a match in `ignored` is
     neither right nor wrong."""
 
@@ -24,7 +58,7 @@ class Dataset:
     """A data set: its scored queries and the folder of its references. `references` are the names of all images of
     `ref_dir`, in the order in which they are mapped. `notes` say what of it is left out."""
 
-    queries: tuple[Query, ...]
+    queries: tuple[ScoredQuery, ...]
     ref_dir: Path
     references: tuple[str, ...]
     notes: tuple[str, ...] = ()
@@ -46,7 +80,53 @@ def load_dataset(query_dir: str | Path, ref_dir: str | Path, ground_truth: str |
             raise UsageError(
                 f"{judged.where}: the reference `{unknown[0]}` is not in {ref_dir}: correct its name, or remove it."
             )
-    queries = tuple(Query(paths[name], judged.right, judged.ignored) for name, judged in truth.scored.items())
+    queries = tuple(ScoredQuery(paths[name], judged.right, judged.ignored) for name, judged in truth.scored.items())
     if not queries:
         raise UsageError(f"{ground_truth} scores no query: it needs a row with ref_files (and status `ok`).")
     return Dataset(queries, Path(ref_dir), references)
+
+
+def read_truth(path: str | Path) -> GroundTruth:
+    """Read a CSV with the columns query_file and ref_files (names separated by spaces). Optional are ref_files_loose
+    (ignored unless they are in ref_files too) and status (only `ok` is scored). Raises UsageError with file, line,
+    value and what to do."""
+    queries: dict[str, Judged | None] = {}
+    places: dict[str, str] = {}
+    for where, row in _rows(Path(path)):
+        name = row["query_file"]
+        if name in queries:
+            raise UsageError(f"{where}: the query `{name}` has a row already: keep one, with all its ref_files.")
+        right, loose = (frozenset(row.get(key, "").split()) for key in ("ref_files", "ref_files_loose"))
+        is_scored = row.get("status", "ok") == "ok"
+        if is_scored and not right:
+            raise UsageError(
+                f"{where}: the query `{name}` has no ref_files: name at least one, or give it a status other than "
+                "`ok`, so that it is not scored."
+            )
+        places[name] = where
+        queries[name] = Judged(right, loose - right, where) if is_scored else None
+    return GroundTruth(queries, places)
+
+
+def _rows(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
+    """Yield each row of the CSV, stripped, with its place in the file for messages."""
+    try:
+        reader = csv.DictReader(io.StringIO(read_file(path, _MAX_FILE_BYTES).decode("utf-8-sig"), newline=""))
+        columns = list(reader.fieldnames or ())
+        for column in _COLUMNS:
+            if column in _COLUMNS[:2] and column not in columns:
+                raise UsageError(f"{path}: the column `{column}` is missing from its first line: add it.")
+            if columns.count(column) > 1:
+                raise UsageError(f"{path}: its first line has two columns `{column}`: keep one of them.")
+        for row in reader:
+            where = f"{path}, line {reader.line_num}"
+            if None in row or None in row.values():
+                raise UsageError(
+                    f"{where}: the row has not as many fields as the first line: separate columns by commas, and file "
+                    "names inside a column by spaces."
+                )
+            yield where, {column: value.strip() for column, value in row.items()}
+    except OSError as error:
+        raise UsageError(f"{path} cannot be read ({error.strerror}): give the path of a CSV file.") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise UsageError(f"{path} is not a CSV file in UTF-8 ({error}): save it as one.") from error

@@ -15,12 +15,13 @@ from edgevpr.core.errors import UsageError
 from edgevpr.core.types import NO_COST, Frame, StageCost
 from edgevpr.frames.source import Source, open_source
 from edgevpr.lab.evaluate import metrics
-from edgevpr.lab.evaluate.asking import Answer, Asking, Progress, Walk, answers
+from edgevpr.lab.evaluate.asking import MatchOptions, Progress, QueryAnswer, Walk, answers
 from edgevpr.lab.evaluate.dataset import Dataset
-from edgevpr.lab.evaluate.quality import Quality, figures
+from edgevpr.lab.evaluate.metrics import Quality, figures
 from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.sequence import length_of
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import pack_ah, parse_pack, queries_ah, rail_ah, stage_energy_j
 from edgevpr.power.meter import QueryMeter
@@ -70,32 +71,44 @@ def evaluate(
     technique_name: str,
     dataset: Dataset,
     parameters: dict[str, Any] | None = None,
-    candidates: int | None = None,
-    progress: Progress = lambda items, total, label: items,
-    sequence: int | None = None,
+    options: MatchOptions = MatchOptions(),  # noqa: B008  it is frozen
+    progress: Progress[Any] = lambda items, total, label: items,
     gate: Gate | NoGate | None = None,
-    exact: bool = False,
-    follow: bool = False,
 ) -> TechniqueResult:
-    """Map the references, ask every query, and score the answers. `candidates` places are compared (None: the
-    technique's own number, as it flies); with `exact` all are, and the scan chooses none. `sequence` queries are
-    matched together, in the order of their names (None: the technique's own number); with `follow` they are followed as
-    those of one flight. `gate` discards queries; the map has all references, as in the thesis (3.3).
+    """Map the references, ask every query, and score the answers. `gate` discards queries; the map has all references,
+    as in the thesis (3.3).
 
     Raises UsageError for an unknown technique or parameter, ImageError for an image that cannot be used, MapError if
     the temporary map cannot be written, and ModelError for a network that cannot be used or a query that fails.
     """
-    technique, gate = create(technique_name, parameters), gate or NoGate()
-    config = load_config(None)
-    meter = meter_of(config, load_board("this"))
+    technique = create(technique_name, parameters)
     source = open_source(str(dataset.ref_dir), live=False)
     frames = progress(all_frames(source), source.total, f"{technique_name}: references")
-    with mapped(frames, technique, meter, dataset.ref_dir) as (place_map, index):
-        asking = Asking(candidates=candidates, sequence=sequence, exact=exact, follow=follow)
-        walk = Walk(technique, place_map, index, meter, asking=asking, gate=gate)
+    with tempfile.TemporaryDirectory(prefix="edgevpr-eval-") as folder:
+        path = Path(folder) / "references.gpkg"
+        make_map(path, frames, technique, dataset.ref_dir)
+        found = answers_on(path, technique, dataset, options, progress, gate)
+    return summary(technique, len(dataset.references), found, length_of(technique.spec, options.sequence))
+
+
+def answers_on(
+    path: Path,
+    technique: Technique,
+    dataset: Dataset,
+    options: MatchOptions,
+    progress: Progress[Any] = lambda items, total, label: items,
+    gate: Gate | NoGate | None = None,
+) -> list[QueryAnswer]:
+    """Ask every query of a data set in the map of its references."""
+    with opened(path, technique) as (place_map, index):
+        walk = Walk(technique, place_map, index, own_meter(), options=options, gate=gate)
         walk.warm_up(dataset.queries[0].path)
-        found = list(answers(walk, dataset, progress))
-    return replace(summary(technique, len(dataset.references), found), sequence=walk.length)
+        return list(answers(walk, dataset, progress))
+
+
+def own_meter() -> QueryMeter:
+    """Return the meter of this machine."""
+    return meter_of(load_config(None), load_board("this"))
 
 
 @contextmanager
@@ -106,23 +119,19 @@ def mapped(
     an index with all its places. `images` is the folder that the frames come from."""
     with tempfile.TemporaryDirectory(prefix="edgevpr-eval-") as folder:
         path = Path(folder) / "references.gpkg"
-        make_map(path, frames, technique, meter, images)
+        make_map(path, frames, technique, images, meter)
         with opened(path, technique) as (place_map, index):
             yield place_map, index
 
 
 def make_map(
-    path: Path,
-    frames: Iterable[Frame],
-    technique: Technique,
-    meter: QueryMeter,
-    images: Path | None,
-    encoder: Technique | None = None,
+    path: Path, frames: Iterable[Frame], technique: Technique, images: Path | None, meter: QueryMeter | None = None
 ) -> None:
-    """Map frames in a new file, refine and calibrate the map as `map build` does. `encoder` makes the places (None: the
-    technique)."""
+    """Map frames in a new file, refine and calibrate the map as `map build` does. `images` is the folder that the
+    frames come from."""
+    meter = meter or own_meter()
     with PlaceMap.create(path, technique.spec) as place_map:
-        build_map(frames, encoder or technique, place_map, meter)
+        build_map(frames, technique, place_map, meter)
         _refine(place_map, technique, images)
         _calibrate(place_map, technique, meter, images)
 
@@ -191,11 +200,14 @@ def all_frames(source: Source) -> Iterator[Frame]:
     """Yield all frames of a folder. Raises ImageError for the first that cannot be used: a set with holes measures
     nothing."""
     while not source.ended:
-        yield source.read(timeout_s=0)
+        if frame := source.read(timeout_s=0):
+            yield frame
 
 
-def summary(technique: Technique, references: int, answers: Sequence[Answer]) -> TechniqueResult:
-    """Return the result of a technique from its answers to all queries; `sequence` and the PCU are those of nobody."""
+def summary(
+    technique: Technique, references: int, answers: Sequence[QueryAnswer], sequence: int = 1
+) -> TechniqueResult:
+    """Return the result of a technique from its answers to all queries, without the PCU."""
     queries = len(answers)
     scores = np.array([answer.score for answer in answers])
     ranks = np.array([answer.first_right for answer in answers])
@@ -227,6 +239,7 @@ def summary(technique: Technique, references: int, answers: Sequence[Answer]) ->
         u_match=u_match,
         ah_total=queries_ah(queries, pack_ah(query_j, pack, efficiency)),
         ah_total_cpu_rail=queries_ah(queries, rail_ah(query_j)),
+        sequence=sequence,
         ah_assumes=(
             f"{board.title}, {board.idle_w:g} W idle and {board.full_w:g} W at full load ({board.source}), "
             f"pack {config.battery.pack}, regulator efficiency {efficiency:g}"

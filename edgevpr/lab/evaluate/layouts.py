@@ -11,23 +11,41 @@
   beside it, query.mp4 with query.csv, or a folder that holds one.
 """
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
+from edgevpr.core.config import bounded
 from edgevpr.core.errors import UsageError
+from edgevpr.core.files import read_file
+from edgevpr.core.geodesy import offset_m
+from edgevpr.core.types import Position
 from edgevpr.frames.exif import read_exif
+from edgevpr.frames.header import read_header
 from edgevpr.frames.images import list_images
 from edgevpr.frames.positions import GeoTag, find_positions, read_positions
-from edgevpr.lab.evaluate.dataset import Dataset, Query, load_dataset
-from edgevpr.lab.evaluate.nearby import Nearness, nearby
+from edgevpr.lab.evaluate.asking import optional
+from edgevpr.lab.evaluate.dataset import Dataset, Judged, ScoredQuery, load_dataset
 from edgevpr.lab.evaluate.numbered import Numbered, read_numbered
-from edgevpr.lab.evaluate.truth import Judged
 from edgevpr.lab.evaluate.videos import side_of, without_position
+from edgevpr.mapmaking.footprint import Footprint, footprint, shared
 
 _FORMS = "query/, ref/ and ground_truth.csv; ground_truth_new.npy; GT.npz; database/ and queries/; or positions"
+_HEADER_BYTES = 400_000_000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Nearness:
+    """A reference is right where it was taken within `within_m` metres of the query; where they are given, also with a
+    heading within `within_deg`, and with a share of at least `overlap` of the smaller picture's ground in common, by
+    height above the ground and `fov_deg`."""
+
+    within_m: float = field(default=25.0, metadata=bounded(0.01, 1_000_000).metadata)
+    within_deg: float | None = optional(0.1, 180)
+    overlap: float | None = optional(0.001, 1)
+    fov_deg: float | None = optional(5, 150)
 
 
 def open_folder(folder: str | Path, rule: Nearness, pictures: Callable[[Path], Path] = Path) -> Dataset:
@@ -41,15 +59,15 @@ def open_folder(folder: str | Path, rule: Nearness, pictures: Callable[[Path], P
     if (truth := folder / "ground_truth.csv").is_file():
         return load_dataset(query, ref, truth)
     if (numbers := folder / "ground_truth_new.npy").is_file():
-        return _of_numbers(folder, numbers)
+        return _of_numbers(query, ref, numbers)
     if (matrices := folder / "GT.npz").is_file():
         return _of_matrices(folder, matrices)
     for inner in (folder, folder / "test", folder / "images" / "test"):
         if (inner / "database").is_dir() and (inner / "queries").is_dir():
             return _of_utm(inner / "queries", inner / "database", rule)
-    sides = [side_of(folder, name) for name in ("query", "ref")]
-    if all(sides):
-        return of_positions(*sides, rule, pictures)
+    query_side, ref_side = side_of(folder, "query"), side_of(folder, "ref")
+    if query_side and ref_side:
+        return of_positions(query_side, ref_side, rule, pictures)
     raise UsageError(f"{folder} is no data set that is known: it needs {_FORMS}.")
 
 
@@ -58,81 +76,73 @@ def of_positions(
 ) -> Dataset:
     """Make the data set of two folders of images, or videos, with positions; `pictures` as of `open_folder`. Raises
     UsageError where there are no positions, and what `pictures` raises."""
-    given = Path(query), Path(ref)
     # One side after the other: nobody waits for the pictures of a video to hear that the other side is not there.
-    folders, images = zip(*((folder, list_images(folder)) for folder in map(pictures, given)), strict=True)
-    tags = tuple(map(_tags, folders, images))
-    dataset = _dataset(*images, nearby(*images, tags, rule), folders[1])
-    return replace(dataset, notes=tuple(_notes(given, folders)))
+    query_dir = pictures(Path(query))
+    queries = _tagged(query_dir)
+    ref_dir = pictures(Path(ref))
+    references = _tagged(ref_dir)
+    if not queries or not references:
+        raise UsageError(
+            "There are no positions to tell which places are right: give --ground-truth, or positions.csv."
+        )
+    _, origin, _ = references[0]
+    judged = _near(_shots(queries, origin), _shots(references, origin), rule)
+    notes = (*_notes(Path(query), query_dir), *_notes(Path(ref), ref_dir))
+    return replace(_dataset(query_dir, ref_dir, judged), notes=notes)
 
 
-def _notes(given: Iterable[Path], folders: Iterable[Path]) -> Iterator[str]:
-    for each, folder in zip(given, folders, strict=True):
-        if each != folder:
-            without, count = without_position(folder)
-            if without:
-                yield f"{each}: {without} of {count} frames have no position, and are left out"
+def _notes(given: Path, folder: Path) -> Iterator[str]:
+    if given != folder:
+        without, count = without_position(folder)
+        if without:
+            yield f"{given}: {without} of {count} frames have no position, and are left out"
 
 
-def _of_numbers(folder: Path, path: Path) -> Dataset:
-    query_dir, ref_dir = folder / "query", folder / "ref"
-    queries, references, numbered = list_images(query_dir), list_images(ref_dir), read_numbered(path)
-    for images, count in zip((references, queries), numbered.shape, strict=True):
-        if count > len(images):
-            raise UsageError(
-                f"{path} names image {count - 1} of {images[0].parent}, which has {len(images)}: bring all of them."
-            )
-    return _dataset(queries, references, _judged(numbered, queries, references), ref_dir)
+def _of_numbers(query_dir: Path, ref_dir: Path, path: Path) -> Dataset:
+    numbered = read_numbered(path)
+    for folder, count in zip((ref_dir, query_dir), numbered.shape, strict=True):
+        there = len(list_images(folder))
+        if count > there:
+            raise UsageError(f"{path} names image {count - 1} of {folder}, which has {there}: bring all of them.")
+    return _dataset(query_dir, ref_dir, _named(numbered, query_dir, ref_dir))
 
 
 def _of_matrices(folder: Path, path: Path) -> Dataset:
-    ref_dir, query_dir = _two_folders(folder)
-    queries, references, numbered = list_images(query_dir), list_images(ref_dir), read_numbered(path)
-    if numbered.shape != (len(references), len(queries)):
-        raise UsageError(
-            f"{path} judges {numbered.shape} pairs, and there are {len(references)} images in {ref_dir} and "
-            f"{len(queries)} in {query_dir}: the first folder by name must be that of the map."
-        )
-    return _dataset(queries, references, _judged(numbered, queries, references), ref_dir)
-
-
-def _judged(numbered: Numbered, queries: list[Path], references: list[Path]) -> dict[str, Judged]:
-    return numbered.named([path.name for path in queries], [path.name for path in references]).scored
-
-
-def _of_utm(query_dir: Path, ref_dir: Path, rule: Nearness) -> Dataset:
-    queries, references = list_images(query_dir), list_images(ref_dir)
-    here, there = (np.array([_utm_m(path) for path in paths]) for paths in (queries, references))
-    judged = {}
-    for query, at in zip(queries, here, strict=True):
-        near = np.flatnonzero(np.hypot(*(there - at).T) <= rule.within_m)
-        if len(near):
-            judged[query.name] = Judged(frozenset(references[each].name for each in near), frozenset(), str(query))
-    if not judged:
-        raise UsageError(f"No query was taken within {rule.within_m:g} m of a reference: allow more with --within-m.")
-    return _dataset(queries, references, judged, ref_dir)
-
-
-def _dataset(queries: list[Path], references: list[Path], judged: dict[str, Judged], ref_dir: Path) -> Dataset:
-    scored = tuple(
-        Query(path, judged[path.name].right, judged[path.name].ignored) for path in queries if path.name in judged
-    )
-    return Dataset(scored, ref_dir, tuple(path.name for path in references))
-
-
-def _two_folders(folder: Path) -> list[Path]:
-    found = sorted(each for each in folder.iterdir() if each.is_dir())
+    found = sorted(inner for inner in folder.iterdir() if inner.is_dir())
     if len(found) != 2:
         raise UsageError(
             f"{folder} has {len(found)} folders beside GT.npz: it needs two, that of the map first by name."
         )
-    return found
+    ref_dir, query_dir = found
+    numbered = read_numbered(path)
+    there = len(list_images(ref_dir)), len(list_images(query_dir))
+    if numbered.shape != there:
+        raise UsageError(
+            f"{path} judges {numbered.shape} pairs, and there are {there[0]} images in {ref_dir} and {there[1]} in "
+            f"{query_dir}: the first folder by name must be that of the map."
+        )
+    return _dataset(query_dir, ref_dir, _named(numbered, query_dir, ref_dir))
 
 
-def _tags(folder: Path, images: Iterable[Path]) -> dict[str, GeoTag]:
-    csv_path = find_positions(folder)
-    known = read_positions(csv_path) if csv_path else {}
-    return {path.name: known.get(path.name) or read_exif(path) for path in images}
+def _named(numbered: Numbered, query_dir: Path, ref_dir: Path) -> dict[str, Judged]:
+    queries, references = ([path.name for path in list_images(folder)] for folder in (query_dir, ref_dir))
+    return numbered.named(queries, references).scored
+
+
+def _of_utm(query_dir: Path, ref_dir: Path, rule: Nearness) -> Dataset:
+    queries, references = (
+        [_Shot(path, *_utm_m(path), GeoTag()) for path in list_images(each)] for each in (query_dir, ref_dir)
+    )
+    only_distance = Nearness(within_m=rule.within_m)
+    return _dataset(query_dir, ref_dir, _near(queries, references, only_distance))
+
+
+def _dataset(query_dir: Path, ref_dir: Path, judged: dict[str, Judged]) -> Dataset:
+    queries, references = list_images(query_dir), list_images(ref_dir)
+    scored = tuple(
+        ScoredQuery(path, judged[path.name].right, judged[path.name].ignored) for path in queries if path.name in judged
+    )
+    return Dataset(scored, ref_dir, tuple(path.name for path in references))
 
 
 def _utm_m(path: Path) -> tuple[float, float]:
@@ -143,3 +153,68 @@ def _utm_m(path: Path) -> tuple[float, float]:
         raise UsageError(
             f"{path}: its name does not say @EASTING@NORTHING@ in metres: rename it, or leave it out."
         ) from None
+
+
+@dataclass(frozen=True, slots=True)
+class _Shot:
+    """A picture and where it was taken, metres, and what else is known of it."""
+
+    path: Path
+    east_m: float
+    north_m: float
+    tag: GeoTag
+
+
+def _tagged(folder: Path) -> list[tuple[Path, Position, GeoTag]]:
+    """Return the pictures of a folder that have a position, with it and all else that is known of them."""
+    csv_path = find_positions(folder)
+    known = read_positions(csv_path) if csv_path else {}
+    tags = ((path, known.get(path.name) or read_exif(path)) for path in list_images(folder))
+    return [(path, tag.position, tag) for path, tag in tags if tag.position]
+
+
+def _shots(tagged: Sequence[tuple[Path, Position, GeoTag]], origin: Position) -> list[_Shot]:
+    there = [(at.lat_deg, at.lon_deg) for _, at, _ in tagged]
+    east_m, north_m = offset_m(origin.lat_deg, origin.lon_deg, *np.transpose(there))
+    places = zip(east_m.tolist(), north_m.tolist(), strict=True)
+    return [_Shot(path, *place, tag) for (path, _, tag), place in zip(tagged, places, strict=True)]
+
+
+def _near(queries: Sequence[_Shot], references: Sequence[_Shot], rule: Nearness) -> dict[str, Judged]:
+    """Return what is right for each query that has any right reference. Raises UsageError where a figure that the rule
+    needs is not known."""
+    there_m = np.array([(shot.east_m, shot.north_m) for shot in references])
+    prints = [_print(shot, rule) for shot in references] if rule.overlap is not None else []
+    judged = {}
+    for query in queries:
+        near = np.hypot(*(there_m - (query.east_m, query.north_m)).T) <= rule.within_m
+        if rule.within_deg is not None:
+            near &= [_apart_deg(query.tag, shot.tag) <= rule.within_deg for shot in references]
+        if rule.overlap is not None and near.any():
+            own = _print(query, rule)
+            near &= [bool(ok) and shared(own, other) >= rule.overlap for ok, other in zip(near, prints, strict=True)]
+        if near.any():
+            names = frozenset(shot.path.name for shot, is_near in zip(references, near, strict=True) if is_near)
+            judged[query.path.name] = Judged(names, frozenset(), str(query.path))
+    if not judged:
+        raise UsageError(f"No query was taken within {rule.within_m:g} m of a reference: allow more with --within-m.")
+    return judged
+
+
+def _apart_deg(one: GeoTag, other: GeoTag) -> float:
+    if one.heading_deg is None or other.heading_deg is None:
+        raise UsageError("--within-deg needs the heading of every picture (yaw_deg in positions.csv): leave it out.")
+    return abs((one.heading_deg - other.heading_deg + 180) % 360 - 180)
+
+
+def _print(shot: _Shot, rule: Nearness) -> Footprint:
+    if rule.fov_deg is None or shot.tag.height_m is None or shot.tag.heading_deg is None:
+        raise UsageError(
+            f"{shot.path}: --overlap needs --fov-deg, and height_m and yaw_deg of every picture in positions.csv: "
+            "leave it out."
+        )
+    header = read_header(read_file(shot.path, _HEADER_BYTES))
+    if header is None:
+        raise UsageError(f"{shot.path} says no size: give a JPEG, PNG, TIFF, BMP or WebP file.")
+    size_px = header.width, header.height
+    return footprint((shot.east_m, shot.north_m), shot.tag.height_m, rule.fov_deg, size_px, shot.tag.heading_deg)

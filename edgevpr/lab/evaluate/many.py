@@ -1,268 +1,332 @@
-"""Many rows on many sets: what is kept from earlier runs is taken, the rest is shared out to workers, and goes on where
-an earlier run broke off."""
+"""Many rows on many sets, shared out to workers. Each result is a file of its own: one that is there is not measured
+again, so a run that was interrupted goes on."""
 
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict, dataclass, field, replace
-from datetime import datetime, timezone
+import json
+import multiprocessing
+import os
+import signal
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from edgevpr.core.crew import Crew
-from edgevpr.core.errors import ModelError
-from edgevpr.lab.evaluate.asking import Answer, in_order
-from edgevpr.lab.evaluate.evaluate import compare
-from edgevpr.lab.evaluate.kept import Kept
-from edgevpr.lab.evaluate.measured import (
-    Measured,
-    OpenSet,
-    Pair,
-    answer_from_kept,
-    as_kept,
-    from_kept,
-    made_now,
-    measured,
-    open_set,
-    pair_of,
+import numpy as np
+
+from edgevpr.core.child import end_with_parent
+from edgevpr.core.contract import Technique
+from edgevpr.core.errors import EdgevprError, ModelError
+from edgevpr.core.files import sha256_of
+from edgevpr.core.types import StageCost
+from edgevpr.frames.images import list_images
+from edgevpr.frames.positions import find_positions
+from edgevpr.frames.source import open_source
+from edgevpr.lab.evaluate import metrics
+from edgevpr.lab.evaluate.asking import Progress, QueryAnswer
+from edgevpr.lab.evaluate.cache import Cache, code_of_everything, key_of
+from edgevpr.lab.evaluate.dataset import Dataset, ScoredQuery
+from edgevpr.lab.evaluate.evaluate import (
+    TechniqueResult,
+    all_frames,
+    answers_on,
+    compare,
+    from_json,
+    make_map,
+    summary,
 )
-from edgevpr.lab.evaluate.plan import Plan
+from edgevpr.lab.evaluate.plan import EvaluationPlan, RowPlan, SetPlan
+from edgevpr.lab.evaluate.provenance import commit_of, machine, today, versions
+from edgevpr.places.sequence import length_of
 from edgevpr.techniques import create
 
-_WORKER = "edgevpr.lab.evaluate.worker"
+CURVE_TO = 25  # the curve of recall@K ends there
 # Products are small here: more threads make them slower. And a result must not depend on the number of workers.
 _ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-_CHUNK = 16  # pictures of one job: no worker is without work for long at the end
 
-Shown = Callable[[Iterable[None], int, str], Iterable[None]]
+Failures = dict[tuple[str, str], str]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Outcome:
-    """All that was measured, the sets it was measured on, and by (set, row) why others were not. `damaged` entries of
-    the cache were made anew."""
+class OpenSet:
+    """A data set that was read: its name, the plan of it, its queries and references, and the hashes of what decides
+    its map, and of what is asked."""
+
+    name: str
+    plan: SetPlan
+    dataset: Dataset
+    references_key: str
+    queries_key: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RowOnSet:
+    """A row on a set, its technique, and the keys under which its result is kept, and its map, which other rows may
+    share. Where it `is_in_order` an answer may depend on the queries before it."""
+
+    of: OpenSet
+    label: str
+    row: RowPlan
+    key: str
+    map_key: str
+    is_in_order: bool
+
+    @property
+    def name(self) -> tuple[str, str]:
+        """The names of the set and of the row."""
+        return self.of.name, self.label
+
+    def technique(self) -> Technique:
+        """Open the technique, as it is set for this set."""
+        return create(self.row.technique, self.row.settings(self.of.plan.camera))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Made:
+    """Story of a result: the date (UTC) of its measurement, the machine, the versions and the commit at that time
+    (None: no checkout), the `workers` that were busy beside each other, and whether it `was_kept` from an earlier
+    run."""
+
+    date: str
+    machine: dict[str, Any]
+    versions: dict[str, str | None]
+    commit: str | None
+    workers: int
+    was_kept: bool = False
+
+    @property
+    def story(self) -> str:
+        """The date and the machine, in a few words."""
+        earlier = "earlier, " if self.was_kept else ""
+        return f"{earlier}{self.date}, {self.machine['cpu']}, {self.workers} of {self.machine['cores']} cores"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MeasuredRow:
+    """The result of a row on a set, `recalls` at K from 1 on, all answers, and how it was made."""
+
+    set_name: str
+    label: str
+    result: TechniqueResult
+    recalls: tuple[float, ...]
+    answers: tuple[QueryAnswer, ...]
+    made: Made
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Measurements:
+    """All that was measured, the sets it was measured on, and by (set, row) why others were not."""
 
     sets: tuple[OpenSet, ...]
-    found: tuple[Measured, ...]
-    failed: dict[tuple[str, str], str]
-    damaged: int
-    cache_bytes: int
+    found: tuple[MeasuredRow, ...]
+    failed: Failures
 
 
-@dataclass(slots=True, kw_only=True)
-class _Map:
-    """A map that is to be made or is there, and the pairs that ask it. `left` jobs are under way or wait."""
-
-    pairs: list[Pair] = field(default_factory=list)
-    left: int = 0
-
-
-def measure(plan: Plan, cache: str | Path, workers: int, progress: Shown) -> Outcome:
-    """Measure every row of a plan on every set. Raises EdgevprError for a set that cannot be read and for a full disk.
-    A row whose technique, or a picture for it, cannot be used fails by itself."""
-    kept = Kept(cache)
-    sets = tuple(open_set(name, each, kept, progress) for name, each in plan.sets.items())
-    run = _Run(kept, workers)
-    pairs, failed = _pairs(plan, sets)
-    run.failed |= failed
-    for pair in pairs:
-        run.take(pair)
-    # A worker costs a second to start.
-    if run.jobs:
-        units = run.units
-        with Crew(_WORKER, min(workers, len(run.jobs)), _ENVIRONMENT) as crew:
-            for _ in progress(run.through(crew), units, f"{len(run.open)} of {len(pairs)} rows"):
-                pass
-    order = [(each.of.name, each.label) for each in pairs]
-    return Outcome(
+def measure(plan: EvaluationPlan, folder: str | Path, workers: int, progress: Progress[Any]) -> Measurements:
+    """Measure every row of a plan on every set; finished work is kept in `folder`. Raises EdgevprError for a set that
+    cannot be read, and where a worker dies. A row whose technique, or a picture for it, cannot be used fails by
+    itself."""
+    cache = Cache(folder)
+    sets = tuple(_open_set(name, each, cache, progress) for name, each in plan.sets.items())
+    rows, failed = _rows_on_sets(plan, sets)
+    found = {
+        row.name: replace(kept, made=replace(kept.made, was_kept=True)) for row in rows if (kept := _kept(cache, row))
+    }
+    if left := [row for row in rows if row.name not in found]:
+        failed |= _measured_by_workers(left, cache, workers, progress)
+        for row in left:
+            if row.name not in failed and (measured := _kept(cache, row)):
+                found[row.name] = measured
+    wanted = [(of.name, label) for of in sets for label in plan.rows]
+    return Measurements(
         sets=sets,
-        found=_compared([run.found[each] for each in order if each in run.found]),
-        failed={
-            each: run.failed[each]
-            for each in ((of.name, row) for of in sets for row in plan.rows)
-            if each in run.failed
-        },
-        damaged=kept.damaged + run.damaged,
-        cache_bytes=kept.size_bytes(),
+        found=_compared([found[name] for name in wanted if name in found]),
+        failed={name: failed[name] for name in wanted if name in failed},
     )
 
 
-def _pairs(plan: Plan, sets: Iterable[OpenSet]) -> tuple[list[Pair], dict[tuple[str, str], str]]:
-    found, failed = [], {}
-    made: dict[str, Any] = {}
+def _open_set(name: str, plan: SetPlan, cache: Cache, progress: Progress[Any]) -> OpenSet:
+    """Read a data set; the pictures of a video are kept. Raises EdgevprError for one that cannot be used."""
+    dataset = plan.open(cache, progress)
+    positions = find_positions(dataset.ref_dir)
+    asked = list_images(dataset.queries[0].path.parent)
+    truth = [[query.path.name, sorted(query.right), sorted(query.ignored)] for query in dataset.queries]
+    return OpenSet(
+        name=name,
+        plan=plan,
+        dataset=dataset,
+        references_key=key_of(
+            dataset.references,
+            [sha256_of(path) for path in list_images(dataset.ref_dir)],
+            positions and sha256_of(positions),
+        ),
+        queries_key=key_of(truth, {path.name: sha256_of(path) for path in asked}),
+    )
+
+
+def _rows_on_sets(plan: EvaluationPlan, sets: Iterable[OpenSet]) -> tuple[list[RowOnSet], Failures]:
+    """Return the rows on sets that can be measured, and why others cannot."""
+    rows, failed = [], {}
+    techniques: dict[str, Technique] = {}
     for of in sets:
         for label, row in plan.rows.items():
             settings = row.settings(of.plan.camera)
-            who = repr((row.technique, settings))
+            who = key_of(row.technique, settings)
             try:
-                technique = made.get(who) or made.setdefault(who, create(row.technique, settings))
-                found.append(pair_of(of, label, row, technique, settings))
+                technique = techniques.get(who) or techniques.setdefault(who, create(row.technique, settings))
             except ModelError as error:  # a network that cannot be used stops no other row
                 failed[of.name, label] = str(error)
-    return found, failed
-
-
-def _compared(found: list[Measured]) -> tuple[Measured, ...]:
-    """Fill in the PCU, which measures each row against the slowest encoder on its set."""
-    done = []
-    for name in dict.fromkeys(each.set_name for each in found):
-        of_set = [each for each in found if each.set_name == name]
-        results = compare(each.result for each in of_set)
-        done += [replace(each, result=result) for each, result in zip(of_set, results, strict=True)]
-    return tuple(done)
-
-
-class _Run:
-    """The work that is left, job by job. Asking waits for the map, and the map for the descriptors."""
-
-    def __init__(self, kept: Kept, workers: int) -> None:
-        self._kept, self._workers = kept, workers
-        self.jobs: deque[dict[str, Any]] = deque()
-        self.found: dict[tuple[str, str], Measured] = {}
-        self.failed: dict[tuple[str, str], str] = {}
-        self.open: dict[str, list[Pair]] = {}  # by key: rows may differ in name only
-        self.damaged = self.units = 0
-        self._maps: dict[str, _Map] = {}
-        self._asked: dict[str, int] = {}  # jobs of a pair that are left
-
-    def take(self, pair: Pair) -> None:
-        """Take the result of a pair from what is kept, or find out what is left to do for it."""
-        if self._take_kept(pair):
-            return
-        if pair.key in self.open:
-            self.open[pair.key].append(pair)
-            return
-        self.open[pair.key] = [pair]
-        missing = self._missing(pair)
-        self.units += len(missing)
-        if not missing:  # killed between the last answer and its result
-            self._finish(pair)
-            return
-        known = self._maps.get(pair.map_key)
-        if known is None:
-            known = self._maps[pair.map_key] = _Map()
-            if self._kept.get_file("maps", pair.map_key) is None:
-                paths = [str(path) for path in pair.of.references]
-                jobs = [self._job("encode", pair, paths=part) for part in _parts(paths)]
-                known.left = len(jobs)
-                self.jobs.extend(jobs)
-                self.units += 2 * len(paths)  # once to encode, once for the map
-        known.pairs.append(pair)
-        if not known.left:
-            self._ask(pair)
-
-    def _take_kept(self, pair: Pair) -> bool:
-        """Take what stands under the key of a pair, for all rows that share it; return whether anything does."""
-        if (content := self._kept.get_json("pairs", pair.key)) is None:
-            return False
-        for each in (*self.open.get(pair.key, ()), pair):
-            self.found[each.of.name, each.label] = from_kept(each, content)
-        return True
-
-    def through(self, crew: Crew) -> Iterator[None]:
-        """Have all jobs done; yield once for each picture that is done with."""
-        while self.jobs or crew.is_working:
-            while self.jobs and crew.has_idle:
-                crew.give(self.jobs.popleft())
-            job, answer = crew.next_done()
-            self.damaged += answer["damaged"]
-            for _ in range(self._done(job, answer["error"])):
-                yield
-
-    def _done(self, job: dict[str, Any], error: list[Any] | None) -> int:
-        known, kind = self._maps[job["map_key"]], job["do"]
-        if error:
-            concerned = [pair for pair in known.pairs if kind != "ask" or pair.key == job["key"]]
-            self._fail(concerned, error[0])
-            return 0
-        if kind == "encode":
-            known.left -= 1
-            if not known.left and (alive := self._alive(known.pairs)):
-                known.left = 1
-                self.jobs.appendleft(self._job("map", alive[0], ref_dir=str(alive[0].of.dataset.ref_dir)))
-            return len(job["paths"])
-        if kind == "map":
-            known.left = 0
-            for pair in self._alive(known.pairs):
-                self._ask(pair)
-            return len(known.pairs[0].of.references)
-        self._asked[job["key"]] -= 1
-        (pair, *_) = self.open[job["key"]]
-        if not self._asked[job["key"]] and self._alive([pair]):
-            self._finish(pair)
-        return len(job["queries"])
-
-    def _ask(self, pair: Pair) -> None:
-        missing = self._missing(pair)
-        if not missing:  # another run has asked them meanwhile
-            self._finish(pair)
-            return
-        everything = [str(path) for path in in_order(pair.of.dataset)] if pair.is_in_order else None
-        parts = [missing] if pair.is_in_order else _parts(missing)
-        self._asked[pair.key] = len(parts)
-        for part in parts:
-            self.jobs.append(
-                self._job(
-                    "ask",
-                    pair,
-                    key=pair.key,
-                    asking=asdict(pair.row.asking),
-                    references=pair.of.dataset.references,
-                    queries=part,
-                    in_order=everything,
+                continue
+            spec = technique.spec
+            # The form is left out: the vectors of all forms are made from one map.
+            map_parts = [code_of_everything(), spec.name, spec.parameters, spec.model_sha256, of.references_key]
+            rows.append(
+                RowOnSet(
+                    of=of,
+                    label=label,
+                    row=row,
+                    key=key_of(map_parts, spec.form, asdict(row), of.queries_key),
+                    map_key=key_of(map_parts),
+                    is_in_order=row.follow or length_of(spec, row.sequence) > 1,
                 )
             )
-
-    def _missing(self, pair: Pair) -> list[list[Any]]:
-        """List the queries that have no answer yet. Of those that are asked in order all are asked again: what came
-        before decides an answer."""
-        keys = {pair.answer_key(query): query for query in pair.of.dataset.queries}
-        missing = [key for key in keys if self._kept.get_json("answers", key) is None]
-        if missing and pair.is_in_order:
-            missing = list(keys)
-        return [[str(keys[key].path), key, sorted(keys[key].right), sorted(keys[key].ignored)] for key in missing]
-
-    def _finish(self, pair: Pair) -> None:
-        keys = [pair.answer_key(query) for query in pair.of.dataset.queries]
-        entries = [self._kept.get_json("answers", key) for key in keys]
-        if any(entry is None for entry in entries):
-            # Another run may have finished the row, and have no more use for its answers.
-            if not self._take_kept(pair):
-                self._fail([pair], "answers are damaged or gone from the cache: run again, to ask them anew")
-            return
-        answers: list[Answer] = [answer_from_kept(entry[0]) for entry in entries]
-        times_s = [t_s for _, *both in entries for t_s in both]
-        story = made_now(_date(min(times_s)), _date(max(times_s)), self._workers)
-        for each in self.open[pair.key]:
-            self.found[each.of.name, each.label] = measured(each, answers, story)
-        self._kept.put_json("pairs", pair.key, as_kept(self.found[pair.of.name, pair.label]))
-        for key in keys:
-            self._kept.drop("answers", key)
-
-    def _fail(self, pairs: list[Pair], why: str) -> None:
-        for pair in pairs:
-            for each in self.open[pair.key]:
-                self.failed[each.of.name, each.label] = why
-        dead = {pair.key for pair in pairs}
-        maps = {pair.map_key for pair in pairs if not self._alive(self._maps[pair.map_key].pairs)}
-        self.jobs = deque(job for job in self.jobs if job.get("key") not in dead and job["map_key"] not in maps)
-
-    def _alive(self, pairs: list[Pair]) -> list[Pair]:
-        return [pair for pair in pairs if (pair.of.name, pair.label) not in self.failed]
-
-    def _job(self, kind: str, pair: Pair, **more: Any) -> dict[str, Any]:
-        return {
-            "do": kind,
-            "cache": str(self._kept.folder.resolve()),
-            "technique": pair.row.technique,
-            "settings": pair.settings,
-            "map_key": pair.map_key,
-            **more,
-        }
+    return rows, failed
 
 
-def _parts(items: list[Any]) -> list[list[Any]]:
-    return [items[at : at + _CHUNK] for at in range(0, len(items), _CHUNK)]
+def _measured_by_workers(rows: Sequence[RowOnSet], cache: Cache, workers: int, progress: Progress[Any]) -> Failures:
+    """Let workers make the maps and then ask the queries, and keep each result; return why others were not measured."""
+    maps = {row.map_key: row for row in rows}
+    failed: dict[str, str] = {}
+    with _pool(min(workers, max(len(rows), len(maps)))) as pool:
+        jobs: dict[Future[Any], str] = {pool.submit(_make_map, row, cache.folder): key for key, row in maps.items()}
+        for job in progress(as_completed(jobs), len(jobs), "maps"):
+            if isinstance(made := job.result(), str):
+                failed[jobs[job]] = made
+        left = {row.key: row for row in rows if row.map_key not in failed}
+        parts: dict[str, list[Future[Any]]] = {}
+        for key, row in left.items():
+            parts[key] = [
+                pool.submit(_ask, row, cache.folder, queries)
+                for queries in _shared_out(row, max(1, workers // len(left)))
+            ]
+        asked = {part: key for key, several in parts.items() for part in several}
+        for part in progress(as_completed(asked), len(asked), f"rows, {len(left)} of {len(rows)}"):
+            key = asked[part]
+            if isinstance(said := part.result(), str):
+                failed[key] = said
+            elif all(each.done() for each in parts[key]) and key not in failed:
+                answers = [answer for each in parts[key] for answer in each.result()]
+                _keep(cache, left[key], answers, workers)
+    return {row.name: why for row in rows if (why := failed.get(row.map_key) or failed.get(row.key))}
 
 
-def _date(t_s: float) -> str:
-    return datetime.fromtimestamp(t_s, timezone.utc).strftime("%Y-%m-%d")
+def _shared_out(row: RowOnSet, count: int) -> list[tuple[ScoredQuery, ...]]:
+    """Share out the queries of a row to several workers, where an answer does not depend on the queries before it."""
+    queries = row.of.dataset.queries
+    size = len(queries) if row.is_in_order else -(-len(queries) // count)
+    return [queries[at : at + size] for at in range(0, len(queries), size)]
+
+
+@contextmanager
+def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
+    """Start workers that die with this process, and are killed at once where it is interrupted."""
+    os.environ.update(_ENVIRONMENT)
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(workers, context, _begin, (os.getpid(),))
+    try:
+        yield pool
+        pool.shutdown()
+    except BrokenProcessPool as error:
+        raise EdgevprError(
+            "A worker has ended; perhaps memory is short: run again, with fewer --workers; all that is done stays."
+        ) from error
+    finally:
+        for child in multiprocessing.active_children():
+            child.kill()
+        pool.shutdown(cancel_futures=True)
+
+
+def _begin(parent_pid: int) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # only the parent process is to act on Ctrl-C
+    end_with_parent(parent_pid)
+
+
+def _make_map(row: RowOnSet, folder: Path) -> str | None:
+    """Make the map of a row in a worker, where it is not there; return what went wrong."""
+    images = row.of.dataset.ref_dir
+
+    def make(path: Path) -> None:
+        make_map(path, all_frames(open_source(str(images), live=False)), row.technique(), images)
+
+    try:
+        Cache(folder).keep("maps", row.map_key, make)
+    except Exception as problem:
+        return _sentence(problem)
+    return None
+
+
+def _ask(row: RowOnSet, folder: Path, queries: tuple[ScoredQuery, ...]) -> list[QueryAnswer] | str:
+    """Ask queries in a worker; return the answers, or what went wrong."""
+    try:
+        path = Cache(folder).path("maps", row.map_key)
+        dataset = replace(row.of.dataset, queries=queries)
+        return answers_on(path, row.technique(), dataset, row.row)
+    except Exception as problem:
+        return _sentence(problem)
+
+
+def _sentence(problem: Exception) -> str:
+    """Say what went wrong: a fault of a technique, a picture or a library ends one row, and not all."""
+    if isinstance(problem, EdgevprError):
+        return str(problem)
+    return f"an unforeseen {type(problem).__name__} ({problem}): report it."
+
+
+def _keep(cache: Cache, row: RowOnSet, answers: Sequence[QueryAnswer], workers: int) -> None:
+    """Sum up the answers to all queries, and keep the result."""
+    technique, references = row.technique(), len(row.of.dataset.references)
+    ranks = np.array([answer.first_right for answer in answers])
+    made = Made(date=today(), machine=machine(), versions=versions(), commit=commit_of(), workers=workers)
+    result = summary(technique, references, answers, length_of(technique.spec, row.row.sequence))
+    content = {
+        "result": asdict(result),
+        "recalls": [metrics.recall_at(k, ranks) for k in range(1, min(CURVE_TO, references) + 1)],
+        "answers": [asdict(answer) for answer in answers],
+        "made": asdict(made),
+    }
+    cache.keep("results", row.key, lambda path: path.write_text(json.dumps(content), "utf-8"))
+
+
+def _kept(cache: Cache, row: RowOnSet) -> MeasuredRow | None:
+    """Return the result that is kept for a row on a set; None where there is none, or none that can be read."""
+    path = cache.path("results", row.key)
+    try:
+        content = json.loads(path.read_text("utf-8"))
+        return MeasuredRow(
+            set_name=row.of.name,
+            label=row.label,
+            result=replace(from_json(content["result"]), technique=row.label),
+            recalls=tuple(content["recalls"]),
+            answers=tuple(_answer(each) for each in content["answers"]),
+            made=Made(**content["made"]),
+        )
+    except FileNotFoundError:
+        return None
+    except (ValueError, KeyError, TypeError):  # damaged: it is measured anew
+        path.unlink(missing_ok=True)
+        return None
+
+
+def _answer(content: dict[str, Any]) -> QueryAnswer:
+    return QueryAnswer(**{**content, **{stage: StageCost(**content[stage]) for stage in ("encoding", "matching")}})
+
+
+def _compared(found: Sequence[MeasuredRow]) -> tuple[MeasuredRow, ...]:
+    """Fill in the PCU, which measures each row against the slowest encoder on its set."""
+    done: list[MeasuredRow] = []
+    for name in dict.fromkeys(row.set_name for row in found):
+        of_set = [row for row in found if row.set_name == name]
+        results = compare(row.result for row in of_set)
+        done += [replace(row, result=result) for row, result in zip(of_set, results, strict=True)]
+    return tuple(done)

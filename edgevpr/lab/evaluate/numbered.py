@@ -8,6 +8,7 @@
 import pickle
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ import numpy as np
 from edgevpr.core.errors import UsageError
 from edgevpr.core.files import open_file, read_file
 from edgevpr.core.npz import arrays_of
-from edgevpr.lab.evaluate.truth import Judged, Truth, read_truth
+from edgevpr.lab.evaluate.dataset import GroundTruth, Judged, read_truth
 
 _MATRICES = ("GThard", "GTsoft")
 _MOST_BYTES = 4_000_000_000
@@ -33,16 +34,16 @@ class Numbered:
     shape: tuple[int, int]
     is_whole: bool
 
-    def named(self, queries: Sequence[str], references: Sequence[str]) -> Truth:
+    def named(self, queries: Sequence[str], references: Sequence[str]) -> GroundTruth:
         """Return the same with names in place of numbers; there are as many names as `shape` asks for."""
         found: dict[str, Judged | None] = dict.fromkeys(queries)
         for number, both in self.judged.items():
             right, ignored = (frozenset(references[each] for each in part) for part in both)
             found[queries[number]] = Judged(right, ignored, str(self.path))
-        return Truth(found, dict.fromkeys(queries, str(self.path)))
+        return GroundTruth(found, dict.fromkeys(queries, str(self.path)))
 
 
-def truth_in(path: str | Path) -> Truth | Numbered:
+def truth_in(path: str | Path) -> GroundTruth | Numbered:
     """Read a ground truth of any form. Raises UsageError for one that cannot be read."""
     return read_numbered(path) if Path(path).suffix.lower() in _WHAT_IT_IS else read_truth(path)
 
@@ -66,10 +67,11 @@ def _of_matrices(path: Path) -> Numbered:
     hard, soft = (arrays[name] for name in _MATRICES)
     if hard.ndim != 2 or soft.shape != hard.shape or not all(each.dtype.kind in "biuf" for each in (hard, soft)):
         raise ValueError(f"GThard is {hard.dtype} {hard.shape} and GTsoft {soft.dtype} {soft.shape}")
-    hard, soft = hard.astype(bool), soft.astype(bool)
+    hard = hard.astype(bool)
+    soft_only = soft.astype(bool) & ~hard
     judged = {
-        int(query): tuple(tuple(np.flatnonzero(each[:, query]).tolist()) for each in (hard, soft & ~hard))
-        for query in np.flatnonzero(hard.any(axis=0))
+        query: (tuple(np.flatnonzero(hard[:, query]).tolist()), tuple(np.flatnonzero(soft_only[:, query]).tolist()))
+        for query in np.flatnonzero(hard.any(axis=0)).tolist()
     }
     return Numbered(path, judged, hard.shape, True)
 
@@ -101,7 +103,7 @@ class _NumbersOnly(pickle.Unpickler):
 
     def find_class(self, module: str, name: str) -> Any:
         if name in ("_reconstruct", "scalar") and module in ("numpy.core.multiarray", "numpy._core.multiarray"):
-            return getattr(np._core.multiarray, name)
+            return getattr(import_module("numpy._core.multiarray"), name)
         if (module, name) in (("numpy", "ndarray"), ("numpy", "dtype")):
             return getattr(np, name)
         raise pickle.UnpicklingError(f"it holds {module}.{name}")
@@ -115,7 +117,7 @@ def _objects(path: Path) -> np.ndarray:
         shape, _, dtype = read(handle)
         if not dtype.hasobject:
             raise ValueError("it holds no lists")
-        found = _NumbersOnly(handle).load()
+        found: np.ndarray = _NumbersOnly(handle).load()
     if np.ndim(found) != 2 or shape[1] != 2:
         raise ValueError(f"its shape is {shape}, and (queries, 2) is meant")
     return found

@@ -6,14 +6,13 @@ from pathlib import Path
 
 from edgevpr.core.errors import ImageError
 from edgevpr.core.text import decoded_name
-from edgevpr.frames.images import counting_order, read_image
+from edgevpr.frames.images import counting_order, list_images, read_image
 from edgevpr.frames.small import small_jpeg
 from edgevpr.lab.evaluate import tables
-from edgevpr.lab.evaluate.asking import Answer
-from edgevpr.lab.evaluate.many import Outcome
-from edgevpr.lab.evaluate.measured import CURVE_TO, Made, Measured, OpenSet
-from edgevpr.lab.evaluate.provenance import commit_of, today, versions
-from edgevpr.lab.evaluate.quality import RESAMPLES, SEED
+from edgevpr.lab.evaluate.asking import QueryAnswer
+from edgevpr.lab.evaluate.many import CURVE_TO, Made, MeasuredRow, Measurements, OpenSet
+from edgevpr.lab.evaluate.metrics import RESAMPLES, SEED
+from edgevpr.lab.evaluate.provenance import commit_of, program, today, versions
 from edgevpr.review.html import address_of, foreign, page, section, table
 from edgevpr.review.svg import Axis, Series, chart, figure, scatter
 
@@ -27,7 +26,7 @@ _HEADINGS = ("row", "recall@1", "95 %", "@5", "@10", "AUC", "P@100%R", "R@100%P"
 _COSTS = ("row", "encode ms", "match ms", "RAM B/place", "disk B/place", "mAh/query", "measured")
 
 
-def page_of(outcome: Outcome) -> str:
+def page_of(outcome: Measurements) -> str:
     """Return the page: HTML with all that it shows inside."""
     labels = list(dict.fromkeys(each.label for each in outcome.found))
     numbers = {label: at for at, label in enumerate(labels, start=1)}
@@ -43,19 +42,18 @@ def page_of(outcome: Outcome) -> str:
     return page("Evaluation", style, "".join(body))
 
 
-def _head(outcome: Outcome) -> str:
+def _head(outcome: Measurements) -> str:
     rows = len({each.label for each in outcome.found})
-    commit = commit_of()
     known = [
         f"{len(outcome.sets)} {'set' if len(outcome.sets) == 1 else 'sets'}",
         f"{rows} {'row' if rows == 1 else 'rows'}",
         f"written on {today()}",
-        f"edgevpr {versions()['edgevpr']}" + (f" ({commit})" if commit else ""),
+        program(versions(), commit_of()),
     ]
     return f'<h1>Evaluation</h1><p class="soft">{foreign(", ".join(known))}</p>'
 
 
-def _notes(outcome: Outcome) -> str:
+def _notes(outcome: Measurements) -> str:
     kept = [each for each in outcome.found if each.made.was_kept]
     alone = all(each.result.recall_at_1_interval for each in outcome.found)
     notes = [
@@ -63,14 +61,13 @@ def _notes(outcome: Outcome) -> str:
         kept
         and f"{len(kept)} of {len(outcome.found)} results were measured earlier: their times are of that day and that "
         "machine, which are named below.",
-        outcome.damaged and f"{outcome.damaged} entries of the cache were damaged, and were made anew.",
         not alone and "SciPy is not installed: there are no intervals.",
     ]
     items = "".join(f"<li>{foreign(note)}</li>" for note in notes if note)
     return f'<section class="notes"><ul>{items}</ul></section>' if items else ""
 
 
-def _over_sets(outcome: Outcome, numbers: dict[str, int]) -> str:
+def _over_sets(outcome: Measurements, numbers: dict[str, int]) -> str:
     """Return recall@1 of every row on every set; nothing for one set, which says so itself."""
     if len(outcome.sets) < 2:
         return ""
@@ -86,7 +83,7 @@ def _over_sets(outcome: Outcome, numbers: dict[str, int]) -> str:
     return "<p>Recall@1 on every set, and the mean of the sets.</p>" + table(["row", *names, "mean"], rows, str)
 
 
-def _of_set(at: int, of: OpenSet, everything: Sequence[Measured], numbers: dict[str, int], most: int) -> str:
+def _of_set(at: int, of: OpenSet, everything: Sequence[MeasuredRow], numbers: dict[str, int], most: int) -> str:
     found = [each for each in everything if each.set_name == of.name]
     dataset, title = of.dataset, f'<span id="set-{at}">{foreign(of.name)}</span>'
     camera = {"nadir": ", camera straight down", "forward": ", camera ahead"}.get(of.plan.camera or "", "")
@@ -132,16 +129,14 @@ def _of_set(at: int, of: OpenSet, everything: Sequence[Measured], numbers: dict[
     )
 
 
-def _quality(each: Measured, numbers: dict[str, int]) -> list[str]:
-    first, within, five, _, ten, _ = tables.recalls(each.result)
-    precise, recalled, area, *_ = tables.curve(each.result)
+def _quality(each: MeasuredRow, numbers: dict[str, int]) -> list[str]:
+    first, within, five, _, ten, _, precise, recalled, area, *_ = tables.quality(each.result)
     shares = [f"<b>{first}</b>", within, five, ten, area, precise, recalled]
     return [_name(each.label, numbers), *shares, *tables.decided(each.result)]
 
 
-def _costs(each: Measured, numbers: dict[str, int]) -> list[str]:
+def _costs(each: MeasuredRow, numbers: dict[str, int]) -> list[str]:
     result, made = each.result, each.made
-    when = made.first if made.first == made.last else f"{made.first} to {made.last}"
     return [
         _name(each.label, numbers),
         f"{1000 * result.t_encode_s:.1f}",
@@ -149,11 +144,11 @@ def _costs(each: Measured, numbers: dict[str, int]) -> list[str]:
         f"{result.descriptor_bytes:,}",
         f"{result.fine_bytes:,}",
         figure(_mah(each)),
-        f"{'earlier: ' if made.was_kept else ''}{when}",
+        f"{'earlier: ' if made.was_kept else ''}{made.date}",
     ]
 
 
-def _intervals(found: Sequence[Measured], numbers: dict[str, int]) -> str:
+def _intervals(found: Sequence[MeasuredRow], numbers: dict[str, int]) -> str:
     """Draw recall@1 of every row as a bar, with the interval that 95 % of other queries would give."""
     lines = ""
     for each in found:
@@ -170,7 +165,7 @@ def _intervals(found: Sequence[Measured], numbers: dict[str, int]) -> str:
 
 
 def _against(
-    title: str, unit: str, found: Sequence[Measured], numbers: dict[str, int], cost: Callable[[Measured], float]
+    title: str, unit: str, found: Sequence[MeasuredRow], numbers: dict[str, int], cost: Callable[[MeasuredRow], float]
 ) -> str:
     """Draw recall@1 over a cost, which has an axis of powers of ten."""
     points = [
@@ -193,13 +188,13 @@ def _power(power: int) -> str:
     return f"{10.0**power:g}" if power < 3 else f"{10 ** (power % 3)} {' kMGT'[power // 3]}"
 
 
-def _matches(of: OpenSet, each: Measured, numbers: dict[str, int], most: int, is_open: bool) -> str:
+def _matches(of: OpenSet, each: MeasuredRow, numbers: dict[str, int], most: int, is_open: bool) -> str:
     """Show matches of a row: the wrong ones with the highest scores first, then the right ones with the lowest."""
     wrong = sorted((one for one in each.answers if not one.is_right), key=lambda one: -one.score)
     right = sorted((one for one in each.answers if one.is_right), key=lambda one: one.score)
     shown = [*wrong[:most], *right[: max(1, most - len(wrong))]]
     queries = {query.path.name: query for query in of.dataset.queries}
-    references = {decoded_name(path.name): path for path in of.references}
+    references = {decoded_name(path.name): path for path in list_images(of.dataset.ref_dir)}
     content = ""
     for one in shown:
         query = queries[one.query]
@@ -221,7 +216,7 @@ def _matches(of: OpenSet, each: Measured, numbers: dict[str, int], most: int, is
     return f"<details{' open' if is_open else ''}>{summary}<div class='matches'>{content}</div></details>"
 
 
-def _flown(answer: Answer) -> str:
+def _flown(answer: QueryAnswer) -> str:
     if answer.accepted_wrong:
         return ', <b class="bad">accepted</b>'
     return ", accepted" if answer.accepted else ", not accepted"
@@ -238,7 +233,7 @@ def _picture(what: str, path: Path | None, more: str) -> str:
     return f'<figure><img alt="{foreign(path.name)}" src="{data}"><figcaption>{said}</figcaption></figure>'
 
 
-def _how(outcome: Outcome, numbers: dict[str, int]) -> str:
+def _how(outcome: Measurements, numbers: dict[str, int]) -> str:
     stories: dict[str, list[str]] = {}
     for each in outcome.found:
         stories.setdefault(_story(each.made), []).append(f"{each.set_name}: {each.label}")
@@ -256,32 +251,24 @@ def _how(outcome: Outcome, numbers: dict[str, int]) -> str:
         "queries whose status is ok; a match that is only loosely right counts neither way.",
         *assumed,
         *weights,
-        f"The cache holds {outcome.cache_bytes / 1e6:,.1f} MB.",
     ]
     return items + "".join(f'<p class="soft">{foreign(said)}</p>' for said in fixed)
 
 
 def _story(made: Made) -> str:
-    when = made.first if made.first == made.last else f"{made.first} to {made.last}"
-    found = {name: version for name, version in made.versions.items() if name != "edgevpr"}
-    libraries = ", ".join(f"{name} {version or 'missing'}" for name, version in found.items())
-    commit = f" ({made.commit})" if made.commit else ""
-    return (
-        f"{when}{', earlier' if made.was_kept else ''}: {made.machine['cpu']}, {made.machine['cores']} cores, "
-        f"{made.workers} {'worker' if made.workers == 1 else 'workers'}; edgevpr {made.versions['edgevpr']}{commit}, "
-        f"{libraries}"
-    )
+    libraries = ", ".join(f"{name} {found or 'missing'}" for name, found in made.versions.items() if name != "edgevpr")
+    return f"{made.story}; {program(made.versions, made.commit)}, {libraries}"
 
 
-def _mah(each: Measured) -> float:
+def _mah(each: MeasuredRow) -> float:
     return 1000 * each.result.ah_total / each.result.queries
 
 
-def _bytes(each: Measured) -> int:
+def _bytes(each: MeasuredRow) -> int:
     return each.result.descriptor_bytes
 
 
-def _look(each: Measured, numbers: dict[str, int]) -> str:
+def _look(each: MeasuredRow, numbers: dict[str, int]) -> str:
     return _class(numbers[each.label])
 
 

@@ -6,73 +6,54 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from edgevpr import techniques
-from edgevpr.core.config import FORMS, bounded, build
+from edgevpr.core.config import FORMS, build
 from edgevpr.core.errors import ConfigError
 from edgevpr.core.text import meant
 from edgevpr.core.yamlfile import read_yaml
-from edgevpr.lab.evaluate.asking import Asking, Progress
+from edgevpr.lab.evaluate.asking import MatchOptions, Progress, optional
+from edgevpr.lab.evaluate.cache import Cache
 from edgevpr.lab.evaluate.dataset import Dataset, load_dataset
-from edgevpr.lab.evaluate.kept import Kept
-from edgevpr.lab.evaluate.layouts import of_positions, open_folder
-from edgevpr.lab.evaluate.nearby import Nearness
-from edgevpr.lab.evaluate.videos import Pictures
+from edgevpr.lab.evaluate.layouts import Nearness, of_positions, open_folder
+from edgevpr.lab.evaluate.videos import VideoPictures
 from edgevpr.runtime.preflight.pick import camera_setting
 
 CAMERAS = ("nadir", "forward")
 T = TypeVar("T")
 
 
-def _bounded(low: float, high: float) -> Any:
-    return field(default=None, metadata=bounded(low, high).metadata)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SetPlan:
+class SetPlan(Nearness):
     """A data set: a `folder` of any layout that is known, or the folders or videos `query` and `ref`. Right is what
-    `ground_truth` names (a CSV, with `query` and `ref`) or the folder itself does, else what was taken near, as
-    `Nearness` says. Of a video, `rate_hz` pictures a second are taken (None: every frame). `camera` looks straight down
-    (nadir) or ahead (forward)."""
+    `ground_truth` names (a CSV, with `query` and `ref`) or the folder itself does, else what was taken near. Of a
+    video, `rate_hz` pictures a second are taken (None: every frame). `camera` looks straight down (nadir) or ahead
+    (forward)."""
 
     folder: str | None = None
     query: str | None = None
     ref: str | None = None
     ground_truth: str | None = None
     camera: str | None = None
-    within_m: float | None = _bounded(0.01, 1_000_000)
-    within_deg: float | None = _bounded(0.1, 180)
-    overlap: float | None = _bounded(0.001, 1)
-    fov_deg: float | None = _bounded(5, 150)
-    rate_hz: float | None = _bounded(0.001, 1000)
+    rate_hz: float | None = optional(0.001, 1000)
 
-    def open(self, kept: Kept, progress: Progress) -> Dataset:
+    def open(self, cache: Cache, progress: Progress[Any]) -> Dataset:
         """Read the set; the pictures of a video are taken once, and kept. Raises UsageError and SourceError as
-        `open_folder` does, and EdgevprError as `videos.Pictures`."""
-        pictures = Pictures(kept, self.rate_hz, progress)
-        rule = Nearness(self.within_m or Nearness().within_m, self.within_deg, self.overlap, self.fov_deg)
+        `open_folder` does, and EdgevprError as `VideoPictures`."""
+        pictures = VideoPictures(cache, self.rate_hz, progress)
         if self.folder:
-            return open_folder(self.folder, rule, pictures)
+            return open_folder(self.folder, self, pictures)
         if self.ground_truth:
             return load_dataset(self.query or "", self.ref or "", self.ground_truth)
-        return of_positions(self.query or "", self.ref or "", rule, pictures)
+        return of_positions(self.query or "", self.ref or "", self, pictures)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RowPlan:
+class RowPlan(MatchOptions):
     """A row of the tables: a technique with its parameters and, where it has forms, the form of its vectors, and how it
-    is asked (see `Asking`)."""
+    is asked."""
 
     technique: str
-    parameters: dict = field(default_factory=dict)
+    parameters: dict[str, Any] = field(default_factory=dict)
     form: str | None = None
-    candidates: int | None = _bounded(1, 1_000_000)
-    sequence: int | None = _bounded(1, 100)
-    exact: bool = False
-    follow: bool = False
-
-    @property
-    def asking(self) -> Asking:
-        """The manner of asking."""
-        return Asking(candidates=self.candidates, sequence=self.sequence, exact=self.exact, follow=self.follow)
 
     def settings(self, camera: str | None) -> dict[str, Any]:
         """Return the settings of the technique on a set whose `camera` is known, or not (None). A parameter of the row
@@ -82,14 +63,14 @@ class RowPlan:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class EvaluationPlan:
     """All that is measured: every row on every set, each by its name."""
 
     sets: dict[str, SetPlan]
     rows: dict[str, RowPlan]
 
 
-def read_plan(path: str | Path) -> Plan:
+def read_plan(path: str | Path) -> EvaluationPlan:
     """Read a plan. A path in it that is not absolute begins at the folder of the file. Raises ConfigError with file,
     key and what to do, and UsageError for a technique or parameter that there is not."""
     content, where = read_yaml(path), str(path)
@@ -98,10 +79,10 @@ def read_plan(path: str | Path) -> Plan:
     sections = {key: _sections(content, key, where) for key in ("sets", "rows")}
     sets = {name: build(SetPlan, each, where, f"sets.{name}.") for name, each in sections["sets"].items()}
     rows = {name: build(RowPlan, each, where, f"rows.{name}.") for name, each in sections["rows"].items()}
-    return checked(Plan({name: _below(Path(path).parent, each) for name, each in sets.items()}, rows), where)
+    return checked(EvaluationPlan({name: _below(Path(path).parent, each) for name, each in sets.items()}, rows), where)
 
 
-def checked(plan: Plan, where: str) -> Plan:
+def checked(plan: EvaluationPlan, where: str) -> EvaluationPlan:
     """Return a plan that can be measured. Raises ConfigError for one that cannot, and UsageError for a technique or a
     parameter that there is not."""
     for name, each in plan.sets.items():
@@ -131,7 +112,7 @@ def checked(plan: Plan, where: str) -> Plan:
     return plan
 
 
-def of_flags(folders: Sequence[str], chosen: dict[str, RowPlan], common: SetPlan) -> Plan:
+def of_flags(folders: Sequence[str], chosen: dict[str, RowPlan], common: SetPlan) -> EvaluationPlan:
     """Make the plan of folders named on the command line, each measured by the rows `chosen`. `common` says how all
     sets are read, and may name `query` and `ref` of a set of its own. Sets are named by their folders."""
     sets: dict[str, SetPlan] = {}
@@ -142,7 +123,7 @@ def of_flags(folders: Sequence[str], chosen: dict[str, RowPlan], common: SetPlan
         path = Path(folder).resolve()
         name = path.name if path.name not in sets else str(path)
         sets[name] = replace(common, folder=str(path))
-    return checked(Plan(sets, chosen), "the command line")
+    return checked(EvaluationPlan(sets, chosen), "the command line")
 
 
 def _sections(content: dict[str, Any], key: str, where: str) -> dict[str, dict[str, Any]]:

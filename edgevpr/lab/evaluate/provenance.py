@@ -1,6 +1,5 @@
-"""Origin of a figure: the date, the machine, the versions, the commit, and hashes of the code that was at work."""
+"""Origin of a figure: the date, the machine, the versions and the commit."""
 
-import hashlib
 import os
 import platform
 import subprocess
@@ -11,8 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import edgevpr
-from edgevpr.core.files import sha256_of
-from edgevpr.core.resources import shipped
 
 PACKAGE = Path(edgevpr.__file__).parent
 _LIBRARIES = {"numpy": "numpy", "opencv": "opencv-python-headless", "onnxruntime": "onnxruntime", "scipy": "scipy"}
@@ -27,8 +24,13 @@ def today() -> str:
 def versions() -> dict[str, str | None]:
     """Return the versions of edgevpr, Python and the libraries that decide a figure; None for one that is missing."""
     return {"edgevpr": edgevpr.__version__, "python": platform.python_version()} | {
-        name: _version(package) for name, package in _LIBRARIES.items()
+        name: version_of(package) for name, package in _LIBRARIES.items()
     }
+
+
+def program(found: dict[str, str | None], commit: str | None) -> str:
+    """Name the program by its version and, where it is known, its commit."""
+    return f"edgevpr {found['edgevpr']}" + (f" ({commit})" if commit else "")
 
 
 def machine() -> dict[str, Any]:
@@ -66,36 +68,8 @@ def commit_of(checkout: Path = PACKAGE.parent) -> str | None:
     return commit + (" with changes" if git("status", "--porcelain", "--", "edgevpr", "models") else "")
 
 
-@cache
-def code_of_techniques() -> str:
-    """Return the hash of all that makes a descriptor of a picture, but for the networks: the techniques' files and the
-    versions of the libraries."""
-    return _hash([*(PACKAGE / "techniques").rglob("*.py"), PACKAGE / "contract.py"])
-
-
-@cache
-def code_of_everything() -> str:
-    """Return the hash of all that makes an answer: the whole package, what it ships, and the versions of the
-    libraries."""
-    shipped_files = [path for kind in ("models", "profiles", "deploy") for path in shipped(kind).rglob("*")]
-    return _hash([*PACKAGE.rglob("*.py"), *PACKAGE.rglob("*.json"), *shipped_files])
-
-
-@cache
-def code_of_frames() -> str:
-    """Return the hash of all that takes the frames of a video: the room of the frames, and the version of PyAV."""
-    return _hash([*(PACKAGE / "frames").rglob("*.py")]) + f" av {_version('av')}"
-
-
-def _hash(paths: list[Path]) -> str:
-    found = hashlib.sha256(repr(sorted(versions().items(), key=str)).encode())
-    for path in sorted({path for path in paths if path.is_file() and "__pycache__" not in path.parts}):
-        found.update(path.as_posix().removeprefix(PACKAGE.parent.as_posix()).encode() + b"\0")
-        found.update(sha256_of(path).encode())
-    return found.hexdigest()
-
-
-def _version(package: str) -> str | None:
+def version_of(package: str) -> str | None:
+    """Return the version of an installed package; None where it is missing."""
     try:
         return version(package)
     except PackageNotFoundError:

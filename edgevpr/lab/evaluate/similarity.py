@@ -15,9 +15,9 @@ import numpy as np
 from edgevpr.core.errors import UsageError
 from edgevpr.frames.images import counting_order
 from edgevpr.lab.evaluate import metrics
+from edgevpr.lab.evaluate.dataset import GroundTruth
+from edgevpr.lab.evaluate.metrics import Quality, figures
 from edgevpr.lab.evaluate.numbered import Numbered
-from edgevpr.lab.evaluate.quality import Quality, figures
-from edgevpr.lab.evaluate.truth import Truth
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,8 +35,8 @@ def read_similarities(path: str | Path) -> Similarities:
     try:
         if path.suffix == ".npz":
             with np.load(path, allow_pickle=False) as stored:
-                names = [tuple(map(str, stored[key])) if key in stored else None for key in ("queries", "references")]
-                found = Similarities(np.asarray(stored["similarity"]), *names)
+                named = [tuple(map(str, stored[key])) if key in stored else None for key in ("queries", "references")]
+                found = Similarities(np.asarray(stored["similarity"]), *named)
         elif path.suffix == ".csv":
             found = _of_csv(path)
         else:
@@ -68,7 +68,7 @@ def read_similarities(path: str | Path) -> Similarities:
 def measure(
     label: str,
     found: Similarities,
-    truth: Truth | Numbered,
+    truth: GroundTruth | Numbered,
     references: Sequence[str] | None = None,
     queries: Sequence[str] | None = None,
 ) -> Quality:
@@ -121,7 +121,7 @@ def _named(
     truth: Numbered,
     references: Sequence[str] | None,
     queries: Sequence[str] | None,
-) -> tuple[Truth, Sequence[str]]:
+) -> tuple[GroundTruth, Sequence[str]]:
     """Return a ground truth of numbers with names, and the names of the references in the order of the numbers."""
     rows, columns = found.scores.shape
     queries = queries or _in_order(label, found.queries, "queries", "--query") or tuple(map(str, range(rows)))

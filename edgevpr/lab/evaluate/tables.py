@@ -1,57 +1,55 @@
-"""Results as tables: plain text for a terminal, Markdown for a page."""
+"""Results as tables: plain text for a terminal, cells for Markdown and for a page."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from edgevpr.core.tables import aligned
 from edgevpr.lab.evaluate.evaluate import TechniqueResult
-from edgevpr.lab.evaluate.quality import Interval, Quality
+from edgevpr.lab.evaluate.metrics import Interval, Quality
 
-RECALLS = ("recall@1", "95 %", "@5", "95 %", "@10", "95 %")
-CURVE = ("P@100%R", "R@100%P", "AUC", "AUC from 0", "EP", "ROC")
-QUALITY = (*RECALLS, *CURVE, "PCU", "accepted (wrong)")
-COSTS = ("t_e ms", "t_m ms", "t_m/ref ms", "RAM B/place", "disk B/place", "U_e", "U_m", "mAh/query")
+# Headings, and the fields that stand below them.
+_RECALLS = (
+    ("recall@1", "recall_at_1"), ("95 %", "recall_at_1_interval"), ("@5", "recall_at_5"),
+    ("95 %", "recall_at_5_interval"), ("@10", "recall_at_10"), ("95 %", "recall_at_10_interval"),
+)  # fmt: skip
+_CURVE = (
+    ("P@100%R", "precision_at_100_recall"), ("R@100%P", "recall_at_100_precision"), ("AUC", "auc"),
+    ("AUC from 0", "auc_from_zero"), ("EP", "ep"), ("ROC", "roc_auc"),
+)  # fmt: skip
+_DECIDED = ("PCU", "accepted (wrong)")
+_COSTS: dict[str, Callable[[TechniqueResult], str]] = {
+    "t_e ms": lambda result: f"{result.t_encode_s * 1000:.1f}",
+    "t_m ms": lambda result: f"{result.t_match_s * 1000:.1f}",
+    "t_m/ref ms": lambda result: f"{result.t_match_per_ref_s * 1000:.3f}",
+    "RAM B/place": lambda result: str(result.descriptor_bytes),
+    "disk B/place": lambda result: str(result.fine_bytes),
+    "U_e": lambda result: f"{result.u_encode:.2f}",
+    "U_m": lambda result: f"{result.u_match:.2f}",
+    "mAh/query": lambda result: f"{result.ah_total * 1000 / result.queries:.2g}",
+}
+QUALITY = (*(heading for heading, _ in (*_RECALLS, *_CURVE)), *_DECIDED)
+COSTS = tuple(_COSTS)
 
 
-def recalls(result: Quality) -> list[str]:
-    """Return the recalls of a technique as texts, in the order of `RECALLS`."""
-    shares = [
-        result.recall_at_1, result.recall_at_1_interval, result.recall_at_5, result.recall_at_5_interval,
-        result.recall_at_10, result.recall_at_10_interval,
-    ]  # fmt: skip
-    return [_share(share) for share in shares]
-
-
-def curve(result: Quality) -> list[str]:
-    """Return the figures of the precision-recall curve of a technique as texts, in the order of `CURVE`."""
-    shares = [
-        result.precision_at_100_recall, result.recall_at_100_precision, result.auc, result.auc_from_zero, result.ep,
-        result.roc_auc,
-    ]  # fmt: skip
-    return [_share(share) for share in shares]
+def share_text(share: float | Interval | None) -> str:
+    """Return a share, or the interval of one, as a text; a dash where it is unknown."""
+    if isinstance(share, tuple):
+        return f"{share[0]:.2f}-{share[1]:.2f}"
+    return "-" if share is None else f"{share:.3f}"
 
 
 def decided(result: TechniqueResult) -> list[str]:
     """Return what a flight would make of a technique as texts: its PCU, and the queries that it accepts."""
-    return [_share(result.pcu), f"{result.accepted} ({result.accepted_wrong})"]
+    return [share_text(result.pcu), f"{result.accepted} ({result.accepted_wrong})"]
 
 
 def quality(result: TechniqueResult) -> list[str]:
     """Return the quality figures of a technique as texts, in the order of `QUALITY`."""
-    return [*recalls(result), *curve(result), *decided(result)]
+    return [share_text(getattr(result, field)) for _, field in (*_RECALLS, *_CURVE)] + decided(result)
 
 
 def costs(result: TechniqueResult) -> list[str]:
     """Return the costs of a technique as texts, in the order of `COSTS`."""
-    return [
-        f"{result.t_encode_s * 1000:.1f}",
-        f"{result.t_match_s * 1000:.1f}",
-        f"{result.t_match_per_ref_s * 1000:.3f}",
-        str(result.descriptor_bytes),
-        str(result.fine_bytes),
-        f"{result.u_encode:.2f}",
-        f"{result.u_match:.2f}",
-        f"{result.ah_total * 1000 / result.queries:.2g}",
-    ]
+    return [text_of(result) for text_of in _COSTS.values()]
 
 
 def quality_text(results: Sequence[Quality]) -> str:
@@ -59,12 +57,10 @@ def quality_text(results: Sequence[Quality]) -> str:
     first = results[0]
     return "\n".join(
         [
-            *aligned([("technique", *RECALLS), *([result.technique, *recalls(result)] for result in results)]),
-            "",
-            *aligned([("technique", *CURVE), *([result.technique, *curve(result)] for result in results)]),
-            "",
+            *_table(results, _RECALLS),
+            *_table(results, _CURVE),
             f"{first.queries} queries scored against {first.references} references.",
-            *_on_figures(first),
+            _on_figures(first),
         ]
     )
 
@@ -72,58 +68,44 @@ def quality_text(results: Sequence[Quality]) -> str:
 def results_text(results: Sequence[TechniqueResult]) -> str:
     """Make the text that `edgevpr eval` prints: tables, and what their figures rest on; `results` by `compare`."""
     first = results[0]
-    found = aligned([("technique", *RECALLS), *([result.technique, *recalls(result)] for result in results)])
-    reached = aligned(
-        [
-            ("technique", *CURVE, "PCU", "accepted (wrong)"),
-            *([result.technique, *curve(result), *decided(result)] for result in results),
-        ]
-    )
-    paid = aligned([("technique", *COSTS), *([result.technique, *costs(result)] for result in results)])
+    sequences = [f"{result.technique} of {result.sequence}" for result in results if result.sequence > 1]
     lines = [
-        *found,
-        "",
-        *reached,
-        "",
-        *paid,
-        "",
+        *_table(results, _RECALLS),
+        *_table(results, _CURVE, _DECIDED, [decided(result) for result in results]),
+        *_table(results, (), COSTS, [costs(result) for result in results]),
         f"{first.queries} queries scored against {first.references} references; times are means over the queries.",
-        *_on_figures(first),
-        *_sequences(results),
-        *_discarded(results),
+        _on_figures(first),
+        *([f"Matched in sequences of queries: {', '.join(sequences)}."] if sequences else []),
+        *(_discarded(result) for result in results if result.discarded),
         "accepted: queries that would have moved the aircraft, by the technique's own rule.",
-        f"PCU: P@100%R x log10(t_e,max / t_e + 9) with t_e,max = {first.t_encode_max_s * 1000:.1f} ms.",
+        f"PCU: P@100%R x log10(t_e,max / t_e + 9) with t_e,max = {1000 * (first.t_encode_max_s or 0):.1f} ms.",
         f"mAh: {first.ah_assumes}.",
-        *(f"Weights of {each}." for each in dict.fromkeys(result.weights for result in results) if each),
+        *(f"Weights of {weights}." for weights in dict.fromkeys(result.weights for result in results) if weights),
     ]
     return "\n".join(lines)
 
 
-def _share(share: float | Interval | None) -> str:
-    if isinstance(share, tuple):
-        return f"{share[0]:.2f}-{share[1]:.2f}"
-    return "-" if share is None else f"{share:.3f}"
+def _table(
+    results: Sequence[Quality],
+    shares: Sequence[tuple[str, str]],
+    headings: Sequence[str] = (),
+    more: Sequence[list[str]] = (),
+) -> list[str]:
+    """Lay out a table with a row for each result: its shares, then the cells `more`; an empty line ends it."""
+    rows = [[result.technique, *(share_text(getattr(result, field)) for _, field in shares)] for result in results]
+    if more:
+        rows = [[*row, *cells] for row, cells in zip(rows, more, strict=True)]
+    return [*aligned([["technique", *(heading for heading, _ in shares), *headings], *rows]), ""]
 
 
-def _on_figures(first: Quality) -> list[str]:
+def _on_figures(first: Quality) -> str:
     known = "the queries resampled" if first.recall_at_1_interval else "not computed: it needs SciPy"
-    return [
-        f"95 %: what other queries of the same kind would give, {known}. AUC: equation 2.3; from 0: scikit-learn's."
-    ]
+    return f"95 %: what other queries of the same kind would give, {known}. AUC: equation 2.3; from 0: scikit-learn's."
 
 
-def _sequences(results: Sequence[TechniqueResult]) -> list[str]:
-    lengths = [f"{result.technique} of {result.sequence}" for result in results if result.sequence > 1]
-    return [f"Matched in sequences of queries: {', '.join(lengths)}."] if lengths else []
-
-
-def _discarded(results: Sequence[TechniqueResult]) -> list[str]:
-    lines = []
-    for each in results:
-        if each.discarded:
-            of_the_others = each.recall_at_1 * each.queries / max(each.queries - each.discarded, 1)
-            lines.append(
-                f"{each.technique}: {each.discarded} queries were not memorable, and count as missed; recall@1 of the "
-                f"others is {of_the_others:.3f}."
-            )
-    return lines
+def _discarded(result: TechniqueResult) -> str:
+    of_the_others = result.recall_at_1 * result.queries / max(result.queries - result.discarded, 1)
+    return (
+        f"{result.technique}: {result.discarded} queries were not memorable, and count as missed; recall@1 of the "
+        f"others is {of_the_others:.3f}."
+    )

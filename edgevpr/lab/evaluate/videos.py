@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from edgevpr.core.errors import EdgevprError, UsageError
 from edgevpr.core.files import sha256_of
@@ -17,57 +18,40 @@ from edgevpr.frames.positions import GeoTag, read_positions, write_positions
 from edgevpr.frames.source import Source, open_source
 from edgevpr.frames.track import MOST_GAP_S
 from edgevpr.lab.evaluate.asking import Progress
-from edgevpr.lab.evaluate.kept import Kept, key_of
-from edgevpr.lab.evaluate.provenance import code_of_frames
+from edgevpr.lab.evaluate.cache import Cache, code_of_frames, key_of
 
 # Of a folder that may hold other files as well; a video that is named itself may be called anything.
-_EXTENSIONS = (
-    ".mp4",
-    ".mov",
-    ".mkv",
-    ".avi",
-    ".m4v",
-    ".webm",
-    ".ts",
-    ".mts",
-    ".m2ts",
-    ".mpg",
-    ".mpeg",
-    ".mjpeg",
-    ".h264",
-)
-_KIND = "videos"
+_EXTENSIONS = frozenset(".mp4 .mov .mkv .avi .m4v .webm .ts .mts .m2ts .mpg .mpeg .mjpeg .h264".split())  # noqa: SIM905
 _POSITIONS = "positions.csv"
 _FORM = "time,lat,lon[,alt,yaw_deg,roll_deg,pitch_deg,height_m], `time` in seconds from its first frame"
 _READ_TIMEOUT_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class Pictures:
+class VideoPictures:
     """Finds the folder of pictures of a side of a data set. Those of a video are taken at `rate_hz` (None: every frame)
-    and kept in `kept`; `progress` shows it."""
+    and kept in `cache`; `progress` shows it."""
 
-    kept: Kept
+    cache: Cache
     rate_hz: float | None
-    progress: Progress
+    progress: Progress[Any]
 
     def __call__(self, given: Path) -> Path:
         """Return the folder of pictures of `given`, which is one, or a video, or a folder that holds one video and no
         picture. Raises UsageError for a video without positions, ImageError for one that is damaged, SourceError for
         one that is none, and EdgevprError for a full disk."""
         video = _video_of(given)
-        return self._taken(video) if video else given
-
-    def _taken(self, video: Path) -> Path:
+        if video is None:
+            return given
         table = _positions_beside(video)
-        key = key_of(_KIND, code_of_frames(), sha256_of(video), sha256_of(table), self.rate_hz)
-        found = self.kept.get_folder(_KIND, key)
-        return found or self.kept.put_folder(_KIND, key, partial(self._take, video, table))
+        key = key_of(code_of_frames(), sha256_of(video), sha256_of(table), self.rate_hz)
+        return self.cache.keep("videos", key, partial(self._take, video, table))
 
     def _take(self, video: Path, table: Path, made: Path) -> None:
         """Write each frame that has a position as a picture without losses, and positions.csv of all frames."""
         source = open_source(str(video), step_s=1 / self.rate_hz if self.rate_hz else None, positions=table, live=False)
         tags: dict[str, GeoTag] = {}
+        made.mkdir()
         try:
             for frame in self.progress(_frames(source), source.total, f"{video.name}: pictures"):
                 name = _file_name(frame)
@@ -83,7 +67,7 @@ class Pictures:
             write_positions(made / _POSITIONS, tags)
         except OSError as error:
             raise EdgevprError(
-                f"{self.kept.folder} takes no more pictures of {video} ({error.strerror}): make room, take fewer with "
+                f"{self.cache.folder} takes no more pictures of {video} ({error.strerror}): make room, take fewer with "
                 "--rate-hz, or name another folder with --out or --cache."
             ) from error
         finally:

@@ -95,7 +95,7 @@ def test_an_unknown_technique_or_parameter_is_refused(folder):
 
 def test_progress_is_shown_for_references_and_queries(folder):
     out = io.StringIO()
-    evaluate("hog", load(folder), HOG, None, lambda items, total, label: progress(items, total, label, out))
+    evaluate("hog", load(folder), HOG, progress=lambda items, total, label: progress(items, total, label, out))
     assert "hog: references  8/8  100 %" in out.getvalue()
     assert "hog: queries  8/8  100 %" in out.getvalue()
 

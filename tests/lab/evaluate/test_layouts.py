@@ -11,8 +11,7 @@ from pictures import textured
 from edgevpr.cli.main import main
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import moved
-from edgevpr.lab.evaluate.layouts import open_folder
-from edgevpr.lab.evaluate.nearby import Nearness
+from edgevpr.lab.evaluate.layouts import Nearness, open_folder
 from edgevpr.mapmaking.footprint import Footprint, footprint, shared
 
 RULE = Nearness()

@@ -2,11 +2,11 @@
 
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,11 +15,11 @@ from generated_sets import COHOG, HOG, make_set, without_costs
 from edgevpr.cli.main import main
 from edgevpr.lab.evaluate.dataset import load_dataset
 from edgevpr.lab.evaluate.evaluate import evaluate
-from edgevpr.lab.evaluate.kept import Kept
 from edgevpr.lab.evaluate.many import measure
 from edgevpr.lab.evaluate.output import as_json
-from edgevpr.lab.evaluate.plan import Plan, RowPlan, SetPlan
+from edgevpr.lab.evaluate.plan import EvaluationPlan, RowPlan, SetPlan
 
+pytestmark = [pytest.mark.process, pytest.mark.slow]
 ROWS = {
     "cohog": RowPlan(technique="cohog", parameters=COHOG),
     "cohog, exact": RowPlan(technique="cohog", parameters=COHOG, exact=True),
@@ -27,6 +27,7 @@ ROWS = {
     "hog 8bit": RowPlan(technique="hog", parameters=HOG, form="8bit"),
     "seqslam of 2": RowPlan(technique="seqslam", sequence=2),
 }
+ONLY_HOG = {"hog 8bit": ROWS["hog 8bit"]}
 
 
 def shown(items, total, label):
@@ -34,7 +35,7 @@ def shown(items, total, label):
 
 
 def plan_of(*folders, rows=ROWS):
-    return Plan({folder.name: SetPlan(folder=str(folder)) for folder in folders}, rows)
+    return EvaluationPlan({folder.name: SetPlan(folder=str(folder)) for folder in folders}, rows)
 
 
 def entries(cache, kind):
@@ -56,115 +57,83 @@ def measured(meadow, tmp_path_factory):
 def test_a_row_is_measured_as_by_itself(measured, meadow):
     outcome, _ = measured
     dataset = load_dataset(meadow / "query", meadow / "ref", meadow / "ground_truth.csv")
-    alone = evaluate("cohog", dataset, COHOG)
-    found = outcome.found[0].result
-    for name in (
-        "recall_at_1",
-        "recall_at_5",
-        "auc",
-        "ep",
-        "accepted",
-        "accepted_wrong",
-        "precision_recall",
-        "queries",
-    ):
-        assert getattr(found, name) == getattr(alone, name), name
-    assert found.technique == "cohog"
-    assert [each.label for each in outcome.found] == list(ROWS)
+    alone = as_json(replace(outcome, found=(replace(outcome.found[0], result=evaluate("cohog", dataset, COHOG)),)))
+    assert without_costs(alone) == without_costs(as_json(outcome))[:1]
+    assert [row.label for row in outcome.found] == list(ROWS)
 
 
 def test_only_what_is_scored_counts_and_a_loose_hit_counts_neither_way(measured):
     outcome, _ = measured
-    answers = {each.query: each for each in outcome.found[0].answers}
+    answers = {answer.query: answer for answer in outcome.found[0].answers}
     assert set(answers) == {"q0.png", "q1.png", "q3.png", "q4.png", "q5.png"}
     assert answers["q1.png"].found != "r1.png", "the loose one"
     assert answers["q5.png"].found == "r5.png"
-    assert not answers["q5.png"].is_right
-    assert answers["q0.png"].is_right
+    assert (answers["q5.png"].is_right, answers["q0.png"].is_right) == (False, True)
 
 
-def test_several_workers_find_the_same(measured, meadow, tmp_path):
+@pytest.mark.parametrize("rows", [ROWS, {"cohog": ROWS["cohog"]}], ids=["rows shared out", "queries shared out"])
+def test_several_workers_find_the_same(measured, meadow, tmp_path, rows):
     outcome, _ = measured
-    again = measure(plan_of(meadow), tmp_path / "cache", 3, shown)
-    assert without_costs(as_json(again)) == without_costs(as_json(outcome))
-    assert {each.made.workers for each in again.found} == {3}
+    again = measure(plan_of(meadow, rows=rows), tmp_path / "cache", 3, shown)
+    assert without_costs(as_json(again)) == without_costs(as_json(outcome))[: len(rows)]
+    assert [row.answers[0].query for row in again.found] == ["q0.png"] * len(rows)
+    assert {row.made.workers for row in again.found} == {3}
 
 
 def test_what_is_kept_is_not_measured_now_and_says_so(measured, meadow):
     outcome, cache = measured
-    before = entries(cache, "pairs")
+    before = {kind: entries(cache, kind) for kind in ("results", "maps")}
     again = measure(plan_of(meadow), cache, 2, shown)
-    assert not any(each.made.was_kept for each in outcome.found)
-    for each, first in zip(again.found, outcome.found, strict=True):
-        assert each.made.was_kept
-        assert each.made.workers == 1, "as when it was measured"
-        assert each.result == first.result, "its costs are those of then"
-    assert entries(cache, "pairs") == before
-    assert entries(cache, "answers") == {}, "they stand in the result"
+    assert not any(row.made.was_kept for row in outcome.found)
+    for row, first in zip(again.found, outcome.found, strict=True):
+        assert row == replace(first, made=replace(first.made, was_kept=True)), "with the costs of then"
+    assert {kind: entries(cache, kind) for kind in before} == before
+    assert (len(before["results"]), len(before["maps"])) == (5, 3), "the rows of cohog share a map"
 
 
-def test_a_changed_query_costs_what_it_must(measured, tmp_path):
-    """A copy of the set is the same set; with one picture changed, all but that one are known."""
+@pytest.mark.parametrize("change", ["query", "truth"])
+def test_what_decides_a_result_is_measured_anew_on_the_map_that_is_there(measured, tmp_path, change):
+    """A copy of the set is the same set."""
     _, cache = measured
     copy = make_set(tmp_path / "copy")
-    rows = {"hog 8bit": ROWS["hog 8bit"]}
-    assert measure(plan_of(copy, rows=rows), cache, 1, shown).found[0].made.was_kept
-    before = entries(cache, "descriptors")
-    picture = copy / "query" / "q3.png"
-    picture.write_bytes((copy / "query" / "q0.png").read_bytes())
-    found = measure(plan_of(copy, rows=rows), cache, 1, shown).found[0]
+    plan, maps = plan_of(copy, rows=ONLY_HOG), entries(cache, "maps")
+    assert measure(plan, cache, 1, shown).found[0].made.was_kept
+    if change == "query":
+        (copy / "query" / "q3.png").write_bytes((copy / "query" / "q0.png").read_bytes())
+    else:
+        truth = copy / "ground_truth.csv"
+        truth.write_text(truth.read_text().replace("q5.png,r0.png", "q5.png,r5.png"))
+    found = measure(plan, cache, 1, shown).found[0]
+    answers = {answer.query: answer for answer in found.answers}
     assert not found.made.was_kept
-    assert {each.query: each.found for each in found.answers}["q3.png"] == "r0.png"
-    assert entries(cache, "descriptors") == before
+    assert answers["q3.png"].found == ("r0.png" if change == "query" else "r3.png")
+    assert answers["q5.png"].is_right == (change == "truth")
+    assert entries(cache, "maps") == maps
 
 
-def test_a_changed_truth_is_another_result(measured, tmp_path):
-    _, cache = measured
-    copy = make_set(tmp_path / "copy")
-    truth = copy / "ground_truth.csv"
-    truth.write_text(truth.read_text().replace("q5.png,r0.png", "q5.png,r5.png"))
-    found = measure(plan_of(copy, rows={"hog 8bit": ROWS["hog 8bit"]}), cache, 1, shown).found[0]
-    assert not found.made.was_kept
-    assert {each.query: each.is_right for each in found.answers}["q5.png"]
-
-
-@pytest.mark.parametrize("kind", ["pairs", "maps", "maps-files", "descriptors"])
-def test_a_damaged_cache_is_noticed_and_made_anew(meadow, tmp_path, kind):
-    plan = plan_of(meadow, rows={"cohog": ROWS["cohog"]})
+def test_a_damaged_result_is_measured_anew(meadow, tmp_path):
+    plan = plan_of(meadow, rows=ONLY_HOG)
     first = measure(plan, tmp_path, 1, shown)
-    for path in entries(tmp_path, kind):
-        content = bytearray(path.read_bytes())
-        content[len(content) // 2] ^= 1
+    (path,) = entries(tmp_path, "results")
+    for content in (path.read_bytes()[:-1], b""):
         path.write_bytes(content)
-    if kind != "pairs":  # else nobody looks at it
-        for path in entries(tmp_path, "pairs"):
-            path.unlink()
-    if kind == "descriptors":
-        for path in entries(tmp_path, "maps"):
-            path.unlink()
-    again = measure(plan, tmp_path, 1, shown)
-    assert again.damaged > 0
-    assert again.failed == {}
-    assert without_costs(as_json(again)) == without_costs(as_json(first))
-    assert measure(plan, tmp_path, 1, shown).damaged == 0
+        again = measure(plan, tmp_path, 1, shown)
+        assert not again.found[0].made.was_kept
+        assert without_costs(as_json(again)) == without_costs(as_json(first))
 
 
 def arguments(folder, out, *flags):
     return [str(each) for each in ("eval", "--data", folder, "--out", out, "--techniques", "cohog,hog", *flags)]
 
 
-def command(folder, out, *flags, **more):
+def command(folder, out, *flags):
     argv = [sys.executable, "-m", "edgevpr", *arguments(folder, out, *flags)]
-    return subprocess.Popen(argv, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, **more)
+    return subprocess.Popen(argv, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
 
 
-def children_of(pid):
-    return [int(each) for each in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
-
-
-def read(path):
-    """The content of an entry, behind its mark and its checksum."""
-    return json.loads(path.read_bytes()[len(b"edgevpr kept 1\n") + 32 :])
+def workers_of(pid):
+    children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    return [int(each) for each in children if b"spawn_main" in Path(f"/proc/{each}/cmdline").read_bytes()]
 
 
 def is_running(pid):
@@ -174,78 +143,46 @@ def is_running(pid):
         return False
 
 
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
-def test_a_run_that_was_stopped_goes_on_where_it_was(tmp_path, how):
-    folder, flags = make_set(tmp_path / "long", places=40), ["--param", "cohog.w1=208", "--exact", "--workers", "2"]
-    process = command(folder, tmp_path / "out", *flags)
-    cache = tmp_path / "out" / "cache"
-    while len(entries(cache, "answers")) < 3:
+def begun(folder, out, kind):
+    """A run of two workers that has kept one map or result and is at work on another."""
+    process = command(folder, out, "--param", "cohog.w1=208", "--exact", "--workers", "2")
+    while not entries(out / "cache", kind):
         assert process.poll() is None, process.stderr.read()
         time.sleep(0.005)
-    workers = children_of(process.pid)
+    return process
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+def test_a_run_that_was_stopped_goes_on_where_it_was(tmp_path, how):
+    folder, out = make_set(tmp_path / "long", places=60), tmp_path / "out"
+    process = begun(folder, out, "results")
+    workers = workers_of(process.pid)
     process.send_signal(how)
-    process.wait()
-    said = process.stderr.read().decode()
-    process.stderr.close()
+    said = process.communicate()[1].decode()
     assert workers
     while any(map(is_running, workers)):
         time.sleep(0.01)
     assert "Traceback" not in said
-    assert not (tmp_path / "out" / "results.json").exists()
-    kept = {kind: entries(cache, kind) for kind in ("answers", "descriptors", "maps")}
-    assert len(kept["answers"]) >= 3
-
-    # What was kept is taken as it is, with the costs of then.
-    given = [read(path)[0] for path in kept["answers"]]
-    assert main(arguments(folder, tmp_path / "out", *flags)) == 0
-    told = [answer for path in entries(cache, "pairs") for answer in read(path)["answers"]]
-    assert [answer for answer in given if answer not in told] == []
-    for kind in ("descriptors", "maps"):
-        now = entries(cache, kind)
-        assert {path: now.get(path) for path in kept[kind]} == kept[kind]
-    whole = tmp_path / "whole"
-    assert main(arguments(folder, whole, *flags)) == 0
-    results = [json.loads((each / "results.json").read_text()) for each in (tmp_path / "out", whole)]
+    assert not (out / "results.json").exists()
+    kept = {kind: entries(out / "cache", kind) for kind in ("results", "maps")}
+    flags = ["--param", "cohog.w1=208", "--exact", "--workers", "2"]
+    assert main(arguments(folder, out, *flags)) == 0
+    for kind, before in kept.items():
+        now = entries(out / "cache", kind)
+        assert {path: now.get(path) for path in before} == before
+    assert main(arguments(folder, tmp_path / "whole", *flags)) == 0
+    results = [json.loads((each / "results.json").read_text()) for each in (out, tmp_path / "whole")]
     assert without_costs(results[0]) == without_costs(results[1])
 
 
-def test_answers_that_are_kept_are_not_asked_again(meadow, tmp_path):
-    plan = plan_of(meadow, rows={"cohog": ROWS["cohog"]})
-
-    class Stop(Exception):
-        pass
-
-    def stopped(items, total, label):
-        for _ in zip(items, range(2 * 6 + 1), strict=False):  # encoded, mapped, and the first answer that is told of
-            pass
-        raise Stop
-        yield
-
-    with pytest.raises(Stop):
-        measure(plan, tmp_path, 1, lambda items, total, label: stopped(items, total, label))
-    before = entries(tmp_path, "answers")
-    assert before or entries(tmp_path, "maps")
-    units = []
-    measure(plan, tmp_path, 1, lambda items, total, label: units.append(total) or items)
-    assert units in ([5 - len(before)], []), "nothing but what is missing"
-
-
-@pytest.mark.parametrize("is_finished", [True, False])
-def test_a_row_that_another_run_has_asked_meanwhile_is_not_lost(meadow, tmp_path, monkeypatch, is_finished):
-    rows = {name: ROWS[name] for name in ("cohog", "cohog, followed", "seqslam of 2")}
-    plan = plan_of(meadow, rows=rows)
-
-    def overtaken(items, total, label):
-        with monkeypatch.context() as patched:
-            if not is_finished:
-                patched.setattr(Kept, "drop", lambda *args: None)
-            measure(plan, tmp_path, 1, shown)
-        if not is_finished:
-            shutil.rmtree(tmp_path / "pairs")
-        return items
-
-    outcome = measure(plan, tmp_path, 1, overtaken)
-    assert ([each.label for each in outcome.found], outcome.failed) == (list(rows), {})
+def test_a_worker_that_was_killed_ends_the_run_with_a_sentence(tmp_path):
+    process = begun(make_set(tmp_path / "long", places=40), tmp_path / "out", "maps")
+    for pid in workers_of(process.pid):
+        os.kill(pid, signal.SIGKILL)
+    said = process.communicate()[1].decode()
+    assert process.returncode == 1
+    assert "--workers" in said
+    assert "Traceback" not in said
 
 
 def test_two_runs_at_once_do_not_harm_each_other(meadow, tmp_path):
@@ -257,35 +194,13 @@ def test_two_runs_at_once_do_not_harm_each_other(meadow, tmp_path):
     assert without_costs(one) == without_costs(other)
 
 
-def test_a_picture_that_cannot_be_used_fails_its_set_only(meadow, tmp_path):
+@pytest.mark.parametrize("broken_part", ["ref/r2.png", "query/q3.png"])
+def test_a_picture_that_cannot_be_used_fails_the_rows_of_its_set_only(meadow, tmp_path, broken_part):
     broken = make_set(tmp_path / "broken")
-    (broken / "ref" / "r2.png").write_bytes(b"")
-    outcome = measure(
-        plan_of(broken, meadow, rows={"hog": RowPlan(technique="hog", parameters=HOG)}), tmp_path, 2, shown
+    (broken / broken_part).write_bytes(b"")
+    outcome = measure(plan_of(broken, meadow, rows=ONLY_HOG), tmp_path / "cache", 2, shown)
+    assert [row.set_name for row in outcome.found] == ["meadow"]
+    assert Path(broken_part).name in outcome.failed["broken", "hog 8bit"]
+    assert len(entries(tmp_path / "cache", "maps")) == 1, (
+        "that of the meadow, which the broken one shares where its references are whole"
     )
-    assert [each.set_name for each in outcome.found] == ["meadow"]
-    (why,) = outcome.failed.values()
-    assert "r2.png is empty" in why
-
-
-def test_a_broken_query_fails_its_rows_and_not_the_map(tmp_path):
-    broken = make_set(tmp_path / "broken")
-    (broken / "query" / "q3.png").write_bytes(b"\x89PNG\r\n\x1a\n")
-    outcome = measure(plan_of(broken, rows={"hog": RowPlan(technique="hog", parameters=HOG)}), tmp_path / "c", 1, shown)
-    assert outcome.found == ()
-    assert "q3.png" in outcome.failed["broken", "hog"]
-    assert len(entries(tmp_path / "c", "maps")) == 1
-
-
-def test_a_worker_that_was_killed_ends_the_run_with_a_sentence(tmp_path):
-    folder = make_set(tmp_path / "long", places=40)
-    process = command(folder, tmp_path / "out", "--exact", "--param", "cohog.w1=208", "--workers", "2")
-    while len(entries(tmp_path / "out" / "cache", "answers")) < 3:
-        assert process.poll() is None
-        time.sleep(0.005)
-    for pid in children_of(process.pid):
-        os.kill(pid, signal.SIGKILL)
-    said = process.communicate()[1].decode()
-    assert process.returncode == 1
-    assert "A worker has ended (it was killed by signal 9" in said
-    assert "Traceback" not in said

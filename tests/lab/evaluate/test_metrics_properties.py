@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edgevpr.lab.evaluate import metrics
-from edgevpr.lab.evaluate.quality import figures, interval
+from edgevpr.lab.evaluate.metrics import figures, interval
 
 pytest.importorskip("sklearn")
 from sklearn.metrics import auc, precision_recall_curve, roc_auc_score

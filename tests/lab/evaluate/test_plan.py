@@ -5,7 +5,7 @@ from generated_sets import make_set
 
 from edgevpr.core.errors import UsageError
 from edgevpr.core.progress import progress
-from edgevpr.lab.evaluate.kept import Kept
+from edgevpr.lab.evaluate.cache import Cache
 from edgevpr.lab.evaluate.plan import RowPlan, read_plan
 
 
@@ -28,11 +28,11 @@ def test_a_plan_names_sets_beside_its_file_and_rows(tmp_path):
         "rows:\n  fast: {technique: cohog, parameters: {w1: 208}, candidates: 5, follow: true}\n"
         "  byte: {technique: hog, form: 8bit, exact: true}\n",
     )
-    assert [len(each.open(Kept(tmp_path / "cache"), progress).queries) for each in found.sets.values()] == [5, 5]
+    assert [len(each.open(Cache(tmp_path / "cache"), progress).queries) for each in found.sets.values()] == [5, 5]
     assert found.rows["fast"].settings("nadir") == {"camera": "nadir", "w1": 208}
     assert found.rows["byte"].settings("nadir") == {"form": "8bit"}
-    assert (found.rows["fast"].asking.candidates, found.rows["fast"].asking.follow) == (5, True)
-    assert found.rows["byte"].asking.exact
+    assert (found.rows["fast"].candidates, found.rows["fast"].follow) == (5, True)
+    assert found.rows["byte"].exact
 
 
 def test_a_parameter_of_a_row_comes_before_the_camera_of_the_set():

@@ -10,8 +10,8 @@ import pytest
 
 from edgevpr.cli.main import main
 from edgevpr.core.errors import UsageError
+from edgevpr.lab.evaluate.dataset import read_truth
 from edgevpr.lab.evaluate.similarity import measure, read_similarities
-from edgevpr.lab.evaluate.truth import read_truth
 
 _DATA = Path(os.environ.get("EDGEVPR_DATA") or Path(__file__).parents[4] / "shared" / "data")
 _PUBLISHED = _DATA / "vprbench_precomputed"
