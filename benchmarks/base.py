@@ -13,8 +13,7 @@ import cv2
 import numpy as np
 
 from edgevpr.core.errors import EdgevprError, UsageError
-from edgevpr.core.figures import figure
-from edgevpr.core.tables import markdown
+from edgevpr.core.text import figure, markdown
 from edgevpr.lab.evaluate import provenance
 
 REPOSITORY = Path(__file__).resolve().parents[1]

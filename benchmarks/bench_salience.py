@@ -26,12 +26,9 @@ from bench_scan import medians_s
 from hostile_pictures import camera_of
 from run_sets import DATA, made_by
 
-from edgevpr.core.figures import figure
-from edgevpr.core.progress import progress
-from edgevpr.core.tables import markdown
+from edgevpr.core.text import figure, markdown, progress
 from edgevpr.core.types import Frame, Place, Salience
-from edgevpr.frames.images import list_images, read_image
-from edgevpr.frames.opencv import cv2
+from edgevpr.frames.images import cv2, list_images, read_image
 from edgevpr.lab.evaluate import metrics
 from edgevpr.lab.evaluate.dataset import Dataset, load_dataset
 from edgevpr.lab.training import export_matchability

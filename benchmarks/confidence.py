@@ -28,7 +28,7 @@ from confidence_rows import CONFIG, Row, frames_of, gather, kind_of_match, site_
 from hostile_pictures import camera_of
 from run_sets import DATA, RESULTS, TUNED_ON, made_by
 
-from edgevpr.core.tables import markdown
+from edgevpr.core.text import markdown
 from edgevpr.core.types import Frame
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.lab.evaluate.dataset import load_dataset

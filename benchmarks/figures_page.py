@@ -9,7 +9,7 @@ import base
 import sets_page
 from base import REPOSITORY, RESULTS
 
-from edgevpr.core.tables import markdown
+from edgevpr.core.text import markdown
 
 BEGIN, END = "<!-- figures: made by benchmarks/figures_page.py -->\n", "<!-- end of figures -->"
 FORMS = (" 8bit", " 1bit")

@@ -8,7 +8,7 @@ from flight_sites import Site
 from run_sets import TUNED_ON
 from where import honest, spread
 
-from edgevpr.core.tables import markdown
+from edgevpr.core.text import markdown
 from edgevpr.mapmaking.orthophoto import Orthophoto
 
 Row = dict[str, object]

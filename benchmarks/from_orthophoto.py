@@ -23,7 +23,7 @@ import run_sets
 from rasterio.warp import transform
 
 from edgevpr.core.geodesy import distance_m
-from edgevpr.core.tables import markdown
+from edgevpr.core.text import markdown
 from edgevpr.frames.images import read_image
 from edgevpr.frames.positions import read_positions
 

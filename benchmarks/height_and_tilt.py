@@ -22,7 +22,7 @@ from run_sets import DATA, FROM_THE_AIR, RESULTS, TUNED_ON, find_sets, made_by
 
 from edgevpr.core.config import load_config
 from edgevpr.core.errors import EdgevprError
-from edgevpr.core.tables import markdown
+from edgevpr.core.text import markdown
 from edgevpr.core.types import Frame
 from edgevpr.frames.images import read_image
 from edgevpr.lab.evaluate.dataset import ScoredQuery, load_dataset

@@ -26,7 +26,7 @@ import hostile_maps
 import hostile_pictures
 from run_sets import made_by
 
-from edgevpr.core.tables import markdown
+from edgevpr.core.text import markdown
 
 RESULTS = Path(__file__).resolve().parent / "results"
 # name: (title, how it is run, usual count: of the pictures of each stream, of each set of pictures, kind of packet or

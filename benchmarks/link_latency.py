@@ -25,7 +25,7 @@ from tempfile import TemporaryDirectory
 
 from run_sets import made_by
 
-from edgevpr.core.tables import markdown
+from edgevpr.core.text import markdown
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import POSITION_FIX, Fix

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from run_sets import RESULTS, made_by
 
-from edgevpr.core.progress import progress
+from edgevpr.core.text import progress
 
 _HIGH, _WIDE = 360, 480
 

@@ -30,7 +30,7 @@ from arm64 import compare, userland
 from arm64.userland import Arm
 from base import REPOSITORY, Row
 
-from edgevpr.core.tables import markdown
+from edgevpr.core.text import markdown
 
 NAME = "test_arm64"
 LOCK = REPOSITORY / "deploy" / "requirements.lock"

@@ -24,7 +24,7 @@ import cv2
 from hostile_pictures import camera_of
 from run_sets import DATA, RESULTS, made_by
 
-from edgevpr.core.tables import markdown
+from edgevpr.core.text import markdown
 from edgevpr.frames.images import decoded, list_images, read_image
 from edgevpr.frames.taped import as_jpeg
 from edgevpr.lab.evaluate.dataset import load_dataset

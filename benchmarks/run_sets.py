@@ -23,7 +23,7 @@ import sets_page
 import yaml
 
 from edgevpr.core.errors import UsageError
-from edgevpr.core.progress import progress
+from edgevpr.core.text import progress
 from edgevpr.lab.evaluate import provenance
 from edgevpr.lab.evaluate.asking import MatchOptions
 from edgevpr.lab.evaluate.dataset import load_dataset

@@ -7,7 +7,7 @@ from typing import Any
 
 import base
 
-from edgevpr.core.tables import markdown
+from edgevpr.core.text import markdown
 from edgevpr.lab.evaluate import tables
 from edgevpr.lab.evaluate.curves import plot
 from edgevpr.lab.evaluate.evaluate import TechniqueResult, from_json

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from run_sets import write_rows
 
-from edgevpr.core.tables import markdown
+from edgevpr.core.text import markdown
 
 TITLES = {"nadir": "Looking straight down", "forward": "Looking ahead"}
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from edgevpr.core.tables import markdown
+from edgevpr.core.text import markdown
 
 GROWTH_MB = 2.0  # asked for: less than that after the first five minutes
 _SETTLED_S = 300.0

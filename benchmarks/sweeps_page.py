@@ -5,7 +5,7 @@ from pathlib import Path
 from run_sets import TUNED_ON, write_rows
 from sweep_changes import SWEEPS
 
-from edgevpr.core.tables import markdown
+from edgevpr.core.text import markdown
 
 COLOURS = {
     "cohog": "tab:orange",

@@ -23,7 +23,7 @@ from run_sets import DATA, made_by
 from thesis_values import read_results
 
 from edgevpr.core.errors import EdgevprError, UsageError
-from edgevpr.frames.opencv import cv2
+from edgevpr.frames.images import cv2
 from edgevpr.lab.evaluate.dataset import Dataset, load_dataset, read_truth
 from edgevpr.lab.evaluate.similarity import measure, read_similarities
 

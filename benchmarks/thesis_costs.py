@@ -15,7 +15,7 @@ from thesis_values import (
     total_ah,
 )
 
-from edgevpr.core.tables import markdown
+from edgevpr.core.text import markdown
 
 FLOAT_BYTES = 4
 

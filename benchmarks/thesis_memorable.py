@@ -9,10 +9,9 @@ import base  # noqa: F401
 import detectors
 import numpy as np
 
-from edgevpr.core.progress import progress
+from edgevpr.core.text import progress
 from edgevpr.core.types import Frame
-from edgevpr.frames.images import list_images, read_image
-from edgevpr.frames.opencv import cv2
+from edgevpr.frames.images import cv2, list_images, read_image
 from edgevpr.lab.evaluate import metrics
 from edgevpr.lab.evaluate.dataset import Dataset
 from edgevpr.lab.training.labels import walk_over

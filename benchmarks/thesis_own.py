@@ -2,7 +2,7 @@
 
 from thesis_values import THESIS, half_digit
 
-from edgevpr.core.tables import markdown
+from edgevpr.core.text import markdown
 
 
 def match_ms(technique: str) -> tuple[list[float], float]:

@@ -7,7 +7,7 @@ import thesis_own as own
 import thesis_quality as quality
 from thesis_values import ROWS, THESIS, Results, total_ah
 
-from edgevpr.core.tables import markdown
+from edgevpr.core.text import markdown
 
 
 def answers(results: Results) -> list[list[str]]:

@@ -7,7 +7,7 @@ from thesis_sweep import THESIS as MEAN
 from thesis_sweep import VOTE, W2_PX
 from thesis_values import MATRICES, THESIS, Results, measured_rows, pcu_of, printed_pcu
 
-from edgevpr.core.figures import figure
+from edgevpr.core.text import figure
 
 LOOKS = {MEAN: "C0", VOTE: "C1"}
 

@@ -9,7 +9,7 @@ from thesis_sweep import GT, VOTE
 from thesis_sweep import THESIS as MEAN
 from thesis_values import MATRICES, ROWS, THESIS, Results, measured_rows, sentence
 
-from edgevpr.core.tables import markdown
+from edgevpr.core.text import markdown
 
 OTHER_SETS = ("grief_stromovka_seasons", "nordland_tiny", "aerial_swindale", "kite_ochota")
 FIGURES = {

@@ -29,7 +29,7 @@ from hostile_pictures import camera_of
 from run_sets import DATA, RESULTS, made_by
 
 from edgevpr.core.config import load_config
-from edgevpr.core.tables import markdown
+from edgevpr.core.text import markdown
 from edgevpr.core.types import Frame
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.level import UNKNOWN_VIEW, Levelled

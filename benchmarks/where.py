@@ -26,7 +26,7 @@ import numpy as np
 import run_sets
 
 from edgevpr.core.geodesy import moved, offset_m
-from edgevpr.core.tables import markdown
+from edgevpr.core.text import markdown
 from edgevpr.core.types import Place
 from edgevpr.frames.images import read_image
 from edgevpr.frames.positions import read_positions

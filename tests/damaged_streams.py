@@ -21,8 +21,8 @@ import numpy as np
 from numbered_pictures import numbers_in, picture
 from rtsp_camera import RtspCamera, free_port
 
-from edgevpr.frames.condition import Condition
 from edgevpr.frames.decoding import Fetched, WholePictures
+from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import open_source
 
 _X264 = ("-c:v", "libx264", "-preset", "ultrafast", "-tune", "zerolatency", "-pix_fmt", "yuv420p", "-g", "30")

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from edgevpr.core.types import Frame, Receiver, Vehicle
-from edgevpr.frames.condition import Condition
+from edgevpr.frames.shot import Condition
 from edgevpr.mavlink.autopilots.channel import Channel
 from edgevpr.mavlink.link import LinkStats
 from edgevpr.mavlink.listener import NoListener

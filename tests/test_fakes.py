@@ -10,8 +10,8 @@ from mavlink_peers import AutopilotThread, Peer, UdpPort, wait_until
 from pictures import textured
 
 from edgevpr.core.errors import ImageError
-from edgevpr.frames.condition import Condition
 from edgevpr.frames.live import Camera, LiveSource
+from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import open_source
 from edgevpr.lab.simulate.flightcontroller.recorded import Track
 from edgevpr.mavlink.address import parse_link

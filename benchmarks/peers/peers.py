@@ -24,7 +24,7 @@ from base import Row, camera_of
 from ways import WAYS
 
 from edgevpr.core.errors import EdgevprError
-from edgevpr.core.tables import markdown
+from edgevpr.core.text import markdown
 
 SETS = "aerial_brighton", "aerial_copr", "aerial_swindale", "kite_ochota", "grief_stromovka_seasons", "nordland_tiny"
 WORK = base.REPOSITORY / "peers_work"

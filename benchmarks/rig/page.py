@@ -12,7 +12,7 @@ from run_sets import made_by
 from scenarios import SCENARIOS
 from simulator import VEHICLES
 
-from edgevpr.core.tables import markdown
+from edgevpr.core.text import markdown
 
 RESULTS = Path(__file__).resolve().parents[1] / "results"
 _SHOWN_PER_M = 0.4  # pixels of the ground in the picture

@@ -5,7 +5,7 @@ from typing import Any
 
 from image import REPOSITORY
 
-from edgevpr.core.tables import markdown
+from edgevpr.core.text import markdown
 
 _BEGIN, _END = "<!-- service faults -->\n", "<!-- end -->"
 

@@ -75,8 +75,7 @@ def add(maps: Any) -> None:
 def map_build(args: Namespace) -> int:
     """Make a map of a recording, or continue one."""
     from edgevpr.frames.mask import mask_of
-    from edgevpr.mapmaking.gaps import Gaps
-    from edgevpr.mapmaking.mapping import build_map
+    from edgevpr.mapmaking.mapping import Gaps, build_map
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.places.mapfiles import map_path, remove
     from edgevpr.places.mapinfo import info_of

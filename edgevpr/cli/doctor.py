@@ -22,7 +22,7 @@ def run_doctor(args: Namespace) -> int:
     """Say what is fine, what is wrong, and what to change."""
     from dataclasses import asdict
 
-    from edgevpr.core.progress import waiting
+    from edgevpr.core.text import waiting
     from edgevpr.mavlink.address import parse_link
     from edgevpr.runtime.service.doctor import doctor
     from edgevpr.runtime.service.finding import lines

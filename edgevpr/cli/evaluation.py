@@ -102,7 +102,7 @@ def _count(text: str) -> int:
 
 def _measure_many(args: Namespace) -> int:
     """Measure many rows on many sets, with all that an earlier run has left."""
-    from edgevpr.core.progress import progress
+    from edgevpr.core.text import progress
     from edgevpr.lab.evaluate.many import measure
     from edgevpr.lab.evaluate.output import as_json, write_results
     from edgevpr.lab.evaluate.tables import quality_text
@@ -204,7 +204,7 @@ def _forms(args: Namespace) -> list[str]:
 
 def _dataset(args: Namespace, cache: str) -> "Dataset":
     """Read the data set; the pictures of a video are taken into the folder `cache`."""
-    from edgevpr.core.progress import progress
+    from edgevpr.core.text import progress
     from edgevpr.lab.evaluate.cache import Cache
 
     chosen = _set_of(args)
@@ -229,8 +229,7 @@ def _say_notes(dataset: "Dataset") -> None:
 def _measure_similarities(args: Namespace) -> int:
     from dataclasses import asdict
 
-    from edgevpr.core.figures import require_picture
-    from edgevpr.core.text import decoded_name
+    from edgevpr.core.text import decoded_name, require_picture
     from edgevpr.frames.images import list_images
     from edgevpr.lab.evaluate.curves import plot
     from edgevpr.lab.evaluate.numbered import truth_in
@@ -258,8 +257,7 @@ def _measure_similarities(args: Namespace) -> int:
 
 
 def _measure_techniques(args: Namespace) -> int:
-    from edgevpr.core.figures import require_picture
-    from edgevpr.core.progress import progress
+    from edgevpr.core.text import progress, require_picture
     from edgevpr.lab.evaluate import evaluate as evaluation
     from edgevpr.lab.evaluate.asking import MatchOptions
     from edgevpr.lab.evaluate.curves import plot

@@ -129,7 +129,7 @@ def run_flight(args: Namespace) -> int:
 
 def run_check(args: Namespace) -> int:
     """Say whether a configuration would fly."""
-    from edgevpr.core.progress import waiting
+    from edgevpr.core.text import waiting
     from edgevpr.runtime.service.check import check, learn_mask
     from edgevpr.runtime.service.finding import lines
 

@@ -147,7 +147,7 @@ def train_matchability(args: Namespace) -> int:
 
 def models_list(args: Namespace) -> int:
     """List every card, whether or not it can be used."""
-    from edgevpr.core.resources import model_folders
+    from edgevpr.core.files import model_folders
     from edgevpr.runtime.preflight.networks import list_models
 
     found = list_models()
@@ -207,7 +207,7 @@ def models_add(args: Namespace) -> int:
 
 def models_quantise(args: Namespace) -> int:
     """Make a network of 8-bit integers, and print its costs and, with a data set, its recall, before and after."""
-    from edgevpr.core.progress import progress
+    from edgevpr.core.text import progress
     from edgevpr.lab.evaluate.dataset import load_dataset
     from edgevpr.lab.evaluate.evaluate import evaluate as measured
     from edgevpr.lab.training.quantise import quantise

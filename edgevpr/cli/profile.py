@@ -50,8 +50,7 @@ def _add_plan(parser: ArgumentParser) -> None:
 
 def profile(args: Namespace) -> int:
     """Estimate all techniques for a flight, or list, detect or measure boards."""
-    from edgevpr.core.figures import require_picture
-    from edgevpr.core.progress import progress
+    from edgevpr.core.text import progress, require_picture
     from edgevpr.power.boards import board_names, load_board
     from edgevpr.runtime.preflight.choose import require_technique
     from edgevpr.runtime.preflight.estimate import estimate
@@ -155,7 +154,7 @@ def _measure(args: Namespace, quiet: bool) -> int:
     """Measure this machine and keep the figures; with `quiet` an estimate follows, and the figures are not printed as
     JSON."""
     from edgevpr import techniques
-    from edgevpr.core.progress import progress
+    from edgevpr.core.text import progress
     from edgevpr.power.boards import load_board
     from edgevpr.runtime.preflight import stored
     from edgevpr.runtime.preflight.offers import offers

@@ -34,7 +34,7 @@ def add(commands: Any) -> None:
 
 def run_replay(args: Namespace) -> int:
     """Fly a recorded flight again."""
-    from edgevpr.core.progress import waiting
+    from edgevpr.core.text import waiting
     from edgevpr.review.replay import recorded, replay, suppose
 
     def say(done: int, total: int) -> None:

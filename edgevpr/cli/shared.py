@@ -109,7 +109,7 @@ def path_of(text: str | None) -> Path | None:
 def frames_of(source: "Source", label: str, unusable: list[ImageError]) -> "Iterator[Frame]":
     """Read every frame of a source that ends, and show progress. An image that cannot be used is reported, added to
     `unusable`, and left out."""
-    from edgevpr.core.progress import progress
+    from edgevpr.core.text import progress
 
     frames = read_to_end(source, lambda error: leave_out(error, unusable))
     return (frame for frame in progress(frames, source.total, label) if frame is not None)
@@ -156,6 +156,6 @@ def positive(text: str) -> float:
 
 def watched(label: str) -> "Watch":
     """Return the function that passes things through, of which there are so many, and shows progress."""
-    from edgevpr.core.progress import progress
+    from edgevpr.core.text import progress
 
     return lambda places, total: progress(places, total, label)

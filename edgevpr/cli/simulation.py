@@ -101,7 +101,7 @@ _NUMBERS = {
 
 
 def _fly_over(args: Namespace) -> str:
-    from edgevpr.core.progress import progress
+    from edgevpr.core.text import progress
     from edgevpr.lab.simulate.rehearsal import WEATHERS, none_written, write_rehearsal
     from edgevpr.lab.simulate.track import read_shots
     from edgevpr.mapmaking.orthophoto import Orthophoto  # loads GDAL, or says that it is missing

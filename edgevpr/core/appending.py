@@ -1,14 +1,23 @@
-"""Files that are appended to in flight, each write as a whole or not at all."""
+"""Files that are appended to in flight, each write as a whole or not at all, and set aside under numbers when full.
+
+NAME-0001.jsonl, NAME-0002.jsonl, ... stand beside NAME.jsonl. The number is one more than the highest there, so
+numbers say what came after what. Names have no dates: the clock of an aircraft may be wrong. Links are followed: the
+numbers stand beside the file that a link leads to.
+"""
 
 import errno
 import fcntl
 import os
+import re
 import stat
 from contextlib import suppress
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, cast
 
 MODE = 0o640  # positions are nobody else's, and a log is for the group that reads logs, whatever the umask
+MOST_FILES = 100  # a service that starts again and again must not bury the logs of flights under its own
+_MOST_NUMBER = 999_999  # eight digits would be a date, and a file of somebody else
+_NUMBERED = re.compile(r"(.+)-(\d{4,6})", re.DOTALL)
 
 
 def open_appending(path: str | Path) -> BinaryIO:
@@ -26,7 +35,7 @@ def open_appending(path: str | Path) -> BinaryIO:
         if is_new:
             with suppress(OSError):  # FAT has no permissions
                 os.fchmod(descriptor, MODE)
-        return os.fdopen(descriptor, "r+b", buffering=0)
+        return cast(BinaryIO, os.fdopen(descriptor, "r+b", buffering=0))
     except BaseException:
         os.close(descriptor)
         raise
@@ -54,20 +63,6 @@ def sync(file: BinaryIO) -> None:
         os.fdatasync(file.fileno())
 
 
-def earlier_part(path: str | Path) -> Path:
-    """Return the name under which the part before a file is kept: NAME.1.jsonl beside NAME.jsonl, with links
-    followed."""
-    path = Path(os.path.realpath(path))
-    return path.with_name(f"{path.stem}.1{path.suffix}")
-
-
-def set_aside(path: str | Path) -> None:
-    """Rename a file that is full to `earlier_part`, in place of the one before. Raises OSError."""
-    earlier = earlier_part(path)
-    os.replace(os.path.realpath(path), earlier)
-    sync_folder(earlier)
-
-
 def sync_folder(path: str | Path) -> None:
     """Bring the name of a file to the disk, where the folder can be synced: with links followed, and not on FAT."""
     with suppress(OSError):
@@ -81,14 +76,13 @@ def sync_folder(path: str | Path) -> None:
 def try_lock(file: BinaryIO) -> bool:
     """Lock an open file until it is closed. Return False where another process has it; a medium that has no locks, and
     what is no file, is locked by nobody."""
-    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-        return True
-    try:
-        fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:
-        return True
+    if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        try:
+            fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        except OSError:
+            pass
     return True
 
 
@@ -98,3 +92,88 @@ def is_at(file: BinaryIO, path: str | Path) -> bool:
         return os.path.samestat(os.fstat(file.fileno()), os.stat(path))
     except OSError:
         return False
+
+
+def keep_as_earlier(path: str | Path) -> None:
+    """Rename a file that is full to NAME.1.jsonl beside NAME.jsonl, in place of the one before. Raises OSError."""
+    path = Path(os.path.realpath(path))
+    os.replace(path, path.with_name(f"{path.stem}.1{path.suffix}"))
+    sync_folder(path)
+
+
+def numbered(path: str | Path) -> list[Path]:
+    """List what has a number beside `path`, the lowest first. Raises OSError."""
+    return [file for _, file in _numbered(Path(os.path.realpath(path)))]
+
+
+def relatives(path: str | Path) -> list[Path]:
+    """List what has a number beside `path`, and beside the file that `path` was before it was set aside, if its name
+    has a number. Raises OSError."""
+    path = Path(os.path.realpath(path))
+    match = _NUMBERED.fullmatch(path.stem)
+    return numbered(path) + (numbered(path.with_name(match[1] + path.suffix)) if match else [])
+
+
+def claim(path: str | Path) -> Path:
+    """Make an empty file under the next number, which is then nobody else's, and return it. Raises OSError."""
+    path = Path(os.path.realpath(path))
+    for number in range(max((number for number, _ in _numbered(path)), default=0) + 1, _MOST_NUMBER + 1):
+        claimed = path.with_name(f"{path.stem}-{number:04d}{path.suffix}")
+        with suppress(FileExistsError):  # another process was faster
+            os.close(os.open(claimed, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, MODE))
+            return claimed
+    raise OSError(errno.EEXIST, f"there is a file of number {_MOST_NUMBER}", str(path))
+
+
+def set_aside(path: str | Path) -> Path:
+    """Rename a file to the next number, and return its new name. Raises OSError."""
+    target = claim(path)  # FAT has no hard links, and a plain rename would replace what is there
+    try:
+        os.replace(os.path.realpath(path), target)
+    except OSError:
+        target.unlink(missing_ok=True)
+        raise
+    sync_folder(target)
+    return target
+
+
+def keep_within(path: str | Path, most_bytes: float) -> list[Path]:
+    """Delete of the files that have a number beside `path` the smallest where there are more than `MOST_FILES`, then
+    the oldest until they have at most `most_bytes`. One that a process writes (see `try_lock`) stays. Return what was
+    deleted. Raises OSError."""
+    sizes, deleted = {}, []
+    for file in numbered(path):
+        with suppress(FileNotFoundError):  # another process deletes as well
+            status = os.lstat(file)
+            if stat.S_ISREG(status.st_mode):
+                sizes[file] = status.st_size
+
+    def delete(file: Path) -> None:
+        if _is_free(file):
+            file.unlink(missing_ok=True)
+            del sizes[file]
+            deleted.append(file)
+
+    # Of about the same size the oldest; and never the newest, whose number would be given again.
+    smallest = sorted(list(sizes)[:-1], key=lambda file: sizes[file].bit_length())
+    for file in smallest[: max(0, len(sizes) - MOST_FILES)]:
+        delete(file)
+    for file in list(sizes):
+        if sum(sizes.values()) <= most_bytes:
+            break
+        delete(file)
+    return deleted
+
+
+def _numbered(path: Path) -> list[tuple[int, Path]]:
+    files = map(path.with_name, os.listdir(path.parent))
+    matches = ((_NUMBERED.fullmatch(file.stem), file) for file in files if file.suffix == path.suffix)
+    return sorted((int(match[2]), file) for match, file in matches if match and match[1] == path.stem)
+
+
+def _is_free(path: Path) -> bool:
+    try:
+        with open(path, "rb") as file:
+            return try_lock(file)
+    except OSError:
+        return True

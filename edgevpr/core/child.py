@@ -11,7 +11,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TextIO
+from typing import Any
 
 _PR_SET_PDEATHSIG = 1  # prctl(2)
 
@@ -52,26 +52,17 @@ def ask_child(module: str, job: Any, limit_s: float) -> Ended:
 
 
 def serve_parent(work: Callable[[Any], Any]) -> None:
-    """Do the work in the child: read the job, and print what `work` makes of it.
-
-    The life of the child is tied to its parent's: when that ends, however it ends, the kernel kills the child, even in
-    an endless loop of a library. What a library prints does not get into the answer.
-    """
-    asked = json.load(sys.stdin)
-    end_with_parent(asked["parent_pid"])
-    with open_answers() as answers:
-        json.dump(work(asked["job"]), answers)
-
-
-def open_answers() -> TextIO:
-    """Open what the parent reads from. What is printed from now on goes to stderr."""
-    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)
-    return answers
+    """Do the work in the child: read the job, and print what `work` makes of it. What a library prints goes to stderr,
+    and not into the answer."""
+    request = json.load(sys.stdin)
+    end_with_parent(request["parent_pid"])
+    with os.fdopen(os.dup(1), "w", encoding="utf-8") as answer:
+        os.dup2(2, 1)
+        json.dump(work(request["job"]), answer)
 
 
 def end_with_parent(parent_pid: int) -> None:
-    """Let the kernel kill this process when its parent ends, however that ends."""
+    """Let the kernel kill this process when its parent ends, however that ends, even in an endless loop of a library."""
     import ctypes  # not at the top: the parent may be a flight, which has no use for it
 
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)

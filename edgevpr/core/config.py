@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from edgevpr.core.errors import ConfigError
-from edgevpr.core.resources import shipped
+from edgevpr.core.files import shipped
 from edgevpr.core.text import meant
 from edgevpr.core.yamlfile import read_yaml
 

@@ -1,19 +1,52 @@
-"""Files that are written as a whole or not at all, and the check of their folders; files of foreign origin, opened
-only where they are files, and no larger than expected."""
+"""Files: the shipped and the user's own folders; files of foreign origin, opened only where they are files and no
+larger than expected; files that are written as a whole or not at all."""
 
 import errno
 import hashlib
+import io
 import os
 import stat
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import BinaryIO, TypeVar
+from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar
 
 from edgevpr.core.errors import UsageError
 
+if TYPE_CHECKING:
+    import numpy as np
+
 T = TypeVar("T")
 _KERNEL_FILE_BYTES = 1_000_000  # those of /proc and /sys say that they have none
+
+
+def shipped(kind: str) -> Path:
+    """Return the folder of `kind` ("profiles", "models" or "deploy"): inside the wheel, or at the top of a checkout."""
+    package = Path(__file__).parents[1]
+    in_wheel = package / "shipped" / kind
+    return in_wheel if in_wheel.is_dir() else package.parent / kind
+
+
+def own_folder() -> Path:
+    """Return the user's own folder, which may not exist: edgevpr below XDG_DATA_HOME or ~/.local/share."""
+    # Without a home folder (a service may have none) "~" is not expanded, and no such folder is found.
+    return Path(os.environ.get("XDG_DATA_HOME") or os.path.expanduser("~/.local/share")) / "edgevpr"
+
+
+def own_models() -> Path:
+    """Return the folder of the user's own models, which may not exist: the environment variable EDGEVPR_MODELS, else
+    models in the user's own folder."""
+    return Path(os.environ.get("EDGEVPR_MODELS") or own_folder() / "models")
+
+
+def model_folders() -> tuple[Path, ...]:
+    """Return the folders that are searched for a model: the user's own, then the shipped one. The first match wins."""
+    return own_models(), shipped("models")
+
+
+def find_model(file: str) -> Path | None:
+    """Return the path of a file in the `model_folders`, None where none has it or the name leads out of them."""
+    return next((folder / file for folder in model_folders() if "/" not in file and (folder / file).is_file()), None)
 
 
 def open_file(path: str | Path, most_bytes: int) -> BinaryIO:
@@ -24,11 +57,11 @@ def open_file(path: str | Path, most_bytes: int) -> BinaryIO:
     """
     handle = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
     try:
-        said = os.fstat(handle.fileno())
-        if not stat.S_ISREG(said.st_mode):
+        status = os.fstat(handle.fileno())
+        if not stat.S_ISREG(status.st_mode):
             raise OSError(errno.EINVAL, "it is a pipe or a device and not a regular file", str(path))
-        if said.st_size > most_bytes:
-            size = f"it has {said.st_size / 1e6:,.1f} MB, and at most {most_bytes / 1e6:,.1f} are read"
+        if status.st_size > most_bytes:
+            size = f"it has {status.st_size / 1e6:,.1f} MB, and at most {most_bytes / 1e6:,.1f} are read"
             raise OSError(errno.EFBIG, size, str(path))
     except BaseException:
         handle.close()
@@ -46,11 +79,28 @@ def read_file(path: str | Path, most_bytes: int) -> bytes:
 
 def sha256_of(path: str | Path, most_bytes: int = sys.maxsize) -> str:
     """Compute the SHA-256 of a regular file, 64 hexadecimal digits; raises OSError as `open_file` does."""
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     with open_file(path, most_bytes) as handle:
         while block := handle.read(1 << 20):
-            found.update(block)
-    return found.hexdigest()
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def arrays_of(content: bytes, most_bytes: int) -> "dict[str, np.ndarray[Any, Any]]":
+    """Unpack an archive (.npz) of foreign origin to its arrays by name. Raises ValueError for one that is damaged,
+    holds objects of Python, or takes more than `most_bytes` unpacked."""
+    import zipfile  # not at the top: only networks and sets of researchers come in archives
+
+    import numpy as np
+
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            if sum(part.file_size for part in archive.infolist()) > most_bytes:
+                raise ValueError(f"it takes more than {most_bytes / 1e6:.0f} MB unpacked")
+        with np.load(io.BytesIO(content), allow_pickle=False) as file:
+            return {key: file[key] for key in file.files}
+    except (OSError, EOFError, KeyError, MemoryError, NotImplementedError, zipfile.BadZipFile) as error:
+        raise ValueError(str(error)) from error
 
 
 def require_folder(path: Path) -> None:

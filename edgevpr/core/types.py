@@ -1,7 +1,9 @@
 """The values that packages pass to each other: frozen dataclasses."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -228,3 +230,32 @@ class FixReport:
     lat_deg: float | None = None
     lon_deg: float | None = None
     accuracy_m: float | None = None
+
+
+T = TypeVar("T")
+
+
+class Tape(Protocol):
+    """Takes note of what comes in, or gives it back. All values are those of JSON, or bytes."""
+
+    def read(self, kind: str, look: Callable[[], T]) -> T:
+        """Return what `look` finds; or, of a flight that is run again, what it found then."""
+        ...
+
+    def note(self, kind: str, *values: Any) -> None:
+        """Take note of what has happened without being asked for, in another thread."""
+        ...
+
+
+class NoTape:
+    """Stands in for a `Tape` where nothing is recorded."""
+
+    def read(self, kind: str, look: Callable[[], T]) -> T:
+        """Return what `look` finds."""
+        return look()
+
+    def note(self, kind: str, *values: Any) -> None:
+        """Take note of nothing."""
+
+
+NO_TAPE = NoTape()

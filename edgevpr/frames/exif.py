@@ -1,15 +1,24 @@
 """Data that the camera wrote into an image file: position, heading and time from EXIF, attitude and height from XMP."""
 
 import logging
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
+from xml.etree import ElementTree
 
 from edgevpr.core.types import Position
 from edgevpr.frames.positions import ALT_M, GeoTag, parse_time, position_or_none
-from edgevpr.frames.xmp import read_xmp
 
 T = TypeVar("T")
+Tags = Mapping[str, Any]  # values of exifread by their names, "GPS GPSLatitude"
+
+_HEAD_BYTES = 300_000  # in a JPEG the XMP stands before the picture, behind EXIF data of 64 KB at most
+_MOST_XMP_BYTES = 65_536  # that of a JPEG fits a segment
+_BEGIN, _END = b"<x:xmpmeta", b"</x:xmpmeta>"
+_DJI, _PARROT = "{http://www.dji.com/drone-dji/1.0/}", "{http://www.parrot.com/drone-parrot/1.0/}"
+_PIX4D = ("{http://pix4d.com/camera/1.0/}", "{http://pix4d.com/camera/1.0}")
 
 _log = logging.getLogger(__name__)
 
@@ -25,44 +34,40 @@ def read_exif(path: str | Path) -> GeoTag:
     The time is that of the GPS receiver, else that of the camera clock, taken as UTC where it has no time zone. The
     heading is that of the gimbal, which goes with its roll and pitch, else that of EXIF. For the height see `read_xmp`.
     """
-    import exifread  # not at the top: most sources never need it
+    tags = _exif_of(path)
 
-    logging.getLogger("exifread").setLevel(logging.CRITICAL)  # it would report every file without EXIF
-
-    def tags() -> dict[str, Any]:
-        with open(path, "rb") as handle:
-            return exifread.process_file(handle, details=False)
-
-    def known(read: Callable[[dict[str, Any]], T]) -> T | None:
+    def known(read: Callable[[Tags], T]) -> T | None:
         try:
-            return _known(lambda: read(found))
+            return read(tags)
         except _Senseless as error:
             _log.warning("%s: its EXIF says %s, which cannot be: it is taken as unknown.", path, error)
-            return None
+        except Exception:  # files of any origin: a tag may be absent, of another type or length, or divide by zero
+            pass
+        return None
 
-    found = _known(tags) or {}
     gps_time_s = known(_gps_time_s)
-    shooting = read_xmp(path)
-    return GeoTag(
+    xmp = read_xmp(path)
+    return replace(
+        xmp,
         position=known(lambda tags: _position(tags, known(_alt_m))),
-        heading_deg=known(_heading_deg) if shooting.heading_deg is None else shooting.heading_deg,
+        heading_deg=known(_heading_deg) if xmp.heading_deg is None else xmp.heading_deg,
         t_utc_s=known(_camera_time_s) if gps_time_s is None else gps_time_s,
-        roll_deg=shooting.roll_deg,
-        pitch_deg=shooting.pitch_deg,
-        height_m=shooting.height_m,
     )
 
 
-def _known(read: Callable[[], T]) -> T | None:
+def _exif_of(path: str | Path) -> Tags:
+    import exifread  # not at the top: most sources never need it
+
+    logging.getLogger("exifread").setLevel(logging.CRITICAL)  # it would report every file without EXIF
     try:
-        return read()
-    except _Senseless:
-        raise
-    except Exception:  # files of any origin: a tag may be absent, of another type or length, or divide by zero
-        return None
+        with open(path, "rb") as handle:
+            tags: Tags = exifread.process_file(handle, details=False)
+            return tags
+    except Exception:  # files of any origin
+        return {}
 
 
-def _position(tags: dict[str, Any], alt_m: float | None) -> Position | None:
+def _position(tags: Tags, alt_m: float | None) -> Position | None:
     if "GPS GPSStatus" in tags and tags["GPS GPSStatus"].values == "V":  # void: the receiver has lost its fix
         return None
     lat_deg = _degrees(tags, "GPS GPSLatitude", {"N": 1, "S": -1}, 90)
@@ -70,7 +75,7 @@ def _position(tags: dict[str, Any], alt_m: float | None) -> Position | None:
     return position_or_none(lat_deg, lon_deg, alt_m)
 
 
-def _degrees(tags: dict[str, Any], name: str, signs: dict[str, int], limit: float) -> float:
+def _degrees(tags: Tags, name: str, signs: dict[str, int], limit: float) -> float:
     degrees, minutes, seconds = map(float, tags[name].values)
     value = degrees + minutes / 60 + seconds / 3600
     # 60 itself is what rounding makes of 59.99999.
@@ -79,7 +84,7 @@ def _degrees(tags: dict[str, Any], name: str, signs: dict[str, int], limit: floa
     return signs[tags[f"{name}Ref"].values.strip()] * value
 
 
-def _alt_m(tags: dict[str, Any]) -> float:
+def _alt_m(tags: Tags) -> float:
     # 0 is above and 1 below sea level; 2 and 3 (EXIF 3.0) are relative to the ellipsoid: not usable here.
     reference = tags["GPS GPSAltitudeRef"].values[0] if "GPS GPSAltitudeRef" in tags else 0
     alt_m = {0: 1, 1: -1}[reference] * float(tags["GPS GPSAltitude"].values[0])
@@ -88,21 +93,21 @@ def _alt_m(tags: dict[str, Any]) -> float:
     return alt_m
 
 
-def _heading_deg(tags: dict[str, Any]) -> float | None:
+def _heading_deg(tags: Tags) -> float | None:
     if "GPS GPSImgDirectionRef" in tags and tags["GPS GPSImgDirectionRef"].values != "T":
         return None  # magnetic: off by the declination, which is unknown
     heading_deg = float(tags["GPS GPSImgDirection"].values[0])
     return heading_deg % 360 if 0 <= heading_deg <= 360 else None
 
 
-def _gps_time_s(tags: dict[str, Any]) -> float:
+def _gps_time_s(tags: Tags) -> float:
     hours, minutes, seconds = map(float, tags["GPS GPSTimeStamp"].values)
     if not (0 <= hours <= 24 and 0 <= minutes <= 60 and 0 <= seconds <= 61):
         raise _Senseless(f"GPSTimeStamp {hours:g} {minutes:g} {seconds:g}")
     return _time_s("GPSDate", f"{tags['GPS GPSDate'].values} 00:00:00") + hours * 3600 + minutes * 60 + seconds
 
 
-def _camera_time_s(tags: dict[str, Any]) -> float:
+def _camera_time_s(tags: Tags) -> float:
     zone = tags["EXIF OffsetTimeOriginal"].values if "EXIF OffsetTimeOriginal" in tags else ""
     return _time_s("DateTimeOriginal", f"{tags['EXIF DateTimeOriginal'].values}{zone}")
 
@@ -110,9 +115,90 @@ def _camera_time_s(tags: dict[str, Any]) -> float:
 def _time_s(name: str, text: str) -> float:
     if not text.strip("\0 :0"):  # the standard's way of writing "unknown", and that of a clock that was never set
         raise KeyError(name)
-    if ":" not in text:  # seconds, which are no EXIF
-        raise _Senseless(f"{name} {text[:40]!r}")
     try:
-        return parse_time(text)
-    except (ValueError, OverflowError) as error:
-        raise _Senseless(f"{name} {text[:40]!r}") from error
+        if ":" in text:  # else seconds, which are no EXIF
+            return parse_time(text)
+    except (ValueError, OverflowError):
+        pass
+    raise _Senseless(f"{name} {text[:40]!r}")
+
+
+def read_xmp(path: str | Path) -> GeoTag:
+    """Read what DJI, Parrot and Pix4D's tags say, from the packet in the first 300 KB of a file. Never raises: a value
+    that is absent, broken or senseless is None.
+
+    The heading is that of the top of the picture. Roll and pitch are the deviation of the camera from straight down.
+    The height is over the take-off point, which is the height above the ground only where the ground is level.
+    """
+    try:
+        with open(path, "rb") as handle:
+            values = _xmp_of(handle.read(_HEAD_BYTES))
+    except (OSError, ElementTree.ParseError, ValueError, MemoryError, RecursionError):  # files of any origin
+        return GeoTag()
+    height_m = _number(values, f"{_DJI}RelativeAltitude", *ALT_M)
+    for maker in (f"{_DJI}Gimbal", f"{_PARROT}Camera"):
+        if angles := _yaw_pitch_roll(values, maker, "Degree"):
+            heading_deg, roll_deg, pitch_deg = _from_straight_down(*angles)
+            return GeoTag(heading_deg=heading_deg, roll_deg=roll_deg, pitch_deg=pitch_deg, height_m=height_m)
+    for maker in _PIX4D:  # of these tags 0 is straight down; a camera without an IMU writes zeros
+        if (angles := _yaw_pitch_roll(values, maker, "")) and any(angles):
+            yaw_deg, pitch_deg, roll_deg = angles
+            return GeoTag(heading_deg=yaw_deg % 360, roll_deg=roll_deg, pitch_deg=pitch_deg, height_m=height_m)
+    nose_deg = _number(values, f"{_DJI}FlightYawDegree")
+    return GeoTag(heading_deg=None if nose_deg is None else nose_deg % 360, height_m=height_m)
+
+
+def _xmp_of(head: bytes) -> dict[str, str]:
+    """Return the texts of the attributes and elements of the first packet, by qualified name.
+
+    The packet is cut out at its first element. A document type, with which entities would be declared, can only stand
+    before that one, and so is never read.
+    """
+    start = head.find(_BEGIN)
+    end = head.find(_END, start)
+    if start < 0 or not 0 < end - start <= _MOST_XMP_BYTES:
+        return {}
+    values: dict[str, str] = {}
+    for element in ElementTree.fromstring(head[start : end + len(_END)]).iter():
+        values.update(element.attrib)
+        if element.text and element.text.strip():
+            values[element.tag] = element.text
+    return values
+
+
+def _yaw_pitch_roll(values: dict[str, str], before: str, behind: str) -> tuple[float, float, float] | None:
+    yaw, pitch, roll = (_number(values, f"{before}{axis}{behind}") for axis in ("Yaw", "Pitch", "Roll"))
+    return None if yaw is None or pitch is None or roll is None else (yaw, pitch, roll)
+
+
+def _number(values: dict[str, str], name: str, low: float = -360.0, high: float = 360.0) -> float | None:
+    try:
+        value = float(values[name])
+    except (KeyError, ValueError):
+        return None
+    return value if low <= value <= high else None
+
+
+def _from_straight_down(yaw_deg: float, pitch_deg: float, roll_deg: float) -> tuple[float, float, float]:
+    """Return heading, roll and pitch from straight down of a gimbal whose pitch is -90 there. Its roll then turns the
+    picture and tilts nothing: a gimbal may tell half a turn in yaw as half a turn in roll."""
+    yaw, pitch, roll = map(math.radians, (yaw_deg, pitch_deg, roll_deg))
+    # Columns: the axes of a level airframe whose camera looks straight down like this one. Its nose is where the top of
+    # the picture points, its right that of the picture, and its down what the camera looks at.
+    nose = _turned(yaw, pitch, roll, (0.0, 0.0, -1.0))
+    right = _turned(yaw, pitch, roll, (0.0, 1.0, 0.0))
+    down = _turned(yaw, pitch, roll, (1.0, 0.0, 0.0))
+    heading = math.atan2(nose[1], nose[0])
+    return (
+        math.degrees(heading) % 360,
+        math.degrees(math.atan2(right[2], down[2])),
+        math.degrees(math.asin(max(-1.0, min(1.0, -nose[2])))),
+    )
+
+
+def _turned(yaw: float, pitch: float, roll: float, axis: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Turn an axis (ahead, right, down) by roll, then pitch, then yaw: (north, east, down)."""
+    ahead, right, down = axis
+    right, down = right * math.cos(roll) - down * math.sin(roll), right * math.sin(roll) + down * math.cos(roll)
+    ahead, down = ahead * math.cos(pitch) + down * math.sin(pitch), down * math.cos(pitch) - ahead * math.sin(pitch)
+    return ahead * math.cos(yaw) - right * math.sin(yaw), ahead * math.sin(yaw) + right * math.cos(yaw), down

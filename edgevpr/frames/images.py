@@ -1,26 +1,39 @@
-"""Image files: the list of a folder, and the pixels of one file. An incomplete file is refused, never half decoded."""
+"""Image files: the list of a folder, the pixels of one file, and pictures made into files. An incomplete file is
+refused, never half decoded.
 
+All modules that read pictures or streams import `cv2` from here. OpenCV's own log messages are turned off, as edgevpr
+reports each fault once, in its own words; to get them back, set OPENCV_LOG_LEVEL before the start.
+"""
+
+import os
 import re
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 
+from edgevpr.core.arrays import Image
 from edgevpr.core.errors import ImageError, SourceError
 from edgevpr.core.files import read_file
-from edgevpr.frames.header import Header, read_header
-from edgevpr.frames.opencv import cv2
+
+if "OPENCV_LOG_LEVEL" not in os.environ:
+    # OpenCV 4 has the function in `cv2`, OpenCV 5 in a submodule; level 0 is silent in both.
+    (getattr(cv2, "setLogLevel", None) or cv2.utils.logging.setLogLevel)(0)
+# Read when the first camera is opened, not at import.
+os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "3")  # seconds; else a hung camera blocks a read for 10 s
 
 EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm")
 MIN_SIDE_PX = 16
-_NAMED = 3  # folders, in a sentence
-# The largest survey cameras that are flown have 100 megapixels (11664 x 8750); decoded that is 300 MB. Without a limit
-# a file of 1 MB, which compresses well, takes gigabytes.
-MAX_PIXELS = 102_100_000
+MAX_PIXELS = int(os.environ["OPENCV_IO_MAX_IMAGE_PIXELS"])
 _MAX_FILE_BYTES = 4 * MAX_PIXELS  # such a picture with transparency, not compressed at all
+_FOLDERS_NAMED = 3  # in a sentence
+_SMALL_PX, _SMALL_QUALITY, _TAPE_QUALITY = 640, 80, 95
 
 _JPEG_START = b"\xff\xd8\xff"
 _PNG_START = b"\x89PNG\r\n\x1a\n"
+_STARTS = re.compile(rb"\xff\xd8\xff|\x89PNG\r\n\x1a\n|II|MM|BM|RIFF|P[1-6]\s")  # TIFF, BMP, WebP and PNM are the last
 # In the scan data of a JPEG, 0xFF followed by 00 (stuffing) or D0..D7 (restart) does not end the data.
 _MARKER = re.compile(rb"\xff+[^\x00\xd0-\xd7\xff]")
 _START_OF_SCAN, _END_OF_IMAGE = 0xDA, 0xD9
@@ -34,72 +47,16 @@ def list_images(folder: str | Path) -> list[Path]:
     """
     folder = Path(folder)
     try:
-        names = [path.name for path in folder.iterdir()]
+        names = sorted((path.name for path in folder.iterdir()), key=counting_order)
     except FileNotFoundError:
         raise SourceError(f"The folder {folder} does not exist: give the folder that holds the images.") from None
     except OSError as error:
         raise SourceError(f"{folder} cannot be listed ({error.strerror}): give a folder of images.") from error
-    images = [name for name in names if is_image(name)]
-    if not images:
-        inner = [path for path in map(folder.joinpath, sorted(names, key=counting_order)) if _holds_images(path)]
-        advice = f"give {' or '.join(map(str, inner[:_NAMED]))}" if inner else "give the one that does"
-        raise SourceError(f"The folder {folder} holds no images ({' '.join(EXTENSIONS)}): {advice}.")
-    return [folder / name for name in sorted(images, key=counting_order)]
-
-
-def read_image(path: str | Path) -> np.ndarray:
-    """Decode an image file to uint8, (H, W, 3) BGR or (H, W) grey; turned as its EXIF says, without transparency.
-
-    Raises ImageError for a file that is missing, no regular file, cut short, no image, not 8 bit, smaller than 16x16
-    pixels, or larger than `MAX_PIXELS`. Size and depth are those of the header: nothing is decoded in vain.
-    """
-    try:
-        data = read_file(path, _MAX_FILE_BYTES)
-    except FileNotFoundError:
-        raise ImageError(f"The image {path} does not exist: check the name.") from None
-    except OSError as error:
-        raise ImageError(f"The image {path} cannot be read ({error.strerror}): give a readable file.") from error
-    except MemoryError:
-        raise ImageError(f"{path} does not fit in the memory that is left: give a smaller image.") from None
-    if not data:
-        raise ImageError(f"{path} is empty: copy it again from the camera.")
-    if _is_incomplete(data):
-        raise ImageError(f"{path} is cut short or damaged: copy it again from the camera.")
-    header = read_header(data)
-    if header:
-        _require_usual(path, header)
-    image = decoded(data) if header else None
-    if image is None:
-        raise ImageError(f"{path} is not an image edgevpr can decode: give a JPEG, PNG, TIFF, BMP or WebP file.")
-    if image.dtype != np.uint8:
-        raise _other_depth(path, 8 * image.dtype.itemsize)
-    height, width = image.shape[:2]
-    if min(height, width) < MIN_SIDE_PX:
-        raise ImageError(
-            f"{path} is {width}x{height} pixels; at least {MIN_SIDE_PX}x{MIN_SIDE_PX} are needed: give a larger image."
-        )
-    return image
-
-
-def write_png(path: Path, image: np.ndarray) -> None:
-    """Write a picture, uint8, (H, W, 3) BGR or (H, W) grey, without losses. Raises OSError where the disk does not take
-    it."""
-    _, png = cv2.imencode(".png", image)
-    path.write_bytes(png.tobytes())
-
-
-def _require_usual(path: str | Path, header: Header) -> None:
-    if header.width * header.height > MAX_PIXELS:
-        raise ImageError(
-            f"{path} is {header.width}x{header.height} pixels; edgevpr reads up to {MAX_PIXELS / 1e6:.0f} megapixels: "
-            "give a smaller image."
-        )
-    if header.bits > 8:
-        raise _other_depth(path, header.bits)
-
-
-def _other_depth(path: str | Path, bits: int) -> ImageError:
-    return ImageError(f"{path} has {bits} bits a channel; edgevpr reads 8-bit images: convert it first.")
+    if images := [folder / name for name in names if is_image(name)]:
+        return images
+    inner = [str(folder / name) for name in names if _holds_images(folder / name)][:_FOLDERS_NAMED]
+    advice = f"give {' or '.join(inner)}" if inner else "give the one that does"
+    raise SourceError(f"The folder {folder} holds no images ({' '.join(EXTENSIONS)}): {advice}.")
 
 
 def is_image(name: str) -> bool:
@@ -121,12 +78,75 @@ def counting_order(name: str) -> tuple[list[str | int], str]:
     return [int(part) if i % 2 else part for i, part in enumerate(parts)], name
 
 
-def decoded(data: bytes) -> np.ndarray | None:
-    """Decode an image file, (H, W, 3) BGR or (H, W) grey; None where it cannot be."""
+def read_image(path: str | Path) -> Image:
+    """Decode an image file to uint8, (H, W, 3) BGR or (H, W) grey; turned as its EXIF says, without transparency.
+
+    Raises ImageError for a file that is missing, no regular file, cut short, no image, not 8 bit, smaller than 16x16
+    pixels, or of more than `MAX_PIXELS`, of which nothing is decoded.
+    """
     try:
-        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
-    except cv2.error:  # a header that promises more pixels than OpenCV is willing to hold
-        return None
+        data = read_file(path, _MAX_FILE_BYTES)
+    except FileNotFoundError:
+        raise ImageError(f"The image {path} does not exist: check the name.") from None
+    except OSError as error:
+        raise ImageError(f"The image {path} cannot be read ({error.strerror}): give a readable file.") from error
+    except MemoryError:
+        raise ImageError(f"{path} does not fit in the memory that is left: give a smaller image.") from None
+    if not data:
+        raise ImageError(f"{path} is empty: copy it again from the camera.")
+    if _is_incomplete(data):
+        raise ImageError(f"{path} is cut short or damaged: copy it again from the camera.")
+    image = None
+    try:
+        if _STARTS.match(data):
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
+    except cv2.error as error:
+        if "MAX_IMAGE" in str(error):
+            raise ImageError(
+                f"{path} has too many pixels; edgevpr reads up to {MAX_PIXELS / 1e6:.0f} megapixels: give a smaller "
+                "image."
+            ) from error
+    if image is None:
+        raise ImageError(f"{path} is not an image edgevpr can decode: give a JPEG, PNG, TIFF, BMP or WebP file.")
+    if image.dtype != np.uint8:
+        bits = 8 * image.dtype.itemsize
+        raise ImageError(f"{path} has {bits} bits a channel; edgevpr reads 8-bit images: convert it first.")
+    height, width = image.shape[:2]
+    if min(height, width) < MIN_SIDE_PX:
+        raise ImageError(
+            f"{path} is {width}x{height} pixels; at least {MIN_SIDE_PX}x{MIN_SIDE_PX} are needed: give a larger image."
+        )
+    return image  # type: ignore[return-value]  # its dtype has been checked
+
+
+def decoded(jpeg: bytes) -> Image:
+    """Decode a JPEG that edgevpr has written, (H, W, 3) BGR or (H, W) grey."""
+    return cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_ANYCOLOR)  # type: ignore[return-value]  # uint8
+
+
+def write_png(path: Path, image: Image) -> None:
+    """Write a picture, uint8, (H, W, 3) BGR or (H, W) grey, without losses. Raises OSError where the disk does not take
+    it."""
+    path.write_bytes(_encoded(".png", image))
+
+
+def as_jpeg(image: Image) -> bytes:
+    """Return a picture, uint8, (H, W) grey or (H, W, 3) BGR, as the JPEG that the tape of a flight keeps."""
+    return _encoded(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, _TAPE_QUALITY))
+
+
+def small_jpeg(image: Image, longest_px: int = _SMALL_PX) -> bytes:
+    """Return a picture for people to look at, uint8, grey or BGR, as a JPEG whose longest side has 640 pixels at most,
+    or `longest_px`."""
+    scale = min(1.0, longest_px / max(image.shape[:2]))
+    if scale < 1:
+        width, height = (max(1, round(scale * side)) for side in image.shape[1::-1])
+        image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)  # type: ignore[assignment]  # uint8
+    return _encoded(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, _SMALL_QUALITY))
+
+
+def _encoded(extension: str, image: Image, options: Sequence[int] = ()) -> bytes:
+    return cv2.imencode(extension, image, options)[1].tobytes()
 
 
 def _is_incomplete(data: bytes) -> bool:
@@ -137,9 +157,7 @@ def _is_incomplete(data: bytes) -> bool:
     """
     if data.startswith(_JPEG_START):
         return not jpeg_is_whole(data)
-    if data.startswith(_PNG_START):
-        return not _png_is_whole(data)
-    return False
+    return data.startswith(_PNG_START) and not _png_is_whole(data)
 
 
 def jpeg_is_whole(data: bytes) -> bool:

@@ -6,10 +6,8 @@ import threading
 from collections.abc import Callable
 
 from edgevpr.core.types import Frame
-from edgevpr.frames.condition import Condition
-from edgevpr.frames.newness import Newness, coarse
-from edgevpr.frames.opencv import cv2
-from edgevpr.frames.shot import Capture, Refusal, Shot
+from edgevpr.frames.images import cv2
+from edgevpr.frames.shot import Capture, Condition, Newness, Refusal, Shot, coarse
 
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.5, 10.0
 _CLOSE_TIMEOUT_S = 0.5
@@ -18,12 +16,12 @@ _FROZEN_S, _FROZEN_PICTURES = 1.0, 3  # the second for a camera that takes less 
 _DAMAGED_S = 5.0  # longer than streams need to recover from a lost packet
 
 
-def open_camera(device: str, clock: Callable[[], float]) -> "Camera":
+def open_camera(device: str, clock: Callable[[], float]) -> "DeviceCapture":
     """Open a V4L2 device (/dev/video0, /dev/v4l/by-id/...)."""
-    return Camera(cv2.VideoCapture(device, cv2.CAP_V4L2), clock)
+    return DeviceCapture(cv2.VideoCapture(device, cv2.CAP_V4L2), clock)
 
 
-class Camera:
+class DeviceCapture:
     """A camera that OpenCV has opened, which decodes its pictures itself and says of none that it is damaged."""
 
     def __init__(self, capture: cv2.VideoCapture, clock: Callable[[], float]) -> None:
@@ -80,6 +78,7 @@ class LiveSource:
 
     @property
     def condition(self) -> Condition:
+        """The condition of the source, for programs."""
         return Condition.ENDED if self.ended else self._condition
 
     def read(self, timeout_s: float) -> Frame | None:

@@ -8,14 +8,13 @@ import numpy as np
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.text import decoded_name
 from edgevpr.core.types import Frame
-from edgevpr.frames.condition import Condition
 from edgevpr.frames.exif import read_exif
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.positions import GeoTag, find_positions, read_positions
-from edgevpr.frames.shot import Refusal
+from edgevpr.frames.shot import Condition, Refusal
 
 
-class Recording:
+class RecordingSource:
     """The common part of all recordings; a subclass sets `ended`. Frames whose names are not in `only` are passed over
     (None: all are read)."""
 
@@ -55,7 +54,7 @@ def tagged(image: np.ndarray, name: str, t_mono_s: float, tag: GeoTag) -> Frame:
     )
 
 
-class FolderSource(Recording):
+class FolderSource(RecordingSource):
     """Each image of a folder once, with the position of its line in positions.csv, else that of its EXIF data."""
 
     def __init__(

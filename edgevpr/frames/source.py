@@ -10,11 +10,10 @@ from urllib.parse import urlsplit
 from edgevpr.core.config import SOURCES
 from edgevpr.core.errors import SourceError, UsageError
 from edgevpr.core.types import Frame
-from edgevpr.frames.condition import Condition
 from edgevpr.frames.images import EXTENSIONS
 from edgevpr.frames.live import LiveSource, open_camera
 from edgevpr.frames.recordings import FolderSource
-from edgevpr.frames.shot import Capture
+from edgevpr.frames.shot import Capture, Condition
 
 _SCHEMES = ("rtsp", "rtsps", "udp", "tcp", "http", "https")
 _SCHEMES_THAT_NEED_A_PORT = ("udp", "tcp")
@@ -95,7 +94,7 @@ def open_source(
         raise SourceError(f"There is nothing at `{uri}`: give {SOURCES}.")
     if path.name.lower().endswith(EXTENSIONS):
         raise SourceError(f"{uri} is a single image: give the folder that holds it.")
-    from edgevpr.frames.track import read_track
+    from edgevpr.frames.positions import read_track
     from edgevpr.frames.video import VideoSource  # loads FFmpeg
 
     return VideoSource(path, step_s or 0.0, clock, only, track=read_track(positions) if positions else None)

@@ -8,17 +8,13 @@ from collections.abc import Callable
 from dataclasses import asdict, replace
 from typing import Any
 
-import numpy as np
-
+from edgevpr.core.arrays import Image
 from edgevpr.core.errors import ImageError
-from edgevpr.core.tape import Tape
-from edgevpr.core.types import Frame, Position
-from edgevpr.frames.condition import Condition
-from edgevpr.frames.images import decoded
-from edgevpr.frames.opencv import cv2
+from edgevpr.core.types import Frame, Position, Tape
+from edgevpr.frames.images import as_jpeg, decoded
+from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import Source
 
-_QUALITY = 95
 _UNPACKED = "image", "position", "pose"
 _STATE = "ended", "dropped", "refused", "latency_s", "condition", "state"
 
@@ -34,9 +30,9 @@ class RecordedSource:
     def __getattr__(self, name: str) -> Any:
         if name not in _STATE:
             raise AttributeError(name)
-        found = getattr(self._source, name)
-        self._tape.note(name, found.name if isinstance(found, Condition) else found)
-        return found
+        value = getattr(self._source, name)
+        self._tape.note(name, value.name if isinstance(value, Condition) else value)
+        return value
 
     def read(self, timeout_s: float) -> Frame | None:
         """Return the next frame, as `Source.read` does, with the picture as it is kept."""
@@ -50,10 +46,11 @@ class RecordedSource:
             return None
         jpeg = as_jpeg(frame.image)
         number = self._keep(jpeg)
-        known = {key: value for key, value in asdict(replace(frame, image=None)).items() if key not in _UNPACKED}
+        kept = replace(frame, image=decoded(jpeg))
+        known = {name: getattr(frame, name) for name in Frame.__slots__ if name not in _UNPACKED}
         position = frame.position and asdict(frame.position)
         self._tape.note("frame", known | {"number": number, "position": position})
-        return replace(frame, image=decoded(jpeg))
+        return kept
 
     def close(self) -> None:
         """Close the source."""
@@ -64,15 +61,15 @@ class ReplayedSource:
     """The source of a recorded flight: everything is read from its tape, and `picture` gives the frame of a number,
     uint8."""
 
-    def __init__(self, tape: Tape, picture: Callable[[int], np.ndarray]) -> None:
+    def __init__(self, tape: Tape, picture: Callable[[int], Image]) -> None:
         self.is_live, self.total = tape.read("is_live", lambda: False), 0
         self._tape, self._picture = tape, picture
 
     def __getattr__(self, name: str) -> Any:
         if name not in _STATE:
             raise AttributeError(name)
-        found = self._tape.read(name, lambda: None)
-        return Condition[found] if name == "condition" else found
+        value = self._tape.read(name, lambda: None)
+        return Condition[value] if name == "condition" else value
 
     def read(self, timeout_s: float) -> Frame | None:
         """Return the next frame of the tape; None where none had come. Raises ImageError where one could not be
@@ -87,9 +84,3 @@ class ReplayedSource:
 
     def close(self) -> None:
         """Do nothing."""
-
-
-def as_jpeg(image: np.ndarray) -> bytes:
-    """Return a picture, uint8, (H, W) grey or (H, W, 3) BGR, as a JPEG."""
-    _, jpeg = cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, _QUALITY))
-    return jpeg.tobytes()

@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING
 from edgevpr.core.errors import ImageError, SourceError
 from edgevpr.core.types import Frame
 from edgevpr.frames.decoding import WholePictures, open_pictures
-from edgevpr.frames.positions import GeoTag
-from edgevpr.frames.recordings import Recording, tagged
+from edgevpr.frames.positions import GeoTag, VideoTrack
+from edgevpr.frames.recordings import RecordingSource, tagged
 from edgevpr.frames.shot import Refusal
-from edgevpr.frames.track import Track
 
 if TYPE_CHECKING:
     from av.video.frame import VideoFrame
@@ -22,7 +21,7 @@ _USUAL_RATE_HZ = 25.0
 _CUT_S = 1.0  # so much may be missing at the end: other streams in the file last a little longer
 
 
-class VideoSource(Recording):
+class VideoSource(RecordingSource):
     """The frames of a video file, at least `step_s` seconds of video time apart: the same frames in every run. `track`
     says where each was taken (None: unknown).
 
@@ -36,7 +35,7 @@ class VideoSource(Recording):
         clock: Callable[[], float],
         only: Collection[str] | None = None,
         *,
-        track: Track | None = None,
+        track: VideoTrack | None = None,
     ):
         super().__init__(only)
         self.ended = False

@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection
 from edgevpr.core.errors import ImageError
 from edgevpr.core.text import decoded_name
 from edgevpr.core.types import Frame, Pose, Position
-from edgevpr.frames.recordings import Recording
+from edgevpr.frames.recordings import RecordingSource
 from edgevpr.frames.shot import Refusal
 from edgevpr.mapmaking.lattice import Lattice
 from edgevpr.mapmaking.orthophoto import Orthophoto
@@ -16,7 +16,7 @@ MOST_WITHOUT_DATA = 0.1
 _GEO_REFERENCE_M = 1.0  # standard deviation of where the orthophoto says that a thing is, in each direction
 
 
-class OrthophotoSource(Recording):
+class OrthophotoSource(RecordingSource):
     """A frame for each place of a grid, but for those of which more than a tenth is without data; `without_data` counts
     these."""
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgevpr.core.errors import UsageError
-from edgevpr.mapmaking.gdal import CRS, geometry_mask, rasterio, transform
 from edgevpr.mapmaking.missions import Area
 from edgevpr.mapmaking.orthophoto import WGS84, Orthophoto, local_crs
+from edgevpr.mapmaking.rasters import CRS, geometry_mask, rasterio, transform
 
 MOST_PLACES = 1_000_000
 _MOST_POINTS = 20 * MOST_PLACES  # of the grid around an area of which they are a part

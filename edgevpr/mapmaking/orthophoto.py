@@ -7,10 +7,8 @@ import numpy as np
 
 from edgevpr.core.errors import SourceError
 from edgevpr.core.types import Position
-from edgevpr.frames.opencv import cv2
-from edgevpr.mapmaking.gdal import CRS, CPLE_BaseError, RasterioError, rasterio, transform
-from edgevpr.mapmaking.georaster import GeoRaster
-from edgevpr.mapmaking.tiles import TileFolder
+from edgevpr.frames.images import cv2
+from edgevpr.mapmaking.rasters import CRS, CPLE_BaseError, GeoRaster, RasterioError, TileFolder, rasterio, transform
 
 WGS84 = CRS.from_epsg(4326)
 _EDGE_POINTS = 25  # a straight edge of the file is a curve elsewhere

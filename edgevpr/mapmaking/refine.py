@@ -18,8 +18,7 @@ from edgevpr.core.errors import MapError, PlaceError
 from edgevpr.core.geodesy import metres, moved
 from edgevpr.core.types import Place, Pose, Position
 from edgevpr.mapmaking.graph import Solved, solve
-from edgevpr.mapmaking.look import looker, pictures
-from edgevpr.mapmaking.tying import likely_pairs, overlapping_pairs, tied, ties_of
+from edgevpr.mapmaking.tying import likely_pairs, looker, overlapping_pairs, pictures, tied, ties_of
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.sqlite import sentences
 

@@ -9,8 +9,7 @@ from collections.abc import Callable, Collection
 from contextlib import AbstractContextManager, suppress
 
 from edgevpr.core.errors import LinkError
-from edgevpr.core.tape import NO_TAPE, Tape
-from edgevpr.core.types import Position, Vehicle
+from edgevpr.core.types import NO_TAPE, Position, Tape, Vehicle
 from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.autopilots.channel import Channel
 from edgevpr.mavlink.conversation import Conversation

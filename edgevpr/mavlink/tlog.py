@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 from typing import BinaryIO
 
-from edgevpr.core.appending import append, is_at, open_appending, set_aside, sync
+from edgevpr.core.appending import append, is_at, keep_as_earlier, open_appending, sync
 from edgevpr.core.errors import EdgevprError
 
 MOST_BYTES = 256_000_000  # of one file, days of a usual link; with the one before it there are at most twice as many
@@ -100,7 +100,7 @@ class Tlog:
         if not is_at(self._file, self._path):  # moved or deleted in flight
             self._file = self._reopened()
         elif os.fstat(self._file.fileno()).st_size + len(records) > MOST_BYTES:
-            set_aside(self._path)
+            keep_as_earlier(self._path)
             self._file = self._reopened()
         disk = os.fstatvfs(self._file.fileno())
         if disk.f_bavail * disk.f_frsize < SPARED_BYTES:

@@ -5,7 +5,7 @@ from contextlib import contextmanager
 from threading import RLock
 from typing import Any
 
-from edgevpr.core.tape import NO_TAPE, Tape
+from edgevpr.core.types import NO_TAPE, Tape
 
 
 class Turns:

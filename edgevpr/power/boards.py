@@ -6,7 +6,7 @@ from pathlib import Path
 
 from edgevpr.core.config import BUDGET_MB, HIGHEST_RATE_HZ, LOWEST_RATE_HZ, bounded, build
 from edgevpr.core.errors import ConfigError
-from edgevpr.core.resources import shipped
+from edgevpr.core.files import shipped
 from edgevpr.core.text import meant
 from edgevpr.core.yamlfile import read_yaml
 from edgevpr.power import machine, thermal

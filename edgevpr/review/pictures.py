@@ -26,8 +26,7 @@ class Album:
         read."""
         if not name or not (self._folders or name in self._recorded):
             return None
-        from edgevpr.frames.images import EXTENSIONS, read_image  # a page without pictures needs no OpenCV
-        from edgevpr.frames.small import small_jpeg
+        from edgevpr.frames.images import EXTENSIONS, read_image, small_jpeg  # a page without pictures needs no OpenCV
 
         if path := self._recorded.get(name):
             with suppress(ImageError):

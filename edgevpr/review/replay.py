@@ -13,7 +13,7 @@ import numpy as np
 
 from edgevpr.core.config import Config, build, changed_config
 from edgevpr.core.errors import EdgevprError, ImageError, UsageError
-from edgevpr.core.tape import Tape
+from edgevpr.core.types import Tape
 from edgevpr.frames.images import read_image
 from edgevpr.frames.taped import ReplayedSource
 from edgevpr.mavlink.signing import NOT_SIGNING

@@ -19,9 +19,7 @@ from functools import lru_cache
 import numpy as np
 
 from edgevpr.core.errors import ModelError
-from edgevpr.core.files import read_file
-from edgevpr.core.npz import arrays_of
-from edgevpr.core.resources import find_model
+from edgevpr.core.files import arrays_of, find_model, read_file
 from edgevpr.techniques.patterns import slow_patterns
 
 DTYPE = "<u2"  # of a word

@@ -8,7 +8,7 @@ import pytest
 
 from edgevpr import techniques
 from edgevpr.cli.main import main
-from edgevpr.core.resources import shipped
+from edgevpr.core.files import shipped
 from edgevpr.core.types import StageCost
 from edgevpr.power import machine, sensors, speed
 from edgevpr.power.boards import board_names, load_board

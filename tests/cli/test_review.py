@@ -3,7 +3,7 @@
 import json
 
 from edgevpr.cli.main import main
-from edgevpr.core.numbered import numbered
+from edgevpr.core.appending import numbered
 from edgevpr.runtime.flight.flightlog import FlightLog
 
 

@@ -14,8 +14,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "runtime/recognise"))
 from tiny_detectors import write_detector, write_memorability
 
 from edgevpr.cli.main import main
-from edgevpr.frames.images import read_image
-from edgevpr.frames.opencv import cv2
+from edgevpr.frames.images import cv2, read_image
 from edgevpr.places.mapfile import PlaceMap
 
 

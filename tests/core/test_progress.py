@@ -5,7 +5,7 @@ import os
 
 from fakes import FakeClock
 
-from edgevpr.core.progress import progress, waiting
+from edgevpr.core.text import progress, waiting
 
 
 def test_a_file_gets_a_line_for_every_tenth():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from edgevpr.frames.age import StampedTime, UnstampedTime
+from edgevpr.frames.streams import StampedTime, UnstampedTime
 
 STEP_S = 0.05
 

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 from fakes import FakeClock
 
-from edgevpr.frames.arrivals import Arrivals
+from edgevpr.frames.streams import Arrivals
 
 
 class Sender:

@@ -1,6 +1,5 @@
 """The header of an image file, as real encoders write it, and as a hostile user does."""
 
-import io
 import os
 import random
 import resource
@@ -10,12 +9,10 @@ import sys
 import zlib
 
 import cv2
-import numpy as np
 import photographs
 import pytest
 
 from edgevpr.core.errors import ImageError
-from edgevpr.frames.header import Header, read_header
 from edgevpr.frames.images import MAX_PIXELS, read_image
 
 FORMATS = {
@@ -45,64 +42,26 @@ def tiff(**tags):
     return b"II*\x00\x08\x00\x00\x00" + struct.pack("<H", len(tags)) + entries + bytes(4)
 
 
-@pytest.mark.parametrize("extension", FORMATS)
-def test_the_size_is_that_of_the_decoded_picture(extension):
-    content = photographs.encoded(extension, photographs.picture(50, 83), *FORMATS[extension])
-    assert read_header(content) == Header(83, 50)
-
-
 @pytest.mark.parametrize(
-    "options",
+    ("name", "content"),
     [
-        {"format": "WEBP", "lossless": True},
-        {"format": "WEBP", "exif": b"Exif\x00\x00MM\x00*\x00\x00\x00\x08\x00\x00"},
-        {"format": "JPEG", "progressive": True},
-        {"format": "TIFF", "compression": "tiff_lzw"},
-        {"format": "TIFF", "big_tiff": True},
+        ("wide.png", png(20_000, 20_000)),
+        ("wide.jpg", photographs.encoded(".jpg", photographs.picture())),
+        ("wide.tif", tiff(t256=30_000, t257=30_000)),
+        ("tile.tif", tiff(t256=20, t257=20, t322=30_000, t323=30_000)),
+        ("wide.bmp", b"BM" + bytes(12) + struct.pack("<Iii", 40, 60_000, -60_000) + bytes(40)),
+        ("wide.webp", b"RIFF\x00\x00\x00\x00WEBPVP8X" + bytes(8) + b"\xff\xff\x00\xff\xff\x00"),
+        ("wide.pgm", b"P5\n60000 60000\n255\n" + bytes(100)),
     ],
 )
-def test_the_size_is_right_in_the_other_forms_of_a_format(options):
-    image = pytest.importorskip("PIL.Image").fromarray(photographs.picture(50, 83))
-    image.save(content := io.BytesIO(), **options)
-    assert read_header(content.getvalue()) == Header(83, 50)
-
-
-def test_the_depth_is_known_before_the_pixels():
-    deep = np.zeros((20, 30), np.uint16)
-    for extension in (".png", ".tif", ".pgm"):
-        assert read_header(photographs.encoded(extension, deep)) == Header(30, 20, 16)
-    deep_colour = np.zeros((20, 30, 3), np.uint16)  # whose depths lie elsewhere in a TIFF
-    assert read_header(photographs.encoded(".tif", deep_colour)) == Header(30, 20, 16)
-
-
-def test_a_thumbnail_in_the_exif_is_not_taken_for_the_picture():
-    thumbnail = photographs.encoded(".jpg", photographs.picture(16, 16))
-    jpeg = photographs.encoded(".jpg", photographs.picture(50, 83))
-    assert read_header(photographs.with_app1(jpeg, thumbnail)) == Header(83, 50)
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "promised"),
-    [
-        ("wide.png", png(20_000, 20_000), "20000x20000"),
-        ("wide.jpg", photographs.encoded(".jpg", photographs.picture()), "65000x65000"),
-        ("wide.tif", tiff(t256=30_000, t257=30_000), "30000x30000"),
-        ("tile.tif", tiff(t256=20, t257=20, t322=30_000, t323=30_000), "30000x30000"),
-        ("wide.bmp", b"BM" + bytes(12) + struct.pack("<Iii", 40, 60_000, -60_000) + bytes(40), "60000x60000"),
-        ("wide.webp", b"RIFF\x00\x00\x00\x00WEBPVP8X" + bytes(8) + b"\xff\xff\x00\xff\xff\x00", "65536x65536"),
-    ],
-)
-def test_a_picture_of_too_many_pixels_is_refused_by_its_header(name, content, promised, tmp_path):
+def test_a_picture_of_too_many_pixels_is_refused_by_its_header(name, content, tmp_path, capfd):
     if name == "wide.jpg":
         at = content.index(b"\xff\xc0") + 5
         content = content[:at] + struct.pack(">HH", 65_000, 65_000) + content[at + 4 :]
     (tmp_path / name).write_bytes(content)
-    with pytest.raises(ImageError, match=f"{name} is {promised} pixels; edgevpr reads up to 102 megapixels"):
+    with pytest.raises(ImageError, match=f"{name}.*(102 megapixels|decode)"):
         read_image(tmp_path / name)
-
-
-def test_the_picture_of_the_largest_camera_is_not_refused():
-    assert read_header(png(11_664, 8_750)).width * 8_750 <= MAX_PIXELS
+    assert capfd.readouterr().err == ""
 
 
 def test_a_small_file_does_not_take_gigabytes(tmp_path):
@@ -119,19 +78,26 @@ def test_a_small_file_does_not_take_gigabytes(tmp_path):
 
     argv = [sys.executable, "-c", code, tmp_path / "bomb.png"]
     done = subprocess.run(argv, capture_output=True, text=True, preexec_fn=limit, timeout=60)
-    assert "20000x20000 pixels" in done.stdout, done.stderr
+    assert "102 megapixels" in done.stdout, done.stderr
 
 
-def test_a_header_with_bytes_gone_wrong_never_raises():
+def test_a_header_with_bytes_gone_wrong_is_read_or_refused(tmp_path):
     chance = random.Random(5)
+
+    def read_image_of(content):
+        (tmp_path / "broken.jpg").write_bytes(content)
+        return read_image(tmp_path / "broken.jpg")
+
     for extension, options in FORMATS.items():
         whole = photographs.encoded(extension, photographs.picture(), *options)
         for _ in range(300):
             broken = bytearray(whole[: chance.choice((len(whole), chance.randrange(len(whole))))])
             for _ in range(min(len(broken), chance.choice((1, 4, 16)))):
                 broken[chance.randrange(min(len(broken), 64))] = chance.choice((0, 255, chance.randrange(256)))
-            found = read_header(bytes(broken))
-            assert found is None or found.width >= 0
+            try:
+                assert read_image_of(bytes(broken)).size <= 3 * MAX_PIXELS
+            except ImageError:
+                continue
 
 
 def test_a_pipe_named_like_an_image_is_refused_and_not_waited_for(tmp_path):

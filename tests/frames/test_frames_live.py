@@ -13,9 +13,8 @@ from fakes import FakeClock
 
 from edgevpr.core.errors import SourceError
 from edgevpr.frames import streams
-from edgevpr.frames.condition import Condition
-from edgevpr.frames.live import Camera, LiveSource, wait_before_reopening_s
-from edgevpr.frames.shot import Refusal, Shot
+from edgevpr.frames.live import DeviceCapture, LiveSource, wait_before_reopening_s
+from edgevpr.frames.shot import Condition, Refusal, Shot
 from edgevpr.frames.source import open_source
 
 PATIENCE_S = 60.0
@@ -182,7 +181,7 @@ class SteppedCamera:
 
 def test_the_newest_frame_wins_and_the_others_are_counted():
     camera, clock = SteppedCamera(), iter(range(100)).__next__
-    source = LiveSource(lambda: Camera(camera, clock), clock)
+    source = LiveSource(lambda: DeviceCapture(camera, clock), clock)
     for value in range(5):
         camera.pictures.put(np.full((20, 20, 3), 9 * value, np.uint8))
     for _ in range(6):  # the sixth call means that the fifth picture has been put away
@@ -200,7 +199,7 @@ def test_the_newest_frame_wins_and_the_others_are_counted():
 def test_the_capture_is_released_by_the_thread_that_reads_it_and_opened_anew():
     cameras = [SteppedCamera(), SteppedCamera()]
     waiting = iter(cameras)
-    source = LiveSource(lambda: Camera(next(waiting), time.monotonic), time.monotonic)
+    source = LiveSource(lambda: DeviceCapture(next(waiting), time.monotonic), time.monotonic)
     cameras[0].pictures.put(np.zeros((20, 20, 3), np.uint8))
     cameras[0].pictures.put(None)
     assert cameras[0].released.wait(PATIENCE_S)

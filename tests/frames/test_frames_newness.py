@@ -4,8 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from edgevpr.frames.newness import Newness, coarse
-from edgevpr.frames.shot import Refusal
+from edgevpr.frames.shot import Newness, Refusal, coarse
 
 HEIGHT, WIDTH = 240, 320
 _NOISE = np.random.default_rng(3).normal(128, 400, (900, 1200))

@@ -6,8 +6,7 @@ import pytest
 
 from edgevpr.core.errors import SourceError, UsageError
 from edgevpr.frames.images import read_image
-from edgevpr.frames.mask import read_mask
-from edgevpr.frames.overlay import FEWEST_FRAMES, learn_overlay, require_png, write_mask
+from edgevpr.frames.mask import FEWEST_FRAMES, learn_overlay, read_mask, require_png, write_mask
 
 _NOISE = np.random.default_rng(1)
 GROUND = sum(cv2.resize(_NOISE.random((side, 4 * side)), (1920, 480)) for side in (20, 40, 80))

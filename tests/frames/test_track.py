@@ -4,8 +4,7 @@ import pytest
 
 from edgevpr.core.errors import UsageError
 from edgevpr.core.types import Position
-from edgevpr.frames.positions import GeoTag
-from edgevpr.frames.track import read_track
+from edgevpr.frames.positions import GeoTag, read_track
 
 
 @pytest.fixture

@@ -6,9 +6,8 @@ import random
 import photographs
 import pytest
 
-from edgevpr.frames.exif import read_exif
+from edgevpr.frames.exif import read_exif, read_xmp
 from edgevpr.frames.positions import GeoTag
-from edgevpr.frames.xmp import Shooting, read_xmp
 
 NAMESPACES = (
     'xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/" xmlns:Camera="http://pix4d.com/camera/1.0/" '
@@ -45,7 +44,9 @@ def gimbal(yaw, pitch, roll, maker="drone-dji:Gimbal"):
 def test_a_photograph_of_dji(read, tmp_path):
     attributes = 'drone-dji:RelativeAltitude="+40.10" drone-dji:FlightYawDegree="+10.0" ' + gimbal("-30.0", "-80.0", 0)
     found = read(packet(attributes))
-    assert found == Shooting(pytest.approx(330), pytest.approx(0), pytest.approx(10), 40.1)
+    assert found == GeoTag(
+        heading_deg=pytest.approx(330), roll_deg=pytest.approx(0), pitch_deg=pytest.approx(10), height_m=40.1
+    )
     assert read_exif(tmp_path / "photo.jpg") == GeoTag(
         heading_deg=found.heading_deg, roll_deg=found.roll_deg, pitch_deg=found.pitch_deg, height_m=40.1
     )
@@ -84,18 +85,19 @@ def test_parrot_writes_elements(read):
 
 
 def test_of_the_tags_of_pix4d_zero_is_straight_down(read):
-    assert read(packet('Camera:Yaw="-10" Camera:Pitch="4.5" Camera:Roll="-3"')) == Shooting(350.0, -3.0, 4.5)
-    assert read(packet('Camera:Yaw="0" Camera:Pitch="0" Camera:Roll="0"')) == Shooting(), "a camera without an IMU"
+    told = read(packet('Camera:Yaw="-10" Camera:Pitch="4.5" Camera:Roll="-3"'))
+    assert told == GeoTag(heading_deg=350.0, roll_deg=-3.0, pitch_deg=4.5)
+    assert read(packet('Camera:Yaw="0" Camera:Pitch="0" Camera:Roll="0"')) == GeoTag(), "a camera without an IMU"
 
 
 def test_without_a_gimbal_the_nose_tells_the_heading_only(read):
     attributes = 'drone-dji:FlightYawDegree="-90" drone-dji:FlightRollDegree="5" drone-dji:FlightPitchDegree="5"'
-    assert read(packet(attributes)) == Shooting(heading_deg=270.0)
+    assert read(packet(attributes)) == GeoTag(heading_deg=270.0)
 
 
 @pytest.mark.parametrize("value", ["nan", "inf", "-1e9", "361", "", "0/100", "north"])
 def test_a_senseless_value_is_unknown(read, value):
-    assert read(packet(gimbal(10, value, 0))) == Shooting()
+    assert read(packet(gimbal(10, value, 0))) == GeoTag()
     assert read(packet(f'drone-dji:RelativeAltitude="{value}"')).height_m in (None, 361.0)
 
 
@@ -112,7 +114,7 @@ def test_a_senseless_value_is_unknown(read, value):
     ],
 )
 def test_rubbish_says_nothing(read, content):
-    assert read(content[:65_000]) == Shooting()
+    assert read(content[:65_000]) == GeoTag()
 
 
 def test_entities_that_grow_are_never_read(read):
@@ -120,9 +122,9 @@ def test_entities_that_grow_are_never_read(read):
         f'<!ENTITY {chr(98 + n)} "{f"&{chr(97 + n)};" * 10}">'.encode() for n in range(9)
     )
     told = packet('drone-dji:RelativeAltitude="&j;"')
-    assert read(bomb + b"]>" + told) == Shooting(), "an entity that was declared before the packet is unknown in it"
+    assert read(bomb + b"]>" + told) == GeoTag(), "an entity that was declared before the packet is unknown in it"
     within = told.replace(b"<rdf:RDF", bomb + b"]><rdf:RDF").replace(b"&j;", b"40")
-    assert read(within) == Shooting()
+    assert read(within) == GeoTag()
 
 
 def test_a_packet_that_is_too_large_or_too_far_is_left_alone(tmp_path):
@@ -130,10 +132,10 @@ def test_a_packet_that_is_too_large_or_too_far_is_left_alone(tmp_path):
     told = packet('drone-dji:RelativeAltitude="40"')
     for content in (told.replace(b"<rdf:RDF", b" " * 70_000 + b"<rdf:RDF"), bytes(400_000) + told):
         path.write_bytes(content)
-        assert read_xmp(path) == Shooting()
+        assert read_xmp(path) == GeoTag()
     path.write_bytes(bytes(200_000) + told)
     assert read_xmp(path).height_m == 40.0
-    assert read_xmp(tmp_path) == read_xmp(tmp_path / "missing.jpg") == Shooting()
+    assert read_xmp(tmp_path) == read_xmp(tmp_path / "missing.jpg") == GeoTag()
 
 
 def test_bytes_gone_wrong_never_raise(tmp_path):

@@ -5,7 +5,7 @@ import os
 import pytest
 
 from edgevpr.core.errors import ConfigError
-from edgevpr.core.resources import shipped
+from edgevpr.core.files import shipped
 from edgevpr.power.boards import board_names, load_board
 
 PROFILE = (shipped("profiles") / "rpi-4b.yaml").read_text()

@@ -5,8 +5,8 @@ import json
 import pytest
 from logs import query, write_log
 
+from edgevpr.core.appending import numbered
 from edgevpr.core.errors import EdgevprError, UsageError
-from edgevpr.core.numbered import numbered
 from edgevpr.review.flight import Outcome, read_flight
 from edgevpr.runtime.flight.flightlog import FlightLog
 

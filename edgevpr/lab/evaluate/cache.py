@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from edgevpr.core.errors import EdgevprError
-from edgevpr.core.files import sha256_of
-from edgevpr.core.resources import shipped
+from edgevpr.core.files import sha256_of, shipped
 from edgevpr.lab.evaluate.provenance import PACKAGE, version_of, versions
 
 _UNFINISHED = ".unfinished-"

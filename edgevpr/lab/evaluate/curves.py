@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from edgevpr.core.figures import figure
+from edgevpr.core.text import figure
 from edgevpr.lab.evaluate.metrics import Quality
 
 _PANELS_A_ROW = 3

@@ -19,21 +19,18 @@ import numpy as np
 
 from edgevpr.core.config import bounded
 from edgevpr.core.errors import UsageError
-from edgevpr.core.files import read_file
 from edgevpr.core.geodesy import offset_m
 from edgevpr.core.types import Position
 from edgevpr.frames.exif import read_exif
-from edgevpr.frames.header import read_header
-from edgevpr.frames.images import list_images
+from edgevpr.frames.images import list_images, read_image
+from edgevpr.frames.level import Footprint, footprint, shared
 from edgevpr.frames.positions import GeoTag, find_positions, read_positions
 from edgevpr.lab.evaluate.asking import optional
 from edgevpr.lab.evaluate.dataset import Dataset, Judged, ScoredQuery, load_dataset
 from edgevpr.lab.evaluate.numbered import Numbered, read_numbered
 from edgevpr.lab.evaluate.videos import side_of, without_position
-from edgevpr.mapmaking.footprint import Footprint, footprint, shared
 
 _FORMS = "query/, ref/ and ground_truth.csv; ground_truth_new.npy; GT.npz; database/ and queries/; or positions"
-_HEADER_BYTES = 400_000_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -213,8 +210,6 @@ def _print(shot: _Shot, rule: Nearness) -> Footprint:
             f"{shot.path}: --overlap needs --fov-deg, and height_m and yaw_deg of every picture in positions.csv: "
             "leave it out."
         )
-    header = read_header(read_file(shot.path, _HEADER_BYTES))
-    if header is None:
-        raise UsageError(f"{shot.path} says no size: give a JPEG, PNG, TIFF, BMP or WebP file.")
-    size_px = header.width, header.height
-    return footprint((shot.east_m, shot.north_m), shot.tag.height_m, rule.fov_deg, size_px, shot.tag.heading_deg)
+    height_px, width_px = read_image(shot.path).shape[:2]
+    middle_m, size_px = (shot.east_m, shot.north_m), (width_px, height_px)
+    return footprint(middle_m, shot.tag.height_m, rule.fov_deg, size_px, shot.tag.heading_deg)

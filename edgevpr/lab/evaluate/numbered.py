@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 
 from edgevpr.core.errors import UsageError
-from edgevpr.core.files import open_file, read_file
-from edgevpr.core.npz import arrays_of
+from edgevpr.core.files import arrays_of, open_file, read_file
 from edgevpr.lab.evaluate.dataset import GroundTruth, Judged, read_truth
 
 _MATRICES = ("GThard", "GTsoft")

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from edgevpr.core.files import write_whole
-from edgevpr.core.tables import markdown
+from edgevpr.core.text import markdown
 from edgevpr.lab.evaluate import tables
 from edgevpr.lab.evaluate.many import MeasuredRow, Measurements
 from edgevpr.lab.evaluate.metrics import RESAMPLES, SEED

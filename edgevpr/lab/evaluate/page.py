@@ -6,8 +6,7 @@ from pathlib import Path
 
 from edgevpr.core.errors import ImageError
 from edgevpr.core.text import decoded_name
-from edgevpr.frames.images import counting_order, list_images, read_image
-from edgevpr.frames.small import small_jpeg
+from edgevpr.frames.images import counting_order, list_images, read_image, small_jpeg
 from edgevpr.lab.evaluate import tables
 from edgevpr.lab.evaluate.asking import QueryAnswer
 from edgevpr.lab.evaluate.many import CURVE_TO, Made, MeasuredRow, Measurements, OpenSet

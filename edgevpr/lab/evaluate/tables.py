@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
-from edgevpr.core.tables import aligned
+from edgevpr.core.text import aligned
 from edgevpr.lab.evaluate.evaluate import TechniqueResult
 from edgevpr.lab.evaluate.metrics import Interval, Quality
 

@@ -14,9 +14,8 @@ from edgevpr.core.errors import EdgevprError, UsageError
 from edgevpr.core.files import sha256_of
 from edgevpr.core.types import Frame
 from edgevpr.frames.images import is_image, write_png
-from edgevpr.frames.positions import GeoTag, read_positions, write_positions
+from edgevpr.frames.positions import MOST_GAP_S, GeoTag, read_positions, write_positions
 from edgevpr.frames.source import Source, open_source
-from edgevpr.frames.track import MOST_GAP_S
 from edgevpr.lab.evaluate.asking import Progress
 from edgevpr.lab.evaluate.cache import Cache, code_of_frames, key_of
 

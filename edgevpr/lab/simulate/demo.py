@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from edgevpr.core.errors import EdgevprError
-from edgevpr.core.progress import progress
+from edgevpr.core.text import progress
 from edgevpr.lab.simulate.camera import lit
 from edgevpr.lab.simulate.flight import (
     SCENE_DEPTH_M,

@@ -13,7 +13,7 @@ import numpy as np
 
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.files import require_folder, write_whole
-from edgevpr.core.progress import progress
+from edgevpr.core.text import progress
 from edgevpr.frames.images import list_images
 from edgevpr.lab.training.kmeans import kmeans
 from edgevpr.lab.training.pictures import read_pictures

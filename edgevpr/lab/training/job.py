@@ -9,8 +9,8 @@ import numpy as np
 
 from edgevpr.core.errors import EdgevprError, ImageError, UsageError
 from edgevpr.core.files import require_folder
-from edgevpr.core.progress import progress
-from edgevpr.frames.opencv import cv2
+from edgevpr.core.text import progress
+from edgevpr.frames.images import cv2
 from edgevpr.lab.training.pictures import batch, read_pictures, require_enough, small_grey
 
 _CHECKED_INPUTS = 16

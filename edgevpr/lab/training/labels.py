@@ -15,8 +15,7 @@ import numpy as np
 
 from edgevpr.core.config import load_config
 from edgevpr.core.types import Frame
-from edgevpr.frames.images import list_images, read_image
-from edgevpr.frames.opencv import cv2
+from edgevpr.frames.images import cv2, list_images, read_image
 from edgevpr.lab.evaluate.dataset import load_dataset
 from edgevpr.lab.evaluate.evaluate import mapped
 from edgevpr.power.boards import load_board

@@ -14,7 +14,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from edgevpr.core.progress import progress
+from edgevpr.core.text import progress
 from edgevpr.lab.evaluate.metrics import roc_auc
 from edgevpr.lab.training.labels import MATCHED, Labelled
 from edgevpr.runtime.recognise.memorability import prepared_crops

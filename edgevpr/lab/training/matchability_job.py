@@ -8,7 +8,7 @@ import numpy as np
 
 from edgevpr.core.errors import EdgevprError, UsageError
 from edgevpr.core.files import require_folder
-from edgevpr.core.progress import progress
+from edgevpr.core.text import progress
 from edgevpr.frames.images import list_images
 from edgevpr.lab.training.job import require_packages
 from edgevpr.lab.training.labels import MATCHED, Labelled, label_site

@@ -13,10 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from edgevpr.core.errors import ImageError, UsageError
-from edgevpr.core.progress import progress
-from edgevpr.core.text import shown
-from edgevpr.frames.images import list_images, read_image
-from edgevpr.frames.opencv import cv2
+from edgevpr.core.text import progress, shown
+from edgevpr.frames.images import cv2, list_images, read_image
 from edgevpr.techniques.gradients import normalised_blocks, oriented_cells
 
 HEIGHT, WIDTH = 120, 160  # of the network's input

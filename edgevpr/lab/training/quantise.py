@@ -6,7 +6,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from edgevpr.core.errors import ModelError, SourceError
-from edgevpr.core.resources import own_models
+from edgevpr.core.files import own_models
 from edgevpr.core.yamlfile import read_yaml
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.runtime.preflight.networks import Verified, card_text, install, verify

@@ -13,9 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from edgevpr.core.errors import ImageError, UsageError
-from edgevpr.core.files import write_whole
-from edgevpr.core.progress import progress
-from edgevpr.core.resources import model_folders
+from edgevpr.core.files import model_folders, write_whole
+from edgevpr.core.text import progress
 from edgevpr.frames.images import list_images
 from edgevpr.lab.training.kmeans import kmeans
 from edgevpr.lab.training.pictures import read_pictures

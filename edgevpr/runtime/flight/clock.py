@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import partial
 
-from edgevpr.core.tape import Tape
+from edgevpr.core.types import Tape
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

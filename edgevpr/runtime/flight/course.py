@@ -8,8 +8,7 @@ from typing import Any
 
 from edgevpr import __version__
 from edgevpr.core.config import Config, MavlinkConfig
-from edgevpr.core.tape import NO_TAPE, Tape
-from edgevpr.core.types import FIX_MAX_AGE_S, Position
+from edgevpr.core.types import FIX_MAX_AGE_S, NO_TAPE, Position, Tape
 from edgevpr.frames.source import Source
 from edgevpr.mavlink.address import LinkAddress, parse_links
 from edgevpr.mavlink.ground import GroundLink

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from edgevpr.core.config import Config
-from edgevpr.core.tape import NO_TAPE
+from edgevpr.core.types import NO_TAPE
 from edgevpr.frames.source import Source
 from edgevpr.runtime.flight.autopilot import Autopilot
 from edgevpr.runtime.flight.clock import Clock

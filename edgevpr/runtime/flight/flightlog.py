@@ -13,8 +13,8 @@ from typing import Any, BinaryIO
 
 from edgevpr.core.appending import append, is_at, sync, sync_folder
 from edgevpr.core.errors import EdgevprError
-from edgevpr.core.jsonline import json_line
-from edgevpr.core.tape import NO_TAPE, Tape
+from edgevpr.core.text import json_line
+from edgevpr.core.types import NO_TAPE, Tape
 from edgevpr.runtime.flight.logfiles import LogFiles, identity, size_of
 
 _log = logging.getLogger(__name__)

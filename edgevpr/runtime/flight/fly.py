@@ -14,7 +14,7 @@ from typing import TypeVar
 from edgevpr import __version__
 from edgevpr.core.config import Config
 from edgevpr.core.errors import EdgevprError, MapError, UsageError
-from edgevpr.core.tape import NO_TAPE, Tape
+from edgevpr.core.types import NO_TAPE, Tape
 from edgevpr.frames.source import Source, open_source
 from edgevpr.frames.taped import RecordedSource
 from edgevpr.mavlink.address import parse_links

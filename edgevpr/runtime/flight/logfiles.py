@@ -7,8 +7,7 @@ import stat
 from pathlib import Path
 from typing import BinaryIO
 
-from edgevpr.core import numbered
-from edgevpr.core.appending import open_appending, try_lock
+from edgevpr.core.appending import claim, keep_within, open_appending, set_aside, try_lock
 
 _PARTS = 4  # of `max_mb`: the file that is written, and three for those that are set aside
 
@@ -34,7 +33,7 @@ class LogFiles:
         if try_lock(file):
             return file
         file.close()
-        self.at = numbered.claim(self._path)
+        self.at = claim(self._path)
         file = open_appending(self.at)
         try_lock(file)
         self._say_once(
@@ -49,9 +48,9 @@ class LogFiles:
         it is then written on, since a line is worth more than a limit."""
         try:
             if self.at == self._path:
-                numbered.set_aside(self._path)
+                set_aside(self._path)
             else:
-                self.at = numbered.claim(self._path)
+                self.at = claim(self._path)
         except OSError as error:
             self._say_once(
                 "stays",
@@ -66,7 +65,7 @@ class LogFiles:
         if math.isinf(self.part_bytes):
             return
         try:
-            deleted = numbered.keep_within(self._path, self.part_bytes * (_PARTS - 1))
+            deleted = keep_within(self._path, self.part_bytes * (_PARTS - 1))
         except OSError as error:
             self._say_once(
                 "grows",

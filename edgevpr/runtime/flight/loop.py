@@ -7,8 +7,7 @@ from dataclasses import replace
 from typing import Protocol
 
 from edgevpr.core.errors import ImageError
-from edgevpr.core.tape import NO_TAPE, Tape
-from edgevpr.core.types import Frame, StageCost
+from edgevpr.core.types import NO_TAPE, Frame, StageCost, Tape
 from edgevpr.frames.source import Source
 from edgevpr.runtime.flight.autopilot import Autopilot
 from edgevpr.runtime.flight.clock import Clock

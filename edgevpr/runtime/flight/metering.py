@@ -6,8 +6,7 @@ from dataclasses import asdict, astuple
 from typing import Any
 
 from edgevpr.core.config import Config
-from edgevpr.core.tape import NO_TAPE, Tape
-from edgevpr.core.types import StageCost
+from edgevpr.core.types import NO_TAPE, StageCost, Tape
 from edgevpr.power.boards import Board
 from edgevpr.power.energy import RunningEnergy
 from edgevpr.power.equations import Pack, marginal_energy_j, pack_ah, parse_pack

@@ -8,7 +8,7 @@ from typing import Any
 
 from edgevpr.core.config import Config, build
 from edgevpr.core.errors import ConfigError, EdgevprError
-from edgevpr.core.tape import NO_TAPE, Tape
+from edgevpr.core.types import NO_TAPE, Tape
 from edgevpr.runtime.flight.flightlog import FlightLog
 
 # Neither opens anything anew, nor decides who is told what.

@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from edgevpr.core.errors import EdgevprError
-from edgevpr.core.jsonline import json_line
+from edgevpr.core.text import json_line
 from edgevpr.runtime.flight.status import Status
 
 NAME = "status.sock"

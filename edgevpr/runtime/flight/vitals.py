@@ -2,7 +2,7 @@
 
 import logging
 
-from edgevpr.frames.condition import Condition
+from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import Source
 from edgevpr.mavlink.messages import Health
 from edgevpr.runtime.flight.autopilot import Autopilot, Mood

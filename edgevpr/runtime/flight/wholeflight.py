@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from edgevpr.core.appending import relatives
 from edgevpr.core.errors import EdgevprError, UsageError
-from edgevpr.core.numbered import relatives
 from edgevpr.runtime.flight.flightlog import read_log, record_of
 
 Line = dict[str, Any]

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from edgevpr.core.figures import figure
+from edgevpr.core.text import figure
 from edgevpr.power.boards import board_names, load_board
 from edgevpr.runtime.preflight.estimate import Estimate
 

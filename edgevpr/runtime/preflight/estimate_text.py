@@ -1,6 +1,6 @@
 """An estimate as plain text of at most 120 columns: three tables, a line for each technique, and notes."""
 
-from edgevpr.core.tables import aligned, wrapped
+from edgevpr.core.text import aligned, wrapped
 from edgevpr.runtime.preflight.estimate import Estimate, TechniqueEstimate
 
 _FINDS = ("technique", "fits", "recall@1", "accepted", "wrong", "sets", "queries", "chosen by itself")

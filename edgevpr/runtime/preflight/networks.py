@@ -15,8 +15,7 @@ from edgevpr import techniques
 from edgevpr.core.child import ask_child, last_line, serve_parent
 from edgevpr.core.config import build
 from edgevpr.core.errors import EdgevprError, ModelError
-from edgevpr.core.files import read_file, write_whole
-from edgevpr.core.resources import own_models
+from edgevpr.core.files import own_models, read_file, write_whole
 from edgevpr.core.yamlfile import MAX_FILE_BYTES, read_yaml
 from edgevpr.power.machine import rss_mb
 from edgevpr.runtime.recognise.detector import detector_of

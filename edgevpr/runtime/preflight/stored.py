@@ -20,8 +20,7 @@ from typing import Any
 from edgevpr import techniques
 from edgevpr.core.config import build
 from edgevpr.core.errors import ConfigError, EdgevprError, UsageError
-from edgevpr.core.files import read_file, require_folder, write_whole
-from edgevpr.core.resources import own_folder
+from edgevpr.core.files import own_folder, read_file, require_folder, write_whole
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.power import machine
 from edgevpr.power.boards import Board, MachineSpeed

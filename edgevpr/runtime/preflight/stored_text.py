@@ -1,6 +1,6 @@
 """The figures measured on this machine, as plain text."""
 
-from edgevpr.core.tables import aligned
+from edgevpr.core.text import aligned
 from edgevpr.runtime.preflight.estimate_text import unusable_lines
 from edgevpr.runtime.preflight.stored import StoredFigures
 from edgevpr.runtime.preflight.trial import Trial

@@ -19,8 +19,7 @@ from functools import lru_cache
 from typing import Any
 
 from edgevpr.core.errors import ModelError
-from edgevpr.core.files import read_file
-from edgevpr.core.resources import shipped
+from edgevpr.core.files import read_file, shipped
 
 Evidence = Mapping[str, float]
 

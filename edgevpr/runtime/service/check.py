@@ -12,8 +12,8 @@ from edgevpr.core.config import Config, load_config
 from edgevpr.core.errors import EdgevprError, ImageError, LinkError, MapError, SourceError, UsageError
 from edgevpr.core.files import require_folder
 from edgevpr.core.types import FIX_MAX_AGE_S
-from edgevpr.frames.condition import Condition
-from edgevpr.frames.overlay import FEWEST_FRAMES, learn_overlay, require_png, write_mask
+from edgevpr.frames.mask import FEWEST_FRAMES, learn_overlay, require_png, write_mask
+from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import Source, open_source
 from edgevpr.mavlink.address import LinkAddress, parse_links
 from edgevpr.mavlink.asking import Asking

@@ -13,8 +13,7 @@ from pathlib import Path
 
 from edgevpr.core.config import load_config
 from edgevpr.core.errors import EdgevprError, UsageError
-from edgevpr.core.files import write_whole
-from edgevpr.core.resources import shipped
+from edgevpr.core.files import shipped, write_whole
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.service.program import NAME, VENV, program_steps, remove_program
 from edgevpr.runtime.service.steps import Step, command, walk

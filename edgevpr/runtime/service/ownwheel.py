@@ -9,7 +9,7 @@ from pathlib import Path
 
 import edgevpr
 from edgevpr.core.errors import EdgevprError
-from edgevpr.core.resources import shipped
+from edgevpr.core.files import shipped
 
 _SHIPPED = ("profiles", "models", "deploy")
 _OF_ONE_INSTALLATION = {"RECORD", "INSTALLER", "REQUESTED", "direct_url.json"}

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from edgevpr import __version__
 from edgevpr.core.errors import EdgevprError
-from edgevpr.core.resources import shipped
+from edgevpr.core.files import shipped
 from edgevpr.runtime.service import ownwheel
 from edgevpr.runtime.service.steps import Step, command
 

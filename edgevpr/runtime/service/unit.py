@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 from edgevpr.core.errors import UsageError
-from edgevpr.core.resources import shipped
+from edgevpr.core.files import shipped
 from edgevpr.core.text import printable
 from edgevpr.power.boards import Board
 

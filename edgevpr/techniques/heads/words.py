@@ -6,9 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgevpr.core.errors import ModelError
-from edgevpr.core.files import read_file
-from edgevpr.core.npz import arrays_of
-from edgevpr.core.resources import find_model
+from edgevpr.core.files import arrays_of, find_model, read_file
 from edgevpr.techniques.heads.vlad import nearest, unit
 from edgevpr.techniques.networks.card import load_card
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from edgevpr.core.config import bounded, build
 from edgevpr.core.contract import TechniqueSpec
 from edgevpr.core.errors import ConfigError, ModelError
-from edgevpr.core.resources import find_model, model_folders
+from edgevpr.core.files import find_model, model_folders
 from edgevpr.core.text import meant
 from edgevpr.core.yamlfile import read_yaml
 

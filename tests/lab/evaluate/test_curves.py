@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from edgevpr.core.errors import UsageError
-from edgevpr.core.figures import require_picture
+from edgevpr.core.text import require_picture
 from edgevpr.lab.evaluate.curves import plot
 from edgevpr.lab.evaluate.evaluate import TechniqueResult
 

@@ -8,8 +8,7 @@ import pytest
 from pictures import textured
 
 from edgevpr.core.errors import ImageError, UsageError
-from edgevpr.core.progress import progress
-from edgevpr.core.tables import markdown
+from edgevpr.core.text import markdown, progress
 from edgevpr.lab.evaluate.dataset import load_dataset
 from edgevpr.lab.evaluate.evaluate import as_json, compare, evaluate
 from edgevpr.lab.evaluate.tables import results_text

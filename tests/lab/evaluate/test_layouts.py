@@ -11,8 +11,8 @@ from pictures import textured
 from edgevpr.cli.main import main
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import moved
+from edgevpr.frames.level import Footprint, footprint, shared
 from edgevpr.lab.evaluate.layouts import Nearness, open_folder
-from edgevpr.mapmaking.footprint import Footprint, footprint, shared
 
 RULE = Nearness()
 

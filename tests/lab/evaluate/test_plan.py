@@ -4,7 +4,7 @@ import pytest
 from generated_sets import make_set
 
 from edgevpr.core.errors import UsageError
-from edgevpr.core.progress import progress
+from edgevpr.core.text import progress
 from edgevpr.lab.evaluate.cache import Cache
 from edgevpr.lab.evaluate.plan import RowPlan, read_plan
 

@@ -3,7 +3,7 @@ import pytest
 from pictures_on_disk import write_pictures
 
 from edgevpr.core.errors import ImageError, SourceError, UsageError
-from edgevpr.frames.opencv import cv2
+from edgevpr.frames.images import cv2
 from edgevpr.lab.training.pictures import (
     TARGET_LENGTH,
     batch,

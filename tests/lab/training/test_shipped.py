@@ -8,7 +8,7 @@ import onnxruntime
 import pytest
 
 from edgevpr.core.config import load_config
-from edgevpr.core.resources import shipped
+from edgevpr.core.files import shipped
 from edgevpr.runtime.recognise.memorability import memorability_of
 from edgevpr.techniques.heads.words import load_words
 from edgevpr.techniques.networks.card import load_card

@@ -34,7 +34,7 @@ def test_the_command_writes_words_that_cohog_can_use(tmp_path, capsys):
 
 
 def test_too_few_regions_are_refused(tmp_path, capsys):
-    from edgevpr.frames.opencv import cv2
+    from edgevpr.frames.images import cv2
 
     (tmp_path / "empty").mkdir()
     cv2.imwrite(str(tmp_path / "empty" / "a.png"), np.full((120, 160), 90, np.uint8))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from edgevpr.cli.main import main
-from edgevpr.frames.opencv import cv2
+from edgevpr.frames.images import cv2
 from edgevpr.lab.training import labels
 from edgevpr.lab.training.labels import changed, label_site
 

@@ -8,7 +8,7 @@ from pictures_on_disk import write_pictures
 
 from edgevpr import techniques
 from edgevpr.cli.main import main
-from edgevpr.core.resources import shipped
+from edgevpr.core.files import shipped
 from edgevpr.lab.training import words as training_words
 from edgevpr.lab.training.pictures import read_pictures
 from edgevpr.techniques.heads import vlad

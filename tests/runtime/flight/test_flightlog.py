@@ -16,10 +16,10 @@ import pytest
 from fakes import FakeClock
 from full_disk import no_file_larger_than
 
+from edgevpr.core.appending import numbered
 from edgevpr.core.config import load_config
 from edgevpr.core.contract import PartSpec, TechniqueSpec
 from edgevpr.core.errors import EdgevprError
-from edgevpr.core.numbered import numbered
 from edgevpr.core.types import Position, QueryCost, Steps
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log

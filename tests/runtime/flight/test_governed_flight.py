@@ -9,7 +9,7 @@ from pictures import textured
 
 from edgevpr.core.config import load_config
 from edgevpr.core.errors import MapError
-from edgevpr.core.resources import shipped
+from edgevpr.core.files import shipped
 from edgevpr.places.index import bytes_per_place, load_index
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.flight import vitals

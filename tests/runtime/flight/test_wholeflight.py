@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from edgevpr.core.appending import numbered
 from edgevpr.core.errors import EdgevprError, UsageError
-from edgevpr.core.numbered import numbered
 from edgevpr.runtime.flight.flightlog import FlightLog
 from edgevpr.runtime.flight.wholeflight import flight_of
 

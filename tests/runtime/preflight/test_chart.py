@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("matplotlib", reason="pictures need matplotlib")
 
-from edgevpr.core.figures import figure
+from edgevpr.core.text import figure
 from edgevpr.core.types import StageCost
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import parse_pack

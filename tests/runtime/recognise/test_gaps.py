@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from edgevpr.core.types import Frame, Position, Salience
-from edgevpr.mapmaking.gaps import Gaps
+from edgevpr.mapmaking.mapping import Gaps
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import Pack
 from edgevpr.power.meter import QueryMeter

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from edgevpr.core.types import Salience
-from edgevpr.frames.opencv import cv2
+from edgevpr.frames.images import cv2
 from edgevpr.runtime.recognise.salience_gate import MOST_ENTROPY, Gate, Thresholds, best_of, worth_of
 from edgevpr.runtime.recognise.salience_maps import Maps, maps_of, scores_of
 

@@ -14,7 +14,7 @@ from flight_process import cpu_s, start, wait_for
 from flights import PLACES, STEP_DEG, of_kind
 
 from edgevpr.cli.main import main
-from edgevpr.core.numbered import numbered
+from edgevpr.core.appending import numbered
 from edgevpr.places.identity import identity_of
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.flight import course
