@@ -10,7 +10,7 @@ from mavlink_peers import AutopilotThread, Peer, UdpPort, wait_until
 from pictures import textured
 
 from edgevpr.core.errors import ImageError
-from edgevpr.frames.live import Camera, LiveSource
+from edgevpr.frames.live import DeviceCapture, LiveSource
 from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import open_source
 from edgevpr.lab.simulate.flightcontroller.recorded import Track
@@ -73,7 +73,7 @@ def camera(request):
 
     def opened():
         asked.append(1)
-        return Camera(FakeCapture(pictures if len(asked) == 1 else []), time.monotonic)
+        return DeviceCapture(FakeCapture(pictures if len(asked) == 1 else []), time.monotonic)
 
     source = LiveSource(opened, time.monotonic)
     yield source, lambda: None  # it is lost by itself, when its pictures are at an end

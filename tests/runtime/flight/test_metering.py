@@ -10,7 +10,7 @@ from flight_process import start
 from flights import PLACES, Flight, flight_meter, of_kind
 from pictures import textured
 
-from edgevpr.frames.live import Camera, LiveSource
+from edgevpr.frames.live import DeviceCapture, LiveSource
 from edgevpr.power.thermal import ThermalState
 from edgevpr.runtime.flight.flightlog import read_log
 
@@ -117,7 +117,7 @@ def test_frames_that_nobody_took_are_counted(recording, tmp_path):
     """The real capture thread, which takes twelve pictures before the loop asks for each next one."""
     clock, picture = FakeClock(), cv2.cvtColor(PICTURE, cv2.COLOR_GRAY2BGR)
     pictures = [np.roll(picture, 9 * number, axis=1) for number in range(12)]
-    source = LiveSource(lambda: Camera(FakeCapture(pictures), clock), clock)
+    source = LiveSource(lambda: DeviceCapture(FakeCapture(pictures), clock), clock)
     flight = Flight(recording / "hog.gpkg", tmp_path / "log", clock, **{"source.rate_hz": 5.0})
 
     class Patient:
