@@ -62,7 +62,7 @@ def serve_parent(work: Callable[[Any], Any]) -> None:
 
 
 def end_with_parent(parent_pid: int) -> None:
-    """Let the kernel kill this process when its parent ends, however that ends, even in an endless loop of a library."""
+    """Let the kernel kill this process when its parent ends, however that ends, even while a library loops for ever."""
     import ctypes  # not at the top: the parent may be a flight, which has no use for it
 
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
