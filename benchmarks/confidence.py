@@ -6,44 +6,34 @@ as `map build` does, and judged by the set's own queries and by those of all oth
 has been fitted without it. Which evidence counts, and how far a map moves the weights, was chosen with all sets in
 view.
 
-Writes confidence.json, confidence.md and confidence.png (reliability) into benchmarks/results/; --gallery draws every
-match that was wrongly accepted, to look at.
+Writes confidence.json, confidence.md and confidence.png (reliability) into benchmarks/results/; --ship writes the
+models that edgevpr has.
 """
 
-import os
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
-
 import argparse
-import json
+import os
 import pickle
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import base
 import numpy as np
-from confidence_rows import CONFIG, Row, frames_of, gather, kind_of_match, site_of, walk_over
-from hostile_pictures import camera_of
-from run_sets import DATA, RESULTS, TUNED_ON, made_by
+import walks
+from base import DATA, RESULTS, camera_of
+from confidence_rows import Row, gather, kind_of_match, site_of
 
-from edgevpr.core.text import markdown
-from edgevpr.core.types import Frame
-from edgevpr.frames.images import list_images, read_image
-from edgevpr.lab.evaluate.dataset import load_dataset
-from edgevpr.lab.evaluate.evaluate import mapped
+from edgevpr.frames.images import list_images
 from edgevpr.lab.evaluate.metrics import roc_auc
 from edgevpr.mapmaking.calibrate import LEFT_OUT, MIRRORED, THERE, Answer, adapted
 from edgevpr.mapmaking.prior import Site, shipped_model
-from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.confidence import Model, as_json
 from edgevpr.runtime.recognise.evidence import AHEAD, DOWN, DOWN_BARE, kind_of
 from edgevpr.runtime.recognise.follow import Follower
 from edgevpr.runtime.recognise.judge import Sureness, accept_rule
-from edgevpr.runtime.recognise.opening import meter_of
 from edgevpr.runtime.recognise.stored_confidence import FEWEST_PLACES
-from edgevpr.techniques import create
 
 PRECISIONS = (0.9, 0.99, 0.999)
 KINDS = {"forward": (AHEAD,), "nadir": (DOWN, DOWN_BARE)}
@@ -51,35 +41,49 @@ FLOWN_ALONG = ("corridor", "grief_stromovka_seasons", "nordland_tiny")  # as the
 _MOST_FLOWN = 250  # queries
 _BINS = 10
 Rows = dict[str, list[Row]]
+_COLUMNS = {
+    "set": "{set}",
+    "use": "{use}",
+    "queries": "{queries}",
+    "right": "{right}",
+    "ROC AUC, score": "{roc_auc_score:.3f}",
+    "ROC AUC, confidence": "{roc_auc:.3f}",
+    "calibration error": "{ece:.3f}",
+} | {
+    f"accepted at {precision:g}: right, wrong, beside, foreign": "{at%d[share]:.2f}, {at%d[wrong]}, {at%d[beside]}, "
+    "{at%d[foreign]} of {foreign}".replace("%d", str(number))
+    for number, precision in enumerate(PRECISIONS)
+}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--work", type=Path, default=Path("confidence_rows"), help="folder of the gathered evidence")
     parser.add_argument("--ship", type=Path, metavar="DIR", help="write the models of all sites there")
-    parser.add_argument("--gallery", type=Path, metavar="PNG", help="draw what was wrongly accepted")
     args = parser.parse_args()
-    names = [path.parent.name for path in sorted(DATA.glob("*/ground_truth.csv"))]
+    names = [folder.name for folder in base.find_sets()]
     with ProcessPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        list(pool.map(partial(gather, args.work), [[name] for name in names]))
+        list(pool.map(partial(gather, args.work), names))
         rows = {name: _read(args.work / f"{name}.pkl") for name in names}
         models = {name: model_without(name, rows) for name in names}
         flights = list(pool.map(partial(followed, models=models), FLOWN_ALONG))
     if args.ship:
-        for camera, kinds in KINDS.items():
-            of = [name for name in names if camera_of(name) == camera]
-            count = sum(row.kind in ("own", "foreign") for name in of for row in rows[name])
-            for kind in kinds:
-                made_of = f"{count} matches in the maps of {len(of)} sets"
-                model = shipped_model(kind, [site(rows[name], kind) for name in of], made_of)
-                (args.ship / f"confidence_{kind}.json").write_text(as_json(model) + "\n")
+        ship(args.ship, rows)
     sets = [judged(rows[name], models[name]) for name in names]
-    found = {**made_by(), "sets": sets, "flights": flights, "reliability": reliability(rows, models)}
-    (RESULTS / "confidence.json").write_text(json.dumps(found, indent=1) + "\n")
-    (RESULTS / "confidence.md").write_text(_page(found))
-    _draw_reliability(found["reliability"], RESULTS / "confidence.png")
-    if args.gallery:
-        _draw_gallery(rows, models, args.gallery)
+    found = {**base.made_by(), "sets": sets, "flights": flights, "reliability": reliability(rows, models)}
+    base.write("confidence", found, page(found))
+    draw(found["reliability"], RESULTS / "confidence.png")
+
+
+def ship(folder: Path, rows: Rows) -> None:
+    """Write the models of all sites."""
+    for camera, kinds in KINDS.items():
+        of = [name for name in rows if camera_of(name) == camera]
+        count = sum(row.kind in ("own", "foreign") for name in of for row in rows[name])
+        for kind in kinds:
+            made_of = f"{count} matches in the maps of {len(of)} sets"
+            model = shipped_model(kind, [site(rows[name], kind) for name in of], made_of)
+            (folder / f"confidence_{kind}.json").write_text(as_json(model) + "\n")
 
 
 def _read(path: Path) -> list[Row]:
@@ -115,22 +119,14 @@ def model_without(name: str, rows: Rows) -> Model:
     return adapted(model, site(rows[name], kind).answers, name)
 
 
-def judged(rows: Sequence[Row], model: Model) -> dict:
+def judged(rows: Sequence[Row], model: Model) -> base.Row:
     """Judge the queries of one map, its own and those of other sites."""
-    own = [row for row in rows if row.kind == "own"]
-    foreign = [row for row in rows if row.kind == "foreign"]
+    own, foreign = ([row for row in rows if row.kind == kind] for kind in ("own", "foreign"))
     sure, right = np.array([_sure(model, row) for row in own]), np.array([row.right for row in own])
-    made = {
-        "set": rows[0].map,
-        "use": "tune" if rows[0].map in TUNED_ON else "report",
-        "queries": len(own),
-        "right": int(right.sum()),
-        "foreign": len(foreign),
-        "roc_auc_score": roc_auc(np.array([row.score for row in own]), right),
-        "roc_auc": roc_auc(sure, right),
-        "ece": calibration_error(sure, right),
-        "precision": {},
-    }
+    apart = [abs(sure[bins].mean() - right[bins].mean()) * bins.mean() for bins in _bins(sure)]
+    made = {"set": rows[0].map, "use": base.use_of(rows[0].map), "queries": len(own), "right": int(right.sum())}
+    made |= {"foreign": len(foreign), "roc_auc_score": roc_auc(np.array([row.score for row in own]), right)}
+    made |= {"roc_auc": roc_auc(sure, right), "ece": float(sum(apart)), "precision": {}}
     for precision in PRECISIONS:
         taken = [row for row in own if _accepted(model, row, precision)]
         made["precision"][str(precision)] = {
@@ -150,40 +146,36 @@ def _accepted(model: Model, row: Row, precision: float) -> bool:
     return row.veto is None and _sure(model, row) >= model.threshold(precision)
 
 
-def calibration_error(sure: np.ndarray, right: np.ndarray) -> float:
-    """Return the expected calibration error: how far confidence and share of right ones are apart, in ten bins."""
+def _bins(sure: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield which confidences are in each tenth that has any, bool (N,)."""
     bins = np.minimum((_BINS * sure).astype(int), _BINS - 1)
-    apart = [abs(sure[bins == each].mean() - right[bins == each].mean()) * np.mean(bins == each) for each in set(bins)]
-    return float(sum(apart))
+    yield from (bins == each for each in sorted(set(bins.tolist())))
 
 
-def reliability(rows: Rows, models: dict[str, Model]) -> dict:
+def reliability(rows: Rows, models: dict[str, Model]) -> base.Row:
     """Return confidence and share of right ones of own queries, by camera, in ten bins; each set counts the same."""
     found = {}
     for camera in KINDS:
-        names = [name for name in rows if camera_of(name) == camera]
-        own = [(name, row) for name in names for row in rows[name] if row.kind == "own"]
-        sure = np.array([_sure(models[name], row) for name, row in own])
-        right = np.array([row.right for _, row in own])
-        weight = np.array([1 / sum(row.kind == "own" for row in rows[name]) for name, _ in own])
-        bins = np.minimum((_BINS * sure).astype(int), _BINS - 1)
+        own = [[row for row in rows[name] if row.kind == "own"] for name in rows if camera_of(name) == camera]
+        sure = np.array([_sure(models[row.map], row) for of_set in own for row in of_set])
+        right = np.array([row.right for of_set in own for row in of_set])
+        weight = np.array([1 / len(of_set) for of_set in own for _ in of_set])
         found[camera] = [
             {
-                "confidence": float(np.average(sure[bins == each], weights=weight[bins == each])),
-                "right": float(np.average(right[bins == each], weights=weight[bins == each])),
-                "queries": int(np.count_nonzero(bins == each)),
+                "confidence": float(np.average(sure[bins], weights=weight[bins])),
+                "right": float(np.average(right[bins], weights=weight[bins])),
+                "queries": int(np.count_nonzero(bins)),
             }
-            for each in sorted(set(bins.tolist()))
+            for bins in _bins(sure)
         ]
     return found
 
 
-def followed(name: str, models: dict[str, Model]) -> dict:
+def followed(name: str, models: dict[str, Model]) -> base.Row:
     """Fly along the way of a map in several manners, each query by itself and followed, and count fixes."""
-    folder = DATA / name
-    dataset = load_dataset(folder / "query", folder / "ref", folder / "ground_truth.csv")
+    dataset = walks.dataset_of(DATA / name)
     truth = {query.path.name: query for query in dataset.queries}
-    own = [path for path in list_images(folder / "query") if path.name in truth][:_MOST_FLOWN]
+    own = [path for path in list_images(DATA / name / "query") if path.name in truth][:_MOST_FLOWN]
     other = "grief_michigan_monthly" if name != "nordland_tiny" else "corridor"
     foreign = list_images(DATA / other / "query")[:30]
     middle, third = len(own) // 2, len(own) // 3
@@ -196,77 +188,75 @@ def followed(name: str, models: dict[str, Model]) -> dict:
         "jump": own[:third] + own[2 * third :] + own[third : 2 * third],
         "leave": own[:middle] + foreign + own[middle:],
     }
-    technique = create("cohog", {"camera": camera_of(name)})
-    meter = meter_of(CONFIG, load_board("this"))
-    rule = accept_rule(technique, CONFIG.match)
-    rule = replace(rule, sure=Sureness({AHEAD: models[name]}, CONFIG.match.accept_precision))
-    made: dict = {"set": name, "ways": {}}
-    with mapped(frames_of(folder / "ref"), technique, meter) as (place_map, index):
+    made: base.Row = {"set": name, "ways": {}}
+    with walks.map_of(DATA / name) as (place_map, index, technique):
+        rule = accept_rule(technique, walks.config().match)
+        rule = replace(rule, sure=Sureness({AHEAD: models[name]}, walks.config().match.accept_precision))
         for way, paths in ways.items():
             counts = {}
-            for follows in (False, True):
-                follower = Follower(place_map, fastest_m_s=None, is_live=False) if follows else None
-                walk = walk_over(place_map, index, technique, rule, follower)
-                count = {"queries": 0, "right": 0, "beside": 0, "wrong": 0, "foreign": 0}
+            for mode in ("alone", "followed"):
+                follower = Follower(place_map, fastest_m_s=None, is_live=False) if mode == "followed" else None
+                walk = walks.walk(place_map, index, technique, rule=rule, follower=follower)
+                counts[mode] = {"queries": 0, "right": 0, "beside": 0, "wrong": 0, "foreign": 0}
                 for path in paths:
-                    event = walk.step(Frame(image=read_image(path), name=path.name, t_mono_s=0.0))
-                    query = truth.get(path.name) if path in own else None
-                    count["queries"] += query is not None
+                    event, query = walk.step(walks.frame(path)), truth.get(path.name) if path in own else None
+                    counts[mode]["queries"] += query is not None
                     if event.accepted:
-                        count[kind_of_match(event.best.place.source_image, query, dataset.references, index)] += 1
-                counts["followed" if follows else "alone"] = count
+                        kind = kind_of_match(event.best.place.source_image, query, dataset.references, index)
+                        counts[mode][kind] += 1
             made["ways"][way] = counts
     return made
 
 
-def _page(found: dict) -> str:
-    text = __doc__.partition("\n\n")[2].partition("Writes confidence.json")[0].strip()
-    header = ["set", "use", "queries", "right", "ROC AUC, score", "ROC AUC, confidence", "calibration error"]
-    header += [f"accepted at {precision:g}: right, wrong, beside, foreign" for precision in PRECISIONS]
-    cells = []
+def page(found: base.Row) -> str:
+    """Return the page for people."""
     for row in found["sets"]:
-        auc = ["-" if row[key] is None else f"{row[key]:.3f}" for key in ("roc_auc_score", "roc_auc")]
-        line = [row["set"], row["use"], str(row["queries"]), str(row["right"]), *auc, f"{row['ece']:.3f}"]
-        for precision in PRECISIONS:
+        for number, precision in enumerate(PRECISIONS):
             of = row["precision"][str(precision)]
-            share = of["accepted_right"] / max(1, row["right"])
-            line.append(f"{share:.2f}, {of['wrong']}, {of['beside']}, {of['foreign']} of {row['foreign']}")
-        cells.append(line)
-    foreign = sum(row["foreign"] for row in found["sets"])
-    default = str(PRECISIONS[-1])
+            row[f"at{number}"] = {**of, "share": of["accepted_right"] / max(1, row["right"])}
+    default, ways = str(PRECISIONS[-1]), list(found["flights"][0]["ways"])
     taken = sum(row["precision"][default]["foreign"] for row in found["sets"])
-    ways = list(found["flights"][0]["ways"])
     flown = [
-        [flight["set"], mode, *(_flown(flight["ways"][way][mode]) for way in ways)]
+        {"set": flight["set"], "mode": mode, **{way: _flown(flight["ways"][way][mode]) for way in ways}}
         for flight in found["flights"]
         for mode in ("alone", "followed")
     ]
-    return (
-        f"# How sure a match is\n\n{text}\n\nRight: share of the queries whose best place is right that are accepted. "
-        "Wrong: accepted, and elsewhere. Beside: accepted, and at most two places beside a right one, which the set "
-        "does not count as right. Foreign: accepted queries of other sites.\n\n"
-        f"{markdown(header, cells)}\n\nAt {default}, {taken} of {foreign} foreign queries are accepted, over all "
-        "pairings of sets and both cameras.\n\n![reliability](confidence.png)\n\n## Followed from query to query\n\n"
-        "Flights along the way of the map, at the default precision, each query by itself and followed; nothing is "
-        f"known of time or speed. Of nordland_tiny the first {_MOST_FLOWN} queries fly. Share of the queries "
-        "accepted as the right place; in brackets wrong, beside, foreign.\n\n"
-        f"{markdown(['set', 'mode', *ways], flown)}\n\nCommit {found['commit']}, {found['date']}, "
-        f"{found['machine']['cpu']}. Made by `python benchmarks/confidence.py`.\n"
-    )
+    table = base.table([{**row, "precision": None} for row in found["sets"]], _COLUMNS)
+    return f"""# How sure a match is
+
+{base.told(__doc__, "Writes confidence.json")}
+
+Right: share of the queries whose best place is right that are accepted. Wrong: accepted, and elsewhere. Beside:
+accepted, and at most two places beside a right one, which the set does not count as right. Foreign: accepted queries of
+other sites.
+
+{table}
+
+At {default}, {taken} of {sum(row["foreign"] for row in found["sets"])} foreign queries are accepted, over all pairings
+of sets and both cameras.
+
+![reliability](confidence.png)
+
+## Followed from query to query
+
+Flights along the way of the map, at the default precision, each query by itself and followed; nothing is known of time
+or speed. Of nordland_tiny the first {_MOST_FLOWN} queries fly. Share of the queries accepted as the right place; in
+brackets wrong, beside, foreign.
+
+{base.table(flown, {name: f"{{{name}}}" for name in ("set", "mode", *ways)})}
+
+{base.made_line(found, "python benchmarks/confidence.py")}
+"""
 
 
-def _flown(count: dict) -> str:
+def _flown(count: base.Row) -> str:
     share = count["right"] / max(1, count["queries"])
     return f"{share:.2f} ({count['wrong']}, {count['beside']}, {count['foreign']})"
 
 
-def _draw_reliability(found: dict, path: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(1, len(found), figsize=(9, 4.4), sharey=True)
+def draw(found: base.Row, path: Path) -> None:
+    """Draw the share of right matches against the confidence, with the number of queries."""
+    drawn, axes = base.panels(9, 4.4, len(found), sharey=True)
     for axis, (camera, bins) in zip(axes, found.items(), strict=True):
         axis.plot([0, 1], [0, 1], color="0.7", linewidth=1)
         sizes = [20 + 60 * np.log10(each["queries"]) for each in bins]
@@ -275,41 +265,8 @@ def _draw_reliability(found: dict, path: Path) -> None:
             axis.annotate(each["queries"], (each["confidence"], each["right"]), (8, -12), textcoords="offset points")
         axis.set(xlabel="confidence", title={"forward": "ahead", "nadir": "straight down"}[camera], xlim=(-0.03, 1.06))
     axes[0].set(ylabel="share of right matches", ylim=(-0.03, 1.06))
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
-
-
-def _draw_gallery(rows: Rows, models: dict[str, Model], path: Path) -> None:
-    """Draw query and place side by side of all that was wrongly accepted at the lower precisions too."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    is_wrong: Callable[[Row], bool] = lambda row: not row.right and row.kind in ("own", "foreign")  # noqa: E731
-    wrong = [
-        (precision, row)
-        for name in rows
-        for row in rows[name]
-        if is_wrong(row)
-        for precision in PRECISIONS[:0:-1]
-        if _accepted(models[name], row, precision)
-    ]
-    worst = {id(row): (precision, row) for precision, row in reversed(wrong)}
-    shown = sorted(worst.values(), key=lambda each: (-each[0], each[1].map))[:30]
-    figure, axes = pyplot.subplots(max(1, len(shown)), 2, figsize=(9, 3 * max(1, len(shown))), squeeze=False)
-    for (left, right), (precision, row) in zip(axes, shown, strict=False):
-        folder = DATA / row.set / ("query" if (DATA / row.set / "query").is_dir() else "images")
-        left.imshow(read_image(folder / row.query), cmap="gray")
-        right.imshow(read_image(DATA / row.map / "ref" / row.found), cmap="gray")
-        kind = "beside" if row.near else row.kind
-        left.set_title(f"{row.set}/{row.query}, {kind}, at {precision:g}", fontsize=8)
-        right.set_title(f"{row.map}/{row.found}: {_sure(models[row.map], row):.4f}", fontsize=8)
-    for axis in axes.ravel():
-        axis.axis("off")
-    figure.tight_layout()
-    figure.savefig(path, dpi=80)
+    base.save(drawn, path)
 
 
 if __name__ == "__main__":
-    main()
+    base.run(main)

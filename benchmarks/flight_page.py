@@ -3,15 +3,14 @@
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import base
 import numpy as np
+from base import Row, use_of
 from flight_sites import Site
-from run_sets import TUNED_ON
 from where import honest, spread
 
-from edgevpr.core.text import markdown
 from edgevpr.mapmaking.orthophoto import Orthophoto
 
-Row = dict[str, object]
 _DRAWN = (
     ("aerial_caliterra", "across"),
     ("aerial_swindale", "along"),
@@ -21,13 +20,24 @@ _DRAWN = (
     ("rows", "along"),
 )
 _COLOURS = {"right": "#20e020", "wrong": "#ff2020", None: "white"}
+_COLUMNS = {
+    "flights": "{name}",
+    "mode": "{mode}",
+    "number": "{flights}",
+    **{title.replace("_", " "): f"{{{title}}}" for title in ("queries", "over_the_map", "right", "wrong", "far_off")},
+    "lost": "{lost:.0%}",
+    "gap s": "{longest_gap_s[median]} / {longest_gap_s[worst]}",
+    "error m": "{error[median_m]:.1f} / {error[p95_m]:.1f}",
+    "claimed sd m": "{claimed_sd_m:.1f}",
+    "within 1, 2 sigma": "{within[one_sigma]:.2f} / {within[two_sigma]:.2f}",
+}
 
 
 def summary(rows: Sequence[Row], modes: Sequence[str]) -> dict:
     """Return the figures of every mode, by what the flights have in common."""
     groups: dict[str, Callable[[Row], object]] = {
         "all": lambda row: "all",
-        "use": lambda row: "tune" if row["site"] in TUNED_ON else "report",
+        "use": lambda row: use_of(row["site"]),
         "site": lambda row: row["site"],
         "kind": lambda row: row["kind"],
         "odometry": lambda row: row["odometry"],
@@ -60,19 +70,10 @@ def _figures(rows: Sequence[Row]) -> dict:
         "wrong_over_other_ground": sum(row["over"] != row["site"] for row in fixes),
         "over_the_map_s": round(sum(each[0] for each in lost)),
         "lost_s": round(sum(each[1] for each in lost)),
-        "longest_gap_s": {
-            "median": round(float(np.median(gaps_s)), 1) if gaps_s else None,
-            "worst": round(max(gaps_s), 1) if gaps_s else None,
-        },
-        "error": spread([complex(row["off_east_m"], row["off_north_m"]) for row in right]) if right else None,
+        "longest_gap_s": dict(zip(("median", "worst"), _gaps_s(gaps_s), strict=True)),
+        "error": spread(_off(right)) if right else None,
         "claimed_sd_m": round(float(np.median([row["sd_m"] for row in right])), 2) if right else None,
-        "within": honest(
-            [complex(row["off_east_m"], row["off_north_m"]) for row in own],
-            [(row["var_east_m2"], row["var_north_m2"]) for row in own],
-            0.0,
-        )
-        if own
-        else None,
+        "within": honest(_off(own), [(row["var_east_m2"], row["var_north_m2"]) for row in own], 0.0) if own else None,
     }
 
 
@@ -98,12 +99,20 @@ def _lost(rows: Sequence[Row]) -> tuple[float, float, list[float]]:
     return over_s, lost_s, gaps_s
 
 
-def page(result: dict, text: str) -> str:
+def _off(rows: Sequence[Row]) -> list[complex]:
+    return [complex(row["off_east_m"], row["off_north_m"]) for row in rows]
+
+
+def _gaps_s(gaps_s: Sequence[float]) -> tuple[float | None, float | None]:
+    return (round(float(np.median(gaps_s)), 1), round(max(gaps_s), 1)) if gaps_s else (None, None)
+
+
+def page(result: Row, text: str) -> str:
     """Return the results as Markdown."""
     tables = [f"By {group}:\n\n{_table(result[group])}" for group in ("use", "site", "kind", "odometry")]
     return f"""# Flights over real aerial pictures
 
-{text.partition(chr(10) * 2)[2].strip()}
+{text}
 
 Right, wrong, far off: fixes. Lost: share of the time over the map. Gap: the longest without a right fix over the map,
 median and worst of the flights. Errors: median / 95th percentile of right fixes. Within: shares of errors, axis by
@@ -112,63 +121,50 @@ ground.
 
 {_table(result["all"])}
 
-Constants of edgevpr were chosen on {" and ".join(name for name in TUNED_ON if name in result["site"])} (use *tune*), of
-the sites here; on none of these flights.
+Constants of edgevpr were chosen on {" and ".join(name for name in base.TUNED_ON if name in result["site"])} (use
+*tune*), of the sites here; on none of these flights.
 
 {(chr(10) * 2).join(tables)}
 
 Commit {result["commit"]}, {result["date"]}, {result["machine"]["cpu"]}; {result["took_s"]} s.
 `python benchmarks/flights.py` makes this page; flights.json has every flight, `--events FILE` every query.
 
-![flights](flights.png)
+![flights](flights.jpg)
 
 Green: a right fix. White: refused over the map. Grey: refused beside it, or over ground of another set. Red: a wrong
 fix, with a line to where it says that the aircraft is. The picture is the mosaic that is flown over.
 """
 
 
-def _table(groups: dict) -> str:
-    head = ("flights", "mode", "number", "queries", "over the map", "right", "wrong", "far off", "lost", "gap s",
-            "error m", "claimed sd m", "within 1, 2 sigma")  # fmt: skip
-    table = []
-    for name, modes in groups.items():
-        for mode, each in modes.items():
-            error, within, gap = each["error"], each["within"], each["longest_gap_s"]
-            table.append(
-                [
-                    name,
-                    mode,
-                    *(str(each[key]) for key in ("flights", "queries", "over_the_map", "right", "wrong", "far_off")),
-                    f"{each['lost_s'] / each['over_the_map_s']:.0%}" if each["over_the_map_s"] else "-",
-                    f"{gap['median']} / {gap['worst']}" if gap["worst"] is not None else "-",
-                    f"{error['median_m']:.1f} / {error['p95_m']:.1f}" if error else "-",
-                    f"{each['claimed_sd_m']:.1f}" if error else "-",
-                    f"{within['one_sigma']:.2f} / {within['two_sigma']:.2f}" if within else "-",
-                ]
-            )
-    return markdown(head, table)
+def _table(groups: Row) -> str:
+    rows = [
+        {
+            "name": name,
+            "mode": mode,
+            "lost": each["lost_s"] / each["over_the_map_s"] if each["over_the_map_s"] else None,
+        }
+        | each
+        for name, modes in groups.items()
+        for mode, each in modes.items()
+    ]
+    return base.table(rows, _COLUMNS)
 
 
 def draw(rows: Sequence[Row], sites: dict[str, Site], path: Path) -> None:
     """Draw some flights over what they were flown over, a row of pictures a mode."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
     modes = list(dict.fromkeys(row["mode"] for row in rows))
     drawn = [each for each in _DRAWN if any((row["site"], row["kind"]) == each for row in rows)]
     if not drawn:
         return
-    figure, axes = pyplot.subplots(len(modes), len(drawn), figsize=(4 * len(drawn), 4.3 * len(modes)), squeeze=False)
+    figure, axes = base.panels(2.6 * len(drawn), 2.9 * len(modes), len(drawn) * len(modes), len(modes))
     for column, (name, kind) in enumerate(drawn):
         site = sites[name]
         half_m = site.room.metres_per_px * len(site.room.values) / 2
         photo = Orthophoto(site.flown)
-        ground, valid = photo.cut(site.position(np.zeros(2)), 2 * half_m, 700)
+        ground, valid = photo.cut(site.position(np.zeros(2)), 2 * half_m, 500)
         photo.close()
         ground[~valid] = 80
-        for axis, mode in zip(axes[:, column], modes, strict=True):
+        for axis, mode in zip(axes[column :: len(drawn)], modes, strict=True):
             these = [row for row in rows if (row["site"], row["kind"], row["mode"]) == (name, kind, mode)]
             at = np.array([(row["east_m"], row["north_m"]) for row in these])
             axis.imshow(0.8 * ground[..., ::-1] / 255, extent=(-half_m, half_m, -half_m, half_m))
@@ -184,8 +180,8 @@ def draw(rows: Sequence[Row], sites: dict[str, Site], path: Path) -> None:
             west, south = middle - room - site.footprint_m / 2
             east, north = middle + room + site.footprint_m / 2
             axis.set(xlim=(west, east), ylim=(south, north), facecolor="0.25")
-            axis.set_title(f"{name}, {kind}\n{mode}: {sum(row['fix'] == 'right' for row in these)} right, "
-                           f"{sum(row['fix'] == 'wrong' for row in these)} wrong", fontsize=9)  # fmt: skip
-            axis.tick_params(labelsize=7)
-    figure.tight_layout()
+            fixes = [row["fix"] for row in these]
+            counts = f"{fixes.count('right')} right, {fixes.count('wrong')} wrong"
+            axis.set_title(f"{name}, {kind}\n{mode}: {counts}", fontsize=8)
+            axis.grid(False)
     figure.savefig(path, dpi=75)

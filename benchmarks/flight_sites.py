@@ -8,10 +8,10 @@ import csv
 from dataclasses import dataclass
 from pathlib import Path
 
+import base
 import cv2
 import numpy as np
 import rasterio
-import run_sets
 from from_orthophoto import Ground, ground_of, laid, mosaic_of, write_tif
 
 from edgevpr.core.geodesy import moved, offset_m
@@ -72,10 +72,6 @@ class Site:
     widest_m: Grid
     room: Grid
     covered: Grid
-
-    @property
-    def use(self) -> str:
-        return "tune" if self.name in run_sets.TUNED_ON else "report"
 
     def position(self, at_m: np.ndarray) -> Position:
         """Return the position of a point (2,)."""
@@ -145,8 +141,8 @@ def _site(name: str, folder: Path, images: Path, positions: dict, footprints_m: 
     place_map, table = folder / "map.gpkg", folder / "positions.csv"
     with open(table, "w", newline="") as handle:
         csv.writer(handle).writerows([("file", "lat", "lon"), *((each, *at) for each, at in positions.items())])
-    flags = ("--images", str(images), "--positions", str(table), "--technique", "cohog", "--camera", "nadir", "--json")
-    run_sets.edgevpr("map", "build", str(place_map), *flags)
+    flags = ("--images", str(images), "--positions", str(table), "--technique", "cohog", "--camera", "nadir")
+    base.edgevpr("map", "build", place_map, *flags)
     photos = {part: Orthophoto(folder / f"{part}.tif") for part in ("ref", "query")}
     middle = photos["ref"].middle
     origin, footprint_m = (middle.lat_deg, middle.lon_deg), float(np.median(footprints_m))

@@ -23,9 +23,7 @@ over: too few.
 
 import argparse
 import csv
-import json
 import os
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -34,17 +32,17 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import base
 import cv2
+import flight_page
 import flight_sites
 import flight_tracks
 import numpy as np
-import run_sets
-from flight_page import draw, page, summary
+import walks
+from base import RESULTS, Row
 from flight_sites import ROWS, Site
 
-from edgevpr.core.config import load_config
 from edgevpr.core.contract import Technique
-from edgevpr.core.types import Frame
 from edgevpr.mapmaking.orthophoto import Orthophoto
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
@@ -54,41 +52,34 @@ from edgevpr.runtime.recognise.calibrated import calibration_of
 from edgevpr.runtime.recognise.follow import Follower
 from edgevpr.runtime.recognise.hints import Prior
 from edgevpr.runtime.recognise.judge import accept_rule
-from edgevpr.runtime.recognise.opening import meter_of, open_recogniser
+from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 
 _SEED = 2026
 _WRONG_OF_SIDE, _WRONG_SD, _FAR_OF_SIDE = 0.25, 3.0, 0.5
 _OVER_THE_MAP = 0.5  # of the picture at least is shown by pictures of the map
-_FEW = ("along", "across", "jump", "leave", "foreign")
 FLOWN = {
-    "aerial_caliterra": flight_tracks.KINDS,
-    "aerial_garfield28": flight_tracks.KINDS,
-    "aerial_swindale": flight_tracks.KINDS,
-    "kite_ochota": flight_tracks.KINDS,
-    "aerial_copr": _FEW,
+    **dict.fromkeys(("aerial_caliterra", "aerial_garfield28", "aerial_swindale", "kite_ochota"), flight_tracks.KINDS),
+    "aerial_copr": ("along", "across", "jump", "leave", "foreign"),
     ROWS: ("along", "backwards", "half speed", "across", "jump"),
 }
-Row = dict[str, object]
 
 
 def _recogniser(
     technique: Technique, place_map: PlaceMap, index: PlaceIndex, *, length: int = 1, follows: bool = False
 ) -> Recogniser:
-    config = load_config(None)
-    prior = Prior(config.match.reach_m_s, technique.spec.heading_within_deg, True) if length == 1 else None
-    return Recogniser(
-        technique=technique,
-        place_map=place_map,
-        index=index,
-        rule=accept_rule(technique, config.match, length, calibration_of(place_map)),
-        meter=meter_of(config, load_board(config.board)),
-        candidates=technique.candidates,
+    config = walks.config()
+    reach_m_s, rule = config.match.reach_m_s, accept_rule(technique, config.match, length, calibration_of(place_map))
+    return walks.walk(
+        place_map,
+        index,
+        technique,
+        rule=rule,
         search=search_of(length),
-        prior=prior,
+        prior=Prior(reach_m_s, technique.spec.heading_within_deg, True) if length == 1 else None,
         min_accuracy_m=config.mavlink.min_accuracy_m,
-        follower=Follower(place_map, fastest_m_s=config.match.reach_m_s, is_live=True) if follows else None,
+        follower=Follower(place_map, fastest_m_s=reach_m_s, is_live=True) if follows else None,
     )
 
 
@@ -123,41 +114,37 @@ def planned() -> list[Flight]:
     return flights
 
 
-def flown(flight: Flight, sites: dict[str, Site], modes: list[str]) -> list[Row]:
+def flown(flight: Flight, sites: dict[str, Site]) -> list[Row]:
     """Fly once, and ask every mode with each picture; return a row for each query and mode."""
     cv2.setNumThreads(1)
     site, rng = sites[flight.site], np.random.default_rng((_SEED, flight.number))
     track = flight_tracks.fly(flight.kind, site, sites[flight.other], rng)
     said = flight_tracks.reports(track, site, flight.odometry, rng)
     photos = {name: Orthophoto(sites[name].flown) for name in {flight.site, flight.other}}
-    opened = open_recogniser(load_config(None, {"map": str(site.place_map)}), load_board("this"))
-    asked = {mode: MODES[mode](opened.technique, opened.place_map, opened.index) for mode in modes}
-    share = site.covered.at(track.at)
+    opened = open_recogniser(walks.config(map=str(site.place_map)), load_board("this"))
+    asked = {mode: make(opened.technique, opened.place_map, opened.index) for mode, make in MODES.items()}
+    share, of_flight = site.covered.at(track.at), {"flight": flight.number, "site": site.name, "kind": flight.kind}
     rows = []
     for number, image in enumerate(flight_tracks.photographs(track, photos, sites, rng)):
         if image is None:
             continue
-        own = track.over[number] == site.name
+        t_s, (east_m, north_m), over = float(track.t_s[number]), track.at[number].tolist(), track.over[number]
         query: Row = {
-            "flight": flight.number,
-            "site": site.name,
-            "kind": flight.kind,
+            **of_flight,
             "odometry": flight.odometry,
             "query": number,
-            "t_s": round(float(track.t_s[number]), 2),
-            "east_m": round(float(track.at[number, 0]), 2),
-            "north_m": round(float(track.at[number, 1]), 2),
-            "over": track.over[number],
-            "is_mapped": bool(own and share[number] >= _OVER_THE_MAP),
+            "t_s": round(t_s, 2),
+            "east_m": round(east_m, 2),
+            "north_m": round(north_m, 2),
+            "over": over,
+            "is_mapped": bool(over == site.name and share[number] >= _OVER_THE_MAP),
             "footprint_m": round(float(track.footprints_m[number]), 1),
         }
-        frame = Frame(image=image, name=f"{number:03d}", t_mono_s=float(track.t_s[number]))
+        frame = walks.frame(image, f"{number:03d}", t_s)
         for mode, recogniser in asked.items():
-            event = recogniser.step(frame, said[number])
-            rows.append(query | {"mode": mode} | _told(event, site, query))
-    for photo in photos.values():
-        photo.close()
-    opened.place_map.close()
+            rows.append(query | {"mode": mode} | _told(recogniser.step(frame, said[number]), site, query))
+    for each in (*photos.values(), opened.place_map):
+        each.close()
     return rows
 
 
@@ -186,40 +173,40 @@ def _told(event: Recognition, site: Site, query: Row) -> Row:
     }
 
 
-def main() -> int:
+def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--modes", metavar="A,B", default=",".join(MODES), help="ways of recognising (default: all)")
     parser.add_argument("--sites", metavar="A,B", default=",".join(FLOWN), help="whose maps are flown with (all)")
     parser.add_argument("--events", type=Path, metavar="CSV", help="write a line for each query and mode, too")
-    parser.add_argument("--out", type=Path, default=run_sets.RESULTS)
+    parser.add_argument("--out", type=Path, default=RESULTS)
     args = parser.parse_args()
-    run_sets.find_sets(run_sets.DATA, [name for name in FLOWN if name != ROWS])
-    modes, began_s = args.modes.split(","), time.monotonic()
+    base.find_sets(names=[name for name in FLOWN if name != ROWS])
+    began_s, rows = time.monotonic(), []
     flights = [flight for flight in planned() if flight.site in args.sites.split(",")]
     with (
         tempfile.TemporaryDirectory(prefix="edgevpr-flights-") as work,
         ProcessPoolExecutor(len(os.sched_getaffinity(0))) as pool,
     ):
-        prepare = partial(flight_sites.prepare, data=run_sets.DATA, work=Path(work))
+        prepare = partial(flight_sites.prepare, data=base.DATA, work=Path(work))
         sites = {site.name: site for site in pool.map(prepare, FLOWN)}
-        rows = []
-        for flight, new in zip(flights, pool.map(partial(flown, sites=sites, modes=modes), flights), strict=True):
+        for flight, new in zip(flights, pool.map(partial(flown, sites=sites), flights), strict=True):
             rows += new
-            fixes = {mode: [row["fix"] for row in new if row["mode"] == mode] for mode in modes}
+            fixes = {mode: [row["fix"] for row in new if row["mode"] == mode] for mode in MODES}
             said = ", ".join(f"{mode} {each.count('right')}/{each.count('wrong')}" for mode, each in fixes.items())
             print(f"{flight.number:3} {flight.site:18} {flight.kind:13} {flight.odometry:12} {said}", flush=True)
         args.out.mkdir(parents=True, exist_ok=True)
-        draw(rows, sites, args.out / "flights.png")
-    result = {**run_sets.made_by(), "took_s": round(time.monotonic() - began_s), **summary(rows, modes)}
-    (args.out / "flights.json").write_text(json.dumps(result, indent=1) + "\n")
-    (args.out / "flights.md").write_text(page(result, __doc__))
+        flight_page.draw(rows, sites, args.out / "flights.jpg")
+    found = {**base.made_by(), "took_s": round(time.monotonic() - began_s), **flight_page.summary(rows, list(MODES))}
+    base.write("flights", found, page(found), args.out)
     if args.events:
         with open(args.events, "w", newline="") as handle:
             table = csv.DictWriter(handle, list(max(rows, key=len)))
             table.writeheader()
             table.writerows(rows)
-    return 0
+
+
+def page(found: Row) -> str:
+    return flight_page.page(found, base.told(__doc__))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    base.run(main)

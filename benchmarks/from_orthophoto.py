@@ -11,28 +11,33 @@ from_orthophoto.md into benchmarks/results/.
 
 import csv
 import json
-import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
+import base
 import cv2
 import numpy as np
 import rasterio
-import run_sets
+from base import Row
 from rasterio.warp import transform
+from run_sets import spread
 
 from edgevpr.core.geodesy import distance_m
-from edgevpr.core.text import markdown
 from edgevpr.frames.images import read_image
 from edgevpr.frames.positions import read_positions
 
-CASES = (
-    ("aerial_caliterra", 64.0, 16.0),
-    ("aerial_garfield28", 140.0, 35.0),
-    ("aerial_swindale", 120.0, 30.0),
-)  # set, footprint and spacing in metres
+# Set: footprint and spacing in metres.
+CASES = {"aerial_caliterra": (64.0, 16.0), "aerial_garfield28": (140.0, 35.0), "aerial_swindale": (120.0, 30.0)}
 _ROUNDS = 10
+_COLUMNS = {
+    "set": "{set}",
+    "use": "{use}",
+    "footprint / spacing m": "{footprint_m:g} / {spacing_m:g}",
+    **{name: f"{{{name}}}" for name in ("places", "queries", "right", "accepted")},
+    "wrong": "{accepted_wrong}",
+    "fix error m": "{error[median_m]} / {error[p90_m]}",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +48,12 @@ class Laid:
     scale: dict[str, float]
     turn: dict[str, float]
     size: tuple[int, int]
+
+    def matrix(self, name: str, image: np.ndarray) -> np.ndarray:
+        """Return where a picture lies: from its pixels to those of the canvas, (2, 3)."""
+        cos, sin = self.scale[name] * np.cos(self.turn[name]), self.scale[name] * np.sin(self.turn[name])
+        turned, middle = np.array([[cos, -sin], [sin, cos]]), (np.array(image.shape[1::-1]) - 1) / 2
+        return np.column_stack([turned, self.middle[name] - turned @ middle])
 
 
 def laid(folder: Path) -> Laid:
@@ -87,9 +98,7 @@ def mosaic_of(folder: Path, on: Laid, part: str) -> tuple[np.ndarray, np.ndarray
             continue
         image = read_image(folder / part / name)
         high, wide = image.shape[:2]
-        cos, sin = on.scale[name] * np.cos(on.turn[name]), on.scale[name] * np.sin(on.turn[name])
-        turned = np.array([[cos, -sin], [sin, cos]])
-        matrix = np.column_stack([turned, on.middle[name] - turned @ [(wide - 1) / 2, (high - 1) / 2]])
+        matrix = on.matrix(name, image)
         y, x = np.mgrid[:high, :wide]
         inward = np.minimum(np.minimum(x, wide - 1 - x) / wide, np.minimum(y, high - 1 - y) / high) + 1e-3
         weight = cv2.warpAffine(inward.astype(np.float32), matrix, on.size)
@@ -123,13 +132,6 @@ def write_tif(path: Path, ground: Ground, canvas: np.ndarray, covered: np.ndarra
         out.write(bands)
 
 
-def write_mosaic(folder: Path, on: Laid, path: Path) -> dict[str, tuple[float, float]]:
-    """Write the mosaic of a set's map pictures; return where its queries are, (lat_deg, lon_deg) by name."""
-    ground = ground_of(folder, on)
-    write_tif(path, ground, *mosaic_of(folder, on, "ref"))
-    return {name: ground.position(at) for name, at in on.middle.items() if (folder / "query" / name).is_file()}
-
-
 def _similarity(pixels: np.ndarray, metres: np.ndarray) -> tuple[complex, complex]:
     """Fit metres = scale pixels + offset; tags that are far off are left out."""
     kept = np.ones(len(pixels), bool)
@@ -140,68 +142,57 @@ def _similarity(pixels: np.ndarray, metres: np.ndarray) -> tuple[complex, comple
     return complex(scale), complex(offset)
 
 
-def measure(folder: Path, footprint_m: float, spacing_m: float, work: Path) -> dict:
+def measure(folder: Path, footprint_m: float, spacing_m: float, work: Path) -> Row:
     """Cut a map of a set's mosaic, and match its queries."""
-    tif, path = work / f"{folder.name}.tif", work / f"{folder.name}.gpkg"
-    truth = write_mosaic(folder, laid(folder), tif)
-    flags = ("--footprint-m", f"{footprint_m:g}", "--spacing-m", f"{spacing_m:g}", "--json")
-    built = run_sets.edgevpr("map", "build", str(path), "--orthophoto", str(tif), *flags)
-    matches = run_sets.edgevpr("match", str(path), "--images", str(folder / "query"), "--json")
-    right = wrong = 0
-    errors_m = []
+    tif, path, on = work / f"{folder.name}.tif", work / f"{folder.name}.gpkg", laid(folder)
+    ground = ground_of(folder, on)
+    write_tif(tif, ground, *mosaic_of(folder, on, "ref"))
+    truth = {name: ground.position(at) for name, at in on.middle.items() if (folder / "query" / name).is_file()}
+    flags = ("--footprint-m", f"{footprint_m:g}", "--spacing-m", f"{spacing_m:g}")
+    built = base.edgevpr("map", "build", path, "--orthophoto", tif, *flags)
+    matches = base.edgevpr("match", path, "--images", folder / "query")
     known = [match for match in matches if match["query"] in truth and match["position"]]
-    for match in known:
-        here = truth[match["query"]]
-        place, where = match["position"], match["located"]
-        right += bool(distance_m(*here, place["lat_deg"], place["lon_deg"]) < footprint_m / 2)
-        if match["accepted"]:
-            errors_m.append(float(distance_m(*here, where["lat_deg"], where["lon_deg"])))
-            wrong += errors_m[-1] > footprint_m / 4
+
+    def off_m(match: Row, where: str) -> float:
+        return float(distance_m(*truth[match["query"]], match[where]["lat_deg"], match[where]["lon_deg"]))
+
+    errors_m = [off_m(match, "located") for match in known if match["accepted"]]
     return {
         "set": folder.name,
-        "use": "tune" if folder.name in run_sets.TUNED_ON else "report",
+        "use": base.use_of(folder.name),
         "footprint_m": footprint_m,
         "spacing_m": spacing_m,
         "places": built["places"],
         "queries": len(known),
-        "right": right,
+        "right": sum(off_m(match, "position") < footprint_m / 2 for match in known),
         "accepted": len(errors_m),
-        "accepted_wrong": wrong,
-        "error": run_sets.spread(errors_m),
+        "accepted_wrong": sum(error_m > footprint_m / 4 for error_m in errors_m),
+        "error": spread(errors_m),
     }
 
 
-def main() -> int:
-    data = run_sets.REPOSITORY.parent / "shared" / "data"
-    rows = []
+def main() -> None:
+    found = {**base.made_by(), "sets": []}
     with tempfile.TemporaryDirectory(prefix="edgevpr-orthophoto-") as work:
-        for name, footprint_m, spacing_m in CASES:
-            (folder,) = run_sets.find_sets(data, [name])
-            rows.append(measure(folder, footprint_m, spacing_m, Path(work)))
-            print(json.dumps(rows[-1]), flush=True)
-    made = run_sets.made_by()
-    (run_sets.RESULTS / "from_orthophoto.json").write_text(json.dumps({**made, "sets": rows}, indent=1) + "\n")
-    table = [
-        [
-            row["set"],
-            row["use"],
-            f"{row['footprint_m']:g} / {row['spacing_m']:g}",
-            *(str(row[key]) for key in ("places", "queries", "right", "accepted", "accepted_wrong")),
-            f"{row['error']['median_m']} / {row['error']['p90_m']}",
-        ]
-        for row in rows
-    ]
-    head = ("set", "use", "footprint / spacing m", "places", "queries", "right", "accepted", "wrong", "fix error m")
-    text = __doc__.partition("\n\n")[2].partition("Footprints were")[0].strip()
-    (run_sets.RESULTS / "from_orthophoto.md").write_text(
-        f"# Maps cut from an orthophoto\n\n{text}\n\nRight: the best place is within half a footprint of the truth. "
-        "Wrong: accepted, and the fix is a quarter of a footprint off or more. Errors: median / 90 % of the accepted."
-        "\n\n"
-        f"{markdown(head, table)}\n\nCommit {made['commit']}, {made['date']}, {made['machine']['cpu']}. Made by "
-        "`python benchmarks/from_orthophoto.py`.\n"
-    )
-    return 0
+        for folder in base.find_sets(names=CASES):
+            found["sets"].append(measure(folder, *CASES[folder.name], Path(work)))
+            print(json.dumps(found["sets"][-1]), flush=True)
+    base.write("from_orthophoto", found, page(found))
+
+
+def page(found: Row) -> str:
+    return f"""# Maps cut from an orthophoto
+
+{base.told(__doc__, "Footprints were")}
+
+Right: the best place is within half a footprint of the truth. Wrong: accepted, and the fix is a quarter of a footprint
+off or more. Errors: median / 90 % of the accepted.
+
+{base.table(found["sets"], _COLUMNS)}
+
+{base.made_line(found, "python benchmarks/from_orthophoto.py")}
+"""
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    base.run(main)

@@ -222,8 +222,8 @@ def page(found: Row) -> str:
 
 Made by `make test-arm64` with {system["qemu"]}, emulating a
 {system["cpu"]}, on {system["machine"]["cores"]} cores of an {system["machine"]["cpu"]}. The emulated system is Debian
-{system["release"]}: Python {system["python"]}, glibc {system["glibc"]}. edgevpr is installed from its wheel, and all that
-it needs from deploy/requirements.lock, with hashes: {packages}.
+{system["release"]}: Python {system["python"]}, glibc {system["glibc"]}. edgevpr is installed from its wheel, and all
+that it needs from deploy/requirements.lock, with hashes: {packages}.
 Tried: {tried}.
 
 **{" ".join(judged)}**

@@ -14,146 +14,115 @@ Looking down, a third of the foreign places is mirrored ground of the very sites
 What is measured stays in the folder --work, so that an interrupted run goes on.
 """
 
-import os
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
-
+import argparse
 import json
 import subprocess
 import sys
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import cv2
+import base
 import numpy as np
-import sites_page
+import walks
+from base import RESULTS, Row
+from flight_process import memory_mb
 from foreign_places import MIRRORED, foreign
-from run_sets import FROM_THE_AIR, find_sets, join, parser_of
+from run_sets import join
 
-from edgevpr.core.config import load_config
-from edgevpr.core.errors import EdgevprError
-from edgevpr.core.types import Frame
-from edgevpr.frames.images import read_image
-from edgevpr.frames.source import open_source
-from edgevpr.lab.evaluate.dataset import Dataset, ScoredQuery, load_dataset
-from edgevpr.lab.evaluate.evaluate import all_frames
+from edgevpr.lab.evaluate.dataset import Dataset, ScoredQuery
 from edgevpr.lab.evaluate.metrics import interval
 from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.examine import examine
 from edgevpr.places.index import bytes_per_place
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.recognise.opening import meter_of, open_recogniser
-from edgevpr.techniques import create
+from edgevpr.runtime.recognise.opening import open_recogniser
 
 SIZES = (50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000)
+TITLES = {"nadir": "Looking straight down", "forward": "Looking ahead"}
 AHEAD = ("corridor", "grief_stromovka_seasons")  # the sets that look ahead and are large enough to be asked
 EXACT_PLACES, EXACT_EVERY = 200, 3  # every third query
 UNLIKE, UNLIKE_PLACES = "unlike", 5_000
+WORK = Path("sites_work")
 _BESIDE = 2  # pictures, as where a map has no positions
+_FOUND = {
+    "places": "{places}",
+    "of the sites": "{of_sites}",
+    "recall@1": "{recall_at_1:.3f}",
+    "95 %": "{recall_at_1_interval[0]:.3f} to {recall_at_1_interval[1]:.3f}",
+    "accepted right": "{accepted_right}",
+    "beside": "{accepted_beside}",
+    "wrong": "{accepted_wrong}",
+    "best place wrong: where": "{where}",
+}
+_COSTS = {
+    "places": "{places}",
+    "encode ms": "{t_encode_ms:.1f}",
+    "scan ms": "{t_scan_ms:.1f}",
+    "query ms": "{t_query_ms:.1f}",
+    "90 % of queries, ms": "{t_query_p90_ms:.1f}",
+    "bytes a place in RAM": "{row_bytes}, with id and position {bytes_per_place}",
+    "peak RAM MB": "{peak_mb:.0f}",
+    "map MB": "{map_mb:.0f}",
+}
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Row:
-    """The result of all queries in one map. `how` is flown, exact (all places compared in full), or unlike (flown, and
-    no mirrored picture is in the map). `hits` has a + for each query whose best place is right. `accepted_right` were
-    accepted for a right place, or one of which the truth says nothing, `accepted_beside` for one at most two pictures
-    beside a right one, which the truth does not count, and `accepted_wrong` for another. `wrong_by` counts the best
-    places that are wrong by where they are: the query's own site, another site, or the kind of foreign place. Times are
-    medians and a 90th percentile of the processor; `peak_mb` is the highest resident memory (VmHWM) of the whole
-    process."""
-
-    camera: str
-    places: int
-    of_sites: int
-    how: str
-    queries: int
-    hits: str
-    recall_at_1: float
-    recall_at_1_interval: tuple[float, float] | None
-    accepted_right: int
-    accepted_beside: int
-    accepted_wrong: int
-    wrong_by: dict[str, int]
-    accepted_wrong_names: list[tuple[str, str]]
-    t_encode_ms: float
-    t_scan_ms: float
-    t_query_ms: float
-    t_query_p90_ms: float
-    bytes_per_place: int
-    row_bytes: int
-    peak_mb: float
-    map_mb: float
-
-
-def main() -> int:
-    parser = parser_of(__doc__, "sites_work")
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--measure", nargs=3, metavar=("CAMERA", "PLACES", "HOW"), help="one map, in this process")
     args = parser.parse_args()
-    cv2.setNumThreads(1)
-    try:
-        args.work.mkdir(parents=True, exist_ok=True)
-        if args.measure:
-            camera, places, how = args.measure
-            row = measured(args.work, args.data, camera, int(places), how)
-            path = args.work / f"{camera}_{places}_{how}.json"
-            path.with_suffix(".new").write_text(json.dumps(asdict(row)))
-            path.with_suffix(".new").replace(path)
-            return 0
-        rows = []
-        for camera, places, how in planned(args.work, args.data):
-            path = args.work / f"{camera}_{places}_{how}.json"
-            if not path.exists():
-                flags = ["--data", args.data, "--work", args.work, "--measure", camera, places, how]
-                subprocess.run([sys.executable, __file__, *map(str, flags)], check=True)
-                print(path.read_text(), flush=True)
-            rows.append(json.loads(path.read_text()))
-            sites_page.write(args.out, rows, __doc__)
-    except EdgevprError as error:
-        print(f"sites: {error}", file=sys.stderr)
-        return error.exit_code
-    return 0
+    if args.measure:
+        camera, places, how = args.measure
+        print(json.dumps(measured(camera, int(places), how)))
+        return
+    rows = []
+    for camera, places, how in planned():
+
+        def in_a_process(words: tuple = (camera, places, how)) -> Row:
+            argv = [sys.executable, __file__, "--measure", *map(str, words)]
+            return json.loads(subprocess.run(argv, check=True, stdout=subprocess.PIPE).stdout)
+
+        rows.append(base.kept(WORK / f"{camera}_{places}_{how}.json", in_a_process))
+        found = {**base.made_by(), "rows": rows}
+        base.write("sites", found, page(found))
+        draw(rows, RESULTS / "sites.png")
 
 
-def planned(work: Path, data: Path) -> Iterator[tuple[str, int, str]]:
+def planned() -> Iterator[tuple[str, int, str]]:
     """Yield what is to be measured; the map of all places is built before its camera's first."""
-    for camera in sites_page.TITLES:
-        dataset, count = dataset_of(work, data, camera), _build(work, data, camera)
+    for camera in TITLES:
+        dataset, count = dataset_of(camera), _build(camera)
         sizes = sorted({size for size in SIZES if size <= count} | {len(dataset.references)})
         yield from ((camera, size, "flown") for size in sizes)
     yield "nadir", UNLIKE_PLACES, UNLIKE
     yield "forward", EXACT_PLACES, "exact"
 
 
-def folders_of(data: Path, camera: str) -> list[Path]:
-    if camera == "forward":
-        return find_sets(data, list(AHEAD))
-    return [folder for folder in find_sets(data, None) if folder.name.startswith(FROM_THE_AIR)]
+def folders_of(camera: str) -> list[Path]:
+    return base.find_sets(names=AHEAD if camera == "forward" else None, camera=camera)
 
 
-def dataset_of(work: Path, data: Path, camera: str) -> Dataset:
+def dataset_of(camera: str) -> Dataset:
     """Return the sets of one camera as one set."""
-    joined = work / f"{camera}_sites"
+    joined = WORK / f"{camera}_sites"
     if not (joined / "ground_truth.csv").exists():
-        join(folders_of(data, camera), joined)
-    return load_dataset(joined / "query", joined / "ref", joined / "ground_truth.csv")
+        join(folders_of(camera), joined)
+    return walks.dataset_of(joined)
 
 
-def _build(work: Path, data: Path, camera: str) -> int:
+def _build(camera: str) -> int:
     """Build the map of all places, or go on with it; return how many it has."""
-    dataset, path = dataset_of(work, data, camera), work / f"{camera}.gpkg"
-    technique, config = create("cohog", {"camera": camera}), load_config(None)
+    dataset, path, technique = dataset_of(camera), WORK / f"{camera}.gpkg", walks.cohog(camera)
     with PlaceMap.open_for_adding(path) if path.exists() else PlaceMap.create(path, technique.spec) as place_map:
         if len(place_map) < max(SIZES):
 
-            def frames() -> Iterator[Frame]:
-                yield from all_frames(open_source(str(dataset.ref_dir), live=False))
+            def frames() -> Iterator:
+                yield from walks.frames_of(dataset.ref_dir)
                 missing = max(SIZES) - len(dataset.references)
-                yield from foreign(camera, missing, data, folders_of(data, camera))
+                yield from foreign(camera, missing, base.DATA, folders_of(camera))
 
-            build_map(frames(), technique, place_map, meter_of(config, load_board("this")))
+            build_map(frames(), technique, place_map, walks.meter())
         return len(place_map)
 
 
@@ -178,11 +147,11 @@ def covering(wanted: list[frozenset[str]]) -> list[str]:
     return cover
 
 
-def part_of(work: Path, dataset: Dataset, camera: str, count: int, how: str) -> Path:
+def part_of(dataset: Dataset, camera: str, count: int, how: str) -> Path:
     """Copy the places of a map of `count` from the map of all, in the same order."""
-    path = work / f"{camera}_{count}_{how}.gpkg"
+    path = WORK / f"{camera}_{count}_{how}.gpkg"
     path.unlink(missing_ok=True)
-    with PlaceMap.open(work / f"{camera}.gpkg") as whole:
+    with PlaceMap.open(WORK / f"{camera}.gpkg") as whole:
         names = {place.place_id: place.source_image for place in whole.places()}
         may_be = [name for name in names.values() if how != UNLIKE or not name.startswith(MIRRORED)]
         kept = chosen(dataset, may_be, count)
@@ -193,27 +162,27 @@ def part_of(work: Path, dataset: Dataset, camera: str, count: int, how: str) -> 
     return path
 
 
-def measured(work: Path, data: Path, camera: str, count: int, how: str) -> Row:
-    """Ask every query in the map of `count` places."""
-    dataset = dataset_of(work, data, camera)
-    path = part_of(work, dataset, camera, count, how)
-    config = load_config(None, {"map": str(path), "source.camera": camera})
-    recogniser = open_recogniser(config, load_board("this"))
+def measured(camera: str, count: int, how: str) -> Row:
+    """Ask every query in the map of `count` places. `how` is flown, exact (all places compared), or unlike (flown, and
+    no mirrored picture is in the map). `hits` has a + for each query whose best place is right. `accepted_right` were
+    accepted for a right place, or one of which the truth says nothing, `accepted_beside` for one at most two pictures
+    beside a right one, which the truth does not count, and `accepted_wrong` for another. `wrong_by` counts the best
+    places that are wrong by where they are: the query's own site, another site, or the kind of foreign place. Times are
+    medians and a 90th percentile of the processor; `peak_mb` is the highest resident memory of the whole process."""
+    dataset, sites = dataset_of(camera), [folder.name for folder in folders_of(camera)]
+    path = part_of(dataset, camera, count, how)
+    recogniser = open_recogniser(walks.config(map=str(path), **{"source.camera": camera}), load_board("this"))
     if how == "exact":
         recogniser.candidates = None
-    sites = [folder.name for folder in folders_of(data, camera)]
-    hits, costs, wrong_by, accepted, beside, wrong = [], [], Counter(), 0, [], []
+    hits, costs, wrong_by, accepted, beside, wrong = [], [], Counter(), 0, 0, []
     queries = dataset.queries[::EXACT_EVERY] if how == "exact" else dataset.queries
     with recogniser.place_map as place_map:
-        name_of = {place.place_id: place.source_image for place in place_map.places()}
-        names = [name_of[place_id] for place_id in recogniser.index.place_ids.tolist()]
+        names = walks.names_of(place_map, recogniser.index)
         for number, query in enumerate((queries[0], *queries)):  # the first pays for tables and a cold disk
-            event = recogniser.step(Frame(image=read_image(query.path), name=query.path.name, t_mono_s=0.0))
-            if event.failed:
-                raise EdgevprError(event.reason)
+            event = recogniser.step(walks.frame(query.path))
+            ranked = walks.ranked(event, names)
             if number == 0:
                 continue
-            ranked = [names[slot] for slot in event.ranking.slots] if event.ranking else []
             counted = next((name for name in ranked if name not in query.ignored), None)
             hits.append(counted in query.right)
             if counted and not hits[-1]:
@@ -221,34 +190,35 @@ def measured(work: Path, data: Path, camera: str, count: int, how: str) -> Row:
             accepted += event.accepted
             if event.accepted and ranked[0] not in query.right | query.ignored:
                 is_beside = _is_beside(ranked[0], query, dataset)
-                (beside if is_beside else wrong).append((query.path.name, ranked[0]))
+                beside += is_beside
+                wrong += [] if is_beside else [(query.path.name, ranked[0])]
             costs.append((event.steps.encode.cpu_s, event.steps.scan.cpu_s, event.cost.cpu_s))
-        peak_mb = _peak_mb()
+        peak_mb = memory_mb("self")["VmHWM"]
     t_encode_ms, t_scan_ms, t_query_ms = (1000 * np.median(costs, axis=0)).round(2).tolist()
     spec = recogniser.technique.spec
-    row = Row(
-        camera=camera,
-        places=len(recogniser.index),
-        of_sites=sum(name in set(dataset.references) for name in names),
-        how=how,
-        queries=len(hits),
-        hits="".join("-+"[hit] for hit in hits),
-        recall_at_1=round(float(np.mean(hits)), 4),
-        recall_at_1_interval=interval(np.array(hits)),
-        accepted_right=int(accepted) - len(beside) - len(wrong),
-        accepted_beside=len(beside),
-        accepted_wrong=len(wrong),
-        wrong_by=dict(wrong_by),
-        accepted_wrong_names=wrong,
-        t_encode_ms=t_encode_ms,
-        t_scan_ms=t_scan_ms,
-        t_query_ms=t_query_ms,
-        t_query_p90_ms=round(1000 * float(np.percentile([each[2] for each in costs], 90)), 1),
-        bytes_per_place=bytes_per_place(spec),
-        row_bytes=spec.row.nbytes,
-        peak_mb=round(peak_mb, 1),
-        map_mb=round(path.stat().st_size / 1e6, 1),
-    )
+    row = {
+        "camera": camera,
+        "places": len(recogniser.index),
+        "of_sites": sum(name in set(dataset.references) for name in names),
+        "how": how,
+        "queries": len(hits),
+        "hits": "".join("-+"[hit] for hit in hits),
+        "recall_at_1": round(float(np.mean(hits)), 4),
+        "recall_at_1_interval": interval(np.array(hits)),
+        "accepted_right": int(accepted) - beside - len(wrong),
+        "accepted_beside": beside,
+        "accepted_wrong": len(wrong),
+        "wrong_by": dict(wrong_by),
+        "accepted_wrong_names": wrong,
+        "t_encode_ms": t_encode_ms,
+        "t_scan_ms": t_scan_ms,
+        "t_query_ms": t_query_ms,
+        "t_query_p90_ms": round(1000 * float(np.percentile([each[2] for each in costs], 90)), 1),
+        "bytes_per_place": bytes_per_place(spec),
+        "row_bytes": spec.row.nbytes,
+        "peak_mb": round(peak_mb, 1),
+        "map_mb": round(path.stat().st_size / 1e6, 1),
+    }
     path.unlink()
     return row
 
@@ -270,10 +240,72 @@ def _whereabouts(place: str, query: str, sites: list[str]) -> str:
     return kind or ("own site" if place.startswith(own) else "another site")
 
 
-def _peak_mb() -> float:
-    status = Path("/proc/self/status").read_text()
-    return next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM:")) * 1024 / 1e6
+def by_how(rows: list[Row], camera: str) -> list[list[Row]]:
+    """Return the rows of a camera that were flown, exact, and unlike, by places, with words for `where` and the recall
+    as flown of the queries that were asked exactly."""
+    mine = sorted((row for row in rows if row["camera"] == camera), key=lambda row: row["places"])
+    for row in mine:
+        row["where"] = ", ".join(f"{count} {kind}" for kind, count in sorted(row["wrong_by"].items())) or "-"
+    flown, exact, unlike = ([row for row in mine if row["how"] == how] for how in ("flown", "exact", UNLIKE))
+    for row in exact:
+        hits = next((each["hits"] for each in flown if each["places"] == row["places"]), "")[::EXACT_EVERY]
+        row["as_flown"] = hits.count("+") / len(hits) if hits else None
+    return [flown, exact, unlike]
+
+
+def page(found: Row) -> str:
+    """Return the page for people."""
+    parts = ["# One map out of many sites", base.told(__doc__, "What is measured")]
+    for camera, title in TITLES.items():
+        flown, exact, unlike = by_how([dict(row) for row in found["rows"]], camera)
+        if not flown:
+            continue
+        parts += [f"## {title}: {flown[0]['queries']} queries", base.table(flown, _FOUND), base.table(flown, _COSTS)]
+        if exact:
+            parts.append(f"All places compared in full, {exact[0]['queries']} of the queries:")
+            also = {"flown, the same queries": "{as_flown:.3f}", "query ms": "{t_query_ms:.0f}"}
+            parts.append(base.table(exact, {**_FOUND, **also}))
+        if unlike:
+            parts += ["Without mirrored ground:", base.table(unlike, _FOUND)]
+    parts.append("![recall, what is accepted, times and memory as the map grows](sites.png)")
+    return "\n\n".join([*parts, base.made_line(found, "make sites")])
+
+
+def draw(rows: list[Row], path: Path) -> None:
+    """Draw recall, what is accepted, and times, against the places of the map."""
+    drawn, axes = base.panels(14, 4.2, 3)
+    for camera, colour in zip(TITLES, ("tab:orange", "tab:blue"), strict=True):
+        flown, exact, unlike = by_how([dict(row) for row in rows], camera)
+        if not flown:
+            continue
+        title, places = TITLES[camera].lower(), [row["places"] for row in flown]
+
+        def curve(
+            axis, style: str, label: str, values: list[float], at: list[int] = places, colour: str = colour
+        ) -> None:
+            axis.plot(at, values, style, color=colour, label=label)
+
+        curve(axes[0], "o-", f"{title}, {flown[0]['queries']} queries", [row["recall_at_1"] for row in flown])
+        intervals = np.array([row["recall_at_1_interval"] or (np.nan, np.nan) for row in flown])
+        axes[0].fill_between(places, *intervals.T, color=colour, alpha=0.15, linewidth=0)
+        for beside, mark, what in ((exact, "x:", "all compared"), (unlike, "s:", "no mirrored ground")):
+            if beside:
+                label, at = f"{title}, {what} ({beside[0]['queries']})", [row["places"] for row in beside]
+                curve(axes[0], mark, label, [row["recall_at_1"] for row in beside], at)
+        curve(axes[1], "o-", f"{title}, right", [row["accepted_right"] / row["queries"] for row in flown])
+        curve(axes[1], "x--", "wrong", [row["accepted_wrong"] / row["queries"] for row in flown])
+        curve(axes[2], "o-", f"{title}, query", [row["t_query_ms"] for row in flown])
+        curve(axes[2], "x--", "scan", [row["t_scan_ms"] for row in flown])
+        for axis in axes[:2]:
+            axis.axvline(max(row["of_sites"] for row in flown), color=colour, linestyle=":", linewidth=1)
+    axes[0].set(title="recall@1 (dotted upright: all sites are in)", ylim=(0.5, 1.01))
+    axes[1].set(title="share of the queries accepted", ylim=(-0.02, 1.01))
+    axes[2].set(title="time of the processor, ms", yscale="log")
+    for axis in axes:
+        axis.set(xscale="log", xlabel="places in the map")
+        axis.legend(fontsize=8, frameon=False)
+    base.save(drawn, path)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    base.run(main)

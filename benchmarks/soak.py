@@ -1,18 +1,12 @@
 """An hour of flight, looked at from outside: `make soak MINUTES=60` writes benchmarks/results/soak.md, soak.json and
 soak.png, and ends with code 1 where memory, descriptors or threads grow.
 
-python benchmarks/soak.py [--minutes M] [--every-s S] [--out FOLDER]
+python benchmarks/soak.py [--minutes M]
 
 A real `edgevpr run` flies with a camera that speaks RTSP, an autopilot over UDP, a second link, a status socket, a
 flight log that is limited to 1 MB and a tlog. Again and again the camera or the autopilot goes away and comes back, the
 second link's other end closes, readers of the status come and leave, and the configuration is read again.
 """
-
-import os
-
-import base  # noqa: F401
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
 
 import argparse
 import signal
@@ -27,22 +21,23 @@ from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import base
 import psutil
 import yaml
+from base import RESULTS, Row
 from rtsp_camera import free_port
-from run_sets import made_by
-from soak_page import Sample, Soak, verdict, write_page
+from soak_page import draw, page, verdict
 from soak_world import FOV_DEG, Autopilot, FilmCamera, make_world
 
 from edgevpr.core.errors import EdgevprError
 from edgevpr.runtime.flight.flightlog import read_log
 from edgevpr.runtime.flight.statusreader import StatusReader
 
-RESULTS = Path(__file__).resolve().parent / "results"
 LOG_MB = 1.0
 _RADIUS_M = 110.0  # of the lap
 _CYCLE_S = 300.0  # in which everything happens once
 _AFTER = 0.06  # of a cycle: so long after its return what was away may still show
+_EVERY_S = 5.0  # from one look at the process to the next
 _PATIENCE_S = 60.0
 _TURN_S = 0.1
 _LOOK_S = 3.0  # for a status, of which one comes every second
@@ -62,25 +57,22 @@ class Absence:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--minutes", type=float, default=60.0)
-    parser.add_argument("--every-s", type=float, default=5.0, help="from one look at the process to the next")
-    parser.add_argument("--out", type=Path, default=RESULTS)
-    args = parser.parse_args()
+    minutes = parser.parse_args().minutes
     with TemporaryDirectory(prefix="edgevpr-soak-") as folder:
         print("drawing the ground, the film and the map", flush=True)
-        soak = run(Path(folder), 60 * args.minutes, args.every_s)
-    broken = verdict(soak)
-    args.out.mkdir(parents=True, exist_ok=True)
-    write_page(args.out, soak, made_by())
-    for each in broken:
-        print(f"soak: {each}", file=sys.stderr)
-    sys.exit(1 if broken else 0)
+        found = base.made_by() | run(Path(folder), 60 * minutes, _EVERY_S)
+    base.write("soak", found, page(found))
+    draw(found, RESULTS / "soak.png")
+    print(page(found))
+    sys.exit("\n".join(f"soak: {each}" for each in verdict(found)) or None)
 
 
-def run(folder: Path, lasts_s: float, every_s: float, radius_m: float = _RADIUS_M) -> Soak:
+def run(folder: Path, lasts_s: float, every_s: float, radius_m: float = _RADIUS_M) -> Row:
     """Fly for so long and return what was seen. Raises RuntimeError where the flight does not start, or ends."""
     world = make_world(folder, radius_m)
-    _edgevpr("map", "build", folder / "map.gpkg", "--images", world.places / "images",
-             "--camera", "nadir", "--fov-deg", FOV_DEG, "--technique", "cohog", "--no-calibrate")  # fmt: skip
+    lens = ("--camera", "nadir", "--fov-deg", FOV_DEG)
+    images = ("--images", world.places / "images", "--technique", "cohog", "--no-calibrate")
+    base.edgevpr("map", "build", folder / "map.gpkg", *images, *lens)
     with ExitStack() as stack:
         camera = FilmCamera(world, folder)
         stack.callback(camera.close)
@@ -96,16 +88,15 @@ def run(folder: Path, lasts_s: float, every_s: float, radius_m: float = _RADIUS_
         samples = watch.look_until(lasts_s, _absences(camera, autopilot, ground, flight))
         code, said = flight.end()
     ends = [line for line in read_log(flight.log) if line["kind"] == "end"]
-    return Soak(
-        samples=samples,
-        events=watch.events,
-        statuses=watch.statuses,
-        exit_code=code,
-        tracebacks=said.count("Traceback"),
-        warnings=sum(" WARNING " in line or "warning" in line.lower() for line in said.splitlines()),
-        log_limit_mb=LOG_MB,
-        end={name: value for name, value in (ends[-1] if ends else {}).items() if isinstance(value, int | float)},
-    )
+    return {
+        "samples": samples,
+        "events": watch.events,
+        "statuses": watch.statuses,
+        "exit_code": code,
+        "tracebacks": said.count("Traceback"),
+        "log_limit_mb": LOG_MB,
+        "end": {name: value for name, value in (ends[-1] if ends else {}).items() if isinstance(value, int | float)},
+    }
 
 
 class Flight:
@@ -186,7 +177,7 @@ class _Watch:
         self._away: list[str] = []
         self._returned_s = float("-inf")
 
-    def look_until(self, lasts_s: float, absences: list[Absence]) -> list[Sample]:
+    def look_until(self, lasts_s: float, absences: list[Absence]) -> list[Row]:
         """Return a sample for each look. Raises RuntimeError where the flight ends before its time."""
         timetable = _timetable(absences, self._cycle_s)
         due_s, *step = next(timetable)
@@ -217,7 +208,7 @@ class _Watch:
             self._away.remove(each.name)
             self._returned_s = t_s
 
-    def _sample(self, t_s: float) -> Sample:
+    def _sample(self, t_s: float) -> Row:
         try:
             with self._process.oneshot():
                 memory, cpu = self._process.memory_full_info(), self._process.cpu_times()
@@ -225,19 +216,21 @@ class _Watch:
             descriptors = self._descriptors()
         except psutil.Error as error:
             raise RuntimeError(f"the flight has ended after {t_s:.0f} s: {self._flight.end()}") from error
-        return Sample(
-            t_s=round(t_s, 2),
-            rss_mb=memory.rss / 1e6,
-            pss_mb=memory.pss / 1e6,
-            uss_mb=memory.uss / 1e6,
-            descriptors=descriptors,
-            threads=threads,
-            cpu_s=cpu.user + cpu.system,
-            log_mb=sum(path.stat().st_size for path in self._flight.log.parent.glob("flight*.jsonl")) / 1e6,
-            tlog_mb=self._flight.tlog.stat().st_size / 1e6 if self._flight.tlog.exists() else 0.0,
-            away=", ".join(self._away),
-            is_calm=not self._away and t_s - self._returned_s >= _AFTER * self._cycle_s,
-        )
+        log_bytes = sum(path.stat().st_size for path in self._flight.log.parent.glob("flight*.jsonl"))
+        tlog_bytes = self._flight.tlog.stat().st_size if self._flight.tlog.exists() else 0
+        return {
+            "t_s": round(t_s, 2),
+            "rss_mb": memory.rss / 1e6,
+            "pss_mb": memory.pss / 1e6,
+            "uss_mb": memory.uss / 1e6,
+            "descriptors": descriptors,
+            "threads": threads,
+            "cpu_s": cpu.user + cpu.system,
+            "log_mb": log_bytes / 1e6,
+            "tlog_mb": tlog_bytes / 1e6,
+            "away": ", ".join(self._away),
+            "is_calm": not self._away and t_s - self._returned_s >= _AFTER * self._cycle_s,
+        }
 
     def _descriptors(self) -> int:
         """Count the descriptors, three times: a log that changes its file has one less for a moment."""
@@ -287,11 +280,5 @@ def _absences(camera: FilmCamera, autopilot: Autopilot, ground: _Ground, flight:
     ]
 
 
-def _edgevpr(*arguments: object) -> None:
-    done = subprocess.run([sys.executable, "-m", "edgevpr", *map(str, arguments)], capture_output=True, text=True)
-    if done.returncode:
-        raise RuntimeError(f"edgevpr {arguments[0]} {arguments[1]} failed: {done.stderr}")
-
-
 if __name__ == "__main__":
-    main()
+    base.run(main)

@@ -18,63 +18,34 @@ calibrated as `map build` does. The networks run on the one that edgevpr ships, 
 What is measured stays in the folder --work, so that an interrupted run goes on.
 """
 
-import os
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
-
 import json
-import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass
 from pathlib import Path
 
+import base
 import cv2
 import numpy as np
-import sweeps_page
+import walks
+from base import RESULTS, Row, camera_of
 from from_orthophoto import laid, mosaic_of
-from height_and_tilt import area, corners, cut, middle, through
-from hostile_pictures import camera_of
-from run_sets import find_sets, parser_of
+from height_and_tilt import area, corners, cut, through
 from sweep_changes import NONE, OF_CAMERA, SWEEPS, spoilt, view
 
 from edgevpr import techniques
-from edgevpr.core.config import load_config
-from edgevpr.core.errors import EdgevprError
 from edgevpr.core.types import Frame, Vehicle
 from edgevpr.frames.images import read_image
 from edgevpr.frames.level import UNKNOWN_VIEW, Levelled
-from edgevpr.frames.source import open_source
-from edgevpr.lab.evaluate.dataset import load_dataset
-from edgevpr.lab.evaluate.evaluate import all_frames, mapped
 from edgevpr.lab.evaluate.metrics import interval
-from edgevpr.power.boards import load_board
-from edgevpr.runtime.recognise.calibrated import calibration_of
-from edgevpr.runtime.recognise.judge import accept_rule
-from edgevpr.runtime.recognise.opening import meter_of
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.techniques import create
 
 SETS = ("aerial_swindale", "corridor")  # one that looks down, one that looks ahead
 TECHNIQUES = tuple(name for name in techniques.names() if name != "seqslam")  # which asks with several pictures
+WORK = Path("sweeps_work")
 _MOST_ASKED = 24
 _LEAST_COVERED, _LEAST_SHOWN, _TOUCHING = 0.8, 0.7, 0.02
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Level:
-    """The result at one level of a sweep: how many were `asked`, how much of their views showed anything, and which
-    were accepted for which wrong place."""
-
-    sweep: str
-    level: float
-    asked: int
-    shown: float
-    recall_at_1: float | None
-    recall_at_1_interval: tuple[float, float] | None
-    accepted: int
-    accepted_wrong: int
-    wrong: list[tuple[str, str]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,89 +80,60 @@ class Asked:
 
     walk: Recogniser
     shown: Shown
-    names: tuple[str, ...]
+    names: list[str]
 
 
-@dataclass(slots=True)
-class Found:
-    """The answers of a technique at one level."""
-
-    hits: list[bool] = field(default_factory=list)
-    accepted: int = 0
-    wrong: list[tuple[str, str]] = field(default_factory=list)
-
-
-def main() -> int:
-    args = parser_of(__doc__, "sweeps_work").parse_args()
-    cv2.setNumThreads(1)
-    args.work.mkdir(parents=True, exist_ok=True)
-    found = []
-    try:
-        for folder in find_sets(args.data, list(SETS)):
-            found += _gathered(args.work / f"{folder.name}.json", folder)
-            sweeps_page.write(args.out, found, __doc__)
-    except EdgevprError as error:
-        print(f"sweeps: {error}", file=sys.stderr)
-        return error.exit_code
-    return 0
+def main() -> None:
+    rows: list[Row] = []
+    for folder in base.find_sets(names=SETS):
+        rows += _gathered(WORK / f"{folder.name}.json", folder)
+        found = {**base.made_by(), "rows": rows}
+        base.write("sweeps", found, page(found))
+        draw(rows, RESULTS / "sweeps.png")
 
 
-def _gathered(path: Path, folder: Path) -> list[dict]:
+def _gathered(path: Path, folder: Path) -> list[Row]:
     """Return what each technique finds of a set: what the file has of it, and the levels that it lacks, written one by
     one."""
     camera = camera_of(folder.name)
     found = [{"set": folder.name, "camera": camera, "technique": name, "levels": []} for name in TECHNIQUES]
-    if path.exists():
-        found = json.loads(path.read_text())
+    found = json.loads(path.read_text()) if path.exists() else found
     wanted = [(sweep, level) for sweep in SWEEPS for level in SWEEPS[sweep].of(camera)]
+    path.parent.mkdir(parents=True, exist_ok=True)
     for levels in swept(folder, wanted[len(found[0]["levels"]) :]):
         for row, level in zip(found, levels, strict=True):
-            row["levels"].append(asdict(level))
+            row["levels"].append(level)
         path.with_suffix(".new").write_text(json.dumps(found))
         path.with_suffix(".new").replace(path)
     return found
 
 
-def swept(folder: Path, wanted: list[tuple[str, float]]) -> Iterator[list[Level]]:
+def swept(folder: Path, wanted: list[tuple[str, float]]) -> Iterator[list[Row]]:
     """Ask in the maps of a set, at the wanted levels of sweeps; yield a level of each technique."""
     if not wanted:
         return
     camera = camera_of(folder.name)
     starts = list(_over_mosaic(folder) if camera == "nadir" else _ahead(folder))
     with ExitStack() as stack:
-        asked = [_opened(stack, folder, name, camera) for name in TECHNIQUES]
+        asked = []
+        for name in TECHNIQUES:
+            technique, shown = create(name, {"camera": camera} if name == "cohog" else {}), Shown()
+            place_map, index, _ = stack.enter_context(walks.map_of(folder, technique, folder / "ref"))
+            walk = walks.walk(place_map, index, technique, levelling=shown)
+            asked.append(Asked(walk, shown, walks.names_of(place_map, index)))
         unchanged = None
         for sweep, level in wanted:
             if level != NONE.get(sweep, 0):
                 yield _asked(asked, starts, camera, sweep, level)
             else:
                 unchanged = unchanged or _asked(asked, starts, camera, sweep, level)
-                yield [replace(each, sweep=sweep, level=level) for each in unchanged]
+                yield [{**each, "sweep": sweep, "level": level} for each in unchanged]
 
 
-def _opened(stack: ExitStack, folder: Path, name: str, camera: str) -> Asked:
-    """Make the map of a technique, and open it as it flies."""
-    config, shown = load_config(None), Shown()
-    technique = create(name, {"camera": camera} if name == "cohog" else {})
-    meter = meter_of(config, load_board("this"))
-    frames = all_frames(open_source(str(folder / "ref"), live=False))
-    place_map, index = stack.enter_context(mapped(frames, technique, meter, folder / "ref"))
-    walk = Recogniser(
-        technique=technique,
-        place_map=place_map,
-        index=index,
-        rule=accept_rule(technique, config.match, 1, calibration_of(place_map)),
-        meter=meter,
-        candidates=technique.candidates,
-        levelling=shown,
-    )
-    names = {place.place_id: place.source_image for place in place_map.places()}
-    return Asked(walk=walk, shown=shown, names=tuple(names[place_id] for place_id in index.place_ids.tolist()))
-
-
-def _asked(asked: list[Asked], starts: list[Start], camera: str, sweep: str, level: float) -> list[Level]:
-    """Ask every technique for the place of every start, at one level of a sweep."""
-    shares, found = [], [Found() for _ in asked]
+def _asked(asked: list[Asked], starts: list[Start], camera: str, sweep: str, level: float) -> list[Row]:
+    """Ask every technique for the place of every start, at one level of a sweep: how many were `asked`, how much of
+    their views showed anything, and which were accepted for which wrong place."""
+    shares, found = [], [{"hits": [], "accepted": 0, "wrong": []} for _ in asked]
     for number, start in enumerate(starts):
         rng = np.random.default_rng((number, list(SWEEPS).index(sweep)))
         change = view(camera, sweep, level, start.size, rng) if sweep in OF_CAMERA else np.eye(3)
@@ -204,26 +146,24 @@ def _asked(asked: list[Asked], starts: list[Start], camera: str, sweep: str, lev
         ignored = start.ignored | _overlapping(start, change @ start.onto)
         for each, of_it in zip(asked, found, strict=True):
             each.shown.mask = None if mask.all() else mask
-            event = each.walk.step(Frame(image=image, name=start.name, t_mono_s=0.0))
-            if event.failed:
-                raise EdgevprError(event.reason)
-            ranked = [each.names[slot] for slot in event.ranking.slots] if event.ranking else []
-            of_it.hits.append(next((place for place in ranked if place not in ignored), None) in start.right)
-            of_it.accepted += event.accepted
+            event = each.walk.step(walks.frame(image, start.name))
+            ranked = walks.ranked(event, each.names)
+            of_it["hits"].append(next((place for place in ranked if place not in ignored), None) in start.right)
+            of_it["accepted"] += event.accepted
             if event.accepted and ranked[0] not in start.right | ignored:
-                of_it.wrong.append((start.name, ranked[0]))
+                of_it["wrong"].append((start.name, ranked[0]))
     return [
-        Level(
-            sweep=sweep,
-            level=level,
-            asked=len(shares),
-            shown=round(float(np.mean(shares)), 3) if shares else 0.0,
-            recall_at_1=round(float(np.mean(each.hits)), 4) if shares else None,
-            recall_at_1_interval=interval(np.array(each.hits)) if shares else None,
-            accepted=each.accepted,
-            accepted_wrong=len(each.wrong),
-            wrong=each.wrong,
-        )
+        {
+            "sweep": sweep,
+            "level": level,
+            "asked": len(shares),
+            "shown": round(float(np.mean(shares)), 3) if shares else 0.0,
+            "recall_at_1": round(float(np.mean(each["hits"])), 4) if shares else None,
+            "recall_at_1_interval": interval(np.array(each["hits"])) if shares else None,
+            "accepted": each["accepted"],
+            "accepted_wrong": len(each["wrong"]),
+            "wrong": each["wrong"],
+        }
         for each in found
     ]
 
@@ -259,9 +199,7 @@ def _over_mosaic(folder: Path) -> Iterator[Start]:
     for name in every:
         if name in on.middle:
             image = read_image(folder / "ref" / name)
-            cos, sin = on.scale[name] * np.cos(on.turn[name]), on.scale[name] * np.sin(on.turn[name])
-            turned = np.array([[cos, -sin], [sin, cos]])
-            there = np.vstack([np.column_stack([turned, on.middle[name] - turned @ middle(image)]), [0, 0, 1]])
+            there = np.vstack([on.matrix(name, image), [0, 0, 1]])
             onto[name], lies[name] = np.linalg.inv(there), through(there, corners(image))
             sizes[name] = image.shape[1::-1]
     starts = []
@@ -283,8 +221,7 @@ def _over_mosaic(folder: Path) -> Iterator[Start]:
 
 def _ahead(folder: Path) -> Iterator[Start]:
     """Start from the queries of a set that looks ahead."""
-    dataset = load_dataset(folder / "query", folder / "ref", folder / "ground_truth.csv")
-    for query in _some(dataset.queries):
+    for query in _some(walks.dataset_of(folder).queries):
         image = read_image(query.path)
         yield Start(
             name=query.path.name,
@@ -303,5 +240,62 @@ def _some(starts):
     return [starts[at] for at in np.unique(np.linspace(0, len(starts) - 1, _MOST_ASKED).round().astype(int))]
 
 
+def page(found: Row) -> str:
+    """Return the page for people."""
+    parts = ["# How far off the map", base.told(__doc__, "What is measured")]
+    parts.append("![recall@1 and accepted queries against each change](sweeps.png)")
+    for name, rows in base.groups(found["rows"], lambda row: row["set"]):
+        columns = {"change": "{change}", "level": "{level:g}", "asked": "{asked}", "shown": "{shown:.2f}"}
+        columns |= {row["technique"]: f"{{{row['technique']}}}" for row in rows}
+        lines = []
+        for levels in zip(*(row["levels"] for row in rows), strict=True):
+            sweep = SWEEPS[levels[0]["sweep"]]
+            cells = ("{recall_at_1:.2f} ({accepted}, {accepted_wrong})", [row["technique"] for row in rows])
+            told = {name: base.cell(cells[0], level) for name, level in zip(cells[1], levels, strict=True)}
+            lines.append({**levels[0], "change": f"{sweep.title}, {sweep.unit}", **told})
+        parts.append(f"## {name} ({base.use_of(name).replace('tune', 'tuned on')})")
+        parts.append("recall@1; in brackets accepted and, of these, wrong.")
+        parts.append(base.table(lines, columns))
+    return "\n\n".join([*parts, base.made_line(found, "make sweeps")])
+
+
+def draw(found: list[Row], path: Path) -> None:
+    """Draw recall against each change, two lines of panels a set, and of `cohog` what was accepted."""
+    sets = dict(base.groups(found, lambda row: row["set"]))
+    columns = -(-len(SWEEPS) // 2)
+    drawn, axes = base.panels(2.3 * columns, 4.4 * len(sets), 2 * columns * len(sets), 2 * len(sets), sharey=True)
+    for number, (name, rows) in enumerate(sets.items()):
+        of_set = axes[2 * columns * number :][: 2 * columns]
+        of_set[0].set_ylabel(f"{name}\n({base.use_of(name)})", fontsize=9)
+        for axis, (key, sweep) in zip(of_set, SWEEPS.items(), strict=False):
+            for colour, row in enumerate(rows):
+                _curve(axis, row, key, "tab:orange" if row["technique"] == "cohog" else f"C{colour + (colour > 0)}")
+            axis.set(xlabel=sweep.unit, ylim=(-0.03, 1.03))
+            axis.set_title(sweep.title, fontsize=9)
+        for axis in of_set[len(SWEEPS) :]:
+            axis.set_visible(False)
+    handles, labels = axes[0].get_legend_handles_labels()
+    drawn.legend(handles, labels, loc="outside lower center", ncols=6, fontsize=9, frameon=False)
+    base.save(drawn, path, 70)
+
+
+def _curve(axis, row: Row, sweep: str, colour: str) -> None:
+    levels = [level for level in row["levels"] if level["sweep"] == sweep and level["asked"]]
+    name, at = row["technique"], [level["level"] for level in levels]
+    recall, width = [level["recall_at_1"] for level in levels], 2 if name == "cohog" else 0.9
+    axis.plot(at, recall, "o-", ms=1.5 * width, lw=width, color=colour, label=f"{name}, recall@1")
+    if name == "cohog":
+        right = [(level["accepted"] - level["accepted_wrong"]) / level["asked"] for level in levels]
+        axis.plot(at, right, "--", color=colour, label="cohog, accepted and right")
+        wrong = [level["accepted_wrong"] / level["asked"] or None for level in levels]
+        axis.plot(at, wrong, "x", color="red", ms=5, zorder=9, label="cohog, accepted and wrong")
+    if sweep in ("dark", "height"):
+        axis.set_xscale("log")
+        axis.set_xticks(at[::2], [f"{level:g}" for level in at[::2]])
+        axis.minorticks_off()
+    if sweep in ("dark", "jpeg") and not axis.xaxis_inverted():
+        axis.invert_xaxis()
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    base.run(main)

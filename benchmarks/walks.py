@@ -31,9 +31,9 @@ def dataset_of(folder: Path) -> Dataset:
     return load_dataset(folder / "query", folder / "ref", folder / "ground_truth.csv")
 
 
-def config() -> Config:
-    """Return the configuration that nobody has changed."""
-    return load_config(None)
+def config(**keys: object) -> Config:
+    """Return the configuration with these keys, `map` for example, and otherwise as nobody has changed it."""
+    return load_config(None, keys)
 
 
 def meter() -> QueryMeter:
@@ -57,10 +57,13 @@ def cohog(camera: str) -> Technique:
 
 
 @contextmanager
-def map_of(folder: Path, technique: Technique | None = None) -> Iterator[tuple[PlaceMap, PlaceIndex, Technique]]:
-    """Map the references of a set as `map build` does, by `cohog` unless another technique is named."""
+def map_of(
+    folder: Path, technique: Technique | None = None, images: Path | None = None
+) -> Iterator[tuple[PlaceMap, PlaceIndex, Technique]]:
+    """Map the references of a set, by `cohog` unless another technique is named. The map is refined and calibrated as
+    `map build` does where `images` names their folder, from which pictures are read again."""
     technique = technique or cohog(base.camera_of(folder.name))
-    with mapped(frames_of(folder / "ref"), technique, meter(), folder / "ref") as (place_map, index):
+    with mapped(frames_of(folder / "ref"), technique, meter(), images) as (place_map, index):
         yield place_map, index, technique
 
 

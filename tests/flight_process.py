@@ -57,7 +57,7 @@ def wait_for(kind: str, log: Path, process: subprocess.Popen) -> dict[str, Any]:
     raise RuntimeError(f"no line `{kind}` in {log} after {_PATIENCE_S:g} s")
 
 
-def memory_mb(pid: int) -> dict[str, float]:
+def memory_mb(pid: int | str) -> dict[str, float]:
     """VmHWM (the largest resident set so far), VmRSS, Pss, ... of a process, MB of 10^6 bytes; {} once it has ended."""
     try:
         text = Path(f"/proc/{pid}/status").read_text() + Path(f"/proc/{pid}/smaps_rollup").read_text()
