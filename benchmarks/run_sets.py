@@ -29,7 +29,7 @@ from edgevpr.lab.evaluate.asking import MatchOptions
 from edgevpr.lab.evaluate.dataset import load_dataset
 from edgevpr.lab.evaluate.evaluate import compare, evaluate
 from edgevpr.runtime.preflight.accuracy import PATH as ACCURACY
-from edgevpr.techniques.networks.session import file_sha256
+from edgevpr.techniques.session import file_sha256
 
 FIVE_PLACES = "five places only: made for studies of change, recall on them says nothing"
 JOINED = "aerial_joined"  # all sets from the air as one map: the rows that are measured on it

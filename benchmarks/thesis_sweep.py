@@ -17,8 +17,7 @@ from edgevpr.lab.evaluate.dataset import Dataset
 from edgevpr.lab.evaluate.metrics import figures
 from edgevpr.techniques.displacement import share
 from edgevpr.techniques.entropy import block_means, filled_bins, good_blocks, shannon
-from edgevpr.techniques.gradients import grey_square, levels, normalised_blocks, oriented_cells
-from edgevpr.techniques.patterns import slow_patterns
+from edgevpr.techniques.gradients import grey_square, levels, normalised_blocks, oriented_cells, slow_patterns
 
 W1, W2, BINS, GT = 512, 16, 8, 0.5  # thesis 6.3.2
 THESIS, VOTE = "mean of cosines (6.2.3)", "displacement vote"

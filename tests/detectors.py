@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 from edgevpr.runtime.preflight.networks import card_text
-from edgevpr.techniques.networks.session import file_sha256
+from edgevpr.techniques.session import file_sha256
 
 FILES = Path(os.environ.get("EDGEVPR_DETECTORS") or Path(__file__).resolve().parents[2] / "shared" / "models")
 NAMES = ("fastestdet", "nanodet_m_320", "yolox_nano")

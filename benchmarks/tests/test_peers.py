@@ -11,7 +11,7 @@ import pytest
 from peers import modern, ways
 from pictures import textured
 
-from edgevpr.techniques.networks.card import read_card
+from edgevpr.techniques.card import read_card
 
 ROOT = Path(__file__).parents[1]
 NEEDS = {"CoHOG, published": "skimage", "pydbow": "dbow", "FAISS on cohog's codes": "faiss"}

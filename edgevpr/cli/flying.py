@@ -80,7 +80,7 @@ def run_match(args: Namespace) -> int:
     from edgevpr.power.boards import load_board
     from edgevpr.runtime.recognise.opening import open_recogniser
     from edgevpr.runtime.recognise.recognition import fields_of
-    from edgevpr.techniques.networks.card import weights_of
+    from edgevpr.techniques.card import weights_of
 
     config = config_of(args, args.config, map=args.map)
     recogniser = open_recogniser(

@@ -171,7 +171,7 @@ def models_verify(args: Namespace) -> int:
     """Run networks, and say what they take."""
     from edgevpr.power.boards import load_board
     from edgevpr.runtime.preflight.networks import verify
-    from edgevpr.techniques.networks.card import card_names, load_card
+    from edgevpr.techniques.card import card_names, load_card
 
     threads = load_board("this").threads
     names = [args.name] if args.name else card_names()

@@ -2,7 +2,7 @@
 
 import importlib
 import inspect
-from dataclasses import dataclass
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -10,33 +10,25 @@ from edgevpr.core.contract import Technique
 from edgevpr.core.errors import EdgevprError, UsageError
 from edgevpr.core.text import meant
 
-
-@dataclass(frozen=True, slots=True)
-class _Own:
-    """A technique of edgevpr itself: the location of its class (`where`), and the output of its `model` that it uses
-    (None: it has no model)."""
-
-    where: str
-    network_output: str | None = None
-
-
-# The first ones are offered to a board automatically, best first: see AUTOMATIC.
-_REGISTRY = {
-    "cohog": _Own("edgevpr.techniques.cohog:CoHog"),
-    "hog": _Own("edgevpr.techniques.hog:Hog"),
-    "seqslam": _Own("edgevpr.techniques.seqslam:SeqSlam"),
-    "calc": _Own("edgevpr.techniques.calc:Calc", "descriptor"),
-    "alexnet": _Own("edgevpr.techniques.alexnet:AlexNet", "features"),
-    "amosnet": _Own("edgevpr.techniques.amosnet:AmosNet", "features"),
-    "hybridnet": _Own("edgevpr.techniques.hybridnet:HybridNet", "features"),
-    "netvlad": _Own("edgevpr.techniques.netvlad:NetVlad", "features"),
-    "rmac": _Own("edgevpr.techniques.rmac:RMac", "features"),
-    "region_vlad": _Own("edgevpr.techniques.region_vlad:RegionVlad", "features"),
-    "cross_region_bow": _Own("edgevpr.techniques.cross_region_bow:CrossRegionBow", "features"),
+# The module of each technique of edgevpr itself, what makes it, and the output of its `model` that it uses (None: it
+# has no model). The first ones are offered to a board automatically, best first: see AUTOMATIC.
+_OWN: dict[str, tuple[str, str, str | None]] = {
+    "cohog": ("cohog", "CoHog", None),
+    "hog": ("vectors", "Hog", None),
+    "seqslam": ("seqslam", "SeqSlam", None),
+    "calc": ("network", "calc", "descriptor"),
+    "alexnet": ("network", "alexnet", "features"),
+    "amosnet": ("network", "amosnet", "features"),
+    "hybridnet": ("network", "hybridnet", "features"),
+    "netvlad": ("network", "netvlad", "features"),
+    "rmac": ("regions", "rmac", "features"),
+    "region_vlad": ("network", "region_vlad", "features"),
+    "cross_region_bow": ("regions", "cross_region_bow", "features"),
 }
 # If several fit a board, the first is taken. Networks must be asked for: they need onnxruntime in RAM, and weights that
 # a person has chosen. So must `seqslam`: a sequence needs a flight along the mapped route.
 AUTOMATIC = ("cohog", "hog")
+_WORDS = {int: "a whole number", float: "a number", str: "a word"}
 
 
 def names() -> tuple[str, ...]:
@@ -45,25 +37,27 @@ def names() -> tuple[str, ...]:
 
     A card that cannot be read is left out here. Asking for it by name raises an error that says what is wrong.
     """
-    return (*_REGISTRY, *(name for name in _cards() if not is_own(name)))
+    from edgevpr.techniques.card import card_names
+
+    return (*_OWN, *(name for name in card_names() if not is_own(name) and _is_technique(name)))
 
 
 def is_own(name: str) -> bool:
     """Tell whether edgevpr itself has a technique of this name. A card of the same name is then only its `model`."""
-    return name in _REGISTRY
+    return name in _OWN
 
 
 def is_known(name: str) -> bool:
     """Tell whether there is a technique, or the card of a network, of this name."""
-    from edgevpr.techniques.networks.card import card_names
+    from edgevpr.techniques.card import card_names
 
-    return name in _REGISTRY or name in card_names()
+    return name in _OWN or name in card_names()
 
 
 def parameters(name: str) -> dict[str, Any]:
     """Return the parameters of the technique `name` and their defaults. Raises UsageError for an unknown technique or a
     network that gives feature maps only, ModelError for a card that cannot be read."""
-    return {key: p.default for key, p in inspect.signature(_class(name)).parameters.items()}
+    return {key: p.default for key, p in inspect.signature(_maker(name)).parameters.items()}
 
 
 def labelled(name: str, form: str | None) -> str:
@@ -75,7 +69,7 @@ def labelled(name: str, form: str | None) -> str:
 def network_output(name: str) -> str | None:
     """Return the output of its `model` that the technique `name` uses, "features" or "descriptor"; None: it has no
     model."""
-    return _REGISTRY[name].network_output if is_own(name) else None
+    return _OWN[name][2] if is_own(name) else None
 
 
 def create(name: str, settings: dict[str, Any] | None = None) -> Technique:
@@ -95,17 +89,19 @@ def create(name: str, settings: dict[str, Any] | None = None) -> Technique:
         try:
             values[key] = kind(value)
         except ValueError:
-            raise UsageError(f"{name}: `{key}` is {value!r}; it must be {_words[kind]}.") from None
-    return _class(name)(**values)
+            raise UsageError(f"{name}: `{key}` is {value!r}; it must be {_WORDS[kind]}.") from None
+    return _maker(name)(**values)
 
 
-def _class(name: str) -> Any:
-    if name in _REGISTRY:
-        module, _, class_name = _REGISTRY[name].where.partition(":")
-        return getattr(importlib.import_module(module), class_name)
+def _maker(name: str) -> Callable[..., Technique]:
+    """Return what makes the technique: its keyword parameters and their defaults are those of the technique."""
+    if is_own(name):
+        module, maker, _ = _OWN[name]
+        own: Callable[..., Technique] = getattr(importlib.import_module(f"edgevpr.techniques.{module}"), maker)
+        return own
     if not is_known(name):
         raise UsageError(f"There is no technique `{name}`: use one of {', '.join(names())}.")
-    from edgevpr.techniques.networks.card import load_card
+    from edgevpr.techniques.card import load_card
 
     card = load_card(name)
     if not card.is_technique:
@@ -113,22 +109,15 @@ def _class(name: str) -> Any:
             f"The network `{name}` gives feature maps only: use it as the `model` of a technique, or name a head on "
             "its card."
         )
-    from edgevpr.techniques.network import CardNetwork
+    from edgevpr.techniques.network import of_card
 
-    return partial(CardNetwork, card)
-
-
-def _cards() -> list[str]:
-    from edgevpr.techniques.networks.card import card_names, load_card
-
-    found = []
-    for name in card_names():
-        try:
-            if load_card(name).is_technique:
-                found.append(name)
-        except EdgevprError:
-            continue
-    return found
+    return partial(of_card, card)
 
 
-_words = {int: "a whole number", float: "a number", str: "a word"}
+def _is_technique(card: str) -> bool:
+    from edgevpr.techniques.card import load_card
+
+    try:
+        return load_card(card).is_technique
+    except EdgevprError:
+        return False

@@ -1,11 +1,15 @@
-"""Oriented gradient histograms over cells and blocks, shared by `hog` and `cohog`.
+"""Oriented gradient histograms over cells and blocks, shared by `hog` and `cohog`, and the slow patterns of blocks.
 
 A map made on one processor flies on another, so all steps are rounded alike on all of them: products, sums and roots
 one by one. Fused steps of OpenCV, and products of matrices, would be rounded otherwise on each.
 """
 
+from functools import lru_cache
+
 import cv2
 import numpy as np
+
+from edgevpr.core.arrays import Image, Mask, Singles
 
 _STRIP_ROWS = 64  # rows computed at once, so that the planes of a strip stay in cache
 _SIGN_BIT = np.uint32(1 << 31)
@@ -24,6 +28,14 @@ _ORIENTATIONS = np.array(
         [0, 0.25, 0, -0.25, 0, 0.25, 0, -0.25],
     ],
     np.float32,
+)
+# Weights of the cells top left, top right, bottom left, bottom right, and the frequencies over the orientations that
+# are kept with them (None: all).
+_KEPT = (
+    ((1, 1, 1, 1), None),
+    ((1, -1, 1, -1), (0, 1, 2)),
+    ((1, 1, -1, -1), (0, 1, 2)),
+    ((1, -1, -1, 1), (1,)),
 )
 
 
@@ -47,6 +59,20 @@ def mask_square(mask: np.ndarray | None, side_px: int) -> np.ndarray | None:
     if mask is None:
         return None
     return cv2.resize(mask.astype(np.uint8), (side_px, side_px), interpolation=cv2.INTER_NEAREST).astype(bool)
+
+
+def in_square(image: Image, mask: Mask | None) -> tuple[Image, Mask]:
+    """Lay a picture into the middle of a square. Returns the square, and bool (side, side): part of the picture and
+    allowed."""
+    height, width = image.shape[:2]
+    side = max(height, width)
+    top, left = (side - height) // 2, (side - width) // 2
+    border = top, side - height - top, left, side - width - left
+    allowed = np.ones((height, width), bool) if mask is None else mask
+    return (
+        cv2.copyMakeBorder(image, *border, cv2.BORDER_REPLICATE),
+        cv2.copyMakeBorder(allowed.astype(np.uint8), *border, cv2.BORDER_CONSTANT, value=0).astype(bool),
+    )
 
 
 def oriented_cells(
@@ -162,3 +188,46 @@ def normalised_blocks(cells: np.ndarray) -> np.ndarray:
     length = np.sqrt(np.add.reduce(blocks * blocks, axis=2))
     blocks /= np.maximum(length, 1e-6)[:, :, None]
     return blocks
+
+
+def unit_rows(rows: Singles) -> Singles:
+    """Scale each row of (N, D) to length 1; a zero row stays zero."""
+    unit: Singles = rows / np.maximum(np.sqrt(np.einsum("ij,ij->i", rows, rows)), 1e-6)[:, None]
+    return unit
+
+
+@lru_cache
+def slow_patterns(bins: int) -> np.ndarray:
+    """Return the patterns that hold most of the information of a block of 2x2 cells of `bins` orientations, each of
+    length 1 and at right angles to all others: float32 (4 bins, patterns), one pattern per column.
+
+    A block is written as waves over the cells (their mean, left against right, top against bottom, and diagonal against
+    diagonal) and over the orientations (the frequencies of a Fourier series). Most of its power lies in the slow waves.
+    Of the 32 patterns of 8 orientations, the 20 with the most power on the data sets used for tuning are kept. This
+    shortens the product that compares all blocks with all blocks by as much, and recall does not fall.
+    """
+    frequency = _frequencies(bins)
+    return np.vstack(
+        [
+            np.kron(np.array(cells) / 2, wave)
+            for cells, kept in _KEPT
+            for at, wave in zip(frequency, waves(bins), strict=True)
+            if kept is None or at in kept
+        ]
+    ).T.astype(np.float32, order="C")
+
+
+@lru_cache
+def waves(bins: int) -> np.ndarray:
+    """Return the real Fourier series over `bins` orientations: float32 (bins, bins), one wave per row, each of length
+    1. The constant comes first, then cosine and sine of each frequency; the highest of an even number of bins has a
+    cosine only."""
+    turn = 2 * np.pi * np.arange(bins) / bins
+    frequency, number = _frequencies(bins), np.arange(bins)
+    series = np.cos(frequency[:, None] * turn - np.pi / 2 * (number[:, None] % 2 == 0) * (number[:, None] > 0))
+    return (series / np.linalg.norm(series, axis=1, keepdims=True)).astype(np.float32)
+
+
+def _frequencies(bins: int) -> np.ndarray:
+    """Return the frequency of each of the `waves`: int (bins,)."""
+    return (np.arange(bins) + 1) // 2

@@ -1,76 +1,218 @@
-"""A network as a technique: a card that makes a vector by itself is a technique of the card's name, without any
-code."""
+"""Techniques that make one vector by a network: a head on its feature map, or the vector that it gives by itself.
 
-import hashlib
-import json
+A card that makes a vector by itself is a technique of the card's name, without any code. The techniques of the thesis
+take their parameters: `model` is the card of the weights, and `form` and `threads` are of this machine.
+"""
+
 from collections.abc import Callable
 from functools import partial
 
 import numpy as np
 
-from edgevpr.techniques.heads import pooling, projection, rmac, vlad, words
-from edgevpr.techniques.networks.card import Card, head_parameters
-from edgevpr.techniques.networks.session import Backbone, backbone_of
+from edgevpr.core.arrays import Image, Mask, Singles
+from edgevpr.core.errors import UsageError
+from edgevpr.techniques import pooling
+from edgevpr.techniques.card import Card, digest_of, head_parameters
+from edgevpr.techniques.regions import describe, find_regions, region_backbone
+from edgevpr.techniques.session import Backbone, backbone_of, open_backbone
 from edgevpr.techniques.vectors import NEVER, VectorTechnique
+from edgevpr.techniques.words import Words, load_words, local_descriptors, sharpness_of, vlad
 
-Head = Callable[[np.ndarray], np.ndarray]
+# Minimum margins in the forms `float`, `8bit` and `1bit`. Beside them the largest margin of a wrong match, with the
+# shipped weights: on corridor and aerial_caliterra (the data sets used for tuning), and with the queries of one of them
+# in the map of the other. Other weights need other values.
+_MARGINS = {
+    "calc": (0.11, 0.15, 0.10),  # 0.089, 0.12, 0.078, also with the original weights
+    "alexnet": (0.15, 0.12, 0.1),  # 0.117, 0.094, 0.080
+    "amosnet": (0.04, 0.04, 0.155),  # 0.033, 0.032, 0.123
+    "hybridnet": (0.04, 0.04, 0.155),
+    "netvlad": (0.13, 0.105, 0.085),  # 0.104, 0.081, 0.067
+    "region_vlad": (0.075, 0.055, 0.03),  # 0.060, 0.042, 0.021
+}
+Head = Callable[[Singles], Singles]  # from an output of a network to a vector, float32 (D,)
+_POOLING: dict[str, Callable[..., Singles]] = {
+    "flatten": np.ravel,
+    "max": pooling.maximum,
+    "gem": pooling.gem,
+    "grid": pooling.grid,
+    "pyramid": pooling.pyramid,
+}
 
 
-class CardNetwork(VectorTechnique):
-    """The network of a card. Its vector is the output of the network or, if the card names a head, the result of the
-    head on the feature map. The model hash of a map covers all of this, so there are no parameters.
+class NetworkVector(VectorTechnique):
+    """The vector that a `head` makes of one output of a network. The head raises ModelError for a feature map that is
+    too small for it. `model_sha256` is that of all that a vector depends on (None: the network alone)."""
 
-    The margins of its wrong matches are unknown: no match is accepted until the configuration sets a minimum margin.
-    """
+    def __init__(
+        self,
+        name: str,
+        parameters: dict[str, int | float | str],
+        backbone: Backbone,
+        head: Head,
+        *,
+        form: str,
+        similarity: str = "cosine",
+        model_sha256: str | None = None,
+    ) -> None:
+        self._backbone, self._head = backbone, head
+        super().__init__(
+            name,
+            parameters,
+            len(head(np.zeros(backbone.shape, np.float32))),
+            form=form,
+            margins=_MARGINS.get(name, (NEVER,) * 3),
+            similarity=similarity,
+            model_sha256=model_sha256 or backbone.sha256,
+        )
 
-    min_margin = NEVER
-
-    def __init__(self, card: Card, form: str = "float", threads: int = 1) -> None:
-        self._backbone = backbone_of(card, "descriptor" if card.head is None else "features", threads)
-        self._head, words_sha256 = _head(card, self._backbone)
-        said = json.dumps([self._backbone.sha256, card.head, card.similarity, words_sha256], sort_keys=True)
-        sha256 = hashlib.sha256(said.encode()).hexdigest()
-        noise = np.random.default_rng(0).integers(0, 256, (card.input.height, card.input.width), np.uint8)
-        length = len(self.vector(noise, None))  # raises ModelError for a feature map too small for the head
-        super().__init__(card.name, {}, length, form=form, similarity=card.similarity, model_sha256=sha256)
-        self.encode(noise)  # raises ModelError for numbers that half precision cannot hold
-
-    def vector(self, image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
-        """Encode uint8 (H, W[, 3]) to float32 (D,)."""
+    def vector(self, image: Image, mask: Mask | None) -> Singles:
         return self._head(self._backbone.run(image, mask))
 
 
-def _head(card: Card, backbone: Backbone) -> tuple[Head, str | None]:
-    """Make the function of the card's head, from a feature map float32 (C, H, W) to (D,), and the hash of its learned
-    words (None: it has none)."""
+def calc(model: str = "calc", form: str = "float", threads: int = 1) -> NetworkVector:
+    """Make `calc`: the vector of a convolutional autoencoder that learned to give the HOG of a picture from a changed
+    copy of it, the output `descriptor` of the card `model`, compared by cosine.
+
+    Merrill and Huang, "Lightweight Unsupervised Deep Loop Closure", RSS 2018: 1064 numbers from a grey,
+    histogram-equalised picture of 160x120. The card of the network says how the picture is prepared.
+    """
+    return NetworkVector("calc", {"model": model}, open_backbone(model, "descriptor", threads), _itself, form=form)
+
+
+def alexnet(
+    *, model: str = "calc", form: str = "float", threads: int = 1, dims: int = 1064, seed: int = 0
+) -> NetworkVector:
+    """Make `alexnet`: all activations of one layer, reduced to `dims` by a Gaussian random projection that is drawn
+    from `seed`, compared by cosine.
+
+    Sünderhauf et al., "On the Performance of ConvNet Features for Place Recognition", IROS 2015, in the form of thesis
+    4.2.1: `conv3` of AlexNet, projected (see `pooling.Projection`). The 1064 dimensions are those of the public code of
+    the thesis's author. The form `1bit` is the locality-sensitive hash of the paper's section IV-D.
+    """
+    if not (8 <= dims <= 65_536 and 0 <= seed < 2**31):
+        raise UsageError(f"alexnet cannot use dims={dims}, seed={seed}: dims must be 8 to 65536, seed 0 or more.")
+    backbone = open_backbone(model, "features", threads)
+    head = pooling.gaussian_projection(int(np.prod(backbone.shape)), dims, seed)
+    return NetworkVector("alexnet", {"model": model, "dims": dims, "seed": seed}, backbone, head, form=form)
+
+
+def amosnet(model: str = "calc", form: str = "float", threads: int = 1, levels: int = 4) -> NetworkVector:
+    """Make `amosnet`: the largest activations over a pyramid of grids of 1x1 to `levels` x `levels` cells, compared by
+    L1 difference.
+
+    Chen et al., "Deep Learning Features at Scale for Visual Place Recognition", ICRA 2017, in the form of thesis 4.2.1:
+    `conv5` of a network trained on the places of SPED, with spatial pyramid pooling. Only its weights, trained from
+    scratch, make a network AMOSNet: give their card as `model`.
+
+    The vector is divided by its sum. The L1 difference then compares the distribution of the activations, not their
+    total, and lies in 0..2. On corridor and aerial_caliterra, the data sets used for tuning, this finds more places.
+    """
+    return _pyramid("amosnet", model, form, threads, levels)
+
+
+def hybridnet(model: str = "calc", form: str = "float", threads: int = 1, levels: int = 4) -> NetworkVector:
+    """Make `hybridnet`: as `amosnet`, with other weights (Chen et al., ICRA 2017; thesis 4.2.1).
+
+    HybridNet has the layers of AMOSNet. Its top five convolutional layers were started from CaffeNet instead of from
+    scratch. Only the weights differ, so give their card as `model`. With the same card both techniques are the same.
+    """
+    return _pyramid("hybridnet", model, form, threads, levels)
+
+
+def netvlad(
+    *, model: str = "calc", form: str = "float", threads: int = 1, words: int = 64, assignment: str = "soft"
+) -> NetworkVector:
+    """Make `netvlad`: VLAD of the activations at each position about `words` learned visual words, whitened, compared
+    by cosine. The `assignment` of a position to the words is "soft" or "hard".
+
+    Arandjelović et al., "NetVLAD: CNN architecture for weakly supervised place recognition", CVPR 2016, in the form of
+    thesis 4.2.1. The paper trains words and network together, for VGG-16. Here the words are learned afterwards
+    (`edgevpr train words`), which is how the paper starts (its section 3.1). The vector is whitened only if the file of
+    the words holds a whitening.
+    """
+    if assignment not in ("soft", "hard"):
+        raise UsageError(f"netvlad has no assignment `{assignment}`: use soft or hard.")
+    backbone = open_backbone(model, "features", threads)
+    learned = load_words(model, "vlad", words)
+    head = partial(_vlad, learned=learned, sharpness=sharpness_of(learned.words) if assignment == "soft" else None)
+    parameters = {"model": model, "words": words, "assignment": assignment}
+    return NetworkVector("netvlad", parameters, backbone, head, form=form, model_sha256=learned.sha256)
+
+
+def region_vlad(
+    *, model: str = "calc", form: str = "float", threads: int = 1, regions: int = 400, words: int = 256
+) -> NetworkVector:
+    """Make `region_vlad`: VLAD of the `regions` that the network marks, about `words` learned visual words, compared by
+    cosine; zeros for a picture without any region.
+
+    Khaliq et al., "A Holistic Visual Place Recognition Approach Using Lightweight CNNs for Significant ViewPoint and
+    Appearance Changes", T-RO 2019, in the form of thesis 4.2.1: 400 regions of `conv4`, 256 words. Regions have length
+    1 (see `regions`), and so has each word's part of the vector. The authors' code takes the signed square root of
+    these parts instead; on corridor and aerial_caliterra, the data sets used for tuning, that finds fewer places.
+    """
+    backbone = region_backbone("region_vlad", model, threads, regions)
+    learned = load_words(model, "regions", words)
+
+    def head(features: Singles) -> Singles:
+        return vlad(describe(features, find_regions(features, regions)), learned.words)
+
+    parameters = {"model": model, "regions": regions, "words": words}
+    return NetworkVector("region_vlad", parameters, backbone, head, form=form, model_sha256=learned.sha256)
+
+
+def of_card(card: Card, form: str = "float", threads: int = 1) -> NetworkVector:
+    """Make the technique of a card: the vector of the network or, if the card names a head, the result of the head on
+    the feature map. The model hash of a map covers all of this, so there are no parameters.
+
+    The margins of its wrong matches are unknown: no match is accepted until the configuration sets a minimum margin.
+    """
+    backbone = backbone_of(card, "descriptor" if card.head is None else "features", threads)
+    head, words_sha256 = _head_of_card(card, backbone)
+    sha256 = digest_of([backbone.sha256, card.head, card.similarity, words_sha256])
+    made = NetworkVector(card.name, {}, backbone, head, form=form, similarity=card.similarity, model_sha256=sha256)
+    noise = np.random.default_rng(0).integers(0, 256, (card.input.height, card.input.width), np.uint8)
+    made.encode(noise)  # raises ModelError for numbers that half precision cannot hold
+    return made
+
+
+def _head_of_card(card: Card, backbone: Backbone) -> tuple[Head, str | None]:
+    """Return the head of a card, and the hash of its learned words (None: it has none)."""
     if card.head is None:
-        return lambda vector: vector, None
-    asked = head_parameters(card)
-    if card.head["name"] == "vlad":
-        learned = words.load_words(card.name, "vlad", asked.words)
-        return partial(_vlad, learned=learned), learned.sha256
-    size, (_, height, width) = int(np.prod(backbone.shape)), backbone.shape
-    heads: dict[str, Callable[[], Head]] = {
-        "flatten": lambda: pooling.flatten,
-        "max": lambda: pooling.maximum,
-        "gem": lambda: partial(pooling.gem, p=asked.p),
-        "grid": lambda: partial(pooling.grid, rows=asked.rows, columns=asked.columns, how=asked.how),
-        "pyramid": lambda: partial(pooling.pyramid, levels=tuple(asked.levels)),
-        "projection": lambda: partial(_projected, by=projection.gaussian_projection(size, asked.length, asked.seed)),
-        "rmac": lambda: partial(_rmac, squares=rmac.square_regions(height, width)),
-    }
-    return heads[card.head["name"]](), None
+        return _itself, None
+    parameters, shape = head_parameters(card), backbone.shape
+    match card.head["name"]:
+        case "projection":
+            return pooling.gaussian_projection(int(np.prod(shape)), **parameters), None
+        case "rmac":
+            return partial(_rmac, squares=pooling.square_regions(*shape[1:])), None
+        case "vlad":
+            learned = load_words(card.name, "vlad", parameters["words"])
+            return partial(_vlad, learned=learned, sharpness=None), learned.sha256
+        case name:
+            return partial(_POOLING[name], **parameters), None
 
 
-def _projected(features: np.ndarray, by: projection.Projection) -> np.ndarray:
-    return by(features.ravel())
+def _itself(vector: Singles) -> Singles:
+    return vector
 
 
-def _rmac(features: np.ndarray, squares: list[tuple[int, int, int]]) -> np.ndarray:
-    return rmac.aggregate(rmac.regional_vectors(features, squares))
+def _pyramid(name: str, model: str, form: str, threads: int, levels: int) -> NetworkVector:
+    if not 1 <= levels <= 64:
+        raise UsageError(f"{name}: levels is {levels}; it must be 1 to 64.")
+
+    def head(features: Singles) -> Singles:
+        pooled = pooling.pyramid(features, range(1, levels + 1))
+        shares: Singles = pooled / max(float(np.abs(pooled).sum()), 1e-6)
+        return shares
+
+    backbone = open_backbone(model, "features", threads)
+    return NetworkVector(name, {"model": model, "levels": levels}, backbone, head, form=form, similarity="l1")
 
 
-def _vlad(features: np.ndarray, learned: words.Words) -> np.ndarray:
-    local = vlad.local_descriptors(features)
-    sums = vlad.residuals(local, learned.words, vlad.hard_weights(local, learned.words))
-    return words.whitened(vlad.intra_normalised(sums), learned)
+def _rmac(features: Singles, squares: list[pooling.Square]) -> Singles:
+    return pooling.unit(pooling.regional_vectors(features, squares).sum(axis=0))
+
+
+def _vlad(features: Singles, learned: Words, sharpness: float | None) -> Singles:
+    vector = vlad(local_descriptors(features), learned.words, sharpness)
+    return vector if learned.whitening is None else learned.whitening(vector)

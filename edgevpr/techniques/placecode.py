@@ -11,7 +11,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from edgevpr.techniques.patterns import waves
+from edgevpr.techniques.gradients import waves
 
 SIDE = 12  # cells along one side
 _SAMPLES = 3  # along one side of a cell: about one per block, for 31 blocks

@@ -20,7 +20,7 @@ import numpy as np
 
 from edgevpr.core.errors import ModelError
 from edgevpr.core.files import arrays_of, find_model, read_file
-from edgevpr.techniques.patterns import slow_patterns
+from edgevpr.techniques.gradients import slow_patterns
 
 DTYPE = "<u2"  # of a word
 SIDE = 10  # regions along one side

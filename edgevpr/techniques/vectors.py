@@ -1,4 +1,5 @@
-"""Techniques that make one vector of a picture: the three forms of a vector in RAM, and the comparison of two vectors.
+"""Techniques that make one vector of a picture, and `hog`, which needs no network for it: the three forms of a vector
+in RAM, and the comparison of two vectors.
 
 The map file keeps each vector in half precision. In RAM it is kept so (`float`) or, less the mean of the map, as one
 byte (`8bit`) or one bit (`1bit`) a number. The mean is common to all places: it does not help to tell them apart, and
@@ -6,14 +7,21 @@ takes most of the range of a byte. It changes while a map grows. So the file is 
 serves all forms.
 """
 
-from typing import ClassVar
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from edgevpr.core.arrays import Array, Bytes, Doubles, Image, Ints, Mask, Singles
 from edgevpr.core.config import FORMS
 from edgevpr.core.contract import Descriptor, PartSpec, TechniqueSpec
 from edgevpr.core.errors import ModelError, UsageError
-from edgevpr.techniques.hamming import hamming
+from edgevpr.techniques.gradients import grey_square, mask_square, normalised_blocks, oriented_cells
+
+try:
+    import simsimd  # optional: the scan of the form `1bit` takes about half the time, and gives the same numbers
+except ImportError:
+    simsimd = None
 
 # A margin that no match can reach. The margins of wrong matches are known for the weights that edgevpr ships. With
 # other weights no match is accepted until the configuration sets a minimum margin.
@@ -24,6 +32,13 @@ _BYTES_AT_ONCE = 4 << 20  # of places converted to float32 together
 _FEWEST_AT_ONCE = 16
 _BESIDE_BYTES = 8  # at the end of a row in 8 bits: its step and its length, both float32
 _WORD_BITS = 64  # a row in 1 bit is padded to whole words, whose bits are counted faster
+# Of binary vectors compared together: about a second-level cache. With smaller blocks the calls cost more than the
+# cache saves.
+_CODE_BYTES_AT_ONCE = 1 << 20
+_GROUP = 64  # places
+_PLACES_AT_ONCE = 1 << 13  # simsimd returns float64: with few places at once there is little to convert
+_EVEN_BYTES = np.uint64(0x00FF00FF00FF00FF)
+_ADD_LANES = np.uint64(0x0001000100010001)
 
 
 class VectorTechnique:
@@ -32,15 +47,13 @@ class VectorTechnique:
     `similarity` is "cosine", "l1" or "l2"; the form `1bit` always compares by Hamming distance. All scores are 0 to 1.
     For "cosine" the score in `float` is the cosine (0 where it is negative: unrelated), in `8bit` (1 + cosine) / 2 of
     the vectors less the mean. For "l1" and "l2" it is 1 / (1 + distance). In `1bit` it is the share of equal bits.
-    `accept` gives (min_score, min_margin) of a form, if they are not those of the class. With another `model` than the
-    shipped one, no match is accepted until the configuration sets a minimum margin.
+    `margins` are the minimum margins of the forms `float`, `8bit` and `1bit`. With another `model` than the shipped
+    one, no match is accepted until the configuration sets a minimum margin.
     """
 
     candidates = 1  # there is no fine part to compare
     min_score = 0.0
-    min_margin = 0.0
     min_quality = 0.5  # the quality is 0 or 1
-    accept: ClassVar[dict[str, tuple[float, float]]] = {}
 
     def __init__(
         self,
@@ -48,15 +61,15 @@ class VectorTechnique:
         parameters: dict[str, int | float | str],
         length: int,
         *,
-        form: str = "float",
+        form: str,
+        margins: tuple[float, ...],
         similarity: str = "cosine",
         model_sha256: str | None = None,
     ) -> None:
         if form not in FORMS:
             raise UsageError(f"{name} has no form `{form}`: use {', '.join(FORMS[:-1])} or {FORMS[-1]}.")
-        self.min_score, self.min_margin = self.accept.get(form, (self.min_score, self.min_margin))
-        if parameters.get("model", _SHIPPED) != _SHIPPED:
-            self.min_margin = NEVER
+        is_measured = parameters.get("model", _SHIPPED) == _SHIPPED
+        self.min_margin = margins[FORMS.index(form)] if is_measured else NEVER
         self._similarity, self._length = similarity, length
         packed = {
             "float": None,
@@ -74,12 +87,12 @@ class VectorTechnique:
             forms=FORMS,
         )
 
-    def vector(self, image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
+    def vector(self, image: Image, mask: Mask | None) -> Singles:
         """Make the vector of a uint8 image (H, W[, 3]): float32 (D,). Pixels where `mask` bool (H, W) is False must not
         count."""
         raise NotImplementedError
 
-    def encode(self, image: np.ndarray, mask: np.ndarray | None = None) -> Descriptor:
+    def encode(self, image: Image, mask: Mask | None = None) -> Descriptor:
         """Encode uint8 (H, W[, 3]) to coarse float16 (D,), of length 1 if the similarity is the cosine. A vector that
         is all zeros in half precision has quality 0. Raises ModelError for numbers beyond half precision."""
         vector = self.vector(image, mask)
@@ -94,7 +107,7 @@ class VectorTechnique:
         coarse = vector.astype("<f2")
         return Descriptor(coarse=coarse, quality=float(coarse.any()))
 
-    def pack(self, coarse: np.ndarray, mean: np.ndarray) -> np.ndarray:
+    def pack(self, coarse: Array, mean: Singles) -> Array:
         """Make the rows of the index in 8 or 1 bit: coarse float16 (N, D), the map's mean (D,) to (N, *row shape)."""
         rows = np.zeros((len(coarse), *self.spec.row.shape), self.spec.row.dtype)
         for block in _blocks(len(coarse), self._length):
@@ -113,55 +126,139 @@ class VectorTechnique:
     def coarse_scores(
         self,
         query: Descriptor,
-        rows: np.ndarray,
-        mean: np.ndarray | None = None,
-        turned_deg: np.ndarray | None = None,
+        rows: Array,
+        mean: Singles | None = None,
+        turned_deg: Doubles | None = None,
         height_ratio: float | None = None,
-    ) -> tuple[np.ndarray, None]:
+    ) -> tuple[Singles, None]:
         """Compare a query with all places: `rows` (N, *row shape) and the map's mean (D,), unless the form is `float`,
-        to scores float32 (N,), all 0 for a query of zeros. `turned_deg` and
-        `height_ratio` are ignored: these vectors know neither."""
-        asked = query.coarse.astype(np.float32)
-        if not asked.any():  # less the mean, zeros would resemble some place, and equal another picture of zeros
+        to scores float32 (N,), all 0 for a query of zeros. `turned_deg` and `height_ratio` are ignored: these vectors
+        know neither."""
+        vector = query.coarse.astype(np.float32)
+        if not vector.any():  # less the mean, zeros would resemble some place, and equal another picture of zeros
             return np.zeros(len(rows), np.float32), None
+        if mean is not None and self.spec.form != "float":
+            vector -= mean
         if self.spec.form == "1bit":
             code = np.zeros(self.spec.row.shape, np.uint8)
-            code[: -(-self._length // 8)] = np.packbits(asked > mean)
+            code[: -(-self._length // 8)] = np.packbits(vector > 0)
             return (1 - hamming(code, rows) / np.float32(self._length)).astype(np.float32, copy=False), None
-        if self.spec.form == "8bit":
-            asked -= mean
         scores = np.empty(len(rows), np.float32)
-        values = None
-        for block in _blocks(len(rows), self._length):
+        blocks = _blocks(len(rows), self._length)
+        values = np.empty((len(rows[blocks[0]]) if blocks else 0, self._length), np.float32)
+        for block in blocks:
             part = rows[block]
-            if values is None:
-                values = np.empty((len(part), self._length), np.float32)
             np.copyto(values[: len(part)], part[:, : self._length])
-            beside = part[:, self._length :]
-            step, length = np.ascontiguousarray(beside).view("<f4").T if beside.size else (None, None)
-            scores[block] = self._compared(asked, values[: len(part)], step, length)
+            beside = np.ascontiguousarray(part[:, self._length :]).view("<f4").T
+            scores[block] = self._compared(vector, values[: len(part)], beside)
         return scores, None
 
-    def _compared(
-        self, asked: np.ndarray, values: np.ndarray, step: np.ndarray | None, length: np.ndarray | None
-    ) -> np.ndarray:
-        """Score some places. In 8 bits a place is `values` times `step`, less the mean as `asked` is, and its length is
-        `length`. `values` is overwritten."""
+    def _compared(self, vector: Singles, values: Singles, beside: Singles) -> Singles:
+        """Score some places, float32 (n, D), which are overwritten. In 8 bits a place is `values` times its step, less
+        the mean as `vector` is, and `beside` float32 (2, n) are the steps and the lengths; else it is (0, n)."""
         if self._similarity == "cosine":
-            cosines = values @ asked
-            if step is None:
-                return np.clip(cosines, 0, 1, out=cosines)
-            cosines *= step
-            cosines /= np.maximum(length * np.linalg.norm(asked), np.finfo(np.float32).tiny)
-            return np.clip((1 + cosines) / 2, 0, 1)
-        if step is not None:
-            values *= step[:, None]
-        values -= asked
+            scores: Singles = values @ vector
+            if not len(beside):
+                return np.clip(scores, 0, 1, out=scores)
+            step, length = beside
+            scores *= step
+            scores /= np.maximum(length * np.linalg.norm(vector), np.finfo(np.float32).tiny)
+            return np.clip((1 + scores) / 2, 0, 1)
+        if len(beside):
+            values *= beside[0][:, None]
+        values -= vector
         if self._similarity == "l1":
-            return 1 / (1 + np.abs(values, out=values).sum(axis=1))
-        return 1 / (1 + np.sqrt(np.einsum("nd,nd->n", values, values)))
+            scores = 1 / (1 + np.abs(values, out=values).sum(axis=1))
+        else:
+            scores = 1 / (1 + np.sqrt(np.einsum("nd,nd->n", values, values)))
+        return scores
+
+
+class Hog(VectorTechnique):
+    """`hog`: one histogram-of-oriented-gradients vector for the whole image, compared by cosine. It has length 1 and is
+    kept in half precision (286 KB per place by default).
+
+    Dalal and Triggs 2005, in the form of thesis 4.2.1: 512x512 grey, cells of 8x8 pixels, blocks of 16x16 with a stride
+    of one cell, 9 orientations over 180 degrees.
+    """
+
+    def __init__(self, w1: int = 512, cell: int = 8, bins: int = 9, form: str = "float") -> None:
+        if not (cell >= 2 and w1 % cell == 0 and 2 * cell <= w1 <= 4096 and 2 <= bins <= 64):
+            raise UsageError(
+                f"hog cannot use w1={w1}, cell={cell}, bins={bins}: w1 must be a multiple of cell (at least 2 cells "
+                "of 2 pixels, at most 4096 pixels), bins 2 to 64."
+            )
+        self._w1, self._cell, self._bins = w1, cell, bins
+        length = (w1 // cell - 1) ** 2 * 4 * bins
+        # Every wrong match on corridor and aerial_caliterra (the data sets used for tuning) had a margin below 0.022
+        # (float), 0.024 (8bit), 0.017 (1bit).
+        margins = (0.03, 0.03, 0.02)
+        super().__init__("hog", {"w1": w1, "cell": cell, "bins": bins}, length, form=form, margins=margins)
+
+    def vector(self, image: Image, mask: Mask | None) -> Singles:
+        """Encode uint8 (H, W[, 3]) to float32 (length,); gradients where `mask` bool (H, W) is False are left out."""
+        grey = grey_square(image, self._w1)
+        allowed = mask_square(mask, self._w1)
+        cells = oriented_cells(grey, self._cell, self._bins, signed=False, allowed=allowed)
+        return normalised_blocks(cells).ravel()
 
 
 def _blocks(count: int, length: int) -> list[slice]:
     at_once = max(_BYTES_AT_ONCE // (4 * length), _FEWEST_AT_ONCE)
     return [slice(start, min(start + at_once, count)) for start in range(0, count, at_once)]
+
+
+def hamming(query: Bytes, codes: Bytes) -> Ints:
+    """Count the bits in which a query uint8 (B,) differs from each place uint8 (N, B): uint16 (N,), or uint32 for more
+    than 8191 bytes."""
+    return hamming_numpy(query, codes) if simsimd is None else hamming_simd(query, codes)
+
+
+def hamming_simd(query: Bytes, codes: Bytes) -> Ints:
+    """Compute `hamming` by simsimd, which must be importable."""
+    asked, places = query[None], np.ascontiguousarray(codes)
+    distances: Ints = np.empty(len(codes), _counts_of(codes))
+    for start in range(0, len(codes), _PLACES_AT_ONCE):
+        here = slice(start, start + _PLACES_AT_ONCE)
+        distances[here] = simsimd.hamming(asked, places[here], dtype="bin8")
+    return distances
+
+
+def hamming_numpy(query: Bytes, codes: Bytes) -> Ints:
+    """Compute `hamming` in NumPy: XOR and count, in the widest words that fit, block by block.
+
+    NumPy is slow along short axes. So a group of places is compared with as many copies of the query at once. The
+    counts of eight words are the bytes of one 64-bit number, and are added inside it.
+    """
+    length = codes.shape[1]
+    word = np.dtype(next(form for form in ("u8", "u4", "u2", "u1") if length % np.dtype(form).itemsize == 0))
+    words = length // word.itemsize
+    group = np.tile(query.view(word), _GROUP)
+    places = np.ascontiguousarray(codes).view(word)
+
+    block = min(max(1, _CODE_BYTES_AT_ONCE // (length * _GROUP)) * _GROUP, len(codes))
+    differ = np.empty((block, words), word)
+    counts = np.zeros((block, -(-words // 8) * 8), np.uint8)  # the words beyond the last stay zero
+    distances: Ints = np.empty(len(codes), _counts_of(codes))
+    for start in range(0, len(codes), max(1, block)):
+        part = places[start : start + block]
+        here, grouped = slice(0, len(part)), len(part) // _GROUP * _GROUP
+        np.bitwise_xor(part[:grouped].reshape(-1, group.size), group, out=differ[:grouped].reshape(-1, group.size))
+        np.bitwise_xor(part[grouped:], group[:words], out=differ[grouped : len(part)])
+        np.bitwise_count(differ[here], out=counts[here, :words])
+        distances[start : start + block] = _sums_of_bytes(counts[here].view(np.uint64))
+    return distances
+
+
+def _counts_of(codes: Bytes) -> type[np.unsignedinteger[Any]]:
+    return np.uint16 if 8 * codes.shape[1] < 1 << 16 else np.uint32
+
+
+def _sums_of_bytes(numbers: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Sum all bytes of each row: uint64 (n, k) to (n,); a byte is at most 64."""
+    sums = numbers >> 8
+    sums &= _EVEN_BYTES
+    sums += numbers & _EVEN_BYTES
+    sums *= _ADD_LANES
+    sums >>= 48
+    return sums[:, 0] if sums.shape[1] == 1 else sums.sum(axis=1)

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from edgevpr.core.arrays import Bools, Bytes, Ints, Mask, Singles
 from edgevpr.core.contract import Picture
 from edgevpr.techniques.placewords import QUARTERS, turned_blocks
 
@@ -34,21 +35,21 @@ _GLANCE_BY_CHANCE = {0.5: 0.53, 0.7: 0.73, 1.0: 1.0, 1.42: 1.8, 2.0: 2.4}
 
 # Encodes a square picture, float32 (side, side), with its allowed pixels, bool of the same shape or None, in cells of
 # so many pixels: blocks float32 (n, n, 4 bins), and which of them are good, bool (n, n).
-Encode = Callable[[np.ndarray, np.ndarray | None, int], tuple[np.ndarray, np.ndarray]]
+Encode = Callable[[Singles, Mask | None, int], tuple[Singles, Bools]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Asking:
+class ViewRegions:
     """The good regions of a view: their `numbers` int (G,), row by row on a grid of `side` x `side`, and `regions`
     float32 (G, P), each of length 1. A share of agreeing votes times `worth` is a score, and one of every `step`-th
     region times `worth_at_glance`."""
 
-    numbers: np.ndarray
-    regions: np.ndarray
+    numbers: Ints
+    regions: Singles
     side: int
-    worth: float = 1.0
-    step: int = _GLANCE[1.0]
-    worth_at_glance: float = 1.0
+    worth: float
+    step: int
+    worth_at_glance: float
 
 
 def hypothesis(number: int) -> tuple[float, int]:
@@ -62,24 +63,23 @@ def cells_along(cells: int, ratio: float) -> int:
     return cells + 2 * round(cells * (ratio - 1) / 2)
 
 
-def grid_numbers(good: np.ndarray, side: int) -> np.ndarray:
-    """Return the numbers of the good regions, bool (n, n), row by row on a grid of `side` x `side` with the same
-    middle: int (G,)."""
-    return np.flatnonzero(np.pad(good, (side - len(good)) // 2))
+def scale_of(cells: int, ratio: float) -> float:
+    """Return the exact height ratio of a view: of its cells along one side to those of a place."""
+    return cells_along(cells, ratio) / cells
 
 
 class Views:
     """The views of one query, each made when it is first asked for. `square` is that of the query as it is: its blocks
     float32 (n, n, 4 bins), and which of them are good, bool (n, n). Only views within a quarter turn are encoded: the
-    others have the same cells, turned."""
+    others have the same cells, turned. `seen` are the blocks that are wholly allowed, bool (n, n)."""
 
-    def __init__(self, picture: Picture, square: tuple[np.ndarray, np.ndarray], cell_px: int, encode: Encode) -> None:
-        self._picture, self._cell_px, self._encode = picture, cell_px, encode
+    def __init__(self, picture: Picture, square: tuple[Singles, Bools], cell_px: int, encode: Encode) -> None:
+        self._picture, self._cell_px, self._encode, self.seen = picture, cell_px, encode, picture.seen
         self._side, self._good = len(square[1]), max(int(square[1].sum()), 1)
         self._encoded = {(1.0, 0): square}
-        self._scaled: dict[float, tuple[np.ndarray, np.ndarray]] = {}
+        self._scaled: dict[float, tuple[Singles, Bytes]] = {}
 
-    def blocks(self, ratio: float, turn: int) -> tuple[np.ndarray, np.ndarray]:
+    def blocks(self, ratio: float, turn: int) -> tuple[Singles, Bools]:
         """Return the blocks float32 (n, n, 4 bins) of the view of a hypothesis, and which are good, bool (n, n)."""
         quarters, within = divmod(turn, WITHIN_QUARTER)
         if (ratio, within) not in self._encoded:
@@ -87,27 +87,21 @@ class Views:
         blocks, good = self._encoded[ratio, within]
         return turned_blocks(blocks, -quarters), np.rot90(good, -quarters)
 
-    def whole(self, ratio: float, turn: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the blocks float32 (G, 4 bins) of the good regions of a view, and their numbers int (G,) on a grid of
-        as many as `side_of` tells."""
-        blocks, good = self.blocks(ratio, turn)
-        return blocks[good], grid_numbers(good, self.side_of(ratio))
-
     def side_of(self, ratio: float) -> int:
         """Return the regions along one side of the grid of a view, no fewer than those of a place."""
         return max(cells_along(self._side + 1, ratio) - 1, self._side)
 
-    def asking(self, ratio: float, turn: int, described: Callable[[np.ndarray], np.ndarray]) -> Asking:
+    def regions(self, ratio: float, turn: int, described: Callable[[Singles], Singles]) -> ViewRegions:
         """Return all good regions of a view, `described` by (G, P) for (G, 4 bins)."""
         blocks, good = self.blocks(ratio, turn)
         side = self.side_of(ratio)
         if ratio > 1:
-            ground = (cells_along(self._side + 1, ratio) / (self._side + 1)) ** 2  # over that of the place
+            ground = scale_of(self._side + 1, ratio) ** 2  # over that of the place
             worth = ground * _LARGER_BY_CHANCE[ratio]  # no more than one in `ground` of the votes can agree
         else:
             worth = 1.0 if ratio == 1 else min(1.0, (int(good.sum()) / self._good) ** _BY_CHANCE)
-        return Asking(
-            numbers=grid_numbers(good, side),
+        return ViewRegions(
+            numbers=np.flatnonzero(np.pad(good, (side - len(good)) // 2)),  # on a grid with the same middle
             regions=described(blocks[good]),
             side=side,
             worth=worth,
@@ -115,7 +109,7 @@ class Views:
             worth_at_glance=_GLANCE_BY_CHANCE[ratio],
         )
 
-    def _picture_of(self, ratio: float, within: int) -> tuple[np.ndarray, np.ndarray, int]:
+    def _picture_of(self, ratio: float, within: int) -> tuple[Singles, Bools, int]:
         """Return the picture of a view, its allowed pixels, and the pixels of a cell. The picture is not enlarged,
         which would add pixels and nothing to see: its cells are smaller instead."""
         cell_px = self._cell_px if ratio <= 1 else max(2, self._cell_px // 2)

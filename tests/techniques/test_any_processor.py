@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from edgevpr.techniques import create, entropy
+from edgevpr.techniques.card import InputRule
 from edgevpr.techniques.gradients import grey_square, levels
-from edgevpr.techniques.networks.card import InputRule
-from edgevpr.techniques.networks.prepare import prepare
+from edgevpr.techniques.session import prepare
 
 _WORDS = [
     29, 690, 747, 54, 116, 894, 839, 498, 689, 90, 326, 674, 1003, 479, 98, 888, 496, 742, 8, 181, 3, 96, 318, 117,

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from edgevpr.techniques import hamming as scans
+from edgevpr.techniques import vectors as scans
 
 
 def _random(places: int, length: int) -> tuple[np.ndarray, np.ndarray]:

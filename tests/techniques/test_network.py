@@ -7,8 +7,8 @@ from tiny_networks import CARD, FEATURES, write_card, write_network
 
 from edgevpr import techniques
 from edgevpr.core.errors import ModelError, UsageError
-from edgevpr.techniques.heads import pooling, projection, rmac
-from edgevpr.techniques.networks.session import open_backbone
+from edgevpr.techniques import pooling
+from edgevpr.techniques.session import open_backbone
 
 CHANNELS, HIGH, WIDE = FEATURES
 HEADS = {
@@ -20,9 +20,9 @@ HEADS = {
     "projection": (
         {"length": 64, "seed": 5},
         64,
-        lambda f: projection.gaussian_projection(f.size, 64, 5)(f.ravel()),
+        lambda f: pooling.gaussian_projection(f.size, 64, 5)(f),
     ),
-    "rmac": ({}, CHANNELS, lambda f: rmac.aggregate(rmac.regional_vectors(f, rmac.square_regions(HIGH, WIDE)))),
+    "rmac": ({}, CHANNELS, lambda f: pooling.regional_vectors(f, pooling.square_regions(HIGH, WIDE)).sum(axis=0)),
 }
 
 

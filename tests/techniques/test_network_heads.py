@@ -10,9 +10,9 @@ from pictures import textured
 
 from edgevpr.core.errors import ModelError, UsageError
 from edgevpr.techniques import create
-from edgevpr.techniques.heads.regions import describe, find_regions
-from edgevpr.techniques.heads.vlad import local_descriptors
-from edgevpr.techniques.networks.session import open_backbone
+from edgevpr.techniques.regions import describe, find_regions
+from edgevpr.techniques.session import open_backbone
+from edgevpr.techniques.words import local_descriptors
 
 SETTINGS = {
     "alexnet": {"dims": 256},
@@ -33,7 +33,7 @@ def few_words(tmp_path_factory):
     backbone = open_backbone("calc", "features")
     features = [backbone.run(textured(seed)) for seed in (20, 21, 22)]
     local = np.concatenate([local_descriptors(each) for each in features])
-    found = np.concatenate([describe(each, find_regions(each, 60)[0]) for each in features])
+    found = np.concatenate([describe(each, find_regions(each, 60)) for each in features])
     for kind, points, count in (("vlad", local, 8), ("vlad", local, 9), ("regions", found, 12), ("bow", found, 40)):
         words = points[np.random.default_rng(0).permutation(len(points))[:count]]
         np.savez(folder / f"calc_{kind}{count}.npz", words=words.astype(np.float16), model_sha256=backbone.sha256)

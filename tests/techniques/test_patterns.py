@@ -6,7 +6,7 @@ from pictures import textured
 
 from edgevpr.techniques import create
 from edgevpr.techniques.displacement import displacement
-from edgevpr.techniques.patterns import slow_patterns, waves
+from edgevpr.techniques.gradients import slow_patterns, waves
 
 
 @pytest.mark.parametrize("bins", [2, 3, 5, 8, 9, 64])

@@ -7,8 +7,7 @@ import pytest
 from edgevpr.core.errors import ModelError, UsageError
 from edgevpr.techniques import placewords
 from edgevpr.techniques.cohog import CoHog
-from edgevpr.techniques.gradients import normalised_blocks, oriented_cells
-from edgevpr.techniques.patterns import slow_patterns
+from edgevpr.techniques.gradients import normalised_blocks, oriented_cells, slow_patterns
 
 SIDE = 31
 NONE = 1024

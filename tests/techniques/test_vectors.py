@@ -14,11 +14,8 @@ LENGTH = 131  # no multiple of anything
 class Given(VectorTechnique):
     """Encodes the vector that the test hands it as the image."""
 
-    accept = {"8bit": (0.1, 0.2)}  # noqa: RUF012
-    min_margin = 0.05
-
     def __init__(self, form="float", similarity="cosine", length=LENGTH):
-        super().__init__("given", {}, length, form=form, similarity=similarity)
+        super().__init__("given", {}, length, form=form, margins=(0.1, 0.2, 0.3), similarity=similarity)
 
     def vector(self, image, mask):
         return image
@@ -96,8 +93,7 @@ def test_sizes_of_a_place_in_ram():
 
 
 def test_a_form_may_have_its_own_rule():
-    assert (Given("8bit").min_score, Given("8bit").min_margin) == (0.1, 0.2)
-    assert (Given("1bit").min_score, Given("1bit").min_margin) == (0.0, 0.05)
+    assert [Given(form).min_margin for form in FORMS] == [0.1, 0.2, 0.3]
     with pytest.raises(UsageError, match="given has no form `2bit`: use float, 8bit or 1bit"):
         Given("2bit")
 

@@ -29,7 +29,7 @@ from edgevpr.runtime.recognise.evidence import kinds_of
 from edgevpr.runtime.recognise.opening import meter_of
 from edgevpr.runtime.recognise.salience_gate import Gate, NoGate
 from edgevpr.techniques import create, labelled
-from edgevpr.techniques.networks.card import weights_of
+from edgevpr.techniques.card import weights_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -12,7 +12,7 @@ from onnx import TensorProto, helper, numpy_helper
 from edgevpr.core.errors import EdgevprError
 from edgevpr.lab.training.network import CODE, FEATURES, LRN_ALPHA, LRN_BETA, LRN_SIZE, Encoder
 from edgevpr.lab.training.pictures import HEIGHT, WIDTH
-from edgevpr.techniques.networks.session import file_sha256
+from edgevpr.techniques.session import file_sha256
 
 LARGEST_DIFFERENCE = 1e-4
 _OPSET = 13

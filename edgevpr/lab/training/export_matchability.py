@@ -12,7 +12,7 @@ from torch import nn
 from edgevpr.lab.training.export import require_small, save
 from edgevpr.lab.training.matchability import FLOOR, HEIGHT, INPUT, SCALES, UNEVEN_SCALES, WIDTH, Small, Statistics
 from edgevpr.runtime.preflight.networks import card_text
-from edgevpr.techniques.networks.session import file_sha256
+from edgevpr.techniques.session import file_sha256
 
 _LAST = 2**31
 

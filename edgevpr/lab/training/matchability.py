@@ -18,7 +18,7 @@ from edgevpr.core.text import progress
 from edgevpr.lab.evaluate.metrics import roc_auc
 from edgevpr.lab.training.labels import MATCHED, Labelled
 from edgevpr.runtime.recognise.memorability import prepared_crops
-from edgevpr.techniques.networks.card import InputRule
+from edgevpr.techniques.card import InputRule
 
 HEIGHT, WIDTH = 48, 64  # of a crop
 INPUT = InputRule(

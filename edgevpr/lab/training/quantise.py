@@ -10,9 +10,8 @@ from edgevpr.core.files import own_models
 from edgevpr.core.yamlfile import read_yaml
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.runtime.preflight.networks import Verified, card_text, install, verify
-from edgevpr.techniques.networks.card import load_card, read_card
-from edgevpr.techniques.networks.prepare import prepare
-from edgevpr.techniques.networks.session import backbone_of, file_sha256
+from edgevpr.techniques.card import load_card, read_card
+from edgevpr.techniques.session import backbone_of, file_sha256, prepare
 
 _MOST_IMAGES = 200
 

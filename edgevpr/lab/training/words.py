@@ -1,6 +1,6 @@
 """`edgevpr train words`: the visual words of VLAD and bag-of-words, learned by k-means from one's own pictures.
 
-`techniques.heads.words.load_words` reads the file. It holds `words` float16 (K, D), rounded to steps of 1/256 so that
+`techniques.words.load_words` reads the file. It holds `words` float16 (K, D), rounded to steps of 1/256 so that
 ten thousand of them take little room, and `model_sha256`, the fingerprint of the card whose feature map they describe.
 If asked for, it also holds the whitening of the VLAD vectors made of the words (Jégou and Chum, ECCV 2012).
 """
@@ -18,9 +18,9 @@ from edgevpr.core.text import progress
 from edgevpr.frames.images import list_images
 from edgevpr.lab.training.kmeans import kmeans
 from edgevpr.lab.training.pictures import read_pictures
-from edgevpr.techniques.heads import vlad
-from edgevpr.techniques.heads.regions import describe, find_regions
-from edgevpr.techniques.networks.session import Backbone, open_backbone
+from edgevpr.techniques.regions import describe, find_regions
+from edgevpr.techniques.session import Backbone, open_backbone
+from edgevpr.techniques.words import local_descriptors, nearest, sharpness_of, vlad
 
 REGIONS = {"regions": 400, "bow": 200}  # regions per picture, as in `region_vlad` and `cross_region_bow`
 _POINTS = 60_000  # the fewest local descriptors to learn words from, if there are as many ...
@@ -95,18 +95,18 @@ def train_words(
     np.savez_compressed(content, **arrays)
     write_whole(path, lambda unfinished: unfinished.write_bytes(content.getbuffer()))
     some, words = points[:: max(1, len(points) // 5000)], words.astype(np.float32)
-    distance = np.square(some - words[vlad.nearest(some, words)]).sum(axis=1).mean()
+    distance = np.square(some - words[nearest(some, words)]).sum(axis=1).mean()
     return WordsResult(str(path), pictures, len(points), float(distance))
 
 
 def _locals(backbone: Backbone, kind: str) -> Callable[[np.ndarray], np.ndarray]:
     """Make the function from a picture to its local descriptors, float32 (N, C), each of length 1."""
     if kind == "vlad":
-        return lambda picture: vlad.local_descriptors(backbone.run(picture))
+        return lambda picture: local_descriptors(backbone.run(picture))
 
     def regions(picture: np.ndarray) -> np.ndarray:
         features = backbone.run(picture)
-        return describe(features, find_regions(features, REGIONS[kind])[0])
+        return describe(features, find_regions(features, REGIONS[kind]))
 
     return regions
 
@@ -120,12 +120,10 @@ def _whitening(
 ) -> dict[str, np.ndarray]:
     """Learn the whitening: the principal components of the pictures' VLAD vectors over the root of their variance.
     Returns the mean float32 (K D,), the matrix int8 (length, K D) and the scale of its rows float32 (length,)."""
-    sharpness = vlad.sharpness(words)
+    sharpness = sharpness_of(words)
     vectors = np.empty((pictures, words.size), np.float32)
     for row, picture in enumerate(read_pictures(folders, "whitening")):
-        local = vlad.local_descriptors(backbone.run(picture))
-        weights = vlad.soft_weights(local, words, sharpness)
-        vectors[row] = vlad.intra_normalised(vlad.residuals(local, words, weights))
+        vectors[row] = vlad(local_descriptors(backbone.run(picture)), words, sharpness)
     mean = vectors.mean(axis=0)
     vectors -= mean
     # There are fewer pictures than values, so the components come from the small product of pictures with pictures.

@@ -20,8 +20,8 @@ from edgevpr.core.yamlfile import MAX_FILE_BYTES, read_yaml
 from edgevpr.power.machine import rss_mb
 from edgevpr.runtime.recognise.detector import detector_of
 from edgevpr.runtime.recognise.memorability import CROPS, memorability_of
-from edgevpr.techniques.networks.card import Card, card_names, load_card, read_card
-from edgevpr.techniques.networks.session import Backbone, backbone_of, file_sha256, import_onnxruntime
+from edgevpr.techniques.card import Card, card_names, load_card, read_card
+from edgevpr.techniques.session import Backbone, backbone_of, file_sha256, import_onnxruntime
 
 _ROUNDS = 10
 _FRAME = (480, 640)
@@ -233,9 +233,9 @@ def _vector_length(card: Card, backbones: dict[str, Backbone], learned: bool) ->
         return None
     if card.head and card.head["name"] == "vlad" and not learned:
         return card.head["words"] * backbones["features"].shape[0]
-    from edgevpr.techniques.network import CardNetwork
+    from edgevpr.techniques.network import of_card
 
-    return CardNetwork(card).spec.coarse.shape[0]
+    return of_card(card).spec.coarse.shape[0]
 
 
 def _answer(job: dict) -> dict:

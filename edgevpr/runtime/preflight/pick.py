@@ -25,7 +25,7 @@ from edgevpr.runtime.preflight.probe import TechniqueCosts, probe
 from edgevpr.runtime.preflight.scale import on_board
 from edgevpr.runtime.recognise.opening import budget_mb, made_for
 from edgevpr.runtime.recognise.recogniser import Recogniser
-from edgevpr.techniques.networks.card import weights_of
+from edgevpr.techniques.card import weights_of
 
 _log = logging.getLogger(__name__)
 

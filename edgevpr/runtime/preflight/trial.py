@@ -18,7 +18,7 @@ from edgevpr.frames.images import read_image
 from edgevpr.runtime.preflight.offers import Offer
 from edgevpr.runtime.preflight.probe import TechniqueCosts, noise, probe
 from edgevpr.runtime.recognise.opening import made_with
-from edgevpr.techniques.networks.card import load_card, weights_of
+from edgevpr.techniques.card import load_card, weights_of
 
 _TRIED_S = 1.0  # pictures are tried again for so long: a flight that begins has no such time
 _LIMIT_S = 900.0  # ten times what the slowest technique takes on the slowest board

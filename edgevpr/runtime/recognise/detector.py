@@ -11,9 +11,8 @@ import numpy as np
 
 from edgevpr.core.errors import ModelError
 from edgevpr.runtime.recognise.boxes import DECODERS
-from edgevpr.techniques.networks.card import Card, load_card
-from edgevpr.techniques.networks.prepare import prepare, shares
-from edgevpr.techniques.networks.session import open_session, run_outputs
+from edgevpr.techniques.card import Card, load_card
+from edgevpr.techniques.session import open_session, prepare, run_outputs, shares
 
 _CAR_M = 4.5
 _CAR_PX = 24  # on the input of a detector: these small ones find little that is smaller

@@ -11,9 +11,8 @@ import cv2
 import numpy as np
 
 from edgevpr.core.errors import ModelError
-from edgevpr.techniques.networks.card import Card, InputRule, load_card
-from edgevpr.techniques.networks.prepare import prepare
-from edgevpr.techniques.networks.session import open_session, run_outputs
+from edgevpr.techniques.card import Card, InputRule, load_card
+from edgevpr.techniques.session import open_session, prepare, run_outputs
 
 CROPS = 5  # a side: C = 5x5 of the thesis
 _SEED = 7

@@ -13,7 +13,7 @@ from edgevpr.cli.main import main
 from edgevpr.core.errors import ModelError, SourceError
 from edgevpr.lab.training.quantise import quantise
 from edgevpr.runtime.preflight.networks import verify_here
-from edgevpr.techniques.networks.session import open_backbone
+from edgevpr.techniques.session import open_backbone
 
 
 @pytest.fixture

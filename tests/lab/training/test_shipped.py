@@ -10,9 +10,9 @@ import pytest
 from edgevpr.core.config import load_config
 from edgevpr.core.files import shipped
 from edgevpr.runtime.recognise.memorability import memorability_of
-from edgevpr.techniques.heads.words import load_words
-from edgevpr.techniques.networks.card import load_card
-from edgevpr.techniques.networks.session import open_backbone
+from edgevpr.techniques.card import load_card
+from edgevpr.techniques.session import open_backbone
+from edgevpr.techniques.words import load_words
 
 MODELS = shipped("models")
 

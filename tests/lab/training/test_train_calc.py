@@ -11,7 +11,7 @@ from pictures_on_disk import write_pictures
 from edgevpr.cli.main import main
 from edgevpr.core.errors import EdgevprError, UsageError
 from edgevpr.lab.training.pictures import read_pictures, small_grey
-from edgevpr.techniques.networks.card import read_card
+from edgevpr.techniques.card import read_card
 
 # PyTorch is a fixture and no import: of all processes that collect these tests, only the one that runs them loads it.
 
@@ -159,7 +159,7 @@ def test_the_command_makes_a_model_that_edgevpr_opens(folder, tmp_path, capsys, 
     assert card.licence == "MIT"
     assert "--steps 3 --seed 1; 20 images of" in card.source
     monkeypatch.setenv("EDGEVPR_MODELS", str(tmp_path))
-    from edgevpr.techniques.networks.session import open_backbone
+    from edgevpr.techniques.session import open_backbone
 
     assert open_backbone("mine", "descriptor").shape == (1064,)
     assert open_backbone("mine", "features").shape == (128, 16, 21)

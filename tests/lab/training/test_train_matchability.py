@@ -95,7 +95,7 @@ def test_the_command_writes_a_network_that_the_gate_can_use(tmp_path, monkeypatc
     torch = pytest.importorskip("torch", reason="training needs torch (pip install 'edgevpr[train]')")
     from edgevpr.lab.training import matchability
     from edgevpr.runtime.recognise.memorability import memorability_of
-    from edgevpr.techniques.networks.card import read_card
+    from edgevpr.techniques.card import read_card
 
     torch.set_num_threads(1)
     monkeypatch.setattr(labels, "TECHNIQUES", ("cohog",))

@@ -11,9 +11,8 @@ from edgevpr.cli.main import main
 from edgevpr.core.files import shipped
 from edgevpr.lab.training import words as training_words
 from edgevpr.lab.training.pictures import read_pictures
-from edgevpr.techniques.heads import vlad
-from edgevpr.techniques.heads.words import load_words, whitened
-from edgevpr.techniques.networks.session import open_backbone
+from edgevpr.techniques.session import open_backbone
+from edgevpr.techniques.words import load_words, local_descriptors, nearest, sharpness_of, vlad
 
 
 @pytest.fixture(autouse=True)
@@ -66,24 +65,24 @@ def test_words_lie_among_the_descriptors(folder):
     assert train(folder, "--kind", "vlad", "--count", "16") == 0
     words = load_words("mine", "vlad", 16).words
     backbone = open_backbone("mine", "features")
-    local = np.concatenate([vlad.local_descriptors(backbone.run(p)) for p in read_pictures([folder], "reading")])
-    to_word = np.square(local - words[vlad.nearest(local, words)]).sum(axis=1).mean()
+    local = np.concatenate([local_descriptors(backbone.run(p)) for p in read_pictures([folder], "reading")])
+    to_word = np.square(local - words[nearest(local, words)]).sum(axis=1).mean()
     assert to_word < 0.6 * np.square(local - local.mean(axis=0)).sum(axis=1).mean()
-    assert len(np.unique(vlad.nearest(local, words))) == 16
+    assert len(np.unique(nearest(local, words))) == 16
 
 
 def test_whitened_vectors_of_the_pictures_learnt_from_are_uncorrelated_and_alike_in_size(folder):
     assert train(folder, "--kind", "vlad", "--count", "8", "--whiten", "6") == 0
     words = load_words("mine", "vlad", 8)
     backbone = open_backbone("mine", "features")
-    sharpness = vlad.sharpness(words.words)
+    sharpness = sharpness_of(words.words)
     rows = []
     for picture in read_pictures([folder], "reading"):
-        local = vlad.local_descriptors(backbone.run(picture))
-        residuals = vlad.residuals(local, words.words, vlad.soft_weights(local, words.words, sharpness))
-        vector = vlad.intra_normalised(residuals)
-        assert np.linalg.norm(whitened(vector, words)) == pytest.approx(1, abs=1e-5)
-        rows.append(words.scale * (words.whitening.astype(np.float32) @ (vector - words.mean)))
+        local = local_descriptors(backbone.run(picture))
+        vector = vlad(local, words.words, sharpness)
+        assert np.linalg.norm(words.whitening(vector)) == pytest.approx(1, abs=1e-5)
+        white = words.whitening
+        rows.append(white.scale * (white.matrix.astype(np.float32) @ (vector - white.mean)))
     covariance = np.cov(np.array(rows).T, bias=True)
     np.testing.assert_allclose(covariance, np.eye(6), atol=0.05)
 

@@ -18,8 +18,8 @@ from edgevpr.cli.main import main
 from edgevpr.core import child
 from edgevpr.core.errors import EdgevprError, ModelError
 from edgevpr.runtime.preflight.networks import add, list_models, technique_with, verify, verify_here
-from edgevpr.techniques.networks import session
-from edgevpr.techniques.networks.card import load_card
+from edgevpr.techniques import session
+from edgevpr.techniques.card import load_card
 
 
 def listed(name):
@@ -82,7 +82,7 @@ def test_verifying_is_done_apart_so_that_memory_is_that_of_the_network(models):
 
 def test_the_command_verifies_all_and_says_which_cannot_be_used(models, capsys, monkeypatch):
     monkeypatch.setattr("edgevpr.runtime.preflight.networks.verify", verify_here)
-    for room in ("resources", "techniques.networks.card"):
+    for room in ("resources", "techniques.card"):
         monkeypatch.setattr(f"edgevpr.{room}.model_folders", lambda: (models,))
     write_network(models, "mine")
     write_network(models, "wrong", fault="zeros")

@@ -6,9 +6,10 @@ Every error in a card is reported when the card is read, not in flight.
 import hashlib
 import json
 import re
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, make_dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 from edgevpr.core.config import bounded, build
 from edgevpr.core.contract import TechniqueSpec
@@ -17,14 +18,24 @@ from edgevpr.core.files import find_model, model_folders
 from edgevpr.core.text import meant
 from edgevpr.core.yamlfile import read_yaml
 
-SIMILARITIES = ("cosine", "l1", "l2")
 _ADDED_LATER = ("pad", "boxes", "memorability")
-FAMILIES = ("yolox", "fastestdet", "nanodet")  # of detectors
 _CHOICES = {
     "input.layout": ("NCHW", "NHWC"),
     "input.colour": ("grey", "bgr", "rgb"),
     "input.resize": ("area", "linear", "cubic"),
-    "similarity": SIMILARITIES,
+    "similarity": ("cosine", "l1", "l2"),
+    "detector.family": ("yolox", "fastestdet", "nanodet"),
+}
+# The parameters of each head: name, type and, for numbers, the range.
+_HEADS: dict[str, tuple[tuple[Any, ...], ...]] = {
+    "flatten": (),
+    "max": (),
+    "gem": (("p", float, bounded(0.1, 100)),),
+    "grid": (("rows", int, bounded(1, 1024)), ("columns", int, bounded(1, 1024)), ("how", str)),
+    "pyramid": (("levels", list),),
+    "projection": (("length", int, bounded(8, 65_536)), ("seed", int, bounded(0, 2**31))),
+    "vlad": (("words", int, bounded(1, 65_536)),),
+    "rmac": (),
 }
 
 
@@ -42,9 +53,13 @@ class InputRule:
     equalise: bool
     resize: str
     scale: float = bounded(1e-9, 1e9)
-    mean: list
-    std: list | None = None
+    mean: list[float]
+    std: list[float] | None = None
     pad: int | None = field(default=None, metadata={"range": (0, 255)})
+
+    @property
+    def channels(self) -> int:
+        return 1 if self.colour == "grey" else 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +69,7 @@ class Outputs:
 
     descriptor: str | None = None
     features: str | None = None
-    boxes: list | None = None
+    boxes: list[str] | None = None
     memorability: str | None = None
 
 
@@ -64,58 +79,13 @@ class DetectorRule:
     not stay where it is, each with its number in the outputs; a box counts from `min_score` on."""
 
     family: str
-    dynamic: dict
+    dynamic: dict[str, int]
     min_score: float = bounded(0.01, 1)
-
-
-@dataclass(frozen=True, slots=True)
-class NoParameters:
-    """Parameters of the heads `flatten`, `max` and `rmac`: there are none."""
-
-
-@dataclass(frozen=True, slots=True)
-class GemParameters:
-    p: float = bounded(0.1, 100)
-
-
-@dataclass(frozen=True, slots=True)
-class GridParameters:
-    rows: int = bounded(1, 1024)
-    columns: int = bounded(1, 1024)
-    how: str
-
-
-@dataclass(frozen=True, slots=True)
-class PyramidParameters:
-    levels: list
-
-
-@dataclass(frozen=True, slots=True)
-class ProjectionParameters:
-    length: int = bounded(8, 65_536)
-    seed: int = bounded(0, 2**31)
-
-
-@dataclass(frozen=True, slots=True)
-class VladParameters:
-    words: int = bounded(1, 65_536)
-
-
-HEADS = {
-    "flatten": NoParameters,
-    "max": NoParameters,
-    "gem": GemParameters,
-    "grid": GridParameters,
-    "pyramid": PyramidParameters,
-    "projection": ProjectionParameters,
-    "vlad": VladParameters,
-    "rmac": NoParameters,
-}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Card:
-    """One network. `path` is that of the card itself; `head` is a name of `HEADS` with its parameters, or None."""
+    """One network. `path` is that of the card itself; `head` has the name of a head and its parameters, or is None."""
 
     path: Path
     title: str
@@ -125,7 +95,7 @@ class Card:
     source: str
     input: InputRule
     outputs: Outputs
-    head: dict | None
+    head: dict[str, Any] | None
     similarity: str = "cosine"
     detector: DetectorRule | None = None
 
@@ -139,21 +109,24 @@ class Card:
 
     @property
     def is_technique(self) -> bool:
-        """Tell whether the card makes a descriptor by itself, and does not only serve techniques that take a
-        `model`."""
+        """True where the card makes a descriptor by itself, and does not only serve techniques that take a `model`."""
         return self.head is not None or self.outputs.descriptor is not None
 
     @cached_property
     def fingerprint(self) -> str:
         """SHA-256 of everything that a feature map or vector depends on: the weights, the preparation of the picture,
         and the names of the outputs."""
-        said = json.dumps([self.sha256, _used(self.input), _used(self.outputs)], sort_keys=True)
-        return hashlib.sha256(said.encode()).hexdigest()
+        return digest_of([self.sha256, _used(self.input), _used(self.outputs)])
 
 
-def _used(part: InputRule | Outputs) -> dict:
-    """Return what a card says there, without the keys that were added later and are not used: words and maps made
-    before then have the fingerprint without them."""
+def digest_of(values: list[Any]) -> str:
+    """Compute the SHA-256 of values that JSON can write, 64 hexadecimal digits."""
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+
+
+def _used(part: InputRule | Outputs) -> dict[str, Any]:
+    """Return a section of a card without the keys that were added later and are not used: words and maps made before
+    then have the fingerprint without them."""
     return {key: value for key, value in asdict(part).items() if value is not None or key not in _ADDED_LATER}
 
 
@@ -192,9 +165,10 @@ def read_card(path: Path, needs_hash: bool = True) -> Card:
     card = build(Card, {"path": path, "head": None, **values}, str(path))
     for key, choices in _CHOICES.items():
         section, _, last = key.rpartition(".")
-        said = getattr(getattr(card, section) if section else card, last)
-        if said not in choices:
-            raise ModelError(f"{path}: `{key}` is `{said}`: write {', '.join(choices[:-1])} or {choices[-1]}.")
+        part = getattr(card, section) if section else card
+        if part is not None and getattr(part, last) not in choices:
+            choice = f"write {', '.join(choices[:-1])} or {choices[-1]}."
+            raise ModelError(f"{path}: `{key}` is `{getattr(part, last)}`: {choice}")
     if not re.fullmatch("[0-9a-f]{64}" if needs_hash else "([0-9a-f]{64})?", card.sha256):
         raise ModelError(f"{path}: `sha256` must be the 64 hexadecimal digits that `sha256sum {card.file}` prints.")
     if card.file in ("", ".", "..") or "/" in card.file:
@@ -207,14 +181,8 @@ def read_card(path: Path, needs_hash: bool = True) -> Card:
             "memorability."
         )
     _require_detector(card)
-    channels = 1 if card.input.colour == "grey" else 3
-    for key in ("mean", "std"):
-        numbers = getattr(card.input, key)
-        if numbers is not None and not _are_numbers(numbers, (1, channels), positive=key == "std"):
-            raise ModelError(
-                f"{path}: `input.{key}` is {numbers!s:.80}: write one number or {channels}, one a channel"
-                + (", all above 0." if key == "std" else ".")
-            )
+    _require_numbers(card, "mean", card.input.mean)
+    _require_numbers(card, "std", card.input.std)
     head_parameters(card)
     return card
 
@@ -223,49 +191,50 @@ def _require_detector(card: Card) -> None:
     boxes, rule = card.outputs.boxes, card.detector
     if (boxes is None) != (rule is None):
         raise ModelError(f"{card.path}: a detector needs both `outputs.boxes` and the section `detector`: write both.")
-    if rule is None:
+    if boxes is None or rule is None:
         return
     if not boxes or not all(isinstance(name, str) for name in boxes):
         raise ModelError(f"{card.path}: `outputs.boxes` is {boxes!s:.80}: write the names of ONNX outputs.")
-    if rule.family not in FAMILIES:
-        raise ModelError(
-            f"{card.path}: `detector.family` is `{rule.family}`: write {', '.join(FAMILIES[:-1])} or {FAMILIES[-1]}."
-        )
-    numbers = rule.dynamic.values()
-    if not numbers or not all(type(number) is int and 0 <= number < 10_000 for number in numbers):
+    if not rule.dynamic or not all(type(number) is int and 0 <= number < 10_000 for number in rule.dynamic.values()):
         raise ModelError(f"{card.path}: `detector.dynamic` needs names of classes with their numbers, {{car: 2}}.")
 
 
-def head_parameters(card: Card) -> object | None:
-    """Return the parameters of the card's head as the dataclass of `HEADS`; None for a card without a head. Raises
-    ModelError for a head that does not exist, lacks a feature map or has wrong `levels` or `how`, ConfigError for other
-    parameters."""
+def _require_numbers(card: Card, key: str, values: list[float] | None) -> None:
+    """Require one number, or one per channel; those of `std` are divided by, and so must be above 0."""
+    channels, positive = card.input.channels, key == "std"
+    if values is None or (
+        len(values) in (1, channels)
+        and all(type(each) in (int, float) and abs(each) < 1e9 and (each > 0 or not positive) for each in values)
+    ):
+        return
+    also = ", all above 0." if positive else "."
+    raise ModelError(
+        f"{card.path}: `input.{key}` is {values!s:.80}: write one number or {channels}, one a channel{also}"
+    )
+
+
+def head_parameters(card: Card) -> dict[str, Any]:
+    """Return the parameters of the card's head by name; nothing for a card without a head. Raises ModelError for a head
+    that does not exist, lacks a feature map or has wrong `levels` or `how`, ConfigError for other parameters."""
     if card.head is None:
-        return None
+        return {}
     name = card.head.get("name")
-    if not isinstance(name, str) or name not in HEADS:
+    if not isinstance(name, str) or name not in _HEADS:
         name = str(name)[:80]
         raise ModelError(
-            f"{card.path}: there is no head `{name}`: " + meant(name, HEADS, f"use {', '.join(HEADS)}, or null.")
+            f"{card.path}: there is no head `{name}`: " + meant(name, _HEADS, f"use {', '.join(_HEADS)}, or null.")
         )
     if card.outputs.features is None:
         raise ModelError(
             f"{card.path}: the head `{name}` needs a feature map: name it in `outputs: {{features: ...}}`."
         )
-    said = {key: value for key, value in card.head.items() if key != "name"}
-    parameters = build(HEADS[name], said, str(card.path), "head.")
-    if name == "pyramid":
-        levels = parameters.levels
-        if not levels or not all(type(level) is int and 1 <= level <= 64 for level in levels):
-            raise ModelError(
-                f"{card.path}: `head.levels` is {levels!s:.80}: write whole numbers from 1 to 64, e.g. [1, 2, 3]."
-            )
-    if name == "grid" and parameters.how not in ("mean", "max"):
-        raise ModelError(f"{card.path}: `head.how` is `{parameters.how}`: write mean or max.")
+    written = {key: value for key, value in card.head.items() if key != "name"}
+    parameters: dict[str, Any] = asdict(build(make_dataclass(name, _HEADS[name]), written, str(card.path), "head."))
+    levels = parameters.get("levels", [1])
+    if not levels or not all(type(level) is int and 1 <= level <= 64 for level in levels):
+        raise ModelError(
+            f"{card.path}: `head.levels` is {levels!s:.80}: write whole numbers from 1 to 64, e.g. [1, 2, 3]."
+        )
+    if parameters.get("how", "mean") not in ("mean", "max"):
+        raise ModelError(f"{card.path}: `head.how` is `{parameters['how']}`: write mean or max.")
     return parameters
-
-
-def _are_numbers(values: list, counts: tuple[int, int], positive: bool) -> bool:
-    return len(values) in counts and all(
-        type(value) in (int, float) and abs(value) < 1e9 and (value > 0 or not positive) for value in values
-    )

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from edgevpr.core.errors import ModelError
-from edgevpr.techniques.heads import pooling, projection, regions, rmac, vlad
+from edgevpr.techniques import pooling, regions, words
 
 
 def feature_map(seed: int, channels: int = 6, height: int = 7, width: int = 9, dead: float = 0.6) -> np.ndarray:
@@ -38,12 +38,11 @@ def test_pyramid(levels):
 
 @pytest.mark.parametrize(("rows", "columns"), [(1, 1), (4, 4), (3, 5), (7, 9)])
 def test_grid_of_means(rows, columns):
-    pooled = pooling.grid(SIGNED, rows, columns)
+    pooled = pooling.grid(SIGNED, rows, columns, "mean")
     np.testing.assert_allclose(pooled, literal.grid_means(SIGNED, rows, columns), rtol=1e-5, atol=1e-6)
 
 
-def test_flatten_and_maximum():
-    assert pooling.flatten(SIGNED)[9 * 7 + 9 + 2] == SIGNED[1, 1, 2]
+def test_maximum():
     assert pooling.maximum(SIGNED).tolist() == [plane.max() for plane in SIGNED]
 
 
@@ -51,25 +50,25 @@ def test_what_is_too_small_is_refused():
     with pytest.raises(ModelError, match="7x9 is too small for a grid of 8x8"):
         pooling.pyramid(SIGNED, (1, 8))
     with pytest.raises(ModelError, match="at least 2 wide"):
-        rmac.square_regions(1, 30)
+        pooling.square_regions(1, 30)
     with pytest.raises(ModelError, match="cannot be projected to 400"):
-        projection.gaussian_projection(315, 400, seed=0)
+        pooling.gaussian_projection(315, 400, seed=0)
 
 
 @pytest.mark.parametrize(("size", "length"), [(60, 20), (61, 61), (2, 1)])
 def test_projection_is_the_product_with_its_matrix(size, length):
     vector = np.random.default_rng(3).normal(size=size).astype(np.float32)
-    row, signs = projection.gaussian_row(size, seed=5)
-    project = projection.gaussian_projection(size, length, seed=5)
+    row, signs = pooling.gaussian_row(size, seed=5)
+    project = pooling.gaussian_projection(size, length, seed=5)
     expected = literal.projected(vector, row, signs, length)
     np.testing.assert_allclose(project(vector), expected, rtol=1e-4, atol=1e-5)
 
 
 def test_the_gaussian_row_is_the_same_everywhere_and_for_ever():
-    row, signs = projection.gaussian_row(5, seed=7)
+    row, signs = pooling.gaussian_row(5, seed=7)
     np.testing.assert_allclose(row, ROW_OF_SEED_7, rtol=1e-12)
     assert signs.tolist() == SIGNS_OF_SEED_7
-    long, _ = projection.gaussian_row(20_001, seed=1)
+    long, _ = pooling.gaussian_row(20_001, seed=1)
     assert abs(long.mean()) < 0.03
     assert abs(long.std() - 1) < 0.03
     assert abs((long**4).mean() - 3) < 0.3  # Gaussian, not uniform (1.8) nor a sign (1)
@@ -80,7 +79,7 @@ def test_projection_keeps_angles_as_a_matrix_of_independent_values_does():
     rng = np.random.default_rng(4)
     vectors = np.abs(rng.normal(size=(20, 4096))).astype(np.float32)
     vectors[1:] = vectors[:-1] * 0.7 + vectors[1:] * 0.3
-    project = projection.gaussian_projection(4096, 512, seed=0)
+    project = pooling.gaussian_projection(4096, 512, seed=0)
 
     def cosines(rows):
         rows = rows / np.linalg.norm(rows, axis=1, keepdims=True)
@@ -94,7 +93,7 @@ def test_projection_keeps_angles_as_a_matrix_of_independent_values_does():
 
 @pytest.mark.parametrize("shape", [(15, 20), (13, 13), (20, 15), (7, 30), (2, 2), (4, 5)])
 def test_rmac_regions(shape):
-    found = rmac.square_regions(*shape)
+    found = pooling.square_regions(*shape)
     assert found == literal.rmac_regions(*shape)
     for top, left, side in found:
         assert side >= 1
@@ -103,40 +102,36 @@ def test_rmac_regions(shape):
 
 
 def test_rmac_regions_of_a_picture_of_4_to_3():
-    assert len(rmac.square_regions(15, 20)) == 2 + 2 * 3 + 3 * 4
+    assert len(pooling.square_regions(15, 20)) == 2 + 2 * 3 + 3 * 4
 
 
 def test_rmac_vectors_and_aggregate():
-    where = rmac.square_regions(7, 9)
-    vectors = rmac.regional_vectors(SIGNED, where)
+    where = pooling.square_regions(7, 9)
+    vectors = pooling.regional_vectors(SIGNED, where)
     np.testing.assert_allclose(vectors, literal.rmac_vectors(SIGNED, where), rtol=1e-5, atol=1e-6)
     expected = literal.rmac_aggregate(literal.rmac_vectors(SIGNED, where))
-    np.testing.assert_allclose(rmac.aggregate(vectors), expected, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(pooling.unit(vectors.sum(axis=0)), expected, rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("soft", [None, 3.0, 50.0])
 def test_vlad(soft):
-    local = vlad.local_descriptors(SIGNED)
+    local = words.local_descriptors(SIGNED)
     np.testing.assert_allclose(np.linalg.norm(local, axis=1), 1, rtol=1e-5)
     np.testing.assert_allclose(local[9 + 2], SIGNED[:, 1, 2] / np.linalg.norm(SIGNED[:, 1, 2]), rtol=1e-5)
-    words = vlad.unit(np.random.default_rng(6).normal(size=(8, 5))).astype(np.float32)
-    weights = vlad.hard_weights(local, words) if soft is None else vlad.soft_weights(local, words, soft)
-    sums = vlad.residuals(local, words, weights)
-    expected = literal.vlad(local, words, soft)
-    np.testing.assert_allclose(sums, expected, rtol=1e-4, atol=1e-4)
-    np.testing.assert_allclose(vlad.intra_normalised(sums), literal.intra_normalised(expected), rtol=1e-3, atol=1e-4)
+    known = pooling.unit(np.random.default_rng(6).normal(size=(8, 5))).astype(np.float32)
+    expected = literal.intra_normalised(literal.vlad(local, known, soft))
+    np.testing.assert_allclose(words.vlad(local, known, soft), expected, rtol=1e-3, atol=1e-4)
 
 
 def test_a_word_that_nothing_falls_to_stays_zero():
     local = np.tile(np.float32([[1, 0]]), (4, 1))
-    words = np.float32([[0.9, 0.1], [-1, 0]])
-    sums = vlad.residuals(local, words, vlad.hard_weights(local, words))
-    np.testing.assert_allclose(vlad.intra_normalised(sums), [0.70710678, -0.70710678, 0, 0], atol=1e-6)
+    known = np.float32([[0.9, 0.1], [-1, 0]])
+    np.testing.assert_allclose(words.vlad(local, known), [0.70710678, -0.70710678, 0, 0], atol=1e-6)
 
 
 def test_sharpness_gives_a_word_a_hundred_times_the_weight_of_the_next():
-    words = np.float32([[0, 0], [3, 0], [0, 3], [3, 3]])
-    weights = vlad.soft_weights(words, words, vlad.sharpness(words))
+    known = np.float32([[0, 0], [3, 0], [0, 3], [3, 3]])
+    weights = words.soft_weights(known, known, words.sharpness_of(known))
     nearest_two = np.sort(weights, axis=1)[:, :-3:-1]
     np.testing.assert_allclose(nearest_two[:, 0] / nearest_two[:, 1], 100, rtol=1e-4)
 
@@ -144,10 +139,9 @@ def test_sharpness_gives_a_word_a_hundred_times_the_weight_of_the_next():
 @pytest.mark.parametrize(("dead", "count"), [(0.6, 12), (0.6, 10_000), (0.9, 30)])
 def test_regions_are_the_most_energetic_connected_activations(dead, count):
     features = feature_map(7, channels=5, dead=dead)
-    boxes, energy = regions.find_regions(features, count)
+    boxes = regions.find_regions(features, count)
     expected = literal.regions(features, count)
-    assert len(energy) == len(expected)
-    np.testing.assert_allclose(energy, [mean for _, _, mean in expected], rtol=1e-5)
+    assert len(boxes) == len(expected)
     described = regions.describe(features, boxes)
     for box, vector, (_, pixels, _) in zip(boxes, described, expected, strict=True):
         ys, xs = zip(*pixels, strict=True)
@@ -158,20 +152,20 @@ def test_regions_are_the_most_energetic_connected_activations(dead, count):
 def test_equal_regions_come_by_channel_and_position():
     features = np.zeros((2, 5, 5), np.float32)
     features[:, 0, 4] = features[:, 0, 0] = features[:, 4, 2] = 1
-    boxes, _ = regions.find_regions(features, 4)
+    boxes = regions.find_regions(features, 4)
     assert boxes[:, :2].tolist() == [[0, 0], [0, 4], [4, 2], [0, 0]]
 
 
 def test_a_dead_feature_map_has_no_regions():
     dead = np.zeros((3, 4, 5), np.float32)
-    boxes, energy = regions.find_regions(dead, 10)
-    assert len(energy) == 0
+    boxes = regions.find_regions(dead, 10)
+    assert len(boxes) == 0
     assert regions.describe(dead, boxes).shape == (0, 3)
 
 
 def test_mutual_score():
     rng = np.random.default_rng(8)
-    query, place = vlad.unit(rng.normal(size=(6, 4))), vlad.unit(rng.normal(size=(9, 4)))
+    query, place = pooling.unit(rng.normal(size=(6, 4))), pooling.unit(rng.normal(size=(9, 4)))
     assert regions.mutual_score(query, place) == pytest.approx(literal.mutual_score(query, place))
     assert regions.mutual_score(query, query) == pytest.approx(1)
     assert regions.mutual_score(query, np.zeros((9, 4))) == 0
@@ -180,7 +174,7 @@ def test_mutual_score():
 
 
 def test_directions_survive_8_bits():
-    vectors = np.concatenate([vlad.unit(np.random.default_rng(9).normal(size=(20, 64))), np.zeros((1, 64))])
+    vectors = np.concatenate([pooling.unit(np.random.default_rng(9).normal(size=(20, 64))), np.zeros((1, 64))])
     back = regions.from_bytes(regions.to_bytes(vectors.astype(np.float32)))
     assert (np.einsum("nd,nd->n", back, vectors)[:20] > 0.9998).all()
     assert not back[20].any()

@@ -10,8 +10,8 @@ from pictures import textured
 from tiny_networks import CARD, FEATURES, HEIGHT, WIDTH, write_card, write_network
 
 from edgevpr.core.errors import ModelError, UsageError
-from edgevpr.techniques.networks import session
-from edgevpr.techniques.networks.session import open_backbone
+from edgevpr.techniques import session
+from edgevpr.techniques.session import open_backbone
 
 
 def test_both_outputs_of_a_network_and_their_shapes(models):
@@ -163,7 +163,7 @@ def test_without_onnxruntime_the_others_fly(models):
 
 def test_onnxruntime_leaves_nothing_at_home_and_reports_nothing(models, tmp_path):
     write_network(models)
-    script = "from edgevpr.techniques.networks.session import open_backbone as o; o('tiny', 'features')"
+    script = "from edgevpr.techniques.session import open_backbone as o; o('tiny', 'features')"
     home = tmp_path / "home"
     home.mkdir()
     variables = {
@@ -181,5 +181,5 @@ def test_a_card_alone_imports_no_onnxruntime(models):
     script = "import sys; from edgevpr import techniques as t; t.names(); t.parameters('calc'); print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     loaded = done.stdout.split()
-    assert "edgevpr.techniques.calc" in loaded
+    assert "edgevpr.techniques.network" in loaded
     assert "onnxruntime" not in loaded

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from pictures import textured
 
-from edgevpr.techniques.networks.card import InputRule
-from edgevpr.techniques.networks.prepare import prepare, without_masked
+from edgevpr.techniques.card import InputRule
+from edgevpr.techniques.session import prepare, without_masked
 
 
 def rule(**changes):

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from edgevpr.techniques.alignment import align
+from edgevpr.techniques.displacement import align
 
 SIDE = 31
 

@@ -1,20 +1,24 @@
-"""Running a network: the only module that uses onnxruntime in flight, and imports it only with the first network.
+"""Running a network, from a picture to its outputs: the only module that uses onnxruntime in flight, and imports it
+only with the first network.
 
 A model file is not trusted: it is run once before it may fly, and every result is checked.
 """
 
 import os
 import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
+from edgevpr.core.arrays import Array, Image, Mask, Singles
 from edgevpr.core.errors import ModelError, UsageError
 from edgevpr.core.files import read_file, sha256_of
-from edgevpr.techniques.networks.card import Card, load_card
-from edgevpr.techniques.networks.prepare import prepare, without_masked
+from edgevpr.techniques.card import Card, InputRule, load_card
 
 _RANKS = {"descriptor": 2, "features": 4}
 _FORMS = {"descriptor": "(1, D)", "features": "(1, C, H, W)"}
@@ -23,16 +27,26 @@ MAX_FILE_BYTES = 2**31  # protobuf, in which ONNX files are written, allows no m
 _RUN_LIMIT_S = 30.0  # of one picture: half of what the watchdog of systemd allows a flight to be silent
 _MOST_THREADS = 256
 _LARGEST = 1e12  # with much larger numbers the length of a vector overflows float32, and the unit vector is zero
+_RESIZE = {"area": cv2.INTER_AREA, "linear": cv2.INTER_LINEAR_EXACT, "cubic": cv2.INTER_CUBIC}
+_NOTHING_ALLOWED = 128
 
 
+@dataclass(frozen=True, slots=True)
 class Backbone:
-    """One output of a network that has run successfully. `shape` is (C, H, W) of features, (D,) of a descriptor.
-    `sha256` is the card's fingerprint: weights, preparation and outputs (`card.sha256` is that of the file alone)."""
+    """One output, "features" or "descriptor", of a network that has run successfully. `shape` is (C, H, W) of features,
+    (D,) of a descriptor."""
 
-    def __init__(self, *, card: Card, output: str, shape: tuple[int, ...], sha256: str, session: Any) -> None:
-        self.card, self.output, self.shape, self.sha256, self.session = card, output, shape, sha256, session
+    card: Card
+    output: str
+    shape: tuple[int, ...]
+    session: Any
 
-    def run(self, image: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
+    @property
+    def sha256(self) -> str:
+        """The card's fingerprint: weights, preparation and outputs (`card.sha256` is that of the file alone)."""
+        return self.card.fingerprint
+
+    def run(self, image: Image, mask: Mask | None = None) -> Singles:
         """Run the network on uint8 (H, W[, 3]); returns float32 of `shape`. Pixels where bool (H, W) `mask` is False
         are filled with the mean of the others. Raises ModelError for a result with NaN or numbers beyond 1e12, and for
         one of zeros only."""
@@ -60,7 +74,7 @@ def backbone_of(card: Card, output: str, threads: int = 1) -> Backbone:
     # Noise, not a uniform picture: many a correct network gives only zeros for that.
     noise = np.random.default_rng(_SEED).integers(0, 256, (card.input.height, card.input.width), np.uint8)
     result = _run(card, output, session, noise)
-    return Backbone(card=card, output=output, shape=result.shape, sha256=card.fingerprint, session=session)
+    return Backbone(card, output, result.shape, session)
 
 
 def open_session(card: Card, outputs: list[str], threads: int = 1) -> Any:
@@ -134,9 +148,8 @@ def _require_input(card: Card, session: Any) -> None:
             f"{card.file_path} has {len(inputs)} inputs: only networks with one, the picture, can be used."
         )
     (it,) = inputs
-    channels = 1 if rule.colour == "grey" else 3
     size = (rule.height, rule.width)
-    wanted = [1, *size, channels] if rule.layout == "NHWC" else [1, channels, *size]
+    wanted = [1, *size, rule.channels] if rule.layout == "NHWC" else [1, rule.channels, *size]
     shape = list(it.shape)
     if any(type(axis) is not int for axis in shape[1:]):
         raise ModelError(
@@ -153,14 +166,14 @@ def _require_input(card: Card, session: Any) -> None:
 
 
 def _require_output(card: Card, name: str, session: Any) -> None:
-    found = {each.name: each for each in session.get_outputs()}
-    if name not in found:
-        raise ModelError(f"{card.file_path} has no output `{name}`, which its card names: it has {', '.join(found)}.")
-    if found[name].type not in ("tensor(float)", "tensor(float16)"):
-        raise ModelError(f"{card.file_path}: its output `{name}` is {found[name].type}: it must be float.")
+    types = {output.name: output.type for output in session.get_outputs()}
+    if name not in types:
+        raise ModelError(f"{card.file_path} has no output `{name}`, which its card names: it has {', '.join(types)}.")
+    if types[name] not in ("tensor(float)", "tensor(float16)"):
+        raise ModelError(f"{card.file_path}: its output `{name}` is {types[name]}: it must be float.")
 
 
-def _run(card: Card, output: str, session: Any, image: np.ndarray) -> np.ndarray:
+def _run(card: Card, output: str, session: Any, image: Image) -> Singles:
     name = getattr(card.outputs, output)
     (result,) = run_outputs(card, session, [name], prepare(image, card.input))
     if result.ndim != _RANKS[output] or len(result) != 1 or not result.size:
@@ -168,7 +181,7 @@ def _run(card: Card, output: str, session: Any, image: np.ndarray) -> np.ndarray
             f"{card.file_path}: its output `{name}` is {_axes(result.shape)} and `{output}` must be {_FORMS[output]}: "
             "correct `outputs` of the card."
         )
-    values = result[0].astype(np.float32, copy=False)
+    values: Singles = result[0].astype(np.float32, copy=False)
     if not values.any():
         raise ModelError(
             f"{card.file_path} gives nothing but zeros for `{name}`: its weights or `input` of its card are wrong, or "
@@ -179,7 +192,7 @@ def _run(card: Card, output: str, session: Any, image: np.ndarray) -> np.ndarray
     return values
 
 
-def run_outputs(card: Card, session: Any, names: list[str], pictures: np.ndarray) -> list[np.ndarray]:
+def run_outputs(card: Card, session: Any, names: list[str], pictures: Singles) -> list[Array]:
     """Run a session of `open_session` on prepared pictures, float32 (N, ...); return the outputs named.
 
     Raises ModelError for a run that fails or takes too long, and for numbers that are not finite or beyond 1e12.
@@ -190,7 +203,7 @@ def run_outputs(card: Card, session: Any, names: list[str], pictures: np.ndarray
     limit.daemon = True
     limit.start()
     try:
-        results = session.run(names, feed, options)
+        results: list[Array] = session.run(names, feed, options)
     except Exception as error:
         if options.terminate:
             raise ModelError(
@@ -214,9 +227,68 @@ def _terminate(options: Any) -> None:
     options.terminate = True  # onnxruntime looks at it before each operator, in loops too
 
 
-def _axes(shape) -> str:
+def _axes(shape: Sequence[object]) -> str:
     return f"({', '.join(str(axis) if type(axis) is int else '?' for axis in shape)})"
 
 
 def _first_line(error: Exception) -> str:
     return (str(error).strip() or type(error).__name__).splitlines()[0][:200]
+
+
+def prepare(image: Image, rule: InputRule) -> Singles:
+    """Prepare uint8 (H, W) grey or (H, W, 3) BGR as float32 (1, C, height, width), or (1, height, width, C) for NHWC.
+
+    Equalising is that of CALC: BGR to YUV, the histogram of Y equalised, back to BGR, all before the picture is made
+    grey and smaller. A grey picture has no U and V: its own histogram is equalised.
+    """
+    if rule.equalise:
+        image = _equalised(image)
+    if rule.colour == "grey":
+        image = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    elif image.ndim == 2:
+        image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+    elif rule.colour == "rgb":
+        image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    image = _sized(image, rule)
+    values = np.multiply(image, np.float32(rule.scale), dtype=np.float32).reshape(rule.height, rule.width, -1)
+    values -= np.array(rule.mean, np.float32)
+    if rule.std is not None:
+        values /= np.array(rule.std, np.float32)
+    return np.ascontiguousarray(values[None] if rule.layout == "NHWC" else values.transpose(2, 0, 1)[None])
+
+
+def shares(image: Image, rule: InputRule) -> tuple[float, float]:
+    """Return the shares of the input's width and height that `prepare` fills with the picture; the rest is padding."""
+    if rule.pad is None:
+        return 1.0, 1.0
+    height, width = image.shape[:2]
+    scale = min(rule.width / width, rule.height / height)
+    return max(1, round(width * scale)) / rule.width, max(1, round(height * scale)) / rule.height
+
+
+def _sized(image: Image, rule: InputRule) -> Image:
+    across, down = shares(image, rule)
+    width, height = round(across * rule.width), round(down * rule.height)
+    image = cv2.resize(image, (width, height), interpolation=_RESIZE[rule.resize])
+    if (width, height) == (rule.width, rule.height):
+        return image
+    border = (0, rule.height - height, 0, rule.width - width)
+    return cv2.copyMakeBorder(image, *border, cv2.BORDER_CONSTANT, value=(rule.pad,) * 3)
+
+
+def without_masked(image: Image, mask: Mask | None) -> Image:
+    """Set every pixel where the bool (H, W) `mask` is False to the mean of the others (128 if there are none). A
+    network needs a whole picture, and a uniform patch adds the least to it."""
+    if mask is None or mask.all():
+        return image
+    filled = image.copy()
+    filled[~mask] = np.rint(image[mask].mean(axis=0)) if mask.any() else _NOTHING_ALLOWED
+    return filled
+
+
+def _equalised(image: Image) -> Image:
+    if image.ndim == 2:
+        return cv2.equalizeHist(image)
+    yuv = cv2.cvtColor(image, cv2.COLOR_BGR2YUV)
+    yuv[..., 0] = cv2.equalizeHist(np.ascontiguousarray(yuv[..., 0]))
+    return cv2.cvtColor(yuv, cv2.COLOR_YUV2BGR)

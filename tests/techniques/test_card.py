@@ -6,7 +6,7 @@ from tiny_networks import CARD, write_card, write_network
 from edgevpr.core.contract import PartSpec, TechniqueSpec
 from edgevpr.core.errors import EdgevprError, ModelError
 from edgevpr.core.files import model_folders, shipped
-from edgevpr.techniques.networks.card import card_names, load_card, read_card, weights_of
+from edgevpr.techniques.card import card_names, load_card, read_card, weights_of
 
 SHA256 = "0" * 64
 

@@ -1,0 +1,173 @@
+"""Pooling of a feature map to one vector. A feature map is float32 (channels, height, width) throughout."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from edgevpr.core.arrays import Array, Doubles, Singles
+from edgevpr.core.errors import ModelError
+
+_TINY = 1e-12
+_RMAC_OVERLAP = 0.4  # wanted, of neighbouring squares (Tolias et al. 2016, section 3.2)
+_RMAC_SCALES = 3
+
+Square = tuple[int, int, int]  # top, left, side
+
+
+def unit(vectors: Array) -> Array:
+    """Scale rows (or a single vector) to length 1; a zero vector stays zero."""
+    unit_vectors: Array = vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), _TINY)
+    return unit_vectors
+
+
+def maximum(features: Singles) -> Singles:
+    """Compute MAC, the largest activation of each channel (Tolias et al. 2016, equation 1): (C, H, W) to float32
+    (C,)."""
+    largest: Singles = features.max(axis=(1, 2))
+    return largest
+
+
+def gem(features: Singles, p: float) -> Singles:
+    """Compute the generalised mean of each channel (Radenović et al. 2018, equation 3): (C, H, W) to float32 (C,).
+
+    p = 1 is the mean, p towards infinity the maximum. Activations below 1e-6 count as 1e-6, so that any p is defined.
+    Each channel is divided by its maximum first: the result is the same, and no power leaves the range of float32.
+    """
+    positive = np.maximum(features, 1e-6)
+    largest = positive.max(axis=(1, 2))
+    shares = positive / largest[:, None, None]
+    means: Singles = (largest * np.mean(shares**p, axis=(1, 2)) ** (1 / p)).astype(np.float32, copy=False)
+    return means
+
+
+def grid(features: Singles, rows: int, columns: int, how: str) -> Singles:
+    """Pool ("mean" or "max") over each cell of a grid: (C, H, W) to float32 (rows * columns * C,), cell by cell.
+
+    Cell i of n covers floor(i H / n) to ceil((i + 1) H / n) (He et al. 2014, section 2.2), so that no activation is
+    left out and no cell is empty. Raises ModelError for a feature map with fewer rows or columns than the grid.
+    """
+    _, height, width = features.shape
+    if rows > height or columns > width:
+        raise ModelError(
+            f"A feature map of {height}x{width} is too small for a grid of {rows}x{columns}: use a coarser grid or a "
+            "network with a larger feature map."
+        )
+    reduce = {"mean": np.mean, "max": np.max}[how]
+    cells = [
+        reduce(features[:, top:bottom, left:right], axis=(1, 2))
+        for top, bottom in _cells(height, rows)
+        for left, right in _cells(width, columns)
+    ]
+    return np.concatenate(cells)
+
+
+def pyramid(features: Singles, levels: Iterable[int]) -> Singles:
+    """Pool the maxima of a spatial pyramid (He et al. 2014, section 2.2): grids of n x n cells for each n of `levels`,
+    one after the other: (C, H, W) to float32 (sum of n^2, times C,).
+
+    The levels 1 to 4 (30 cells) are those of the public benchmark code of the thesis's author for AMOSNet and HybridNet
+    (Chen et al. 2017). That code leaves out the row and column between two cells; here nothing is left out. Raises
+    ModelError for a feature map smaller than the finest level.
+    """
+    return np.concatenate([grid(features, n, n, "max") for n in levels])
+
+
+@dataclass(frozen=True, slots=True)
+class Projection:
+    """Gaussian random projection to fewer dimensions, in a form that fits a small board: `spectrum` complex128
+    (n // 2 + 1,) of the Gaussian row, `signs` float32 (n,), `length` of the result.
+
+    A matrix of Gaussian values keeps the angles between vectors to about 1 / sqrt(dimensions). For the 43 008
+    activations of CALC and 1064 dimensions it takes 183 MB, and drawing it anew for each picture takes far longer than
+    the network. Here its rows are the cyclic shifts of *one* Gaussian vector, applied after a random sign for each
+    activation (Hinrichs and Vybíral 2011). Each row is still Gaussian, and angles are kept as well. The matrix is two
+    vectors (0.5 MB). The product is a correlation, which the Fourier transform computes in a twentieth of the time.
+    """
+
+    spectrum: Array
+    signs: Singles
+    length: int
+
+    def __call__(self, features: Singles) -> Singles:
+        """Project float32 of n values in any shape to (length,); the Euclidean length is kept on average."""
+        size = len(self.signs)
+        shifted = np.fft.irfft(self.spectrum * np.fft.rfft(features.ravel() * self.signs, size), size)
+        projected: Singles = (shifted[: self.length] / np.sqrt(self.length)).astype(np.float32)
+        return projected
+
+
+def gaussian_projection(size: int, length: int, seed: int) -> Projection:
+    """Make the projection from `size` to `length` values that belongs to `seed`.
+
+    Raises ModelError if `length` is larger than `size`.
+    """
+    if length > size:
+        raise ModelError(
+            f"A feature map of {size} values cannot be projected to {length} dimensions: ask for at most {size}."
+        )
+    row, signs = gaussian_row(size, seed)
+    # Row j of the matrix is the Gaussian vector shifted by j. The product is a correlation, hence the conjugate.
+    return Projection(np.conj(np.fft.rfft(row)), signs, length)
+
+
+def gaussian_row(size: int, seed: int) -> tuple[Doubles, Singles]:
+    """Make the Gaussian vector float64 (size,) and the signs float32 (size,) of a seed.
+
+    The same seed must give the same matrix for as long as a map is used. NumPy promises that for the raw numbers of its
+    bit generators, not for `standard_normal` (NEP 19). So both come from the raw 64-bit numbers of PCG64: first two for
+    each pair of Gaussian values (Box and Muller 1958), then one for each sign.
+    """
+    pairs = -(-size // 2)
+    raw = np.random.PCG64(seed).random_raw(2 * pairs + size)
+    uniform = ((raw[: 2 * pairs] >> np.uint64(11)) + 0.5) * 2.0**-53  # never 0
+    radius = np.sqrt(-2 * np.log(uniform[:pairs]))
+    angle = 2 * np.pi * uniform[pairs:]
+    row = np.concatenate([radius * np.cos(angle), radius * np.sin(angle)])[:size]
+    signs = np.where(raw[2 * pairs :] >> np.uint64(63), np.float32(1), np.float32(-1))
+    return row, signs
+
+
+def square_regions(height: int, width: int) -> list[Square]:
+    """Return the squares of R-MAC at three scales over a feature map (Tolias et al. 2016, section 3.2).
+
+    At scale l the squares are 2 min(H, W) / (l + 1) wide. There are l along the short side and l + m - 1 along the long
+    one, evenly spaced. m is the number that brings the overlap of two neighbours at the first scale closest to 40 %.
+    Raises ModelError for a feature map so small that a square of the last scale is not one activation wide.
+    """
+    short, long = min(height, width), max(height, width)
+    if 2 * short // (_RMAC_SCALES + 1) < 1:
+        raise ModelError(
+            f"A feature map of {height}x{width} is too small for the regions of R-MAC: it must be at least 2 wide."
+        )
+    # A square feature map has one region at the first scale; for others 2 to 7 are tried, as in the authors' code.
+    m = (
+        1
+        if long == short
+        else min(range(2, 8), key=lambda n: abs(1 - (long - short) / (n - 1) / short - _RMAC_OVERLAP))
+    )
+    regions = []
+    for scale in range(1, _RMAC_SCALES + 1):
+        side = 2 * short // (scale + 1)
+        down, across = (scale, scale + m - 1) if height <= width else (scale + m - 1, scale)
+        regions += [(top, left, side) for top in _starts(height, side, down) for left in _starts(width, side, across)]
+    return regions
+
+
+def regional_vectors(features: Singles, regions: list[Square]) -> Singles:
+    """Return the largest activation of each channel in each region, power- and L2-normalised: (C, H, W) to float32
+    (R, C).
+
+    The power normalisation is the signed square root, as the thesis uses it (4.2). The paper whitens by PCA instead,
+    which would have to be learned.
+    """
+    vectors = np.stack([features[:, y : y + side, x : x + side].max(axis=(1, 2)) for y, x, side in regions])
+    return unit(np.sign(vectors) * np.sqrt(np.abs(vectors)))
+
+
+def _starts(length: int, side: int, count: int) -> list[int]:
+    return [i * (length - side) // max(count - 1, 1) for i in range(count)]
+
+
+def _cells(length: int, count: int) -> list[tuple[int, int]]:
+    return [(i * length // count, -(-(i + 1) * length // count)) for i in range(count)]

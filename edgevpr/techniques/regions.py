@@ -1,0 +1,197 @@
+"""Techniques that match regions of a feature map: `rmac` its squares, `cross_region_bow` what the network marks.
+
+Both scan by one vector of a picture, and compare the best places region by region: the score sums over the mutually
+best pairs. Cross-Region-BoW (Chen, Maffra, Sa and Chli, IROS 2017) and Region-VLAD (Khaliq et al., T-RO 2019) find
+regions in the same way. In each channel, activations above zero that touch one another, corners included, make a
+region. Its energy is their mean. The most energetic regions over all channels are kept.
+
+Both describe a region by the activations of all channels under it, summed or averaged. Here these are the activations
+in the box around the region, as in the public code of Region-VLAD. The result has length 1, which makes sum and mean
+the same. Without that a large region outweighs all others, and both techniques are worse on corridor and
+aerial_caliterra, the data sets used for tuning. The pixels of the region alone do worse there than its box.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+
+from edgevpr.core.arrays import Array, Bools, Image, Ints, Mask, Singles
+from edgevpr.core.contract import Descriptor, FineMatch, PartSpec
+from edgevpr.core.errors import ModelError, UsageError
+from edgevpr.techniques.pooling import regional_vectors, square_regions, unit
+from edgevpr.techniques.session import Backbone, open_backbone
+from edgevpr.techniques.vectors import VectorTechnique
+from edgevpr.techniques.words import bag_of_words, load_words
+
+_SMALLEST = 3  # rows and columns of a feature map: in a smaller one nearly every region covers the picture
+_TINY = 1e-12
+Describe = Callable[[Singles], tuple[Singles, Singles]]
+
+
+class RegionTechnique(VectorTechnique):
+    """A technique that scans by one vector, and has a fine part of regions, int8 (N, C): 8 bits per number, zeros where
+    fewer are found. `describe` makes of a feature map the vector float32 (D,), and the regions float32 (N, C), each of
+    length 1; `quality` is taken of which regions are found, bool (N,)."""
+
+    candidates = 40
+
+    def __init__(self, backbone: Backbone, describe: Describe, quality: Callable[[Bools], float], **spec: Any) -> None:
+        self._backbone, self._describe, self._quality = backbone, describe, quality
+        vector, regions = describe(np.zeros(backbone.shape, np.float32))
+        super().__init__(length=len(vector), **spec)
+        self.spec = replace(self.spec, fine=PartSpec(regions.shape, "|i1"))
+
+    def encode(self, image: Image, mask: Mask | None = None) -> Descriptor:
+        """Encode uint8 (H, W[, 3]) to coarse float16 (D,) and fine int8 (N, C). For a query there are also the regions
+        as float32 of length 1; `good` marks those that were found."""
+        vector, regions = self._describe(self._backbone.run(image, mask))
+        good = regions.any(axis=1)
+        return Descriptor(
+            coarse=vector.astype("<f2"),
+            fine=to_bytes(regions),
+            regions=regions,
+            good=good,
+            quality=float(self._quality(good)),
+        )
+
+    def match(self, query: Descriptor, fine: Array, hypotheses: None = None) -> FineMatch:
+        """Score the mutually best pairs of regions, 0 to 1 (see `mutual_score`)."""
+        return FineMatch(mutual_score(query.regions, from_bytes(fine)))
+
+
+def rmac(model: str = "calc", form: str = "float", threads: int = 1) -> RegionTechnique:
+    """Make `rmac`: the largest activations in squares of the feature map of the card `model`, at three scales.
+
+    Tolias, Sicre and Jégou, "Particular object retrieval with integral max-pooling of CNN activations", ICLR 2016, in
+    the form of thesis 4.2.1: `conv5_2` of VGG-16, power- and L2-normalised. The squares of two pictures are matched
+    mutually, and the cosines of the mutual pairs are summed, without a check of geometry. The coarse part is the sum of
+    the squares, which the paper compares by cosine. The quality is the share of squares with any activation.
+    """
+    backbone = open_backbone(model, "features", threads)
+    squares = square_regions(*backbone.shape[1:])
+
+    def described(features: Singles) -> tuple[Singles, Singles]:
+        vectors = regional_vectors(features, squares)
+        return unit(vectors.sum(axis=0)), vectors
+
+    # With the shipped weights every wrong match had a margin below 0.147 (see `network`).
+    spec = {"name": "rmac", "parameters": {"model": model}, "model_sha256": backbone.sha256}
+    return RegionTechnique(backbone, described, np.mean, **spec, form=form, margins=(0.185,) * 3)
+
+
+def cross_region_bow(
+    *, model: str = "calc", form: str = "float", threads: int = 1, regions: int = 200, words: int = 10_000
+) -> RegionTechnique:
+    """Make `cross_region_bow`: the `regions` most energetic regions of the feature map of the card `model`, and a bag
+    of `words` visual words.
+
+    Chen, Maffra, Sa and Chli, "Only Look Once, Mining Distinctive Landmarks from ConvNet for Visual Place Recognition",
+    IROS 2017, in the form of thesis 4.2.1. The paper finds regions in `conv5_3` of VGG-16 and describes them from
+    `conv5_2`; a card names one feature map, which is used for both. The coarse part is the bag of words.
+    """
+    backbone = region_backbone("cross_region_bow", model, threads, regions)
+    learned = load_words(model, "bow", words)
+
+    def described(features: Singles) -> tuple[Singles, Singles]:
+        found = describe(features, find_regions(features, regions))
+        padded = np.zeros((regions, len(features)), np.float32)
+        padded[: len(found)] = found
+        return bag_of_words(found, learned.words), padded
+
+    # With the shipped weights every wrong match had a margin below 0.056 in every form (see `network`).
+    parameters = {"model": model, "regions": regions, "words": words}
+    spec = {"name": "cross_region_bow", "parameters": parameters, "model_sha256": learned.sha256}
+    return RegionTechnique(backbone, described, np.any, **spec, form=form, margins=(0.07,) * 3)
+
+
+def region_backbone(technique: str, model: str, threads: int, regions: int) -> Backbone:
+    """Open the network of the card `model`, to find regions in its feature map. Raises ModelError for a feature map
+    that is too small for regions or has no activation above zero, and UsageError for a number of regions outside 1 to
+    10 000."""
+    if not 1 <= regions <= 10_000:
+        raise UsageError(f"{technique}: regions is {regions}; it must be 1 to 10000.")
+    backbone = open_backbone(model, "features", threads)
+    height, width = backbone.shape[1:]
+    if min(height, width) < _SMALLEST:
+        raise ModelError(
+            f"{technique}: the feature map of `{model}` is {height}x{width}, too small for regions: at least "
+            f"{_SMALLEST}x{_SMALLEST} are needed, use an earlier layer."
+        )
+    noise = np.random.default_rng(0).integers(0, 256, (120, 160), np.uint8)
+    if not len(find_regions(backbone.run(noise), 1)):
+        raise ModelError(
+            f"{technique}: the feature map of `{model}` has nothing above zero, and regions are made of that: use an "
+            "output after the rectifier."
+        )
+    return backbone
+
+
+def find_regions(features: Singles, count: int) -> Ints:
+    """Return the `count` most energetic regions of a feature map float32 (C, H, W), or all if there are fewer.
+
+    They are boxes int (N, 4) as (top, left, bottom, right), bottom and right excluded, those of the largest energy
+    first. Regions with the same energy are ordered by channel, then from the top, then from the left, whatever the
+    order in which they are found.
+    """
+    channels, height, width = features.shape
+    # All channels in one tall picture, an empty row between them: one search instead of one per channel.
+    tall = np.zeros((channels, height + 1, width), np.float32)
+    np.maximum(features, 0, out=tall[:, :height])
+    tall = tall.reshape(-1, width)
+    found, labels, stats, _ = cv2.connectedComponentsWithStats((tall > 0).view(np.uint8), connectivity=8)
+    left, top, wide, high, area = stats[1:].T
+    sums = np.bincount(labels.ravel(), weights=tall.ravel(), minlength=found)[1:]
+    energy = (sums / area).astype(np.float32)
+    channel, row = np.divmod(top, height + 1)
+    best = np.lexsort((left, row, channel, -energy))[:count]
+    return np.stack([row, left, row + high, left + wide], axis=1)[best]
+
+
+def describe(features: Singles, boxes: Ints) -> Singles:
+    """Sum the activations of all channels under each box, and L2-normalise: (C, H, W), (N, 4) to float32 (N, C)."""
+    channels, height, width = features.shape
+    sums = np.zeros((height + 1, width + 1, channels), np.float64)  # of everything above and to the left
+    sums[1:, 1:] = features.transpose(1, 2, 0)
+    np.cumsum(sums, axis=0, out=sums)
+    np.cumsum(sums, axis=1, out=sums)
+    top, left, bottom, right = boxes.T
+    under = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
+    under /= np.maximum(np.linalg.norm(under, axis=1, keepdims=True), _TINY)
+    regions: Singles = under.astype(np.float32)
+    return regions
+
+
+def mutual_score(query: Singles, place: Singles) -> float:
+    """Score two sets of L2-normalised regions (N, D), (M, D), 0 to 1: the sum of the cosines (below 0: 0) of the
+    mutually best pairs, over the larger number of regions. A pair is mutually best if each is the other's best match.
+    All-zero rows are not regions.
+
+    Both papers sum over mutually best pairs. Dividing by the number of regions keeps pictures with few regions from
+    scoring low, and the score in 0..1. Several channels often mark the same box. Only one of such equal regions finds a
+    partner, so a picture may score below 1 with itself.
+    """
+    regions_of_query, regions_of_place = (int(regions.any(axis=1).sum()) for regions in (query, place))
+    if not regions_of_query or not regions_of_place:
+        return 0.0
+    cosines = query @ place.T
+    best = cosines.argmax(axis=1)
+    mutual = cosines.argmax(axis=0)[best] == np.arange(len(query))
+    total = np.maximum(cosines[np.arange(len(query)), best], 0)[mutual].sum()
+    return float(min(total / max(regions_of_query, regions_of_place), 1.0))
+
+
+def to_bytes(vectors: Singles) -> Array:
+    """Store directions in 8 bits: float32 (N, D) to int8 (N, D), each row over its own largest magnitude."""
+    largest = np.maximum(np.abs(vectors).max(axis=1, keepdims=True), _TINY)
+    stored: Array = np.rint(127 / largest * vectors).astype(np.int8)
+    return stored
+
+
+def from_bytes(stored: Array) -> Singles:
+    """Restore the rows of `to_bytes`, L2-normalised: int8 (N, D) to float32 (N, D); a zero row stays zero."""
+    vectors: Singles = stored.astype(np.float32)
+    vectors /= np.maximum(np.sqrt(np.einsum("nd,nd->n", vectors, vectors)), _TINY)[:, None]
+    return vectors

@@ -1,0 +1,155 @@
+"""Learned visual words: the file that `edgevpr train words` writes, VLAD about them, and the bag of them.
+
+VLAD is the sum of the residuals of a picture's local descriptors to the words (Jégou et al., CVPR 2010).
+"""
+
+import hashlib
+from dataclasses import dataclass
+
+import numpy as np
+
+from edgevpr.core.arrays import Ints, Singles
+from edgevpr.core.errors import ModelError
+from edgevpr.core.files import arrays_of, find_model, read_file
+from edgevpr.techniques.card import load_card
+from edgevpr.techniques.pooling import unit
+
+_MAX_FILE_BYTES = 500_000_000  # 65,536 words of 2,048 numbers
+_ROWS_AT_ONCE = 64  # of an 8-bit matrix converted to float32 together
+_TINY = 1e-12
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Whitening:
+    """A learned whitening W (v - mean) of VLAD vectors (Jégou and Chum, ECCV 2012): `mean` float32 (K D,), and W as
+    `matrix` int8 (P, K D), to be multiplied by `scale` float32 (P,)."""
+
+    mean: Singles
+    matrix: np.ndarray
+    scale: Singles
+
+    def __call__(self, vector: Singles) -> Singles:
+        """Whiten and L2-normalise: (K D,) to float32 (P,)."""
+        centred = vector - self.mean
+        product = np.empty(len(self.matrix), np.float32)
+        for start in range(0, len(product), _ROWS_AT_ONCE):
+            rows = slice(start, start + _ROWS_AT_ONCE)
+            product[rows] = self.matrix[rows].astype(np.float32) @ centred
+        return unit(product * self.scale)
+
+
+@dataclass(frozen=True, slots=True)
+class Words:
+    """Learned words: `words` float32 (K, D), the `sha256` of model and words together, for the map, and the
+    `whitening` of the descriptor made of them (None: it is not whitened)."""
+
+    words: Singles
+    sha256: str
+    whitening: Whitening | None = None
+
+
+def load_words(model: str, kind: str, count: int) -> Words:
+    """Load the `count` words of `kind` ("vlad", "regions", "bow") learned on the feature map of the card `model`.
+
+    Raises ModelError for a file that is missing, damaged or learned on another network, and names the command that
+    makes it. The fingerprint of the card tells networks apart: weights, preparation of the picture, and outputs.
+    """
+    name = f"{model}_{kind}{count}.npz"
+    command = f"make them with `edgevpr train words --images DIR --model {model} --kind {kind} --count {count}`"
+    path = find_model(name)
+    if path is None:
+        raise ModelError(f"There are no words {name} for the model `{model}`: {command}.")
+    wanted = load_card(model).fingerprint
+    try:
+        content = read_file(path, _MAX_FILE_BYTES)
+        arrays = arrays_of(content, _MAX_FILE_BYTES)
+        learned_on = str(arrays["model_sha256"])
+        words = arrays["words"].astype(np.float32)
+    except (OSError, ValueError, KeyError, MemoryError) as error:
+        raise ModelError(f"{path} cannot be read as words ({error}): {command}.") from error
+    if learned_on != wanted:
+        raise ModelError(
+            f"{path} was learned on another network ({learned_on[:12]}...) than `{model}` is now ({wanted[:12]}...): "
+            f"{command}."
+        )
+    if words.ndim != 2 or len(words) != count or not np.isfinite(words).all():
+        raise ModelError(f"{path} must hold {count} words, and holds an array {words.shape}: {command}.")
+    sha256 = hashlib.sha256((wanted + hashlib.sha256(content).hexdigest()).encode()).hexdigest()
+    if "whitening" not in arrays:
+        return Words(words, sha256)
+    mean, matrix, scale = (arrays.get(key) for key in ("mean", "whitening", "whitening_scale"))
+    fits = mean is not None and matrix is not None and scale is not None and mean.shape == (words.size,)
+    if not fits or matrix.shape != (scale.size, words.size):
+        raise ModelError(f"{path} holds a whitening that does not fit its words: {command}.")
+    mean, scale = mean.astype(np.float32), scale.astype(np.float32).ravel()
+    return Words(words, sha256, Whitening(mean=mean, matrix=matrix, scale=scale))
+
+
+def local_descriptors(features: Singles) -> Singles:
+    """Return the activations at each position as one L2-normalised descriptor: (C, H, W) to float32 (H * W, C).
+
+    NetVLAD collects the same (Arandjelović et al. 2016, section 3.1). The positions are in rows from the top left.
+    """
+    return unit(features.reshape(len(features), -1).T)
+
+
+def vlad(local: Singles, words: Singles, sharpness: float | None = None) -> Singles:
+    """Compute VLAD of descriptors (N, D) about words (K, D): float32 (K * D,).
+
+    The residuals are V(k) = sum over descriptors of a_k(x) (x - c_k) (Arandjelović et al. 2016, equation 1). Each
+    word's residual is scaled to length 1 (Arandjelović and Zisserman 2013), then the whole. The weights a_k are 1 for
+    the nearest word and 0 for the others; with a `sharpness` they are those of `soft_weights`.
+    """
+    if sharpness is None:
+        weights = np.zeros((len(local), len(words)), np.float32)
+        weights[np.arange(len(local)), nearest(local, words)] = 1
+    else:
+        weights = soft_weights(local, words, sharpness)
+    return unit(unit(weights.T @ local - weights.sum(axis=0)[:, None] * words).ravel())
+
+
+def soft_weights(local: Singles, words: Singles, sharpness: float) -> Singles:
+    """Compute the softmax over the words of -sharpness |x - c|^2 (Arandjelović et al. 2016, equation 2): (N, D), (K, D)
+    to float32 (N, K)."""
+    closeness = sharpness * _closeness(local, words)
+    closeness -= closeness.max(axis=1, keepdims=True)
+    weights: Singles = np.exp(closeness, out=closeness)
+    weights /= weights.sum(axis=1, keepdims=True)
+    return weights
+
+
+def sharpness_of(words: Singles) -> float:
+    """Compute the sharpness of `soft_weights`: at a word, its own weight is on average 100 times that of the next word.
+
+    NetVLAD asks for that ratio over the training descriptors (section 5, "Training"). Only the words are kept here, so
+    the ratio is taken over the words.
+    """
+    squares = np.einsum("kd,kd->k", words, words)
+    apart = squares[:, None] + squares - 2 * words @ words.T
+    np.fill_diagonal(apart, np.inf)
+    return float(np.log(100) / max(apart.min(axis=1).mean(), _TINY)) if len(words) > 1 else 1.0
+
+
+def bag_of_words(local: Singles, words: Singles) -> Singles:
+    """Mark the words (K, D) that are nearest to any of the descriptors (N, D), and L2-normalise: float32 (K,).
+
+    A word counts once, however often it occurs. Many channels mark the same part of a picture, so that counts say
+    little; on corridor and aerial_caliterra, the data sets used for tuning, they find fewer places. The inverse
+    document frequency is left out too, since it would weigh words by a map that is still being made.
+    """
+    present = np.zeros(len(words), np.float32)
+    present[nearest(local, words)] = 1
+    return unit(present)
+
+
+def nearest(local: Singles, words: Singles) -> Ints:
+    """Return the number of the word nearest to each descriptor: (N, D), (K, D) to int (N,); of equally near words the
+    first."""
+    numbers: Ints = _closeness(local, words).argmax(axis=1)
+    return numbers
+
+
+def _closeness(local: Singles, words: Singles) -> Singles:
+    """Compute -|x - c|^2, up to a term that is the same for all words of a descriptor: (N, K)."""
+    closeness: Singles = 2 * local @ words.T - np.einsum("kd,kd->k", words, words)
+    return closeness
