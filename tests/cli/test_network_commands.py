@@ -167,7 +167,7 @@ def tried_once(try_each):
 def test_profile_lists_every_form_and_says_in_a_sentence_what_cannot_be_used(models, capsys, monkeypatch):
     wanted = ("cohog", "seqslam", "tiny", "calc", "rmac")
     monkeypatch.setattr("edgevpr.techniques.names", lambda: wanted)
-    for room in ("core.resources", "techniques.card"):
+    for room in ("core.files", "techniques.card"):
         monkeypatch.setattr(f"edgevpr.{room}.model_folders", lambda: (models,))
     monkeypatch.setattr(stored, "try_each", tried_once(stored.try_each))
     assert main(["profile", "--places", "100", "--json"]) == 0

@@ -82,7 +82,7 @@ def test_verifying_is_done_apart_so_that_memory_is_that_of_the_network(models):
 
 def test_the_command_verifies_all_and_says_which_cannot_be_used(models, capsys, monkeypatch):
     monkeypatch.setattr("edgevpr.runtime.preflight.networks.verify", verify_here)
-    for room in ("core.resources", "techniques.card"):
+    for room in ("core.files", "techniques.card"):
         monkeypatch.setattr(f"edgevpr.{room}.model_folders", lambda: (models,))
     write_network(models, "mine")
     write_network(models, "wrong", fault="zeros")
