@@ -7,30 +7,26 @@ is fitted to all other sites, so that no figure comes from a network that has se
 salience.md and salience_budget.png into benchmarks/results/.
 """
 
-import os
-
-import base  # noqa: F401
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
-
 import argparse
-import json
+import os
 import tempfile
+import time
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import base
+import cv2
 import detectors
 import numpy as np
-from bench_scan import medians_s
-from hostile_pictures import camera_of
-from run_sets import DATA, made_by
+import walks
+from base import DATA, RESULTS, Row, camera_of
 
-from edgevpr.core.text import figure, markdown, progress
-from edgevpr.core.types import Frame, Place, Salience
-from edgevpr.frames.images import cv2, list_images, read_image
+from edgevpr.core.text import progress
+from edgevpr.core.types import Place, Salience
+from edgevpr.frames.images import list_images, read_image
 from edgevpr.lab.evaluate import metrics
-from edgevpr.lab.evaluate.dataset import Dataset, load_dataset
+from edgevpr.lab.evaluate.dataset import Dataset
 from edgevpr.lab.training import export_matchability
 from edgevpr.lab.training.labels import label_site, walk_over
 from edgevpr.lab.training.matchability import compared, fit, site_of
@@ -40,7 +36,6 @@ from edgevpr.runtime.recognise.memorability import Memorability, open_memorabili
 from edgevpr.runtime.recognise.salience_gate import Gate, Thresholds, worth_of
 from edgevpr.runtime.recognise.salience_maps import maps_of, scores_of
 
-RESULTS = Path(__file__).resolve().parent / "results"
 TECHNIQUES = ("hog", "cohog", "calc", "netvlad")
 FULL = Thresholds(0.3, 0.6, 0.4)
 GATES = {
@@ -59,24 +54,6 @@ _SEED = 1
 DETECTOR = "yolox_nano"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class GateRow:
-    """One technique on one set under one gate. `auc` is that of the thesis's count (a query that is discarded is a true
-    negative), `recall_strict` counts it as missed. `true_discarded` of the `queries` were matched rightly without the
-    gate, `false_discarded` wrongly. `places` is the share of the references that pass the gate."""
-
-    set: str
-    technique: str
-    gate: str
-    recall: float
-    auc: float
-    recall_strict: float
-    queries: int
-    true_discarded: int
-    false_discarded: int
-    places: float
-
-
 @dataclass(frozen=True, slots=True)
 class Asked:
     """The answers of a technique on a set: for each query the slots of the places, best first, their scores, and which
@@ -93,8 +70,7 @@ def main() -> None:
     parser.add_argument("--sets", metavar="A,B", help="(default: all)")
     args = parser.parse_args()
     names = args.sets.split(",") if args.sets else None
-    folders = [path.parent for path in sorted(DATA.glob("*/ground_truth.csv"))]
-    folders = [each for each in folders if not names or each.name in names]
+    folders = base.find_sets(names=names)
     with tempfile.TemporaryDirectory(prefix="edgevpr-salience-") as temporary:
         os.environ["EDGEVPR_MODELS"] = temporary
         judged = fit_each([each.name for each in folders], Path(temporary))
@@ -106,7 +82,7 @@ def main() -> None:
         rows, budget, light = [], [], []
         for folder in folders:
             memorability = open_memorability(f"without_{folder.name}")
-            dataset = load_dataset(folder / "query", folder / "ref", folder / "ground_truth.csv")
+            dataset = walks.dataset_of(folder)
             queries = [each.path for each in dataset.queries]
             places = list_images(folder / "ref")
             every = progress([*queries, *places], len(queries) + len(places), f"{folder.name}: salience")
@@ -117,16 +93,8 @@ def main() -> None:
                 asked = ask(technique, dataset)
                 rows += gated(folder.name, technique, asked, [seen[path] for path in queries], kept)
                 budget += shrunk(folder.name, technique, asked, [seen[path]["all three"] for path in places])
-    measured = {
-        **made_by(),
-        "speed": speed,
-        "unseen": judged,
-        "gate": [asdict(row) for row in rows],
-        "light": light,
-        "budget": budget,
-    }
-    (RESULTS / "salience.json").write_text(json.dumps(measured, indent=1) + "\n")
-    (RESULTS / "salience.md").write_text(page(measured))
+    found = {**base.made_by(), "speed": speed, "unseen": judged, "gate": rows, "light": light, "budget": budget}
+    base.write("salience", found, page(found))
     plot(budget, RESULTS / "salience_budget.png")
 
 
@@ -134,7 +102,7 @@ def fit_each(names: list[str], models: Path) -> dict[str, dict[str, dict[str, fl
     """For every set fit the better kind of network to all other sites, and write it with its card; return how both
     kinds do on sites that they have not seen, on generated changes and on real queries."""
     sites = []
-    for folder in sorted(path.parent for path in DATA.glob("*/ground_truth.csv")):
+    for folder in base.find_sets():
         if folder.name not in NOT_LEARNT:
             labelled = label_site(folder, camera_of(folder.name) == "nadir", _SEED, progress)
             sites.append(site_of(folder.name, labelled))
@@ -160,7 +128,13 @@ def speeds(network: str, there: list[str]) -> dict[str, float]:
         ways[f"all three, {name}"] = lambda each=each: scores_of(
             maps_of(picture, memorability, each.is_static(picture))
         )
-    return {name: 1e3 * t_s for name, t_s in medians_s(ways, 30).items()}
+    times_ms: dict[str, list[float]] = {name: [] for name in ways}
+    for _ in range(31):  # in turn, so that a busy moment hits all of them; the first round only warms
+        for name, way in ways.items():
+            start = time.perf_counter()
+            way()
+            times_ms[name].append(1e3 * (time.perf_counter() - start))
+    return {name: float(np.median(each[1:])) for name, each in times_ms.items()}
 
 
 def ask(name: str, dataset: Dataset) -> Asked:
@@ -169,7 +143,7 @@ def ask(name: str, dataset: Dataset) -> Asked:
     slots, scores, right, ignored = [], [], [], []
     with walk_over(list_images(dataset.ref_dir), name, camera_of(site) == "nadir") as walk:
         for query in progress(dataset.queries, len(dataset.queries), f"{site}, {name}"):
-            ranking = walk.step(Frame(image=read_image(query.path), name=query.path.name, t_mono_s=0.0)).ranking
+            ranking = walk.step(walks.frame(query.path)).ranking
             slots.append(np.empty(0, int) if ranking is None else ranking.slots)
             scores.append(np.empty(0) if ranking is None else ranking.scores)
             right.append(np.array([each in query.right for each in dataset.references]))
@@ -189,25 +163,27 @@ def answers(asked: Asked, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def gated(
     name: str, technique: str, asked: Asked, seen: list[dict[str, Salience]], kept: dict[str, np.ndarray]
-) -> Iterable[GateRow]:
+) -> Iterable[Row]:
     """Yield the rows of a technique on a set: without a gate, with all criteria, and with each alone. All references
-    stay, as in the thesis."""
+    stay, as in the thesis. `auc` is that of the thesis's count (a query that is discarded is a true negative),
+    `recall_strict` counts it as missed. `true_discarded` of the `queries` were matched rightly without the gate,
+    `false_discarded` wrongly. `places` is the share of the references that pass the gate."""
     score, found = answers(asked, np.ones(len(asked.right[0]), bool))
     for gate, thresholds in GATES.items():
         passes = np.array([worth_of(each[gate], thresholds).reason is None for each in seen])
         precision, recall = metrics.precision_recall(score[passes], found[passes])
-        yield GateRow(
-            set=name,
-            technique=technique,
-            gate=gate,
-            recall=float(found[passes].mean()) if passes.any() else 0.0,
-            auc=float(metrics.auc(precision, recall)) if passes.any() else 0.0,
-            recall_strict=float((found & passes).mean()),
-            queries=len(passes),
-            true_discarded=int((found & ~passes).sum()),
-            false_discarded=int((~found & ~passes).sum()),
-            places=float(kept[gate].mean()),
-        )
+        yield {
+            "set": name,
+            "technique": technique,
+            "gate": gate,
+            "recall": float(found[passes].mean()) if passes.any() else 0.0,
+            "auc": float(metrics.auc(precision, recall)) if passes.any() else 0.0,
+            "recall_strict": float((found & passes).mean()),
+            "queries": len(passes),
+            "true_discarded": int((found & ~passes).sum()),
+            "false_discarded": int((~found & ~passes).sum()),
+            "places": float(kept[gate].mean()),
+        }
 
 
 def shrunk(name: str, technique: str, asked: Asked, seen: list[Salience]) -> Iterable[dict]:
@@ -229,14 +205,8 @@ def shrunk(name: str, technique: str, asked: Asked, seen: list[Salience]) -> Ite
                 places[slots] = True
                 recalls.append(float(answers(asked, places)[1].mean()))
                 gaps.append(int(np.diff([-1, *slots, total]).max()) - 1)
-            yield {
-                "set": name,
-                "technique": technique,
-                "share": share,
-                "way": way,
-                "recall": float(np.mean(recalls)),
-                "gap": float(np.mean(gaps)),
-            }
+            row = {"set": name, "technique": technique, "share": share, "way": way}
+            yield row | {"recall": float(np.mean(recalls)), "gap": float(np.mean(gaps))}
 
 
 def kept_in_bad_light(paths: list[Path]) -> Iterable[dict]:
@@ -293,81 +263,95 @@ def _place(number: int, salience: Salience) -> Place:
     return Place(place_id=number + 1, source_image=str(number), salience=salience)
 
 
-def page(measured: dict) -> str:
+_GATE = {
+    "set": "{set}",
+    "technique": "{technique}",
+    "gate": "{gate}",
+    "recall": "{recall:.2f}",
+    "AUC": "{auc:.2f}",
+    "strict": "{recall_strict:.2f}",
+    "right": "{true_discarded}",
+    "wrong": "{false_discarded}",
+}
+_LIGHT = {
+    "set": "{set}",
+    "threshold": "{threshold:.2f}",
+    "light": "{light}",
+    "follows the light": "{kept:.0%}",
+    "constant": "{kept_constant:.0%}",
+}
+
+
+def page(found: Row) -> str:
     """Return the page for people."""
-    rows = measured["gate"]
+    rows = found["gate"]
     told = [
-        [kind, of, *("-" if each is None else f"{each:.2f}" for each in by_site.values())]
-        for kind, unseen in measured["unseen"].items()
+        {"network": kind, "pictures": of, **by_site}
+        for kind, unseen in found["unseen"].items()
         for of, by_site in unseen.items()
     ]
-    sets = list(next(iter(measured["unseen"].values()))["generated"])
+    columns = {"network": "{network}", "pictures": "{pictures}"} | {
+        name: f"{{{name}:.2f}}" for name in list(told[0])[2:]
+    }
     discards = {(row["set"], row["technique"]) for row in rows if row["true_discarded"] or row["false_discarded"]}
-    found = [
-        [
-            row["set"],
-            row["technique"],
-            row["gate"],
-            *(f"{row[key]:.2f}" for key in ("recall", "auc", "recall_strict")),
-            str(row["true_discarded"]),
-            str(row["false_discarded"]),
-        ]
-        for row in rows
-        if (row["set"], row["technique"]) in discards
-    ]
-    all_sets = list(dict.fromkeys(row["set"] for row in rows))
-    unchanged = [name for name in all_sets if not any(each == name for each, _ in discards)]
-    shares = {(row["set"], row["gate"]): f"{row['places']:.0%}" for row in rows}
-    sizes = [[gate, *(shares[name, gate] for name in all_sets)] for gate in GATES if gate != "none"]
-    light = [
-        [row["set"], f"{row['threshold']:.2f}", row["light"], f"{row['kept']:.0%}", f"{row['kept_constant']:.0%}"]
-        for row in measured["light"]
-    ]
-    parts = (
-        "# Memorable maps: what the gate and the choice of places are worth",
-        f"Made by `python benchmarks/bench_salience.py`, {measured['date']}, commit {measured['commit']}, "
-        f"{measured['machine']['cpu']}. Thresholds: memorability {FULL.memorability:g}, staticity {FULL.staticity:g}, "
-        f"entropy {FULL.entropy:g}.",
-        "## Time of a frame of 640x480, one thread",
-        markdown(["what", "ms"], [[name, f"{t_ms:.1f}"] for name, t_ms in measured["speed"].items()]),
-        "## Is it told which frames are found again? On sites that were left out; .50 is chance",
-        markdown(["network", "pictures", *sets], told),
-        "## With and without the gate",
-        "recall@1 and AUC are those of the thesis's count: a query that is discarded is a true negative. *strict*: it "
-        "is a miss.\n*right* and *wrong* count the discarded queries that would have been matched so. The map has all "
-        f"references. No query is discarded of\n{', '.join(unchanged) or 'any set'}: there all "
-        "figures are those without a gate.",
-        markdown(["set", "technique", "gate", "recall", "AUC", "strict", "right", "wrong"], found),
-        "The size of a map that is built through the gate, before its gaps are filled: share of the references kept",
-        markdown(["gate", *all_sets], sizes),
-        "## Entropy in bad light: share of the references kept",
-        markdown(["set", "threshold", "light", "follows the light", "constant"], light),
-        "## A map that shrinks",
-        "![recall and largest gap of maps of 50, 25 and 10 % of the places](salience_budget.png)",
-    )
-    return "\n\n".join(parts) + "\n"
+    sets = list(dict.fromkeys(row["set"] for row in rows))
+    unchanged = [name for name in sets if not any(each == name for each, _ in discards)]
+    shares = {(row["gate"], row["set"]): row["places"] for row in rows}
+    speed = [{"what": what, "ms": t_ms} for what, t_ms in found["speed"].items()]
+    sizes = [{"gate": gate, **{name: shares[gate, name] for name in sets}} for gate in GATES if gate != "none"]
+    return f"""# Memorable maps: what the gate and the choice of places are worth
+
+Made by `python benchmarks/bench_salience.py`, {found["date"]}, commit {found["commit"]}, {found["machine"]["cpu"]}.
+Thresholds: memorability {FULL.memorability:g}, staticity {FULL.staticity:g}, entropy {FULL.entropy:g}.
+
+## Time of a frame of 640x480, one thread
+
+{base.table(speed, {"what": "{what}", "ms": "{ms:.1f}"})}
+
+## Is it told which frames are found again? On sites that were left out; .50 is chance
+
+{base.table(told, columns)}
+
+## With and without the gate
+
+recall@1 and AUC are those of the thesis's count: a query that is discarded is a true negative. *strict*: it is a miss.
+*right* and *wrong* count the discarded queries that would have been matched so. The map has all references. No query is
+discarded of
+{", ".join(unchanged) or "any set"}: there all figures are those without a gate.
+
+{base.table([row for row in rows if (row["set"], row["technique"]) in discards], _GATE)}
+
+The size of a map that is built through the gate, before its gaps are filled: share of the references kept
+
+{base.table(sizes, {"gate": "{gate}", **{name: f"{{{name}:.0%}}" for name in sets}})}
+
+## Entropy in bad light: share of the references kept
+
+{base.table(found["light"], _LIGHT)}
+
+## A map that shrinks
+
+![recall and largest gap of maps of 50, 25 and 10 % of the places](salience_budget.png)
+"""
 
 
-def plot(budget: list[dict], path: Path) -> None:
+def plot(budget: list[Row], path: Path) -> None:
     """Draw recall of `cohog` and the largest gap against the share of places that is left, of sets of many places."""
     sets = [name for name in dict.fromkeys(row["set"] for row in budget) if name not in FIVE_PLACES]
-    drawn = figure(2.2 * len(sets), 6.0)
-    axes = drawn.subplots(2, len(sets), sharex=True, sharey="row", squeeze=False)
-    for column, name in enumerate(sets):
-        for way in dict.fromkeys(row["way"] for row in budget):
-            rows = [row for row in budget if (row["set"], row["technique"], row["way"]) == (name, "cohog", way)]
+    drawn, axes = base.panels(2.2 * len(sets), 6.0, 2 * len(sets), 2, sharex=True)
+    for above, below, name in zip(axes, axes[len(sets) :], sets, strict=False):
+        of_set = [row for row in budget if (row["set"], row["technique"]) == (name, "cohog")]
+        for way, rows in base.groups(of_set, lambda row: row["way"]):
             share = [100 * row["share"] for row in rows]
-            axes[0][column].plot(share, [row["recall"] for row in rows], "o-", label=way)
-            axes[1][column].plot(share, [row["gap"] for row in rows], "o-", label=way)
-        axes[0][column].set_title(name, fontsize=9)
-        axes[1][column].set_xlabel("% of the places")
-        axes[1][column].set_yscale("symlog")
-    axes[0][0].set_ylabel("recall@1 of cohog")
-    axes[1][0].set_ylabel("largest gap, frames")
-    axes[0][0].legend(fontsize=8)
-    drawn.savefig(path, dpi=100)
+            above.plot(share, [row["recall"] for row in rows], "o-", label=way)
+            below.plot(share, [row["gap"] for row in rows], "o-", label=way)
+        above.set_title(name, fontsize=9)
+        below.set(xlabel="% of the places", yscale="symlog")
+    axes[0].set_ylabel("recall@1 of cohog")
+    axes[len(sets)].set_ylabel("largest gap, frames")
+    axes[0].legend(fontsize=8)
+    base.save(drawn, path)
 
 
 if __name__ == "__main__":
-    cv2.setNumThreads(1)
-    main()
+    base.run(main)

@@ -6,16 +6,10 @@ Streams that break, pictures that say nothing, maps that are damaged, packets of
 files that are wrong are all made from a seed. The table says what was tried, how often, and what left the aircraft.
 """
 
-import os
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
-
 import argparse
-import json
-from dataclasses import asdict
-from pathlib import Path
+from dataclasses import asdict, is_dataclass
 
-import base  # noqa: F401
+import base
 import damaged_streams
 import hostile_bytes
 import hostile_flights
@@ -24,17 +18,14 @@ import hostile_kills
 import hostile_links
 import hostile_maps
 import hostile_pictures
-from run_sets import made_by
+from base import Row
 
-from edgevpr.core.text import markdown
-
-RESULTS = Path(__file__).resolve().parent / "results"
 # name: (title, how it is run, usual count: of the pictures of each stream, of each set of pictures, kind of packet or
 # input, and in all of maps and of kills of each kind; of `bytes`, ten times as many bytes)
 PARTS = {
     "streams": ("Streams: pictures that are cut, corrupted, lost or frozen", damaged_streams.run, 240),
     "flights": ("Flights behind such streams: how much older than claimed a picture was", hostile_flights.run, 800),
-    "pictures": ("Pictures that say nothing, and those of the other camera", hostile_pictures.run_in_groups, 276),
+    "pictures": ("Pictures that say nothing, and those of the other camera", hostile_pictures.run, 276),
     "maps": ("Maps that are damaged", hostile_maps.run, 200),
     "links": ("Links: packets and autopilots that are not ours", hostile_links.run, 1000),
     "bytes": ("Bytes and packets: random, changed, and forged", hostile_bytes.run, 1_000_000),
@@ -49,34 +40,24 @@ def main() -> None:
     parser.add_argument("--share", type=float, default=1.0, help="of the usual counts (default: 1)")
     parser.add_argument("--seed", type=int, default=1)
     args = parser.parse_args()
-    kept = RESULTS / "hostile.json"
-    measured = json.loads(kept.read_text()) if kept.exists() else {}
     for name in args.parts.split(","):
         _, run, count = PARTS[name]
         print(f"trying: {name}", flush=True)
-        rows = run(max(1, round(args.share * count)), args.seed)
-        measured[name] = {
-            **made_by(),
-            "seed": args.seed,
-            "rows": [asdict(row) for row in rows],
-        }
-        kept.write_text(json.dumps(measured, indent=2) + "\n")
-    (RESULTS / "hostile.md").write_text(report(measured))
+        rows = [asdict(row) if is_dataclass(row) else row for row in run(max(1, round(args.share * count)), args.seed)]
+        found = base.read("hostile") | {name: {**base.made_by(), "seed": args.seed, "rows": rows}}
+        base.write("hostile", found, page(found))
 
 
-def report(measured: dict) -> str:
+def page(found: Row) -> str:
     """Return the page for people: a table for each part, with the fields of its rows as columns."""
-    page = ["# Tried as a hostile world would\n\nMade by `make hostile`: all inputs come from a seed."]
+    parts = ["# Tried as a hostile world would\n\nMade by `make hostile`: all inputs come from a seed."]
     for name, (title, _, _) in PARTS.items():
-        if name in measured:
-            part = measured[name]
-            rows = part["rows"]
-            columns = [key.replace("_", " ") for key in rows[0]]
-            page.append(
-                f"## {title}\n\n{part['date']}, commit {part['commit']}, seed {part['seed']}, "
-                f"{part['machine']['cpu']}.\n\n{markdown(columns, [list(map(_shown, row.values())) for row in rows])}"
-            )
-    return "\n\n".join(page) + "\n"
+        if part := found.get(name):
+            made = f"{part['date']}, commit {part['commit']}, seed {part['seed']}, {part['machine']['cpu']}."
+            rows = [{key: _shown(value) for key, value in row.items()} for row in part["rows"]]
+            columns = {key.replace("_", " "): f"{{{key}}}" for key in rows[0]}
+            parts.append(f"## {title}\n\n{made}\n\n{base.table(rows, columns)}")
+    return "\n\n".join(parts)
 
 
 def _shown(value: object) -> str:
@@ -89,4 +70,4 @@ def _shown(value: object) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    base.run(main)

@@ -7,9 +7,10 @@ import logging
 import random
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+
+from base import Row
 
 from edgevpr.mavlink.conversation import Conversation
 from edgevpr.mavlink.messages import Fix
@@ -25,33 +26,14 @@ _KINDS = tuple(mavlink.mavlink_map.values())
 _PAGE_MB = 4096 / 1e6
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Row:
-    """What was tried, and what came of it.
-
-    `believed` are the messages of a known kind that came through, among them the autopilot's own first, and those that
-    a change has left whole. `grown_mb` is what the process has grown by since the first tenth. `us_each` and `mb_s` are
-    of the CPU time of hearing alone.
-    """
-
-    kind: str
-    packets: int
-    mb: float
-    believed: int
-    exceptions: int
-    grown_mb: float
-    us_each: float
-    mb_s: float
-
-
-class _Clock:
+class Clock:
     now_s = 1000.0
 
     def __call__(self) -> float:
         return self.now_s
 
 
-class _Maker:
+class Maker:
     """Makes packets from a seed. Signed ones have time stamps that go on with the clock of their hearer."""
 
     def __init__(self, rng: random.Random, stamp: int) -> None:
@@ -104,27 +86,27 @@ class _Maker:
 
 
 # Kind: whether there is a key, and what makes the next packet of it.
-KINDS: dict[str, tuple[bool, Callable[[_Maker], bytes]]] = {
+KINDS: dict[str, tuple[bool, Callable[[Maker], bytes]]] = {
     "changed anywhere": (False, lambda maker: maker.mutated(maker.packet())),
     "any content, right checksum": (False, lambda maker: maker.packet()),
     "any header and length, right checksum": (False, lambda maker: maker.any_header(maker.packet)),
     "signed, changed anywhere": (True, lambda maker: maker.mutated(maker.signed())),
     "signed, any content": (True, lambda maker: maker.signed()),
     "signed, any header and length": (True, lambda maker: maker.any_header(maker.signed)),
-    "forged, old, replayed or unsigned": (True, _Maker.forged),
+    "forged, old, replayed or unsigned": (True, Maker.forged),
 }
 
 
-def _random_bytes(maker: _Maker) -> bytes:
+def _random_bytes(maker: Maker) -> bytes:
     return maker.rng.randbytes(BYTES)
 
 
-def _beginnings(maker: _Maker) -> bytes:
+def _beginnings(maker: Maker) -> bytes:
     """Make ten bytes, among them more beginnings of messages than chance has."""
     return bytes(maker.rng.choice((0xFD, 0xFE, 0, 1, 255, maker.rng.randrange(256))) for _ in range(BYTES))
 
 
-BYTE_KINDS: dict[str, tuple[bool, Callable[[_Maker], bytes]]] = {
+BYTE_KINDS: dict[str, tuple[bool, Callable[[Maker], bytes]]] = {
     "random bytes": (False, _random_bytes),
     "random bytes, with a key": (True, _random_bytes),
     "beginnings of messages": (False, _beginnings),
@@ -135,12 +117,12 @@ class Hearer:
     """A link without its port, which knows its autopilot. Its clock goes on by a hundredth of a second a packet."""
 
     def __init__(self, rng: random.Random, folder: Path, with_key: bool) -> None:
-        self.clock = _Clock()
+        self.clock = Clock()
         stamps = TimeStamps(folder / "time", self.clock, lambda: 1.8e9 + self.clock.now_s)
         signing = Signing(KEY, stamps) if with_key else NOT_SIGNING
         self.conversation = Conversation(self.clock, 197, None, 1.0, signing=signing)
         self.conversation.want_position()
-        self.maker = _Maker(rng, stamps.next())
+        self.maker = Maker(rng, stamps.next())
         self.failures: list[str] = []
         self.heard_s = 0.0
         beat = mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 1, 0, 4, 3)
@@ -178,8 +160,7 @@ class Hearer:
 
 def run(count: int, seed: int) -> list[Row]:
     """Try `count` packets of every kind, and ten times as many bytes of the kinds that are no packets."""
-    rng = random.Random(seed)
-    logger = logging.getLogger("edgevpr.mavlink")
+    rng, logger = random.Random(seed), logging.getLogger("edgevpr.mavlink")
     level, logger.level = logger.level, logging.CRITICAL  # thousands of warnings are what is wanted
     try:
         return [_row(kind, *made, count, rng) for kind, made in {**BYTE_KINDS, **KINDS}.items()]
@@ -187,7 +168,10 @@ def run(count: int, seed: int) -> list[Row]:
         logger.level = level
 
 
-def _row(kind: str, with_key: bool, make: Callable[[_Maker], bytes], count: int, rng: random.Random) -> Row:
+def _row(kind: str, with_key: bool, make: Callable[[Maker], bytes], count: int, rng: random.Random) -> Row:
+    """Return what was tried, and what came of it. `believed` are the messages of a known kind that came through, among
+    them the autopilot's own first, and those that a change has left whole. `grown_mb` is what the process has grown by
+    since the first tenth. `us_each` and `mb_s` are of the CPU time of hearing alone."""
     with TemporaryDirectory(ignore_cleanup_errors=True) as folder:  # the time may just be being kept in it
         hearer = Hearer(rng, Path(folder), with_key)
         done = heard_bytes = 0
@@ -199,18 +183,17 @@ def _row(kind: str, with_key: bool, make: Callable[[_Maker], bytes], count: int,
             heard_bytes += sum(map(len, packets))
             if before_mb is None and done >= count / 10:
                 before_mb = _rss_mb()
-        after_mb = _rss_mb()
-        received = hearer.conversation.receiver.received
-    return Row(
-        kind=kind,
-        packets=count,
-        mb=round(heard_bytes / 1e6, 1),
-        believed=received.total() - received["UNKNOWN"],
-        exceptions=len(hearer.failures),
-        grown_mb=round(after_mb - before_mb, 1),
-        us_each=round(1e6 * hearer.heard_s / count, 1),
-        mb_s=round(heard_bytes / 1e6 / hearer.heard_s, 2),
-    )
+        grown_mb, received = _rss_mb() - before_mb, hearer.conversation.receiver.received
+    return {
+        "kind": kind,
+        "packets": count,
+        "mb": round(heard_bytes / 1e6, 1),
+        "believed": received.total() - received["UNKNOWN"],
+        "exceptions": len(hearer.failures),
+        "grown_mb": round(grown_mb, 1),
+        "us_each": round(1e6 * hearer.heard_s / count, 1),
+        "mb_s": round(heard_bytes / 1e6 / hearer.heard_s, 2),
+    }
 
 
 def _rss_mb() -> float:

@@ -5,15 +5,15 @@ belongs to one moment: a fix tells when the picture was sent that it was made fr
 """
 
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import base  # noqa: F401
 import numpy as np
+from base import Row
 from damaged_streams import Camera, Film, Stream, streams
 from flight_process import start, wait_for
 from rtsp_camera import free_port
@@ -42,46 +42,27 @@ _DEPTH_M = 320.0  # the road that crosses every scene from west to east passes n
 _LENS = simulated.Camera(width=320, height=240, focal_px=_HEIGHT_M / _METRES_PER_PIXEL)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Row:
-    """What became of one stream: pictures `sent`, `queries` asked with those that were taken, and `fixes` that reached
-    the autopilot; of a damaged stream those for pictures said to be taken since the damage began.
-
-    Of the fixes, `old` say a place that had passed more than a second, and half a place's spacing, before the time that
-    they claim, and `ahead` one that was as far ahead; `oldest_s` is the most that any was behind."""
-
-    stream: str
-    is_whole: bool
-    sent: int
-    queries: int
-    fixes: int
-    old: int
-    ahead: int
-    oldest_s: float
-
-
 def run(count: int, seed: int, only: Callable[[str], bool] = lambda stream: True) -> list[Row]:
-    """Fly `count` pictures far behind every stream whose name is wanted; the last row is the sum of all damaged
-    ones."""
+    """Fly `count` pictures far behind every stream whose name is wanted; the last row is the sum of all damaged ones.
+
+    A row tells of one stream: pictures `sent`, `queries` asked with those that were taken, and `fixes` that reached the
+    autopilot; of a damaged stream those for pictures said to be taken since the damage began. Of the fixes, `old` say a
+    place that had passed more than a second, and half a place's spacing, before the time that they claim, and `ahead`
+    one that was as far ahead; `oldest_s` is the most that any was behind."""
     with TemporaryDirectory(prefix="edgevpr-flights-") as name:
         film, place_map = _land(Path(name), count, seed)
         rows = []
         for number, stream in enumerate(each for each in streams() if only(each.name)):
             log = place_map.with_name(f"{number}.jsonl")
             rows.append(_flown(stream, stream.camera(film, seed), film, place_map, log))
-    return [*rows, total(row for row in rows if not row.is_whole)]
+    return [*rows, total([row for row in rows if not row["is_whole"]])]
 
 
-def total(rows: Iterable[Row]) -> Row:
+def total(rows: list[Row]) -> Row:
     """Add up the rows of damaged streams."""
-    rows = list(rows)
-    sums = {name: sum(getattr(row, name) for row in rows) for name in ("sent", "queries", "fixes", "old", "ahead")}
-    return Row(
-        stream="all that are damaged",
-        is_whole=False,
-        oldest_s=max((row.oldest_s for row in rows), default=0.0),
-        **sums,
-    )
+    sums = {name: sum(row[name] for row in rows) for name in ("sent", "queries", "fixes", "old", "ahead")}
+    oldest_s = max((row["oldest_s"] for row in rows), default=0.0)
+    return {"stream": "all that are damaged", "is_whole": False, **sums, "oldest_s": oldest_s}
 
 
 def behind_s(fixes: Sequence[ReceivedFix], sent_s: dict[int, float]) -> np.ndarray:
@@ -157,16 +138,16 @@ def _flown(stream: Stream, camera: Camera, film: Film, place_map: Path, log: Pat
     begin_s = 0.0 if stream.is_whole else camera.sent_s[film.whole_at_first]
     fixes = [fix for fix, claimed_s in zip(fixes, _claimed_s(fixes), strict=True) if claimed_s > begin_s]
     older_s = behind_s(fixes, camera.sent_s)
-    return Row(
-        stream=stream.name,
-        is_whole=stream.is_whole,
-        sent=len(camera.sent_s),
-        queries=sum(line["kind"] == "query" and line["t_frame_s"] > begin_s for line in read_log(log)),
-        fixes=len(fixes),
-        old=int((older_s > _LIMIT_S).sum()),
-        ahead=int((older_s < -_LIMIT_S).sum()),
-        oldest_s=float(older_s.max(initial=0.0)),
-    )
+    return {
+        "stream": stream.name,
+        "is_whole": stream.is_whole,
+        "sent": len(camera.sent_s),
+        "queries": sum(line["kind"] == "query" and line["t_frame_s"] > begin_s for line in read_log(log)),
+        "fixes": len(fixes),
+        "old": int((older_s > _LIMIT_S).sum()),
+        "ahead": int((older_s < -_LIMIT_S).sum()),
+        "oldest_s": float(older_s.max(initial=0.0)),
+    }
 
 
 @contextmanager

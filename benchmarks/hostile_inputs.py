@@ -18,24 +18,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import hostile_files as files
+from base import Row
 
 LIMIT_S = 60.0  # far more than any of these commands takes on its own
 MEMORY_BYTES = 4 << 30  # of addresses, of which the libraries alone take a good part
 _AT_ONCE = 8  # images in one folder, for one command
 _SAID = b"edgevpr: "
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Row:
-    """Counts of one kind of input. `examples` say what went wrong, at most three times."""
-
-    kind: str
-    tried: int
-    tracebacks: int
-    hangs: int
-    wrong_exit_codes: int
-    leaks: int
-    examples: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,12 +36,11 @@ class Attempt:
 
 
 def run(count: int, seed: int) -> list[Row]:
-    """Try `count` inputs of each kind; the same seed makes the same inputs."""
+    """Try `count` inputs of each kind; the same seed makes the same inputs. `examples` of a row say what went wrong, at
+    most three times."""
     with tempfile.TemporaryDirectory() as folder:
         ground = _Ground.made(Path(folder))
-        return [
-            _tried(kind, attempts, ground, count, random.Random(f"{seed} {kind}")) for kind, attempts in KINDS.items()
-        ]
+        return [_tried(kind, make, ground, count, random.Random(f"{seed} {kind}")) for kind, make in KINDS.items()]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -176,15 +163,8 @@ def _tried(kind: str, make: Maker, ground: _Ground, count: int, chance: random.R
                 shown = " ".join(os.fsdecode(word) for word in attempt.argv)
                 examples.append(f"{wrong}: edgevpr {shown!a:.300}: ... {said[-900:]!a}")
         shutil.rmtree(here)
-    return Row(
-        kind=kind,
-        tried=tried,
-        tracebacks=wrongs["traceback"],
-        hangs=wrongs["hang"],
-        wrong_exit_codes=wrongs["exit code"],
-        leaks=wrongs["leak"],
-        examples=tuple(examples),
-    )
+    counts = dict(zip(("tracebacks", "hangs", "wrong_exit_codes", "leaks"), wrongs.values(), strict=True))
+    return {"kind": kind, "tried": tried, **counts, "examples": examples}
 
 
 def _wrongs(attempt: Attempt, here: Path) -> Iterator[tuple[str, str]]:

@@ -5,11 +5,10 @@ import sqlite3
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import base  # noqa: F401
+from base import Row
 from flight_process import start, write_frames
 
 from edgevpr.places.mapfile import PlaceMap
@@ -20,21 +19,10 @@ _LONGEST_LIFE_S = 2.5
 _STEP_DEG = 0.0002  # 22 m: each picture is a place of its own
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class KillRow:
-    """Outcome of `kills` of one kind: places that a program had confirmed, and how many of them were `lost`, were there
-    twice (`doubled`), or stood in a map that SQLite calls damaged (`corrupt`, maps)."""
-
-    kind: str
-    kills: int
-    confirmed: int
-    lost: int
-    doubled: int
-    corrupt: int
-
-
-def run(count: int, seed: int) -> list[KillRow]:
-    """Kill `count` builders and as many learning flights, each at a moment drawn from the seed."""
+def run(count: int, seed: int) -> list[Row]:
+    """Kill `count` builders and as many learning flights, each at a moment drawn from the seed. Counted are places that
+    a program had confirmed, and how many of them were `lost`, were there twice (`doubled`), or stood in a map that
+    SQLite calls damaged (`corrupt`, maps)."""
     rng = random.Random(seed)
     with TemporaryDirectory(prefix="edgevpr-kills-") as folder:
         frames = Path(folder) / "frames"
@@ -44,7 +32,7 @@ def run(count: int, seed: int) -> list[KillRow]:
         return [_killed("map build", count, rng, frames, _built), _killed("run --learn", count, rng, frames, _learnt)]
 
 
-def _killed(kind, count, rng, frames, go) -> KillRow:
+def _killed(kind, count, rng, frames, go) -> Row:
     confirmed: set[str] = set()
     totals = {"confirmed": 0, "lost": 0, "doubled": 0, "corrupt": 0}
     path = frames.parent / f"{kind.split()[-1].strip('-')}.gpkg"
@@ -59,7 +47,7 @@ def _killed(kind, count, rng, frames, go) -> KillRow:
         totals["doubled"] += len(held) - len(set(held))
         totals["corrupt"] += not _is_whole(path)
         confirmed |= set(held)  # what was there once must stay
-    return KillRow(kind=kind, kills=count, **totals)
+    return {"kind": kind, "kills": count, **totals}
 
 
 def _built(path: Path, frames: Path, log: Path, life_s: float) -> set[str]:

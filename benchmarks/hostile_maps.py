@@ -7,11 +7,11 @@ import shutil
 import sqlite3
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
+from base import Row
 
 from edgevpr.cli.main import main
 from edgevpr.core.config import Config, load_config
@@ -48,18 +48,6 @@ _SCHEMA = (
 IN_FLIGHT_ONLY = ("another map", "moved by a program")
 
 Rng = np.random.Generator
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class HostileMaps:
-    """Maps of one kind of damage: how many were `tried`; how many commands or flights ended with a traceback; queries
-    that accepted another position than the whole map has; and places that could be read, but were lost by a repair."""
-
-    kind: str
-    tried: int
-    tracebacks: int
-    wrong_positions: int
-    places_lost: int
 
 
 def _bits(path: Path, rng: Rng, first: int = 0, end: int | None = None, most: int = 64) -> None:
@@ -171,8 +159,10 @@ def damaged_maps(folder: Path, whole_map: Path, count: int, seed: int) -> Iterat
         yield kind, path
 
 
-def run(count: int, seed: int) -> list[HostileMaps]:
-    """Try `count` damaged maps, at take-off, in flight, with the commands and with a repair; return a row a kind."""
+def run(count: int, seed: int) -> list[Row]:
+    """Try `count` damaged maps, at take-off, in flight, with the commands and with a repair; return a row a kind: how
+    many commands or flights ended with a traceback, queries that accepted another position than the whole map has, and
+    places that could be read, but were lost by a repair."""
     found: dict[str, list[tuple[int, int, int]]] = {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -182,12 +172,10 @@ def run(count: int, seed: int) -> list[HostileMaps]:
                 found.setdefault(kind, []).append(_tried(kind, path, whole))
             for each in folder.glob(path.name + "*"):
                 each.unlink()
+    names = ("tracebacks", "wrong_positions", "places_lost")
     return [
-        HostileMaps(
-            kind=kind, tried=len(each), tracebacks=sum(tracebacks), wrong_positions=sum(wrong), places_lost=sum(lost)
-        )
+        {"kind": kind, "tried": len(each), **dict(zip(names, map(sum, zip(*each, strict=True)), strict=True))}
         for kind, each in found.items()
-        for tracebacks, wrong, lost in [zip(*each, strict=True)]
     ]
 
 

@@ -19,13 +19,12 @@ import time
 import tty
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from run_sets import made_by
+import base
+from base import Row
 
-from edgevpr.core.text import markdown
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import POSITION_FIX, Fix
@@ -33,7 +32,6 @@ from edgevpr.mavlink.signing import NOT_SIGNING, Signing
 from edgevpr.mavlink.timestamps import TimeStamps
 from edgevpr.mavlink.wire import Message, Receiver, mavlink
 
-RESULTS = Path(__file__).resolve().parent / "results"
 EVERY_S = 0.02  # between two fixes, and a little more each time, so that they meet the streams everywhere
 KEY = bytes(range(32))
 STREAMS: dict[float, Callable[[], Message]] = {
@@ -43,17 +41,15 @@ STREAMS: dict[float, Callable[[], Message]] = {
 }
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LinkRow:
-    """One kind of link: milliseconds from `send_fix` to the other end, and the share of a core while it is idle."""
-
-    link: str
-    fixes: int
-    median_ms: float
-    p99_ms: float
-    most_ms: float
-    idle_cpu_share: float
-    idle_messages_s: float
+_COLUMNS = {
+    "link": "{link}",
+    "fixes": "{fixes}",
+    "median, ms": "{median_ms:.2f}",
+    "99 %, ms": "{p99_ms:.2f}",
+    "most, ms": "{most_ms:.2f}",
+    "idle, % of a core": "{idle_percent:.2f}",
+    "messages/s": "{idle_messages_s:.1f}",
+}
 
 
 def main() -> None:
@@ -65,14 +61,13 @@ def main() -> None:
     if args.peer:
         _peer(args.peer[0], int(args.peer[1]), bytes.fromhex(args.peer[2]))
         return
-    rows = [asdict(row(kind, signed, args.fixes, args.idle_s)) for kind in OPENERS for signed in (False, True)]
-    page = report(made := made_by(), rows)
-    (RESULTS / "link.json").write_text(json.dumps({**made, "rows": rows}, indent=2) + "\n")
-    (RESULTS / "link.md").write_text(page)
-    print(page)
+    rows = [row(kind, signed, args.fixes, args.idle_s) for kind in OPENERS for signed in (False, True)]
+    found = {**base.made_by(), "rows": rows}
+    base.write("link", found, page(found))
+    print(page(found))
 
 
-def row(kind: str, signed: bool, fixes: int, idle_s: float) -> LinkRow:
+def row(kind: str, signed: bool, fixes: int, idle_s: float) -> Row:
     """Measure one kind of link, with or without signing."""
     with TemporaryDirectory(ignore_cleanup_errors=True) as folder, OPENERS[kind]() as (url, descriptor):
         signing = Signing(KEY, TimeStamps(Path(folder) / "time")) if signed else NOT_SIGNING
@@ -88,15 +83,15 @@ def row(kind: str, signed: bool, fixes: int, idle_s: float) -> LinkRow:
                 cpu_share, messages_s = _idle(link, idle_s)
             arrived_s = json.loads(peer.communicate("")[0])
     took_ms = sorted(1000 * (arrived_s[str(number)] - sent_s[number]) for number in range(fixes))
-    return LinkRow(
-        link=f"{kind}, signed" if signed else kind,
-        fixes=len(took_ms),
-        median_ms=statistics.median(took_ms),
-        p99_ms=took_ms[round(0.99 * (fixes - 1))],
-        most_ms=took_ms[-1],
-        idle_cpu_share=cpu_share,
-        idle_messages_s=messages_s,
-    )
+    return {
+        "link": f"{kind}, signed" if signed else kind,
+        "fixes": len(took_ms),
+        "median_ms": statistics.median(took_ms),
+        "p99_ms": took_ms[round(0.99 * (fixes - 1))],
+        "most_ms": took_ms[-1],
+        "idle_cpu_share": cpu_share,
+        "idle_messages_s": messages_s,
+    }
 
 
 def _send(link: Link, fixes: int) -> list[float]:
@@ -194,26 +189,19 @@ def _peer(kind: str, descriptor: int, key: bytes) -> None:
     print(json.dumps(arrived_s))
 
 
-def report(made: dict, rows: list[dict]) -> str:
+def page(found: Row) -> str:
     """Return the page for people."""
-    columns = ["link", "fixes", "median, ms", "99 %, ms", "most, ms", "idle, % of a core", "messages/s"]
-    cells = [
-        [
-            each["link"],
-            str(each["fixes"]),
-            *(f"{each[name]:.2f}" for name in ("median_ms", "p99_ms", "most_ms")),
-            f"{100 * each['idle_cpu_share']:.2f}",
-            f"{each['idle_messages_s']:.1f}",
-        ]
-        for each in rows
-    ]
-    return (
-        "# From a fix to the wire, and an idle link\n\nMade by `python benchmarks/link_latency.py`, "
-        f"{made['date']}, commit {made['commit']}, {made['machine']['cores']} cores of {made['machine']['cpu']}. From "
-        "`send_fix` to the moment when another process on this machine has read the bytes; and the CPU time of a link "
-        f"that only hears an autopilot and beats.\n\n{markdown(columns, cells)}\n"
-    )
+    rows = [{**row, "idle_percent": 100 * row["idle_cpu_share"]} for row in found["rows"]]
+    return f"""# From a fix to the wire, and an idle link
+
+From `send_fix` to the moment when another process on this machine has read the bytes; and the CPU time of a link that
+only hears an autopilot and beats.
+
+{base.table(rows, _COLUMNS)}
+
+{base.made_line(found, "python benchmarks/link_latency.py")}
+"""
 
 
 if __name__ == "__main__":
-    main()
+    base.run(main)

@@ -1,21 +1,15 @@
-"""`make thesis`: the sweeps are of the technique that flies, and the pages say what the results say."""
+"""`make thesis`: the sweeps are of the technique that flies."""
 
 import math
-from pathlib import Path
 
-import figures_page
 import numpy as np
 import pytest
-import thesis
 import thesis_memorable
-import thesis_page
 import thesis_sweep
 import thesis_values
 from pictures import textured
 
 from edgevpr.techniques import create
-
-REPOSITORY = Path(figures_page.__file__).parents[1]
 
 
 @pytest.mark.parametrize(
@@ -72,23 +66,3 @@ def test_a_number_has_three_digits_and_no_exponent():
     assert [thesis_values.three(each) for each in (None, 0.12345, 12.345, 1234.5, 159_999)] == [
         "-", "0.123", "12.3", "1,230", "160,000",
     ]  # fmt: skip
-
-
-def test_without_the_sets_there_is_a_sentence(tmp_path, capsys):
-    assert thesis.main(["--data", str(tmp_path)]) == 2
-    assert capsys.readouterr().err.startswith(f"thesis: {tmp_path} has no `corridor`: name the folder")
-
-
-def test_the_page_is_what_the_results_say():
-    page = (REPOSITORY / "docs" / "thesis.md").read_text(encoding="utf-8")
-    said = thesis_page.page(thesis_values.read_results(figures_page.RESULTS))
-    assert page == said, "results have changed since: run `python benchmarks/thesis.py --page`"
-
-
-def test_the_page_of_figures_is_what_the_results_say(tmp_path):
-    page = REPOSITORY / "docs" / "figures.md"
-    copy = tmp_path / page.name
-    copy.write_bytes(page.read_bytes())
-    contents = figures_page.read_sets(figures_page.RESULTS)
-    figures_page.put(copy, f"{figures_page.recall(contents)}\n\n{figures_page.speed()}")
-    assert copy.read_bytes() == page.read_bytes(), "run `python benchmarks/figures_page.py`"

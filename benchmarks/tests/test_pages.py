@@ -1,0 +1,87 @@
+"""Every script can be loaded, and every page is what its results say."""
+
+import importlib
+import re
+from pathlib import Path
+
+import base
+import figures_page
+import pytest
+import sets_page
+import thesis_page
+import thesis_values
+
+BENCHMARKS = Path(base.__file__).parent
+PAGES = {
+    "arm64": "bench_arm64",
+    "bench": "bench",
+    "confidence": "confidence",
+    "flights": "flights",
+    "from_orthophoto": "from_orthophoto",
+    "height_and_tilt": "height_and_tilt",
+    "hostile": "hostile",
+    "link": "link_latency",
+    "peers": "peers",
+    "replay": "recorded",
+    "salience": "bench_salience",
+    "sites": "sites",
+    "soak": "soak",
+    "sweeps": "sweeps",
+    "test_arm64": "on_arm64",
+    "verification": "verification",
+    "where": "where",
+}
+
+
+def loaded(name: str):
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name in ("torch", "skimage"):
+            pytest.skip(f"{error.name} is not installed")
+        raise
+
+
+@pytest.fixture(autouse=True)
+def peers_on_the_path(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS / "peers"))
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in BENCHMARKS.glob("*.py")))
+def test_a_script_can_be_loaded(name):
+    assert loaded(name).__doc__
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_a_page_is_what_its_results_say(name):
+    page = (base.RESULTS / f"{name}.md").read_text("utf-8")
+    assert loaded(PAGES[name]).page(base.read(name)).strip() + "\n" == page
+
+
+def test_the_page_of_the_thesis_is_what_the_results_say():
+    page = (base.REPOSITORY / "docs" / "thesis.md").read_text("utf-8")
+    assert page == thesis_page.page(thesis_values.read_results(base.RESULTS)), "python benchmarks/thesis.py --page"
+
+
+def test_the_page_of_figures_is_what_the_results_say(tmp_path):
+    page, copy = base.REPOSITORY / "docs" / "figures.md", tmp_path / "figures.md"
+    copy.write_text(page.read_text("utf-8"), "utf-8")
+    contents = sets_page.read_sets(base.RESULTS)
+    figures_page.put(copy, f"{figures_page.recall(contents)}\n\n{figures_page.speed()}")
+    assert copy.read_text("utf-8") == page.read_text("utf-8"), "python benchmarks/figures_page.py"
+
+
+def test_a_page_names_pictures_that_are_there():
+    for page in base.RESULTS.glob("*.md"):
+        for picture in re.findall(r"!\[[^]]*\]\(([^)]+)\)", page.read_text("utf-8")):
+            assert (base.RESULTS / picture).is_file(), (page.name, picture)
+
+
+def test_a_table_has_a_dash_for_what_a_row_lacks():
+    rows = [{"a": 1.25, "b": {"c": None}}, {"a": None}]
+    said = base.table(rows, {"one": "{a:.1f}", "two": "{b[c]}"})
+    assert said.splitlines()[2:] == ["| 1.2 | - |", "| - | - |"]
+
+
+def test_numbers_are_kept_to_six_digits():
+    assert base.rounded({"a": [1.23456789, 1e-9 / 3, 7, "x", True]}) == {"a": [1.23457, 3.33333e-10, 7, "x", True]}
