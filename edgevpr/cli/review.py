@@ -10,8 +10,8 @@ from edgevpr.cli.shared import command
 from edgevpr.core.errors import MapError, UsageError
 
 if TYPE_CHECKING:
-    from edgevpr.review.flight import Flight
-    from edgevpr.review.ground import Ground
+    from edgevpr.review.logged import LoggedFlight
+    from edgevpr.review.overhead import MapGround
 
 _log = logging.getLogger(__name__)
 
@@ -48,8 +48,7 @@ def _number(text: str) -> int:
 def run_report(args: Namespace) -> int:
     """Make the page of a flight."""
     from edgevpr.core.files import require_folder, write_whole
-    from edgevpr.review.page import page_of
-    from edgevpr.review.pictures import Album
+    from edgevpr.review.page import Album, page_of
     from edgevpr.runtime.flight.recording import frames_of, recording_of
 
     out = _out(args.out, args.log)
@@ -86,8 +85,8 @@ def run_export(args: Namespace) -> int:
     return 0
 
 
-def _read(args: Namespace) -> "Flight":
-    from edgevpr.review.flight import read_flight
+def _read(args: Namespace) -> "LoggedFlight":
+    from edgevpr.review.logged import read_flight
 
     flight = read_flight(args.log, args.flight)
     if flight.missing:
@@ -102,15 +101,15 @@ def _out(target: str, log: str) -> Path:
     return out
 
 
-def _ground(given: str | None, flight: "Flight") -> "Ground":
+def _ground(given: str | None, flight: "LoggedFlight") -> "MapGround":
     """Read the map that was given, or else that of the log, which need not be on this machine."""
-    from edgevpr.review.ground import Ground, read_ground
+    from edgevpr.review.overhead import MapGround, read_ground
 
     if given:
         return read_ground(given)
     if flight.map_path is None:
-        return Ground(trouble="The log does not name a map: give it with --map.")
+        return MapGround(trouble="The log does not name a map: give it with --map.")
     try:
         return read_ground(flight.map_path)
     except (MapError, UsageError) as error:
-        return Ground(trouble=f"The map of the flight is not drawn: {error} Its place can be given with --map.")
+        return MapGround(trouble=f"The map of the flight is not drawn: {error} Its place can be given with --map.")

@@ -3,16 +3,17 @@
 import csv
 import json
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, TextIO
 from xml.etree import ElementTree
 
 from edgevpr.core.text import printable
-from edgevpr.review.flight import Flight, Query
-from edgevpr.review.values import Point
+from edgevpr.review.logged import LoggedFlight, LoggedQuery, Point
 
 _KML = "http://www.opengis.net/kml/2.2"
+_OF_MATCH = ("place", "reference_image", "score", "confidence", "accuracy_m")
+_OF_FIX = ("why", "accuracy_m", "latency_ms")
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,16 +26,31 @@ class Feature:
     properties: dict[str, Any]
 
 
-def features_of(flight: Flight) -> list[Feature]:
+def features_of(flight: LoggedFlight) -> list[Feature]:
     """Return the points of a flight: of every query the accepted match, the fix that was made of it, and where
     autopilot and receiver were; then the places that were found, each once, and those that were learnt."""
-    features = [each for query in flight.queries for each in _of_query(query)]
-    found = Counter(each.place for each in flight.queries if each.place_at)
-    places = {each.place: each for each in flight.queries if each.place_at}
-    for number, query in places.items():
-        known = {"place": number, "reference_image": query.reference_image, "times_found": found[number]}
-        features.append(Feature("place", query.place_at, known))
+    features = [feature for query in flight.queries for feature in _of_query(query)]
+    at_place = [(query.place, query.place_at, query.reference_image) for query in flight.queries if query.place_at]
+    times_found = Counter(number for number, _, _ in at_place)
+    for number, (at, image) in {number: (at, image) for number, at, image in at_place}.items():
+        known = {"place": number, "reference_image": image, "times_found": times_found[number]}
+        features.append(Feature("place", at, known))
     return features + [Feature("learnt", at, {}) for at in flight.learnt]
+
+
+def _of_query(query: LoggedQuery) -> Iterator[Feature]:
+    named = {"time": query.time, "t_s": round(query.t_s, 3), "query": query.name}
+    if query.at:
+        match = {name: getattr(query, name) for name in _OF_MATCH}
+        from_gps_m = None if query.off_m is None else round(query.off_m, 2)
+        yield Feature("match", query.at, {**named, **match, "from_gps_m": from_gps_m})
+    if query.fix and query.fix.at:
+        fix = {"outcome": query.fix.outcome.value} | {name: getattr(query.fix, name) for name in _OF_FIX}
+        yield Feature("fix", query.fix.at, named | fix)
+    if query.autopilot_at:
+        yield Feature("autopilot", query.autopilot_at, named)
+    if query.gps_at:
+        yield Feature("gps", query.gps_at, named)
 
 
 def write_geojson(features: Sequence[Feature], out: TextIO) -> None:
@@ -67,25 +83,29 @@ def write_kml(features: Sequence[Feature], out: TextIO) -> None:
     document = ElementTree.SubElement(root, "Document")
     for kind in dict.fromkeys(each.kind for each in features):
         folder = ElementTree.SubElement(document, "Folder")
-        ElementTree.SubElement(folder, "name").text = kind
+        _child(folder, "name", kind)
         for each in features:
-            if each.kind != kind:
-                continue
-            mark = ElementTree.SubElement(folder, "Placemark")
-            name = each.properties.get("query") or each.properties.get("place") or kind
-            ElementTree.SubElement(mark, "name").text = printable(str(name))
-            if when := each.properties.get("time"):
-                ElementTree.SubElement(ElementTree.SubElement(mark, "TimeStamp"), "when").text = printable(when)
-            extended = ElementTree.SubElement(mark, "ExtendedData")
-            for key, known in each.properties.items():
-                if known is not None:
-                    data = ElementTree.SubElement(extended, "Data", name=key)
-                    ElementTree.SubElement(data, "value").text = printable(str(known))
-            lat_deg, lon_deg = each.at
-            point = ElementTree.SubElement(mark, "Point")
-            ElementTree.SubElement(point, "coordinates").text = f"{lon_deg:.8f},{lat_deg:.8f}"
+            if each.kind == kind:
+                _add_placemark(folder, each)
     ElementTree.indent(root, " ")
     out.write('<?xml version="1.0" encoding="UTF-8"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n")
+
+
+def _add_placemark(folder: ElementTree.Element, feature: Feature) -> None:
+    mark = ElementTree.SubElement(folder, "Placemark")
+    properties, (lat_deg, lon_deg) = feature.properties, feature.at
+    _child(mark, "name", properties.get("query") or properties.get("place") or feature.kind)
+    if when := properties.get("time"):
+        _child(ElementTree.SubElement(mark, "TimeStamp"), "when", when)
+    extended = ElementTree.SubElement(mark, "ExtendedData")
+    for key, known in properties.items():
+        if known is not None:
+            _child(ElementTree.SubElement(extended, "Data", name=key), "value", known)
+    _child(ElementTree.SubElement(mark, "Point"), "coordinates", f"{lon_deg:.8f},{lat_deg:.8f}")
+
+
+def _child(parent: ElementTree.Element, tag: str, text: object) -> None:
+    ElementTree.SubElement(parent, tag).text = printable(str(text))
 
 
 WRITERS: dict[str, Callable[[Sequence[Feature], TextIO], None]] = {
@@ -93,32 +113,3 @@ WRITERS: dict[str, Callable[[Sequence[Feature], TextIO], None]] = {
     "csv": write_csv,
     "kml": write_kml,
 }
-
-
-def _of_query(query: Query) -> list[Feature]:
-    named = {"time": query.time, "t_s": round(query.t_s, 3), "query": query.name}
-    features = []
-    if query.at:
-        known = {
-            "place": query.place,
-            "reference_image": query.reference_image,
-            "score": query.score,
-            "confidence": query.confidence,
-            "accuracy_m": query.accuracy_m,
-            "from_gps_m": None if query.off_m is None else round(query.off_m, 2),
-        }
-        features.append(Feature("match", query.at, named | known))
-    if query.fix and query.fix.at:
-        fix = query.fix
-        known = {
-            "outcome": fix.outcome.value,
-            "why": fix.why,
-            "accuracy_m": fix.accuracy_m,
-            "latency_ms": fix.latency_ms,
-        }
-        features.append(Feature("fix", fix.at, named | known))
-    if query.autopilot_at:
-        features.append(Feature("autopilot", query.autopilot_at, dict(named)))
-    if query.gps_at:
-        features.append(Feature("gps", query.gps_at, dict(named)))
-    return features

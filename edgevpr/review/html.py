@@ -1,7 +1,7 @@
 """A page that needs nothing else: no network, no script, in the colours that the reader's machine has."""
 
 import base64
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from html import escape
 from pathlib import Path
 
@@ -11,21 +11,27 @@ from edgevpr.core.text import shown
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 
 
-def page(title: str, style: str, body: str) -> str:
-    """Return a whole page. `style` is what it needs beside the style that all pages have; `body` is HTML."""
+def page(title: str, style: Path, body: Iterable[str]) -> str:
+    """Return a whole page. `style` is a file of what it needs beside the style that all pages have; `body` is HTML."""
     common = Path(__file__).with_name("common.css").read_text("utf-8")
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         '<meta name="color-scheme" content="light dark"><link rel="icon" href="data:,">'
-        f"<title>{foreign(title)}</title><style>{common}{style}</style></head>\n<body>{body}</body></html>\n"
+        f"<title>{foreign(title)}</title><style>{common}{style.read_text('utf-8')}</style></head>\n"
+        f"<body>{''.join(body)}</body></html>\n"
     )
 
 
-def foreign(said: str) -> str:
+def foreign(text: str) -> str:
     """Return foreign text fit for a page."""
-    return escape(shown(said))
+    return escape(shown(text))
+
+
+def heading(title: str, known: Iterable[str]) -> str:
+    """Return the title of a page, with what is known of it below."""
+    return f'<h1>{foreign(title)}</h1><p class="soft">{foreign(", ".join(known))}</p>'
 
 
 def section(title: str, content: str) -> str:
@@ -35,13 +41,23 @@ def section(title: str, content: str) -> str:
     return f"<section>{f'<h2>{title}</h2>' if title else ''}{content}</section>\n"
 
 
+def notes(sentences: Iterable[str]) -> str:
+    """Return the box of what a reader must know; "" where there is nothing."""
+    items = "".join(f"<li>{foreign(sentence)}</li>" for sentence in sentences)
+    return f'<section class="notes"><ul>{items}</ul></section>' if items else ""
+
+
 def table(headings: Sequence[str], rows: Sequence[Sequence[str]], cell: Callable[[str], str] = foreign) -> str:
     """Return a table that scrolls where there is no room for it. `cell` makes HTML of what stands in a cell."""
-    head = "".join(f"<th>{each}</th>" for each in headings)
-    lines = "".join(f"<tr>{''.join(f'<td>{cell(each)}</td>' for each in row)}</tr>" for row in rows)
+    head = "".join(f"<th>{text}</th>" for text in headings)
+    lines = "".join(f"<tr>{''.join(f'<td>{cell(text)}</td>' for text in row)}</tr>" for row in rows)
     return f'<div class="scroll"><table><tr>{head}</tr>{lines}</table></div>'
 
 
-def address_of(jpeg: bytes) -> str:
-    """Return a picture as an address that holds all of it (data:)."""
-    return "data:image/jpeg;base64," + base64.b64encode(jpeg).decode()
+def picture(name: str, caption: str, jpeg: bytes) -> str:
+    """Return a picture with all of it inside the page (data:), and a caption."""
+    data = base64.b64encode(jpeg).decode()
+    return (
+        f'<figure><img alt="{foreign(name)}" src="data:image/jpeg;base64,{data}">'
+        f"<figcaption>{foreign(caption)}</figcaption></figure>"
+    )

@@ -4,18 +4,23 @@ The drawing stretches to the width that there is, and its lines and dots keep th
 it, so that it stays readable on a phone.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from html import escape
+from itertools import pairwise
 
 Points = Sequence[tuple[float, float]]
 
 UNKNOWN = "–"
 
-WIDE, HIGH = 1000.0, 100.0
+_WIDE, _HIGH = 1000.0, 100.0
 _MOST_POINTS = 1200  # of a line: more than there are pixels
 _LAST = 0.97  # a text in the middle of a point further right would stand out of the page
 _TAG_WIDE, _TAG_HIGH = 0.035, 0.14  # of a chart: room for the number of a point
+_STEPS_S = (1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400, 28800, 86400)
+_MOST_TICKS = 6
+_GAP, _LEAST_GAP_S = 5.0, 3.0  # a line is broken where a point is missing for so many usual steps, and so long
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,10 +46,19 @@ class Axis:
         """Return where a value lies, from 0 (left) to 1."""
         return min(max((x - self.first) / ((self.last - self.first) or 1.0), 0.0), 1.0)
 
+    def grid(self, high: float) -> str:
+        """Return the path of the lines above the texts."""
+        lines = "".join(f"M{_WIDE * self.across(x):.1f} 0v{high:g}" for x, _ in self.ticks)
+        return f'<path class="grid" d="{lines}M0 {high:g}h{_WIDE:g}"/>'
 
-def whole(points: Points) -> Iterable[Points]:
-    """Leave a line in one part."""
-    return [points]
+    def below(self) -> str:
+        """Return the texts."""
+        texts = ""
+        for x, text in self.ticks:
+            left = self.across(x)
+            last = " class=last" if left > _LAST else ""
+            texts += f'<span{last} style="left:{100 * left:.1f}%">{escape(text)}</span>' if text else ""
+        return f'<div class="times">{texts}</div>'
 
 
 def chart(
@@ -53,7 +67,7 @@ def chart(
     series: Sequence[Series],
     axis: Axis,
     top: float = 0.0,
-    parts: Callable[[Points], Iterable[Points]] = whole,
+    parts: Callable[[Points], Iterable[Points]] = lambda points: [points],
 ) -> str:
     """Draw series over an axis. The axis of the values reaches from 0 to the highest, and to `top` at least; a series
     without points is left out, and a chart without any is empty (""). `parts` breaks lines."""
@@ -61,9 +75,20 @@ def chart(
     if not series:
         return ""
     highest = nice(max(top, *(value for each in series for _, value in each.points)))
-    drawn = "".join(_drawn(each, axis, highest, parts) for each in series)
+    paths = ""
+    for each in series:
+        path, kind = (dots, "dots") if each.are_dots else (way, "line")
+        several = [each.points] if each.are_dots else parts(_thinned(each.points))
+        places = ([(_WIDE * axis.across(x), _HIGH * (1 - max(v, 0.0) / highest)) for x, v in part] for part in several)
+        paths += f'<path class="{kind} {each.colour}" d="{"".join(map(path, places))}"/>'
     legend = "".join(f'<span class="key {each.colour}">{escape(each.name)}</span>' for each in series if each.name)
-    return _framed(title, unit, legend, highest, axis, svg(_said(title, unit), HIGH, grid(axis, HIGH) + drawn))
+    drawing = _svg(_label(title, unit), _HIGH, axis.grid(_HIGH) + paths)
+    return _framed(title, f"{unit} {legend}", highest, axis, drawing)
+
+
+def time_chart(title: str, unit: str, series: Sequence[Series], span_s: float, top: float = 0.0) -> str:
+    """Draw series over time, from 0 to `span_s`; a line is broken where nothing is known for longer than usual."""
+    return chart(title, unit, series, _times(span_s), top, _known_parts)
 
 
 def scatter(title: str, unit: str, points: Sequence[tuple[float, float, str, str]], axis: Axis, top: float) -> str:
@@ -71,16 +96,26 @@ def scatter(title: str, unit: str, points: Sequence[tuple[float, float, str, str
     over each other are moved to the right."""
     taken: list[tuple[float, float]] = []
     marks = tags = ""
-    for x, value, said, colour in points:
+    for x, value, text, colour in points:
         left, above = axis.across(x), 1 - min(max(value / top, 0.0), 1.0)
-        marks += f'<path class="dots {colour}" d="{dots([(WIDE * left, HIGH * above)])}"/>'
+        marks += f'<path class="dots {colour}" d="{dots([(_WIDE * left, _HIGH * above)])}"/>'
         tag = left
         while any(abs(tag - other) < _TAG_WIDE and abs(above - at) < _TAG_HIGH for other, at in taken):
             tag += _TAG_WIDE
         taken.append((tag, above))
-        tags += f'<span class="tag {colour}" style="left:{100 * tag:.1f}%;top:{100 * above:.1f}%">{escape(said)}</span>'
-    drawn = svg(_said(title, unit), HIGH, grid(axis, HIGH) + marks)
-    return _framed(title, unit, "", top, axis, f'<div class="tagged">{drawn}{tags}</div>') if points else ""
+        tags += f'<span class="tag {colour}" style="left:{100 * tag:.1f}%;top:{100 * above:.1f}%">{escape(text)}</span>'
+    drawing = _svg(_label(title, unit), _HIGH, axis.grid(_HIGH) + marks)
+    return _framed(title, f"{unit} ", top, axis, f'<div class="tagged">{drawing}{tags}</div>') if points else ""
+
+
+def lanes(rows: Sequence[tuple[str, str, Sequence[float]]], span_s: float) -> str:
+    """Draw one lane for each (name, colour, times): a mark at every time, and how many there are."""
+    axis, lines = _times(span_s), ""
+    for name, colour, times in rows:
+        marks = "".join(f"M{x:g} 0v20" for x in sorted({round(_WIDE * axis.across(t_s), 1) for t_s in times}))
+        drawing = _svg(f"{name}: {len(times)}", 20, f'{axis.grid(20)}<path class="mark {colour}" d="{marks}"/>')
+        lines += f"<span>{escape(name)} <b>{len(times)}</b></span>{drawing}"
+    return f'<div class="lanes">{lines}<span></span>{axis.below()}</div>'
 
 
 def dots(points: Points) -> str:
@@ -97,67 +132,42 @@ def nice(value: float) -> float:
     """Round up to two digits that are easily read: 1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6 or 8 times a power of ten."""
     if value <= 0:
         return 1.0
-    power = 10.0 ** (len(f"{value:.0f}") - 1 if value >= 1 else -_zeros(value))
-    return next(step * power for step in (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10, 12) if step * power >= value * 0.999)
+    power = 10.0 ** math.floor(math.log10(value))
+    return next(step * power for step in (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10) if step * power >= value * 0.999)
 
 
 def figure(value: float | None, unit: str = "") -> str:
     """Return a number with three digits that say something, and its unit; a dash where it is unknown."""
     if value is None:
         return UNKNOWN
-    shown = f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
-    return f"{shown} {unit}".strip()
+    digits = f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
+    return f"{digits} {unit}".strip()
 
 
-def _drawn(series: Series, axis: Axis, highest: float, parts: Callable[[Points], Iterable[Points]]) -> str:
-    drawn = [series.points] if series.are_dots else parts(_thinned(series.points))
-    path = dots if series.are_dots else way
-    said = "".join(
-        path([(WIDE * axis.across(x), HIGH * (1 - max(value, 0.0) / highest)) for x, value in part]) for part in drawn
-    )
-    return f'<path class="{"dots" if series.are_dots else "line"} {series.colour}" d="{said}"/>'
+def clock(t_s: float) -> str:
+    """Return a time of the flight as minutes and seconds, from an hour on with the hours: 1:02:03."""
+    minutes, seconds = divmod(round(t_s), 60)
+    if minutes < 60:
+        return f"{minutes}:{seconds:02d}"
+    return f"{minutes // 60}:{minutes % 60:02d}:{seconds:02d}"
 
 
-def _zeros(value: float) -> int:
-    zeros = 1
-    while value * 10**zeros < 1 and zeros < 12:
-        zeros += 1
-    return zeros
-
-
-def svg(said: str, high: float, content: str) -> str:
-    """Return a drawing, `WIDE` by `high` of its own units, that stretches to the room there is."""
+def _svg(label: str, high: float, content: str) -> str:
     return (
-        f'<svg role="img" aria-label="{escape(said)}" viewBox="0 0 {WIDE:g} {high:g}" preserveAspectRatio="none">'
+        f'<svg role="img" aria-label="{escape(label)}" viewBox="0 0 {_WIDE:g} {high:g}" preserveAspectRatio="none">'
         f"{content}</svg>"
     )
 
 
-def grid(axis: Axis, high: float) -> str:
-    """Return the path of the lines above the texts of an axis."""
-    lines = "".join(f"M{WIDE * axis.across(x):.1f} 0v{high:g}" for x, _ in axis.ticks)
-    return f'<path class="grid" d="{lines}M0 {high:g}h{WIDE:g}"/>'
-
-
-def below(axis: Axis) -> str:
-    """Return the texts of an axis."""
-    said = ""
-    for x, each in axis.ticks:
-        left = axis.across(x)
-        last = " class=last" if left > _LAST else ""
-        said += f'<span{last} style="left:{100 * left:.1f}%">{escape(each)}</span>' if each else ""
-    return f'<div class="times">{said}</div>'
-
-
-def _framed(title: str, unit: str, legend: str, highest: float, axis: Axis, drawn: str) -> str:
+def _framed(title: str, beside: str, highest: float, axis: Axis, drawing: str) -> str:
     return (
-        f'<figure class="chart"><figcaption><b>{escape(title)}</b> {escape(unit)} {legend}</figcaption>'
+        f'<figure class="chart"><figcaption><b>{escape(title)}</b> {beside}</figcaption>'
         f'<div class="plot"><div class="scale"><span>{figure(highest)}</span><span>0</span></div>'
-        f"<div>{drawn}{below(axis)}</div></div></figure>"
+        f"<div>{drawing}{axis.below()}</div></div></figure>"
     )
 
 
-def _said(title: str, unit: str) -> str:
+def _label(title: str, unit: str) -> str:
     return f"{title}, {unit}" if unit else title
 
 
@@ -166,8 +176,27 @@ def _thinned(points: Points) -> Points:
     if len(points) <= _MOST_POINTS:
         return points
     step = -(-2 * len(points) // _MOST_POINTS)
-    kept = []
+    kept: list[tuple[float, float]] = []
     for first in range(0, len(points), step):
         several = points[first : first + step]
-        kept += sorted({min(several, key=lambda each: each[1]), max(several, key=lambda each: each[1])})
+        kept += sorted({min(several, key=lambda point: point[1]), max(several, key=lambda point: point[1])})
     return kept
+
+
+def _times(span_s: float) -> Axis:
+    step = next((each for each in _STEPS_S if span_s / each <= _MOST_TICKS), span_s / _MOST_TICKS)
+    ticks = [count * step for count in range(int(span_s / step) + 1)] if step else [0.0]
+    last = _LAST * span_s
+    return Axis(0.0, span_s, [(t_s, clock(t_s) if t_s <= last or not t_s else "") for t_s in ticks])
+
+
+def _known_parts(points: Points) -> Iterator[Points]:
+    """Yield the parts of a line between the times at which nothing is known for longer than usual."""
+    steps_s = sorted(after[0] - before[0] for before, after in pairwise(points))
+    most_s = max(_LEAST_GAP_S, _GAP * steps_s[len(steps_s) // 2]) if steps_s else 0.0
+    first = 0
+    for at, (before, after) in enumerate(pairwise(points), start=1):
+        if after[0] - before[0] > most_s:
+            yield points[first:at]
+            first = at
+    yield points[first:]

@@ -4,8 +4,8 @@ import re
 
 import pytest
 
-from edgevpr.review.charts import chart, clock, lanes
-from edgevpr.review.svg import Series, figure, nice
+from edgevpr.review.svg import Series, clock, figure, lanes, nice
+from edgevpr.review.svg import time_chart as chart
 
 
 def paths(drawn, kind):

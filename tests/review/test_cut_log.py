@@ -9,7 +9,7 @@ from logs import query, write_log
 from edgevpr.cli.main import main
 from edgevpr.core.errors import EdgevprError
 from edgevpr.review.export import features_of, write_csv, write_geojson, write_kml
-from edgevpr.review.flight import read_flight
+from edgevpr.review.logged import read_flight
 
 
 @pytest.fixture(scope="module")

@@ -51,8 +51,9 @@ def test_nothing_to_draw_is_nothing():
 
 
 @pytest.mark.parametrize("said", ["<b>", "a\x1b[0m", "rtsp://me:secret@host/"])
-def test_foreign_text_is_only_text(said):
-    made = page(said, "", table(["a"], [[said]])) + foreign(said)
+def test_foreign_text_is_only_text(said, tmp_path):
+    (tmp_path / "none.css").touch()
+    made = page(said, tmp_path / "none.css", [table(["a"], [[said]])]) + foreign(said)
     assert not {"\x1b"} & set(made)
     assert "<b>" not in made
     assert "secret" not in made

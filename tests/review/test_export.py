@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 from logs import query, write_log
 
 from edgevpr.review.export import features_of, write_csv, write_geojson, write_kml
-from edgevpr.review.flight import read_flight
+from edgevpr.review.logged import read_flight
 
 KML = "{http://www.opengis.net/kml/2.2}"
 

@@ -7,7 +7,7 @@ from logs import query, write_log
 
 from edgevpr.core.appending import numbered
 from edgevpr.core.errors import EdgevprError, UsageError
-from edgevpr.review.flight import Outcome, read_flight
+from edgevpr.review.logged import FixOutcome, read_flight
 from edgevpr.runtime.flight.flightlog import FlightLog
 
 
@@ -25,7 +25,7 @@ def test_a_real_flight_is_read(flown):
     assert first.autopilot_at == pytest.approx((50.0, 8.0), abs=1e-5)
     assert first.off_m == pytest.approx(90, abs=2), "the receiver is beside the map"
     assert first.has_link
-    assert first.fix.outcome is Outcome.TAKEN
+    assert first.fix.outcome is FixOutcome.TAKEN
     assert flight.end
 
 
@@ -37,7 +37,7 @@ def test_an_answer_that_comes_later_says_what_became_of_the_fix(tmp_path):
         ("answer", {"query": "c", "sent": False, "result": None, "why": "too late", "latency_ms": None}),
     ]
     flight = read_flight(write_log(tmp_path / "log", *lines, *answers))
-    assert outcomes(flight) == [Outcome.TAKEN, Outcome.REFUSED, Outcome.KEPT, Outcome.UNANSWERED]
+    assert outcomes(flight) == [FixOutcome.TAKEN, FixOutcome.REFUSED, FixOutcome.KEPT, FixOutcome.UNANSWERED]
     assert [each.fix.latency_ms for each in flight.queries] == [12.5, 3.0, None, None]
     assert flight.queries[1].fix.why == "denied"
 
@@ -45,7 +45,7 @@ def test_an_answer_that_comes_later_says_what_became_of_the_fix(tmp_path):
 def test_the_next_query_knows_of_an_answer_too(tmp_path):
     later = query("b", last_fix=query("a")["fix"] | {"answer": "FAILED"})
     flight = read_flight(write_log(tmp_path / "log", ("query", query("a")), ("query", later)))
-    assert outcomes(flight) == [Outcome.REFUSED, Outcome.UNANSWERED]
+    assert outcomes(flight) == [FixOutcome.REFUSED, FixOutcome.UNANSWERED]
 
 
 def test_the_last_of_several_flights_is_taken_unless_another_is_asked_for(tmp_path):

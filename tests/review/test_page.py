@@ -10,17 +10,16 @@ from browser import show
 from logs import query, write_log
 
 from edgevpr.cli.main import main
-from edgevpr.review.flight import read_flight
-from edgevpr.review.ground import Ground, read_ground
-from edgevpr.review.page import page_of
-from edgevpr.review.pictures import Album
+from edgevpr.review.logged import read_flight
+from edgevpr.review.overhead import MapGround, read_ground
+from edgevpr.review.page import Album, page_of
 
 NO_PICTURES = Album([])
 NASTY = "<script>alert(1)</script>\"'><img src=http://example.test/x.png>\x1b\u202e\ud800"
 
 
 def page(path):
-    return page_of(read_flight(path), Ground(), NO_PICTURES, NO_PICTURES)
+    return page_of(read_flight(path), MapGround(), NO_PICTURES, NO_PICTURES)
 
 
 def report(capsys, *argv):
@@ -81,7 +80,7 @@ def test_only_pictures_of_the_folders_that_are_given_are_shown(tmp_path):
 
 def test_a_picture_is_made_small(tmp_path):
     cv2.imwrite(str(tmp_path / "one.png"), np.random.default_rng(1).integers(0, 255, (1000, 2000), np.uint8))
-    data = base64.b64decode(Album([tmp_path]).picture("one.png").partition(",")[2])
+    data = Album([tmp_path]).picture("one.png")
     assert cv2.imdecode(np.frombuffer(data, np.uint8), 0).shape == (320, 640)
 
 

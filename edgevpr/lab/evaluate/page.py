@@ -1,7 +1,7 @@
 """The page of an evaluation: tables, curves, costs, and the matches that went wrong, to look at."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from edgevpr.core.errors import ImageError
@@ -12,7 +12,7 @@ from edgevpr.lab.evaluate.asking import QueryAnswer
 from edgevpr.lab.evaluate.many import CURVE_TO, Made, MeasuredRow, Measurements, OpenSet
 from edgevpr.lab.evaluate.metrics import RESAMPLES, SEED
 from edgevpr.lab.evaluate.provenance import commit_of, program, today, versions
-from edgevpr.review.html import address_of, foreign, page, section, table
+from edgevpr.review.html import foreign, heading, notes, page, picture, section, table
 from edgevpr.review.svg import Axis, Series, chart, figure, scatter
 
 _COLOURS = 8  # then the lines are dashed
@@ -32,13 +32,12 @@ def page_of(outcome: Measurements) -> str:
     most = max(_OF_A_ROW[0], min(_OF_A_ROW[1], _MOST_MATCHES // max(1, len(outcome.found))))
     body = [
         _head(outcome),
-        _notes(outcome),
+        notes(_notes(outcome)),
         section("All sets", _over_sets(outcome, numbers)),
         *(_of_set(at, of, outcome.found, numbers, most) for at, of in enumerate(outcome.sets, start=1)),
         section("How it was measured", _how(outcome, numbers)),
     ]
-    style = Path(__file__).with_name("page.css").read_text("utf-8")
-    return page("Evaluation", style, "".join(body))
+    return page("Evaluation", Path(__file__).with_name("page.css"), body)
 
 
 def _head(outcome: Measurements) -> str:
@@ -49,21 +48,19 @@ def _head(outcome: Measurements) -> str:
         f"written on {today()}",
         program(versions(), commit_of()),
     ]
-    return f'<h1>Evaluation</h1><p class="soft">{foreign(", ".join(known))}</p>'
+    return heading("Evaluation", known)
 
 
-def _notes(outcome: Measurements) -> str:
-    kept = [each for each in outcome.found if each.made.was_kept]
-    alone = all(each.result.recall_at_1_interval for each in outcome.found)
-    notes = [
-        *(f"{row} was not measured on {of}: {why}" for (of, row), why in outcome.failed.items()),
-        kept
-        and f"{len(kept)} of {len(outcome.found)} results were measured earlier: their times are of that day and that "
-        "machine, which are named below.",
-        not alone and "SciPy is not installed: there are no intervals.",
-    ]
-    items = "".join(f"<li>{foreign(note)}</li>" for note in notes if note)
-    return f'<section class="notes"><ul>{items}</ul></section>' if items else ""
+def _notes(outcome: Measurements) -> Iterator[str]:
+    for (of, row), why in outcome.failed.items():
+        yield f"{row} was not measured on {of}: {why}"
+    if kept := sum(row.made.was_kept for row in outcome.found):
+        yield (
+            f"{kept} of {len(outcome.found)} results were measured earlier: their times are of that day and that "
+            "machine, which are named below."
+        )
+    if not all(row.result.recall_at_1_interval for row in outcome.found):
+        yield "SciPy is not installed: there are no intervals."
 
 
 def _over_sets(outcome: Measurements, numbers: dict[str, int]) -> str:
@@ -225,11 +222,9 @@ def _picture(what: str, path: Path | None, more: str) -> str:
     if path is None:
         return f"<figure><figcaption>{what}: none</figcaption></figure>"
     try:
-        data = address_of(small_jpeg(read_image(path), _PICTURE_PX))
+        return picture(path.name, f"{what}: {path.name}{more}", small_jpeg(read_image(path), _PICTURE_PX))
     except ImageError:  # it was there when it was measured
         return f"<figure><figcaption>{what}: {foreign(path.name)} (gone)</figcaption></figure>"
-    said = foreign(f"{what}: {path.name}{more}")
-    return f'<figure><img alt="{foreign(path.name)}" src="{data}"><figcaption>{said}</figcaption></figure>'
 
 
 def _how(outcome: Measurements, numbers: dict[str, int]) -> str:

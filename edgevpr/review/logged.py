@@ -6,15 +6,16 @@ from pathlib import Path
 from typing import Any
 
 from edgevpr.core.geodesy import distance_m, moved
-from edgevpr.review.values import Point, number, point, text, value
 from edgevpr.runtime.flight.wholeflight import flight_of
 
+Point = tuple[float, float]  # latitude and longitude, degrees
 _FRESH_S = 1.0  # an older report of the autopilot says nothing of a frame
 _CONTINUOUS = "taken into the continuous position"  # which is sent all the time and not answered
-_SAYING = ("said", "state", "problem", "why")  # the field of a line that people read, the first that is there
+_WORDS = ("said", "state", "problem", "why")  # the field of a line that people read, the first that is there
+_LARGEST = 1e15  # what is larger is no figure of a flight; comparing excludes NaN, and integers that no float can hold
 
 
-class Outcome(Enum):
+class FixOutcome(Enum):
     """Fate of a fix, in the words of the page."""
 
     TAKEN = "fix taken"
@@ -25,11 +26,11 @@ class Outcome(Enum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Fix:
+class LoggedFix:
     """The fix of a query: `outcome`, `why` it was not sent or not taken, the position that it says (None: there was
     nothing to send), and how long the answer took."""
 
-    outcome: Outcome
+    outcome: FixOutcome
     why: str | None
     at: Point | None
     accuracy_m: float | None
@@ -37,7 +38,7 @@ class Fix:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Query:
+class LoggedQuery:
     """One query, `t_s` seconds after the start. `at` is the position of an accepted match, `place_at` that of the place
     found, `autopilot_at` and `gps_at` where autopilot and receiver say that the aircraft was when the frame was taken,
     and `off_m` is from there to the match: from the autopilot that has GPS, else from the receiver. `cores` are those
@@ -58,7 +59,7 @@ class Query:
     autopilot_at: Point | None
     gps_at: Point | None
     off_m: float | None
-    fix: Fix | None
+    fix: LoggedFix | None
     wall_ms: float | None
     latency_ms: float | None
     cores: float | None
@@ -78,7 +79,7 @@ class Remark:
 
 
 @dataclass(slots=True, kw_only=True)
-class Flight:
+class LoggedFlight:
     """One flight of a log: `number` of `flights` in it. `start` and `end` are the first and the last line ({}: it lacks
     one). `unusable` are the times of frames that never became queries, `learnt` the positions of new places. `missing`
     is a sentence about files of the flight that are not there (None: none)."""
@@ -88,7 +89,7 @@ class Flight:
     flights: int = 0
     start: dict[str, Any] = field(default_factory=dict)
     end: dict[str, Any] = field(default_factory=dict)
-    queries: list[Query] = field(default_factory=list)
+    queries: list[LoggedQuery] = field(default_factory=list)
     remarks: list[Remark] = field(default_factory=list)
     unusable: list[float] = field(default_factory=list)
     learnt: list[Point] = field(default_factory=list)
@@ -106,11 +107,11 @@ class Flight:
         return text(self.start, "recording")
 
 
-def read_flight(path: str | Path, number: int | None = None) -> Flight:
+def read_flight(path: str | Path, number: int | None = None) -> LoggedFlight:
     """Read one flight of a log, with the files before it where it is one of several (see `wholeflight.flight_of`, also
     for what is raised): the last flight in the file unless its `number` (1, 2, ...) is given."""
     lines = flight_of(path, number)
-    flight = Flight(path=lines.path, number=lines.number, flights=lines.flights, missing=lines.missing)
+    flight = LoggedFlight(path=lines.path, number=lines.number, flights=lines.flights, missing=lines.missing)
     if lines.missing:
         flight.remarks.append(Remark(0.0, "missing", lines.missing))
     reading = _Reading(flight)
@@ -122,7 +123,7 @@ def read_flight(path: str | Path, number: int | None = None) -> Flight:
 class _Reading:
     """Reads the lines of one flight in their order."""
 
-    def __init__(self, flight: Flight) -> None:
+    def __init__(self, flight: LoggedFlight) -> None:
         self.flight = flight
         self._at: dict[str, int] = {}  # the number of a query by its name
         self._cpu_s = self._elapsed_s = 0.0
@@ -147,7 +148,7 @@ class _Reading:
         elif kind == "learnt":
             flight.learnt += filter(None, [point(line, "position")])
         else:
-            flight.remarks.append(Remark(t_s, kind, _said(line)))
+            flight.remarks.append(Remark(t_s, kind, _words(line)))
 
     def _since_start(self, t_mono_s: float | None) -> float:
         """Return the seconds since the first line that has a time; of a line without, those of the latest before it."""
@@ -163,7 +164,7 @@ class _Reading:
         if at is None or not isinstance(told, dict):
             return
         query = self.flight.queries[at]
-        if query.fix is None or (query.fix.outcome is not Outcome.UNANSWERED and key == "last_fix"):
+        if query.fix is None or (query.fix.outcome is not FixOutcome.UNANSWERED and key == "last_fix"):
             return  # its line of kind "answer" knows more
         fix = replace(
             query.fix,
@@ -173,26 +174,26 @@ class _Reading:
         )
         self.flight.queries[at] = replace(query, fix=fix)
 
-    def _query(self, line: dict[str, Any], t_s: float) -> Query:
-        t_mono_s = number(line, "t_frame_s")
+    def _query(self, line: dict[str, Any], t_s: float) -> LoggedQuery:
+        t_frame_s = number(line, "t_frame_s")
         accepted = line.get("accepted") is True
         at = point(line, "located") or point(line, "position") if accepted else None
-        gps_at = None if t_mono_s is None else _gps_at(line, t_mono_s)
-        costs = number(line, "costs", "t_encode_s"), number(line, "costs", "t_match_s")
-        place = number(line, "place")
-        heard_s = number(line, "vehicle", "t_heard_s")
-        is_heard = None not in (heard_s, t_mono_s) and abs(t_mono_s - heard_s) <= _FRESH_S
+        gps_at = _gps_at(line, t_frame_s)
+        is_heard = _is_fresh(number(line, "vehicle", "t_heard_s"), t_frame_s)
         autopilot_at = point(line, "vehicle") if is_heard else None
         # An autopilot that has GPS knows by how much its receiver lags: at 20 m/s that is metres.
         truth = autopilot_at if gps_at and value(line, "vehicle", "has_gps") is True else gps_at
-        latency_s = number(line, "totals", "latency_s")
-        return Query(
+        # The confidence by which a match was judged: its own, or that of the flight so far where it is higher.
+        confidences = number(line, "confidence"), number(line, "followed", "confidence")
+        encode_s, match_s = number(line, "costs", "t_encode_s"), number(line, "costs", "t_match_s")
+        place, latency_s = number(line, "place"), number(line, "totals", "latency_s")
+        return LoggedQuery(
             name=text(line, "query") or "",
-            t_s=t_s if t_mono_s is None else self._since_start(t_mono_s),
+            t_s=t_s if t_frame_s is None else self._since_start(t_frame_s),
             time=text(line, "time") or "",
             accepted=accepted,
             reason=text(line, "reason") or "no reason is given",
-            confidence=_confidence(line),
+            confidence=max((known for known in confidences if known is not None), default=None),
             score=number(line, "score"),
             place=None if place is None else int(place),
             reference_image=text(line, "reference_image"),
@@ -203,7 +204,7 @@ class _Reading:
             gps_at=gps_at,
             off_m=float(distance_m(*truth, *at)) if truth and at else None,
             fix=_fix(line),
-            wall_ms=None if None in costs else 1e3 * sum(costs),
+            wall_ms=None if encode_s is None or match_s is None else 1e3 * (encode_s + match_s),
             latency_ms=None if latency_s is None else 1e3 * latency_s,
             cores=self._cores(line),
             rss_mb=number(line, "costs", "rss_mb"),
@@ -221,17 +222,11 @@ class _Reading:
         return max(0.0, busy)
 
 
-def _confidence(line: dict[str, Any]) -> float | None:
-    """Return the confidence by which a match was judged: its own, or that of the flight so far where it is higher."""
-    known = number(line, "confidence"), number(line, "followed", "confidence")
-    return max((each for each in known if each is not None), default=None)
-
-
-def _fix(line: dict[str, Any]) -> Fix | None:
+def _fix(line: dict[str, Any]) -> LoggedFix | None:
     told = value(line, "fix")
     if not isinstance(told, dict):
         return None
-    return Fix(
+    return LoggedFix(
         outcome=_outcome(told, told.get("answer")),
         why=text(told, "why"),
         at=point(told),
@@ -239,30 +234,62 @@ def _fix(line: dict[str, Any]) -> Fix | None:
     )
 
 
-def _outcome(told: dict[str, Any], answer: object) -> Outcome:
+def _outcome(told: dict[str, Any], answer: object) -> FixOutcome:
     if told.get("sent") is False:
-        return Outcome.CONTINUOUS if told.get("why") == _CONTINUOUS else Outcome.KEPT
+        return FixOutcome.CONTINUOUS if told.get("why") == _CONTINUOUS else FixOutcome.KEPT
     if answer is None:
-        return Outcome.UNANSWERED
-    return Outcome.TAKEN if answer == "ACCEPTED" else Outcome.REFUSED
+        return FixOutcome.UNANSWERED
+    return FixOutcome.TAKEN if answer == "ACCEPTED" else FixOutcome.REFUSED
 
 
-def _gps_at(line: dict[str, Any], t_mono_s: float) -> Point | None:
+def _is_fresh(t_s: float | None, t_frame_s: float | None) -> bool:
+    return t_s is not None and t_frame_s is not None and abs(t_frame_s - t_s) <= _FRESH_S
+
+
+def _gps_at(line: dict[str, Any], t_frame_s: float | None) -> Point | None:
     """Return where the receiver was when the frame was taken: its newest position, moved on by the velocity."""
     at, t_s = point(line, "vehicle", "gps"), number(line, "vehicle", "gps", "t_s")
-    if at is None or t_s is None or abs(t_mono_s - t_s) > _FRESH_S:
+    if at is None or t_s is None or t_frame_s is None or not _is_fresh(t_s, t_frame_s):
         return None
     match value(line, "vehicle", "velocity_m_s"):
         case [int() | float() as east_m_s, int() | float() as north_m_s]:
-            return moved(*at, (t_mono_s - t_s) * east_m_s, (t_mono_s - t_s) * north_m_s)
+            return moved(*at, (t_frame_s - t_s) * east_m_s, (t_frame_s - t_s) * north_m_s)
     return at
 
 
-def _said(line: dict[str, Any]) -> str:
-    said = next((each for key in _SAYING if (each := text(line, key))), None)
+def _words(line: dict[str, Any]) -> str:
+    words = next((known for key in _WORDS if (known := text(line, key))), None)
     before, after = line.get("from"), line.get("to")  # of the governor
-    if said and isinstance(before, dict) and isinstance(after, dict):
-        changed = [f"{key} {before.get(key)} to {each}" for key, each in after.items() if before.get(key) != each]
-        return ": ".join(filter(None, (", ".join(changed), said)))
+    if words and isinstance(before, dict) and isinstance(after, dict):
+        changed = [f"{key} {before.get(key)} to {now}" for key, now in after.items() if before.get(key) != now]
+        return ": ".join(filter(None, (", ".join(changed), words)))
     others = {"kind", "time", "t_mono_s"}
-    return said or ", ".join(f"{key} {each}" for key, each in line.items() if key not in others)
+    return words or ", ".join(f"{key} {known}" for key, known in line.items() if key not in others)
+
+
+def value(record: Any, *keys: str) -> Any:
+    """Return what stands under `keys`, one inside the other; None where anything is missing."""
+    for key in keys:
+        record = record.get(key) if isinstance(record, dict) else None
+    return record
+
+
+def number(record: Any, *keys: str) -> float | None:
+    """Return a number, as `value` finds it."""
+    found = value(record, *keys)
+    is_number = isinstance(found, (int, float)) and not isinstance(found, bool)
+    return float(found) if is_number and -_LARGEST < found < _LARGEST else None
+
+
+def text(record: Any, *keys: str) -> str | None:
+    """Return a text, as `value` finds it; None for an empty one."""
+    found = value(record, *keys)
+    return found if isinstance(found, str) and found else None
+
+
+def point(record: Any, *keys: str) -> Point | None:
+    """Return the position (lat_deg, lon_deg) of the object under `keys`; None where it has none on the Earth."""
+    lat_deg, lon_deg = number(record, *keys, "lat_deg"), number(record, *keys, "lon_deg")
+    if lat_deg is None or lon_deg is None or abs(lat_deg) > 90 or abs(lon_deg) > 180:
+        return None
+    return lat_deg, lon_deg

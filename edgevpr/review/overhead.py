@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
-from itertools import chain, groupby
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +13,8 @@ from edgevpr.core.errors import EdgevprError
 from edgevpr.core.geodesy import axes_of, offset_m
 from edgevpr.core.types import Pose
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.review.flight import Flight, Outcome
+from edgevpr.review.logged import FixOutcome, LoggedFlight, Point
 from edgevpr.review.svg import Points, dots, way
-from edgevpr.review.values import Point
 
 _WIDE = 1000.0  # of the drawing, in its own units
 _MARGIN = 0.04
@@ -24,14 +23,14 @@ _MOST_VH = 80  # of the height of the window
 _MOST_PLACES = 6000  # more are a whole page of dots; then every second, third, ... is drawn
 _ROUND = (1, 2, 5)
 _FIXES = (
-    (Outcome.TAKEN, "fixes taken", "taken"),
-    (Outcome.UNANSWERED, "fixes not answered", "unanswered"),
-    (Outcome.REFUSED, "fixes refused", "refused"),
+    (FixOutcome.TAKEN, "fixes taken", "taken"),
+    (FixOutcome.UNANSWERED, "fixes not answered", "unanswered"),
+    (FixOutcome.REFUSED, "fixes refused", "refused"),
 )
 
 
 @dataclass(frozen=True, slots=True)
-class Ground:
+class MapGround:
     """Ground of a map: its positions and how their pictures lie there (None: unknown), and `places` in all, also those
     without position. `trouble` says in a sentence why there is no more of it."""
 
@@ -42,21 +41,16 @@ class Ground:
 
 @dataclass(frozen=True, slots=True)
 class Layer:
-    """Part of the drawing that a person may hide: its name, the class that colours it, and the points or, as lines, the
-    ways."""
+    """Part of the drawing that a person may hide: its name, the class that colours it, and the ways through points; or,
+    with `are_dots`, one way of dots."""
 
     name: str
     colour: str
-    points: Sequence[Point] = ()
-    ways: Sequence[Sequence[Point]] = ()
-
-    @property
-    def everything(self) -> Sequence[Point]:
-        """All its points."""
-        return [*self.points, *chain.from_iterable(self.ways)]
+    ways: Sequence[Sequence[Point]]
+    are_dots: bool = True
 
 
-def read_ground(path: str | Path) -> Ground:
+def read_ground(path: str | Path) -> MapGround:
     """Read the places of a map; what cannot be read of it is left out. Raises MapError where that is all."""
     with PlaceMap.open(path) as place_map:
         places = 0
@@ -69,58 +63,56 @@ def read_ground(path: str | Path) -> Ground:
                     at.append(((place.position.lat_deg, place.position.lon_deg), place.pose))
         except EdgevprError as error:
             trouble = f"Only {places} places of the map are drawn. {error}"
-    return Ground(at, places, trouble)
+    return MapGround(at, places, trouble)
 
 
-def layers_of(flight: Flight) -> list[Layer]:
+def layers_of(flight: LoggedFlight) -> list[Layer]:
     """Return what there is to draw of a flight, from the bottom to the top."""
     queries = flight.queries
-    fixed = [each.fix for each in queries if each.fix and each.fix.at]
-    found = [
-        Layer("places found", "found", list(dict.fromkeys(each.place_at for each in queries if each.place_at))),
-        Layer("places learnt", "learnt", flight.learnt),
-        Layer("GPS", "gps", ways=_ways(each.gps_at for each in queries)),
-        Layer("autopilot", "autopilot", ways=_ways(each.autopilot_at for each in queries)),
-        Layer("matches", "accepted", [each.at for each in queries if each.at]),
+    found = list(dict.fromkeys(query.place_at for query in queries if query.place_at))
+    layers = [
+        Layer("places found", "found", [found]),
+        Layer("places learnt", "learnt", [flight.learnt]),
+        Layer("GPS", "gps", _known_ways(query.gps_at for query in queries), are_dots=False),
+        Layer("autopilot", "autopilot", _known_ways(query.autopilot_at for query in queries), are_dots=False),
+        Layer("matches", "accepted", [[query.at for query in queries if query.at]]),
     ]
     for outcome, name, colour in _FIXES:
-        found.append(Layer(name, colour, [each.at for each in fixed if each.outcome is outcome]))
-    return [each for each in found if each.everything]
+        fixes = [query.fix.at for query in queries if query.fix and query.fix.at and query.fix.outcome is outcome]
+        layers.append(Layer(name, colour, [fixes]))
+    return [layer for layer in layers if any(layer.ways)]
 
 
-def _ways(points: Iterable[Point | None]) -> list[list[Point]]:
+def _known_ways(points: Iterable[Point | None]) -> list[list[Point]]:
     """Return the lines through points, each up to one that is not known."""
-    return [list(several) for are_known, several in groupby(points, bool) if are_known]
+    return [[point for point in several if point] for are_known, several in groupby(points, bool) if are_known]
 
 
-def draw(ground: Ground, layers: Sequence[Layer], named: Iterable[tuple[str, Point]] = ()) -> str:
+def draw(ground: MapGround, layers: Sequence[Layer], named: Iterable[tuple[str, Point]] = ()) -> str:
     """Draw the ground with the layers over it, and labels at the `named` points; "" where nothing has a position."""
-    everything = [at for at, _ in ground.at] + [at for layer in layers for at in layer.everything]
+    everything = [at for at, _ in ground.at] + [at for layer in layers for way in layer.ways for at in way]
     if not everything:
         return ""
     view = _View(everything, max((pose.footprint_m for _, pose in ground.at if pose), default=20.0))
-    thin = -(-len(ground.at) // _MOST_PLACES)
-    shown = ground.at[::thin] if thin else ()
+    shown = ground.at[:: -(-len(ground.at) // _MOST_PLACES) or 1]
     squares = "".join(view.square(at, pose) for at, pose in shown if pose)
-    parts = [
-        f'<path class="footprints" d="{squares}"/>' if squares else "",
-        f'<path class="dots place layer-places" d="{dots(view.on([at for at, _ in shown]))}"/>' if shown else "",
-    ]
+    paths = f'<path class="footprints" d="{squares}"/>' if squares else ""
+    if shown:
+        paths += f'<path class="dots place layer-places" d="{dots(view.on([at for at, _ in shown]))}"/>'
     for layer in layers:
-        path = dots(view.on(layer.points)) + "".join(way(view.on(each)) for each in layer.ways)
-        kind = "line" if layer.ways else "dots"
-        parts.append(f'<path class="{kind} {layer.colour} layer-{layer.colour}" d="{path}"/>')
+        kind, path = ("dots", dots) if layer.are_dots else ("line", way)
+        drawn = "".join(path(view.on(points)) for points in layer.ways)
+        paths += f'<path class="{kind} {layer.colour} layer-{layer.colour}" d="{drawn}"/>'
     labels = "".join(
         f'<a class="label" href="#moment-{escape(name)}" style="left:{x / _WIDE:.2%};top:{y / view.high:.2%}">'
         f"{escape(name)}</a>"
         for name, at in named
         for x, y in view.on([at])
     )
-    keys = [Layer("places of the map", "places"), *layers] if shown else layers
     boxes = "".join(
-        f'<label class="key {each.colour}"><input type="checkbox" checked id="show-{each.colour}">'
-        f"{escape(each.name)}</label>"
-        for each in keys
+        f'<label class="key {layer.colour}"><input type="checkbox" checked id="show-{layer.colour}">'
+        f"{escape(layer.name)}</label>"
+        for layer in ([Layer("places of the map", "places", ())] if shown else []) + list(layers)
     )
     shape = _WIDE / view.high  # labels lie right only while the view has exactly this
     length_m, share = view.ruler()
@@ -129,7 +121,7 @@ def draw(ground: Ground, layers: Sequence[Layer], named: Iterable[tuple[str, Poi
         f'<div class="ground"><div class="legend">{boxes}</div>'
         f'<div class="view" style="aspect-ratio:{shape:.4f};max-width:{_MOST_VH * shape:.1f}vh">'
         f'<svg role="img" aria-label="the flight over the ground of the map" viewBox="0 0 {_WIDE:g} {view.high:.0f}">'
-        f'{"".join(parts)}</svg>{labels}<div class="ruler" style="width:{share:.1%}">{ruler}</div>'
+        f'{paths}</svg>{labels}<div class="ruler" style="width:{share:.1%}">{ruler}</div>'
         '<div class="north">N ↑</div></div></div>'
     )
 
@@ -169,7 +161,8 @@ class _View:
 
     def _metres(self, points: Sequence[Point]) -> tuple[np.ndarray, np.ndarray]:
         lat_deg, lon_deg = np.array(points, dtype=float).reshape(-1, 2).T
-        return offset_m(*self._origin, lat_deg, lon_deg)
+        east_m, north_m = offset_m(*self._origin, lat_deg, lon_deg)
+        return east_m, north_m
 
     def _drawn(self, east_m: np.ndarray, north_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         middle_e, middle_n = self._middle_m
