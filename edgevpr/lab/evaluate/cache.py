@@ -50,11 +50,8 @@ class Cache:
             with tempfile.TemporaryDirectory(prefix=_UNFINISHED, dir=self.folder) as unfinished:
                 made = Path(unfinished) / "made"
                 make(made)
-                try:
+                if not path.exists():  # another program may have kept the same meanwhile, and have it open
                     os.replace(made, path)
-                except OSError:  # another program may have kept the same folder meanwhile
-                    if not path.exists():
-                        raise
         except OSError as error:
             raise EdgevprError(
                 f"{self.folder} takes no more ({error.strerror}): make room, or name another --cache, and run again; "
