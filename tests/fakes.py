@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from edgevpr.core.config import load_config
 from edgevpr.core.types import Frame, Receiver, Vehicle
 from edgevpr.frames.shot import Condition
 from edgevpr.mavlink.autopilots.channel import Channel
@@ -20,7 +21,10 @@ from edgevpr.mavlink.outbox import Outbox, Sending
 from edgevpr.mavlink.reasons import State
 from edgevpr.mavlink.replies import Replies
 from edgevpr.mavlink.wishes import Wish, Wished
+from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.clock import Clock
+from edgevpr.runtime.flight.flightlog import FlightLog
+from edgevpr.runtime.flight.herald import Herald
 
 
 class FakeClock:
@@ -128,6 +132,14 @@ class FakeSource:
 
     def close(self) -> None:
         self._left.clear()
+
+
+def to_autopilot(link, navigator, clock: "FakeClock", flight_log: FlightLog | None = None, **settings) -> ToAutopilot:
+    """An autopilot at a link, with keys of the section `mavlink`."""
+    config = load_config(None, {f"mavlink.{key}": value for key, value in settings.items()}).mavlink
+    return ToAutopilot(
+        link, navigator, Herald(flight_log or FlightLog(None), link), settings=config, cores=4, clock=clock.clock
+    )
 
 
 class FakeLink:

@@ -1,19 +1,20 @@
 """The whole walk in under a second: pictures become a map, a frame is recognised, a fix is sent. The first gate."""
 
-from fakes import FakeClock, FakeLink, FakeSource
+from fakes import FakeClock, FakeLink, FakeSource, to_autopilot
 from pictures import textured
 
 from edgevpr.core.config import load_config
-from edgevpr.core.types import Frame, Position
+from edgevpr.core.types import NO_TAPE, Frame, Position
 from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.flight.autopilot import ToAutopilot
-from edgevpr.runtime.flight.flight import fly
+from edgevpr.runtime.flight.flight import Flight
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log
-from edgevpr.runtime.flight.loop import Stop
+from edgevpr.runtime.flight.herald import Herald
+from edgevpr.runtime.flight.metering import meter_of_flight
 from edgevpr.runtime.flight.navigator import Navigator
+from edgevpr.runtime.flight.world import Crew, Stop
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.opening import meter_of
 from edgevpr.runtime.recognise.recogniser import Recogniser
@@ -38,18 +39,21 @@ def test_the_whole_walk(tmp_path):
             candidates=technique.candidates,
         )
         link = FakeLink(clock)
-        flown = fly(
-            recogniser,
-            FakeSource([textured(3), textured(9)], clock),
-            config,
+        crew = Crew(
+            recogniser=recogniser,
+            source=FakeSource([textured(3), textured(9)], clock),
+            link=link,
+            autopilot=to_autopilot(link, Navigator(5.0, 1.0), clock, flight_log),
             flight_log=flight_log,
-            autopilot=ToAutopilot(link, Navigator(5.0, 1.0), send_fixes=True, cores=board.cores, clock=clock.clock),
-            stop=Stop(),
+            herald=Herald(flight_log, link),
+            meter=meter_of_flight(config.battery, board, clock.clock, NO_TAPE),
             clock=clock.clock,
+            stop=Stop(),
         )
-    assert (flown.queries, flown.accepted, flown.failed) == (2, 1, 0)
+        assert Flight(config, crew).run() == 0
     assert link.stats().fixes_sent == 1
-    known, answer, unknown = read_log(tmp_path / "log")
+    known, answer, unknown, end = read_log(tmp_path / "log")
+    assert (end["queries"], end["accepted"], end["unusable"]) == (2, 1, 0)
     assert (known["place"], known["accepted"], known["fix"]["sent"]) == (4, True, True)
     assert (answer["kind"], answer["query"], answer["result"]) == ("answer", known["query"], "ACCEPTED")
     assert (unknown["accepted"], unknown["fix"], unknown["last_fix"]["answer"]) == (False, None, "ACCEPTED")

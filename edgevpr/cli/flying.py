@@ -119,7 +119,7 @@ def run_match(args: Namespace) -> int:
 
 def run_flight(args: Namespace) -> int:
     """Fly with a configuration."""
-    from edgevpr.runtime.flight.fly import fly
+    from edgevpr.runtime.flight.flight import fly
 
     def config() -> Config:
         return with_logs_in(config_of(args, args.config), os.environ.get("LOGS_DIRECTORY", ""))

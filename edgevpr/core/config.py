@@ -208,7 +208,7 @@ class Config:
     battery: BatteryConfig
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Key:
     """A key of the configuration: its dotted name, the type of its value (None apart), its lowest and highest value,
     its command-line flag, and what the flag `sets` where that is true or false."""
@@ -229,7 +229,13 @@ def keys_of(cls: type = Config, prefix: str = "") -> Iterator[Key]:
             yield from keys_of(kind, f"{prefix}{each.name}.")
         else:
             known = each.metadata
-            yield Key(prefix + each.name, kind, known.get("range"), known.get("flag"), known.get("sets", True))
+            yield Key(
+                name=prefix + each.name,
+                kind=kind,
+                limits=known.get("range"),
+                flag=known.get("flag"),
+                sets=known.get("sets", True),
+            )
 
 
 def load_config(path: str | Path | None, overrides: dict[str, Any] | None = None) -> Config:

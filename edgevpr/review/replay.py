@@ -3,7 +3,7 @@
 import logging
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,7 +13,6 @@ import numpy as np
 
 from edgevpr.core.config import Config, build, changed_config
 from edgevpr.core.errors import EdgevprError, ImageError, UsageError
-from edgevpr.core.types import Tape
 from edgevpr.frames.images import read_image
 from edgevpr.frames.taped import ReplayedSource
 from edgevpr.mavlink.signing import NOT_SIGNING
@@ -25,13 +24,12 @@ from edgevpr.review.packets import Packets
 from edgevpr.review.supposed import Supposed, SupposedGround, SupposedLink
 from edgevpr.review.tape import Playback, TapeEnded, read_tape
 from edgevpr.runtime.flight.clock import Clock, taped
-from edgevpr.runtime.flight.course import Aboard, World, fly_course, learning_of, recogniser_of
-from edgevpr.runtime.flight.flightlog import FlightLog, read_log
-from edgevpr.runtime.flight.loop import Stop
+from edgevpr.runtime.flight.flight import Flight
+from edgevpr.runtime.flight.flightlog import read_log
 from edgevpr.runtime.flight.recording import FRAMES, MAP, TAPE, frame_path, recording_of
 from edgevpr.runtime.flight.reloading import Reread
-from edgevpr.runtime.flight.statussocket import NoReaders
 from edgevpr.runtime.flight.wholeflight import flight_of
+from edgevpr.runtime.flight.world import Stop, World
 
 Say = Callable[[int, int], None]  # told of the frames so far, and of all
 
@@ -121,28 +119,29 @@ def _flown(
     sleep: Callable[[float], None],
     say: Say,
 ) -> Replayed:
-    board, why_ended = build(Board, header["board"], "the board of the flight"), None
-    with TemporaryDirectory(prefix="edgevpr-replay-") as temporary, ExitStack() as stack:
+    why_ended = None
+    with TemporaryDirectory(prefix="edgevpr-replay-") as temporary:
         log = Path(temporary) / "flight.jsonl" if config.log.path else None
-        clock = taped(Clock(sleep=sleep), playback)
+        place_map = _map_of(flight.folder, Path(temporary), config, map_path)
+        world = World(
+            board=build(Board, header["board"], "the board of the flight"),
+            place_map=place_map,
+            log=replace(config.log, path=log and str(log), max_mb=None),
+            tape=playback,
+            clock=taped(Clock(sleep=sleep), playback),
+            open_source=lambda step_s: ReplayedSource(playback, _pictures_of(flight.folder, say)),
+            link=kinds.link,
+            ground=kinds.ground,
+            signing=ReplayedSigning() if config.mavlink.signing_key else NOT_SIGNING,
+            tap=untapped,
+            stop=Stop(playback),
+            reread=Reread(lambda: config, playback) if header["is_reread"] else None,
+            status=None,
+            recording=header["recording"],
+        )
         try:
-            aboard = _aboard(flight.folder, Path(temporary), replace(config, map=map_path), board, playback)
-            stack.callback(aboard.recogniser.place_map.close)
-            with FlightLog(log, clock.mono_s, clock.utc_s, tape=playback) as flight_log:
-                world = World(
-                    tape=playback,
-                    clock=clock,
-                    flight_log=flight_log,
-                    readers=NoReaders(),
-                    open_source=lambda step_s: ReplayedSource(playback, _pictures_of(flight.folder, say)),
-                    link=kinds.link,
-                    ground=kinds.ground,
-                    signing=ReplayedSigning() if config.mavlink.signing_key else NOT_SIGNING,
-                    tap=untapped,
-                    recording=header["recording"],
-                )
-                reread = Reread(lambda: config, playback) if header["is_reread"] else None
-                fly_course(config, board, aboard, world, stop=Stop(playback), reread=reread)
+            with closing(Flight.open(config, world)) as again:
+                again.run()
         except TapeEnded as end:
             why_ended = str(end) or "the recording ends there"
         return Replayed(list(read_log(log)) if log else [], playback.packets, why_ended, playback.guessed)
@@ -162,16 +161,13 @@ def _pictures_of(folder: Path, say: Say) -> Callable[[int], np.ndarray]:
     return picture
 
 
-def _aboard(folder: Path, temporary: Path, config: Config, board: Board, tape: Tape) -> Aboard:
-    """Open what recognised in a flight; one that learnt gets a copy of its map, as it was."""
-    clock = taped(Clock(), tape)
-    name, cannot_learn = tape.read("picked", str), tape.read("cannot_learn", str)
-    if not config.mapping.learn or cannot_learn:
-        if config.map and not Path(config.map).exists():
-            raise UsageError(f"{config.map}, the map of the flight, is not there: give it with --map.")
-        return Aboard(recogniser=recogniser_of(config, board), learner=None, cannot_learn=cannot_learn, load_s=0.0)
-    copy = temporary / MAP
-    if (folder / MAP).is_file():
-        shutil.copyfile(folder / MAP, copy)
-    recogniser, learner = learning_of(replace(config, map=str(copy)), board, name, clock)
-    return Aboard(recogniser=recogniser, learner=learner, cannot_learn=None, load_s=0.0)
+def _map_of(folder: Path, temporary: Path, config: Config, map_path: str | None) -> str | None:
+    """Return the path of the map to fly with: for a flight that learnt, that of a copy of its map, as it was."""
+    if config.mapping.learn:
+        copy = temporary / MAP
+        if (folder / MAP).is_file():
+            shutil.copyfile(folder / MAP, copy)
+        return str(copy)
+    if map_path and not Path(map_path).exists():
+        raise UsageError(f"{map_path}, the map of the flight, is not there: give it with --map.")
+    return map_path

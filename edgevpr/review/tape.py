@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 from edgevpr.core.errors import EdgevprError
 from edgevpr.review.packets import Packets
-from edgevpr.runtime.flight.loop import StopNow
+from edgevpr.runtime.flight.world import StopNow
 
 T = TypeVar("T")
 _CLOCKS = "mono_s", "wall_s", "utc_s", "process_cpu_s", "thread_cpu_s"

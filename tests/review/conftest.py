@@ -5,19 +5,20 @@ from dataclasses import replace
 
 import cv2
 import pytest
-from fakes import FakeClock, FakeLink, FakeSource
+from fakes import FakeClock, FakeLink, FakeSource, to_autopilot
 from pictures import textured
 
 from edgevpr.cli.main import main
 from edgevpr.core.config import load_config
-from edgevpr.core.types import Frame, Receiver, Vehicle
+from edgevpr.core.types import NO_TAPE, Frame, Receiver, Vehicle
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.flight.autopilot import ToAutopilot
-from edgevpr.runtime.flight.flight import fly
+from edgevpr.runtime.flight.aboard import start_fields
+from edgevpr.runtime.flight.flight import Flight
 from edgevpr.runtime.flight.flightlog import FlightLog
-from edgevpr.runtime.flight.loop import Stop
+from edgevpr.runtime.flight.herald import Herald
+from edgevpr.runtime.flight.metering import meter_of_flight
 from edgevpr.runtime.flight.navigator import Navigator
-from edgevpr.runtime.flight.startline import start_fields
+from edgevpr.runtime.flight.world import Crew, Stop
 from edgevpr.runtime.recognise.opening import open_recogniser
 
 PLACES, SEEN = 8, 10  # the last pictures are of nothing in the map
@@ -56,10 +57,19 @@ def flown(tmp_path_factory):
     board, recogniser = load_board(config.board), open_recogniser(config, load_board(config.board), narrowed=True)
     link = FakeLink(clock, vehicle=vehicle)
     link.listener = Navigator(config.mavlink.min_accuracy_m, 1.0)
-    autopilot = ToAutopilot(link, link.listener, send_fixes=True, cores=board.cores, clock=clock.clock)
     source = FakeSource([Frame(image=each, name=name, t_mono_s=0.0) for name, each in pictures.items()], clock)
     with recogniser.place_map, FlightLog(folder / "flight.jsonl", clock=clock) as log:
         log.write("start", **start_fields(config, board.name, recogniser.technique.spec, recogniser.place_map))
-        fly(recogniser, source, config, flight_log=log, autopilot=autopilot, stop=Stop(), clock=clock.clock)
-        log.write("end", queries=SEEN)
+        crew = Crew(
+            recogniser=recogniser,
+            source=source,
+            link=link,
+            autopilot=to_autopilot(link, link.listener, clock, log),
+            flight_log=log,
+            herald=Herald(log, link),
+            meter=meter_of_flight(config.battery, board, clock.clock, NO_TAPE),
+            clock=clock.clock,
+            stop=Stop(),
+        )
+        Flight(config, crew).run()
     return folder

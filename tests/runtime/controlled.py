@@ -3,13 +3,14 @@ by hand: nothing depends on how fast the machine is."""
 
 import select
 import socket
+from dataclasses import replace
 
 import numpy as np
 from air import match_at
 from fakes import FakeClock
 from mavlink_peers import wait_until
 
-from edgevpr.core.config import SourceSetsConfig
+from edgevpr.core.config import SourceSetsConfig, load_config
 from edgevpr.core.geodesy import moved
 from edgevpr.core.types import Position
 from edgevpr.lab.simulate.flight import ORIGIN
@@ -21,8 +22,9 @@ from edgevpr.mavlink.messages import Health
 from edgevpr.mavlink.wire import Receiver, mavlink
 from edgevpr.power.load import MachineLoad
 from edgevpr.runtime.flight.autopilot import ToAutopilot
+from edgevpr.runtime.flight.flightlog import FlightLog
+from edgevpr.runtime.flight.herald import Herald
 from edgevpr.runtime.flight.navigator import Muted, Navigator
-from edgevpr.runtime.flight.sourcesets import SourceSets
 
 STEP_S = 0.025
 FIX_SD_M = 1.0
@@ -49,13 +51,10 @@ class Controlled:
             clock=self.clock,
             listener=self.navigator if send_fixes else Muted(self.navigator),
         )
+        settings = replace(load_config(None).mavlink, send_fixes=send_fixes, source_sets=source_sets)
+        herald = Herald(FlightLog(None), self.link)
         self.autopilot = ToAutopilot(
-            self.link,
-            self.navigator,
-            send_fixes=send_fixes,
-            cores=4,
-            clock=self.clock.clock,
-            source_sets=SourceSets(source_sets),
+            self.link, self.navigator, herald, settings=settings, cores=4, clock=self.clock.clock
         )
         self._packer, self._receiver = mavlink.MAVLink(None, 1, 1), Receiver()
         self._to, self._said, self._steps = None, 0, 0

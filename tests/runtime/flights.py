@@ -5,28 +5,28 @@ from pathlib import Path
 from fakes import FakeClock, FakeLink, FakeSource
 
 from edgevpr.core.config import Config, load_config
+from edgevpr.core.types import NO_TAPE
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import parse_pack
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.flight.autopilot import NoAutopilot, ToAutopilot
-from edgevpr.runtime.flight.flight import Flown, fly
+from edgevpr.runtime.flight.flight import Flight as FlightItself
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log
-from edgevpr.runtime.flight.loop import Stop
-from edgevpr.runtime.flight.metering import FlightMeter
+from edgevpr.runtime.flight.herald import Herald
+from edgevpr.runtime.flight.metering import FlightMeter, meter_of_flight
 from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.flight.reloading import Reread
-from edgevpr.runtime.flight.statussocket import NoReaders, Readers
+from edgevpr.runtime.flight.world import Crew, Stop
 from edgevpr.runtime.recognise.learn import Learner
 from edgevpr.runtime.recognise.opening import open_learning, open_recogniser
 from edgevpr.runtime.recognise.recogniser import Recogniser
 
 PLACES = 30
 STEP_DEG = 0.001  # of latitude: 111 m
-_NOBODY = NoReaders()
 
 
 class Flight:
-    """A flight with a map, ready to be flown: `fly` does so and gives the lines of its log; `flown` is what it came to.
+    """A flight with a map, ready to be flown: `fly` does so and gives the lines of its log but the last, the `end`.
 
     `settings` are keys of the configuration; with `learns` the flight makes places; `navigator` is the listener of a
     real link.
@@ -59,7 +59,7 @@ class Flight:
         )
         self.stop = Stop()
         self.reread: Reread | None = None
-        self.flown: Flown | None = None
+        self.end: dict = {}
 
     def fly(
         self,
@@ -67,34 +67,37 @@ class Flight:
         meter: FlightMeter | None = None,
         smaller_forms: tuple[str, ...] = (),
         fewer_candidates: tuple[int, ...] = (),
-        readers: Readers = _NOBODY,
+        status=None,
     ) -> list[dict]:
-        autopilot = NoAutopilot()
-        if self.link:
-            send_fixes = self.config.mavlink.send_fixes
-            navigator = self.navigator
-            if navigator is None:  # of a real link it is the listener from the start
-                navigator = self.link.listener = Navigator(self.config.mavlink.min_accuracy_m, 1.0)
-            autopilot = ToAutopilot(
-                self.link, navigator, send_fixes=send_fixes, cores=self.board.cores, clock=self.clock.clock
-            )
+        settings, clock = self.config.mavlink, self.clock.clock
         with self.recogniser.place_map, FlightLog(self.log, clock=self.clock) as flight_log:
-            self.flown = fly(
-                self.recogniser,
-                source,
-                self.config,
-                flight_log=flight_log,
-                autopilot=autopilot,
-                stop=self.stop,
+            herald, autopilot = Herald(flight_log, self.link), NoAutopilot()
+            if self.link:
+                navigator = self.navigator
+                if navigator is None:  # of a real link it is the listener from the start
+                    navigator = self.link.listener = Navigator(settings.min_accuracy_m, 1.0)
+                autopilot = ToAutopilot(
+                    self.link, navigator, herald, settings=settings, cores=self.board.cores, clock=clock
+                )
+            crew = Crew(
+                recogniser=self.recogniser,
                 learner=self.learner,
+                source=source,
+                link=self.link,
+                autopilot=autopilot,
+                flight_log=flight_log,
+                herald=herald,
+                meter=meter or meter_of_flight(self.config.battery, self.board, clock, NO_TAPE),
+                clock=clock,
+                stop=self.stop,
                 reread=self.reread,
+                status=status,
                 fewer_candidates=fewer_candidates,
                 smaller_forms=smaller_forms,
-                clock=self.clock.clock,
-                meter=meter,
-                readers=readers,
             )
-        return list(read_log(self.log))
+            FlightItself(self.config, crew).run()
+        *lines, self.end = read_log(self.log)
+        return lines
 
 
 def metered(config: Config, recogniser: Recogniser, clock: FakeClock) -> QueryMeter:

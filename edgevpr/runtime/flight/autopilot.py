@@ -1,22 +1,20 @@
 """The channel to the autopilot: tells it of every event, and gives what it says of its vehicle."""
 
 import logging
+import math
 from collections.abc import Collection
 from dataclasses import replace
-from enum import Enum, auto
 
-from edgevpr.core.config import SourceSetsConfig
+from edgevpr.core.config import MavlinkConfig, SourceSetsConfig
 from edgevpr.core.types import FixReport, Vehicle
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.outbox import Sending
 from edgevpr.mavlink.wishes import Wish, Wished
 from edgevpr.power.load import MachineLoad
-from edgevpr.runtime.flight.answerlog import AnswerLog
 from edgevpr.runtime.flight.clock import Clock
-from edgevpr.runtime.flight.flightlog import FlightLog
+from edgevpr.runtime.flight.herald import Herald
 from edgevpr.runtime.flight.navigator import Navigator
-from edgevpr.runtime.flight.sourcesets import SourceSets
 from edgevpr.runtime.flight.status import LinkState
 from edgevpr.runtime.recognise.recognition import Recognition
 
@@ -26,19 +24,9 @@ _SETTLED_WITHIN_S = 0.02
 
 DRY_RUN = "dry run: no fix is sent"
 
-_NO_SETS = SourceSets(SourceSetsConfig(None, None))
+_GPS_GOOD_FOR_S = 10.0  # before the sources with GPS are asked for again
 
 _log = logging.getLogger(__name__)
-
-
-class Mood(Enum):
-    """Importance of an announcement to people on the ground."""
-
-    NOTE = auto()
-    WARNING = auto()
-
-
-_SEVERITY = {Mood.NOTE: messages.Severity.INFO, Mood.WARNING: messages.Severity.WARNING}
 
 
 class NoAutopilot:
@@ -46,7 +34,7 @@ class NoAutopilot:
 
     summary = None
 
-    def log_answers(self, flight_log: FlightLog) -> None:
+    def log_answers(self) -> None:
         """Write nothing: no fix is sent."""
 
     def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
@@ -62,9 +50,6 @@ class NoAutopilot:
     def state(self) -> None:
         """Return None: there is no link."""
 
-    def announce(self, mood: Mood, text: str, topic: str | None = None) -> None:
-        """Say nothing."""
-
     def wishes(self) -> tuple[Wished, ...]:
         """Return none."""
         return ()
@@ -77,25 +62,18 @@ class NoAutopilot:
 
 
 class ToAutopilot:
-    """Tells an autopilot of events over an open link. With `send_fixes` an accepted match with a position is sent as a
-    fix, where the `navigator` says that the autopilot is better off with it; without, all else is as with it. `cores`
-    is the number of the board's cores. `source_sets` are those that may be asked for. Whatever is done with what the
-    link's thread uses too is done in a turn of its own."""
+    """Tells an autopilot of events over an open link. With `mavlink.send_fixes` an accepted match with a position is
+    sent as a fix, where the `navigator` says that the autopilot is better off with it; without, all else is as with it.
+    `cores` is the number of the board's cores. Whatever is done with what the link's thread uses too is done in a turn
+    of its own."""
 
     def __init__(
-        self,
-        link: Link,
-        navigator: Navigator,
-        *,
-        send_fixes: bool,
-        cores: int,
-        clock: Clock,
-        source_sets: SourceSets = _NO_SETS,
+        self, link: Link, navigator: Navigator, herald: Herald, *, settings: MavlinkConfig, cores: int, clock: Clock
     ) -> None:
-        self._link, self._send_fixes, self._cores, self._clock = link, send_fixes, cores, clock
+        self._link, self._navigator, self._herald, self._cores, self._clock = link, navigator, herald, cores, clock
+        self._send_fixes, self._source_sets = settings.send_fixes, SourceSets(settings.source_sets)
         self._last: tuple[str, Sending] | None = None
-        self._answers = AnswerLog()
-        self._navigator, self._source_sets = navigator, source_sets
+        self._unanswered: list[tuple[str, Sending]] = []
         self._held, self._is_holding = 0, False
 
     @property
@@ -129,10 +107,29 @@ class ToAutopilot:
                 accuracy_m=self._navigator.accuracy_m(self._clock.mono_s()),
             )
 
-    def log_answers(self, flight_log: FlightLog) -> None:
-        """Write a line for every answer to a fix that has come since the last call (see `AnswerLog`)."""
+    def log_answers(self) -> None:
+        """Write a line of kind "answer" for every fix that was answered since the last call, was not answered in time,
+        or was given up before it was sent.
+
+        Its fields are: query, sent, result (the name of a MAV_RESULT; null: no answer), why (null: it was taken),
+        latency_ms from sending to answer, t_sent_s on the clock of t_mono_s.
+        """
         with self._link.turn("answers"):
-            self._answers.write(flight_log)
+            # An answer can be there a moment before the link has noted that the fix has left.
+            settled = [each for each in self._unanswered if each[1].sent is False or (each[1].sent and each[1].outcome)]
+            for query, sending in settled:
+                self._unanswered.remove((query, sending))
+                outcome = sending.outcome
+                latency_s = outcome and outcome.latency_s
+                self._herald.note(
+                    "answer",
+                    query=query,
+                    sent=sending.sent,
+                    result=sending.answer,
+                    why=outcome.why if outcome else sending.why,
+                    latency_ms=None if latency_s is None else round(latency_s * 1e3, 1),
+                    t_sent_s=sending.t_sent_s,
+                )
 
     def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
         """Return the autopilot's last report of its vehicle, with the attitude at the time of a frame; None where it
@@ -154,7 +151,8 @@ class ToAutopilot:
             self._last = _name(event), sending
         with self._link.turn("told of its fix"):
             if sending:
-                self._answers.wait_for(*self._last)
+                if sending.sent is not False:  # else it has no answer, as the line of its query says
+                    self._unanswered.append(self._last)
                 fix = _reported(*self._last)
             self._tell(event, used_mah)
         return replace(event, fix=fix, last_fix=last)
@@ -174,11 +172,6 @@ class ToAutopilot:
         with self._link.turn("gps"):
             self._link.send(messages.gps_distance(self._clock.mono_s(), off_m))
             self._navigator.believe_gps(not is_wrong)
-
-    def announce(self, mood: Mood, text: str, topic: str | None = None) -> None:
-        """Send a text to people on the ground, when its turn comes. The newest text of a `topic` takes the place of one
-        that still waits."""
-        self._link.announce(_SEVERITY[mood], text, topic)
 
     def wishes(self) -> tuple[Wished, ...]:
         """Return the wishes of the ground since the last call."""
@@ -205,8 +198,7 @@ class ToAutopilot:
             return
         has_own = self._navigator.knows_position(now_s)
         if number := self._source_sets.wanted(now_s, self._navigator.has_gps, has_own):
-            _log.warning("the autopilot is asked for its source set %d", number)
-            self.announce(Mood.WARNING, f"source set {number} asked for", "sources")
+            self._herald.say(messages.Severity.WARNING, f"source set {number} asked for", topic="sources")
             self._link.send(messages.source_set(number, self._link.stats().autopilot_system_id or 0))
 
     def _fixed(self, event: Recognition) -> tuple[FixReport | None, Sending | None]:
@@ -231,14 +223,38 @@ class ToAutopilot:
             return
         self._is_holding = is_holding
         if is_holding:
-            _log.warning("a fix is %s", objection)
-            self.announce(Mood.WARNING, "fix held back, contradicts autopilot", "held back")
+            ground = "fix held back, contradicts autopilot"
+            self._herald.say(messages.Severity.WARNING, f"a fix is {objection}", ground=ground, topic="held back")
         else:
-            _log.warning("fixes are not held back any more")
-            self.announce(Mood.NOTE, "fixes agree again", "held back")
+            self._herald.say(messages.Severity.INFO, "fixes agree again", topic="held back")
 
 
 Autopilot = NoAutopilot | ToAutopilot
+
+
+class SourceSets:
+    """Decides which set of sources the autopilot is asked to navigate by, where its operator has allowed that: the one
+    without GPS as soon as GPS is lost or wrong and there is a position of ours, the one with GPS when it has been good
+    for ten seconds. Without both numbers nothing is ever asked for."""
+
+    def __init__(self, settings: SourceSetsConfig) -> None:
+        self._with_gps, self._without = settings.gps, settings.no_gps
+        self._asked: int | None = None
+        self._bad_s = -math.inf
+
+    def wanted(self, now_s: float, has_gps: bool, has_own: bool) -> int | None:
+        """Return the number of the set to ask for now; None: there is nothing to ask."""
+        if self._with_gps is None or self._without is None:
+            return None
+        if not has_gps:
+            self._bad_s = now_s
+        wanted = self._without if not has_gps and has_own else None
+        if self._asked == self._without and now_s - self._bad_s > _GPS_GOOD_FOR_S:
+            wanted = self._with_gps
+        if wanted is None or wanted == self._asked:
+            return None
+        self._asked = wanted
+        return wanted
 
 
 def _reported(query: str, sending: Sending) -> FixReport:

@@ -1,4 +1,4 @@
-"""The clocks of a flight in one value: a test, or a replay, hands in its own."""
+"""The clocks of a flight in one value, so that a test or a replay hands in its own; and the pace of its frames."""
 
 import time
 from collections.abc import Callable
@@ -26,3 +26,20 @@ def taped(clock: Clock, tape: Tape) -> Clock:
     """Return the same clocks, each look at which is on the tape."""
     names = [each.name for each in fields(clock) if each.name != "sleep"]
     return replace(clock, **{name: partial(tape.read, name, getattr(clock, name)) for name in names})
+
+
+class Pace:
+    """Frames at `rate_hz`, evenly spaced; a frame that comes late does not make the frames after it come sooner."""
+
+    def __init__(self, rate_hz: float, clock: Clock) -> None:
+        self._clock = clock
+        self._due_s = clock.mono_s()
+        self.rate_hz = rate_hz
+
+    def wait_s(self) -> float:
+        """Return the seconds until the next frame is due, 0 or below where it is due already."""
+        return self._due_s - self._clock.mono_s()
+
+    def taken(self) -> None:
+        """Note that a frame has been taken."""
+        self._due_s = max(self._due_s + 1 / self.rate_hz, self._clock.mono_s())

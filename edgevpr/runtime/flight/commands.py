@@ -1,22 +1,24 @@
 """The wishes of the ground, and what becomes of them: the flight pauses and goes on, learning stops and goes on."""
 
-import logging
-
+from edgevpr.mavlink.messages import Severity
 from edgevpr.mavlink.wishes import Wish, Wished
-from edgevpr.runtime.flight.autopilot import Autopilot, Mood
-from edgevpr.runtime.flight.flightlog import FlightLog
-from edgevpr.runtime.recognise.learn import Learner
+from edgevpr.runtime.flight.world import Crew
 
-_log = logging.getLogger(__name__)
+_TEXTS = {
+    Wish.PAUSE: ("paused by command", "pause"),
+    Wish.RESUME: ("goes on by command", "pause"),
+    Wish.LEARN: ("learning on by command", "learning"),
+    Wish.LEARN_NOTHING: ("learning off by command", "learning"),
+}
 
 
 class Commands:
     """Fulfils the wishes of the ground. While the flight `is_paused` nothing is recognised and no fix is sent. Learning
-    can be switched only where there is a `learner` that has no trouble."""
+    can be switched only where there is a learner that has no trouble."""
 
-    def __init__(self, autopilot: Autopilot, flight_log: FlightLog, learner: Learner | None) -> None:
+    def __init__(self, crew: Crew) -> None:
         self.is_paused = False
-        self._autopilot, self._flight_log, self._learner = autopilot, flight_log, learner
+        self._autopilot, self._herald, self._learner = crew.autopilot, crew.herald, crew.learner
 
     @property
     def summary(self) -> str | None:
@@ -32,23 +34,14 @@ class Commands:
         self._autopilot.offer(tuple(Wish) if can_learn else (Wish.PAUSE, Wish.RESUME))
 
     def _fulfil(self, wished: Wished) -> None:
-        before = self.is_paused, self._learner and self._learner.is_off
+        before = self.summary
         match wished.wish:
             case Wish.PAUSE | Wish.RESUME:
                 self.is_paused = wished.wish is Wish.PAUSE
             case Wish.LEARN | Wish.LEARN_NOTHING if self._learner:
                 self._learner.is_off = wished.wish is Wish.LEARN_NOTHING
-        is_new = before != (self.is_paused, self._learner and self._learner.is_off)
-        said, topic = _SAID[wished.wish]
-        self._flight_log.write("command", wish=wished.wish.name, sender=wished.sender, said=said, is_new=is_new)
+        is_new = before != self.summary
+        text, topic = _TEXTS[wished.wish]
+        self._herald.note("command", wish=wished.wish.name, sender=wished.sender, said=text, is_new=is_new)
         if is_new:  # a command that is sent once more, since its answer was lost, changes nothing
-            _log.warning("%s, as %s wishes", said, wished.sender)
-            self._autopilot.announce(Mood.NOTE, said, topic)
-
-
-_SAID = {
-    Wish.PAUSE: ("paused by command", "pause"),
-    Wish.RESUME: ("goes on by command", "pause"),
-    Wish.LEARN: ("learning on by command", "learning"),
-    Wish.LEARN_NOTHING: ("learning off by command", "learning"),
-}
+            self._herald.say(Severity.INFO, f"{text}, as {wished.sender} wishes", ground=text, topic=topic)

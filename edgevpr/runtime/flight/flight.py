@@ -1,148 +1,327 @@
-"""A flight: wires the listeners to the loop, with everything that has been opened for it, and runs the loop."""
+"""A flight from start to end: `Flight.open` opens everything for it, `run` flies, and `close` closes everything.
 
-from dataclasses import dataclass
+Each turn of the loop takes the newest frame, recognises it, and tells the autopilot and the observers. The same code
+flies in the air and in a replay: what differs is handed in as its `World`.
+"""
+
+import logging
+from collections.abc import Callable
+from contextlib import ExitStack, closing, suppress
+from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any
 
-from edgevpr.core.config import Config
-from edgevpr.core.types import NO_TAPE
-from edgevpr.frames.source import Source
-from edgevpr.runtime.flight.autopilot import Autopilot
-from edgevpr.runtime.flight.clock import Clock
+from edgevpr.core.config import Config, MavlinkConfig
+from edgevpr.core.errors import ImageError
+from edgevpr.core.types import Position
+from edgevpr.mavlink.address import parse_links
+from edgevpr.mavlink.ground import GroundLink
+from edgevpr.mavlink.link import Link
+from edgevpr.mavlink.messages import Severity
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.runtime.flight import systemd
+from edgevpr.runtime.flight.aboard import come_aboard, rate_hz, say_start
+from edgevpr.runtime.flight.air import in_the_air
+from edgevpr.runtime.flight.autopilot import DRY_RUN, Autopilot, NoAutopilot, ToAutopilot
+from edgevpr.runtime.flight.clock import Pace
 from edgevpr.runtime.flight.commands import Commands
-from edgevpr.runtime.flight.flightlog import FlightLog
-from edgevpr.runtime.flight.flightstate import FlightState
 from edgevpr.runtime.flight.governing import Governing
-from edgevpr.runtime.flight.gpswatch import GpsWatch
-from edgevpr.runtime.flight.learning import Learning
-from edgevpr.runtime.flight.loop import Observer, Stop, loop
-from edgevpr.runtime.flight.mapstate import MapState
-from edgevpr.runtime.flight.metering import FlightMeter, meter_of_flight
-from edgevpr.runtime.flight.pace import Pace
-from edgevpr.runtime.flight.querylog import QueryLog, totals_of
-from edgevpr.runtime.flight.reloading import NoReloading, Reloading, Reread
-from edgevpr.runtime.flight.sight import Sight
-from edgevpr.runtime.flight.statussocket import NoReaders, Readers
-from edgevpr.runtime.flight.tally import Tally
+from edgevpr.runtime.flight.herald import Herald
+from edgevpr.runtime.flight.metering import meter_of_flight
+from edgevpr.runtime.flight.navigator import Muted, Navigator
+from edgevpr.runtime.flight.reloading import reload
 from edgevpr.runtime.flight.vitals import Vitals
+from edgevpr.runtime.flight.watching import GpsWatch, MapWatch, Sight, Tally
+from edgevpr.runtime.flight.world import Crew, StopNow, World, signals
+from edgevpr.runtime.preflight.pick import trusted_candidates
 from edgevpr.runtime.recognise.learn import Learner
-from edgevpr.runtime.recognise.recogniser import Recogniser
+from edgevpr.runtime.recognise.recognition import Recognition, fields_of
 
-_NOBODY = NoReaders()
+_TURN_S = 0.2  # the loop turns at least this often, with or without frames
 
-
-@dataclass(frozen=True, slots=True)
-class Flown:
-    """Result of a flight: counts of its events, and `totals` of what it took (see `querylog.totals_of`)."""
-
-    queries: int
-    accepted: int
-    failed: int
-    totals: dict[str, Any]
+_log = logging.getLogger(__name__)
 
 
-def rate_hz(config: Config, recogniser: Recogniser) -> float:
-    """Return the queries a second: the configuration's figure, else that of the board's profile."""
-    return config.source.rate_hz or recogniser.meter.board.rate_hz
+def fly(config: Config, positions: Path | None = None, read_again: Callable[[], Config] | None = None) -> int:
+    """Fly in the air, and return the exit code: 1 if any frame failed, else 0. `positions` is a file with those of the
+    frames of a recording; `read_again` reads the configuration anew, when SIGHUP asks for that. Raises an EdgevprError,
+    one sentence, where the flight cannot start."""
+    with in_the_air(config, positions, read_again) as world, signals(world):
+        try:
+            with closing(Flight.open(config, world)) as flight:
+                return flight.run()
+        except StopNow:
+            _log.info("stopped before the flight began")
+            return 0
 
 
-def fly(
-    recogniser: Recogniser,
-    source: Source,
-    config: Config,
-    *,
-    flight_log: FlightLog,
-    autopilot: Autopilot,
-    stop: Stop,
-    learner: Learner | None = None,
-    reread: Reread | None = None,
-    fewer_candidates: tuple[int, ...] = (),
-    smaller_forms: tuple[str, ...] = (),
-    clock: Clock | None = None,
-    meter: FlightMeter | None = None,
-    readers: Readers = _NOBODY,
-) -> Flown:
-    """Fly until the source has ended or `stop` is asked for.
+class Flight:
+    """A flight for which everything is open. Close it when it has been flown."""
 
-    `learner` makes places (None: nothing is learnt); `reread` asks for the configuration to be read again;
-    `fewer_candidates`, and `smaller_forms` of the index, are those that the governor may change to. `clock` and `meter`
-    are the real ones unless given. `readers` are told the status.
-    """
-    clock = clock or Clock()
-    if meter is None:
-        meter = meter_of_flight(config, recogniser.meter.board, clock, NO_TAPE)
-    map_state = MapState(flight_log, autopilot)
-    tally, pace = Tally(), Pace(rate_hz(config, recogniser), clock)
-    governing = Governing(
-        recogniser,
-        pace,
-        config,
-        meter=meter,
-        flight_log=flight_log,
-        autopilot=autopilot,
-        clock=clock,
-        fewer_candidates=fewer_candidates,
-        smaller_forms=smaller_forms,
-    )
-    reloading: Reloading | NoReloading = NoReloading()
-    if reread:
-        reloading = Reloading(reread, config, flight_log, lambda new: governing.take(new, rate_hz(new, recogniser)))
-    commands = Commands(autopilot, flight_log, learner)
-    state = FlightState(
-        source=source,
-        autopilot=autopilot,
-        meter=meter,
-        tally=tally,
-        pace=pace,
-        commands=commands,
-        clock=clock,
-        remarks=(
-            lambda: commands.summary,
-            lambda: governing.held,
-            lambda: learner and learner.summary,
-            lambda: map_state.summary,
-            lambda: flight_log.state,
-        ),
-    )
-    vitals = Vitals(
-        source=source,
-        flight_log=flight_log,
-        autopilot=autopilot,
-        meter=meter,
-        tally=tally,
-        commands=commands,
-        clock=clock,
-        state=state,
-        readers=readers,
-    )
-
-    def totals() -> dict[str, Any]:
-        return totals_of(tally, meter, source, map_state)
-
-    observers: list[Observer] = [
-        tally,
-        state,
-        map_state,
-        Sight(flight_log, autopilot),
-        GpsWatch(config.mavlink.min_accuracy_m, flight_log, autopilot),
-        QueryLog(flight_log, meter, totals),
-    ]
-    if learner:
-        observers.append(Learning(learner, flight_log, autopilot))
-    try:
-        loop(
-            source,
-            recogniser,
-            autopilot,
-            observers,
-            commands=commands,
-            governing=governing,
-            reloading=reloading,
-            vitals=vitals,
-            meter=meter,
-            pace=pace,
-            clock=clock,
-            stop=stop,
+    def __init__(self, config: Config, crew: Crew) -> None:
+        self._config, self._crew, self._opened = config, crew, ExitStack()
+        self._map_watch, self._tally = MapWatch(crew.herald), Tally()
+        self._pace = Pace(rate_hz(config, crew.recogniser), crew.clock)
+        self._governing = Governing(config, crew, self._pace)
+        self._commands = Commands(crew)
+        remarks = (
+            lambda: self._commands.summary,
+            lambda: self._governing.held,
+            lambda: crew.learner.summary if crew.learner else None,
+            lambda: self._map_watch.summary,
+            lambda: crew.flight_log.state,
         )
-    finally:
-        meter.close()
-    return Flown(tally.queries, tally.accepted, tally.unusable + tally.failed, totals())
+        self._vitals = Vitals(crew, tally=self._tally, pace=self._pace, commands=self._commands, remarks=remarks)
+        self._observers: tuple[Callable[[Recognition], None], ...] = (
+            self._tally.tell,
+            self._vitals.tell,
+            self._map_watch.tell,
+            Sight(crew.herald).tell,
+            GpsWatch(config.mavlink.min_accuracy_m, crew.herald, crew.autopilot).tell,
+            self._log_event,
+            self._learn,
+        )
+
+    @classmethod
+    def open(cls, config: Config, world: World) -> "Flight":
+        """Open the map, the log, the links and the source, in this order. Raises an EdgevprError where one of them
+        cannot be opened, and StopNow where the flight is to end before it has begun."""
+        with ExitStack() as stack:
+            with systemd.more_time_to_start(), world.stop.beginning():
+                aboard = come_aboard(config, world, stack)
+            say_start(config, world, aboard)
+            recogniser, learner = aboard.recogniser, aboard.learner
+            step_s = 1 / rate_hz(config, recogniser)
+            navigator = Navigator(config.mavlink.min_accuracy_m, step_s)
+            link, ground = open_links(config.mavlink, world, navigator, recogniser.place_map, stack)
+            source = world.open_source(step_s)
+            stack.callback(source.close)
+            if link and not source.is_live:
+                _say_recording(config, learner)
+            herald = Herald(aboard.flight_log, link)
+            autopilot: Autopilot = NoAutopilot()
+            if link:
+                autopilot = ToAutopilot(
+                    link, navigator, herald, settings=config.mavlink, cores=world.board.cores, clock=world.clock
+                )
+            if not config.mavlink.send_fixes:
+                herald.say(Severity.WARNING, DRY_RUN)
+            if aboard.cannot_learn:
+                _say_learning_stopped(herald, aboard.cannot_learn)
+            herald.say(Severity.INFO, f"started, {len(recogniser.place_map)} places", topic="start")
+            meter = meter_of_flight(config.battery, world.board, world.clock, world.tape)
+            stack.callback(meter.close)
+            crew = Crew(
+                recogniser=recogniser,
+                learner=learner,
+                source=source,
+                link=link,
+                ground=ground,
+                autopilot=autopilot,
+                flight_log=aboard.flight_log,
+                herald=herald,
+                meter=meter,
+                clock=world.clock,
+                stop=world.stop,
+                reread=world.reread,
+                status=world.status,
+                fewer_candidates=() if config.match.candidates else trusted_candidates(recogniser.technique),
+                smaller_forms=aboard.smaller_forms,
+            )
+            flight = cls(config, crew)
+            flight._opened = stack.pop_all()
+        systemd.ready()
+        return flight
+
+    def close(self) -> None:
+        """Close everything that was opened, the last first."""
+        self._opened.close()
+
+    def run(self) -> int:
+        """Fly until the source has ended or a signal ends the flight, and write the last line of the log; return 1 if
+        any frame failed, else 0."""
+        with suppress(StopNow):
+            while not (self._crew.stop.asked or self._crew.source.ended):
+                self._turn()
+        self._end()
+        return 1 if self._tally.unusable + self._tally.failed else 0
+
+    def totals(self) -> dict[str, Any]:
+        """Return the counts and costs of the flight so far: queries, those of `FlightMeter.totals`, the pictures that
+        were not read in time (`dropped`) or not new and whole (`refused`, by reason), the seconds that the newest was
+        old when it could be read (`latency_s`), and the places that were left out."""
+        source = self._crew.source
+        return {
+            "queries": self._tally.queries,
+            **self._crew.meter.totals(),
+            "dropped": source.dropped,
+            "refused": dict(source.refused),
+            "latency_s": source.latency_s,
+            "left_out": self._map_watch.left_out,
+        }
+
+    def _turn(self) -> None:
+        source, clock, meter = self._crew.source, self._crew.clock, self._crew.meter
+        self._vitals.beat()
+        self._commands.obey()
+        if self._crew.reread and self._crew.reread.take():
+            self._reload()
+        if (wait_s := self._pace.wait_s()) > 0:
+            clock.sleep(min(wait_s, _TURN_S))
+            return
+        if self._commands.is_paused:
+            self._pass_over()
+            self._pace.taken()
+            return
+        frame = problem = None
+        with meter.reading_frame(source.is_live) as reading:
+            try:
+                frame = source.read(_TURN_S)
+            except ImageError as error:
+                problem = error
+        if frame is None and problem is None:
+            return
+        self._pace.taken()
+        recogniser, autopilot = self._crew.recogniser, self._crew.autopilot
+        with meter.working():
+            with self._crew.stop.breaks_off():
+                if problem:
+                    event = recogniser.unread(problem)
+                else:
+                    event = recogniser.step(frame, autopilot.vehicle_at(frame.t_mono_s))
+            self._tell(replace(event, steps=replace(event.steps, read=reading.cost)))
+        self._governing.look()  # here, so that each reading covers a whole number of queries
+
+    def _pass_over(self) -> None:
+        """Let the newest picture of a camera or stream go by, so that none is old when the flight goes on; a recording
+        waits."""
+        if self._crew.source.is_live:
+            with suppress(ImageError):
+                self._crew.source.read(_TURN_S)
+        else:
+            self._crew.clock.sleep(_TURN_S)
+
+    def _tell(self, event: Recognition) -> None:
+        """Tell the autopilot of an event, then all observers, who also learn what became of its fix. A listener that
+        fails is logged: it must not end the flight."""
+        meter = self._crew.meter
+        meter.count(event)
+        with meter.telling():
+            try:
+                event = self._crew.autopilot.told(event, meter.used_mah)
+            except Exception:
+                _log.exception("the autopilot could not be told")
+            for tell in self._observers:
+                try:
+                    tell(event)
+                except Exception:
+                    _log.exception("%s could not be told", tell.__qualname__)
+
+    def _log_event(self, event: Recognition) -> None:
+        """Write the line of an event: of kind "query", or "unusable" for a frame that never became a query."""
+        if not event.is_query:
+            self._crew.flight_log.write("unusable", problem=event.reason)
+            return
+        self._crew.flight_log.write(
+            "query",
+            t_frame_s=event.frame.t_mono_s,
+            **fields_of(event),
+            fix=event.fix,
+            last_fix=event.last_fix,
+            reading=event.steps.read,
+            vehicle=event.vehicle,
+            board=self._crew.meter.heat_fields(),
+            hints=event.hints.fields() if event.hints else None,
+            totals=self.totals(),
+        )
+
+    def _learn(self, event: Recognition) -> None:
+        """Make a place of the frame, where it is worth one; later frames may be recognised as that place."""
+        learner = self._crew.learner
+        if learner is None:
+            return
+        well = learner.trouble is None
+        place = learner.learn(event)
+        if place:
+            self._crew.flight_log.write(
+                "learnt",
+                place=place.place_id,
+                query=event.frame.name,
+                position=asdict(place.position),
+                quality=place.quality,
+            )
+        if well and learner.trouble:
+            _say_learning_stopped(self._crew.herald, learner.trouble)
+
+    def _reload(self) -> None:
+        config = reload(self._crew.reread, self._config, self._crew.flight_log)
+        if config != self._config:
+            self._config = config
+            self._governing.take(config, rate_hz(config, self._crew.recogniser))
+
+    def _end(self) -> None:
+        crew, totals = self._crew, self.totals()
+        systemd.stopping()
+        if crew.link:
+            crew.link.close()  # sends waiting messages first, so that the log's last line counts them
+            crew.autopilot.log_answers()
+        crew.flight_log.write(
+            "end",
+            accepted=self._tally.accepted,
+            unusable=self._tally.unusable + self._tally.failed,
+            **totals,
+            mavlink=crew.link.stats() if crew.link else None,
+            **({"ground": crew.ground.stats()} if crew.ground else {}),
+            **({"learnt": crew.learner.totals} if crew.learner else {}),
+        )
+        _log.info(
+            "%d queries, %d accepted%s, %.3f mAh (%.3f of them for recognising)",
+            self._tally.queries,
+            self._tally.accepted,
+            f", {crew.autopilot.summary}" if crew.autopilot.summary else "",
+            totals["used_mah"],
+            totals["marginal_mah"],
+        )
+        if crew.learner:
+            _log.info("%s, %d in %s", crew.learner.summary, len(crew.recogniser.place_map), self._config.map)
+
+
+def open_links(
+    settings: MavlinkConfig, world: World, navigator: Navigator, place_map: PlaceMap, stack: ExitStack
+) -> tuple[Link | None, GroundLink | None]:
+    """Open the link to the flight controller and the one to the ground, None where there is none."""
+    address, ground_address = parse_links(settings.link, settings.ground)
+    if address is None:
+        return None, None
+    link = world.link(
+        address,
+        settings.component_id,
+        system_id=settings.system_id,
+        max_fix_age_s=settings.max_fix_age_s,
+        listener=navigator if settings.send_fixes else Muted(navigator),
+        tap=world.tap,
+        origin=_first_position(place_map) if settings.set_origin else None,
+        signing=world.signing,
+        tape=world.tape,
+    )
+    stack.enter_context(link)
+    link.want_position()
+    return link, stack.enter_context(world.ground(ground_address, link)) if ground_address else None
+
+
+def _first_position(place_map: PlaceMap) -> Position | None:
+    return next((place.position for place in place_map.places() if place.position), None)
+
+
+def _say_recording(config: Config, learner: Learner | None) -> None:
+    uri = config.source.uri
+    if config.mavlink.send_fixes:
+        _log.warning("%s is a recording: the fixes sent say where it was made, not where you are", uri)
+    if learner:
+        _log.warning("%s is a recording: what it learns is put where the vehicle is now", uri)
+
+
+def _say_learning_stopped(herald: Herald, problem: str) -> None:
+    ground = "nothing more is learnt, see its log"
+    text = f"nothing more is learnt: {problem}"
+    herald.tell("learning stopped", Severity.WARNING, text, ground=ground, topic="learning", problem=problem)

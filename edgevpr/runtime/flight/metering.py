@@ -5,7 +5,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, astuple
 from typing import Any
 
-from edgevpr.core.config import Config
+from edgevpr.core.config import BatteryConfig
 from edgevpr.core.types import NO_TAPE, StageCost, Tape
 from edgevpr.power.boards import Board
 from edgevpr.power.energy import RunningEnergy
@@ -139,19 +139,18 @@ class FlightMeter:
         return 1000 * pack_ah(energy_j, self._pack, self._regulator_efficiency)
 
 
-def meter_of_flight(config: Config, board: Board, clock: Clock, tape: Tape) -> FlightMeter:
+def meter_of_flight(battery: BatteryConfig, board: Board, clock: Clock, tape: Tape) -> FlightMeter:
     """Make the meter of a flight on a board that is fed by the configured pack."""
-    pack, efficiency = parse_pack(config.battery.pack), config.battery.regulator_efficiency
-    return FlightMeter(board, pack, efficiency, clock=clock, tape=tape)
+    return FlightMeter(board, parse_pack(battery.pack), battery.regulator_efficiency, clock=clock, tape=tape)
 
 
-def meter_of_queries(config: Config, board: Board, clock: Clock, tape: Tape) -> QueryMeter:
+def meter_of_queries(battery: BatteryConfig, board: Board, clock: Clock, tape: Tape) -> QueryMeter:
     """Make the meter of the queries of a flight."""
     memory = OwnMemory()
     return QueryMeter(
         board,
-        parse_pack(config.battery.pack),
-        config.battery.regulator_efficiency,
+        parse_pack(battery.pack),
+        battery.regulator_efficiency,
         wall_clock=clock.wall_s,
         cpu_clock=clock.process_cpu_s,
         memory_mb=lambda: tape.read("memory_mb", memory.look),

@@ -2,7 +2,7 @@
 refused by name."""
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -47,53 +47,37 @@ class Reread:
             return {"problem": str(error)}
 
 
-class NoReloading:
-    """Stands in for a `Reloading` where the configuration has no file."""
-
-    def look(self) -> None:
-        """Read nothing."""
-
-
-class Reloading:
-    """Reads the configuration again when `reread` is asked to. Of what differs from the one in force, `TAKEN` is handed
-    to `take`; a configuration that cannot be read changes nothing."""
-
-    def __init__(self, reread: Reread, config: Config, flight_log: FlightLog, take: Callable[[Config], None]) -> None:
-        self._reread, self._config, self._flight_log, self._take = reread, config, flight_log, take
-
-    def look(self) -> None:
-        """Read the configuration, if that is asked for, and say what comes of it."""
-        if not self._reread.take():
-            return
-        try:
-            new = self._reread.read()
-        except EdgevprError as error:
-            _log.warning("the configuration stays as it is: %s", error)
-            self._flight_log.write("reload", problem=str(error))
-            return
-        before, after = dict(_keys(asdict(self._config))), dict(_keys(asdict(new)))
-        changed = [name for name, value in after.items() if value != before[name]]
-        taken = {name: after[name] for name in changed if name in TAKEN}
-        refused = [name for name in changed if name not in TAKEN]
-        self._config = replace(
-            self._config,
-            match=replace(self._config.match, accept_precision=new.match.accept_precision),
-            source=replace(self._config.source, rate_hz=new.source.rate_hz),
-        )
-        if taken:
-            self._take(self._config)
-            self._flight_log.restate(config=asdict(self._config))
-        said = [f"{name} is {'the default' if value is None else value}" for name, value in taken.items()]
-        _log.info("the configuration is read again: %s", ", ".join(said) or "nothing changes")
-        if refused:
-            _log.warning("only a new start changes %s", ", ".join(refused))
-        self._flight_log.write("reload", taken=taken, refused=refused)
+def reload(reread: Reread, config: Config, flight_log: FlightLog) -> Config:
+    """Read the configuration again, say what comes of it, and return the one in force: `config` with those keys of the
+    new one that are `TAKEN`. One that cannot be read changes nothing."""
+    try:
+        new = reread.read()
+    except EdgevprError as error:
+        _log.warning("the configuration stays as it is: %s", error)
+        flight_log.write("reload", problem=str(error))
+        return config
+    before, after = _keys(asdict(config)), _keys(asdict(new))
+    changed = [name for name, value in after.items() if value != before[name]]
+    taken = {name: after[name] for name in changed if name in TAKEN}
+    refused = [name for name in changed if name not in TAKEN]
+    config = replace(
+        config,
+        match=replace(config.match, accept_precision=new.match.accept_precision),
+        source=replace(config.source, rate_hz=new.source.rate_hz),
+    )
+    if taken:
+        flight_log.restate(config=asdict(config))
+    values = [f"{name} is {'the default' if value is None else value}" for name, value in taken.items()]
+    _log.info("the configuration is read again: %s", ", ".join(values) or "nothing changes")
+    if refused:
+        _log.warning("only a new start changes %s", ", ".join(refused))
+    flight_log.write("reload", taken=taken, refused=refused)
+    return config
 
 
-def _keys(section: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the dotted name and the value of every key."""
+def _keys(section: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return the value of every key by its dotted name."""
+    found: dict[str, Any] = {}
     for name, value in section.items():
-        if isinstance(value, dict):
-            yield from _keys(value, f"{prefix}{name}.")
-        else:
-            yield prefix + name, value
+        found |= _keys(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
+    return found

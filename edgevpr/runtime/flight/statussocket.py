@@ -17,19 +17,6 @@ _MOST_READERS = 32  # at once: descriptors are for the camera and the link; othe
 _WAITING_BYTES = 32_768  # for each reader, of the flight's memory
 
 
-class NoReaders:
-    """Stands in for a `StatusSocket` where there is none."""
-
-    def __enter__(self) -> "NoReaders":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-    def tell(self, status: Status) -> None:
-        """Tell nobody."""
-
-
 class StatusSocket:
     """A socket in the file system that tells the status to whoever connects. Close it (it is a context manager), which
     removes the file.
@@ -106,9 +93,6 @@ class StatusSocket:
                 reader.setblocking(False)
                 reader.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _WAITING_BYTES)
                 self._readers.append(reader)
-
-
-Readers = NoReaders | StatusSocket
 
 
 def usual_path() -> str | None:

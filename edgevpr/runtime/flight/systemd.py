@@ -14,7 +14,7 @@ from edgevpr.core.text import shown
 from edgevpr.power.load import cpu_spent_s
 
 _SEND_TIMEOUT_S = 0.5
-_LOOK_S, _MORE = 20.0, {"EXTEND_TIMEOUT_USEC": 60_000_000}
+_LOOK_S, _MORE_US = 20.0, 60_000_000
 _WORKS = 0.05  # the share of a core below which a start waits for something and does not compute
 _LONGEST_START_S = 1800.0
 
@@ -41,8 +41,28 @@ def notify(**assignments: object) -> bool:
     return True
 
 
+def ready() -> None:
+    """Tell that the start is over, and the flight begins."""
+    notify(READY=1)
+
+
+def stopping() -> None:
+    """Tell that the flight ends."""
+    notify(STOPPING=1)
+
+
+def watchdog_ping() -> None:
+    """Tell that the loop turns."""
+    notify(WATCHDOG=1)
+
+
+def status(text: str) -> None:
+    """Tell how the flight goes, in one line."""
+    notify(STATUS=text)
+
+
 def watchdog_interval_s() -> float | None:
-    """Return the seconds after which `notify(WATCHDOG=1)` is due again, None where no watchdog waits for this process.
+    """Return the seconds after which `watchdog_ping` is due again, None where no watchdog waits for this process.
 
     It is half the unit's WatchdogSec, as sd_watchdog_enabled(3) advises.
     """
@@ -72,14 +92,14 @@ def more_time_to_start(
         while not begun.wait(look_s) and time.monotonic() < until_s:
             now_s = spent_s()
             if now_s - before_s >= _WORKS * look_s:
-                notify(**_MORE)
+                notify(EXTEND_TIMEOUT_USEC=_MORE_US)
             before_s = now_s
 
     if "NOTIFY_SOCKET" not in os.environ:
         yield
         return
     if longest_s > 0:
-        notify(**_MORE)  # at once: to get here took imports, on a slow board half a minute
+        notify(EXTEND_TIMEOUT_USEC=_MORE_US)  # at once: to get here took imports, on a slow board half a minute
     thread = threading.Thread(target=ask, name="start", daemon=True)
     thread.start()
     try:

@@ -1,100 +1,168 @@
-"""The state of a flight, reported once a second, and the watchdog's beat."""
+"""Telling how a flight goes, once a second: to systemd (with the beat), to the autopilot, and to whoever looks."""
 
-import logging
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from datetime import datetime, timezone
 
+from edgevpr import __version__
 from edgevpr.frames.shot import Condition
-from edgevpr.frames.source import Source
-from edgevpr.mavlink.messages import Health
-from edgevpr.runtime.flight.autopilot import Autopilot, Mood
-from edgevpr.runtime.flight.clock import Clock
+from edgevpr.mavlink.messages import Health, Severity
+from edgevpr.power.load import MachineLoad
+from edgevpr.runtime.flight import systemd
+from edgevpr.runtime.flight.autopilot import confidence_of
+from edgevpr.runtime.flight.clock import Pace
 from edgevpr.runtime.flight.commands import Commands
-from edgevpr.runtime.flight.flightlog import FlightLog
-from edgevpr.runtime.flight.flightstate import FlightState
-from edgevpr.runtime.flight.metering import FlightMeter
-from edgevpr.runtime.flight.statussocket import Readers
-from edgevpr.runtime.flight.systemd import notify, watchdog_interval_s
-from edgevpr.runtime.flight.tally import FAILURES_IN_A_ROW, Tally
-from edgevpr.runtime.flight.trouble import Trouble
+from edgevpr.runtime.flight.herald import Trouble
+from edgevpr.runtime.flight.status import Seen, Status
+from edgevpr.runtime.flight.watching import FAILURES_IN_A_ROW, Tally
+from edgevpr.runtime.flight.world import Crew
+from edgevpr.runtime.recognise.recognition import Recognition
 
 _HEALTH_S = 1.0
+_WINDOW = 10  # reports, one a second, over which rate and load are taken
 _TROUBLES = {Condition.LOST: "lost", Condition.FROZEN: "frozen", Condition.DAMAGED: "damaged"}
-
-_log = logging.getLogger(__name__)
 
 
 class Vitals:
-    """Tells systemd that the loop turns, it and the `readers` how the flight goes, and the autopilot how this companion
-    computer is. It tells everybody, once, when the camera is lost, frozen or damaged or shows nothing, when nothing can
-    be recognised any more, and when that is over."""
+    """Tells systemd that the loop turns, it and the status's readers how the flight goes, and the autopilot how this
+    companion computer is. It tells everybody, once, when the camera is lost, frozen or damaged or shows nothing, when
+    nothing can be recognised any more, and when that is over. `remarks` are asked for what else people are to know."""
 
     def __init__(
-        self,
-        *,
-        source: Source,
-        flight_log: FlightLog,
-        autopilot: Autopilot,
-        meter: FlightMeter,
-        tally: Tally,
-        commands: Commands,
-        clock: Clock,
-        state: FlightState,
-        readers: Readers,
+        self, crew: Crew, *, tally: Tally, pace: Pace, commands: Commands, remarks: Sequence[Callable[[], str | None]]
     ) -> None:
-        self._source, self._flight_log, self._autopilot = source, flight_log, autopilot
-        self._meter, self._tally, self._commands, self._clock = meter, tally, commands, clock
-        self._state, self._readers = state, readers
-        self._watchdog_s = watchdog_interval_s()
-        self._watchdog_due_s = self._health_due_s = clock.mono_s()
-        self._trouble: str | None = None
-        failing = f"{FAILURES_IN_A_ROW} frames in a row have failed"
-        told = {"flight_log": flight_log, "autopilot": autopilot}
-        self._failing = Trouble("failing", failing, "frames are recognised again", **told)
+        self._crew, self._tally, self._pace, self._commands, self._remarks = crew, tally, pace, commands, remarks
+        self._watchdog_s = systemd.watchdog_interval_s()
+        self._watchdog_due_s = self._health_due_s = crew.clock.mono_s()
+        self._source_trouble: str | None = None
         self._has_log = True
-        self._blind = Trouble("camera", "camera shows nothing", "camera shows ground again", **told)
+        failing = f"{FAILURES_IN_A_ROW} frames in a row have failed"
+        self._failing = Trouble(crew.herald, "failing", failing, "frames are recognised again")
+        self._blind = Trouble(crew.herald, "camera", "camera shows nothing", "camera shows ground again")
+        self._newest: Seen | None = None
+        self._match: Seen | None = None
+        self._newest_s = self._match_s = 0.0
+        self._looks: deque[tuple[float, int, float]] = deque(maxlen=_WINDOW + 1)
+
+    def tell(self, event: Recognition) -> None:
+        """Take note of an event."""
+        if not event.is_query:
+            return
+        self._newest, self._newest_s = _seen(event), event.frame.t_mono_s
+        if event.accepted:
+            self._match, self._match_s = self._newest, self._newest_s
 
     def beat(self) -> None:
         """Send the watchdog's beat and the report, where they are due, and log the answers to fixes that have come."""
-        now_s = self._clock.mono_s()
+        now_s = self._crew.clock.mono_s()
         if self._watchdog_s and now_s >= self._watchdog_due_s:
-            notify(WATCHDOG=1)
+            systemd.watchdog_ping()
             self._watchdog_due_s = now_s + self._watchdog_s
-        self._autopilot.log_answers(self._flight_log)
+        self._crew.autopilot.log_answers()
         if now_s >= self._health_due_s:
             self._health_due_s = now_s + _HEALTH_S
-            self._flight_log.sync_due(now_s)
-            self._tell()
+            self._crew.flight_log.sync_due(now_s)
+            self._report()
 
-    def _tell(self) -> None:
-        self._meter.look_at_heat()
-        self._say_source()
+    def _report(self) -> None:
+        meter = self._crew.meter
+        meter.look_at_heat()
+        self._look_at_source()
         self._failing.note(self._tally.is_failing)
-        self._say_log()
+        self._look_at_log()
         self._blind.note(self._tally.sees_nothing)
-        health, load = self._health(), self._meter.machine_load()
-        status = self._state.status(health, load)
-        notify(STATUS=status.summary)
-        self._readers.tell(status)
-        self._autopilot.report(health, load, self._meter.thermal.temperature_c)
+        health, load = self._health(), meter.machine_load()
+        status = self._status(health, load)
+        systemd.status(status.summary)
+        if self._crew.status:
+            self._crew.status.tell(status)
+        self._crew.autopilot.report(health, load, meter.thermal.temperature_c)
 
-    def _say_source(self) -> None:
-        trouble = _TROUBLES.get(self._source.condition)
-        if trouble != self._trouble:
-            self._trouble = trouble
-            _log.warning("source: %s", self._source.state)
-            self._flight_log.write("source", state=self._source.state, refused=self._source.refused)
-            self._autopilot.announce(Mood.WARNING if trouble else Mood.NOTE, f"camera {trouble or 'is back'}", "source")
+    def _look_at_source(self) -> None:
+        source = self._crew.source
+        trouble = _TROUBLES.get(source.condition)
+        if trouble == self._source_trouble:
+            return
+        self._source_trouble = trouble
+        self._crew.herald.tell(
+            "source",
+            Severity.WARNING if trouble else Severity.INFO,
+            f"source: {source.state}",
+            ground=f"camera {trouble or 'is back'}",
+            state=source.state,
+            refused=source.refused,
+        )
 
-    def _say_log(self) -> None:
+    def _look_at_log(self) -> None:
         """Tell the ground of a flight log that cannot be written; the journal has the reason."""
-        has_log = self._flight_log.is_written
+        has_log = self._crew.flight_log.is_written
         if has_log != self._has_log:
             self._has_log = has_log
             text = f"flight log {'is written again' if has_log else 'cannot be written'}"
-            self._autopilot.announce(Mood.NOTE if has_log else Mood.WARNING, text, "log")
+            self._crew.herald.announce(Severity.INFO if has_log else Severity.WARNING, text, "log")
 
     def _health(self) -> Health:
-        if self._trouble:
+        if self._source_trouble:
             return Health.CRITICAL
         if self._commands.is_paused:
             return Health.STANDBY
         return Health.CRITICAL if self._failing.is_so or self._blind.is_so else Health.ACTIVE
+
+    def _status(self, health: Health, load: MachineLoad) -> Status:
+        crew, tally = self._crew, self._tally
+        totals, now_s = crew.meter.totals(), crew.clock.mono_s()
+        rate_hz, cpu_cores = self._lately(totals["elapsed_s"], totals["process_cpu_s"])
+        utc = datetime.fromtimestamp(crew.clock.utc_s(), timezone.utc)
+        return Status(
+            version=__version__,
+            time=utc.isoformat(timespec="seconds").replace("+00:00", "Z"),
+            elapsed_s=totals["elapsed_s"],
+            health=health.name,
+            paused=self._commands.is_paused,
+            source=crew.source.state,
+            latency_s=crew.source.latency_s,
+            queries=tally.queries,
+            accepted=tally.accepted,
+            failed=tally.failed + tally.unusable,
+            rate_hz=rate_hz,
+            asked_rate_hz=self._pace.rate_hz,
+            cpu_cores=cpu_cores,
+            rss_mb=crew.meter.rss_mb(),
+            machine_cpu_share=sum(load.core_shares) / max(1, len(load.core_shares)),
+            machine_ram_mb=load.ram_used_bytes / 1e6,
+            machine_ram_total_mb=load.ram_total_bytes / 1e6,
+            used_mah=totals["used_mah"],
+            temperature_c=crew.meter.thermal.temperature_c,
+            throttled=crew.meter.thermal.throttled,
+            newest=self._newest and replace(self._newest, age_s=now_s - self._newest_s),
+            match=self._match and replace(self._match, age_s=now_s - self._match_s),
+            link=crew.autopilot.state(),
+            remarks=[text for remark in self._remarks if (text := remark())],
+        )
+
+    def _lately(self, elapsed_s: float, cpu_s: float) -> tuple[float | None, float | None]:
+        """Return the queries a second, and the cores kept busy, since the oldest look that is kept."""
+        self._looks.append((elapsed_s, self._tally.queries, cpu_s))
+        begin_s, queries, begin_cpu_s = self._looks[0]
+        span_s = elapsed_s - begin_s
+        if span_s <= 0:
+            return None, None
+        return (self._tally.queries - queries) / span_s, (cpu_s - begin_cpu_s) / span_s
+
+
+def _seen(event: Recognition) -> Seen:
+    place = event.best and event.best.place
+    return Seen(
+        query=event.frame.name,
+        age_s=0.0,
+        accepted=event.accepted,
+        reason=event.reason,
+        place=place and place.place_id,
+        reference_image=place and place.source_image,
+        score=event.best and event.best.match.score,
+        confidence=confidence_of(event),
+        lat_deg=event.position and event.position.lat_deg,
+        lon_deg=event.position and event.position.lon_deg,
+        accuracy_m=event.accuracy_m,
+    )

@@ -12,7 +12,7 @@ from pictures import textured
 
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.link import Link
-from edgevpr.runtime.flight import autopilot, vitals
+from edgevpr.runtime.flight import autopilot, systemd
 from edgevpr.runtime.flight.autopilot import DRY_RUN
 
 
@@ -86,7 +86,7 @@ def test_a_match_that_takes_longer_than_a_fix_may_be_old_says_so_in_its_line_and
     recording, tmp_path, monkeypatch
 ):
     clock, statuses = FakeClock(), []
-    monkeypatch.setattr(vitals, "notify", lambda **said: statuses.append(said.get("STATUS", "")))
+    monkeypatch.setattr(systemd, "status", statuses.append)
     link = FakeLink(clock)
     flown = flight(recording, tmp_path, link, clock)
     encode = flown.recogniser.technique.encode
@@ -141,7 +141,7 @@ def test_the_cost_of_every_query_is_told(recording, tmp_path):
     flown.fly(FakeSource(pictures(1, first=100), clock))
     told = {each.name: each.value for each in link.sent if each.get_type() == "NAMED_VALUE_FLOAT"}
     assert told["vpr_cpu"] == pytest.approx(0.5), "two of four cores while the query lasted"
-    assert told["vpr_mah"] == pytest.approx(flown.flown.totals["used_mah"], rel=0.01)
+    assert told["vpr_mah"] == pytest.approx(flown.end["used_mah"], rel=0.01)
 
 
 @pytest.mark.parametrize("technique", ["cohog", "hog"])

@@ -7,7 +7,7 @@ from flights import Flight, of_kind
 from pictures import textured
 
 from edgevpr.mavlink.messages import Health
-from edgevpr.runtime.flight.tally import NOTHING_IN_A_ROW
+from edgevpr.runtime.flight.watching import NOTHING_IN_A_ROW
 
 GROUND, NOTHING = textured(1, 240, 320), np.zeros((240, 320), np.uint8)
 

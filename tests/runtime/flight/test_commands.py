@@ -12,7 +12,7 @@ from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.wire import mavlink
 from edgevpr.mavlink.wishes import Wish
-from edgevpr.runtime.flight import systemd, vitals
+from edgevpr.runtime.flight import systemd
 
 
 @pytest.fixture
@@ -71,14 +71,14 @@ def test_while_paused_the_watchdog_is_fed_and_the_status_says_so(recording, tmp_
     monkeypatch.setenv("WATCHDOG_USEC", "2000000")
     monkeypatch.delenv("WATCHDOG_PID", raising=False)
     assert systemd.watchdog_interval_s() == 1.0
-    monkeypatch.setattr(vitals, "notify", lambda **said: told.append(said))
+    monkeypatch.setattr(systemd, "notify", lambda **said: told.append(said))
     link = FakeLink(clock)
     source = FakeSource(pictures(9), clock, work=lambda: link.wish(Wish.PAUSE))
     lines = flight(recording, tmp_path, clock, link).fly(source)
     assert queries(lines) == ["frame 000000"]
     assert sum("WATCHDOG" in each for each in told) == 9
-    assert "streaming; 1 queries, 1 accepted" in told[-1]["STATUS"]
-    assert "; paused" in told[-1]["STATUS"]
+    assert "streaming; 1 queries, 1 accepted" in told[-2]["STATUS"]
+    assert "; paused" in told[-2]["STATUS"]
 
 
 def test_a_camera_that_is_lost_while_paused_is_critical(recording, tmp_path, clock):

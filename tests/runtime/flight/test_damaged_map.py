@@ -14,8 +14,8 @@ from flights import PLACES, STEP_DEG, Flight, of_kind
 from pictures import textured
 
 from edgevpr.mavlink.messages import Health
-from edgevpr.runtime.flight import vitals
-from edgevpr.runtime.flight.tally import FAILURES_IN_A_ROW
+from edgevpr.runtime.flight import systemd
+from edgevpr.runtime.flight.watching import FAILURES_IN_A_ROW
 
 DAMAGE = (None, b"", b"\xff", b"\x00" * 7, "text", 10**18, -1.5, float("inf"), b"\xa5" * 40_000)
 COLUMNS = ("geom", "time", "alt_m", "heading_deg", "source_image", "quality", "coarse", "fine")
@@ -75,20 +75,20 @@ def test_a_damaged_fine_part_of_any_place_costs_one_query_and_then_only_where_it
         else:
             assert place == shown or "may be the right one" in line["reason"]
     assert sum(line["accepted"] for line in queries[2:]) >= 4, "the flight goes on with the rest"
-    assert flight.flown.failed == 1
+    assert flight.end["unusable"] == 1
     assert [(line["place"], line["problem"]) for line in of_kind(lines, "left out")] == [
         (place, "its fine part has a wrong size")
     ]
     assert flight.link.texts() == [(4, "edgevpr: map damaged, 1 place left out")]
-    assert flight.flown.totals["left_out"] == queries[-1]["totals"]["left_out"] == 1
+    assert flight.end["left_out"] == queries[-1]["totals"]["left_out"] == 1
 
 
 def test_each_damaged_place_is_counted_once_however_often_it_is_met(place_map, tmp_path):
     damages = [lambda n=n: damaged(place_map, "UPDATE places SET fine = x'00' WHERE place_id = ?", n) for n in (4, 9)]
     queries, lines, flight = fly(place_map, tmp_path / "log", [*damages, *[nothing] * 20])
     assert [line["place"] for line in of_kind(lines, "left out")] == [4, 9]
-    assert flight.flown.totals["left_out"] == 2
-    assert flight.flown.failed == 2
+    assert flight.end["left_out"] == 2
+    assert flight.end["unusable"] == 2
     assert [text for _, text in flight.link.texts()] == ["edgevpr: map damaged, 1 place left out"], "said once"
     assert sum(line["accepted"] for line in queries) >= 8
 
@@ -112,7 +112,7 @@ def test_whatever_stands_in_a_column_the_flight_goes_on_and_sends_nothing_that_i
     damages = [damage(value) for value in DAMAGE]
     queries, _, flight = fly(place_map, tmp_path / "log", damages)
     assert len(queries) == len(DAMAGE)
-    assert flight.flown.queries == len(DAMAGE)
+    assert flight.end["queries"] == len(DAMAGE)
     sent = flight.link.stats().fixes_sent
     assert sent == sum(line["accepted"] and bool(line["fix"]["sent"]) for line in queries)
     for line in queries:
@@ -135,7 +135,7 @@ def test_a_map_whose_rows_go_in_flight_costs_queries_and_not_the_flight(place_ma
     queries, _, flight = fly(place_map, tmp_path / "log", [nothing, lambda: damaged(place_map, statement), nothing])
     assert len(queries) == 3
     assert all(mapped(line) for line in queries)
-    assert flight.flown.queries == 3
+    assert flight.end["queries"] == 3
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
@@ -164,7 +164,7 @@ def test_ten_failures_in_a_row_are_critical_and_said_once_until_it_works_again(
     place_map, tmp_path, monkeypatch, caplog
 ):
     health, statuses = [], []
-    monkeypatch.setattr(vitals, "notify", lambda **said: statuses.append(said.get("STATUS", "")))
+    monkeypatch.setattr(systemd, "status", statuses.append)
     whole = place_map.read_bytes()
 
     def damage():
@@ -193,7 +193,7 @@ def test_ten_failures_in_a_row_are_critical_and_said_once_until_it_works_again(
         (6, "edgevpr: its map is read again"),
         (6, "edgevpr: frames are recognised again"),
     ]
-    assert flight.flown.failed == FAILURES_IN_A_ROW + 1
-    assert flight.flown.totals["left_out"] == 0, "where all are damaged the file is at fault, and may come back"
+    assert flight.end["unusable"] == FAILURES_IN_A_ROW + 1
+    assert flight.end["left_out"] == 0, "where all are damaged the file is at fault, and may come back"
     told = [record.message for record in caplog.records if "is damaged" in record.message]
     assert len(told) == 1, "the same trouble is said once"

@@ -7,12 +7,11 @@ from flights import Flight
 
 from edgevpr.frames.images import read_image
 from edgevpr.mavlink.wishes import Wish
-from edgevpr.runtime.flight.statussocket import NoReaders
 
 GREY = np.full((120, 160), 90, np.uint8)
 
 
-class Kept(NoReaders):
+class Kept:
     def __init__(self):
         self.statuses = []
 
@@ -32,7 +31,7 @@ def told(recording, tmp_path):
         seen = sorted((recording / "seen" / "images").iterdir())[:count]
         source = FakeSource([*map(read_image, seen), *pictures], clock, work=lambda: clock.work(0.1, cores=0.5))
         settings = {"source.rate_hz": 2.0} | settings
-        Flight(recording / "cohog.gpkg", tmp_path / "log", clock, link, **settings).fly(source, readers=kept)
+        Flight(recording / "cohog.gpkg", tmp_path / "log", clock, link, **settings).fly(source, status=kept)
         return kept.statuses
 
     return flown

@@ -12,8 +12,8 @@ from edgevpr.core.errors import MapError
 from edgevpr.core.files import shipped
 from edgevpr.places.index import bytes_per_place, load_index
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.flight import vitals
-from edgevpr.runtime.flight.course import smaller_forms_of
+from edgevpr.runtime.flight import systemd
+from edgevpr.runtime.flight.aboard import smaller_forms
 from edgevpr.runtime.flight.governor import Reading
 from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.preflight import accuracy
@@ -52,7 +52,7 @@ def governed(place_map, log, readings, count, fewer_candidates=(), **settings):
     """(changes, all lines, announcements, the flight) of a flight of `count` turns of 4 s."""
     clock = FakeClock()
     flight = Flight(place_map, log, clock, FakeLink(clock), **settings)
-    forms = smaller_forms_of(flight.config, flight.recogniser, None, load_s=0.0)
+    forms = smaller_forms(flight.config, flight.recogniser, None, load_s=0.0)
     source = FakeSource([textured(0, 240, 320)] * count, clock, work=lambda: clock.sleep(TURN_S))
     lines = flight.fly(source, flight_meter(flight, Scripted, readings=readings), forms, fewer_candidates)
     return of_kind(lines, "governor"), lines, flight.link.texts(), flight
@@ -60,7 +60,7 @@ def governed(place_map, log, readings, count, fewer_candidates=(), **settings):
 
 def test_a_change_is_logged_and_announced_once_and_taken_back(recording, tmp_path, monkeypatch, caplog):
     statuses = []
-    monkeypatch.setattr(vitals, "notify", lambda **said: statuses.append(said.get("STATUS", "")))
+    monkeypatch.setattr(systemd, "status", statuses.append)
     script = [BUSY] * 2 + [CALM] * 3
     changes, _, texts, _ = governed(recording / "cohog.gpkg", tmp_path / "log", script, 8, **{"source.rate_hz": 60.0})
     down, back = changes
@@ -168,7 +168,7 @@ def test_what_a_map_cannot_serve_is_not_offered(recording, tmp_path, trusted):
         config = load_config(None, {"map": str(recording / f"{name}.gpkg"), **settings})
         recogniser = open_recogniser(config, load_board("this"))
         with recogniser.place_map:
-            return smaller_forms_of(config, recogniser, learner, load_s)
+            return smaller_forms(config, recogniser, learner, load_s)
 
     assert forms("hog") == ("8bit", "1bit")
     assert forms("hog", **{"match.form": "8bit"}) == ("1bit",)
@@ -183,7 +183,7 @@ def test_what_a_map_cannot_serve_is_not_offered(recording, tmp_path, trusted):
     config = load_config(None, {"map": str(tmp_path / "grows.gpkg")})
     learning, growing = open_learning(config, load_board("this"), None)
     with learning.place_map:
-        assert smaller_forms_of(config, learning, growing, 0.0) == (), "an index that grows does so in one form"
+        assert smaller_forms(config, learning, growing, 0.0) == (), "an index that grows does so in one form"
 
 
 def test_of_a_part_of_a_map_no_smaller_form_is_offered(recording):
@@ -193,7 +193,7 @@ def test_of_a_part_of_a_map_no_smaller_form_is_offered(recording):
         technique = recogniser.technique
         part = load_index(recogniser.place_map, technique, 9 * bytes_per_place(technique.spec))
         recogniser.take(technique, part, recogniser.rule, recogniser.search)
-        assert smaller_forms_of(config, recogniser, None, 0.0) == (), "it is as large as it may be"
+        assert smaller_forms(config, recogniser, None, 0.0) == (), "it is as large as it may be"
 
 
 def test_a_sequence_is_asked_as_often_as_its_map_was_made(recording, tmp_path):
@@ -245,5 +245,5 @@ def test_a_flight_that_must_share_its_core_asks_less_often_until_it_has_it_back(
     assert changes[0]["to"]["rate_hz"] == pytest.approx(rate_hz / 2, rel=1e-3)
     assert changes[-1]["why"] == "there is room again"
     assert changes[-1]["to"] == changes[0]["from"]
-    said = [record.message for record in caplog.records if record.name.endswith("governing")]
+    said = [record.message for record in caplog.records if record.name.endswith("herald")]
     assert len(said) == len(changes) == len(flight.link.texts()), "each is said once"

@@ -6,17 +6,18 @@ from functools import partial
 import numpy as np
 import pytest
 from air import GPS_SD_M, HOME, Air, lengths, match_at
-from fakes import FakeClock, FakeLink, vehicle_at
+from fakes import FakeClock, FakeLink, to_autopilot, vehicle_at
 
 from edgevpr.core.geodesy import moved
 from edgevpr.core.types import Position, Receiver
 from edgevpr.frames.level import View
 from edgevpr.mavlink.autopilots.channel import Channel
-from edgevpr.runtime.flight.autopilot import NoAutopilot, ToAutopilot
+from edgevpr.runtime.flight.autopilot import NoAutopilot
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log
-from edgevpr.runtime.flight.gpswatch import GpsWatch
+from edgevpr.runtime.flight.herald import Herald
 from edgevpr.runtime.flight.integrity import Integrity
 from edgevpr.runtime.flight.navigator import Advice, Navigator
+from edgevpr.runtime.flight.watching import GpsWatch
 
 MAP_SD_M = 5.0
 AWAY = np.array([0.6, 0.8])
@@ -30,9 +31,9 @@ class Watched(Air):
         super().__init__(navigator or Navigator(MAP_SD_M, 1.0), **{"fix_sd_m": 2.0, "late_s": 0.0} | how)
         self.clock = clock
         self.link = FakeLink(self.clock)
-        self.autopilot = ToAutopilot(self.link, self.navigator, send_fixes=True, cores=4, clock=self.clock.clock)
+        self.autopilot = to_autopilot(self.link, self.navigator, self.clock, flight_log)
         self.log, self.drift_m_s, self.reports = flight_log.path, 0.0, []
-        self.watch = GpsWatch(MAP_SD_M, flight_log, self.autopilot)
+        self.watch = GpsWatch(MAP_SD_M, Herald(flight_log, self.link), self.autopilot)
 
     def tell(self, event):
         self.clock.now_s = self.t_s
@@ -266,5 +267,5 @@ def test_the_time_between_receiver_and_frame_is_allowed_for():
 
 def test_without_a_link_the_log_has_nothing_of_gps(tmp_path):
     with FlightLog(tmp_path / "log") as log:
-        GpsWatch(5.0, log, NoAutopilot()).tell(match_at(Position(*HOME), 5.0, None, 3.0, (1,)))
+        GpsWatch(5.0, Herald(log, None), NoAutopilot()).tell(match_at(Position(*HOME), 5.0, None, 3.0, (1,)))
     assert list(read_log(tmp_path / "log")) == []

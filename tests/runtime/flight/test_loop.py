@@ -6,8 +6,8 @@ from flights import Flight, of_kind
 from pictures import textured
 
 from edgevpr.core.errors import ImageError
-from edgevpr.runtime.flight.loop import Stop, StopNow
-from edgevpr.runtime.flight.pace import Pace
+from edgevpr.runtime.flight.clock import Pace
+from edgevpr.runtime.flight.world import Stop, StopNow
 
 PICTURE = textured(1, 240, 320)
 
@@ -78,7 +78,7 @@ def test_a_frame_that_cannot_be_read_is_logged_and_the_next_is_recognised(record
     lines = flown.fly(FakeSource(pictures, clock, is_live=False))
     assert [line["problem"] for line in of_kind(lines, "unusable")] == ["1.png is cut short: copy it again."]
     assert len(of_kind(lines, "query")) == 2
-    assert (flown.flown.queries, flown.flown.failed) == (2, 1)
+    assert (flown.end["queries"], flown.end["unusable"]) == (2, 1)
 
 
 def test_frames_are_taken_evenly_and_a_late_one_does_not_hurry_the_next(clock):
@@ -92,7 +92,7 @@ def test_frames_are_taken_evenly_and_a_late_one_does_not_hurry_the_next(clock):
     assert pace.wait_s() == 0, "what was missed is not made up for"
     pace.taken()
     assert pace.wait_s() == pytest.approx(0.5)
-    pace.set_rate(1.0)
+    pace.rate_hz = 1.0
     clock.now_s += 0.5
     pace.taken()
     assert pace.wait_s() == pytest.approx(1.0)

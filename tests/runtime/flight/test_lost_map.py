@@ -67,7 +67,7 @@ def test_a_locked_map_refuses_at_once_and_is_used_again_when_it_is_free(place_ma
     assert all("another program is writing to it" in line["reason"] for line in queries[1:10])
     assert flight.link.texts() == SAID
     assert [line["state"] for line in of_kind(lines, "map")] == ["cannot be read", "read again"]
-    assert flight.flown.totals["left_out"] == 0
+    assert flight.end["left_out"] == 0
 
 
 @pytest.mark.parametrize("technique", ["cohog", "hog"])
@@ -101,7 +101,7 @@ def test_a_map_that_is_gone_refuses_and_is_used_again_when_it_is_back(recording,
     assert [line["accepted"] for line in queries] == [True, False, False, False, True, True], queries[-1]["reason"]
     assert all(str(place_map) in line["reason"] for line in queries[1:4])
     assert flight.link.texts() == SAID
-    assert flight.flown.totals["left_out"] == 0, "no place is lost for good with the file"
+    assert flight.end["left_out"] == 0, "no place is lost for good with the file"
 
 
 @pytest.mark.parametrize("technique", ["cohog", "hog"])

@@ -8,10 +8,9 @@ from flights import Flight, of_kind
 from pictures import textured
 
 from edgevpr.frames.level import View
-from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log
-from edgevpr.runtime.flight.navigator import Navigator
-from edgevpr.runtime.flight.sight import Sight
+from edgevpr.runtime.flight.herald import Herald
+from edgevpr.runtime.flight.watching import Sight
 
 
 class Seen:
@@ -20,8 +19,7 @@ class Seen:
     def __init__(self, folder):
         self.clock, self.log = FakeClock(), folder / "log"
         self.link = FakeLink(self.clock)
-        autopilot = ToAutopilot(self.link, Navigator(5.0, 1.0), send_fixes=True, cores=1, clock=self.clock.clock)
-        self.sight = Sight(FlightLog(self.log, clock=self.clock), autopilot)
+        self.sight = Sight(Herald(FlightLog(self.log, clock=self.clock), self.link))
 
     def look(self, outcomes: str, every_s: float = 1.0):
         """`+` accepted, `-` not, `L` not and lost, `0` shows nothing, `x` failed, `t` tilted, `n` not worth a search,

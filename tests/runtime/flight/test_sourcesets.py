@@ -3,15 +3,14 @@
 import pytest
 from air import Air
 from controlled import LOAD, Controlled
-from fakes import FakeClock, FakeLink
+from fakes import FakeClock, FakeLink, to_autopilot
 
 from edgevpr.core.config import SourceSetsConfig
 from edgevpr.mavlink.autopilots.channel import Channel
 from edgevpr.mavlink.messages import Health
 from edgevpr.mavlink.wire import mavlink
-from edgevpr.runtime.flight.autopilot import ToAutopilot
+from edgevpr.runtime.flight.autopilot import SourceSets
 from edgevpr.runtime.flight.navigator import Navigator
-from edgevpr.runtime.flight.sourcesets import SourceSets
 
 ASK = mavlink.MAV_CMD_SET_EKF_SOURCE_SET
 ALLOWED = SourceSetsConfig(gps=1, no_gps=2)
@@ -95,7 +94,7 @@ def test_looking_whether_to_ask_moves_no_continuous_position():
     plain, asking = (Air(Navigator(1.0, 1.0)) for _ in range(2))
     clock = FakeClock()
     link = FakeLink(clock, vehicle=lambda: asking.vehicle)
-    autopilot = ToAutopilot(link, asking.navigator, send_fixes=True, cores=4, clock=clock.clock)
+    autopilot = to_autopilot(link, asking.navigator, clock)
     for air in (plain, asking):
         air.navigator.hear_channel(Channel.GPS_INPUT)
     for _ in range(20):

@@ -10,8 +10,8 @@ from tiny_networks import CARD, write_network
 
 from edgevpr.cli.main import main
 from edgevpr.core.config import load_config
+from edgevpr.runtime.flight.flight import fly
 from edgevpr.runtime.flight.flightlog import read_log
-from edgevpr.runtime.flight.fly import fly
 
 
 @pytest.fixture

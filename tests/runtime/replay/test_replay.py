@@ -22,7 +22,7 @@ from edgevpr.review.replay import recorded, replay
 from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.flightlog import read_log
 from edgevpr.runtime.flight.recording import TAPE, recordings
-from edgevpr.runtime.flight.tally import Tally
+from edgevpr.runtime.flight.watching import Tally
 
 QUICK = "--rate-hz", "15"
 

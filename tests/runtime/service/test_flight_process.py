@@ -17,7 +17,7 @@ from edgevpr.cli.main import main
 from edgevpr.core.appending import numbered
 from edgevpr.places.identity import identity_of
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.runtime.flight import course
+from edgevpr.runtime.flight import aboard
 from edgevpr.runtime.flight.flightlog import read_log
 
 
@@ -151,7 +151,7 @@ def test_a_signal_ends_a_flight_that_has_not_begun(recording, tmp_path, monkeypa
         time.sleep(60)
         pytest.fail("it went on computing")
 
-    monkeypatch.setattr(course, "outlook", computing)
+    monkeypatch.setattr(aboard, "outlook", computing)
     flags = (
         "--map",
         recording / "cohog.gpkg",

@@ -1,18 +1,27 @@
 """The link of a flight is opened as the configuration says."""
 
 from contextlib import ExitStack, closing
+from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 from mavlink_peers import Peer, UdpPort, wait_until
 
 from edgevpr.core.config import load_config
 from edgevpr.core.errors import ConfigError
-from edgevpr.mavlink.address import parse_link
+from edgevpr.core.types import NO_TAPE
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.signing import NOT_SIGNING, open_signing
-from edgevpr.runtime.flight import course
+from edgevpr.mavlink.wire import untapped
+from edgevpr.runtime.flight.flight import open_links
 from edgevpr.runtime.flight.navigator import Navigator
+
+
+def opened(config, port, signing, stack):
+    settings = replace(config.mavlink, link=f"udpout:127.0.0.1:{port.number}")
+    world = SimpleNamespace(link=Link, ground=None, signing=signing, tap=untapped, tape=NO_TAPE)
+    return open_links(settings, world, Navigator(5.0, 1.0), None, stack)[0]
 
 
 def test_the_keys_of_the_configuration_reach_the_link():
@@ -20,8 +29,7 @@ def test_the_keys_of_the_configuration_reach_the_link():
     config = load_config(None, keys)
     with ExitStack() as stack:
         port = stack.enter_context(closing(UdpPort()))
-        address = parse_link(f"udpout:127.0.0.1:{port.number}")
-        link = stack.enter_context(course.link_of(Link, address, config.mavlink, Navigator(5.0, 1.0), NOT_SIGNING))
+        link = opened(config, port, NOT_SIGNING, stack)
         heartbeat = Peer(port).expect("HEARTBEAT")
         assert (heartbeat.get_srcSystem(), heartbeat.get_srcComponent()) == (5, 191)
         sending = link.send_fix(Fix(50.0, 8.0, 20.0, link._clock()))
@@ -44,9 +52,8 @@ def test_the_key_and_where_the_time_is_kept_reach_the_link(tmp_path):
     config = load_config(None, {"mavlink.signing_key": str(key), "mavlink.signing_state": str(state)})
     with ExitStack() as stack:
         port = stack.enter_context(closing(UdpPort()))
-        address = parse_link(f"udpout:127.0.0.1:{port.number}")
         signing = open_signing(config.mavlink.signing_key, config.mavlink.signing_state)
-        stack.enter_context(course.link_of(Link, address, config.mavlink, Navigator(5.0, 1.0), signing))
+        opened(config, port, signing, stack)
         assert Peer(port).expect("HEARTBEAT").get_header().incompat_flags == 1  # signed
     assert state.exists()
     key.chmod(0o644)

@@ -1,0 +1,193 @@
+"""All that is aboard before the links and the source are opened: map, recogniser and learner, and the log, whose
+first line says all that identifies a flight."""
+
+import logging
+import os
+import platform
+import sys
+import time
+from contextlib import ExitStack
+from dataclasses import asdict, astuple, dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from edgevpr import __version__
+from edgevpr.core.config import Config
+from edgevpr.core.contract import TechniqueSpec
+from edgevpr.core.errors import MapError
+from edgevpr.core.types import FIX_MAX_AGE_S
+from edgevpr.places.identity import MapIdentity, identity_of
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.runtime.flight.flightlog import FlightLog
+from edgevpr.runtime.flight.metering import meter_of_queries
+from edgevpr.runtime.flight.world import World
+from edgevpr.runtime.preflight.choose import too_late
+from edgevpr.runtime.preflight.pick import Outlook, outlook, picked_technique, trusted_forms
+from edgevpr.runtime.recognise.learn import Learner
+from edgevpr.runtime.recognise.opening import has_map, open_learning, open_recogniser
+from edgevpr.runtime.recognise.recogniser import Recogniser
+
+_LOAD_S = 10.0  # a map that takes longer to load is not loaded again in flight: nothing is recognised meanwhile
+_NEW_MAP_PLACES = 1000  # a technique picked for an empty map must be able to fly with so many
+_LIBRARIES = ("numpy", "cv2", "onnxruntime")
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Aboard:
+    """The recogniser, its `learner` (None: nothing is learnt), the reason why it cannot learn (None: it can, or is not
+    to), the log, how the technique will do, and the forms of the index that the governor may take."""
+
+    recogniser: Recogniser
+    learner: Learner | None
+    cannot_learn: str | None
+    flight_log: FlightLog
+    found: Outlook
+    smaller_forms: tuple[str, ...]
+
+
+def come_aboard(config: Config, world: World, stack: ExitStack) -> Aboard:
+    """Open the map and the log, which are closed with the `stack`, and try how the technique will do. Raises an
+    EdgevprError where one of them cannot be opened."""
+    begin_s = time.monotonic()
+    recogniser, learner, cannot_learn = _opened(config, world)
+    load_s = time.monotonic() - begin_s
+    stack.callback(recogniser.place_map.close)
+    flight_log = FlightLog(
+        world.log.path,
+        world.clock.mono_s,
+        world.clock.utc_s,
+        wait="NOTIFY_SOCKET" in os.environ,
+        max_mb=world.log.max_mb,
+        tape=world.tape,
+    )
+    stack.enter_context(flight_log)
+    recogniser.meter = meter_of_queries(config.battery, world.board, world.clock, world.tape)
+    forms = world.tape.read("forms", lambda: smaller_forms(config, recogniser, learner, load_s))
+    found = Outlook(*world.tape.read("outlook", lambda: astuple(outlook(recogniser, config))))
+    recogniser.candidates = found.candidates
+    return Aboard(
+        recogniser=recogniser,
+        learner=learner,
+        cannot_learn=cannot_learn,
+        flight_log=flight_log,
+        found=found,
+        smaller_forms=tuple(forms),
+    )
+
+
+def _opened(config: Config, world: World) -> tuple[Recogniser, Learner | None, str | None]:
+    """Open the recogniser of a flight, its learner if it is to have one, and say why it has none.
+
+    Where the map cannot be written (a card that has become read-only, a full disk), the recogniser alone is opened: the
+    places of the map are recognised all the same.
+    """
+    here = replace(config, map=world.place_map)
+    name = world.tape.read("picked", lambda: _picked(config))
+    learning = cache(lambda: _learning(here, world, name))
+
+    def problem() -> str | None:
+        try:
+            if config.mapping.learn:
+                learning()
+        except MapError as error:
+            return str(error)
+        return None
+
+    cannot_learn = world.tape.read("cannot_learn", problem)
+    if config.mapping.learn and not cannot_learn:
+        return *learning(), None
+    try:
+        recogniser = open_recogniser(here, world.board, narrowed=True, follows=config.match.follow)
+    except MapError:
+        if cannot_learn:
+            raise MapError(cannot_learn) from None
+        raise
+    return recogniser, None, cannot_learn
+
+
+def _picked(config: Config) -> str | None:
+    """Return the technique that is asked for; one is picked for a new map."""
+    if config.mapping.learn and config.technique is None and config.map is not None and not has_map(Path(config.map)):
+        return picked_technique(config.board, _NEW_MAP_PLACES, config.source.camera)
+    return config.technique
+
+
+def _learning(config: Config, world: World, name: str | None) -> tuple[Recogniser, Learner]:
+    """Open the recogniser of a flight and its learner; a new map is made for the technique of this name."""
+    recogniser, growing = open_learning(config, world.board, name)
+    spacing_m, gap_m = config.mapping.spacing_m, config.salience.gap_m
+    learner = Learner(recogniser, growing, spacing_m=spacing_m, gap_m=gap_m, utc_clock=world.clock.utc_s)
+    return recogniser, learner
+
+
+def smaller_forms(config: Config, recogniser: Recogniser, learner: Learner | None, load_s: float) -> tuple[str, ...]:
+    """List the forms of the index that the governor may take: only for a map that is wholly in memory, does not grow
+    and loads quickly. Another form has other scores, so a limit of acceptance set by the user holds for one form only,
+    and no other is taken."""
+    own_limits = config.match.min_score is not None or config.match.min_margin is not None
+    is_whole = len(recogniser.index) == len(recogniser.place_map)  # else a smaller form would hold more places
+    if own_limits or learner or not is_whole or load_s > _LOAD_S:
+        return ()
+    return trusted_forms(recogniser.technique)
+
+
+def rate_hz(config: Config, recogniser: Recogniser) -> float:
+    """Return the queries a second: the configuration's figure, else that of the board's profile."""
+    return config.source.rate_hz or recogniser.meter.board.rate_hz
+
+
+def say_start(config: Config, world: World, aboard: Aboard) -> None:
+    """Say which technique flies, and write the first line of the log."""
+    board, recogniser, found = world.board, aboard.recogniser, aboard.found
+    _log.info("version %s on %s", __version__, board.title)
+    _log.info("%s", found.reason)
+    if config.mavlink.link and config.mavlink.send_fixes and (found.t_query_s or 0.0) > FIX_MAX_AGE_S:
+        _log.warning("no fix will be sent: %s", too_late(found.t_query_s))
+    if not board.verified:
+        _log.warning("mAh are estimates: the power of %s is unverified (%s)", board.title, board.source)
+    decided: dict[str, Any] = {
+        "reason": found.reason,
+        "rule": recogniser.rule,
+        "candidates": recogniser.candidates,
+        "sequence": recogniser.search.length,
+        "accuracy_m": recogniser.accuracy_m,
+        "rate_hz": rate_hz(config, recogniser),
+        "idle_w": board.idle_w,
+        "full_w": board.full_w,
+        "power_verified": board.verified,
+        "dry_run": not config.mavlink.send_fixes,
+    }
+    fields = start_fields(config, board.name, recogniser.technique.spec, recogniser.place_map)
+    aboard.flight_log.write("start", **fields, recording=world.recording, decided=decided)
+
+
+def start_fields(config: Config, board_name: str, spec: TechniqueSpec, place_map: PlaceMap) -> dict[str, Any]:
+    """Return the fields of a flight's first line, of kind "start": all that a flight depends on, but for its pictures
+    and its autopilot. Of the libraries those are named that are loaded."""
+    loaded = {name: getattr(sys.modules.get(name), "__version__", None) for name in _LIBRARIES}
+    return {
+        "version": __version__,
+        "technique": spec.name,
+        "parameters": spec.parameters,
+        "model_sha256": spec.model_sha256,
+        "board": board_name,
+        "machine": platform.machine(),
+        "python": platform.python_version(),
+        "libraries": {name: version for name, version in loaded.items() if version},
+        "map": config.map,
+        "map_identity": _identity(place_map),
+        "config": asdict(config),
+    }
+
+
+def _identity(place_map: PlaceMap) -> MapIdentity | None:
+    """Return the identity of a map, None for one without places: each of those is a new one."""
+    try:
+        found = identity_of(place_map)
+        return found if found.places else None
+    except MapError as error:  # the places that can be read are flown with
+        _log.warning("the log does not say which map it is: %s", error)
+        return None

@@ -1,0 +1,112 @@
+"""The world of a flight in the air: what comes in from real cameras, clocks and links, recorded where that is asked
+for."""
+
+import logging
+import os
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import TypeVar
+
+from edgevpr import __version__
+from edgevpr.core.config import Config
+from edgevpr.core.errors import EdgevprError, UsageError
+from edgevpr.core.types import NO_TAPE, Tape
+from edgevpr.frames.source import Source, open_source
+from edgevpr.frames.taped import RecordedSource
+from edgevpr.mavlink.address import parse_links
+from edgevpr.mavlink.ground import GroundLink
+from edgevpr.mavlink.link import Link
+from edgevpr.mavlink.signing import open_signing
+from edgevpr.mavlink.tlog import Tlog
+from edgevpr.mavlink.wire import untapped
+from edgevpr.power.boards import load_board
+from edgevpr.runtime.flight.clock import Clock, taped
+from edgevpr.runtime.flight.recording import Recording
+from edgevpr.runtime.flight.reloading import Reread
+from edgevpr.runtime.flight.statussocket import StatusSocket, usual_path
+from edgevpr.runtime.flight.world import Stop, World
+from edgevpr.runtime.recognise.learn import check_positions
+from edgevpr.runtime.recognise.opening import has_map
+
+T = TypeVar("T")
+
+_log = logging.getLogger(__name__)
+
+
+@contextmanager
+def in_the_air(
+    config: Config, positions: Path | None = None, read_again: Callable[[], Config] | None = None
+) -> Iterator[World]:
+    """Open what a flight takes in and speaks to in the air, and close it at the end. `positions` is a file with those
+    of the frames of a recording, and `read_again` reads the configuration anew. Raises an EdgevprError where something
+    cannot be opened."""
+    if config.source.uri is None:
+        raise UsageError("There is no source of frames: name one with --source, or `source: {uri: ...}`.")
+    parse_links(config.mavlink.link, config.mavlink.ground)
+    if config.mapping.learn:
+        check_positions(config, positions)
+    board, uri = load_board(config.board), config.source.uri
+    with ExitStack() as stack:
+        recording = _or_without(lambda: _recording(config, stack))
+        tape: Tape = recording or NO_TAPE
+        if recording:
+            tape.note(
+                "flight",
+                {
+                    "version": __version__,
+                    "config": asdict(config),
+                    "board": asdict(board),
+                    "is_reread": read_again is not None,
+                    "recording": str(recording.path.resolve()),
+                },
+            )
+        status_path = config.status.socket or usual_path()
+        status = _or_without(lambda: stack.enter_context(StatusSocket(status_path))) if status_path else None
+        if config.log.tlog and not config.mavlink.link:
+            _log.warning("there is no link, so there is no tlog either")
+        tlog_path = config.log.tlog if config.mavlink.link else None
+        tlog = _or_without(lambda: stack.enter_context(Tlog(tlog_path))) if tlog_path else None
+
+        def opened_source(step_s: float) -> Source:
+            source = open_source(uri, step_s=step_s, positions=positions, live=True)
+            return RecordedSource(source, recording, recording.keep) if recording else source
+
+        yield World(
+            board=board,
+            place_map=config.map,
+            log=config.log,
+            tape=tape,
+            clock=taped(Clock(), tape) if recording else Clock(),
+            open_source=opened_source,
+            link=Link,
+            ground=GroundLink,
+            signing=open_signing(config.mavlink.signing_key, config.mavlink.signing_state),
+            tap=tlog.record if tlog else untapped,
+            stop=Stop(tape),
+            reread=Reread(read_again, tape) if read_again else None,
+            status=status,
+            recording=str(recording.path.resolve()) if recording else None,
+        )
+
+
+def _recording(config: Config, stack: ExitStack) -> Recording | None:
+    """Begin the recording, if there is to be one."""
+    if config.log.record is None:
+        return None
+    recording = stack.enter_context(Recording(config.log.record, config.log.record_mb))
+    if config.mapping.learn and config.map and has_map(Path(config.map)):
+        recording.keep_map(Path(config.map))
+    return recording
+
+
+def _or_without(opened: Callable[[], T]) -> T | None:
+    """Return what is opened. A service, which may restart in the air, flies without what cannot be opened."""
+    try:
+        return opened()
+    except EdgevprError as error:
+        if "NOTIFY_SOCKET" not in os.environ:
+            raise
+        _log.warning("%s", error)
+        return None

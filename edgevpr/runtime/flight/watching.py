@@ -1,0 +1,157 @@
+"""Watching the events of a flight: counts them, and tells everybody when something goes wrong or is right again.
+
+Each class listens with `tell`, which takes an event; one that fails ends no flight.
+"""
+
+import logging
+
+from edgevpr.mavlink.messages import Severity
+from edgevpr.runtime.flight.autopilot import Autopilot
+from edgevpr.runtime.flight.herald import Herald, Trouble
+from edgevpr.runtime.flight.integrity import Integrity
+from edgevpr.runtime.recognise.recognition import Recognition
+
+FAILURES_IN_A_ROW = 10  # one may be a bad frame; so many are a fault of the camera, the map or the technique
+NOTHING_IN_A_ROW = 10  # likewise of pictures that say nothing
+
+_KNOWN_WITH = 3  # accepted matches: with fewer it is not known that the map was ever there to be left
+_LEFT_AFTER = 30  # queries in a row that are not accepted; over poor ground ten are nothing unusual
+_LOST, _LOST_AFTER = 0.9, 10  # queries in a row that are not accepted, and the flight so far says that it is lost
+_FOUND_WITH, _FORGOTTEN_AFTER = 2, 10  # accepted matches, without so many others between two of them
+_TILT_LASTS_S = 5.0  # longer than a gust, and than the way from one turn into the next
+
+_log = logging.getLogger(__name__)
+
+
+class Tally:
+    """Counts the events of a flight: `queries` and how many of them were `accepted`; `unusable` frames, which never
+    became a query; `failed` queries; `failed_in_a_row`, the latest events that all failed; and `nothing_in_a_row`, the
+    latest pictures that all said nothing."""
+
+    def __init__(self) -> None:
+        self._trouble: str | None = None
+        self.queries = self.accepted = self.unusable = self.failed = 0
+        self.failed_in_a_row = self.nothing_in_a_row = 0
+
+    def tell(self, event: Recognition) -> None:
+        """Count an event. A failure is logged, but only once for failures in a row with the same reason."""
+        trouble = event.reason if event.failed else None
+        if trouble and trouble != self._trouble:
+            _log.warning("%s", trouble)
+        self._trouble = trouble
+        self.queries += event.is_query
+        self.accepted += event.accepted
+        self.unusable += not event.is_query
+        self.failed += event.is_query and event.failed
+        self.failed_in_a_row = self.failed_in_a_row + 1 if event.failed else 0
+        self.nothing_in_a_row = self.nothing_in_a_row + 1 if event.says_nothing else 0
+
+    @property
+    def is_failing(self) -> bool:
+        """True where the last `FAILURES_IN_A_ROW` events, or more, have all failed."""
+        return self.failed_in_a_row >= FAILURES_IN_A_ROW
+
+    @property
+    def sees_nothing(self) -> bool:
+        """True where the last `NOTHING_IN_A_ROW` pictures, or more, have all said nothing."""
+        return self.nothing_in_a_row >= NOTHING_IN_A_ROW
+
+
+class MapWatch:
+    """Watches the map: each place that is left out has a line of kind "left out" in the log, and the ground is told
+    once. Everybody is told when the file cannot be read, in a line of kind "map", and when it can be read again.
+
+    `left_out` counts the places.
+    """
+
+    def __init__(self, herald: Herald) -> None:
+        self.left_out = 0
+        self._herald, self._is_lost = herald, False
+
+    @property
+    def summary(self) -> str | None:
+        """Number of places left out, in a few words; None where there are none."""
+        return f"{self.left_out} places of the map left out" if self.left_out else None
+
+    def tell(self, event: Recognition) -> None:
+        """Take note of an event."""
+        for place_id, problem in event.left_out:
+            self._herald.note("left out", place=place_id, problem=problem)
+        if event.left_out and not self.left_out:
+            count = len(event.left_out)
+            ground = f"map damaged, {count} place{'' if count == 1 else 's'} left out"
+            text = f"the map is damaged, place {event.left_out[0][0]} is the first to be left out"
+            self._herald.say(Severity.WARNING, text, ground=ground, topic="left out")
+        self.left_out += len(event.left_out)
+        if event.is_query and event.map_lost != self._is_lost:
+            self._is_lost = event.map_lost
+            if self._is_lost:
+                text, severity, state = "its map cannot be read, see its log", Severity.WARNING, "cannot be read"
+            else:
+                text, severity, state = "its map is read again", Severity.INFO, "read again"
+            self._herald.tell("map", severity, text, state=state, why=event.reason)
+
+
+class Sight:
+    """Tells everybody, once, when the map is left and found again, and when pictures are tilted too far and no more.
+
+    A picture that shows nothing, is not worth a search, could not be used or is tilted too far says nothing of the map.
+    """
+
+    def __init__(self, herald: Herald) -> None:
+        self._map = Trouble(herald, "sight", "map left", "map found again")
+        self._tilt = Trouble(herald, "tilt", "tilt too large", "tilt is fine again")
+        self._accepted = self._misses = self._misses_lost = 0
+        self._is_tilted, self._tilt_since_s = False, 0.0
+
+    def tell(self, event: Recognition) -> None:
+        """Take note of an event."""
+        if event.is_query and event.frame:
+            self._look_at_tilt(event.view.reason is not None, event.frame.t_mono_s)
+            self._look_for_map(event)
+
+    def _look_at_tilt(self, is_tilted: bool, now_s: float) -> None:
+        if is_tilted != self._is_tilted:
+            self._is_tilted, self._tilt_since_s = is_tilted, now_s
+        if now_s - self._tilt_since_s >= _TILT_LASTS_S:
+            self._tilt.note(is_tilted)
+
+    def _look_for_map(self, event: Recognition) -> None:
+        if event.accepted:
+            self._accepted += 1
+            self._misses = self._misses_lost = 0
+            if self._accepted >= _FOUND_WITH:
+                self._map.note(False)
+            return
+        if event.failed or event.says_nothing or event.view.reason or (event.worth and event.worth.reason):
+            return
+        self._misses += 1
+        is_lost = event.followed is not None and event.followed.lost >= _LOST
+        self._misses_lost = self._misses_lost + 1 if is_lost else 0
+        if self._map.is_so:
+            if self._misses >= _FORGOTTEN_AFTER:
+                self._accepted = 0
+        elif self._accepted >= _KNOWN_WITH and (self._misses >= _LEFT_AFTER or self._misses_lost >= _LOST_AFTER):
+            self._accepted = 0
+            self._map.note(True)
+
+
+class GpsWatch:
+    """Holds GPS against the matches, and tells everybody, once, when it is contradicted and when it agrees again. The
+    autopilot is told of every comparison, and the flight navigates no longer by a receiver that is wrong."""
+
+    def __init__(self, map_sd_m: float, herald: Herald, autopilot: Autopilot) -> None:
+        self._integrity, self._herald, self._autopilot = Integrity(map_sd_m), herald, autopilot
+
+    def tell(self, event: Recognition) -> None:
+        """Take note of an event."""
+        if event.position is None or event.view.reason:
+            return
+        news = self._integrity.look(event)
+        off_m, is_wrong = self._integrity.off_m, self._integrity.is_wrong
+        if off_m is None:
+            return
+        self._autopilot.compare_gps(off_m, is_wrong)
+        if news:
+            severity = Severity.WARNING if is_wrong else Severity.INFO
+            self._herald.tell("gps", severity, news, said=news, off_m=round(off_m, 1), is_wrong=is_wrong)
