@@ -58,9 +58,13 @@ def read(name: str, folder: Path = RESULTS) -> Row:
 
 def write(name: str, found: Row, page: str, folder: Path = RESULTS) -> None:
     """Write NAME.json and NAME.md."""
+    write_json(name, found, folder)
+    (folder / f"{name}.md").write_text(page.strip() + "\n")
+
+
+def write_json(name: str, found: Row, folder: Path = RESULTS) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{name}.json").write_text(json.dumps(rounded(found), indent=1) + "\n")
-    (folder / f"{name}.md").write_text(page.strip() + "\n")
 
 
 def rounded(value: Any) -> Any:

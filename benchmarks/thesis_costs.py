@@ -53,14 +53,7 @@ def charge_here(results: Results) -> str:
         t_match_s = row["t_match_per_ref_s"] * table["references"]
         ours = total_ah(row["u_encode"] * share, row["u_match"] * share, row["t_encode_s"], t_match_s)
         theirs = float(table["techniques"][name][-1]) if name in table["techniques"] else None
-        rows.append(
-            [
-                name,
-                "-" if theirs is None else f"{theirs:.4f}",
-                f"{ours:.4f}",
-                "-" if theirs is None else three(theirs / ours),
-            ]
-        )
+        rows.append([name, _digits(theirs, ".4f"), f"{ours:.4f}", three(theirs, 1 / ours)])
     (flown,) = (row for row in results.bench["two_stage"] if row["camera"] == "forward")
     one_core = 1 / table["cores"]
     encode_s, query_s = flown["encode_ms"] / 1000, flown["two_stage_ms"] / 1000
@@ -92,18 +85,10 @@ def times(results: Results) -> str:
             t_match_s = float(THESIS["cohog"]["t_match_per_ref_s"])
         later = published.get(MATRICES.get(name, ""), {})
         rows.append(
-            [
-                name,
-                f"{1e3 * t_encode_s:.0f}",
-                three(later.get("t_encode_s"), 1e3),
-                f"{1e3 * row['t_encode_s']:.1f}",
-                three(t_encode_s / row["t_encode_s"]),
-                three(t_match_s, 1e6),
-                three(later.get("t_match_per_ref_s"), 1e6),
-                three(row["t_match_per_ref_s"], 1e6),
-                "-" if t_match_s is None else three(t_match_s / row["t_match_per_ref_s"]),
-            ]
+            [name, f"{1e3 * t_encode_s:.0f}", three(later.get("t_encode_s"), 1e3), f"{1e3 * row['t_encode_s']:.1f}"]
         )
+        matched = [three(each, 1e6) for each in (t_match_s, later.get("t_match_per_ref_s"), row["t_match_per_ref_s"])]
+        rows[-1] += [three(t_encode_s / row["t_encode_s"]), *matched, three(t_match_s, 1 / row["t_match_per_ref_s"])]
     heads = (
         "technique", "t_e thesis, ms", "author's, corridor", "here", "thesis / here",
         "t_m a reference, thesis, µs", "author's, corridor", "here", "thesis / here",
@@ -144,7 +129,9 @@ def pcu(results: Results) -> str:
         theirs = published.get(MATRICES.get(name, ""))
         ours = here.get(name)
         difference = None if theirs is None or ours is None else ours - theirs
-        rows.append([name, *map(_two, printed), _two(theirs), _two(ours), _signed(difference), _two(seasons.get(name))])
+        rows.append(
+            [name, *map(_digits, (*printed, theirs, ours)), _digits(difference, "+.2f"), _digits(seasons.get(name))]
+        )
     heads = ("technique", *table["sets"], "corridor, author's", "corridor, here", "difference", "seasons, here")
     best = []
     for at, on in enumerate(table["sets"]):
@@ -186,18 +173,8 @@ def memory(results: Results) -> str:
         theirs = many * numbers * FLOAT_BYTES
         row = results.sets["corridor"]["techniques"][ROWS[name] if name != "CoHOG" else "cohog"]
         ram, disk = row["descriptor_bytes"], row["fine_bytes"]
-        rows.append(
-            [
-                name,
-                f"{many} x {numbers}",
-                str(theirs),
-                f"{theirs * count / 1e6:.0f}",
-                str(ram),
-                str(disk),
-                f"{ram * count / 1e6:.1f}",
-                f"{theirs / ram:.0f}",
-            ]
-        )
+        sizes = (theirs, theirs * count / 1e6, ram, disk, ram * count / 1e6, theirs / ram)
+        rows.append([name, f"{many} x {numbers}", *map(format, sizes, ("d", ".0f", "d", "d", ".1f", ".0f"))])
     heads = (
         "technique", "numbers, thesis", "bytes a reference", f"MB of {count}",
         "RAM here, bytes", "disk here, bytes", f"RAM here, MB of {count}", "thesis / RAM here",
@@ -243,9 +220,5 @@ def sets_where_cohog_leads() -> int:
     return sum(own > max(each[at] or 0.0 for each in others) for at, own in enumerate(printed_pcu("CoHOG")))
 
 
-def _two(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"
-
-
-def _signed(value: float | None) -> str:
-    return "-" if value is None else f"{value:+.2f}"
+def _digits(value: float | None, form: str = ".2f") -> str:
+    return "-" if value is None else format(value, form)

@@ -5,12 +5,11 @@ does to the AUC; and how the entropy of a picture depends on the radius of its d
 from collections.abc import Sequence
 from pathlib import Path
 
-import base  # noqa: F401
 import detectors
 import numpy as np
+import walks
 
 from edgevpr.core.text import progress
-from edgevpr.core.types import Frame
 from edgevpr.frames.images import cv2, list_images, read_image
 from edgevpr.lab.evaluate import metrics
 from edgevpr.lab.evaluate.dataset import Dataset
@@ -74,7 +73,7 @@ def answers(technique: str, dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:
     scores, right = [], []
     with walk_over(list_images(dataset.ref_dir), technique, looks_down=False) as walk:
         for query in progress(dataset.queries, len(dataset.queries), f"{technique}: queries"):
-            ranking = walk.step(Frame(image=read_image(query.path), name=query.path.name, t_mono_s=0.0)).ranking
+            ranking = walk.step(walks.frame(query.path)).ranking
             found = ranking is not None and len(ranking.slots)
             scores.append(float(ranking.scores[0]) if found else 0.0)
             right.append(bool(found) and dataset.references[ranking.slots[0]] in query.right)

@@ -6,7 +6,7 @@ than twelve regions a side. A place keeps its regions in full, and not in 8 bits
 
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -28,24 +28,6 @@ W2_PX = (16, 32, 64, 128)
 SAME_RATIO = ((256, 8), (384, 12), (512, 16), (640, 20), (768, 24))
 _ENTROPY = {"filled_bins": filled_bins, "shannon": shannon}
 _VOTES_COUNT = (1.0, 1.0, 0.75, 0.5)  # as `cohog` counts them, looking ahead
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Point:
-    """One point of a sweep: which of the four, its parameters, by which score; `regions` is the mean number of regions
-    a query asks with, `t_encode_s` the median CPU time of encoding one by `filled_bins` and GT 0.5, on one thread."""
-
-    sweep: str
-    score: str
-    w1: int
-    w2: int
-    chosen: str
-    gt: float | None
-    regions: float
-    t_encode_s: float
-    recall_at_1: float
-    precision_at_100_recall: float
-    auc: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +60,9 @@ class Selection:
 
 
 def sweep(dataset: Dataset) -> list[dict]:
-    """Run all four sweeps and the best G; minutes."""
+    """Run all four sweeps and the best G; minutes. A point says which of the sweeps it is of, its parameters, and by
+    which score; `regions` is the mean number of regions a query asks with, `t_encode_s` the median CPU time of encoding
+    one by `filled_bins` and GT 0.5, on one thread."""
     points = []
     good = at_least("filled_bins", GT)
     for size in dict.fromkeys([(W1, W2), *((w1, W2) for w1 in W1_PX), *((W1, w2) for w2 in W2_PX), *SAME_RATIO]):
@@ -92,11 +76,9 @@ def sweep(dataset: Dataset) -> list[dict]:
         asked += [("W2", good)] if w1 == W1 and w2 in W2_PX else []
         asked += [("W1/W2", good)] if size in SAME_RATIO else []
         for name, selection in asked:
-            points += [
-                Point(sweep=name, w1=w1, w2=w2, chosen=selection.label, gt=selection.gt, t_encode_s=t_encode_s, **found)
-                for found in measure(dataset, compared, selection)
-            ]
-    return [asdict(point) for point in points]
+            row = {"sweep": name, "w1": w1, "w2": w2, "chosen": selection.label, "gt": selection.gt}
+            points += [{**row, "t_encode_s": t_encode_s, **found} for found in measure(dataset, compared, selection)]
+    return points
 
 
 def regions_of(image: np.ndarray, w1: int, w2: int) -> Regions:
@@ -164,7 +146,7 @@ def encode_s(dataset: Dataset, w1: int, w2: int) -> float:
 
 
 def measure(dataset: Dataset, compared: list[Compared], selection: Selection) -> Iterator[dict]:
-    """Yield what each score makes of all queries: the fields of a `Point` that are measured."""
+    """Yield what each score makes of all queries: the fields of a point that are measured."""
     chosen = [selection.of(each) for each in compared]
     scores = [scores_of(each, which) for each, which in zip(compared, chosen, strict=True)]
     right = [np.array([name in query.right for name in dataset.references]) for query in dataset.queries]

@@ -27,12 +27,8 @@ def spread(values: np.ndarray) -> Row:
     if len(values) == 0:
         return {"n": 0}
     median, p90, largest = np.quantile(values, (0.5, 0.9, 1.0))
-    return {
-        "n": len(values),
-        "median": round(float(median), 1),
-        "p90": round(float(p90), 1),
-        "max": round(float(largest), 1),
-    }
+    found = {"median": median, "p90": p90, "max": largest}
+    return {"n": len(values), **{name: round(float(value), 1) for name, value in found.items()}}
 
 
 def read_table(path: Path) -> np.ndarray:

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import base
 import ground
 from camera import Camera
 from recording import COMPANION, Recorder
 from relay import Relay
-from run_sets import commit_of
 from scenarios import (
     CIRCUIT_M,
     CLIMB_M,
@@ -160,7 +160,7 @@ class Run:
             "is_control": self._plan.is_control,
             "rate_hz": self._plan.rate_hz,
             "words": self._plan.words,
-            "commit": commit_of(),
+            "commit": base.commit(),
             "marks_s": self.marks_s,
             "edgevpr_exit": status,
             "texts": self.recorder.texts,

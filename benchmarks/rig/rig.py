@@ -9,10 +9,6 @@ The simulator is ArduPilot built from its public source (github.com/ArduPilot/ar
 `python benchmarks/rig/rig.py plane_wind --control` flies one.
 """
 
-import os
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
-
 import argparse
 import json
 import signal
@@ -22,7 +18,7 @@ from pathlib import Path
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 
-import cv2
+import base
 from figures import figures_of
 from flying import Plan, Run
 from page import write_page
@@ -33,7 +29,6 @@ WORK = Path.home() / ".cache" / "edgevpr-rig"
 
 
 def main() -> None:
-    cv2.setNumThreads(1)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that what was started ends
     arguments, words = parsed()
     if arguments.report:
@@ -106,4 +101,4 @@ def fly(plan: Plan) -> dict:
 
 
 if __name__ == "__main__":
-    main()
+    base.run(main)
