@@ -16,11 +16,12 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import base
+from arm64 import counted
 from arm64.userland import CPU, PYTHON, install, make_system, run
 from big_map import make_big_map
 
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.preflight import counted
+from edgevpr.runtime.preflight.scale import COUNTED_PATH
 from edgevpr.techniques import create
 
 HERE = Path(__file__).resolve().parent
@@ -53,7 +54,7 @@ def main() -> None:
         here = json.loads(run([sys.executable, str(HERE / "arm64" / "work.py"), "--here", *maps]).stdout)
     found = {**base.made_by(), "parts": [row | here[row["part"]] for row in rows]}
     figures = counted.figures({row["part"]: row["instructions"] for row in rows})
-    counted.PATH.write_text(json.dumps(figures, indent=1) + "\n")
+    COUNTED_PATH.write_text(json.dumps(figures, indent=1) + "\n")
     base.write("arm64", found, page(found))
 
 

@@ -14,12 +14,12 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
+from counted import SMALL
 
 from edgevpr.places.index import PlaceIndex, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import NOTHING, Expected, compare, scan
 from edgevpr.power.speed import pass_round, product_round
-from edgevpr.runtime.preflight import counted
 from edgevpr.techniques import create
 
 PER_PLACE = ("place_ids", "lat_deg", "lon_deg", "heading_deg", "rows")
@@ -43,7 +43,7 @@ def of_camera(name: str, camera: str, path: str) -> Iterator[tuple[str, Callable
     technique = create("cohog", {"camera": camera})
     with PlaceMap.open(path) as place_map:
         index = load_index(place_map, technique, 100_000_000)
-        small = replace(index, **{each: getattr(index, each)[: counted.SMALL] for each in PER_PLACE})
+        small = replace(index, **{each: getattr(index, each)[:SMALL] for each in PER_PLACE})
         known = Expected(turned_deg=rng.choice([0.0, 180.0], len(index)))
         fine, _ = place_map.fine_part(index.place_ids[0])
         asked, one = technique.encode(picture), [0] if camera == "nadir" else None

@@ -132,7 +132,7 @@ def _measure_many(args: Namespace) -> int:
 
 def _plan(args: Namespace) -> "EvaluationPlan":
     from edgevpr.lab.evaluate.plan import RowPlan, of_flags, read_plan
-    from edgevpr.runtime.preflight.offers import offers
+    from edgevpr.runtime.preflight.trial import offers
 
     if args.sets:
         if args.data or args.query or args.ref or args.rate_hz:
@@ -262,7 +262,7 @@ def _measure_techniques(args: Namespace) -> int:
     from edgevpr.lab.evaluate.asking import MatchOptions
     from edgevpr.lab.evaluate.curves import plot
     from edgevpr.lab.evaluate.tables import results_text
-    from edgevpr.runtime.preflight.offers import offers, usable
+    from edgevpr.runtime.preflight.trial import offers, usable
     from edgevpr.runtime.recognise.opening import gate_of
 
     wanted, forms = _wanted(args), _forms(args)

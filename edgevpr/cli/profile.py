@@ -12,7 +12,7 @@ from edgevpr.core.errors import EdgevprError, UsageError
 if TYPE_CHECKING:
     from edgevpr.power.boards import Board
     from edgevpr.runtime.preflight.estimate import FlightPlan
-    from edgevpr.runtime.preflight.offers import Offer
+    from edgevpr.runtime.preflight.trial import Offer
 
 
 def add(commands: Any) -> None:
@@ -104,8 +104,8 @@ def _plan(args: Namespace, board: "Board") -> "tuple[FlightPlan, str | None, tup
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.power.equations import parse_pack
     from edgevpr.runtime.preflight.estimate import FlightPlan
-    from edgevpr.runtime.preflight.offers import offers
     from edgevpr.runtime.preflight.pick import camera_setting
+    from edgevpr.runtime.preflight.trial import offers
 
     places, map_technique, camera = args.places, None, value_of(args, "source.camera")
     settings = {name: camera_setting(name, camera) for name in techniques.names()}
@@ -131,9 +131,9 @@ def _plan(args: Namespace, board: "Board") -> "tuple[FlightPlan, str | None, tup
 
 
 def _detect(args: Namespace) -> int:
-    from edgevpr.power.detect import detect, findings, profile_text
-    from edgevpr.runtime.preflight.ownprofile import require_new_profile, write_profile
-    from edgevpr.runtime.preflight.stored import micro_benchmark
+    from edgevpr.power.boards import describe, detect, own_profile
+    from edgevpr.power.speed import micro_benchmark
+    from edgevpr.runtime.preflight.stored import require_new_profile, write_profile
 
     found = detect()
     if args.out:
@@ -141,9 +141,9 @@ def _detect(args: Namespace) -> int:
     if args.json:
         print_json(asdict(found))
     else:
-        print("\n".join(findings(found)))
+        print("\n".join(describe(found)))
     if args.out:
-        write_profile(Path(args.out), profile_text(found, micro_benchmark()))
+        write_profile(Path(args.out), own_profile(micro_benchmark()))
         print(f"edgevpr: {args.out} is written: use it with --board {args.out}.", file=sys.stderr)
     elif found.board is None and not args.json:
         print("--out FILE.yaml writes a profile of it.")
@@ -156,26 +156,26 @@ def _measure(args: Namespace, quiet: bool) -> int:
     from edgevpr import techniques
     from edgevpr.core.text import progress
     from edgevpr.power.boards import load_board
+    from edgevpr.power.speed import micro_benchmark
     from edgevpr.runtime.preflight import stored
-    from edgevpr.runtime.preflight.offers import offers
-    from edgevpr.runtime.preflight.ownprofile import measured_profile
-    from edgevpr.runtime.preflight.stored_text import format_stored
+    from edgevpr.runtime.preflight.estimate_text import format_stored
+    from edgevpr.runtime.preflight.trial import offers, try_each
 
     path = Path(args.out) if args.out else stored.default_path()
     stored.require_room(path, make=not args.out)
     images, pictures = stored.pictures_of(args.images)
     threads, wanted = load_board("this").threads, offers(techniques.names())
-    speed = stored.micro_benchmark()
-    trials = progress(stored.measure_each(wanted, threads, images), len(wanted), "measuring techniques")
-    found = stored.gathered(trials, pictures, threads, speed)
-    stored.save(found, path)
+    speed = micro_benchmark()
+    trials = try_each(wanted, threads, images, rounds=stored.MEASURED_PICTURES)
+    figures = stored.gathered(progress(trials, len(wanted), "measuring techniques"), pictures, threads, speed)
+    stored.save(figures, path)
     try:
-        own, said = measured_profile(path, speed)
+        own, power = stored.measured_profile(path, speed)
     except EdgevprError as error:
-        own, said = None, str(error)
+        own, power = None, str(error)
     if args.json and not quiet:
-        print_json({**asdict(found), "file": str(path), "profile": own and str(own), "power": said})
+        print_json({**asdict(figures), "file": str(path), "profile": own and str(own), "power": power})
     elif not args.json:
-        print(format_stored(found))
-        print(f"Kept in {path}.\n{said}\n" if quiet else f"Kept in {path}.\n{said}")
+        print(format_stored(figures))
+        print(f"Kept in {path}.\n{power}\n" if quiet else f"Kept in {path}.\n{power}")
     return 0

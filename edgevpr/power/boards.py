@@ -1,7 +1,11 @@
-"""The boards that edgevpr knows, one YAML file each in `profiles/`: what they have, draw, and may spend on edgevpr."""
+"""The boards that edgevpr knows, one YAML file each in `profiles/`: what they have, draw, and may spend on edgevpr; and
+the machine that this runs on, which is one of them or gets a profile of its own.
 
-import os
-from dataclasses import dataclass, field, replace
+`root` is where the machine's /proc and /sys are: another tree can stand in its place.
+"""
+
+import json
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from edgevpr.core.config import BUDGET_MB, HIGHEST_RATE_HZ, LOWEST_RATE_HZ, bounded, build
@@ -77,7 +81,7 @@ def load_board(name: str, root: Path = Path("/")) -> Board:
     """Load the board called `name`: "this" (the machine itself), one of `board_names()`, or the path of a YAML file.
 
     Raises ConfigError for a board that does not exist, for an incomplete or invalid file, and for a file of this very
-    machine that promises more memory than there is. `root` is where the machine's /proc and /sys are.
+    machine that promises more memory than there is.
     """
     if name == "this":
         return _this_machine(root)
@@ -98,9 +102,105 @@ def load_board(name: str, root: Path = Path("/")) -> Board:
 
 def is_this_machine(board: Board, root: Path = Path("/")) -> bool:
     """Tell whether a profile is of the machine that this runs on."""
-    model = machine.model(root)
-    recognised = board.recognised_by and model and board.recognised_by.lower() in model.lower()
-    return bool(recognised) or (board.machine is not None and board.machine == machine.title(root))
+    return _is_called(board, machine.model(root)) or (
+        board.machine is not None and board.machine == machine.title(root)
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Detected:
+    """Description of this machine. `board` is the name of its profile, None where it has none. `model` is its name in
+    the device tree or DMI. `usable_cores` and `ram_limit_mb` are what affinity and control groups leave of `cores` and
+    `ram_mb`. It begins to slow down at `thermal_limit_c`."""
+
+    board: str | None
+    model: str | None
+    from_device_tree: bool
+    cpu: str
+    cores: int
+    usable_cores: float
+    ram_mb: float
+    ram_limit_mb: float
+    thermal_limit_c: float
+    title: str
+
+
+def detect(root: Path = Path("/")) -> Detected:
+    """Look at this machine. Never guesses: a value that is found nowhere is None or says "unknown"."""
+    model, cores = machine.model(root), machine.cores_online(root)
+    recognised = _recognised(model)
+    return Detected(
+        board=recognised.name if recognised else None,
+        model=model or machine.dmi_model(root),
+        from_device_tree=model is not None,
+        cpu=machine.cpu(root),
+        cores=cores,
+        usable_cores=min(float(cores), machine.cores(root)),
+        ram_mb=machine.ram_mb(root),
+        ram_limit_mb=machine.ram_limit_mb(root),
+        thermal_limit_c=thermal.limit_c(root),
+        title=machine.title(root),
+    )
+
+
+def describe(found: Detected) -> tuple[str, ...]:
+    """Say what this machine is, and how that was found, a sentence each."""
+    if found.from_device_tree:
+        called = f"The device tree calls it `{found.model}`"
+    elif found.model:
+        called = f"There is no device tree; its firmware (DMI) calls it `{found.model}`"
+    else:
+        called = "There is no device tree, and its firmware (DMI) does not name it"
+    stand_in = f"no board of edgevpr's is that: {_ANY_MACHINE} stands in"
+    cores = f"{found.cores} cores are switched on ({found.cpu})"
+    if found.usable_cores < found.cores:
+        cores += f"; affinity and control groups leave this process {found.usable_cores:.3g}"
+    ram = f"{found.ram_mb:.0f} MB of RAM"
+    if found.ram_limit_mb < found.ram_mb:
+        ram += f"; its control group leaves this process {found.ram_limit_mb:.0f}"
+    return (
+        f"{called}: {f'that is the board {found.board}' if found.board else stand_in}.",
+        f"{cores}.",
+        f"{ram}.",
+        f"It begins to slow down at {found.thermal_limit_c:g} degrees Celsius.",
+    )
+
+
+def own_profile(speed: MachineSpeed, root: Path = Path("/")) -> Board:
+    """Return a profile for this machine, as fast as `speed`, under the name by which it is recognised again. Its power
+    is that of the known board, else relative figures; memory and shares are those that `load_board` gives `this`."""
+    board, model = _this_machine(root), machine.model(root)
+    source = board.source
+    if not _is_called(board, model):
+        unknown = model or machine.dmi_model(root) or "machine like this"
+        source = f"nobody has measured a {unknown}: relative figures (idle 0, full load 1 W)"
+    return replace(board, title=machine.title(root), recognised_by=model, source=source, benchmark_score=speed)
+
+
+def profile_text(board: Board) -> str:
+    """Write a profile as YAML, which `load_board` accepts."""
+    values = asdict(board)
+    del values["name"]  # that of the file
+    # JSON values are YAML's too, whatever a board is called.
+    texts = {key: json.dumps(_printable(value), ensure_ascii=False) for key, value in values.items()}
+    lines = "".join(f"{key}: {text}\n" for key, text in texts.items())
+    return f"# Written by edgevpr for the machine it ran on; profiles/{_ANY_MACHINE}.yaml explains it.\n\n{lines}"
+
+
+def _is_called(board: Board, model: str | None) -> bool:
+    """Tell whether the model in a device tree is that of a board."""
+    return bool(board.recognised_by and model) and str(board.recognised_by).lower() in str(model).lower()
+
+
+def _recognised(model: str | None) -> Board | None:
+    """Return the profile of the board with this model in its device tree; None where there is none."""
+    known = (_read(shipped("profiles") / f"{name}.yaml") for name in board_names() if model)
+    return next((board for board in known if _is_called(board, model)), None)
+
+
+def _printable(value: object) -> object:
+    is_odd = isinstance(value, str) and not value.isprintable()
+    return "".join(c if c.isprintable() else " " for c in str(value)) if is_odd else value
 
 
 def _read(path: Path) -> Board:
@@ -121,35 +221,23 @@ def _this_machine(root: Path) -> Board:
     """Return the profile of this machine's board, or of any machine, with the cores and the memory that are really
     there."""
     model = machine.model(root)
-    profile = _read(shipped("profiles") / f"{_ANY_MACHINE}.yaml")
-    if model is None:
-        title = f"this machine ({profile.title})"
-    else:
-        known = (_read(shipped("profiles") / f"{name}.yaml") for name in board_names())
-        recognised = next((b for b in known if b.recognised_by and b.recognised_by.lower() in model.lower()), None)
-        if recognised:
-            profile, title = recognised, f"this machine ({recognised.title})"
-        else:
-            unknown = MachineSpeed(
-                single=None,
-                multi=None,
-                products=None,
-                passes=None,
-                verified=False,
-                source=f"nobody has measured a {model}",
-            )
-            profile = replace(profile, benchmark_score=unknown)
-            title = f"this machine ({model}, which has no profile: the figures of {_ANY_MACHINE})"
-
+    recognised = _recognised(model)
+    profile = recognised or _read(shipped("profiles") / f"{_ANY_MACHINE}.yaml")
+    title, speed = profile.title, profile.benchmark_score
+    if model and not recognised:
+        title = f"{model}, which has no profile: the figures of {_ANY_MACHINE}"
+        unknown = f"nobody has measured a {model}"
+        speed = MachineSpeed(single=None, multi=None, products=None, passes=None, verified=False, source=unknown)
     ram_mb = machine.ram_mb(root)
     # The profile's shares of the memory that is really there; a control group may allow less.
     memory_max_mb = min(profile.memory_max_mb / profile.ram_mb * ram_mb, machine.ram_limit_mb(root))
     # The power model speaks of all cores of the machine, so a quota lowers the share and not their number.
-    cores = os.cpu_count() or 1
+    cores = machine.cores_online(root)
     cpu_share = min(profile.cpu_share, machine.cores(root) / cores)
     return replace(
         profile,
-        title=title,
+        title=f"this machine ({title})",
+        benchmark_score=speed,
         ram_mb=ram_mb,
         cores=cores,
         cpu_share=cpu_share,

@@ -29,24 +29,17 @@ _ARM_PARTS = {
 def model(root: Path = _ROOT) -> str | None:
     """Return the board's name in the device tree, e.g. "Raspberry Pi 4 Model B Rev 1.4"; None where there is none
     (x86)."""
-    try:
-        return (root / "proc/device-tree/model").read_text().strip("\0\n ")
-    except OSError:
-        return None
+    return text(root / "proc/device-tree/model")
 
 
 def dmi_model(root: Path = _ROOT) -> str | None:
     """Return maker and product by the firmware of an x86 machine; its mainboard where the product is not filled in,
     else None."""
-    said = {
-        name: words
-        for name in ("sys_vendor", "product_name", "board_vendor", "board_name")
-        if (words := text(root / "sys/class/dmi/id" / name)) and not _FILLERS.search(words)
-    }
-    for vendor, product in (("sys_vendor", "product_name"), ("board_vendor", "board_name")):
-        if product in said:
-            maker = said.get(vendor, "")
-            return said[product] if said[product].startswith(maker) else f"{maker} {said[product]}"
+    for names in (("sys_vendor", "product_name"), ("board_vendor", "board_name")):
+        maker, product = (text(root / "sys/class/dmi/id" / name) or "none" for name in names)
+        if not _FILLERS.search(product):
+            is_named = _FILLERS.search(maker) or product.startswith(maker)
+            return product if is_named else f"{maker} {product}"
     return None
 
 
@@ -66,6 +59,19 @@ def title(root: Path = _ROOT) -> str:
     again."""
     words = f"{model(root) or dmi_model(root) or 'a machine without a name'} ({cpu(root)})"
     return "".join(c if c.isprintable() else " " for c in words)
+
+
+def cores_online(root: Path = _ROOT) -> int:
+    """Count the cores of the machine that are switched on, whatever this process may use of them."""
+    spans = re.findall(r"(\d+)(?:-(\d+))?", text(root / "sys/devices/system/cpu/online") or "")
+    return sum(int(last or first) - int(first) + 1 for first, last in spans) or os.cpu_count() or 1
+
+
+def vcgencmd(root: Path = _ROOT) -> Path | None:
+    """Find the Raspberry Pi's program for asking its firmware; None on another board. Older systems keep it in
+    /opt/vc."""
+    places = (root / "usr/bin/vcgencmd", root / "opt/vc/bin/vcgencmd")
+    return next((place for place in places if place.exists()), None)
 
 
 def cores(root: Path = _ROOT) -> float:
@@ -136,15 +142,10 @@ def _kib_line(path: Path, label: str) -> float:
 def _cgroup_limits(name: str, root: Path) -> Iterator[list[str]]:
     """Yield the words of a limit file (cgroup v2) of this process's group and of every group above it: each limit
     binds."""
-    try:
-        memberships = (root / "proc/self/cgroup").read_text().splitlines()
-    except OSError:
-        return
+    memberships = (text(root / "proc/self/cgroup") or "").splitlines()
     for group in (PurePosixPath(line.removeprefix("0::")) for line in memberships if line.startswith("0::")):
         for level in (group, *group.parents):
-            try:
-                words = (root / "sys/fs/cgroup" / level.relative_to("/") / name).read_text().split()
-            except OSError:  # the group of the root has no limits, and not every kernel has every controller
-                continue
+            # The group of the root has no limits, and not every kernel has every controller.
+            words = (text(root / "sys/fs/cgroup" / level.relative_to("/") / name) or "max").split()
             if words[0] != "max":
                 yield words

@@ -1,4 +1,8 @@
-"""Metering of the cost of a query and of its steps: seconds, CPU-seconds, utilisation, charge."""
+"""Metering of what queries cost: seconds, CPU-seconds, utilisation and charge of each, and the totals of a flight.
+
+Energies add up, powers do not (see `equations`). The sum of a T and of s U t over all stages is exactly the integral of
+5.1 over the flight, in whatever order the stages come.
+"""
 
 import math
 import time
@@ -40,7 +44,8 @@ class OwnMemory:
 
     def __init__(self, clock: Clock = time.monotonic, read: Callable[[], float | None] = machine.pss_mb) -> None:
         self._clock, self._read = clock, read
-        self._read_s, self._pss_mb = -math.inf, None
+        self._read_s = -math.inf
+        self._pss_mb: float | None = None
 
     def look(self) -> tuple[float, float | None]:
         """Return RSS now, and the PSS that was read last, both MB; None where the kernel does not say."""
@@ -132,3 +137,47 @@ def query_cost(
         marginal_mah=1000 * pack_ah(marginal_j, pack, regulator_efficiency),
         pss_mb=pss_mb,
     )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EnergySoFar:
+    """Totals since the start: seconds, joules at the board's input, CPU-seconds of the stages and of the whole
+    process."""
+
+    elapsed_s: float
+    idle_j: float
+    marginal_j: float
+    stages_cpu_s: float
+    process_cpu_s: float
+
+
+class RunningEnergy:
+    """Adds up stages as they end. `clock` and `cpu_clock` give wall and CPU-seconds (all threads) in flight."""
+
+    def __init__(
+        self,
+        board: Board,
+        clock: Clock = time.monotonic,
+        cpu_clock: Clock = time.process_time,
+    ) -> None:
+        self._board, self._clock, self._cpu_clock = board, clock, cpu_clock
+        self._start_s, self._cpu_start_s = clock(), cpu_clock()
+        self._marginal_j = self._stages_cpu_s = 0.0
+
+    def add(self, *stages: StageCost) -> None:
+        """Count stages that have ended; the time between them costs idle power, which needs no counting."""
+        for stage in stages:
+            u = stage.utilisation(self._board.cores)
+            self._marginal_j += marginal_energy_j(self._board.idle_w, self._board.full_w, u, stage.wall_s)
+            self._stages_cpu_s += stage.cpu_s
+
+    def so_far(self) -> EnergySoFar:
+        """Return the totals until now."""
+        elapsed_s = self._clock() - self._start_s
+        return EnergySoFar(
+            elapsed_s=elapsed_s,
+            idle_j=self._board.idle_w * elapsed_s,
+            marginal_j=self._marginal_j,
+            stages_cpu_s=self._stages_cpu_s,
+            process_cpu_s=self._cpu_clock() - self._cpu_start_s,
+        )

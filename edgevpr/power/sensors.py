@@ -1,122 +1,134 @@
-"""Power meters that boards carry: INA219/226/3221 chips (hwmon), RAPL (x86), the power chip of the Pi 5.
+"""Power meters at a board's input: INA chips (hwmon) of Jetsons and of hats, and the power chip of the Pi 5.
 
-`root` is the root of the file system: another tree can stand in its place.
+A meter gives one number, or raises MeterError with a sentence: a missing file, a text, a negative or an absurd value is
+never passed on as a figure. What measures less than all that the board draws (RAPL: the processor alone; the other
+rails of a Jetson) is no meter here: a profile's watts are those at the board's input.
 """
 
 import re
-from collections.abc import Iterator
+import subprocess
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
-from edgevpr.power import machine, vcgencmd
-from edgevpr.power.powermeter import Meter, MeterError, number, parsed
+import numpy as np
 
-_ROOT = Path("/")
+from edgevpr.core.errors import EdgevprError
+from edgevpr.power import machine
 
+NO_METER = (
+    "This machine has no power meter at its input that edgevpr knows (an INA219, INA226 or INA3221 in "
+    "/sys/class/hwmon, or the power chip of a Raspberry Pi 5): write its watts into a profile by hand, from a meter in "
+    "its supply."
+)
+_ABSURD_W = 1000.0  # no companion computer draws this: the reading is wrong (the bound of `full_w` in a profile)
+_MOST_FAILURES = 3  # in a row: the meter is gone, and a mean from before would hide it
 # Channels that carry everything the module draws, by NVIDIA's rail names: Orin and Xavier NX; Nano.
 _INPUT_RAILS = ("VDD_IN", "POM_5V_IN")
 _ONE_CHANNEL = ("ina219", "ina220", "ina226", "ina230", "ina231", "ina260")
-_NO_METER = (
-    "This machine has no power meter that edgevpr knows (an INA219, INA226 or INA3221 in /sys/class/hwmon, RAPL, the "
-    "power chip of a Raspberry Pi 5): write its watts into a profile by hand, from a meter in its supply."
-)
 
 
-@dataclass(frozen=True, slots=True)
-class Found:
-    """The meters of this machine, those of the board's input first; `notes` are sentences on meters that could not be
-    used."""
-
-    meters: tuple[Meter, ...]
-    notes: tuple[str, ...]
+class MeterError(EdgevprError):
+    """A power meter cannot be read, or gives an impossible value."""
 
 
-def find_meters(root: Path = _ROOT) -> Found:
-    """Look for power meters. Never raises: a meter that is there but cannot be read becomes a note, and so does no
-    meter at all."""
-    notes: list[str] = []
-    meters = [*_ina_meters(root), *_pmic_meters(root), *_rapl_meters(root, notes)]
-    if not meters and not notes:
-        notes.append(_NO_METER)
-    order = ("board", "cpu", "rail")
-    return Found(tuple(sorted(meters, key=lambda meter: order.index(meter.covers))), tuple(notes))
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Meter:
+    """A power meter: `look` gives watts, and more often than every `period_s` seconds makes no sense. `certain` is
+    False where the title contains an assumption."""
+
+    title: str
+    period_s: float
+    look: Callable[[], float]
+    certain: bool = True
+
+    def read_w(self) -> float:
+        """Read the power in watts. Raises MeterError."""
+        watts = self.look()
+        if not 0 <= watts < _ABSURD_W:
+            raise MeterError(f"{self.title} says {watts:g} W, which cannot be: check its wiring and its driver.")
+        return watts
+
+
+def find_meters(root: Path = Path("/")) -> tuple[Meter, ...]:
+    """Find the power meters at the input of this machine. `root` is where its /proc and /sys are."""
+    return (*_ina_meters(root), *_pmic_meters(root))
+
+
+def mean_power(
+    meter: Meter,
+    window_s: float,
+    clock: Callable[[], float] = time.monotonic,
+    sleep: Callable[[float], None] = time.sleep,
+) -> float:
+    """Read `meter` every `meter.period_s` for `window_s` seconds and return the mean watts, by trapezoids.
+
+    A reading that fails is left out and counted; its neighbours bridge the gap. Raises MeterError when three fail in a
+    row, when fewer than two are good, or when more than half have failed. Short windows say little: one study had to
+    read at 350 Hz to trust them, so let the same work run for many seconds.
+    """
+    start_s = clock()
+    steps = max(1, round(window_s / meter.period_s))  # at least two readings, the last one at the very end
+    times_s: list[float] = []
+    watts: list[float] = []
+    skipped = failed_in_a_row = 0
+    for step in range(steps + 1):
+        sleep(max(0.0, start_s + window_s * step / steps - clock()))
+        before_s = clock()
+        try:
+            watts.append(meter.read_w())
+        except MeterError as error:
+            skipped, failed_in_a_row = skipped + 1, failed_in_a_row + 1
+            if failed_in_a_row == _MOST_FAILURES:
+                raise MeterError(
+                    f"{meter.title} failed {_MOST_FAILURES} times in a row; the last time: {error}"
+                ) from None
+        else:
+            times_s.append((before_s + clock()) / 2)
+            failed_in_a_row = 0
+    if len(watts) < 2 or skipped > len(watts) or times_s[-1] <= times_s[0]:
+        raise MeterError(
+            f"{meter.title} gave {len(watts)} usable readings in {window_s:g} s and failed {skipped} times: measure "
+            "for longer, or check its wiring."
+        )
+    return float(np.trapezoid(watts, times_s)) / (times_s[-1] - times_s[0])
 
 
 def _ina_meters(root: Path) -> Iterator[Meter]:
     for folder in sorted((root / "sys/class/hwmon").glob("hwmon*")):
-        name = machine.text(folder / "name")
-        if name in _ONE_CHANNEL:
-            label = machine.text(folder / "in1_label")
+        name = machine.text(folder / "name") or ""
+        label = machine.text(folder / "in1_label")
+        if name in _ONE_CHANNEL and (label is None or label in _INPUT_RAILS):
             where = f", channel {label}" if label else ", taken to be wired to the board's input"
-            covers = "board" if label is None or label in _INPUT_RAILS else "rail"
-            yield _ina_channel(folder, 1, f"{name.upper()} ({folder.name}){where}", covers, label is not None)
+            yield _ina_channel(folder, 1, f"{name.upper()} ({folder.name}){where}", certain=label is not None)
         elif name == "ina3221":
             for channel in (1, 2, 3):  # in4 to in7 are shunt voltages
-                if (
-                    machine.text(folder / f"in{channel}_enable") == "0"
-                    or not (folder / f"curr{channel}_input").exists()
-                ):
-                    continue
-                label = machine.text(folder / f"in{channel}_label") or str(channel)
-                covers = "board" if label in _INPUT_RAILS else "rail"
-                yield _ina_channel(folder, channel, f"INA3221 ({folder.name}), channel {label}", covers)
+                label = machine.text(folder / f"in{channel}_label")
+                if label in _INPUT_RAILS and machine.text(folder / f"in{channel}_enable") != "0":
+                    yield _ina_channel(folder, channel, f"INA3221 ({folder.name}), channel {label}")
 
 
-def _ina_channel(
-    folder: Path, channel: int, title: str, covers: Literal["board", "rail"], certain: bool = True
-) -> Meter:
+def _ina_channel(folder: Path, channel: int, title: str, certain: bool = True) -> Meter:
     power = folder / f"power{channel}_input"
 
-    def look() -> tuple[float, ...]:
+    def look() -> float:
         if power.exists():
-            return (number(power) / 1e6,)
+            return _number(power) / 1e6
         # An INA3221 gives no power. A small negative current (-1 mA at no load) is its offset and counts as none.
-        current_ma = number(folder / f"curr{channel}_input")
-        return (number(folder / f"in{channel}_input") * (0.0 if -5 < current_ma < 0 else current_ma) / 1e6,)
+        current_ma = _number(folder / f"curr{channel}_input")
+        return _number(folder / f"in{channel}_input") * (0.0 if -5 < current_ma < 0 else current_ma) / 1e6
 
-    return Meter(kind="ina", title=title, covers=covers, period_s=0.05, look=look, certain=certain)
-
-
-def _rapl_meters(root: Path, notes: list[str]) -> Iterator[Meter]:
-    """Make one meter for all packages. Cores, memory and graphics (intel-rapl:0:0 ...) are parts of a package, and psys
-    is the platform that contains the packages: adding those would count energy twice."""
-    counters, wraps_j = [], []
-    for folder in sorted((root / "sys/class/powercap").glob("intel-rapl:*")):
-        if not (machine.text(folder / "name") or "").startswith("package"):
-            continue
-        try:
-            number(folder / "energy_uj")
-            wrap_j = number(folder / "max_energy_range_uj") / 1e6
-        except MeterError as error:
-            notes.append(str(error))
-            continue
-        if wrap_j <= 0:
-            notes.append(f"{folder} does not say when its counter wraps (max_energy_range_uj): it is not used.")
-            continue
-        counters.append(folder / "energy_uj")
-        wraps_j.append(wrap_j)
-    if counters:
-        packages = "1 CPU package" if len(counters) == 1 else f"{len(counters)} CPU packages"
-        yield Meter(
-            kind="rapl",
-            title=f"RAPL ({packages}, without memory, disks and converters)",
-            covers="cpu",
-            period_s=1.0,  # a counter advances every millisecond, and wraps after many minutes at the earliest
-            look=lambda: tuple(number(path) / 1e6 for path in counters),
-            wraps_j=tuple(wraps_j),
-        )
+    return Meter(title=title, period_s=0.05, look=look, certain=certain)
 
 
 def _pmic_meters(root: Path) -> Iterator[Meter]:
-    program = vcgencmd.find(root)
+    program = machine.vcgencmd(root)
     if program and re.search(r"Raspberry Pi (5|Compute Module 5)", machine.model(root) or ""):
         yield Meter(
-            kind="pmic",
             title="power chip of the Raspberry Pi 5 (sum of its rails, corrected; without USB devices)",
-            covers="board",
             period_s=0.5,  # a reading starts a process: more often would be a load of its own
-            look=lambda: (_pmic_w(program),),
+            look=lambda: _pmic_w(program),
             certain=False,
         )
 
@@ -128,15 +140,33 @@ def _pmic_w(program: Path) -> float:
     (project jfikar/RPi5-power).
     """
     try:
-        answer = vcgencmd.ask(program, "pmic_read_adc")
-    except OSError as error:
+        done = subprocess.run([program, "pmic_read_adc"], capture_output=True, timeout=2, check=True)
+    except (OSError, subprocess.SubprocessError) as error:
         raise MeterError(
             f"The power chip cannot be read with vcgencmd ({error}): see that your user is in the group video."
         ) from None
+    answer = done.stdout.decode(errors="replace")
     rails: dict[str, dict[str, float]] = {"A": {}, "V": {}}
     for name, unit, value in re.findall(r"(\w+)_([AV])\b[^=\n]*=\s*(-?[0-9.]+)[AV]\s*$", answer, re.MULTILINE):
-        rails[unit][name] = parsed(value, f"{program} pmic_read_adc, {name}")
+        rails[unit][name] = _parsed(value, f"{program} pmic_read_adc, {name}")
     both = rails["A"].keys() & rails["V"].keys()
     if not both:
         raise MeterError(f"{program} pmic_read_adc lists no rail with volts and amperes: this firmware cannot be used.")
     return 1.1451 * sum(rails["A"][name] * rails["V"][name] for name in both) + 0.5879
+
+
+def _number(path: Path) -> float:
+    try:
+        return _parsed(path.read_text(errors="replace"), str(path))
+    except OSError as error:
+        raise MeterError(f"{path} cannot be read ({error.strerror}): the power meter is gone.") from None
+
+
+def _parsed(text: str, where: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not abs(value) < float("inf"):
+        raise MeterError(f"{where} says {text.strip()[:40]!r}, which is no number: the power meter does not work.")
+    return value

@@ -6,14 +6,16 @@ units, passes over bytes (encoding an image, scanning a map) do not. A small ARM
 
 import math
 import os
-import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from concurrent.futures import ThreadPoolExecutor
+from threading import Barrier
 
 import numpy as np
 
-# Rounds a second of one core of the reference, an AMD EPYC (Zen 4) in a virtual machine, by `_rate` below with
+from edgevpr.power.boards import MachineSpeed
+
+# Rounds a second of one core of the reference, an AMD EPYC (Zen 4) in a virtual machine, by `_round_times_s` below with
 # OPENBLAS_NUM_THREADS=1, Python 3.11 and NumPy 2.4 (OpenBLAS 0.3.31).
 REFERENCE_PRODUCTS_HZ = 1585.0
 REFERENCE_PASSES_HZ = 1960.0
@@ -22,29 +24,25 @@ _LEAST_S = 0.4  # of each of the four measurements
 _LEAST_ROUNDS = 5
 
 
-@dataclass(frozen=True, slots=True)
-class Speed:
-    """Relative speed, 1 for one core of the reference. One thread: `products`, `passes`, and `single`, their geometric
-    mean; `multi` is that mean for all usable cores together."""
-
-    single: float
-    multi: float
-    products: float
-    passes: float
-
-
-def score() -> Speed:
+def micro_benchmark() -> MachineSpeed:
     """Measure the speed, in about two seconds (a slow board: some more). The machine should have nothing else to do.
 
     NumPy's library must have one thread (OPENBLAS_NUM_THREADS=1, which edgevpr's command line sets before NumPy is
-    imported). Then one thread is one core, and all cores are loaded by as many threads of our own.
+    imported). Then one thread is one core, and all cores are loaded by as many threads of our own. `single` and `multi`
+    are the geometric means of both kinds of work.
     """
     cores = len(os.sched_getaffinity(0))
-    products = _rate(product_round()) / REFERENCE_PRODUCTS_HZ
-    passes = _rate(pass_round()) / REFERENCE_PASSES_HZ
-    all_products = _rate_together(product_round, cores) / REFERENCE_PRODUCTS_HZ
-    all_passes = _rate_together(pass_round, cores) / REFERENCE_PASSES_HZ
-    return Speed(math.sqrt(products * passes), math.sqrt(all_products * all_passes), products, passes)
+    products, all_products = (hz / REFERENCE_PRODUCTS_HZ for hz in _rates_hz(product_round, cores))
+    passes, all_passes = (hz / REFERENCE_PASSES_HZ for hz in _rates_hz(pass_round, cores))
+    figures = {
+        "single": math.sqrt(products * passes),
+        "multi": math.sqrt(all_products * all_passes),
+        "products": products,
+        "passes": passes,
+    }
+    rounded = {name: float(f"{value:.3g}") for name, value in figures.items()}
+    source = "edgevpr's micro-benchmark, run on it; single and multi are means of both kinds"
+    return MachineSpeed(**rounded, verified=True, source=source)
 
 
 def product_round() -> Callable[[], object]:
@@ -76,36 +74,23 @@ def pass_round() -> Callable[[], object]:
     return work
 
 
-def _rate(work: Callable[[], object]) -> float:
-    """Return the rounds a second of one thread, by its quickest round: disturbances of other rounds are not the
-    machine's speed."""
+def _rates_hz(make: Callable[[], Callable[[], object]], threads: int) -> tuple[float, float]:
+    """Return the rounds a second of one thread, by its quickest round, since disturbances of other rounds are not the
+    machine's speed; and those of `threads` threads at once, in all. NumPy lets them run in parallel."""
+    alone_hz = 1 / min(_round_times_s(make(), Barrier(1)))
+    start = Barrier(threads)
+    with ThreadPoolExecutor(threads) as pool:
+        together = list(pool.map(lambda work: _round_times_s(work, start), [make() for _ in range(threads)]))
+    return alone_hz, sum(len(times_s) / sum(times_s) for times_s in together)
+
+
+def _round_times_s(work: Callable[[], object], start: Barrier) -> list[float]:
+    """Return how long each round took, after a first one that does not count and a wait for all to be ready."""
     work()
-    quickest_s, rounds, start_s = math.inf, 0, time.perf_counter()
-    while rounds < _LEAST_ROUNDS or time.perf_counter() - start_s < _LEAST_S:
+    start.wait()
+    times_s: list[float] = []
+    while len(times_s) < _LEAST_ROUNDS or sum(times_s) < _LEAST_S:
         before_s = time.perf_counter()
         work()
-        quickest_s = min(quickest_s, time.perf_counter() - before_s)
-        rounds += 1
-    return 1 / quickest_s
-
-
-def _rate_together(make: Callable[[], Callable[[], object]], threads: int) -> float:
-    """Return the rounds a second of `threads` threads at once, in all; NumPy lets them run in parallel."""
-    start, rates = threading.Barrier(threads), [0.0] * threads
-
-    def run(thread: int) -> None:
-        work = make()
-        work()
-        start.wait()
-        rounds, start_s = 0, time.perf_counter()
-        while rounds < _LEAST_ROUNDS or time.perf_counter() - start_s < _LEAST_S:
-            work()
-            rounds += 1
-        rates[thread] = rounds / (time.perf_counter() - start_s)
-
-    workers = [threading.Thread(target=run, args=(thread,)) for thread in range(threads)]
-    for worker in workers:
-        worker.start()
-    for worker in workers:
-        worker.join()
-    return sum(rates)
+        times_s.append(time.perf_counter() - before_s)
+    return times_s

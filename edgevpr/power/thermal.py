@@ -1,25 +1,19 @@
 """Temperature and frequency of the machine, and whether it slows itself down, in one cheap look.
 
-A look opens two or three files of /sys: microseconds. Slower sources (the Raspberry Pi's firmware, the heat counters of
-x86) are asked once in `SLOW_S` seconds. `vcgencmd` runs in a process of its own whose answer a later look collects, so
-no look ever waits for it.
+A look opens two or three files of /sys: microseconds. The Raspberry Pi's firmware, which is slower, is asked once in
+`SLOW_S` seconds.
 """
 
-import contextlib
 import os
 import re
-import subprocess
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from edgevpr.power import vcgencmd
-
 SLOW_S = 5.0
 _UNKNOWN_LIMIT_C = 80.0  # here a Raspberry Pi's firmware begins to slow down; cautious for other boards
 _CPU_ZONE = re.compile(r"cpu|soc|pkg|tj|acpitz|bigcore|littlecore", re.IGNORECASE)
-_CPU_CHIPS = ("coretemp", "k10temp", "zenpower", "cpu_thermal")
 # Bits of the firmware's answer: the present state. The same bits, 16 places higher: any time since start.
 _BITS = ((1, "under-voltage"), (2, "frequency capped"), (4, "throttled"), (8, "soft temperature limit"))
 _SLOWS = 2 | 4 | 8
@@ -37,48 +31,33 @@ class ThermalState:
 
 
 class ThermalWatch:
-    """Watch over the sensors that are found when it is made. `close` it when done."""
+    """Watch over the sensors that are found when it is made."""
 
     def __init__(self, root: Path = Path("/"), clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._temperatures = [zone / "temp" for zone in _cpu_zones(root)] or list(_chip_files(root))
+        self._temperatures = [zone / "temp" for zone in _cpu_zones(root)]
         self._limit_c = limit_c(root)
         policies = sorted((root / "sys/devices/system/cpu/cpufreq").glob("policy*"))
         self._policy = max(policies, key=lambda policy: _number(policy / "cpuinfo_max_freq") or 0, default=None)
         self._top_khz = (self._policy and _number(self._policy / "cpuinfo_max_freq")) or 0.0
         self._allowed_khz = 0.0
-        self._counters = sorted((root / "sys/devices/system/cpu").glob("cpu[0-9]*/thermal_throttle/*_throttle_count"))
-        self._counted: dict[Path, float] = {}
-        self._count_heat_events()
         self._firmware = next((root / "sys/devices/platform").glob("soc*/*firmware/get_throttled"), None)
-        self._program = vcgencmd.find(root)
-        self._asking: subprocess.Popen | None = None
         self._bits: int | None = None
-        self._heat_events = 0.0
         self._slow_at_s = float("-inf")
 
     def look(self) -> ThermalState:
         """Look once; never raises: a sensor that has gone, or gives an impossible value, is None."""
         now_s = self._clock()
-        if now_s - self._slow_at_s >= SLOW_S:
-            self._slow_at_s = now_s
-            self._look_slowly()
-        self._collect()
+        if self._firmware and now_s - self._slow_at_s >= SLOW_S:
+            self._slow_at_s, self._bits = now_s, _hexadecimal(_content(self._firmware))
         degrees = [value / 1000 for value in map(_number, self._temperatures) if value is not None]
         temperature_c = max((value for value in degrees if -40 <= value <= 150), default=None)
         khz = _number(self._policy / "scaling_cur_freq") if self._policy else None
         frequency_mhz = khz / 1000 if khz is not None and khz > 0 else None
         reasons = list(self._reasons(temperature_c, khz))
-        can_tell = self._bits is not None or self._counters or self._top_khz > 0
+        can_tell = self._bits is not None or self._top_khz > 0
         throttled = any(slows for slows, _ in reasons) if can_tell else None
         return ThermalState(temperature_c, frequency_mhz, throttled, "; ".join(why for _, why in reasons))
-
-    def close(self) -> None:
-        """End the process of `vcgencmd`, if one runs."""
-        if self._asking:
-            self._asking.kill()
-            self._asking.communicate()
-            self._asking = None
 
     def _reasons(self, temperature_c: float | None, khz: float | None) -> Iterator[tuple[bool, str]]:
         """Yield (True if it slows the machine down, what it is) for everything seen."""
@@ -87,8 +66,6 @@ class ThermalWatch:
             yield bool(bits & _SLOWS), f"{', '.join(now)} now"
         if before := [word for bit, word in _BITS if bits >> 16 & bit and not bits & bit]:
             yield False, f"{', '.join(before)} since start"
-        if self._heat_events > 0:
-            yield True, f"the processor has slowed down {self._heat_events:g} times in {SLOW_S:g} s for heat"
         if self._policy:
             # Cooling lowers this limit. A power mode may hold it low for good, so the highest one seen is normal.
             allowed_khz = _number(self._policy / "scaling_max_freq") or 0.0
@@ -100,30 +77,6 @@ class ThermalWatch:
             # A low frequency alone says nothing, since idle cores slow down; a hot machine is not idle.
             elif hot and khz and khz < 0.9 * normal_khz:
                 yield True, f"{khz / 1000:g} of {normal_khz / 1000:g} MHz at {temperature_c:g} degrees"
-
-    def _look_slowly(self) -> None:
-        self._heat_events = self._count_heat_events()
-        if self._firmware:
-            self._bits = _hexadecimal(_content(self._firmware))
-        elif self._program:
-            self.close()  # a process that has not answered by then hangs: ask again
-            with contextlib.suppress(OSError):
-                self._asking = subprocess.Popen(
-                    [self._program, "get_throttled"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
-                )
-
-    def _count_heat_events(self) -> float:
-        """Count the heat events since the last count. The counters of a core that is switched off vanish, and start
-        anew when it comes back."""
-        counted = {path: count for path in self._counters if (count := _number(path)) is not None}
-        before, self._counted = self._counted, self._counted | counted
-        return sum(max(0.0, count - before.get(path, count)) for path, count in counted.items())
-
-    def _collect(self) -> None:
-        if self._asking and self._asking.poll() is not None:
-            answer, _ = self._asking.communicate()
-            self._bits = _hexadecimal(answer.decode(errors="replace").rpartition("=")[2])
-            self._asking = None
 
 
 def limit_c(root: Path = Path("/")) -> float:
@@ -147,12 +100,6 @@ def limit_c(root: Path = Path("/")) -> float:
 def _cpu_zones(root: Path) -> list[Path]:
     zones = sorted((root / "sys/class/thermal").glob("thermal_zone*"))
     return [zone for zone in zones if _CPU_ZONE.search(_content(zone / "type") or "")] or zones
-
-
-def _chip_files(root: Path) -> Iterator[Path]:
-    for chip in sorted((root / "sys/class/hwmon").glob("hwmon*")):
-        if (_content(chip / "name") or "").strip() in _CPU_CHIPS:
-            yield from sorted(chip.glob("temp*_input"))
 
 
 def _content(path: Path) -> str | None:

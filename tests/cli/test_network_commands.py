@@ -16,8 +16,8 @@ from edgevpr.core.errors import ConfigError, ModelError, UsageError
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.preflight import stored
-from edgevpr.runtime.preflight.offers import offers, usable
 from edgevpr.runtime.preflight.pick import outlook
+from edgevpr.runtime.preflight.trial import offers, usable
 from edgevpr.runtime.recognise.opening import made_for, open_recogniser, technique_of
 from edgevpr.techniques import create, vectors
 

@@ -12,7 +12,7 @@ from edgevpr.core.files import shipped
 from edgevpr.core.types import StageCost
 from edgevpr.power import machine, sensors, speed
 from edgevpr.power.boards import board_names, load_board
-from edgevpr.runtime.preflight import accuracy
+from edgevpr.runtime.preflight import accuracy, trial
 from edgevpr.runtime.preflight import stored as measured
 from edgevpr.runtime.preflight.probe import TechniqueCosts
 from edgevpr.runtime.preflight.trial import Trial
@@ -40,7 +40,7 @@ def alone(monkeypatch, tmp_path):
     """Nobody's stored figures, no meter, and a micro-benchmark without patience."""
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     monkeypatch.setattr(speed, "_LEAST_S", 0.01)
-    monkeypatch.setattr(sensors, "find_meters", lambda: sensors.Found((), ("There is no power meter.",)))
+    monkeypatch.setattr(sensors, "find_meters", tuple)
 
 
 @pytest.fixture
@@ -59,6 +59,7 @@ def tried(monkeypatch):
             )
 
     monkeypatch.setattr(measured, "try_each", try_each)
+    monkeypatch.setattr(trial, "try_each", try_each)
     monkeypatch.setattr(techniques, "names", lambda: ("cohog", "hog", "seqslam", "calc"))
     counts = {"sets": 2, "queries": 90, "asked": 90, "accepted": 9, "accepted_wrong": 0, "accepted_elsewhere": 0}
     recalls = {"cohog": 0.9, "hog": 0.4, "hog 8bit": 0.4, "hog 1bit": 0.3, "seqslam": 0.5}
@@ -141,7 +142,7 @@ def test_what_was_measured_is_kept_used_and_dated(capsys, tmp_path, monkeypatch)
     said = run(capsys, "--measure", "--images", folder)
     assert "measuring techniques" in said.err
     kept = tmp_path / "data/edgevpr/measured.json"
-    assert f"Kept in {kept}.\nThere is no power meter." in said.out
+    assert f"Kept in {kept}.\n{sensors.NO_METER}" in said.out
     assert f"3 pictures of {folder}" in said.out
     fields = json.loads(kept.read_text())
     assert [trial["label"] for trial in fields["trials"]] == ["cohog", "seqslam"]
@@ -174,7 +175,7 @@ def test_figures_of_another_machine_are_refused_and_tried_anew(capsys, tmp_path,
 def test_figures_are_kept_where_one_says_and_can_be_had_as_json(capsys, tmp_path, tried):
     found = json.loads(run(capsys, "--measure", "--out", tmp_path / "m.json", "--json").out)
     assert found["file"] == str(tmp_path / "m.json")
-    assert (found["profile"], found["power"]) == (None, "There is no power meter.")
+    assert (found["profile"], found["power"]) == (None, sensors.NO_METER)
     assert json.loads((tmp_path / "m.json").read_text())["trials"] == found["trials"]
     assert not (tmp_path / "data").exists()
 
@@ -195,7 +196,7 @@ def test_an_interruption_leaves_the_old_figures_as_they_were(capsys, tmp_path, m
         yield Trial(label="cohog", name="cohog", settings={}, costs=COSTS)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(measured, "try_each", interrupted)
+    monkeypatch.setattr(trial, "try_each", interrupted)
     assert main(["profile", "--measure"]) == 130
     assert "stopped" in capsys.readouterr().err
     assert (folder / "measured.json").read_bytes() == before

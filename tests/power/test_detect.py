@@ -4,10 +4,7 @@ import os
 
 import pytest
 
-from edgevpr.power.boards import MachineSpeed, is_this_machine, load_board
-from edgevpr.power.calibrate import Calibration, PowerFit
-from edgevpr.power.detect import detect, findings, profile_text
-from edgevpr.power.powermeter import Meter
+from edgevpr.power.boards import MachineSpeed, describe, detect, is_this_machine, load_board, own_profile, profile_text
 
 DMI = "sys/class/dmi/id"
 USABLE = len(os.sched_getaffinity(0))
@@ -31,10 +28,14 @@ def x86(**dmi):
     return machine() | {"proc/cpuinfo": cpuinfo} | {f"{DMI}/{name}": text + "\n" for name, text in dmi.items()}
 
 
-def written(tmp_path, found, *figures):
-    path = tmp_path / "written.yaml"
-    path.write_text(profile_text(found, *figures), encoding="utf-8")
-    return load_board(str(path))
+SPEED = MachineSpeed(single=0.21, multi=0.8, products=0.11, passes=0.4, verified=True, source="a benchmark")
+
+
+def written(root):
+    """The profile that is written for a machine, as it is read back."""
+    path = root / "written.yaml"
+    path.write_text(profile_text(own_profile(SPEED, root)), encoding="utf-8")
+    return load_board(str(path), root)
 
 
 @pytest.mark.parametrize(
@@ -49,20 +50,19 @@ def written(tmp_path, found, *figures):
          "4 x Cortex-A7 + 4 x Cortex-A15"),
     ],
 )  # fmt: skip
-def test_a_known_board_is_recognised_and_its_profile_has_what_is_really_there(
-    tree, tmp_path, model, parts, ram_kb, board, cpu
-):
-    found = detect(tree(arm(model, *parts, ram_kb=ram_kb)))
+def test_a_known_board_is_recognised_and_its_profile_has_what_is_really_there(tree, model, parts, ram_kb, board, cpu):
+    root = tree(arm(model, *parts, ram_kb=ram_kb))
+    found = detect(root)
     assert (found.board, found.model, found.cpu, found.cores) == (board, model, cpu, len(parts))
     assert found.usable_cores == min(len(parts), USABLE)
-    mine, shipped = written(tmp_path, found), load_board(board)
+    mine, shipped = written(root), load_board(board)
     assert (mine.idle_w, mine.full_w, mine.verified) == (shipped.idle_w, shipped.full_w, shipped.verified)
-    assert (mine.source, mine.benchmark_score) == (shipped.source, shipped.benchmark_score)
+    assert (mine.source, mine.benchmark_score) == (shipped.source, SPEED)
     assert mine.ram_mb == pytest.approx(ram_kb * 1.024e-3, rel=0.001)
     assert mine.memory_max_mb == pytest.approx(mine.ram_mb * shipped.memory_max_mb / shipped.ram_mb, rel=0.01)
 
 
-def test_an_unknown_arm_board_gets_a_profile_that_invents_nothing(tree, tmp_path):
+def test_an_unknown_arm_board_gets_a_profile_that_invents_nothing(tree):
     root = tree(
         arm("Radxa ROCK 5B", *["0xd05"] * 4, *["0xd0b"] * 4, ram_kb=16_000_000)
         | {
@@ -73,22 +73,20 @@ def test_an_unknown_arm_board_gets_a_profile_that_invents_nothing(tree, tmp_path
     )
     found = detect(root)
     assert (found.board, found.cpu, found.thermal_limit_c) == (None, "4 x Cortex-A55 + 4 x Cortex-A76", 85.0)
-    board = written(tmp_path, found)
+    board = written(root)
     assert board.title == "Radxa ROCK 5B (4 x Cortex-A55 + 4 x Cortex-A76)"
     assert (board.recognised_by, board.cores, board.ram_mb) == ("Radxa ROCK 5B", 8, 16384.0)
     assert (board.idle_w, board.full_w, board.verified) == (0.0, 1.0, False)
     assert board.source.startswith("nobody has measured a Radxa ROCK 5B: relative figures")
-    assert board.benchmark_score == MachineSpeed(
-        single=None, multi=None, products=None, passes=None, verified=False, source="nobody has measured it"
-    )
     assert (board.thermal_limit_c, board.technique) == (85.0, "cohog")
 
 
-def test_an_x86_machine_is_named_by_its_firmware(tree, tmp_path):
-    found = detect(tree(x86(sys_vendor="AAEON", product_name="UP-APL03", board_name="UP-APL03")))
+def test_an_x86_machine_is_named_by_its_firmware(tree):
+    root = tree(x86(sys_vendor="AAEON", product_name="UP-APL03", board_name="UP-APL03"))
+    found = detect(root)
     assert (found.board, found.model, found.cpu) == (None, "AAEON UP-APL03", "Intel(R) N100")
     assert found.thermal_limit_c == 80.0
-    board = written(tmp_path, found)
+    board = written(root)
     assert (board.title, board.recognised_by) == ("AAEON UP-APL03 (Intel(R) N100)", None)
 
 
@@ -113,51 +111,27 @@ def test_what_a_maker_has_not_filled_in_is_no_name(tree, dmi, model):
     assert detect(tree(x86(**dmi))).model == model
 
 
-def test_a_control_group_limits_what_the_profile_may_take(tree, tmp_path):
+def test_a_control_group_limits_what_the_profile_may_take(tree):
     groups = {
         "proc/self/cgroup": "0::/system.slice/edgevpr.service\n",
         "sys/fs/cgroup/system.slice/edgevpr.service/memory.max": "300000000\n",
         "sys/fs/cgroup/system.slice/edgevpr.service/cpu.max": "40000 100000\n",
     }
-    found = detect(tree(arm("Raspberry Pi 4 Model B Rev 1.5", *["0xd08"] * 4) | groups))
+    root = tree(arm("Raspberry Pi 4 Model B Rev 1.5", *["0xd08"] * 4) | groups)
+    found = detect(root)
     assert (found.cores, found.usable_cores) == (4, 0.4)
     assert (found.ram_mb, found.ram_limit_mb) == (4096.0, 300.0)
-    board = written(tmp_path, found)
+    board = written(root)
     assert (board.ram_mb, board.memory_max_mb, board.budget_mb) == (4096.0, 300.0, 150.0)
     assert (board.cores, board.cpu_share, board.threads) == (4, 0.1, 1)
 
 
-def test_a_machine_with_very_little_for_us_still_gets_a_profile_that_loads(tree, tmp_path):
-    limits = {"sys/fs/cgroup/memory.max": "600000\n", "sys/fs/cgroup/cpu.max": "1000 1000000\n"}
-    board = written(tmp_path, detect(tree(x86() | limits)))
-    assert (board.memory_max_mb, board.budget_mb, board.cpu_share) == (1.0, 1.0, 0.01)
-
-
 @pytest.mark.parametrize("model", ['Board: "X" #1', "- [a, {b", "Bård ÅÄ\x07\x85 ½", "null", "'", "\\n %YAML"])
-def test_whatever_a_board_calls_itself_the_file_can_be_read(tree, tmp_path, model):
-    board = written(tmp_path, detect(tree(arm(model, "0xd03"))))
+def test_whatever_a_board_calls_itself_the_file_can_be_read(tree, model):
+    root = tree(arm(model, "0xd03"))
+    board = written(root)
     assert board.recognised_by == "".join(c if c.isprintable() else " " for c in model)
-    assert is_this_machine(board, tmp_path)
-
-
-def test_a_score_and_a_calibration_replace_what_nobody_knows(tree, tmp_path):
-    meter = Meter(kind="ina", title="INA3221 (hwmon1), channel VDD_IN", covers="board", period_s=0.05, look=tuple)
-    calibration = Calibration(
-        PowerFit(idle_w=2.123456, span_w=4.5, residual_w=0.08, r2=0.997, samples=((0, 2.1), (0.5, 4.4), (1, 6.6))),
-        meter,
-        0,
-    )
-    found = detect(tree(arm("Radxa ZERO 3", *["0xd05"] * 4)))
-    score = MachineSpeed(
-        single=0.21, multi=0.8, products=0.11, passes=0.4, verified=True, source="edgevpr's micro-benchmark"
-    )
-    board = written(tmp_path, found, score, calibration)
-    assert (board.idle_w, board.full_w, board.verified) == (2.123, 6.623, True)
-    assert board.source == (
-        "straight line through 3 loads measured on this machine with its INA3221 (hwmon1), channel VDD_IN; residual "
-        "0.08 W, R2 0.997"
-    )
-    assert board.benchmark_score == score
+    assert is_this_machine(board, root)
 
 
 def test_an_unknown_processor_is_called_so(tree):
@@ -166,17 +140,16 @@ def test_an_unknown_processor_is_called_so(tree):
     assert detect(tree({"proc/cpuinfo": "nothing"})).cpu.startswith("unknown ")
 
 
-def test_the_real_machine_is_looked_at_and_its_profile_loads(tmp_path):
+def test_the_real_machine_is_looked_at():
     found = detect()
     assert 0 < found.usable_cores <= found.cores
     assert found.ram_limit_mb <= found.ram_mb
-    assert written(tmp_path, found).cores == found.cores
 
 
 def test_it_says_what_the_machine_is_and_how_that_was_seen(tree):
     pi = detect(tree(arm("Raspberry Pi 4 Model B Rev 1.5", *["0xd08"] * 4, ram_kb=1_000_000)))
     usable = "" if USABLE >= 4 else f"; affinity and control groups leave this process {USABLE}"
-    assert findings(pi) == (
+    assert describe(pi) == (
         "The device tree calls it `Raspberry Pi 4 Model B Rev 1.5`: that is the board rpi-4b.",
         f"4 cores are switched on (4 x Cortex-A72){usable}.",
         "1024 MB of RAM.",
@@ -186,12 +159,12 @@ def test_it_says_what_the_machine_is_and_how_that_was_seen(tree):
 
 def test_it_says_what_a_control_group_leaves_and_that_an_x86_machine_has_no_profile(tree):
     limits = {"sys/fs/cgroup/memory.max": "300000000\n", "sys/fs/cgroup/cpu.max": "40000 100000\n"}
-    said = findings(detect(tree(x86(sys_vendor="AAEON", product_name="UP-APL03") | limits)))
+    said = describe(detect(tree(x86(sys_vendor="AAEON", product_name="UP-APL03") | limits)))
     assert said[0] == (
         "There is no device tree; its firmware (DMI) calls it `AAEON UP-APL03`: no board of edgevpr's is that: "
         "generic-x86 stands in."
     )
     assert "leave this process 0.4." in said[1]
     assert said[2] == "4096 MB of RAM; its control group leaves this process 300."
-    nameless = findings(detect(tree({f"{DMI}/sys_vendor": "Default string", f"{DMI}/product_name": "x.x"})))
+    nameless = describe(detect(tree({f"{DMI}/sys_vendor": "Default string", f"{DMI}/product_name": "x.x"})))
     assert nameless[0].startswith("There is no device tree, and its firmware (DMI) does not name it: ")

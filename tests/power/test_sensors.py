@@ -1,12 +1,10 @@
-"""Power meters found in trees that stand for /sys, and what they say when they are broken."""
+"""Power meters found in trees that stand for /sys, what they say when they are broken, and their mean over a time."""
 
 import pytest
 
-from edgevpr.power.powermeter import MeterError
-from edgevpr.power.sensors import find_meters
+from edgevpr.power.sensors import Meter, MeterError, find_meters, mean_power
 
 HWMON = "sys/class/hwmon"
-RAPL = "sys/class/powercap"
 
 PMIC = """\
      3V7_WL_SW_A current(0)=0.10000000A
@@ -26,15 +24,6 @@ def orin(**changes):
     return {f"{HWMON}/hwmon1/{name}": text for name, text in (files | changes).items()}
 
 
-def package(number, energy_uj=5_000_000, wrap_uj=262_143_328_850, name=None):
-    folder = f"{RAPL}/intel-rapl:{number}"
-    return {
-        f"{folder}/name": name or f"package-{number}\n",
-        f"{folder}/energy_uj": f"{energy_uj}\n",
-        f"{folder}/max_energy_range_uj": f"{wrap_uj}\n",
-    }
-
-
 def pi5(tree, answer=PMIC, model="Raspberry Pi 5 Model B Rev 1.0", code=0):
     root = tree(
         {
@@ -46,152 +35,138 @@ def pi5(tree, answer=PMIC, model="Raspberry Pi 5 Model B Rev 1.0", code=0):
     return root
 
 
-def test_of_three_channels_the_board_s_input_comes_first(tree):
-    found = find_meters(tree(orin()))
-    assert [(meter.covers, meter.read().power_w) for meter in found.meters] == [
-        ("board", pytest.approx(6.0)),
-        ("rail", pytest.approx(1.47)),
-        ("rail", pytest.approx(1.98)),
-    ]
-    assert "channel VDD_IN" in found.meters[0].title
-    assert found.notes == ()
+def test_of_three_channels_only_the_boards_input_is_a_meter(tree):
+    (meter,) = find_meters(tree(orin()))
+    assert meter.read_w() == pytest.approx(6.0)
+    assert "channel VDD_IN" in meter.title
+    assert meter.certain
 
 
-def test_three_channels_without_labels_are_not_taken_for_the_input(tree):
-    files = {name: text for name, text in orin().items() if "label" not in name}
-    assert [meter.covers for meter in find_meters(tree(files)).meters] == ["rail"] * 3
-
-
-def test_a_channel_that_is_switched_off_is_no_meter(tree):
-    titles = [meter.title for meter in find_meters(tree(orin(in2_enable="0\n", in3_enable="1\n"))).meters]
-    assert len(titles) == 2
-    assert not any("CPU_GPU" in title for title in titles)
-
-
-def test_a_jetson_nano_names_its_input_otherwise(tree):
-    found = find_meters(tree(orin(in1_label="POM_5V_GPU", in3_label="POM_5V_IN")))
-    assert found.meters[0].read().power_w == pytest.approx(1.98)
+@pytest.mark.parametrize(
+    ("changes", "watts"),
+    [
+        ({"in1_label": "POM_5V_GPU", "in3_label": "POM_5V_IN"}, [1.98]),  # a Jetson Nano
+        ({"in1_enable": "0\n", "in3_enable": "1\n"}, []),
+        ({"in1_label": "VDD_GPU"}, []),
+    ],
+)
+def test_the_input_goes_by_its_name_and_must_be_switched_on(tree, changes, watts):
+    assert [meter.read_w() for meter in find_meters(tree(orin(**changes)))] == pytest.approx(watts)
 
 
 def test_a_chip_of_one_channel_says_its_power_itself(tree):
     folder = f"{HWMON}/hwmon3"
-    root = tree(
-        {
-            f"{folder}/name": "ina219\n",
-            f"{folder}/power1_input": "3250000\n",
-            f"{folder}/in1_input": "5100\n",
-            f"{folder}/curr1_input": "637\n",
-        }
-    )
-    (meter,) = find_meters(root).meters
-    assert (meter.covers, meter.read(lambda: 7.0).power_w, meter.read(lambda: 7.0).t_mono_s) == ("board", 3.25, 7.0)
+    figures = {"power1_input": "3250000\n", "in1_input": "5100\n", "curr1_input": "637\n"}
+    root = tree({f"{folder}/{name}": text for name, text in ({"name": "ina219\n"} | figures).items()})
+    (meter,) = find_meters(root)
+    assert (meter.read_w(), meter.certain) == (3.25, False)
     (root / folder / "power1_input").unlink()
-    assert meter.read().power_w == pytest.approx(5.1 * 0.637)
+    assert meter.read_w() == pytest.approx(5.1 * 0.637)
+    assert find_meters(tree({f"{folder}/in1_label": "VDD_CPU"})) == ()
 
 
-def test_only_whole_packages_are_counted_and_each_once(tree):
-    root = tree(
-        {
-            **package(0, energy_uj=10_000_000),
-            **package("0:0", name="core", energy_uj=4_000_000),
-            **package(1, energy_uj=20_000_000),
-            **package("1:0", name="dram"),
-            **package(2, name="psys"),
-        }
-    )
-    (meter,) = find_meters(root).meters
-    assert (meter.kind, meter.covers) == ("rapl", "cpu")
-    assert meter.read().energies_j == (10.0, 20.0)
-    assert meter.wraps_j == (262143.32885, 262143.32885)
-
-
-def test_a_counter_for_the_superuser_only_is_a_sentence(tree, monkeypatch):
-    root = tree(package(0))
-    path = root / RAPL / "intel-rapl:0/energy_uj"
-    read_text = type(path).read_text
-
-    def refused(self, *args, **options):
-        if self == path:
-            raise PermissionError(13, "Permission denied")
-        return read_text(self, *args, **options)
-
-    monkeypatch.setattr(type(path), "read_text", refused)
-    found = find_meters(root)
-    assert found.meters == ()
-    assert found.notes == (
-        f"{path} can be read by the superuser only: run this with sudo, or allow it with sudo chmod a+r {path}.",
-    )
-
-
-def test_a_counter_that_does_not_say_when_it_wraps_is_not_used(tree):
-    found = find_meters(tree(package(0, wrap_uj=0)))
-    assert found.meters == ()
-    assert "does not say when its counter wraps" in found.notes[0]
-
-
-def test_a_counter_beyond_its_range_is_refused(tree):
-    root = tree(package(0, wrap_uj=10_000_000))
-    (meter,) = find_meters(root).meters
-    tree(package(0, energy_uj=-1, wrap_uj=10_000_000))
-    with pytest.raises(MeterError, match="outside its own range"):
-        meter.read()
-
-
+@pytest.mark.process
 def test_the_power_chip_of_a_pi_5_is_corrected_for_what_its_rails_leave_out(tree):
-    (meter,) = find_meters(pi5(tree)).meters
-    assert (meter.kind, meter.covers) == ("pmic", "board")
-    assert meter.read().power_w == pytest.approx(1.1451 * (0.1 * 3.7 + 2.0 * 0.8) + 0.5879)
+    (meter,) = find_meters(pi5(tree))
+    assert meter.read_w() == pytest.approx(1.1451 * (0.1 * 3.7 + 2.0 * 0.8) + 0.5879)
+    assert find_meters(pi5(tree, model="Raspberry Pi 4 Model B Rev 1.5")) == ()
 
 
-def test_other_raspberry_pis_have_no_such_chip(tree):
-    assert find_meters(pi5(tree, model="Raspberry Pi 4 Model B Rev 1.5")).meters == ()
+@pytest.mark.process
+@pytest.mark.parametrize(
+    ("answer", "code", "word"),
+    [
+        ("", 0, "no rail"),
+        ("error=2 error_msg=not registered\n", 0, "no rail"),
+        ("VDD_CORE_A current(7)=1..2A\n", 0, "no number"),
+        ("", 1, "vcgencmd"),
+    ],
+)
+def test_a_power_chip_that_answers_nonsense_is_a_sentence(tree, answer, code, word):
+    (meter,) = find_meters(pi5(tree, answer, code=code))
+    with pytest.raises(MeterError, match=word):
+        meter.read_w()
 
 
 @pytest.mark.parametrize(
-    ("answer", "code", "sentence"),
-    [
-        ("", 0, "lists no rail with volts and amperes"),
-        ("error=2 error_msg=not registered\n", 0, "lists no rail with volts and amperes"),
-        ("VDD_CORE_A current(7)=1..2A\n", 0, "which is no number"),
-        ("", 1, "cannot be read with vcgencmd"),
-    ],
+    ("current", "word"),
+    [("-800", "-4 W"), ("900000", "4500 W"), ("many", "'many'"), ("", "''"), ("nan", "no number"), ("inf", "'inf'")],
 )
-def test_a_power_chip_that_answers_nonsense_is_a_sentence(tree, answer, code, sentence):
-    (meter,) = find_meters(pi5(tree, answer, code=code)).meters
-    with pytest.raises(MeterError, match=sentence):
-        meter.read()
-
-
-@pytest.mark.parametrize(
-    ("current", "sentence"),
-    [
-        ("-800", "says -4 W, which cannot be"),
-        ("900000", "says 4500 W, which cannot be"),
-        ("many", "says 'many', which is no number"),
-        ("", "says '', which is no number"),
-        ("nan", "which is no number"),
-        ("inf", "which is no number"),
-    ],
-)
-def test_nonsense_is_never_passed_on_as_a_figure(tree, current, sentence):
-    meter = find_meters(tree(orin(curr1_input=current))).meters[0]
-    with pytest.raises(MeterError, match=sentence):
-        meter.read()
+def test_nonsense_is_never_passed_on_as_a_figure(tree, current, word):
+    (meter,) = find_meters(tree(orin(curr1_input=current)))
+    with pytest.raises(MeterError, match=word):
+        meter.read_w()
 
 
 def test_the_offset_of_an_idle_channel_is_no_nonsense(tree):
-    assert find_meters(tree(orin(curr1_input="-1"))).meters[0].read().power_w == 0
+    assert find_meters(tree(orin(curr1_input="-1")))[0].read_w() == 0
 
 
 def test_a_meter_that_goes_is_a_sentence(tree):
     root = tree(orin())
-    meter = find_meters(root).meters[0]
+    (meter,) = find_meters(root)
     (root / HWMON / "hwmon1/curr1_input").unlink()
-    with pytest.raises(MeterError, match=r"curr1_input cannot be read \(No such file or directory\): the power meter"):
-        meter.read()
+    with pytest.raises(MeterError, match="curr1_input"):
+        meter.read_w()
 
 
-def test_a_machine_without_a_meter_is_told_so(tree):
-    found = find_meters(tree({f"{HWMON}/hwmon0/name": "coretemp\n", f"{HWMON}/hwmon0/temp1_input": "40000\n"}))
-    assert found.meters == ()
-    assert found.notes[0].startswith("This machine has no power meter that edgevpr knows")
+def test_a_machine_without_a_meter_has_none(tree):
+    assert find_meters(tree({f"{HWMON}/hwmon0/name": "coretemp\n", f"{HWMON}/hwmon0/temp1_input": "40000\n"})) == ()
+
+
+def watts(clock, power, period_s=0.1):
+    """A meter: `power` of seconds since the start; a text instead of a number is a failure."""
+
+    def look():
+        value = power(clock() - 1000.0)
+        if isinstance(value, str):
+            raise MeterError(value)
+        return value
+
+    return Meter(title="INA219 (hwmon0)", period_s=period_s, look=look)
+
+
+def test_a_ramp_is_integrated_exactly(clock):
+    mean_w = mean_power(watts(clock, lambda t_s: 2.0 + 0.3 * t_s), 10.0, clock, clock.sleep)
+    assert mean_w == pytest.approx(3.5, abs=1e-9)
+
+
+def test_readings_that_come_late_weigh_by_their_time(clock):
+    """Every second sleep takes three times as long: a plain mean of the readings would be wrong."""
+    late = [False]
+
+    def sleep(seconds):
+        late[0] = not late[0]
+        clock.sleep(seconds * (3 if late[0] else 1))
+
+    mean_w = mean_power(watts(clock, lambda t_s: 10.0 * t_s), 4.0, clock, sleep)
+    assert mean_w == pytest.approx(10.0 * (clock() - 1000.0) / 2, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    "power",
+    [
+        lambda t_s: "it stutters" if round(t_s * 10) % 7 == 3 else 2.0 + 0.3 * t_s,
+        lambda t_s: 5e6 if 2.05 < t_s < 2.15 else 2.0 + 0.3 * t_s,
+    ],
+)
+def test_failures_and_nonsense_between_good_readings_are_left_out(clock, power):
+    assert mean_power(watts(clock, power), 10.0, clock, clock.sleep) == pytest.approx(3.5, abs=1e-9)
+
+
+def test_a_meter_that_disappears_midway_is_an_error_and_no_mean(clock):
+    meter = watts(clock, lambda t_s: 4.0 if t_s < 6 else "/sys/x is gone.")
+    with pytest.raises(MeterError) as raised:
+        mean_power(meter, 10.0, clock, clock.sleep)
+    assert str(raised.value) == "INA219 (hwmon0) failed 3 times in a row; the last time: /sys/x is gone."
+    assert clock() < 1000 + 6.5  # it does not go on for the rest of the window
+
+
+def test_a_meter_that_fails_more_than_it_works_is_an_error(clock):
+    meter = watts(clock, lambda t_s: 4.0 if round(t_s * 10) % 3 == 0 else "it stutters")
+    with pytest.raises(MeterError, match=r"34 usable .* 66 times"):
+        mean_power(meter, 9.9, clock, clock.sleep)
+
+
+def test_a_slow_meter_is_still_read_at_both_ends(clock):
+    assert mean_power(watts(clock, lambda t_s: t_s, period_s=60.0), 4.0, clock, clock.sleep) == pytest.approx(2.0)

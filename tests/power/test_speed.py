@@ -1,34 +1,40 @@
 """The micro-benchmark: what it makes of its rounds, and that it runs, on however fast a machine."""
 
+from threading import Barrier
+
 import pytest
 
 from edgevpr.power import speed
 
 
 def test_the_score_is_relative_to_the_reference_and_keeps_its_two_parts_apart(monkeypatch):
-    monkeypatch.setattr(speed, "product_round", lambda: "product")
-    monkeypatch.setattr(speed, "pass_round", lambda: "pass")
-    rates = {"product": speed.REFERENCE_PRODUCTS_HZ / 16, "pass": speed.REFERENCE_PASSES_HZ / 4}
-    monkeypatch.setattr(speed, "_rate", lambda work: rates[work])
-    monkeypatch.setattr(speed, "_rate_together", lambda make, threads: 3 * rates[make()])
-    found = speed.score()
-    assert (found.products, found.passes) == pytest.approx((1 / 16, 1 / 4))
-    assert (found.single, found.multi) == pytest.approx((1 / 8, 3 / 8))
+    rates_hz = {speed.product_round: speed.REFERENCE_PRODUCTS_HZ / 16, speed.pass_round: speed.REFERENCE_PASSES_HZ / 4}
+    monkeypatch.setattr(speed, "_rates_hz", lambda make, threads: (rates_hz[make], 3 * rates_hz[make]))
+    found = speed.micro_benchmark()
+    assert (found.products, found.passes) == (0.0625, 0.25)
+    assert (found.single, found.multi) == (0.125, 0.375)
+    assert found.verified
 
 
-def test_the_rate_is_that_of_the_quickest_round(monkeypatch):
-    now_s, lengths_s = [0.0], [0.1, 0.3, 0.05, 0.2]
+def test_one_thread_counts_by_its_quickest_round_and_several_by_all(monkeypatch):
+    lengths_s = iter([[0.1, 0.3, 0.05, 0.2], [0.1, 0.3], [0.5]])
+    monkeypatch.setattr(speed, "_round_times_s", lambda work, start: next(lengths_s))
+    assert speed._rates_hz(lambda: None, 2) == (pytest.approx(20.0), pytest.approx(2 / 0.4 + 1 / 0.5))
+
+
+def test_rounds_go_on_until_there_are_enough_of_them_and_of_time(monkeypatch):
+    now_s = [0.0]
     monkeypatch.setattr(speed.time, "perf_counter", lambda: now_s[0])
 
     def work():
-        now_s[0] += lengths_s[0]
-        lengths_s.append(lengths_s.pop(0))
+        now_s[0] += length_s
 
-    assert speed._rate(work) == pytest.approx(1 / 0.05)
+    for length_s, rounds in ((0.125, 5), (0.0625, 7)):
+        assert speed._round_times_s(work, Barrier(1)) == [length_s] * rounds
 
 
 def test_the_real_benchmark_runs(monkeypatch):
     monkeypatch.setattr(speed, "_LEAST_S", 0.01)
-    found = speed.score()
+    found = speed.micro_benchmark()
     assert all(value > 0 for value in (found.single, found.multi, found.products, found.passes))
-    assert found.single == pytest.approx((found.products * found.passes) ** 0.5)
+    assert found.single == pytest.approx((found.products * found.passes) ** 0.5, rel=0.01)

@@ -1,7 +1,4 @@
-"""Temperature, frequency and throttling from trees that stand for /sys, and from firmware that is a shell script."""
-
-import os
-import time
+"""Temperature, frequency and throttling from trees that stand for /sys."""
 
 import pytest
 
@@ -34,16 +31,6 @@ def test_the_hottest_sensor_of_the_cpu_counts_and_no_other(tree, clock):
         f"{ZONE}2/temp": "51000\n",
     }
     assert ThermalWatch(tree(PI | zones), clock).look().temperature_c == 51.0
-
-
-def test_without_zones_the_chip_of_the_cpu_is_asked(tree, clock):
-    chips = {
-        "sys/class/hwmon/hwmon0/name": "nvme\n",
-        "sys/class/hwmon/hwmon0/temp1_input": "70000\n",
-        "sys/class/hwmon/hwmon1/name": "k10temp\n",
-        "sys/class/hwmon/hwmon1/temp1_input": "44500\n",
-    }
-    assert ThermalWatch(tree(chips), clock).look() == ThermalState(44.5, None, None, "")
 
 
 def test_a_machine_that_says_nothing_is_unknown(tmp_path, clock):
@@ -118,84 +105,6 @@ def test_the_firmware_is_asked_once_in_some_seconds(tree, clock):
     clock.sleep(SLOW_S - 0.1)
     assert watch.look().throttled is False
     clock.sleep(0.2)
-    assert watch.look().throttled is True
-
-
-def vcgencmd(tree, script):
-    root = tree(PI | {"usr/bin/vcgencmd": f"#!/bin/sh\n{script}\n"})
-    (root / "usr/bin/vcgencmd").chmod(0o755)
-    return root
-
-
-def until(condition):
-    give_up_s = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < give_up_s
-        time.sleep(0.01)
-
-
-def test_vcgencmd_is_never_waited_for_and_its_answer_comes_later(tree, clock):
-    root = vcgencmd(tree, f'while [ ! -e "{tree({})}/go" ]; do sleep 0.01; done\necho "throttled=0x80008"')
-    watch = ThermalWatch(root, clock)
-    assert watch.look() == ThermalState(48.312, 600.0, False, "")  # still at work
-    tree({"go": ""})
-    until(lambda: watch.look().throttled)
-    assert watch.look().why == "soft temperature limit now"
-    watch.close()
-
-
-def test_a_vcgencmd_that_hangs_is_ended(tree, clock):
-    root = vcgencmd(tree, 'echo $$ >> "$0.pids"; exec sleep 60')
-    watch = ThermalWatch(root, clock)
-    watch.look()
-    pids = root / "usr/bin/vcgencmd.pids"
-    until(lambda: pids.exists() and pids.read_text().endswith("\n"))
-    clock.sleep(SLOW_S + 1)
-    assert watch.look().throttled is False
-    with pytest.raises(ProcessLookupError):
-        os.kill(int(pids.read_text().split()[0]), 0)
-    watch.close()
-
-
-@pytest.mark.parametrize("script", ["exit 1", "echo no; exit 3", "echo 'throttled=0xzz'"])
-def test_a_vcgencmd_that_fails_says_nothing(tree, clock, script):
-    watch = ThermalWatch(vcgencmd(tree, script), clock)
-    for _ in range(20):
-        assert watch.look() == ThermalState(48.312, 600.0, False, "")
-        time.sleep(0.01)
-    watch.close()
-
-
-def test_a_vcgencmd_that_cannot_be_started_says_nothing(tree, clock):
-    assert ThermalWatch(tree(PI | {"usr/bin/vcgencmd": "no program"}), clock).look().throttled is False
-
-
-def test_heat_counters_of_x86_that_move_are_throttling(tree, clock):
-    folder = f"{CPU}/cpu0/thermal_throttle"
-    counters = {f"{folder}/core_throttle_count": "17\n", f"{folder}/package_throttle_count": "20\n"}
-    watch = ThermalWatch(tree(counters), clock)
-    assert watch.look().throttled is False  # what was before it was made does not count
-    tree({f"{folder}/core_throttle_count": "19\n"})
-    clock.sleep(SLOW_S)
-    state = watch.look()
-    assert (state.throttled, state.why) == (True, "the processor has slowed down 2 times in 5 s for heat")
-    clock.sleep(SLOW_S)
-    assert watch.look().throttled is False
-
-
-def test_heat_counters_that_go_and_come_back_are_none(tree, clock):
-    path = f"{CPU}/cpu0/thermal_throttle/core_throttle_count"
-    root = tree({path: "1700\n"})
-    watch = ThermalWatch(root, clock)
-    watch.look()
-    (root / path).unlink()  # its core is switched off
-    for count in (None, "1700\n", "3\n"):
-        if count:
-            tree({path: count})
-        clock.sleep(SLOW_S)
-        assert watch.look().throttled is False
-    tree({path: "4\n"})
-    clock.sleep(SLOW_S)
     assert watch.look().throttled is True
 
 

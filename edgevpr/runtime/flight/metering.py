@@ -8,11 +8,10 @@ from typing import Any
 from edgevpr.core.config import BatteryConfig
 from edgevpr.core.types import NO_TAPE, StageCost, Tape
 from edgevpr.power.boards import Board
-from edgevpr.power.energy import RunningEnergy
 from edgevpr.power.equations import Pack, marginal_energy_j, pack_ah, parse_pack
 from edgevpr.power.load import MachineLoad, OwnLoad, machine_load
 from edgevpr.power.machine import rss_mb
-from edgevpr.power.meter import OwnMemory, QueryMeter, Stage, stage
+from edgevpr.power.meter import OwnMemory, QueryMeter, RunningEnergy, Stage, stage
 from edgevpr.power.thermal import ThermalState, ThermalWatch, limit_c
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.governor import Reading
@@ -132,8 +131,7 @@ class FlightMeter:
         )
 
     def close(self) -> None:
-        """Release the sensors."""
-        self._watch.close()
+        """End the metering: nothing is held open."""
 
     def _mah(self, energy_j: float) -> float:
         return 1000 * pack_ah(energy_j, self._pack, self._regulator_efficiency)

@@ -7,6 +7,7 @@ import json
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 PATH = Path(__file__).with_name("accuracy.json")
 _FEWER = "{}, {} candidates"
@@ -46,8 +47,8 @@ def labelled(label: str, candidates: int | None) -> str:
 def of(label: str, camera: str | None, candidates: int | None = None) -> Accuracy | None:
     """Return the accuracy of a technique in a form (see `techniques.labelled`), for a `camera` that looks "nadir" or
     "forward" (None: forward), with fewer `candidates` than its own (None: its own); None where it was not measured."""
-    found = _content()[camera or "forward"].get(labelled(label, candidates))
-    return Accuracy(**found) if found else None
+    figures = _content()[camera or "forward"].get(labelled(label, candidates))
+    return Accuracy(**figures) if figures else None
 
 
 def fewer_candidates(label: str, camera: str | None) -> tuple[int, ...]:
@@ -58,5 +59,6 @@ def fewer_candidates(label: str, camera: str | None) -> tuple[int, ...]:
 
 
 @lru_cache(maxsize=1)
-def _content() -> dict[str, dict[str, dict]]:
-    return json.loads(PATH.read_text("utf-8"))
+def _content() -> dict[str, dict[str, dict[str, Any]]]:
+    content: dict[str, dict[str, dict[str, Any]]] = json.loads(PATH.read_text("utf-8"))
+    return content

@@ -20,6 +20,17 @@ from edgevpr.runtime.preflight.probe import TechniqueCosts
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Demand:
+    """Demands of a flight: places of the map, queries a second, MB for the index, and the way the camera looks
+    ("nadir" or "forward"; None: forward)."""
+
+    places: int
+    rate_hz: float
+    budget_mb: float
+    camera: str | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Fit:
     """Fit of a technique on a board; `t_query_s` is the time of one query, and `cpu_s` that of all cores together. It
     fits where there are no `shortfalls`; `remedies` would make it fit."""
@@ -56,16 +67,19 @@ class Option:
         """Recall@1, 0 where it was not measured."""
         return self.accuracy.recall_at_1 if self.accuracy else 0.0
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Demand:
-    """Demands of a flight: places of the map, queries a second, MB for the index, and the way the camera looks
-    ("nadir" or "forward"; None: forward)."""
-
-    places: int
-    rate_hz: float
-    budget_mb: float
-    camera: str | None = None
+    @property
+    def objection(self) -> str | None:
+        """Reason for which it is not chosen by itself; None where nothing is against it."""
+        if self.fit.shortfalls:
+            return f"{self.label} does not fit, {' and '.join(self.fit.shortfalls)}"
+        if self.accuracy is None:
+            return f"{self.label} was never measured: name it to use it"
+        if not self.accuracy.is_trusted:
+            wrong = f"{self.accuracy.accepted_elsewhere} wrong places in {self.accuracy.asked} queries"
+            return f"{self.label} accepted {wrong}: name it to use it"
+        if self.costs.sequence > 1:
+            return f"{self.label} needs a flight along the mapped way: name it to use it"
+        return None
 
 
 def options(board: Board, label: str, name: str, costs: TechniqueCosts, demand: Demand) -> Iterator[Option]:
@@ -79,19 +93,19 @@ def options(board: Board, label: str, name: str, costs: TechniqueCosts, demand: 
             name=name,
             candidates=candidates,
             costs=fewer,
-            fit=fit(board, fewer, demand.places, demand.rate_hz, demand.budget_mb),
+            fit=fit(board, fewer, demand),
             accuracy=accuracy.of(label, demand.camera, candidates),
         )
 
 
 def front(wanted: Iterable[Option]) -> list[Option]:
     """Return those that fit, can be trusted, and are not both less accurate and dearer than another, cheapest first."""
-    found: list[Option] = []
-    sound = [each for each in wanted if not each.fit.shortfalls and each.is_sound]
-    for each in sorted(sound, key=lambda option: (option.fit.cpu_s, -option.recall)):
-        if not found or each.recall > found[-1].recall:
-            found.append(each)
-    return found
+    best_so_far: list[Option] = []
+    sound = [option for option in wanted if not option.fit.shortfalls and option.is_sound]
+    for option in sorted(sound, key=lambda option: (option.fit.cpu_s, -option.recall)):
+        if not best_so_far or option.recall > best_so_far[-1].recall:
+            best_so_far.append(option)
+    return best_so_far
 
 
 def best(wanted: Sequence[Option], board: Board, min_recall: float | None = None) -> Option | None:
@@ -100,10 +114,10 @@ def best(wanted: Sequence[Option], board: Board, min_recall: float | None = None
 
     The board's own technique is taken without measured accuracy too: its profile names it.
     """
-    own = [each for each in wanted if each.name == board.technique]
-    unmeasured = [each for each in own if each.accuracy is None and not each.fit.shortfalls]
+    own = [option for option in wanted if option.name == board.technique]
+    unmeasured = [option for option in own if option.accuracy is None and not option.fit.shortfalls]
     for among in (own, wanted):
-        reaching = [each for each in front(among) if each.recall >= (min_recall or 0.0)]
+        reaching = [option for option in front(among) if option.recall >= (min_recall or 0.0)]
         if reaching:
             return reaching[0] if min_recall is not None else reaching[-1]
         if unmeasured and min_recall is None:
@@ -111,34 +125,18 @@ def best(wanted: Sequence[Option], board: Board, min_recall: float | None = None
     return None
 
 
-def objection(option: Option) -> str | None:
-    """Say why an option is not chosen by itself; None where nothing is against it."""
-    if option.fit.shortfalls:
-        return f"{option.label} does not fit, {' and '.join(option.fit.shortfalls)}"
-    if option.accuracy is None:
-        return f"{option.label} was never measured: name it to use it"
-    if not option.accuracy.is_trusted:
-        return (
-            f"{option.label} accepted {option.accuracy.accepted_elsewhere} wrong places in "
-            f"{option.accuracy.asked} queries: name it to use it"
-        )
-    if option.costs.sequence > 1:
-        return f"{option.label} needs a flight along the mapped way: name it to use it"
-    return None
-
-
-def fit(board: Board, costs: TechniqueCosts, places: int, rate_hz: float, budget_mb: float) -> Fit:
-    """Check whether a technique fits: its map in `budget_mb`, its process in the board's memory, its queries in the
+def fit(board: Board, costs: TechniqueCosts, demand: Demand) -> Fit:
+    """Check whether a technique fits: its map in the budget, its process in the board's memory, its queries in the
     CPU's time.
 
     A query must be over before the next one begins and before its fix is too old to be sent. All queries together may
     take `cpu_share` of the cores at most.
     """
-    encode, match = costs.encode, costs.match(places)
+    rate_hz, budget_mb = demand.rate_hz, demand.budget_mb
     usable_cores = board.cores * board.cpu_share
-    map_ram_mb = costs.ram_bytes_per_place * places / 1e6
+    map_ram_mb = costs.ram_bytes_per_place * demand.places / 1e6
     process_ram_mb = costs.process_mb + map_ram_mb
-    query = encode + match
+    query = costs.encode + costs.match(demand.places)
     reachable_hz = min(1 / query.wall_s, usable_cores / query.cpu_s)
 
     shortfalls, remedies = [], []
@@ -151,9 +149,10 @@ def fit(board: Board, costs: TechniqueCosts, places: int, rate_hz: float, budget
     if query.wall_s > FIX_MAX_AGE_S:
         shortfalls.append(too_late(query.wall_s))
     if shortfalls:
+        wall_s = min(1 / rate_hz, FIX_MAX_AGE_S) - costs.encode.wall_s
         most_places = min(
             min(budget_mb, board.memory_max_mb - costs.process_mb) * 1e6 / costs.ram_bytes_per_place,
-            costs.places_within(min(1 / rate_hz, FIX_MAX_AGE_S) - encode.wall_s, usable_cores / rate_hz - encode.cpu_s),
+            costs.places_within(wall_s, usable_cores / rate_hz - costs.encode.cpu_s),
         )
         if most_places >= 1:
             remedies.append(f"with up to {int(most_places)} places")
@@ -199,29 +198,37 @@ def preferred(board: Board, camera: str | None = None) -> tuple[str, ...]:
     return tuple(name for name in names if camera != "nadir" or "camera" in techniques.parameters(name))
 
 
+def objections(wanted: Iterable[Option]) -> str:
+    """Say why none of several options is chosen by itself."""
+    return "; ".join(option.objection for option in wanted if option.objection)
+
+
+def what_would_fit(wanted: Iterable[Option], board: Board) -> list[str]:
+    """Say what would make those options fit that would then be chosen."""
+    return [
+        f"{option.label} {' or '.join(option.fit.remedies)}"
+        for option in wanted
+        if option.fit.remedies and (option.is_sound or option.name == board.technique)
+    ]
+
+
 def require_best(wanted: Sequence[Option], board: Board, demand: Demand) -> Option:
     """Choose as `best` does. Raises UsageError where nothing can be chosen; it says what would make something fit."""
-    found = best(wanted, board)
-    if found:
-        return found
-    against = filter(None, map(objection, wanted))
-    remedies = [
-        f"{each.label} {' or '.join(each.fit.remedies)}"
-        for each in wanted
-        if each.fit.remedies and (each.is_sound or each.name == board.technique)
-    ]
+    if chosen := best(wanted, board):
+        return chosen
+    remedies = what_would_fit(wanted, board)
     raise UsageError(
-        f"No technique fits {board.title} with {demand.places} places at {demand.rate_hz:g} Hz ({'; '.join(against)}): "
+        f"No technique fits {board.title} with {demand.places} places at {demand.rate_hz:g} Hz ({objections(wanted)}): "
         + (f"what would fit is {', or '.join(remedies)}." if remedies else "use a larger board.")
     )
 
 
-def described(board: Board, found: Fit, places: int, rate_hz: float, budget_mb: float) -> str:
+def described(board: Board, found: Fit, demand: Demand) -> str:
     """Describe a fit in one line of figures; where the technique does not fit, add why and what would make it fit."""
     figures = (
-        f"{places} places take {found.map_ram_mb:.1f} of {budget_mb:.1f} MB, the process {found.process_ram_mb:.0f} of "
-        f"{board.memory_max_mb:.0f} MB, and {_rounded_down(found.reachable_hz):g} Hz of {rate_hz:g} are reached with "
-        f"{board.cores * board.cpu_share:.2g} of {board.cores} cores"
+        f"{demand.places} places take {found.map_ram_mb:.1f} of {demand.budget_mb:.1f} MB, the process "
+        f"{found.process_ram_mb:.0f} of {board.memory_max_mb:.0f} MB, and {_rounded_down(found.reachable_hz):g} Hz of "
+        f"{demand.rate_hz:g} are reached with {board.cores * board.cpu_share:.2g} of {board.cores} cores"
     )
     if not found.shortfalls:
         return figures

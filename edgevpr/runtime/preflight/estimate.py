@@ -1,6 +1,6 @@
 """Estimate of a flight: what each technique will cost a board, before take-off, from costs measured on some machine.
 
-`dataclasses.asdict` of an Estimate is ready for JSON.
+`dataclasses.asdict` of a FlightEstimate is ready for JSON.
 """
 
 from collections.abc import Iterable, Iterator
@@ -10,14 +10,12 @@ from edgevpr.core.errors import UsageError
 from edgevpr.power.boards import Board
 from edgevpr.power.equations import Pack, endurance_min, pack_ah, queries_ah
 from edgevpr.power.meter import query_cost
-from edgevpr.runtime.preflight import counted
 from edgevpr.runtime.preflight.accuracy import Accuracy
-from edgevpr.runtime.preflight.choose import Demand, Option, best, front, objection, options
-from edgevpr.runtime.preflight.probe import TechniqueCosts
-from edgevpr.runtime.preflight.scale import UNKNOWN_PRODUCTS, Ratios, is_same, on_board, ratios
+from edgevpr.runtime.preflight.choose import Demand, Option, best, front, objections, options, what_would_fit
+from edgevpr.runtime.preflight.scale import UNKNOWN_PRODUCTS, Ratios, counted_work, is_same, on_board, ratios
 from edgevpr.runtime.preflight.trial import Trial
 
-_BUSY = 0.1  # of the time of a trial, in which other programs had the processor
+_BUSY_SHARE = 0.1  # of the time of a trial, in which other programs had the processor
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,8 +35,13 @@ class FlightPlan:
     camera: str | None = None
     min_recall: float | None = None
 
+    @property
+    def demand(self) -> Demand:
+        """Demands of this flight on a technique."""
+        return Demand(places=self.places, rate_hz=self.rate_hz, budget_mb=self.budget_mb, camera=self.camera)
+
     def __post_init__(self) -> None:
-        asked = {
+        numbers = {
             "number of places": self.places,
             "rate in Hz": self.rate_hz,
             "length of the flight in minutes": self.flight_min,
@@ -46,7 +49,7 @@ class FlightPlan:
             "hover power in W": self.hover_w,
             "least recall": self.min_recall,
         }
-        for what, value in asked.items():
+        for what, value in numbers.items():
             if value is not None and not 0 < value < float("inf"):
                 raise UsageError(f"The {what} is {value:g}: give a number above 0.")
         if self.min_recall is not None and self.min_recall > 1:
@@ -100,7 +103,7 @@ class TechniqueEstimate:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Estimate:
+class FlightEstimate:
     """All techniques on one board.
 
     `times` is "measured" (on this machine, for this machine), "scaled" (from this machine to the board, by `ratios`) or
@@ -132,60 +135,50 @@ def estimate(
     plan: FlightPlan,
     map_technique: str | None = None,
     measured_on: str | None = None,
-) -> Estimate:
+) -> FlightEstimate:
     """Estimate every technique of `trials`, best first, for a flight of `board`.
 
     The trials were made on the machine `here`; each is paired with True if it was stored, on `measured_on`.
     `map_technique` is the technique that an existing map was built with (None: there is no map).
     """
     trials = list(trials)
-    demand = Demand(places=plan.places, rate_hz=plan.rate_hz, budget_mb=plan.budget_mb, camera=plan.camera)
-    wanted = [
-        (option, stored)
-        for trial, stored in trials
-        if trial.costs
-        for option in options(board, trial.label, trial.name, _costs_on(trial, here, board), demand)
-    ]
-    of_front = [each.label for each in front(option for option, _ in wanted)]
-    rows = tuple(_technique(option, board, plan, stored, option.label in of_front) for option, stored in wanted)
-    found = ratios(here, board)
-    times = "unscaled" if found is None else "measured" if is_same(here, board) else "scaled"
-    used_stored = any(row.measured for row in rows)
-    waited = max((option.costs.waited for option, _ in wanted), default=0.0)
-    recommended, reason = _recommended([option for option, _ in wanted], rows, board, plan, map_technique)
-    return Estimate(
+    wanted: dict[str, Option] = {}
+    stored: dict[str, bool] = {}
+    for trial, is_stored in trials:
+        if trial.costs:
+            work = counted_work(trial.name, {**trial.parameters, **trial.settings})
+            costs = on_board(trial.costs, here, board, work)
+            for option in options(board, trial.label, trial.name, costs, plan.demand):
+                wanted[option.label], stored[option.label] = option, is_stored
+    on_front = {option.label for option in front(wanted.values())}
+    rows = tuple(_technique(option, board, plan, stored[label], label in on_front) for label, option in wanted.items())
+    ratio = ratios(here, board)
+    times = "unscaled" if ratio is None else "measured" if is_same(here, board) else "scaled"
+    waited = max((option.costs.waited for option in wanted.values()), default=0.0)
+    recommended, reason = _recommended(list(wanted.values()), rows, board, plan, map_technique)
+    return FlightEstimate(
         board=board.name,
         title=board.title,
         verified=board.verified,
         times=times,
-        ratios=found,
-        measured_on=measured_on if used_stored else None,
+        ratios=ratio,
+        measured_on=measured_on if any(stored.values()) else None,
         plan=plan,
         techniques=rows,
         recommended=recommended,
         reason=reason,
-        notes=tuple(_notes(board, here, found, times, plan, waited)),
+        notes=(*_notes_on_times(board, here, ratio), *_notes_on_figures(board, plan, waited)),
         unusable={trial.label: trial.problem for trial, _ in trials if trial.problem},
         weights=tuple(dict.fromkeys(trial.weights for trial, _ in trials if trial.weights)),
     )
 
 
-def _costs_on(trial: Trial, here: Board, board: Board) -> TechniqueCosts:
-    return on_board(trial.costs, here, board, counted.of(trial.name, {**trial.parameters, **trial.settings}))
-
-
 def _technique(option: Option, board: Board, plan: FlightPlan, stored: bool, on_front: bool) -> TechniqueEstimate:
-    costs, found = option.costs, option.fit
-    query = query_cost(
-        costs.encode,
-        costs.match(plan.places),
-        board,
-        plan.pack,
-        plan.regulator_efficiency,
-        rss_mb=costs.process_mb,
-    )
+    costs, fit = option.costs, option.fit
+    encode, match = costs.encode, costs.match(plan.places)
+    query = query_cost(encode, match, board, plan.pack, plan.regulator_efficiency, rss_mb=costs.process_mb)
     flight_s = 60 * plan.flight_min
-    marginal_mah = queries_ah(min(plan.rate_hz, found.reachable_hz) * flight_s, query.marginal_mah)
+    marginal_mah = queries_ah(min(plan.rate_hz, fit.reachable_hz) * flight_s, query.marginal_mah)
     # Equation 5.7 leaves out the idle power between two queries; the pack supplies it all the same.
     idle_mah = 1000 * pack_ah(board.idle_w * flight_s, plan.pack, plan.regulator_efficiency)
     lost_min, lost_marginal_min = _lost_min(plan, idle_mah, marginal_mah)
@@ -195,20 +188,20 @@ def _technique(option: Option, board: Board, plan: FlightPlan, stored: bool, on_
         candidates=option.candidates,
         accuracy=option.accuracy,
         on_front=on_front,
-        objection=None if found.shortfalls else objection(option),
-        fits=not found.shortfalls,
+        objection=None if fit.shortfalls else option.objection,
+        fits=not fit.shortfalls,
         ram_bytes_per_place=costs.ram_bytes_per_place,
         disk_bytes_per_place=costs.disk_bytes_per_place,
-        map_ram_mb=found.map_ram_mb,
+        map_ram_mb=fit.map_ram_mb,
         map_disk_mb=costs.disk_bytes_per_place * plan.places / 1e6,
-        process_ram_mb=found.process_ram_mb,
+        process_ram_mb=fit.process_ram_mb,
         encode_ram_mb=costs.encode_mb,
         t_encode_s=query.t_encode_s,
         t_match_s=query.t_match_s,
         u_encode=query.u_encode,
         u_match=query.u_match,
-        u_query=found.cpu_s / (found.t_query_s * board.cores),
-        reachable_hz=found.reachable_hz,
+        u_query=fit.cpu_s / (fit.t_query_s * board.cores),
+        reachable_hz=fit.reachable_hz,
         query_mah=query.used_mah,
         query_marginal_mah=query.marginal_mah,
         flight_mah=idle_mah + marginal_mah,
@@ -216,8 +209,8 @@ def _technique(option: Option, board: Board, plan: FlightPlan, stored: bool, on_
         flight_pack_frac=(idle_mah + marginal_mah) / plan.pack.capacity_mah,
         lost_min=lost_min,
         lost_marginal_min=lost_marginal_min,
-        shortfalls=found.shortfalls,
-        remedies=found.remedies,
+        shortfalls=fit.shortfalls,
+        remedies=fit.remedies,
         measured=stored,
     )
 
@@ -242,7 +235,7 @@ def _recommended(
     map_technique: str | None,
 ) -> tuple[str | None, str]:
     """Return the technique to take, of those that the map can serve, and the reason."""
-    usable = [each for each in wanted if map_technique in (None, each.name)]
+    usable = [option for option in wanted if map_technique in (None, option.name)]
     served = f"the map was built with {map_technique}, and " if map_technique else ""
     if not usable:
         return None, f"None: the map was built with {map_technique}, which cannot be used here."
@@ -266,44 +259,42 @@ def _recommended(
 
 def _nothing(usable: list[Option], board: Board, plan: FlightPlan) -> str:
     """Say why nothing can be taken, and what could be."""
-    fitting = [each for each in usable if not each.fit.shortfalls]
+    fitting = [option for option in usable if not option.fit.shortfalls]
     if not fitting:
-        sound = [each for each in usable if each.fit.remedies and (each.is_sound or each.name == board.technique)]
-        remedies = [f"{each.label} {' or '.join(each.fit.remedies)}" for each in sound]
-        hint = f"what would fit is {', or '.join(remedies[:3])}" if remedies else "use a larger board"
+        remedies = what_would_fit(usable, board)[:3]
+        hint = f"what would fit is {', or '.join(remedies)}" if remedies else "use a larger board"
         return f"nothing that was tried fits {board.title}; {hint}"
-    sound = front(fitting)
-    if sound:
-        best_recall = max(each.recall for each in sound)
-        return f"nothing that fits has a recall@1 of {plan.min_recall:g}; the most is {best_recall:.2f}"
-    return f"of what fits {board.title} nothing is chosen by itself: {'; '.join(filter(None, map(objection, fitting)))}"
+    if sound := front(fitting):
+        most = max(option.recall for option in sound)
+        return f"nothing that fits has a recall@1 of {plan.min_recall:g}; the most is {most:.2f}"
+    return f"of what fits {board.title} nothing is chosen by itself: {objections(fitting)}"
 
 
-def _notes(
-    board: Board, here: Board, found: Ratios | None, times: str, plan: FlightPlan, waited: float
-) -> Iterator[str]:
-    if found is None:
-        unknown = board if board.benchmark_score.single is None else here
+def _notes_on_times(board: Board, here: Board, ratio: Ratios | None) -> Iterator[str]:
+    score, own_score = board.benchmark_score, here.benchmark_score
+    if ratio is None:
+        unknown = board if score.single is None else here
         yield (
             f"The times are this machine's, unscaled, not measured on this board: the speed of {unknown.title} is not "
             f"known ({unknown.benchmark_score.source})."
         )
-    if found and times == "scaled":
-        score = board.benchmark_score
-        doubt = "" if score.verified and here.benchmark_score.verified else "unverified; "
+    elif not is_same(here, board):
+        doubt = "" if score.verified and own_score.verified else "unverified; "
         apart = f"; its products are not known apart: {UNKNOWN_PRODUCTS:g} of its single thread"
         yield (
             f"The times are scaled from this machine, not measured on this board: networks and full comparisons to "
-            f"{found.products:.2g} of its speed, everything else to {found.passes:.2g} ({doubt}the board by "
-            f"{score.source}; this machine by {here.benchmark_score.source})"
-            f"{'' if score.products or score.arm64_mips else apart}."
+            f"{ratio.products:.2g} of its speed, everything else to {ratio.passes:.2g} ({doubt}the board by "
+            f"{score.source}; this machine by {own_score.source}){'' if score.products or score.arm64_mips else apart}."
         )
         if score.arm64_mips:
             yield (
                 f"Those of cohog are the instructions that it takes on an ARM core (`make bench-arm64`), at "
                 f"{score.arm64_mips:g} million a second."
             )
-    if waited > _BUSY:
+
+
+def _notes_on_figures(board: Board, plan: FlightPlan, waited: float) -> Iterator[str]:
+    if waited > _BUSY_SHARE:
         yield (
             f"This machine was busy: while techniques were tried, other programs had it for {waited:.0%} of the time. "
             "Times of the processor were measured, which that changes little; to be sure, ask again when it is idle."

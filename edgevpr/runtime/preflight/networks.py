@@ -6,12 +6,15 @@
 import json
 import shutil
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from edgevpr import techniques
+from edgevpr.core.arrays import Image
 from edgevpr.core.child import ask_child, last_line, serve_parent
 from edgevpr.core.config import build
 from edgevpr.core.errors import EdgevprError, ModelError
@@ -106,7 +109,7 @@ def verify_here(card: Card, threads: int = 1, learned: bool = True) -> Verified:
     outputs = [output for output in ("descriptor", "features") if getattr(card.outputs, output)]
     backbones = {output: backbone_of(card, output, threads) for output in outputs}
     shapes = {output: backbone.shape for output, backbone in backbones.items()}
-    runs = {output: backbone.run for output, backbone in backbones.items()}
+    runs: dict[str, Callable[[Image], object]] = {output: backbone.run for output, backbone in backbones.items()}
     if card.outputs.boxes:
         runs["boxes"], shapes["boxes"] = detector_of(card, threads).is_static, _FRAME
     if card.outputs.memorability:
@@ -187,7 +190,7 @@ def _text_of(card_path: Path) -> str:
     return read_file(card_path, MAX_FILE_BYTES).decode("utf-8")
 
 
-def card_text(values: dict) -> str:
+def card_text(values: dict[str, Any]) -> str:
     """Write a card as YAML, one line a key: JSON values are valid YAML."""
     return "".join(f"{key}: {json.dumps(value, ensure_ascii=False)}\n" for key, value in values.items())
 
@@ -199,21 +202,12 @@ def _listed(name: str) -> Listed:
         return Listed(name=name, ok=False, problem=str(error))
     problem = None
     try:
-        found = file_sha256(card.file_path)
-        if found != card.sha256:
-            problem = f"{card.file_path} is not the file of its card: its SHA-256 is {found}, not {card.sha256}."
+        sha256 = file_sha256(card.file_path)
+        if sha256 != card.sha256:
+            problem = f"{card.file_path} is not the file of its card: its SHA-256 is {sha256}, not {card.sha256}."
     except ModelError as error:
         problem = str(error)
-    users = [
-        each
-        for each in techniques.names()
-        if techniques.parameters(each).get("model") == name and getattr(card.outputs, techniques.network_output(each))
-    ]
-    if card.is_technique and not techniques.is_own(name):
-        users.insert(0, name)
-    users += [
-        f"salience.{key}" for key, said in (("detector", card.detector), ("network", card.outputs.memorability)) if said
-    ]
+    outputs = tuple(output for output, layer in asdict(card.outputs).items() if layer)
     return Listed(
         name=name,
         ok=problem is None,
@@ -222,23 +216,37 @@ def _listed(name: str) -> Listed:
         licence=card.licence,
         source=card.source,
         file=str(card.file_path),
-        outputs=tuple(output for output, said in asdict(card.outputs).items() if said),
+        outputs=outputs,
         head=card.head["name"] if card.head else None,
-        techniques=tuple(users),
+        techniques=tuple(_users(card, outputs)),
     )
+
+
+def _users(card: Card, outputs: tuple[str, ...]) -> Iterator[str]:
+    """Yield what uses a network unless told otherwise: its own technique, others, and the gate."""
+    if card.is_technique and not techniques.is_own(card.name):
+        yield card.name
+    for technique in techniques.names():
+        is_of_card = techniques.parameters(technique).get("model") == card.name
+        if is_of_card and techniques.network_output(technique) in outputs:
+            yield technique
+    if card.detector:
+        yield "salience.detector"
+    if card.outputs.memorability:
+        yield "salience.network"
 
 
 def _vector_length(card: Card, backbones: dict[str, Backbone], learned: bool) -> int | None:
     if not card.is_technique:
         return None
     if card.head and card.head["name"] == "vlad" and not learned:
-        return card.head["words"] * backbones["features"].shape[0]
+        return int(card.head["words"]) * backbones["features"].shape[0]
     from edgevpr.techniques.network import of_card
 
     return of_card(card).spec.coarse.shape[0]
 
 
-def _answer(job: dict) -> dict:
+def _answer(job: dict[str, Any]) -> dict[str, Any]:
     card = build(Card, {**job["card"], "path": Path(job["card"]["path"])}, job["card"]["path"])
     try:
         return asdict(verify_here(card, job["threads"], job["learned"]))

@@ -11,18 +11,10 @@ from edgevpr.core.errors import MapError, ModelError, UsageError
 from edgevpr.places.index import bytes_per_place
 from edgevpr.places.sequence import bytes_beside_place
 from edgevpr.power.boards import Board, load_board
-from edgevpr.runtime.preflight import accuracy, counted
-from edgevpr.runtime.preflight.choose import (
-    Demand,
-    Option,
-    described,
-    objection,
-    options,
-    preferred,
-    require_best,
-)
+from edgevpr.runtime.preflight import accuracy
+from edgevpr.runtime.preflight.choose import Demand, Option, described, options, preferred, require_best
 from edgevpr.runtime.preflight.probe import TechniqueCosts, probe
-from edgevpr.runtime.preflight.scale import on_board
+from edgevpr.runtime.preflight.scale import counted_work, on_board
 from edgevpr.runtime.recognise.opening import budget_mb, made_for
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.techniques.card import weights_of
@@ -52,13 +44,7 @@ def picked_technique(board_name: str, places: int, camera: str | None = None) ->
     wanted = [
         option
         for technique in _usable(board, preferred(board, camera), camera)
-        for option in options(
-            board,
-            _label(technique),
-            technique.spec.name,
-            _costs_on(technique, board),
-            demand,
-        )
+        for option in options(board, _label(technique), technique.spec.name, _costs_on(technique, board), demand)
     ]
     if not wanted:
         raise ModelError("No technique can be used here (see above): correct what it names, or name another one.")
@@ -67,9 +53,9 @@ def picked_technique(board_name: str, places: int, camera: str | None = None) ->
     except UsageError as error:
         _log.warning("technique %s is taken all the same: %s", wanted[0].name, error)
         return wanted[0].name
-    figures = described(board, taken.fit, places, demand.rate_hz, demand.budget_mb)
-    against = filter(None, (objection(each) for each in wanted if each.name != taken.name))
-    _log.info("technique %s", "; ".join([f"{taken.label}: {taken.accuracy or 'never measured'}; {figures}", *against]))
+    chosen = f"{taken.label}: {taken.accuracy or 'never measured'}; {described(board, taken.fit, demand)}"
+    against = [option.objection for option in wanted if option.name != taken.name and option.objection]
+    _log.info("technique %s", "; ".join([chosen, *against]))
     return taken.name
 
 
@@ -78,41 +64,42 @@ def outlook(recogniser: Recogniser, config: Config) -> Outlook:
     configuration does not say how many candidates are compared, fewer are taken that fit (see `choose`). Never a reason
     not to fly."""
     technique, board = recogniser.technique, recogniser.meter.board
-    spec, candidates = technique.spec, recogniser.candidates
-    weights = weights_of(spec)
-    left_out = len(recogniser.place_map) - len(recogniser.index)
+    usual = candidates = recogniser.candidates or technique.candidates
     t_query_s = None
     try:
         taken, afforded = _afforded(recogniser, config, board)
         t_query_s, candidates = taken.fit.t_query_s, taken.candidates or candidates
     except (MapError, ModelError, OSError) as error:  # the trial map needs a little room for temporary files
         afforded = f"what it takes could not be tried ({error})"
-    parts = (
-        "the map was built with it" if config.technique is None else "it was named",
-        weights and f"weights of {weights}",
-        left_out and f"{left_out} places are left to the map file",
-        candidates != recogniser.candidates and f"{candidates} candidates instead of {recogniser.candidates}",
-        afforded,
-    )
-    return Outlook(f"technique {_label(technique)}: {'; '.join(filter(None, parts))}", candidates, t_query_s)
+    parts = ["the map was built with it" if config.technique is None else "it was named"]
+    if weights := weights_of(technique.spec):
+        parts.append(f"weights of {weights}")
+    if left_out := len(recogniser.place_map) - len(recogniser.index):
+        parts.append(f"{left_out} places are left to the map file")
+    if candidates != usual:
+        parts.append(f"{candidates} candidates instead of {usual}")
+    return Outlook(f"technique {_label(technique)}: {'; '.join([*parts, afforded])}", candidates, t_query_s)
 
 
 def _afforded(recogniser: Recogniser, config: Config, board: Board) -> tuple[Option, str]:
     """Return how to recognise, and what it finds and costs in a few words."""
-    technique, places = recogniser.technique, len(recogniser.index)
-    rate_hz, limit_mb = config.source.rate_hz or board.rate_hz, budget_mb(config, board)
+    technique = recogniser.technique
     costs = _costs_on(technique, board)
     beside_bytes = bytes_beside_place(recogniser.search.length)
     costs = replace(costs, ram_bytes_per_place=bytes_per_place(technique.spec) + beside_bytes)
     if technique.spec.fine:
         costs = replace(costs, candidates=recogniser.candidates)
-    camera = technique.spec.parameters.get("camera")
-    demand = Demand(places=places, rate_hz=rate_hz, budget_mb=limit_mb, camera=camera)
+    demand = Demand(
+        places=len(recogniser.index),
+        rate_hz=config.source.rate_hz or board.rate_hz,
+        budget_mb=budget_mb(config, board),
+        camera=_camera(technique),
+    )
     usual, *fewer = options(board, _label(technique), technique.spec.name, costs, demand)
     is_open = config.match.candidates is None and recogniser.search.length == 1
-    fitting = [each for each in (usual, *fewer) if not objection(each)] if is_open and usual.fit.shortfalls else []
+    fitting = [option for option in fewer if not option.objection] if is_open and usual.fit.shortfalls else []
     taken = fitting[0] if fitting else usual
-    figures = described(board, taken.fit, places, rate_hz, limit_mb)
+    figures = described(board, taken.fit, demand)
     return taken, f"{taken.accuracy}; {figures}" if taken.accuracy else figures
 
 
@@ -123,31 +110,37 @@ def _label(technique: Technique) -> str:
     return techniques.labelled(spec.name, spec.form) + other
 
 
+def _camera(technique: Technique) -> str | None:
+    """Return the way a technique was told that the camera looks; None where it has no such setting."""
+    camera = technique.spec.parameters.get("camera")
+    return None if camera is None else str(camera)
+
+
 def _costs_on(technique: Technique, board: Board) -> TechniqueCosts:
     """Try a technique here, and convert its costs to `board`."""
-    work = counted.of(technique.spec.name, technique.spec.parameters) if technique.spec.in_full else None
+    work = counted_work(technique.spec.name, technique.spec.parameters) if technique.spec.in_full else None
     return on_board(probe(technique), load_board("this"), board, work)
 
 
 def trusted_candidates(technique: Technique) -> tuple[int, ...]:
     """Return the numbers of candidates, fewer than the technique's own, with which no wrong place was accepted on the
     image sets, largest first."""
-    label, camera = _label(technique), technique.spec.parameters.get("camera")
-    measured = accuracy.fewer_candidates(label, camera)
-    return tuple(count for count in measured if accuracy.of(label, camera, count).is_trusted)
+    label, camera = _label(technique), _camera(technique)
+    measured = ((count, accuracy.of(label, camera, count)) for count in accuracy.fewer_candidates(label, camera))
+    return tuple(count for count, figures in measured if figures and figures.is_trusted)
 
 
 def trusted_forms(technique: Technique) -> tuple[str, ...]:
     """Return the smaller forms of a technique that accepted no more wrong places on the image sets than its own form,
     in the order of their size; all of them where its own form was not measured."""
-    spec, camera = technique.spec, technique.spec.parameters.get("camera")
+    spec, camera = technique.spec, _camera(technique)
     own = accuracy.of(_label(technique), camera)
-    found = []
-    for form in spec.smaller_forms:
-        other = accuracy.of(techniques.labelled(spec.name, form), camera)
-        if own is None or (other and other.accepted_elsewhere <= own.accepted_elsewhere):
-            found.append(form)
-    return tuple(found)
+    smaller = {form: accuracy.of(techniques.labelled(spec.name, form), camera) for form in spec.smaller_forms}
+    return tuple(
+        form
+        for form, other in smaller.items()
+        if own is None or (other and other.accepted_elsewhere <= own.accepted_elsewhere)
+    )
 
 
 def camera_setting(name: str, camera: str | None) -> dict[str, str]:

@@ -12,6 +12,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from edgevpr.core.arrays import Image
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import ModelError
 from edgevpr.core.types import NO_COST, Frame, StageCost, Steps
@@ -77,15 +78,15 @@ class TechniqueCosts:
         once = self.scan_once + self.compare_once
         wall_s, cpu_s = wall_s - once.wall_s, cpu_s - once.cpu_s
         full, scan = self.match_per_place, self.scan_per_place
-        each = full + scan
-        in_full = max(0.0, min(wall_s / each.wall_s, cpu_s / each.cpu_s))
+        both = full + scan
+        in_full = max(0.0, min(wall_s / both.wall_s, cpu_s / both.cpu_s))
         if self.candidates is None or in_full < self.candidates:
             return in_full
         rest_wall_s, rest_cpu_s = wall_s - self.candidates * full.wall_s, cpu_s - self.candidates * full.cpu_s
         return min(rest_wall_s / scan.wall_s, rest_cpu_s / scan.cpu_s) if scan.wall_s else math.inf
 
 
-def noise(count: int) -> list[np.ndarray]:
+def noise(count: int) -> list[Image]:
     """Make `count` pictures, uint8 (480, 640), in which every region has structure, so that matching costs the most it
     can."""
     rng = Random(0)  # not NumPy's, which a flight needs for nothing else: it would keep 2.5 MB for it
@@ -94,7 +95,7 @@ def noise(count: int) -> list[np.ndarray]:
 
 def probe(
     technique: Technique,
-    images: Sequence[np.ndarray] | None = None,
+    images: Sequence[Image] | None = None,
     *,
     tried_s: float = 0.0,
     wall_clock: Callable[[], float] = time.perf_counter,
@@ -108,91 +109,109 @@ def probe(
     for about `tried_s` seconds a map, and the least time of the processor counts: what other programs take is no cost
     of the technique. Raises ModelError for a technique that fails on a picture.
     """
-    counted = _least if images is None else _median
-    pictures = noise(_PICTURES) if images is None else images
-    frames = [Frame(image=image, name=f"trial {i}", t_mono_s=0.1 * i) for i, image in enumerate(pictures)]
-    spec, length = technique.spec, length_of(technique.spec, None)
     meter = QueryMeter(load_board("this"), _ANY_PACK, 1.0, wall_clock=wall_clock, cpu_clock=cpu_clock)
-    spent: list[StageCost] = []
+    bench = _Bench(technique, noise(_PICTURES) if images is None else images, meter, tried_s)
+    typical = _least if images is None else _median
+    spec = technique.spec
+    fewer = max(spec.in_full or 1, technique.candidates // 2)
+    with TemporaryDirectory() as folder, PlaceMap.create(Path(folder) / "trial.gpkg", spec) as trial_map:
+        peak_is_new = machine.forget_peak()
+        encode_mb = bench.fill(trial_map)
+        index = load_index(trial_map, technique, _PLACES * bytes_per_place(spec))
+        small = bench.tries(trial_map, index, 1)
+        process_mb = machine.peak_mb() if peak_is_new else machine.rss_mb()
+        many = _many(technique, index)
+        large = bench.tries(trial_map, many, technique.candidates)
+        half = bench.tries(trial_map, many, fewer) if spec.in_full else large
+    whole = typical([steps.scan if spec.fine else steps.match for steps in large])
+    once = typical([steps.scan for steps in small]) if spec.fine else NO_COST
+    # What a scan of six places takes is not of these places: it is what is made of the query, and of calling at all.
+    scan = _beyond(whole, once) * (1 / len(many))
+    compare, part = (typical([steps.compare for steps in tries]) for tries in (large, half))
+    if spec.in_full:
+        one_more = _beyond(compare, part) * (1 / max(1, technique.candidates - fewer))
+        # Only a picture that is found is verified, and of pictures of noise that is the one in the map.
+        verify = max((steps.verify for steps in large), key=lambda cost: cost.wall_s)
+        compare_once = _beyond(compare, one_more * technique.candidates) + verify
+    else:
+        one_more, compare_once = compare * (1 / technique.candidates) if spec.fine else scan, NO_COST
+    fine_bytes = spec.fine.nbytes if spec.fine else 0
+    return TechniqueCosts(
+        encode=typical([steps.encode for steps in [*small, *large]]),
+        match_per_place=one_more,
+        compare_once=compare_once,
+        in_full=spec.in_full or 1,
+        ram_bytes_per_place=bytes_per_place(spec) + bytes_beside_place(bench.sequence),
+        disk_bytes_per_place=spec.coarse.nbytes + fine_bytes + (MOST_LANDMARK_BYTES if spec.cells else 0),
+        process_mb=process_mb + (0.0 if "pymavlink" in sys.modules else _LINK_MB),
+        candidates=technique.candidates if spec.fine else None,
+        scan_per_place=scan if spec.fine else NO_COST,
+        scan_once=once,
+        encode_mb=encode_mb if peak_is_new else None,
+        is_network=spec.model_sha256 is not None,
+        sequence=bench.sequence,
+        waited=bench.waited,
+    )
 
-    def walk(place_map: PlaceMap, index: PlaceIndex, candidates: int) -> Recogniser:
-        return Recogniser(
-            technique=technique,
-            place_map=place_map,
-            index=index,
-            rule=AcceptRule(min_score=technique.min_score, min_margin=technique.min_margin, neighbour_m=0.0),
-            meter=meter,
-            candidates=candidates,
-            search=search_of(length),
-        )
 
-    def tried(walk: Recogniser) -> list[Steps]:
+class _Bench:
+    """A technique at work on some pictures, again and again; `sequence` is the number of queries that it matches
+    together."""
+
+    def __init__(self, technique: Technique, pictures: Sequence[Image], meter: QueryMeter, tried_s: float) -> None:
+        self.sequence = length_of(technique.spec, None)
+        self._technique, self._meter, self._tried_s = technique, meter, tried_s
+        self._frames = [Frame(image=image, name=f"trial {i}", t_mono_s=0.1 * i) for i, image in enumerate(pictures)]
+        self._spent = NO_COST
+
+    @property
+    def waited(self) -> float:
+        """Share of the time of all tries in which other programs had the processor."""
+        return max(0.0, 1 - self._spent.cpu_s / self._spent.wall_s) if self._spent.wall_s else 0.0
+
+    def fill(self, trial_map: PlaceMap) -> float:
+        """Fill a map with the first picture, and return the MB by which the peak of the memory rose above what was
+        resident before it was encoded. The first picture also starts threads and causes late imports."""
+        before_mb = machine.rss_mb()
+        alone = self._walk(trial_map, empty_index(self._technique.spec, 0, None), 1)
+        first = _stepped(alone, self._frames[0])
+        rise_mb = machine.peak_mb() - before_mb
+        if first.descriptor is None:
+            raise ModelError(f"{self._technique.spec.name} describes no picture: try it with --images.")
+        for _ in range(_PLACES):
+            trial_map.add(self._frames[0], first.descriptor, landmarks=alone.landmarks(first))
+        return rise_mb
+
+    def tries(self, place_map: PlaceMap, index: PlaceIndex, candidates: int) -> list[Steps]:
         """Return what each picture takes at least, of several tries."""
+        walk = self._walk(place_map, index, candidates)
         times_s = (0.1 * number for number in itertools.count())
 
-        def asked() -> list[Steps]:
-            return [_stepped(walk, replace(frame, t_mono_s=next(times_s))).steps for frame in frames]
+        def ask() -> list[Steps]:
+            return [_stepped(walk, replace(frame, t_mono_s=next(times_s))).steps for frame in self._frames]
 
-        for _ in range(math.ceil((length - 1) / len(frames))):
-            asked()  # the frames of the first rounds fill the sequence
-        end_s, rounds = time.monotonic() + tried_s, [asked()]
+        for _ in range(math.ceil((self.sequence - 1) / len(self._frames))):
+            ask()  # the frames of the first rounds fill the sequence
+        end_s, rounds = time.monotonic() + self._tried_s, [ask()]
         while len(rounds) < _TRIES and time.monotonic() < end_s:
-            rounds.append(asked())
-        spent.extend(steps.encode + steps.match for each in rounds for steps in each)
+            rounds.append(ask())
+        self._spent = sum((steps.encode + steps.match for tries in rounds for steps in tries), self._spent)
         return [
             Steps(**{name: _least([getattr(steps, name) for steps in tries]) for name in _STEPS})
             for tries in zip(*rounds, strict=True)
         ]
 
-    with TemporaryDirectory() as folder, PlaceMap.create(Path(folder) / "trial.gpkg", spec) as trial_map:
-        peak_is_new = machine.forget_peak()
-        before_mb = machine.rss_mb()
-        # The first frame also starts threads and causes late imports.
-        alone = walk(trial_map, empty_index(spec, 0, None), 1)
-        first = _stepped(alone, frames[0])
-        encode_mb = machine.peak_mb() - before_mb if peak_is_new else None
-        landmarks = alone.landmarks(first)
-        for _ in range(_PLACES):
-            trial_map.add(frames[0], first.descriptor, landmarks=landmarks)
-        index = load_index(trial_map, technique, _PLACES * bytes_per_place(spec))
-        small = tried(walk(trial_map, index, 1))
-        process_mb = machine.peak_mb() if peak_is_new else machine.rss_mb()
-        many = _many(technique, index)
-        large = tried(walk(trial_map, many, technique.candidates))
-        fewer = max(spec.in_full or 1, technique.candidates // 2)
-        half = tried(walk(trial_map, many, fewer)) if spec.in_full else large
-    whole = counted([each.scan if spec.fine else each.match for each in large])
-    once = counted([each.scan for each in small]) if spec.fine else NO_COST
-    # What a scan of six places takes is not of these places: it is what is made of the query, and of calling at all.
-    scan = _beyond(whole, once) * (1 / len(many))
-    compare, part = (counted([each.compare for each in tries]) for tries in (large, half))
-    # Only a picture that is found is verified, and of pictures of noise that is the one in the map.
-    verify = max((each.verify for each in large), key=lambda cost: cost.wall_s)
-    if spec.in_full:
-        each_more = _beyond(compare, part) * (1 / max(1, technique.candidates - fewer))
-        compare_once = _beyond(compare, each_more * technique.candidates) + verify
-    else:
-        each_more = compare * (1 / technique.candidates) if spec.fine else scan
-        compare_once = NO_COST
-    passed = sum(spent, NO_COST)
-    return TechniqueCosts(
-        encode=counted([each.encode for each in [*small, *large]]),
-        match_per_place=each_more,
-        compare_once=compare_once,
-        in_full=spec.in_full or 1,
-        ram_bytes_per_place=bytes_per_place(spec) + bytes_beside_place(length),
-        disk_bytes_per_place=spec.coarse.nbytes
-        + (spec.fine.nbytes if spec.fine else 0)
-        + (MOST_LANDMARK_BYTES if spec.cells else 0),
-        process_mb=process_mb + (0.0 if "pymavlink" in sys.modules else _LINK_MB),
-        candidates=technique.candidates if spec.fine else None,
-        scan_per_place=scan if spec.fine else NO_COST,
-        scan_once=once,
-        encode_mb=encode_mb,
-        is_network=spec.model_sha256 is not None,
-        sequence=length,
-        waited=max(0.0, 1 - passed.cpu_s / passed.wall_s) if passed.wall_s else 0.0,
-    )
+    def _walk(self, place_map: PlaceMap, index: PlaceIndex, candidates: int) -> Recogniser:
+        technique = self._technique
+        return Recogniser(
+            technique=technique,
+            place_map=place_map,
+            index=index,
+            rule=AcceptRule(min_score=technique.min_score, min_margin=technique.min_margin, neighbour_m=0.0),
+            meter=self._meter,
+            candidates=candidates,
+            search=search_of(self.sequence),
+        )
 
 
 def _stepped(walk: Recogniser, frame: Frame) -> Recognition:

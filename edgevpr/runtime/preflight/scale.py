@@ -1,18 +1,27 @@
-"""Costs measured on one machine, converted to another: times by the ratio of two scores, or by the instructions that
-were counted; memory unchanged."""
+"""Costs measured on one machine, converted to another; memory stays unchanged.
 
+Times are converted by the ratio of two scores. A board whose profile says how many instructions a second one of its
+cores runs (`arm64_mips`) is estimated by the instructions that `make bench-arm64` counted: they are of its own
+instruction set, and no busy moment of this machine is in them.
+"""
+
+import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
 
 from edgevpr.core.types import StageCost
 from edgevpr.power.boards import Board, MachineSpeed
 from edgevpr.power.speed import REFERENCE_PASSES_HZ, REFERENCE_PRODUCTS_HZ
-from edgevpr.runtime.preflight import counted
-from edgevpr.runtime.preflight.counted import Work
 from edgevpr.runtime.preflight.probe import TechniqueCosts
 
 # Share of a single thread's score, for boards whose products have not been measured: that of the Raspberry Pi 4, the
 # lowest that is known (Pi 5: 0.21), so that the estimate does not promise too much.
 UNKNOWN_PRODUCTS = 0.15
+COUNTED_PATH = Path(__file__).with_name("counted.json")
+_COUNTED_SETTINGS = {"w1": 512, "w2": 16, "bins": 8, "entropy": "shannon", "matching": "displacement"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,6 +31,24 @@ class Ratios:
 
     products: float
     passes: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CountedWork:
+    """Instructions of `cohog` on an ARM core, by the fields of `TechniqueCosts` of the same names."""
+
+    encode: float
+    match_per_place: float
+    compare_once: float
+    scan_per_place: float
+    scan_once: float
+
+
+def counted_work(name: str, parameters: Mapping[str, Any]) -> CountedWork | None:
+    """Return the counted work of a technique with these parameters; None where it was not counted."""
+    if name != "cohog" or any(parameters.get(key, value) != value for key, value in _COUNTED_SETTINGS.items()):
+        return None
+    return CountedWork(**_counted()[parameters.get("camera", "forward")])
 
 
 def is_same(here: Board, board: Board) -> bool:
@@ -39,53 +66,54 @@ def ratios(here: Board, board: Board) -> Ratios | None:
     if is_same(here, board):
         return Ratios(1.0, 1.0)
     mine, other = here.benchmark_score, board.benchmark_score
-    pairs = [
-        (_products(other), _products(mine)),
-        (_passes(other), _passes(mine)),
-    ]
-    if not all(there and here_too for there, here_too in pairs):
+    products, passes = (_products(other), _products(mine)), (_passes(other), _passes(mine))
+    if not (products[0] and products[1] and passes[0] and passes[1]):
         return None
-    return Ratios(*(there / here_too for there, here_too in pairs))
+    return Ratios(products[0] / products[1], passes[0] / passes[1])
 
 
-def _products(score: MachineSpeed) -> float | None:
-    if score.products is None and score.arm64_mips:
-        return counted.rounds_hz("products", score.arm64_mips) / REFERENCE_PRODUCTS_HZ
-    return score.products or (score.single and UNKNOWN_PRODUCTS * score.single)
-
-
-def _passes(score: MachineSpeed) -> float | None:
-    if score.passes is None and score.arm64_mips:
-        return counted.rounds_hz("passes", score.arm64_mips) / REFERENCE_PASSES_HZ
-    return score.passes or score.single
-
-
-def on_board(costs: TechniqueCosts, here: Board, board: Board, work: Work | None = None) -> TechniqueCosts:
+def on_board(costs: TechniqueCosts, here: Board, board: Board, work: CountedWork | None = None) -> TechniqueCosts:
     """Convert costs measured `here` to `board`: by the counted `work` of the technique, where it is known and the board
     says how many instructions a second it runs, else by the ratios. The times stay as they are where no ratio is
     known."""
     if is_same(here, board):
         return costs
     if work and (mips := board.benchmark_score.arm64_mips):
-        times_s = {stage: instructions / (1e6 * mips) for stage, instructions in asdict(work).items()}
-        return replace(costs, **{stage: StageCost(time_s, time_s) for stage, time_s in times_s.items()})
-    found = ratios(here, board)
-    if found is None:
+        times = {stage: StageCost(*2 * (count / (1e6 * mips),)) for stage, count in asdict(work).items()}
+        return replace(costs, **times)  # type: ignore[arg-type]  # a field of TechniqueCosts for each of CountedWork
+    ratio = ratios(here, board)
+    if ratio is None:
         return costs
     # A network's layers are products, and so is the comparison of all regions with all regions. Work on pictures and on
     # rows of the index is passes.
+    encoding = (ratio.products, board, board.threads) if costs.is_network else (ratio.passes, board)
     return replace(
         costs,
-        encode=_scaled(costs.encode, found.products, board, board.threads)
-        if costs.is_network
-        else _scaled(costs.encode, found.passes, board),
+        encode=_scaled(costs.encode, *encoding),
         match_per_place=_scaled(
-            costs.match_per_place, found.passes if costs.candidates is None else found.products, board
+            costs.match_per_place, ratio.passes if costs.candidates is None else ratio.products, board
         ),
-        compare_once=_scaled(costs.compare_once, found.products, board),
-        scan_per_place=_scaled(costs.scan_per_place, found.passes, board),
-        scan_once=_scaled(costs.scan_once, found.passes, board),
+        compare_once=_scaled(costs.compare_once, ratio.products, board),
+        scan_per_place=_scaled(costs.scan_per_place, ratio.passes, board),
+        scan_once=_scaled(costs.scan_once, ratio.passes, board),
     )
+
+
+def _products(score: MachineSpeed) -> float | None:
+    if score.products is None and score.arm64_mips:
+        return _rounds_hz("products", score.arm64_mips) / REFERENCE_PRODUCTS_HZ
+    return score.products or (score.single and UNKNOWN_PRODUCTS * score.single)
+
+
+def _passes(score: MachineSpeed) -> float | None:
+    if score.passes is None and score.arm64_mips:
+        return _rounds_hz("passes", score.arm64_mips) / REFERENCE_PASSES_HZ
+    return score.passes or score.single
+
+
+def _rounds_hz(kind: str, mips: float) -> float:
+    """Return how often a second a core of `mips` million instructions a second does a round of the micro-benchmark."""
+    return 1e6 * mips / float(_counted()[kind])
 
 
 def _scaled(cost: StageCost, ratio: float, board: Board, threads: int | None = None) -> StageCost:
@@ -104,3 +132,10 @@ def _kept(score: MachineSpeed, busy_cores: float) -> float:
     if score.single is None or score.multi is None:
         return 1.0
     return min(1.0, score.multi / (busy_cores * score.single))
+
+
+@lru_cache(maxsize=1)
+def _counted() -> dict[str, Any]:
+    """Return the instructions that were counted: of cohog by camera, and of a round of each micro-benchmark."""
+    content: dict[str, Any] = json.loads(COUNTED_PATH.read_text("utf-8"))
+    return content

@@ -1,4 +1,5 @@
-"""Figures that `edgevpr profile --measure` has found on this machine, kept in a file with a description of the machine.
+"""Figures that `edgevpr profile --measure` has found on this machine, kept in a file with a description of the machine,
+and the profile that it writes.
 
 Figures of another machine, or of other versions of the measured software, are never used: the user is told, and the
 techniques are tried anew.
@@ -6,11 +7,11 @@ techniques are tried anew.
 
 import contextlib
 import json
-import math
 import os
 import platform
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, astuple, dataclass, replace
+import sys
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass, replace
 from datetime import datetime, timezone
 from importlib import metadata
 from itertools import groupby
@@ -23,14 +24,14 @@ from edgevpr.core.errors import ConfigError, EdgevprError, UsageError
 from edgevpr.core.files import own_folder, read_file, require_folder, write_whole
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.power import machine
-from edgevpr.power.boards import Board, MachineSpeed
-from edgevpr.runtime.preflight.offers import Offer
+from edgevpr.power.boards import Board, MachineSpeed, own_profile, profile_text
+from edgevpr.power.speed import micro_benchmark
 from edgevpr.runtime.preflight.scale import is_same
-from edgevpr.runtime.preflight.trial import Trial, model_of, trial_of, try_each
+from edgevpr.runtime.preflight.trial import Offer, Trial, model_of, trial_of, try_each
 
+MEASURED_PICTURES = 8
 _FORMAT = 3  # 1 had no cost of a scan that is paid once, 2 times that passed
 _MAX_FILE_BYTES = 10_000_000
-_PICTURES = 8
 _SAME_RAM = 0.02  # kernels keep some RAM for themselves, every version another amount
 _PACKAGES = {
     "edgevpr": ("edgevpr",),
@@ -64,12 +65,6 @@ class StoredFigures:
         return None
 
 
-def _same_settings(trial: Trial, offer: Offer) -> bool:
-    """Tell whether an offer asks for the settings that were tried: a setting that is named may be the default."""
-    had = {**techniques.parameters(offer.name), **trial.parameters}
-    return {**had, **offer.settings} == {**had, **trial.settings}
-
-
 def default_path() -> Path:
     """Return the file in which figures are kept unless the user says otherwise."""
     return own_folder() / "measured.json"
@@ -88,33 +83,19 @@ def identity(root: Path = Path("/")) -> dict[str, Any]:
 
 
 def pictures_of(folder: str | None) -> tuple[list[Path], str]:
-    """Choose up to eight images of a folder, spread over it, and a text that names them; without a folder, none, for
-    generated ones.
+    """Choose up to eight images of a folder, spread over it; without a folder, none, for generated ones.
 
-    Raises SourceError for a folder without images, ImageError for one that cannot be used.
+    Returns their paths, and a text that names them. Raises SourceError for a folder without images, ImageError for one
+    that cannot be used.
     """
     if folder is None:
-        return [], f"{_PICTURES} generated pictures"
+        return [], f"{MEASURED_PICTURES} generated pictures"
     images = list_images(folder)
-    chosen = [images[i * len(images) // _PICTURES] for i in range(_PICTURES)] if len(images) > _PICTURES else images
+    count = min(len(images), MEASURED_PICTURES)
+    chosen = [images[i * len(images) // count] for i in range(count)]
     for path in chosen:
         read_image(path)
     return chosen, f"{len(chosen)} pictures of {folder}"
-
-
-def measure_each(wanted: Iterable[Offer], threads: int, images: Sequence[Path]) -> Iterator[Trial]:
-    """Try each offer thoroughly: on the pictures `images`, or on eight generated ones."""
-    return try_each(wanted, threads, images, rounds=_PICTURES)
-
-
-def micro_benchmark() -> MachineSpeed:
-    """Measure how fast this machine is. Takes about two seconds."""
-    from edgevpr.power import speed
-
-    found = speed.score()
-    figures = {name: float(f"{value:.3g}") for name, value in asdict(found).items()}
-    source = "edgevpr's micro-benchmark, run on it; single and multi are means of both kinds"
-    return MachineSpeed(**figures, verified=True, source=source)
 
 
 def gathered(trials: Iterable[Trial], pictures: str, threads: int, score: MachineSpeed) -> StoredFigures:
@@ -132,19 +113,19 @@ def require_room(path: Path, make: bool) -> None:
         raise UsageError(f"{path}: the name of a file of figures ends in .json: choose such a name.")
     folder = path.resolve().parent
     if make:
-        if not folder.is_absolute() or str(path).startswith("~"):
+        if str(path).startswith("~"):
             raise UsageError(
                 f"{path}: there is no home to keep figures in: set XDG_DATA_HOME, or give --out FILE.json."
             )
         folder.mkdir(parents=True, exist_ok=True)
     require_folder(path)
-    if path.is_dir() or not os.access(folder, os.W_OK) or (path.exists() and not os.access(path, os.W_OK)):
+    if path.is_dir() or not os.access(path if path.exists() else folder, os.W_OK):
         raise EdgevprError(f"{path} cannot be written: give another --out, or correct the permissions.")
 
 
-def save(found: StoredFigures, path: Path) -> None:
+def save(figures: StoredFigures, path: Path) -> None:
     """Write the figures, completely or not at all."""
-    text = json.dumps({"format": _FORMAT, **asdict(found)}, indent=1)
+    text = json.dumps({"format": _FORMAT, **asdict(figures)}, indent=1)
     write_whole(path, lambda unfinished: unfinished.write_text(text + "\n", "utf-8"))
 
 
@@ -158,47 +139,17 @@ def load(path: Path) -> tuple[StoredFigures | None, str | None]:
         fields = json.loads(read_file(path, _MAX_FILE_BYTES))
         if fields.pop("format") != _FORMAT:
             return None, f"{path} is of another version of edgevpr: {again}"
-        trials = tuple(trial_of(each) for each in fields["trials"])
-        found = StoredFigures(**{**fields, "score": MachineSpeed(**fields["score"]), "trials": trials})
-        _require_figures(found)
-        different = _differences(found.identity, identity())
+        score = build(MachineSpeed, fields["score"], "score")
+        trials = tuple(trial_of(trial) for trial in fields["trials"])
+        figures = StoredFigures(**{**fields, "score": score, "trials": trials})
+        different = _differences(figures.identity, identity())
     except FileNotFoundError:
         return None, None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, ConfigError):
         return None, f"{path} holds no figures that can be read: {again}"
     if different:
         return None, f"The figures in {path} are of another machine or installation ({different}): {again}"
-    return found, None
-
-
-def _require_figures(found: StoredFigures) -> None:
-    """Raise ConfigError, TypeError or ValueError for a file that has the form of figures but no valid numbers."""
-    build(MachineSpeed, asdict(found.score), "score")
-    for trial in found.trials:
-        if not (isinstance(trial.settings, dict) and isinstance(trial.parameters, dict)):
-            raise TypeError(f"the settings of {trial.label} are none")
-        if costs := trial.costs:
-            stages = [*astuple(costs.encode), *astuple(costs.match_per_place)]
-            sizes = [costs.ram_bytes_per_place, costs.disk_bytes_per_place, costs.process_mb]
-            above_0 = [*stages, *sizes, costs.sequence, costs.in_full]
-            parts = [costs.scan_per_place, costs.scan_once, costs.compare_once]
-            rest = [costs.encode_mb or 0.0, costs.candidates or 0, costs.waited]
-            others = [*(value for part in parts for value in astuple(part)), *rest]
-            if not (all(0 < each < math.inf for each in above_0) and all(0 <= each < math.inf for each in others)):
-                raise ValueError(f"the costs of {trial.label} are no figures")
-
-
-def _differences(there: dict[str, Any], here: dict[str, Any]) -> str:
-    found = []
-    for key, value in here.items():
-        said = there.get(key)
-        if key == "RAM in MB":
-            if isinstance(said, int) and abs(said - value) <= _SAME_RAM * value:
-                continue
-        elif said == value:
-            continue
-        found.append(f"{key}: {said} there, {value} here")
-    return ", ".join(found)
+    return figures, None
 
 
 def known_and_tried(
@@ -226,6 +177,64 @@ def scaled_from(here: Board, board: Board, stored: StoredFigures | None) -> Boar
     if is_same(here, board) or published:
         return here
     return replace(here, benchmark_score=stored.score if stored else micro_benchmark())
+
+
+def require_new_profile(path: Path) -> None:
+    """Raise UsageError where `write_profile` could not write."""
+    if path.suffix not in (".yaml", ".yml"):
+        raise UsageError(f"{path}: a profile's name ends in .yaml: choose such a name.")
+    require_folder(path)
+    if path.exists():
+        raise UsageError(f"{path} is there already: move it away, or choose another name.")
+
+
+def write_profile(path: Path, board: Board) -> None:
+    """Write a profile that does not exist yet, completely or not at all. Raises EdgevprError where the file has
+    appeared meanwhile."""
+    try:
+        write_whole(path, lambda unfinished: unfinished.write_text(profile_text(board), "utf-8"), instead=False)
+    except FileExistsError:
+        raise EdgevprError(f"{path} is there already: move it away, or choose another name.") from None
+
+
+def measured_profile(figures: Path, score: MachineSpeed) -> tuple[Path | None, str]:
+    """Measure idle and load power (minutes), where this machine has a power meter, and write a profile beside the file
+    `figures`. Returns the path of the profile (None: no meter can be read) and a sentence. Raises MeterError."""
+    from edgevpr.power.calibrate import LOADS, calibrate
+    from edgevpr.power.sensors import NO_METER, find_meters
+
+    meter = next(iter(find_meters()), None)
+    if meter is None:
+        return None, NO_METER
+    title = meter.title
+    held = iter(range(1, len(LOADS) + 1))
+
+    def progress(share: float) -> None:
+        print(f"measuring power with the {title}  {next(held)}/{len(LOADS)}  load {share:.0%}", file=sys.stderr)
+
+    fit = calibrate(meter, progress=progress)
+    path = figures.with_name(f"{figures.stem}-{datetime.now():%Y%m%d-%H%M%S}.yaml")
+    write_profile(path, fit.applied_to(own_profile(score), meter))
+    return path, (
+        f"Power: {fit.idle_w:.3g} W idle, {fit.full_w:.3g} W with every core busy, by the {title} "
+        f"(residual {fit.residual_w:.2g} W, R2 {fit.r2:.3f}); written to {path}: use it with --board {path}."
+    )
+
+
+def _same_settings(trial: Trial, offer: Offer) -> bool:
+    """Tell whether an offer asks for the settings that were tried: a setting that is named may be the default."""
+    had = {**techniques.parameters(offer.name), **trial.parameters}
+    return {**had, **offer.settings} == {**had, **trial.settings}
+
+
+def _differences(there: dict[str, Any], here: dict[str, Any]) -> str:
+    ram_mb = there.get("RAM in MB")
+    same_ram = isinstance(ram_mb, int) and abs(ram_mb - here["RAM in MB"]) <= _SAME_RAM * here["RAM in MB"]
+    return ", ".join(
+        f"{key}: {there.get(key)} there, {value} here"
+        for key, value in here.items()
+        if there.get(key) != value and not (key == "RAM in MB" and same_ram)
+    )
 
 
 def _version(packages: tuple[str, ...]) -> str | None:

@@ -5,23 +5,34 @@ library that crashes on this processor loses only its own row.
 """
 
 import signal
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from edgevpr import techniques
 from edgevpr.core.child import Ended, ask_child, last_line, serve_parent
-from edgevpr.core.errors import EdgevprError
+from edgevpr.core.config import FORMS
+from edgevpr.core.contract import Technique
+from edgevpr.core.errors import EdgevprError, ModelError
 from edgevpr.core.types import StageCost
 from edgevpr.frames.images import read_image
-from edgevpr.runtime.preflight.offers import Offer
+from edgevpr.power.boards import Board
 from edgevpr.runtime.preflight.probe import TechniqueCosts, noise, probe
-from edgevpr.runtime.recognise.opening import made_with
+from edgevpr.runtime.recognise.opening import made_for, made_with
 from edgevpr.techniques.card import load_card, weights_of
 
 _TRIED_S = 1.0  # pictures are tried again for so long: a flight that begins has no such time
 _LIMIT_S = 900.0  # ten times what the slowest technique takes on the slowest board
+
+
+@dataclass(frozen=True, slots=True)
+class Offer:
+    """A technique with its settings, one of which may be its form; `label` tells it from other offers."""
+
+    label: str
+    name: str
+    settings: dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,6 +50,39 @@ class Trial:
     parameters: dict[str, Any] = field(default_factory=dict)
 
 
+def offers(
+    names: Iterable[str], forms: Iterable[str] = FORMS, settings: Mapping[str, Mapping[str, Any]] | None = None
+) -> tuple[Offer, ...]:
+    """List each technique in each of `forms`, or once where it has none; `settings` are by technique name.
+
+    Raises UsageError for an unknown name, and ModelError for a card that is incomplete.
+    """
+    listed = []
+    for name in names:
+        own = dict((settings or {}).get(name, {}))
+        if "form" in own or "form" not in techniques.parameters(name):
+            listed.append(Offer(techniques.labelled(name, own.get("form")), name, own))
+        else:
+            listed += [Offer(techniques.labelled(name, form), name, {**own, "form": form}) for form in forms]
+    return tuple(listed)
+
+
+def usable(wanted: Iterable[Offer], board: Board | None = None) -> Iterator[tuple[Offer, Technique | ModelError]]:
+    """Make each technique for `board`, or give the error that says why it cannot be used.
+
+    An error is given once for all forms of a technique, under its name.
+    """
+    refused = set()
+    for offer in wanted:
+        if offer.name in refused:
+            continue
+        try:
+            yield offer, made_for(board, offer.name, offer.settings)
+        except ModelError as error:
+            refused.add(offer.name)
+            yield Offer(offer.name, offer.name, offer.settings), error
+
+
 def try_each(wanted: Iterable[Offer], threads: int, images: Sequence[Path] = (), rounds: int = 0) -> Iterator[Trial]:
     """Try each offer in a process of its own; a technique that cannot be used is one row, under its name.
 
@@ -49,8 +93,11 @@ def try_each(wanted: Iterable[Offer], threads: int, images: Sequence[Path] = (),
     for offer in wanted:
         if offer.name in refused:
             continue
-        problem = _missing(offer)
-        trial = _refused(offer, problem) if problem else _in_a_process(offer, threads, images, rounds)
+        try:
+            model_of(offer.name, offer.settings)  # where its card shows already that it cannot, no process is needed
+            trial = _in_a_process(offer, threads, images, rounds)
+        except EdgevprError as error:
+            trial = _refused(offer, str(error))
         if trial.problem:
             refused.add(offer.name)
         yield trial
@@ -64,52 +111,37 @@ def model_of(name: str, settings: dict[str, Any]) -> str | None:
     return load_card(settings.get("model") or parameters.get("model", name)).fingerprint
 
 
-def _missing(offer: Offer) -> str | None:
-    """Return why a technique cannot be used, if its card shows that already (no process is needed then), else None."""
-    try:
-        model_of(offer.name, offer.settings)
-    except EdgevprError as error:
-        return str(error)
-    return None
+def trial_of(fields: dict[str, Any]) -> Trial:
+    """Make a Trial from the output of `asdict`. Raises TypeError, KeyError or ValueError for anything else."""
+    costs = fields["costs"]
+    if costs is not None:
+        stages = ("encode", "match_per_place", "scan_per_place", "scan_once", "compare_once")
+        costs = TechniqueCosts(**{**costs, **{stage: StageCost(**costs[stage]) for stage in stages}})
+    return Trial(**{**fields, "costs": costs})
+
+
+def _in_a_process(offer: Offer, threads: int, images: Sequence[Path], rounds: int) -> Trial:
+    job = {**asdict(offer), "threads": threads, "images": [str(path) for path in images], "rounds": rounds}
+    ended = ask_child("edgevpr.runtime.preflight.trial", job, _LIMIT_S)
+    return trial_of(ended.answer) if ended.code == 0 else _refused(offer, _why_it_ended(offer.label, ended))
 
 
 def _refused(offer: Offer, problem: str) -> Trial:
     return Trial(label=offer.name, name=offer.name, settings=offer.settings, problem=problem)
 
 
-def _in_a_process(offer: Offer, threads: int, images: Sequence[Path], rounds: int) -> Trial:
-    job = {**asdict(offer), "threads": threads, "images": [str(path) for path in images], "rounds": rounds}
-    ended = ask_child("edgevpr.runtime.preflight.trial", job, _LIMIT_S)
-    if ended.code != 0:
-        return _refused(offer, _end(offer.label, ended))
-    return trial_of(ended.answer)
-
-
-def _end(label: str, ended: Ended) -> str:
+def _why_it_ended(label: str, ended: Ended) -> str:
     if ended.code is None:
         return f"Trying {label} took longer than {_LIMIT_S / 60:.0f} minutes: it is too slow for this machine."
-    if ended.code < 0:
-        how = f"ended by {signal.Signals(-ended.code).name}"
-        hint = (
-            "memory ran out"
-            if ended.code == -signal.SIGKILL
-            else "a library does not suit this processor: install another"
-        )
-        return f"Trying {label} was {how}: {hint}."
-    return f"Trying {label} failed ({last_line(ended)}): install edgevpr and its packages again."
+    if ended.code >= 0:
+        return f"Trying {label} failed ({last_line(ended)}): install edgevpr and its packages again."
+    hint = "a library does not suit this processor: install another"
+    if ended.code == -signal.SIGKILL:
+        hint = "memory ran out"
+    return f"Trying {label} was ended by {signal.Signals(-ended.code).name}: {hint}."
 
 
-def trial_of(fields: dict[str, Any]) -> Trial:
-    """Make a Trial from the output of `asdict`. Raises TypeError, KeyError or ValueError for anything else."""
-    costs = fields["costs"]
-    if costs is not None:
-        names = ("encode", "match_per_place", "scan_per_place", "scan_once", "compare_once")
-        stages = {key: StageCost(**costs[key]) for key in names}
-        costs = TechniqueCosts(**{**costs, **stages})
-    return Trial(**{**fields, "costs": costs})
-
-
-def _tried(job: dict[str, Any]) -> Trial:
+def _try_here(job: dict[str, Any]) -> Trial:
     offer = Offer(job["label"], job["name"], job["settings"])
     try:
         pictures = [read_image(path) for path in job["images"]] or (noise(job["rounds"]) if job["rounds"] else None)
@@ -119,17 +151,8 @@ def _tried(job: dict[str, Any]) -> Trial:
     except EdgevprError as error:
         return _refused(offer, str(error))
     spec = technique.spec
-    return Trial(
-        label=offer.label,
-        name=offer.name,
-        settings=offer.settings,
-        costs=costs,
-        problem=None,
-        model=model,
-        weights=weights_of(spec),
-        parameters=spec.parameters,
-    )
+    return Trial(**asdict(offer), costs=costs, model=model, weights=weights_of(spec), parameters=spec.parameters)
 
 
 if __name__ == "__main__":
-    serve_parent(lambda job: asdict(_tried(job)))
+    serve_parent(lambda job: asdict(_try_here(job)))

@@ -17,7 +17,7 @@ from edgevpr.power import machine
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.preflight import accuracy, pick
 from edgevpr.runtime.preflight import choose as choosing
-from edgevpr.runtime.preflight.choose import Demand, best, fit, front, options, preferred, require_best
+from edgevpr.runtime.preflight.choose import Demand, best, front, options, preferred, require_best
 from edgevpr.runtime.preflight.probe import TechniqueCosts, noise, probe
 from edgevpr.runtime.preflight.scale import on_board
 
@@ -47,6 +47,10 @@ def accuracies(monkeypatch):
 def wanted(board, costs, places, rate_hz=1.0):
     demand = Demand(places=places, rate_hz=rate_hz, budget_mb=100)
     return [each for name, cost in costs.items() for each in options(board, name, name, cost, demand)]
+
+
+def fit(board, costs, places, rate_hz=1.0, budget_mb=100):
+    return choosing.fit(board, costs, Demand(places=places, rate_hz=rate_hz, budget_mb=budget_mb))
 
 
 def chosen(board, costs, places, rate_hz=1.0, min_recall=None):
@@ -213,14 +217,14 @@ def test_what_has_accepted_wrong_places_is_never_chosen_by_itself(accuracies):
     assert chosen(board(), COSTS, 100) == "vector"
     assert chosen(board(technique="regions"), COSTS, 100) == "vector"
     accuracies["vector"] = found(0.5, wrong=2)
-    with pytest.raises(UsageError, match="regions accepted 1 wrong places in 120 queries: name it to use it; vector a"):
+    with pytest.raises(UsageError, match=r"regions accepted 1 .*; vector accepted 2 "):
         require_best(wanted(board(), COSTS, 100), board(), Demand(places=100, rate_hz=1, budget_mb=100))
 
 
 def test_a_wrong_place_beside_the_right_one_is_no_objection(accuracies):
     accuracies["regions"] = {**found(0.9), "accepted_wrong": 1}
     assert chosen(board(), COSTS, 100) == "regions"
-    assert "30 of 120 accepted, 0 wrong (1 as a neighbour)" in str(accuracy.of("regions", None))
+    assert str(accuracy.of("regions", None)).endswith("0 wrong (1 as a neighbour)")
 
 
 def test_what_was_never_measured_is_chosen_only_where_the_board_names_it(accuracies):
@@ -251,7 +255,7 @@ def test_a_big_board_takes_a_technique_for_a_map_that_a_tiny_one_refuses(accurac
     )
     demand = Demand(places=1000, rate_hz=1, budget_mb=2000)
     assert best(list(options(big, "vector", "vector", on_board(fast, here, big), demand)), big)
-    with pytest.raises(UsageError, match=r"No technique fits Raspberry Pi Zero 2 W with 1000 places at 1 Hz"):
+    with pytest.raises(UsageError, match="Zero 2 W"):
         require_best(list(options(tiny, "vector", "vector", on_board(fast, here, tiny), demand)), tiny, demand)
 
 
@@ -280,8 +284,8 @@ def test_the_whole_map_counts_in_ram_and_only_its_candidates_in_time():
     assert not found.shortfalls
     assert found.map_ram_mb == pytest.approx(50.0)
     assert found.reachable_hz == pytest.approx(1 / (0.1 + 20 * 0.004))
-    assert fit(board(), two_stages, 150_000, 1, 100).remedies[0] == "with up to 100000 places"
-    assert fit(board(), two_stages, 50_000, 8, 100).remedies[0] == "with up to 6 places"
+    assert fit(board(), two_stages, 150_000, 1, 100).remedies[0].split()[-2] == "100000"
+    assert fit(board(), two_stages, 50_000, 8, 100).remedies[0].split()[-2] == "6"
 
 
 def test_where_none_fits_the_sentence_says_what_would(accuracies):
@@ -306,14 +310,14 @@ def test_what_is_said_to_fit_fits():
 
 def test_a_small_budget_is_the_only_thing_in_the_way():
     found = fit(board(), VECTOR, places=500, rate_hz=1, budget_mb=100)
-    assert found.shortfalls == ("its map takes 143.0 MB of RAM and 100.0 are allowed",)
-    assert found.remedies == ("with up to 349 places", "with a budget of 143 MB")
+    assert len(found.shortfalls) == 1
+    assert [remedy.split()[-2] for remedy in found.remedies] == ["349", "143"]
     assert not fit(board(), VECTOR, places=500, rate_hz=1, budget_mb=143).shortfalls
 
 
 def test_a_board_too_small_for_the_process_itself_has_no_remedy(accuracies):
     small = board(memory_max_mb=64.0)
-    with pytest.raises(UsageError, match=r"the process takes 90 MB and 64 are allowed\): use a larger board\.$"):
+    with pytest.raises(UsageError, match=r"90 MB and 64 .* larger board\.$"):
         require_best(wanted(small, {"regions": REGIONS}, 10), small, Demand(places=10, rate_hz=1, budget_mb=100))
 
 
@@ -336,9 +340,7 @@ def test_the_boards_own_technique_is_tried_before_those_offered_to_all():
 
 
 def test_a_technique_of_the_board_that_is_not_there_is_one_sentence():
-    with pytest.raises(
-        ConfigError, match=r"^The profile of Test board names the technique `cohgo`, which is not there: "
-    ):
+    with pytest.raises(ConfigError, match="`cohgo`"):
         preferred(board(technique="cohgo"))
 
 
@@ -364,14 +366,14 @@ def test_a_network_that_the_board_wants_and_that_is_not_there_is_passed_over(mon
     own = board(technique="netvlad", budget_mb=20.0, memory_max_mb=4000.0)
     monkeypatch.setattr(pick, "load_board", lambda name: own)
     assert pick.picked_technique("this", 10) == "cohog"
-    assert any("netvlad is passed over" in message for message in caplog.messages)
+    assert any("netvlad" in message for message in caplog.messages)
 
 
 def test_where_no_fix_could_be_sent_in_time_it_does_not_fit_at_any_rate():
     found = fit(board(), REGIONS, places=1300, rate_hz=0.1, budget_mb=100)
     assert found.t_query_s == pytest.approx(5.3)
-    assert found.shortfalls == ("a query takes 5.3 s, and no fix of a frame older than 5 s is ever sent",)
-    assert found.remedies == ("with up to 1225 places",)
+    assert found.shortfalls == (choosing.too_late(5.3),)
+    assert [remedy.split()[-2] for remedy in found.remedies] == ["1225"]
     assert not fit(board(), REGIONS, places=1225, rate_hz=0.1, budget_mb=100).shortfalls
 
 
@@ -390,7 +392,7 @@ def test_where_nothing_fits_the_best_is_picked_all_the_same_and_the_log_says_wha
         assert pick.camera_setting("hog", camera) == {}
     said = [record.message for record in caplog.records if "all the same" in record.message]
     assert len(said) == 3
-    assert "a query takes 30.0 s" in said[0]
+    assert choosing.too_late(30.0) in said[0]
 
 
 def test_the_figures_that_travel_are_those_of_the_results():

@@ -43,9 +43,9 @@ def test_the_list_goes_on_after_a_card_or_file_that_is_wrong(models):
     write_card(models / "gone.yaml", {"sha256": "0" * 64, "file": "gone.onnx"})
     write_card(models / "broken.yaml", {"sha256": "0" * 64, "titel": "x"})
     assert listed("good").ok
-    for name, says in (("other", "is not the file of its card"), ("gone", "cannot be read"), ("broken", "`titel`")):
+    for name, named in (("other", "SHA-256"), ("gone", "gone.onnx"), ("broken", "`titel`")):
         assert not listed(name).ok
-        assert says in listed(name).problem
+        assert named in listed(name).problem
 
 
 def test_the_list_is_printed_and_is_json(models, capsys):
@@ -56,7 +56,7 @@ def test_the_list_is_printed_and_is_json(models, capsys):
     assert main(["models", "list"]) == 0
     out = capsys.readouterr().out
     assert "MIT; made by a test" in out
-    assert "used by none, unless told: --param model=mine" in out
+    assert "--param model=mine" in out
 
 
 def test_verifying_says_shapes_time_and_memory(models):
@@ -70,13 +70,14 @@ def test_verifying_says_shapes_time_and_memory(models):
     assert verify_here(load_card("backbone")).vector_length is None
 
 
+@pytest.mark.process
 def test_verifying_is_done_apart_so_that_memory_is_that_of_the_network(models):
     write_network(models, "mine")
     found = verify(load_card("mine"))
     assert found.runtime_mb > 3  # onnxruntime is imported anew
     assert found.network_mb > 0
     write_network(models, "mine", fault="nan")
-    with pytest.raises(ModelError, match="not finite"):
+    with pytest.raises(ModelError, match="finite"):
         verify(load_card("mine"))
 
 
@@ -88,12 +89,12 @@ def test_the_command_verifies_all_and_says_which_cannot_be_used(models, capsys, 
     write_network(models, "wrong", fault="zeros")
     assert main(["models", "verify"]) == 1
     said = capsys.readouterr()
-    assert "works: descriptor 16, features 4x10x14; a descriptor of 16 numbers" in said.out
-    assert "edgevpr: wrong cannot be used:" in said.err
+    assert "descriptor 16, features 4x10x14; " in said.out
+    assert said.err.startswith("edgevpr: wrong ")
     assert main(["models", "verify", "mine", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["works"][0]["vector_length"] == 16
     assert main(["models", "verify", "none"]) == 1
-    assert "There is no model `none`" in capsys.readouterr().err
+    assert "`none`" in capsys.readouterr().err
 
 
 @pytest.fixture
@@ -135,14 +136,14 @@ def test_a_card_without_a_hash_gets_it(models, download, missing):
 @pytest.mark.parametrize(
     ("card", "fault", "says"),
     [
-        ({"sha256": "0" * 64}, None, "is not the file of .*mine.yaml: its SHA-256 is"),
-        ({"head": {"name": "rmak"}}, None, "no head `rmak`"),
-        ({"outputs": {"features": "conv9"}}, None, "no output `conv9`"),
-        ({"head": {"name": "pyramid", "levels": [1, 11]}}, None, "too small for a grid of 11x11"),
-        ({}, "no onnx", "cannot be opened as an ONNX model"),
-        ({}, "dynamic size", "axes without a size"),
-        ({}, "nan", "not finite"),
-        ({"input": {**CARD["input"], "width": 64}}, None, "the card says"),
+        ({"sha256": "0" * 64}, None, "SHA-256"),
+        ({"head": {"name": "rmak"}}, None, "`rmak`"),
+        ({"outputs": {"features": "conv9"}}, None, "`conv9`"),
+        ({"head": {"name": "pyramid", "levels": [1, 11]}}, None, "11x11"),
+        ({}, "no onnx", "ONNX"),
+        ({}, "dynamic size", "axes"),
+        ({}, "nan", "finite"),
+        ({"input": {**CARD["input"], "width": 64}}, None, "card"),
     ],
 )
 @pytest.mark.usefixtures("tried_here")
@@ -158,28 +159,28 @@ def test_what_would_not_fly_is_not_added(models, tmp_path, card, fault, says):
 @pytest.mark.usefixtures("tried_here")
 def test_nothing_of_another_network_is_overwritten(models, download):
     write_network(models, "mine", card={"title": "An older one"})
-    with pytest.raises(ModelError, match="is there already and says something else"):
+    with pytest.raises(ModelError, match=r"mine\.yaml"):
         add(download / "mine.onnx", download / "mine.yaml")
     write_network(models, "other", fault="dynamic batch")
     (models / "mine.yaml").unlink()
     write_network(download, "mine", card={"file": "other.onnx"})
-    with pytest.raises(ModelError, match=r"other\.onnx is there already and is another file"):
+    with pytest.raises(ModelError, match=r"other\.onnx"):
         add(download / "mine.onnx", download / "mine.yaml")
 
 
 @pytest.mark.usefixtures("tried_here")
 def test_a_file_or_card_that_is_not_there_is_one_sentence(models, download, capsys):
-    assert main(["models", "add", str(download / "none.onnx"), "--card", str(download / "mine.yaml")]) == 1
-    assert "none.onnx cannot be read (No such file" in capsys.readouterr().err
-    assert main(["models", "add", str(download / "mine.onnx"), "--card", str(download / "none.yaml")]) == 2
-    assert "none.yaml cannot be read (No such file" in capsys.readouterr().err
+    for words, code in ((("none.onnx", "mine.yaml"), 1), (("mine.onnx", "none.yaml"), 2)):
+        file, card = (str(download / word) for word in words)
+        assert main(["models", "add", file, "--card", card]) == code
+        assert "none." in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("tried_here")
 def test_a_network_is_added_before_its_words_are_learned(models, download):
     write_network(download, "mine", card={"head": {"name": "vlad", "words": 5}})
     assert add(download / "mine.onnx", download / "mine.yaml")[0].vector_length == 5 * 4
-    with pytest.raises(ModelError, match="train words"):
+    with pytest.raises(ModelError, match="words"):
         verify_here(load_card("mine"))
 
 
@@ -196,25 +197,27 @@ def test_a_card_called_like_a_technique_is_not_said_to_be_it(models):
     assert technique_with("hog") == ("calc", {"model": "hog"})
 
 
+@pytest.mark.process
 def test_a_network_that_ends_the_process_that_tries_it_is_one_sentence(models, monkeypatch):
     write_network(models, "large")
     really = subprocess.Popen
     argv = [sys.executable, "-c", "import os; input(); os.kill(os.getpid(), 9)"]  # as the kernel does
     monkeypatch.setattr(child.subprocess, "Popen", lambda _, **more: really(argv, **more))
-    with pytest.raises(ModelError, match=r"large\.onnx ended the process that tried it"):
+    with pytest.raises(ModelError, match=r"large\.onnx ended"):
         verify(load_card("large"))
 
 
+@pytest.mark.process
 def test_a_network_without_an_end_is_given_up_in_the_process_that_tries_it(models):
     write_network(models, "endless", fault="endless")
-    with pytest.raises(ModelError, match=r"endless\.onnx was tried for 2 s and had no end: it loops"):
+    with pytest.raises(ModelError, match="for 2 s"):
         verify(load_card("endless"), limit_s=2)
 
 
 def test_a_network_without_an_end_is_given_up_in_our_own_process_too(models, monkeypatch):
     monkeypatch.setattr(session, "_RUN_LIMIT_S", 0.2)
     write_network(models, "endless", fault="endless")
-    with pytest.raises(ModelError, match=r"endless\.onnx had no result for a picture within 0\.2 s: it loops"):
+    with pytest.raises(ModelError, match=r"0\.2 s"):
         verify_here(load_card("endless"))
 
 
@@ -228,20 +231,13 @@ def processes_that_try() -> dict[int, str]:
     return found
 
 
+@pytest.mark.process
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, -15), (signal.SIGKILL, -9)])
 def test_a_signal_ends_the_trial_and_its_process(models, tmp_path, number, code):
     folder = tmp_path / "download"
     write_network(folder, "endless", fault="endless")
-    argv = [
-        sys.executable,
-        "-m",
-        "edgevpr",
-        "models",
-        "add",
-        folder / "endless.onnx",
-        "--card",
-        folder / "endless.yaml",
-    ]
+    words = ["models", "add", folder / "endless.onnx", "--card", folder / "endless.yaml"]
+    argv = [sys.executable, "-m", "edgevpr", *words]
     adding = subprocess.Popen(argv, stderr=subprocess.DEVNULL)
     try:
         mine = wait_for(lambda: [pid for pid, parent in processes_that_try().items() if int(parent) == adding.pid])
@@ -266,17 +262,17 @@ def test_devices_and_pipes_are_no_networks(models, tmp_path):
     os.mkfifo(tmp_path / "pipe.onnx")
     write_network(tmp_path / "download", "mine", card={"sha256": ""})
     for file in (Path("/dev/zero"), tmp_path / "pipe.onnx"):
-        with pytest.raises(ModelError, match=r"cannot be read \(it is a pipe or a device and not a regular file\)"):
+        with pytest.raises(ModelError, match="regular file"):
             add(file, tmp_path / "download" / "mine.yaml")
     (tmp_path / "vast.onnx").touch()
     os.truncate(tmp_path / "vast.onnx", 2**31 + 1)
-    with pytest.raises(ModelError, match=r"cannot be read \(it has 2,147.5 MB, and at most 2,147.5 are read\)"):
+    with pytest.raises(ModelError, match=r"2,147\.5 MB"):
         add(tmp_path / "vast.onnx", tmp_path / "download" / "mine.yaml")
 
 
 def test_a_card_that_names_itself_is_not_added(models, download):
     write_card(download / "same.yaml", {"file": "same.yaml", "sha256": ""})
-    with pytest.raises(ModelError, match=r"same\.yaml, which is the name of a card|`same\.yaml`, which is the name"):
+    with pytest.raises(ModelError, match=r"same\.yaml"):
         add(download / "mine.onnx", download / "same.yaml")
     assert not list(models.iterdir())
 
@@ -284,7 +280,7 @@ def test_a_card_that_names_itself_is_not_added(models, download):
 def test_a_card_whose_head_has_a_list_for_a_name_stops_no_command(models, capsys):
     write_network(models, "odd", card={"head": {"name": [1]}})
     assert main(["models", "list"]) == 0
-    assert "there is no head `[1]`" in capsys.readouterr().out
+    assert "`[1]`" in capsys.readouterr().out
 
 
 @pytest.mark.usefixtures("tried_here")
@@ -294,6 +290,6 @@ def test_a_full_disk_leaves_nothing_half_written(models, download, monkeypatch):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr("edgevpr.runtime.preflight.networks.shutil.copyfile", full)
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(OSError, match="No space"):
         add(download / "mine.onnx", download / "mine.yaml")
     assert not list(models.iterdir())

@@ -11,8 +11,7 @@ from example_costs import VECTOR
 from edgevpr.core.types import StageCost
 from edgevpr.power.boards import MachineSpeed, load_board
 from edgevpr.power.speed import REFERENCE_PASSES_HZ
-from edgevpr.runtime.preflight import counted
-from edgevpr.runtime.preflight.scale import UNKNOWN_PRODUCTS, Ratios, is_same, on_board, ratios
+from edgevpr.runtime.preflight.scale import UNKNOWN_PRODUCTS, Ratios, counted_work, is_same, on_board, ratios
 
 REGIONS = replace(example_costs.REGIONS, candidates=40, scan_per_place=StageCost(1e-6, 1e-6))
 HERE, PI = load_board("generic-x86"), load_board("rpi-4b")
@@ -75,7 +74,7 @@ def test_what_is_not_known_apart_of_an_arm_board_is_by_the_instructions_that_wer
 
 
 def test_counted_work_takes_its_instructions_whatever_was_measured_here():
-    work = counted.of("cohog", {"camera": "nadir"})
+    work = counted_work("cohog", {"camera": "nadir"})
     there = on_board(REGIONS, HERE, PI, work)
     parts, rate_hz = counted_parts(), 1e6 * PI.benchmark_score.arm64_mips
     assert there.encode.wall_s == pytest.approx(parts["down: encode a frame"] / rate_hz, rel=1e-6)
@@ -86,14 +85,10 @@ def test_counted_work_takes_its_instructions_whatever_was_measured_here():
 
 
 def test_only_what_was_counted_is_known():
-    assert counted.of("cohog", {}) == counted.of("cohog", {"camera": "forward", "w1": 512, "gt": 0.4})
-    assert counted.of("cohog", {"w1": 256}) is None
-    assert counted.of("cohog", {"matching": "thesis"}) is None
-    assert counted.of("hog", {}) is None
-
-
-def test_the_counts_are_those_of_the_benchmark():
-    assert counted.figures(counted_parts()) == json.loads(counted.PATH.read_text())
+    assert counted_work("cohog", {}) == counted_work("cohog", {"camera": "forward", "w1": 512, "gt": 0.4})
+    assert counted_work("cohog", {"w1": 256}) is None
+    assert counted_work("cohog", {"matching": "thesis"}) is None
+    assert counted_work("hog", {}) is None
 
 
 def counted_parts():

