@@ -12,10 +12,9 @@ from tempfile import TemporaryDirectory
 
 from base import Row
 
-from edgevpr.mavlink.conversation import Conversation
+from edgevpr.mavlink.conversation import Conversation, LinkSettings
 from edgevpr.mavlink.messages import Fix
-from edgevpr.mavlink.signing import NOT_SIGNING, Signing
-from edgevpr.mavlink.timestamps import TICKS_S, TimeStamps
+from edgevpr.mavlink.signing import NOT_SIGNING, TICKS_S, Signing, TimeStamps
 from edgevpr.mavlink.wire import mavlink
 
 BYTES = 10  # times as many bytes as packets are tried
@@ -120,7 +119,7 @@ class Hearer:
         self.clock = Clock()
         stamps = TimeStamps(folder / "time", self.clock, lambda: 1.8e9 + self.clock.now_s)
         signing = Signing(KEY, stamps) if with_key else NOT_SIGNING
-        self.conversation = Conversation(self.clock, 197, None, 1.0, signing=signing)
+        self.conversation = Conversation(LinkSettings(signing=signing), self.clock)
         self.conversation.want_position()
         self.maker = Maker(rng, stamps.next())
         self.failures: list[str] = []
@@ -144,7 +143,7 @@ class Hearer:
         self._try(self._speak)
 
     def _speak(self) -> None:
-        self.conversation.outbox.put_fix(Fix(50.0, 8.0, 20.0, self.clock.now_s), self.clock.now_s)
+        self.conversation.fixes.put(Fix(50.0, 8.0, 20.0, self.clock.now_s), self.clock.now_s)
         while (said := self.conversation.next_packet()) is not None:
             if said[1]:
                 self.conversation.note_departed([said[1]])
@@ -183,7 +182,7 @@ def _row(kind: str, with_key: bool, make: Callable[[Maker], bytes], count: int, 
             heard_bytes += sum(map(len, packets))
             if before_mb is None and done >= count / 10:
                 before_mb = _rss_mb()
-        grown_mb, received = _rss_mb() - before_mb, hearer.conversation.receiver.received
+        grown_mb, received = _rss_mb() - before_mb, hearer.conversation.reader.received
     return {
         "kind": kind,
         "packets": count,

@@ -13,10 +13,11 @@ from base import Row
 from hostile_bytes import Clock, Maker
 
 from edgevpr.mavlink.address import parse_link
+from edgevpr.mavlink.conversation import LinkSettings
+from edgevpr.mavlink.fixes import MAX_FIX_WAIT_S, Sending
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import POSITION_FIX, Fix, place_match, query_figures
-from edgevpr.mavlink.outbox import MAX_FIX_WAIT_S, Sending
-from edgevpr.mavlink.wire import Message, Receiver, mavlink
+from edgevpr.mavlink.wire import Message, PacketReader, mavlink
 
 OURS, FOREIGN = 1, 2
 BURST, FLOOD = 40, 400  # hostile packets in a second
@@ -29,7 +30,7 @@ class _Pilot:
     def __init__(self, sock: socket.socket, system_id: int = OURS) -> None:
         sock.setblocking(False)
         self.system_id, self.fixes = system_id, []
-        self._sock, self._receiver = sock, Receiver()
+        self._sock, self._receiver = sock, PacketReader()
 
     def send(self, packet: bytes) -> None:
         with suppress(OSError):
@@ -129,7 +130,7 @@ def _bench(*systems: int, tcp: bool = False, narrow: bool = False) -> Iterator[_
             listener.listen()
         else:
             listener.close()
-        with Link(parse_link(f"{kind}:127.0.0.1:{where[1]}"), clock=clock) as link:
+        with Link(parse_link(f"{kind}:127.0.0.1:{where[1]}"), LinkSettings(clock=clock)) as link:
             bench = _Bench(link, clock, failures)
             for system_id in systems:
                 sock = listener.accept()[0] if tcp else socket.socket(socket.AF_INET, style)

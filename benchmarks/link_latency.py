@@ -26,11 +26,11 @@ import base
 from base import Row
 
 from edgevpr.mavlink.address import parse_link
+from edgevpr.mavlink.conversation import LinkSettings
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import POSITION_FIX, Fix
-from edgevpr.mavlink.signing import NOT_SIGNING, Signing
-from edgevpr.mavlink.timestamps import TimeStamps
-from edgevpr.mavlink.wire import Message, Receiver, mavlink
+from edgevpr.mavlink.signing import NOT_SIGNING, Signing, TimeStamps
+from edgevpr.mavlink.wire import Message, PacketReader, mavlink
 
 EVERY_S = 0.02  # between two fixes, and a little more each time, so that they meet the streams everywhere
 KEY = bytes(range(32))
@@ -75,7 +75,7 @@ def row(kind: str, signed: bool, fixes: int, idle_s: float) -> Row:
         with subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, pass_fds=[descriptor], text=True
         ) as peer:
-            with Link(parse_link(url), signing=signing) as link:
+            with Link(parse_link(url), LinkSettings(signing=signing)) as link:
                 while not link.listens():
                     time.sleep(0.01)
                 sent_s = _send(link, fixes)
@@ -165,7 +165,7 @@ class _Port:
 
 def _peer(kind: str, descriptor: int, key: bytes) -> None:
     """Be an autopilot until standard input ends, then print when each fix was read."""
-    port, packer, receiver = _Port(kind, descriptor), mavlink.MAVLink(None, 1, 1), Receiver()
+    port, packer, receiver = _Port(kind, descriptor), mavlink.MAVLink(None, 1, 1), PacketReader()
     if key:
         packer.signing.sign_outgoing, packer.signing.secret_key = True, key
         packer.signing.timestamp = int((time.time() - 1_420_070_400 + 120) * 1e5)

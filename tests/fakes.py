@@ -13,14 +13,13 @@ import numpy as np
 from edgevpr.core.config import load_config
 from edgevpr.core.types import Frame, Receiver, Vehicle
 from edgevpr.frames.shot import Condition
-from edgevpr.mavlink.autopilots.channel import Channel
+from edgevpr.mavlink.channel import Channel
+from edgevpr.mavlink.fixes import Fixes, Sending
 from edgevpr.mavlink.link import LinkStats
-from edgevpr.mavlink.listener import NoListener
 from edgevpr.mavlink.messages import Fix, Health, Severity, status_text
-from edgevpr.mavlink.outbox import Outbox, Sending
-from edgevpr.mavlink.reasons import State
-from edgevpr.mavlink.replies import Replies
-from edgevpr.mavlink.wishes import Wish, Wished
+from edgevpr.mavlink.peer import NoListener
+from edgevpr.mavlink.readiness import AutopilotState
+from edgevpr.mavlink.requests import Wish, Wished
 from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.flightlog import FlightLog
@@ -158,7 +157,7 @@ class FakeLink:
         self.listener = NoListener()
         self.health = Health.BOOT
         self._clock, self._vehicle = clock, vehicle
-        self._outbox, self._replies = Outbox(), Replies()
+        self._waiting = Fixes()
         self._fixes: list[Fix] = []
         self._acks: Counter[str] = Counter()
         self._offered, self._wishes = (), []
@@ -170,7 +169,7 @@ class FakeLink:
         self.sent += outgoing
 
     def send_fix(self, fix: Fix) -> Sending:
-        sending = self._outbox.put_fix(fix, self._clock())
+        sending = self._waiting.put(fix, self._clock())
         self._turn()
         return sending
 
@@ -203,7 +202,7 @@ class FakeLink:
         vehicle = self._vehicle()
         if vehicle is None:
             return None
-        vehicle = replace(vehicle, t_fix_s=self._replies.t_fix_s)
+        vehicle = replace(vehicle, t_fix_s=self._waiting.t_fix_s)
         self.listener.hear_vehicle(vehicle)
         return vehicle
 
@@ -225,12 +224,12 @@ class FakeLink:
             sent=dict(sent),
             received={},
             acks=dict(self._acks),
-            dropped_stale_fixes=self._outbox.dropped_stale_fixes,
-            withheld_fixes=self._outbox.withheld_fixes,
+            dropped_stale_fixes=self._waiting.dropped,
+            withheld_fixes=self._waiting.withheld,
             commands={},
             ignored_requests=0,
-            unanswered_fixes=self._replies.unanswered,
-            refused_why=self._replies.refusal and self._replies.refusal.brief,
+            unanswered_fixes=self._waiting.unanswered,
+            refused_why=self._waiting.refusal and self._waiting.refusal.brief,
             foreign_messages=0,
             refused_signatures={},
             dropped_queue_full=0,
@@ -247,13 +246,13 @@ class FakeLink:
 
     def _turn(self) -> None:
         if not self.listens():
-            self._outbox.drop_stale_fixes(self._clock())
+            self._waiting.drop_stale(self._clock())
             return
-        while (sending := self._outbox.next_fix(self._clock())) is not None:
+        while (sending := self._waiting.next(self._clock())) is not None:
             self._fixes.append(sending.fix)
-            self._replies.note_sent(sending, self._clock())
+            self._waiting.note_sent(sending, self._clock(), has_answer=True)
             sending.settle(True)
-            self._replies.hear(self.answer, State(gps_age_s=0.0), self._clock())
+            self._waiting.hear(self.answer, AutopilotState(gps_age_s=0.0), self._clock())
             self._acks[self.answer] += 1
 
 

@@ -6,7 +6,7 @@ from dataclasses import fields
 import cv2
 import pytest
 from fakes import FakeCapture, FakeClock, FakeLink, FakeSource, vehicle_at
-from mavlink_peers import AutopilotThread, Peer, UdpPort, wait_until
+from mavlink_peers import AutopilotThread, Peer, UdpPort, link_to, wait_until
 from pictures import textured
 
 from edgevpr.core.errors import ImageError
@@ -14,11 +14,10 @@ from edgevpr.frames.live import DeviceCapture, LiveSource
 from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import open_source
 from edgevpr.lab.simulate.flightcontroller.recorded import Track
-from edgevpr.mavlink.address import parse_link
-from edgevpr.mavlink.link import Link, LinkStats
+from edgevpr.mavlink.link import LinkStats
 from edgevpr.mavlink.messages import Fix, Health, Severity, status_text
+from edgevpr.mavlink.requests import Wish
 from edgevpr.mavlink.wire import mavlink
-from edgevpr.mavlink.wishes import Wish
 from edgevpr.runtime.flight.clock import Clock
 
 COUNT = 3
@@ -114,7 +113,7 @@ def link(request):
         return real.listens() and real.vehicle()
 
     try:
-        with Link(parse_link(f"udpout:127.0.0.1:{number}"), clock=clock) as real:
+        with link_to(f"udpout:127.0.0.1:{number}", clock=clock) as real:
             real.want_position()
             wait_until(is_ready)
             yield real, clock
@@ -170,7 +169,7 @@ def test_a_text_is_announced_and_a_wish_of_the_ground_is_handed_on_where_it_is_o
     clock, port = FakeClock(), UdpPort()
     link = FakeLink(clock)
     if kind == "real":
-        link = Link(parse_link(f"udpout:127.0.0.1:{port.number}"), clock=clock)
+        link = link_to(f"udpout:127.0.0.1:{port.number}", clock=clock)
         link.start()
         peer = Peer(port)
         peer.expect("HEARTBEAT")
@@ -199,7 +198,7 @@ def test_without_an_autopilot_a_fix_waits_for_a_second_and_is_dropped(kind):
     port = UdpPort()
     link = FakeLink(clock, answer=None)
     if kind == "real":
-        link = Link(parse_link(f"udpout:127.0.0.1:{port.number}"), clock=clock)
+        link = link_to(f"udpout:127.0.0.1:{port.number}", clock=clock)
         link.start()
     assert not link.listens()
     assert link.vehicle() is None

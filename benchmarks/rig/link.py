@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from edgevpr.mavlink.wire import Message, Receiver, mavlink
+from edgevpr.mavlink.wire import Message, PacketReader, mavlink
 
 GROUND_STATION, AUTOPILOT = (255, 190), (1, 1)
 # SIM_STATE is the truth; a plane, whose loop turns 50 times a second, gives it no more often.
@@ -106,7 +106,7 @@ class Link:
         raise RuntimeError("the autopilot does not take the mission")
 
     def _receive(self) -> None:
-        receiver = Receiver()
+        receiver = PacketReader()
         self._socket.settimeout(0.2)
         while self._is_open:
             try:

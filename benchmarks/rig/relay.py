@@ -9,7 +9,7 @@ from pathlib import Path
 from truth import Truth
 
 from edgevpr.lab.simulate.flight import to_metres
-from edgevpr.mavlink.wire import Message, Receiver, mavlink
+from edgevpr.mavlink.wire import Message, PacketReader, mavlink
 
 COLUMNS = ("t_s", "kind", "age_s", "east_m", "north_m", "accuracy_m", "true_east_m", "true_north_m")
 Sent = tuple[float, float, float, float]  # age in seconds, east and north in metres, accuracy in metres
@@ -50,10 +50,10 @@ class Relay:
                         end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                     back = threading.Thread(target=self._hand_on, args=(far, near, None), daemon=True)
                     back.start()
-                    self._hand_on(near, far, Receiver())
+                    self._hand_on(near, far, PacketReader())
                     back.join()
 
-    def _hand_on(self, source: socket.socket, sink: socket.socket, receiver: Receiver | None) -> None:
+    def _hand_on(self, source: socket.socket, sink: socket.socket, receiver: PacketReader | None) -> None:
         """Hand on bytes until one of the two has gone, and let the other one know."""
         source.settimeout(0.2)
         try:

@@ -5,16 +5,14 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
-from types import TracebackType
 
 from edgevpr.core.errors import LinkError
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.messages import AUTOPILOT, Health
-from edgevpr.mavlink.parameter import value_of
-from edgevpr.mavlink.signing import NOT_SIGNING, NotSigning, Signing
-from edgevpr.mavlink.transport import open_transport
-from edgevpr.mavlink.wire import Message, Receiver, mavlink
+from edgevpr.mavlink.ports import open_port
+from edgevpr.mavlink.signing import NOT_SIGNING, NotSigning
+from edgevpr.mavlink.wire import Message, PacketReader, mavlink, parameter_value
 
 HEARTBEAT_S = 1.0
 HEARTBEAT_WAIT_S = 5.0  # an autopilot sends one each second
@@ -25,7 +23,7 @@ _WAITING_MAX = 64  # a port that takes nothing must not fill the memory
 _SIGNED = mavlink.MAVLINK_IFLAG_SIGNED
 
 
-class Asking:
+class Inquiry:
     """A conversation with one autopilot by a caller that waits for each answer. As every companion it sends a heartbeat
     a second, without which some ports do not answer.
 
@@ -40,9 +38,9 @@ class Asking:
         address: LinkAddress,
         component_id: int = 197,
         system_id: int | None = None,
-        signing: Signing | NotSigning = NOT_SIGNING,
+        signing: NotSigning = NOT_SIGNING,
     ) -> None:
-        """Open the link; raises LinkError where it cannot be opened, as `open_transport` does, and where nothing is
+        """Open the link; raises LinkError where it cannot be opened, as `open_port` does, and where nothing is
         there."""
         self.system_id = system_id
         self.heard: Counter[str] = Counter()
@@ -51,55 +49,57 @@ class Asking:
         self.says_version_1 = False  # of its last message
         self._address = address
         self._signing = signing
-        self._receiver = Receiver(signing.admits)
+        self._reader = PacketReader(signing.admits)
         self._packer = mavlink.MAVLink(None, srcSystem=system_id or 1, srcComponent=component_id)
         self._waiting: deque[bytes] = deque(maxlen=_WAITING_MAX)  # packets to be written, one datagram each
         self._arrived: deque[Message] = deque()  # not looked at yet
         self._heartbeat_due_s = 0.0
         self._autopilot_heard = False
         try:
-            self._transport = open_transport(address)
+            self._port = open_port(address)
         except OSError as error:
             raise LinkError(
                 f"{address} is not there ({error.strerror or error}): connect it or start the other end, or correct "
                 "the link."
             ) from error
 
-    def __enter__(self) -> "Asking":
+    def __enter__(self) -> "Inquiry":
         return self
 
-    def __exit__(self, kind: type | None, error: BaseException | None, where: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         with suppress(OSError):
-            if self._waiting or self._transport.unsent():  # a line that takes nothing must not delay the end
-                self._transport.throw_away()
-        self._transport.close()
+            if self._waiting or self._port.unsent():  # a line that takes nothing must not delay the end
+                self._port.throw_away()
+        self._port.close()
 
     @property
     def bad_bytes(self) -> int:
-        return self._receiver.bad_bytes
+        """The number of bytes that were no message."""
+        return self._reader.bad_bytes
 
     @property
     def signs(self) -> bool:
+        """True where there is a key."""
         return self._signing is not NOT_SIGNING
 
     @property
     def refused(self) -> Mapping[str, int]:
+        """The messages without the right signature, by reason."""
         return self._signing.refused
 
     def heartbeat(self, wait_s: float = HEARTBEAT_WAIT_S) -> Message | None:
         """Wait for a heartbeat of the autopilot; from then on only that one is listened to. None: none came."""
-        return self._first(wait_s, lambda message: message.get_type() == "HEARTBEAT")
+        return self._first(wait_s, lambda message: bool(message.get_type() == "HEARTBEAT"))
 
     def listen(self, wait_s: float) -> None:
         """Count what the autopilot sends without being asked."""
-        for _ in self._messages(wait_s):
-            pass
+        self._first(wait_s, lambda message: False)
 
     def message(self, message_id: int) -> Message | None:
         """Ask for one message (MAV_CMD_REQUEST_MESSAGE); None where the autopilot refuses it, or nothing comes."""
         name = mavlink.mavlink_map[message_id].msgname
         for _ in range(TRIES):
-            self._put(messages.message_request(self.system_id, message_id))
+            self._put(messages.message_request(self.system_id or 0, message_id))
             answer = self._first(ANSWER_WAIT_S, lambda message: message.get_type() == name or _refuses(message))
             if answer is not None:
                 return answer if answer.get_type() == name else None
@@ -111,13 +111,13 @@ class Asking:
 
         `bytewise`: it packs whole numbers into the bytes of the float (PX4), as AUTOPILOT_VERSION says.
         """
-        found: dict[str, float | int] = {}
+        values: dict[str, float | int] = {}
         missing = list(dict.fromkeys(names))
         for _ in range(TRIES):
             for start in range(0, len(missing), IN_FLIGHT):
-                self._read_parameters(missing[start : start + IN_FLIGHT], found, bytewise)
-            missing = [name for name in missing if name not in found]
-        return found
+                self._read_parameters(missing[start : start + IN_FLIGHT], values, bytewise)
+            missing = [name for name in missing if name not in values]
+        return values
 
     def round_trips_s(self, count: int) -> list[float]:
         """Measure by TIMESYNC, so many times, the seconds from a question to its answer; a lost one is left out."""
@@ -127,27 +127,30 @@ class Asking:
             self._put(mavlink.MAVLink_timesync_message(0, sent_ns))
 
             def answers(message: Message, sent_ns: int = sent_ns) -> bool:
-                return message.get_type() == "TIMESYNC" and message.tc1 != 0 and message.ts1 == sent_ns
+                return bool(message.get_type() == "TIMESYNC" and message.tc1 != 0 and message.ts1 == sent_ns)
 
             if self._first(ANSWER_WAIT_S, answers):
                 times_s.append((time.monotonic_ns() - sent_ns) / 1e9)
         return times_s
 
-    def _read_parameters(self, names: Collection[str], found: dict[str, float | int], bytewise: bool) -> None:
-        """Ask for a few parameters, and put into `found` what comes until all are there or a second is quiet."""
+    def _read_parameters(self, names: Collection[str], values: dict[str, float | int], bytewise: bool) -> None:
+        """Ask for a few parameters, and put into `values` what comes until all are there or a second is quiet."""
         waiting = set(names)
         for name in names:
-            self._put(messages.parameter_request(self.system_id, name))
+            self._put(messages.parameter_request(self.system_id or 0, name))
+        kinds = ("PARAM_VALUE", "PARAM_ERROR")  # the value, or that the parameter is unknown
         while waiting:
-            said = self._first(ANSWER_WAIT_S, lambda message: _parameter_name(message) in waiting)
-            if said is None:
+            answer = self._first(
+                ANSWER_WAIT_S, lambda message: message.get_type() in kinds and message.param_id in waiting
+            )
+            if answer is None:
                 return
-            waiting.remove(said.param_id)
-            if said.get_type() == "PARAM_VALUE" and (value := value_of(said, bytewise)) is not None:
-                found[said.param_id] = value
+            waiting.remove(answer.param_id)
+            if answer.get_type() == "PARAM_VALUE" and (value := parameter_value(answer, bytewise)) is not None:
+                values[answer.param_id] = value
 
-    def _first(self, wait_s: float, wanted: Callable[[Message], bool]) -> Message | None:
-        return next((message for message in self._messages(wait_s) if wanted(message)), None)
+    def _first(self, wait_s: float, is_wanted: Callable[[Message], bool]) -> Message | None:
+        return next((message for message in self._messages(wait_s) if is_wanted(message)), None)
 
     def _messages(self, wait_s: float) -> Iterator[Message]:
         """Yield the autopilot's messages of the next `wait_s` seconds, those that have arrived already first."""
@@ -165,22 +168,22 @@ class Asking:
 
     def _turn(self, now_s: float, wait_s: float) -> None:
         """Write what the port takes at once, and read what comes within `wait_s`."""
-        if self._transport.connected:
+        if self._port.connected:
             if now_s >= self._heartbeat_due_s:
                 self._heartbeat_due_s = now_s + HEARTBEAT_S
                 self._put(messages.heartbeat(Health.BOOT))
             while self._waiting:
                 packet = self._waiting.popleft()
-                rest = packet[self._transport.write(packet) :]
+                rest = packet[self._port.write(packet) :]
                 if rest:
                     self._waiting.appendleft(rest)
                     break
-        readable, _, _ = select.select([self._transport], [], [], wait_s)
+        readable, _, _ = select.select([self._port], [], [], wait_s)
         # A serial port without a byte would look lost; a refused datagram makes its port readable again and again.
-        data = self._transport.read() if readable else b""
+        data = self._port.read() if readable else b""
         if readable and not data:
             time.sleep(0.01)
-        arrived = self._receiver.feed(data, self._transport.sender)
+        arrived = self._reader.feed(data, self._port.sender)
         self._arrived.extend(message for message in arrived if self._is_ours(message))
 
     def _is_ours(self, message: Message) -> bool:
@@ -194,7 +197,7 @@ class Asking:
             return False
         if beats:
             self._autopilot_heard = True
-            self._transport.answer_sender()
+            self._port.answer_sender()
         if not self._autopilot_heard:
             return False
         self.heard[message.get_type()] += 1
@@ -209,13 +212,5 @@ class Asking:
 
 
 def _refuses(message: Message) -> bool:
-    return (
-        message.get_type() == "COMMAND_ACK"
-        and message.command == mavlink.MAV_CMD_REQUEST_MESSAGE
-        and message.result in _FINAL
-    )
-
-
-def _parameter_name(message: Message) -> str | None:
-    """Return the name of the parameter that a message gives, or says to be unknown."""
-    return message.param_id if message.get_type() in ("PARAM_VALUE", "PARAM_ERROR") else None
+    is_answer = message.get_type() == "COMMAND_ACK" and message.command == mavlink.MAV_CMD_REQUEST_MESSAGE
+    return is_answer and message.result in _FINAL

@@ -1,11 +1,11 @@
-"""An open transport, and what was written into it: no fix leaves a buffer late, be it ours or the system's."""
+"""An open port, and what was written into it: no fix leaves a buffer late, be it ours or the system's."""
 
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 
-from edgevpr.mavlink.outbox import Sending
-from edgevpr.mavlink.transport import Transport
+from edgevpr.mavlink.fixes import Sending
+from edgevpr.mavlink.ports import Port
 from edgevpr.mavlink.wire import Tap, untapped
 
 LOST = "the link was lost before it had left"
@@ -13,15 +13,15 @@ STUCK_S = 0.5  # a port that has taken no byte for this time is reopened: bytes 
 
 
 class Line:
-    """A transport into which one packet after another is written.
+    """A port into which one packet after another is written.
 
     A fix counts as sent when its bytes have left the system (over TCP: when the other end has confirmed them). One that
-    has not left when it is due makes the line fail: the bytes are thrown away with the transport. `tap` gets each
+    has not left when it is due makes the line fail: the bytes are thrown away with the port. `tap` gets each
     packet that the port has taken in full.
     """
 
-    def __init__(self, transport: Transport, clock: Callable[[], float], tap: Tap = untapped) -> None:
-        self.transport = transport
+    def __init__(self, port: Port, clock: Callable[[], float], tap: Tap = untapped) -> None:
+        self.port = port
         self._tap = tap
         self._clock = clock
         self._packet = b""  # the last one put
@@ -43,7 +43,7 @@ class Line:
     @property
     def is_idle(self) -> bool:
         """True where every byte has left."""
-        return not self._unsent and self.transport.unsent() == 0
+        return not self._unsent and self.port.unsent() == 0
 
     def put(self, packet: bytes, sending: Sending | None) -> None:
         """Take the next packet, with the fix in it if it holds one. The packet before must have been taken in full."""
@@ -55,7 +55,7 @@ class Line:
         """Write what the port takes at once. Raises OSError where the connection is lost, or takes nothing for long."""
         if not self._unsent:
             return
-        taken = self.transport.write(self._unsent)
+        taken = self.port.write(self._unsent)
         self._unsent = self._unsent[taken:]
         self._taken += taken
         if not self._unsent:
@@ -73,7 +73,7 @@ class Line:
         departed = []
         # Read before the bytes are asked for: a clock that jumps meanwhile must not condemn what has just left.
         now_s = self._clock()
-        left = self._taken - self.transport.unsent() if self._leaving else 0
+        left = self._taken - self.port.unsent() if self._leaving else 0
         while self._leaving and self._leaving[0][0] <= left:
             departed.append(self._leaving.popleft()[1])
             departed[-1].settle(True)
@@ -82,11 +82,11 @@ class Line:
         return departed
 
     def close(self) -> int:
-        """Close the transport, throw away what has not left, and return the number of fixes in it."""
+        """Close the port, throw away what has not left, and return the number of fixes in it."""
         with suppress(OSError):
             if not self.is_idle:
-                self.transport.throw_away()
-        self.transport.close()
+                self.port.throw_away()
+        self.port.close()
         lost = len(self._leaving)
         for _, sending in self._leaving:
             sending.settle(False, LOST)

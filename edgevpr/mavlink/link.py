@@ -7,78 +7,84 @@ import threading
 import time
 from collections.abc import Callable, Collection
 from contextlib import AbstractContextManager, suppress
+from dataclasses import dataclass
 
 from edgevpr.core.errors import LinkError
-from edgevpr.core.types import NO_TAPE, Position, Tape, Vehicle
+from edgevpr.core.types import Vehicle
 from edgevpr.mavlink.address import LinkAddress
-from edgevpr.mavlink.autopilots.channel import Channel
-from edgevpr.mavlink.conversation import Conversation
+from edgevpr.mavlink.channel import Channel
+from edgevpr.mavlink.conversation import Conversation, LinkSettings
+from edgevpr.mavlink.fixes import Sending
 from edgevpr.mavlink.line import Line
-from edgevpr.mavlink.listener import Listener, NoListener
 from edgevpr.mavlink.messages import Fix, Health, Severity
-from edgevpr.mavlink.outbox import MAX_FIX_WAIT_S, Sending
-from edgevpr.mavlink.signing import NOT_SIGNING, NotSigning, Signing
-from edgevpr.mavlink.stats import LinkStats
-from edgevpr.mavlink.transport import open_transport
+from edgevpr.mavlink.ports import open_port
+from edgevpr.mavlink.requests import Wish, Wished
 from edgevpr.mavlink.turns import Turns
-from edgevpr.mavlink.wire import Message, Tap, untapped
-from edgevpr.mavlink.wishes import Wish, Wished
+from edgevpr.mavlink.wire import Message
 
 TURN_S = 0.25  # longest sleep of the thread when nothing wakes it
 RETRY_FIRST_S, RETRY_MAX_S = 0.2, 2.0
 WATCH_S = 0.01  # between two looks whether a fix has left
 FLUSH_S = 0.5
 
-_NOBODY = NoListener()
+_USUAL = LinkSettings()
 
 Step = Callable[..., None]  # takes note of a step of a turn
 
 log = logging.getLogger(__name__)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkStats:
+    """Counts and state of a link. `trouble` is the reason why it is or last was not open, None once data arrives.
+
+    `foreign_messages` came from another autopilot or another address than ours and were refused. `withheld_fixes` were
+    not sent because those before had no answer, or the ground has paused the flight. `unanswered_fixes` were sent and
+    had no answer within a second, and `refused_why` is why the last one was refused (None: none was), in a few words.
+    `commands` counts those that were for us, by result, and `ignored_requests` what else was for us and had no effect.
+    With a signing key, `refused_signatures` counts the messages without a right signature or time stamp, by reason.
+    """
+
+    connected: bool
+    trouble: str | None
+    autopilot_heard: bool
+    autopilot_system_id: int | None
+    sent: dict[str, int]
+    received: dict[str, int]
+    acks: dict[str, int]
+    dropped_stale_fixes: int
+    withheld_fixes: int
+    commands: dict[str, int]
+    ignored_requests: int
+    unanswered_fixes: int
+    refused_why: str | None
+    foreign_messages: int
+    refused_signatures: dict[str, int]
+    dropped_queue_full: int
+    bad_bytes: int
+    reopened: int
+
+    @property
+    def fixes_sent(self) -> int:
+        """Number of position fixes sent."""
+        return self.sent.get("COMMAND_INT", 0)
+
+
 class Link:
     """The link to one flight controller. It sends the queued messages and one heartbeat a second, listens, and reopens
     the port after every loss of the other end. What is said and heard is the `Conversation`'s.
 
-    `system_id` is that of the autopilot (None: that of the first heard); a fix that has waited for `max_fix_age_s` is
-    never sent. `listener` hears how the vehicle moves, and gives the positions of a continuous channel. `tap` gets each
-    packet written and each packet heard, in the link's thread. `origin` is set where an autopilot that flies by
-    ODOMETRY has none. The `tape` takes note of all that is heard and said. `send`, `send_fix`, `announce`, `offer`,
-    `take_wishes`, `set_health`, `want_position`, `vehicle`, `vehicle_at`, `channel`, `listens`, `stats` and `turn` may
-    be called from any thread; none waits for the other end, and none raises.
+    All but `start` and `close` may be called from any thread; none waits for the other end, and none raises.
     """
 
     name = "link"
 
-    def __init__(
-        self,
-        address: LinkAddress,
-        component_id: int = 197,
-        clock: Callable[[], float] = time.monotonic,
-        *,
-        system_id: int | None = None,
-        max_fix_age_s: float = MAX_FIX_WAIT_S,
-        listener: Listener = _NOBODY,
-        tap: Tap = untapped,
-        signing: Signing | NotSigning = NOT_SIGNING,
-        origin: Position | None = None,
-        tape: Tape = NO_TAPE,
-    ) -> None:
-        self._address = address
-        self._tap, self._tape = tap, tape
-        self._clock = clock
-        self._turns = Turns(clock, tape)
+    def __init__(self, address: LinkAddress, settings: LinkSettings = _USUAL) -> None:
+        self._address, self._settings = address, settings
+        self._tape = settings.tape
+        self._turns = Turns(settings.clock, settings.tape)
         with self.turn("begin"):
-            self._conversation = Conversation(
-                self._turns.now_s,
-                component_id,
-                system_id,
-                max_fix_age_s,
-                listener=listener,
-                tap=tap,
-                signing=signing,
-                origin=origin,
-            )
+            self._conversation = Conversation(settings, self._turns.now_s)
         self._line: Line | None = None
         self._reopened = 0
         self._retry_s = RETRY_FIRST_S
@@ -95,7 +101,7 @@ class Link:
         to open it again and again, and `stats` gives the reason.
         """
         try:
-            self._line = Line(open_transport(self._address), self._clock, self._tap)
+            self._line = self._opened()
         except OSError as error:
             self._note_trouble(error)
         except LinkError:
@@ -112,21 +118,21 @@ class Link:
         """Queue messages. If the queue is full, the oldest messages are dropped and counted."""
         with self.turn("send"):
             for message in outgoing:
-                self._conversation.outbox.put(message)
+                self._conversation.put(message)
         self._ring()
 
     def send_fix(self, fix: Fix) -> Sending:
         """Queue a position fix, to be sent within `max_fix_age_s` and only to an autopilot that is there, or never. The
         returned `Sending` gives the outcome as soon as it is known."""
         with self.turn("send_fix"):
-            sending = self._conversation.outbox.put_fix(fix, self._turns.now_s())
+            sending = self._conversation.fixes.put(fix, self._turns.now_s())
         self._ring()
         return sending
 
     def announce(self, severity: Severity, text: str, topic: str | None = None) -> None:
         """Let a text for the people on the ground wait for its turn (see `Texts`)."""
         with self.turn("announce"):
-            self._conversation.texts.put(severity, text, topic)
+            self._conversation.announce(severity, text, topic)
         self._ring()
 
     def offer(self, wishes: Collection[Wish]) -> None:
@@ -174,6 +180,7 @@ class Link:
             return is_connected and self._conversation.autopilot.listens(self._turns.now_s())
 
     def stats(self) -> LinkStats:
+        """Return counts and state of the link."""
         with self.turn("stats"):
             return self._stats()
 
@@ -197,26 +204,26 @@ class Link:
         self.close()
 
     def _stats(self) -> LinkStats:
-        said, autopilot, outbox = self._conversation, self._conversation.autopilot, self._conversation.outbox
+        conversation, autopilot, fixes = self._conversation, self._conversation.autopilot, self._conversation.fixes
         connected, trouble, reopened = self._tape.read("port", self._port)
         return LinkStats(
             connected=connected,
             trouble=trouble,
             autopilot_heard=autopilot.listens(self._turns.now_s()),
             autopilot_system_id=autopilot.system_id,
-            sent=dict(said.sent),
-            received=dict(said.receiver.received),
+            sent=dict(conversation.sent),
+            received=dict(conversation.reader.received),
             acks=dict(autopilot.acks),
-            dropped_stale_fixes=outbox.dropped_stale_fixes,
-            withheld_fixes=outbox.withheld_fixes,
-            commands=dict(said.requests.results),
-            ignored_requests=said.requests.ignored,
-            unanswered_fixes=said.replies.unanswered,
-            refused_why=said.replies.refusal and said.replies.refusal.brief,
+            dropped_stale_fixes=fixes.dropped,
+            withheld_fixes=fixes.withheld,
+            commands=dict(conversation.requests.results),
+            ignored_requests=conversation.requests.ignored,
+            unanswered_fixes=fixes.unanswered,
+            refused_why=fixes.refusal.brief if fixes.refusal else None,
             foreign_messages=autopilot.identity.foreign_messages,
-            refused_signatures=dict(said.signing.refused),
-            dropped_queue_full=outbox.dropped_queue_full,
-            bad_bytes=said.receiver.bad_bytes,
+            refused_signatures=dict(conversation.settings.signing.refused),
+            dropped_queue_full=conversation.dropped_queue_full,
+            bad_bytes=conversation.reader.bad_bytes,
             reopened=reopened,
         )
 
@@ -225,7 +232,10 @@ class Link:
 
     def _is_connected(self) -> bool:
         line = self._line
-        return line is not None and line.transport.connected
+        return line is not None and line.port.connected
+
+    def _opened(self) -> Line:
+        return Line(open_port(self._address), self._settings.clock, self._settings.tap)
 
     # The methods below run in the link's own thread.
 
@@ -249,28 +259,28 @@ class Link:
             return
         self._retry_s = min(2 * self._retry_s, RETRY_MAX_S)
         with self._turns.of_link(self.name) as step:
-            self._conversation.outbox.drop_stale_fixes(self._turns.now_s())
+            self._conversation.fixes.drop_stale(self._turns.now_s())
             step("waits")
-        self._line = Line(open_transport(self._address), self._clock, self._tap)
+        self._line = self._opened()
         self._reopened += 1
 
     def _turn(self, line: Line, timeout_s: float) -> None:
         """Write what the port takes, wait until there is something to do or the time is up, and read."""
         with self._turns.of_link(self.name) as step:
-            if line.transport.connected:
+            if line.port.connected:
                 self._transmit(line, step)
             self._conversation.tell_of_answers()
             step("answers")
-        writing = [line.transport] if line.is_writing else []
+        writing = [line.port] if line.is_writing else []
         timeout_s = min(timeout_s, WATCH_S) if line.is_watched else self._conversation.wait_s(timeout_s)
-        readable, _, _ = select.select([line.transport, self._bell], writing, [], timeout_s)
+        readable, _, _ = select.select([line.port, self._bell], writing, [], timeout_s)
         if self._bell in readable:
             self._bell.recv(4096)
-        if line.transport in readable:
+        if line.port in readable:
             self._receive(line)
 
     def _receive(self, line: Line) -> None:
-        data = line.transport.read()
+        data = line.port.read()
         if data:
             self._retry_s = RETRY_FIRST_S
             if self._trouble is not None:
@@ -279,12 +289,12 @@ class Link:
         with self._turns.of_link(self.name) as step:
             self._note_departed(line, step)  # before its answer is read
             try:
-                beats = self._conversation.hear(data, self._turns.now_s(), line.transport.sender)
+                beats = self._conversation.hear(data, self._turns.now_s(), line.port.sender)
             finally:
-                verdicts = self._conversation.signing.take_verdicts()
-                step("heard", data, line.transport.sender, verdicts)
+                verdicts = self._settings.signing.take_verdicts()
+                step("heard", data, line.port.sender, verdicts)
         if beats:
-            line.transport.answer_sender()
+            line.port.answer_sender()
 
     def _transmit(self, line: Line, step: Step) -> None:
         while True:
@@ -322,11 +332,10 @@ class Link:
     def _flush(self) -> None:
         give_up_s = time.monotonic() + FLUSH_S
         with suppress(OSError):
-            while self._is_connected() and time.monotonic() < give_up_s:
+            while self._line and self._is_connected() and time.monotonic() < give_up_s:
                 self._turn(self._line, timeout_s=0.01)
-                waits = self._conversation.outbox or self._conversation.texts
-                is_all_answered = not len(self._conversation.replies)  # so that the final counts include all answers
-                if not waits and self._line.is_idle and is_all_answered:
+                is_all_answered = not len(self._conversation.fixes)  # so that the final counts include all answers
+                if not self._conversation.waits and self._line.is_idle and is_all_answered:
                     break
 
     def _close_all(self) -> None:

@@ -1,7 +1,7 @@
-"""Four kinds of port, none of which ever blocks once it is open: UDP out and in, TCP, serial.
+"""Ports of four kinds, none of which ever blocks once it is open: UDP out and in, TCP, serial.
 
 This thin layer over `socket` and pyserial behaves the same in every fault. pymavlink's own connections may spin, hang
-or raise. `transport.Transport` says what each method does.
+or raise.
 """
 
 import errno
@@ -11,9 +11,11 @@ import socket
 import stat
 import struct
 import termios
+from collections.abc import Callable
 from contextlib import suppress
 
-from edgevpr.mavlink.address import Sender
+from edgevpr.core.errors import LinkAddressError, LinkError
+from edgevpr.mavlink.address import LinkAddress, Sender
 
 CONNECT_TIMEOUT_S = 1.0
 TCP_GIVE_UP_MS = 1000  # if the other end has not confirmed bytes by then, the connection is closed and they are lost
@@ -21,40 +23,57 @@ TCP_SEND_BYTES = 8192  # doubled by the system: some 30 messages; left to itself
 READ_BYTES = 65_536
 
 
-class _Socket:
+class Port:
+    """A port, as a link needs it; its owner closes one that is lost, and opens another. `connected`: there is a
+    receiver to send to; `sender` is that of the last bytes read, None where there can be only one."""
+
     connected = True
     sender: Sender | None = None
+    _end = "the other end closed the connection"
 
     def __init__(self, sock: socket.socket) -> None:
         sock.setblocking(False)
         self._sock = sock
 
     def fileno(self) -> int:
+        """Return the file descriptor, to wait for."""
         return self._sock.fileno()
 
+    def read(self) -> bytes:
+        """Return the bytes that have arrived, b"" for none; raises OSError where the connection is lost."""
+        with suppress(BlockingIOError):
+            data = os.read(self.fileno(), READ_BYTES)
+            if not data:
+                raise ConnectionError(self._end)
+            return data
+        return b""
+
+    def write(self, data: bytes) -> int:
+        """Take as many bytes as fit at once and return their number; raises OSError where the connection is lost."""
+        with suppress(BlockingIOError):
+            return os.write(self.fileno(), data)
+        return 0
+
     def answer_sender(self) -> None:
-        pass
+        """Send from this call on to the sender of the last bytes (where there can be several senders)."""
 
     def unsent(self) -> int:
+        """Return the number of bytes taken that have not left the system yet, or are not confirmed (TCP)."""
         return 0
 
     def throw_away(self) -> None:
-        pass
+        """Let `close` throw away the bytes that have not left, instead of sending them later."""
 
     def close(self) -> None:
+        """Close the port."""
         self._sock.close()
 
 
-class UdpOutPort(_Socket):
+class UdpOutPort(Port):
     """A UDP socket that is connected to one peer: the system drops what comes from any other address."""
 
     def __init__(self, host: str, port: int) -> None:
-        super().__init__(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-        try:
-            self._sock.connect(_resolved(host, port))
-        except OSError:
-            self.close()
-            raise
+        super().__init__(_udp_socket(socket.socket.connect, host, port))
 
     # A datagram that nobody took makes the next call fail, once.
 
@@ -70,40 +89,36 @@ class UdpOutPort(_Socket):
         return 0
 
 
-class UdpInPort(_Socket):
+class UdpInPort(Port):
     """A UDP socket that listens. It sends to the first sender heard, until `answer_sender` selects another."""
 
     def __init__(self, host: str, port: int) -> None:
-        super().__init__(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        # No SO_REUSEADDR: with it, a second program on the port would silently take the first one's datagrams.
+        super().__init__(_udp_socket(socket.socket.bind, host, port))
         self._peer: Sender | None = None
-        try:
-            # No SO_REUSEADDR: with it, a second program on the port would silently take the first one's datagrams.
-            self._sock.bind(_resolved(host, port))
-        except OSError:
-            self.close()
-            raise
-
-    @property
-    def connected(self) -> bool:  # type: ignore[override]
-        return self._peer is not None
+        self.connected = False
 
     def read(self) -> bytes:
         with suppress(BlockingIOError):
             data, self.sender = self._sock.recvfrom(READ_BYTES)
-            self._peer = self._peer or self.sender
+            if self._peer is None:
+                self.answer_sender()
             return data
         return b""
 
     def write(self, data: bytes) -> int:
         with suppress(BlockingIOError):
-            return self._sock.sendto(data, self._peer)  # type: ignore[arg-type]
+            return self._sock.sendto(data, self._peer) if self._peer else 0
         return 0
 
     def answer_sender(self) -> None:
         self._peer = self.sender
+        self.connected = self._peer is not None
 
 
-class TcpPort(_Socket):
+class TcpPort(Port):
+    """A TCP connection to a server."""
+
     def __init__(self, host: str, port: int) -> None:
         super().__init__(socket.create_connection((host, port), CONNECT_TIMEOUT_S))
         self._sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -115,30 +130,19 @@ class TcpPort(_Socket):
             self.close()
             raise ConnectionRefusedError(errno.ECONNREFUSED, os.strerror(errno.ECONNREFUSED))
 
-    def read(self) -> bytes:
-        with suppress(BlockingIOError):
-            data = self._sock.recv(READ_BYTES)
-            if not data:
-                raise ConnectionError("the other end closed the connection")
-            return data
-        return b""
-
-    def write(self, data: bytes) -> int:
-        with suppress(BlockingIOError):
-            return self._sock.send(data)
-        return 0
-
     def unsent(self) -> int:
         # SIOCOUTQ, which has the number of TIOCOUTQ.
-        return struct.unpack("i", fcntl.ioctl(self._sock, termios.TIOCOUTQ, bytes(4)))[0]
+        return int.from_bytes(fcntl.ioctl(self._sock, termios.TIOCOUTQ, bytes(4)), "little")
 
     def throw_away(self) -> None:
         self._sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
 
 
-class SerialPort:
-    connected = True
-    sender: Sender | None = None
+class SerialPort(Port):
+    """A serial line. It is read and written by its descriptor: when the buffer is full, pyserial's own non-blocking
+    write spins."""
+
+    _end = "the device is gone"
 
     def __init__(self, device: str, baud: int) -> None:
         import serial  # not at the top: no other kind of link needs it
@@ -155,31 +159,10 @@ class SerialPort:
             raise
 
     def fileno(self) -> int:
-        return self._port.fileno()
-
-    # Not pyserial's own `read` and `write`: when the buffer is full, its non-blocking write spins.
-
-    def read(self) -> bytes:
-        with suppress(BlockingIOError):
-            data = os.read(self._port.fd, READ_BYTES)
-            if not data:
-                raise ConnectionError("the device is gone")
-            return data
-        return b""
-
-    def write(self, data: bytes) -> int:
-        with suppress(BlockingIOError):
-            return os.write(self._port.fd, data)
-        return 0
-
-    def answer_sender(self) -> None:
-        pass
+        return int(self._port.fileno())
 
     def unsent(self) -> int:
-        return self._port.out_waiting
-
-    def throw_away(self) -> None:
-        pass
+        return int(self._port.out_waiting)
 
     def close(self) -> None:
         with suppress(OSError, termios.error):
@@ -189,5 +172,55 @@ class SerialPort:
         self._port.close()
 
 
-def _resolved(host: str, port: int) -> Sender:
-    return socket.getaddrinfo(host, port, socket.AF_INET, socket.SOCK_DGRAM)[0][4]  # type: ignore[return-value]
+def open_port(address: LinkAddress) -> Port:
+    """Open the port of a link.
+
+    Raises LinkAddressError for an address that is wrong (an unknown host, a file that is no device, the address of a
+    network), LinkError for another fault that the user must correct (a port in use, no permission), and OSError for a
+    fault that may end by itself (a device that is not plugged in, a server that is not running).
+    """
+    try:
+        return _OPENERS[address.kind](address.where, address.number)
+    except (socket.gaierror, UnicodeError) as error:
+        # A host may be found later where no name server answers, or where it announces itself.
+        is_unasked = isinstance(error, socket.gaierror) and error.errno != socket.EAI_NONAME
+        kind = LinkError if is_unasked or address.where.endswith(".local") else LinkAddressError
+        raise kind(f"{address}: there is no host {address.where!r}: correct it, or give an IP address.") from error
+    except ValueError as error:
+        raise LinkAddressError(
+            f"{address}: it cannot be opened ({error}): correct the device or the baud rate."
+        ) from error
+    except OSError as error:
+        match error.errno, address.kind:
+            case (errno.EADDRINUSE, _):
+                advice = f"port {address.number} is in use by another program: stop that one, or take another port"
+            case (errno.EWOULDBLOCK, "serial"):
+                advice = "the device is in use by another program: stop that one"
+            case (errno.EACCES | errno.EPERM, "serial"):
+                advice = "this user may not open the device: add the user to the group that owns it (often `dialout`)"
+            case (errno.EACCES | errno.EPERM, _):
+                advice = "the system does not permit it: take a port above 1023 and the address of one host"
+            case _:
+                raise
+        is_wrong = error.errno == errno.EACCES and address.kind != "serial"
+        raise (LinkAddressError if is_wrong else LinkError)(f"{address}: {advice}.") from error
+
+
+_OPENERS: dict[str, Callable[[str, int], Port]] = {
+    "udpout": UdpOutPort,
+    "udpin": UdpInPort,
+    "tcp": TcpPort,
+    "serial": SerialPort,
+}
+
+
+def _udp_socket(attach: Callable[[socket.socket, Sender], None], host: str, port: int) -> socket.socket:
+    """Make a UDP socket, and bind or connect it."""
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        address = socket.getaddrinfo(host, port, socket.AF_INET, socket.SOCK_DGRAM)[0][4]
+        attach(sock, (str(address[0]), int(address[1])))
+    except OSError:
+        sock.close()
+        raise
+    return sock

@@ -4,16 +4,16 @@ import math
 from dataclasses import dataclass
 
 from edgevpr.core.geodesy import offset_m
-from edgevpr.mavlink.autopilots.px4 import SENSOR_ID
 from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.wire import Message, mavlink
 
+SENSOR_ID = 1  # in our messages 296, and of EKF2_AGP0_ID: 0 switches the slot off
 _YAW_SD = math.radians(5.0)
 _GPS_EPOCH_S, _LEAP_S = 315_964_800, 18  # 1980-01-06; leap seconds since then, as of 2017
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class State:
+class MotionState:
     """Position and motion of the vehicle at `t_mono_s`: altitude above sea level, velocity east, north and down, and
     standard deviations (1 sigma of one axis; `alt_accuracy_m` of the altitude). `attitude` is roll, pitch and yaw in
     radians."""
@@ -49,26 +49,12 @@ def position_sensor(fix: Fix, t_sent_s: float) -> Message:
     )
 
 
-def gps_input(state: State | None, receiver: int, t_mono_s: float, t_unix_s: float | None) -> Message:
+def gps_input(state: MotionState | None, receiver: int, t_mono_s: float, t_unix_s: float | None) -> Message:
     """Make a GPS_INPUT (232) as the receiver of this number; a `state` of None says that there is no fix. `t_unix_s` is
     the time of the state by the vehicle's clock, seconds since 1970 (None: unknown)."""
     week, week_ms = _gps_time(t_unix_s)
     ignored = mavlink.GPS_INPUT_IGNORE_FLAG_HDOP | mavlink.GPS_INPUT_IGNORE_FLAG_VDOP
-    told = {}
-    if state:
-        east, north, down = state.velocity_m_s
-        told = {
-            "lat": round(state.lat_deg * 1e7),
-            "lon": round(state.lon_deg * 1e7),
-            "alt": state.alt_m,
-            "vn": north,
-            "ve": east,
-            "vd": down,
-            "speed_accuracy": state.speed_accuracy_m_s,
-            "horiz_accuracy": state.accuracy_m,
-            "vert_accuracy": state.alt_accuracy_m,
-        }
-    names = ["lat", "lon", "alt", "vn", "ve", "vd", "speed_accuracy", "horiz_accuracy", "vert_accuracy"]
+    east, north, down = state.velocity_m_s if state else (0, 0, 0)
     return mavlink.MAVLink_gps_input_message(
         time_usec=round(t_mono_s * 1e6),
         gps_id=receiver,
@@ -80,20 +66,28 @@ def gps_input(state: State | None, receiver: int, t_mono_s: float, t_unix_s: flo
         vdop=0.0,
         # The fewest with which a filter begins, so that a real receiver is always preferred.
         satellites_visible=6 if state else 0,
-        **{name: told.get(name, 0) for name in names},
+        lat=round(state.lat_deg * 1e7) if state else 0,
+        lon=round(state.lon_deg * 1e7) if state else 0,
+        alt=state.alt_m if state else 0,
+        vn=north,
+        ve=east,
+        vd=down,
+        speed_accuracy=state.speed_accuracy_m_s if state else 0,
+        horiz_accuracy=state.accuracy_m if state else 0,
+        vert_accuracy=state.alt_accuracy_m if state else 0,
     )
 
 
-def odometry(state: State, origin: tuple[float, float, float]) -> Message:
+def odometry(state: MotionState, attitude: tuple[float, float, float], origin: tuple[float, float, float]) -> Message:
     """Make an ODOMETRY (331) in the only frames that ArduPilot takes: position north, east, down of an `origin`
-    (degrees, metres above sea level), velocity along the airframe.
+    (degrees, metres above sea level), velocity along the airframe at an `attitude` (roll, pitch, yaw in radians).
 
     ArduPilot takes the cube root of the sum of the squared variances of a position for its standard deviation
     (`GCS_MAVLINK::handle_odometry`, 4.7-dev), and the same of the angles; so the variances are those that give it the
     right one. No angle may be NaN. The height's own is none of ours, and zero.
     """
     east_m, north_m = offset_m(origin[0], origin[1], state.lat_deg, state.lon_deg)
-    roll, pitch, yaw = state.attitude
+    roll, pitch, yaw = attitude
     east, north, down = state.velocity_m_s
     vx, vy, vz = _along_airframe((north, east, down), roll, pitch, yaw)
     # The upper triangle of 6 x 6, row by row: only its diagonal is known.

@@ -5,8 +5,8 @@ import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from edgevpr.mavlink.asking import Asking
-from edgevpr.mavlink.autopilots.channel import Asked, Kind, kind_of
+from edgevpr.mavlink.asking import Inquiry
+from edgevpr.mavlink.channel import Answers, Kind, kind_of
 from edgevpr.mavlink.wire import Message, mavlink
 
 LISTEN_S = 4.0
@@ -18,7 +18,7 @@ _BYTEWISE = mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Filter:
+class FilterState:
     """The state of the autopilot's filter (EKF), by the flags that it reports."""
 
     flags: int
@@ -29,7 +29,7 @@ class Filter:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Reading:
+class AutopilotReading:
     """The answers of an autopilot; None and empty stand for what it did not say.
 
     `firmware` is "ardupilot", "px4" or "other"; `vehicle` is the value of its `Kind`; `gps_fix` holds the fix type of
@@ -48,7 +48,7 @@ class Reading:
     streams_hz: dict[str, float]
     heard: tuple[str, ...]
     gps_fix: tuple[int | None, int | None]
-    filter: Filter | None
+    filter: FilterState | None
     origin: tuple[float, float] | None
     signs: bool
     is_signed_to: bool
@@ -60,12 +60,12 @@ class Reading:
     clock_ahead_s: float | None
 
     @property
-    def asked(self) -> Asked:
+    def asked(self) -> Answers:
         """Answers by which the flight chooses the channel."""
-        return Asked(kind=Kind(self.vehicle), version=self.version and self.version[:2], parameters=self.parameters)
+        return Answers(kind=Kind(self.vehicle), version=self.version and self.version[:2], parameters=self.parameters)
 
 
-def read_autopilot(asking: Asking, wanted: Mapping[str, Iterable[str]]) -> Reading | None:
+def read_autopilot(asking: Inquiry, wanted: Mapping[str, Iterable[str]]) -> AutopilotReading | None:
     """Read all that can be read; None where no heartbeat comes. `wanted` are the names of parameters by firmware.
 
     It takes ten seconds, half a minute where the autopilot does not answer. Raises LinkError where the link is lost.
@@ -90,7 +90,7 @@ def read_autopilot(asking: Asking, wanted: Mapping[str, Iterable[str]]) -> Readi
     clock_ahead_s = clock.time_unix_usec / 1e6 - time.time() if clock and clock.time_unix_usec else None
     bytewise = bool(said.capabilities & _BYTEWISE) if said else is_px4
     names = wanted.get(firmware, ()) if answers else ()
-    return Reading(
+    return AutopilotReading(
         system_id=asking.system_id,
         firmware=firmware,
         vehicle=kind_of(beat.type).value,
@@ -115,13 +115,13 @@ def read_autopilot(asking: Asking, wanted: Mapping[str, Iterable[str]]) -> Readi
 
 
 def _no_message(message_id: int) -> Message | None:
-    """Stand in for `Asking.message` where the autopilot answers nothing: each question would take three seconds."""
+    """Stand in for `Inquiry.message` where the autopilot answers nothing: each question would take three seconds."""
     return None
 
 
-def _filter(report: Message) -> Filter:
+def _filter(report: Message) -> FilterState:
     """Read EKF_STATUS_REPORT or ESTIMATOR_STATUS: those of the flags that are used here have the same values."""
-    return Filter(
+    return FilterState(
         flags=report.flags,
         has_attitude=bool(report.flags & mavlink.EKF_ATTITUDE),
         has_position=bool(report.flags & mavlink.EKF_POS_HORIZ_ABS),

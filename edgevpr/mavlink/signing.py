@@ -1,7 +1,8 @@
-"""Signing of MAVLink 2: the key, the signature of what is sent, and the check of what arrives.
+"""Signing of MAVLink 2: the key, the signature of what is sent, the check of what arrives, and their time stamps.
 
 pymavlink signs what is sent. It does not check what arrives: it would store the time stamp of a message before it
-compares the signature, so that one forged message from the far future would shut out all true ones.
+compares the signature, so that one forged message from the far future would shut out all true ones. Time stamps never
+go back, neither in a flight nor from one flight to the next.
 """
 
 import hashlib
@@ -9,20 +10,32 @@ import hmac
 import logging
 import os
 import stat
+import time
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from threading import Lock, Thread
 from types import MappingProxyType
 
 from edgevpr.core.errors import ConfigError
-from edgevpr.core.files import open_file
-from edgevpr.mavlink.timestamps import CROWDED, FUTURE, OLD, BorrowedTimeStamps, TimeStamps
+from edgevpr.core.files import open_file, read_file, write_whole
 from edgevpr.mavlink.wire import Message, mavlink
+
+TICKS_S = 100_000  # a time stamp counts units of 10 microseconds since the beginning of 2015, UTC
+_EPOCH_S = 1_420_070_400
+_LATEST = 2**48 - 1  # it has six bytes
+_NEAR = 60 * TICKS_S
+_KEPT_EVERY = 30 * TICKS_S
+# At a start the time stamps move on by a minute beyond the largest that can have been used. So nothing that was sent
+# before, to us or by us, is less than a minute old, and a replay of it passes for no new stream.
+_MOVED_ON = _KEPT_EVERY + 60 * TICKS_S
+_STREAMS_MAX = 64  # far more than are on the air; invented ones must not fill the memory
 
 KEY_BYTES = 32
 # Link ids: who hears us over two has two streams, each with its own time.
 TO_AUTOPILOT, TO_GROUND, TO_ASK = 1, 2, 3
 UNSIGNED, WRONG = "unsigned", "wrong signature"
+OLD, FUTURE, CROWDED = "old time stamp", "time stamp from the future", "too many senders"
 _SIGNATURE_BYTES, _STAMP_BYTES = 6, 6
 _BLOCK_BYTES = 1 + _STAMP_BYTES + _SIGNATURE_BYTES  # link id, time stamp, signature
 _MAKE_ONE = "`(umask 077; head -c 32 /dev/urandom > FILE)` makes one"
@@ -35,7 +48,104 @@ MEANING = {
     CROWDED: "there are more of them than an aircraft and its ground have",
 }
 
+Stream = tuple[int, int, int]  # system, component and link id of a sender
+
 log = logging.getLogger(__name__)
+
+
+class TimeStamps:
+    """The largest time stamp that was ever sent or received, and the last of every stream; any thread may ask.
+
+    The largest is kept in a file, since a board without a clock chip begins with an old time: it is written at the
+    start, raises ConfigError where it is damaged or cannot be made, and from then on every half minute.
+
+    A program that only asks reads the file and never writes it (`is_kept` False): it may run as root, whose file the
+    service could not write. So the next flight does not know what was sent meanwhile. It need not: with a link id of
+    its own the program is another stream, which the autopilot compares with the flight's only for whether a new one is
+    a minute old. Both begin at the same kept time, and the program ends within that minute.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        mono_s: Callable[[], float] = time.monotonic,
+        utc_s: Callable[[], float] = time.time,
+        is_kept: bool = True,
+    ) -> None:
+        self._path, self._mono_s, self._utc_s, self._is_kept = path, mono_s, utc_s, is_kept
+        self._lock, self._writing = Lock(), Lock()
+        self._streams: dict[Stream, int] = {}
+        self._has_warned = False
+        self._written = _read_stamp(path)
+        self._rebase(self._written + _MOVED_ON)
+        self._largest = self._kept = self._now()
+        self._keep(self._kept, may_fail=not path.exists())
+
+    def next(self) -> int:
+        """Return the time stamp of the next message to be sent, which is larger than any before."""
+        with self._lock:
+            self._move_on(max(self._largest + 1, self._now()))
+            return min(self._largest, _LATEST)
+
+    def refusal(self, stream: Stream, stamp: int) -> str | None:
+        """Return why a message with this time stamp is refused, in a few words. Return None where it is admitted, and
+        take note of it: so this must be asked only of a message whose signature is right.
+
+        A stream must go on. A new one must be within a minute of the largest time stamp, except that the first of all
+        may be ahead by any time: it is how a board without a clock chip learns the time.
+        """
+        with self._lock:
+            now = max(self._largest, self._now())
+            if stamp <= self._streams.get(stream, now - _NEAR):
+                return OLD
+            if stream not in self._streams:
+                if self._streams and stamp > now + _NEAR:
+                    return FUTURE
+                if self._is_crowded(now):
+                    return CROWDED
+            self._streams[stream] = stamp
+            if stamp > now:
+                self._rebase(stamp)
+                self._move_on(stamp)
+            return None
+
+    def _is_crowded(self, now: int) -> bool:
+        if len(self._streams) >= _STREAMS_MAX:
+            # What these have sent stays refused: as a new stream's it would be older than a minute.
+            self._streams = {stream: last for stream, last in self._streams.items() if last > now - _NEAR}
+        return len(self._streams) >= _STREAMS_MAX
+
+    def _now(self) -> int:
+        """Return the time of the system's clock, or that which has gone on since the largest time was learnt."""
+        by_system = int((self._utc_s() - _EPOCH_S) * TICKS_S)
+        return max(by_system, self._base + int((self._mono_s() - self._base_s) * TICKS_S))
+
+    def _rebase(self, stamp: int) -> None:
+        self._base, self._base_s = stamp, self._mono_s()
+
+    def _move_on(self, stamp: int) -> None:
+        self._largest = stamp
+        if stamp - self._kept >= _KEPT_EVERY:
+            self._kept = stamp
+            # Not in the thread of a link: a slow card must not hold up a fix.
+            Thread(target=self._keep, args=(stamp,), name="signing time", daemon=True).start()
+
+    def _keep(self, stamp: int, may_fail: bool = False) -> None:
+        """Write a time stamp. That this is not possible is said once; where it `may_fail`, it raises ConfigError."""
+        try:
+            with self._writing:
+                if self._is_kept and stamp > self._written:  # two that are written at once may come in any order
+                    write_whole(self._path, lambda path: path.write_text(f"{stamp}\n"))
+                    self._written = stamp
+        except OSError as error:
+            if may_fail:
+                raise ConfigError(
+                    f"{self._path}: the time of signed messages cannot be kept there ({error.strerror}): correct "
+                    "`mavlink: {signing_state: ...}`."
+                ) from error
+            if not self._has_warned:
+                self._has_warned = True
+                log.warning("%s: the time of signed messages is not kept (%s)", self._path, error.strerror)
 
 
 class NotSigning:
@@ -44,25 +154,25 @@ class NotSigning:
     refused: Mapping[str, int] = MappingProxyType({})
 
     def of_ground(self) -> "NotSigning":
-        """Return the same: there is nothing to keep apart."""
+        """Return that of the link to the ground."""
         return self
 
     def take_verdicts(self) -> list[str | None]:
-        """Return none: nothing is judged."""
+        """Return of every message since the last call why it was refused, None where it was admitted."""
         return []
 
-    def stamp(self, packer: mavlink.MAVLink) -> None:
-        """Do nothing."""
+    def stamp(self, packer: Message) -> None:
+        """Let a packer sign its next message."""
 
     def admits(self, message: Message) -> bool:
-        """Return True."""
+        """Tell whether a message is to be believed."""
         return True
 
 
 NOT_SIGNING = NotSigning()
 
 
-class Signing:
+class Signing(NotSigning):
     """Signs what one link sends, and admits what is signed with the same key and not older than what came before.
     `refused` counts the rest by reason; each reason is said once."""
 
@@ -72,16 +182,14 @@ class Signing:
         self._verdicts: list[str | None] = []
 
     def of_ground(self) -> "Signing":
-        """Return that of the link to the ground: the same key and time, another link id."""
+        """Return one with the same key and time, and another link id."""
         return Signing(self._key, self._stamps, TO_GROUND)
 
     def take_verdicts(self) -> list[str | None]:
-        """Return of every message since the last call why it was refused, None where it was admitted."""
         verdicts, self._verdicts = self._verdicts, []
         return verdicts
 
-    def stamp(self, packer: mavlink.MAVLink) -> None:
-        """Let a packer sign its next message."""
+    def stamp(self, packer: Message) -> None:
         signing = packer.signing
         signing.sign_outgoing, signing.secret_key, signing.link_id = True, self._key, self._link_id
         signing.timestamp = self._stamps.next()
@@ -91,16 +199,17 @@ class Signing:
         since a radio has no key; but it must not speak for an autopilot."""
         header = message.get_header()
         reason = self._refusal(message.get_msgbuf(), header)
-        is_admitted = reason is None or (reason == UNSIGNED and _is_of_radio(header))
-        self._verdicts.append(None if is_admitted else reason)
-        if is_admitted:
+        if reason == UNSIGNED and _is_of_radio(header):
+            reason = None
+        self._verdicts.append(reason)
+        if reason is None:
             return True
         if reason not in self.refused:
             log.warning("messages are refused (%s): %s", reason, MEANING[reason])
         self.refused[reason] += 1
         return False
 
-    def _refusal(self, packet: bytes, header: mavlink.MAVLink_header) -> str | None:
+    def _refusal(self, packet: bytes, header: Message) -> str | None:
         if not header.incompat_flags & mavlink.MAVLINK_IFLAG_SIGNED:
             return UNSIGNED
         signed, signature = packet[:-_SIGNATURE_BYTES], packet[-_SIGNATURE_BYTES:]
@@ -111,28 +220,14 @@ class Signing:
         return self._stamps.refusal((header.srcSystem, header.srcComponent, packet[-_BLOCK_BYTES]), stamp)
 
 
-def _is_of_radio(header: mavlink.MAVLink_header) -> bool:
-    return header.msgId == mavlink.MAVLINK_MSG_ID_RADIO_STATUS and header.srcComponent != mavlink.MAV_COMP_ID_AUTOPILOT1
-
-
-def open_signing(key_path: str | None, state_path: str | None) -> Signing | NotSigning:
+def open_signing(key_path: str | None, state_path: str | None, to_ask: bool = False) -> NotSigning:
     """Read the key and the time kept; without a key there is no signing. `state_path` is where the time is kept, None:
-    beside the key. Raises ConfigError."""
-    return _opened(key_path, state_path, TimeStamps, TO_AUTOPILOT)
-
-
-def open_signing_to_ask(key_path: str | None, state_path: str | None) -> Signing | NotSigning:
-    """Open the same for questions on the ground: the time that is kept is read, and not written. Raises ConfigError."""
-    return _opened(key_path, state_path, BorrowedTimeStamps, TO_ASK)
-
-
-def _opened(
-    key_path: str | None, state_path: str | None, time_stamps: type[TimeStamps], link_id: int
-) -> Signing | NotSigning:
+    beside the key. For questions on the ground (`to_ask`) the time is read, and not written. Raises ConfigError."""
     if key_path is None:
         return NOT_SIGNING
     key = read_key(key_path)
-    return Signing(key, time_stamps(Path(state_path or f"{key_path}.time")), link_id)
+    stamps = TimeStamps(Path(state_path or f"{key_path}.time"), is_kept=not to_ask)
+    return Signing(key, stamps, TO_ASK if to_ask else TO_AUTOPILOT)
 
 
 def read_key(path: str) -> bytes:
@@ -155,3 +250,20 @@ def _is_credential(path: str, mode: int) -> bool:
     which shows as the right of a group to read; the folder is open to nobody else."""
     folder = os.environ.get("CREDENTIALS_DIRECTORY")
     return folder is not None and Path(path).absolute().parent == Path(folder) and not mode & 0o037
+
+
+def _read_stamp(path: Path) -> int:
+    """Read the kept time stamp, 0 where there is none."""
+    try:
+        text = read_file(path, 64).decode("ascii", "replace").strip()
+    except FileNotFoundError:
+        return 0
+    except OSError as error:
+        raise ConfigError(f"{path}: the time of signed messages cannot be read ({error.strerror}).") from error
+    if not (text.isascii() and text.isdigit() and int(text) <= _LATEST):
+        raise ConfigError(f"{path} holds no time of signed messages: set the clock, and delete the file.")
+    return int(text)
+
+
+def _is_of_radio(header: Message) -> bool:
+    return header.msgId == mavlink.MAVLINK_MSG_ID_RADIO_STATUS and header.srcComponent != mavlink.MAV_COMP_ID_AUTOPILOT1

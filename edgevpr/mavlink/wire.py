@@ -5,14 +5,18 @@ of RAM. `mavutil` is not imported: it would take another 20 MB, and its connecti
 this package must not.
 """
 
+import math
+import struct
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterator
+from typing import Any, TypeAlias
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-Message = mavlink.MAVLink_message
-Tap = Callable[[bytes], object]  # gets every whole packet, as it is on the wire
+__all__ = ["Message", "PacketReader", "Tap", "mavlink", "parameter_value", "untapped"]
 
+Message: TypeAlias = Any  # mavlink.MAVLink_message, of which every kind has fields of its own
+Tap = Callable[[bytes], object]  # gets every whole packet, as it is on the wire
 
 _SENDERS_MAX = 8  # whose unfinished messages are kept; a flood from invented addresses must not fill the memory
 
@@ -21,7 +25,7 @@ def untapped(packet: bytes) -> None:
     """Do nothing with a packet: the tap of a link that has no tlog."""
 
 
-class Receiver:
+class PacketReader:
     """The parser of what arrives, apart for each sender: a message that one begins swallows nothing of another's. It
     yields the messages that are admitted; bytes that are no message are dropped and counted."""
 
@@ -65,3 +69,15 @@ class Receiver:
                 self._parsers.pop(next(iter(self._parsers)))
         self._parsers[sender] = parser
         return parser
+
+
+def parameter_value(message: Message, bytewise: bool) -> float | int | None:
+    """Read a PARAM_VALUE: its float32 is the number itself or, where the autopilot works `bytewise` (PX4), holds the
+    bytes of a whole number. Return None where it is no number."""
+    is_whole = message.param_type < mavlink.MAV_PARAM_TYPE_REAL32
+    if is_whole and bytewise:
+        return int.from_bytes(struct.pack("<f", message.param_value), "little", signed=True)
+    value: float = message.param_value
+    if not math.isfinite(value):
+        return None
+    return int(value) if is_whole else value

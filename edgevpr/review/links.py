@@ -5,10 +5,10 @@ from base64 import b64decode
 from collections import Counter, deque
 from typing import Any
 
-from edgevpr.mavlink.ground import GroundLink
+from edgevpr.mavlink.fixes import Sending
+from edgevpr.mavlink.groundlink import GroundLink
 from edgevpr.mavlink.line import LOST
 from edgevpr.mavlink.link import Link
-from edgevpr.mavlink.outbox import Sending
 from edgevpr.mavlink.signing import KEY_BYTES
 from edgevpr.mavlink.wire import Message, mavlink
 
@@ -37,14 +37,14 @@ class ReplayedLink(Link):
                     _log.debug("a turn of the link failed", exc_info=True)
 
     def _waits(self) -> None:
-        self._conversation.outbox.drop_stale_fixes(self._turns.now_s())
+        self._conversation.fixes.drop_stale(self._turns.now_s())
 
     def _answers(self) -> None:
         self._conversation.tell_of_answers()
 
     def _heard(self, data: str, sender: list[Any] | None, verdicts: list[str | None]) -> None:
         if verdicts:
-            self._conversation.signing.verdicts = deque(verdicts)
+            self._settings.signing.verdicts = deque(verdicts)
         self._conversation.hear(b64decode(data), self._turns.now_s(), sender and tuple(sender))
 
     def _said(self, then: str | None) -> None:

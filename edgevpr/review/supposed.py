@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from edgevpr.mavlink.ground import GroundLink
+from edgevpr.mavlink.groundlink import GroundLink
 from edgevpr.review.links import ReplayedLink
 from edgevpr.review.tape import Playback
 

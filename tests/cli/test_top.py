@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from edgevpr.cli.top import rows
-from edgevpr.mavlink.autopilots.channel import Channel
+from edgevpr.mavlink.channel import Channel
 from tests.runtime.statuses import LINK, STATUS
 
 

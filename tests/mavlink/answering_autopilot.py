@@ -10,7 +10,7 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from edgevpr.mavlink.wire import Receiver, mavlink
+from edgevpr.mavlink.wire import PacketReader, mavlink
 
 BEAT_S = 0.05  # twenty times as fast as a real one, so that nothing is waited for
 
@@ -71,7 +71,7 @@ class AnsweringAutopilot:
         if key:
             self._packer.signing.secret_key, self._packer.signing.sign_outgoing = key, True
             self._packer.signing.timestamp = int((time.time() - 1_420_070_400) * 1e5)
-        self._receiver = Receiver(lambda message: not wants_signed or message.get_signed())
+        self._receiver = PacketReader(lambda message: not wants_signed or message.get_signed())
         if wants_signed:
             self._receiver._parser_of(None).signing.secret_key = key
         self._port = UdpEnd(to) if isinstance(to, int) else SerialEnd(to)

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 from mavlink_peers import wait_until
 
-from edgevpr.mavlink.wire import Receiver
+from edgevpr.mavlink.wire import PacketReader
 
 CLIENTS = Path(os.environ.get("EDGEVPR_CLIENTS") or Path(sys.prefix) / "clients")
 # ArduPilot passes these of a companion's messages on to the ground, among others.
@@ -48,7 +48,7 @@ class Router:
             each.close()
 
     def _route(self) -> None:
-        receiver, has_autopilot = Receiver(), False
+        receiver, has_autopilot = PacketReader(), False
         while not self._stop.is_set():
             if not has_autopilot:
                 self._pass(b"\n", self._autopilot)  # it listens, and speaks to who has spoken

@@ -10,7 +10,10 @@ import tty
 from pathlib import Path
 
 from edgevpr.lab.simulate.autopilot import AutopilotSummary, run_autopilot
-from edgevpr.mavlink.wire import Receiver, mavlink
+from edgevpr.mavlink.address import parse_link
+from edgevpr.mavlink.conversation import LinkSettings
+from edgevpr.mavlink.link import Link
+from edgevpr.mavlink.wire import PacketReader, mavlink
 
 PATIENCE_S = 60.0  # a machine that does much else is slow, and not wrong
 
@@ -25,6 +28,11 @@ def wait_until(condition, what: str = "the condition", every_s: float = 0.005):
     raise AssertionError(f"{what} did not come true in {PATIENCE_S:.0f} s")
 
 
+def link_to(url: str, **settings) -> Link:
+    """Make a link by its address as a user writes it, and its settings."""
+    return Link(parse_link(url), LinkSettings(**settings))
+
+
 def free_port(kind: int = socket.SOCK_DGRAM) -> int:
     with socket.socket(socket.AF_INET, kind) as sock:
         sock.bind(("127.0.0.1", 0))
@@ -37,7 +45,7 @@ class Peer:
     def __init__(self, port, system_id: int = 1) -> None:
         self.port = port
         self.seen = []
-        self.receiver = Receiver()
+        self.receiver = PacketReader()
         self._senders = {}
         self._system_id = system_id
 

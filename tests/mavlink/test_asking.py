@@ -10,7 +10,7 @@ from edgevpr.core.errors import LinkAddressError, LinkError
 from edgevpr.mavlink import asking as module
 from edgevpr.mavlink import reading
 from edgevpr.mavlink.address import LinkAddress, parse_link
-from edgevpr.mavlink.asking import Asking
+from edgevpr.mavlink.asking import Inquiry
 from edgevpr.mavlink.reading import read_autopilot
 from edgevpr.mavlink.wire import mavlink
 
@@ -28,7 +28,7 @@ def _listens_briefly(monkeypatch):
 
 
 def read(address, names=(), **autopilot):
-    with AnsweringAutopilot(address.number, **autopilot) as peer, Asking(address) as asking:
+    with AnsweringAutopilot(address.number, **autopilot) as peer, Inquiry(address) as asking:
         return read_autopilot(asking, {"ardupilot": names, "px4": names}), peer
 
 
@@ -57,7 +57,7 @@ def test_nothing_is_ever_set(address):
 def test_questions_that_are_lost_are_asked_again(address):
     names = [f"P{number}" for number in range(12)]
     answers = {"messages": healthy_messages(), "parameters": dict.fromkeys(names, 3)}
-    with AnsweringAutopilot(address.number, loses=1, **answers), Asking(address) as asking:
+    with AnsweringAutopilot(address.number, loses=1, **answers), Inquiry(address) as asking:
         assert asking.heartbeat(60)
         assert asking.message(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
         assert asking.parameters(names, bytewise=False) == dict.fromkeys(names, 3)
@@ -106,7 +106,7 @@ def test_a_second_autopilot_is_named_and_not_listened_to(address):
         said, _ = read(address, ["A"], system_id=9, messages=healthy_messages((4, 5, 1)))
     assert (said.system_id, said.other_systems) == (9, ())
     with AnsweringAutopilot(address.number, system_id=3), AnsweringAutopilot(address.number, system_id=4) as other:
-        with Asking(address, system_id=4) as asking:
+        with Inquiry(address, system_id=4) as asking:
             assert asking.heartbeat(60).get_srcSystem() == 4
             asking.listen(0.3)
         assert asking.others == {3}
@@ -115,7 +115,7 @@ def test_a_second_autopilot_is_named_and_not_listened_to(address):
 
 
 def test_where_no_autopilot_is_there_is_no_reading(address):
-    with Asking(address) as asking:
+    with Inquiry(address) as asking:
         assert asking.heartbeat(0.1) is None
         assert asking.bad_bytes == 0
 
@@ -126,7 +126,7 @@ def test_a_serial_cable_is_a_link_too(tmp_path):
     answers = {"messages": healthy_messages(), "parameters": {"GPS1_TYPE": 14}}
     with (
         AnsweringAutopilot(tmp_path / "b", **answers),
-        Asking(LinkAddress("serial", str(tmp_path / "a"), 115_200)) as asking,
+        Inquiry(LinkAddress("serial", str(tmp_path / "a"), 115_200)) as asking,
     ):
         said = read_autopilot(asking, {"ardupilot": ["GPS1_TYPE"]})
     cable.unplug()
@@ -136,15 +136,15 @@ def test_a_serial_cable_is_a_link_too(tmp_path):
 def test_what_cannot_be_opened_is_a_sentence():
     server = LinkAddress("tcp", "127.0.0.1", free_port(socket.SOCK_STREAM))
     with pytest.raises(LinkError, match=r"is not there \(Connection refused\): connect it or start the other end"):
-        Asking(server)
+        Inquiry(server)
     with pytest.raises(LinkAddressError, match="there is no host"):
-        Asking(parse_link("udpout:no-such-host.invalid:14550"))
+        Inquiry(parse_link("udpout:no-such-host.invalid:14550"))
 
 
 def test_a_cable_that_is_pulled_is_a_sentence(tmp_path):
     cable = SerialCable(tmp_path)
     cable.plug()
-    asking = Asking(LinkAddress("serial", str(tmp_path / "a"), 115_200))
+    asking = Inquiry(LinkAddress("serial", str(tmp_path / "a"), 115_200))
     cable.unplug()
     with pytest.raises(LinkError, match=r"was lost \(.*\): look at the cable"), asking:
         asking.listen(60)

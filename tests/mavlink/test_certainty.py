@@ -5,9 +5,9 @@ import math
 import pytest
 from fakes import FakeClock
 
-from edgevpr.mavlink.certainty import DRIFT_M_S, GPS_SD_M
-from edgevpr.mavlink.conversation import Conversation
+from edgevpr.mavlink.conversation import Conversation, LinkSettings
 from edgevpr.mavlink.messages import Fix
+from edgevpr.mavlink.vehicle import DRIFT_M_S, GPS_SD_M
 from edgevpr.mavlink.wire import mavlink
 
 ABS, REL, CONST_POS = mavlink.EKF_POS_HORIZ_ABS, mavlink.EKF_POS_HORIZ_REL, mavlink.EKF_CONST_POS_MODE
@@ -19,7 +19,7 @@ class Autopilot:
 
     def __init__(self) -> None:
         self.clock = FakeClock()
-        self.conversation = Conversation(self.clock, 197, None, 1.0)
+        self.conversation = Conversation(LinkSettings(), self.clock)
         self._packer = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
         self.beat()
 
@@ -42,7 +42,7 @@ class Autopilot:
     def take_fix(self, result, accuracy_m=12.0):
         """Let a fix be sent, and answer it."""
         self.beat()
-        sending = self.conversation.outbox.put_fix(Fix(50.0, 8.0, accuracy_m, self.clock.now_s), self.clock.now_s)
+        sending = self.conversation.fixes.put(Fix(50.0, 8.0, accuracy_m, self.clock.now_s), self.clock.now_s)
         while (packet := self.conversation.next_packet()) and packet[1] is None:
             pass
         self.conversation.note_departed([sending])

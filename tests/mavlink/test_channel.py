@@ -4,19 +4,19 @@ import struct
 
 import pytest
 from fakes import FakeClock
-from mavlink_peers import Peer, UdpPort, wait_until
+from mavlink_peers import Peer, UdpPort, link_to, wait_until
 
 from edgevpr.core.types import Position
 from edgevpr.mavlink.address import parse_link
-from edgevpr.mavlink.autopilots import ardupilot, px4
-from edgevpr.mavlink.autopilots.channel import Asked, Channel, Kind, kind_of
+from edgevpr.mavlink.channel import Answers, Channel, Kind, ardupilot_choice, kind_of, px4_can_fuse, px4_choice
+from edgevpr.mavlink.conversation import LinkSettings
 from edgevpr.mavlink.link import Link
-from edgevpr.mavlink.listener import NoListener
-from edgevpr.mavlink.positions import State
+from edgevpr.mavlink.peer import NoListener
+from edgevpr.mavlink.positions import MotionState
 from edgevpr.mavlink.wire import mavlink
 
 ARDUPILOT, PX4 = mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, mavlink.MAV_AUTOPILOT_PX4
-STATE = State(
+STATE = MotionState(
     t_mono_s=0.0,
     lat_deg=47.0,
     lon_deg=8.0,
@@ -30,7 +30,7 @@ STATE = State(
 
 
 def asked(kind=Kind.PLANE, version=(4, 7), **parameters):
-    return Asked(kind=kind, version=version, parameters=parameters)
+    return Answers(kind=kind, version=version, parameters=parameters)
 
 
 @pytest.mark.parametrize(
@@ -45,34 +45,34 @@ def asked(kind=Kind.PLANE, version=(4, 7), **parameters):
     ],
 )
 def test_an_ardupilot_gets_what_its_operator_has_set_up_else_single_fixes(kind, parameters, channel):
-    assert ardupilot.choice(asked(kind, **parameters)).channel is channel
+    assert ardupilot_choice(asked(kind, **parameters)).channel is channel
 
 
 def test_the_receiver_is_the_one_that_is_ours_and_as_late_as_it_is_taken_to_be():
-    second = ardupilot.choice(asked(Kind.COPTER, GPS1_TYPE=1, GPS2_TYPE=14, GPS2_DELAY_MS=0))
+    second = ardupilot_choice(asked(Kind.COPTER, GPS1_TYPE=1, GPS2_TYPE=14, GPS2_DELAY_MS=0))
     assert (second.receiver, second.lag_s) == (1, 0.2)
-    first = ardupilot.choice(asked(Kind.COPTER, GPS_TYPE=14, GPS_TYPE2=1, GPS_DELAY_MS=60))
+    first = ardupilot_choice(asked(Kind.COPTER, GPS_TYPE=14, GPS_TYPE2=1, GPS_DELAY_MS=60))
     assert (first.receiver, first.lag_s) == (0, 0.06)
 
 
 def test_a_copter_with_nothing_set_up_is_told_what_to_set():
-    assert "GPS2_TYPE=14" in ardupilot.choice(asked(Kind.COPTER, GPS1_TYPE=1)).reason
-    assert "GPS_TYPE2=14" in ardupilot.choice(asked(Kind.ROVER, GPS_TYPE=1, GPS_TYPE2=0)).reason
-    assert "GPS2_TYPE" not in ardupilot.choice(asked(Kind.PLANE, GPS1_TYPE=1)).reason
+    assert "GPS2_TYPE=14" in ardupilot_choice(asked(Kind.COPTER, GPS1_TYPE=1)).reason
+    assert "GPS_TYPE2=14" in ardupilot_choice(asked(Kind.ROVER, GPS_TYPE=1, GPS_TYPE2=0)).reason
+    assert "GPS2_TYPE" not in ardupilot_choice(asked(Kind.PLANE, GPS1_TYPE=1)).reason
 
 
 def test_a_px4_gets_the_sensor_s_message_where_it_fuses_it():
-    assert px4.choice(asked(version=(1, 17), EKF2_AGP0_CTRL=1)).channel is Channel.SENSOR
-    assert px4.choice(asked(version=(1, 17), EKF2_AGP0_CTRL=2)).channel is Channel.COMMAND
-    assert px4.choice(asked(version=(1, 16), EKF2_AGP0_CTRL=1)).channel is Channel.COMMAND
-    assert px4.choice(asked(version=None)).channel is Channel.COMMAND
-    assert px4.choice(asked(version=None, EKF2_AGP0_CTRL=3)).channel is Channel.SENSOR
+    assert px4_choice(asked(version=(1, 17), EKF2_AGP0_CTRL=1)).channel is Channel.SENSOR
+    assert px4_choice(asked(version=(1, 17), EKF2_AGP0_CTRL=2)).channel is Channel.COMMAND
+    assert px4_choice(asked(version=(1, 16), EKF2_AGP0_CTRL=1)).channel is Channel.COMMAND
+    assert px4_choice(asked(version=None)).channel is Channel.COMMAND
+    assert px4_choice(asked(version=None, EKF2_AGP0_CTRL=3)).channel is Channel.SENSOR
 
 
 def test_a_px4_can_be_told_to_fuse_where_it_has_the_parameter():
-    assert px4.can_fuse(asked(version=(1, 17), EKF2_AGP0_CTRL=0))
-    assert not px4.can_fuse(asked(version=(1, 17)))
-    assert not px4.can_fuse(asked(version=(1, 16), EKF2_AGP0_CTRL=0))
+    assert px4_can_fuse(asked(version=(1, 17), EKF2_AGP0_CTRL=0))
+    assert not px4_can_fuse(asked(version=(1, 17)))
+    assert not px4_can_fuse(asked(version=(1, 16), EKF2_AGP0_CTRL=0))
 
 
 def test_kinds():
@@ -132,7 +132,7 @@ def port():
 
 
 def opened(port, clock, ear, firmware, parameters):
-    link = Link(parse_link(f"udpout:127.0.0.1:{port.number}"), clock=clock, listener=ear)
+    link = link_to(f"udpout:127.0.0.1:{port.number}", clock=clock, listener=ear)
     link.want_position()
     link.start()
     peer = Questioned(port, firmware, parameters)
@@ -183,7 +183,7 @@ def test_a_copter_with_our_receiver_gets_a_position_ten_times_a_second(port):
 def test_odometry_waits_for_an_origin_and_sets_one_where_it_may(port):
     clock, ear = FakeClock(), Ear()
     address = parse_link(f"udpout:127.0.0.1:{port.number}")
-    link = Link(address, clock=clock, listener=ear, origin=Position(46.5, 7.5, 400.0))
+    link = Link(address, LinkSettings(clock=clock, listener=ear, origin=Position(46.5, 7.5, 400.0)))
     link.want_position()
     link.start()
     peer = Questioned(port, ARDUPILOT, {"VISO_TYPE": (1.0, mavlink.MAV_PARAM_TYPE_INT8)})

@@ -4,11 +4,12 @@ from contextlib import closing
 
 import pytest
 from fakes import FakeClock
-from mavlink_peers import Peer, UdpPort, free_port, wait_until
+from mavlink_peers import Peer, UdpPort, free_port, link_to, wait_until
 
 from edgevpr.core.errors import LinkAddressError
 from edgevpr.mavlink.address import LinkAddress, parse_link, parse_links
-from edgevpr.mavlink.ground import GroundLink
+from edgevpr.mavlink.conversation import LinkSettings
+from edgevpr.mavlink.groundlink import GroundLink
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import (
     Fix,
@@ -20,8 +21,7 @@ from edgevpr.mavlink.messages import (
     query_figures,
     status_text,
 )
-from edgevpr.mavlink.signing import TO_GROUND, Signing
-from edgevpr.mavlink.timestamps import TimeStamps
+from edgevpr.mavlink.signing import TO_GROUND, Signing, TimeStamps
 from edgevpr.mavlink.wire import mavlink
 
 
@@ -34,7 +34,7 @@ def clock():
 def two(clock):
     """The link to the flight controller, the autopilot, the link to the ground, the ground station."""
     with closing(UdpPort()) as port, closing(UdpPort()) as ground_port:
-        flight = Link(parse_link(f"udpout:127.0.0.1:{port.number}"), 191, clock)
+        flight = link_to(f"udpout:127.0.0.1:{port.number}", component_id=191, clock=clock)
         ground = GroundLink(parse_link(f"udpout:127.0.0.1:{ground_port.number}"), flight, clock)
         with flight, ground:
             autopilot, station = Peer(port, system_id=7), Peer(ground_port, system_id=255)
@@ -77,7 +77,7 @@ def test_what_the_link_itself_has_to_say_is_said_on_the_ground_too(two, clock):
 
 def test_the_ground_hears_texts_while_the_flight_controller_s_cable_is_out(clock, tmp_path):
     with closing(UdpPort()) as port:
-        flight = Link(LinkAddress("serial", str(tmp_path / "absent"), 57_600), clock=clock)
+        flight = Link(LinkAddress("serial", str(tmp_path / "absent"), 57_600), LinkSettings(clock=clock))
         with flight, GroundLink(parse_link(f"udpout:127.0.0.1:{port.number}"), flight, clock):
             station = Peer(port, system_id=255)
             flight.announce(Severity.WARNING, "link lost", "link")
@@ -156,7 +156,7 @@ def test_a_ground_station_that_is_lost_holds_up_no_fix(two, clock):
 
 def test_of_two_stations_at_a_listening_port_the_first_is_answered_while_it_beats(clock):
     number = free_port()
-    flight = Link(parse_link("udpout:127.0.0.1:9"), clock=clock)
+    flight = link_to("udpout:127.0.0.1:9", clock=clock)
     ground = GroundLink(parse_link(f"udpin:127.0.0.1:{number}"), flight, clock)
     beat = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 4, 3)
     with closing(UdpPort(to=number)) as one, closing(UdpPort(to=number)) as other, flight, ground:
@@ -176,7 +176,7 @@ def test_of_two_stations_at_a_listening_port_the_first_is_answered_while_it_beat
 def test_the_ground_is_spoken_to_with_the_same_key_and_another_link_id(clock, tmp_path):
     signing = Signing(bytes(32), TimeStamps(tmp_path / "time"))
     with closing(UdpPort()) as port:
-        flight = Link(parse_link("udpout:127.0.0.1:9"), clock=clock, signing=signing)
+        flight = link_to("udpout:127.0.0.1:9", clock=clock, signing=signing)
         with flight, GroundLink(parse_link(f"udpout:127.0.0.1:{port.number}"), flight, clock):
             peer = Peer(port)
             peer.receiver._parser_of(None).signing.secret_key = bytes(32)

@@ -9,9 +9,8 @@ from contextlib import closing
 import pytest
 import serial
 from fakes import FakeClock
-from mavlink_peers import UdpPort, free_port, wait_until
+from mavlink_peers import UdpPort, free_port, link_to, wait_until
 
-from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.wire import mavlink
 
@@ -40,7 +39,7 @@ def beat_until_heard(other, link: Link, beats: int) -> None:
 def test_a_tcp_server_of_pymavlink_closes_refuses_and_comes_back(mavutil):
     url = f"tcpin:127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     other = mavutil.mavlink_connection(url, dialect="all", source_system=7, source_component=1)
-    with Link(parse_link(url.replace("tcpin", "tcp"))) as link:
+    with link_to(url.replace("tcpin", "tcp")) as link:
         for times in (1, 2, 3):
             beat_until_heard(other, link, beats=link.stats().received.get("HEARTBEAT", 0) + 1)
             other.close()
@@ -55,7 +54,7 @@ def test_a_tcp_server_of_pymavlink_closes_refuses_and_comes_back(mavutil):
 
 def test_a_udp_end_of_pymavlink_starts_again_at_its_port(mavutil):
     url = f"udpin:127.0.0.1:{free_port()}"
-    with Link(parse_link(url.replace("udpin", "udpout"))) as link:
+    with link_to(url.replace("udpin", "udpout")) as link:
         for _ in range(3):
             with closing(mavutil.mavlink_connection(url, dialect="all", source_system=7, source_component=1)) as other:
                 first = other.recv_match(type="HEARTBEAT", blocking=True, timeout=60)
@@ -68,7 +67,7 @@ def test_a_program_of_pymavlink_cannot_take_our_port_away(mavutil):
     """Two of pymavlink's own bind to one port without a word, and the first then hears nothing."""
     number = free_port()
     url = f"udpin:127.0.0.1:{number}"
-    with Link(parse_link(url), clock=FakeClock()) as link, closing(UdpPort(to=number)) as port:
+    with link_to(url, clock=FakeClock()) as link, closing(UdpPort(to=number)) as port:
         for everywhere in (url, url.replace("127.0.0.1", "0.0.0.0")):
             with pytest.raises(OSError, match="in use"):
                 mavutil.mavlink_connection(everywhere)
@@ -79,7 +78,7 @@ def test_a_program_of_pymavlink_cannot_take_our_port_away(mavutil):
 def test_a_device_that_another_program_probes_when_it_appears_is_opened_later(tmp_path):
     """A modem manager opens what is plugged in: at the start that is said, in flight it is waited for."""
     device = tmp_path / "ttyACM0"
-    with Link(parse_link(f"serial:{device}:57600")) as link:
+    with link_to(f"serial:{device}:57600") as link:
         assert link.stats().trouble == "No such file or directory"
         master, slave = pty.openpty()
         tty.setraw(slave)
@@ -97,7 +96,7 @@ def test_a_device_that_another_program_probes_when_it_appears_is_opened_later(tm
 def test_a_device_that_comes_back_under_another_number_is_found_by_its_name(tmp_path):
     """A flight controller that restarts may become ttyACM1; its name in by-id leads there, and the old one is gone."""
     device = tmp_path / "usb-ArduPilot-if00"
-    with Link(parse_link(f"serial:{device}:57600")) as link:
+    with link_to(f"serial:{device}:57600") as link:
         for system_id in (7, 7, 7):
             master, slave = pty.openpty()
             tty.setraw(slave)

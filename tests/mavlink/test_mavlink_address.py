@@ -5,7 +5,7 @@ import pytest
 from edgevpr.cli.main import main
 from edgevpr.core.errors import LinkAddressError, LinkError
 from edgevpr.mavlink.address import LinkAddress, parse_link
-from edgevpr.mavlink.transport import open_transport
+from edgevpr.mavlink.ports import open_port
 
 
 @pytest.mark.parametrize(
@@ -70,7 +70,7 @@ def test_a_malformed_link_gets_one_sentence(url, says):
 )
 def test_a_wrong_link_is_a_wrong_request_which_a_service_must_not_repeat(link):
     with pytest.raises(LinkAddressError) as caught:
-        open_transport(parse_link(link))
+        open_port(parse_link(link))
     assert caught.value.exit_code == 2
 
 
@@ -83,8 +83,8 @@ def test_what_may_end_by_itself_is_no_wrong_request():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", 0))
         with pytest.raises(LinkError) as caught:
-            open_transport(parse_link(f"udpin:127.0.0.1:{other.getsockname()[1]}"))
+            open_port(parse_link(f"udpin:127.0.0.1:{other.getsockname()[1]}"))
         assert caught.value.exit_code == 1
     with pytest.raises(LinkError) as caught:
-        open_transport(parse_link("tcp:no-such-drone.local:5760"))
+        open_port(parse_link("tcp:no-such-drone.local:5760"))
     assert caught.value.exit_code == 1, "a host that announces itself may not be up yet"

@@ -10,14 +10,13 @@ from contextlib import closing
 
 import pytest
 from fakes import FakeClock
-from mavlink_peers import Peer, TcpServer, UdpPort, free_port, wait_until
+from mavlink_peers import Peer, TcpServer, UdpPort, free_port, link_to, wait_until
 
 from edgevpr.mavlink.address import parse_link
+from edgevpr.mavlink.fixes import Sending
 from edgevpr.mavlink.line import Line
-from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Fix, Severity, status_text
-from edgevpr.mavlink.outbox import Sending
-from edgevpr.mavlink.transport import open_transport
+from edgevpr.mavlink.ports import open_port
 from edgevpr.mavlink.wire import mavlink
 
 THROWN_AWAY = "the link was lost before it had left"
@@ -41,9 +40,9 @@ def narrow_server():
 def line(narrow_server, clock):
     """A line over TCP, and the other end of it."""
     port = narrow_server._listener.getsockname()[1]
-    line = Line(open_transport(parse_link(f"tcp:127.0.0.1:{port}")), clock)
+    line = Line(open_port(parse_link(f"tcp:127.0.0.1:{port}")), clock)
     yield line, narrow_server.accept()
-    line.transport.close()
+    line.port.close()
 
 
 def sending(clock):
@@ -52,7 +51,7 @@ def sending(clock):
 
 def hold_up(line) -> None:
     """Write until the system holds bytes that the other end does not take."""
-    while line.transport.unsent() < 2000:
+    while line.port.unsent() < 2000:
         line.put(bytes(100), None)
         line.write()
         assert not line.is_writing
@@ -127,7 +126,7 @@ def test_closing_throws_away_what_cannot_leave(line):
 
 def test_a_tcp_peer_that_reads_late_finds_no_fix_that_was_called_unsent(narrow_server):
     number = narrow_server._listener.getsockname()[1]
-    with Link(parse_link(f"tcp:127.0.0.1:{number}"), max_fix_age_s=0.2) as link:
+    with link_to(f"tcp:127.0.0.1:{number}", max_fix_age_s=0.2) as link:
         far = narrow_server.accept()
         peer = Peer(far, 7)
         peer.heartbeat()
@@ -148,20 +147,20 @@ def test_a_tcp_peer_that_reads_late_finds_no_fix_that_was_called_unsent(narrow_s
         assert found <= {each.fix.lat_deg for each in fixes if each.sent}
         assert not all(each.sent for each in fixes)
         assert link.stats().fixes_sent == sum(each.sent for each in fixes)
-        unanswered = link._conversation.answers.unanswered
+        unanswered = link._conversation.fixes._row
         assert unanswered == link.stats().fixes_sent, "what was thrown away waits for no answer"
 
 
 def _held(link) -> bool:
     line = link._line
-    return line is None or line.transport.unsent() > 4000
+    return line is None or line.port.unsent() > 4000
 
 
 @pytest.mark.parametrize(("max_age_s", "leaves"), [(0.3, False), (0.6, True)])
 def test_the_longest_wait_is_the_configurations(clock, max_age_s, leaves):
     with (
         closing(UdpPort()) as port,
-        Link(parse_link(f"udpout:127.0.0.1:{port.number}"), clock=clock, max_fix_age_s=max_age_s) as link,
+        link_to(f"udpout:127.0.0.1:{port.number}", clock=clock, max_fix_age_s=max_age_s) as link,
     ):
         peer = Peer(port)
         peer.expect("HEARTBEAT")
@@ -178,7 +177,7 @@ def test_a_serial_line_that_is_held_up_gives_no_old_fix_when_it_goes_on():
     master, slave = pty.openpty()
     tty.setraw(slave)
     peer = Peer(_Terminal(master), 7)
-    with Link(parse_link(f"serial:{os.ttyname(slave)}:57600"), max_fix_age_s=0.2) as link:
+    with link_to(f"serial:{os.ttyname(slave)}:57600", max_fix_age_s=0.2) as link:
         peer.heartbeat()
         wait_until(link.listens)
         termios.tcflow(slave, termios.TCOOFF)

@@ -5,17 +5,19 @@ from contextlib import closing
 
 import pytest
 from fakes import FakeClock
-from mavlink_peers import Peer, TcpServer, UdpPort, free_port, wait_until
+from mavlink_peers import Peer, TcpServer, UdpPort, free_port, link_to, wait_until
 
-from edgevpr.mavlink.address import parse_link
-from edgevpr.mavlink.answers import Answers
-from edgevpr.mavlink.link import Link
+from edgevpr.mavlink.fixes import FixAnswer, Fixes, Sending
 from edgevpr.mavlink.messages import Fix
-from edgevpr.mavlink.outbox import Answer
+from edgevpr.mavlink.readiness import AutopilotState
 from edgevpr.mavlink.wire import mavlink
 
 UNANSWERED = "not sent: five fixes in a row had no answer"
 STOPPED, ANSWERED = "edgevpr: fixes unanswered: signing? system id?", "edgevpr: fixes are answered again"
+
+
+def sending_of(t_s):
+    return Sending(Fix(50.0, 8.0, 20.0, t_s), t_s + 1)
 
 
 @pytest.fixture
@@ -25,7 +27,10 @@ def clock():
 
 @pytest.fixture
 def link_and_peer(clock):
-    with closing(UdpPort()) as port, Link(parse_link(f"udpout:127.0.0.1:{port.number}"), clock=clock) as link:
+    with (
+        closing(UdpPort()) as port,
+        link_to(f"udpout:127.0.0.1:{port.number}", clock=clock) as link,
+    ):
         peer = Peer(port, 7)
         peer.expect("HEARTBEAT")
         yield link, peer
@@ -103,31 +108,34 @@ def test_late_answers_to_the_fixes_of_before_do_not_pass_for_one_to_a_new_fix(li
         answer(link, peer, mavlink.MAV_RESULT_DENIED)
     ((_, new),) = fly(link, peer, clock, 1, every_s=0.6)
     assert (new.sent, new.answer) == (True, None)
-    assert last.outcome == Answer(None, "it had no answer within 1 s", None)
+    assert last.outcome == FixAnswer(None, "it had no answer within 1 s", None)
     assert link.stats().unanswered_fixes == 5
 
 
 def test_answers_that_take_half_a_second_stop_no_quick_fixes_and_nothing_is_said():
-    answers, said, sent = Answers(), [], 0
+    fixes, state, news, sent = Fixes(), AutopilotState(), [], 0
     due_s = []
     for step in range(1000):  # ten fixes a second, each answered after half a second
         now_s = step / 10
         while due_s and due_s[0] <= now_s:
             due_s.pop(0)
-            answers.note_answer(now_s)
-        if answers.why_not(now_s) is None:
-            answers.note_sent(now_s)
+            fixes.hear("ACCEPTED", state, now_s)
+        if fixes.why_not(now_s) is None:
+            fixes.note_sent(sending_of(now_s), now_s, has_answer=True)
             due_s.append(now_s + 0.45)
             sent += 1
-        said.append(answers.has_changed(now_s))
-    assert not any(said)
+        news.append(fixes.news_of_silence(state, now_s))
+    assert not any(news)
     assert sent > 900
 
 
 def test_a_peer_that_stops_reading_for_a_minute_finds_a_few_fixes_and_not_all(clock):
     """The autopilot goes on beating, and its system takes what it does not read."""
     number = free_port(socket.SOCK_STREAM)
-    with closing(TcpServer(number)) as server, Link(parse_link(f"tcp:127.0.0.1:{number}"), clock=clock) as link:
+    with (
+        closing(TcpServer(number)) as server,
+        link_to(f"tcp:127.0.0.1:{number}", clock=clock) as link,
+    ):
         peer = Peer(server.accept(), 7)
         start_s = clock.now_s
         became = fly(link, peer, clock, 180, every_s=1 / 3)
@@ -162,22 +170,28 @@ def test_another_autopilot_starts_with_a_clean_slate(link_and_peer, clock):
 
 
 def test_fixes_thrown_away_with_the_port_wait_for_no_answer_but_do_not_end_a_stop():
-    answers = Answers()
-    for t_s in range(5):
-        answers.note_sent(t_s)
-    answers.note_lost(3)
-    assert (answers.unanswered, answers.why_not(5.0)) == (2, None)
-    for t_s in range(5, 8):
-        answers.note_sent(t_s)
-    assert answers.has_changed(8.5)
-    answers.note_sent(17.5)
-    answers.note_lost(2)
-    assert (answers.why_not(20.0), answers.has_changed(20.0)) == (UNANSWERED, False)
+    fixes, state = Fixes(), AutopilotState()
+
+    def note_sent(*times_s):
+        for t_s in times_s:
+            fixes.note_sent(sending_of(t_s), t_s, has_answer=True)
+
+    note_sent(0, 1, 2, 3, 4)
+    fixes.note_lost(3)
+    assert (fixes._row, fixes.why_not(5.0)) == (2, None)
+    note_sent(5, 6, 7)
+    assert fixes.news_of_silence(state, 8.5)
+    note_sent(17.5)
+    fixes.note_lost(2)
+    assert (fixes.why_not(20.0), fixes.news_of_silence(state, 20.0)) == (UNANSWERED, None)
 
 
 def test_over_tcp_every_answer_is_that_of_its_fix(clock):
     number = free_port(socket.SOCK_STREAM)
-    with closing(TcpServer(number)) as server, Link(parse_link(f"tcp:127.0.0.1:{number}"), clock=clock) as link:
+    with (
+        closing(TcpServer(number)) as server,
+        link_to(f"tcp:127.0.0.1:{number}", clock=clock) as link,
+    ):
         peer = Peer(server.accept(), 7)
         beat(link, peer)
         for turn in range(20):

@@ -5,9 +5,8 @@ import socket
 
 import pytest
 from fakes import FakeClock
-from mavlink_peers import Peer, TcpServer, UdpPort, free_port, wait_until
+from mavlink_peers import Peer, TcpServer, UdpPort, free_port, link_to, wait_until
 
-from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.identity import Identity, Speaker
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Fix
@@ -126,7 +125,7 @@ def listening(clock):
         ports.append(UdpPort(to=number))
         return Peer(ports[-1], system_id)
 
-    with Link(parse_link(f"udpin:127.0.0.1:{number}"), clock=clock) as link:
+    with link_to(f"udpin:127.0.0.1:{number}", clock=clock) as link:
         yield link, autopilot
     for port in ports:
         port.close()
@@ -246,7 +245,7 @@ def test_the_vehicle_of_the_autopilot_before_is_forgotten(listening, clock):
 
 def test_the_configured_system_is_our_own_number_from_the_start_and_the_only_one_sent_to(clock):
     number = free_port()
-    with Link(parse_link(f"udpin:127.0.0.1:{number}"), clock=clock, system_id=5) as link:
+    with link_to(f"udpin:127.0.0.1:{number}", clock=clock, system_id=5) as link:
         port = UdpPort(to=number)
         peer = Peer(port, system_id=9)
         speak(link, peer, clock, 40)
@@ -263,7 +262,7 @@ def test_after_a_reconnection_no_fix_leaves_before_ours_has_spoken(clock, caplog
     caplog.set_level(logging.INFO, "edgevpr.mavlink")
     number = free_port(socket.SOCK_STREAM)
     server = TcpServer(number)
-    with Link(parse_link(f"tcp:127.0.0.1:{number}"), clock=clock) as link:
+    with link_to(f"tcp:127.0.0.1:{number}", clock=clock) as link:
         speak(link, Peer(server.accept(), 1), clock, 1)
         server.close()
         wait_until(lambda: not link.stats().connected, "noticing the loss")
@@ -278,7 +277,7 @@ def test_after_a_reconnection_no_fix_leaves_before_ours_has_spoken(clock, caplog
 
 def test_a_sending_link_hears_no_other_port_of_its_peers_host(clock):
     port, thief = UdpPort(), UdpPort()
-    with Link(parse_link(f"udpout:127.0.0.1:{port.number}"), clock=clock) as link:
+    with link_to(f"udpout:127.0.0.1:{port.number}", clock=clock) as link:
         peer = Peer(port)
         peer.expect("HEARTBEAT")
         thief.to = port.to

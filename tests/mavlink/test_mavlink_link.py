@@ -10,13 +10,12 @@ from contextlib import closing
 
 import pytest
 from fakes import FakeClock
-from mavlink_peers import Peer, TcpServer, UdpPort, free_port, wait_until
+from mavlink_peers import Peer, TcpServer, UdpPort, free_port, link_to, wait_until
 
 from edgevpr.core.errors import LinkError
-from edgevpr.mavlink.address import parse_link
+from edgevpr.mavlink.conversation import MESSAGES_MAX
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Fix, Health, Severity, place_match, query_figures, status_text
-from edgevpr.mavlink.outbox import MESSAGES_MAX
 from edgevpr.mavlink.wire import mavlink
 
 
@@ -34,7 +33,7 @@ def port():
 
 @pytest.fixture
 def link(port, clock):
-    with Link(parse_link(f"udpout:127.0.0.1:{port.number}"), clock=clock) as link:
+    with link_to(f"udpout:127.0.0.1:{port.number}", clock=clock) as link:
         yield link
 
 
@@ -189,7 +188,7 @@ def test_a_value_that_its_field_cannot_hold_costs_that_message_only(link, peer, 
 
 def test_a_udp_peer_that_goes_and_comes_back_is_served_again(clock):
     port = UdpPort()
-    with Link(parse_link(f"udpout:127.0.0.1:{port.number}"), clock=clock) as link:
+    with link_to(f"udpout:127.0.0.1:{port.number}", clock=clock) as link:
         Peer(port).expect("HEARTBEAT")
         port.close()
         for _ in range(5):
@@ -203,7 +202,7 @@ def test_a_udp_peer_that_goes_and_comes_back_is_served_again(clock):
 
 def test_a_listening_link_speaks_when_spoken_to_and_follows_the_autopilot_to_a_new_port(clock):
     number = free_port()
-    with Link(parse_link(f"udpin:127.0.0.1:{number}"), clock=clock) as link:
+    with link_to(f"udpin:127.0.0.1:{number}", clock=clock) as link:
         assert not link.stats().connected
         link.send(text("waits for somebody"))
         port = UdpPort(to=number)
@@ -226,7 +225,7 @@ def test_a_listening_link_speaks_when_spoken_to_and_follows_the_autopilot_to_a_n
 
 def test_a_listening_link_keeps_to_the_autopilot_when_others_speak(clock):
     number = free_port()
-    with Link(parse_link(f"udpin:127.0.0.1:{number}"), clock=clock) as link:
+    with link_to(f"udpin:127.0.0.1:{number}", clock=clock) as link:
         port, stranger = UdpPort(to=number), UdpPort(to=number)
         peer = Peer(port)
         heard(link, peer)
@@ -243,7 +242,7 @@ def test_a_sending_link_hears_nothing_from_another_host(clock):
         pytest.skip("this system has no 127.0.0.2")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger, closing(UdpPort()) as port:
         stranger.bind(("127.0.0.2", 0))
-        with Link(parse_link(f"udpout:127.0.0.1:{port.number}"), clock=clock) as link:
+        with link_to(f"udpout:127.0.0.1:{port.number}", clock=clock) as link:
             peer = Peer(port)
             peer.expect("HEARTBEAT")
             stranger.sendto(b"hello", port.to)
@@ -253,8 +252,8 @@ def test_a_sending_link_hears_nothing_from_another_host(clock):
 
 def test_a_udp_port_in_use_is_said_at_the_start(clock):
     number = free_port()
-    with Link(parse_link(f"udpin:127.0.0.1:{number}"), clock=clock):
-        second = Link(parse_link(f"udpin:0.0.0.0:{number}"), clock=clock)
+    with link_to(f"udpin:127.0.0.1:{number}", clock=clock):
+        second = link_to(f"udpin:0.0.0.0:{number}", clock=clock)
         with pytest.raises(LinkError, match=f"port {number} is in use"):
             second.start()
 
@@ -265,7 +264,7 @@ def test_a_udp_port_held_by_another_program_of_pymavlink_is_said_at_the_start():
     number = free_port()
     other = mavutil.mavlink_connection(f"udpin:127.0.0.1:{number}")
     with pytest.raises(LinkError, match=f"port {number} is in use"):
-        Link(parse_link(f"udpin:127.0.0.1:{number}")).start()
+        link_to(f"udpin:127.0.0.1:{number}").start()
     other.close()
 
 
@@ -275,13 +274,13 @@ def test_a_udp_port_held_by_another_program_of_pymavlink_is_said_at_the_start():
 )
 def test_an_unknown_host_is_said_at_the_start(kind, host):
     with pytest.raises(LinkError, match=re.escape(f"no host '{host}'")):
-        Link(parse_link(f"{kind}:{host}:14550")).start()
+        link_to(f"{kind}:{host}:14550").start()
 
 
 def test_a_tcp_server_that_dies_and_comes_back_is_found_again_and_old_fixes_are_not_sent(clock):
     number = free_port(socket.SOCK_STREAM)
     server = TcpServer(number)
-    with Link(parse_link(f"tcp:127.0.0.1:{number}"), clock=clock) as link:
+    with link_to(f"tcp:127.0.0.1:{number}", clock=clock) as link:
         peer = Peer(server.accept())
         peer.expect("HEARTBEAT")
         heard(link, peer)
@@ -306,7 +305,7 @@ def test_a_tcp_server_that_dies_and_comes_back_is_found_again_and_old_fixes_are_
 
 def test_an_absent_tcp_server_is_no_error_and_the_newest_messages_wait_for_it(clock):
     number = free_port(socket.SOCK_STREAM)
-    with Link(parse_link(f"tcp:127.0.0.1:{number}"), clock=clock) as link:
+    with link_to(f"tcp:127.0.0.1:{number}", clock=clock) as link:
         assert not link.stats().connected
         assert link.stats().trouble == "Connection refused"
         for count in range(MESSAGES_MAX + 36):
@@ -322,7 +321,7 @@ def test_an_absent_tcp_server_is_no_error_and_the_newest_messages_wait_for_it(cl
 def test_a_peer_that_does_not_read_never_blocks_the_sender(clock):
     number = free_port(socket.SOCK_STREAM)
     server = TcpServer(number)
-    with Link(parse_link(f"tcp:127.0.0.1:{number}"), clock=clock) as link:
+    with link_to(f"tcp:127.0.0.1:{number}", clock=clock) as link:
         server.accept()
 
         def stuck() -> bool:
@@ -354,7 +353,7 @@ def test_many_threads_may_send_and_no_packet_is_lost_or_torn(link, peer):
 
 
 def test_a_closed_link_sends_nothing_more_and_can_be_closed_again(port, clock):
-    link = Link(parse_link(f"udpout:127.0.0.1:{port.number}"), clock=clock)
+    link = link_to(f"udpout:127.0.0.1:{port.number}", clock=clock)
     link.start()
     link.send(text("last"))
     link.close()
@@ -386,7 +385,7 @@ def test_an_autopilot_that_answers_no_fix_does_not_hold_up_the_end(link, peer, c
 
 
 def test_a_link_that_was_never_started_can_be_closed():
-    Link(parse_link("udpout:127.0.0.1:14550")).close()
+    link_to("udpout:127.0.0.1:14550").close()
 
 
 def test_pymavlinks_own_connection_decodes_all_that_is_sent(monkeypatch, clock):
@@ -395,7 +394,7 @@ def test_pymavlinks_own_connection_decodes_all_that_is_sent(monkeypatch, clock):
 
     number = free_port()
     other = mavutil.mavlink_connection(f"udpin:127.0.0.1:{number}", dialect="all", source_system=5, source_component=1)
-    with Link(parse_link(f"udpout:127.0.0.1:{number}"), clock=clock) as link:
+    with link_to(f"udpout:127.0.0.1:{number}", clock=clock) as link:
         first = other.recv_match(blocking=True, timeout=60)
         assert first.get_type() == "HEARTBEAT"
         other.mav.heartbeat_send(

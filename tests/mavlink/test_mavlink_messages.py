@@ -4,13 +4,13 @@ import pytest
 
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.messages import Fix, Health, Severity
-from edgevpr.mavlink.wire import Message, Receiver, mavlink
+from edgevpr.mavlink.wire import Message, PacketReader, mavlink
 
 
 def sent_and_received(message: Message) -> Message:
     """What the other end makes of it."""
     packed = message.pack(mavlink.MAVLink(None, 1, 197))
-    (received,) = Receiver().feed(packed)
+    (received,) = PacketReader().feed(packed)
     return received
 
 

@@ -4,14 +4,11 @@ import math
 
 import pytest
 from fakes import FakeClock
-from mavlink_peers import Peer, UdpPort, free_port, wait_until
+from mavlink_peers import Peer, UdpPort, free_port, link_to, wait_until
 
-from edgevpr.mavlink.address import parse_link
-from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Fix, Health, Severity, computer_status, query_figures, status_text
-from edgevpr.mavlink.requests import ANSWERED_MAX
+from edgevpr.mavlink.requests import ANSWERED_MAX, Wish
 from edgevpr.mavlink.wire import mavlink
-from edgevpr.mavlink.wishes import Wish
 
 STATION = {"system_id": 255, "component_id": 190}
 US = (7, 197)
@@ -32,7 +29,7 @@ def port():
 
 @pytest.fixture
 def link(port, clock):
-    with Link(parse_link(f"udpout:127.0.0.1:{port.number}"), clock=clock) as link:
+    with link_to(f"udpout:127.0.0.1:{port.number}", clock=clock) as link:
         yield link
 
 
@@ -118,7 +115,7 @@ def test_the_heartbeat_can_be_asked_for(peer, link, form):
 
 
 def test_the_version_can_be_asked_for(peer, monkeypatch):
-    monkeypatch.setattr("edgevpr.mavlink.allowed.__version__", "1.22.3.dev4")
+    monkeypatch.setattr("edgevpr.mavlink.requests.__version__", "1.22.3.dev4")
     assert answered(peer, command_long(512, 148.0)) == "ACCEPTED"
     version = peer.expect("AUTOPILOT_VERSION")
     assert version.flight_sw_version == 0x01160300
@@ -283,7 +280,7 @@ def test_a_flood_of_requests_is_answered_in_part_and_does_not_push_out_what_we_s
 
 def test_over_a_port_that_listens_only_the_autopilots_address_commands(clock):
     number = free_port()
-    with Link(parse_link(f"udpin:127.0.0.1:{number}"), clock=clock) as link:
+    with link_to(f"udpin:127.0.0.1:{number}", clock=clock) as link:
         port, stranger = UdpPort(to=number), UdpPort(to=number)
         peer, other = Peer(port, system_id=7), Peer(stranger, system_id=255)
         peer.heartbeat()
@@ -303,7 +300,7 @@ def test_pymavlinks_own_connection_pauses_the_flight(monkeypatch, clock):
 
     number = free_port()
     station = mavutil.mavlink_connection(f"udpin:127.0.0.1:{number}", dialect="all", source_system=255)
-    with Link(parse_link(f"udpout:127.0.0.1:{number}"), clock=clock) as link:
+    with link_to(f"udpout:127.0.0.1:{number}", clock=clock) as link:
         link.offer(tuple(Wish))
         beat = station.recv_match(type="HEARTBEAT", blocking=True, timeout=60)
         us = beat.get_srcSystem(), beat.get_srcComponent()

@@ -8,13 +8,11 @@ import time
 
 import pytest
 from fakes import FakeClock
-from mavlink_peers import AutopilotThread, SerialCable, wait_until
+from mavlink_peers import AutopilotThread, SerialCable, link_to, wait_until
 
 from edgevpr.core.errors import LinkError
-from edgevpr.mavlink.address import parse_link
-from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Fix, Severity, status_text
-from edgevpr.mavlink.wire import Receiver
+from edgevpr.mavlink.wire import PacketReader
 
 
 @pytest.fixture
@@ -39,7 +37,7 @@ def losses_told(caplog) -> int:
 def test_an_unplugged_cable_is_found_again_when_it_is_plugged_in(tmp_path, caplog):
     cable = SerialCable(tmp_path)
     here, there = (f"serial:{end}:57600" for end in cable.ends)
-    with Link(parse_link(here)) as link:
+    with link_to(here) as link:
         assert link.stats().trouble == "No such file or directory"  # absent at the start: no error
         for times in (1, 2):
             cable.plug()
@@ -59,7 +57,7 @@ def test_an_unplugged_cable_is_found_again_when_it_is_plugged_in(tmp_path, caplo
 
 
 def test_a_line_that_takes_no_bytes_never_blocks_the_sender(terminal):
-    with Link(parse_link(f"serial:{terminal}:57600")) as link:
+    with link_to(f"serial:{terminal}:57600") as link:
 
         def stuck() -> bool:
             link.send(*[status_text(Severity.INFO, "x" * 50)] * 64)
@@ -71,7 +69,7 @@ def test_a_line_that_takes_no_bytes_never_blocks_the_sender(terminal):
 
 def test_closing_sends_what_waits(line):
     master, terminal = line
-    link = Link(parse_link(f"serial:{terminal}:57600"), clock=FakeClock())
+    link = link_to(f"serial:{terminal}:57600", clock=FakeClock())
     link.start()
 
     def full() -> bool:
@@ -80,7 +78,7 @@ def test_closing_sends_what_waits(line):
 
     wait_until(full, "filling the line and the queue")
     link.send(status_text(Severity.INFO, "last"))
-    texts, receiver = [], Receiver()
+    texts, receiver = [], PacketReader()
 
     def read() -> None:
         while "last" not in texts and select.select([master], [], [], 1)[0]:
@@ -95,8 +93,8 @@ def test_closing_sends_what_waits(line):
 
 
 def test_a_device_in_use_is_said_at_the_start(terminal):
-    with Link(parse_link(f"serial:{terminal}:57600")), pytest.raises(LinkError, match="in use by another program"):
-        Link(parse_link(f"serial:{terminal}:115200")).start()
+    with link_to(f"serial:{terminal}:57600"), pytest.raises(LinkError, match="in use by another program"):
+        link_to(f"serial:{terminal}:115200").start()
 
 
 def test_a_device_that_this_user_may_not_open_is_said_at_the_start(terminal):
@@ -106,7 +104,7 @@ def test_a_device_that_this_user_may_not_open_is_said_at_the_start(terminal):
         os.seteuid(65_534)  # root may open everything
     try:
         with pytest.raises(LinkError, match="dialout"):
-            Link(parse_link(f"serial:{terminal}:57600")).start()
+            link_to(f"serial:{terminal}:57600").start()
     finally:
         os.seteuid(user)
 
@@ -115,4 +113,4 @@ def test_a_path_that_is_no_serial_device_is_said_at_the_start(tmp_path):
     path = tmp_path / "ttyACM0"
     path.write_bytes(b"")
     with pytest.raises(LinkError, match="no serial device"):
-        Link(parse_link(f"serial:{path}:57600")).start()
+        link_to(f"serial:{path}:57600").start()

@@ -8,25 +8,27 @@ from contextlib import closing
 
 import pytest
 from fakes import FakeClock
-from mavlink_peers import Peer, UdpPort, free_port, wait_until
+from mavlink_peers import Peer, UdpPort, free_port, link_to, wait_until
 
 from edgevpr.core.errors import ConfigError
-from edgevpr.mavlink.address import parse_link
-from edgevpr.mavlink.conversation import Conversation
-from edgevpr.mavlink.link import Link
+from edgevpr.mavlink.conversation import Conversation, LinkSettings
 from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.signing import (
     _MAKE_ONE,
+    CROWDED,
+    FUTURE,
     NOT_SIGNING,
+    OLD,
+    TICKS_S,
     TO_AUTOPILOT,
     UNSIGNED,
     WRONG,
     Signing,
+    TimeStamps,
     open_signing,
     read_key,
 )
-from edgevpr.mavlink.timestamps import CROWDED, FUTURE, OLD, TICKS_S, TimeStamps
-from edgevpr.mavlink.wire import Receiver, mavlink
+from edgevpr.mavlink.wire import PacketReader, mavlink
 
 KEY, OTHER_KEY = bytes(range(32)), bytes(32)
 NOW = 1_000_000 * TICKS_S  # the time stamp that the clocks of these tests begin with
@@ -61,7 +63,7 @@ class Signer:
 
 
 def admitted(signing: Signing, *packets: bytes) -> list[bool]:
-    receiver = Receiver(signing.admits)
+    receiver = PacketReader(signing.admits)
     return [bool(list(receiver.feed(packet))) for packet in packets]
 
 
@@ -192,7 +194,7 @@ def test_a_link_and_pymavlink_understand_each_other_by_key(key_file, monkeypatch
 
     number = free_port()
     signing = open_signing(str(key_file), None)
-    with Link(parse_link(f"udpin:127.0.0.1:{number}"), signing=signing) as link:
+    with link_to(f"udpin:127.0.0.1:{number}", signing=signing) as link:
         other = mavutil.mavlink_connection(
             f"udpout:127.0.0.1:{number}", dialect="all", source_system=7, source_component=1
         )
@@ -218,7 +220,7 @@ def test_no_fix_goes_to_who_has_not_the_key(key, tmp_path, clock):
     signing = Signing(KEY, TimeStamps(tmp_path / "time", clock, lambda: UTC_S))
     with (
         closing(UdpPort()) as port,
-        Link(parse_link(f"udpout:127.0.0.1:{port.number}"), clock=clock, signing=signing) as link,
+        link_to(f"udpout:127.0.0.1:{port.number}", clock=clock, signing=signing) as link,
     ):
         peer = Peer(port, system_id=7)
         peer.expect("HEARTBEAT")
@@ -231,7 +233,7 @@ def test_no_fix_goes_to_who_has_not_the_key(key, tmp_path, clock):
 
 
 def test_a_replay_is_refused_after_the_port_was_opened_anew(signing, clock):
-    conversation = Conversation(clock, 197, None, 1.0, signing=signing)
+    conversation = Conversation(LinkSettings(signing=signing), clock)
     packet = Signer().packet()
     assert conversation.hear(packet, clock(), None)
     conversation.break_off(0)

@@ -5,10 +5,8 @@ from contextlib import closing
 
 import pytest
 from fakes import FakeClock
-from mavlink_peers import Peer, UdpPort, wait_until
+from mavlink_peers import Peer, UdpPort, link_to, wait_until
 
-from edgevpr.mavlink.address import parse_link
-from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Severity
 from edgevpr.mavlink.texts import SPACING_S, WAITING_MAX, Texts
 
@@ -99,7 +97,10 @@ def test_a_flood_drops_notes_first_and_says_which_warnings_it_drops(texts, caplo
 
 def test_over_a_link_the_turns_are_kept_and_at_its_end_nothing_is_left_behind():
     clock = FakeClock()
-    with closing(UdpPort()) as port, Link(parse_link(f"udpout:127.0.0.1:{port.number}"), clock=clock) as link:
+    with (
+        closing(UdpPort()) as port,
+        link_to(f"udpout:127.0.0.1:{port.number}", clock=clock) as link,
+    ):
         peer = Peer(port)
         peer.expect("HEARTBEAT")
         for name in ("one", "two", "three"):

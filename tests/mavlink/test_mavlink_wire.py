@@ -2,7 +2,7 @@
 
 import random
 
-from edgevpr.mavlink.wire import Receiver, mavlink
+from edgevpr.mavlink.wire import PacketReader, mavlink
 
 
 def a_packet_of_every_kind(rng: random.Random) -> list[bytes]:
@@ -18,7 +18,7 @@ def test_every_message_of_the_dialect_arrives_however_the_stream_is_cut():
     rng = random.Random(1)
     packets = a_packet_of_every_kind(rng)
     stream = b"".join(packets)
-    receiver = Receiver()
+    receiver = PacketReader()
     heard = 0
     while stream:
         cut = rng.randrange(1, 600)
@@ -31,7 +31,7 @@ def test_every_message_of_the_dialect_arrives_however_the_stream_is_cut():
 def test_damaged_packets_and_noise_never_raise_and_are_counted():
     rng = random.Random(2)
     packets = a_packet_of_every_kind(rng)
-    receiver = Receiver()
+    receiver = PacketReader()
     for _ in range(5000):
         packet = bytearray(rng.choice(packets))
         harm = rng.randrange(5)
@@ -52,7 +52,7 @@ def test_damaged_packets_and_noise_never_raise_and_are_counted():
 
 def test_after_noise_the_next_messages_arrive_again():
     packet = mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3).pack(mavlink.MAVLink(None, 1, 1))
-    receiver = Receiver()
+    receiver = PacketReader()
     # A beginning that announces 255 bytes swallows what follows, but no more than that.
     heard = list(receiver.feed(b"\xfd\xff\x00" + packet * 40))
     assert len(heard) >= 40 - 1 - 280 // len(packet)

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from edgevpr.core.geodesy import moved
-from edgevpr.mavlink.autopilots.px4 import SENSOR_ID
 from edgevpr.mavlink.messages import Fix
-from edgevpr.mavlink.positions import State, gps_input, odometry, position_sensor
-from edgevpr.mavlink.wire import Receiver, mavlink
+from edgevpr.mavlink.positions import SENSOR_ID, MotionState, gps_input, odometry, position_sensor
+from edgevpr.mavlink.wire import PacketReader, mavlink
 
-STATE = State(
+STATE = MotionState(
     t_mono_s=100.0,
     lat_deg=47.1234567,
     lon_deg=8.7654321,
@@ -25,7 +24,7 @@ STATE = State(
 
 
 def received(message):
-    (heard,) = Receiver().feed(message.pack(mavlink.MAVLink(None, 1, 197)))
+    (heard,) = PacketReader().feed(message.pack(mavlink.MAVLink(None, 1, 197)))
     return heard
 
 
@@ -50,7 +49,7 @@ def test_a_receiver_without_a_fix_says_so_and_one_without_a_clock_says_no_time()
 
 def test_odometry_lies_north_east_down_of_the_origin_and_moves_along_the_airframe():
     origin = *moved(STATE.lat_deg, STATE.lon_deg, -200.0, 300.0), 500.0
-    heard = received(odometry(STATE, origin))
+    heard = received(odometry(STATE, STATE.attitude, origin))
     assert (heard.frame_id, heard.child_frame_id) == (mavlink.MAV_FRAME_LOCAL_FRD, mavlink.MAV_FRAME_BODY_FRD)
     assert (heard.x, heard.y, heard.z) == pytest.approx((-300.0, 200.0, -12.3), abs=0.1)
     w, x, y, z = heard.q

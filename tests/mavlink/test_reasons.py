@@ -2,22 +2,22 @@
 
 import pytest
 
-from edgevpr.mavlink import reasons
+from edgevpr.mavlink import readiness as reasons
 from edgevpr.mavlink.messages import TEXT_BYTES
-from edgevpr.mavlink.reasons import Reason, State, why, why_failed, why_silent
+from edgevpr.mavlink.readiness import AutopilotState, Reason, why, why_silent
 from edgevpr.mavlink.wire import mavlink
 
 CONST, UNINITIALIZED = mavlink.EKF_CONST_POS_MODE, mavlink.EKF_UNINITIALIZED
-AIRBORNE = State(is_armed=True, gps_age_s=60.0, has_origin=True, filter_flags=0)
+AIRBORNE = AutopilotState(is_armed=True, gps_age_s=60.0, has_origin=True, filter_flags=0)
 
 
 @pytest.mark.parametrize(
     ("state", "reason"),
     [
-        (State(), reasons.UNKNOWN),
-        (State(gps_age_s=0.0), reasons.GPS_IN_USE),
-        (State(gps_age_s=2.5, is_armed=False), reasons.GPS_IN_USE),
-        (State(gps_age_s=2.6), reasons.UNKNOWN),
+        (AutopilotState(), reasons.UNKNOWN),
+        (AutopilotState(gps_age_s=0.0), reasons.GPS_IN_USE),
+        (AutopilotState(gps_age_s=2.5, is_armed=False), reasons.GPS_IN_USE),
+        (AutopilotState(gps_age_s=2.6), reasons.UNKNOWN),
         (AIRBORNE, reasons.UNKNOWN),
         (AIRBORNE._replace(gps_age_s=1.0), reasons.GPS_IN_USE),
         (AIRBORNE._replace(has_origin=False, is_armed=False), reasons.NO_ORIGIN),
@@ -29,23 +29,23 @@ AIRBORNE = State(is_armed=True, gps_age_s=60.0, has_origin=True, filter_flags=0)
         (AIRBORNE._replace(has_origin=False, filter_flags=UNINITIALIZED), reasons.NO_ORIGIN),
         (AIRBORNE._replace(gps_age_s=0.0, has_origin=False), reasons.GPS_IN_USE),
         (AIRBORNE._replace(is_px4=True, filter_flags=UNINITIALIZED), reasons.NOT_PLAUSIBLE),
-        (State(is_px4=True, has_origin=False), reasons.NO_ORIGIN),
+        (AutopilotState(is_px4=True, has_origin=False), reasons.NO_ORIGIN),
     ],
 )
 def test_a_fix_failed_for_the_first_cause_that_is_known(state, reason):
-    assert why_failed(state) == reason == why("FAILED", state)
+    assert why("FAILED", state) == reason
 
 
 @pytest.mark.parametrize(
     ("result", "state", "reason"),
     [
-        ("ACCEPTED", State(), reasons.TAKEN),
-        ("DENIED", State(gps_age_s=0.0), reasons.WRONG_FORM),
-        ("UNSUPPORTED", State(), reasons.NO_COMMAND),
-        ("TEMPORARILY_REJECTED", State(is_px4=True, gps_age_s=0.0), reasons.GPS_IN_USE),
-        ("TEMPORARILY_REJECTED", State(is_px4=True, gps_age_s=9.0), reasons.OTHER_AID),
-        ("TEMPORARILY_REJECTED", State(), reasons.UNKNOWN),
-        ("99", State(), Reason("see its log", "it answers 99")),
+        ("ACCEPTED", AutopilotState(), reasons.TAKEN),
+        ("DENIED", AutopilotState(gps_age_s=0.0), reasons.WRONG_FORM),
+        ("UNSUPPORTED", AutopilotState(), reasons.NO_COMMAND),
+        ("TEMPORARILY_REJECTED", AutopilotState(is_px4=True, gps_age_s=0.0), reasons.GPS_IN_USE),
+        ("TEMPORARILY_REJECTED", AutopilotState(is_px4=True, gps_age_s=9.0), reasons.OTHER_AID),
+        ("TEMPORARILY_REJECTED", AutopilotState(), reasons.UNKNOWN),
+        ("99", AutopilotState(), Reason("see its log", "it answers 99")),
     ],
 )
 def test_every_answer_has_a_reason(result, state, reason):
@@ -53,8 +53,8 @@ def test_every_answer_has_a_reason(result, state, reason):
 
 
 def test_silence_to_all_commands_is_another_matter_than_silence_to_fixes():
-    assert "signed" in why_silent(State()).sentence
-    assert "43003" in why_silent(State(answers_others=True)).sentence
+    assert "signed" in why_silent(AutopilotState()).sentence
+    assert "43003" in why_silent(AutopilotState(answers_others=True)).sentence
 
 
 def test_every_reason_fits_the_text_for_the_ground_station():

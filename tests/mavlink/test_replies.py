@@ -7,90 +7,87 @@ from contextlib import closing
 
 import pytest
 from fakes import FakeClock
-from mavlink_peers import Peer, TcpServer, UdpPort, free_port, wait_until
+from mavlink_peers import Peer, TcpServer, UdpPort, free_port, link_to, wait_until
 
-from edgevpr.mavlink import reasons
-from edgevpr.mavlink.address import parse_link
-from edgevpr.mavlink.link import Link
+from edgevpr.mavlink import readiness as reasons
+from edgevpr.mavlink.fixes import FixAnswer, Fixes, Sending
 from edgevpr.mavlink.messages import Fix
-from edgevpr.mavlink.outbox import Answer, Sending
-from edgevpr.mavlink.reasons import GPS_IN_USE, State
-from edgevpr.mavlink.replies import Replies
+from edgevpr.mavlink.readiness import GPS_IN_USE, AutopilotState
 from edgevpr.mavlink.wire import mavlink
 
 ACCEPTED, FAILED, IN_PROGRESS = mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_FAILED, mavlink.MAV_RESULT_IN_PROGRESS
-LATE = Answer(None, "it had no answer within 1 s", None)
+LATE = FixAnswer(None, "it had no answer within 1 s", None)
 ARMED = mavlink.MAV_MODE_FLAG_SAFETY_ARMED
 
 
-def sent(replies, t_s):
+def sent(fixes, t_s):
     sending = Sending(Fix(50.0, 8.0, 20.0, t_s), t_s + 1)
-    replies.note_sent(sending, t_s)
+    fixes.note_sent(sending, t_s, has_answer=True)
     sending.settle(True)
     return sending
 
 
 def test_one_fix_a_second_has_its_own_answer_though_some_are_lost():
-    replies, sendings = Replies(), []
+    fixes, sendings = Fixes(), []
     for t_s in range(10):
-        sendings.append(sent(replies, t_s))
+        sendings.append(sent(fixes, t_s))
         if t_s not in (3, 4):
-            replies.hear("ACCEPTED" if t_s % 2 else "FAILED", State(gps_age_s=0.0), t_s + 0.02)
+            fixes.hear("ACCEPTED" if t_s % 2 else "FAILED", AutopilotState(gps_age_s=0.0), t_s + 0.02)
     answers = [sending.answer for sending in sendings]
     assert answers == [None if t_s in (3, 4) else ("ACCEPTED" if t_s % 2 else "FAILED") for t_s in range(10)]
     assert sendings[3].outcome == sendings[4].outcome == LATE
-    assert sendings[9].outcome == Answer("ACCEPTED", None, pytest.approx(0.02))
-    assert (replies.unanswered, len(replies), replies.refusal) == (2, 0, GPS_IN_USE)
+    assert sendings[9].outcome == FixAnswer("ACCEPTED", None, pytest.approx(0.02))
+    assert (fixes.unanswered, len(fixes), fixes.refusal) == (2, 0, GPS_IN_USE)
 
 
 def test_of_several_fixes_under_way_the_oldest_is_answered():
-    replies = Replies()
-    first, second, third = (sent(replies, t_s) for t_s in (0.0, 0.2, 0.4))
-    assert replies.hear("FAILED", State(), 0.5) is first
-    assert replies.hear("ACCEPTED", State(), 0.6) is second
+    fixes = Fixes()
+    first, second, third = (sent(fixes, t_s) for t_s in (0.0, 0.2, 0.4))
+    assert fixes.hear("FAILED", AutopilotState(), 0.5) is first
+    assert fixes.hear("ACCEPTED", AutopilotState(), 0.6) is second
     assert third.outcome is None
-    assert len(replies) == 1
+    assert len(fixes) == 1
 
 
 def test_an_answer_that_is_late_or_one_too_many_belongs_to_no_fix():
-    replies = Replies()
-    late = sent(replies, 0.0)
-    assert replies.hear("FAILED", State(), 1.1) is None
+    fixes = Fixes()
+    late = sent(fixes, 0.0)
+    assert fixes.hear("FAILED", AutopilotState(), 1.1) is None
     assert late.outcome == LATE
-    new = sent(replies, 2.0)
-    assert replies.hear("FAILED", State(), 2.1) is new
-    assert replies.hear("FAILED", State(), 2.1) is None
-    assert replies.unanswered == 1
+    new = sent(fixes, 2.0)
+    assert fixes.hear("FAILED", AutopilotState(), 2.1) is new
+    assert fixes.hear("FAILED", AutopilotState(), 2.1) is None
+    assert fixes.unanswered == 1
 
 
 def test_a_fix_may_be_in_the_position_unless_it_was_refused():
-    replies = Replies()
-    assert replies.t_fix_s == -math.inf
-    sent(replies, 10.0)
-    assert replies.t_fix_s == 10.0, "it may be taken before the answer comes"
-    replies.hear("FAILED", State(), 10.1)
-    assert replies.t_fix_s == -math.inf
-    sent(replies, 11.0)
-    replies.hear("ACCEPTED", State(), 11.1)
-    assert replies.t_fix_s == 11.1
-    sent(replies, 12.0)
-    replies.hear("DENIED", State(), 12.1)
-    assert replies.t_fix_s == 11.1
-    sent(replies, 13.0)
-    replies.time_out(14.1)
-    assert replies.t_fix_s == 13.0, "only the answer may have been lost"
-    sent(replies, 15.0)
-    replies.break_off("the link was lost")
-    assert replies.t_fix_s == 15.0
-    replies.hear("ACCEPTED", State(), 17.0)
-    assert replies.t_fix_s == 17.0, "a fix was taken, whichever it was"
+    fixes = Fixes()
+    assert fixes.t_fix_s == -math.inf
+    sent(fixes, 10.0)
+    assert fixes.t_fix_s == 10.0, "it may be taken before the answer comes"
+    fixes.hear("FAILED", AutopilotState(), 10.1)
+    assert fixes.t_fix_s == -math.inf
+    sent(fixes, 11.0)
+    fixes.hear("ACCEPTED", AutopilotState(), 11.1)
+    assert fixes.t_fix_s == 11.1
+    sent(fixes, 12.0)
+    fixes.hear("DENIED", AutopilotState(), 12.1)
+    assert fixes.t_fix_s == 11.1
+    sent(fixes, 13.0)
+    fixes.time_out(14.1)
+    assert fixes.t_fix_s == 13.0, "only the answer may have been lost"
+    sent(fixes, 15.0)
+    fixes.break_off("the link was lost")
+    assert fixes.t_fix_s == 15.0
+    fixes.hear("ACCEPTED", AutopilotState(), 17.0)
+    assert fixes.t_fix_s == 17.0, "a fix was taken, whichever it was"
 
 
 def test_a_message_without_answers_is_waited_for_by_nobody_and_may_be_taken():
-    replies, sending = Replies(), Sending(Fix(50.0, 8.0, 20.0, 5.0), 6.0)
-    replies.note_unanswerable(sending, 5.0)
-    assert sending.outcome == Answer(None, "its message has no answer", None)
-    assert (len(replies), replies.unanswered, replies.t_fix_s) == (0, 0, 5.0)
+    fixes, sending = Fixes(), Sending(Fix(50.0, 8.0, 20.0, 5.0), 6.0)
+    fixes.note_sent(sending, 5.0, has_answer=False)
+    assert sending.outcome == FixAnswer(None, "its message has no answer", None)
+    assert (len(fixes), fixes.unanswered, fixes.t_fix_s) == (0, 0, 5.0)
 
 
 @pytest.fixture
@@ -100,7 +97,10 @@ def clock():
 
 @pytest.fixture
 def link_and_peer(clock):
-    with closing(UdpPort()) as port, Link(parse_link(f"udpout:127.0.0.1:{port.number}"), clock=clock) as link:
+    with (
+        closing(UdpPort()) as port,
+        link_to(f"udpout:127.0.0.1:{port.number}", clock=clock) as link,
+    ):
         peer = Peer(port, 7)
         peer.expect("HEARTBEAT")
         yield link, peer
@@ -138,7 +138,7 @@ def test_a_refused_fix_says_why_by_what_the_autopilot_has_said(link_and_peer, cl
     link, peer = link_and_peer
     beat(link, peer)
     say(link, peer, gps(mavlink.GPS_FIX_TYPE_3D_FIX))
-    assert refused(link, peer, clock) == Answer("FAILED", GPS_IN_USE.sentence, pytest.approx(0.03))
+    assert refused(link, peer, clock) == FixAnswer("FAILED", GPS_IN_USE.sentence, pytest.approx(0.03))
     clock.now_s += 2
     say(link, peer, gps(mavlink.GPS_FIX_TYPE_NO_FIX))
     assert refused(link, peer, clock).why == reasons.UNKNOWN.sentence
@@ -230,7 +230,7 @@ def test_silence_to_five_fixes_says_whether_other_commands_are_answered(link_and
 def test_a_link_that_is_lost_and_a_flight_that_ends_take_the_answers_along(clock):
     number = free_port(socket.SOCK_STREAM)
     with closing(TcpServer(number)) as server:
-        with Link(parse_link(f"tcp:127.0.0.1:{number}"), clock=clock) as link:
+        with link_to(f"tcp:127.0.0.1:{number}", clock=clock) as link:
             for how in ("lost", "closed"):
                 peer = Peer(server.accept(), 7)
                 beat(link, peer)
@@ -240,8 +240,8 @@ def test_a_link_that_is_lost_and_a_flight_that_ends_take_the_answers_along(clock
                 if how == "lost":
                     peer.port.close()
                     wait_until(lambda: sending.outcome)  # noqa: B023
-                    assert sending.outcome == Answer(None, "the link was lost before its answer came", None)
-        assert sending.outcome == Answer(None, "the flight ended before its answer came", None)
+                    assert sending.outcome == FixAnswer(None, "the link was lost before its answer came", None)
+        assert sending.outcome == FixAnswer(None, "the flight ended before its answer came", None)
 
 
 def test_the_report_of_the_vehicle_says_when_a_fix_may_have_come_into_it(link_and_peer, clock):

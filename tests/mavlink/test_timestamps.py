@@ -8,7 +8,7 @@ from fakes import FakeClock
 from mavlink_peers import wait_until
 
 from edgevpr.core.errors import ConfigError
-from edgevpr.mavlink.timestamps import OLD, TICKS_S, BorrowedTimeStamps, TimeStamps
+from edgevpr.mavlink.signing import OLD, TICKS_S, TimeStamps
 
 STREAM = (7, 1, 0)
 MINUTE = 60 * TICKS_S
@@ -67,7 +67,7 @@ def test_a_clock_that_is_set_forward_is_followed_and_one_that_is_set_back_is_not
 KILLED = """
 import sys, time
 from pathlib import Path
-from edgevpr.mavlink.timestamps import TimeStamps
+from edgevpr.mavlink.signing import TimeStamps
 mono_s = 0.0
 stamps = TimeStamps(Path(sys.argv[1]), lambda: mono_s, lambda: 0.0)
 while True:
@@ -112,9 +112,9 @@ def test_a_disk_that_becomes_full_in_flight_ends_nothing(path, monkeypatch, capl
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("edgevpr.mavlink.timestamps.write_whole", full)
+    monkeypatch.setattr("edgevpr.mavlink.signing.write_whole", full)
     tries = []
-    monkeypatch.setattr("edgevpr.mavlink.timestamps.Thread.start", lambda thread: tries.append(thread.run()))
+    monkeypatch.setattr("edgevpr.mavlink.signing.Thread.start", lambda thread: tries.append(thread.run()))
     first = stamps.next()
     for _ in range(3):
         clock.now_s += 60
@@ -127,7 +127,7 @@ def test_a_borrowed_time_goes_on_from_the_file_and_leaves_it_as_it_is(path):
     clock = FakeClock()
     flown = stamps_at(path, clock=clock).next()
     before = path.read_bytes()
-    borrowed = BorrowedTimeStamps(path, clock, lambda: 0.0)
+    borrowed = TimeStamps(path, clock, lambda: 0.0, is_kept=False)
     assert borrowed.next() > flown
     clock.now_s += 300
     assert borrowed.refusal((1, 1, 0), borrowed.next() + 3600 * TICKS_S) is None  # the time is learnt
@@ -137,5 +137,5 @@ def test_a_borrowed_time_goes_on_from_the_file_and_leaves_it_as_it_is(path):
 
 
 def test_a_borrowed_time_needs_no_file(tmp_path):
-    assert BorrowedTimeStamps(tmp_path / "absent" / "time").next() > 0
+    assert TimeStamps(tmp_path / "absent" / "time", is_kept=False).next() > 0
     assert list(tmp_path.iterdir()) == []

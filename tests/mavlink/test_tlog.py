@@ -13,17 +13,16 @@ from pathlib import Path
 import pytest
 from fakes import FakeClock
 from full_disk import no_file_larger_than
-from mavlink_peers import Peer, TcpServer, UdpPort, free_port, wait_until
+from mavlink_peers import Peer, TcpServer, UdpPort, free_port, link_to, wait_until
 
 from edgevpr.core.errors import EdgevprError
 from edgevpr.mavlink import messages, tlog
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.line import Line
-from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Fix, Health
+from edgevpr.mavlink.ports import open_port
 from edgevpr.mavlink.tlog import Tlog
-from edgevpr.mavlink.transport import open_transport
-from edgevpr.mavlink.wire import Receiver, mavlink
+from edgevpr.mavlink.wire import PacketReader, mavlink
 
 MAVLOGDUMP = Path(sys.prefix) / "bin" / "mavlogdump.py"
 
@@ -79,13 +78,13 @@ def test_both_directions_of_a_link_are_read_by_mavlogdump(path):
     began_us = time.time_ns() // 1000
     with closing(UdpPort()) as port, Tlog(path) as log:
         peer = Peer(port)
-        with Link(parse_link(f"udpout:127.0.0.1:{port.number}"), tap=log.record) as link:
+        with link_to(f"udpout:127.0.0.1:{port.number}", tap=log.record) as link:
             link.set_health(Health.ACTIVE)
             peer.expect("HEARTBEAT")
             port.send(b"no packet\xfd\x05" + bytes(300))
             peer.heartbeat()
             wait_until(link.listens)
-            sending = link.send_fix(Fix(50.0, 8.0, 20.0, link._clock()))
+            sending = link.send_fix(Fix(50.0, 8.0, 20.0, link._settings.clock()))
             assert peer.expect("COMMAND_INT").x == 500_000_000
             wait_until(lambda: sending.sent)
             peer.answer_fix(mavlink.MAV_RESULT_ACCEPTED)
@@ -97,7 +96,7 @@ def test_both_directions_of_a_link_are_read_by_mavlogdump(path):
     assert all(began_us - 4 <= t_us <= time.time_ns() // 1000 for t_us, _ in written)
     assert [t_us for t_us, _ in written] == sorted(t_us for t_us, _ in written)
     assert unknown in [each for _, each in written]
-    names = [message.get_type() for message in Receiver().feed(b"".join(each for _, each in written))]
+    names = [message.get_type() for message in PacketReader().feed(b"".join(each for _, each in written))]
     counted = {name: names.count(name) for name in names}
     assert counted == {**stats.sent, "HEARTBEAT": stats.sent["HEARTBEAT"] + 1, "COMMAND_ACK": 1}
     said = dumped(path, "--show-source")
@@ -111,7 +110,7 @@ def test_both_directions_of_a_link_are_read_by_mavlogdump(path):
 
 def test_a_packet_is_in_the_log_when_the_port_has_taken_all_of_it():
     server, taken = TcpServer(number := free_port()), []
-    line = Line(open_transport(parse_link(f"tcp:127.0.0.1:{number}")), FakeClock(), taken.append)
+    line = Line(open_port(parse_link(f"tcp:127.0.0.1:{number}")), FakeClock(), taken.append)
     with closing(server):
         far = server.accept()
         line.put(big := bytes(1_000_000), None)

@@ -4,12 +4,10 @@ import math
 
 import pytest
 from fakes import FakeClock
-from mavlink_peers import Peer, UdpPort, wait_until
+from mavlink_peers import Peer, UdpPort, link_to, wait_until
 
 from edgevpr.core.geodesy import offset_m
 from edgevpr.core.types import Vehicle
-from edgevpr.mavlink.address import parse_link
-from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.wire import mavlink
 
 
@@ -21,7 +19,7 @@ def clock():
 @pytest.fixture
 def link_and_peer(clock):
     port = UdpPort()
-    with Link(parse_link(f"udpout:127.0.0.1:{port.number}"), clock=clock) as link:
+    with link_to(f"udpout:127.0.0.1:{port.number}", clock=clock) as link:
         peer = Peer(port, system_id=7)
         peer.expect("HEARTBEAT")
         yield link, peer

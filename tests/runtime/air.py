@@ -11,7 +11,7 @@ from edgevpr.core.contract import FineMatch
 from edgevpr.core.geodesy import moved, offset_m
 from edgevpr.core.types import Candidate, Frame, Place, Position, QueryCost, Receiver, Steps, Vehicle
 from edgevpr.frames.level import Levelled, View
-from edgevpr.mavlink.attitude import Attitude
+from edgevpr.mavlink.vehicle import Attitude
 from edgevpr.runtime.flight.navigator import Advice, Navigator
 from edgevpr.runtime.recognise.locate import Located
 from edgevpr.runtime.recognise.recognition import Recognition

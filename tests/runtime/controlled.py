@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from air import match_at
 from fakes import FakeClock
-from mavlink_peers import wait_until
+from mavlink_peers import link_to, wait_until
 
 from edgevpr.core.config import SourceSetsConfig, load_config
 from edgevpr.core.geodesy import moved
@@ -16,10 +16,8 @@ from edgevpr.core.types import Position
 from edgevpr.lab.simulate.flight import ORIGIN
 from edgevpr.lab.simulate.flightcontroller.controller import FlightController
 from edgevpr.lab.simulate.flightcontroller.freeflight import FreeFlight
-from edgevpr.mavlink.address import parse_link
-from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Health
-from edgevpr.mavlink.wire import Receiver, mavlink
+from edgevpr.mavlink.wire import PacketReader, mavlink
 from edgevpr.power.load import MachineLoad
 from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.flightlog import FlightLog
@@ -46,17 +44,15 @@ class Controlled:
         self._sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._sock.bind(("127.0.0.1", 0))
         self.navigator = Navigator(1.0, 1.0)
-        self.link = Link(
-            parse_link(f"udpout:127.0.0.1:{self._sock.getsockname()[1]}"),
-            clock=self.clock,
-            listener=self.navigator if send_fixes else Muted(self.navigator),
-        )
+        listener = self.navigator if send_fixes else Muted(self.navigator)
+        url = f"udpout:127.0.0.1:{self._sock.getsockname()[1]}"
+        self.link = link_to(url, clock=self.clock, listener=listener)
         settings = replace(load_config(None).mavlink, send_fixes=send_fixes, source_sets=source_sets)
         herald = Herald(FlightLog(None), self.link)
         self.autopilot = ToAutopilot(
             self.link, self.navigator, herald, settings=settings, cores=4, clock=self.clock.clock
         )
-        self._packer, self._receiver = mavlink.MAVLink(None, 1, 1), Receiver()
+        self._packer, self._receiver = mavlink.MAVLink(None, 1, 1), PacketReader()
         self._to, self._said, self._steps = None, 0, 0
         self.sees, self.heard, self.texts, self.reports = True, [], [], []
         self.link.want_position()

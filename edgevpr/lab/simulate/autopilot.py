@@ -17,8 +17,8 @@ from edgevpr.lab.simulate.flightcontroller.controller import STEP_S, FlightContr
 from edgevpr.lab.simulate.flightcontroller.recorded import AlongTrack, Nowhere, Track
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.messages import AUTOPILOT
-from edgevpr.mavlink.transport import Transport, open_transport
-from edgevpr.mavlink.wire import Message, Receiver, mavlink
+from edgevpr.mavlink.ports import Port, open_port
+from edgevpr.mavlink.wire import Message, PacketReader, mavlink
 
 DEFAULT_VEHICLE = "arduplane"
 _QUESTIONS = {"HEARTBEAT", "PARAM_REQUEST_LIST", "PARAM_REQUEST_READ", "PING", "TIMESYNC"}
@@ -93,7 +93,7 @@ def serve(
     stop = stop or threading.Event()
     address = parse_link(link_url)
     try:
-        transport = open_transport(address)
+        transport = open_port(address)
     except OSError as error:
         raise LinkError(f"{address}: it cannot be opened ({error.strerror or error}): is the other end up?") from error
     log.info("%s is up at %s", controller, address)
@@ -111,10 +111,10 @@ def serve(
 class _Port:
     """The link of a flight controller, and the count of what comes over it."""
 
-    def __init__(self, transport: Transport, controller: FlightController, speedup: float) -> None:
+    def __init__(self, transport: Port, controller: FlightController, speedup: float) -> None:
         self._transport, self._controller, self._speedup = transport, controller, speedup
         self._packer = mavlink.MAVLink(None, srcSystem=controller.system_id, srcComponent=AUTOPILOT)
-        self._receiver = Receiver()
+        self._receiver = PacketReader()
         self._by_sender: defaultdict[str, Counter[str]] = defaultdict(Counter)
         self._companion: str | None = None
         self._next_seq: dict[str, int] = {}

@@ -16,7 +16,7 @@ from edgevpr.core.types import NO_TAPE, Tape
 from edgevpr.frames.source import Source, open_source
 from edgevpr.frames.taped import RecordedSource
 from edgevpr.mavlink.address import parse_links
-from edgevpr.mavlink.ground import GroundLink
+from edgevpr.mavlink.groundlink import GroundLink
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.signing import open_signing
 from edgevpr.mavlink.tlog import Tlog

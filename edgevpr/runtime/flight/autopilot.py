@@ -8,9 +8,9 @@ from dataclasses import replace
 from edgevpr.core.config import MavlinkConfig, SourceSetsConfig
 from edgevpr.core.types import FixReport, Vehicle
 from edgevpr.mavlink import messages
+from edgevpr.mavlink.fixes import Sending
 from edgevpr.mavlink.link import Link
-from edgevpr.mavlink.outbox import Sending
-from edgevpr.mavlink.wishes import Wish, Wished
+from edgevpr.mavlink.requests import Wish, Wished
 from edgevpr.power.load import MachineLoad
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.herald import Herald

@@ -1,7 +1,7 @@
 """The wishes of the ground, and what becomes of them: the flight pauses and goes on, learning stops and goes on."""
 
 from edgevpr.mavlink.messages import Severity
-from edgevpr.mavlink.wishes import Wish, Wished
+from edgevpr.mavlink.requests import Wish, Wished
 from edgevpr.runtime.flight.world import Crew
 
 _TEXTS = {

@@ -15,7 +15,8 @@ from edgevpr.core.config import Config, MavlinkConfig
 from edgevpr.core.errors import ImageError
 from edgevpr.core.types import Position
 from edgevpr.mavlink.address import parse_links
-from edgevpr.mavlink.ground import GroundLink
+from edgevpr.mavlink.conversation import LinkSettings
+from edgevpr.mavlink.groundlink import GroundLink
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Severity
 from edgevpr.places.mapfile import PlaceMap
@@ -293,9 +294,8 @@ def open_links(
     address, ground_address = parse_links(settings.link, settings.ground)
     if address is None:
         return None, None
-    link = world.link(
-        address,
-        settings.component_id,
+    link_settings = LinkSettings(
+        component_id=settings.component_id,
         system_id=settings.system_id,
         max_fix_age_s=settings.max_fix_age_s,
         listener=navigator if settings.send_fixes else Muted(navigator),
@@ -304,7 +304,7 @@ def open_links(
         signing=world.signing,
         tape=world.tape,
     )
-    stack.enter_context(link)
+    link = stack.enter_context(world.link(address, link_settings))
     link.want_position()
     return link, stack.enter_context(world.ground(ground_address, link)) if ground_address else None
 

@@ -12,10 +12,10 @@ import numpy as np
 
 from edgevpr.core.geodesy import distance_m, moved
 from edgevpr.core.types import Vehicle
-from edgevpr.mavlink.attitude import Attitude
-from edgevpr.mavlink.autopilots.channel import Channel
+from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.messages import Fix
-from edgevpr.mavlink.positions import State
+from edgevpr.mavlink.positions import MotionState
+from edgevpr.mavlink.vehicle import Attitude
 from edgevpr.runtime.flight.consistency import Consistency, Seen
 from edgevpr.runtime.flight.filter import INERTIAL, RECKONED
 from edgevpr.runtime.flight.navigation import Estimate, Navigation, reckons_by_gps
@@ -146,7 +146,7 @@ class Navigator:
             estimate = self._navigation.at(now_s)
             return estimate and self._claimed_m(estimate)
 
-    def state_at(self, t_s: float) -> State | None:
+    def state_at(self, t_s: float) -> MotionState | None:
         """Return where the vehicle is or was, later than at the last call, to be sent as a continuous position; None:
         that is not known well enough."""
         with self._lock:
@@ -157,7 +157,7 @@ class Navigator:
             lat_deg, lon_deg, behind_m = self._slew.followed(estimate)
             east, north = estimate.velocity_m_s
             attitude = self._attitude
-            return State(
+            return MotionState(
                 t_mono_s=t_s,
                 lat_deg=lat_deg,
                 lon_deg=lon_deg,

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from edgevpr.core.config import LogConfig
 from edgevpr.core.types import NO_TAPE, Tape
 from edgevpr.frames.source import Source
-from edgevpr.mavlink.ground import GroundLink
+from edgevpr.mavlink.groundlink import GroundLink
 from edgevpr.mavlink.link import Link
-from edgevpr.mavlink.signing import NotSigning, Signing
+from edgevpr.mavlink.signing import NotSigning
 from edgevpr.mavlink.wire import Tap
 from edgevpr.power.boards import Board
 from edgevpr.runtime.flight.autopilot import Autopilot
@@ -93,7 +93,7 @@ class World:
     open_source: Callable[[float], Source]
     link: type[Link]
     ground: type[GroundLink]
-    signing: Signing | NotSigning
+    signing: NotSigning
     tap: Tap
     stop: Stop
     reread: Reread | None

@@ -3,16 +3,24 @@ changed? Every rule has its source here: ArduPilot 4.7-dev, flown in simulation 
 
 from collections.abc import Iterator, Mapping
 
-from edgevpr.mavlink.autopilots import ardupilot
-from edgevpr.mavlink.autopilots.channel import Channel, Choice, Kind
-from edgevpr.mavlink.reading import Reading
+from edgevpr.mavlink.channel import (
+    ARDUPILOT,
+    MAVLINK_GPS,
+    SECOND,
+    Channel,
+    Choice,
+    Kind,
+    ardupilot_choice,
+    receiver_name,
+)
+from edgevpr.mavlink.reading import AutopilotReading
 from edgevpr.runtime.service.finding import Finding, Plan, sentence
 
 Parameters = Mapping[str, float | int]
 
 _SERIALS, _SOURCE_SETS = range(10), (1, 2, 3)
 PARAMETERS = (
-    *ardupilot.PARAMETERS, "GPS_AUTO_SWITCH", "FLOW_TYPE", "ARSPD_TYPE", "ARSPD_USE", "Q_ENABLE", "AHRS_EKF_TYPE",
+    *ARDUPILOT.parameters, "GPS_AUTO_SWITCH", "FLOW_TYPE", "ARSPD_TYPE", "ARSPD_USE", "Q_ENABLE", "AHRS_EKF_TYPE",
     "EK3_ENABLE",
     *(f"EK3_SRC{n}_{what}" for n in _SOURCE_SETS for what in ("POSXY", "VELXY", "POSZ", "YAW")),
     *(f"SERIAL{n}_{what}" for n in _SERIALS for what in ("PROTOCOL", "BAUD")),
@@ -26,10 +34,10 @@ KNOWS_FIXES = (4, 5)  # release notes of 4.5.0: MAV_CMD_EXTERNAL_POSITION_ESTIMA
 _SHORT_BAUDS = {111_100: 111}  # SERIALn_BAUD is in thousands, rounded down; above 2000 it is the rate itself
 
 
-def findings(reading: Reading, plan: Plan) -> Iterator[Finding]:
+def findings(reading: AutopilotReading, plan: Plan) -> Iterator[Finding]:
     """Judge what was read of an ArduPilot."""
     yield _filter_used(reading.parameters)
-    chosen = ardupilot.choice(reading.asked)
+    chosen = ardupilot_choice(reading.asked)
     if chosen.channel.is_continuous and not plan.sends_fixes:
         yield _dry(chosen, reading)
     elif chosen.channel is Channel.GPS_INPUT:
@@ -59,7 +67,7 @@ def _filter_used(parameters: Parameters) -> Finding:
     return Finding("EKF3", True, "the filter that takes fixes is in use")
 
 
-def _single_fixes(chosen: Choice, reading: Reading) -> Finding:
+def _single_fixes(chosen: Choice, reading: AutopilotReading) -> Finding:
     """Judge command 43003: something else must carry the vehicle from one fix to the next."""
     parameters = reading.parameters
     hovers = parameters.get("Q_ENABLE") == 1  # a plane's, whatever type its heartbeat tells
@@ -73,7 +81,7 @@ def _single_fixes(chosen: Choice, reading: Reading) -> Finding:
     # ArduPlane's ekf_check.cpp: the one looks on while the sticks fly it, the other while it flies by itself.
     end = "falls back to QHOVER or QLAND" if hovers else "stops" if reading.asked.kind is Kind.ROVER else "lands"
     unused = " FLOW_TYPE is set, but no EK3_SRCn_VELXY is 5, so the flow is not used." if has_flow else ""
-    if taken := parameters.get(ardupilot.receiver_name(parameters, ardupilot.SECOND), 0):
+    if taken := parameters.get(receiver_name(parameters, SECOND), 0):
         unused += f" It takes the place of the second receiver (type {taken:g})."
     return Finding(
         "channel",
@@ -88,7 +96,7 @@ def _single_fixes(chosen: Choice, reading: Reading) -> Finding:
 def _gps(chosen: Choice, parameters: Parameters) -> Finding:
     wrong = []
     switches = parameters.get("GPS_AUTO_SWITCH", _USE_BEST) in (_USE_BEST, _PRIMARY_WHILE_FIXED)
-    if chosen.receiver == ardupilot.SECOND and not switches:
+    if chosen.receiver == SECOND and not switches:
         wrong.append(f"GPS_AUTO_SWITCH={_USE_BEST}")
     if not _sets_with(parameters, "POSXY", _FROM_GPS):
         wrong.append(f"EK3_SRC1_POSXY={_FROM_GPS}")
@@ -97,11 +105,11 @@ def _gps(chosen: Choice, parameters: Parameters) -> Finding:
     return Finding("channel", True, sentence(chosen.reason))
 
 
-def _dry(chosen: Choice, reading: Reading) -> Finding:
+def _dry(chosen: Choice, reading: AutopilotReading) -> Finding:
     """Judge a continuous channel in a dry run, which sends no position: AP_Arming wants one of all that is set up."""
     if chosen.channel is Channel.GPS_INPUT:
-        name = ardupilot.receiver_name(reading.parameters, chosen.receiver)
-        change = f"{name}={_NO_RECEIVER if chosen.receiver == ardupilot.SECOND else _ANY_RECEIVER}"
+        name = receiver_name(reading.parameters, chosen.receiver)
+        change = f"{name}={_NO_RECEIVER if chosen.receiver == SECOND else _ANY_RECEIVER}"
     else:
         change = "VISO_TYPE=0"
     return Finding(
@@ -123,7 +131,7 @@ def _not_yet(found: Finding) -> Finding:
     )
 
 
-def _odometry(chosen: Choice, reading: Reading) -> Finding:
+def _odometry(chosen: Choice, reading: AutopilotReading) -> Finding:
     sets = _sets_with(reading.parameters, "POSXY", _FROM_VISION)
     if not sets:
         wanted = {"POSXY": _FROM_VISION, "VELXY": 0, "POSZ": 1, "YAW": 1}
@@ -153,7 +161,7 @@ def _odometry(chosen: Choice, reading: Reading) -> Finding:
     return Finding("channel", True, sentence(f"{chosen.reason}{switch}"))
 
 
-def _airspeed(reading: Reading) -> Iterator[Finding]:
+def _airspeed(reading: AutopilotReading) -> Iterator[Finding]:
     if reading.asked.kind is not Kind.PLANE:
         return
     parameters = reading.parameters
@@ -167,7 +175,7 @@ def _airspeed(reading: Reading) -> Iterator[Finding]:
         )
 
 
-def _ports(reading: Reading) -> Finding:
+def _ports(reading: AutopilotReading) -> Finding:
     parameters = reading.parameters
     ports = {n: parameters.get(f"SERIAL{n}_PROTOCOL") for n in _SERIALS}
     if reading.says_version_1:
@@ -186,7 +194,7 @@ def _ports(reading: Reading) -> Finding:
 
 def _second_receiver(parameters: Parameters) -> tuple[str, ...]:
     switch = parameters.get("GPS_AUTO_SWITCH") in (_USE_BEST, _PRIMARY_WHILE_FIXED)
-    wanted = (f"{ardupilot.receiver_name(parameters, ardupilot.SECOND)}={ardupilot.MAVLINK_GPS}",)
+    wanted = (f"{receiver_name(parameters, SECOND)}={MAVLINK_GPS}",)
     return wanted if switch else (*wanted, f"GPS_AUTO_SWITCH={_USE_BEST}")
 
 

@@ -16,8 +16,8 @@ from edgevpr.frames.mask import FEWEST_FRAMES, learn_overlay, require_png, write
 from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import Source, open_source
 from edgevpr.mavlink.address import LinkAddress, parse_links
-from edgevpr.mavlink.asking import Asking
-from edgevpr.mavlink.signing import open_signing_to_ask
+from edgevpr.mavlink.asking import Inquiry
+from edgevpr.mavlink.signing import open_signing
 from edgevpr.mavlink.wire import mavlink
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import map_path
@@ -182,27 +182,27 @@ def _with_a_frame(source: Source, uri: str) -> str:
     )
 
 
-def _link(config: Config, look: Callable[[Asking, LinkAddress, Config], str]) -> str:
+def _link(config: Config, look: Callable[[Inquiry, LinkAddress, Config], str]) -> str:
     settings = config.mavlink
     address, ground = parse_links(settings.link, settings.ground)
     if address is None:
         return "none, so what is recognised goes into the log only"
-    signing = open_signing_to_ask(settings.signing_key, settings.signing_state)
-    with Asking(address, settings.component_id, settings.system_id, signing) as asking:
+    signing = open_signing(settings.signing_key, settings.signing_state, to_ask=True)
+    with Inquiry(address, settings.component_id, settings.system_id, signing) as asking:
         said = [f"{address}{look(asking, address, config)}"]
     if ground:
-        with Asking(ground, settings.component_id, settings.system_id):
+        with Inquiry(ground, settings.component_id, settings.system_id):
             said.append(f"ground station at {ground}")
     if settings.signing_key is not None:
         said.append("signed")
     return ", ".join(said if settings.send_fixes else [*said, DRY_RUN])
 
 
-def _only_opened(asking: Asking, address: LinkAddress, config: Config) -> str:
+def _only_opened(asking: Inquiry, address: LinkAddress, config: Config) -> str:
     return ""
 
 
-def _with_a_heartbeat(asking: Asking, address: LinkAddress, config: Config) -> str:
+def _with_a_heartbeat(asking: Inquiry, address: LinkAddress, config: Config) -> str:
     beat = asking.heartbeat()
     if beat is None:
         raise LinkError(silence(address, asking.bad_bytes, asking.others, asking.refused).message)

@@ -8,9 +8,9 @@ from types import MappingProxyType
 from edgevpr.core.config import Config
 from edgevpr.core.errors import LinkAddressError, LinkError
 from edgevpr.mavlink.address import LinkAddress
-from edgevpr.mavlink.asking import Asking
-from edgevpr.mavlink.reading import Reading, read_autopilot
-from edgevpr.mavlink.signing import MEANING, open_signing_to_ask
+from edgevpr.mavlink.asking import Inquiry
+from edgevpr.mavlink.reading import AutopilotReading, read_autopilot
+from edgevpr.mavlink.signing import MEANING, open_signing
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.service import ardupilot, px4
 from edgevpr.runtime.service.board import board_findings
@@ -30,7 +30,7 @@ class Diagnosis:
     """All findings, and what was read of the autopilot (None: nothing)."""
 
     findings: list[Finding]
-    reading: Reading | None
+    reading: AutopilotReading | None
 
     @property
     def is_fine(self) -> bool:
@@ -42,12 +42,12 @@ def doctor(config: Config, address: LinkAddress, say: Callable[[str], None], roo
     few words what is waited for. Raises LinkAddressError for an address that is wrong, and ConfigError for a board that
     is unknown or a signing key that cannot be used."""
     settings = config.mavlink
-    signing = open_signing_to_ask(settings.signing_key, settings.signing_state)
+    signing = open_signing(settings.signing_key, settings.signing_state, to_ask=True)
     about_board = list(board_findings(config, address, root))
     say(f"asking the autopilot at {address}")
     reading, trouble = None, None
     try:
-        with Asking(address, settings.component_id, settings.system_id, signing) as asking:
+        with Inquiry(address, settings.component_id, settings.system_id, signing) as asking:
             reading = read_autopilot(asking, {name: rules.PARAMETERS for name, rules in _ADVICE.items()})
             if reading is None:
                 trouble = silence(address, asking.bad_bytes, asking.others, asking.refused)
@@ -99,7 +99,7 @@ def silence(
     return Finding("link", False, f"{address}: no heartbeat of an autopilot in 5 s: {advice[address.kind]}.")
 
 
-def autopilot_findings(reading: Reading, address: LinkAddress, plan: Plan) -> Iterator[Finding]:
+def autopilot_findings(reading: AutopilotReading, address: LinkAddress, plan: Plan) -> Iterator[Finding]:
     """Judge what was read for the flight that is to be: first what holds for every autopilot, then the rules of its
     firmware."""
     yield _link(reading, address)
@@ -120,7 +120,7 @@ def autopilot_findings(reading: Reading, address: LinkAddress, plan: Plan) -> It
         yield from (_streams(reading), _filter(reading), _gps(reading), _origin(reading), _clock(reading))
 
 
-def _firmware(reading: Reading) -> Finding:
+def _firmware(reading: AutopilotReading) -> Finding:
     name, needed = _NAMES[reading.firmware], _ADVICE[reading.firmware].KNOWS_FIXES
     least = f"{needed[0]}.{needed[1]} or later"
     if reading.version is None:
@@ -135,7 +135,7 @@ def _firmware(reading: Reading) -> Finding:
     return Finding("firmware", True, f"{name} {reading.version_text}, {reading.vehicle}")
 
 
-def _link(reading: Reading, address: LinkAddress) -> Finding:
+def _link(reading: AutopilotReading, address: LinkAddress) -> Finding:
     who = f"{address}: {_NAMES.get(reading.firmware, 'an autopilot')}, system {reading.system_id}"
     who += ", armed" if reading.is_armed else ""
     if not reading.answers:
@@ -160,7 +160,7 @@ def _link(reading: Reading, address: LinkAddress) -> Finding:
     return Finding("link", True, f"{who}; {trip}")
 
 
-def _signing(reading: Reading) -> Finding:
+def _signing(reading: AutopilotReading) -> Finding:
     if reading.is_signed_to:
         return Finding("signing", True, "its packets carry the right signature, and so do ours")
     if not reading.signs:
@@ -175,7 +175,7 @@ def _signing(reading: Reading) -> Finding:
     )
 
 
-def _streams(reading: Reading) -> Finding:
+def _streams(reading: AutopilotReading) -> Finding:
     missing = [name for name in _NEEDED if name not in reading.heard]
     if missing:
         return Finding(
@@ -188,7 +188,7 @@ def _streams(reading: Reading) -> Finding:
     return Finding("streams", True, f"without being asked: {said or 'none'}; in flight edgevpr asks for what it needs")
 
 
-def _filter(reading: Reading) -> Finding:
+def _filter(reading: AutopilotReading) -> Finding:
     state = reading.filter
     if state is None:
         return Finding("filter", False, "It does not say how its filter is, so no fix could be weighed against it.")
@@ -199,14 +199,14 @@ def _filter(reading: Reading) -> Finding:
     return Finding("filter", False, f"The filter has no {lacks} yet ({flags}): wait, outdoors and standing still.")
 
 
-def _gps(reading: Reading) -> Finding:
+def _gps(reading: AutopilotReading) -> Finding:
     fixes = [fix for fix in reading.gps_fix if fix is not None]
     if any(fix >= _GPS_3D for fix in fixes):
         return Finding("gps", True, f"fix type {' and '.join(map(str, fixes))}")
     return Finding("gps", False, "No GPS receiver has a fix: take off only with one, so that the start is known.")
 
 
-def _origin(reading: Reading) -> Finding:
+def _origin(reading: AutopilotReading) -> Finding:
     if reading.origin is None:
         return Finding(
             "origin",
@@ -217,7 +217,7 @@ def _origin(reading: Reading) -> Finding:
     return Finding("origin", True, f"{reading.origin[0]:.6f}, {reading.origin[1]:.6f}")
 
 
-def _clock(reading: Reading) -> Finding:
+def _clock(reading: AutopilotReading) -> Finding:
     ahead_s = reading.clock_ahead_s
     if ahead_s is None:
         return Finding("clock", True, "the autopilot has no time of day yet, so the board's is not compared with it")

@@ -3,16 +3,16 @@ Every rule has its source here: the sources of PX4 1.17-alpha."""
 
 from collections.abc import Iterator, Mapping
 
-from edgevpr.mavlink.autopilots import px4
-from edgevpr.mavlink.autopilots.channel import Channel, Kind
-from edgevpr.mavlink.reading import Reading
+from edgevpr.mavlink.channel import CONTROL, FUSES_POSITION, PX4, Channel, Kind, px4_can_fuse, px4_choice
+from edgevpr.mavlink.positions import SENSOR_ID
+from edgevpr.mavlink.reading import AutopilotReading
 from edgevpr.runtime.service.finding import Finding, Plan, sentence
 
 Parameters = Mapping[str, float | int]
 
 _INSTANCES, _TELEMETRY = (0, 1, 2), (1, 2, 3)
 PARAMETERS = (
-    *px4.PARAMETERS, "EKF2_AGP0_ID", "EKF2_AGP0_DELAY", "EKF2_EV_CTRL", "EKF2_OF_CTRL", "MAV_PROTO_VER",
+    *PX4.parameters, "EKF2_AGP0_ID", "EKF2_AGP0_DELAY", "EKF2_EV_CTRL", "EKF2_OF_CTRL", "MAV_PROTO_VER",
     *(f"MAV_{n}_{what}" for n in _INSTANCES for what in ("CONFIG", "MODE", "RATE")),
     *(f"SER_TEL{n}_BAUD" for n in _TELEMETRY),
 )  # fmt: skip
@@ -24,7 +24,7 @@ _SILENT_S = 5.0  # aux_global_position.cpp: positions of message 296 are used no
 _TELEM2, _ONBOARD = 102, 2  # MAV_1_CONFIG, MAV_1_MODE
 
 
-def findings(reading: Reading, plan: Plan) -> Iterator[Finding]:
+def findings(reading: AutopilotReading, plan: Plan) -> Iterator[Finding]:
     """Judge what was read of a PX4."""
     yield _channel(reading)
     yield from _rate(reading, plan)
@@ -47,8 +47,8 @@ def rarity(every_s: float) -> str:
     return f"a query every {every_s:g} s, and PX4 drops positions after {_SILENT_S:g} s of silence"
 
 
-def _rate(reading: Reading, plan: Plan) -> Iterator[Finding]:
-    if px4.choice(reading.asked).channel is not Channel.SENSOR:
+def _rate(reading: AutopilotReading, plan: Plan) -> Iterator[Finding]:
+    if px4_choice(reading.asked).channel is not Channel.SENSOR:
         return
     if not is_too_rare(plan.every_s):
         yield Finding("rate", True, rarity(plan.every_s))
@@ -62,10 +62,10 @@ def _rate(reading: Reading, plan: Plan) -> Iterator[Finding]:
     )
 
 
-def _channel(reading: Reading) -> Finding:
+def _channel(reading: AutopilotReading) -> Finding:
     parameters = reading.parameters
-    chosen = px4.choice(reading.asked)
-    if not px4.can_fuse(reading.asked):
+    chosen = px4_choice(reading.asked)
+    if not px4_can_fuse(reading.asked):
         if reading.asked.kind is Kind.PLANE or parameters.get("EKF2_OF_CTRL") == 1:
             return Finding("channel", True, sentence(chosen.reason))
         return Finding(
@@ -78,9 +78,9 @@ def _channel(reading: Reading) -> Finding:
         )
     wrong = []
     if chosen.channel is Channel.COMMAND:
-        wrong.append(f"{px4.CONTROL}={px4.FUSES_POSITION}")
-    if parameters.get("EKF2_AGP0_ID", px4.SENSOR_ID) != px4.SENSOR_ID:
-        wrong.append(f"EKF2_AGP0_ID={px4.SENSOR_ID}")
+        wrong.append(f"{CONTROL}={FUSES_POSITION}")
+    if parameters.get("EKF2_AGP0_ID", SENSOR_ID) != SENSOR_ID:
+        wrong.append(f"EKF2_AGP0_ID={SENSOR_ID}")
     if parameters.get("EKF2_AGP0_DELAY", 0) > _MOST_DELAY_MS:
         wrong.append("EKF2_AGP0_DELAY=0")
     if wrong:
@@ -103,7 +103,7 @@ def _vision(parameters: Parameters) -> Iterator[Finding]:
         )
 
 
-def _ports(reading: Reading) -> Finding:
+def _ports(reading: AutopilotReading) -> Finding:
     if reading.says_version_1:
         return Finding(
             "port", False, "It speaks MAVLink 1, which knows neither signatures nor new messages.", ("MAV_PROTO_VER=2",)

@@ -13,7 +13,7 @@ from edgevpr.core.geodesy import distance_m
 from edgevpr.lab.simulate.flight import ORIGIN
 from edgevpr.lab.simulate.flightcontroller.controller import FlightController
 from edgevpr.lab.simulate.flightcontroller.freeflight import FreeFlight
-from edgevpr.mavlink.wire import Receiver, mavlink
+from edgevpr.mavlink.wire import PacketReader, mavlink
 
 ARDUPILOT = os.environ.get("EDGEVPR_ARDUPILOT")  # the folder of a built ArduPilot
 _INSTANCE = 5
@@ -30,7 +30,7 @@ class Pilot:
 
     def __init__(self, port) -> None:
         self._port = port
-        self._receiver = Receiver()
+        self._receiver = PacketReader()
         self._packer = mavlink.MAVLink(None, 255, mavlink.MAV_COMP_ID_MISSIONPLANNER)
         self._beat_s = -math.inf
         self.now_s = 0.0
@@ -158,7 +158,7 @@ class _Simulated:
         self.controller = FlightController(f"ardu{kind}", FreeFlight(kind, ORIGIN), gps=True)
         for name, value in parameters.items():
             self.controller.set(name, value)
-        self._receiver, self._packer = Receiver(), mavlink.MAVLink(None, 1, 1)
+        self._receiver, self._packer = PacketReader(), mavlink.MAVLink(None, 1, 1)
         self._said, self._now_s = b"", 0.0
 
     def send(self, data: bytes) -> None:

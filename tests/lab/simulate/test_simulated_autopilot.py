@@ -10,7 +10,7 @@ import time
 
 import numpy as np
 import pytest
-from mavlink_peers import AutopilotThread, Peer, UdpPort, free_port, wait_until
+from mavlink_peers import AutopilotThread, Peer, UdpPort, free_port, link_to, wait_until
 
 from edgevpr.cli.main import main
 from edgevpr.cli.simulation import _VEHICLES
@@ -22,8 +22,7 @@ from edgevpr.lab.simulate.flightcontroller.freeflight import FreeFlight
 from edgevpr.lab.simulate.flightcontroller.recorded import Nowhere, Track, read_track, truth_at
 from edgevpr.mavlink import messages, reading
 from edgevpr.mavlink.address import parse_link
-from edgevpr.mavlink.asking import Asking
-from edgevpr.mavlink.link import Link
+from edgevpr.mavlink.asking import Inquiry
 from edgevpr.mavlink.messages import Fix, Health
 from edgevpr.mavlink.wire import mavlink
 
@@ -79,7 +78,7 @@ def test_it_is_a_process_that_ends_well_on_sigterm_and_says_what_it_saw():
         f"from edgevpr.lab.simulate.autopilot import run_autopilot as r; print(r('udpin:127.0.0.1:{number}').to_json())"
     )
     process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
-    with Link(parse_link(f"udpout:127.0.0.1:{number}")) as link:
+    with link_to(f"udpout:127.0.0.1:{number}") as link:
         link.set_health(Health.ACTIVE)
         wait_until(lambda: link.stats().autopilot_heard, "the other process")
         link.send_fix(Fix(50.1234567, 14.0, 25.0, time.monotonic()))
@@ -104,7 +103,7 @@ def test_it_flies_along_a_track_from_when_a_companion_is_heard(tmp_path):
     ]
     csv.write_text("\n".join(["file,lat,lon,alt,yaw_deg,time", *rows]))
     number = free_port()
-    with Link(parse_link(f"udpin:127.0.0.1:{number}")) as link:
+    with link_to(f"udpin:127.0.0.1:{number}") as link:
         link.want_position()
         autopilot = AutopilotThread(f"udpout:127.0.0.1:{number}", track=read_track(csv))
         seen = []
@@ -138,11 +137,11 @@ def test_questions_do_not_start_the_track_and_whatever_a_flight_says_does(monkey
     link = f"127.0.0.1:{free_port()}"
     autopilot = AutopilotThread(f"udpin:{link}", track=track, vehicle="px4-copter", gps=True)
     try:
-        with Asking(parse_link(f"udpout:{link}")) as asking:
+        with Inquiry(parse_link(f"udpout:{link}")) as asking:
             assert reading.read_autopilot(asking, {"px4": ("EKF2_AGP0_CTRL",)}).parameters == {"EKF2_AGP0_CTRL": 1}
             there = asking.message(mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT)
         assert there.lat / 1e7 == 50.0
-        with Link(parse_link(f"udpout:{link}")) as flight:
+        with link_to(f"udpout:{link}") as flight:
             wait_until(lambda: flight.stats().autopilot_heard)
             flight.send(*messages.place_match(time.monotonic(), 3, 0.5))
             wait_until(lambda: (vehicle := flight.vehicle()) and vehicle.lat_deg == 50.1, "the end of the track")
@@ -173,7 +172,7 @@ def test_it_says_how_it_hangs_in_the_air_where_the_track_knows(tmp_path):
         "a.jpg,50.000,8.0,100,80.5,300,-12,7,2026-02-14T00:30:00Z\n"
     )
     number = free_port()
-    with Link(parse_link(f"udpin:127.0.0.1:{number}")) as link:
+    with link_to(f"udpin:127.0.0.1:{number}") as link:
         link.want_position()
         autopilot = AutopilotThread(f"udpout:127.0.0.1:{number}", track=read_track(csv))
 
@@ -263,7 +262,7 @@ def test_the_command_says_what_is_up_and_sets_parameters():
     )
     try:
         said = process.stderr.readline()
-        with Asking(parse_link(f"udpout:127.0.0.1:{number}")) as asking:
+        with Inquiry(parse_link(f"udpout:127.0.0.1:{number}")) as asking:
             assert asking.heartbeat().type == mavlink.MAV_TYPE_QUADROTOR
             assert asking.parameters(["GPS2_TYPE"], bytewise=False) == {"GPS2_TYPE": 14}
         process.terminate()

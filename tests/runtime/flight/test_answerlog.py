@@ -6,12 +6,10 @@ from contextlib import closing
 import pytest
 from fakes import FakeClock, FakeLink, FakeSource
 from flights import Flight, of_kind
-from mavlink_peers import Peer, UdpPort, wait_until
+from mavlink_peers import Peer, UdpPort, link_to, wait_until
 from pictures import textured
 
-from edgevpr.mavlink.address import parse_link
-from edgevpr.mavlink.link import Link
-from edgevpr.mavlink.reasons import GPS_IN_USE
+from edgevpr.mavlink.readiness import GPS_IN_USE
 from edgevpr.mavlink.wire import mavlink
 from edgevpr.runtime.flight import systemd
 
@@ -51,7 +49,10 @@ class Answering:
 
 
 def flown(recording, tmp_path, clock, results):
-    with closing(UdpPort()) as port, Link(parse_link(f"udpout:127.0.0.1:{port.number}"), clock=clock) as link:
+    with (
+        closing(UdpPort()) as port,
+        link_to(f"udpout:127.0.0.1:{port.number}", clock=clock) as link,
+    ):
         peer = Peer(port)
         peer.expect("HEARTBEAT")
         autopilot = Answering(link, peer, clock, results)

@@ -7,11 +7,9 @@ import sqlite3
 import pytest
 from fakes import FakeClock, FakeLink, FakeSource
 from flights import Flight, of_kind
-from mavlink_peers import Peer, UdpPort, wait_until
+from mavlink_peers import Peer, UdpPort, link_to, wait_until
 from pictures import textured
 
-from edgevpr.mavlink.address import parse_link
-from edgevpr.mavlink.link import Link
 from edgevpr.runtime.flight import autopilot, systemd
 from edgevpr.runtime.flight.autopilot import DRY_RUN
 
@@ -53,7 +51,7 @@ def test_an_answer_that_says_no_is_in_the_next_line(recording, tmp_path):
 def test_five_fixes_that_nobody_answers_stop_the_sending_and_the_lines_say_so(recording, tmp_path, monkeypatch):
     monkeypatch.setattr(autopilot, "_SETTLED_WITHIN_S", 60.0)
     clock, port = FakeClock(), UdpPort()
-    with Link(parse_link(f"udpout:127.0.0.1:{port.number}"), clock=clock) as link:
+    with link_to(f"udpout:127.0.0.1:{port.number}", clock=clock) as link:
         peer = Peer(port)
         peer.expect("HEARTBEAT")
 

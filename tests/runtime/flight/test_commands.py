@@ -5,13 +5,11 @@ import shutil
 import pytest
 from fakes import FakeClock, FakeLink, FakeSource, vehicle_at
 from flights import Flight, of_kind
-from mavlink_peers import Peer, UdpPort, wait_until
+from mavlink_peers import Peer, UdpPort, link_to, wait_until
 from pictures import textured
 
-from edgevpr.mavlink.address import parse_link
-from edgevpr.mavlink.link import Link
+from edgevpr.mavlink.requests import Wish
 from edgevpr.mavlink.wire import mavlink
-from edgevpr.mavlink.wishes import Wish
 from edgevpr.runtime.flight import systemd
 
 
@@ -169,7 +167,7 @@ def test_nor_can_one_whose_learning_has_stopped_for_good(recording, tmp_path, cl
 
 def test_a_ground_station_pauses_a_flight_over_a_real_link(recording, tmp_path, clock):
     port, acks = UdpPort(), []
-    with Link(parse_link(f"udpout:127.0.0.1:{port.number}"), clock=clock) as link:
+    with link_to(f"udpout:127.0.0.1:{port.number}", clock=clock) as link:
         peer = Peer(port)
         peer.expect("HEARTBEAT")
         peer.heartbeat()

@@ -3,14 +3,12 @@
 import numpy as np
 from fakes import FakeClock, FakeLink, FakeSource, vehicle_at
 from flights import STEP_DEG, Flight, of_kind
-from mavlink_peers import Peer, UdpPort, wait_until
+from mavlink_peers import Peer, UdpPort, link_to, wait_until
 from pictures import textured
 
 from edgevpr.core.contract import FineMatch
 from edgevpr.core.geodesy import distance_m, moved
 from edgevpr.core.types import Candidate, Frame, Place, Position, QueryCost, Steps
-from edgevpr.mavlink.address import parse_link
-from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.wire import mavlink
 from edgevpr.runtime.flight import autopilot
 from edgevpr.runtime.flight.autopilot import DRY_RUN
@@ -203,7 +201,7 @@ def test_over_a_real_link_it_is_what_the_autopilot_says_of_itself_that_counts(re
     monkeypatch.setattr(autopilot, "_SETTLED_WITHIN_S", 60.0)
     clock, port = FakeClock(), UdpPort()
     navigator = Navigator(5.0, 1.0)
-    with Link(parse_link(f"udpout:127.0.0.1:{port.number}"), clock=clock, listener=navigator) as link:
+    with link_to(f"udpout:127.0.0.1:{port.number}", clock=clock, listener=navigator) as link:
         peer = Peer(port)
         peer.expect("HEARTBEAT")
         peer.heartbeat()

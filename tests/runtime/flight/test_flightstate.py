@@ -6,7 +6,7 @@ from fakes import FakeClock, FakeLink, FakeSource, vehicle_at
 from flights import Flight
 
 from edgevpr.frames.images import read_image
-from edgevpr.mavlink.wishes import Wish
+from edgevpr.mavlink.requests import Wish
 
 GREY = np.full((120, 160), 90, np.uint8)
 

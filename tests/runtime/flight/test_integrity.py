@@ -11,7 +11,7 @@ from fakes import FakeClock, FakeLink, to_autopilot, vehicle_at
 from edgevpr.core.geodesy import moved
 from edgevpr.core.types import Position, Receiver
 from edgevpr.frames.level import View
-from edgevpr.mavlink.autopilots.channel import Channel
+from edgevpr.mavlink.channel import Channel
 from edgevpr.runtime.flight.autopilot import NoAutopilot
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log
 from edgevpr.runtime.flight.herald import Herald

@@ -9,7 +9,7 @@ from air import Air, lengths
 
 from edgevpr.core.geodesy import distance_m
 from edgevpr.frames.level import View
-from edgevpr.mavlink.autopilots.channel import Channel
+from edgevpr.mavlink.channel import Channel
 from edgevpr.runtime.flight import navigator
 from edgevpr.runtime.flight.navigator import Muted, Navigator
 

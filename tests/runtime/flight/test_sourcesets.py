@@ -6,7 +6,7 @@ from controlled import LOAD, Controlled
 from fakes import FakeClock, FakeLink, to_autopilot
 
 from edgevpr.core.config import SourceSetsConfig
-from edgevpr.mavlink.autopilots.channel import Channel
+from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.messages import Health
 from edgevpr.mavlink.wire import mavlink
 from edgevpr.runtime.flight.autopilot import SourceSets

@@ -13,9 +13,9 @@ from mavlink_peers import AutopilotThread, free_port
 from edgevpr.cli.main import main
 from edgevpr.mavlink import reading as module
 from edgevpr.mavlink.address import parse_link
-from edgevpr.mavlink.autopilots.ardupilot import choice as ardupilot_choice
-from edgevpr.mavlink.autopilots.px4 import SENSOR_ID
-from edgevpr.mavlink.reading import Filter, Reading
+from edgevpr.mavlink.channel import ardupilot_choice
+from edgevpr.mavlink.positions import SENSOR_ID
+from edgevpr.mavlink.reading import AutopilotReading, FilterState
 from edgevpr.mavlink.signing import UNSIGNED, WRONG
 from edgevpr.mavlink.wire import mavlink
 from edgevpr.runtime.service import ardupilot, px4
@@ -25,8 +25,8 @@ from edgevpr.runtime.service.finding import Plan
 UDP, SERIAL = parse_link("udpin:127.0.0.1:14550"), parse_link("serial:/dev/ttyAMA0:57600")
 FIXES, DRY = Plan(sends_fixes=True, every_s=1.0), Plan(sends_fixes=False, every_s=1.0)
 PLAIN = {"GPS1_TYPE": 1, "GPS2_TYPE": 0, "GPS_AUTO_SWITCH": 1, "VISO_TYPE": 0, "FLOW_TYPE": 0, "EK3_SRC1_POSXY": 3}
-READY = Filter(flags=0x33F, has_attitude=True, has_position=True, has_velocity=True, holds_still=False)
-COPTER = Reading(
+READY = FilterState(flags=0x33F, has_attitude=True, has_position=True, has_velocity=True, holds_still=False)
+COPTER = AutopilotReading(
     system_id=1,
     firmware="ardupilot",
     vehicle="copter",
@@ -57,16 +57,16 @@ PX4 = replace(
 )
 
 
-def with_parameters(reading: Reading, **parameters) -> Reading:
+def with_parameters(reading: AutopilotReading, **parameters) -> AutopilotReading:
     return replace(reading, parameters=reading.parameters | parameters)
 
 
-def wrong(reading: Reading, link=UDP, plan=FIXES) -> dict:
+def wrong(reading: AutopilotReading, link=UDP, plan=FIXES) -> dict:
     """What is wrong, and the changes that it needs."""
     return {each.what: each.changes for each in autopilot_findings(reading, link, plan) if not each.ok}
 
 
-def said(reading: Reading, what: str, link=UDP, plan=FIXES) -> str:
+def said(reading: AutopilotReading, what: str, link=UDP, plan=FIXES) -> str:
     return next(each.message for each in autopilot_findings(reading, link, plan) if each.what == what)
 
 

@@ -10,9 +10,9 @@ from collections.abc import Callable
 from copy import copy
 
 from edgevpr.mavlink.address import LinkAddress, Sender
-from edgevpr.mavlink.conversation import Conversation
+from edgevpr.mavlink.conversation import Conversation, LinkSettings
+from edgevpr.mavlink.fixes import Sending
 from edgevpr.mavlink.link import Link
-from edgevpr.mavlink.outbox import Sending
 from edgevpr.mavlink.requests import Requests
 from edgevpr.mavlink.wire import Message, mavlink
 
@@ -28,13 +28,18 @@ class GroundLink(Link):
     name = "ground"
 
     def __init__(self, address: LinkAddress, flight: Link, clock: Callable[[], float] = time.monotonic) -> None:
-        super().__init__(address, clock=clock, tape=flight._tape)
+        told = flight._conversation
+        signing = told.settings.signing.of_ground()
+        settings = LinkSettings(
+            component_id=told.settings.component_id, max_fix_age_s=0.0, clock=clock, signing=signing, tape=flight._tape
+        )
+        super().__init__(address, settings)
         self._turns = flight._turns
         with self.turn("ground link"):
-            self._conversation = GroundConversation(flight._conversation, self._turns.now_s)
-        flight._conversation.outbox.copy_to = self._tell
+            self._conversation = GroundConversation(told, settings, self._turns.now_s)
+        told.copy_message = self._tell
         # Texts wait for their turn on each link by itself: on one that is lost they wait for ever.
-        flight._conversation.texts.copy_to = self.announce
+        told.copy_text = self.announce
 
     def _tell(self, message: Message) -> None:
         if message.get_type() in FOR_PEOPLE:
@@ -44,8 +49,8 @@ class GroundLink(Link):
 class GroundConversation(Conversation):
     """The conversation with a ground station: heartbeats and what is queued. Nobody who is heard is an autopilot."""
 
-    def __init__(self, flight: Conversation, clock: Callable[[], float]) -> None:
-        super().__init__(clock, flight.component_id, None, 0.0, signing=flight.signing.of_ground())
+    def __init__(self, flight: Conversation, settings: LinkSettings, clock: Callable[[], float]) -> None:
+        super().__init__(settings, clock)
         self.wishes, self.requests = flight.wishes, Requests(flight.wishes)
         self._flight = flight
         self._station: Sender | None = None
@@ -61,7 +66,7 @@ class GroundConversation(Conversation):
         """Take in bytes that arrived from `sender`; return True where they hold a heartbeat of the ground station that
         is answered. Whatever else is to be heard on the ground's link is heard here."""
         beats = False
-        for message in self.receiver.feed(data, sender):
+        for message in self.reader.feed(data, sender):
             if message.get_type() == "HEARTBEAT" and message.type == mavlink.MAV_TYPE_GCS:
                 beats |= self._is_answered(sender, now_s)
             self._hear_request(message, now_s)
