@@ -80,10 +80,10 @@ def _add_models(models: Any) -> None:
 
 def train_calc(args: Namespace) -> int:
     """Train the CALC autoencoder, and print the result."""
-    from edgevpr.lab.training import job
+    from edgevpr.lab.training import jobs
 
     unusable: list[ImageError] = []
-    result = job.train_calc(args.images, Path(args.out), args.steps, args.seed, args.resume, unusable)
+    result = jobs.train_calc(args.images, Path(args.out), args.steps, args.seed, args.resume, unusable)
     said = (
         f"{result.model} and {result.card}: {result.steps} steps on {result.pictures} images, equal to PyTorch to "
         f"{result.largest_difference:.1e}"
@@ -96,9 +96,8 @@ def train_words(args: Namespace) -> int:
     from edgevpr.lab.training import words
 
     unusable: list[ImageError] = []
-    result = words.train_words(
-        args.images, args.model, args.kind, args.count, args.whiten, path_of(args.out), args.seed, unusable
-    )
+    wanted = words.WordsWanted(args.model, args.kind, args.count, args.whiten)
+    result = words.train_words(args.images, wanted, path_of(args.out), args.seed, unusable)
     said = (
         f"{result.file}: {args.count} words of {result.descriptors} descriptors in {result.pictures} images, mean "
         f"square distance {result.distance:.3f}"
@@ -108,7 +107,7 @@ def train_words(args: Namespace) -> int:
 
 def train_ground(args: Namespace) -> int:
     """Learn the words of the ground, and print how well they fit."""
-    from edgevpr.lab.training.ground import train_ground
+    from edgevpr.lab.training.words import train_ground
 
     unusable: list[ImageError] = []
     result = train_ground(args.images, Path(args.out), args.seed, unusable)
@@ -130,7 +129,7 @@ def _learnt(args: Namespace, result: Any, said: str, unusable: list[ImageError])
 
 def train_matchability(args: Namespace) -> int:
     """Learn which pictures are found again, and print how well that is told on a site that was left out."""
-    from edgevpr.lab.training.matchability_job import train_matchability
+    from edgevpr.lab.training.jobs import train_matchability
 
     result = train_matchability(args.data, args.nadir, Path(args.out), args.seed)
     if args.json:

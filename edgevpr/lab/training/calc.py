@@ -1,10 +1,20 @@
-"""`edgevpr train calc`: the encoder learns to ignore a change of view and light (Merrill and Huang 2018).
+"""`edgevpr train calc`: the CALC autoencoder in PyTorch, and its training on one's own pictures, without labels.
 
-The target is the HOG of a picture. The input is the same ground from elsewhere in other light. There are no labels. The
-encoder and the L2 loss are the paper's. Different are the target (see `pictures`), the decoder (see `network`), and
-Adam with a rate that falls like a cosine instead of plain momentum.
+The encoder learns to ignore a change of view and light (Merrill and Huang 2018, section III, and their public network
+definition). The target is the HOG of a picture. The input is the same ground from elsewhere in other light. The encoder
+and the L2 loss are the paper's. Different are the target (see `pictures`), the decoder, and Adam with a rate that falls
+like a cosine instead of plain momentum.
+
+Two things of the network differ, because the paper's saw 2.5 million pictures 42 times. First, batch normalisation
+follows each convolution: without it one or more of the four channels of the code become zero for good. It is folded
+into the weights after training, so the network that flies has the paper's layers and no others. Second, the decoder is
+three small convolutions, where the paper's is fully connected (1064, 1064, 2048, 3648). A change of view moves things
+near where they were, and 130 000 numbers learn that from fewer pictures than 11 million. The second layer of the
+encoder also has a threshold, so that fewer of its activations are above zero: regions are made of activations that
+touch, and where most are above zero, everything is one region.
 """
 
+import copy
 import hashlib
 import io
 import math
@@ -14,17 +24,110 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import nn
 from torch.nn import functional
 
+from edgevpr.core.arrays import Image, Singles
 from edgevpr.core.errors import UsageError
 from edgevpr.core.files import write_whole
-from edgevpr.lab.training.network import Autoencoder, Encoder
 from edgevpr.lab.training.pictures import batch, gradients_of, require_enough, two_sights
 
+CODE = (4, 14, 19)
+_FEATURES = 128
+_LRN_SIZE, _LRN_ALPHA, _LRN_BETA = 5, 1e-4, 0.75
+_HIDDEN = 64
+_THRESHOLD = 1.25  # standard deviations that an activation of the second layer must be above its channel's mean
 BATCH = 32
 _RATE = 2e-3
 _WARM_UP_STEPS = 100
 _STEPS_BETWEEN_CHECKPOINTS = 250
+
+
+class Encoder(nn.Module):
+    """The encoder: image float32 (N, 1, 120, 160) in 0..1 to descriptor (N, 1064) of length 1 and features
+    (N, 128, 16, 21).
+
+    Pooling rounds up, as Caffe does: this gives the 1064 values.
+    """
+
+    def __init__(self, normalised: bool = False) -> None:
+        """Make the layers; `normalised` adds batch normalisation, for training."""
+        super().__init__()
+        self.conv1 = nn.Conv2d(1, 64, 5, stride=2, padding=4)
+        self.conv2 = nn.Conv2d(64, 128, 4, padding=2)
+        self.conv3 = nn.Conv2d(128, CODE[0], 3)
+        self.norm1 = nn.BatchNorm2d(64) if normalised else nn.Identity()
+        # Without a learned scale and shift no channel can become zero everywhere, nor active everywhere.
+        self.norm2 = nn.BatchNorm2d(_FEATURES, affine=False) if normalised else nn.Identity()
+        self.threshold = _THRESHOLD if normalised else 0.0
+        self.norm3 = nn.BatchNorm2d(CODE[0], affine=False) if normalised else nn.Identity()
+
+    def features(self, image: torch.Tensor) -> torch.Tensor:
+        x = functional.max_pool2d(functional.relu(self.norm1(self.conv1(image))), 3, 2, ceil_mode=True)
+        x = functional.relu(self.norm2(self.conv2(_response_normalised(x))) - self.threshold)
+        return _response_normalised(functional.max_pool2d(x, 3, 2, ceil_mode=True))
+
+    def code(self, features: torch.Tensor) -> torch.Tensor:
+        """Compute the input of the decoder, (N, 4, 14, 19): the descriptor before it is flat and of length 1."""
+        return functional.relu(self.norm3(self.conv3(features)))
+
+    def forward(self, image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        features = self.features(image)
+        return functional.normalize(self.code(features).flatten(1)), features
+
+    def folded(self) -> "Encoder":
+        """Return the same encoder on the CPU, with batch normalisation and threshold folded into the convolutions."""
+        learnt = copy.deepcopy(self).cpu().eval()
+        plain = Encoder()
+        for number in (1, 2, 3):
+            conv, norm = getattr(learnt, f"conv{number}"), getattr(learnt, f"norm{number}")
+            setattr(plain, f"conv{number}", nn.utils.fuse_conv_bn_eval(conv, norm))
+        weights = plain.requires_grad_(False).eval().state_dict()
+        weights["conv2.bias"] -= self.threshold  # in place: of the encoder itself
+        return plain
+
+
+class Autoencoder(nn.Module):
+    """The autoencoder: changed image to the HOG of the unchanged one, (N, 14 * 19 * M) in 0..1, M values per block.
+
+    The last bias starts at the mean target, so that the first steps need not learn what all pictures share.
+    """
+
+    def __init__(self, mean_target: torch.Tensor) -> None:
+        """Make the layers; `mean_target` is float32 (14 * 19 * M,)."""
+        super().__init__()
+        blocks = mean_target.reshape(CODE[1], CODE[2], -1).permute(2, 0, 1)
+        self.encoder = Encoder(normalised=True)
+        self.decoder = nn.Sequential(
+            nn.Conv2d(CODE[0], _HIDDEN, 5, padding=2),
+            nn.ReLU(),
+            nn.Conv2d(_HIDDEN, _HIDDEN, 5, padding=2),
+            nn.ReLU(),
+            nn.Conv2d(_HIDDEN, len(blocks), 3, padding=1),
+        )
+        self.offset = nn.Parameter(torch.logit(blocks, 1e-3))
+        for name, value in self.named_parameters():
+            if name.endswith("weight") and value.ndim == 4:
+                nn.init.kaiming_normal_(value, nonlinearity="relu")
+            elif name.endswith("bias"):
+                nn.init.zeros_(value)
+        nn.init.normal_(self.decoder.get_parameter("4.weight"), std=0.01)
+
+    def forward(self, image: torch.Tensor) -> torch.Tensor:
+        seen = self.decoder(self.encoder.code(self.encoder.features(image))) + self.offset
+        return torch.sigmoid(seen).permute(0, 2, 3, 1).flatten(1)
+
+
+def _response_normalised(x: torch.Tensor) -> torch.Tensor:
+    """Apply local response normalisation over channels (Krizhevsky et al. 2012), as ONNX and Caffe define it.
+
+    The sums over neighbouring channels are one product with a band matrix: PyTorch's own pooling over channels is slow
+    on a CPU.
+    """
+    channels = torch.arange(x.shape[1], device=x.device)
+    band = ((channels[:, None] - channels).abs() <= _LRN_SIZE // 2).to(x.dtype)
+    sums = functional.conv2d(x * x, band[:, :, None, None])
+    return x * (1 + _LRN_ALPHA / _LRN_SIZE * sums) ** -_LRN_BETA
 
 
 class Training:
@@ -35,7 +138,7 @@ class Training:
     lies).
     """
 
-    def __init__(self, pictures: Sequence[np.ndarray], steps: int, seed: int) -> None:
+    def __init__(self, pictures: Sequence[Image], steps: int, seed: int) -> None:
         """Prepare the training; `pictures` are uint8 grey. Raises UsageError for too few of them."""
         require_enough(pictures)
         self.pictures, self.steps, self.seed, self.step = pictures, steps, seed, 0
@@ -45,7 +148,7 @@ class Training:
         self._halves = _has_halves(self._device)
         torch.manual_seed(seed)
         network = Autoencoder(torch.from_numpy(_mean_target(pictures, seed)))
-        self._network = network.to(self._device, memory_format=torch.channels_last)
+        self._network = network.to(self._device).to(memory_format=torch.channels_last)
         self._optimiser = torch.optim.Adam(self._network.parameters(), _RATE)
 
     def encoder(self) -> Encoder:
@@ -109,7 +212,7 @@ class Training:
     def _key(self) -> str:
         digest = hashlib.sha256(f"{self.steps} {self.seed}".encode())
         for picture in self.pictures:
-            digest.update(picture)
+            digest.update(np.ascontiguousarray(picture).data)
         return digest.hexdigest()
 
 
@@ -123,10 +226,11 @@ def _has_halves(device: torch.device) -> bool:
         return False
 
 
-def _mean_target(pictures: Sequence[np.ndarray], seed: int) -> np.ndarray:
+def _mean_target(pictures: Sequence[Image], seed: int) -> Singles:
     rng = np.random.default_rng(seed)
     some = [pictures[index] for index in rng.permutation(len(pictures))[:512]]
-    return np.mean([gradients_of(two_sights(picture, rng)[0]) for picture in some], axis=0)
+    mean: Singles = np.mean([gradients_of(two_sights(picture, rng)[0]) for picture in some], axis=0)
+    return mean
 
 
 def _rate(step: int, steps: int) -> float:

@@ -10,9 +10,11 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from edgevpr.core.arrays import Image
 from edgevpr.core.config import load_config
 from edgevpr.core.types import Frame
 from edgevpr.frames.images import cv2, list_images, read_image
@@ -29,7 +31,7 @@ TURNS = ("cohog",)  # techniques that know a picture under every heading, where 
 CHANGES = 3  # of each place
 MATCHED = 0.5  # a picture is matched if so many of the techniques know it
 _NEIGHBOURS = 3  # before and after a place, in the order of the frames
-Progress = Callable[[Iterable, int, str], Iterable]
+Progress = Callable[[Iterable[Any], int, str], Iterable[Any]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +43,7 @@ class Question:
     right: frozenset[int]
     ignored: frozenset[int]
 
-    def picture(self, turns: bool = False) -> np.ndarray:
+    def picture(self, turns: bool = False) -> Image:
         """Return the picture, uint8 (H, W[, 3]), with `turns` under any heading. Raises ImageError."""
         picture = read_image(self.path)
         return picture if self.change is None else changed(picture, np.random.default_rng(self.change), turns)
@@ -70,27 +72,28 @@ def label_site(folder: Path, looks_down: bool, seed: int, progress: Progress) ->
     for name in TECHNIQUES:
         turns = looks_down and name in TURNS
         with walk_over(places, name, looks_down) as walk:
-            each = progress(questions, len(questions), f"{folder.name}, {name}")
-            answers.append([_answer(walk, question, turns) for question in each])
+            asked = progress(questions, len(questions), f"{folder.name}, {name}")
+            answers.append([_answer(walk, question, turns) for question in asked])
     means = np.mean(answers, axis=0).tolist()
     return [Labelled(question, *mean) for question, mean in zip(questions, means, strict=True)]
 
 
-def changed(picture: np.ndarray, rng: np.random.Generator, turns: bool) -> np.ndarray:
+def changed(picture: Image, rng: np.random.Generator, turns: bool) -> Image:
     """Change a picture as a later flight would: another view (with `turns` under any heading), light, haze, blur and
     noise, most of it little and some of it much; uint8 of the same form. The view changes little: what it costs cannot
     be seen in the picture."""
     height, width = picture.shape[:2]
     turn_deg = rng.uniform(0, 360) if turns else rng.uniform(-3, 3)
     matrix = cv2.getRotationMatrix2D((width / 2, height / 2), turn_deg, rng.uniform(0.93, 1.08))
-    matrix[:, 2] += rng.uniform(-0.05, 0.05, 2) * (width, height)
+    matrix[:, 2] = matrix[:, 2] + rng.uniform(-0.05, 0.05, 2) * (width, height)
     seen = cv2.warpAffine(picture, matrix, (width, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
     clouds = np.exp(cv2.resize(rng.normal(0, 0.35, (3, 4)), (width, height), interpolation=cv2.INTER_CUBIC))
     dark, haze, blur, noise = rng.uniform(0, 1, 4) ** 2
     values = (seen / 255.0) ** np.exp(rng.normal(0, 0.4))
     values *= (clouds if seen.ndim == 2 else clouds[..., None]) * 1.2 * np.exp(-3 * dark)
     values = cv2.GaussianBlur(values * (1 - 0.95 * haze) + 0.95 * haze * 0.8, (0, 0), 0.3 + 0.015 * blur * width)
-    return np.clip(values * 255 + rng.normal(0, 20 * noise, values.shape), 0, 255).astype(np.uint8)
+    later: Image = np.clip(values * 255 + rng.normal(0, 20 * noise, values.shape), 0, 255).astype(np.uint8)
+    return later
 
 
 @contextmanager
@@ -121,7 +124,7 @@ def _questions(folder: Path, places: list[Path], seed: int) -> list[Question]:
     truth = folder / "ground_truth.csv"
     numbers = {path.name: slot for slot, path in enumerate(places)}
     for query in load_dataset(folder / "query", folder / "ref", truth).queries if truth.is_file() else ():
-        right, ignored = (frozenset(numbers[each] for each in names) for names in (query.right, query.ignored))
+        right, ignored = (frozenset(numbers[name] for name in names) for names in (query.right, query.ignored))
         asked.append(Question(query.path, None, right, ignored))
     return asked
 

@@ -8,15 +8,18 @@ of a crop, and a convolutional network of 6,000 weights. The better one is kept,
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import torch
 from torch import nn
 from torch.nn import functional
 
+from edgevpr.core.arrays import Bools, Bytes, Singles
 from edgevpr.core.text import progress
 from edgevpr.lab.evaluate.metrics import roc_auc
 from edgevpr.lab.training.labels import MATCHED, Labelled
+from edgevpr.lab.training.onnxfile import ModelFile, write_model
 from edgevpr.runtime.recognise.memorability import prepared_crops
 from edgevpr.techniques.card import InputRule
 
@@ -32,8 +35,8 @@ INPUT = InputRule(
     mean=[0.0],
 )
 _BATCH = 16
-SCALES, UNEVEN_SCALES = 4, 2
-FLOOR = 1e-4  # of what a logarithm is taken
+_SCALES, _UNEVEN_SCALES = 4, 2
+_FLOOR = 1e-4  # of what a logarithm is taken
 
 
 class Statistics(nn.Module):
@@ -42,7 +45,7 @@ class Statistics(nn.Module):
 
     RATE, STEPS = 0.03, 400
     NOISE = 3 / 255  # a weaker contrast than that is the sensor's
-    LENGTH = 2 + SCALES + UNEVEN_SCALES
+    LENGTH = 2 + _SCALES + _UNEVEN_SCALES
 
     def __init__(self) -> None:
         super().__init__()
@@ -54,18 +57,18 @@ class Statistics(nn.Module):
         contrast = ((crops - mean) ** 2).mean((2, 3), keepdim=True).add(self.NOISE**2).sqrt()
         even = (crops - mean) / contrast
         said = [mean, contrast.log()]
-        for scale in range(SCALES):
+        for scale in range(_SCALES):
             here = even[..., :-1, :-1]
             strength = (even[..., 1:, :-1] - here) ** 2 + (even[..., :-1, 1:] - here) ** 2
-            usual = strength.mean((2, 3), keepdim=True) + FLOOR
+            usual = strength.mean((2, 3), keepdim=True) + _FLOOR
             said.append(usual.log())
-            if scale < UNEVEN_SCALES:
-                said.append(((strength**2).mean((2, 3), keepdim=True) / usual**2 + FLOOR).log())
+            if scale < _UNEVEN_SCALES:
+                said.append(((strength**2).mean((2, 3), keepdim=True) / usual**2 + _FLOOR).log())
             even = functional.avg_pool2d(even, 2)
         return torch.sigmoid(self.linear(self.norm(torch.cat(said, 1).flatten(1))))
 
 
-class Small(nn.Module):
+class Convolutions(nn.Module):
     """Four convolutions and the mean of what they find."""
 
     RATE, STEPS = 0.003, 600
@@ -83,33 +86,33 @@ class Small(nn.Module):
         return torch.sigmoid(self.linear(self.layers(crops).mean((2, 3))))
 
 
-KINDS = {"statistics": Statistics, "convolutions": Small}
+KINDS: dict[str, type[Statistics | Convolutions]] = {"statistics": Statistics, "convolutions": Convolutions}
 
 
 @dataclass(frozen=True, slots=True)
-class Site:
+class TrainingSite:
     """The pictures of one site: `crops` uint8 (N, 25, 1, 48, 64), the share of the techniques that knew each rightly,
     float32 (N,), and which are real queries, not generated, bool (N,)."""
 
     name: str
-    crops: np.ndarray
-    found: np.ndarray
-    is_real: np.ndarray
+    crops: Bytes
+    found: Singles
+    is_real: Bools
 
     def inputs(self, frame: int) -> torch.Tensor:
         """Return a picture's crops as the network takes them, float32 (25, 1, 48, 64) in 0..1."""
         return torch.from_numpy(self.crops[frame]) / 255
 
 
-def site_of(name: str, labelled: Sequence[Labelled]) -> Site:
+def site_of(name: str, labelled: Sequence[Labelled]) -> TrainingSite:
     """Read the labelled pictures of a site, and cut them into crops as in flight."""
-    pictures = (each.question.picture() for each in labelled)
+    pictures = (label.question.picture() for label in labelled)
     crops = np.stack([(255 * prepared_crops(picture, INPUT)).round().astype(np.uint8) for picture in pictures])
-    found = np.array([each.found for each in labelled], np.float32)
-    return Site(name, crops, found, np.array([each.question.change is None for each in labelled]))
+    found = np.array([label.found for label in labelled], np.float32)
+    return TrainingSite(name, crops, found, np.array([label.question.change is None for label in labelled]))
 
 
-def fit(kind: str, sites: Sequence[Site], seed: int) -> nn.Module:
+def fit(kind: str, sites: Sequence[TrainingSite], seed: int) -> nn.Module:
     """Fit a network of this kind to the frames of all sites, each site as often as any other."""
     torch.manual_seed(seed)
     rng = np.random.default_rng(seed)
@@ -130,7 +133,7 @@ def fit(kind: str, sites: Sequence[Site], seed: int) -> nn.Module:
     return network.eval()
 
 
-def scores(network: nn.Module, site: Site) -> np.ndarray:
+def scores(network: nn.Module, site: TrainingSite) -> Singles:
     """Return the score of every frame of a site, float32 (N,) in 0..1."""
     with torch.no_grad():
         said = [network(site.inputs(frame)).mean().item() for frame in range(len(site.found))]
@@ -153,7 +156,7 @@ class Unseen:
         return float(np.mean(known)) if known else 0.5
 
 
-def leave_one_out(kind: str, sites: Sequence[Site], seed: int) -> Unseen:
+def leave_one_out(kind: str, sites: Sequence[TrainingSite], seed: int) -> Unseen:
     """Fit a kind as often as there are sites, each time without one of them, and judge it on that one."""
     unseen = Unseen({}, {})
     for site in sites:
@@ -164,7 +167,16 @@ def leave_one_out(kind: str, sites: Sequence[Site], seed: int) -> Unseen:
     return unseen
 
 
-def compared(sites: Sequence[Site], seed: int) -> tuple[str, dict[str, Unseen]]:
+def compared(sites: Sequence[TrainingSite], seed: int) -> tuple[str, dict[str, Unseen]]:
     """Judge every kind on sites that it has not seen; return the better one, and what each does."""
     unseen = {kind: leave_one_out(kind, sites, seed) for kind in progress(KINDS, len(KINDS), "fitting")}
     return max(unseen, key=lambda kind: unseen[kind].mean), unseen
+
+
+def write_network(
+    network: nn.Module, out: Path, title: str, source: str, site: TrainingSite
+) -> tuple[ModelFile, float]:
+    """Write a fitted network, `crops` (N, 1, 48, 64) in 0..1 -> `memorability` (N, 1), and its card; tried on a picture
+    of `site`. Returns the file, and the largest difference to PyTorch; raises what `write_model` raises."""
+    file = ModelFile(path=out, title=title, input="crops", rule=INPUT, outputs={"memorability": "memorability"})
+    return file, write_model(file, network, [site.inputs(0).numpy()], source, "run the command again")

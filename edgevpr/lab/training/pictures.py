@@ -6,13 +6,16 @@ half of the time. Corners move outwards as well as inwards, so that the changed 
 unevenly, which histogram equalisation (part of the network's input here as in flight) cannot undo.
 """
 
+import importlib
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from edgevpr.core.errors import ImageError, UsageError
+from edgevpr.core.arrays import Array, Doubles, Image, Singles
+from edgevpr.core.errors import EdgevprError, ImageError, UsageError
+from edgevpr.core.files import require_folder
 from edgevpr.core.text import progress, shown
 from edgevpr.frames.images import cv2, list_images, read_image
 from edgevpr.techniques.gradients import normalised_blocks, oriented_cells
@@ -34,7 +37,7 @@ _NOISE = 2.0  # largest standard deviation, in grey levels
 
 def read_pictures(
     folders: Sequence[str | Path], label: str, unusable: list[ImageError] | None = None
-) -> Iterator[np.ndarray]:
+) -> Iterator[Image]:
     """Yield each image of `folders`, uint8 grey or BGR, the longer side at most 640 pixels, and print the progress
     under `label`. Images that cannot be used are printed to stderr and added to `unusable` (None: that was done
     before).
@@ -51,18 +54,19 @@ def read_pictures(
                 unusable.append(error)
 
 
-def small_grey(image: np.ndarray) -> np.ndarray:
+def small_grey(image: Image) -> Image:
     """Convert a uint8 image to the form that `batch` takes: uint8 grey, the longer side at most 320 pixels."""
-    grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    grey: Array = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     return _at_most(grey, _LONGEST_LEARNT_PX)
 
 
-def _at_most(image: np.ndarray, longest_px: int) -> np.ndarray:
+def _at_most(image: Array, longest_px: int) -> Image:
     shrink = longest_px / max(image.shape[:2])
-    return cv2.resize(image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA) if shrink < 1 else image
+    small: Array = cv2.resize(image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA) if shrink < 1 else image
+    return small
 
 
-def require_enough(pictures: Sequence[np.ndarray]) -> None:
+def require_enough(pictures: Sequence[Image]) -> None:
     """Raise UsageError for too few pictures to learn from."""
     if len(pictures) < MIN_PICTURES:
         raise UsageError(
@@ -71,25 +75,46 @@ def require_enough(pictures: Sequence[np.ndarray]) -> None:
         )
 
 
-def batch(pictures: Sequence[np.ndarray], size: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def require_new(out: Path) -> None:
+    """Raise UsageError where `out` is no name for a new ONNX file with a card beside it."""
+    if out.suffix != ".onnx":
+        raise UsageError(f"--out {out}: give a name that ends in .onnx.")
+    for path in (out, out.with_suffix(".yaml")):
+        if path.exists():
+            raise UsageError(f"{path} is there already: give another --out, or delete it.")
+    require_folder(out)
+
+
+def require_packages() -> None:
+    """Raise EdgevprError if the packages of the extra `train` cannot be imported."""
+    for package in ("torch", "onnx", "onnxscript"):
+        try:
+            importlib.import_module(package)
+        except ImportError as error:
+            raise EdgevprError(
+                f"Training needs {package}, which cannot be imported ({error}): pip install 'edgevpr[train]'."
+            ) from error
+
+
+def batch(pictures: Sequence[Image], size: int, rng: np.random.Generator) -> tuple[Singles, Singles]:
     """Return `size` inputs, float32 (size, 1, 120, 160) in 0..1, and their targets, float32 (size, TARGET_LENGTH)."""
     inputs = np.empty((size, 1, HEIGHT, WIDTH), np.float32)
     targets = np.empty((size, TARGET_LENGTH), np.float32)
     for row in range(size):
-        sight, changed = two_sights(pictures[rng.integers(len(pictures))], rng)
+        sight, changed = two_sights(pictures[int(rng.integers(len(pictures)))], rng)
         inputs[row, 0] = cv2.equalizeHist(changed)
         targets[row] = gradients_of(sight)
     inputs /= 255
     return inputs, targets
 
 
-def gradients_of(sight: np.ndarray) -> np.ndarray:
+def gradients_of(sight: Image) -> Singles:
     """Compute the target, the HOG of a view: uint8 (120, 160) to float32 (TARGET_LENGTH,) in 0..1. Cells are 8x8
     pixels, blocks 2x2 cells with a stride of one cell, orientations 9 over 180 degrees."""
     return normalised_blocks(oriented_cells(sight, _CELL_PX, _ORIENTATIONS, signed=False)).ravel()
 
 
-def two_sights(picture: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def two_sights(picture: Image, rng: np.random.Generator) -> tuple[Image, Image]:
     """Return a random part of a grey picture as uint8 (120, 160), and the same ground from elsewhere in other light."""
     height, width = picture.shape
     largest = min(width / WIDTH, height / HEIGHT)
@@ -103,18 +128,19 @@ def two_sights(picture: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarra
     return _seen(picture, corners), _relit(_seen(picture, moved), rng)
 
 
-def _seen(picture: np.ndarray, corners: np.ndarray) -> np.ndarray:
+def _seen(picture: Image, corners: Doubles) -> Image:
     frame = np.array([[0, 0], [WIDTH, 0], [WIDTH, HEIGHT], [0, HEIGHT]], np.float32)
     to_frame = cv2.getPerspectiveTransform(corners.astype(np.float32), frame)
-    return cv2.warpPerspective(
+    sight: Array = cv2.warpPerspective(
         picture, to_frame, (WIDTH, HEIGHT), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101
     )
+    return sight
 
 
-def _relit(sight: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def _relit(sight: Image, rng: np.random.Generator) -> Image:
     """Change the light of a view: another gamma, mostly darker, light that varies over the view (shadows of clouds),
     and noise of the sensor."""
-    light = rng.normal(0, _LIGHT_VARIES * rng.random(), (3, 4)).astype(np.float32)
+    light: Array = rng.normal(0, _LIGHT_VARIES * rng.random(), (3, 4)).astype(np.float32)
     light = np.exp(cv2.resize(light, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC))
     changed = (sight / np.float32(255)) ** np.float32(rng.uniform(0.6, 1.6))
     changed *= light * np.float32(255 * rng.uniform(0.5, 1.1))

@@ -1,23 +1,29 @@
-"""`edgevpr train words`: the visual words of VLAD and bag-of-words, learned by k-means from one's own pictures.
+"""`edgevpr train words` and `train ground`: visual words, learned by k-means from one's own pictures.
 
-`techniques.words.load_words` reads the file. It holds `words` float16 (K, D), rounded to steps of 1/256 so that
-ten thousand of them take little room, and `model_sha256`, the fingerprint of the card whose feature map they describe.
-If asked for, it also holds the whitening of the VLAD vectors made of the words (Jégou and Chum, ECCV 2012).
+The words of VLAD and bag-of-words are typical activations of a network, or regions of it. `techniques.words.load_words`
+reads their file. It holds `words` float16 (K, D), rounded to steps of 1/256 so that ten thousand of them take little
+room, and `model_sha256`, the fingerprint of the card whose feature map they describe. If asked for, it also holds the
+whitening of the VLAD vectors made of the words (Jégou and Chum, ECCV 2012).
+
+The words of the ground are those by which `cohog` names places, looking down (see `techniques.placewords`). The regions
+of the pictures, under several headings, are turned by quarter turns until they all run the same way. So a word stands
+for four: itself, and itself turned.
 """
 
-import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from edgevpr.core.arrays import Array, Image, Ints, Singles
 from edgevpr.core.errors import ImageError, UsageError
-from edgevpr.core.files import model_folders, write_whole
+from edgevpr.core.files import model_folders, require_folder, write_whole
 from edgevpr.core.text import progress
 from edgevpr.frames.images import list_images
-from edgevpr.lab.training.kmeans import kmeans
 from edgevpr.lab.training.pictures import read_pictures
+from edgevpr.techniques import placewords
+from edgevpr.techniques.cohog import CoHog
 from edgevpr.techniques.regions import describe, find_regions
 from edgevpr.techniques.session import Backbone, open_backbone
 from edgevpr.techniques.words import local_descriptors, nearest, sharpness_of, vlad
@@ -29,6 +35,22 @@ _ROUNDS = 10
 _STEP = 256
 _ALIKE = 1e-9  # variance of vectors of length 1 that are the same but for rounding
 _LEAST_VARIANCE = 1e-3  # of the largest: a smaller variance is mostly noise, which whitening must not amplify
+_HEADINGS = (0, 2, 4)  # of the ground, in steps of 15 degrees
+_GROUND_POINTS = 90_000
+_GROUND_ROUNDS = 12
+_JUDGED = 5000  # of the points: enough to tell how well the words fit
+_BLOCK_VALUES = 8_000_000  # distances held at once: 32 MB
+
+
+@dataclass(frozen=True, slots=True)
+class WordsWanted:
+    """The words to learn: `count` of a `kind` ("vlad", "regions", "bow") on the feature map of the card `model`.
+    `whiten` is the length of the whitened VLAD vectors (None: no whitening)."""
+
+    model: str
+    kind: str
+    count: int
+    whiten: int | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,38 +64,40 @@ class WordsResult:
     distance: float
 
 
-def train_words(
-    folders: Sequence[str],
-    model: str,
-    kind: str,
-    count: int,
-    whiten: int | None,
-    folder: Path | None,
-    seed: int,
-    unusable: list[ImageError],
-) -> WordsResult:
-    """Learn `count` words of `kind` ("vlad", "regions", "bow") and write <model>_<kind><count>.npz to `folder` (None:
-    the user's own models folder).
+@dataclass(frozen=True, slots=True)
+class GroundResult:
+    """Result of a training: the file, the numbers of pictures and regions it was learned from, and the mean cosine of a
+    region and its word."""
 
-    `whiten` is the length of the whitened VLAD vectors (None: no whitening). Raises UsageError for settings that make
-    no sense, a file that exists already or too few descriptors, ModelError for a network that cannot be used,
-    SourceError for a folder without images.
+    file: str
+    pictures: int
+    regions: int
+    cosine: float
+
+
+def train_words(
+    folders: Sequence[str], wanted: WordsWanted, folder: Path | None, seed: int, unusable: list[ImageError]
+) -> WordsResult:
+    """Learn words and write <model>_<kind><count>.npz to `folder` (None: the user's own models folder).
+
+    Raises UsageError for settings that make no sense, a file that exists already or too few descriptors, ModelError for
+    a network that cannot be used, SourceError for a folder without images.
     """
+    count, whiten = wanted.count, wanted.whiten
     if count < 2 or seed < 0 or (whiten is not None and whiten < 1):
         raise UsageError(f"--count {count} --seed {seed}: give at least 2 words, a seed of 0 or more, --whiten from 1.")
-    if whiten is not None and kind != "vlad":
-        raise UsageError(f"--whiten is for --kind vlad: leave it out for {kind}.")
+    if whiten is not None and wanted.kind != "vlad":
+        raise UsageError(f"--whiten is for --kind vlad: leave it out for {wanted.kind}.")
     folder = model_folders()[0] if folder is None else folder
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{model}_{kind}{count}.npz"
+    path = folder / f"{wanted.model}_{wanted.kind}{count}.npz"
     if path.exists():
         raise UsageError(f"{path} is there already: delete it, or give another --out.")
-    backbone = open_backbone(model, "features")
+    backbone = open_backbone(wanted.model, "features")
     rng = np.random.default_rng(seed)
-    wanted = max(_POINTS, _POINTS_PER_WORD * count)
-    each = -(-wanted // sum(len(list_images(name)) for name in folders))
-    local = _locals(backbone, kind)
-    points_of = [_some(local(picture), each, rng) for picture in read_pictures(folders, "describing", unusable)]
+    per_picture = _share(max(_POINTS, _POINTS_PER_WORD * count), folders)
+    local = _locals(backbone, wanted.kind)
+    points_of = [_some(local(picture), per_picture, rng) for picture in read_pictures(folders, "describing", unusable)]
     pictures = len(points_of)
     points = np.concatenate(points_of or [np.empty((0, backbone.shape[0]), np.float32)])
     if whiten is not None and whiten >= pictures:
@@ -87,37 +111,122 @@ def train_words(
             f"or a --count of at most {len(points) // 2}."
         )
     *_, centres = progress(kmeans(points, count, _ROUNDS, rng), _ROUNDS, "learning")
-    words = (np.rint(centres * _STEP) / _STEP).astype(np.float16)
-    arrays = {"words": words, "model_sha256": np.array(backbone.sha256)}
+    stored = (np.rint(centres * _STEP) / _STEP).astype(np.float16)
+    words = stored.astype(np.float32)
+    arrays = {"words": stored, "model_sha256": np.array(backbone.sha256)}
     if whiten is not None:
-        arrays |= _whitening(backbone, folders, pictures, words.astype(np.float32), whiten)
-    content = io.BytesIO()
-    np.savez_compressed(content, **arrays)
-    write_whole(path, lambda unfinished: unfinished.write_bytes(content.getbuffer()))
-    some, words = points[:: max(1, len(points) // 5000)], words.astype(np.float32)
+        arrays |= _whitening(backbone, folders, pictures, words, whiten)
+    _write(path, arrays)
+    some = points[:: max(1, len(points) // _JUDGED)]
     distance = np.square(some - words[nearest(some, words)]).sum(axis=1).mean()
     return WordsResult(str(path), pictures, len(points), float(distance))
 
 
-def _locals(backbone: Backbone, kind: str) -> Callable[[np.ndarray], np.ndarray]:
+def train_ground(folders: Sequence[str], out: Path, seed: int, unusable: list[ImageError]) -> GroundResult:
+    """Learn 256 words of the ground, each of four turns, and write them to `out` (.npz).
+
+    Raises UsageError for a file that exists already or too few regions, SourceError for a folder without images.
+    """
+    if out.suffix != ".npz" or out.exists():
+        raise UsageError(f"--out {out}: give a name that ends in .npz, of a file that is not there.")
+    require_folder(out)
+    rng = np.random.default_rng(seed)
+    technique = CoHog(camera="nadir")
+    per_view = _share(_GROUND_POINTS / len(_HEADINGS), folders)
+    pictures, regions = 0, []
+    for pictures, picture in enumerate(read_pictures(folders, "describing", unusable), start=1):  # noqa: B007
+        query = technique.encode(picture)
+        regions += [_some(technique.good_patterns(query, turn)[0], per_view, rng) for turn in _HEADINGS]
+    points = np.concatenate(regions) if regions else np.empty((0, 1), np.float32)
+    if len(points) < 2 * placewords.COUNT:
+        raise UsageError(f"{pictures} usable images give {len(points)} regions, too few to learn from: give more.")
+    learning = kmeans(aligned(points), placewords.COUNT, _GROUND_ROUNDS, rng)
+    *_, centres = progress(learning, _GROUND_ROUNDS, "learning")
+    words = (centres / np.linalg.norm(centres, axis=1, keepdims=True)).astype(np.float16)
+    _write(out, {"words": words})
+    some = points[:: max(1, len(points) // _JUDGED)]
+    cosine = (some @ placewords.turned_words(words.astype(np.float32)).T).max(axis=1).mean()
+    return GroundResult(str(out), pictures, len(points), float(cosine))
+
+
+def aligned(patterns: Singles) -> Singles:
+    """Turn patterns float32 (N, 20) by quarter turns until their main direction is within 45 degrees of the first
+    orientation."""
+    # The second and third pattern are the cosine and sine of the first frequency over the orientations.
+    quarters = np.rint(np.arctan2(patterns[:, 2], patterns[:, 1]) / (np.pi / 2)).astype(np.intp) % placewords.QUARTERS
+    turned = placewords.turned_words(patterns).reshape(len(patterns), placewords.QUARTERS, -1)
+    return turned[np.arange(len(patterns)), quarters]
+
+
+def kmeans(points: Singles, count: int, rounds: int, rng: np.random.Generator) -> Iterator[Singles]:
+    """Yield `count` centres, float32 (count, D), of `points` float32 (N, D), after each of `rounds` (Lloyd 1982).
+
+    The centres start as points drawn at random. A centre to which no point belongs moves to one of the points that lie
+    furthest from their centres. N must be at least `count`.
+    """
+    centres = points[np.sort(rng.choice(len(points), count, replace=False))].copy()
+    for _ in range(rounds):
+        nearest_centre, distance = _assigned(points, centres)
+        order = np.argsort(nearest_centre, kind="stable")
+        sizes = np.bincount(nearest_centre, minlength=count)
+        used = np.flatnonzero(sizes)
+        starts = np.concatenate([[0], np.cumsum(sizes[used])[:-1]])
+        # Sorted by centre, the points of one centre are neighbours, and `reduceat` can sum them.
+        centres[used] = np.add.reduceat(points[order], starts, axis=0) / sizes[used, None]
+        empty = np.flatnonzero(sizes == 0)
+        centres[empty] = points[np.argsort(-distance, kind="stable")[: len(empty)]]
+        yield centres
+
+
+def _assigned(points: Singles, centres: Singles) -> tuple[Ints, Singles]:
+    """Find the nearest centre of each point, int (N,), and the square of its distance, float32 (N,)."""
+    numbers = np.empty(len(points), np.intp)
+    distance = np.empty(len(points), np.float32)
+    half_squares = 0.5 * np.einsum("kd,kd->k", centres, centres)
+    rows = max(1, _BLOCK_VALUES // len(centres))
+    for start in range(0, len(points), rows):  # block by block: for ten thousand words of a hundred thousand points
+        block = points[start : start + rows]
+        closeness = block @ centres.T
+        closeness -= half_squares
+        best = closeness.argmax(axis=1)
+        numbers[start : start + rows] = best
+        own = np.einsum("nd,nd->n", block, block)
+        distance[start : start + rows] = own - 2 * closeness[np.arange(len(block)), best]
+    return numbers, distance
+
+
+def _share(points: float, folders: Sequence[str]) -> int:
+    """Return how many of so many points one picture gives."""
+    return int(-(-points // sum(len(list_images(name)) for name in folders)))
+
+
+def _some(points: Singles, count: int, rng: np.random.Generator) -> Singles:
+    return points[rng.permutation(len(points))[:count]]
+
+
+def _locals(backbone: Backbone, kind: str) -> Callable[[Image], Singles]:
     """Make the function from a picture to its local descriptors, float32 (N, C), each of length 1."""
     if kind == "vlad":
         return lambda picture: local_descriptors(backbone.run(picture))
 
-    def regions(picture: np.ndarray) -> np.ndarray:
+    def regions(picture: Image) -> Singles:
         features = backbone.run(picture)
         return describe(features, find_regions(features, REGIONS[kind]))
 
     return regions
 
 
-def _some(points: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    return points[rng.permutation(len(points))[:count]]
+def _write(path: Path, arrays: dict[str, Array]) -> None:
+    def write(unfinished: Path) -> None:
+        with open(unfinished, "wb") as file:
+            np.savez_compressed(file, **arrays)  # type: ignore[arg-type]  # numpy's third parameter is a bool
+
+    write_whole(path, write)
 
 
 def _whitening(
-    backbone: Backbone, folders: Sequence[str], pictures: int, words: np.ndarray, length: int
-) -> dict[str, np.ndarray]:
+    backbone: Backbone, folders: Sequence[str], pictures: int, words: Singles, length: int
+) -> dict[str, Array]:
     """Learn the whitening: the principal components of the pictures' VLAD vectors over the root of their variance.
     Returns the mean float32 (K D,), the matrix int8 (length, K D) and the scale of its rows float32 (length,)."""
     sharpness = sharpness_of(words)

@@ -43,9 +43,9 @@ def test_with_too_few_images_that_can_be_read(folder, tmp_path, capsys):
     assert "14 usable images are too few" in said
 
 
-@pytest.mark.parametrize("package", ["torch", "onnx"])
+@pytest.mark.parametrize("package", ["torch", "onnx", "onnxscript"])
 def test_without_the_extra(package, folder, tmp_path, capsys, monkeypatch):
-    if package == "onnx":
+    if package != "torch":
         pytest.importorskip("torch", reason="PyTorch is not installed (pip install 'edgevpr[train]')")
     monkeypatch.setitem(sys.modules, package, None)
     code, said = refused(capsys, "calc", "--images", str(folder), "--out", str(tmp_path / "m.onnx"))

@@ -2,7 +2,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from edgevpr.lab.training.kmeans import kmeans
+from edgevpr.lab.training.words import kmeans
 
 
 def clusters(rng, per_cluster=50):

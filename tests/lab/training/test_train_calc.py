@@ -10,10 +10,13 @@ from pictures_on_disk import write_pictures
 
 from edgevpr.cli.main import main
 from edgevpr.core.errors import EdgevprError, UsageError
+from edgevpr.lab.training import jobs
 from edgevpr.lab.training.pictures import read_pictures, small_grey
 from edgevpr.techniques.card import read_card
 
 # PyTorch is a fixture and no import: of all processes that collect these tests, only the one that runs them loads it.
+
+pytestmark = pytest.mark.slow  # networks are fitted
 
 
 @pytest.fixture(scope="module")
@@ -23,6 +26,7 @@ def torch():
 
 @pytest.fixture(scope="module")
 def onnx():
+    pytest.importorskip("onnxscript", reason="onnxscript is not installed (pip install 'edgevpr[train]')")
     return pytest.importorskip("onnx", reason="onnx is not installed (pip install 'edgevpr[train]')")
 
 
@@ -32,13 +36,8 @@ def calc(torch):
 
 
 @pytest.fixture(scope="module")
-def export(torch, onnx):
-    return import_module("edgevpr.lab.training.export")
-
-
-@pytest.fixture(scope="module")
-def network(torch):
-    return import_module("edgevpr.lab.training.network")
+def onnxfile(torch, onnx):
+    return import_module("edgevpr.lab.training.onnxfile")
 
 
 @pytest.fixture(autouse=True)
@@ -112,9 +111,9 @@ def test_a_damaged_or_missing_checkpoint_is_refused(calc, pictures, tmp_path):
         training.load(tmp_path / "none")
 
 
-def test_folding_changes_nothing(torch, network):
+def test_folding_changes_nothing(torch, calc):
     """What batch normalisation does in evaluation, in the weights."""
-    encoder = network.Autoencoder(torch.full((14 * 19 * 36,), 0.3)).encoder
+    encoder = calc.Autoencoder(torch.full((14 * 19 * 36,), 0.3)).encoder
     image = torch.rand(4, 1, 120, 160)
     for _ in range(3):
         encoder.features(image)
@@ -128,21 +127,30 @@ def test_folding_changes_nothing(torch, network):
             torch.testing.assert_close(got, wanted, atol=1e-5, rtol=1e-4)
 
 
-def test_the_encoder_normalises_responses_as_pytorch_does(torch, network):
+def test_the_encoder_normalises_responses_as_pytorch_does(torch, calc):
     x = 100 * torch.rand(2, 64, 6, 5)
     wanted = torch.nn.functional.local_response_norm(x, 5, 1e-4, 0.75, 1.0)
-    torch.testing.assert_close(network._response_normalised(x), wanted)
+    torch.testing.assert_close(calc._response_normalised(x), wanted)
 
 
-def test_the_file_equals_pytorch_and_a_difference_is_found(torch, network, export, tmp_path):
+def test_the_file_equals_pytorch_and_a_difference_is_found(torch, calc, onnxfile, tmp_path, monkeypatch):
     torch.manual_seed(0)
-    encoder = network.Encoder().eval().requires_grad_(False)
-    export.write_onnx(encoder, tmp_path / "m.onnx")
-    inputs = np.random.default_rng(0).random((3, 1, 120, 160), np.float32)
-    assert export.require_equal(encoder, tmp_path / "m.onnx", inputs) <= 1e-4
-    encoder.conv3.bias += 0.1
-    with pytest.raises(EdgevprError, match="other values than PyTorch"):
-        export.require_equal(encoder, tmp_path / "m.onnx", inputs)
+    encoder = calc.Encoder().eval().requires_grad_(False)
+    outputs = {"descriptor": "descriptor", "features": "features"}
+    file = onnxfile.ModelFile(path=tmp_path / "m.onnx", title="", input="image", rule=jobs._INPUT, outputs=outputs)
+    inputs = list(np.random.default_rng(0).random((3, 1, 1, 120, 160), np.float32))
+    assert onnxfile.write_model(file, encoder, inputs, "", "") <= 1e-4
+    assert read_card(file.card).outputs.features == "features"
+    write = onnxfile._write_onnx
+
+    def write_another(*parts):
+        write(*parts)
+        encoder.conv3.bias += 0.1
+
+    monkeypatch.setattr(onnxfile, "_write_onnx", write_another)
+    with pytest.raises(EdgevprError, match="PyTorch"):
+        onnxfile.write_model(file, encoder, inputs, "", "")
+    assert not file.path.exists()
 
 
 def train(folder, out, *more):
@@ -165,9 +173,9 @@ def test_the_command_makes_a_model_that_edgevpr_opens(folder, tmp_path, capsys, 
     assert open_backbone("mine", "features").shape == (128, 16, 21)
 
 
-def test_a_file_that_differs_is_not_left_and_another_try_goes_on(export, folder, tmp_path, capsys, monkeypatch):
+def test_a_file_that_differs_is_not_left_and_another_try_goes_on(onnxfile, folder, tmp_path, capsys, monkeypatch):
     with monkeypatch.context() as patched:
-        patched.setattr(export, "LARGEST_DIFFERENCE", -1.0)
+        patched.setattr(onnxfile, "LARGEST_DIFFERENCE", -1.0)
         assert train(folder, tmp_path / "mine.onnx") == 1
     assert "run the command again with --resume" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["mine.checkpoint"]

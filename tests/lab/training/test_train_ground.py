@@ -6,7 +6,7 @@ import numpy as np
 from pictures_on_disk import write_pictures
 
 from edgevpr.cli.main import main
-from edgevpr.lab.training.ground import aligned
+from edgevpr.lab.training.words import aligned
 from edgevpr.techniques import placewords
 
 

@@ -1,0 +1,102 @@
+"""A trained network as an ONNX file with its card, checked against PyTorch."""
+
+import logging
+import warnings
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+import torch
+
+from edgevpr.core.arrays import Singles
+from edgevpr.core.errors import EdgevprError
+from edgevpr.runtime.preflight.networks import card_text
+from edgevpr.techniques.card import InputRule
+from edgevpr.techniques.session import file_sha256
+
+LARGEST_DIFFERENCE = 1e-4
+_OPSET, _IR_VERSION = 18, 8  # that every onnxruntime since 1.17 reads
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelFile:
+    """An ONNX file to be made, and what its card says: the name of its `input` and its preparation, and the names of
+    its `outputs`, each under the key of the card that it is of."""
+
+    path: Path
+    title: str
+    input: str
+    rule: InputRule
+    outputs: dict[str, str]
+
+    @property
+    def card(self) -> Path:
+        return self.path.with_suffix(".yaml")
+
+
+def write_model(file: ModelFile, network: torch.nn.Module, samples: Sequence[Singles], source: str, then: str) -> float:
+    """Write a network and its card. A sample is float32 (N, ...), an input; where it holds several pictures, the file
+    takes any number of them.
+
+    Returns the largest difference between the outputs of the file and of PyTorch, as a share of the largest value (of
+    1, if that is larger). Raises EdgevprError with what to do `then`, and leaves no file, if it is more than 1e-4.
+    """
+    _write_onnx(file, network, samples[0])
+    try:
+        largest = _largest_difference(file, network, samples)
+        if not largest <= LARGEST_DIFFERENCE:
+            raise EdgevprError(
+                f"{file.path} gives other values than PyTorch (they differ by {largest:.2g}): install another version "
+                f"of onnx or torch and {then}."
+            )
+    except EdgevprError:
+        file.path.unlink()  # a wrong file must not be taken for a model, nor be in the way of another try
+        raise
+    values = {
+        "title": file.title,
+        "file": file.path.name,
+        "sha256": file_sha256(file.path),
+        "licence": "MIT",
+        "source": source,
+        "input": {key: value for key, value in asdict(file.rule).items() if value is not None},
+        "outputs": file.outputs,
+    }
+    file.card.write_text(card_text(values), encoding="utf-8")
+    return largest
+
+
+def _write_onnx(file: ModelFile, network: torch.nn.Module, sample: Singles) -> None:
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # its warnings are about packages that are not needed
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # those of PyTorch about PyTorch
+        program = torch.onnx.export(
+            network,
+            (torch.from_numpy(sample),),
+            dynamo=True,
+            verbose=False,
+            input_names=[file.input],
+            output_names=list(file.outputs.values()),
+            dynamic_shapes=({0: torch.export.Dim("n")},) if len(sample) > 1 else None,
+            opset_version=_OPSET,
+        )
+    if program is None:
+        raise EdgevprError(f"PyTorch made no ONNX of {file.path}: install another version of torch.")
+    model = program.model_proto
+    model.ir_version, model.producer_name = _IR_VERSION, "edgevpr"
+    onnx.checker.check_model(model, full_check=True)
+    file.path.write_bytes(model.SerializeToString())
+
+
+def _largest_difference(file: ModelFile, network: torch.nn.Module, samples: Sequence[Singles]) -> float:
+    session = onnxruntime.InferenceSession(str(file.path), providers=["CPUExecutionProvider"])
+    largest = 0.0
+    for sample in samples:
+        with torch.no_grad():
+            result = network(torch.from_numpy(sample))
+        expected = [value.numpy() for value in (result if isinstance(result, tuple) else (result,))]
+        for found, wanted in zip(session.run(list(file.outputs.values()), {file.input: sample}), expected, strict=True):
+            largest = max(largest, float(np.abs(found - wanted).max() / max(1.0, np.abs(wanted).max())))
+    return largest
