@@ -3,7 +3,7 @@ soak.png, and ends with code 1 where memory, descriptors or threads grow.
 
 python benchmarks/soak.py [--minutes M]
 
-A real `edgevpr run` flies with a camera that speaks RTSP, an autopilot over UDP, a second link, a status socket, a
+A real `edgevpr run` flies with a camera that speaks RTSP, an autopilot over UDP, a second link, a status file, a
 flight log that is limited to 1 MB and a tlog. Again and again the camera or the autopilot goes away and comes back, the
 second link's other end closes, readers of the status come and leave, and the configuration is read again.
 """
@@ -15,7 +15,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
@@ -31,7 +31,7 @@ from soak_world import FOV_DEG, Autopilot, FilmCamera, make_world
 
 from edgevpr.core.errors import EdgevprError
 from edgevpr.runtime.flight.flightlog import read_log
-from edgevpr.runtime.flight.statusreader import StatusReader
+from edgevpr.runtime.flight.status import read_status
 
 LOG_MB = 1.0
 _RADIUS_M = 110.0  # of the lap
@@ -40,7 +40,6 @@ _AFTER = 0.06  # of a cycle: so long after its return what was away may still sh
 _EVERY_S = 5.0  # from one look at the process to the next
 _PATIENCE_S = 60.0
 _TURN_S = 0.1
-_LOOK_S = 3.0  # for a status, of which one comes every second
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +102,7 @@ class Flight:
     """`edgevpr run` as a process of its own, with its files in `folder`."""
 
     def __init__(self, folder: Path, uri: str, port: int, ground_port: int) -> None:
-        self.log, self.tlog, self.socket = folder / "flight.jsonl", folder / "flight.tlog", folder / "status.sock"
+        self.log, self.tlog, self.status = folder / "flight.jsonl", folder / "flight.tlog", folder / "status.json"
         self._config, self._rate_hz = folder / "config.yaml", 2.0
         self._stderr = folder / "said.txt"
         self._settings = {
@@ -111,7 +110,7 @@ class Flight:
             "source": {"uri": uri, "camera": "nadir", "fov_deg": FOV_DEG, "rate_hz": self._rate_hz},
             "mavlink": {"link": f"udpout:127.0.0.1:{port}", "ground": f"udpout:127.0.0.1:{ground_port}"},
             "log": {"path": str(self.log), "max_mb": LOG_MB, "tlog": str(self.tlog)},
-            "status": {"socket": str(self.socket)},
+            "status": {"file": str(self.status)},
         }
         self._config.write_text(yaml.safe_dump(self._settings))
         with open(self._stderr, "w") as stderr:
@@ -241,12 +240,9 @@ class _Watch:
         return max(counts)
 
     def _read_status(self) -> None:
-        """Come as a reader of the status, read one, and leave."""
-        try:
-            with StatusReader(self._flight.socket) as reader:
-                self.statuses += reader.read(_LOOK_S) is not None
-        except EdgevprError:  # counted as none
-            pass
+        """Read the status once."""
+        with suppress(EdgevprError):  # counted as none
+            self.statuses += read_status(self._flight.status) is not None
 
 
 def _timetable(absences: list[Absence], cycle_s: float) -> Iterator[tuple[float, bool, Absence]]:
@@ -259,19 +255,11 @@ def _timetable(absences: list[Absence], cycle_s: float) -> Iterator[tuple[float,
 
 
 def _absences(camera: FilmCamera, autopilot: Autopilot, ground: _Ground, flight: Flight) -> list[Absence]:
-    mute: list[socket.socket] = []
-
-    def come_and_be_mute() -> None:
-        reader = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        mute.append(reader)
-        reader.connect(str(flight.socket))
-
     def nothing() -> None:
         pass
 
     return [
         Absence("configuration read again", 0.03, 0.06, flight.reread, nothing),
-        Absence("a reader that reads nothing", 0.10, 0.20, come_and_be_mute, lambda: mute.pop().close()),
         Absence("camera pulled out", 0.27, 0.33, camera.pull_out, camera.plug_in),
         Absence("autopilot killed", 0.42, 0.49, autopilot.kill, autopilot.start),
         Absence("camera silent", 0.58, 0.63, lambda: camera.fall_silent(True), lambda: camera.fall_silent(False)),

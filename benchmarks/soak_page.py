@@ -72,7 +72,7 @@ def page(soak: Row) -> str:
 Made by `make soak` on {soak["date"]}, commit {soak["commit"]}, {soak["machine"]["cores"]} cores of an
 {soak["machine"]["cpu"]}: `edgevpr run` for {samples[-1]["t_s"] / 60:.1f} minutes, {len(samples)} looks from outside.
 The camera is an RTSP stream (H.264, 640x480), the autopilot a process of its own over UDP; there are a second link, a
-status socket, a tlog, and a flight log limited to {soak["log_limit_mb"]:g} MB.
+status file, a tlog, and a flight log limited to {soak["log_limit_mb"]:g} MB.
 
 **{"As it should be." if not broken else " ".join(broken)}**
 

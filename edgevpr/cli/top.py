@@ -16,9 +16,9 @@ from edgevpr.core.text import printable
 if TYPE_CHECKING:
     from edgevpr.runtime.flight.status import LinkState, Seen, Status
 
-_SOCKET = "/run/edgevpr/status.sock"
-_LOOK_S = 1.5  # a status comes once a second
-_ONCE_S = 10.0  # a slow frame delays it
+_FILE = "/run/edgevpr/status.json"
+_LOOK_S = 1.0  # a status comes once a second
+_SILENT_S, _GONE_S = 2.5, 10.0  # a slow frame delays it; a flight that was killed leaves its last one
 _CHANNELS = {"COMMAND": "command 43003", "SENSOR": "message 296"}  # the others are called as their messages
 
 Row = tuple[str, str]
@@ -27,35 +27,35 @@ Row = tuple[str, str]
 def add(commands: Any) -> None:
     """Add the command and its flags."""
     parser = command(commands, "top", run_top, "show how the flight on this computer goes")
-    parser.add_argument("--socket", default=_SOCKET, metavar="PATH", help=f"the flight's status.socket ({_SOCKET})")
+    parser.add_argument("--file", default=_FILE, metavar="PATH", help=f"the flight's status.file ({_FILE})")
     parser.add_argument("--once", action="store_true", help="show it once, and end")
     add_json(parser)
 
 
 def run_top(args: Namespace) -> int:
     """Show the status of a flight, until Ctrl-C."""
-    from edgevpr.runtime.flight.statusreader import StatusReader
+    from edgevpr.runtime.flight.status import read_status
 
-    with StatusReader(args.socket) as reader:
-        if args.once:
-            status = reader.read(_LOOK_S) or (None if reader.trouble else reader.read(_ONCE_S))
-            if status is None:
-                why = reader.trouble or f"the flight at {args.socket} says nothing"
-                raise EdgevprError(f"{why[0].upper()}{why[1:]}: start one, or name its socket with --socket.")
-            print(_json(status) if args.json else "\n".join(_table(rows(status))))
-            return 0
-        screen = _Json() if args.json else _Terminal() if sys.stdout.isatty() else _Lines()
-        heard_s, status = time.monotonic(), None
-        try:
-            while True:
-                if new := reader.read(_LOOK_S):
-                    heard_s, status = time.monotonic(), new
-                    screen.show(status)
-                else:
-                    silent = f"the flight has said nothing for {time.monotonic() - heard_s:.0f} s"
-                    screen.show_silence(reader.trouble or silent, None if reader.trouble else status)
-        except KeyboardInterrupt:
-            return 0
+    nobody = f"no flight tells its status at {args.file}"
+    if args.once:
+        found = read_status(args.file)
+        if found is None or found[1] > _GONE_S:
+            raise EdgevprError(f"N{nobody[1:]}: start one, or name its file with --file.")
+        print(_json(found[0]) if args.json else "\n".join(_table(rows(found[0]))))
+        return 0
+    screen = _Json() if args.json else _Terminal() if sys.stdout.isatty() else _Lines()
+    try:
+        while True:
+            found = read_status(args.file)
+            if found is None:
+                screen.show_silence(nobody, None)
+            elif found[1] > _SILENT_S:
+                screen.show_silence(f"the flight has said nothing for {found[1]:.0f} s", found[0])
+            else:
+                screen.show(found[0])
+            time.sleep(_LOOK_S)
+    except KeyboardInterrupt:
+        return 0
 
 
 def rows(status: "Status") -> list[Row]:

@@ -181,7 +181,7 @@ class LogConfig:
 
 @dataclass(frozen=True, slots=True)
 class StatusConfig:
-    socket: str | None = field()
+    file: str | None = field()
 
 
 @dataclass(frozen=True, slots=True)

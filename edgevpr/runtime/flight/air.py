@@ -25,7 +25,7 @@ from edgevpr.power.boards import load_board
 from edgevpr.runtime.flight.clock import Clock, taped
 from edgevpr.runtime.flight.recording import Recording
 from edgevpr.runtime.flight.reloading import Reread
-from edgevpr.runtime.flight.statussocket import StatusSocket, usual_path
+from edgevpr.runtime.flight.status import StatusFile, usual_path
 from edgevpr.runtime.flight.world import Stop, World
 from edgevpr.runtime.recognise.learn import check_positions
 from edgevpr.runtime.recognise.opening import has_map
@@ -62,8 +62,8 @@ def in_the_air(
                     "recording": str(recording.path.resolve()),
                 },
             )
-        status_path = config.status.socket or usual_path()
-        status = _or_without(lambda: stack.enter_context(StatusSocket(status_path))) if status_path else None
+        status_path = config.status.file or usual_path()
+        status = _or_without(lambda: stack.enter_context(StatusFile(status_path))) if status_path else None
         if config.log.tlog and not config.mavlink.link:
             _log.warning("there is no link, so there is no tlog either")
         tlog_path = config.log.tlog if config.mavlink.link else None

@@ -1,6 +1,21 @@
-"""The status of a flight at one moment, as people and programs beside it are told."""
+"""The status of a flight at one moment, and the file in which people and programs beside it read it: one JSON object,
+replaced as a whole once a second."""
 
+import json
+import os
+import stat
+import time
+from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from edgevpr.core.config import build
+from edgevpr.core.errors import ConfigError, EdgevprError
+from edgevpr.core.text import json_line
+
+NAME = "status.json"
+_MODE = 0o660  # positions are nobody else's, and the group of the flight may look on
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,7 +49,7 @@ class LinkState:
     autopilot: int | None
     channel: str
     fixes: str
-    answers: dict
+    answers: dict[str, int]
     unanswered: int
     accuracy_m: float | None
 
@@ -75,10 +90,74 @@ class Status:
     newest: Seen | None
     match: Seen | None
     link: LinkState | None
-    remarks: list
+    remarks: list[str]
 
     @property
     def summary(self) -> str:
         """The most important of it in one line."""
         counts = f"{self.queries} queries, {self.accepted} accepted, {self.used_mah:.2f} mAh"
         return "; ".join((self.source, counts, *([self.link.fixes] if self.link else []), *self.remarks))
+
+
+class StatusFile:
+    """Tells the status in a file. Close it (it is a context manager), which removes the file."""
+
+    def __init__(self, path: str | Path) -> None:
+        """Try the folder. Raises EdgevprError where no file can be made in it."""
+        self._path, self._new = Path(path), Path(f"{path}.new")
+        try:
+            if self._path.exists() and not stat.S_ISREG(self._path.stat().st_mode):
+                raise OSError("it is there and is no file")
+            self._write(b"")
+            self._new.unlink()
+        except OSError as error:
+            raise EdgevprError(
+                f"The status file {path} cannot be made ({error.strerror or error}): give a name in a folder that is "
+                "there and may be written to, or none (status.file)."
+            ) from error
+
+    def __enter__(self) -> "StatusFile":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with suppress(OSError):
+            self._path.unlink()
+
+    def tell(self, status: Status) -> None:
+        """Put a status in place of the one before. Never raises OSError."""
+        with suppress(OSError):
+            self._write(json_line(status))
+            os.replace(self._new, self._path)
+
+    def _write(self, data: bytes) -> None:
+        descriptor = os.open(self._new, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC, _MODE)
+        with open(descriptor, "wb") as file:
+            os.fchmod(descriptor, _MODE)  # of which the umask has taken away
+            file.write(data)
+
+
+def read_status(path: str | Path) -> tuple[Status, float] | None:
+    """Return the status in a file, and its age in seconds; None where no flight tells one. Raises EdgevprError where
+    the file may not be read, or holds something else."""
+    try:
+        with open(path, "rb") as file:
+            age_s = time.time() - os.fstat(file.fileno()).st_mtime
+            fields: Any = json.loads(file.read())
+        return build(Status, fields, str(path)), age_s
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise EdgevprError(
+            f"The status at {path} cannot be read ({error.strerror}): be its user or of its group (sudo), or name "
+            "another file with --file."
+        ) from error
+    except (ValueError, TypeError, RecursionError, ConfigError) as error:
+        raise EdgevprError(
+            f"{path} tells no status that this edgevpr understands: use the edgevpr of the flight."
+        ) from error
+
+
+def usual_path() -> str | None:
+    """Return the path in the folder that systemd has made for a service, None where it has made none."""
+    folder = os.environ.get("RUNTIME_DIRECTORY", "").partition(":")[0]
+    return str(Path(folder) / NAME) if folder else None

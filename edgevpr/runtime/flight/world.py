@@ -20,7 +20,7 @@ from edgevpr.runtime.flight.flightlog import FlightLog
 from edgevpr.runtime.flight.herald import Herald
 from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.flight.reloading import Reread
-from edgevpr.runtime.flight.statussocket import StatusSocket
+from edgevpr.runtime.flight.status import StatusFile
 from edgevpr.runtime.recognise.learn import Learner
 from edgevpr.runtime.recognise.recogniser import Recogniser
 
@@ -97,7 +97,7 @@ class World:
     tap: Tap
     stop: Stop
     reread: Reread | None
-    status: StatusSocket | None
+    status: StatusFile | None
     recording: str | None
 
 
@@ -119,7 +119,7 @@ class Crew:
     clock: Clock
     stop: Stop
     reread: Reread | None = None
-    status: StatusSocket | None = None
+    status: StatusFile | None = None
     fewer_candidates: tuple[int, ...] = ()
     smaller_forms: tuple[str, ...] = ()
 

@@ -1,0 +1,80 @@
+"""The status file: whole at every moment, for its user and group, and nobody else."""
+
+import os
+from dataclasses import replace
+
+import pytest
+from statuses import STATUS
+
+from edgevpr.cli.main import main
+from edgevpr.core.errors import EdgevprError
+from edgevpr.runtime.flight.status import StatusFile, read_status, usual_path
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "status.json"
+
+
+def test_what_is_told_is_read_again_and_the_file_goes_with_the_flight(path):
+    with StatusFile(path) as told:
+        assert read_status(path) is None
+        for queries in (7, 8):
+            told.tell(replace(STATUS, queries=queries))
+            status, age_s = read_status(path)
+            assert status == replace(STATUS, queries=queries)
+            assert age_s < 60
+        assert path.stat().st_mode & 0o777 == 0o660
+        assert os.listdir(path.parent) == [path.name]
+    assert read_status(path) is None
+
+
+def test_the_mode_is_the_same_under_any_umask_and_what_was_left_is_replaced(path):
+    path.write_text("left by a flight that was killed")
+    before = os.umask(0o077)
+    try:
+        with StatusFile(path) as told:
+            told.tell(STATUS)
+            assert path.stat().st_mode & 0o777 == 0o660
+            assert read_status(path)[0] == STATUS
+    finally:
+        os.umask(before)
+
+
+@pytest.mark.parametrize("name", ["nowhere/status", ".", "x" * 300])
+def test_a_file_that_cannot_be_made_is_refused_by_name(tmp_path, name):
+    with pytest.raises(EdgevprError, match=r"status\.file"):
+        StatusFile(tmp_path / name)
+
+
+def test_a_disk_that_is_full_ends_no_flight(path):
+    with StatusFile(path) as told:
+        path.with_name(f"{path.name}.new").mkdir()
+        told.tell(STATUS)
+    assert read_status(path) is None
+
+
+@pytest.mark.parametrize("text", ["", "no JSON", "[]", '{"version": 1}', "[" * 100_000])
+def test_what_is_no_status_is_refused_by_name(path, text):
+    path.write_text(text)
+    with pytest.raises(EdgevprError, match=path.name):
+        read_status(path)
+
+
+def test_once_takes_no_status_of_a_flight_that_is_gone(path, capsys):
+    assert main(["top", "--file", str(path), "--once"]) == 1
+    assert "--file" in capsys.readouterr().err
+    with StatusFile(path) as told:
+        told.tell(STATUS)
+        assert main(["top", "--file", str(path), "--once"]) == 0
+        os.utime(path, (0, 0))
+        assert main(["top", "--file", str(path), "--once"]) == 1
+
+
+@pytest.mark.parametrize(
+    ("folder", "usual"),
+    [("/run/edgevpr", "/run/edgevpr/status.json"), ("/run/a:/run/b", "/run/a/status.json"), ("", None)],
+)
+def test_a_service_has_a_folder_for_it(monkeypatch, folder, usual):
+    monkeypatch.setenv("RUNTIME_DIRECTORY", folder)
+    assert usual_path() == usual
