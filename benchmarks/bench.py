@@ -1,4 +1,4 @@
-"""Every speed and memory figure in one run: `make bench` writes benchmarks/results/bench.md, bench.json and growth.png.
+"""Every speed and memory figure in one run: `make bench` writes benchmarks/results/bench.md and bench.json.
 
 Figures of competitors stand beside ours from the same, interleaved run: on a busy machine the ratios hold, the times do
 not.
@@ -7,7 +7,7 @@ not.
 import base
 import bench_flight
 import bench_stages
-from base import RESULTS, Row
+from base import Row
 
 COLUMNS = {
     "encode": {
@@ -37,13 +37,6 @@ COLUMNS = {
         "ratio": "{ratio:.0f}",
         "bytes a place in RAM": "{bytes_per_place}",
     },
-    "growth": {
-        "places": "{places}",
-        "rotations": "{rotations}",
-        "bytes a place": "{place_bytes}",
-        "scan ms": "{t_scan_ms:.1f}",
-        "RAM MB": "{index_mb:.2f}",
-    },
     "flight": {
         "`edgevpr run`, cohog, 10 000 places": "{what}",
         "measured": "{value:.3g} {unit}",
@@ -58,24 +51,7 @@ def main() -> None:
         print(f"measuring: {name}", flush=True)
         found[name] = list(rows())
     base.write("bench", found, page(found))
-    draw(found["growth"])
     print(page(found))
-
-
-def draw(rows: list[Row]) -> None:
-    """Draw time of a query's scan and memory of the index against the number of places, both logarithmic."""
-    drawn, (time_axes, ram_axes) = base.panels(10, 4.2, 2)
-    for label, these in base.groups(rows, lambda row: "camera ahead" if row["rotations"] == 1 else "straight down"):
-        places, scan_ms = [row["places"] for row in these], [row["t_scan_ms"] for row in these]
-        (line,) = time_axes.loglog(places, scan_ms, "o-", label=label)
-        time_axes.loglog(places, [scan_ms[-1] * count / places[-1] for count in places], ":", color=line.get_color())
-        each = f"{label}: {these[0]['place_bytes']} bytes a place"
-        ram_axes.loglog(places, [row["index_mb"] for row in these], "o-", label=each)
-    time_axes.set(xlabel="places", ylabel="scan of all places, ms", title="time of the scan (dotted: linear)")
-    ram_axes.set(xlabel="places", ylabel="in RAM, MB", title="memory of the places")
-    for axes in (time_axes, ram_axes):
-        axes.legend(frameon=False)
-    base.save(drawn, RESULTS / "growth.png")
 
 
 def page(found: Row) -> str:
@@ -101,12 +77,6 @@ The published way is written plainly in `benchmarks/competitor.py`; the floor is
 ## A query over 10 000 places
 
 {tables["two_stage"]}
-
-## Growth of the scan
-
-{tables["growth"]}
-
-![growth](growth.png)
 
 ## The whole program
 

@@ -1,10 +1,10 @@
-"""What memorable maps are worth: every image set with and without the gate, and what is left of a map that shrinks.
+"""What memorable maps are worth: every image set with and without the gate.
 
 python benchmarks/bench_salience.py [--sets A,B]
 
 Needs the extra `train`, and for the staticity a detector (see `detectors`). For every set the network of matchability
-is fitted to all other sites, so that no figure comes from a network that has seen its site. Writes salience.json,
-salience.md and salience_budget.png into benchmarks/results/.
+is fitted to all other sites, so that no figure comes from a network that has seen its site. Writes salience.json
+and salience.md into benchmarks/results/.
 """
 
 import argparse
@@ -20,19 +20,19 @@ import cv2
 import detectors
 import numpy as np
 import walks
-from base import DATA, RESULTS, Row, camera_of
+from base import DATA, Row, camera_of
 
 from edgevpr.core.text import progress
-from edgevpr.core.types import Place, Salience
+from edgevpr.core.types import Salience
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.lab.evaluate import metrics
 from edgevpr.lab.evaluate.dataset import Dataset
+from edgevpr.lab.training import export_matchability
 from edgevpr.lab.training.labels import label_site, walk_over
-from edgevpr.lab.training.matchability import compared, fit, site_of, write_network
-from edgevpr.places.shrink import chosen
+from edgevpr.lab.training.matchability import compared, fit, site_of
 from edgevpr.runtime.recognise.detector import Detector, open_detector
 from edgevpr.runtime.recognise.memorability import Memorability, open_memorability
-from edgevpr.runtime.recognise.salience_gate import Gate, Thresholds, worth_of
+from edgevpr.runtime.recognise.salience_gate import Thresholds, worth_of
 from edgevpr.runtime.recognise.salience_maps import maps_of, scores_of
 
 TECHNIQUES = ("hog", "cohog", "calc", "netvlad")
@@ -44,7 +44,6 @@ GATES = {
     "staticity": Thresholds(staticity=FULL.staticity),
     "entropy": Thresholds(entropy=FULL.entropy),
 }
-SHARES = (0.5, 0.25, 0.1)
 # Sets of which no network learns: of five places, and of 64x32 pixels.
 FIVE_PLACES = ("grief_michigan_monthly", "grief_stromovka_monthly")
 NOT_LEARNT = (*FIVE_PLACES, "nordland_tiny")
@@ -78,7 +77,7 @@ def main() -> None:
             detectors.write_card(name, Path(temporary))
         detector = open_detector(DETECTOR) if DETECTOR in there else None
         speed = speeds(f"without_{folders[0].name}", there)
-        rows, budget, light = [], [], []
+        rows = []
         for folder in folders:
             memorability = open_memorability(f"without_{folder.name}")
             dataset = walks.dataset_of(folder)
@@ -86,15 +85,12 @@ def main() -> None:
             places = list_images(folder / "ref")
             every = progress([*queries, *places], len(queries) + len(places), f"{folder.name}: salience")
             seen = {path: scores_by_gate(path, memorability, detector) for path in every}
-            light += [{"set": folder.name, **row} for row in kept_in_bad_light(places)]
             kept = _kept(places, seen)
             for technique in TECHNIQUES:
                 asked = ask(technique, dataset)
                 rows += gated(folder.name, technique, asked, [seen[path] for path in queries], kept)
-                budget += shrunk(folder.name, technique, asked, [seen[path]["all three"] for path in places])
-    found = {**base.made_by(), "speed": speed, "unseen": judged, "gate": rows, "light": light, "budget": budget}
+    found = {**base.made_by(), "speed": speed, "unseen": judged, "gate": rows}
     base.write("salience", found, page(found))
-    plot(budget, RESULTS / "salience_budget.png")
 
 
 def fit_each(names: list[str], models: Path) -> dict[str, dict[str, dict[str, float | None]]]:
@@ -108,7 +104,9 @@ def fit_each(names: list[str], models: Path) -> dict[str, dict[str, dict[str, fl
     kind, unseen = compared(sites, _SEED)
     for name in names:
         network = fit(kind, [site for site in sites if site.name not in (name, SAME_SITE.get(name))], _SEED)
-        write_network(network, models / f"without_{name}.onnx", f"without {name}", "a benchmark", sites[0])
+        file = models / f"without_{name}.onnx"
+        export_matchability.write_onnx(network, file)
+        export_matchability.write_card(file.with_suffix(".yaml"), file, f"without {name}", "a benchmark")
     return {each: asdict(found) for each, found in unseen.items()}
 
 
@@ -183,61 +181,6 @@ def gated(
         }
 
 
-def shrunk(name: str, technique: str, asked: Asked, seen: list[Salience]) -> Iterable[dict]:
-    """Yield recall and the largest gap, in frames, of maps that were made smaller: by worth and coverage, evenly, and
-    at random (the mean of five)."""
-    total = len(seen)
-    for share in SHARES:
-        count = max(1, round(share * total))
-        rng = np.random.default_rng(_SEED)
-        ways = {
-            "worth and coverage": [chosen([_place(number, each) for number, each in enumerate(seen)], count)],
-            "even": [np.unique(np.linspace(0, total - 1, count).round().astype(int))],
-            "random": [np.sort(rng.choice(total, count, replace=False)) for _ in range(5)],
-        }
-        for way, choices in ways.items():
-            recalls, gaps = [], []
-            for slots in choices:
-                places = np.zeros(total, bool)
-                places[slots] = True
-                recalls.append(float(answers(asked, places)[1].mean()))
-                gaps.append(int(np.diff([-1, *slots, total]).max()) - 1)
-            row = {"set": name, "technique": technique, "share": share, "way": way}
-            yield row | {"recall": float(np.mean(recalls)), "gap": float(np.mean(gaps))}
-
-
-def kept_in_bad_light(paths: list[Path]) -> Iterable[dict]:
-    """Yield the share of the pictures that the entropy keeps, as they are, dark and in fog: by the threshold that
-    follows the light, and by the thesis's constant one. By day a tenth of them fail it, or a half."""
-    pictures = [read_image(path) for path in paths]
-    by_day = [_entropy(picture) for picture in pictures]
-    for keeps in (0.9, 0.5):
-        threshold = float(np.quantile(by_day, 1 - keeps))
-        for light, change in {"as it is": None, "dark": _dark, "fog": _fog}.items():
-            changed = [change(picture, number) if change else picture for number, picture in enumerate(pictures)]
-            gate = Gate(Thresholds(entropy=threshold))
-            yield {
-                "threshold": threshold,
-                "light": light,
-                "kept": float(np.mean([gate.look(picture).reason is None for picture in changed])),
-                "kept_constant": float(np.mean([_entropy(picture) >= threshold for picture in changed])),
-            }
-
-
-def _dark(picture: np.ndarray, seed: int) -> np.ndarray:
-    values = (picture / 255.0) ** 2.2 * 255 * 0.35 + np.random.default_rng(seed).normal(0, 1.5, picture.shape)
-    return np.clip(values, 0, 255).astype(np.uint8)
-
-
-def _fog(picture: np.ndarray, seed: int) -> np.ndarray:
-    values = 0.35 * picture + 0.65 * 200 + np.random.default_rng(seed).normal(0, 1, picture.shape)
-    return np.clip(values, 0, 255).astype(np.uint8)
-
-
-def _entropy(picture: np.ndarray) -> float:
-    return scores_of(maps_of(picture, None, None)).entropy
-
-
 def scores_by_gate(path: Path, memorability: Memorability, detector: Detector | None) -> dict[str, Salience]:
     """Return the scores of a picture under each gate. A criterion alone knows nothing of what moves, but staticity."""
     picture = read_image(path)
@@ -256,10 +199,6 @@ def _kept(places: list[Path], seen: dict[Path, dict[str, Salience]]) -> dict[str
     }
 
 
-def _place(number: int, salience: Salience) -> Place:
-    return Place(place_id=number + 1, source_image=str(number), salience=salience)
-
-
 _GATE = {
     "set": "{set}",
     "technique": "{technique}",
@@ -269,13 +208,6 @@ _GATE = {
     "strict": "{recall_strict:.2f}",
     "right": "{true_discarded}",
     "wrong": "{false_discarded}",
-}
-_LIGHT = {
-    "set": "{set}",
-    "threshold": "{threshold:.2f}",
-    "light": "{light}",
-    "follows the light": "{kept:.0%}",
-    "constant": "{kept_constant:.0%}",
 }
 
 
@@ -322,32 +254,7 @@ The size of a map that is built through the gate, before its gaps are filled: sh
 
 {base.table(sizes, {"gate": "{gate}", **{name: f"{{{name}:.0%}}" for name in sets}})}
 
-## Entropy in bad light: share of the references kept
-
-{base.table(found["light"], _LIGHT)}
-
-## A map that shrinks
-
-![recall and largest gap of maps of 50, 25 and 10 % of the places](salience_budget.png)
 """
-
-
-def plot(budget: list[Row], path: Path) -> None:
-    """Draw recall of `cohog` and the largest gap against the share of places that is left, of sets of many places."""
-    sets = [name for name in dict.fromkeys(row["set"] for row in budget) if name not in FIVE_PLACES]
-    drawn, axes = base.panels(2.2 * len(sets), 6.0, 2 * len(sets), 2, sharex=True)
-    for above, below, name in zip(axes, axes[len(sets) :], sets, strict=False):
-        of_set = [row for row in budget if (row["set"], row["technique"]) == (name, "cohog")]
-        for way, rows in base.groups(of_set, lambda row: row["way"]):
-            share = [100 * row["share"] for row in rows]
-            above.plot(share, [row["recall"] for row in rows], "o-", label=way)
-            below.plot(share, [row["gap"] for row in rows], "o-", label=way)
-        above.set_title(name, fontsize=9)
-        below.set(xlabel="% of the places", yscale="symlog")
-    axes[0].set_ylabel("recall@1 of cohog")
-    axes[len(sets)].set_ylabel("largest gap, frames")
-    axes[0].legend(fontsize=8)
-    base.save(drawn, path)
 
 
 if __name__ == "__main__":

@@ -25,13 +25,12 @@ from edgevpr.lab.simulate.scene import make_scene
 from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import NOTHING, Expected, compare, scan
-from edgevpr.techniques import create, placecode, placewords
+from edgevpr.techniques import create
 
 PLACES = 10_000
 REACH_M = 300.0
 FRAME, SIDE_PX, FRAMES_A_SET = (640, 480), 512, 2  # width and height of a frame; of the square it is laid into
 ENCODE_TURNS, MATCH_TURNS, QUERY_TURNS, REFERENCES = 10, 15, 9, 60
-GROWTH = (1_000, 3_000, 10_000, 30_000, 100_000)
 
 
 def frames() -> list[np.ndarray]:
@@ -163,36 +162,7 @@ def _query(large: tuple[Technique, PlaceMap, PlaceIndex], camera: str, beside: s
     }
 
 
-def growth_rows() -> Iterator[Row]:
-    """Scan maps of more and more places: place codes ahead, words looking down (24 rotations). The query's own part
-    does not grow, and stands apart as `t_query_ms`."""
-    rng = np.random.default_rng(0)
-    blocks = rng.random((31, 31, 32), dtype=np.float32)
-    mean = rng.random((placecode.SIDE, placecode.SIDE, 8), dtype=np.float32)
-    patterns = rng.normal(size=(700, 20)).astype(np.float32)
-    numbers = np.sort(rng.permutation(31 * 31)[:700])
-
-    def ask_ahead() -> object:
-        return placecode.hypotheses(*placecode.seen_grid(blocks, np.ones((31, 31), bool)), mean)
-
-    def ask_down() -> object:
-        asking = dict.fromkeys(range(6), (patterns, numbers))
-        return placewords.of_query(placewords.load("ground_words"), asking, 6, (31, 31))
-
-    for rotations, ask, scan_all, side, most, dtype in (
-        (1, ask_ahead, placecode.scan_ahead, placecode.SIDE, 256, np.uint8),
-        (24, ask_down, placewords.scan, placewords.SIDE, 1024, np.uint16),
-    ):
-        asked = ask()
-        for count in GROWTH:
-            there, rounds = rng.integers(0, most, (count, side**2), dtype=dtype), 2_000_000 // (count * rotations)
-            times_s = [(timed_s(ask), timed_s(scan_all, asked, there)) for _ in range(max(1, min(20, rounds)))]
-            t_query_s, t_scan_s = np.median(times_s, axis=0)
-            row = {"places": count, "rotations": rotations, "place_bytes": there.nbytes // count}
-            yield row | {"t_query_ms": 1e3 * t_query_s, "t_scan_ms": 1e3 * t_scan_s, "index_mb": there.nbytes / 1e6}
-
-
-ROWS = {"encode": encode_rows, "match": match_rows, "two_stage": query_rows, "growth": growth_rows}
+ROWS = {"encode": encode_rows, "match": match_rows, "two_stage": query_rows}
 
 
 if __name__ == "__main__":

@@ -165,12 +165,6 @@ def _packet(rng: random.Random, system_id: int, component_id: int = 1) -> bytes:
     return _maker(rng).packet(system_id=system_id, component_id=component_id)
 
 
-def _unknown(rng: random.Random) -> bytes:
-    length = rng.randrange(256)
-    number = rng.randrange(60_000, 2**24).to_bytes(3, "little")
-    return bytes([0xFD, length, 0, 0, rng.randrange(256), OURS, 1]) + number + rng.randbytes(length + 2)
-
-
 def _beat(rng: random.Random, system_id: int) -> bytes:
     message = mavlink.MAVLink_heartbeat_message(rng.randrange(40), rng.randrange(21), 1, 0, 4, 3)
     return message.pack(mavlink.MAVLink(None, system_id, 1))
@@ -183,10 +177,6 @@ def _foreign(rng: random.Random) -> bytes:
 
 # Each kind makes packets that go over our autopilot's own socket and over another one, in turn.
 PACKETS: dict[str, Callable[[random.Random], bytes]] = {
-    "changed": lambda rng: _maker(rng).mutated(_packet(rng, OURS)),
-    "random bytes": lambda rng: rng.randbytes(rng.randrange(1, 400)),
-    "beginnings only": lambda rng: bytes([rng.choice((0xFD, 0xFE)), rng.randrange(256), rng.randrange(2)]),
-    "unknown message numbers": _unknown,
     "any message of other components": lambda rng: _packet(rng, OURS, rng.randrange(2, 256)),
     "any message of other systems": _foreign,
     "heartbeats of other systems": lambda rng: _beat(rng, rng.randrange(2, 256)),

@@ -84,10 +84,6 @@ class Arm:
         paths = os.pathsep.join(map(str, (self.own, self.locked, self.tools)))
         return {**os.environ, "PYTHONPATH": paths, "IMAGEIO_FFMPEG_EXE": self.ffmpeg}
 
-    def edgevpr(self, *arguments: object) -> str:
-        """Run edgevpr under emulation; return what it prints."""
-        return run([str(self.python), "-m", "edgevpr", *map(str, arguments)], self.env).stdout
-
 
 def versions(arm: Arm, qemu: str) -> dict[str, Any]:
     """Return what the emulated system is made of."""

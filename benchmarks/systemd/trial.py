@@ -16,7 +16,7 @@ _BOARD = "rpi-zero-2w"  # its limits of memory and CPU are those of the unit
 
 
 @dataclass(kw_only=True)
-class Row:
+class Outcome:
     """What came of one fault. `told` are the texts that the ground station heard, `again_s` the seconds from the end of
     the fault to the next accepted match (None: it never went away, or never came back); `failed` names what should be
     so and was not."""
@@ -35,11 +35,58 @@ class Row:
             self.failed.append(what)
 
 
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """A fault to try: its title, whether the usual flight is to go on before it, the restarts of the service that it
+    brings about (None: any), and what is done."""
+
+    title: str
+    flies: bool
+    restarts: int | None
+    act: Callable[["Trial", Outcome], None]
+
+
+FAULTS: dict[str, Fault] = {}
+
+
+def fault(title: str, *, flies: bool = True, restarts: int | None = 0) -> Callable[[Callable], Callable]:
+    """Register a function as a fault by its name."""
+
+    def registered(act: Callable[["Trial", Outcome], None]) -> Callable:
+        FAULTS[act.__name__] = Fault(title, flies, restarts, act)
+        return act
+
+    return registered
+
+
 class Trial:
-    """One machine, with its world. All times are of this machine's monotonic clock unless `inside` is in the name."""
+    """One machine, with its world. All times are of this machine's monotonic clock unless `inside` is in the name;
+    `begin_s` and `begin_inside_s` are those at which the fault that is tried begins."""
 
     def __init__(self, machine: Machine, world: World) -> None:
         self.machine, self.world = machine, world
+        self.begin_s = self.begin_inside_s = 0.0
+
+    def tries(self, name: str) -> Outcome:
+        """Try a fault, and find out what comes of it."""
+        of = FAULTS[name]
+        outcome = Outcome(fault=of.title)
+        if of.flies:
+            self.flies()
+        restarts = self.restarts()
+        self.begin_s, self.begin_inside_s = time.monotonic(), self.inside_s()
+        of.act(self, outcome)
+        outcome.told = outcome.told or self.world.ground.told_since(self.begin_s)
+        if of.restarts is not None:
+            outcome.expect(self.restarts() == restarts + of.restarts, f"the service was restarted {of.restarts} times")
+        return outcome
+
+    def matches_since(self, since_s: float) -> list[float]:
+        """Return when accepted matches were told, after a time."""
+        return [each for each in self.world.ground.matches_s if each > since_s]
+
+    def restart(self) -> None:
+        self.run("systemctl restart edgevpr", limit_s=PATIENCE_S)
 
     def run(self, script: str, **more: Any) -> str:
         """Run a shell script in the machine and return what it said."""
@@ -55,10 +102,7 @@ class Trial:
             "board": _BOARD,
             "map": MAP,
             "source": {"uri": f"http://{HOST}:{self.world.camera_port}/", "rate_hz": 1.0},
-            "mavlink": {
-                "link": f"udpout:{HOST}:{self.world.autopilot_port}",
-                "ground": f"udpout:{HOST}:{self.world.ground.port}",
-            },
+            "mavlink": {name: f"udpout:{HOST}:{port}" for name, port in self.world.ports.items()},
             "log": {"path": LOG},
         }
         self.machine.put("/etc/edgevpr/config.yaml", json.dumps(usual | sections).encode())

@@ -98,6 +98,11 @@ class World:
         self.camera: subprocess.Popen | None = None
         self.autopilot: subprocess.Popen | None = None
 
+    @property
+    def ports(self) -> dict[str, int]:
+        """Return the ports of the flight controller and of the ground station, by the keys of the configuration."""
+        return {"link": self.autopilot_port, "ground": self.ground.port}
+
     def start_camera(self) -> None:
         words = _HERE / "camera.py", self.flight / "images", self.camera_port, RATE_HZ
         self.camera = subprocess.Popen([sys.executable, *map(str, words)])

@@ -7,7 +7,6 @@ import hostile_bytes
 import hostile_files
 import hostile_flights
 import hostile_inputs
-import hostile_kills
 import hostile_links
 import hostile_maps
 import hostile_pictures
@@ -80,11 +79,6 @@ def test_exif_data_of_every_kind_ends_and_leaves_the_picture(tmp_path):
         assert tag.heading_deg is None or 0 <= tag.heading_deg < 360
         assert read_image(tmp_path / "a.jpg").shape[2] == 3
     assert positions  # else the generator makes nothing but rubbish
-
-
-def test_nothing_confirmed_is_lost_by_a_kill():
-    for row in hostile_kills.run(2, seed=1):
-        assert (row["lost"], row["doubled"], row["corrupt"]) == (0, 0, 0), row
 
 
 def test_a_flight_behind_a_damaged_stream_sends_no_fix_from_an_old_picture(monkeypatch):

@@ -18,7 +18,7 @@ if lacking := image.lacking():
     pytest.skip(f"no machine can be made here: {lacking}", allow_module_level=True)
 
 from installed import installed_trial  # noqa: E402
-from service_faults import FAULTS  # noqa: E402
+from service_faults import ORDER  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -27,8 +27,8 @@ def trial():
         yield trial
 
 
-@pytest.mark.parametrize("name", FAULTS)
+@pytest.mark.parametrize("name", ORDER)
 def test_a_fault_leaves_what_it_should(trial, name):
-    row = FAULTS[name](trial)
-    assert row.failed == []
-    assert row.does
+    outcome = trial.tries(name)
+    assert outcome.failed == []
+    assert outcome.does
