@@ -27,9 +27,8 @@ from edgevpr.core.types import Salience
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.lab.evaluate import metrics
 from edgevpr.lab.evaluate.dataset import Dataset
-from edgevpr.lab.training import export_matchability
 from edgevpr.lab.training.labels import label_site, walk_over
-from edgevpr.lab.training.matchability import compared, fit, site_of
+from edgevpr.lab.training.matchability import compared, fit, site_of, write_network
 from edgevpr.runtime.recognise.detector import Detector, open_detector
 from edgevpr.runtime.recognise.memorability import Memorability, open_memorability
 from edgevpr.runtime.recognise.salience_gate import Thresholds, worth_of
@@ -104,9 +103,7 @@ def fit_each(names: list[str], models: Path) -> dict[str, dict[str, dict[str, fl
     kind, unseen = compared(sites, _SEED)
     for name in names:
         network = fit(kind, [site for site in sites if site.name not in (name, SAME_SITE.get(name))], _SEED)
-        file = models / f"without_{name}.onnx"
-        export_matchability.write_onnx(network, file)
-        export_matchability.write_card(file.with_suffix(".yaml"), file, f"without {name}", "a benchmark")
+        write_network(network, models / f"without_{name}.onnx", f"without {name}", "a benchmark", sites[0])
     return {each: asdict(found) for each, found in unseen.items()}
 
 
