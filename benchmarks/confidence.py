@@ -24,11 +24,11 @@ import numpy as np
 import walks
 from base import DATA, RESULTS, camera_of
 from confidence_rows import Row, gather, kind_of_match, site_of
+from shipped_model import FittedSite, shipped_model
 
 from edgevpr.frames.images import list_images
 from edgevpr.lab.evaluate.metrics import roc_auc
-from edgevpr.mapmaking.calibrate import LEFT_OUT, MIRRORED, THERE, Answer, adapted
-from edgevpr.mapmaking.prior import Site, shipped_model
+from edgevpr.mapmaking.calibrate import LEFT_OUT, MIRRORED, THERE, MapAnswer, adapted
 from edgevpr.runtime.recognise.confidence import Model, as_json
 from edgevpr.runtime.recognise.evidence import AHEAD, DOWN, DOWN_BARE, kind_of
 from edgevpr.runtime.recognise.follow import Follower
@@ -95,14 +95,14 @@ def _read(path: Path) -> list[Row]:
     return rows
 
 
-def site(rows: Sequence[Row], kind: str, without: str | None = None) -> Site:
+def site(rows: Sequence[Row], kind: str, without: str | None = None) -> FittedSite:
     """Return what a map says of its site, without the queries of `without`. A place beside a right one is right."""
-    return Site(
+    return FittedSite(
         name=rows[0].map,
         own=[(row.evidence, row.right or row.near) for row in rows if row.kind == "own"],
         foreign=[row.evidence for row in rows if row.kind == "foreign" and site_of(row.set) != without],
         answers=[
-            Answer(place_id=0, way=row.kind, right=row.right, evidence=row.evidence)
+            MapAnswer(place_id=0, way=row.kind, right=row.right, evidence=row.evidence)
             for row in rows
             if row.kind in (THERE, LEFT_OUT, MIRRORED)
         ],

@@ -75,7 +75,7 @@ def add(maps: Any) -> None:
 def map_build(args: Namespace) -> int:
     """Make a map of a recording, or continue one."""
     from edgevpr.frames.mask import mask_of
-    from edgevpr.mapmaking.mapping import Gaps, build_map
+    from edgevpr.mapmaking.mapping import Gaps, Preparation, Selection, build_map
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.places.mapfiles import map_path, remove
     from edgevpr.places.mapinfo import info_of
@@ -118,18 +118,16 @@ def map_build(args: Namespace) -> int:
         meter = meter_of(config, here)
         # What is cut lies on the ground already, and no lens has seen it.
         levelling = NoLevelling() if is_cut else levelling_of(config.source, technique, below=True)
+        preparation = Preparation(mask=mask, levelling=levelling)
         try:
             result = build_map(
                 frames,
                 technique,
                 place_map,
                 meter,
+                preparation,
+                Selection(gate=gate, gaps=gaps, min_quality=technique.min_quality if is_cut else 0.0),
                 lambda error: leave_out(error, unusable),
-                mask=mask,
-                gate=gate,
-                gaps=gaps,
-                levelling=levelling,
-                min_quality=technique.min_quality if is_cut else 0.0,
             )
         except EdgevprError:
             if is_new and not len(place_map):  # a full disk: an empty map would only stand in the way of the next try
@@ -142,7 +140,7 @@ def map_build(args: Namespace) -> int:
         if args.calibrate:
             calibrated = calibrating.calibrated_after(
                 technique,
-                lambda: calibrating.calibrated(args, place_map, technique, config.match, meter, mask, levelling),
+                lambda: calibrating.calibrated(args, place_map, technique, config.match, meter, preparation),
             )
     if args.json:
         more = {"refined": asdict(refined)} if refined else {}

@@ -23,10 +23,9 @@ if TYPE_CHECKING:
     from edgevpr.core.config import MatchConfig
     from edgevpr.core.contract import Technique
     from edgevpr.core.types import Frame
-    from edgevpr.frames.mask import AnyMask
+    from edgevpr.mapmaking.mapping import Preparation
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.power.meter import QueryMeter
-    from edgevpr.runtime.recognise.levelling import AnyLevelling
     from edgevpr.runtime.recognise.stored_confidence import Calibration
 
 
@@ -44,6 +43,7 @@ def add(maps: Any) -> None:
 def map_calibrate(args: Namespace) -> int:
     """Calibrate a map, and say what to expect of it."""
     from edgevpr.frames.mask import mask_of
+    from edgevpr.mapmaking.mapping import Preparation
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.power.boards import load_board
     from edgevpr.runtime.recognise.levelling import NoLevelling, levelling_of
@@ -56,7 +56,7 @@ def map_calibrate(args: Namespace) -> int:
         technique = technique_of(place_map)
         levelling = NoLevelling() if args.orthophoto else levelling_of(config.source, technique, below=True)
         meter = meter_of(config, load_board("this"))
-        found = calibrated(args, place_map, technique, config.match, meter, mask, levelling)
+        found = calibrated(args, place_map, technique, config.match, meter, Preparation(mask=mask, levelling=levelling))
     if args.json:
         print_json({"map": args.map, "calibration": found.figures()})
     else:
@@ -83,8 +83,7 @@ def calibrated(
     technique: "Technique",
     config: "MatchConfig",
     meter: "QueryMeter",
-    mask: "AnyMask",
-    levelling: "AnyLevelling",
+    preparation: "Preparation",
 ) -> "Calibration":
     """Calibrate an open map with the pictures that the flags name. Raises UsageError where that cannot be done, and
     where SciPy is missing."""
@@ -99,7 +98,7 @@ def calibrated(
     def pictures(names: Sequence[str]) -> "Iterator[Frame]":
         return _pictures(args, names)
 
-    return calibrate(technique, place_map, config, meter, pictures, watched("calibrating"), mask, levelling)
+    return calibrate(technique, place_map, config, meter, pictures, watched("calibrating"), preparation)
 
 
 def _pictures(args: Namespace, names: Sequence[str]) -> "Iterator[Frame]":

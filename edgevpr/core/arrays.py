@@ -11,13 +11,14 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Array", "Bools", "Bytes", "Covariance", "Doubles", "Floats", "Image", "Ints", "LatLon", "Mask", "Singles"]
-
 Array: TypeAlias = NDArray[Any]
 Floats: TypeAlias = NDArray[np.floating[Any]]
 Singles: TypeAlias = NDArray[np.float32]
 Doubles: TypeAlias = NDArray[np.float64]
 Bools: TypeAlias = NDArray[np.bool_]
+
+# Points and directions on the ground or in a picture: east + i north, or right + i up.
+Complexes: TypeAlias = NDArray[np.complexfloating[Any, Any]]
 
 # Numbers of things: slots of an index, ids of places, regions of a picture.
 Ints: TypeAlias = NDArray[np.integer[Any]]

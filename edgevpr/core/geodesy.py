@@ -1,30 +1,53 @@
 """Distances on the Earth, for flights of some metres to some kilometres."""
 
 import math
+from typing import TypeAlias, overload
 
 import numpy as np
+
+from edgevpr.core.arrays import Doubles, Floats
+
+Degrees: TypeAlias = float | Floats
 
 EARTH_RADIUS_M = 6_371_009.0  # mean radius: over a few kilometres a sphere is within 0.5 % of the ellipsoid
 
 
-def distance_m(lat_deg, lon_deg, other_lat_deg, other_lon_deg):
+@overload
+def distance_m(lat_deg: float, lon_deg: float, other_lat_deg: float, other_lon_deg: float) -> float: ...
+@overload
+def distance_m(lat_deg: Degrees, lon_deg: Degrees, other_lat_deg: Floats, other_lon_deg: Floats) -> Floats: ...
+def distance_m(lat_deg: Degrees, lon_deg: Degrees, other_lat_deg: Degrees, other_lon_deg: Degrees) -> Degrees:
     """Return the metres between points given in degrees (scalars, or arrays that broadcast); NaN stays NaN."""
-    north_m = np.radians(np.subtract(other_lat_deg, lat_deg)) * EARTH_RADIUS_M
-    turn_deg = (np.subtract(other_lon_deg, lon_deg) + 180) % 360 - 180  # the shorter way, also across the date line
+    north_m, turn = _north_m_and_turn(lat_deg, lon_deg, other_lat_deg, other_lon_deg)
     middle_deg = np.add(lat_deg, other_lat_deg) / 2
-    east_m = np.radians(turn_deg) * EARTH_RADIUS_M * np.cos(np.radians(middle_deg))
-    return np.hypot(north_m, east_m)
+    distance: Floats = np.hypot(north_m, turn * EARTH_RADIUS_M * np.cos(np.radians(middle_deg)))
+    return distance
 
 
-def offset_m(lat_deg, lon_deg, other_lat_deg, other_lon_deg):
+@overload
+def offset_m(lat_deg: float, lon_deg: float, other_lat_deg: float, other_lon_deg: float) -> tuple[float, float]: ...
+@overload
+def offset_m(
+    lat_deg: Degrees, lon_deg: Degrees, other_lat_deg: Floats, other_lon_deg: Floats
+) -> tuple[Floats, Floats]: ...
+def offset_m(
+    lat_deg: Degrees, lon_deg: Degrees, other_lat_deg: Degrees, other_lon_deg: Degrees
+) -> tuple[Degrees, Degrees]:
     """Return the metres (east, north) from a point to others (scalars, or arrays that broadcast), on the plane that
     touches the Earth at the point; NaN stays NaN."""
+    north_m, turn = _north_m_and_turn(lat_deg, lon_deg, other_lat_deg, other_lon_deg)
+    return turn * EARTH_RADIUS_M * np.cos(np.radians(lat_deg)), north_m
+
+
+def _north_m_and_turn(
+    lat_deg: Degrees, lon_deg: Degrees, other_lat_deg: Degrees, other_lon_deg: Degrees
+) -> tuple[Floats, Floats]:
     north_m = np.radians(np.subtract(other_lat_deg, lat_deg)) * EARTH_RADIUS_M
-    turn_deg = (np.subtract(other_lon_deg, lon_deg) + 180) % 360 - 180
-    return np.radians(turn_deg) * EARTH_RADIUS_M * np.cos(np.radians(lat_deg)), north_m
+    turn_deg = (np.subtract(other_lon_deg, lon_deg) + 180) % 360 - 180  # the shorter way, also across the date line
+    return north_m, np.radians(turn_deg)
 
 
-def metres(lat_deg: np.ndarray, lon_deg: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def metres(lat_deg: Floats, lon_deg: Floats) -> tuple[Floats, Floats]:
     """Project places (N,), degrees, to metres (east, north) on the plane that touches the Earth at the first known
     place; NaN stays NaN."""
     known = np.flatnonzero(~np.isnan(lat_deg))
@@ -40,7 +63,7 @@ def moved(lat_deg: float, lon_deg: float, east_m: float, north_m: float) -> tupl
     return lat_deg + north_deg, (lon_deg + east_deg + 180) % 360 - 180
 
 
-def axes_of(up_deg: float) -> np.ndarray:
+def axes_of(up_deg: float) -> Doubles:
     """Return the directions on the ground of the right and of the top of a picture, as the columns of a matrix (2, 2):
     east and north of each. The top points to the compass direction `up_deg`."""
     up = math.radians(up_deg)

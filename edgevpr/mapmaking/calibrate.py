@@ -11,9 +11,9 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
-from typing import TypeVar
 
 import numpy as np
+from scipy.optimize import minimize
 
 from edgevpr.core.config import MatchConfig
 from edgevpr.core.contract import Technique
@@ -21,9 +21,9 @@ from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import distance_m
 from edgevpr.core.types import Frame
 from edgevpr.frames.level import Levelled
-from edgevpr.frames.mask import AnyMask, Mask, NoMask, encoded
+from edgevpr.frames.mask import Mask, encoded
 from edgevpr.mapmaking.changes import changed
-from edgevpr.mapmaking.fit import fitted
+from edgevpr.mapmaking.mapping import Preparation, Watch
 from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import elsewhere
@@ -32,12 +32,9 @@ from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.confidence import Evidence, Logistic, Model, prior
 from edgevpr.runtime.recognise.evidence import kind_of, kinds_of
 from edgevpr.runtime.recognise.judge import AcceptRule, Sureness, accept_rule
-from edgevpr.runtime.recognise.levelling import AnyLevelling, NoLevelling
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.stored_confidence import FEWEST_PLACES, Calibration, as_text
 
-T = TypeVar("T")
-Watch = Callable[[Iterable[T], int], Iterable[T]]
 Pictures = Callable[[Sequence[str]], Iterable[Frame]]  # the frames of these names, as far as they are at hand
 
 THERE, LEFT_OUT, MIRRORED = "there", "left out", "mirrored"
@@ -53,7 +50,7 @@ _EVEN = 0.5  # precision at which hardly anything is refused for want of confide
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Answer:
+class MapAnswer:
     """The answer to one question of a map: of which place the picture was, in which `way` it was asked for (THERE,
     LEFT_OUT, MIRRORED), whether the best place was `right`, and its evidence (None: the picture says too little to look
     for it). `refused`: something beside the confidence speaks against the best place."""
@@ -73,11 +70,13 @@ def ask(
     meter: QueryMeter,
     pictures: Iterable[tuple[int, Levelled]],
     seed: int = 0,
-) -> Iterator[Answer]:
+) -> Iterator[MapAnswer]:
     """Ask a map for changed pictures of its own places, in each way. `pictures` are numbers of places with the pictures
     that they were made of, as they were encoded then. A place that is not in the index is left out."""
     rng = np.random.default_rng((_SEED, seed))
-    rule = replace(rule, sure=replace(rule.sure, precision=_EVEN))
+    assert rule.sure is not None  # of a technique that has a confidence
+    sure = replace(rule.sure, precision=_EVEN)
+    rule = replace(rule, sure=sure)
     looks_down = technique.spec.cells is not None
     near_m = max(rule.neighbour_m, place_map.footprint_m() or index.spacing_m() or 0.0)
     slots = {int(place_id): slot for slot, place_id in enumerate(index.place_ids)}
@@ -104,15 +103,15 @@ def ask(
                 mask=None if shown is None else Mask(shown, sha256=""),
             )
             event = walk.step(Frame(image=image, name=f"place {place_id}", t_mono_s=0.0))
-            if event.evidence is None:
-                yield Answer(place_id=place_id, way=way, right=False, evidence=None)
+            if event.evidence is None or event.best is None or event.confidence is None:
+                yield MapAnswer(place_id=place_id, way=way, right=False, evidence=None)
                 continue
             best = int(np.flatnonzero(index.place_ids == event.best.place.place_id)[0])
             right = way == THERE and not elsewhere(index, slot, np.array([best]), near_m)[0]
             if way == THERE and not right and may_be_same[best] and not np.isnan(index.lat_deg[best]):
                 continue  # their pictures may overlap: nobody knows whether it is right
-            refused = not event.accepted and event.confidence >= rule.sure.threshold(event.evidence)
-            yield Answer(place_id=place_id, way=way, right=bool(right), evidence=event.evidence, refused=refused)
+            refused = not event.accepted and event.confidence >= sure.threshold(event.evidence)
+            yield MapAnswer(place_id=place_id, way=way, right=bool(right), evidence=event.evidence, refused=refused)
 
 
 def calibrate(
@@ -121,14 +120,12 @@ def calibrate(
     config: MatchConfig,
     meter: QueryMeter,
     pictures: Pictures,
-    watch: Watch,
-    mask: AnyMask | None = None,
-    levelling: AnyLevelling | None = None,
+    watch: Watch[Frame],
+    preparation: Preparation | None = None,
 ) -> Calibration:
-    """Calibrate a map that is open for adding, and record it there. `mask` and `levelling` are those that the map was
-    made with. Raises UsageError where the technique is judged by its limits, the map has too few places, or too few of
-    their pictures are at hand: the shipped model is then used. Raises MapError for a file that cannot be read or
-    written.
+    """Calibrate a map that is open for adding, and record it there. `preparation` is that which the map was made with.
+    Raises UsageError where the technique is judged by its limits, the map has too few places, or too few of their
+    pictures are at hand: the shipped model is then used. Raises MapError for a file that cannot be read or written.
     """
     kinds = kinds_of(technique.spec)
     if not kinds:
@@ -147,37 +144,17 @@ def calibrate(
             f"{place_map.path}: its places have no positions, so nobody knows which of them show the same ground: the "
             "shipped confidence is used."
         )
-    mask, levelling = mask or NoMask(), levelling or NoLevelling()
-    ids = {name: found for (name,), found in place_map.ids_by("source_image").items() if isinstance(name, str)}
-    names = sorted(ids)
-    names = [names[at] for at in np.random.default_rng(_SEED).permutation(len(names)).tolist()]
-
-    count = asked_of(technique)
-
-    def asked() -> Iterator[Frame]:
-        for done in range(0, count, len(names)):
-            yield from pictures(names[: count - done])
-
-    def as_mapped() -> Iterator[tuple[int, Levelled]]:
-        """Yield what is really the picture of a place: another folder may have the same names."""
-        for frame in watch(asked(), count):
-            picture = levelling.prepare(frame, None, mask.fitted(frame.image))
-            coarse = encoded(technique, picture.image, picture.mask).coarse
-            found = (each for each in ids.get(readable(frame.name), ()) if place_map.is_of(each, coarse))
-            if (place_id := next(found, None)) is not None:
-                yield place_id, picture
-
-    rule = accept_rule(technique, config)
-    answers = list(ask(technique, place_map, index, rule, meter, as_mapped()))
-    at_hand = len({each.place_id for each in answers})
+    as_mapped = _as_mapped(technique, place_map, pictures, watch, preparation or Preparation())
+    answers = list(ask(technique, place_map, index, accept_rule(technique, config), meter, as_mapped))
+    at_hand = len({answer.place_id for answer in answers})
     if at_hand < FEWEST_PLACES:
         raise UsageError(
             f"Of {place_map.path} the pictures of {at_hand} places are at hand, and those of {FEWEST_PLACES} are "
             "needed: give the pictures that it was made of, with the same camera and mask."
         )
-    found = _calibration(answers, kinds, config.accept_precision)
-    place_map.record_calibration(as_text(found))
-    return found
+    calibration = _calibration(answers, kinds, config.accept_precision)
+    place_map.record_calibration(as_text(calibration))
+    return calibration
 
 
 def asked_of(technique: Technique) -> int:
@@ -185,74 +162,113 @@ def asked_of(technique: Technique) -> int:
     return ASKED_AHEAD if technique.spec.cells is None else ASKED_DOWN
 
 
-def _calibration(answers: Sequence[Answer], kinds: Sequence[str], precision: float) -> Calibration:
+def _as_mapped(
+    technique: Technique, place_map: PlaceMap, pictures: Pictures, watch: Watch[Frame], preparation: Preparation
+) -> Iterator[tuple[int, Levelled]]:
+    """Yield places with what is really their picture: another folder may have the same names."""
+    ids_by_image = {name: ids for (name,), ids in place_map.ids_by("source_image").items() if isinstance(name, str)}
+    names = sorted(ids_by_image)
+    names = [names[at] for at in np.random.default_rng(_SEED).permutation(len(names)).tolist()]
+    count = asked_of(technique)
+    frames = (frame for done in range(0, count, len(names)) for frame in pictures(names[: count - done]))
+    for frame in watch(frames, count):
+        picture = preparation.levelling.prepare(frame, None, preparation.mask.fitted(frame.image))
+        coarse = encoded(technique, picture.image, picture.mask).coarse
+        of_name = ids_by_image.get(readable(frame.name), ())
+        if (place_id := next((at for at in of_name if place_map.is_of(at, coarse)), None)) is not None:
+            yield place_id, picture
+
+
+def _calibration(answers: Sequence[MapAnswer], kinds: Sequence[str], precision: float) -> Calibration:
     """Fit the model of the kind of evidence that most answers have, and count what it accepts."""
-    counts = Counter(kind_of(each.evidence) for each in answers if each.evidence)
-    kind = max(kinds, key=lambda each: counts[each])
-    mine = [each for each in answers if each.evidence and kind_of(each.evidence) == kind]
-    model = adapted(prior(kind), mine, f"{len(mine)} answers of the map itself")
+    counts = Counter(kind_of(answer.evidence) for answer in answers if answer.evidence)
+    kind = max(kinds, key=lambda kind: counts[kind])
+    of_kind = [answer for answer in answers if answer.evidence and kind_of(answer.evidence) == kind]
+    model = adapted(prior(kind), of_kind, f"{len(of_kind)} answers of the map itself")
     sure = Sureness({each: prior(each) for each in kinds} | {kind: model}, precision)
-
-    def is_accepted(answer: Answer) -> bool:
-        return (
-            answer.evidence is not None
-            and not answer.refused
-            and sure.confidence(answer.evidence) >= sure.threshold(answer.evidence)
-        )
-
-    accepted = [each for each in answers if is_accepted(each)]
-    asked = sum(each.way == THERE for each in answers)
+    accepted = [
+        answer
+        for answer in answers
+        if (seen := answer.evidence) and not answer.refused and sure.confidence(seen) >= sure.threshold(seen)
+    ]
+    asked = sum(answer.way == THERE for answer in answers)
     return Calibration(
         models={kind: model},
         made=date.today().isoformat(),
         asked=asked,
         precision=precision,
-        accepted=sum(each.way == THERE for each in accepted) / asked,
-        accepted_wrong=sum(not each.right for each in accepted),
+        accepted=sum(answer.way == THERE for answer in accepted) / asked,
+        accepted_wrong=sum(not answer.right for answer in accepted),
         recognisable=_by_place(answers, sure),
     )
 
 
-def _by_place(answers: Sequence[Answer], sure: Sureness) -> dict[int, float]:
+def _by_place(answers: Sequence[MapAnswer], sure: Sureness) -> dict[int, float]:
     """Return the mean confidence of each place that was asked for. A match that is wrong or refused counts as 0."""
     of_place: dict[int, list[float]] = {}
     for answer in answers:
         if answer.way == THERE:
-            confidence = sure.confidence(answer.evidence) if answer.right and not answer.refused else 0.0
-            of_place.setdefault(answer.place_id, []).append(confidence)
-    return {place_id: round(float(np.mean(each)), 4) for place_id, each in sorted(of_place.items())}
+            seen = answer.evidence if answer.right and not answer.refused else None
+            of_place.setdefault(answer.place_id, []).append(sure.confidence(seen) if seen else 0.0)
+    return {place_id: round(float(np.mean(values)), 4) for place_id, values in sorted(of_place.items())}
 
 
-def adapted(model: Model, answers: Iterable[Answer], made_of: str) -> Model:
-    """Return a model for the map that gave these answers, which all have evidence."""
-    answers = list(answers)
-    right = [each for each in answers if each.right]
-    nowhere = [each for each in answers if each.way == MIRRORED]
-    of_map = _adapted(model.of_map, right, nowhere, 1.0, _PULL_OF_MAP)
-    wrong = [each for each in answers if each.way == THERE and not each.right]
-    left_out = [each for each in answers if each.way == LEFT_OUT]
-    of_place = _adapted(model.of_place, right + wrong, left_out, _LEFT_OUT_COUNTS, _PULL_OF_PLACE)
-    scale = model.adapted_scale or model.scale
-    today = date.today().isoformat()
-    return Model(of_map=of_map, of_place=of_place, scale=scale, made=today, made_of=made_of)
+def adapted(model: Model, answers: Iterable[MapAnswer], made_of: str) -> Model:
+    """Return a model for the map that gave these answers; those without evidence say nothing."""
+    answers = [answer for answer in answers if answer.evidence]
+    right = [answer for answer in answers if answer.right]
+    nowhere = [answer for answer in answers if answer.way == MIRRORED]
+    wrong = [answer for answer in answers if answer.way == THERE and not answer.right]
+    left_out = [answer for answer in answers if answer.way == LEFT_OUT]
+    return Model(
+        of_map=_adapted(model.of_map, right, nowhere, 1.0, _PULL_OF_MAP),
+        of_place=_adapted(model.of_place, right + wrong, left_out, _LEFT_OUT_COUNTS, _PULL_OF_PLACE),
+        scale=model.adapted_scale or model.scale,
+        made=date.today().isoformat(),
+        made_of=made_of,
+    )
 
 
 def _adapted(
-    start: Logistic, found: Sequence[Answer], beside: Sequence[Answer], counts: float, pull: float
+    start: Logistic, found: Sequence[MapAnswer], beside: Sequence[MapAnswer], counts: float, pull: float
 ) -> Logistic:
     answers = [*found, *beside]
-    if all(each.right for each in answers):  # they say nothing of how a wrong one could be told
+    if all(answer.right for answer in answers):  # they say nothing of how a wrong one could be told
         return start
-    right = np.array([each.right for each in answers], bool)
+    right = np.array([answer.right for answer in answers], bool)
     weights = np.repeat([1.0, counts], [len(found), len(beside)])
-    return fitted(start, [each.evidence for each in answers], right, weights, pull)
+    return fitted(start, [answer.evidence for answer in answers if answer.evidence], right, weights, pull)
+
+
+def fitted(start: Logistic, rows: Sequence[Evidence], right: np.ndarray, weights: np.ndarray, pull: float) -> Logistic:
+    """Fit a logistic regression to rows that are `right` or not, bool (N,), with `weights` float (N,).
+
+    The most probable one, where weights times scales are expected around those of `start` with the variance 1 / `pull`
+    (a Gaussian prior; the bias is free). With few rows it stays at `start`.
+    """
+    scales, mine = np.array(start.scales), evidence_matrix(rows, start.names) / np.array(start.scales)
+    middle = np.array(start.weights) * scales
+    sign = np.where(right, 1.0, -1.0)
+
+    def cost(at: np.ndarray) -> tuple[float, np.ndarray]:
+        logit = mine @ at[:-1] + at[-1]
+        off = at[:-1] - middle
+        loss = weights @ np.logaddexp(0, -sign * logit) + pull / 2 * off @ off
+        slope = -weights * sign * np.exp(-np.logaddexp(0, sign * logit))
+        return float(loss), np.append(mine.T @ slope + pull * off, slope.sum())
+
+    found = minimize(cost, np.append(middle, start.bias), jac=True, method="L-BFGS-B").x
+    return Logistic(start.names, tuple((found[:-1] / scales).tolist()), start.scales, float(found[-1]))
+
+
+def evidence_matrix(rows: Sequence[Evidence], names: Sequence[str]) -> np.ndarray:
+    """Return evidence as a matrix, float64 (N, F)."""
+    return np.array([[row[name] for name in names] for row in rows], float).reshape(len(rows), len(names))
 
 
 def _mirrored(picture: Levelled) -> Levelled:
-    image, mask = (
-        None if each is None else np.ascontiguousarray(each[:, ::-1]) for each in (picture.image, picture.mask)
-    )
-    return Levelled(image, mask, picture.view)
+    mask = None if picture.mask is None else np.ascontiguousarray(picture.mask[:, ::-1])
+    return Levelled(np.ascontiguousarray(picture.image[:, ::-1]), mask, picture.view)
 
 
 def _same_ground(index: PlaceIndex, slot: int, near_m: float) -> np.ndarray:

@@ -1,8 +1,14 @@
-"""Making places: every frame is encoded, and is on the disk before the next one is taken."""
+"""Making places: every frame is encoded, and is on the disk before the next one is taken.
+
+Where no frame is memorable for long, the best of them are kept all the same (thesis 3.4.8). A frame that does not pass
+waits. When there would be no place for `most_frames` frames, or for `most_m` metres of the way, all thresholds are
+lowered in steps of 0.03 until some of those that wait pass; these become places of low quality.
+"""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -10,19 +16,21 @@ from edgevpr.core.contract import Technique
 from edgevpr.core.errors import ImageError, ModelError
 from edgevpr.core.geodesy import distance_m
 from edgevpr.core.types import Frame, Position, Salience
-from edgevpr.frames.mask import AnyMask
+from edgevpr.frames.mask import AnyMask, NoMask
 from edgevpr.places.index import empty_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.rows import readable
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.gate import says_nothing
 from edgevpr.runtime.recognise.judge import ACCEPT_NOTHING
-from edgevpr.runtime.recognise.levelling import AnyLevelling, laid
+from edgevpr.runtime.recognise.levelling import AnyLevelling, NoLevelling, laid
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.runtime.recognise.salience_gate import GAP_FRAMES, Gate, NoGate, best_of
 
 _NO_PIXELS = np.empty((0, 0), np.uint8)
+T = TypeVar("T")
+Watch = Callable[[Iterable[T], int], Iterable[T]]  # passes items through, so many of them, and shows the progress
 Kept = tuple[Recognition, Salience | None]
 
 
@@ -56,10 +64,9 @@ class Gaps:
 
     def _best_waiting(self) -> Iterator[Kept]:
         """Yield the best of those that wait; those after the last of them wait on."""
-        best = best_of([event.worth.short_by for event in self._waiting])
-        last = max(number for number, is_best in enumerate(best) if is_best)
+        best = best_of([event.worth.short_by for event in self._waiting if event.worth])
         chosen = [event for event, is_best in zip(self._waiting, best, strict=True) if is_best]
-        self._waiting = self._waiting[last + 1 :]
+        self._waiting = self._waiting[max(np.flatnonzero(best)) + 1 :]
         for event in chosen:
             yield self._kept(event), replace(event.worth.salience, is_low=True)
 
@@ -71,6 +78,25 @@ class Gaps:
         if self._most_m is None or position is None or self._last is None:
             return False
         return distance_m(self._last.lat_deg, self._last.lon_deg, position.lat_deg, position.lon_deg) > self._most_m
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Preparation:
+    """What is done to every picture of a map before it is encoded: `mask` leaves parts of it out, and `levelling` lays
+    it on the ground."""
+
+    mask: AnyMask = field(default_factory=NoMask)
+    levelling: AnyLevelling = field(default_factory=NoLevelling)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Selection:
+    """Which frames become places: those whose quality is at least `min_quality` and that pass the `gate` (None: all
+    do), and of those that do not pass it the ones that `gaps` keeps."""
+
+    gate: Gate | NoGate | None = None
+    gaps: Gaps = field(default_factory=Gaps)
+    min_quality: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -91,70 +117,61 @@ def build_map(
     technique: Technique,
     place_map: PlaceMap,
     meter: QueryMeter,
+    preparation: Preparation | None = None,
+    selection: Selection | None = None,
     unusable: Callable[[ImageError], None] | None = None,
-    mask: AnyMask | None = None,
-    gate: Gate | NoGate | None = None,
-    gaps: Gaps | None = None,
-    levelling: AnyLevelling | None = None,
-    min_quality: float = 0.0,
 ) -> MappingResult:
     """Add a place for every frame that is not in the map yet, so that an interrupted map can be continued.
 
     A frame goes through the steps of a query, with no place to find. It is in the map already if a place has the same
     name and nearly the same descriptor; the name alone does not tell, since cameras restart their numbering. A frame
-    that cannot be encoded is handed to `unusable` and left out; with `unusable` None it raises ModelError. `mask`
-    leaves parts of every frame out, and `levelling` lays each on the ground. Frames whose quality is below
-    `min_quality` are left out, and so are those that do not pass the `gate`, but for those that `gaps` keeps.
+    that cannot be encoded is handed to `unusable` and left out; with `unusable` None it raises ModelError.
     """
     place_map.require(technique.spec)
-    nothing = empty_index(technique.spec, 0, None)
+    preparation, selection = preparation or Preparation(), selection or Selection()
     walk = Recogniser(
         technique=technique,
         place_map=place_map,
-        index=nothing,
+        index=empty_index(technique.spec, 0, None),
         rule=ACCEPT_NOTHING,
         meter=meter,
-        mask=mask,
-        gate=gate,
-        levelling=levelling,
+        mask=preparation.mask,
+        gate=selection.gate,
+        levelling=preparation.levelling,
     )
-    gaps = gaps or Gaps()
-    here = place_map.ids_by("source_image")
-    added = without_position = already_here = of_low_quality = silent = 0
+    ids_by_image = place_map.ids_by("source_image")
+    counts: Counter[str] = Counter()
     not_memorable: Counter[str] = Counter()
 
     def keep(kept: Iterable[Kept]) -> None:
-        nonlocal added, without_position, of_low_quality
         for event, salience in kept:
             place_map.add(laid(event.frame, event.view), event.descriptor, salience, walk.landmarks(event))
-            added += 1
-            without_position += event.frame.position is None
+            counts["added"] += 1
+            counts["without_position"] += event.frame.position is None
             if salience and salience.is_low:
-                of_low_quality += 1
+                counts["of_low_quality"] += 1
                 not_memorable[event.worth.lacks] -= 1
 
     for frame in frames:
-        seen = walk.step(frame)
-        if seen.failed:
+        event = walk.step(frame)
+        if event.failed:
             if unusable is None:
-                raise ModelError(seen.reason)
-            unusable(ImageError(f"{frame.name}: {seen.reason}"))
-            continue
-        if says_nothing(seen.descriptor, min_quality):
-            silent += 1
-            continue
-        if any(place_map.is_of(place_id, seen.descriptor.coarse) for place_id in here.get((readable(frame.name),), ())):
-            already_here += 1
-            continue
-        if seen.worth and seen.worth.lacks:
-            not_memorable[seen.worth.lacks] += 1
-        keep(gaps.take(seen))
-    keep(gaps.end())
+                raise ModelError(event.reason)
+            unusable(ImageError(f"{frame.name}: {event.reason}"))
+        elif says_nothing(event.descriptor, selection.min_quality):
+            counts["says_nothing"] += 1
+        elif any(place_map.is_of(at, event.descriptor.coarse) for at in ids_by_image.get((readable(frame.name),), ())):
+            counts["already_here"] += 1
+        else:
+            if event.worth and event.worth.lacks:
+                not_memorable[event.worth.lacks] += 1
+            keep(selection.gaps.take(event))
+    keep(selection.gaps.end())
     return MappingResult(
-        added=added,
-        without_position=without_position,
-        already_here=already_here,
-        of_low_quality=of_low_quality,
-        says_nothing=silent,
+        added=counts["added"],
+        without_position=counts["without_position"],
+        already_here=counts["already_here"],
+        of_low_quality=counts["of_low_quality"],
+        says_nothing=counts["says_nothing"],
         not_memorable=dict(+not_memorable),
     )

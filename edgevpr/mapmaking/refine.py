@@ -5,25 +5,23 @@ mounted askew, a missing compass or a lens that nobody has measured are no obsta
 is tied to too few others stays where it was recorded, without a pose.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
+from edgevpr.core.arrays import Bools, Complexes, Floats
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import MapError, PlaceError
 from edgevpr.core.geodesy import metres, moved
 from edgevpr.core.types import Place, Pose, Position
 from edgevpr.mapmaking.graph import Solved, solve
+from edgevpr.mapmaking.mapping import Watch
 from edgevpr.mapmaking.tying import likely_pairs, looker, overlapping_pairs, pictures, tied, ties_of
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.sqlite import sentences
-
-T = TypeVar("T")
-Watch = Callable[[Iterable[T], int], Iterable[T]]
 
 _LEAST_GROUP = 4  # places tied to each other: three positions fit any error of the scale too well
 _MOST_TURN = 0.15  # standard deviation of a log: 9 degrees, 15 % of the footprint
@@ -58,7 +56,9 @@ class Refined:
         return self.places - self.without_position - self.surveyed - self.refined
 
 
-def refine(place_map: PlaceMap, technique: Technique, watch: Watch, images: str | Path | None = None) -> Refined:
+def refine(
+    place_map: PlaceMap, technique: Technique, watch: Watch[tuple[int, int]], images: str | Path | None = None
+) -> Refined:
     """Refine a map that is open for adding: all of it, or nothing is changed. `watch` passes pairs through and shows
     progress. `images` is the folder of the pictures that the map was made of, where they are at hand. Raises MapError
     for a map of an older format, and where the file cannot be read or written.
@@ -71,33 +71,33 @@ def refine(place_map: PlaceMap, technique: Technique, watch: Watch, images: str 
     places = list(_readable(place_map))
     placed = [place for place in places if place.position]
     surveyed = np.array([bool(place.pose and place.pose.is_surveyed) for place in placed], bool)
-    counts = {
-        "places": len(places),
-        "without_position": len(places) - len(placed),
-        "surveyed": int(surveyed.sum()),
-    }
-    was = [place.pose.recorded if place.pose and place.pose.recorded else place.position for place in placed]
+    result = Refined(
+        places=len(places), without_position=len(places) - len(placed), surveyed=int(surveyed.sum()), refined=0, ties=0,
+        ties_refused=0,
+    )  # fmt: skip
     if not placed or surveyed.all():
-        return Refined(**counts, refined=0, ties=0, ties_refused=0)
-    origin, recorded = was[0], complex_metres(was)
-    known_sd_m = np.array([_sd_m(place) if of else np.nan for place, of in zip(placed, surveyed, strict=True)])
-    known_log = np.array([log_of(place.pose) if of else np.nan for place, of in zip(placed, surveyed, strict=True)])
+        return result
+    recorded_at = [_recorded(place) for place in placed]
+    recorded = complex_metres(recorded_at)
+    poses = [place.pose if place.pose and place.pose.is_surveyed else None for place in placed]
+    known_sd_m = np.array([np.nan if pose is None else _sd_m(pose) for pose in poses])
+    known_log = np.array([np.nan if pose is None else log_of(pose) for pose in poses])
     look = looker(place_map, technique, placed, pictures(images, technique) if images else None)
     pairs = likely_pairs(recorded)
-    found = tied(watch(pairs, len(pairs)), look)
-    solved = solve(recorded, known_sd_m, ties_of(found), known_log)
+    ties = tied(watch(pairs, len(pairs)), look)
+    solved = solve(recorded, known_sd_m, ties_of(ties), known_log)
     more = sorted(set(overlapping_pairs(solved.position, solved.log, _is_sure(solved))) - set(pairs))
     if more:
-        found |= tied(watch(more, len(more)), look)
-        solved = solve(recorded, known_sd_m, ties_of(found), known_log)
+        ties |= tied(watch(more, len(more)), look)
+        solved = solve(recorded, known_sd_m, ties_of(ties), known_log)
     sure = _is_sure(solved) & ~surveyed
     # A place that is not tied goes back to where it was recorded, but for one whose pose is not by refining.
     by_refining = np.array([place.pose is None or place.pose.recorded is not None for place in placed], bool)
-    _write(place_map, placed, was, origin, solved, sure, sure | by_refining)
+    _write(place_map, placed, recorded_at, solved, sure, sure | by_refining)
     off_m = abs(solved.position - recorded)
     amiss = sure & ~solved.recorded_counts & (off_m > _AMISS * solved.recorded_sd_m)
-    return Refined(
-        **counts,
+    return replace(
+        result,
         refined=int(sure.sum()),
         ties=int(solved.ties_count.sum()),
         ties_refused=int((~solved.ties_count).sum()),
@@ -111,26 +111,34 @@ def refine(place_map: PlaceMap, technique: Technique, watch: Watch, images: str 
     )
 
 
-def complex_metres(positions: list[Position]) -> np.ndarray:
+def complex_metres(positions: Sequence[Position]) -> Complexes:
     """Return positions as complex (N,), east + i north in metres from the first of them."""
-    lat_deg, lon_deg = np.array([(each.lat_deg, each.lon_deg) for each in positions]).T
+    lat_deg, lon_deg = np.array([(position.lat_deg, position.lon_deg) for position in positions]).T
     east_m, north_m = metres(lat_deg, lon_deg)
     return east_m + 1j * north_m
 
 
 def log_of(pose: Pose) -> complex:
     """Return the log of a pose (see `graph`)."""
-    return np.log(pose.footprint_m) - 1j * np.radians(pose.up_deg)
+    return complex(np.log(pose.footprint_m) - 1j * np.radians(pose.up_deg))
 
 
-def _is_sure(solved: Solved) -> np.ndarray:
+def _recorded(place: Place) -> Position:
+    """Return the position of a place as it was before any refining."""
+    position = place.pose.recorded if place.pose and place.pose.recorded else place.position
+    assert position is not None  # of a place that has one
+    return position
+
+
+def _is_sure(solved: Solved) -> Bools:
     """Tell which places are tied to enough others, and lie as exactly as a pose should, bool (N,)."""
     members = np.bincount(solved.component)[solved.component]
-    return (members >= _LEAST_GROUP) & (solved.log_var / 2 <= _MOST_TURN**2)
+    is_sure: Bools = (members >= _LEAST_GROUP) & (solved.log_var / 2 <= _MOST_TURN**2)
+    return is_sure
 
 
-def _sd_m(place: Place) -> float:
-    var_east, _, var_north = place.pose.covariance_m2
+def _sd_m(pose: Pose) -> float:
+    var_east, _, var_north = pose.covariance_m2
     return float(np.sqrt((var_east + var_north) / 2))
 
 
@@ -143,29 +151,27 @@ def _readable(place_map: PlaceMap) -> Iterator[Place]:
 def _write(
     place_map: PlaceMap,
     placed: list[Place],
-    was: list[Position],
-    origin: Position,
+    recorded_at: list[Position],
     solved: Solved,
-    sure: np.ndarray,
-    may_change: np.ndarray,
+    sure: Bools,
+    may_change: Bools,
 ) -> None:
+    """Write the solution: a pose for each place that is `sure`, none for the others that `may_change`."""
+    origin = recorded_at[0]
     with sentences(place_map.path), place_map.transaction():
         for at in np.flatnonzero(may_change).tolist():
-            position, pose = was[at], None
+            position, pose = recorded_at[at], None
             if sure[at]:
-                var_m2 = float(solved.position_var[at]) / 2
-                lat_deg, lon_deg = moved(
-                    origin.lat_deg, origin.lon_deg, solved.position[at].real, solved.position[at].imag
-                )
-                position = Position(lat_deg, lon_deg)
+                var_m2, offset_m = float(solved.position_var[at]) / 2, solved.position[at]
+                position = Position(*moved(origin.lat_deg, origin.lon_deg, offset_m.real, offset_m.imag))
                 pose = Pose(
                     up_deg=float(-np.degrees(solved.log[at].imag)) % 360,
                     footprint_m=float(np.exp(solved.log[at].real)),
                     covariance_m2=(var_m2, 0.0, var_m2),
-                    recorded=was[at],
+                    recorded=recorded_at[at],
                 )
             place_map.lay(placed[at].place_id, position, pose)
 
 
-def _median(values: np.ndarray) -> float | None:
+def _median(values: Floats) -> float | None:
     return float(np.median(values)) if len(values) else None

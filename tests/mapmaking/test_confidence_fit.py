@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from edgevpr.mapmaking.fit import fitted, nothing_known
+from edgevpr.mapmaking.calibrate import fitted
+from edgevpr.runtime.recognise.confidence import Logistic
 
-START = nothing_known(("a", "b"), (1.0, 2.0))
+START = Logistic(("a", "b"), (0.0, 0.0), (1.0, 2.0), 0.0)
 
 
 def rows_of(count, seed=1):

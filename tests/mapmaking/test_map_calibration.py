@@ -15,7 +15,7 @@ from edgevpr.frames.level import UNKNOWN_VIEW, Lens, Levelled
 from edgevpr.frames.mask import Mask
 from edgevpr.mapmaking import calibrate as calibrating
 from edgevpr.mapmaking.calibrate import LEFT_OUT, MIRRORED, THERE, ask, calibrate
-from edgevpr.mapmaking.mapping import build_map
+from edgevpr.mapmaking.mapping import Preparation, build_map
 from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
@@ -142,11 +142,11 @@ def test_the_mask_of_the_map_holds_for_its_pictures(tmp_path):
     allowed[:60] = allowed[190:] = False
     mask = Mask(allowed, sha256="display")
     with PlaceMap.create(tmp_path / "m.gpkg", AHEAD.spec) as place_map:
-        build_map(map(frame, range(PLACES)), AHEAD, place_map, meter(), mask=mask)
+        build_map(map(frame, range(PLACES)), AHEAD, place_map, meter(), Preparation(mask=mask))
         pictures, _ = at_hand(*map(frame, range(PLACES)))
         with pytest.raises(UsageError, match="with the same camera and mask"):
             calibrated(place_map, pictures)
-        assert calibrated(place_map, pictures, mask=mask).asked == 2 * PLACES
+        assert calibrated(place_map, pictures, preparation=Preparation(mask=mask)).asked == 2 * PLACES
 
 
 def test_pictures_are_levelled_as_those_of_the_map(tmp_path, monkeypatch):
@@ -158,10 +158,10 @@ def test_pictures_are_levelled_as_those_of_the_map(tmp_path, monkeypatch):
         return Levelling(Lens(60.0), below=True, is_live=False)
 
     with PlaceMap.create(tmp_path / "m.gpkg", down.spec) as place_map:
-        build_map(tilted, down, place_map, meter(), levelling=levelling())
+        build_map(tilted, down, place_map, meter(), Preparation(levelling=levelling()))
         with pytest.raises(UsageError, match="pictures of 0 places are at hand"):
             calibrated(place_map, at_hand(*tilted)[0], down)
-        found = calibrated(place_map, at_hand(*tilted)[0], down, levelling=levelling())
+        found = calibrated(place_map, at_hand(*tilted)[0], down, preparation=Preparation(levelling=levelling()))
     assert (found.asked, len(found.recognisable)) == (PLACES, PLACES)
 
 

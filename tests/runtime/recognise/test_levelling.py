@@ -15,7 +15,7 @@ from edgevpr.core.types import Frame, Position
 from edgevpr.frames.level import UNKNOWN_VIEW, Lens, View
 from edgevpr.frames.mask import Mask
 from edgevpr.lab.simulate.camera import Camera, Light, Pose, ground_to_pixel, photograph
-from edgevpr.mapmaking.mapping import build_map
+from edgevpr.mapmaking.mapping import Preparation, build_map
 from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
@@ -71,7 +71,9 @@ def place_map(ground, technique, tmp_path_factory):
     frames = [frame(ground, place, **pose) for place, pose in enumerate(poses)]
     levelling = Levelling(LENS, below=True, is_live=False)
     with PlaceMap.create(path, technique.spec) as made:
-        build_map(frames, technique, made, meter_of(load_config(None), load_board("this")), levelling=levelling)
+        build_map(
+            frames, technique, made, meter_of(load_config(None), load_board("this")), Preparation(levelling=levelling)
+        )
     with PlaceMap.open(path) as opened:
         yield opened
 

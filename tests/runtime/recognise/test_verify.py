@@ -16,7 +16,7 @@ from sureness import landmarks_count, sure_rule
 
 from edgevpr.core.types import Frame, Position
 from edgevpr.frames.mask import Mask
-from edgevpr.mapmaking.mapping import build_map
+from edgevpr.mapmaking.mapping import Preparation, build_map
 from edgevpr.places.growing import GrowingIndex
 from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
@@ -248,7 +248,7 @@ def test_the_mask_holds_for_landmarks_too(whole, technique, tmp_path):
     allowed = np.ones((240, 320), bool)
     allowed[:, :160] = False
     with PlaceMap.create(tmp_path / "half.gpkg", technique.spec) as place_map:
-        build_map([frame(1)], technique, place_map, meter(), mask=Mask(allowed, "half"))
+        build_map([frame(1)], technique, place_map, meter(), Preparation(mask=Mask(allowed, "half")))
         there = unpacked(place_map.landmarks_of(1))
     assert len(there) > 30
     assert there.points[:, 0].min() > 0

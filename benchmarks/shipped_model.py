@@ -1,4 +1,4 @@
-"""The shipped model of confidence, fitted to the matches of many sites."""
+"""The shipped model of confidence, fitted to the matches of many sites: what benchmarks/confidence.py writes."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -7,8 +7,7 @@ from datetime import date
 
 import numpy as np
 
-from edgevpr.mapmaking.calibrate import Answer, adapted
-from edgevpr.mapmaking.fit import fitted, matrix, nothing_known, tail_of
+from edgevpr.mapmaking.calibrate import MapAnswer, adapted, evidence_matrix, fitted
 from edgevpr.runtime.recognise.confidence import Evidence, Logistic, Model, Scale, Tail
 from edgevpr.runtime.recognise.evidence import OF_MAP, OF_PLACE
 
@@ -17,20 +16,22 @@ _PULL = 0.3
 _TAIL_OFF_MAP, _TAIL_OFF_PLACE = 0.02, 0.1
 _FEWEST_WRONG = 20
 _EACH = 100.0  # the weight of the right, and of the wrong, matches of a map
+_FEWEST_IN_TAIL = 5
+_LEAST_SCALE = 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Site:
+class FittedSite:
     """Evidence of one site, by its map: that of real queries, and the `answers` to changed pictures of its own.
     `own` are queries of the site with whether their match is right, `foreign` queries of other sites."""
 
     name: str
     own: Sequence[tuple[Evidence, bool]]
     foreign: Sequence[Evidence]
-    answers: Sequence[Answer]
+    answers: Sequence[MapAnswer]
 
 
-def shipped_model(kind: str, sites: Sequence[Site], made_of: str) -> Model:
+def shipped_model(kind: str, sites: Sequence[FittedSite], made_of: str) -> Model:
     """Fit the model of one kind of evidence to these sites, each as important as any other."""
     of_map = _regression(
         OF_MAP[kind],
@@ -63,11 +64,11 @@ def _regression(names: Sequence[str], groups: Iterable[tuple[Sequence[Evidence],
     rows = [row for group, _ in groups for row in group]
     right = np.concatenate([np.full(len(group), each) for group, each in groups])
     weights = np.concatenate([np.full(len(group), _EACH / len(group)) for group, _ in groups])
-    scales = np.maximum(matrix(rows, names).std(0), 1e-3)
+    scales = np.maximum(evidence_matrix(rows, names).std(0), 1e-3)
     return fitted(nothing_known(names, scales), rows, right, weights, _PULL * len(groups))
 
 
-def _scale(sites: Sequence[tuple[Site, Model]]) -> Scale:
+def _scale(sites: Sequence[tuple[FittedSite, Model]]) -> Scale:
     """Return what the logits mean that models give at their sites."""
     off_map = _tail(
         [[model.of_map.logit(each) for each in site.foreign] for site, model in sites],
@@ -95,3 +96,18 @@ def _tail(logits: Sequence[Sequence[float]], counts: Sequence[int], part: float)
     """Fit the tail of the wrong matches of sites, which have these `counts` of matches; each site counts the same."""
     shares = [np.full(len(of_site), 1 / (count * len(logits))) for of_site, count in zip(logits, counts, strict=True)]
     return tail_of(np.concatenate([np.array(each, float) for each in logits]), np.concatenate(shares), part)
+
+
+def nothing_known(names: Sequence[str], scales: Sequence[float]) -> Logistic:
+    """Return the regression from which the first one is fitted: no evidence weighs anything."""
+    return Logistic(tuple(names), (0.0,) * len(names), tuple(map(float, scales)), 0.0)
+
+
+def tail_of(wrong: np.ndarray, shares: np.ndarray, part: float) -> Tail:
+    """Fit the tail of the logits of wrong matches, float (N,), each of which is this share of all matches, float (N,):
+    to the highest `part` of them."""
+    order = np.argsort(-wrong, kind="stable")
+    wrong, shares = wrong[order], shares[order]
+    count = max(_FEWEST_IN_TAIL, int(np.searchsorted(np.cumsum(shares), part * shares.sum())) + 1)
+    start, high, weight = float(wrong[min(count, len(wrong) - 1)]), wrong[:count], shares[:count]
+    return Tail(start, float(weight.sum()), max(float(weight @ (high - start) / weight.sum()), _LEAST_SCALE))
