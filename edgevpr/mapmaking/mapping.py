@@ -82,8 +82,8 @@ class Gaps:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Preparation:
-    """What is done to every picture of a map before it is encoded: `mask` leaves parts of it out, and `levelling` lays
-    it on the ground."""
+    """Preparation of every picture of a map before it is encoded: `mask` leaves parts of it out, and `levelling` lays it
+    on the ground."""
 
     mask: AnyMask = field(default_factory=NoMask)
     levelling: AnyLevelling = field(default_factory=NoLevelling)
@@ -91,8 +91,8 @@ class Preparation:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Selection:
-    """Which frames become places: those whose quality is at least `min_quality` and that pass the `gate` (None: all
-    do), and of those that do not pass it the ones that `gaps` keeps."""
+    """Selection of the frames that become places: those whose quality is at least `min_quality` and that pass the `gate`
+    (None: all do), and of those that do not pass it the ones that `gaps` keeps."""
 
     gate: Gate | NoGate | None = None
     gaps: Gaps = field(default_factory=Gaps)
