@@ -39,6 +39,7 @@ LEFT_OUT = {"grief_michigan_monthly": FIVE_PLACES, "grief_stromovka_monthly": FI
 # Rows that no board is offered: other weights, another way to match, or a comparison with everything.
 NOT_OFFERED = ("exact", "thesis", "sequence", "one frame", "original weights")
 _COLUMNS = ("query_file", "ref_files", "ref_files_loose")
+_POINTS = 100  # of a curve that is kept
 _RAM = """
 import json, sys
 import cv2, numpy
@@ -171,6 +172,7 @@ def write_set(path: Path, folder: Path, wanted: list[Variant]) -> None:
         )
         result = evaluate(variant.technique, dataset, chosen, options, shown)
         rows[variant.label] = asdict(replace(result, technique=variant.label)) | {
+            "precision_recall": thinned(result.precision_recall),
             "encode_ram_mb": encode_ram_mb(variant.technique, chosen),
             "commit": base.commit(),
             "cpu": provenance.cpu_model(),
@@ -185,6 +187,11 @@ def write_set(path: Path, folder: Path, wanted: list[Variant]) -> None:
         flown = [name for name in ("hog", "cohog") if any(variant.label == name for variant in wanted)]
         content["positions"] = before.get("positions", {}) | {name: position_errors(folder, name) for name in flown}
     path.write_text(json.dumps(base.rounded(content), indent=1) + "\n")
+
+
+def thinned(curve: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Return at most some points of a curve, evenly spread: it is only drawn from here on."""
+    return [curve[at] for at in np.unique(np.linspace(0, len(curve) - 1, min(len(curve), _POINTS)).round().astype(int))]
 
 
 def settings(variant: Variant, folder: Path) -> dict[str, str]:
