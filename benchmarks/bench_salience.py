@@ -21,14 +21,13 @@ import detectors
 import numpy as np
 import walks
 from base import DATA, Row, camera_of
+from matchability import NOT_LEARNT, compared, fit, label_site, site_of, write_network
 
 from edgevpr.core.text import progress
 from edgevpr.core.types import Salience
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.lab.evaluate import metrics
 from edgevpr.lab.evaluate.dataset import Dataset
-from edgevpr.lab.training.labels import label_site, walk_over
-from edgevpr.lab.training.matchability import compared, fit, site_of, write_network
 from edgevpr.runtime.recognise.detector import Detector, open_detector
 from edgevpr.runtime.recognise.memorability import Memorability, open_memorability
 from edgevpr.runtime.recognise.salience_gate import Thresholds, worth_of
@@ -43,9 +42,7 @@ GATES = {
     "staticity": Thresholds(staticity=FULL.staticity),
     "entropy": Thresholds(entropy=FULL.entropy),
 }
-# Sets of which no network learns: of five places, and of 64x32 pixels.
 FIVE_PLACES = ("grief_michigan_monthly", "grief_stromovka_monthly")
-NOT_LEARNT = (*FIVE_PLACES, "nordland_tiny")
 SAME_SITE = {"grief_stromovka_monthly": "grief_stromovka_seasons"}
 _SEED = 1
 DETECTOR = "yolox_nano"
@@ -133,7 +130,7 @@ def ask(name: str, dataset: Dataset) -> Asked:
     """Map the references and ask all queries."""
     site = dataset.ref_dir.parent.name
     slots, scores, right, ignored = [], [], [], []
-    with walk_over(list_images(dataset.ref_dir), name, camera_of(site) == "nadir") as walk:
+    with walks.walk_over(list_images(dataset.ref_dir), name, camera_of(site) == "nadir") as walk:
         for query in progress(dataset.queries, len(dataset.queries), f"{site}, {name}"):
             ranking = walk.step(walks.frame(query.path)).ranking
             slots.append(np.empty(0, int) if ranking is None else ranking.slots)

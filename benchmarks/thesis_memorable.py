@@ -13,7 +13,6 @@ from edgevpr.core.text import progress
 from edgevpr.frames.images import cv2, list_images, read_image
 from edgevpr.lab.evaluate import metrics
 from edgevpr.lab.evaluate.dataset import Dataset
-from edgevpr.lab.training.labels import walk_over
 from edgevpr.runtime.recognise.detector import Detector, open_detector
 from edgevpr.runtime.recognise.memorability import Memorability, open_memorability
 from edgevpr.runtime.recognise.salience_maps import maps_of, scores_of
@@ -71,7 +70,7 @@ def auc_of(scores: np.ndarray, right: np.ndarray, passes: np.ndarray) -> float |
 def answers(technique: str, dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:
     """Ask all queries of a set that looks ahead: the score of each best match, and whether it is right."""
     scores, right = [], []
-    with walk_over(list_images(dataset.ref_dir), technique, looks_down=False) as walk:
+    with walks.walk_over(list_images(dataset.ref_dir), technique, looks_down=False) as walk:
         for query in progress(dataset.queries, len(dataset.queries), f"{technique}: queries"):
             ranking = walk.step(walks.frame(query.path)).ranking
             found = ranking is not None and len(ranking.slots)

@@ -1,6 +1,6 @@
 """Walks over maps of image sets, as a flight, an evaluation or a calibration has them, for the benchmarks."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.calibrated import calibration_of
-from edgevpr.runtime.recognise.judge import accept_rule
+from edgevpr.runtime.recognise.judge import ACCEPT_NOTHING, accept_rule
 from edgevpr.runtime.recognise.opening import meter_of
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
@@ -87,3 +87,11 @@ def names_of(place_map: PlaceMap, index: PlaceIndex) -> list[str]:
     """Return the names of the pictures of the places, by slot."""
     names = {place.place_id: place.source_image for place in place_map.places()}
     return [names[place_id] for place_id in index.place_ids.tolist()]
+
+
+@contextmanager
+def walk_over(places: Iterable[Path], name: str, looks_down: bool) -> Iterator[Recogniser]:
+    """Map images with a technique, and give what recognises in that map, as it flies, and accepts nothing."""
+    technique = create(name, {"camera": "nadir"} if looks_down and name == "cohog" else {})
+    with mapped(map(frame, places), technique, meter()) as (place_map, index):
+        yield walk(place_map, index, technique, rule=ACCEPT_NOTHING)

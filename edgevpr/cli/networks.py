@@ -42,18 +42,6 @@ def _add_train(trainings: Any) -> None:
     ground.add_argument("--out", required=True, metavar="FILE.npz", help="the file to make")
     ground.add_argument("--seed", type=int, default=1, metavar="N", help="(1)")
     add_json(ground)
-    _add_matchability(trainings)
-
-
-def _add_matchability(trainings: Any) -> None:
-    matchability = command(trainings, "matchability", train_matchability, "learn which pictures are found again")
-    matchability.add_argument("--data", nargs="+", default=[], metavar="DIR", help="data sets that look ahead")
-    matchability.add_argument("--nadir", nargs="+", default=[], metavar="DIR", help="data sets that look straight down")
-    matchability.add_argument(
-        "--out", required=True, metavar="FILE.onnx", help="the model to make; its card lies beside"
-    )
-    matchability.add_argument("--seed", type=int, default=1, metavar="N", help="(1)")
-    add_json(matchability)
 
 
 def _add_images(parser: ArgumentParser) -> None:
@@ -80,10 +68,10 @@ def _add_models(models: Any) -> None:
 
 def train_calc(args: Namespace) -> int:
     """Train the CALC autoencoder, and print the result."""
-    from edgevpr.lab.training import jobs
+    from edgevpr.lab.training import job
 
     unusable: list[ImageError] = []
-    result = jobs.train_calc(args.images, Path(args.out), args.steps, args.seed, args.resume, unusable)
+    result = job.train_calc(args.images, Path(args.out), args.steps, args.seed, args.resume, unusable)
     said = (
         f"{result.model} and {result.card}: {result.steps} steps on {result.pictures} images, equal to PyTorch to "
         f"{result.largest_difference:.1e}"
@@ -125,23 +113,6 @@ def _learnt(args: Namespace, result: Any, said: str, unusable: list[ImageError])
     else:
         print(said)
     return exit_code(unusable)
-
-
-def train_matchability(args: Namespace) -> int:
-    """Learn which pictures are found again, and print how well that is told on a site that was left out."""
-    from edgevpr.lab.training.jobs import train_matchability
-
-    result = train_matchability(args.data, args.nadir, Path(args.out), args.seed)
-    if args.json:
-        print_json(asdict(result))
-        return 0
-    for kind, unseen in result.unseen.items():
-        for of, by_site in unseen.items():
-            judged = ", ".join(f"{site} {value:.2f}" for site, value in by_site.items() if value is not None)
-            print(f"{kind}, {of} pictures, each site left out once (.50 is chance): {judged or 'none to judge by'}")
-    print("; ".join(f"{count} pictures {name}" for name, count in result.classes.items()))
-    print(f"{result.model} and {result.card}: {result.kind}, fitted to {result.frames} pictures of all sites")
-    return 0
 
 
 def models_list(args: Namespace) -> int:

@@ -1,7 +1,7 @@
 """Memorability: how well the parts of a frame can be remembered, by a network with a card (thesis 3.2.1).
 
 The picture is cut into 5x5 crops that do not overlap. The network says of each how memorable it is, 0..1; between the
-middles of the crops the map is interpolated. `edgevpr train matchability` makes a network that says how likely such a
+middles of the crops the map is interpolated. `benchmarks/matchability.py` fits a network that says how likely such a
 part is to be found again.
 """
 

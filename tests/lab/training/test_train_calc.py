@@ -10,7 +10,7 @@ from pictures_on_disk import write_pictures
 
 from edgevpr.cli.main import main
 from edgevpr.core.errors import EdgevprError, UsageError
-from edgevpr.lab.training import jobs
+from edgevpr.lab.training import job
 from edgevpr.lab.training.pictures import read_pictures, small_grey
 from edgevpr.techniques.card import read_card
 
@@ -137,7 +137,7 @@ def test_the_file_equals_pytorch_and_a_difference_is_found(torch, calc, onnxfile
     torch.manual_seed(0)
     encoder = calc.Encoder().eval().requires_grad_(False)
     outputs = {"descriptor": "descriptor", "features": "features"}
-    file = onnxfile.ModelFile(path=tmp_path / "m.onnx", title="", input="image", rule=jobs._INPUT, outputs=outputs)
+    file = onnxfile.ModelFile(path=tmp_path / "m.onnx", title="", input="image", rule=job._INPUT, outputs=outputs)
     inputs = list(np.random.default_rng(0).random((3, 1, 1, 120, 160), np.float32))
     assert onnxfile.write_model(file, encoder, inputs, "", "") <= 1e-4
     assert read_card(file.card).outputs.features == "features"

@@ -1,17 +1,16 @@
-"""`edgevpr train matchability`: labels without truth, two kinds of network, and the file of the better one."""
-
-import json
-from pathlib import Path
+"""The fitting of matchability: labels without truth, and the file of a network."""
 
 import numpy as np
 import pytest
 
-from edgevpr.cli.main import main
 from edgevpr.frames.images import cv2
-from edgevpr.lab.training import labels
-from edgevpr.lab.training.labels import changed, label_site
 
-pytestmark = pytest.mark.slow  # networks are fitted
+pytest.importorskip("torch", reason="fitting needs torch (pip install 'edgevpr[train]')")
+pytest.importorskip("onnxscript", reason="fitting needs onnxscript (pip install 'edgevpr[train]')")
+import matchability as labels
+from matchability import changed, label_site
+
+pytestmark = pytest.mark.slow  # maps are asked
 
 
 def ground(seed, height=96, width=128):
@@ -76,56 +75,11 @@ def test_a_changed_picture_has_the_form_of_the_picture_and_follows_from_the_seed
         assert np.abs(once.astype(int) - picture).mean() > 3
 
 
-@pytest.mark.parametrize(
-    ("sites", "out", "complaint"),
-    [
-        (("a", "b"), "m.onnx", "2 data sets are too few"),
-        (("a", "b", "c"), "m.bin", "ends in .onnx"),
-        (("a", "b", "few"), "m.onnx", "too few images"),
-        (("a", "b", "nowhere"), "m.onnx", "does not exist"),
-    ],
-)
-def test_what_cannot_be_trained_is_refused_before_the_work(sites, out, complaint, tmp_path, capsys):
-    for name, count in {"a": 9, "b": 9, "c": 9, "few": 3}.items():
-        site(tmp_path / name, 1, count)
-    folders = [str(tmp_path / name) for name in sites]
-    assert main(["train", "matchability", "--data", *folders, "--out", str(tmp_path / out)]) != 0
-    assert complaint in capsys.readouterr().err
-
-
-def test_the_command_writes_a_network_that_the_gate_can_use(tmp_path, monkeypatch, capsys):
-    torch = pytest.importorskip("torch", reason="training needs torch (pip install 'edgevpr[train]')")
-    pytest.importorskip("onnxscript", reason="training needs onnxscript (pip install 'edgevpr[train]')")
-    from edgevpr.lab.training import matchability
-    from edgevpr.runtime.recognise.memorability import memorability_of
-    from edgevpr.techniques.card import read_card
-
-    torch.set_num_threads(1)
-    monkeypatch.setattr(labels, "TECHNIQUES", ("cohog",))
-    for kind in matchability.KINDS.values():
-        monkeypatch.setattr(kind, "STEPS", 60)
-    folders = [str(site(tmp_path / name, seed, empty=(0, 4, 8))) for seed, name in enumerate("abc")]
-    out = tmp_path / "m.onnx"
-    assert main(["train", "matchability", "--data", *folders, "--out", str(out), "--json"]) == 0
-    result = json.loads(capsys.readouterr().out)
-    assert result["frames"] == sum(result["classes"].values()) == 27 * labels.CHANGES
-    assert set(result["unseen"]) == set(matchability.KINDS)
-    assert set(result["unseen"]["statistics"]["generated"]) == {"a", "b", "c"}
-    assert set(result["unseen"]["statistics"]["real"].values()) == {None}  # these sites have no queries
-    assert result["largest_difference"] < 1e-4
-    network = memorability_of(read_card(Path(result["card"])))
-    assert network.matrix(ground(5)).mean() > network.matrix(np.full((96, 128), 90, np.uint8)).mean()
-    assert main(["train", "matchability", "--data", *folders, "--out", str(out)]) != 0
-    assert "is there already" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("kind", ["statistics", "convolutions"])
 def test_the_file_equals_pytorch_for_any_number_of_crops(kind, tmp_path):
-    torch = pytest.importorskip("torch", reason="training needs torch (pip install 'edgevpr[train]')")
-    pytest.importorskip("onnxscript", reason="training needs onnxscript (pip install 'edgevpr[train]')")
+    import matchability
     import onnxruntime
-
-    from edgevpr.lab.training import matchability
+    import torch
 
     torch.manual_seed(2)
     network = matchability.KINDS[kind]().train()
