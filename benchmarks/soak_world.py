@@ -21,10 +21,9 @@ from rtsp_camera import RtspCamera, free_port
 
 from edgevpr.lab.simulate.autopilot import serve
 from edgevpr.lab.simulate.camera import Pose, lit, photograph
+from edgevpr.lab.simulate.controller import FlightController
 from edgevpr.lab.simulate.flight import SCENE_DEPTH_M, SCENE_WIDTH_M, Flight, later_flight, mapping_flight, write_flight
-from edgevpr.lab.simulate.flightcontroller.controller import FlightController
-from edgevpr.lab.simulate.flightcontroller.recorded import AlongTrack, Track, read_track, truth_at
-from edgevpr.lab.simulate.flightcontroller.truth import Truth
+from edgevpr.lab.simulate.motion import AlongTrack, FlownTrack, TrueState, read_track, truth_at
 from edgevpr.lab.simulate.scene import Scene, make_scene
 
 SEED = 1
@@ -143,11 +142,11 @@ class Autopilot:
 class _Laps(AlongTrack):
     """Flies a track over and over by the clock, so that a new process goes on where an old one was killed."""
 
-    def __init__(self, track: Track, lap_s: float, start_s: float) -> None:
+    def __init__(self, track: FlownTrack, lap_s: float, start_s: float) -> None:
         super().__init__(track)
         self._lap, self._lap_s, self._first_s = track, lap_s, start_s
 
-    def step(self, now_s: float, dt_s: float) -> Truth:
+    def step(self, now_s: float, dt_s: float) -> TrueState:
         return truth_at(self._lap, (time.monotonic() - self._first_s) % self._lap_s)
 
 

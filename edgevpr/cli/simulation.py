@@ -9,7 +9,7 @@ from typing import Any
 from edgevpr.cli.shared import add_json, add_parameters, command, group, parameters_of, print_json
 from edgevpr.core.errors import UsageError
 
-# Those of edgevpr.lab.simulate.flightcontroller.controller, which is not loaded for a page of help.
+# Those of edgevpr.lab.simulate.controller, which is not loaded for a page of help.
 _VEHICLES = ("arduplane", "arducopter", "ardurover", "px4-copter", "px4-plane")
 _PARAMETER = "GPS2_TYPE=14"  # an example
 
@@ -54,7 +54,7 @@ def add(commands: Any) -> None:
 def simulate_autopilot(args: Namespace) -> int:
     """Run a simulated flight controller, and print what it has received."""
     from edgevpr.lab.simulate.autopilot import run_autopilot
-    from edgevpr.lab.simulate.flightcontroller.recorded import read_track
+    from edgevpr.lab.simulate.motion import read_track
 
     track = read_track(args.track) if args.track else None
     has_gps = track is not None and not args.no_gps

@@ -8,14 +8,14 @@ from dataclasses import replace
 import numpy as np
 from air import match_at
 from fakes import FakeClock
+from freeflight import FreeFlight
 from mavlink_peers import link_to, wait_until
 
 from edgevpr.core.config import SourceSetsConfig, load_config
 from edgevpr.core.geodesy import moved
 from edgevpr.core.types import Position
+from edgevpr.lab.simulate.controller import FlightController
 from edgevpr.lab.simulate.flight import ORIGIN
-from edgevpr.lab.simulate.flightcontroller.controller import FlightController
-from edgevpr.lab.simulate.flightcontroller.freeflight import FreeFlight
 from edgevpr.mavlink.messages import Health
 from edgevpr.mavlink.wire import PacketReader, mavlink
 from edgevpr.power.load import MachineLoad

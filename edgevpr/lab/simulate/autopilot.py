@@ -13,8 +13,8 @@ from dataclasses import asdict, dataclass
 from types import MappingProxyType
 
 from edgevpr.core.errors import LinkError
-from edgevpr.lab.simulate.flightcontroller.controller import STEP_S, FlightController, ReceivedFix
-from edgevpr.lab.simulate.flightcontroller.recorded import AlongTrack, Nowhere, Track
+from edgevpr.lab.simulate.controller import STEP_S, FlightController, ReceivedFix
+from edgevpr.lab.simulate.motion import AlongTrack, FlownTrack, Motion
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.messages import AUTOPILOT
 from edgevpr.mavlink.ports import Port, open_port
@@ -61,7 +61,7 @@ def run_autopilot(
     stop: threading.Event | None = None,
     *,
     system_id: int = 1,
-    track: Track | None = None,
+    track: FlownTrack | None = None,
     vehicle: str = DEFAULT_VEHICLE,
     gps: bool = False,
     parameters: Mapping[str, str] = MappingProxyType({}),
@@ -74,7 +74,7 @@ def run_autopilot(
     it starts. Raises LinkError where the link cannot be opened, UsageError for an unknown vehicle or parameter, and for
     a value that a parameter cannot have.
     """
-    motion = AlongTrack(track) if track else Nowhere()
+    motion = AlongTrack(track) if track else Motion()
     controller = FlightController(vehicle, motion, gps=gps, system_id=system_id, start_utc_s=time.time())
     for name, text in parameters.items():
         controller.brain.parameters.set_written(name, text)

@@ -7,18 +7,18 @@ import subprocess
 import time
 from pathlib import Path
 
+from freeflight import FreeFlight
 from mavlink_peers import PATIENCE_S
 
 from edgevpr.core.geodesy import distance_m
+from edgevpr.lab.simulate.controller import FlightController
 from edgevpr.lab.simulate.flight import ORIGIN
-from edgevpr.lab.simulate.flightcontroller.controller import FlightController
-from edgevpr.lab.simulate.flightcontroller.freeflight import FreeFlight
 from edgevpr.mavlink.wire import PacketReader, mavlink
 
 ARDUPILOT = os.environ.get("EDGEVPR_ARDUPILOT")  # the folder of a built ArduPilot
 _INSTANCE = 5
 _SPEEDUP = 3
-_REPORTS_HZ = {1: 2, 24: 5, 33: 10, 108: 10, 193: 10}  # SYS_STATUS, GPS_RAW_INT, GLOBAL_POSITION_INT, SIM_STATE, EKF
+_REPORTS_HZ = {24: 5, 33: 10, 108: 10, 193: 10}  # GPS_RAW_INT, GLOBAL_POSITION_INT, SIM_STATE, EKF
 _DEFAULTS = {"plane": "models/plane.parm", "copter": "default_params/copter.parm"}
 _MODELS = {"plane": "plane", "copter": "quad"}
 _QUIET = {"FS_GCS_ENABLE": 0, "TERRAIN_ENABLE": 0, "FS_GCS_ENABL": 0, "FS_LONG_ACTN": 0, "THR_FAILSAFE": 0}

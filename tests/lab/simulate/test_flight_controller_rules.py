@@ -3,13 +3,12 @@
 import math
 
 import pytest
+from freeflight import FreeFlight
 
 from edgevpr.core.errors import UsageError
-from edgevpr.core.geodesy import distance_m
+from edgevpr.lab.simulate.controller import VEHICLES, FlightController
 from edgevpr.lab.simulate.flight import ORIGIN
-from edgevpr.lab.simulate.flightcontroller.controller import VEHICLES, FlightController
-from edgevpr.lab.simulate.flightcontroller.freeflight import FreeFlight
-from edgevpr.lab.simulate.flightcontroller.recorded import Nowhere
+from edgevpr.lab.simulate.motion import Motion
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.wire import mavlink
@@ -95,7 +94,7 @@ def lost(vehicle: str, wind_m_s: float = 6.0, **parameters: float) -> Flown:
     ],
 )
 def test_ardupilot_judges_a_command_by_its_form(changes, result):
-    controller = FlightController("arduplane", Nowhere(), gps=False)
+    controller = FlightController("arduplane", Motion(), gps=False)
     command = messages.position_fix(Fix(50.0, 14.0, 25.0, 0.0), 0.5, target_system=1)
     for field, value in changes.items():
         setattr(command, field, value)
@@ -302,26 +301,9 @@ def test_px4_says_integers_byte_by_byte():
     assert [each.param_index for each in listed] == list(range(listed[0].param_count))
 
 
-def test_a_ping_is_answered_by_px4():
-    ping = mavlink.MAVLink_ping_message(1, 7, 0, 0)
-    assert [each.seq for each in Flown("px4-copter").tell(ping)] == [7]
-
-
-def test_a_velocity_is_flown_by_a_copter_while_it_is_told():
-    flown = Flown("arducopter").in_air()
-    before = flown.truth
-    only_velocity = 0b0000111111000111
-    flown.tell(
-        mavlink.MAVLink_set_position_target_local_ned_message(0, 1, 1, 1, only_velocity, *[0] * 3, 0, 6, *[0] * 6)
-    )
-    flown.wait(10)
-    gone_m = distance_m(before.lat_deg, before.lon_deg, flown.truth.lat_deg, flown.truth.lon_deg)
-    assert gone_m == pytest.approx(18, abs=1), "three seconds"
-
-
 def test_an_unknown_vehicle_is_refused_in_a_sentence():
     with pytest.raises(UsageError, match="arducopter"):
-        FlightController("balloon", Nowhere(), gps=False)
+        FlightController("balloon", Motion(), gps=False)
 
 
 def test_what_is_for_another_is_not_answered():

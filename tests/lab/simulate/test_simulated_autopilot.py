@@ -10,16 +10,16 @@ import time
 
 import numpy as np
 import pytest
+from freeflight import FreeFlight
 from mavlink_peers import AutopilotThread, Peer, UdpPort, free_port, link_to, wait_until
 
 from edgevpr.cli.main import main
 from edgevpr.cli.simulation import _VEHICLES
 from edgevpr.core.errors import LinkError, UsageError
 from edgevpr.lab.simulate.autopilot import run_autopilot, serve
+from edgevpr.lab.simulate.controller import VEHICLES, FlightController
 from edgevpr.lab.simulate.flight import ORIGIN
-from edgevpr.lab.simulate.flightcontroller.controller import VEHICLES, FlightController
-from edgevpr.lab.simulate.flightcontroller.freeflight import FreeFlight
-from edgevpr.lab.simulate.flightcontroller.recorded import Nowhere, Track, read_track, truth_at
+from edgevpr.lab.simulate.motion import FlownTrack, Motion, read_track, truth_at
 from edgevpr.mavlink import messages, reading
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.asking import Inquiry
@@ -127,7 +127,7 @@ def test_it_flies_along_a_track_from_when_a_companion_is_heard(tmp_path):
 
 def test_questions_do_not_start_the_track_and_whatever_a_flight_says_does(monkeypatch):
     monkeypatch.setattr(reading, "LISTEN_S", 0.2)
-    track = Track(
+    track = FlownTrack(
         t_s=np.array([0.0, 0.1]),
         lat_deg=np.array([50.0, 50.1]),
         lon_deg=np.array([8.0, 8.0]),
@@ -150,7 +150,7 @@ def test_questions_do_not_start_the_track_and_whatever_a_flight_says_does(monkey
 
 
 def test_it_says_how_fast_it_flies_along_the_track():
-    track = Track(
+    track = FlownTrack(
         t_s=np.array([0.0, 10.0, 20.0, 21.0]),
         lat_deg=np.array([50.0, 50.001, 50.001, 51.0]),
         lon_deg=np.array([8.0, 8.0, 8.001, 8.0]),
@@ -246,7 +246,7 @@ def test_it_tells_the_time_of_this_machine(vehicle):
 
 
 def test_without_a_machine_its_clock_is_handed_in():
-    controller = FlightController("arduplane", Nowhere(), gps=False, start_utc_s=1_000.0)
+    controller = FlightController("arduplane", Motion(), gps=False, start_utc_s=1_000.0)
     controller.advance(5.0)
     asked = messages.message_request(1, mavlink.MAVLINK_MSG_ID_SYSTEM_TIME)
     told = next(each for each in controller.hear(asked) if each.get_type() == "SYSTEM_TIME")

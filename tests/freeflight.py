@@ -6,7 +6,7 @@ import math
 
 from edgevpr.core.geodesy import moved
 from edgevpr.core.types import Position
-from edgevpr.lab.simulate.flightcontroller.truth import Truth
+from edgevpr.lab.simulate.motion import Motion, TrueState
 
 GRAVITY_M_S2 = 9.81
 AIRSPEED_M_S = 22.0  # of a plane
@@ -17,7 +17,7 @@ _COMMAND_GOOD_FOR_S = 3.0  # a copter that is told no velocity any more stops
 _CRUISE_DEG = 90.0  # the nose at the start
 
 
-class FreeFlight:
+class FreeFlight(Motion):
     """A copter, plane or rover that begins at `home`, on the ground."""
 
     is_known = True
@@ -51,7 +51,7 @@ class FreeFlight:
         """Sink where it is, whatever it is told."""
         self._lands, self._goal_m = True, 0.0
 
-    def step(self, now_s: float, dt_s: float) -> Truth:
+    def step(self, now_s: float, dt_s: float) -> TrueState:
         """Move on by `dt_s`."""
         most_m = (_DESCENT_M_S if self._lands else _CLIMB_M_S[self._kind]) * dt_s
         climb_m = max(-most_m, min(most_m, self._goal_m - self._height_m))
@@ -65,7 +65,7 @@ class FreeFlight:
                 velocity = 0j
         self._at_m += velocity * dt_s
         lat_deg, lon_deg = moved(self._home.lat_deg, self._home.lon_deg, self._at_m.real, self._at_m.imag)
-        return Truth(
+        return TrueState(
             lat_deg=lat_deg,
             lon_deg=lon_deg,
             alt_m=(self._home.alt_m or 0.0) + self._height_m,

@@ -1,14 +1,13 @@
-"""Reports of a flight controller on itself: one function a message, from a `Moment` to the message, None where there is
-nothing to say. Messages that a real one knows and this one has nothing to say of are in `SILENT`."""
+"""Reports of a flight controller on itself: one function a message, from a `VehicleMoment` to the message, None where
+there is nothing to say. Messages that a real one knows and this one has nothing to say of are in `SILENT`."""
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from edgevpr.lab.simulate.flightcontroller.ardupilot import ArduPilot
-from edgevpr.lab.simulate.flightcontroller.px4 import Px4
-from edgevpr.lab.simulate.flightcontroller.receivers import FIX_3D, NO_FIX, Gps
-from edgevpr.lab.simulate.flightcontroller.truth import Truth
+from edgevpr.lab.simulate.firmware import Firmware
+from edgevpr.lab.simulate.motion import TrueState
+from edgevpr.lab.simulate.sensors import FIX_3D, NO_FIX, Gps
 from edgevpr.mavlink.wire import Message, mavlink
 
 _UNKNOWN_16 = 65_535
@@ -21,27 +20,28 @@ _CAPABILITIES = (
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Moment:
+class VehicleMoment:
     """The vehicle at a time, `t_s` seconds after its start, which was at `start_utc_s`: where it truly is, what its
     firmware makes of it, and whether its position may be told."""
 
     t_s: float
     start_utc_s: float
-    truth: Truth
-    brain: ArduPilot | Px4
+    truth: TrueState
+    brain: Firmware
     is_known: bool
 
     @property
     def boot_ms(self) -> int:
+        """Milliseconds since the start."""
         return round(self.t_s * 1000)
 
 
-def heartbeat(now: Moment) -> Message:
+def heartbeat(now: VehicleMoment) -> Message:
     """Make the HEARTBEAT of an autopilot."""
     armed = mavlink.MAV_MODE_FLAG_SAFETY_ARMED if now.brain.is_armed else 0
     return mavlink.MAVLink_heartbeat_message(
         type=now.brain.vehicle_type,
-        autopilot=now.brain.firmware,
+        autopilot=now.brain.number,
         base_mode=mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | armed,
         custom_mode=now.brain.mode,
         system_status=mavlink.MAV_STATE_ACTIVE if now.brain.is_armed else mavlink.MAV_STATE_STANDBY,
@@ -49,18 +49,7 @@ def heartbeat(now: Moment) -> Message:
     )
 
 
-def _status(now: Moment) -> Message:
-    sensors = mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO | mavlink.MAV_SYS_STATUS_SENSOR_GPS
-    checked = mavlink.MAV_SYS_STATUS_PREARM_CHECK
-    is_ready = now.brain.is_armed or now.brain.why_not_arm(now.t_s) is None
-    has_gps = now.brain.receivers.first.fix_type >= FIX_3D
-    healthy = sensors if has_gps else sensors & ~mavlink.MAV_SYS_STATUS_SENSOR_GPS
-    return mavlink.MAVLink_sys_status_message(
-        sensors | checked, sensors | checked, healthy | (checked if is_ready else 0), 100, 12_000, -1, -1, *[0] * 6
-    )
-
-
-def _position(now: Moment) -> Message | None:
+def _position(now: VehicleMoment) -> Message | None:
     if now.brain.origin is None:
         return None
     truth, (lat_deg, lon_deg) = now.truth, now.brain.reckoning.place(now.truth)
@@ -78,7 +67,7 @@ def _position(now: Moment) -> Message | None:
     )
 
 
-def _attitude(now: Moment) -> Message | None:
+def _attitude(now: VehicleMoment) -> Message | None:
     """Make the message of the attitude, None where a track does not know it."""
     truth = now.truth
     if math.isnan(truth.roll_deg + truth.pitch_deg):
@@ -89,18 +78,13 @@ def _attitude(now: Moment) -> Message | None:
     )
 
 
-def _first_gps(now: Moment) -> Message:
-    return mavlink.MAVLink_gps_raw_int_message(**_gps(now.brain.receivers.first, now))
-
-
-def _second_gps(now: Moment) -> Message | None:
+def _second_gps(now: VehicleMoment) -> Message | None:
     if not now.brain.receivers.has_second:
         return None
-    fields = _gps(now.brain.receivers.second, now)
-    return mavlink.MAVLink_gps2_raw_message(**fields, dgps_numch=0, dgps_age=0)
+    return mavlink.MAVLink_gps2_raw_message(**_gps(now.brain.receivers.second, now), dgps_numch=0, dgps_age=0)
 
 
-def _gps(gps: Gps, now: Moment) -> dict:
+def _gps(gps: Gps, now: VehicleMoment) -> dict[str, int]:
     last = gps.last
     if last is None or not now.is_known:  # a second GPS that has never been heard, or has been silent for long
         lost = {"lat": 0, "lon": 0, "alt": 0, "eph": 9999, "epv": 9999, "vel": 0, "cog": 0}
@@ -122,46 +106,26 @@ def _gps(gps: Gps, now: Moment) -> dict:
     }
 
 
-def _ekf_status(now: Moment) -> Message:
+def _ekf_status(now: VehicleMoment) -> Message:
     ratio = now.brain.test_ratio
     return mavlink.MAVLink_ekf_status_report_message(now.brain.flags(now.t_s), 0.05, ratio, 0.05, 0.02, 0.0)
 
 
-def _estimator_status(now: Moment) -> Message:
+def _estimator_status(now: VehicleMoment) -> Message:
     both_m = math.sqrt(2) * now.brain.reckoning.sd_m if now.brain.origin else 0.0
     return mavlink.MAVLink_estimator_status_message(
         round(now.t_s * 1e6), now.brain.flags(now.t_s), 0.1, now.brain.test_ratio, 0.1, 0.1, 0.0, 0.0, both_m, 0.5
     )
 
 
-def _origin(now: Moment) -> Message | None:
+def _origin(now: VehicleMoment) -> Message | None:
     if now.brain.origin is None:
         return None
     lat_deg, lon_deg, alt_m = now.brain.origin
     return mavlink.MAVLink_gps_global_origin_message(round(lat_deg * 1e7), round(lon_deg * 1e7), round(alt_m * 1e3))
 
 
-def _home(now: Moment) -> Message | None:
-    if now.brain.origin is None:
-        return None
-    lat_deg, lon_deg, alt_m = now.brain.origin
-    place = round(lat_deg * 1e7), round(lon_deg * 1e7), round(alt_m * 1e3)
-    return mavlink.MAVLink_home_position_message(*place, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0)
-
-
-def _scaled_imu(now: Moment) -> Message:
-    return mavlink.MAVLink_scaled_imu_message(now.boot_ms, 0, 0, -_G_MG, 0, 0, 0, 0, 0, 0)
-
-
-def _raw_imu(now: Moment) -> Message:
-    return mavlink.MAVLink_raw_imu_message(round(now.t_s * 1e6), 0, 0, -_G_MG, 0, 0, 0, 0, 0, 0)
-
-
-def _time(now: Moment) -> Message:
-    return mavlink.MAVLink_system_time_message(round((now.start_utc_s + now.t_s) * 1e6), now.boot_ms)
-
-
-def _truth(now: Moment) -> Message | None:
+def _truth(now: VehicleMoment) -> Message | None:
     """Make the SIM_STATE, in which a simulator says where the vehicle truly is."""
     truth = now.truth
     if not now.is_known:
@@ -175,29 +139,32 @@ def _truth(now: Moment) -> Message | None:
     )
 
 
-def _version(now: Moment) -> Message:
+def _version(now: VehicleMoment) -> Message:
     nothing = [0] * 8
-    is_px4 = now.brain.firmware == mavlink.MAV_AUTOPILOT_PX4
+    is_px4 = now.brain.number == mavlink.MAV_AUTOPILOT_PX4
     encoding = mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE if is_px4 else 0
     return mavlink.MAVLink_autopilot_version_message(
         _CAPABILITIES | encoding, now.brain.version, 0, 0, 0, nothing, nothing, nothing, 0, 0, 0
     )
 
 
-REPORTS: dict[int, Callable[[Moment], Message | None]] = {
+REPORTS: dict[int, Callable[[VehicleMoment], Message | None]] = {
     mavlink.MAVLINK_MSG_ID_HEARTBEAT: heartbeat,
-    mavlink.MAVLINK_MSG_ID_SYS_STATUS: _status,
-    mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: _time,
-    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: _first_gps,
-    mavlink.MAVLINK_MSG_ID_SCALED_IMU: _scaled_imu,
-    mavlink.MAVLINK_MSG_ID_RAW_IMU: _raw_imu,
+    mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: lambda now: mavlink.MAVLink_system_time_message(
+        round((now.start_utc_s + now.t_s) * 1e6), now.boot_ms
+    ),
+    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: lambda now: mavlink.MAVLink_gps_raw_int_message(
+        **_gps(now.brain.receivers.first, now)
+    ),
+    mavlink.MAVLINK_MSG_ID_SCALED_IMU: lambda now: mavlink.MAVLink_scaled_imu_message(
+        now.boot_ms, 0, 0, -_G_MG, *[0] * 6
+    ),
     mavlink.MAVLINK_MSG_ID_ATTITUDE: _attitude,
     mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: _position,
     mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN: _origin,
     mavlink.MAVLINK_MSG_ID_SIM_STATE: _truth,
     mavlink.MAVLINK_MSG_ID_GPS2_RAW: _second_gps,
     mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: _version,
-    mavlink.MAVLINK_MSG_ID_HOME_POSITION: _home,
 }
 # Each firmware has its own report of its filter, and knows nothing of the other's.
 FILTER_REPORTS = {
@@ -206,12 +173,11 @@ FILTER_REPORTS = {
 }
 SILENT = {  # known, but there is no such sensor
     mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR,
-    mavlink.MAVLINK_MSG_ID_RANGEFINDER,
     mavlink.MAVLINK_MSG_ID_TERRAIN_REPORT,
 }
 
 
-def _yaw(truth: Truth) -> float:
+def _yaw(truth: TrueState) -> float:
     return 0.0 if math.isnan(truth.heading_deg) else math.remainder(math.radians(truth.heading_deg), math.tau)
 
 

@@ -1,0 +1,253 @@
+"""A simulated flight controller: what it hears, obeys and says. It knows no port and no clock; time is an argument."""
+
+import cmath
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from edgevpr.core.errors import UsageError
+from edgevpr.lab.simulate.ardupilot_rules import ArduPilot
+from edgevpr.lab.simulate.firmware import FAILED, OK, UNSUPPORTED, Firmware
+from edgevpr.lab.simulate.motion import Motion
+from edgevpr.lab.simulate.px4_rules import Px4
+from edgevpr.lab.simulate.reports import FILTER_REPORTS, REPORTS, SILENT, VehicleMoment, heartbeat
+from edgevpr.mavlink.messages import AUTOPILOT
+from edgevpr.mavlink.wire import Message, mavlink
+
+STEP_S = 0.02
+VEHICLES: dict[str, Callable[[Motion], Firmware]] = {
+    "arducopter": lambda motion: ArduPilot("copter", motion),
+    "arduplane": lambda motion: ArduPilot("plane", motion),
+    "ardurover": lambda motion: ArduPilot("rover", motion),
+    "px4-copter": lambda motion: Px4("copter", motion),
+    "px4-plane": lambda motion: Px4("plane", motion),
+}
+_START_UTC_S = 1_770_000_000.0  # where nobody says when it starts
+_FORCED = 21_196  # of an arming that passes over the checks
+HEARTBEAT_S = 1.0
+_WHERE = {
+    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
+    mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN,
+    mavlink.MAVLINK_MSG_ID_SIM_STATE,
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReceivedFix:
+    """An accepted position fix as it arrived; `t_sent_s` and `processing_s` are the sender's."""
+
+    lat_deg: float
+    lon_deg: float
+    accuracy_m: float
+    t_sent_s: float
+    processing_s: float
+
+
+class Streams:
+    """The intervals of a link. `is_known` False leaves out every message that tells where the vehicle is."""
+
+    def __init__(self, default_hz: dict[int, float], filter_report: int, is_known: bool) -> None:
+        self._reports = {**REPORTS, filter_report: FILTER_REPORTS[filter_report]}
+        if not is_known:
+            self._reports = {number: report for number, report in self._reports.items() if number not in _WHERE}
+        self._default_s = {number: 1 / hz for number, hz in default_hz.items() if number in self._reports}
+        self._interval_s = dict(self._default_s)
+        self._due_s = dict.fromkeys(self._interval_s, 0.0)
+        self._beat_due_s = 0.0
+
+    def knows(self, number: int) -> bool:
+        """Tell whether there is such a message."""
+        return number in self._reports or number in SILENT
+
+    def ask(self, number: int, interval_us: float, now_s: float) -> bool:
+        """Set an interval: -1 ends the stream, 0 is the default; return whether there is such a message."""
+        if not self.knows(number):
+            return False
+        if number in SILENT or not math.isfinite(interval_us):
+            return True
+        interval_s = self._default_s.get(number, 0.0) if interval_us == 0 else interval_us / 1e6
+        if interval_s <= 0:
+            self._interval_s.pop(number, None)
+        else:
+            self._interval_s[number], self._due_s[number] = interval_s, now_s
+        return True
+
+    def make(self, number: int, now: VehicleMoment) -> Message | None:
+        """Make a message that somebody asked for once."""
+        return self._reports[number](now) if number in self._reports else None
+
+    def due(self, now: VehicleMoment) -> list[Message]:
+        """Return what is to be sent now."""
+        messages = []
+        if now.t_s >= self._beat_due_s:
+            self._beat_due_s = max(self._beat_due_s + HEARTBEAT_S, now.t_s)
+            messages.append(heartbeat(now))
+        for number, interval_s in self._interval_s.items():
+            if now.t_s >= self._due_s[number]:
+                self._due_s[number] = max(self._due_s[number] + interval_s, now.t_s)
+                if message := self._reports[number](now):
+                    messages.append(message)
+        return messages
+
+
+class FlightController:
+    """One vehicle of a firmware, of those in VEHICLES. Without `gps` it has lost GPS in flight, before the start, which
+    is at `start_utc_s` by its clock."""
+
+    def __init__(
+        self, vehicle: str, motion: Motion, *, gps: bool, system_id: int = 1, start_utc_s: float = _START_UTC_S
+    ) -> None:
+        if vehicle not in VEHICLES:
+            raise UsageError(f"There is no vehicle {vehicle!r}: choose one of {', '.join(VEHICLES)}.")
+        self.brain = VEHICLES[vehicle](motion)
+        self.vehicle, self.system_id = vehicle, system_id
+        self._start_utc_s = start_utc_s
+        self.fixes: list[ReceivedFix] = []
+        self.answers: list[int] = []  # to fixes, MAV_RESULT
+        self._motion = motion
+        self._streams = Streams(self.brain.default_hz, self.brain.filter_report, motion.is_known)
+        self._now_s, self._truth = 0.0, motion.step(0.0, 0.0)
+        self._has_begun = False
+        if not gps:
+            self.brain.lose_gps(self._truth, 0.0)
+
+    def __str__(self) -> str:
+        gps = "with GPS" if self.brain.parameters["SIM_GPS1_ENABLE"] else "that has lost GPS"
+        return f"a simulated {self.vehicle} {gps}, system {self.system_id},"
+
+    @property
+    def error_m(self) -> float:
+        """Distance of the estimate from the truth."""
+        return abs(self.brain.reckoning.error_m)
+
+    def set(self, name: str, value: float) -> None:
+        """Set a parameter, as PARAM_SET does: SIM_GPS1_ENABLE 0 takes GPS away."""
+        self.brain.parameters.set(name, value)
+
+    def begin(self) -> None:
+        """Note that a flight is heard; a track starts when it first is."""
+        if not self._has_begun:
+            self._has_begun = True
+            self._motion.begin(self._now_s)
+
+    def advance(self, now_s: float) -> list[Message]:
+        """Go on to `now_s`, in small steps; return what is said on the way."""
+        said = []
+        while self._now_s + STEP_S <= now_s:
+            self._now_s += STEP_S
+            self._truth = self._motion.step(self._now_s, STEP_S)
+            self.brain.step(self._truth, self._wind_m_s(), self._now_s, STEP_S)
+            said += self._streams.due(self._moment())
+            said += [mavlink.MAVLink_statustext_message(each[0], each[1].encode()) for each in self.brain.texts]
+            self.brain.texts.clear()
+        return said
+
+    def hear(self, message: Message) -> list[Message]:
+        """Take in a message; return the answers."""
+        if getattr(message, "target_system", 0) not in (0, self.system_id):
+            return []
+        if getattr(message, "target_component", 0) not in (0, AUTOPILOT):
+            return []
+        match message.get_type():
+            case "COMMAND_INT" | "COMMAND_LONG":
+                result, answers = self._obey(message)
+                return [self._ack(message, result), *answers]
+            case "PARAM_REQUEST_READ" | "PARAM_REQUEST_LIST" | "PARAM_SET":
+                return self.brain.parameters.answer(message)
+            case "TIMESYNC" if message.tc1 == 0:
+                return [mavlink.MAVLink_timesync_message(round(self._now_s * 1e9) + 1, message.ts1)]
+            case "GPS_INPUT":
+                self.brain.receivers.hear(message, self._now_s)
+            case "ODOMETRY":
+                self.brain.external.hear(message, self._now_s)
+            case "GLOBAL_POSITION_SENSOR":
+                self.brain.take_global_position(message, self._truth, self._now_s)
+            case "SET_GPS_GLOBAL_ORIGIN":
+                return self._set_origin(message)
+        return []
+
+    def _obey(self, command: Message) -> tuple[int, list[Message]]:
+        """Obey a command; return the result (MAV_RESULT) and what else is said."""
+        number = int(command.param1) if math.isfinite(command.param1) else -1
+        match command.command:
+            case mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE:
+                return self._judge(command), []
+            case mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
+                if self._streams.ask(number, command.param2, self._now_s):
+                    return OK, []
+                if self.brain.number == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA:
+                    self.brain.texts.append((mavlink.MAV_SEVERITY_INFO, f"No ap_message for mavlink id ({number})"))
+                return mavlink.MAV_RESULT_DENIED, []
+            case mavlink.MAV_CMD_REQUEST_MESSAGE:
+                message = self._streams.make(number, self._moment())
+                return OK if self._streams.knows(number) else FAILED, [message] if message else []
+            case mavlink.MAV_CMD_COMPONENT_ARM_DISARM:
+                return self._arm(command)
+            case mavlink.MAV_CMD_NAV_TAKEOFF if command.get_type() == "COMMAND_LONG":
+                return self.brain.take_off(command.param7), []
+            case mavlink.MAV_CMD_DO_SET_MODE:
+                mode = int(command.param2)
+                if self.brain.number == mavlink.MAV_AUTOPILOT_PX4:
+                    mode = mode << 16 | int(command.param3) << 24
+                return OK if self.brain.set_mode(mode) else FAILED, []
+            case mavlink.MAV_CMD_SET_EKF_SOURCE_SET:
+                return self.brain.use_source_set(command.param1), []
+        return UNSUPPORTED, []
+
+    def _judge(self, command: Message) -> int:
+        if command.get_type() == "COMMAND_LONG":  # PX4 would take that too, with a latitude in float32
+            return UNSUPPORTED
+        result = self.brain.take_fix(command, self._truth, self._now_s)
+        self.answers.append(result)
+        if result == OK:
+            self.fixes.append(
+                ReceivedFix(
+                    lat_deg=command.x / 1e7,
+                    lon_deg=command.y / 1e7,
+                    accuracy_m=command.param3,
+                    t_sent_s=command.param1,
+                    processing_s=command.param2,
+                )
+            )
+        return result
+
+    def _arm(self, command: Message) -> tuple[int, list[Message]]:
+        is_wanted = command.param1 == 1
+        why_not = self.brain.why_not_arm(self._now_s) if is_wanted and command.param2 != _FORCED else None
+        if why_not:
+            text = f"Arm: {why_not}" if self.brain.number == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA else why_not
+            told = mavlink.MAVLink_statustext_message(mavlink.MAV_SEVERITY_CRITICAL, text.encode())
+            return FAILED, [told]
+        self.brain.arm(is_wanted)
+        return OK, []
+
+    def _set_origin(self, message: Message) -> list[Message]:
+        lat_deg, lon_deg = message.latitude / 1e7, message.longitude / 1e7
+        if not (abs(lat_deg) <= 90 and abs(lon_deg) <= 180) or lat_deg == lon_deg == 0:
+            return []
+        if not self.brain.set_origin((lat_deg, lon_deg, message.altitude / 1e3)):
+            return []
+        told = self._streams.make(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN, self._moment())
+        return [told] if told else []
+
+    def _ack(self, command: Message, result: int) -> Message:
+        return mavlink.MAVLink_command_ack_message(
+            command=command.command,
+            result=result,
+            target_system=command.get_srcSystem(),
+            target_component=command.get_srcComponent(),
+        )
+
+    def _moment(self) -> VehicleMoment:
+        return VehicleMoment(
+            t_s=self._now_s,
+            start_utc_s=self._start_utc_s,
+            truth=self._truth,
+            brain=self.brain,
+            is_known=self._motion.is_known,
+        )
+
+    def _wind_m_s(self) -> complex:
+        parameters = self.brain.parameters
+        from_deg = parameters["SIM_WIND_DIR"]
+        return -cmath.rect(parameters["SIM_WIND_SPD"], math.radians(90 - from_deg))

@@ -1,0 +1,244 @@
+"""The common ground of the firmwares of simulated flight controllers: parameters, an estimator, modes and arming.
+
+How fast an estimate goes wrong is a plain model.
+"""
+
+import difflib
+import math
+import struct
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from typing import ClassVar
+
+from edgevpr.core.errors import UsageError
+from edgevpr.lab.simulate.motion import Motion, TrueState
+from edgevpr.lab.simulate.sensors import ExternalNavigation, PositionMeasurement, Receivers, Reckoning
+from edgevpr.mavlink.wire import Message, mavlink, parameter_value
+
+GATE_SD = 5.0  # of an innovation; ArduPilot: EK3_POS_I_GATE, EK3_VEL_I_GATE
+OK: int = mavlink.MAV_RESULT_ACCEPTED
+FAILED: int = mavlink.MAV_RESULT_FAILED
+DENIED: int = mavlink.MAV_RESULT_DENIED
+NOT_NOW: int = mavlink.MAV_RESULT_TEMPORARILY_REJECTED
+UNSUPPORTED: int = mavlink.MAV_RESULT_UNSUPPORTED
+SD_GROWS_M_S = {"plane": 1.0, "copter": 3.0, "rover": 3.0}
+_INERTIAL_M_S2 = 0.05 + 0j  # the error of the acceleration that a copter or a rover reckons with
+_WIND_LEARNT_IN_S = 5.0
+_NAME_BYTES = 16
+_MOST = 2**31 - 1
+_TYPES = {
+    "copter": mavlink.MAV_TYPE_QUADROTOR,
+    "plane": mavlink.MAV_TYPE_FIXED_WING,
+    "rover": mavlink.MAV_TYPE_GROUND_ROVER,
+}
+
+
+class Firmware(ABC):
+    """The estimator of a vehicle and what hangs on it. `motion` is landed where the failsafe says so; `texts` are the
+    severities and words that are to be told."""
+
+    number: ClassVar[int]  # MAV_AUTOPILOT
+    version: ClassVar[int]
+    filter_report: ClassVar[int]
+    default_hz: ClassVar[Mapping[int, float]] = {}
+
+    def __init__(self, kind: str, motion: Motion, parameters: dict[str, float], mode: int) -> None:
+        self.kind, self.vehicle_type = kind, _TYPES[kind]
+        is_px4 = self.number == mavlink.MAV_AUTOPILOT_PX4
+        self.parameters = Parameters({**parameters, **SIMULATOR}, bytewise=is_px4)
+        self.receivers, self.external = Receivers(self.parameters), ExternalNavigation(self.parameters)
+        self.reckoning = Reckoning()
+        self.origin: tuple[float, float, float] | None = None
+        self.mode, self.is_armed = mode, motion.is_flying
+        self.texts: list[tuple[int, str]] = []
+        self.test_ratio = 0.0
+        self._motion = motion
+        self._passed_s = -math.inf  # when a position of a sensor last passed the gate
+        self._used: PositionMeasurement | None = None
+        self._wind_m_s = 0j  # as the filter knows it
+        self._has_failed = False
+
+    @abstractmethod
+    def lose_gps(self, truth: TrueState, now_s: float) -> None:
+        """Be as one that had GPS until a while ago, and has none any more."""
+
+    @abstractmethod
+    def step(self, truth: TrueState, wind_m_s: complex, now_s: float, dt_s: float) -> None:
+        """Let sensors report, and the estimator and its watchers follow."""
+
+    @abstractmethod
+    def flags(self, now_s: float) -> int:
+        """Return the flags of the filter's report."""
+
+    @abstractmethod
+    def take_fix(self, command: Message, truth: TrueState, now_s: float) -> int:
+        """Judge command 43003, and set the position where it is accepted."""
+
+    @abstractmethod
+    def why_not_arm(self, now_s: float) -> str | None:
+        """Return the reason of the pre-arm checks, None where they pass."""
+
+    def take_global_position(self, message: Message, truth: TrueState, now_s: float) -> None:  # noqa: B027
+        """Take in a GLOBAL_POSITION_SENSOR (296), where the firmware knows it."""
+
+    def set_origin(self, at: tuple[float, float, float]) -> bool:
+        """Move the origin; the vehicle stays where it is. Return whether it was set."""
+        self.origin = at
+        return True
+
+    def use_source_set(self, number: float) -> int:
+        """Obey MAV_CMD_SET_EKF_SOURCE_SET (42007), where there are source sets."""
+        return UNSUPPORTED
+
+    def set_mode(self, mode: int) -> bool:
+        """Change the flight mode; return whether it was changed."""
+        self.mode = mode
+        return True
+
+    def take_off(self, height_m: float) -> int:
+        """Obey MAV_CMD_NAV_TAKEOFF, where the firmware is told to take off by it."""
+        return UNSUPPORTED
+
+    def arm(self, is_armed: bool) -> None:
+        """Arm or disarm."""
+        self.is_armed = is_armed
+
+    def _fuse(
+        self, truth: TrueState, measured: PositionMeasurement, wind_m_s: complex, now_s: float, reset_after_s: float
+    ) -> bool:
+        """Follow a measurement within the gate, or one outside of it after a while; return whether it was used. One
+        that is not used still tells the velocity."""
+        away_m = abs(self.reckoning.innovation_m(truth, measured.lat_deg, measured.lon_deg))
+        self.test_ratio = away_m / (GATE_SD * math.hypot(self.reckoning.sd_m, measured.sd_m))
+        if self.test_ratio <= 1:
+            self.reckoning.fuse(truth, measured)
+        elif now_s - self._passed_s > reset_after_s:
+            self.reckoning.reset_to(truth, measured.lat_deg, measured.lon_deg, measured.sd_m)
+        else:
+            return False
+        self._passed_s = now_s
+        self._wind_m_s += (wind_m_s - self._wind_m_s) * min(1.0, 0.2 / _WIND_LEARNT_IN_S)
+        return True
+
+    def _go_wrong(self, wind_m_s: complex, dt_s: float, unnoticed_share: float) -> None:
+        """Let the reckoning drift: of a plane by the wind that it does not know, of the others by their
+        accelerometers."""
+        if self.kind == "plane":
+            drift_m_s = unnoticed_share * (self._wind_m_s - wind_m_s) if self._motion.is_flying else 0j
+            self.reckoning.drift_m_s = drift_m_s
+        elif self._motion.is_flying:
+            self.reckoning.drift_m_s += _INERTIAL_M_S2 * dt_s
+
+
+class Parameters(Mapping[str, float]):
+    """Named values, each an int or a float for good. `bytewise` (PX4): the bytes of an integer stand in the float of
+    the message; else (ArduPilot) the float has the integer's value."""
+
+    def __init__(self, values: dict[str, float], bytewise: bool) -> None:
+        self._values = dict(values)
+        self._bytewise = bytewise
+
+    def __getitem__(self, name: str) -> float:
+        return self._values[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def set(self, name: str, value: float) -> None:
+        """Set the value of a parameter, which must exist."""
+        self._values[name] = type(self._values[name])(value)
+
+    def set_written(self, name: str, text: str) -> None:
+        """Set a parameter to a number as a user writes it. Raises UsageError for a name that does not exist, and for a
+        text that is no value of it."""
+        if name not in self._values:
+            near = difflib.get_close_matches(name.upper(), self._values, n=1)
+            hint = f"did you mean {near[0]}?" if near else f"it has {', '.join(sorted(self._values))}."
+            raise UsageError(f"The simulated vehicle has no parameter {name}: {hint}")
+        kind = type(self._values[name])
+        try:
+            value = kind(text)
+        except ValueError:
+            value = None
+        if value is None or not -_MOST <= value <= _MOST:  # false for NaN
+            wanted = "a whole number" if kind is int else "a number"
+            raise UsageError(f"{name}={text}: its value is {wanted}, e.g. {self._values[name]}.")
+        self.set(name, value)
+
+    def answer(self, message: Message) -> list[Message]:
+        """Return the answers to a PARAM_REQUEST_READ, PARAM_REQUEST_LIST or PARAM_SET; none for an unknown name."""
+        names = list(self._values)
+        if message.get_type() == "PARAM_REQUEST_LIST":
+            return [self._message(name, index) for index, name in enumerate(names)]
+        if message.get_type() == "PARAM_REQUEST_READ" and 0 <= message.param_index < len(names):
+            return [self._message(names[message.param_index], message.param_index)]
+        name = message.param_id
+        if name not in self._values:
+            return []
+        if message.get_type() == "PARAM_SET":
+            self.set(name, parameter_value(message, self._bytewise) or 0.0)
+        return [self._message(name, names.index(name))]
+
+    def _message(self, name: str, index: int) -> Message:
+        value, is_whole = self._values[name], isinstance(self._values[name], int)
+        kind = mavlink.MAV_PARAM_TYPE_INT32 if is_whole else mavlink.MAV_PARAM_TYPE_REAL32
+        if is_whole and self._bytewise:
+            value = struct.unpack("<f", struct.pack("<i", value))[0]
+        return mavlink.MAVLink_param_value_message(
+            name.encode()[:_NAME_BYTES], float(value), kind, len(self._values), index
+        )
+
+
+# Those of the simulator itself, under the names of ArduPilot's: the same test can drive both.
+SIMULATOR = {
+    "SIM_GPS1_ENABLE": 1,
+    "SIM_GPS1_GLTCH_X": 0.0,  # degrees of latitude
+    "SIM_GPS1_GLTCH_Y": 0.0,  # degrees of longitude
+    "SIM_WIND_SPD": 0.0,
+    "SIM_WIND_DIR": 180.0,  # where it comes from
+}
+
+ARDUPILOT = {
+    "AHRS_EKF_TYPE": 3,
+    "ARMING_CHECK": 1,
+    "EK3_ENABLE": 1,
+    **{f"EK3_SRC{number}_POSXY": 3 if number == 1 else 0 for number in (1, 2, 3)},
+    **{f"EK3_SRC{number}_VELXY": 3 if number == 1 else 0 for number in (1, 2, 3)},
+    **{f"EK3_SRC{number}_POSZ": 1 for number in (1, 2, 3)},
+    **{f"EK3_SRC{number}_VELZ": 3 if number == 1 else 0 for number in (1, 2, 3)},
+    **{f"EK3_SRC{number}_YAW": 1 if number == 1 else 0 for number in (1, 2, 3)},
+    "FLOW_TYPE": 0,
+    "GPS1_TYPE": 1,
+    "GPS2_TYPE": 0,
+    "GPS_AUTO_SWITCH": 1,
+    "SERIAL1_BAUD": 57,
+    "SERIAL1_PROTOCOL": 2,
+    "SERIAL2_BAUD": 57,
+    "SERIAL2_PROTOCOL": 2,
+    "VISO_QUAL_MIN": 0,
+    "VISO_TYPE": 0,
+}
+ARDUPILOT_KINDS = {
+    "copter": {"FS_EKF_ACTION": 1, "FS_EKF_THRESH": 0.8},
+    "plane": {"ARSPD_TYPE": 2, "ARSPD_USE": 1, "FS_LONG_ACTN": 0, "FS_SHORT_ACTN": 3, "TKOFF_ALT": 50.0},
+    "rover": {"FS_EKF_ACTION": 1, "FS_EKF_THRESH": 0.8},
+}
+
+PX4 = {
+    "EKF2_AGP0_ID": 1,
+    "EKF2_AGP0_CTRL": 1,
+    "EKF2_AGP0_DELAY": 0.0,
+    "EKF2_AGP0_GATE": 3.0,
+    "EKF2_AGP0_NOISE": 1.0,
+    "EKF2_EV_CTRL": 0,
+    "EKF2_GPS_CTRL": 7,
+    "EKF2_NOAID_TOUT": 5_000_000,
+    "EKF2_OF_CTRL": 0,
+    "MAV_1_CONFIG": 102,
+    "MAV_1_MODE": 2,
+    "SER_TEL2_BAUD": 921_600,
+    "SYS_HAS_GPS": 1,
+}

@@ -1,0 +1,154 @@
+"""The motion of a simulated vehicle: along a recorded track, or nobody knows where. East and north are one complex
+number, east + 1j * north."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgevpr.core.errors import UsageError
+from edgevpr.core.geodesy import moved, offset_m
+from edgevpr.frames.positions import GeoTag, read_positions
+
+_FASTEST_M_S = 327.0  # that the message can say
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrueState:
+    """The vehicle as it truly is: degrees, metres above sea level and above the ground, m/s over the ground (east + 1j
+    * north) and upwards. Angles are NaN where nobody knows them."""
+
+    lat_deg: float
+    lon_deg: float
+    alt_m: float
+    height_m: float
+    velocity_m_s: complex
+    climb_m_s: float
+    roll_deg: float
+    pitch_deg: float
+    heading_deg: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlownTrack:
+    """Path of the simulated vehicle: seconds from its start on, degrees, metres above sea level, each (N,) float64;
+    heading, roll, pitch and height above the ground are NaN where unknown (None: everywhere)."""
+
+    t_s: NDArray[np.float64]
+    lat_deg: NDArray[np.float64]
+    lon_deg: NDArray[np.float64]
+    alt_m: NDArray[np.float64]
+    heading_deg: NDArray[np.float64]
+    roll_deg: NDArray[np.float64] | None = None
+    pitch_deg: NDArray[np.float64] | None = None
+    height_m: NDArray[np.float64] | None = None
+
+
+class Motion:
+    """A vehicle that flies at a place that is never told, and obeys nobody. `is_flying`: from take-off to landing;
+    `is_known`: its position is reported."""
+
+    is_flying = True
+    is_known = False
+
+    def begin(self, now_s: float) -> None:
+        """Note that a flight is heard for the first time."""
+
+    def step(self, now_s: float, dt_s: float) -> TrueState:
+        """Move on to `now_s`, and return where that is."""
+        return truth_at(_NOWHERE, 0.0)
+
+    def take_off(self, height_m: float) -> None:
+        """Climb to a height over home, where it obeys."""
+
+    def land(self) -> None:
+        """Sink where it is, where it obeys."""
+
+
+class AlongTrack(Motion):
+    """Flies along a track from the moment a flight is first heard, stays where it ends, and obeys nobody."""
+
+    is_known = True
+
+    def __init__(self, track: FlownTrack) -> None:
+        self._track = track
+        self._start_s: float | None = None
+
+    def begin(self, now_s: float) -> None:
+        """Start the flight along the track."""
+        self._start_s = now_s
+
+    def step(self, now_s: float, dt_s: float) -> TrueState:
+        """Return the point of the track that belongs to `now_s`."""
+        return truth_at(self._track, 0.0 if self._start_s is None else now_s - self._start_s)
+
+
+def read_track(csv_path: str | Path) -> FlownTrack:
+    """Read the rows of a positions.csv that have a position and a time, in the order of time. Raises UsageError where
+    there are none."""
+    rows = [
+        (tag.t_utc_s, tag.position.lat_deg, tag.position.lon_deg, tag.position.alt_m or 0.0, *_hanging(tag))
+        for tag in read_positions(csv_path).values()
+        if tag.position and tag.t_utc_s is not None
+    ]
+    if not rows:
+        raise UsageError(f"{csv_path} has no row with lat, lon and time: a track needs them.")
+    rows.sort(key=lambda row: row[0])
+    t_s, lat_deg, lon_deg, alt_m, heading_deg, roll_deg, pitch_deg, height_m = np.array(rows, float).T
+    return FlownTrack(
+        t_s=t_s - t_s[0],
+        lat_deg=lat_deg,
+        lon_deg=lon_deg,
+        alt_m=alt_m,
+        heading_deg=heading_deg,
+        roll_deg=roll_deg,
+        pitch_deg=pitch_deg,
+        height_m=height_m,
+    )
+
+
+def _hanging(tag: GeoTag) -> tuple[float | None, ...]:
+    return tag.heading_deg, tag.roll_deg, tag.pitch_deg, tag.height_m
+
+
+def truth_at(track: FlownTrack, t_s: float) -> TrueState:
+    """Return the point of a track at a time, seconds from its start on. Outside the track the vehicle stands. Height
+    and angles are those of the point that was passed last."""
+    leg = int(np.searchsorted(track.t_s, t_s, side="right"))  # the one that is being flown
+    velocity = 0j
+    if 0 < leg < len(track.t_s):
+        ends = track.lat_deg[leg - 1], track.lon_deg[leg - 1], track.lat_deg[leg], track.lon_deg[leg]
+        velocity = from_to(*map(float, ends)) / float(track.t_s[leg] - track.t_s[leg - 1])
+        velocity = complex(*np.clip((velocity.real, velocity.imag), -_FASTEST_M_S, _FASTEST_M_S).tolist())
+
+    def passed_last(values: NDArray[np.float64] | None) -> float:
+        return math.nan if values is None else float(values[max(0, leg - 1)])
+
+    return TrueState(
+        lat_deg=float(np.interp(t_s, track.t_s, track.lat_deg)),
+        lon_deg=float(np.interp(t_s, track.t_s, track.lon_deg)),
+        alt_m=float(np.interp(t_s, track.t_s, track.alt_m)),
+        height_m=passed_last(track.height_m),
+        velocity_m_s=velocity,
+        climb_m_s=0.0,
+        roll_deg=passed_last(track.roll_deg),
+        pitch_deg=passed_last(track.pitch_deg),
+        heading_deg=passed_last(track.heading_deg),
+    )
+
+
+def from_to(lat_deg: float, lon_deg: float, other_lat_deg: float, other_lon_deg: float) -> complex:
+    """Return the metres from one point to another, east + 1j * north."""
+    east_m, north_m = offset_m(lat_deg, lon_deg, other_lat_deg, other_lon_deg)
+    return complex(float(east_m), float(north_m))
+
+
+def beside(lat_deg: float, lon_deg: float, step_m: complex) -> tuple[float, float]:
+    """Return the point so many metres (east + 1j * north) from a point: the reverse of `from_to`."""
+    return moved(lat_deg, lon_deg, step_m.real, step_m.imag) if step_m else (lat_deg, lon_deg)
+
+
+_ZERO = np.zeros(1)
+_NOWHERE = FlownTrack(t_s=_ZERO, lat_deg=_ZERO, lon_deg=_ZERO, alt_m=_ZERO, heading_deg=np.array([math.nan]))

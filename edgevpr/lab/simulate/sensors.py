@@ -1,0 +1,190 @@
+"""Sensors of a simulated flight controller: its GPS, a second one that a companion plays (GPS_INPUT), external
+navigation (ODOMETRY), and its own reckoning. Rules and numbers are those of ArduPilot 4.7-dev: AP_GPS, AP_GPS_MAV and
+AP_VisualOdom."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from edgevpr.lab.simulate.motion import TrueState, beside, from_to
+from edgevpr.mavlink.wire import Message, mavlink
+
+NO_FIX, FIX_3D = mavlink.GPS_FIX_TYPE_NO_FIX, mavlink.GPS_FIX_TYPE_3D_FIX
+_BEST_FIX = mavlink.GPS_FIX_TYPE_RTK_FIXED  # so good is that of ArduPilot's simulator
+_BY_MAVLINK = 14  # of GPS1_TYPE and GPS2_TYPE
+GPS_S = 0.2  # from one report of the simulated GPS to the next
+_SIMULATED_SD_M = 0.3
+_TIMEOUT_S = 4.0
+_MEAN_INTERVAL_S = 0.215  # a receiver that reports more rarely is not healthy, nor is one that is late twice in a row
+_LATE_S, _LATE_TIMES = 0.245, 2
+_MEAN_OVER = 50  # reports
+_LEAST_NOISE_M, _MOST_NOISE_M = 0.2, 100.0  # VISO_POS_M_NSE, and the most
+_EXTERNAL_GOOD_FOR_S = 0.3
+_TAKEN_SHARE = 0.3  # of an innovation, by each measurement
+_LEAST_SD_M = 0.3
+
+Values = Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PositionMeasurement:
+    """A measured position, degrees, its standard deviation, and when it was measured."""
+
+    lat_deg: float
+    lon_deg: float
+    alt_m: float
+    sd_m: float
+    t_s: float
+    velocity_m_s: complex = 0j
+
+
+class Gps:
+    """A receiver as the autopilot sees it: its last report, and whether it comes often enough."""
+
+    def __init__(self) -> None:
+        self.fix_type: int = NO_FIX
+        self.last: PositionMeasurement | None = None
+        self._heard_s = -math.inf
+        self._mean_s = 0.0
+        self._late = 0
+
+    @property
+    def is_healthy(self) -> bool:
+        """True while reports come at about 5 Hz or more."""
+        return self.fix_type >= FIX_3D and 0 < self._mean_s < _MEAN_INTERVAL_S and self._late < _LATE_TIMES
+
+    def report(self, fix_type: int, measured: PositionMeasurement) -> None:
+        """Take in a report."""
+        interval_s = measured.t_s - self._heard_s
+        self._heard_s, self.fix_type, self.last = measured.t_s, fix_type, measured
+        if interval_s > _TIMEOUT_S:
+            self._mean_s, self._late = 0.0, 0
+            return
+        self._late = self._late + 1 if interval_s > _LATE_S else 0
+        self._mean_s = self._mean_s + (interval_s - self._mean_s) / _MEAN_OVER if self._mean_s else interval_s
+
+    def age(self, now_s: float) -> None:
+        """Give up a receiver that has been silent for four seconds."""
+        if now_s - self._heard_s > _TIMEOUT_S:
+            self.fix_type, self.last, self._mean_s = NO_FIX, None, 0.0
+
+
+class Receivers:
+    """The first GPS, which sees the true position (and its glitch) while it is enabled, and the second one."""
+
+    def __init__(self, parameters: Values) -> None:
+        self.first, self.second = Gps(), Gps()
+        self.primary = self.first  # the one in use: another one takes over when it has the better fix
+        self._parameters = parameters
+        self._due_s = 0.0
+
+    @property
+    def has_second(self) -> bool:
+        """True where the second GPS is one that comes by MAVLink."""
+        return self._parameters.get("GPS2_TYPE", 0) == _BY_MAVLINK
+
+    def step(self, truth: TrueState, now_s: float) -> None:
+        """Let the simulated receiver report, and the silent ones be given up."""
+        if now_s >= self._due_s:
+            self._due_s = now_s + GPS_S - 1e-6
+            seen = PositionMeasurement(
+                lat_deg=truth.lat_deg + self._parameters["SIM_GPS1_GLTCH_X"],
+                lon_deg=truth.lon_deg + self._parameters["SIM_GPS1_GLTCH_Y"],
+                alt_m=truth.alt_m,
+                sd_m=_SIMULATED_SD_M,
+                t_s=now_s,
+                velocity_m_s=truth.velocity_m_s,
+            )
+            if self._parameters["SIM_GPS1_ENABLE"]:
+                self.first.report(_BEST_FIX, seen)
+            else:  # it goes on to report, without a fix
+                self.first.report(NO_FIX, replace(self.first.last or seen, t_s=now_s))
+        self.second.age(now_s)
+        other = self.second if self.primary is self.first else self.first
+        if max(other.fix_type, FIX_3D - 1) > self.primary.fix_type:
+            self.primary = other
+
+    def hear(self, message: Message, now_s: float) -> None:
+        """Take in a GPS_INPUT, where it is for the second receiver."""
+        if self.has_second and message.gps_id == 1:
+            measured = PositionMeasurement(
+                lat_deg=message.lat / 1e7,
+                lon_deg=message.lon / 1e7,
+                alt_m=message.alt,
+                sd_m=message.horiz_accuracy,
+                t_s=now_s,
+                velocity_m_s=complex(message.ve, message.vn),
+            )
+            self.second.report(message.fix_type, measured)
+
+
+class ExternalNavigation:
+    """Positions relative to the origin of the estimator, metres north, east and down."""
+
+    def __init__(self, parameters: Values) -> None:
+        self._parameters = parameters
+        self._heard_s = -math.inf
+        self._last: tuple[complex, float, float] | None = None  # position, standard deviation, time
+
+    def is_healthy(self, now_s: float) -> bool:
+        """Tell whether a message came in the last 0.3 s; it may be one of too low a quality."""
+        return now_s - self._heard_s < _EXTERNAL_GOOD_FOR_S
+
+    def hear(self, message: Message, now_s: float) -> None:
+        """Take in an ODOMETRY."""
+        frames = (mavlink.MAV_FRAME_LOCAL_FRD, mavlink.MAV_FRAME_BODY_FRD)
+        if not self._parameters.get("VISO_TYPE", 0) or (message.frame_id, message.child_frame_id) != frames:
+            return
+        self._heard_s = now_s
+        if message.quality >= self._parameters["VISO_QUAL_MIN"]:
+            variances = [message.pose_covariance[number] for number in (0, 6, 11)]
+            # The cube root is ArduPilot's own.
+            sd_m = 0.0 if math.isnan(variances[0]) else sum(variance**2 for variance in variances) ** (1 / 3)
+            sd_m = min(_MOST_NOISE_M, max(_LEAST_NOISE_M, sd_m))
+            self._last = complex(message.y, message.x), sd_m, now_s
+
+    def measured(self, origin: tuple[float, float, float] | None, now_s: float) -> PositionMeasurement | None:
+        """Return the last position on the Earth; None where there is none, or no origin."""
+        if self._last is None or origin is None or now_s - self._last[2] > _EXTERNAL_GOOD_FOR_S:
+            return None
+        step_m, sd_m, t_s = self._last
+        lat_deg, lon_deg = beside(origin[0], origin[1], step_m)
+        return PositionMeasurement(lat_deg=lat_deg, lon_deg=lon_deg, alt_m=origin[2], sd_m=sd_m, t_s=t_s)
+
+
+class Reckoning:
+    """The estimate of the position, as its error against the truth: metres by which it is off, how fast that grows, and
+    the standard deviation that the estimator gives itself."""
+
+    def __init__(self) -> None:
+        self.error_m = 0j
+        self.drift_m_s = 0j
+        self.sd_m = _LEAST_SD_M
+
+    def step(self, dt_s: float, sd_m_s: float) -> None:
+        """Reckon on for a while, in which the standard deviation grows by so much a second."""
+        self.error_m += self.drift_m_s * dt_s
+        self.sd_m += sd_m_s * dt_s
+
+    def place(self, truth: TrueState) -> tuple[float, float]:
+        """Return the estimated latitude and longitude, degrees."""
+        return beside(truth.lat_deg, truth.lon_deg, self.error_m)
+
+    def velocity_m_s(self, truth: TrueState) -> complex:
+        """Return the estimated velocity."""
+        return truth.velocity_m_s + self.drift_m_s
+
+    def innovation_m(self, truth: TrueState, lat_deg: float, lon_deg: float) -> complex:
+        """Return the step from the estimate to a point."""
+        return from_to(truth.lat_deg, truth.lon_deg, lat_deg, lon_deg) - self.error_m
+
+    def fuse(self, truth: TrueState, measured: PositionMeasurement) -> None:
+        """Follow a measurement; velocities are right from then on."""
+        self.error_m += _TAKEN_SHARE * self.innovation_m(truth, measured.lat_deg, measured.lon_deg)
+        self.drift_m_s = 0j
+        self.sd_m = max(_LEAST_SD_M, min(self.sd_m, measured.sd_m))
+
+    def reset_to(self, truth: TrueState, lat_deg: float, lon_deg: float, sd_m: float) -> None:
+        """Be at a point from now on."""
+        self.error_m += self.innovation_m(truth, lat_deg, lon_deg)
+        self.sd_m = max(_LEAST_SD_M, sd_m)
