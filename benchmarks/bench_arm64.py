@@ -1,5 +1,5 @@
 """What a query costs an ARM core: instructions, bytes and multiply-adds of its parts, counted while an emulated
-Cortex-A53 runs them, beside their times and calls on this machine. `make bench-arm64` writes
+Cortex-A53 runs them. `make bench-arm64` writes
 benchmarks/results/arm64.md and arm64.json, and the counts that `edgevpr profile` estimates ARM boards by.
 
 It needs Debian's packages qemu-user, debootstrap and gcc, and the registries of Debian and PyPI. Counts repeat to some
@@ -32,8 +32,6 @@ _COLUMNS = {
     "million instructions": "{millions:.2f}",
     "MB moved": "{mb:.1f}",
     "million multiply-adds": "{million_madds:.1f}",
-    "calls": "{calls}",
-    "ms here": "{here_ms:.2f}",
     "s on Zero 2 W": "{zero_s:.3f}",
 }
 
@@ -51,8 +49,7 @@ def main() -> None:
             make_big_map(Path(path), create("cohog", {"camera": Path(path).stem}).spec, counted.LARGE)
         print("counting", flush=True)
         rows = count(work, maps)
-        here = json.loads(run([sys.executable, str(HERE / "arm64" / "work.py"), "--here", *maps]).stdout)
-    found = {**base.made_by(), "parts": [row | here[row["part"]] for row in rows]}
+    found = {**base.made_by(), "parts": rows}
     figures = counted.figures({row["part"]: row["instructions"] for row in rows})
     COUNTED_PATH.write_text(json.dumps(figures, indent=1) + "\n")
     base.write("arm64", found, page(found))
@@ -96,8 +93,8 @@ def page(found: dict[str, Any]) -> str:
 Made by `make bench-arm64` on {found["date"]}, commit {found["commit"]}: {counted.LARGE} places, and a picture in which
 nearly every region is good. Counted while QEMU ran a Cortex-A53, with NumPy {machine["numpy"]} and OpenCV
 {machine["opencv"]} for aarch64. MB moved are all loads and stores, most of them from caches. Multiply-adds are those of
-vector instructions. Calls are of compiled functions, by Python. Times here are the quickest on an {machine["cpu"]}, one
-thread. The last column divides by the {mips:g} million instructions a second of `profiles/rpi-zero-2w.yaml`.
+vector instructions. The last column divides by the {mips:g} million instructions a second of
+`profiles/rpi-zero-2w.yaml`.
 
 {base.table(rows, _COLUMNS)}
 """

@@ -7,7 +7,6 @@ of no place of the map, and whatever is confirmed of them is wrong. Truth is pai
 
 import csv
 import math
-import tempfile
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
@@ -17,13 +16,11 @@ import base
 import numpy as np
 import walks
 from base import Row
-from big_map import make_big_map
 
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.level import UNKNOWN_VIEW, Levelled
 from edgevpr.lab.evaluate.dataset import Dataset
-from edgevpr.mapmaking.mapping import build_map
-from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
+from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Ranking
 from edgevpr.runtime.recognise.agreement import CONFIRMED, Agreement
@@ -33,7 +30,6 @@ from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.runtime.recognise.verify import Verification
 from edgevpr.techniques import Technique
 
-LARGE_PLACES = 10_000  # of the large map in which times are taken
 LEAST_OVERLAP = 0.3
 WIDTH_PX = 640  # of the pictures that the truth was measured in
 Way = tuple[complex, complex]  # turn with scale, and step in shares of the longest side
@@ -62,7 +58,6 @@ def main() -> None:
     for folder in folders:
         found["sets"].append(_of_set(folder, asked))
         print(found["sets"][-1], flush=True)
-    found["large_map"] = _times_of_large(folders[0], asked[folders[0].name])
     base.write("verification", found, page(found))
 
 
@@ -162,30 +157,9 @@ def _summary(errors: list[tuple[float, float, float]]) -> dict[str, tuple[float,
     return {name: tuple(np.quantile(column, (0.5, 0.9)).round(3).tolist()) for name, column in columns}
 
 
-def _times_of_large(folder: Path, asked: Pictures) -> Row:
-    """Map a set behind places of random content, and return the times of a query and of its verification."""
-    technique = walks.cohog("nadir")
-    with tempfile.TemporaryDirectory(prefix="edgevpr-verification-") as temporary:
-        path = Path(temporary) / "large.gpkg"
-        make_big_map(path, technique.spec, LARGE_PLACES)
-        with PlaceMap.open_for_adding(path) as place_map:
-            build_map(walks.frames_of(folder / "ref"), technique, place_map, walks.meter())
-        with PlaceMap.open(path) as place_map:
-            index = load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
-            both = _both(place_map, index, technique)
-            events = [[walk.step(walks.frame(image, query)) for walk in both] for query, image in asked]
-    taken_s = [
-        [without.cost.whole.wall_s, found.cost.whole.wall_s, found.steps.verify.wall_s]
-        for without, found in events
-        if found.proof
-    ]
-    times = zip(("t_query_without_ms", "t_query_ms", "t_verify_ms"), 1000 * np.median(taken_s, axis=0), strict=True)
-    return {"places": LARGE_PLACES, **{name: float(each) for name, each in times}}
-
-
 def page(found: Row) -> str:
     """Return the page for people."""
-    rows, large = found["sets"], found["large_map"]
+    rows = found["sets"]
     for row in rows:
         accepted = zip(row["wrong_accepted"], row["foreign_accepted"], strict=True)
         row["others_accepted"] = [own + other for own, other in accepted]
@@ -201,9 +175,6 @@ aerial_garfield28, and the number of landmarks that proves a place on the pairs 
 {base.table(rows, _COLUMNS)}
 
 Places compared with queries of other sets, by how many of their landmarks agree: {counts}.
-
-In a map of {large["places"]} places more, a query takes {large["t_query_ms"]:.0f} ms, {large["t_verify_ms"]:.0f} of
-them to verify; without verification {large["t_query_without_ms"]:.0f}.
 """
 
 

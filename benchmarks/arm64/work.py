@@ -1,14 +1,11 @@
-"""The parts of a query, once each: what `bench_arm64.py` counts under emulation, and times here.
+"""The parts of a query, once each: what `bench_arm64.py` counts under emulation.
 
 `python work.py AHEAD.gpkg DOWN.gpkg` marks the beginning and the end of each part by a call of getppid(), which costs
-next to nothing, and prints its name. With `--here` it prints JSON of each part's quickest time in milliseconds, and of
-its calls of compiled functions.
+next to nothing, and prints its name.
 """
 
-import json
 import os
 import sys
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
@@ -23,7 +20,6 @@ from edgevpr.power.speed import pass_round, product_round
 from edgevpr.techniques import create
 
 PER_PLACE = ("place_ids", "lat_deg", "lon_deg", "heading_deg", "rows")
-_TURNS = 7
 
 
 def parts(ahead: str, down: str) -> Iterator[tuple[str, Callable[[], object]]]:
@@ -76,30 +72,6 @@ def mark_each(*maps: str) -> None:
         print(name, flush=True)
 
 
-def time_each(*maps: str) -> None:
-    found = {}
-    for name, work in parts(*maps):
-        calls, times_ms = 0, []
-
-        def count(_: object, event: str, called: object) -> None:
-            nonlocal calls
-            calls += event == "c_call"
-
-        work()
-        sys.setprofile(count)
-        work()
-        sys.setprofile(None)
-        for _ in range(_TURNS):
-            start = time.perf_counter()
-            work()
-            times_ms.append(1000 * (time.perf_counter() - start))
-        found[name] = {"here_ms": min(times_ms), "calls": calls}
-    print(json.dumps(found))
-
-
 if __name__ == "__main__":
     cv2.setNumThreads(1)
-    if sys.argv[1] == "--here":
-        time_each(*sys.argv[2:])
-    else:
-        mark_each(*sys.argv[1:])
+    mark_each(*sys.argv[1:])

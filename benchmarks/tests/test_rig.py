@@ -13,7 +13,7 @@ import pytest
 from edgevpr.lab.simulate.camera import Pose
 from edgevpr.lab.simulate.flight import ORIGIN, to_metres, to_position
 
-RIG = Path(__file__).parents[1] / "benchmarks" / "rig"
+RIG = Path(__file__).parents[1] / "rig"
 
 
 @pytest.fixture
