@@ -18,7 +18,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from edgevpr import techniques
+from edgevpr import __version__, techniques
 from edgevpr.core.config import build
 from edgevpr.core.errors import ConfigError, EdgevprError, UsageError
 from edgevpr.core.files import own_folder, read_file, require_folder, write_whole
@@ -34,7 +34,6 @@ _FORMAT = 3  # 1 had no cost of a scan that is paid once, 2 times that passed
 _MAX_FILE_BYTES = 10_000_000
 _SAME_RAM = 0.02  # kernels keep some RAM for themselves, every version another amount
 _PACKAGES = {
-    "edgevpr": ("edgevpr",),
     "numpy": ("numpy",),
     "opencv": ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless", "opencv-contrib-python"),
     "onnxruntime": ("onnxruntime", "onnxruntime-gpu"),
@@ -78,6 +77,7 @@ def identity(root: Path = Path("/")) -> dict[str, Any]:
         "usable cores": machine.cores(root),
         "RAM in MB": round(machine.ram_mb(root)),
         "kernel": platform.release(),
+        "edgevpr": __version__,
         **{name: _version(packages) for name, packages in _PACKAGES.items()},
     }
 

@@ -15,8 +15,7 @@ from edgevpr.core.config import load_config
 from edgevpr.core.errors import EdgevprError, UsageError
 from edgevpr.core.files import shipped, write_whole
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.service.program import NAME, VENV, program_steps, remove_program
-from edgevpr.runtime.service.steps import Step, command, walk
+from edgevpr.runtime.service.program import NAME, VENV, Step, command, program_steps, remove_program, walk
 from edgevpr.runtime.service.unit import HIDDEN_FROM_THE_SERVICE, render_unit
 
 _CONFIG = "etc/edgevpr/config.yaml"
@@ -51,7 +50,7 @@ def install(config: Path | None, dry_run: bool, say: Callable[[str], None], root
         (
             Step(
                 f"system user {NAME}, without a login",
-                lambda: _uid(root) is not None,
+                lambda: _ids(root) is not None,
                 lambda: command(
                     "useradd", "--system", "--user-group", "--home-dir", "/" + _MAPS, "--shell", "/usr/sbin/nologin",
                     NAME,
@@ -149,22 +148,24 @@ def _own_folder(root: Path, name: str, what: str) -> Step:
 
     def do() -> None:
         path.mkdir(parents=True, exist_ok=True)
-        shutil.chown(path, *_ids(root))
+        if ids := _ids(root):
+            os.chown(path, *ids)
 
-    return Step(f"folder /{name} for {what}", lambda: path.is_dir() and path.stat().st_uid == _uid(root), do)
+    def is_so() -> bool:
+        ids = _ids(root)
+        return ids is not None and path.is_dir() and path.stat().st_uid == ids[0]
+
+    return Step(f"folder /{name} for {what}", is_so, do)
 
 
 def _is_gone(path: Path) -> bool:
     return not os.path.lexists(path)
 
 
-def _uid(root: Path) -> int | None:
-    return _ids(root)[0] if _entry(root / "etc/passwd", NAME) else None
-
-
-def _ids(root: Path) -> tuple[int, int]:
+def _ids(root: Path) -> tuple[int, int] | None:
+    """Return the numbers of the service's user and of the user's group; None where there is no such user."""
     entry = _entry(root / "etc/passwd", NAME)
-    return int(entry[2]), int(entry[3])
+    return (int(entry[2]), int(entry[3])) if entry else None
 
 
 def _members(root: Path, group: str) -> list[str]:

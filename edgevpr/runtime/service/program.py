@@ -1,80 +1,124 @@
-"""The program of the service: a virtual environment of its own, with the edgevpr that runs and what it needs."""
+"""The program of the service: a virtual environment of its own, with the edgevpr that runs and what it needs.
 
-import json
-import re
+It is made in steps: each says what it does, or that it is so already, and a run that was broken off goes on where it
+stopped.
+"""
+
+import filecmp
+import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
-from importlib import metadata, util
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from importlib import util
 from pathlib import Path
 
-from edgevpr import __version__
+import edgevpr
 from edgevpr.core.errors import EdgevprError
 from edgevpr.core.files import shipped
-from edgevpr.runtime.service import ownwheel
-from edgevpr.runtime.service.steps import Step, command
 
 NAME = "edgevpr"  # of the package, its command, the service, its user and the user's group
 VENV = "opt/edgevpr"  # below the root; not below /home, which the service cannot see
+_AGAIN = "correct that and run it again: what is done stays"
+_SHIPPED = ("profiles", "models", "deploy")
+_SCRIPT = "#!{python}\nimport sys\n\nfrom edgevpr.cli.main import program\n\nsys.exit(program())\n"
 
-_PROBE = "import json, pip, sys, sysconfig; print(json.dumps([sysconfig.get_path('purelib'), sys.version_info[:2]]))"
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One step: in words, what is so after it; `is_so` tells whether it is so already, and `do` makes it so."""
+
+    what: str
+    is_so: Callable[[], bool]
+    do: Callable[[], object]
+
+
+def walk(steps: Iterable[Step], dry_run: bool, say: Callable[[str], None]) -> None:
+    """Take the steps that are not so already, and say each before it is taken. With `dry_run` the same is said and
+    nothing done. Raises EdgevprError for the first step that fails."""
+    before = os.umask(0o022)  # the service's user is to read what root writes
+    try:
+        for step in steps:
+            is_so = step.is_so()
+            say(f"{'is so' if is_so else 'to do'}  {step.what}")
+            if is_so or dry_run:
+                continue
+            try:
+                step.do()
+                os.sync()  # what another run will find so, is so after a power cut too
+            except OSError as error:
+                where = f"{error.filename}: " if error.filename else ""
+                raise EdgevprError(f"{step.what}: {where}{error.strerror or error}; {_AGAIN}.") from error
+    finally:
+        os.umask(before)
+
+
+def command(*words: str | Path, **environment: str) -> None:
+    """Run a program of the system; raises EdgevprError with the last that it said where it fails."""
+    path = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"  # `su` leaves those two out
+    name = Path(words[0]).name
+    try:
+        done = subprocess.run(
+            words,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            env={**os.environ, "PATH": path, **environment},
+        )
+    except FileNotFoundError as error:
+        raise EdgevprError(f"{name} is not on this machine; {_AGAIN}.") from error
+    if done.returncode:
+        lines = [line.strip() for line in (done.stdout + done.stderr).splitlines() if line.strip()]
+        errors = [line for line in lines if line.startswith("ERROR: ")]  # pip's, which may go on to advise an upgrade
+        said = (errors or lines or [f"exit code {done.returncode}"])[-1]
+        raise EdgevprError(f"{name}: {said.removeprefix('ERROR: ').rstrip('.')}; {_AGAIN}.")
+
+
+def is_told(*words: str | Path) -> bool:
+    """Run a program that tells by its exit code; False where it is not there."""
+    try:
+        return subprocess.run(words, stdin=subprocess.DEVNULL, capture_output=True).returncode == 0
+    except OSError:
+        return False
 
 
 def program_steps(venv: Path) -> tuple[Step, ...]:
-    """Return the steps to a virtual environment with this edgevpr, the packages it needs, and compiled bytecode."""
-    python = venv / "bin" / "python"
+    """Return the steps to a virtual environment with the packages that edgevpr needs, this edgevpr, and compiled
+    bytecode."""
     lock = shipped("deploy") / "requirements.lock"
-
-    def site() -> Path | None:
-        return (found := _probed(python)) and found[0]
-
-    def pip(folder: Path, *words: str | Path) -> None:
-        for broken in site().glob("*.dist-info"):  # left by a run that was broken off, and a package to pip
-            if not (broken / "RECORD").is_file():
-                shutil.rmtree(broken)
-        quiet = "--disable-pip-version-check", "--no-input"
-        command(python, "-I", "-m", "pip", *quiet, "install", *words, TMPDIR=str(folder))
-
-    def install_packages() -> None:
-        with _room(venv) as folder:
-            pip(folder, "--require-hashes", "--only-binary", ":all:", "--requirement", lock)
-
-    def install_own() -> None:
-        with _room(venv) as folder:
-            wheel = ownwheel.write_wheel(folder)
-            pip(folder, "--no-deps", "--no-index", "--no-compile", "--force-reinstall", wheel)
-
+    compileall = (venv / "bin" / "python", "-I", "-m", "compileall", "-q")
     return (
-        Step(f"virtual environment in /{VENV}", lambda: site() is not None, lambda: _make_venv(venv)),
+        Step(f"virtual environment in /{VENV}", lambda: is_told(*_pip(venv), "--version"), lambda: _make_venv(venv)),
         Step(
             f"packages of {lock.name}, by their hashes",
-            lambda: (found := _probed(python)) is not None and _has_packages(*found, lock.read_text("utf-8")),
-            install_packages,
+            lambda: _has_packages(venv, lock),
+            lambda: _install_packages(venv, lock),
         ),
-        Step(
-            f"edgevpr {__version__}",
-            lambda: (venv / "bin" / NAME).is_file() and (found := site()) is not None and ownwheel.is_in(found),
-            install_own,
-        ),
+        Step(f"edgevpr {edgevpr.__version__}", lambda: _is_copied(venv), lambda: _copy_edgevpr(venv)),
         Step(
             "compiled bytecode, for a quick start",
-            lambda: site() is not None and _is_compiled(site() / NAME),
-            lambda: command(python, "-I", "-m", "compileall", "-q", site() / NAME),
+            lambda: _is_compiled(venv),
+            lambda: command(*compileall, _site(venv) / NAME),
         ),
     )
 
 
-def _probed(python: Path) -> tuple[Path, tuple[int, int]] | None:
-    """Return the folder of packages of a virtual environment and the version of its Python, None where it does not
-    work or has no pip."""
-    try:
-        done = subprocess.run([python, "-I", "-c", _PROBE], stdin=subprocess.DEVNULL, capture_output=True, check=True)
-        folder, (major, minor) = json.loads(done.stdout)
-    except (OSError, subprocess.CalledProcessError, ValueError):
-        return None
-    return Path(folder), (major, minor)
+def remove_program(path: Path) -> None:
+    """Remove the virtual environment; raises EdgevprError for something else in its place."""
+    if not (path / "pyvenv.cfg").is_file():
+        raise EdgevprError(f"{path} is no virtual environment: look at it, and remove it by hand.")
+    shutil.rmtree(path)
+
+
+def _pip(venv: Path) -> tuple[str | Path, ...]:
+    return venv / "bin" / "python", "-I", "-m", "pip", "--disable-pip-version-check", "--no-input"
+
+
+def _site(venv: Path) -> Path:
+    """Return the folder of packages; a path that is not there where there is none."""
+    return next(venv.glob("lib/python3*/site-packages"), venv / "lib")
 
 
 def _make_venv(path: Path) -> None:
@@ -91,48 +135,74 @@ def _make_venv(path: Path) -> None:
 
 def _require_stopped() -> None:
     """Raise EdgevprError while the service runs: what it imports later would be another version's."""
-    if shutil.which("systemctl") is None:
-        return
-    if subprocess.run(["systemctl", "is-active", "--quiet", NAME], capture_output=True).returncode == 0:
+    if is_told("systemctl", "is-active", "--quiet", NAME):
         raise EdgevprError(f"The service runs: `systemctl stop {NAME}` on the ground, then run it again.")
 
 
-def _has_packages(site: Path, python: tuple[int, int], lock: str) -> bool:
-    """Tell whether all that the lock names for this Python is there, in its version and installed to the end."""
-    there = {
-        _canonical(each.name or ""): each.version
-        for each in metadata.distributions(path=[str(site)])
-        if each.read_text("RECORD")
-    }
-    wanted = re.findall(r"(?m)^([\w.-]+)==(\S+)(?: ; (.*?))? *\\?$", lock)
-    own = f'"{python[0]}.{python[1]}"'
-    return all(there.get(_canonical(name)) == version for name, version, when in wanted if not when or own in when)
+def _broken(venv: Path) -> list[Path]:
+    """List packages of which a run that was broken off has left a part: pip takes them for whole."""
+    return [folder for folder in _site(venv).glob("*.dist-info") if not (folder / "RECORD").is_file()]
 
 
-@contextmanager
-def _room(venv: Path) -> Iterator[Path]:
-    """Give a folder for what is unfinished. /tmp may be memory, of which a small board has too little."""
+def _has_packages(venv: Path, lock: Path) -> bool:
+    """Tell whether all that the lock names for this Python is there, installed to the end: then pip, which is shown no
+    place to get any from, has nothing to complain of."""
+    asked = ("--isolated", "install", "--no-index", "--require-hashes", "--requirement", lock)
+    return not _broken(venv) and is_told(*_pip(venv), *asked)
+
+
+def _install_packages(venv: Path, lock: Path) -> None:
     _require_stopped()
-    folder = venv / "unfinished"
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir()
-    try:
-        yield folder
-    finally:
+    for folder in _broken(venv):
         shutil.rmtree(folder)
+    room = venv / "unfinished"  # /tmp may be memory, of which a small board has too little
+    shutil.rmtree(room, ignore_errors=True)
+    room.mkdir()
+    try:
+        words = ("install", "--require-hashes", "--only-binary", ":all:", "--requirement", lock)
+        command(*_pip(venv), *words, TMPDIR=str(room))
+    finally:
+        shutil.rmtree(room)
 
 
-def _canonical(name: str) -> str:
-    return re.sub(r"[-_.]+", "-", name).lower()
+def _own_files() -> dict[str, Path]:
+    """Return the files of the edgevpr that runs by their names in a folder of packages. What is shipped may lie beside
+    the package, in a checkout."""
+    package = Path(edgevpr.__file__).parent
+    folders = {NAME: package} | {f"{NAME}/shipped/{kind}": shipped(kind) for kind in _SHIPPED}
+    return {
+        f"{name}/{path.relative_to(folder).as_posix()}": path
+        for name, folder in folders.items()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.parent.name != "__pycache__"
+    }
 
 
-def _is_compiled(package: Path) -> bool:
-    modules = list(package.rglob("*.py"))
+def _is_copied(venv: Path) -> bool:
+    site, script = _site(venv), venv / "bin" / NAME
+    return script.is_file() and all(
+        (site / name).is_file() and filecmp.cmp(path, site / name, shallow=False) for name, path in _own_files().items()
+    )
+
+
+def _copy_edgevpr(venv: Path) -> None:
+    """Copy the edgevpr that runs, which may be a checkout, an installed one, or that of the service itself: no network
+    and no tool to build it is needed."""
+    _require_stopped()
+    site, room = _site(venv), venv / "unfinished"
+    shutil.rmtree(room, ignore_errors=True)
+    for name, path in _own_files().items():
+        (room / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(path, room / name)
+    for old in (site / NAME, *site.glob(f"{NAME}-*.dist-info")):
+        shutil.rmtree(old, ignore_errors=True)
+    (room / NAME).rename(site / NAME)
+    room.rmdir()
+    script = venv / "bin" / NAME
+    script.write_text(_SCRIPT.format(python=venv / "bin" / "python"), "utf-8")
+    script.chmod(0o755)
+
+
+def _is_compiled(venv: Path) -> bool:
+    modules = list((_site(venv) / NAME).rglob("*.py"))
     return bool(modules) and all(any((path.parent / "__pycache__").glob(f"{path.stem}.*.pyc")) for path in modules)
-
-
-def remove_program(path: Path) -> None:
-    """Remove the virtual environment; raises EdgevprError for something else in its place."""
-    if not (path / "pyvenv.cfg").is_file():
-        raise EdgevprError(f"{path} is no virtual environment: look at it, and remove it by hand.")
-    shutil.rmtree(path)

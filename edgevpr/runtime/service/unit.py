@@ -10,7 +10,7 @@ from edgevpr.power.boards import Board
 
 # ProtectHome and PrivateTmp put empty folders in their place.
 HIDDEN_FROM_THE_SERVICE = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")
-_RUNS = re.compile(r"(?m)^(ExecStart=.* --config )(\S+)$")
+USUAL_CONFIG = "/etc/edgevpr/config.yaml"
 
 
 def render_unit(board: Board, config_path: str | Path | None = None) -> str:
@@ -18,32 +18,33 @@ def render_unit(board: Board, config_path: str | Path | None = None) -> str:
     names). Raises UsageError for a configuration file that the service would not see, or whose name would be more than
     a word of its command line."""
     text = (shipped("deploy") / "edgevpr.service").read_text(encoding="utf-8")
-    usual = _RUNS.search(text)[2]
-    config_path = _visible(Path(config_path or usual), usual)
-    text = _RUNS.sub(lambda line: line[1] + _quoted(str(config_path)), text)
-    for key, value in {
+    visible = _visible(Path(config_path or USUAL_CONFIG))
+    text = text.replace(f" --config {USUAL_CONFIG}\n", f" --config {_quoted(str(visible))}\n")
+    changed = {
         "# Board: ": printable(board.name),
         "MemoryMax=": f"{board.memory_max_mb * 1e6:.0f}",
         "CPUQuota=": f"{100 * board.cpu_share * board.cores:.0f}%",
-    }.items():
-        text = re.sub(f"(?m)^{re.escape(key)}.*$", lambda _, line=key + value: line, text)
-    return text
+    }
+    keys = re.compile(f"(?m)^({'|'.join(changed)}).*$")
+    return keys.sub(lambda line: line[1] + changed[line[1]], text)
 
 
-def _visible(path: Path, usual: str) -> Path:
+def _visible(path: Path) -> Path:
     """Return the absolute path of a configuration file that the service sees and that a unit can name, else raise
     UsageError. Links and `..` are followed to tell; where there is a `..`, the path that they lead to is written."""
     if not str(path).isprintable():  # a line break would begin a line of its own in the unit
-        raise UsageError(f"{path} holds a character that a unit cannot hold: give it another name, e.g. {usual}.")
+        raise UsageError(
+            f"{path} holds a character that a unit cannot hold: give it another name, e.g. {USUAL_CONFIG}."
+        )
     try:
         leads_to = path.resolve()
     except (OSError, RuntimeError) as error:  # links in a circle; RuntimeError before Python 3.13
-        raise UsageError(f"{path} leads nowhere ({error}): give the path of a file, e.g. {usual}.") from error
+        raise UsageError(f"{path} leads nowhere ({error}): give the path of a file, e.g. {USUAL_CONFIG}.") from error
     written = leads_to if ".." in path.parts else path.absolute()
     for folder in HIDDEN_FROM_THE_SERVICE:
         if hidden := next((each for each in (written, leads_to) if each.is_relative_to(folder)), None):
             raise UsageError(
-                f"{hidden} is out of sight of the service, which has no access to {folder}: copy it to {usual}."
+                f"{hidden} is out of sight of the service, which has no access to {folder}: copy it to {USUAL_CONFIG}."
             )
     return written
 

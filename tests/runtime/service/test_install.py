@@ -19,6 +19,8 @@ from edgevpr.runtime.service import program
 from edgevpr.runtime.service.install import install, require_system, uninstall
 from edgevpr.runtime.service.unit import render_unit
 
+pytestmark = [pytest.mark.process, pytest.mark.slow]
+
 DEBIAN = 'PRETTY_NAME="Debian GNU/Linux 12 (bookworm)"\nID=debian\n'
 SCRIPTS = {
     "useradd": 'for name; do :; done; echo "$name:x:$(id -u):$(id -g)::/var/lib/edgevpr:/none" >> "$ROOT/etc/passwd"',
@@ -129,7 +131,7 @@ def test_everything_is_made_once(installed_root):
     assert (root / "var/log/edgevpr").stat().st_uid == os.getuid()
     assert "edgevpr" in (root / "etc/passwd").read_text()
     assert (root / "udev").read_text().split() == ["control", "trigger"]
-    bytecode = list((root / "opt/edgevpr").glob("lib/python3*/site-packages/edgevpr/__pycache__/config.*.pyc"))
+    bytecode = list((root / "opt/edgevpr").glob("lib/python3*/site-packages/edgevpr/core/__pycache__/config.*.pyc"))
     assert len(bytecode) == 1
     done = subprocess.run([root / "opt/edgevpr/bin/edgevpr", "--version"], capture_output=True, text=True, cwd="/")
     assert done.stdout == f"edgevpr {__version__}\n", done.stderr
@@ -167,9 +169,9 @@ def test_a_dry_run_says_what_the_run_before_the_first_said(installed_root, syste
         ("etc/systemd/system/edgevpr.service", "unit"),
         ("opt/edgevpr/bin/edgevpr", "edgevpr "),
         ("opt/edgevpr/lib/*/site-packages/edgevpr/core/config.py", "edgevpr "),
-        ("opt/edgevpr/lib/*/site-packages/edgevpr-*/RECORD", "edgevpr "),
+        ("opt/edgevpr/lib/*/site-packages/edgevpr/shipped/profiles/rpi-5.yaml", "edgevpr "),
         ("opt/edgevpr/lib/*/site-packages/tiny_one-1.0.dist-info/RECORD", "packages"),
-        ("opt/edgevpr/lib/*/site-packages/edgevpr/__pycache__/config.*.pyc", "compiled bytecode"),
+        ("opt/edgevpr/lib/*/site-packages/edgevpr/core/__pycache__/config.*.pyc", "compiled bytecode"),
         ("opt/edgevpr/bin/python", "virtual environment"),
         ("read", "systemd"),
     ],
@@ -200,7 +202,7 @@ def test_a_configuration_of_ones_own_is_taken_and_the_one_before_kept(installed,
 def test_a_configuration_that_is_none_stops_it_before_anything_is_done(system, tmp_path):
     (tmp_path / "bad.yaml").write_text("mapp: x\n")
     before = tree(system)
-    with pytest.raises(ConfigError, match="unknown key `mapp`"):
+    with pytest.raises(ConfigError, match="mapp"):
         lines_of(system, tmp_path / "bad.yaml")
     assert tree(system) == before
 
@@ -211,7 +213,7 @@ def test_the_program_is_not_changed_under_a_flight(installed):
         assert to_do(lines_of(installed)) == []
         (command,) = installed.glob("opt/edgevpr/bin/edgevpr")
         command.unlink()
-        with pytest.raises(EdgevprError, match=r"^The service runs: `systemctl stop edgevpr`"):
+        with pytest.raises(EdgevprError, match="systemctl stop"):
             lines_of(installed)
     finally:
         (installed / "running").unlink()
@@ -245,25 +247,23 @@ def test_uninstalling_leaves_maps_logs_and_configuration(installed):
 def test_what_is_no_virtual_environment_is_left_alone(system, packages):
     (system / "opt/edgevpr").mkdir(parents=True)
     (system / "opt/edgevpr/mine").touch()
-    with pytest.raises(EdgevprError, match=r"holds something that is no virtual environment: move it away"):
+    with pytest.raises(EdgevprError, match="/opt/edgevpr"):
         lines_of(system)
-    with pytest.raises(EdgevprError, match="is no virtual environment"):
+    with pytest.raises(EdgevprError, match="/opt/edgevpr"):
         uninstall(False, lambda _: None, system)
     assert (system / "opt/edgevpr/mine").exists()
 
 
 def test_without_the_venv_module_the_package_is_named(system, packages, monkeypatch):
     monkeypatch.setitem(sys.modules, "ensurepip", None)
-    with pytest.raises(EdgevprError, match=r"^Python's venv module is missing: `apt install python3-venv`"):
+    with pytest.raises(EdgevprError, match="python3-venv"):
         lines_of(system)
     assert (system / "var/lib/edgevpr").is_dir(), "what is done stays"
 
 
 def test_a_package_that_cannot_be_had_is_named(system, packages, monkeypatch, tmp_path):
     monkeypatch.setenv("PIP_FIND_LINKS", str(tmp_path))
-    with pytest.raises(
-        EdgevprError, match=r"^python: No matching distribution found for tiny[.-]one==1.0.*run it again"
-    ):
+    with pytest.raises(EdgevprError, match=r"^python: .*tiny[.-]one==1\.0"):
         lines_of(system)
 
 
@@ -271,7 +271,7 @@ def test_without_systemd_all_else_is_done_and_one_sentence_said(installed):
     (installed / "read").unlink()
     (installed / "run/systemd/system").rmdir()
     try:
-        with pytest.raises(EdgevprError, match=r"^systemd does not run here, and the service needs it"):
+        with pytest.raises(EdgevprError, match=r"^systemd"):
             lines_of(installed)
     finally:
         (installed / "run/systemd/system").mkdir()
@@ -282,9 +282,7 @@ def test_without_systemd_all_else_is_done_and_one_sentence_said(installed):
 def test_a_program_of_the_system_that_fails_is_named_with_what_it_said(installed):
     (installed / "no-udev").touch()
     try:
-        with pytest.raises(
-            EdgevprError, match=r"^udevadm: no udev; correct that and run it again: what is done stays\.$"
-        ):
+        with pytest.raises(EdgevprError, match=r"^udevadm: no udev; "):
             lines_of(installed)
     finally:
         (installed / "no-udev").unlink()
@@ -301,32 +299,33 @@ def test_a_file_that_cannot_be_written_is_one_sentence_and_the_next_run_goes_on(
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.returncode == 1
-    failed = "configuration in /etc/edgevpr/config.yaml: File too large"
-    assert done.stderr == f"{failed}; correct that and run it again: what is done stays.\n"
+    assert done.stderr.startswith("configuration in /etc/edgevpr/config.yaml: File too large; ")
     assert list((system / "etc/edgevpr").iterdir()) == []
     assert not [line for line in lines_of(system, dry_run=True) if "user" in line and line.startswith("to do")]
 
 
-@pytest.mark.parametrize("said", [DEBIAN, "ID=ubuntu\nID_LIKE=debian\n", 'ID=armbian\nID_LIKE="ubuntu debian"\n'])
-def test_the_systems_it_is_made_for(tmp_path, said):
-    (tmp_path / "os-release").write_text(said)
-    require_system(tmp_path / "os-release", "aarch64", True)
-    require_system(tmp_path / "os-release", "x86_64", True)
+def os_release(folder: Path, text: str | None) -> Path:
+    if text is not None:
+        (folder / "os-release").write_text(text)
+    return folder / "os-release"
 
 
-@pytest.mark.parametrize("said", ["ID=fedora\nPRETTY_NAME=Fedora\n", "", None])
-def test_another_system_is_refused(tmp_path, said):
-    if said is not None:
-        (tmp_path / "os-release").write_text(said)
-    with pytest.raises(UsageError, match="installed on Debian, Ubuntu and Raspberry Pi OS only"):
-        require_system(tmp_path / "os-release", "x86_64", True)
+@pytest.mark.parametrize("text", [DEBIAN, "ID=ubuntu\nID_LIKE=debian\n", 'ID=armbian\nID_LIKE="ubuntu debian"\n'])
+def test_the_systems_it_is_made_for(tmp_path, text):
+    for processor in ("aarch64", "x86_64"):
+        require_system(os_release(tmp_path, text), processor, True)
+
+
+@pytest.mark.parametrize("text", ["ID=fedora\nPRETTY_NAME=Fedora\n", "", None])
+def test_another_system_is_refused(tmp_path, text):
+    with pytest.raises(UsageError, match="Debian"):
+        require_system(os_release(tmp_path, text), "x86_64", True)
 
 
 @pytest.mark.parametrize(("processor", "has_64_bits"), [("armv7l", False), ("aarch64", False), ("riscv64", True)])
 def test_32_bits_are_refused(tmp_path, processor, has_64_bits):
-    (tmp_path / "os-release").write_text("ID=raspbian\nID_LIKE=debian\n")
-    with pytest.raises(UsageError, match="has not 64 bits"):
-        require_system(tmp_path / "os-release", processor, has_64_bits)
+    with pytest.raises(UsageError, match="64"):
+        require_system(os_release(tmp_path, "ID=raspbian\nID_LIKE=debian\n"), processor, has_64_bits)
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
@@ -338,17 +337,31 @@ def test_only_root_may_change_the_system():
         "    except Exception as error: print(error)\n"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    assert done.stdout == 2 * "Only root may change the system: run it again with sudo (--dry-run needs none).\n"
+    assert [line.split()[:2] for line in done.stdout.splitlines()] == 2 * [["Only", "root"]]
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "named"),
     [
-        (["--dry-run"], "--dry-run goes with"),
-        (["install", "--board", "rpi-5"], "--board goes with printing"),
-        (["uninstall", "--config", "x.yaml"], "--config goes with"),
+        (["--dry-run"], "--dry-run"),
+        (["install", "--board", "rpi-5"], "--board"),
+        (["uninstall", "--config", "x.yaml"], "--config"),
     ],
 )
-def test_flags_that_would_be_passed_over_are_refused(words, said, capsys):
+def test_flags_that_would_be_passed_over_are_refused(words, named, capsys):
     assert main(["service", *words]) == 2
-    assert said in capsys.readouterr().err
+    assert capsys.readouterr().err.startswith(f"edgevpr: {named} ")
+
+
+def test_the_program_that_was_installed_installs_itself_elsewhere_without_a_network(installed, system, packages):
+    """From the wheel's layout, where the shipped folders lie inside, as from a checkout."""
+    script = (
+        "from pathlib import Path; from edgevpr.runtime.service import program\n"
+        f"venv = Path({str(system)!r}) / program.VENV\n"
+        "program._make_venv(venv); program._copy_edgevpr(venv); print(program._is_copied(venv))\n"
+    )
+    (python,) = installed.glob("opt/edgevpr/bin/python")
+    done = subprocess.run([python, "-I", "-c", script], capture_output=True, text=True, cwd="/")
+    assert done.stdout == "True\n", done.stderr
+    said = subprocess.run([system / "opt/edgevpr/bin/edgevpr", "--version"], capture_output=True, text=True, cwd="/")
+    assert said.stdout == f"edgevpr {__version__}\n", said.stderr
