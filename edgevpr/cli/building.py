@@ -1,12 +1,10 @@
-"""`edgevpr map build` and `map refine`: places of a recording or an orthophoto, and where their pictures really lie."""
+"""`edgevpr map build`, `map refine` and `map calibrate`: places of a recording or an orthophoto, where their pictures
+really lie, and how sure the map can be."""
 
-import sys
-from argparse import Namespace
+from argparse import ArgumentParser, Namespace
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from edgevpr.cli import calibrating, orthophotos
 from edgevpr.cli.shared import (
     add_json,
     add_keys,
@@ -15,22 +13,18 @@ from edgevpr.cli.shared import (
     command,
     config_of,
     exit_code,
-    frames_of,
     leave_out,
     parameters_of,
     path_of,
     positive,
     print_json,
-    watched,
-)  # fmt: skip
-from edgevpr.core.errors import EdgevprError, ImageError, UsageError
+)
+from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.text import shown
 
 if TYPE_CHECKING:
-    from edgevpr.core.contract import Technique
-    from edgevpr.frames.source import Source
+    from edgevpr.mapmaking.making import Cuttings, MadeMap, Recording
     from edgevpr.mapmaking.refine import Refined
-    from edgevpr.places.mapfile import PlaceMap
 
 
 _WITHOUT_POSITIONS = (
@@ -38,14 +32,15 @@ _WITHOUT_POSITIONS = (
     "pictures with GPS in their EXIF data, or a positions.csv beside them (file,lat,lon[,alt,...], --positions); of a "
     "video, give --positions with time,lat,lon, in seconds from its first frame"
 )
+_OF_AN_ORTHOPHOTO = ("footprint_m", "spacing_m", "area", "margin_m")
+_OF_A_RECORDING = ("positions", "rate_hz")
 
 
 def add(maps: Any) -> None:
     """Add the commands and their flags to those of maps."""
     build = command(maps, "build", map_build, "make a map of a flight, or of an orthophoto")
     build.add_argument("map", metavar="MAP", help="the map file to make, e.g. valley.gpkg")
-    add_recording(build, required=False)
-    orthophotos.add(build)
+    _add_pictures(build)
     build.add_argument("--technique", metavar="NAME", help="see `edgevpr profile` (default: by the board)")
     add_parameters(build, "a parameter of the technique")
     build.add_argument(
@@ -70,120 +65,116 @@ def add(maps: Any) -> None:
         "--images", metavar="DIR", help="the images that the map was made of: with them more pictures are tied"
     )
     add_json(refine)
+    calibrate = command(maps, "calibrate", map_calibrate, "find out how sure a map can be, with the pictures it is of")
+    calibrate.add_argument("map", metavar="MAP")
+    _add_pictures(calibrate)
+    calibrate.add_argument("--config", metavar="FILE", help="that of the flight: its camera, mask and precision")
+    add_keys(calibrate, "source.mask", "source.fov_deg", "source.up_deg")
+    add_json(calibrate)
+
+
+def _add_pictures(parser: ArgumentParser) -> None:
+    """Add the flags of the pictures that a map is made of: of a recording, or of an orthophoto."""
+    add_recording(parser, required=False)
+    flags = parser.add_argument_group("of an orthophoto, in place of --images")
+    flags.add_argument("--orthophoto", metavar="FILE", help="GeoTIFF, VRT, MBTiles, or a folder of tiles (z/x/y.png)")
+    flags.add_argument(
+        "--footprint-m", type=float, metavar="M", help="ground along the longest side of a picture in flight"
+    )
+    flags.add_argument("--spacing-m", type=float, metavar="M", help="ground from place to place, e.g. a quarter")
+    flags.add_argument(
+        "--area", metavar="FILE", help="only over this: a mission (waypoints, QGC .plan) or GeoJSON (default: all)"
+    )
+    flags.add_argument(
+        "--margin-m", type=float, metavar="M", help="this far beside the path of --area (default: the footprint)"
+    )
+
+
+def _pictures(args: Namespace) -> "Recording | Cuttings":
+    """Return the pictures that the flags name. Raises UsageError for none, both, or flags of the other."""
+    from edgevpr.mapmaking.making import Cuttings, Recording
+
+    if (args.source is None) == (args.orthophoto is None):
+        raise UsageError("Give either --images (pictures of a flight) or --orthophoto: a map is made of one of them.")
+    others = _OF_AN_ORTHOPHOTO if args.orthophoto is None else _OF_A_RECORDING
+    if given := [name for name in others if getattr(args, name, None) is not None]:
+        source = "--orthophoto" if args.orthophoto is None else "--images"
+        raise UsageError(f"--{given[0].replace('_', '-')} goes with {source}: leave it out.")
+    if args.source is not None:
+        rate_hz = getattr(args, "rate_hz", None)
+        return Recording(source=args.source, positions=path_of(args.positions), rate_hz=rate_hz)
+    if args.footprint_m is None or args.spacing_m is None:
+        raise UsageError("--orthophoto needs --footprint-m (ground along a picture's longest side) and --spacing-m.")
+    if args.margin_m is not None and not (args.area and 0 <= args.margin_m < float("inf")):
+        raise UsageError(f"--margin-m {args.margin_m:g}: give 0 or more, with --area.")
+    return Cuttings(
+        orthophoto=args.orthophoto,
+        footprint_m=args.footprint_m,
+        spacing_m=args.spacing_m,
+        area=args.area,
+        margin_m=args.margin_m,
+    )
 
 
 def map_build(args: Namespace) -> int:
-    """Make a map of a recording, or continue one."""
-    from edgevpr.frames.mask import mask_of
-    from edgevpr.mapmaking.mapping import Gaps, Preparation, Selection, build_map
-    from edgevpr.places.mapfile import PlaceMap
-    from edgevpr.places.mapfiles import map_path, remove
-    from edgevpr.places.mapinfo import info_of
-    from edgevpr.power.boards import load_board
-    from edgevpr.runtime.preflight.pick import camera_setting, picked_technique
-    from edgevpr.runtime.recognise.levelling import NoLevelling, levelling_of
-    from edgevpr.runtime.recognise.opening import gate_of, made_for, meter_of, say_other_mask, technique_of
+    """Make a map of a recording or an orthophoto, or continue one."""
+    from edgevpr.core.text import progress
+    from edgevpr.mapmaking.making import MapOrder, make_map
 
     config = config_of(args, args.config)
-    path = map_path(args.map)
-    orthophotos.require_one_source(args)
-    is_cut = args.orthophoto is not None
-    camera = orthophotos.camera_of(config.source.camera) if is_cut else config.source.camera
-    source = orthophotos.open_cuttings(args) if is_cut else _recording(args)
-    mask = mask_of(None if is_cut else config.source.mask)  # the mask hides parts of the aircraft, not of the ground
-    settings, here = parameters_of(args.param), load_board("this")
-    gate = gate_of(config.salience, here.threads)
-    gaps = Gaps(config.salience.gap_frames, config.salience.gap_m)
-
-    def asked(name: str) -> dict[str, str]:
-        said = {"camera": camera} if camera else {}
-        return settings | (camera_setting(name, camera) if is_cut else said)
-
-    is_new = not (args.append and path.exists())
-    if not is_new:
-        place_map = PlaceMap.open_for_adding(path)
-        technique = technique_of(place_map, args.technique, asked(args.technique or place_map.spec.name), here)
-        say_other_mask(place_map, mask)
-    else:
-        if name := args.technique or (orthophotos.TECHNIQUE if is_cut else None):
-            technique = made_for(here, name, asked(name))
-        else:
-            name = picked_technique(args.board, source.total or 1, camera)
-            technique = made_for(here, name, settings | camera_setting(name, camera))
-        place_map = PlaceMap.create(path, technique.spec)
-        place_map.record_mask(mask.sha256)
+    order = MapOrder(
+        path=args.map,
+        pictures=_pictures(args),
+        technique=args.technique,
+        parameters=parameters_of(args.param),
+        board=args.board,
+        append=args.append,
+        refine=args.refine,
+        calibrate=args.calibrate,
+    )
     unusable: list[ImageError] = []
-    with place_map:
-        frames = frames_of(source, "mapping", unusable)
-        meter = meter_of(config, here)
-        # What is cut lies on the ground already, and no lens has seen it.
-        levelling = NoLevelling() if is_cut else levelling_of(config.source, technique, below=True)
-        preparation = Preparation(mask=mask, levelling=levelling)
-        try:
-            result = build_map(
-                frames,
-                technique,
-                place_map,
-                meter,
-                preparation,
-                Selection(gate=gate, gaps=gaps, min_quality=technique.min_quality if is_cut else 0.0),
-                lambda error: leave_out(error, unusable),
-            )
-        except EdgevprError:
-            if is_new and not len(place_map):  # a full disk: an empty map would only stand in the way of the next try
-                remove(path)
-            raise
-        places = len(place_map)
-        has_positions = info_of(place_map).with_position > 0
-        refined = _refined_after(place_map, technique, args) if args.refine else None
-        calibrated = None
-        if args.calibrate:
-            calibrated = calibrating.calibrated_after(
-                technique,
-                lambda: calibrating.calibrated(args, place_map, technique, config.match, meter, preparation),
-            )
+    made = make_map(order, config, lambda error: leave_out(error, unusable), progress)
     if args.json:
-        more = {"refined": asdict(refined)} if refined else {}
-        more |= {"calibration": calibrated.figures()} if calibrated else {}
-        more |= {"without_data": source.without_data} if is_cut else {}
-        print_json({"map": args.map, "technique": technique.spec.name, "places": places, **asdict(result), **more})
+        more: dict[str, Any] = {"refined": asdict(made.refined)} if made.refined else {}
+        more |= {"calibration": made.calibration.figures()} if made.calibration else {}
+        more |= {} if made.without_data is None else {"without_data": made.without_data}
+        about = {"map": args.map, "technique": made.technique, "places": made.places}
+        print_json({**about, **asdict(made.result), **more})
     else:
-        print(
-            f"{args.map}: {result.added} places added ({result.without_position} without a position), {places} in all"
-        )
-        if result.already_here:
-            print(f"  {result.already_here} images were in the map already")
-        if result.not_memorable:
-            lacking = ", ".join(f"{count} for want of {what}" for what, count in result.not_memorable.items())
-            print(f"  left out: {lacking}")
-        if is_cut:
-            print(f"  left out: {source.without_data} for want of data, {result.says_nothing} for want of texture")
-        if result.of_low_quality:
-            print(f"  {result.of_low_quality} of the places are of low quality, kept to bound the gaps")
-        if refined:
-            _print_refined(args.map, refined, technique.spec.cells)
-        if calibrated:
-            print(f"expect: {calibrated.said()}")
-        if places and not has_positions:
-            print(f"{args.map}: {_WITHOUT_POSITIONS}")
+        _print_made(args.map, made)
     return exit_code(unusable)
 
 
-def _recording(args: Namespace) -> "Source":
-    from edgevpr.frames.source import open_source
-
-    step_s = 1 / args.rate_hz if args.rate_hz else None
-    return open_source(args.source, step_s=step_s, positions=path_of(args.positions), live=False)
+def _print_made(path: str, made: "MadeMap") -> None:
+    result = made.result
+    print(f"{path}: {result.added} places added ({result.without_position} without a position), {made.places} in all")
+    if result.already_here:
+        print(f"  {result.already_here} images were in the map already")
+    if result.not_memorable:
+        lacking = ", ".join(f"{count} for want of {what}" for what, count in result.not_memorable.items())
+        print(f"  left out: {lacking}")
+    if made.without_data is not None:
+        print(f"  left out: {made.without_data} for want of data, {result.says_nothing} for want of texture")
+    if result.of_low_quality:
+        print(f"  {result.of_low_quality} of the places are of low quality, kept to bound the gaps")
+    if made.refined:
+        _print_refined(path, made.refined, made.cells)
+    if made.calibration:
+        print(f"expect: {made.calibration.said()}")
+    if made.places and not made.with_position:
+        print(f"{path}: {_WITHOUT_POSITIONS}")
 
 
 def map_refine(args: Namespace) -> int:
     """Find out where the pictures of a map really lie, and say it."""
+    from edgevpr.core.text import progress
+    from edgevpr.mapmaking.making import refine_map
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.runtime.recognise.opening import technique_of
 
     with PlaceMap.open_for_adding(args.map) as place_map:
         technique = technique_of(place_map)
-        refined = _refined(place_map, technique, args.images)
+        refined = refine_map(place_map, technique, args.images, progress)
     if args.json:
         print_json({"map": args.map, **asdict(refined)})
     else:
@@ -191,32 +182,21 @@ def map_refine(args: Namespace) -> int:
     return 0
 
 
-def _refined_after(place_map: "PlaceMap", technique: "Technique", args: Namespace) -> "Refined | None":
-    """Refine a map that has just been built, where anything can be refined; the map is whole without it."""
-    if technique.spec.cells is None:
-        return None
-    try:
-        return _refined(place_map, technique, args.source if args.source and Path(args.source).is_dir() else None)
-    except EdgevprError as error:
-        print(f"edgevpr: the map is not refined: {error}", file=sys.stderr)
-        return None
+def map_calibrate(args: Namespace) -> int:
+    """Calibrate a map, and say what to expect of it."""
+    from edgevpr.core.text import progress
+    from edgevpr.mapmaking.making import calibrate_map
+    from edgevpr.places.mapfile import PlaceMap
+    from edgevpr.runtime.recognise.opening import technique_of
 
-
-def _refined(place_map: "PlaceMap", technique: "Technique", images: str | None) -> "Refined":
-    """Refine an open map. Raises UsageError for one that nothing can be refined of, and where SciPy is missing."""
-    if technique.spec.cells is None:
-        raise UsageError(
-            f"{place_map.path} is of {technique.spec.name}, and not of a camera that looks straight down: only `cohog` "
-            "with `--camera nadir` can be refined."
-        )
-    try:
-        from edgevpr.mapmaking.refine import refine
-    except ModuleNotFoundError as error:
-        raise UsageError(
-            f"Refining a map needs SciPy ({error}): install it on the machine that builds maps, with "
-            "`pip install 'edgevpr[maps]'`, and run `edgevpr map refine`."
-        ) from error
-    return refine(place_map, technique, watched("refining"), images)
+    config, pictures = config_of(args, args.config), _pictures(args)
+    with PlaceMap.open_for_adding(args.map) as place_map:
+        found = calibrate_map(place_map, technique_of(place_map), config, pictures, progress)
+    if args.json:
+        print_json({"map": args.map, "calibration": found.figures()})
+    else:
+        print(f"{args.map}: calibrated: {found.said()}")
+    return 0
 
 
 def _print_refined(path: str, refined: "Refined", cells: int | None) -> None:
@@ -224,7 +204,7 @@ def _print_refined(path: str, refined: "Refined", cells: int | None) -> None:
         print("  not refined: no place has a position")
         return
     print(f"{path}: {refined.refined} of {refined.places} places refined, by {refined.ties} ties between pictures")
-    if refined.refined:
+    if refined.footprint_m and cells:
         scatter = f"as recorded they scatter by {refined.recorded_sd_m:.1f} m"
         moved = f"moved by {refined.moved_m:.1f} m, known to {refined.position_sd_m:.1f} m (medians)"
         print(f"  position    {moved}; {scatter}")

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from edgevpr.cli import building, calibrating
+from edgevpr.cli import building
 from edgevpr.cli.shared import add_json, command, group, positive, print_json, watched
 from edgevpr.core.errors import UsageError
 
@@ -19,7 +19,6 @@ def add(commands: Any) -> None:
     """Add the commands and their flags."""
     maps = group(commands, "map", "build, look into, check, repair, merge and export place maps")
     building.add(maps)
-    calibrating.add(maps)
     info = command(maps, "info", map_info, "say what a map holds")
     info.add_argument("map", metavar="MAP")
     add_json(info)

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from edgevpr.places.repair import Watch
 
 _KEY = "key "  # begins the name under which argparse keeps the value of a flag that is a key of the configuration
-_READ_TIMEOUT_S = 1.0
 _RECORDING = "a folder of images or a video file"
 
 
@@ -110,21 +109,10 @@ def frames_of(source: "Source", label: str, unusable: list[ImageError]) -> "Iter
     """Read every frame of a source that ends, and show progress. An image that cannot be used is reported, added to
     `unusable`, and left out."""
     from edgevpr.core.text import progress
+    from edgevpr.frames.source import read_to_end
 
     frames = read_to_end(source, lambda error: leave_out(error, unusable))
     return (frame for frame in progress(frames, source.total, label) if frame is not None)
-
-
-def read_to_end(source: "Source", left_out: Callable[[ImageError], None]) -> "Iterator[Frame | None]":
-    """Read a source that ends, and close it. An image that cannot be used is handed to `left_out`; for it, and where no
-    frame has come yet, None is yielded."""
-    while not source.ended:
-        try:
-            yield source.read(_READ_TIMEOUT_S)
-        except ImageError as error:
-            left_out(error)
-            yield None
-    source.close()
 
 
 def leave_out(error: ImageError, unusable: list[ImageError]) -> None:

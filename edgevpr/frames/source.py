@@ -2,13 +2,13 @@
 
 import os
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Protocol
 from urllib.parse import urlsplit
 
 from edgevpr.core.config import SOURCES
-from edgevpr.core.errors import SourceError, UsageError
+from edgevpr.core.errors import ImageError, SourceError, UsageError
 from edgevpr.core.types import Frame
 from edgevpr.frames.images import EXTENSIONS
 from edgevpr.frames.live import LiveSource, open_camera
@@ -16,6 +16,7 @@ from edgevpr.frames.recordings import FolderSource
 from edgevpr.frames.shot import Capture, Condition
 
 _SCHEMES = ("rtsp", "rtsps", "udp", "tcp", "http", "https")
+_READ_TIMEOUT_S = 1.0
 _SCHEMES_THAT_NEED_A_PORT = ("udp", "tcp")
 
 
@@ -98,6 +99,18 @@ def open_source(
     from edgevpr.frames.video import VideoSource  # loads FFmpeg
 
     return VideoSource(path, step_s or 0.0, clock, only, track=read_track(positions) if positions else None)
+
+
+def read_to_end(source: Source, left_out: Callable[[ImageError], None]) -> Iterator[Frame | None]:
+    """Read a source that ends, and close it. An image that cannot be used is handed to `left_out`; for it, and where no
+    frame has come yet, None is yielded."""
+    while not source.ended:
+        try:
+            yield source.read(_READ_TIMEOUT_S)
+        except ImageError as error:
+            left_out(error)
+            yield None
+    source.close()
 
 
 def is_live(uri: str) -> bool:

@@ -100,7 +100,11 @@ def test_water_and_what_is_not_known_are_left_out_and_said(tmp_path, capsys, cap
         (["--orthophoto", "GROUND", "--footprint-m", "80"], 2, "and --spacing-m"),
         (["--orthophoto", "GROUND", "--positions", "p.csv"], 2, "--positions goes with --images"),
         (["--orthophoto", "GROUND", "--rate-hz", "2"], 2, "--rate-hz goes with --images"),
-        (["--orthophoto", "GROUND", "--camera", "forward"], 2, "give nadir, or leave it out"),
+        (
+            ["--orthophoto", "GROUND", "--footprint-m", "80", "--spacing-m", "20", "--camera", "forward"],
+            2,
+            "give nadir",
+        ),
         (["--orthophoto", "GROUND", "--footprint-m", "80", "--spacing-m", "20", "--margin-m", "5"], 2, "with --area"),
         (["--orthophoto", "GROUND", "--footprint-m", "8000", "--spacing-m", "20"], 2, "--footprint-m is 8000"),
         (["--orthophoto", "nothing.tif", "--footprint-m", "80", "--spacing-m", "20"], 1, "no orthophoto nothing.tif"),

@@ -1,7 +1,7 @@
 """Measurement of a technique on a data set by the code that flies: map file, index, retrieval, stage meter."""
 
 import tempfile
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -18,6 +18,7 @@ from edgevpr.lab.evaluate import metrics
 from edgevpr.lab.evaluate.asking import MatchOptions, Progress, QueryAnswer, Walk, answers
 from edgevpr.lab.evaluate.dataset import Dataset
 from edgevpr.lab.evaluate.metrics import Quality, figures
+from edgevpr.mapmaking.making import Recording, calibrate_map, refine_map
 from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
@@ -25,7 +26,6 @@ from edgevpr.places.sequence import length_of
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import pack_ah, parse_pack, queries_ah, rail_ah, stage_energy_j
 from edgevpr.power.meter import QueryMeter
-from edgevpr.runtime.recognise.evidence import kinds_of
 from edgevpr.runtime.recognise.opening import meter_of
 from edgevpr.runtime.recognise.salience_gate import Gate, NoGate
 from edgevpr.techniques import create, labelled
@@ -67,12 +67,16 @@ class TechniqueResult(Quality):
     t_encode_max_s: float | None = None
 
 
+def _quietly(items: Iterable[Any], total: int, label: str) -> Iterable[Any]:
+    return items
+
+
 def evaluate(
     technique_name: str,
     dataset: Dataset,
     parameters: dict[str, Any] | None = None,
     options: MatchOptions = MatchOptions(),  # noqa: B008  it is frozen
-    progress: Progress[Any] = lambda items, total, label: items,
+    progress: Progress[Any] = _quietly,
     gate: Gate | NoGate | None = None,
 ) -> TechniqueResult:
     """Map the references, ask every query, and score the answers. `gate` discards queries; the map has all references,
@@ -96,7 +100,7 @@ def answers_on(
     technique: Technique,
     dataset: Dataset,
     options: MatchOptions,
-    progress: Progress[Any] = lambda items, total, label: items,
+    progress: Progress[Any] = _quietly,
     gate: Gate | NoGate | None = None,
 ) -> list[QueryAnswer]:
     """Ask every query of a data set in the map of its references."""
@@ -132,8 +136,11 @@ def make_map(
     meter = meter or own_meter()
     with PlaceMap.create(path, technique.spec) as place_map:
         build_map(frames, technique, place_map, meter)
-        _refine(place_map, technique, images)
-        _calibrate(place_map, technique, meter, images)
+        with suppress(UsageError):  # nothing to refine, or no SciPy: it flies as it was recorded
+            refine_map(place_map, technique, images, _quietly)
+        if images:
+            with suppress(UsageError):  # too small a map, or one whose pictures cannot tell: by the shipped model
+                calibrate_map(place_map, technique, load_config(None), Recording(source=str(images)), _quietly)
 
 
 @contextmanager
@@ -141,31 +148,6 @@ def opened(path: Path, technique: Technique) -> Iterator[tuple[PlaceMap, PlaceIn
     """Give a map, open to read, and an index with all its places."""
     with PlaceMap.open(path) as place_map:
         yield place_map, load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
-
-
-def _refine(place_map: PlaceMap, technique: Technique, images: Path | None) -> None:
-    if technique.spec.cells is None:
-        return
-    try:
-        from edgevpr.mapmaking.refine import refine
-    except ModuleNotFoundError:  # without SciPy, the maps of this machine are not refined either
-        return
-    refine(place_map, technique, lambda pairs, total: pairs, images)
-
-
-def _calibrate(place_map: PlaceMap, technique: Technique, meter: QueryMeter, images: Path | None) -> None:
-    if images is None or not kinds_of(technique.spec):
-        return
-    try:
-        from edgevpr.mapmaking.calibrate import calibrate
-    except ModuleNotFoundError:  # without SciPy
-        return
-
-    def pictures(names: Collection[str]) -> Iterator[Frame]:
-        return all_frames(open_source(str(images), live=False, only=names))
-
-    with suppress(UsageError):  # too small a map, or one whose pictures cannot tell: it flies with the shipped model
-        calibrate(technique, place_map, load_config(None).match, meter, pictures, lambda frames, total: frames)
 
 
 def compare(results: Iterable[TechniqueResult]) -> list[TechniqueResult]:

@@ -1,0 +1,244 @@
+"""A map from its pictures to its confidence: what `edgevpr map build`, `map refine` and `map calibrate` do."""
+
+import logging
+import time
+from collections.abc import Callable, Collection, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from edgevpr.core.config import Config
+from edgevpr.core.contract import Technique
+from edgevpr.core.errors import EdgevprError, ImageError, UsageError
+from edgevpr.core.types import Frame
+from edgevpr.frames.mask import mask_of
+from edgevpr.frames.source import Source, open_source, read_to_end
+from edgevpr.mapmaking.mapping import Gaps, MappingResult, Preparation, Selection, build_map
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.mapfiles import map_path, remove
+from edgevpr.places.mapinfo import info_of
+from edgevpr.power.boards import load_board
+from edgevpr.runtime.preflight.pick import camera_setting, picked_technique
+from edgevpr.runtime.recognise.evidence import kinds_of
+from edgevpr.runtime.recognise.levelling import NoLevelling, levelling_of
+from edgevpr.runtime.recognise.opening import gate_of, made_for, meter_of, say_other_mask, technique_of
+from edgevpr.runtime.recognise.stored_confidence import Calibration
+
+if TYPE_CHECKING:
+    from edgevpr.mapmaking.refine import Refined
+
+_log = logging.getLogger(__name__)
+_OF_ORTHOPHOTOS = "cohog"
+
+Shown = Callable[[Iterable[Any], int, str], Iterable[Any]]  # passes things through, and shows progress
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recording:
+    """Pictures of a flight: a folder or a video, its positions (None: those beside it), and how many pictures a second
+    of a video are taken (None: every frame)."""
+
+    source: str
+    positions: Path | None = None
+    rate_hz: float | None = None
+
+    def open(self, only: Collection[str] | None = None) -> Source:
+        """Open it; only the pictures of the names in `only` are read (None: all)."""
+        step_s = 1 / self.rate_hz if self.rate_hz else None
+        return open_source(self.source, step_s=step_s, positions=self.positions, live=False, only=only)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cuttings:
+    """Pictures that are cut from an orthophoto: the ground along a picture's longest side and from place to place, the
+    file of the area (None: all), and how far beside its path (None: the footprint)."""
+
+    orthophoto: str
+    footprint_m: float
+    spacing_m: float
+    area: str | None = None
+    margin_m: float | None = None
+
+    def open(self, only: Collection[str] | None = None) -> Source:
+        """Open the orthophoto and lay the grid of its places; those of the names in `only` are cut (None: all). Raises
+        SourceError, and UsageError for what does not fit."""
+        from edgevpr.mapmaking.cuttings import OrthophotoSource
+        from edgevpr.mapmaking.lattice import lattice_of
+        from edgevpr.mapmaking.missions import read_area
+        from edgevpr.mapmaking.orthophoto import Orthophoto  # loads GDAL, or says that it is missing
+
+        area = read_area(self.area) if self.area else None
+        margin_m = self.footprint_m if self.margin_m is None else self.margin_m
+        orthophoto = Orthophoto(self.orthophoto)
+        lattice = lattice_of(orthophoto, self.footprint_m, self.spacing_m, area, margin_m)
+        return OrthophotoSource(orthophoto, lattice, self.footprint_m, time.monotonic, only=only)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapOrder:
+    """The map to be made: its technique (None: by the board that will fly) with its parameters, whether places are
+    added to a map that is there, and whether it is refined and calibrated in the end."""
+
+    path: str
+    pictures: Recording | Cuttings
+    technique: str | None = None
+    parameters: dict[str, str]
+    board: str = "this"
+    append: bool = False
+    refine: bool = True
+    calibrate: bool = True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MadeMap:
+    """What became of an order: the technique, its cells, the places in all, how many of them have a position, what the
+    frames were, and how the map was refined and calibrated (None: it was not). Of an orthophoto, `without_data` places
+    were left out."""
+
+    technique: str
+    cells: int | None
+    places: int
+    with_position: int
+    result: MappingResult
+    refined: "Refined | None"
+    calibration: Calibration | None
+    without_data: int | None
+
+
+def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], None], shown: Shown) -> MadeMap:
+    """Make a map of pictures, or continue one. Pictures that cannot be used are handed to `unusable`."""
+    path, is_cut = map_path(order.path), isinstance(order.pictures, Cuttings)
+    camera = _camera(config.source.camera, is_cut)
+    source = order.pictures.open()
+    mask = mask_of(None if is_cut else config.source.mask)
+    is_new = not (order.append and path.exists())
+    if is_new:
+        technique = _new_technique(order, camera, source.total)
+        place_map = PlaceMap.create(path, technique.spec)
+        place_map.record_mask(mask.sha256)
+    else:
+        place_map = PlaceMap.open_for_adding(path)
+        settings = _settings(order, order.technique or place_map.spec.name, camera)
+        technique = technique_of(place_map, order.technique, settings, load_board("this"))
+        say_other_mask(place_map, mask)
+    with place_map:
+        try:
+            result = build_map(
+                (frame for frame in shown(read_to_end(source, unusable), source.total, "mapping") if frame),
+                technique,
+                place_map,
+                meter_of(config, load_board("this")),
+                _preparation(config, order.pictures, technique),
+                Selection(
+                    gate=gate_of(config.salience, load_board("this").threads),
+                    gaps=Gaps(config.salience.gap_frames, config.salience.gap_m),
+                    min_quality=technique.min_quality if is_cut else 0.0,
+                ),
+                unusable,
+            )
+        except EdgevprError:
+            if is_new and not len(place_map):  # a full disk: an empty map would only stand in the way of the next try
+                remove(path)
+            raise
+        refined, calibration = None, None
+        if order.refine and technique.spec.cells is not None:
+            images = order.pictures.source if isinstance(order.pictures, Recording) else ""
+            refined = _unless_impossible(
+                "refined", lambda: refine_map(place_map, technique, images if Path(images).is_dir() else None, shown)
+            )
+        if order.calibrate and kinds_of(technique.spec):
+            calibration = _unless_impossible(
+                "calibrated", lambda: calibrate_map(place_map, technique, config, order.pictures, shown)
+            )
+        return MadeMap(
+            technique=technique.spec.name,
+            cells=technique.spec.cells,
+            places=len(place_map),
+            with_position=info_of(place_map).with_position,
+            result=result,
+            refined=refined,
+            calibration=calibration,
+            without_data=getattr(source, "without_data", None),
+        )
+
+
+def refine_map(place_map: PlaceMap, technique: Technique, images: str | Path | None, shown: Shown) -> "Refined":
+    """Refine an open map. Raises UsageError for one that nothing can be refined of, and where SciPy is missing."""
+    if technique.spec.cells is None:
+        raise UsageError(
+            f"{place_map.path} is of {technique.spec.name}, and not of a camera that looks straight down: only `cohog` "
+            "with `--camera nadir` can be refined."
+        )
+    try:
+        from edgevpr.mapmaking.refine import refine
+    except ModuleNotFoundError as error:
+        raise _without_scipy("Refining", "refine", error) from error
+    return refine(place_map, technique, lambda pairs, total: shown(pairs, total, "refining"), images)
+
+
+def calibrate_map(
+    place_map: PlaceMap, technique: Technique, config: Config, pictures: Recording | Cuttings, shown: Shown
+) -> Calibration:
+    """Calibrate an open map with its pictures; one that cannot be read is left out. Raises UsageError where that cannot
+    be done, and where SciPy is missing."""
+    try:
+        from edgevpr.mapmaking.calibrate import calibrate
+    except ModuleNotFoundError as error:
+        raise _without_scipy("Calibrating", "calibrate", error) from error
+
+    def frames(names: Collection[str]) -> Iterator[Frame]:
+        yield from filter(None, read_to_end(pictures.open(names), lambda error: None))
+
+    return calibrate(
+        technique,
+        place_map,
+        config.match,
+        meter_of(config, load_board("this")),
+        frames,
+        lambda asked, total: shown(asked, total, "calibrating"),
+        _preparation(config, pictures, technique),
+    )
+
+
+def _preparation(config: Config, pictures: Recording | Cuttings, technique: Technique) -> Preparation:
+    """Return what is done to pictures. What is cut lies on the ground already: no aircraft hides it, no lens has seen
+    it."""
+    if isinstance(pictures, Cuttings):
+        return Preparation(mask=mask_of(None), levelling=NoLevelling())
+    return Preparation(mask=mask_of(config.source.mask), levelling=levelling_of(config.source, technique, below=True))
+
+
+def _unless_impossible(what: str, work: Callable[[], Any]) -> Any:
+    """Do what a map is whole without; return None where it cannot be done."""
+    try:
+        return work()
+    except EdgevprError as error:
+        _log.warning("the map is not %s: %s", what, error)
+        return None
+
+
+def _without_scipy(what: str, command: str, error: ModuleNotFoundError) -> UsageError:
+    return UsageError(
+        f"{what} a map needs SciPy ({error}): install it on the machine that builds maps, with "
+        f"`pip install 'edgevpr[maps]'`, and run `edgevpr map {command}`."
+    )
+
+
+def _camera(camera: str | None, is_cut: bool) -> str | None:
+    if is_cut and camera not in (None, "nadir"):
+        raise UsageError(f"--camera {camera}: an orthophoto shows the ground from above: give nadir, or leave it out.")
+    return "nadir" if is_cut else camera
+
+
+def _settings(order: MapOrder, name: str, camera: str | None) -> dict[str, str]:
+    if isinstance(order.pictures, Cuttings):
+        return order.parameters | camera_setting(name, camera)
+    return order.parameters | ({"camera": camera} if camera else {})
+
+
+def _new_technique(order: MapOrder, camera: str | None, places: int) -> Technique:
+    here = load_board("this")
+    if name := order.technique or (_OF_ORTHOPHOTOS if isinstance(order.pictures, Cuttings) else None):
+        return made_for(here, name, _settings(order, name, camera))
+    name = picked_technique(order.board, places or 1, camera)
+    return made_for(here, name, order.parameters | camera_setting(name, camera))
