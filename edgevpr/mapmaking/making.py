@@ -91,7 +91,7 @@ class MapOrder:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MadeMap:
-    """What became of an order: the technique, its cells, the places in all, how many of them have a position, what the
+    """Result of an order: the technique, its cells, the places in all, how many of them have a position, what the
     frames were, and how the map was refined and calibrated (None: it was not). Of an orthophoto, `without_data` places
     were left out."""
 
