@@ -24,7 +24,7 @@ from edgevpr.core.types import Position
 from edgevpr.lab.simulate.scene import make_scene
 from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import NOTHING, Expected, compare, scan
+from edgevpr.places.retrieve import NOTHING, Expectation, Query, compare, scan
 from edgevpr.techniques import create
 
 PLACES = 10_000
@@ -129,18 +129,23 @@ def query_rows() -> Iterator[Row]:
         near = index.within(Position(float(index.lat_deg.mean()), float(index.lon_deg.mean())), REACH_M)
         in_reach = f"{np.count_nonzero(near)} places within {REACH_M:.0f} m"
         yield _query(large, "nadir", "24 rotations", NOTHING)
-        yield _query(large, "nadir, heading known", "3 rotations", Expected(turned_deg=turned_deg))
-        yield _query(large, "nadir, in reach", in_reach, Expected(in_reach=near))
-        yield _query(large, "nadir, both", f"{in_reach}, 3 rotations", Expected(near, turned_deg))
+        yield _query(large, "nadir, heading known", "3 rotations", Expectation(turned_deg=turned_deg))
+        yield _query(large, "nadir, in reach", in_reach, Expectation(in_reach=near))
+        yield _query(large, "nadir, both", f"{in_reach}, 3 rotations", Expectation(near, turned_deg))
 
 
-def _query(large: tuple[Technique, PlaceMap, PlaceIndex], camera: str, beside: str, expected: Expected) -> Row:
+def _query(large: tuple[Technique, PlaceMap, PlaceIndex], camera: str, beside: str, expected: Expectation) -> Row:
     (technique, place_map, index), picture = large, frames()[0]
 
     def query(candidates: int | None) -> None:
-        asked = technique.encode(picture)
-        scanned = scan(technique, asked, index, expected)
-        compare(technique, asked, scanned, place_map, index, candidates=candidates, expected=expected)
+        asked = Query(
+            technique=technique,
+            descriptor=technique.encode(picture),
+            place_map=place_map,
+            index=index,
+            expected=expected,
+        )
+        compare(asked, scan(asked), candidates)
 
     query(technique.candidates)
     encode_s = statistics.median(timed_s(technique.encode, picture) for _ in range(QUERY_TURNS))

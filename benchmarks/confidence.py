@@ -30,10 +30,9 @@ from edgevpr.frames.images import list_images
 from edgevpr.lab.evaluate.metrics import roc_auc
 from edgevpr.mapmaking.calibrate import LEFT_OUT, MIRRORED, THERE, MapAnswer, adapted
 from edgevpr.runtime.recognise.confidence import Model, as_json
-from edgevpr.runtime.recognise.evidence import AHEAD, DOWN, DOWN_BARE, kind_of
+from edgevpr.runtime.recognise.evidence import AHEAD, DOWN, DOWN_BARE, FEWEST_PLACES, kind_of
 from edgevpr.runtime.recognise.follow import Follower
 from edgevpr.runtime.recognise.judge import Sureness, accept_rule
-from edgevpr.runtime.recognise.stored_confidence import FEWEST_PLACES
 
 PRECISIONS = (0.9, 0.99, 0.999)
 KINDS = {"forward": (AHEAD,), "nadir": (DOWN, DOWN_BARE)}

@@ -48,7 +48,7 @@ from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.sequence import search_of
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.recognise.calibrated import calibration_of
+from edgevpr.runtime.recognise.evidence import calibration_of
 from edgevpr.runtime.recognise.follow import Follower
 from edgevpr.runtime.recognise.hints import Prior
 from edgevpr.runtime.recognise.judge import accept_rule

@@ -17,12 +17,14 @@ from edgevpr.lab.evaluate.dataset import Dataset, load_dataset
 from edgevpr.lab.evaluate.evaluate import all_frames, mapped
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.sequence import SequenceSearch
 from edgevpr.power.boards import load_board
 from edgevpr.power.meter import QueryMeter
-from edgevpr.runtime.recognise.calibrated import calibration_of
-from edgevpr.runtime.recognise.judge import ACCEPT_NOTHING, accept_rule
+from edgevpr.runtime.recognise.evidence import calibration_of
+from edgevpr.runtime.recognise.judge import ACCEPT_NOTHING, AcceptRule, accept_rule
+from edgevpr.runtime.recognise.levelling import AnyLevelling
 from edgevpr.runtime.recognise.opening import meter_of
-from edgevpr.runtime.recognise.recogniser import Recogniser
+from edgevpr.runtime.recognise.recogniser import Matcher, Preparation, Recogniser, WalkSettings
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.techniques import create
 
@@ -67,12 +69,24 @@ def map_of(
         yield place_map, index, technique
 
 
-def walk(place_map: PlaceMap, index: PlaceIndex, technique: Technique, **more: Any) -> Recogniser:
-    """Return a walk over a map with the technique's own number of candidates; `more` is anything else of a
-    `Recogniser`, such as another `rule` than that of the map."""
-    more.setdefault("rule", accept_rule(technique, config().match, 1, calibration_of(place_map)))
-    parts = {"technique": technique, "place_map": place_map, "index": index, "meter": meter()}
-    return Recogniser(**parts, candidates=technique.candidates, **more)
+def walk(
+    place_map: PlaceMap,
+    index: PlaceIndex,
+    technique: Technique,
+    *,
+    rule: AcceptRule | None = None,
+    search: SequenceSearch | None = None,
+    verify: bool = True,
+    min_accuracy_m: float = 1.0,
+    levelling: AnyLevelling | None = None,
+    **more: Any,
+) -> Recogniser:
+    """Return a walk over a map with the technique's own number of candidates, and the rule of the map unless another is
+    given; `more` is anything else of a `Recogniser`."""
+    rule = rule or accept_rule(technique, config().match, 1, calibration_of(place_map))
+    settings = WalkSettings(candidates=technique.candidates, verify=verify, min_accuracy_m=min_accuracy_m)
+    matcher, preparation = Matcher(technique, index, rule, search), Preparation(levelling=levelling)
+    return Recogniser(matcher, place_map, meter(), settings, preparation=preparation, **more)
 
 
 def ranked(event: Recognition, names: list[str] | tuple[str, ...]) -> list[str]:

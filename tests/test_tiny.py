@@ -17,7 +17,7 @@ from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.flight.world import Crew, Stop
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.opening import meter_of
-from edgevpr.runtime.recognise.recogniser import Recogniser
+from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser, WalkSettings
 from edgevpr.techniques import create
 
 
@@ -31,12 +31,10 @@ def test_the_whole_walk(tmp_path):
         assert build_map(frames, technique, place_map, meter).added == 5
     with PlaceMap.open(tmp_path / "m.gpkg") as place_map, FlightLog(tmp_path / "log", clock=clock) as flight_log:
         recogniser = Recogniser(
-            technique=technique,
-            place_map=place_map,
-            index=load_index(place_map, technique, 10**6),
-            rule=accept_rule(technique, config.match),
-            meter=meter,
-            candidates=technique.candidates,
+            Matcher(technique, load_index(place_map, technique, 10**6), accept_rule(technique, config.match)),
+            place_map,
+            meter,
+            WalkSettings(candidates=technique.candidates),
         )
         link = FakeLink(clock)
         crew = Crew(

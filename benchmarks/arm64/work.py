@@ -15,7 +15,7 @@ from counted import SMALL
 
 from edgevpr.places.index import PlaceIndex, load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import NOTHING, Expected, compare, scan
+from edgevpr.places.retrieve import NOTHING, Expectation, Query, compare, scan
 from edgevpr.power.speed import pass_round, product_round
 from edgevpr.techniques import create
 
@@ -40,17 +40,20 @@ def of_camera(name: str, camera: str, path: str) -> Iterator[tuple[str, Callable
     with PlaceMap.open(path) as place_map:
         index = load_index(place_map, technique, 100_000_000)
         small = replace(index, **{each: getattr(index, each)[:SMALL] for each in PER_PLACE})
-        known = Expected(turned_deg=rng.choice([0.0, 180.0], len(index)))
+        known = Expectation(turned_deg=rng.choice([0.0, 180.0], len(index)))
         fine, _ = place_map.fine_part(index.place_ids[0])
         asked, one = technique.encode(picture), [0] if camera == "nadir" else None
 
-        def scanned(places: PlaceIndex) -> object:
-            return scan(technique, technique.encode(picture), places)
+        def encoded(places: PlaceIndex, expected: Expectation = NOTHING) -> Query:
+            seen = technique.encode(picture)
+            return Query(technique=technique, descriptor=seen, place_map=place_map, index=places, expected=expected)
 
-        def query(expected: Expected) -> object:
-            seen, count = technique.encode(picture), technique.candidates
-            found = scan(technique, seen, index, expected)
-            return compare(technique, seen, found, place_map, index, candidates=count, expected=expected)
+        def scanned(places: PlaceIndex) -> object:
+            return scan(encoded(places))
+
+        def query(expected: Expectation) -> object:
+            one = encoded(index, expected)
+            return compare(one, scan(one), technique.candidates)
 
         yield f"{name}: encode a frame", lambda: technique.encode(picture)
         yield f"{name}: read a place", lambda: place_map.fine_part(index.place_ids[1])

@@ -160,7 +160,7 @@ def _print_made(path: str, made: "MadeMap") -> None:
     if made.refined:
         _print_refined(path, made.refined, made.cells)
     if made.calibration:
-        print(f"expect: {made.calibration.said()}")
+        print(f"expect: {made.calibration.described()}")
     if made.places and not made.with_position:
         print(f"{path}: {_WITHOUT_POSITIONS}")
 
@@ -195,7 +195,7 @@ def map_calibrate(args: Namespace) -> int:
     if args.json:
         print_json({"map": args.map, "calibration": found.figures()})
     else:
-        print(f"{args.map}: calibrated: {found.said()}")
+        print(f"{args.map}: calibrated: {found.described()}")
     return 0
 
 

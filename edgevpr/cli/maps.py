@@ -12,7 +12,7 @@ from edgevpr.cli.shared import add_json, command, group, positive, print_json, w
 from edgevpr.core.errors import UsageError
 
 if TYPE_CHECKING:
-    from edgevpr.places.repair import MapCheck
+    from edgevpr.places.examine import MapCheck
 
 
 def add(commands: Any) -> None:
@@ -52,9 +52,7 @@ def map_info(args: Namespace) -> int:
     from edgevpr.places.index import bytes_per_place
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.places.mapinfo import info_of
-    from edgevpr.runtime.recognise.calibrated import calibration_of
-    from edgevpr.runtime.recognise.evidence import WITH_CONFIDENCE
-    from edgevpr.runtime.recognise.stored_confidence import not_calibrated
+    from edgevpr.runtime.recognise.evidence import WITH_CONFIDENCE, calibration_of, not_calibrated
 
     with PlaceMap.open(args.map) as place_map:
         info, calibration = info_of(place_map), calibration_of(place_map)
@@ -82,7 +80,7 @@ def map_info(args: Namespace) -> int:
     if info.of_low_quality:
         print(f"  salience    {info.of_low_quality} of low quality, kept to bound the gaps")
     if calibration:
-        print(f"  confidence  calibrated {calibration.made}: {calibration.said()}")
+        print(f"  confidence  calibrated {calibration.made}: {calibration.described()}")
     elif spec.name == WITH_CONFIDENCE:
         print(f"  confidence  {not_calibrated(info.places)}")
     print(f"  size        {info.file_bytes / 1e6:.1f} MB on disk, {ram_mb:.2f} MB in RAM ({info.made_by})")
@@ -91,7 +89,7 @@ def map_info(args: Namespace) -> int:
 
 def map_check(args: Namespace) -> int:
     """Read everything in a map and say what is damaged; the exit code is 1 where anything is."""
-    from edgevpr.places.repair import check
+    from edgevpr.places.examine import check
 
     found = check(args.map, watched("checking"))
     if args.json:
@@ -103,7 +101,7 @@ def map_check(args: Namespace) -> int:
 
 def map_repair(args: Namespace) -> int:
     """Drop what is damaged in a map, and keep the original."""
-    from edgevpr.places.repair import check, repair
+    from edgevpr.places.examine import check, repair
 
     found = check(args.map, watched("checking"))
     _print_check(found)
@@ -158,9 +156,9 @@ def map_merge(args: Namespace) -> int:
 
 def map_shrink(args: Namespace) -> int:
     """Make a smaller map of the places that are worth most."""
+    from edgevpr.places.examine import places_in, shrink
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.places.mapfiles import map_path
-    from edgevpr.places.shrink import places_in, shrink
 
     count = args.places
     if count is None:
@@ -178,7 +176,7 @@ def map_export(args: Namespace) -> int:
     from edgevpr.core.files import require_folder, write_whole
     from edgevpr.places.geojson import write_geojson
     from edgevpr.places.mapfile import PlaceMap
-    from edgevpr.runtime.recognise.calibrated import calibration_of
+    from edgevpr.runtime.recognise.evidence import calibration_of
 
     with PlaceMap.open(args.map) as place_map:
         calibration = calibration_of(place_map)

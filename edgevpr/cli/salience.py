@@ -26,8 +26,7 @@ def salience(args: Namespace) -> int:
     from edgevpr.frames.images import read_image
     from edgevpr.runtime.recognise.opening import gate_of
     from edgevpr.runtime.recognise.salience_gate import worth_of
-    from edgevpr.runtime.recognise.salience_maps import scores_of
-    from edgevpr.runtime.recognise.salience_picture import panels, png, said
+    from edgevpr.runtime.recognise.salience_maps import in_words, panels, png, scores_of
 
     asked = {"salience.use": True, "salience.network": args.network, "salience.detector": args.detector}
     gate = gate_of(config_of(args, args.config, **asked).salience)
@@ -45,7 +44,7 @@ def salience(args: Namespace) -> int:
         )
     else:
         for name, score in worth.salience.scores.items():
-            print(f"{name:<13} {said(score)}")
+            print(f"{name:<13} {in_words(score)}")
         print(worth.reason or "worth remembering")
     if out:
         drawn = png(panels(image, maps, worth.salience))

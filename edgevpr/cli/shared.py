@@ -14,7 +14,7 @@ from edgevpr.core.text import shown
 if TYPE_CHECKING:
     from edgevpr.core.types import Frame
     from edgevpr.frames.source import Source
-    from edgevpr.places.repair import Watch
+    from edgevpr.places.examine import Watch
 
 _KEY = "key "  # begins the name under which argparse keeps the value of a flag that is a key of the configuration
 _RECORDING = "a folder of images or a video file"

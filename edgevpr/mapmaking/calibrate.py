@@ -23,17 +23,16 @@ from edgevpr.core.types import Frame
 from edgevpr.frames.level import Levelled
 from edgevpr.frames.mask import Mask, encoded
 from edgevpr.mapmaking.changes import changed
-from edgevpr.mapmaking.mapping import Preparation, Watch
+from edgevpr.mapmaking.mapping import Watch
 from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import elsewhere
 from edgevpr.places.rows import readable
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.confidence import Evidence, Logistic, Model, prior
-from edgevpr.runtime.recognise.evidence import kind_of, kinds_of
+from edgevpr.runtime.recognise.evidence import FEWEST_PLACES, MapCalibration, calibration_text, kind_of, kinds_of
 from edgevpr.runtime.recognise.judge import AcceptRule, Sureness, accept_rule
-from edgevpr.runtime.recognise.recogniser import Recogniser
-from edgevpr.runtime.recognise.stored_confidence import FEWEST_PLACES, Calibration, as_text
+from edgevpr.runtime.recognise.recogniser import Matcher, Preparation, Recogniser, WalkSettings
 
 Pictures = Callable[[Sequence[str]], Iterable[Frame]]  # the frames of these names, as far as they are at hand
 
@@ -94,13 +93,11 @@ def ask(
                 continue
             image, shown = changed(seen.image, rng, looks_down, seen.mask)
             walk = Recogniser(
-                technique=technique,
-                place_map=place_map,
-                index=among,
-                rule=rule,
-                meter=meter,
-                candidates=technique.candidates,
-                mask=None if shown is None else Mask(shown, sha256=""),
+                Matcher(technique, among, rule),
+                place_map,
+                meter,
+                WalkSettings(candidates=technique.candidates),
+                preparation=Preparation(mask=None if shown is None else Mask(shown, sha256="")),
             )
             event = walk.step(Frame(image=image, name=f"place {place_id}", t_mono_s=0.0))
             if event.evidence is None or event.best is None or event.confidence is None:
@@ -122,7 +119,7 @@ def calibrate(
     pictures: Pictures,
     watch: Watch[Frame],
     preparation: Preparation | None = None,
-) -> Calibration:
+) -> MapCalibration:
     """Calibrate a map that is open for adding, and record it there. `preparation` is that which the map was made with.
     Raises UsageError where the technique is judged by its limits, the map has too few places, or too few of their
     pictures are at hand: the shipped model is then used. Raises MapError for a file that cannot be read or written.
@@ -153,7 +150,7 @@ def calibrate(
             "needed: give the pictures that it was made of, with the same camera and mask."
         )
     calibration = _calibration(answers, kinds, config.accept_precision)
-    place_map.record_calibration(as_text(calibration))
+    place_map.record_calibration(calibration_text(calibration))
     return calibration
 
 
@@ -172,14 +169,14 @@ def _as_mapped(
     count = asked_of(technique)
     frames = (frame for done in range(0, count, len(names)) for frame in pictures(names[: count - done]))
     for frame in watch(frames, count):
-        picture = preparation.levelling.prepare(frame, None, preparation.mask.fitted(frame.image))
+        picture = preparation.picture(frame)
         coarse = encoded(technique, picture.image, picture.mask).coarse
         of_name = ids_by_image.get(readable(frame.name), ())
         if (place_id := next((at for at in of_name if place_map.is_of(at, coarse)), None)) is not None:
             yield place_id, picture
 
 
-def _calibration(answers: Sequence[MapAnswer], kinds: Sequence[str], precision: float) -> Calibration:
+def _calibration(answers: Sequence[MapAnswer], kinds: Sequence[str], precision: float) -> MapCalibration:
     """Fit the model of the kind of evidence that most answers have, and count what it accepts."""
     counts = Counter(kind_of(answer.evidence) for answer in answers if answer.evidence)
     kind = max(kinds, key=lambda kind: counts[kind])
@@ -192,7 +189,7 @@ def _calibration(answers: Sequence[MapAnswer], kinds: Sequence[str], precision: 
         if (seen := answer.evidence) and not answer.refused and sure.confidence(seen) >= sure.threshold(seen)
     ]
     asked = sum(answer.way == THERE for answer in answers)
-    return Calibration(
+    return MapCalibration(
         models={kind: model},
         made=date.today().isoformat(),
         asked=asked,

@@ -13,16 +13,16 @@ from edgevpr.core.errors import EdgevprError, ImageError, UsageError
 from edgevpr.core.types import Frame
 from edgevpr.frames.mask import mask_of
 from edgevpr.frames.source import Source, open_source, read_to_end
-from edgevpr.mapmaking.mapping import Gaps, MappingResult, Preparation, Selection, build_map
+from edgevpr.mapmaking.mapping import Gaps, MappingResult, Selection, build_map
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import map_path, remove
 from edgevpr.places.mapinfo import info_of
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.preflight.pick import camera_setting, picked_technique
-from edgevpr.runtime.recognise.evidence import kinds_of
-from edgevpr.runtime.recognise.levelling import NoLevelling, levelling_of
+from edgevpr.runtime.recognise.evidence import MapCalibration, kinds_of
+from edgevpr.runtime.recognise.levelling import levelling_of
 from edgevpr.runtime.recognise.opening import gate_of, made_for, meter_of, say_other_mask, technique_of
-from edgevpr.runtime.recognise.stored_confidence import Calibration
+from edgevpr.runtime.recognise.recogniser import Preparation
 
 if TYPE_CHECKING:
     from edgevpr.mapmaking.refine import Refined
@@ -101,7 +101,7 @@ class MadeMap:
     with_position: int
     result: MappingResult
     refined: "Refined | None"
-    calibration: Calibration | None
+    calibration: MapCalibration | None
     without_data: int | None
 
 
@@ -178,7 +178,7 @@ def refine_map(place_map: PlaceMap, technique: Technique, images: str | Path | N
 
 def calibrate_map(
     place_map: PlaceMap, technique: Technique, config: Config, pictures: Recording | Cuttings, shown: Shown
-) -> Calibration:
+) -> MapCalibration:
     """Calibrate an open map with its pictures; one that cannot be read is left out. Raises UsageError where that cannot
     be done, and where SciPy is missing."""
     try:
@@ -204,7 +204,7 @@ def _preparation(config: Config, pictures: Recording | Cuttings, technique: Tech
     """Return what is done to pictures. What is cut lies on the ground already: no aircraft hides it, no lens has seen
     it."""
     if isinstance(pictures, Cuttings):
-        return Preparation(mask=mask_of(None), levelling=NoLevelling())
+        return Preparation(mask=mask_of(None), levelling=None)
     return Preparation(mask=mask_of(config.source.mask), levelling=levelling_of(config.source, technique, below=True))
 
 

@@ -16,17 +16,15 @@ from edgevpr.core.contract import Technique
 from edgevpr.core.errors import ImageError, ModelError
 from edgevpr.core.geodesy import distance_m
 from edgevpr.core.types import Frame, Position, Salience
-from edgevpr.frames.mask import AnyMask, NoMask
 from edgevpr.places.index import empty_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.rows import readable
 from edgevpr.power.meter import QueryMeter
-from edgevpr.runtime.recognise.gate import says_nothing
-from edgevpr.runtime.recognise.judge import ACCEPT_NOTHING
-from edgevpr.runtime.recognise.levelling import AnyLevelling, NoLevelling, laid
-from edgevpr.runtime.recognise.recogniser import Recogniser
+from edgevpr.runtime.recognise.judge import ACCEPT_NOTHING, says_nothing
+from edgevpr.runtime.recognise.levelling import laid
+from edgevpr.runtime.recognise.recogniser import Matcher, Preparation, Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
-from edgevpr.runtime.recognise.salience_gate import GAP_FRAMES, Gate, NoGate, best_of
+from edgevpr.runtime.recognise.salience_gate import GAP_FRAMES, Gate, best_of
 
 _NO_PIXELS = np.empty((0, 0), np.uint8)
 T = TypeVar("T")
@@ -81,20 +79,11 @@ class Gaps:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Preparation:
-    """Preparation of every picture of a map before it is encoded: `mask` leaves parts of it out, and `levelling` lays it
-    on the ground."""
-
-    mask: AnyMask = field(default_factory=NoMask)
-    levelling: AnyLevelling = field(default_factory=NoLevelling)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Selection:
-    """Selection of the frames that become places: those whose quality is at least `min_quality` and that pass the `gate`
-    (None: all do), and of those that do not pass it the ones that `gaps` keeps."""
+    """Selection of the frames that become places: those whose quality is at least `min_quality` and that pass the
+    `gate` (None: all do), and of those that do not pass it the ones that `gaps` keeps."""
 
-    gate: Gate | NoGate | None = None
+    gate: Gate | None = None
     gaps: Gaps = field(default_factory=Gaps)
     min_quality: float = 0.0
 
@@ -130,14 +119,10 @@ def build_map(
     place_map.require(technique.spec)
     preparation, selection = preparation or Preparation(), selection or Selection()
     walk = Recogniser(
-        technique=technique,
-        place_map=place_map,
-        index=empty_index(technique.spec, 0, None),
-        rule=ACCEPT_NOTHING,
-        meter=meter,
-        mask=preparation.mask,
-        gate=selection.gate,
-        levelling=preparation.levelling,
+        Matcher(technique, empty_index(technique.spec, 0, None), ACCEPT_NOTHING),
+        place_map,
+        meter,
+        preparation=replace(preparation, gate=selection.gate),
     )
     ids_by_image = place_map.ids_by("source_image")
     counts: Counter[str] = Counter()

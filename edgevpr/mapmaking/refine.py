@@ -14,7 +14,7 @@ import numpy as np
 
 from edgevpr.core.arrays import Bools, Complexes, Floats
 from edgevpr.core.contract import Technique
-from edgevpr.core.errors import MapError, PlaceError
+from edgevpr.core.errors import PlaceError
 from edgevpr.core.geodesy import metres, moved
 from edgevpr.core.types import Place, Pose, Position
 from edgevpr.mapmaking.graph import Solved, solve
@@ -61,13 +61,8 @@ def refine(
 ) -> Refined:
     """Refine a map that is open for adding: all of it, or nothing is changed. `watch` passes pairs through and shows
     progress. `images` is the folder of the pictures that the map was made of, where they are at hand. Raises MapError
-    for a map of an older format, and where the file cannot be read or written.
+    where the file cannot be read or written.
     """
-    if not place_map.has_pose:
-        raise MapError(
-            f"{place_map.path} has the form of an older edgevpr, with no room for what refining finds: make a new map "
-            "of it with `edgevpr map merge NEW OLD`, or build it again."
-        )
     places = list(_readable(place_map))
     placed = [place for place in places if place.position]
     surveyed = np.array([bool(place.pose and place.pose.is_surveyed) for place in placed], bool)

@@ -24,7 +24,7 @@ from edgevpr.core.types import Place
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.mapmaking.graph import Ties
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.runtime.recognise.agreement import CONFIRMED, PROVEN, Agreement, Expected, agreement
+from edgevpr.runtime.recognise.agreement import CONFIRMED, PROVEN, Agreement, Overlay, agreement
 from edgevpr.runtime.recognise.landmarks import Landmarks, unpacked
 
 _NEAREST = 8  # places recorded nearest
@@ -121,7 +121,7 @@ def looker(place_map: PlaceMap, technique: Technique, places: list[Place], encod
         found = encoded(places[at].source_image) if encoded else None
         return found if found and place_map.is_of(places[at].place_id, found.coarse) else None
 
-    def agreed(query: int, place: int, expected: Expected | None) -> Agreement | None:
+    def agreed(query: int, place: int, expected: Overlay | None) -> Agreement | None:
         one, other = landmarks(query), landmarks(place)
         return None if one is None or other is None else agreement(one, other, expected)
 
@@ -170,18 +170,18 @@ def _likely(technique: Technique, asking: Descriptor, part: Array) -> list[int]:
     return likely
 
 
-def _vote_of(match: FineMatch, cells: int) -> Expected:
+def _vote_of(match: FineMatch, cells: int) -> Overlay:
     dx, dy = match.shift_cells or (0.0, 0.0)
-    return Expected((dx / cells, dy / cells), match.rotation_deg or 0.0, match.height_ratio)
+    return Overlay((dx / cells, dy / cells), match.rotation_deg or 0.0, match.height_ratio)
 
 
 def _of_landmarks(found: Agreement) -> Tie:
     assert found.shift_share is not None  # of landmarks that agree
     assert found.rotation_deg is not None
-    return _tie(Expected(found.shift_share, found.rotation_deg, found.scale), _OF_LANDMARKS)
+    return _tie(Overlay(found.shift_share, found.rotation_deg, found.scale), _OF_LANDMARKS)
 
 
-def _tie(seen: Expected, sds: tuple[float, float]) -> Tie:
+def _tie(seen: Overlay, sds: tuple[float, float]) -> Tie:
     dx, dy = seen.shift_share
     turned = np.radians((seen.rotation_deg + 180) % 360 - 180)
     return Tie(complex(dx, -dy), complex(np.log(seen.scale or 1.0), -turned), *sds)

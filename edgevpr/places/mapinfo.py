@@ -1,13 +1,28 @@
-"""Summary of a map, from what SQLite can say of it quickly."""
+"""Quick looks at a whole map by SQLite: its summary, its identity, and which of its places is near a position."""
 
+import hashlib
 import math
+import sqlite3
 from dataclasses import dataclass
 
 from edgevpr.core.contract import TechniqueSpec
+from edgevpr.core.geodesy import EARTH_RADIUS_M, distance_m
+from edgevpr.core.types import Position
+from edgevpr.places import geopackage, rows
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.sqlite import sentences
 
 Extent = tuple[float, float, float, float]
+
+_SUMMARY = """
+SELECT count(*), count(geom), avg(quality), total(is_low_quality = 1), count(up_deg), avg(footprint_m),
+    avg(var_east_m2 + var_north_m2), min(time), max(time)
+FROM places
+"""
+_IN_BOX = """
+SELECT place_id, geom FROM rtree_places_geom JOIN places ON place_id = id
+WHERE maxy >= ? AND miny <= ? AND maxx >= ? AND minx <= ?
+"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,28 +49,34 @@ class MapInfo:
     made_by: str | None
 
 
+@dataclass(frozen=True, slots=True)
+class MapIdentity:
+    """The identity of a map: the same for every copy of its file, another as soon as one place is another. `map_id`
+    was drawn when the map was made. `sha256` is of all `places` (positions, poses, names of pictures, checksums of what
+    is larger) and of all else the map says of itself, such as its calibration."""
+
+    map_id: str | None
+    places: int
+    sha256: str
+
+
 def info_of(place_map: PlaceMap) -> MapInfo:
     """Summarise a map. Raises MapError where it cannot be read."""
-    db = place_map.db
     with sentences(place_map.path):
-        low = place_map.salience.split(", ")[-1]
-        up, footprint, var_east, _, var_north, *_ = place_map.pose.split(", ")
-        asked = f"count({up}), avg({footprint}), avg({var_east} + {var_north})"
-        places, with_position, quality, of_low_quality, with_pose, footprint_m, var_m2, *times = db.execute(
-            f"SELECT count(*), count(geom), avg(quality), total({low} = 1), {asked}, min(time), max(time) FROM places"
-        ).fetchone()
-        extent = db.execute(
+        summary = place_map.db.execute(_SUMMARY).fetchone()
+        extent = place_map.db.execute(
             "SELECT min_y, min_x, max_y, max_x FROM gpkg_contents WHERE table_name = 'places'"
         ).fetchone()
-    first, last = (time if isinstance(time, str) else None for time in times)
+    places, with_position, quality, of_low_quality, with_pose, footprint_m, var_m2, first, last = summary
+    is_extent = extent and all(isinstance(side, (int, float)) and math.isfinite(side) for side in extent)
     return MapInfo(
         path=str(place_map.path),
         spec=place_map.spec,
         places=places,
         with_position=with_position,
-        extent=_extent(extent) if with_position else None,
-        first_time=first,
-        last_time=last,
+        extent=extent if with_position and is_extent else None,
+        first_time=first if isinstance(first, str) else None,
+        last_time=last if isinstance(last, str) else None,
         mean_quality=quality,
         of_low_quality=int(of_low_quality),
         with_pose=with_pose,
@@ -66,6 +87,49 @@ def info_of(place_map: PlaceMap) -> MapInfo:
     )
 
 
-def _extent(stored: tuple | None) -> Extent | None:
-    is_known = stored and all(isinstance(each, (int, float)) and math.isfinite(each) for each in stored)
-    return stored if is_known else None
+def identity_of(place_map: PlaceMap) -> MapIdentity:
+    """Return the identity of an open map, as it is now. Raises MapError where it cannot be read.
+
+    A hash of the file would read all of it at every start, which takes a small board seconds. The checksums of the
+    places stand before their descriptors, so reading them is quick, and they say as much.
+    """
+    digest, places = hashlib.sha256(), 0
+    with sentences(place_map.path):
+        for row in place_map.db.execute("SELECT key, value FROM edgevpr_map ORDER BY key"):
+            digest.update(repr(row).encode("utf-8", "backslashreplace"))
+    for place in place_map.scan(f"{rows.VALUES}, {rows.SALIENCE}, {rows.POSE}, {rows.CHECKSUMS}"):
+        digest.update(repr(place).encode("utf-8", "backslashreplace"))
+        places += 1
+    return MapIdentity(place_map.map_id, places, digest.hexdigest())
+
+
+def index_positions(place_map: PlaceMap) -> None:
+    """Add the R-tree, unless the map has it. A damaged position is not in it. Raises MapError."""
+    db = place_map.db
+    with sentences(place_map.path):
+        if not db.execute("SELECT 1 FROM sqlite_master WHERE name = 'rtree_places_geom'").fetchone():
+            try:
+                db.executescript("BEGIN IMMEDIATE;" + geopackage.SPATIAL_INDEX + "COMMIT;")
+            except sqlite3.Error:
+                if db.in_transaction:
+                    db.execute("ROLLBACK")
+                raise
+
+
+def nearest_m(place_map: PlaceMap, position: Position, within_m: float) -> float | None:
+    """Return the metres to the nearest place of the file that can be read; None where none lies within `within_m`
+    metres.
+
+    Call `index_positions` before. Raises MapError where the file cannot be read.
+    """
+    lat_deg, lon_deg = position.lat_deg, position.lon_deg
+    north_deg = math.degrees(within_m / EARTH_RADIUS_M)
+    east_deg = min(180.0, north_deg / max(math.cos(math.radians(min(abs(lat_deg) + north_deg, 90.0))), 1e-9))
+    nearest = math.inf
+    with sentences(place_map.path):
+        for turn_deg in (-360.0, 0.0, 360.0):  # places on the other side of the date line
+            box = (lat_deg - north_deg, lat_deg + north_deg, lon_deg + turn_deg - east_deg)
+            for place_id, geom in place_map.db.execute(_IN_BOX, (*box, lon_deg + turn_deg + east_deg)):
+                if place_id not in place_map.left_out and (point := geopackage.point_or_none(geom)):
+                    nearest = min(nearest, float(distance_m(lat_deg, lon_deg, *point)))
+    return nearest if nearest <= within_m else None

@@ -14,6 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from edgevpr.core.arrays import Bools, Floats, Singles
 from edgevpr.core.contract import TechniqueSpec
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.retrieve import Ranking
@@ -32,24 +33,14 @@ def length_of(spec: TechniqueSpec, asked: int | None) -> int:
     return asked or spec.sequence
 
 
-def search_of(length: int) -> "Search":
-    """Make the search over sequences of `length` queries; for a length of one, `Alone`."""
-    return SequenceSearch(length) if length > 1 else Alone()
+def search_of(length: int) -> "SequenceSearch | None":
+    """Make the search over sequences of `length` queries; None for a length of one: each query is matched alone."""
+    return SequenceSearch(length) if length > 1 else None
 
 
 def bytes_beside_place(length: int) -> int:
     """Return the resident bytes that a sequence adds to each place: a score for each query, and one for the rivals."""
     return 4 * (length + 1) if length > 1 else 0
-
-
-class Alone:
-    """Matching of each query by itself: it stands in for `SequenceSearch` where no sequences are searched."""
-
-    length = frames = 1
-
-    def follow(self, ranking: Ranking, index: PlaceIndex, t_mono_s: float) -> Ranking:
-        """Return the ranking of the newest query unchanged."""
-        return ranking
 
 
 class SequenceSearch:
@@ -64,8 +55,8 @@ class SequenceSearch:
         self.length = length
         self._trajectories = trajectories(length, FOLLOWED_SPEEDS)
         self._other_trajectories = trajectories(length, _OTHER_SPEEDS)
-        self.rivals = np.empty(0, np.float32)
-        self._rows: deque[np.ndarray] = deque(maxlen=length)  # newest first
+        self.rivals: Singles = np.empty(0, np.float32)
+        self._rows: deque[Singles] = deque(maxlen=length)  # newest first
         self._usual: deque[float] = deque(maxlen=_NEWEST_ALONE)  # score of the places not compared, by query
         self._known = (0, 0)  # number of places of the index, and the checksum of their ids
         self._t_last_s: float | None = None
@@ -108,7 +99,7 @@ class SequenceSearch:
         matches = {slot: replace(match, score=float(means[slot])) for slot, match in ranking.compared.items()}
         return replace(ranking, slots=slots, scores=means[slots], compared=matches)
 
-    def goes_on(self, near: np.ndarray, min_score: float) -> bool:
+    def goes_on(self, near: Bools, min_score: float) -> bool:
         """Tell whether the newest queries alone still agree with the sequence.
 
         `near` bool (N,) is the neighbourhood of the sequence's best place. After a vehicle has left the mapped track,
@@ -142,7 +133,7 @@ class SequenceSearch:
         )
 
 
-def trajectories(length: int, velocities: np.ndarray) -> list[list[int]]:
+def trajectories(length: int, velocities: Floats) -> list[list[int]]:
     """Return how many slots before the newest query each query of a trajectory was, newest first.
 
     Gives one list for each velocity (places a query); velocities with equal lists share one.
@@ -152,7 +143,7 @@ def trajectories(length: int, velocities: np.ndarray) -> list[list[int]]:
     return np.unique(back, axis=0).tolist()
 
 
-def best_means(rows: Sequence[np.ndarray], trajectories: Sequence[Sequence[int]]) -> np.ndarray:
+def best_means(rows: Sequence[Singles], trajectories: Sequence[Sequence[int]]) -> Singles:
     """Return the best mean score of the trajectories that end at each slot: rows float32 (up to N,), newest first ->
     (N,). Older rows may be shorter, where the index has grown since.
     """
@@ -166,6 +157,3 @@ def best_means(rows: Sequence[np.ndarray], trajectories: Sequence[Sequence[int]]
         np.maximum(best, total, out=best)
     best /= len(rows)
     return best
-
-
-Search = Alone | SequenceSearch

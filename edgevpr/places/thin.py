@@ -1,21 +1,22 @@
-"""The choice of the places that stay in RAM when not all of a map fits: the best ones. The file keeps all places."""
+"""The choice of the places that are worth most, spread so that no wide gap is left."""
 
 import math
 
 import numpy as np
 
+from edgevpr.core.arrays import Floats, Ints
 from edgevpr.core.geodesy import metres
 
 _BLOCK = 256  # places in a block; the least worth of each block is kept, so that the least of all is found quickly
 
 
 def best_places(
-    lat_deg: np.ndarray,
-    lon_deg: np.ndarray,
-    quality: np.ndarray,
+    lat_deg: Floats,
+    lon_deg: Floats,
+    quality: Floats,
     capacity: int,
-    numbers: np.ndarray | None = None,
-) -> np.ndarray:
+    numbers: Ints | None = None,
+) -> Ints:
     """Choose `capacity` of the places (N,), given in the order they were mapped; return their slots, in that order.
 
     `numbers` (N,) int, ascending, number all places that were ever mapped, also those dropped before (None: none were

@@ -11,7 +11,7 @@ from pictures import textured
 from edgevpr.cli.main import main
 from edgevpr.mapmaking import calibrate
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.runtime.recognise.stored_confidence import from_text
+from edgevpr.runtime.recognise.evidence import read_calibration
 
 PLACES = 8
 
@@ -70,7 +70,7 @@ def mapped(bare, flight, capsys):
 def calibration_in(path):
     with PlaceMap.open(path) as place_map:
         text = place_map.calibration
-    return None if text is None else from_text(text)
+    return None if text is None else read_calibration(text)
 
 
 def test_a_build_ends_with_what_to_expect(flight, tmp_path, capsys):
@@ -78,7 +78,7 @@ def test_a_build_ends_with_what_to_expect(flight, tmp_path, capsys):
     assert built(path, flight / "ref") == 0
     last = capsys.readouterr().out.splitlines()[-1]
     found = calibration_in(path)
-    assert last == f"expect: {found.said()}"
+    assert last == f"expect: {found.described()}"
     assert last.startswith(f"expect: of {PLACES} changed pictures of its own places")
     assert built(tmp_path / "again.gpkg", flight / "ref", "--json") == 0
     assert json.loads(capsys.readouterr().out)["calibration"] == found.figures()
@@ -113,7 +113,7 @@ def test_a_technique_without_a_confidence_is_built_in_silence(flight, tmp_path, 
 def test_a_map_is_calibrated_later_and_says_so(bare, flight, capsys):
     assert main(["map", "calibrate", str(bare), "--images", str(flight / "ref")]) == 0
     found = calibration_in(bare)
-    assert capsys.readouterr().out == f"{bare}: calibrated: {found.said()}\n"
+    assert capsys.readouterr().out == f"{bare}: calibrated: {found.described()}\n"
     assert main(["map", "info", str(bare)]) == 0
     assert f"confidence  calibrated {found.made}: of {PLACES} changed pictures" in capsys.readouterr().out
     assert main(["map", "info", str(bare), "--json"]) == 0
@@ -166,7 +166,7 @@ def test_a_smaller_map_keeps_its_calibration_and_a_merged_one_has_none(mapped, b
 
 
 def test_a_check_before_the_flight_says_what_to_expect(mapped, bare_map, flight, tmp_path, capsys):
-    for path, said in ((mapped, calibration_in(mapped).said()), (bare_map, "not calibrated (8 places")):
+    for path, said in ((mapped, calibration_in(mapped).described()), (bare_map, "not calibrated (8 places")):
         config = tmp_path / "c.yaml"
         config.write_text(f"map: {path}\nsource: {{uri: {flight / 'ref'}}}\nlog: {{path: null}}\n")
         main(["check", "--config", str(config)])

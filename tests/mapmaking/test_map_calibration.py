@@ -1,4 +1,4 @@
-"""Calibration of small maps: what they are asked, what is believed, and what the map keeps of it."""
+"""MapCalibration of small maps: what they are asked, what is believed, and what the map keeps of it."""
 
 from collections import Counter
 
@@ -15,15 +15,16 @@ from edgevpr.frames.level import UNKNOWN_VIEW, Lens, Levelled
 from edgevpr.frames.mask import Mask
 from edgevpr.mapmaking import calibrate as calibrating
 from edgevpr.mapmaking.calibrate import LEFT_OUT, MIRRORED, THERE, ask, calibrate
-from edgevpr.mapmaking.mapping import Preparation, build_map
+from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import Pack
 from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.recognise.evidence import read_calibration
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.levelling import Levelling
-from edgevpr.runtime.recognise.stored_confidence import from_text
+from edgevpr.runtime.recognise.recogniser import Preparation
 from edgevpr.techniques import create
 
 PLACES = 8
@@ -93,7 +94,7 @@ def test_a_picture_that_says_nothing_is_an_answer_without_evidence(place_map):
 def test_a_calibration_is_kept_in_the_map(place_map):
     pictures, asked = at_hand(*map(frame, range(PLACES)))
     found = calibrated(place_map, pictures)
-    assert from_text(place_map.calibration) == found
+    assert read_calibration(place_map.calibration) == found
     assert sorted(asked) == sorted(2 * [f"{number}.png" for number in range(PLACES)])
     assert (found.asked, found.precision) == (2 * PLACES, CONFIG.accept_precision)
     assert sorted(found.recognisable) == list(range(1, PLACES + 1))

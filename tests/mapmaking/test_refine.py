@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from edgevpr.cli.main import main
-from edgevpr.core.errors import MapError
 from edgevpr.core.geodesy import distance_m, metres, moved
 from edgevpr.core.types import Frame, Position
 from edgevpr.lab.simulate.camera import Camera, lit, photograph
@@ -245,13 +244,6 @@ def test_what_cannot_be_refined_says_why(tmp_path, flown, map_path, capsys):
     assert "refined, by" not in capsys.readouterr().out, "a map of another kind is built as it was"
     assert main(["map", "refine", str(path)]) == 2
     assert "only `cohog` with `--camera nadir` can be refined" in capsys.readouterr().err
-
-
-def test_a_map_of_an_older_format_says_how_to_renew_it(map_path):
-    with PlaceMap.open_for_adding(map_path) as place_map:
-        place_map.has_pose = False
-        with pytest.raises(MapError, match="map merge NEW OLD"):
-            refine(place_map, technique_of(place_map), lambda pairs, total: pairs)
 
 
 def test_a_place_that_cannot_be_read_is_left_alone(map_path):

@@ -9,8 +9,7 @@ from ranking import rank
 from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
 from edgevpr.core.errors import MapError
 from edgevpr.core.types import Frame, Position
-from edgevpr.places.growing import GrowingIndex
-from edgevpr.places.index import bytes_per_place, load_index
+from edgevpr.places.index import GrowingIndex, bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.techniques import create
 

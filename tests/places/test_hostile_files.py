@@ -24,8 +24,7 @@ from edgevpr.places.examine import absorb, examine
 from edgevpr.places.geopackage import point_blob
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapinfo import info_of
-from edgevpr.places.near import index_positions, nearest_m
-from edgevpr.places.rows import LANDMARKS, POSE, SALIENCE, readable
+from edgevpr.places.rows import readable
 
 PLACES = 40
 
@@ -163,7 +162,7 @@ def test_a_damaged_page_hides_only_the_places_on_it(map_path):
             continue  # a page that every map needs
         whole = [each for each in found if not each.problem]
         for each in whole:
-            assert each.content.fine == descriptor(each.place_id - 1).fine.tobytes()
+            assert each.content["fine"] == descriptor(each.place_id - 1).fine.tobytes()
         lost.append(PLACES - len(whole))
         assert len(whole) + len([each for each in found if each.problem]) >= PLACES - 8 or not whole
     assert lost.count(1) > PLACES, "most pages hold a part of one place"
@@ -270,38 +269,6 @@ with PlaceMap.open({str(folder / "m.gpkg")!r}) as place_map:
         counted, parts = map(int, read.stdout.split())
         assert counted == parts >= 5
         assert sorted(entry.name for entry in folder.iterdir()) == before
-
-
-def first_format(path):
-    """Make a map of the first format of one of today: without checksums, and without an id."""
-    columns = "place_id, geom, time, alt_m, heading_deg, source_image, quality, coarse, fine"
-    written(
-        path,
-        "DROP TRIGGER places_moved",
-        *(f"ALTER TABLE places DROP COLUMN {part}_crc32" for part in ("geom", "coarse", "fine", "pose", "landmarks")),
-        *(f"ALTER TABLE places DROP COLUMN {column}" for column in f"{SALIENCE}, {POSE}, {LANDMARKS}".split(", ")),
-        "UPDATE edgevpr_map SET value = '1' WHERE key = 'format_version'",
-        "DELETE FROM edgevpr_map WHERE key = 'map_id'",
-    )
-    with sqlite3.connect(path) as db:
-        assert ", ".join(row[1] for row in db.execute("PRAGMA table_info(places)")) == columns
-    db.close()
-
-
-def test_a_map_of_the_first_format_is_read_added_to_and_merged(map_path, tmp_path):
-    first_format(map_path)
-    with PlaceMap.open_for_adding(map_path) as place_map:
-        assert not place_map.has_checksums
-        place_map.add(frame(41), descriptor(41))
-        index_positions(place_map)
-        assert nearest_m(place_map, Position(50.0041, 8.0), 1.0) == 0
-        place_map.require_unchanged()
-    with PlaceMap.open(map_path) as place_map, PlaceMap.create(tmp_path / "new.gpkg", SPEC) as new:
-        assert len(list(place_map.coarse_parts())) == PLACES + 1
-        np.testing.assert_array_equal(place_map.fine_part(41)[0], descriptor(41).fine)
-        assert {(each.problem, each.has_checksums) for each in examine(place_map)} == {(None, False)}
-        assert absorb(new, place_map) == (PLACES + 1, 0)
-        assert {(each.problem, each.has_checksums) for each in examine(new)} == {(None, True)}
 
 
 @pytest.mark.parametrize("part", ["geom", "coarse", "fine"])

@@ -8,8 +8,8 @@ import pytest
 
 from edgevpr.core.contract import Descriptor, PartSpec, TechniqueSpec
 from edgevpr.core.types import Frame, Position
-from edgevpr.places.identity import MapIdentity, identity_of
 from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.mapinfo import MapIdentity, identity_of
 from edgevpr.places.sqlite import connect
 
 SPEC = TechniqueSpec(name="x", parameters={}, coarse=PartSpec((4,), "<f4"), fine=PartSpec((8,), "|u1"))

@@ -18,8 +18,7 @@ from edgevpr.places.geopackage import point_blob
 from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import margin, named
-from edgevpr.places.sequence import Alone
-from edgevpr.runtime.recognise.judge import AcceptRule, judge
+from edgevpr.runtime.recognise.judge import AcceptRule, Findings, judge
 from edgevpr.techniques import create
 
 RULE = AcceptRule(min_score=0.1, min_margin=0.1, neighbour_m=20.0)
@@ -111,7 +110,7 @@ def test_the_query_that_meets_a_damaged_place_is_refused_and_the_next_goes_witho
     assert len(ranking.slots) == 10, "the next best takes its turn"
     assert named(ranking, index, place_map, 1)[0].place.source_image == "140"
     assert not len(ranking.unread)
-    assert judge(ranking, index, RULE, Alone(), False).accepted
+    assert judge(Findings(ranking), index, RULE).accepted
 
 
 def test_all_damaged_candidates_of_a_query_are_found_at_once_and_each_is_counted_once(ruler):
@@ -128,15 +127,15 @@ def test_without_the_right_place_no_other_is_accepted(ruler):
     """The query shows place 100, with a neighbour 111 m on that looks nearly like it: alone, the neighbour is ahead."""
     technique, place_map, index = ruler
     query, rule = technique.encode(104), dataclasses.replace(RULE, min_margin=0.01)
-    assert judge(rank(technique, query, place_map, index), index, rule, Alone(), False).accepted
+    assert judge(Findings(rank(technique, query, place_map, index)), index, rule).accepted
     damage(place_map, "fine = x'00'", 100)
     with pytest.raises(PlaceError):
         rank(technique, query, place_map, index)
     ranking = rank(technique, query, place_map, index)
     assert named(ranking, index, place_map, 1)[0].place.source_image == "110"
     bare = dataclasses.replace(ranking, unread=np.empty(0, np.intp))
-    assert judge(bare, index, rule, Alone(), False).accepted, "but for the rule"
-    verdict = judge(ranking, index, rule, Alone(), False)
+    assert judge(Findings(bare), index, rule).accepted, "but for the rule"
+    verdict = judge(Findings(ranking), index, rule)
     assert (verdict.accepted, verdict.reason) == (False, "a place that cannot be read may be the right one")
 
 
@@ -204,7 +203,7 @@ def test_on_real_pictures_no_wrong_place_is_accepted_for_want_of_the_right_ones(
             query = dataset.queries[number]
             place_map.left_out = {1 + dataset.references.index(name): "damaged" for name in query.right}
             ranking = rank(technique, technique.encode(read_image(query.path)), place_map, index, technique.candidates)
-            assert not judge(ranking, index, rule, Alone(), False).accepted
+            assert not judge(Findings(ranking), index, rule).accepted
             bare = dataclasses.replace(ranking, unread=np.empty(0, np.intp))
-            deceived += judge(bare, index, rule, Alone(), False).accepted
+            deceived += judge(Findings(bare), index, rule).accepted
         assert deceived >= 5, "but for the rule"

@@ -21,14 +21,11 @@ from map_writer import SPEC, descriptor, frame, make_map
 from edgevpr.core.contract import PartSpec
 from edgevpr.core.errors import MapError, PlaceError
 from edgevpr.core.types import Position
-from edgevpr.places.examine import absorb
+from edgevpr.places.examine import absorb, repair, shrink
 from edgevpr.places.geojson import write_geojson
 from edgevpr.places.geopackage import point_blob
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.mapinfo import info_of
-from edgevpr.places.near import index_positions, nearest_m
-from edgevpr.places.repair import repair
-from edgevpr.places.shrink import shrink
+from edgevpr.places.mapinfo import index_positions, info_of, nearest_m
 
 
 @pytest.fixture(scope="module")
@@ -176,13 +173,12 @@ def test_another_technique_or_parameter_is_refused_by_name(map_path):
         place_map.require(SPEC)
 
 
-def test_a_map_from_a_newer_version_is_refused(map_path):
-    db = sqlite3.connect(map_path)
-    db.execute("UPDATE edgevpr_map SET value = '5' WHERE key = 'format_version'")
-    db.commit()
-    db.close()
-    with pytest.raises(MapError, match=r"newer edgevpr .*update edgevpr"):
-        PlaceMap.open(map_path)
+def test_a_map_from_before_the_release_is_read_and_one_of_another_format_refused(map_path):
+    for version, is_read in ((1, True), (4, True), (2, False), (5, False)):
+        with contextlib.closing(sqlite3.connect(map_path)) as db, db:
+            db.execute("UPDATE edgevpr_map SET value = ? WHERE key = 'format_version'", (str(version),))
+        with contextlib.nullcontext() if is_read else pytest.raises(MapError, match=f"format {version}"):
+            PlaceMap.open(map_path).close()
 
 
 @pytest.mark.parametrize(

@@ -19,12 +19,12 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Ranking, elsewhere
 from edgevpr.places.sequence import length_of, search_of
 from edgevpr.power.meter import QueryMeter
-from edgevpr.runtime.recognise.calibrated import calibration_of
+from edgevpr.runtime.recognise.evidence import calibration_of
 from edgevpr.runtime.recognise.follow import Follower
 from edgevpr.runtime.recognise.judge import accept_rule
-from edgevpr.runtime.recognise.recogniser import Recogniser
+from edgevpr.runtime.recognise.recogniser import Matcher, Preparation, Recogniser, WalkSettings
 from edgevpr.runtime.recognise.recognition import Recognition
-from edgevpr.runtime.recognise.salience_gate import Gate, NoGate
+from edgevpr.runtime.recognise.salience_gate import Gate
 
 T = TypeVar("T")
 Progress = Callable[[Iterable[T], int, str], Iterable[T]]
@@ -84,9 +84,8 @@ class Walk:
         meter: QueryMeter,
         *,
         options: MatchOptions,
-        gate: Gate | NoGate | None = None,
+        gate: Gate | None = None,
     ) -> None:
-        gate = gate or NoGate()
         self.length = length_of(technique.spec, options.sequence)
         rule = accept_rule(technique, load_config(None).match, self.length, calibration_of(place_map))
         follows = options.follow and self.length == 1 and rule.sure is not None
@@ -94,14 +93,11 @@ class Walk:
 
         def recogniser(length: int, follows: bool) -> Recogniser:
             return Recogniser(
-                technique=technique,
-                place_map=place_map,
-                index=index,
-                rule=rule,
-                meter=meter,
-                candidates=None if options.exact else options.candidates or technique.candidates,
-                search=search_of(length),
-                gate=gate,
+                Matcher(technique, index, rule, search_of(length)),
+                place_map,
+                meter,
+                WalkSettings(candidates=None if options.exact else options.candidates or technique.candidates),
+                preparation=Preparation(gate=gate),
                 follower=Follower(place_map, fastest_m_s=None, is_live=False) if follows else None,
             )
 
@@ -111,7 +107,8 @@ class Walk:
     def warm_up(self, path: Path) -> None:
         """Ask a query that is not counted: the first one pays for lazy imports, tables and a cold disk."""
         asked(self._once, path)
-        self._gate.forget()
+        if self._gate:
+            self._gate.forget()
 
 
 def answer_of(event: Recognition, query: ScoredQuery, references: Sequence[str], index: PlaceIndex) -> QueryAnswer:

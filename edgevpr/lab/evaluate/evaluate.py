@@ -27,7 +27,7 @@ from edgevpr.power.boards import load_board
 from edgevpr.power.equations import pack_ah, parse_pack, queries_ah, rail_ah, stage_energy_j
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.opening import meter_of
-from edgevpr.runtime.recognise.salience_gate import Gate, NoGate
+from edgevpr.runtime.recognise.salience_gate import Gate
 from edgevpr.techniques import create, labelled
 from edgevpr.techniques.card import weights_of
 
@@ -77,7 +77,7 @@ def evaluate(
     parameters: dict[str, Any] | None = None,
     options: MatchOptions = MatchOptions(),  # noqa: B008  it is frozen
     progress: Progress[Any] = _quietly,
-    gate: Gate | NoGate | None = None,
+    gate: Gate | None = None,
 ) -> TechniqueResult:
     """Map the references, ask every query, and score the answers. `gate` discards queries; the map has all references,
     as in the thesis (3.3).
@@ -101,7 +101,7 @@ def answers_on(
     dataset: Dataset,
     options: MatchOptions,
     progress: Progress[Any] = _quietly,
-    gate: Gate | NoGate | None = None,
+    gate: Gate | None = None,
 ) -> list[QueryAnswer]:
     """Ask every query of a data set in the map of its references."""
     with opened(path, technique) as (place_map, index):

@@ -17,8 +17,8 @@ from edgevpr.core.config import Config
 from edgevpr.core.contract import TechniqueSpec
 from edgevpr.core.errors import MapError
 from edgevpr.core.types import FIX_MAX_AGE_S
-from edgevpr.places.identity import MapIdentity, identity_of
 from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.mapinfo import MapIdentity, identity_of
 from edgevpr.runtime.flight.flightlog import FlightLog
 from edgevpr.runtime.flight.metering import meter_of_queries
 from edgevpr.runtime.flight.world import World
@@ -152,7 +152,7 @@ def say_start(config: Config, world: World, aboard: Aboard) -> None:
         "reason": found.reason,
         "rule": recogniser.rule,
         "candidates": recogniser.candidates,
-        "sequence": recogniser.search.length,
+        "sequence": recogniser.sequence,
         "accuracy_m": recogniser.accuracy_m,
         "rate_hz": rate_hz(config, recogniser),
         "idle_w": board.idle_w,

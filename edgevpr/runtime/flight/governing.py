@@ -92,7 +92,7 @@ def _governor(crew: Crew, rate_hz: float, index_mb: dict[str | None, float]) -> 
     map was made, and its rivals compared."""
     recogniser = crew.recogniser
     board, spec = recogniser.meter.board, recogniser.technique.spec
-    in_sequence = recogniser.search.length > 1
+    in_sequence = recogniser.sequence > 1
     asked = Setting(rate_hz, recogniser.candidates, spec.form)
     settings = steps(asked, in_sequence, () if in_sequence else crew.fewer_candidates, crew.smaller_forms)
     return Governor(Limits(board.cpu_share, board.memory_max_mb, crew.meter.limit_c), settings, index_mb)

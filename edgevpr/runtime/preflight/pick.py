@@ -85,7 +85,7 @@ def _afforded(recogniser: Recogniser, config: Config, board: Board) -> tuple[Opt
     """Return how to recognise, and what it finds and costs in a few words."""
     technique = recogniser.technique
     costs = _costs_on(technique, board)
-    beside_bytes = bytes_beside_place(recogniser.search.length)
+    beside_bytes = bytes_beside_place(recogniser.sequence)
     costs = replace(costs, ram_bytes_per_place=bytes_per_place(technique.spec) + beside_bytes)
     if technique.spec.fine:
         costs = replace(costs, candidates=recogniser.candidates)
@@ -96,7 +96,7 @@ def _afforded(recogniser: Recogniser, config: Config, board: Board) -> tuple[Opt
         camera=_camera(technique),
     )
     usual, *fewer = options(board, _label(technique), technique.spec.name, costs, demand)
-    is_open = config.match.candidates is None and recogniser.search.length == 1
+    is_open = config.match.candidates is None and recogniser.sequence == 1
     fitting = [option for option in fewer if not option.objection] if is_open and usual.fit.shortfalls else []
     taken = fitting[0] if fitting else usual
     figures = described(board, taken.fit, demand)

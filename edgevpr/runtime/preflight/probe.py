@@ -25,7 +25,7 @@ from edgevpr.power.boards import load_board
 from edgevpr.power.equations import Pack
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.judge import AcceptRule
-from edgevpr.runtime.recognise.recogniser import Recogniser
+from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser, WalkSettings
 from edgevpr.runtime.recognise.recognition import Recognition
 
 _PICTURES = 2
@@ -204,13 +204,15 @@ class _Bench:
     def _walk(self, place_map: PlaceMap, index: PlaceIndex, candidates: int) -> Recogniser:
         technique = self._technique
         return Recogniser(
-            technique=technique,
-            place_map=place_map,
-            index=index,
-            rule=AcceptRule(min_score=technique.min_score, min_margin=technique.min_margin, neighbour_m=0.0),
-            meter=self._meter,
-            candidates=candidates,
-            search=search_of(self.sequence),
+            Matcher(
+                technique,
+                index,
+                AcceptRule(min_score=technique.min_score, min_margin=technique.min_margin, neighbour_m=0.0),
+                search_of(self.sequence),
+            ),
+            place_map,
+            self._meter,
+            WalkSettings(candidates=candidates),
         )
 
 

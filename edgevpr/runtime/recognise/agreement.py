@@ -8,9 +8,11 @@ pictures always agree alike.
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
+from edgevpr.core.arrays import Array, Bools, Bytes, Covariance, Singles
 from edgevpr.runtime.recognise.landmarks import Landmarks
 
 # Inliers. Of 14,799 pairs of a query and a place of another site, laid as the match says, 31 had four, 7 five, 3 six
@@ -35,8 +37,9 @@ _ALIKE = 40.0
 
 
 @dataclass(frozen=True, slots=True)
-class Expected:
-    """Guess of how the query lies on the place: `shift_share` (dx, dy) of its middle, `rotation_deg` and `scale`
+class Overlay:
+    """Guess of how one picture lies on another, such as the query on a place: `shift_share` (dx, dy) of its middle,
+    `rotation_deg` and `scale`
     (None: unknown), as in `Agreement`."""
 
     shift_share: tuple[float, float]
@@ -44,13 +47,13 @@ class Expected:
     scale: float | None = None
 
 
-def onto(one: Expected, other: Expected) -> Expected:
+def onto(one: Overlay, other: Overlay) -> Overlay:
     """Return how one place lies on another, of how the same query lies on both."""
     turn_scale = _turn_scale(other) / _turn_scale(one)
     shift = complex(*other.shift_share) - turn_scale * complex(*one.shift_share)
     scale = None if None in (one.scale, other.scale) else float(abs(turn_scale))
     rotation_deg = float(np.angle(turn_scale, deg=True)) % 360
-    return Expected((float(shift.real), float(shift.imag)), rotation_deg, scale)
+    return Overlay((float(shift.real), float(shift.imag)), rotation_deg, scale)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,30 +72,38 @@ class Agreement:
     shift_share: tuple[float, float] | None = None
     rotation_deg: float | None = None
     scale: float | None = None
-    covariance_share2: tuple[float, float, float] | None = None
+    covariance_share2: Covariance | None = None
     is_expected: bool = True
+
+    @property
+    def way(self) -> tuple[complex, complex] | None:
+        """The turn with the scale, and the step, that lay the query on the place."""
+        if self.shift_share is None or self.rotation_deg is None or self.scale is None:
+            return None
+        return complex(self.scale * np.exp(1j * np.radians(self.rotation_deg))), complex(*self.shift_share)
 
     @property
     def is_at_rest(self) -> bool:
         """True where one picture lies on the other without any step, as a display over all pictures does."""
-        if self.shift_share is None:
+        if self.shift_share is None or self.rotation_deg is None or self.scale is None:
             return False
         turned_deg = min(self.rotation_deg, 360 - self.rotation_deg)
         return max(map(abs, self.shift_share)) <= _TOLERANCE and turned_deg <= 2 and abs(self.scale - 1) <= 0.03
 
 
-def held_against(query: Landmarks, place: Landmarks, expected: Expected) -> Agreement:
+def held_against(query: Landmarks, place: Landmarks, expected: Overlay) -> Agreement:
     """Return how two pictures agree as `expected`; where few of their landmarks do, and many agree otherwise, that."""
     found = agreement(query, place, expected)
     if found.inliers >= CONFIRMED:
         return found
     otherwise = agreement(query, place)
-    if otherwise.inliers < PROVEN or otherwise.is_at_rest or _near(*_way(otherwise), expected):
+    way = otherwise.way
+    if way is None or otherwise.inliers < PROVEN or otherwise.is_at_rest or _is_near(*way, expected):
         return found  # what is at rest may be a display, and says nothing of the ground
     return replace(otherwise, is_expected=False)
 
 
-def agreement(query: Landmarks, place: Landmarks, expected: Expected | None = None) -> Agreement:
+def agreement(query: Landmarks, place: Landmarks, expected: Overlay | None = None) -> Agreement:
     """Compare the landmarks of two pictures. Only ways in which the query may lie near to what is `expected` are tried;
     None: all."""
     possible = min(len(query), len(place))
@@ -118,7 +129,7 @@ def agreement(query: Landmarks, place: Landmarks, expected: Expected | None = No
         way = _fitted(asked[along], known[along])
     along = np.abs(way[0] * asked + way[1] - known) <= _TOLERANCE
     inliers = int(np.count_nonzero(along))
-    if inliers < _FEWEST or not _near(*way, expected):
+    if inliers < _FEWEST or not _is_near(*way, expected):
         return nothing
     turn_scale, shift = way
     variance = _variance(asked[along], known[along], turn_scale, shift)
@@ -133,44 +144,38 @@ def agreement(query: Landmarks, place: Landmarks, expected: Expected | None = No
     )
 
 
-def _way(found: Agreement) -> tuple[complex, complex]:
-    return found.scale * np.exp(1j * np.radians(found.rotation_deg)), complex(*found.shift_share)
-
-
-def _complex(landmarks: Landmarks) -> np.ndarray:
+def _complex(landmarks: Landmarks) -> Array:
     return np.ascontiguousarray(landmarks.points, np.float32).view(np.complex64).ravel()
 
 
-def _differing_bits(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+def _differing_bits(one: Bytes, other: Bytes) -> Singles:
     """Count the bits in which descriptions differ, uint8 (N, 32) and (M, 32) -> float32 (N, M)."""
-    one, other = (2 * np.unpackbits(bits, axis=1).astype(np.float32) - 1 for bits in (one, other))
-    return (one.shape[1] - one @ other.T) / 2
+    ours, theirs = (2 * np.unpackbits(bits, axis=1).astype(np.float32) - 1 for bits in (one, other))
+    return np.asarray((ours.shape[1] - ours @ theirs.T) / 2)
 
 
-def _turn_scale(expected: Expected) -> complex:
+def _turn_scale(expected: Overlay) -> np.complex64:
     return np.complex64((expected.scale or 1.0) * np.exp(1j * np.deg2rad(expected.rotation_deg)))
 
 
-def _plausible(
-    query: Landmarks, place: Landmarks, asked: np.ndarray, known: np.ndarray, expected: Expected
-) -> np.ndarray:
+def _plausible(query: Landmarks, place: Landmarks, asked: Array, known: Array, expected: Overlay) -> Bools:
     """Tell which landmarks of the place (M,) those of the query (N,) can be, bool (N, M): by where they lie, their
     directions and sizes."""
     factor = _factor(expected)
     laid = _turn_scale(expected) * asked + np.complex64(complex(*expected.shift_share))
     room = _STEP + np.abs(asked) * (factor - 1 + np.radians(_TURN_DEG) / 2)
-    there = np.abs(laid[:, None] - known) <= room[:, None].astype(np.float32)
+    there: Bools = np.abs(laid[:, None] - known) <= room[:, None].astype(np.float32)
     turned = np.radians(query.angle_deg + expected.rotation_deg)[:, None] - np.radians(place.angle_deg)
     there &= np.cos(turned) >= np.cos(np.radians(_ANGLE_DEG))
     size, most = query.size[:, None] * np.float32(expected.scale or 1.0), np.float32(factor * _SIZE_BEYOND)
     return there & (size <= place.size * most) & (size * most >= place.size)
 
 
-def _factor(expected: Expected) -> float:
+def _factor(expected: Overlay) -> float:
     return _ANY_SCALE if expected.scale is None else _SCALE
 
 
-def _near(turn_scale: np.ndarray, shift: np.ndarray, expected: Expected | None) -> np.ndarray:
+def _is_near(turn_scale: Any, shift: Any, expected: Overlay | None) -> Bools:
     """Tell which ways to lay the query on the place are near to what is expected, bool like `shift`."""
     if expected is None:
         return (np.abs(turn_scale) >= _LEAST_SCALE) & (np.abs(turn_scale) <= _MOST_SCALE)
@@ -182,7 +187,7 @@ def _near(turn_scale: np.ndarray, shift: np.ndarray, expected: Expected | None) 
     )
 
 
-def _most_followed(asked: np.ndarray, known: np.ndarray, expected: Expected | None) -> tuple[complex, complex] | None:
+def _most_followed(asked: Array, known: Array, expected: Overlay | None) -> tuple[complex, complex] | None:
     """Return the turn with the scale, and the step, of two matches, that most of the matches follow; None where there
     is none. The nearer they come, the more they count."""
     one, other = np.triu_indices(min(_BEST_MATCHES, len(asked)), 1)
@@ -191,7 +196,7 @@ def _most_followed(asked: np.ndarray, known: np.ndarray, expected: Expected | No
     turn_scale = (known[other] - known[one]) / (asked[other] - asked[one])
     turn_scale = np.where(turn_scale == 0, np.finfo(float).tiny, turn_scale)  # two landmarks on one spot: no scale
     shift = known[one] - turn_scale * asked[one]
-    near = _near(turn_scale, shift, expected)
+    near = _is_near(turn_scale, shift, expected)
     if not near.any():
         return None
     turn_scale, shift = turn_scale[near], shift[near]
@@ -201,15 +206,15 @@ def _most_followed(asked: np.ndarray, known: np.ndarray, expected: Expected | No
     return turn_scale[best], shift[best]
 
 
-def _fitted(asked: np.ndarray, known: np.ndarray) -> tuple[complex, complex]:
+def _fitted(asked: Array, known: Array) -> tuple[complex, complex]:
     """Return the turn with the scale, and the step, that lay `asked` over `known` by least squares."""
-    middle, onto = asked.mean(), known.mean()
+    middle, there = asked.mean(), known.mean()
     spread = np.vdot(asked - middle, asked - middle).real
-    turn_scale = np.vdot(asked - middle, known - onto) / spread if spread > 0 else 1.0 + 0j
-    return turn_scale, onto - turn_scale * middle
+    turn_scale = np.vdot(asked - middle, known - there) / spread if spread > 0 else 1.0 + 0j
+    return turn_scale, there - turn_scale * middle
 
 
-def _variance(asked: np.ndarray, known: np.ndarray, turn_scale: complex, shift: complex) -> float:
+def _variance(asked: Array, known: Array, turn_scale: complex, shift: complex) -> float:
     """Return the variance of the step of the query's middle, along x as along y: the farther the landmarks are from the
     middle, the more a wrong turn moves it."""
     left = np.abs(turn_scale * asked + shift - known) ** 2

@@ -1,7 +1,7 @@
 """Belief where the aircraft is, followed from query to query: a Bayes filter over the places of a map.
 
 The aircraft is lost (off the map, or on it where no query has seen it), or near one of at most `MOST` hypotheses, each
-a Gaussian on the ground. Being lost is a state like any other, and explains what the map does not.
+a Gaussian on the scale. Being lost is a state like any other, and explains what the map does not.
 
 A query is heard by its own probabilities. Divided by the prior they were made with they are likelihoods, so a query
 without history is believed as it stands. Three things keep a history from being believed too much:
@@ -18,9 +18,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from edgevpr.runtime.recognise.hypotheses import Hypotheses, Way, apart, density, fused, joined, mean_of, none
-from edgevpr.runtime.recognise.motion import Moved
-from edgevpr.runtime.recognise.seen import Ground, Seen, usable
+from edgevpr.core.arrays import Doubles, Ints
+from edgevpr.runtime.recognise.hypotheses import (
+    Hypotheses,
+    MapScale,
+    Proposals,
+    Way,
+    apart,
+    density,
+    fused,
+    joined,
+    mean_of,
+    no_hypotheses,
+    usable,
+)  # fmt: skip
 
 MOST = 64  # hypotheses kept
 PRIOR_LOST = 0.5  # of the probabilities that are handed in
@@ -38,14 +49,28 @@ _SCATTERS = 2.0  # standard deviations of a position: a step as short as that ma
 _FORGOTTEN = 1e-9  # a hypothesis of less weight
 _MOSTLY = 0.5  # of a share
 _LEAST = 1e-300  # instead of zero, where a number divides
+_OF_LENGTH_SD = 0.15  # of the length of a displacement by odometry that can be believed
+_LONGEST_S = 3600.0  # after which an aircraft may be anywhere
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Estimate:
-    """Position (2,) with its covariance (2, 2), and the heading (None: unknown)."""
+class Moved:
+    """Knowledge of how an aircraft has moved since the query before. `reach` is how far it can have moved, in the unit
+    of the map (metres, or places), and `elapsed_s` the time it had. `by` (2,) is the displacement by odometry, with its
+    `covariance` (2, 2); None: there is none."""
 
-    at: np.ndarray
-    covariance: np.ndarray
+    reach: float
+    elapsed_s: float
+    by: Doubles | None = None
+    covariance: Doubles | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlaneEstimate:
+    """Position (2,) in the plane of the map with its covariance (2, 2), and the heading (None: unknown)."""
+
+    at: Doubles
+    covariance: Doubles
     heading_deg: float | None
 
 
@@ -55,49 +80,68 @@ class Posterior:
     all hypotheses near the `estimate` (None: there is no hypothesis)."""
 
     lost: float
-    p: np.ndarray
+    p: Doubles
     mass: float
-    estimate: Estimate | None
+    estimate: PlaneEstimate | None
+
+
+def moved(
+    elapsed_s: float | None, usual_s: float, speed_max: float, velocity: tuple[float, float] | None = None
+) -> Moved:
+    """Return what is known of the motion in `elapsed_s` seconds (None: unknown), usually `usual_s`.
+
+    `speed_max` is the highest speed, in units of the map a second, and `velocity` (east, north) that of odometry (None:
+    unknown). A clock that has gone back, or stood still, says nothing of the time; then odometry says nothing of the
+    way.
+    """
+    if elapsed_s is None or not elapsed_s > 0:
+        return Moved(reach=speed_max * usual_s, elapsed_s=usual_s)
+    elapsed_s = min(elapsed_s, _LONGEST_S)
+    reach = speed_max * elapsed_s
+    if velocity is None or not math.hypot(*velocity) <= 2 * speed_max:  # NaN, or too fast even if it is twice the truth
+        return Moved(reach=reach, elapsed_s=elapsed_s)
+    by = elapsed_s * np.asarray(velocity, float)
+    return Moved(reach=reach, elapsed_s=elapsed_s, by=by, covariance=(_OF_LENGTH_SD**2 * by @ by) * np.eye(2))
 
 
 class Belief:
     """The belief of one flight over one map, taken on with each query by `update`."""
 
-    def __init__(self, ground: Ground) -> None:
-        self._ground = ground
+    def __init__(self, scale: MapScale) -> None:
+        self._scale = scale
         self._lost, self._enters = 1.0, 1 - PRIOR_LOST
-        self._now, self._strongest = none(), 0.0
+        self._now, self._strongest = no_hypotheses(), 0.0
 
     @property
     def nbytes(self) -> int:
         return self._now.nbytes
 
-    def update(self, seen: Seen | None, moved: Moved, places: int) -> Posterior:
+    def update(self, proposed: Proposals | None, moved: Moved, places: int) -> Posterior:
         """Take what a query has seen (None: its picture says nothing), and how the aircraft has moved since the query
         before; `places` is how many the map has now.
 
-        Never raises for numbers that make no sense: a candidate that is not finite counts as not seen.
+        Never raises for numbers that make no sense: a candidate that is not finite counts as not proposed.
         """
         odds = (1 - self._lost) / max(self._lost, _FORGOTTEN)
         now, lost, appears = self._left()
         places = max(1, places)
         ways = self._ways(now, moved, places)
-        p = np.zeros(0 if seen is None else len(seen.p))
-        if seen is None:
+        p = np.zeros(0 if proposed is None else len(proposed.p))
+        numbers: Ints = np.zeros(0, int)
+        if proposed is None:
             lost += appears  # nobody knows where
             after = _unseen(now, ways, 1.0)
-            heard = np.zeros(0, int)
         else:
             self._enters = _ENTERS
-            heard, seen = usable(seen, self._ground, MOST)
-            there, alike, staleness, left = self._heard(seen, now, ways, moved.elapsed_s, appears, places)
+            numbers, proposed = usable(proposed, self._scale, MOST)
+            there, alike, staleness, left = self._credit(proposed, now, ways, moved.elapsed_s, appears, places)
             lost *= alike
             unseen = _unseen(now, ways, _MISSED)
             # One who is lost and sees the same again has not moved on either, so staying here is no evidence for it.
             kept = (left * odds * lost - float(unseen.w.sum())) / max(float(there.w.sum()), _FORGOTTEN)
             after = joined(replace(there, w=there.w * max(1.0, kept) ** staleness), unseen)
         share = after.w / (lost + float(after.w.sum()))
-        p[heard] = share[: len(heard)]
+        p[numbers] = share[: len(numbers)]
         kept = np.argsort(-share, kind="stable")[:MOST]
         kept = kept[share[kept] > _FORGOTTEN]
         self._now = replace(after, w=share)[kept]
@@ -118,53 +162,53 @@ class Belief:
 
     def _ways(self, now: Hypotheses, moved: Moved, places: int) -> list[Way]:
         """Return the ways in which each hypothesis can have moved: by odometry, on as before, or anywhere in reach."""
-        ground, ways = self._ground, []
-        area = places * ground.cell
-        widest = area / 2 if ground.is_ordinal else math.sqrt(area / math.pi)
+        scale, ways = self._scale, []
+        area = places * scale.cell
+        widest = area / 2 if scale.is_ordinal else math.sqrt(area / math.pi)
         is_everywhere = not moved.reach < widest
         reach = widest if is_everywhere else moved.reach
         is_going = ~np.isnan(now.velocity[:, 0])
         ahead = np.where(is_going[:, None], now.velocity, 0) * moved.elapsed_s
         ahead *= (moved.reach / np.maximum(np.hypot(*ahead.T), max(moved.reach, _LEAST)))[:, None]
-        left, middle, sd = np.ones(len(now.w)), np.zeros(2), max(reach / _REACH_SD, _GOES_ON_SD * ground.spacing)
+        left, middle, sd = np.ones(len(now.w)), np.zeros(2), max(reach / _REACH_SD, _GOES_ON_SD * scale.spacing)
         if moved.by is not None:
-            spread = moved.covariance + (_ODOMETRY_SD * ground.spacing) ** 2 * np.eye(2)
+            spread = moved.covariance + (_ODOMETRY_SD * scale.spacing) ** 2 * np.eye(2)
             ways.append(Way(_ODOMETRY * left, now.at + moved.by, now.covariance + spread))
             # Odometry that is wrong by a factor of two is wrong by as much as its length.
-            left, middle, sd = (1 - _ODOMETRY) * left, moved.by, min(sd, ground.spacing + math.hypot(*moved.by))
-        variance = (_GOES_ON_SD * ground.spacing) ** 2 + (_GOES_ON_SD * np.hypot(*ahead.T)) ** 2 / 2
+            left, middle, sd = (1 - _ODOMETRY) * left, moved.by, min(sd, scale.spacing + math.hypot(*moved.by))
+        variance = (_GOES_ON_SD * scale.spacing) ** 2 + (_GOES_ON_SD * np.hypot(*ahead.T)) ** 2 / 2
         going = now.covariance + variance[:, None, None] * np.eye(2)
         ways.append(Way(_GOES_ON * is_going * left, now.at + ahead, going))
         anywhere = now.covariance + sd**2 * np.eye(2)
         ways.append(Way((1 - _GOES_ON * is_going) * left, now.at + middle, anywhere, is_everywhere / area))
         return ways
 
-    def _heard(
-        self, seen: Seen, now: Hypotheses, ways: list[Way], elapsed_s: float, appears: float, places: int
+    def _credit(
+        self, proposed: Proposals, now: Hypotheses, ways: list[Way], elapsed_s: float, appears: float, places: int
     ) -> tuple[Hypotheses, float, float, float]:
         """Return one hypothesis for each candidate of a query, whose weight has come from the hypotheses before, each
         by the ways that lead here, and from nowhere; how much likelier one who is lost sees the query than if
         nothing out there were like the map; how far the query shows the same ground as the one before (0..1), and what
         is then left of the odds: 1 at most, less where this look says less."""
-        ground, at, of_step = self._ground, seen.at, seen.covariance
-        rest = max(_LEAST_REST, 1 - float(seen.p.sum()))
-        ratio = np.log(np.maximum(seen.p, _LEAST) * places * PRIOR_LOST / ((1 - PRIOR_LOST) * rest))
+        scale, at, of_step = self._scale, proposed.at, proposed.covariance
+        rest = max(_LEAST_REST, 1 - float(proposed.p.sum()))
+        ratio = np.log(np.maximum(proposed.p, _LEAST) * places * PRIOR_LOST / ((1 - PRIOR_LOST) * rest))
         born = appears / places * np.exp(ratio)
 
         # A picture of the same ground says what the one before has said, to whoever was there: also to one who is lost.
         strongest, before = max(0.0, float(ratio.max(initial=0))), self._strongest
         same, self._strongest = min(before, strongest), strongest
-        scatter = np.sqrt(of_step[:, 0, 0] if ground.is_ordinal else np.trace(of_step, axis1=1, axis2=2) / 2)
-        fresh = np.clip((apart(now.anchor, at) - _SCATTERS * scatter) / ground.spacing, 0, 1)
-        evidence = np.exp(ratio + (1 - fresh) * (same - now.credited[:, None])) * (ground.cell * now.w[:, None])
-        led = [way.share[:, None] * evidence * density(way, at, of_step, ground.is_ordinal) for way in ways]
+        scatter = np.sqrt(of_step[:, 0, 0] if scale.is_ordinal else np.trace(of_step, axis1=1, axis2=2) / 2)
+        fresh = np.clip((apart(now.anchor, at) - _SCATTERS * scatter) / scale.spacing, 0, 1)
+        evidence = np.exp(ratio + (1 - fresh) * (same - now.credited[:, None])) * (scale.cell * now.w[:, None])
+        led = [way.share[:, None] * evidence * density(way, at, of_step, scale.is_ordinal) for way in ways]
         weight = sum(each.sum(0) for each in led)  # of what has come from hypotheses
         by = sum(led) / np.maximum(weight, _LEAST)
         stale = by * (1 - fresh)
         staleness = float(weight @ stale.sum(0)) / max(_LEAST, float((weight + born).sum()))
         newest = float(ratio[stale.sum(0) > _MOSTLY].max(initial=-math.inf))
         left = math.exp(min(0.0, newest - before))
-        agreement = float(weight.sum()) * rest / max(_LEAST, float(now.w.sum() * seen.p.sum()))
+        agreement = float(weight.sum()) * rest / max(_LEAST, float(now.w.sum() * proposed.p.sum()))
         alike = (1 - _ALIKE + _ALIKE * agreement) ** (1 - staleness) if len(now.w) else 1.0
 
         before, of_before = mean_of(
@@ -183,17 +227,17 @@ class Belief:
             at=np.where(is_led, at_both, at),
             covariance=np.where(is_led[..., None], of_both, of_step),
             velocity=np.where(is_led, velocity, np.nan),
-            heading=_vector(seen.heading_deg),
+            heading=_vector(proposed.heading_deg),
             credited=np.maximum(ratio, 0),
             anchor=np.where(is_led, anchor, at),
         )
         return there, alike, staleness, left
 
-    def _posterior(self, p: np.ndarray) -> Posterior:
+    def _posterior(self, p: Doubles) -> Posterior:
         now = self._now
         if not len(now.w):
             return Posterior(lost=self._lost, p=p, mass=0.0, estimate=None)
-        is_near = apart(now.at, now.at) <= self._ground.near
+        is_near = apart(now.at, now.at) <= self._scale.near
         there = is_near[(is_near @ now.w).argmax()]
         mass = float(now.w[there].sum())
         share = now.w[there] / mass
@@ -201,7 +245,7 @@ class Belief:
         north, east = (share @ now.heading[there]).tolist()
         is_known = math.hypot(north, east) > 0.5
         heading_deg = math.degrees(math.atan2(east, north)) % 360 if is_known else None
-        estimate = Estimate(at=at, covariance=covariance, heading_deg=heading_deg)
+        estimate = PlaneEstimate(at=at, covariance=covariance, heading_deg=heading_deg)
         return Posterior(lost=self._lost, p=p, mass=mass, estimate=estimate)
 
 
@@ -216,6 +260,6 @@ def _unseen(now: Hypotheses, ways: list[Way], chance: float) -> Hypotheses:
     return replace(now, w=chance * now.w, at=mean, covariance=spread)
 
 
-def _vector(heading_deg: np.ndarray) -> np.ndarray:
+def _vector(heading_deg: Doubles) -> Doubles:
     heading = np.radians(heading_deg)
     return np.nan_to_num(np.stack([np.cos(heading), np.sin(heading)], 1))

@@ -1,4 +1,4 @@
-"""Evidence of a match: the figures from which its confidence is made (see `confidence.model`).
+"""Evidence of a match: the figures from which its confidence is made (see `confidence`), and the calibration of a map.
 
 There are three kinds, since a camera that looks ahead sees other things than one that looks straight down, and not
 every map has landmarks. All figures are larger the more they speak for the match, but for `rank_gap`.
@@ -13,16 +13,23 @@ every map has landmarks. All figures are larger the more they speak for the matc
 * landmarks: log of one more than the landmarks that agree as expected (down)
 """
 
+import json
+import logging
 import math
-from collections.abc import Mapping, Sequence
+import zlib
+from collections.abc import Collection, Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
 
 import numpy as np
 
-from edgevpr.core.contract import TechniqueSpec
+from edgevpr.core.contract import FineMatch, TechniqueSpec
+from edgevpr.core.errors import MapError
 from edgevpr.places.index import PlaceIndex
+from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Ranking, elsewhere
 from edgevpr.runtime.recognise.agreement import Agreement
-from edgevpr.runtime.recognise.confidence import Model
+from edgevpr.runtime.recognise.confidence import Evidence, Model, model_of
 
 AHEAD, DOWN, DOWN_BARE = "ahead", "down", "down_bare"
 _LOOKING_DOWN = {DOWN: ("agree", "lead", "coverage", "landmarks"), DOWN_BARE: ("agree", "lead", "coverage")}
@@ -33,6 +40,63 @@ WITH_CONFIDENCE = "cohog"  # the technique that gives evidence, for want of its 
 _LEAST = 1e-3  # of a share whose logarithm is taken
 _BY_CHANCE = 0.07  # a share that pictures of foreign ground reach, where there is no place elsewhere to compare with
 _BESIDE = 0.5  # weight of either neighbour
+FEWEST_PLACES = 30  # with fewer the shipped model is used as it is
+_HARDLY = 0.5  # mean confidence of a place that is hardly recognisable
+_CHECKSUM_DIGITS = 8
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapCalibration:
+    """Calibration of a map, from `asked` changed pictures of its own places. `models` are those of its kinds of
+    evidence. Of the pictures the share `accepted` is accepted at the precision that was asked for then, and
+    `accepted_wrong` of all accepted matches are wrong, those of places that were left out among them. `recognisable`
+    is the mean confidence of the right matches of a place, 0..1 by its number, of the places that were asked for."""
+
+    models: Mapping[str, Model]
+    made: str
+    asked: int
+    precision: float
+    accepted: float
+    accepted_wrong: int
+    recognisable: Mapping[int, float] = field(default_factory=dict)
+
+    @property
+    def hardly_recognisable(self) -> float:
+        """Share of the places asked for that are hardly recognisable."""
+        return sum(each < _HARDLY for each in self.recognisable.values()) / max(len(self.recognisable), 1)
+
+    @property
+    def looks_alike(self) -> bool:
+        """True where most of the map looks alike."""
+        return self.hardly_recognisable > 0.5
+
+    def figures(self) -> dict[str, Any]:
+        """Return the figures for programs."""
+        return {
+            "made": self.made,
+            "made_of": [model.made_of for model in self.models.values()],
+            "asked": self.asked,
+            "places_asked": len(self.recognisable),
+            "precision": self.precision,
+            "accepted": round(self.accepted, 4),
+            "accepted_wrong": self.accepted_wrong,
+            "hardly_recognisable": round(self.hardly_recognisable, 4),
+            "looks_alike": self.looks_alike,
+        }
+
+    def described(self) -> str:
+        """Say in words what to expect of the map."""
+        wrong = {0: "no wrong match was", 1: "1 wrong match was"}.get(
+            self.accepted_wrong, f"{self.accepted_wrong} wrong matches were"
+        )
+        alike = "; most of this map looks alike: expect few fixes over it" if self.looks_alike else ""
+        return (
+            f"of {self.asked} changed pictures of its own places {100 * self.accepted:.0f} % were accepted, at a "
+            f"precision of {100 * self.precision:.6g} %, and {wrong}; {100 * self.hardly_recognisable:.0f} % of "
+            f"{len(self.recognisable)} places are hardly recognisable{alike}"
+        )
 
 
 def kinds_of(spec: TechniqueSpec) -> tuple[str, ...]:
@@ -42,7 +106,7 @@ def kinds_of(spec: TechniqueSpec) -> tuple[str, ...]:
     return (AHEAD,) if spec.scan_counts else ()
 
 
-def kind_of(evidence: Mapping[str, float]) -> str:
+def kind_of(evidence: Evidence) -> str:
     """Return the kind of some evidence."""
     if "likeness" in evidence:
         return AHEAD
@@ -62,8 +126,8 @@ def require_usable(kind: str, model: Model) -> None:
     model.threshold(0.5), model.threshold(0.999999)
 
 
-def said(evidence: Mapping[str, float]) -> str:
-    """Say the evidence of a match in words, for the log."""
+def described(evidence: Evidence) -> str:
+    """Describe the evidence of a match in words, for the log."""
     ahead = (
         f"{math.exp(evidence['lead']):.2f} times as many regions agree as elsewhere ({math.exp(evidence['agree']):.1%})"
     )
@@ -72,68 +136,119 @@ def said(evidence: Mapping[str, float]) -> str:
     return f"{ahead}, {math.exp(evidence['coverage']):.1%} of the place agrees"
 
 
-def evidence_ahead(ranking: Ranking, index: PlaceIndex, neighbour_m: float) -> dict[str, float] | None:
-    """Return the evidence of the best place of a ranking, of a camera that looks ahead; None where there is none."""
-    slots = [slot for slot in ranking.slots.tolist() if slot in ranking.compared]
-    matches = {slot: ranking.compared[slot] for slot in slots}
-    if not slots or any(match.support is None for match in matches.values()):
+def evidence_of(
+    ranking: Ranking, index: PlaceIndex, neighbour_m: float, proof: Agreement | None, same: Collection[int], down: bool
+) -> dict[str, float] | None:
+    """Return the evidence of the best place of a ranking; None where there is none.
+
+    `down` tells whether the camera looks straight down. Then `proof` is how the landmarks of the place agree (None:
+    nothing is known of them), and the places numbered `same` show the same ground, and are not elsewhere.
+    """
+    matches = {slot: ranking.compared[slot] for slot in ranking.compared_slots}
+    if not matches or (not down and any(match.support is None for match in matches.values())):
         return None
-    best = slots[0]
-    away = _away(index, best, slots, neighbour_m)
-    agree = {slot: math.sqrt(match.score * match.support.back) for slot, match in matches.items()}
-    score = {slot: match.score for slot, match in matches.items()}
-    mutual = {slot: match.support.mutual for slot, match in matches.items()}
-    around = _with_neighbours(score)
-    support = matches[best].support
-    most_mutual = max(mutual, key=mutual.get)
+    slots = np.array(list(matches))
+    best = int(slots[0])
+    away = frozenset(slots[elsewhere(index, best, slots, neighbour_m, same if down else ())].tolist())
+    return _evidence_down(matches, best, away, proof) if down else _evidence_ahead(matches, best, away)
+
+
+def votes_of(match: FineMatch) -> float:
+    """Return the share of regions that agree on a step: ahead, the geometric mean of both ways."""
+    return match.score if match.support is None else math.sqrt(match.score * match.support.back)
+
+
+def _evidence_ahead(matches: dict[int, FineMatch], best: int, away: frozenset[int]) -> dict[str, float]:
+    support = {slot: match.support for slot, match in matches.items() if match.support}
+    agree = {slot: votes_of(match) for slot, match in matches.items()}
+    around = _with_neighbours({slot: match.score for slot, match in matches.items()})
+    most_mutual = max(support, key=lambda slot: support[slot].mutual)
     return {
-        "agree": _log(agree[best]),
+        "agree": _log_share(agree[best]),
         "lead": _lead(agree, best, away),
         "lead_around": _lead(around, best, away),
-        "coverage": _log(matches[best].coverage or 0.0),
-        "mutual": _log(support.mutual),
+        "coverage": _log_share(matches[best].coverage or 0.0),
+        "mutual": _log_share(support[best].mutual),
         "mutual_best": float(most_mutual not in away),
-        "rank_gap": support.log_rank - min(match.support.log_rank for match in matches.values()),
-        "back": _log(support.back),
-        "likeness": support.likeness,
+        "rank_gap": support[best].log_rank - min(each.log_rank for each in support.values()),
+        "back": _log_share(support[best].back),
+        "likeness": support[best].likeness,
     }
 
 
-def evidence_down(
-    ranking: Ranking,
-    index: PlaceIndex,
-    neighbour_m: float,
-    proof: Agreement | None,
-    same: Sequence[int] = (),
-) -> dict[str, float] | None:
-    """Return the evidence of the best place of a ranking, of a camera that looks straight down; None where there is
-    none. `proof` is how its landmarks agree (None: nothing is known of them). The places numbered `same` show the same
-    ground, and are not elsewhere."""
-    slots = [slot for slot in ranking.slots.tolist() if slot in ranking.compared]
-    if not slots:
-        return None
-    best = slots[0]
-    score = {slot: ranking.compared[slot].score for slot in slots}
+def _evidence_down(
+    matches: dict[int, FineMatch], best: int, away: frozenset[int], proof: Agreement | None
+) -> dict[str, float]:
+    score = {slot: match.score for slot, match in matches.items()}
     evidence = {
-        "agree": _log(score[best]),
-        "lead": _lead(score, best, _away(index, best, slots, neighbour_m, same)),
-        "coverage": _log(ranking.compared[best].coverage or 0.0),
+        "agree": _log_share(score[best]),
+        "lead": _lead(score, best, away),
+        "coverage": _log_share(matches[best].coverage or 0.0),
     }
     if proof is not None:
         evidence["landmarks"] = math.log1p(proof.inliers if proof.is_expected and not proof.is_at_rest else 0)
     return evidence
 
 
-def _away(
-    index: PlaceIndex, best: int, slots: Sequence[int], neighbour_m: float, same: Sequence[int] = ()
-) -> frozenset[int]:
-    """Return those of the slots that are elsewhere."""
-    slots = np.array(slots)
-    return frozenset(slots[elsewhere(index, best, slots, neighbour_m, same)].tolist())
+def calibration_of(place_map: PlaceMap) -> MapCalibration | None:
+    """Return the calibration of a map; None where it has none, and, with a warning, where it cannot be used."""
+    try:
+        text = place_map.calibration
+        if text is None:
+            return None
+        found = read_calibration(text)
+        for kind, model in found.models.items():
+            require_usable(kind, model)
+    except (ValueError, ArithmeticError, MapError) as error:
+        _log.warning(
+            "%s: its calibration cannot be used (%s): the shipped one is used; `edgevpr map calibrate` makes it anew",
+            place_map.path,
+            error,
+        )
+        return None
+    return found
+
+
+def not_calibrated(places: int) -> str:
+    """Say of a map with so many places that it is not calibrated, and why."""
+    if places < FEWEST_PLACES:
+        return f"not calibrated ({places} places: fewer than {FEWEST_PLACES}): the shipped confidence is used"
+    return "not calibrated: the shipped confidence is used; `edgevpr map calibrate` makes its own of its pictures"
+
+
+def calibration_text(calibration: MapCalibration) -> str:
+    """Write a calibration as `read_calibration` reads it: JSON, after the CRC-32 of it."""
+    body = json.dumps(asdict(calibration))
+    return _checksum(body) + body
+
+
+def read_calibration(text: str) -> MapCalibration:
+    """Read the text of a map. Raises ValueError for one that is damaged or makes no sense."""
+    checksum, body = text[:_CHECKSUM_DIGITS], text[_CHECKSUM_DIGITS:]
+    if checksum != _checksum(body):
+        raise ValueError("its checksum is wrong")
+    try:
+        found = json.loads(body)
+        recognisable = {int(place_id): float(each) for place_id, each in found["recognisable"].items()}
+        calibration = MapCalibration(
+            models={str(kind): model_of(each) for kind, each in found["models"].items()},
+            made=str(found["made"]),
+            asked=int(found["asked"]),
+            precision=float(found["precision"]),
+            accepted=float(found["accepted"]),
+            accepted_wrong=int(found["accepted_wrong"]),
+            recognisable=recognisable,
+        )
+    except (KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
+        raise ValueError(f"no calibration ({error!r:.80})") from error
+    shares = (calibration.precision, calibration.accepted, *recognisable.values())
+    if not all(math.isfinite(each) and 0 <= each <= 1 for each in shares):
+        raise ValueError("a share is not within 0 and 1")
+    return calibration
 
 
 def _lead(share: dict[int, float], best: int, away: frozenset[int]) -> float:
-    return _log(share[best]) - _log(max((share[slot] for slot in away), default=_BY_CHANCE))
+    return _log_share(share[best]) - _log_share(max((share[slot] for slot in away), default=_BY_CHANCE))
 
 
 def _with_neighbours(share: dict[int, float]) -> dict[int, float]:
@@ -146,5 +261,9 @@ def _with_neighbours(share: dict[int, float]) -> dict[int, float]:
     }
 
 
-def _log(share: float) -> float:
+def _log_share(share: float) -> float:
     return math.log(max(share, _LEAST))
+
+
+def _checksum(body: str) -> str:
+    return f"{zlib.crc32(body.encode('utf-8', 'surrogatepass')):0{_CHECKSUM_DIGITS}x}"

@@ -11,7 +11,7 @@ from edgevpr.core.contract import nearest_height
 from edgevpr.core.geodesy import distance_m
 from edgevpr.core.types import Candidate, Frame, Position, Vehicle
 from edgevpr.places.index import PlaceIndex
-from edgevpr.places.retrieve import Expected
+from edgevpr.places.retrieve import Expectation
 
 _FIX_GOOD_FOR_S = 60.0
 
@@ -25,32 +25,36 @@ class Sighting:
 
 
 @dataclass(frozen=True, slots=True)
-class Hints:
-    """Hints for one query: the aircraft is within `radius_m` metres of `position`, and its nose points to
-    `heading_deg`. None: unknown."""
+class Reach:
+    """The aircraft is within `radius_m` metres of `position`."""
 
-    position: Position | None = None
-    radius_m: float | None = None
+    position: Position
+    radius_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Hints:
+    """Hints for one query: where the aircraft can be, and the heading of its nose. None: unknown."""
+
+    reach: Reach | None = None
     heading_deg: float | None = None
 
     def fields(self) -> dict[str, float | bool | None]:
         """Return the fields that the flight log has for hints that were used."""
-        radius_m = None if self.radius_m is None else round(self.radius_m, 1)
+        radius_m = round(self.reach.radius_m, 1) if self.reach else None
         return {"reach_m": radius_m, "heading": self.heading_deg is not None}
 
-
-class NoPrior:
-    """Stands in for a `Prior` where no query is to be narrowed: it has no hints, and each is looked for from all
-    heights where it is not accepted from that of the map."""
-
-    height_ratio = 1.0
-    looks_again = True
-
-    def hints(self, frame: Frame, vehicle: Vehicle | None, index: PlaceIndex, margin_m: float) -> Hints | None:
-        """Return None: there are no hints."""
-
-    def learn(self, found: Candidate, accepted: bool, t_mono_s: float) -> None:
-        """Learn nothing."""
+    def agree_with(self, found: Candidate, heading_within_deg: float | None) -> bool:
+        """Tell whether a place found agrees with these hints; a position or heading that is unknown agrees with any."""
+        place, turned_deg = found.place, found.match.rotation_deg
+        if self.reach and place.position:
+            here, there = self.reach.position, place.position
+            if distance_m(here.lat_deg, here.lon_deg, there.lat_deg, there.lon_deg) > self.reach.radius_m:
+                return False
+        if self.heading_deg is None or place.heading_deg is None or turned_deg is None or heading_within_deg is None:
+            return True
+        off_deg = (turned_deg - (self.heading_deg - place.heading_deg) + 180) % 360 - 180
+        return abs(off_deg) <= heading_within_deg
 
 
 class Prior:
@@ -69,7 +73,7 @@ class Prior:
         self.height_ratio = 1.0  # of the last accepted match; until there is one, that of the map
         self.looks_again = True
         self._known: Hints | None = None
-        self._believed = True
+        self._are_believed = True
 
     def hints(self, frame: Frame, vehicle: Vehicle | None, index: PlaceIndex, margin_m: float) -> Hints | None:
         """Return the hints for a frame, None where there are none or they are not believed at present.
@@ -81,65 +85,65 @@ class Prior:
             vehicle = None
         around = heading_deg = None
         if self._reach_m_s:
-            around = reach(frame.t_mono_s, vehicle, self._last_fix, self._reach_m_s, margin_m)
+            around = reach_of(frame.t_mono_s, vehicle, self._last_fix, self._reach_m_s, margin_m)
         if self._heading_within_deg is not None:
             heading_deg = vehicle.heading_deg if frame.heading_deg is None and vehicle else frame.heading_deg
         self._known = hints_of(index, around, heading_deg)
-        return self._known if self._believed else None
+        return self._known if self._are_believed else None
 
     def learn(self, found: Candidate, accepted: bool, t_mono_s: float) -> None:
-        """Learn from what a query found whether the next one is to use hints, and keep the position and the
-        height of an accepted match."""
+        """Learn from what a query found whether the next one is to use hints, and keep the position and the height of
+        an accepted match.
+
+        Queries with hints and without take turns until a match is accepted. That match then tells whether the hints can
+        be believed.
+        """
         # Over ground that is not in the map every second query is looked for from all heights: it takes twice as long.
         self.looks_again = accepted or not self.looks_again
-        self._believed = use_next(self._known, self._believed, found, accepted, self._heading_within_deg)
+        if self._known is None:
+            self._are_believed = True
+        elif accepted:
+            self._are_believed = self._known.agree_with(found, self._heading_within_deg)
+        else:
+            self._are_believed = not self._are_believed
         if accepted and found.match.height_ratio:
             self.height_ratio = found.match.height_ratio
         if accepted and found.place.position:
             self._last_fix = Sighting(found.place.position, t_mono_s)
 
 
-def hints_of(index: PlaceIndex, around: tuple[Position, float] | None, heading_deg: float | None) -> Hints | None:
-    """Return the hints of a position with its `reach`, and of a heading, as far as they leave any place out of the
-    search; None where neither does.
-
-    Where no place is in reach, all are searched.
-    """
-    if around and not 0 < index.within(*around).sum() < len(index):
+def hints_of(index: PlaceIndex, around: Reach | None, heading_deg: float | None) -> Hints | None:
+    """Return the hints of a reach and of a heading, as far as they leave any place out of the search; None where
+    neither does. Where no place is in reach, all are searched."""
+    if around and not 0 < index.within(around.position, around.radius_m).sum() < len(index):
         around = None
     if heading_deg is not None and not index.knows_headings:
         heading_deg = None
-    if around is None and heading_deg is None:
-        return None
-    position, radius_m = around or (None, None)
-    return Hints(position, radius_m, heading_deg)
+    return None if around is None and heading_deg is None else Hints(around, heading_deg)
 
 
-def reach(
+def reach_of(
     now_s: float, vehicle: Vehicle | None, own_fix: Sighting | None, reach_m_s: float, margin_m: float
-) -> tuple[Position, float] | None:
-    """Return where the aircraft must be at `now_s`: a position, and the radius in metres that it may have flown since.
+) -> Reach | None:
+    """Return where the aircraft must be at `now_s`, by how far it may have flown since its last known position.
 
-    The position is that of an autopilot that has GPS and has reported within a second, else our own last fix if it is
-    at most a minute old. None where there is neither.
+    This is that of an autopilot that has GPS and has reported within a second, else our own last fix if it is at most a
+    minute old. None where there is neither.
     """
-    seen = None
-    if own_fix and now_s - own_fix.t_mono_s <= _FIX_GOOD_FOR_S:
-        seen = own_fix
+    seen = own_fix if own_fix and now_s - own_fix.t_mono_s <= _FIX_GOOD_FOR_S else None
     if vehicle and vehicle.has_gps and vehicle.is_fresh_at(now_s):  # without GPS its position drifts: our fix is better
         seen = Sighting(Position(vehicle.lat_deg, vehicle.lon_deg), vehicle.t_heard_s)
-    return seen and (seen.position, margin_m + reach_m_s * abs(now_s - seen.t_mono_s))
+    return seen and Reach(seen.position, margin_m + reach_m_s * abs(now_s - seen.t_mono_s))
 
 
-def expected_of(hints: Hints | None, index: PlaceIndex) -> Expected:
-    """Return the hints as expectations for every place of the index."""
-    if hints is None:
-        return Expected()
-    in_reach = index.within(hints.position, hints.radius_m) if hints.position else None
-    turned_deg = None
-    if hints.heading_deg is not None:
+def expected_of(hints: Hints | None, height_ratio: float, index: PlaceIndex) -> Expectation:
+    """Return hints and height as expectations for every place of the index."""
+    in_reach = turned_deg = None
+    if hints and hints.reach:
+        in_reach = index.within(hints.reach.position, hints.reach.radius_m)
+    if hints and hints.heading_deg is not None:
         turned_deg = (hints.heading_deg - index.heading_deg.astype(float)) % 360
-    return Expected(in_reach, turned_deg)
+    return Expectation(in_reach, turned_deg, height_ratio)
 
 
 def other_heights(height_ratios: Sequence[float], first: float) -> list[float]:
@@ -148,29 +152,3 @@ def other_heights(height_ratios: Sequence[float], first: float) -> list[float]:
         return []
     tried = nearest_height(height_ratios, first)
     return [ratio for ratio in height_ratios if ratio != tried]
-
-
-def agree(hints: Hints, found: Candidate, heading_within_deg: float | None) -> bool:
-    """Tell whether a place found agrees with these hints; a position or heading that is unknown agrees with any."""
-    place = found.place
-    if hints.position and place.position:
-        here, there = hints.position, place.position
-        if distance_m(here.lat_deg, here.lon_deg, there.lat_deg, there.lon_deg) > hints.radius_m:
-            return False
-    if None in (hints.heading_deg, place.heading_deg, found.match.rotation_deg, heading_within_deg):
-        return True
-    off_deg = (found.match.rotation_deg - (hints.heading_deg - place.heading_deg) + 180) % 360 - 180
-    return abs(off_deg) <= heading_within_deg
-
-
-def use_next(
-    hints: Hints | None, used: bool, found: Candidate | None, accepted: bool, heading_within_deg: float | None
-) -> bool:
-    """Tell whether the next query is to use hints, after a query that had `hints` and `used` them or not.
-
-    Queries with hints and without take turns until a match is accepted. That match then tells whether the hints can be
-    believed.
-    """
-    if hints is None:
-        return True
-    return agree(hints, found, heading_within_deg) if accepted else not used

@@ -1,11 +1,15 @@
-"""Hypotheses of where an aircraft is, as arrays, and the arithmetic of their Gaussians."""
+"""Hypotheses of where an aircraft is, as arrays, what one query proposes, and the arithmetic of their Gaussians."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
+from edgevpr.core.arrays import Doubles, Ints
+
 _ROUNDING = 1e-12  # share of squares that their difference may lose
 _THINNEST = 1e-6  # ratio of the axes of a covariance, as variances, with which can still be calculated
+_FARTHEST = 1e8  # metres or places: farther than any two points on the Earth
+_LEAST_SD = 0.25  # of a position, in spacings of the map
 _FLAT = 1 / (2 * np.pi)  # a variance whose Gaussian has the density 1 in its middle: a direction that does not exist
 
 
@@ -16,15 +20,15 @@ class Hypotheses:
     unknown). `credited` (M,) is the logarithm of the likelihood ratio that the ground about `anchor` (M, 2) was given.
     """
 
-    w: np.ndarray
-    at: np.ndarray
-    covariance: np.ndarray
-    velocity: np.ndarray
-    heading: np.ndarray
-    credited: np.ndarray
-    anchor: np.ndarray
+    w: Doubles
+    at: Doubles
+    covariance: Doubles
+    velocity: Doubles
+    heading: Doubles
+    credited: Doubles
+    anchor: Doubles
 
-    def __getitem__(self, index: np.ndarray) -> "Hypotheses":
+    def __getitem__(self, index: Ints) -> "Hypotheses":
         return Hypotheses(**{name: getattr(self, name)[index] for name in self.__slots__})
 
     @property
@@ -37,24 +41,46 @@ class Way:
     """One way in which each of M hypotheses can have moved: its `share` (M,), and where it ends: mean `at` (M, 2) with
     `covariance` (M, 2, 2). No place of the map has less than the density `least`."""
 
-    share: np.ndarray
-    at: np.ndarray
-    covariance: np.ndarray
+    share: Doubles
+    at: Doubles
+    covariance: Doubles
     least: float = 0.0
 
 
-def none() -> Hypotheses:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapScale:
+    """Measure of a map. `spacing` is the distance after which a picture is new evidence: about half a footprint, or 1
+    for a map of places in order (`is_ordinal`), whose second coordinate is 0. Hypotheses within `near` of each other
+    are one position."""
+
+    spacing: float
+    near: float
+    is_ordinal: bool = False
+
+    @property
+    def cell(self) -> float:
+        """Ground of one place: an area, or a length where places are in order."""
+        return self.spacing if self.is_ordinal else self.spacing**2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Proposals:
+    """Positions that one query proposes by itself, K of them. `p` (K,) is the probability of each, by this query alone;
+    the rest of 1 is the probability of none. It was made with the prior that the aircraft is off the map as likely as
+    on it, and there at any place. `at` (K, 2) is where the aircraft then is, east and north of a fixed origin in
+    metres, or the number of the place and 0. `covariance` (K, 2, 2) is that of `at`, and `heading_deg` (K,) is NaN
+    where unknown."""
+
+    p: Doubles
+    at: Doubles
+    covariance: Doubles
+    heading_deg: Doubles
+
+
+def no_hypotheses() -> Hypotheses:
     """Return no hypothesis."""
-    pairs = np.zeros((0, 2))
-    return Hypotheses(
-        w=np.zeros(0),
-        at=pairs,
-        covariance=np.zeros((0, 2, 2)),
-        velocity=pairs,
-        heading=pairs,
-        credited=np.zeros(0),
-        anchor=pairs,
-    )
+    one, pairs, covariance = np.zeros(0), np.zeros((0, 2)), np.zeros((0, 2, 2))
+    return Hypotheses(w=one, at=pairs, covariance=covariance, velocity=pairs, heading=pairs, credited=one, anchor=pairs)
 
 
 def joined(one: Hypotheses, other: Hypotheses) -> Hypotheses:
@@ -64,32 +90,30 @@ def joined(one: Hypotheses, other: Hypotheses) -> Hypotheses:
     )
 
 
-def apart(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+def apart(one: Doubles, other: Doubles) -> Doubles:
     """Return the distances (M, K) between positions (M, 2) and others (K, 2)."""
     return np.sqrt((one[:, None, 0] - other[None, :, 0]) ** 2 + (one[:, None, 1] - other[None, :, 1]) ** 2)
 
 
-def density(way: Way, at: np.ndarray, covariance: np.ndarray, is_ordinal: bool) -> np.ndarray:
+def density(way: Way, at: Doubles, covariance: Doubles, is_ordinal: bool) -> Doubles:
     """Return the density (M, K) of each of K positions `at` (K, 2), known to `covariance` (K, 2, 2), by a way."""
     xx, xy, yy = (way.covariance[:, None, i, j] + covariance[None, :, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
     dx, dy = (at[None, :, i] - way.at[:, None, i] for i in (0, 1))
     if is_ordinal:
-        xy, yy, dy = 0.0, _FLAT, 0.0
+        xy, yy, dy = np.zeros(()), np.full((), _FLAT), np.zeros(())
     determinant = np.maximum(xx * yy - xy * xy, _THINNEST * xx * yy)
     squared = (yy * (dx * dx) - 2 * xy * (dx * dy) + xx * (dy * dy)) / determinant
     return np.maximum(np.exp(-np.maximum(squared, 0) / 2) / (2 * np.pi * np.sqrt(determinant)), way.least)
 
 
-def firm(covariance: np.ndarray, least: float) -> np.ndarray:
+def firm(covariance: Doubles, least: float) -> Doubles:
     """Return covariances (K, 2, 2) that can be inverted: a variance of `least`, and a share of their own, is added to
     each axis."""
     more = least + _THINNEST * np.abs(np.trace(covariance, axis1=1, axis2=2))
     return covariance + more[:, None, None] * np.eye(2)
 
 
-def fused(
-    one: np.ndarray, of_one: np.ndarray, other: np.ndarray, of_other: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def fused(one: Doubles, of_one: Doubles, other: Doubles, of_other: Doubles) -> tuple[Doubles, Doubles]:
     """Join two estimates each of K positions (K, 2), with their covariances (K, 2, 2), by covariance intersection
     (Julier and Uhlmann 1997): what is wrong with the map is common to both, so that two make no error smaller."""
     traces = [np.trace(each, axis1=1, axis2=2) for each in (of_one, of_other)]
@@ -100,7 +124,7 @@ def fused(
     return at[..., 0], covariance
 
 
-def mean_of(share: np.ndarray, at: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def mean_of(share: Doubles, at: Doubles, covariance: Doubles) -> tuple[Doubles, Doubles]:
     """Return means (K, 2) and covariances (K, 2, 2) of mixtures: `share` (K, M) of Gaussians `at` (M, 2)."""
     middle = at.mean(0) if len(at) else np.zeros(2)  # coordinates far from zero would lose digits in their squares
     off = at - middle
@@ -108,3 +132,28 @@ def mean_of(share: np.ndarray, at: np.ndarray, covariance: np.ndarray) -> tuple[
     mean = share @ off
     spread = (share @ second.reshape(-1, 4)).reshape(-1, 2, 2) - mean[:, :, None] * mean[:, None]
     return middle + mean, firm(spread, _ROUNDING * float(np.abs(second).max(initial=1)))
+
+
+def usable(proposed: Proposals, scale: MapScale, most: int) -> tuple[Ints, Proposals]:
+    """Return the numbers of the likeliest candidates of a query, at most `most`, and these candidates. Left out is what
+    makes no sense; the probabilities have a sum of 1 at most."""
+    numbers = np.flatnonzero((proposed.p > 0) & (proposed.p < np.inf) & (np.abs(proposed.at) < _FARTHEST).all(1))
+    numbers = numbers[np.argsort(-proposed.p[numbers], kind="stable")[:most]]
+    p = proposed.p[numbers].astype(float)
+    heading_deg = proposed.heading_deg[numbers].astype(float)
+    return numbers, Proposals(
+        p=p / max(1.0, float(p.sum())),
+        at=proposed.at[numbers].astype(float),
+        covariance=_sound(proposed.covariance[numbers].astype(float), _LEAST_SD * scale.spacing),
+        heading_deg=np.where(np.isfinite(heading_deg), heading_deg, np.nan),
+    )
+
+
+def _sound(covariance: Doubles, least_sd: float) -> Doubles:
+    """Return covariances (K, 2, 2) with the variance of `least_sd` on top; one that makes no sense is no more than
+    that."""
+    covariance = np.where((np.abs(covariance) < _FARTHEST**2).all((1, 2))[:, None, None], covariance, 0.0)
+    covariance = (covariance + covariance.transpose(0, 2, 1)) / 2
+    xx, xy, yy = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    is_sound = (xx >= 0) & (yy >= 0) & (xy * xy <= xx * yy)
+    return firm(np.where(is_sound[:, None, None], covariance, 0.0), least_sd**2)

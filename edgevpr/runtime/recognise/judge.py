@@ -2,20 +2,19 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from edgevpr.core.config import MatchConfig
-from edgevpr.core.contract import FineMatch, Technique
+from edgevpr.core.contract import Descriptor, FineMatch, Technique
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.retrieve import Ranking, elsewhere, margin
-from edgevpr.places.sequence import Search, SequenceSearch
+from edgevpr.places.sequence import SequenceSearch
 from edgevpr.runtime.recognise.agreement import Agreement
 from edgevpr.runtime.recognise.confidence import Evidence, Model, prior
-from edgevpr.runtime.recognise.evidence import kind_of, kinds_of, said
+from edgevpr.runtime.recognise.evidence import MapCalibration, described, kind_of, kinds_of
 from edgevpr.runtime.recognise.locate import Located
-from edgevpr.runtime.recognise.stored_confidence import Calibration
 
 NEW_FOR_S = 30.0  # seconds; a place learnt so recently only repeats what the autopilot has just said
 
@@ -86,6 +85,27 @@ class AcceptRule:
 ACCEPT_NOTHING = AcceptRule(min_score=1.0, min_margin=1.0, neighbour_m=0.0)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Findings:
+    """All that is known of the best place of a `ranking` when it is judged.
+
+    `is_new` tells whether the place was learnt within the last `NEW_FOR_S` seconds. `proof` is how the landmarks of
+    query and place agree (None: nothing is known of it), and `rival` the number of those of the best place elsewhere
+    that agree. `where` is the position that the best places say together (None: only that of the best one is known); a
+    place that says the same as the best one is no rival. `evidence` is that of the match (None: the rule has no use for
+    it), and `by_flight` the probability that the aircraft is there by all of the flight (None: the query is taken by
+    itself).
+    """
+
+    ranking: Ranking = field(kw_only=False)
+    is_new: bool = False
+    proof: Agreement | None = None
+    rival: int = 0
+    where: Located | None = None
+    evidence: Evidence | None = None
+    by_flight: float | None = None
+
+
 @dataclass(frozen=True, slots=True)
 class Verdict:
     """Decision on the best place: accepted as the place or not, and the reason in a few words for the log."""
@@ -95,7 +115,7 @@ class Verdict:
 
 
 def accept_rule(
-    technique: Technique, config: MatchConfig, length: int = 1, calibration: Calibration | None = None
+    technique: Technique, config: MatchConfig, length: int = 1, calibration: MapCalibration | None = None
 ) -> AcceptRule:
     """Return the rule of a technique: by confidence where there is a model of its evidence, else by its own limits,
     where the configuration leaves them open. `calibration` is that of the map.
@@ -120,52 +140,48 @@ def accept_rule(
     )
 
 
-def judge(
-    ranking: Ranking,
-    index: PlaceIndex,
-    rule: AcceptRule,
-    search: Search,
-    is_new: bool,
-    proof: Agreement | None = None,
-    rival: int = 0,
-    where: Located | None = None,
-    evidence: Evidence | None = None,
-    followed: float | None = None,
-) -> Verdict:
-    """Decide whether the best place of a ranking is accepted.
+def says_nothing(query: Descriptor, min_quality: float) -> str | None:
+    """Return the reason why a picture says too little to be recognised, None where it says enough: its quality is at
+    least `min_quality`.
 
-    `search` is the search that made the ranking; `is_new` tells whether the best place was learnt within the last
-    `NEW_FOR_S` seconds. `proof` is how the landmarks of query and place agree (None: nothing is known of it), and
-    `rival` the number of those of the best place elsewhere that agree. `where` is the position that the best places say
-    together (None: only that of the best one is known); a place that says the same as the best one is no rival.
-    `evidence` is that of the match (None: the rule has no use for it), and `followed` the probability that the aircraft
-    is there by all of the flight (None: the query is taken by itself).
+    Screens without a signal, displays on a dark ground, bare sky, a covered lens: such a picture has few regions that
+    hold information. The share of regions that agree on a place is then the share of a few, and reaches any limit by
+    chance.
     """
-    if search.frames < search.length:
+    if query.quality >= min_quality:  # False for NaN
+        return None
+    return f"the picture says nothing: {query.quality:.0%} of it holds information, {min_quality:.0%} are needed"
+
+
+def judge(findings: Findings, index: PlaceIndex, rule: AcceptRule, search: SequenceSearch | None = None) -> Verdict:
+    """Decide whether the best place of a ranking is accepted; `search` is the search of sequences that made it (None:
+    the query is ranked alone)."""
+    if search and search.frames < search.length:
         return Verdict(False, f"the sequence has {search.frames} queries of {search.length} yet")
+    ranking, proof, where = findings.ranking, findings.proof, findings.where
     score = float(ranking.scores[0])
     ahead = margin(ranking, index, rule.neighbour_m, where.places if where else ())
     if objection := _below_limits(score, ahead, rule):
         return Verdict(False, objection)
-    if isinstance(search, SequenceSearch) and (objection := _lost_track(ranking, index, rule, search)):
+    if search and (objection := _lost_track(ranking, index, rule, search)):
         return Verdict(False, objection)
     if len(ranking.unread):
         return Verdict(False, "a place that cannot be read may be the right one")
     if rule.sure:
-        verdict = _by_confidence(rule.sure, evidence, proof, rival, followed)
+        verdict = _by_confidence(rule.sure, findings)
     elif ahead is None:
         verdict = Verdict(True, f"score {score:.3f}; there is no place elsewhere to compare with")
     else:
         verdict = Verdict(True, f"score {score:.3f}, {ahead:.3f} ahead of any place elsewhere")
     if not verdict.accepted:
         return verdict
-    if search.length == 1 and (objection := _is_display(ranking, index, rule)):
+    if search is None and (objection := _is_display(ranking, index, rule)):
         return Verdict(False, objection)
     if proof is not None and (objection := _disproves(proof, score)):
         return Verdict(False, objection)
     if where and where.objection:
         return Verdict(False, where.objection)
-    if is_new:  # a fix would only repeat the autopilot's position, and make its errors look confirmed
+    if findings.is_new:  # a fix would only repeat the autopilot's position, and make its errors look confirmed
         return Verdict(False, f"this place was learnt within the last {NEW_FOR_S:g} s and says nothing new")
     return verdict
 
@@ -183,14 +199,13 @@ def _below_limits(score: float, ahead: float | None, rule: AcceptRule) -> str | 
     return None
 
 
-def _by_confidence(
-    sure: Sureness, evidence: Evidence | None, proof: Agreement | None, rival: int, followed: float | None
-) -> Verdict:
+def _by_confidence(sure: Sureness, findings: Findings) -> Verdict:
     """Decide by the confidence of a match, or of the flight so far; say it in words and figures."""
+    evidence, followed, rival = findings.evidence, findings.by_flight, findings.rival
     if evidence is None:
         return Verdict(False, "nothing is known that could make it sure")
     confidence, needed = sure.confidence(evidence), sure.threshold(evidence)
-    figures = f"confidence {confidence:.4f}, {needed:.4f} needed: {said(evidence)}"
+    figures = f"confidence {confidence:.4f}, {needed:.4f} needed: {described(evidence)}"
     if followed is not None:
         figures = f"{followed:.4f} sure by the flight so far; {figures}"
     by_itself = confidence >= needed
@@ -199,7 +214,7 @@ def _by_confidence(
         return Verdict(False, figures)
     if followed is not None and followed < _LEAST_FOLLOWED:
         return Verdict(False, f"the flight so far speaks against it: {figures}")
-    if proof is not None and is_hardly_ahead(evidence) and proof.inliers < 2 * rival:
+    if findings.proof and is_hardly_ahead(evidence) and findings.proof.inliers < 2 * rival:
         return Verdict(False, f"{rival} landmarks of a place elsewhere agree as well; {figures}")
     return Verdict(True, figures)
 
@@ -221,16 +236,17 @@ def _disproves(proof: Agreement, score: float) -> str | None:
 def _is_display(ranking: Ranking, index: PlaceIndex, rule: AcceptRule) -> str | None:
     """Return the reason why what agrees may be a display over every frame, None where nothing points to one. Only a
     camera that looks down can tell: ahead, places one after the other agree without a step."""
-    if not _at_rest(ranking.compared.get(int(ranking.slots[0]))):
+    best = int(ranking.slots[0])
+    if not _is_at_rest(ranking.compared.get(best)):
         return None
-    others = ranking.slots[elsewhere(index, ranking.slots[0], ranking.slots, rule.neighbour_m)]
-    matches = (ranking.compared.get(slot) for slot in others.tolist())
-    if not any(_at_rest(match) and match.score >= _DISPLAY_SCORE for match in matches):
+    others = ranking.slots[elsewhere(index, best, ranking.slots, rule.neighbour_m)]
+    matches = (ranking.compared[slot] for slot in others.tolist() if slot in ranking.compared)
+    if not any(_is_at_rest(match) and match.score >= _DISPLAY_SCORE for match in matches):
         return None
     return "a place elsewhere has not moved either, as behind a display: learn a mask with `edgevpr check --learn-mask`"
 
 
-def _at_rest(match: FineMatch | None) -> bool:
+def _is_at_rest(match: FineMatch | None) -> bool:
     if match is None or match.rotation_deg is None or match.shift_cells is None:
         return False
     off_deg = abs((match.rotation_deg + 180) % 360 - 180)
@@ -241,7 +257,7 @@ def _at_rest(match: FineMatch | None) -> bool:
 
 def _lost_track(ranking: Ranking, index: PlaceIndex, rule: AcceptRule, search: SequenceSearch) -> str | None:
     """Return the reason why the mean of a sequence is not to be believed, None where there is none."""
-    away = elsewhere(index, ranking.slots[0], np.arange(len(index)), rule.neighbour_m)
+    away = elsewhere(index, int(ranking.slots[0]), np.arange(len(index)), rule.neighbour_m)
     if not search.goes_on(~away, rule.min_score):
         return "the newest queries no longer see what those before them saw"
     ahead_of_rivals = float(ranking.scores[0]) - float(search.rivals[away].max(initial=0))

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from edgevpr.core.arrays import Bytes, Image, Ints, Mask, Singles
+
 OF_PLACE, OF_QUERY = 250, 1000  # points
 _LONGEST_SIDE_PX = 640
 _FOUND = 4 * OF_PLACE  # corners among which those of a place are chosen
@@ -32,16 +34,16 @@ class Landmarks:
     the direction of each, clockwise from the right. `size` float32 (K,) is the width of the patch it was described by,
     as a share of the longest side, and `bits` uint8 (K, 32) the description."""
 
-    points: np.ndarray
-    angle_deg: np.ndarray
-    size: np.ndarray
-    bits: np.ndarray
+    points: Singles
+    angle_deg: Singles
+    size: Singles
+    bits: Bytes
 
     def __len__(self) -> int:
         return len(self.points)
 
 
-def describe(image: np.ndarray, mask: np.ndarray | None = None, most: int = OF_PLACE) -> Landmarks:
+def describe(image: Image, mask: Mask | None = None, most: int = OF_PLACE) -> Landmarks:
     """Find the `most` best landmarks of a uint8 image, (H, W) grey or (H, W, 3) BGR, best first.
 
     None touches a pixel where `mask` bool (H, W) is False. A picture without corners, or one smaller than a patch, has
@@ -72,7 +74,7 @@ def describe(image: np.ndarray, mask: np.ndarray | None = None, most: int = OF_P
     )
 
 
-def _spread(at_px: np.ndarray, most: int) -> np.ndarray:
+def _spread(at_px: Singles, most: int) -> Ints:
     """Choose `most` of the points float32 (K, 2), best first: in turn the best, second best, ... of every cell. Returns
     their numbers int (up to `most`,)."""
     # Of the same corner on several levels the best one is left.

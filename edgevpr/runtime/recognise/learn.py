@@ -21,8 +21,8 @@ from edgevpr.frames.exif import read_exif
 from edgevpr.frames.images import list_images
 from edgevpr.frames.level import View
 from edgevpr.frames.positions import find_positions
-from edgevpr.places.growing import GrowingIndex
-from edgevpr.places.near import nearest_m
+from edgevpr.places.index import GrowingIndex
+from edgevpr.places.mapinfo import nearest_m
 from edgevpr.places.retrieve import named
 from edgevpr.runtime.recognise.follow import Followed
 from edgevpr.runtime.recognise.levelling import GPS_SD_M, laid

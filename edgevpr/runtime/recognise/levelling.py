@@ -6,13 +6,12 @@ A wrong height scales wrongly. A technique with `height_ratios` finds the pictur
 import logging
 from dataclasses import replace
 
-import numpy as np
-
+from edgevpr.core.arrays import Mask
 from edgevpr.core.config import SourceConfig
 from edgevpr.core.contract import Technique
 from edgevpr.core.geodesy import axes_of, moved
 from edgevpr.core.types import Frame, Pose, Position, Vehicle
-from edgevpr.frames.level import UNKNOWN_VIEW, Lens, Levelled, View, leaning, levelled
+from edgevpr.frames.level import Lens, Levelled, View, leaning, levelled
 from edgevpr.frames.source import is_live
 
 GPS_SD_M = 5.0  # of one axis of a recorded position, as long as nothing better is known
@@ -23,14 +22,6 @@ UNTOLD_TILT = 0.04
 _log = logging.getLogger(__name__)
 
 
-class NoLevelling:
-    """Stands in for a `Levelling` where pictures are taken as they are."""
-
-    def prepare(self, frame: Frame, vehicle: Vehicle | None, overlay: np.ndarray | None) -> Levelled:
-        """Return the picture as it is."""
-        return Levelled(frame.image, overlay, UNKNOWN_VIEW)
-
-
 class Leaning:
     """Takes the pictures of a camera that looks straight down as they are, for want of a lens, and says how far they
     look aside. `is_live` is as that of `Levelling`."""
@@ -38,7 +29,7 @@ class Leaning:
     def __init__(self, is_live: bool) -> None:
         self._is_live = is_live
 
-    def prepare(self, frame: Frame, vehicle: Vehicle | None, overlay: np.ndarray | None) -> Levelled:
+    def prepare(self, frame: Frame, vehicle: Vehicle | None, overlay: Mask | None) -> Levelled:
         """Return the picture as it is."""
         return Levelled(frame.image, overlay, leaning(frame, _now(vehicle, frame) if self._is_live else None))
 
@@ -63,33 +54,34 @@ class Levelling:
     ) -> None:
         self.lens, self.footprint_m = lens, footprint_m
         self._below, self._on_gimbal, self._is_live = below, on_gimbal, is_live
-        self._has_said = False
+        self._has_warned = False
 
-    def prepare(self, frame: Frame, vehicle: Vehicle | None, overlay: np.ndarray | None) -> Levelled:
+    def prepare(self, frame: Frame, vehicle: Vehicle | None, overlay: Mask | None) -> Levelled:
         """Level the picture of a frame; `overlay`, bool (H, W), is False where it shows no ground (None: nowhere)."""
         vehicle = _now(vehicle, frame) if self._is_live else None
         if vehicle and self._on_gimbal:
             vehicle = replace(vehicle, roll_deg=0.0, pitch_deg=0.0)
-        found = levelled(frame, vehicle, self.lens, self.footprint_m, overlay=overlay, below=self._below)
-        if found.view.reason and not self._has_said:
-            self._has_said = True
-            _log.warning("%s is taken as it is, as others like it will be: %s", frame.name, found.view.reason)
-        return found
+        picture = levelled(frame, vehicle, self.lens, self.footprint_m, overlay=overlay, below=self._below)
+        if picture.view.reason and not self._has_warned:
+            self._has_warned = True
+            _log.warning("%s is taken as it is, as others like it will be: %s", frame.name, picture.view.reason)
+        return picture
 
 
-AnyLevelling = NoLevelling | Leaning | Levelling
+AnyLevelling = Leaning | Levelling
 
 
 def levelling_of(
     config: SourceConfig, technique: Technique, *, footprint_m: float | None = None, below: bool = False
-) -> AnyLevelling:
-    """Make the levelling that the configuration asks for; none for a camera that looks ahead, or of unknown lens."""
+) -> AnyLevelling | None:
+    """Make the levelling that the configuration asks for; None where pictures are taken as they are: for a camera that
+    looks ahead, or one of unknown lens on a gimbal."""
     if technique.spec.parameters.get("camera") != "nadir":
-        return NoLevelling()
+        return None
     live = config.uri is not None and is_live(config.uri)
     if config.fov_deg is None:
         _log.info("`source.fov_deg` is not set: pictures are neither untilted nor scaled nor turned")
-        return NoLevelling() if config.gimbal else Leaning(live)
+        return None if config.gimbal else Leaning(live)
     return Levelling(
         Lens(config.fov_deg, config.up_deg),
         footprint_m=footprint_m,
@@ -119,17 +111,13 @@ def laid(frame: Frame, view: View) -> Frame:
     if view.aside is None:
         variance_m2 += (UNTOLD_TILT * view.footprint_m) ** 2
     else:
-        position = _middle(position, view)
+        # What is `aside` is under the aircraft: the middle of the picture is as far off on the other side.
+        off_m = -view.footprint_m * axes_of(view.up_deg) @ view.aside
+        lat_deg, lon_deg = moved(position.lat_deg, position.lon_deg, *off_m.tolist())
+        position = Position(lat_deg, lon_deg, position.alt_m)
     pose = Pose(up_deg=view.up_deg, footprint_m=view.footprint_m, covariance_m2=(variance_m2, 0.0, variance_m2))
     return replace(frame, position=position, pose=pose)
 
 
 def _now(vehicle: Vehicle | None, frame: Frame) -> Vehicle | None:
     return vehicle if vehicle and vehicle.is_fresh_at(frame.t_mono_s) else None
-
-
-def _middle(position: Position, view: View) -> Position:
-    """Return the position of what is in the middle of a picture, of that which is `view.aside`."""
-    off_m = -view.footprint_m * axes_of(view.up_deg) @ view.aside
-    lat_deg, lon_deg = moved(position.lat_deg, position.lon_deg, *off_m.tolist())
-    return Position(lat_deg, lon_deg, position.alt_m)

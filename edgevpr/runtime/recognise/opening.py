@@ -11,25 +11,23 @@ from edgevpr.core.contract import Technique
 from edgevpr.core.errors import ConfigError, MapError, UsageError
 from edgevpr.frames.mask import AnyMask, mask_of
 from edgevpr.frames.source import is_live
-from edgevpr.places.growing import GrowingIndex
-from edgevpr.places.index import PlaceIndex, empty_index, load_index
+from edgevpr.places.index import GrowingIndex, PlaceIndex, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import map_path, remove, require_regular
-from edgevpr.places.near import index_positions
+from edgevpr.places.mapinfo import index_positions
 from edgevpr.places.sequence import bytes_beside_place, length_of, search_of
 from edgevpr.power.boards import Board
 from edgevpr.power.equations import parse_pack
 from edgevpr.power.meter import QueryMeter
-from edgevpr.runtime.recognise.calibrated import calibration_of
 from edgevpr.runtime.recognise.detector import open_detector
-from edgevpr.runtime.recognise.evidence import kinds_of
-from edgevpr.runtime.recognise.follow import Follower, NoFollower
+from edgevpr.runtime.recognise.evidence import calibration_of, kinds_of
+from edgevpr.runtime.recognise.follow import Follower
 from edgevpr.runtime.recognise.hints import Prior
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.levelling import levelling_of
 from edgevpr.runtime.recognise.memorability import open_memorability
-from edgevpr.runtime.recognise.recogniser import Recogniser
-from edgevpr.runtime.recognise.salience_gate import MOST_ENTROPY, Gate, NoGate, Thresholds
+from edgevpr.runtime.recognise.recogniser import Matcher, Preparation, Recogniser, WalkSettings
+from edgevpr.runtime.recognise.salience_gate import MOST_ENTROPY, Gate, Thresholds
 
 _WAIT_S = 0.05  # in flight, for another program that writes to the map: the next query is better than a late one
 _log = logging.getLogger(__name__)
@@ -57,7 +55,7 @@ def open_recogniser(
     with _closed_on_error(place_map):
         technique = technique_of(place_map, config.technique, _wanted(config) | (settings or {}), board)
         index = _loaded(config, board, technique, place_map)
-    return _recogniser(config, board, technique, place_map, index, narrowed=narrowed, follows=follows)
+        return _recogniser(config, board, _matcher(config, technique, place_map, index), place_map, narrowed, follows)
 
 
 def open_learning(config: Config, board: Board, new_technique: str | None) -> tuple[Recogniser, GrowingIndex]:
@@ -71,25 +69,23 @@ def open_learning(config: Config, board: Board, new_technique: str | None) -> tu
         raise UsageError("There is no map to learn places into: name one with --map, or `map:` in the configuration.")
     path = map_path(config.map)
     require_regular(path)
-    if has_map(path):
-        place_map, technique = PlaceMap.open_for_adding(path), None
-    else:
+    technique = None
+    if not has_map(path):
         technique = made_for(board, new_technique, _wanted(config))
-        place_map = _new_map(path, technique, mask_of(config.source.mask))
+        _make_map(path, technique, mask_of(config.source.mask))
+    place_map = PlaceMap.open_for_adding(path)
     with _closed_on_error(place_map):
         technique = technique or technique_of(place_map, config.technique, _wanted(config), board)
         index_positions(place_map)
         growing = GrowingIndex(
             place_map,
             technique,
-            budget_bytes=int(budget_mb(config, board) * 1e6),
+            budget_bytes=_budget_bytes(config, board),
             room=_ROOM,
             beside_bytes=bytes_beside_place(length_of(technique.spec, config.match.sequence)),
         )
-    recogniser = _recogniser(
-        config, board, technique, place_map, growing.index, narrowed=True, follows=config.match.follow
-    )
-    return recogniser, growing
+        matcher = _matcher(config, technique, place_map, growing.index)
+        return _recogniser(config, board, matcher, place_map, True, config.match.follow), growing
 
 
 def has_map(path: Path) -> bool:
@@ -104,12 +100,10 @@ def take_form(recogniser: Recogniser, config: Config, form: str) -> None:
     cannot be read any more; nothing is recognised then until a form has been loaded.
     """
     board, place_map = recogniser.meter.board, recogniser.place_map
-    nothing = empty_index(recogniser.technique.spec, 0, None)
-    recogniser.take(recogniser.technique, nothing, recogniser.rule, recogniser.search)
+    recogniser.release_index()
     technique = technique_of(place_map, config.technique, _wanted(config) | {"form": form}, board)
-    length = length_of(technique.spec, config.match.sequence)
     index = _loaded(config, board, technique, place_map)
-    recogniser.take(technique, index, accept_rule(technique, config.match, length), search_of(length))
+    recogniser.take(_matcher(config, technique, None, index))
 
 
 def budget_mb(config: Config, board: Board) -> float:
@@ -117,14 +111,15 @@ def budget_mb(config: Config, board: Board) -> float:
     return config.memory.budget_mb or board.budget_mb
 
 
-def gate_of(config: SalienceConfig, threads: int = 1) -> Gate | NoGate:
-    """Make the gate of salience that the configuration asks for, and say which criteria are off for want of a network.
+def gate_of(config: SalienceConfig, threads: int = 1) -> Gate | None:
+    """Make the gate of salience that the configuration asks for (None: none), and say which criteria are off for want
+    of a network.
 
     Raises ConfigError for thresholds that nothing can reach, or of which none is above 0, and ModelError for a network
     that cannot be used.
     """
     if not config.use:
-        return NoGate()
+        return None
     if config.entropy > MOST_ENTROPY:
         raise ConfigError(
             f"`salience.entropy` is {config.entropy:g}, and no picture has more than {MOST_ENTROPY:.3f}: lower it."
@@ -197,37 +192,45 @@ def technique_of(
     return technique
 
 
-def _recogniser(
-    config: Config,
-    board: Board,
-    technique: Technique,
-    place_map: PlaceMap,
-    index: PlaceIndex,
-    *,
-    narrowed: bool,
-    follows: bool,
-) -> Recogniser:
+def _matcher(config: Config, technique: Technique, place_map: PlaceMap | None, index: PlaceIndex) -> Matcher:
+    """Return what frames are recognised with; the calibration of a `place_map` counts (None: no map's does)."""
     length = length_of(technique.spec, config.match.sequence)
+    rule = accept_rule(technique, config.match, length, place_map and calibration_of(place_map))
+    return Matcher(technique, index, rule, search_of(length))
+
+
+def _recogniser(
+    config: Config, board: Board, matcher: Matcher, place_map: PlaceMap, narrowed: bool, follows: bool
+) -> Recogniser:
+    technique, match = matcher.technique, config.match
     if narrowed:
         place_map.wait_at_most(_WAIT_S)
     mask = mask_of(config.source.mask)
     say_other_mask(place_map, mask)
+    is_now = config.source.uri is not None and is_live(config.source.uri)
+    prior = follower = None
+    # In a sequence, a place that a wrong hint kept out of one query would count as compared and unlike it.
+    if narrowed and matcher.search is None:
+        prior = Prior(match.reach_m_s, technique.spec.heading_within_deg, is_now)
+    # Only matches that have a confidence can be followed, and only where no sequence is asked for.
+    if follows and match.sequence is None and kinds_of(technique.spec):
+        follower = Follower(place_map, fastest_m_s=match.reach_m_s, is_live=is_now)
     return Recogniser(
-        technique=technique,
-        place_map=place_map,
-        index=index,
-        rule=accept_rule(technique, config.match, length, calibration_of(place_map)),
-        meter=meter_of(config, board),
-        candidates=config.match.candidates or technique.candidates,
-        search=search_of(length),
-        # In a sequence, a place that a wrong hint kept out of one query would count as compared and unlike it.
-        prior=_prior(config, technique) if narrowed and length == 1 else None,
-        min_accuracy_m=config.mavlink.min_accuracy_m,
-        mask=mask,
-        gate=gate_of(config.salience, board.threads),
-        levelling=levelling_of(config.source, technique, footprint_m=place_map.footprint_m()),
-        verify=config.match.verify,
-        follower=_follower(config, technique, place_map) if follows else None,
+        matcher,
+        place_map,
+        meter_of(config, board),
+        WalkSettings(
+            candidates=match.candidates or technique.candidates,
+            verify=match.verify,
+            min_accuracy_m=config.mavlink.min_accuracy_m,
+        ),
+        preparation=Preparation(
+            levelling=levelling_of(config.source, technique, footprint_m=place_map.footprint_m()),
+            mask=mask,
+            gate=gate_of(config.salience, board.threads),
+        ),
+        prior=prior,
+        follower=follower,
     )
 
 
@@ -240,21 +243,6 @@ def say_other_mask(place_map: PlaceMap, mask: AnyMask) -> None:
         _log.warning("%s was built %s; more is recognised where map and frames have the same", place_map.path, how)
 
 
-def _follower(config: Config, technique: Technique, place_map: PlaceMap) -> Follower | NoFollower:
-    """Make a follower, for a technique whose matches have a confidence and that is asked for no sequence."""
-    if config.match.sequence is not None or not kinds_of(technique.spec):
-        return NoFollower()
-    return Follower(place_map, fastest_m_s=config.match.reach_m_s, is_live=_is_now(config))
-
-
-def _is_now(config: Config) -> bool:
-    return config.source.uri is not None and is_live(config.source.uri)
-
-
-def _prior(config: Config, technique: Technique) -> Prior:
-    return Prior(config.match.reach_m_s, technique.spec.heading_within_deg, _is_now(config))
-
-
 @contextmanager
 def _closed_on_error(place_map: PlaceMap) -> Iterator[None]:
     try:
@@ -264,7 +252,7 @@ def _closed_on_error(place_map: PlaceMap) -> Iterator[None]:
         raise
 
 
-def _new_map(path: Path, technique: Technique, mask: AnyMask) -> PlaceMap:
+def _make_map(path: Path, technique: Technique, mask: AnyMask) -> None:
     """Make an empty map that is there completely or not at all: a service killed at power-on must be able to start
     again."""
     unfinished = path.with_name(path.name + ".new")
@@ -272,7 +260,6 @@ def _new_map(path: Path, technique: Technique, mask: AnyMask) -> PlaceMap:
     with PlaceMap.create(unfinished, technique.spec) as place_map:
         place_map.record_mask(mask.sha256)
     unfinished.replace(path)
-    return PlaceMap.open_for_adding(path)
 
 
 def _wanted(config: Config) -> dict[str, str]:
@@ -280,6 +267,10 @@ def _wanted(config: Config) -> dict[str, str]:
     return {key: value for key, value in wanted.items() if value}
 
 
+def _budget_bytes(config: Config, board: Board) -> int:
+    return int(budget_mb(config, board) * 1e6)
+
+
 def _loaded(config: Config, board: Board, technique: Technique, place_map: PlaceMap) -> PlaceIndex:
     beside_bytes = bytes_beside_place(length_of(technique.spec, config.match.sequence))
-    return load_index(place_map, technique, int(budget_mb(config, board) * 1e6), beside_bytes=beside_bytes)
+    return load_index(place_map, technique, _budget_bytes(config, board), beside_bytes=beside_bytes)

@@ -5,207 +5,268 @@ No link, flight log, thread or clock is inside: what is handed in with a frame d
 
 import logging
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from itertools import islice
 
 from edgevpr.core.contract import Descriptor, Technique
 from edgevpr.core.errors import EdgevprError, MapError, PlaceError
 from edgevpr.core.types import Candidate, Frame, Vehicle
-from edgevpr.frames.mask import AnyMask, NoMask, encoded
-from edgevpr.places.index import PlaceIndex
+from edgevpr.frames.level import UNKNOWN_VIEW, Levelled
+from edgevpr.frames.mask import AnyMask, encoded
+from edgevpr.places.index import PlaceIndex, empty_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import Expected, Ranking, compare, named, scan, together
-from edgevpr.places.sequence import Alone, Search
+from edgevpr.places.retrieve import Expectation, Query, Ranking, compare, named, scan, together
+from edgevpr.places.sequence import SequenceSearch
 from edgevpr.power.meter import QueryMeter
-from edgevpr.runtime.recognise.agreement import Agreement
-from edgevpr.runtime.recognise.evidence import evidence_ahead, evidence_down
-from edgevpr.runtime.recognise.follow import Followed, Follower, NoFollower
-from edgevpr.runtime.recognise.gate import says_nothing
-from edgevpr.runtime.recognise.hints import NoPrior, Prior, expected_of, other_heights
-from edgevpr.runtime.recognise.judge import NEW_FOR_S, AcceptRule, Verdict, is_hardly_ahead, judge
-from edgevpr.runtime.recognise.levelling import AnyLevelling, NoLevelling, seen_as
-from edgevpr.runtime.recognise.locate import HEARD, Located, at_place, located
+from edgevpr.runtime.recognise.evidence import evidence_of
+from edgevpr.runtime.recognise.follow import Followed, Follower
+from edgevpr.runtime.recognise.hints import Hints, Prior, expected_of, other_heights
+from edgevpr.runtime.recognise.judge import (
+    NEW_FOR_S,
+    AcceptRule,
+    Findings,
+    Verdict,
+    is_hardly_ahead,
+    judge,
+    says_nothing,
+)
+from edgevpr.runtime.recognise.levelling import AnyLevelling, seen_as
+from edgevpr.runtime.recognise.locate import HEARD, at_place, located
 from edgevpr.runtime.recognise.recognition import Recognition
-from edgevpr.runtime.recognise.salience_gate import Gate, NoGate
+from edgevpr.runtime.recognise.salience_gate import Gate, Worth
 from edgevpr.runtime.recognise.verify import Verification, landmarks_of
 
 _log = logging.getLogger(__name__)
 _OF_CANDIDATES = 0.4  # are compared from each height but the first
 
 
+@dataclass(frozen=True, slots=True)
+class Matcher:
+    """All that a frame is recognised with: a technique, the index that it has packed, the rule by which its matches are
+    accepted, and the search over sequences of queries (None: each query is ranked alone). They go together: another
+    form of the same vectors has other scores, and so other limits."""
+
+    technique: Technique
+    index: PlaceIndex
+    rule: AcceptRule
+    search: SequenceSearch | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Preparation:
+    """Preparation of a frame before it is encoded: `levelling` lays it on the ground (None: it is taken as it is),
+    `mask` leaves parts of it out, and `gate` refuses it where it is not memorable (None: all are)."""
+
+    levelling: AnyLevelling | None = None
+    mask: AnyMask | None = None
+    gate: Gate | None = None
+
+    def picture(self, frame: Frame, vehicle: Vehicle | None = None) -> Levelled:
+        """Return the picture of a frame as it is encoded."""
+        mask = self.mask.fitted(frame.image) if self.mask else None
+        return (
+            self.levelling.prepare(frame, vehicle, mask)
+            if self.levelling
+            else Levelled(frame.image, mask, UNKNOWN_VIEW)
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WalkSettings:
+    """`candidates` places are compared (None: all in full, see `places.retrieve.compare`). With `verify` the best place
+    is held against its landmarks, where the map has some. No position is said to be more exact than
+    `min_accuracy_m`."""
+
+    candidates: int | None = None
+    verify: bool = True
+    min_accuracy_m: float = 1.0
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Judged:
-    """The ranking of a query after all that is known, its best place, the verdict on it, and what led to it."""
+    """The best place of a query after all that is known, what led to it, and the verdict on it."""
 
-    ranking: Ranking | None = None
-    best: Candidate | None = None
-    verdict: Verdict | None = None
-    proof: Agreement | None = None
-    where: Located | None = None
-    evidence: dict[str, float] | None = None
-    followed: Followed | None = None
+    findings: Findings
+    best: Candidate
+    followed: Followed | None
+    verdict: Verdict
 
 
-_NOT_JUDGED = _Judged()
+@dataclass(slots=True, kw_only=True)
+class _Walk:
+    """State of one frame on its walk; None for the steps that it has not reached. `nothing` is the reason why its
+    picture says too little, `objection` that or why it is not memorable."""
+
+    frame: Frame
+    vehicle: Vehicle | None
+    picture: Levelled | None = None
+    worth: Worth | None = None
+    descriptor: Descriptor | None = None
+    nothing: str | None = None
+    objection: str | None = None
+    hints: Hints | None = None
+    judged: _Judged | None = None
 
 
 class Recogniser:
     """Recognises places of an open map, frame after frame.
 
-    `candidates` places are compared (None: all in full, see `places.retrieve.compare`). `gate` refuses frames that are
-    not memorable, `mask` leaves parts of every frame out, and `levelling` lays each on the ground. `search` joins
-    several queries, and `prior` narrows each; without them each query is ranked alone, over the whole map. `verify`
-    holds the best place against its landmarks, where the map has some. `follower` follows the flight from query to
-    query. The governor changes `candidates`; the learner and the governor change the index (`take`, `extend`).
+    `prior` narrows each query; without it each is searched over the whole map. `follower` follows the flight from query
+    to query. The governor changes `candidates`; the learner and the governor change the index (`take`, `extend`).
     """
 
     def __init__(
         self,
-        *,
-        technique: Technique,
+        matcher: Matcher,
         place_map: PlaceMap,
-        index: PlaceIndex,
-        rule: AcceptRule,
         meter: QueryMeter,
-        candidates: int | None = None,
-        search: Search | None = None,
-        prior: Prior | NoPrior | None = None,
-        min_accuracy_m: float = 1.0,
-        mask: AnyMask | None = None,
-        gate: Gate | NoGate | None = None,
-        levelling: AnyLevelling | None = None,
-        verify: bool = True,
-        follower: Follower | NoFollower | None = None,
+        settings: WalkSettings = WalkSettings(),
+        *,
+        preparation: Preparation | None = None,
+        prior: Prior | None = None,
+        follower: Follower | None = None,
     ) -> None:
-        self.place_map, self.meter, self.candidates = place_map, meter, candidates
-        self._prior, self._min_accuracy_m, self._mask = prior or NoPrior(), min_accuracy_m, mask or NoMask()
-        self._gate, self._levelling, self._verifies = gate or NoGate(), levelling or NoLevelling(), verify
-        self._follower = follower or NoFollower()
+        self.place_map, self.meter, self.candidates = place_map, meter, settings.candidates
+        self._settings, self._preparation = settings, preparation or Preparation()
+        self._prior, self._follower = prior, follower
         self._told = 0  # number of places left out that an event has told of
         self._new: deque[tuple[int, float]] = deque()  # place id, and the time it was learnt at
-        self.take(technique, index, rule, search or Alone())
+        self._lost: str | None = None
+        self.take(matcher)
 
-    def take(self, technique: Technique, index: PlaceIndex, rule: AcceptRule, search: Search) -> None:
-        """Recognise with these from the next frame on. Another form of the same vectors has other scores, and so other
-        limits."""
-        self.technique, self.rule, self.search = technique, rule, search
-        self._take_index(index)
+    def take(self, matcher: Matcher) -> None:
+        """Recognise with another matcher from the next frame on."""
+        self._matcher, self._lost = matcher, None
+        # 1-sigma accuracy of a place as a fix: such a match cannot tell where between two places the aircraft is.
+        self.accuracy_m = max(self._settings.min_accuracy_m, matcher.index.spacing_m() or 0.0)
+
+    @property
+    def technique(self) -> Technique:
+        return self._matcher.technique
+
+    @property
+    def index(self) -> PlaceIndex:
+        return self._matcher.index
+
+    @property
+    def rule(self) -> AcceptRule:
+        return self._matcher.rule
+
+    @property
+    def search(self) -> SequenceSearch | None:
+        return self._matcher.search
+
+    @property
+    def sequence(self) -> int:
+        """Number of queries that are matched together."""
+        return self.search.length if self.search else 1
 
     def accept_with(self, precision: float) -> None:
         """Accept matches with this precision from the next frame on. A rule that goes by limits stays as it is."""
-        if self.rule.sure:
-            self.rule = replace(self.rule, sure=replace(self.rule.sure, precision=precision))
+        if sure := self.rule.sure:
+            rule = replace(self.rule, sure=replace(sure, precision=precision))
+            self._matcher = replace(self._matcher, rule=rule)
 
     def extend(self, index: PlaceIndex, place_id: int, t_mono_s: float) -> None:
         """Recognise in an index that has one place more, learnt from the frame taken at `t_mono_s`."""
         self._new.append((place_id, t_mono_s))
-        self._take_index(index)
+        self.take(replace(self._matcher, index=index))
+
+    def release_index(self) -> None:
+        """Let go of the index, so that another one need not be in memory beside it."""
+        self.take(replace(self._matcher, index=empty_index(self.technique.spec, 0, None)))
 
     def lose_index(self, error: Exception) -> None:
         """Fail every frame with this error until there is an index again (see `take`)."""
         self._lost = _sentence(error)
-
-    def _take_index(self, index: PlaceIndex) -> None:
-        self.index, self._lost = index, None
-        # 1-sigma accuracy of a place as a fix: such a match cannot tell where between two places the aircraft is.
-        self.accuracy_m = max(self._min_accuracy_m, index.spacing_m() or 0.0)
 
     def step(self, frame: Frame, vehicle: Vehicle | None = None) -> Recognition:
         """Recognise one frame; `vehicle` is the autopilot's report at that moment.
 
         Never raises an Exception: an error of a frame, a place or the technique becomes a refusal with its reason.
         """
-        meter, technique, index = self.meter, self.technique, self.index
-        worth = descriptor = hints = judged = nothing = objection = picture = None
-        map_lost = False
-        meter.begin()
+        self.meter.begin()
+        walk, failure = _Walk(frame=frame, vehicle=vehicle), None
         try:
-            with meter.step("prepare"):
-                picture = self._levelling.prepare(frame, vehicle, self._mask.fitted(frame.image))
-            with meter.step("gate"):
-                worth = self._gate.look(frame.image)
-            with meter.step("encode"):
-                descriptor = encoded(technique, picture.image, picture.mask)
-            if self._lost:
-                raise MapError(self._lost)
-            nothing = says_nothing(descriptor, self.rule.min_quality)
-            objection = nothing or (worth and worth.reason)
-            self._follower.went_on(frame, vehicle)
-            if not len(index):
-                verdict = Verdict(False, "the map has no place yet")
-            elif objection and self.search.length == 1:  # in a sequence it is searched for, to keep the others in step
-                verdict = Verdict(False, objection)
-                self._follower.saw_nothing(index)
-            else:
-                margin_m = max(self.accuracy_m, self.rule.neighbour_m)
-                hints = self._prior.hints(seen_as(frame, picture.view), vehicle, index, margin_m)
-                expected = replace(expected_of(hints, index), height_ratio=self._prior.height_ratio)
-                ranking = self.search.follow(self._look(descriptor, expected), index, frame.t_mono_s)
-                looked = Verification(technique.spec, picture, index, self.place_map)
-                judged = self._judged(frame, ranking, looked)
-                if not judged.verdict.accepted and self.search.length == 1 and self._prior.looks_again:
-                    others = other_heights(technique.spec.height_ratios, self._prior.height_ratio)
-                    for ratio in others:
-                        # What spoke against the first look counts in the others as well.
-                        look = self._look(descriptor, replace(expected, height_ratio=ratio), _OF_CANDIDATES)
-                        ranking = together(ranking, look)
-                    if others:
-                        judged = self._judged(frame, ranking, looked)
-                self._follower.settle()
-                verdict = Verdict(False, objection) if objection else judged.verdict
-                self._prior.learn(judged.best, verdict.accepted, frame.t_mono_s)
-            failed = False
+            picture, descriptor = self._encode(walk)
+            verdict = self._recognise(walk, picture, descriptor)
         except Exception as error:
             _log.debug("%s failed", frame.name, exc_info=True)
-            verdict, failed = Verdict(False, _sentence(error)), True
-            map_lost = isinstance(error, MapError) and not isinstance(error, PlaceError)
-        judged = judged or _NOT_JUDGED
-        where = judged.where if verdict.accepted else None
-        sure, evidence = self.rule.sure, judged.evidence
-        return Recognition(
-            frame=frame,
-            vehicle=vehicle,
-            picture=picture,
-            worth=worth,
-            descriptor=descriptor,
-            hints=hints,
-            ranking=judged.ranking,
-            best=judged.best,
-            proof=judged.proof,
-            evidence=evidence,
-            followed=judged.followed,
-            confidence=sure.confidence(evidence) if sure and evidence else None,
-            accepted=verdict.accepted,
-            reason=verdict.reason,
-            says_nothing=nothing is not None,
-            failed=failed,
-            map_lost=map_lost,
-            left_out=self._newly_left_out(),
-            located=where,
-            accuracy_m=max(self._min_accuracy_m, where.accuracy_m) if where else None,
-            steps=meter.steps(),
-            cost=meter.cost(),
-        )
+            verdict, failure = Verdict(False, _sentence(error)), error
+        return self._event(walk, verdict, failure)
 
-    def _look(self, descriptor: Descriptor, expected: Expected, part: float = 1.0) -> Ranking:
+    def _encode(self, walk: _Walk) -> tuple[Levelled, Descriptor]:
+        """Prepare the picture of a frame, look at its worth, and encode it."""
+        frame, preparation = walk.frame, self._preparation
+        with self.meter.step("prepare"):
+            walk.picture = picture = preparation.picture(frame, walk.vehicle)
+        with self.meter.step("gate"):
+            walk.worth = preparation.gate.look(frame.image) if preparation.gate else None
+        with self.meter.step("encode"):
+            walk.descriptor = descriptor = encoded(self.technique, picture.image, picture.mask)
+        return picture, descriptor
+
+    def _recognise(self, walk: _Walk, picture: Levelled, descriptor: Descriptor) -> Verdict:
+        """Search the map for a frame that is encoded, and judge what is found."""
+        if self._lost:
+            raise MapError(self._lost)
+        walk.nothing = says_nothing(descriptor, self.rule.min_quality)
+        walk.objection = walk.nothing or (walk.worth and walk.worth.reason)
+        if self._follower:
+            self._follower.went_on(walk.frame, walk.vehicle)
+        if not len(self.index):
+            return Verdict(False, "the map has no place yet")
+        if walk.objection and self.search is None:  # in a sequence it is searched for, to keep the others in step
+            if self._follower:
+                self._follower.saw_nothing(self.index)
+            return Verdict(False, walk.objection)
+        walk.judged = judged = self._found(walk, picture, descriptor)
+        if self._follower:
+            self._follower.settle()
+        verdict = Verdict(False, walk.objection) if walk.objection else judged.verdict
+        if self._prior:
+            self._prior.learn(judged.best, verdict.accepted, walk.frame.t_mono_s)
+        return verdict
+
+    def _found(self, walk: _Walk, picture: Levelled, descriptor: Descriptor) -> _Judged:
+        """Look for a query as it is expected and, where nothing is accepted, from all other heights as well."""
+        frame, prior, spec, search = walk.frame, self._prior, self.technique.spec, self.search
+        height_ratio = prior.height_ratio if prior else 1.0
+        if prior:
+            margin_m = max(self.accuracy_m, self.rule.neighbour_m)
+            walk.hints = prior.hints(seen_as(frame, picture.view), walk.vehicle, self.index, margin_m)
+        expected = expected_of(walk.hints, height_ratio, self.index)
+        ranking = self._look(descriptor, expected)
+        if search:
+            ranking = search.follow(ranking, self.index, frame.t_mono_s)
+        looked = Verification(spec, picture, self.index, self.place_map)
+        walk.judged = judged = self._judged(frame, ranking, looked)
+        others = other_heights(spec.height_ratios, height_ratio)
+        if judged.verdict.accepted or search or not others or (prior and not prior.looks_again):
+            return judged
+        for ratio in others:
+            # What spoke against the first look counts in the others as well.
+            look = self._look(descriptor, replace(expected, height_ratio=ratio), _OF_CANDIDATES)
+            ranking = together(ranking, look)
+        return self._judged(frame, ranking, looked)
+
+    def _look(self, descriptor: Descriptor, expected: Expectation, part: float = 1.0) -> Ranking:
         """Search the map for a query, with a `part` of the candidates. Raises MapError and PlaceError as `compare`
         does."""
-        candidates = self.candidates and max(1, round(part * self.candidates))
+        query = Query(
+            technique=self.technique,
+            descriptor=descriptor,
+            place_map=self.place_map,
+            index=self.index,
+            expected=expected,
+        )
         with self.meter.step("scan"):
             self.place_map.require_unchanged()
-            scanned = scan(self.technique, descriptor, self.index, expected)
+            scanned = scan(query)
         with self.meter.step("compare"):
-            return compare(
-                self.technique,
-                descriptor,
-                scanned,
-                self.place_map,
-                self.index,
-                candidates=candidates,
-                neighbour_m=self.rule.neighbour_m,
-                expected=expected,
-            )
+            candidates = self.candidates and max(1, round(part * self.candidates))
+            return compare(query, scanned, candidates, self.rule.neighbour_m)
 
     def _judged(
         self, frame: Frame, ranking: Ranking, looked: Verification, followed: Followed | None = None
@@ -219,7 +280,7 @@ class Recogniser:
         where = proof = None
         is_worth_it = best.match.score >= rule.worth_a_look
         # The newest query of a sequence need not be sure by itself.
-        if verifies := is_worth_it and self._verifies and self.search.length == 1 and cells is not None:
+        if verifies := is_worth_it and self._settings.verify and self.search is None and cells is not None:
             with self.meter.step("verify"):
                 proof = looked.proof(ranking)
         if is_worth_it:
@@ -228,37 +289,58 @@ class Recogniser:
                 where = located(found, cells, looked.picture.view, proof)
                 if where is None and best.place.position:
                     where = at_place(best.place.position, self.accuracy_m)
-        same = where.places if where else ()
+        same: Collection[int] = where.places if where else ()
         if verifies and proof and not same:
             with self.meter.step("verify"):
                 same = looked.same_ground(ranking)
-        evidence, rival = self._evidence(ranking, proof, same), 0
-        if followed is None and evidence is not None:
+        evidence = None
+        if rule.sure:
+            evidence = evidence_of(ranking, index, rule.neighbour_m, proof, same, cells is not None)
+        if self._follower and followed is None and rule.sure and evidence is not None:
             with self.meter.step("locate"):
                 followed = self._follower.heard(ranking, index, evidence, rule.sure, where)
-            if followed and followed.leads_from(int(ranking.slots[0])):
+            if followed.slot is not None and followed.leads_from(int(ranking.slots[0])):
                 return self._judged(frame, ranking.led_by(followed.slot), looked, followed)
+        rival = 0
         if verifies and proof and is_hardly_ahead(evidence):
             with self.meter.step("verify"):
                 rival = looked.rival(ranking, rule.neighbour_m, same)
-        sure = followed and followed.confidence
-        verdict = judge(ranking, index, rule, self.search, is_new, proof, rival, where, evidence, sure)
-        return _Judged(
-            ranking=ranking,
-            best=best,
-            verdict=verdict,
-            proof=proof,
-            where=where,
-            evidence=evidence,
-            followed=followed,
+        by_flight = followed and followed.confidence
+        findings = Findings(
+            ranking, is_new=is_new, proof=proof, rival=rival, where=where, evidence=evidence, by_flight=by_flight
         )
+        verdict = judge(findings, index, rule, self.search)
+        return _Judged(findings=findings, best=best, followed=followed, verdict=verdict)
 
-    def _evidence(self, ranking: Ranking, proof: Agreement | None, same: Sequence[int]) -> dict[str, float] | None:
-        if self.rule.sure is None:
-            return None
-        if self.technique.spec.cells is None:
-            return evidence_ahead(ranking, self.index, self.rule.neighbour_m)
-        return evidence_down(ranking, self.index, self.rule.neighbour_m, proof, same)
+    def _event(self, walk: _Walk, verdict: Verdict, failure: Exception | None) -> Recognition:
+        """Return the event of a frame, with all that happened to it."""
+        judged, findings = walk.judged, walk.judged and walk.judged.findings
+        where = findings.where if findings and verdict.accepted else None
+        sure, evidence = self.rule.sure, findings and findings.evidence
+        return Recognition(
+            frame=walk.frame,
+            vehicle=walk.vehicle,
+            picture=walk.picture,
+            worth=walk.worth,
+            descriptor=walk.descriptor,
+            hints=walk.hints,
+            ranking=findings and findings.ranking,
+            best=judged and judged.best,
+            proof=findings and findings.proof,
+            evidence=evidence,
+            followed=judged and judged.followed,
+            confidence=sure.confidence(evidence) if sure and evidence else None,
+            accepted=verdict.accepted,
+            reason=verdict.reason,
+            says_nothing=walk.nothing is not None,
+            failed=failure is not None,
+            map_lost=isinstance(failure, MapError) and not isinstance(failure, PlaceError),
+            left_out=self._newly_left_out(),
+            located=where,
+            accuracy_m=max(self._settings.min_accuracy_m, where.accuracy_m) if where else None,
+            steps=self.meter.steps(),
+            cost=self.meter.cost(),
+        )
 
     def landmarks(self, event: Recognition) -> bytes | None:
         """Return what a map keeps of the landmarks of a frame that becomes a place, None for a technique that does not
@@ -273,9 +355,9 @@ class Recogniser:
         )
 
     def _newly_left_out(self) -> tuple[tuple[int, str], ...]:
-        found = self.place_map.left_out
-        newly = tuple(islice(found.items(), self._told, None))
-        self._told = len(found)
+        left_out = self.place_map.left_out
+        newly = tuple(islice(left_out.items(), self._told, None))
+        self._told = len(left_out)
         return newly
 
     def _is_new(self, place_id: int, t_mono_s: float) -> bool:

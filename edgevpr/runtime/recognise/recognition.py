@@ -1,5 +1,6 @@
 """The event of one frame: everything that happened to it, in one value."""
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -89,71 +90,67 @@ def fields_of(event: Recognition) -> dict[str, Any]:
     landmarks; where the technique has one, the confidence and the evidence that it is made from; and, where anything is
     known of how the picture lies on the ground, view.
     """
+    known: dict[str, Any] = {
+        "view": event.view.fields() if event.view != UNKNOWN_VIEW else None,
+        "salience": event.worth and event.worth.salience.rounded(),
+        "landmarks": event.proof and _landmarks(event.proof),
+        "confidence": _rounded(event.confidence, 6),
+        "evidence": event.evidence and {key: round(value, 3) for key, value in event.evidence.items()},
+        "followed": event.followed and _followed(event.followed),
+    }
     return {
-        "query": event.frame.name,
+        "query": event.frame and event.frame.name,
         **_best(event.best),
-        **({"view": event.view.fields()} if event.view != UNKNOWN_VIEW else {}),
-        **({"salience": event.worth.salience.rounded()} if event.worth else {}),
-        **({"landmarks": _landmarks(event.proof)} if event.proof else {}),
-        **({"confidence": round(event.confidence, 6)} if event.confidence is not None else {}),
-        **({"evidence": {key: round(each, 3) for key, each in event.evidence.items()}} if event.evidence else {}),
-        **({"followed": _belief(event.followed)} if event.followed else {}),
+        **{key: value for key, value in known.items() if value is not None and value != {}},
         "accepted": event.accepted,
         "reason": event.reason,
         "accuracy_m": event.accuracy_m,
-        "located": _rounded(event.located),
+        "located": event.located and _located(event.located),
         "costs": {key: value and float(f"{value:.6g}") for key, value in asdict(event.cost).items()},
     }
 
 
-def _belief(followed: Followed) -> dict[str, Any]:
-    found = {"confidence": round(followed.confidence, 6), "lost": round(followed.lost, 6)}
-    if (estimate := followed.estimate) is None:
-        return found
-    return found | {
-        "lat_deg": round(estimate.position.lat_deg, 8),
-        "lon_deg": round(estimate.position.lon_deg, 8),
-        "covariance_m2": [round(each, 3) for each in estimate.covariance_m2],
-        "heading_deg": estimate.heading_deg and round(estimate.heading_deg, 1),
+def _rounded(value: float | None, digits: int) -> float | None:
+    return None if value is None else round(value, digits)
+
+
+def _where(position: Position, covariance_m2: Sequence[float], heading_deg: float | None) -> dict[str, Any]:
+    return {
+        "lat_deg": round(position.lat_deg, 8),
+        "lon_deg": round(position.lon_deg, 8),
+        "covariance_m2": [round(value, 3) for value in covariance_m2],
+        "heading_deg": _rounded(heading_deg, 1),
     }
+
+
+def _followed(followed: Followed) -> dict[str, Any]:
+    fields = {"confidence": round(followed.confidence, 6), "lost": round(followed.lost, 6)}
+    if (estimate := followed.estimate) is None:
+        return fields
+    return fields | _where(estimate.position, estimate.covariance_m2, estimate.heading_deg)
 
 
 def _landmarks(proof: Agreement) -> dict[str, Any]:
+    fields = {"inliers": proof.inliers, "matched": proof.matched}
     if proof.shift_share is None:
-        return {"inliers": proof.inliers, "matched": proof.matched}
-    return {
-        "inliers": proof.inliers,
-        "matched": proof.matched,
-        "shift_share": [round(each, 4) for each in proof.shift_share],
-        "rotation_deg": round(proof.rotation_deg, 1),
-        "scale": round(proof.scale, 3),
+        return fields
+    return fields | {
+        "shift_share": [round(share, 4) for share in proof.shift_share],
+        "rotation_deg": _rounded(proof.rotation_deg, 1),
+        "scale": _rounded(proof.scale, 3),
     }
 
 
-def _rounded(where: Located | None) -> dict[str, Any] | None:
-    if where is None:
-        return None
-    return {
-        "lat_deg": round(where.position.lat_deg, 8),
-        "lon_deg": round(where.position.lon_deg, 8),
-        "covariance_m2": [round(each, 3) for each in where.covariance_m2],
-        "heading_deg": where.heading_deg and round(where.heading_deg, 1),
-        "height_ratio": where.height_ratio and round(where.height_ratio, 3),
-        "places": list(where.places),
-    }
+def _located(where: Located) -> dict[str, Any]:
+    fields = _where(where.position, where.covariance_m2, where.heading_deg)
+    return fields | {"height_ratio": _rounded(where.height_ratio, 3), "places": list(where.places)}
 
 
 def _best(candidate: Candidate | None) -> dict[str, Any]:
     if candidate is None:
         return dict.fromkeys(_OF_THE_BEST)
     place, match = candidate.place, candidate.match
-    values = (
-        place.place_id,
-        place.source_image,
-        round(match.score, 5),
-        asdict(place.position) if place.position else None,
-        match.shift_cells,
-        match.covariance_cells2,
-        match.rotation_deg,
-    )
-    return dict(zip(_OF_THE_BEST, values, strict=True))
+    position = asdict(place.position) if place.position else None
+    named = (place.place_id, place.source_image, round(match.score, 5), position)
+    step = (match.shift_cells, match.covariance_cells2, match.rotation_deg)
+    return dict(zip(_OF_THE_BEST, (*named, *step), strict=True))

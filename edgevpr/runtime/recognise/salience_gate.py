@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from edgevpr.core.arrays import Image, Mask
 from edgevpr.core.types import Salience
 from edgevpr.runtime.recognise.detector import Detector
 from edgevpr.runtime.recognise.memorability import Memorability
@@ -49,16 +50,6 @@ class Worth:
     reason: str | None = None
 
 
-class NoGate:
-    """The gate that lets every frame pass and looks at none."""
-
-    def look(self, image: np.ndarray) -> None:
-        """Say nothing of a frame."""
-
-    def forget(self) -> None:
-        """Remember nothing."""
-
-
 class Gate:
     """Looks at one frame of a flight after the other.
 
@@ -80,13 +71,13 @@ class Gate:
         self._detect_every, self._footprint_m = detect_every, footprint_m
         self._entropies: deque[float] = deque(maxlen=_REMEMBERED)
         self._until_detection = 0
-        self._static: np.ndarray | None = None
+        self._static: Mask | None = None
 
-    def look(self, image: np.ndarray) -> Worth:
+    def look(self, image: Image) -> Worth:
         """Tell what a frame, uint8 (H, W[, 3]), is worth. Raises ModelError for a network that cannot be used."""
         return self.worth(self.maps(image))
 
-    def maps(self, image: np.ndarray) -> Maps:
+    def maps(self, image: Image) -> Maps:
         """Compute the maps of a frame. Raises ModelError as `look` does."""
         return maps_of(image, self._memorability, self._is_static(image))
 
@@ -103,7 +94,7 @@ class Gate:
         self._entropies.clear()
         self._until_detection, self._static = 0, None
 
-    def _is_static(self, image: np.ndarray) -> np.ndarray | None:
+    def _is_static(self, image: Image) -> Mask | None:
         if self._detector is None:
             return None
         if self._until_detection == 0 or self._static is None or self._static.shape != image.shape[:2]:

@@ -26,10 +26,9 @@ from edgevpr.power.equations import parse_pack
 from edgevpr.runtime.flight.autopilot import DRY_RUN
 from edgevpr.runtime.preflight.choose import too_late
 from edgevpr.runtime.preflight.pick import outlook
-from edgevpr.runtime.recognise.calibrated import calibration_of
+from edgevpr.runtime.recognise.evidence import calibration_of, not_calibrated
 from edgevpr.runtime.recognise.learn import check_positions
 from edgevpr.runtime.recognise.opening import open_recogniser
-from edgevpr.runtime.recognise.stored_confidence import not_calibrated
 from edgevpr.runtime.service import px4
 from edgevpr.runtime.service.board import log_findings
 from edgevpr.runtime.service.doctor import plan_of, silence
@@ -137,7 +136,7 @@ def _map(config: Config) -> str:
         sure = ""
         if recogniser.rule.sure:
             calibration = calibration_of(place_map)
-            sure = f"; {calibration.said() if calibration else not_calibrated(len(place_map))}"
+            sure = f"; {calibration.described() if calibration else not_calibrated(len(place_map))}"
     if config.mavlink.link and config.mavlink.send_fixes and (found.t_query_s or 0.0) > FIX_MAX_AGE_S:
         raise UsageError(
             f"No fix would ever be sent ({too_late(found.t_query_s)}): use a faster board, fewer places or candidates, "

@@ -18,7 +18,7 @@ from edgevpr.runtime.flight.governor import Reading
 from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.preflight import accuracy
 from edgevpr.runtime.recognise.opening import open_learning, open_recogniser
-from edgevpr.runtime.recognise.recogniser import Recogniser
+from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser
 
 TURN_S = 4.0  # more than the governor's patience: each reading can bring a change
 CALM = Reading(cpu_share=0.01, late_share=0.0, rss_mb=100.0, temperature_c=40.0, throttled=False)
@@ -192,7 +192,7 @@ def test_of_a_part_of_a_map_no_smaller_form_is_offered(recording):
     with recogniser.place_map:
         technique = recogniser.technique
         part = load_index(recogniser.place_map, technique, 9 * bytes_per_place(technique.spec))
-        recogniser.take(technique, part, recogniser.rule, recogniser.search)
+        recogniser.take(Matcher(technique, part, recogniser.rule))
         assert smaller_forms(config, recogniser, None, 0.0) == (), "it is as large as it may be"
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from pictures import textured
 
-from edgevpr.runtime.recognise.agreement import CONFIRMED, PROVEN, Expected, agreement, held_against, onto
+from edgevpr.runtime.recognise.agreement import CONFIRMED, PROVEN, Overlay, agreement, held_against, onto
 from edgevpr.runtime.recognise.landmarks import OF_QUERY, Landmarks, describe, packed, unpacked
 from edgevpr.techniques import create
 
@@ -63,7 +63,7 @@ def test_the_signs_are_those_of_a_match_of_cohog(landscape, right_px, down_px, t
     assert abs((match.rotation_deg - turned_deg + 180) % 360 - 180) < 1
     assert np.array(match.shift_cells) / 32 == pytest.approx(found.shift_share, abs=1.5 / 32)
 
-    expected = Expected((match.shift_cells[0] / 32, match.shift_cells[1] / 32), match.rotation_deg)
+    expected = Overlay((match.shift_cells[0] / 32, match.shift_cells[1] / 32), match.rotation_deg)
     guided = held_against(asked(query), kept(place), expected)
     assert guided.is_expected
     assert guided.inliers >= PROVEN
@@ -80,7 +80,7 @@ def test_the_covariance_holds_what_is_off(landscape):
 
 def test_landmarks_that_lie_otherwise_than_expected_are_not_taken_for_what_is(landscape):
     query, place = asked(cut(landscape, 860, 560)), kept(cut(landscape, 800, 600))
-    wrong = Expected((-0.2, 0.1), 90.0)
+    wrong = Overlay((-0.2, 0.1), 90.0)
     assert agreement(query, place, wrong).inliers < CONFIRMED
     found = held_against(query, place, wrong)
     assert not found.is_expected
@@ -101,7 +101,7 @@ def test_the_same_two_pictures_always_agree_alike(landscape):
 @pytest.mark.parametrize("seed", range(12))
 def test_pictures_of_other_ground_do_not_agree(landscape, seed):
     other = textured(100 + seed, HIGH, WIDE)
-    expected = Expected((0.05 * (seed % 3), -0.05), 15.0 * seed)
+    expected = Overlay((0.05 * (seed % 3), -0.05), 15.0 * seed)
     found = held_against(asked(other), kept(cut(landscape, 800, 600)), expected)
     assert found.inliers < CONFIRMED
     assert found.is_expected
@@ -109,7 +109,7 @@ def test_pictures_of_other_ground_do_not_agree(landscape, seed):
 
 def test_a_pattern_that_repeats_itself_raises_nothing():
     board = np.kron(np.indices((24, 32)).sum(axis=0) % 2, np.ones((20, 20))).astype(np.uint8) * 255
-    for expected in (None, Expected((0.03, 0.0), 0.0), Expected((0.0, 0.0), 45.0, 1.2)):
+    for expected in (None, Overlay((0.03, 0.0), 0.0), Overlay((0.0, 0.0), 45.0, 1.2)):
         assert agreement(asked(board), kept(board), expected).inliers >= 0
 
 
@@ -118,14 +118,14 @@ def test_pictures_with_hardly_any_landmarks_do_not_agree(landscape):
     for count in range(4):
         few = Landmarks(place.points[:count], place.angle_deg[:count], place.size[:count], place.bits[:count])
         assert agreement(few, place).inliers <= count
-        assert agreement(place, few, Expected((0.0, 0.0), 0.0)).inliers <= count
+        assert agreement(place, few, Overlay((0.0, 0.0), 0.0)).inliers <= count
 
 
 def test_landmarks_all_on_one_spot_do_not_agree(landscape):
     """What a damaged map may hold."""
     place = kept(cut(landscape, 800, 600))
     heap = Landmarks(np.zeros_like(place.points), place.angle_deg, np.zeros_like(place.size), place.bits)
-    for expected in (None, Expected((0.0, 0.0), 0.0)):
+    for expected in (None, Overlay((0.0, 0.0), 0.0)):
         assert agreement(asked(cut(landscape, 800, 600)), heap, expected).inliers < CONFIRMED
         assert agreement(heap, place, expected).inliers < CONFIRMED
 
@@ -144,12 +144,12 @@ def test_how_two_places_lie_on_each_other_follows_from_one_query_on_both(landsca
     ways = []
     for place in (first, second):
         found = agreement(query, kept(place))
-        ways.append(Expected(found.shift_share, found.rotation_deg, found.scale))
+        ways.append(Overlay(found.shift_share, found.rotation_deg, found.scale))
     truth, told = agreement(asked(first), kept(second)), onto(*ways)
     assert truth.inliers >= PROVEN
     assert told.shift_share == pytest.approx(truth.shift_share, abs=0.01)
     assert abs((told.rotation_deg - truth.rotation_deg + 180) % 360 - 180) < 1.5
     assert told.scale == pytest.approx(truth.scale, rel=0.03)
     assert agreement(kept(first), kept(second), told).inliers >= CONFIRMED
-    unscaled = onto(Expected(ways[0].shift_share, ways[0].rotation_deg), ways[1])
+    unscaled = onto(Overlay(ways[0].shift_share, ways[0].rotation_deg), ways[1])
     assert unscaled.scale is None, "where one height is unknown, that of both is"

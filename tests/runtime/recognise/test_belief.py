@@ -3,13 +3,12 @@
 import numpy as np
 import pytest
 
-from edgevpr.runtime.recognise.belief import MOST, Belief
-from edgevpr.runtime.recognise.motion import moved
-from edgevpr.runtime.recognise.seen import Ground, Seen
+from edgevpr.runtime.recognise.belief import MOST, Belief, moved
+from edgevpr.runtime.recognise.hypotheses import MapScale, Proposals
 
 PLACES, SPACING_M = 100, 20.0
-IN_ORDER = Ground(spacing=1.0, near=2.0, is_ordinal=True)
-IN_METRES = Ground(spacing=SPACING_M, near=30.0)
+IN_ORDER = MapScale(spacing=1.0, near=2.0, is_ordinal=True)
+IN_METRES = MapScale(spacing=SPACING_M, near=30.0)
 STEP = moved(1.0, 1.0, 3.0)  # within three places of the query before
 SURE = 0.999
 
@@ -18,7 +17,7 @@ def seen(at, p, sd=0.5, heading_deg=np.nan):
     """Evidence for positions `at` (K, 2), or (K,) in a map of places in order."""
     at = np.asarray(at, float)
     at = np.column_stack([at, np.zeros(len(at))]) if at.ndim == 1 else at
-    return Seen(
+    return Proposals(
         p=np.asarray(p, float),
         at=at,
         covariance=np.tile(sd**2 * np.eye(2), (len(at), 1, 1)),
@@ -289,7 +288,7 @@ def test_numbers_that_make_no_sense_pass(bad):
     rng, (p, at, variance) = np.random.default_rng(11), bad
     belief = Belief(IN_METRES)
     for n in range(20):
-        query = Seen(
+        query = Proposals(
             p=np.array([0.5, p]),
             at=np.array([[20.0 * n, 0.0], [at, at]]),
             covariance=np.array([25 * np.eye(2), np.full((2, 2), variance)]),
@@ -323,7 +322,7 @@ def some(rng, count, scale):
     for each in (p, at, covariance):
         if each.size and rng.random() < 0.1:
             each.flat[rng.integers(each.size)] = rng.choice([np.nan, np.inf, -np.inf, 1e300, -1])
-    return Seen(p=p, at=at, covariance=covariance, heading_deg=rng.choice([np.nan, 10, np.inf], count))
+    return Proposals(p=p, at=at, covariance=covariance, heading_deg=rng.choice([np.nan, 10, np.inf], count))
 
 
 @pytest.mark.parametrize("ground", [IN_ORDER, IN_METRES])

@@ -18,14 +18,15 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import Pack
 from edgevpr.power.meter import QueryMeter
-from edgevpr.runtime.recognise.calibrated import calibration_of
 from edgevpr.runtime.recognise.confidence import prior
+from edgevpr.runtime.recognise.evidence import MapCalibration, calibration_of, calibration_text
 from edgevpr.runtime.recognise.opening import open_recogniser
-from edgevpr.runtime.recognise.stored_confidence import Calibration, as_text
 from edgevpr.techniques import create
 
 OWN = replace(prior("ahead"), made_of="this map")
-FOUND = Calibration(models={"ahead": OWN}, made="2026-05-01", asked=9, precision=0.99, accepted=1.0, accepted_wrong=0)
+FOUND = MapCalibration(
+    models={"ahead": OWN}, made="2026-05-01", asked=9, precision=0.99, accepted=1.0, accepted_wrong=0
+)
 
 
 def frame(number):
@@ -65,7 +66,7 @@ def flown(path):
 
 def test_a_flight_decides_by_the_models_of_its_map(path, caplog):
     assert flown(path) == {"ahead": prior("ahead")}
-    keep(path, as_text(FOUND))
+    keep(path, calibration_text(FOUND))
     assert flown(path) == {"ahead": OWN}
     with PlaceMap.open(path) as place_map:
         assert calibration_of(place_map) == FOUND
@@ -83,10 +84,10 @@ def too_sure(model):
 DAMAGED = {
     "empty": "",
     "no json": "deadbeef{",
-    "changed": as_text(FOUND).replace("2026", "2025"),
-    "evidence that there is not": as_text(replace(FOUND, models={"ahead": renamed(OWN)})),
-    "a kind that there is not": as_text(replace(FOUND, models={"sideways": OWN})),
-    "not a number": as_text(replace(FOUND, models={"ahead": too_sure(OWN)})),
+    "changed": calibration_text(FOUND).replace("2026", "2025"),
+    "evidence that there is not": calibration_text(replace(FOUND, models={"ahead": renamed(OWN)})),
+    "a kind that there is not": calibration_text(replace(FOUND, models={"sideways": OWN})),
+    "not a number": calibration_text(replace(FOUND, models={"ahead": too_sure(OWN)})),
 }
 
 

@@ -13,7 +13,7 @@ from edgevpr.core.types import Frame, Pose, Position
 from edgevpr.places.index import PlaceIndex, empty_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Ranking
-from edgevpr.runtime.recognise.follow import Follower, NoFollower
+from edgevpr.runtime.recognise.follow import Follower
 from edgevpr.runtime.recognise.locate import Located
 
 PLACES, SPACING_M, FOOTPRINT_M = 150, 20.0, 80.0
@@ -383,15 +383,6 @@ def test_a_map_of_one_place(bare_map, position):
     assert followed[0].confidence == pytest.approx(0.9)
     assert max(each.confidence for each in followed) < 0.95
     assert flight.over([0] * 3, 0.01, others=(0,))[-1].confidence < 0.1
-
-
-def test_without_a_follower_nothing_is_known_of_the_flight():
-    none = NoFollower()
-    none.went_on(Frame(image=NOTHING, name="", t_mono_s=0.0), None)
-    none.saw_nothing(IN_ORDER)
-    ranking = Ranking(np.array([1]), np.array([0.3], np.float32), {1: FineMatch(0.3)})
-    assert none.heard(ranking, IN_ORDER, {"lead": 1.0}, told(lambda evidence: 1.0), None) is None
-    none.settle()
 
 
 BAD = {

@@ -20,7 +20,7 @@ from edgevpr.power.equations import Pack
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.follow import Follower
 from edgevpr.runtime.recognise.judge import accept_rule
-from edgevpr.runtime.recognise.recogniser import Recogniser
+from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser, WalkSettings
 from edgevpr.runtime.recognise.recognition import fields_of
 from edgevpr.techniques import create
 
@@ -54,12 +54,14 @@ class Walk:
     def __init__(self, place_map, rule=None, follows=True):
         self.confidence, self._t_s = 0.88, 0.0
         self.recogniser = Recogniser(
-            technique=TECHNIQUE,
-            place_map=place_map,
-            index=load_index(place_map, TECHNIQUE, 10**7),
-            rule=rule or sure_rule(lambda evidence: self.confidence, neighbour_m=30.0, min_quality=0.1),
-            meter=meter(),
-            candidates=42,
+            Matcher(
+                TECHNIQUE,
+                load_index(place_map, TECHNIQUE, 10**7),
+                rule or sure_rule(lambda evidence: self.confidence, neighbour_m=30.0, min_quality=0.1),
+            ),
+            place_map,
+            meter(),
+            WalkSettings(candidates=42),
             follower=Follower(place_map, fastest_m_s=None, is_live=False) if follows else None,
         )
 
@@ -168,10 +170,10 @@ def test_ground_that_is_not_in_the_map_is_not_accepted_for_the_flight(whole_map)
 
 def test_an_index_that_changes_in_flight_is_followed(flight):
     whole = flight.recogniser.index
-    flight.recogniser.take(TECHNIQUE, whole.first(0), flight.recogniser.rule, flight.recogniser.search)
+    flight.recogniser.take(Matcher(TECHNIQUE, whole.first(0), flight.recogniser.rule))
     assert flight.see(1).reason == "the map has no place yet"
     for place in range(4, 28, STRIDE):
         index = whole.first(place + 3)
-        flight.recogniser.take(TECHNIQUE, index, flight.recogniser.rule, flight.recogniser.search)
+        flight.recogniser.take(Matcher(TECHNIQUE, index, flight.recogniser.rule))
         event = flight.see(place)
     assert event.accepted

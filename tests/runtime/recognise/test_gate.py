@@ -14,7 +14,7 @@ from edgevpr.core.types import NO_COST, Frame
 from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.recognise.gate import says_nothing
+from edgevpr.runtime.recognise.judge import says_nothing
 from edgevpr.runtime.recognise.opening import meter_of, open_recogniser
 from edgevpr.techniques import create
 

@@ -13,7 +13,7 @@ from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.hints import Prior
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.opening import meter_of
-from edgevpr.runtime.recognise.recogniser import Recogniser
+from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser, WalkSettings
 from edgevpr.techniques import create
 
 PLACES = 4
@@ -47,9 +47,7 @@ def recogniser(opened, monkeypatch, prior=None):
 
     monkeypatch.setattr(technique, "coarse_scores", coarse_scores, raising=False)
     rule = accept_rule(technique, load_config(None).match)
-    walk = Recogniser(
-        technique=technique, place_map=place_map, index=index, rule=rule, meter=meter, candidates=50, prior=prior
-    )
+    walk = Recogniser(Matcher(technique, index, rule), place_map, meter, WalkSettings(candidates=50), prior=prior)
     return walk, heights
 
 

@@ -4,19 +4,9 @@ import numpy as np
 import pytest
 
 from edgevpr.core.contract import FineMatch
-from edgevpr.core.types import Candidate, Place, Position, Vehicle
+from edgevpr.core.types import Candidate, Frame, Place, Position, Vehicle
 from edgevpr.places.index import PlaceIndex
-from edgevpr.runtime.recognise.hints import (
-    Hints,
-    NoPrior,
-    Prior,
-    Sighting,
-    agree,
-    expected_of,
-    hints_of,
-    reach,
-    use_next,
-)
+from edgevpr.runtime.recognise.hints import Hints, Prior, Reach, Sighting, expected_of, hints_of, reach_of
 
 HOME = Position(50.0, 8.0)
 WITHIN_DEG = 22.5
@@ -62,93 +52,86 @@ def found(metres=0.0, heading_deg=None, rotation_deg=None):
 
 
 def test_reach_grows_with_the_time_since_the_position_was_known():
-    assert reach(10.0, None, Sighting(HOME, 8.0), 15.0, 50.0) == (HOME, 80.0)
-    assert reach(10.0, None, Sighting(HOME, 10.0), 15.0, 50.0) == (HOME, 50.0)
+    assert reach_of(10.0, None, Sighting(HOME, 8.0), 15.0, 50.0) == Reach(HOME, 80.0)
+    assert reach_of(10.0, None, Sighting(HOME, 10.0), 15.0, 50.0) == Reach(HOME, 50.0)
 
 
 def test_a_fresh_autopilot_goes_before_our_own_fix_and_both_grow_old():
     autopilot, fix = vehicle(north(500), 9.5), Sighting(HOME, 0.0)
-    assert reach(10.0, autopilot, fix, 10.0, 50.0) == (north(500), 55.0)
-    assert reach(10.6, autopilot, fix, 10.0, 50.0) == (HOME, pytest.approx(156.0))
-    assert reach(60.1, None, fix, 10.0, 50.0) is None
-    assert reach(10.0, None, None, 10.0, 50.0) is None
+    assert reach_of(10.0, autopilot, fix, 10.0, 50.0) == Reach(north(500), 55.0)
+    assert reach_of(10.6, autopilot, fix, 10.0, 50.0) == Reach(HOME, pytest.approx(156.0))
+    assert reach_of(60.1, None, fix, 10.0, 50.0) is None
+    assert reach_of(10.0, None, None, 10.0, 50.0) is None
 
 
 def test_a_position_heard_after_the_frame_was_taken_is_as_far_off_in_time():
-    assert reach(10.0, vehicle(HOME, 10.5), None, 10.0, 50.0) == (HOME, 55.0)
+    assert reach_of(10.0, vehicle(HOME, 10.5), None, 10.0, 50.0) == Reach(HOME, 55.0)
 
 
 def test_only_places_in_reach_are_allowed_and_none_without_a_position(index):
-    hints = hints_of(index, (north(120), 90.0), None)
-    assert hints == Hints(north(120), 90.0)
-    assert expected_of(hints, index).in_reach.tolist() == [False, True, True, False, False]
-    assert expected_of(hints, index).turned_deg is None
+    hints = hints_of(index, Reach(north(120), 90.0), None)
+    assert hints == Hints(Reach(north(120), 90.0))
+    assert expected_of(hints, 1.0, index).in_reach.tolist() == [False, True, True, False, False]
+    assert expected_of(hints, 1.0, index).turned_deg is None
 
 
 def test_where_no_place_is_in_reach_all_are_searched(index):
-    assert hints_of(index, (north(5000), 100.0), None) is None
-    assert expected_of(None, index).in_reach is None
-    assert expected_of(None, index).turned_deg is None
+    assert hints_of(index, Reach(north(5000), 100.0), None) is None
+    assert expected_of(None, 1.0, index).in_reach is None
+    assert expected_of(None, 1.0, index).turned_deg is None
 
 
 def test_a_heading_says_how_far_each_place_is_turned(index):
     hints = hints_of(index, None, 5.0)
-    assert expected_of(hints, index).in_reach is None
-    np.testing.assert_array_equal(expected_of(hints, index).turned_deg, [5, 355, 345, np.nan, 15])
+    assert expected_of(hints, 1.0, index).in_reach is None
+    np.testing.assert_array_equal(expected_of(hints, 1.0, index).turned_deg, [5, 355, 345, np.nan, 15])
 
 
 def test_a_heading_is_no_hint_where_no_place_has_one(index):
     index.heading_deg[:] = np.nan
     assert hints_of(index, None, 5.0) is None
-    assert hints_of(index, (HOME, 50.0), 5.0) == Hints(HOME, 50.0)
+    assert hints_of(index, Reach(HOME, 50.0), 5.0) == Hints(Reach(HOME, 50.0))
 
 
 def test_what_the_log_says():
-    assert Hints(HOME, 61.26, 90.0).fields() == {"reach_m": 61.3, "heading": True}
+    assert Hints(Reach(HOME, 61.26), 90.0).fields() == {"reach_m": 61.3, "heading": True}
     assert Hints(heading_deg=0.0).fields() == {"reach_m": None, "heading": True}
 
 
 @pytest.mark.parametrize(
     ("hints", "candidate", "agrees"),
     [
-        (Hints(HOME, 100.0), found(90), True),
-        (Hints(HOME, 100.0), found(110), False),
-        (Hints(HOME, 100.0), Candidate(Place(place_id=1, source_image="a"), FineMatch(0.5)), True),
+        (Hints(Reach(HOME, 100.0)), found(90), True),
+        (Hints(Reach(HOME, 100.0)), found(110), False),
+        (Hints(Reach(HOME, 100.0)), Candidate(Place(place_id=1, source_image="a"), FineMatch(0.5)), True),
         (Hints(heading_deg=10.0), found(0, 350.0, 30.0), True),
         (Hints(heading_deg=10.0), found(0, 350.0, 0.0), True),
         (Hints(heading_deg=10.0), found(0, 350.0, 345.0), False),
         (Hints(heading_deg=10.0), found(0, 350.0, 45.0), False),
         (Hints(heading_deg=10.0), found(0, None, 180.0), True),
-        (Hints(HOME, 100.0, 10.0), found(0, 10.0, 180.0), False),
-        (Hints(HOME, 100.0, 10.0), found(110, 10.0, 0.0), False),
+        (Hints(Reach(HOME, 100.0), 10.0), found(0, 10.0, 180.0), False),
+        (Hints(Reach(HOME, 100.0), 10.0), found(110, 10.0, 0.0), False),
     ],
 )
 def test_a_place_found_agrees_with_hints_that_would_have_led_to_it(hints, candidate, agrees):
-    assert agree(hints, candidate, WITHIN_DEG) is agrees
+    assert hints.agree_with(candidate, WITHIN_DEG) is agrees
 
 
-def test_queries_look_with_and_without_hints_in_turn_until_one_is_accepted():
-    hints, nothing = Hints(HOME, 100.0), found(0)
-    used, seen = True, []
-    for _ in range(4):
-        seen.append(used)
-        used = use_next(hints, used, nothing, accepted=False, heading_within_deg=WITHIN_DEG)
-    assert seen == [True, False, True, False]
-
-
-def test_an_accepted_match_says_whether_the_hints_can_be_believed():
-    hints = Hints(HOME, 100.0)
-    assert use_next(hints, False, found(50), accepted=True, heading_within_deg=WITHIN_DEG) is True
-    assert use_next(hints, True, found(50), accepted=True, heading_within_deg=WITHIN_DEG) is True
-    assert use_next(hints, False, found(500), accepted=True, heading_within_deg=WITHIN_DEG) is False
-    assert use_next(hints, False, None, accepted=False, heading_within_deg=WITHIN_DEG) is True
-    assert use_next(None, False, None, accepted=False, heading_within_deg=WITHIN_DEG) is True
+def test_queries_look_with_and_without_hints_until_a_match_says_whether_they_can_be_believed(index):
+    prior, near, seen = Prior(10.0, None, is_live=True), Position(50.0, 8.0), []
+    answers = [(50, False), (50, False), (50, False), (50, True), (50, True), (500, True), (0, False)]
+    for number, (metres, accepted) in enumerate(answers):
+        # The autopilot knows where it is to within 100 m, so that hints are there for every query.
+        frame = Frame(image=np.zeros((1, 1), np.uint8), name="", t_mono_s=float(number))
+        seen.append(prior.hints(frame, vehicle(near, float(number)), index, 100.0) is not None)
+        prior.learn(found(metres), accepted, float(number))
+    assert seen == [True, False, True, False, True, True, False]
 
 
 def test_the_next_query_is_looked_for_from_the_height_of_the_last_match():
     prior = Prior(None, WITHIN_DEG, is_live=True)
     at_height = Candidate(Place(place_id=1, source_image="a"), FineMatch(0.5, height_ratio=0.7))
-    assert prior.height_ratio == NoPrior().height_ratio == 1.0
+    assert prior.height_ratio == 1.0
     prior.learn(at_height, False, 0.0)
     assert prior.height_ratio == 1.0
     prior.learn(at_height, True, 1.0)

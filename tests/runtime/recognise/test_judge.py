@@ -10,10 +10,10 @@ from edgevpr.core.config import load_config
 from edgevpr.core.contract import FineMatch, PartSpec, TechniqueSpec
 from edgevpr.places.index import empty_index
 from edgevpr.places.retrieve import Ranking
-from edgevpr.places.sequence import Alone, SequenceSearch
+from edgevpr.places.sequence import SequenceSearch
 from edgevpr.runtime.recognise.agreement import Agreement
 from edgevpr.runtime.recognise.evidence import AHEAD, DOWN, DOWN_BARE, OF_MAP, OF_PLACE
-from edgevpr.runtime.recognise.judge import AcceptRule, accept_rule, judge
+from edgevpr.runtime.recognise.judge import AcceptRule, Findings, accept_rule, judge
 from edgevpr.techniques import create
 
 RULE = AcceptRule(min_score=0.08, min_margin=0.03, neighbour_m=50.0)
@@ -24,7 +24,7 @@ def judged(scores=(0.2, 0.1), rule=RULE, evidence=None):
     slots = np.array([0, 9])[: len(scores)]
     matches = {int(slot): FineMatch(score) for slot, score in zip(slots, scores, strict=True)}
     ranking = Ranking(slots, np.array(scores, np.float32), matches)
-    return judge(ranking, index, rule, Alone(), is_new=False, evidence=evidence)
+    return judge(Findings(ranking, evidence=evidence), index, rule)
 
 
 def test_a_technique_without_a_confidence_is_judged_by_its_limits():
@@ -95,7 +95,7 @@ def behind(*others, best=(0.3, (0.2, -0.1), 0.0)):
         for slot, (score, step, turn) in zip(slots, (best, *others), strict=True)
     }
     ranking = Ranking(slots, np.array([match.score for match in matches.values()], np.float32), matches)
-    return judge(ranking, index, RULE, Alone(), is_new=False)
+    return judge(Findings(ranking), index, RULE)
 
 
 @pytest.mark.parametrize("step", [(0.0, 0.0), (-1.4, 1.4)])
@@ -130,7 +130,7 @@ def test_in_a_sequence_the_newest_query_need_not_be_sure_by_itself():
         slots = np.argsort(-scores, kind="stable")
         matches = {int(slot): FineMatch(float(scores[slot]), coverage=0.01) for slot in slots}
         ranking = search.follow(Ranking(slots, scores[slots], matches), index, float(query))
-        verdicts.append(judge(ranking, index, RULE, search, is_new=False))
+        verdicts.append(judge(Findings(ranking), index, RULE, search))
     assert verdicts[-1].accepted, verdicts[-1].reason
 
 
@@ -159,7 +159,7 @@ def held(score, ahead, proof, rival=0, rule=RULE, evidence=None):
     scores = np.array([score, score - ahead], np.float32)
     matches = {slot: FineMatch(float(value)) for slot, value in zip((0, 9), scores, strict=True)}
     ranking = Ranking(np.array([0, 9]), scores, matches)
-    return judge(ranking, index, rule, Alone(), is_new=False, proof=proof, rival=rival, evidence=evidence)
+    return judge(Findings(ranking, proof=proof, rival=rival, evidence=evidence), index, rule)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from edgevpr.core.contract import PartSpec, TechniqueSpec
 from edgevpr.places.index import empty_index
 from edgevpr.places.retrieve import Ranking
 from edgevpr.places.sequence import SequenceSearch
-from edgevpr.runtime.recognise.judge import AcceptRule, accept_rule, judge
+from edgevpr.runtime.recognise.judge import AcceptRule, Findings, accept_rule, judge
 from edgevpr.techniques import create
 
 PLACES, LENGTH = 80, 6
@@ -31,7 +31,7 @@ def flown(velocity, start, leaves=18, seed=3):
         slots = np.argsort(-scores)
         ranking = Ranking(slots, scores[slots], {})
         ranking = sequence.follow(ranking, index, float(query))
-        verdict = judge(ranking, index, RULE, sequence, is_new=False)
+        verdict = judge(Findings(ranking), index, RULE, sequence)
         found.append((verdict.accepted, verdict.reason, int(ranking.slots[0])))
     return found
 

@@ -12,15 +12,15 @@ from edgevpr.core.contract import Descriptor
 from edgevpr.core.errors import MapError, UsageError
 from edgevpr.core.types import Frame, Position, QueryCost, Steps
 from edgevpr.frames.level import UNKNOWN_VIEW, Levelled, View
-from edgevpr.places.growing import GrowingIndex
+from edgevpr.places.index import GrowingIndex
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.near import index_positions
+from edgevpr.places.mapinfo import index_positions
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.recognise.follow import Estimate, Followed
+from edgevpr.runtime.recognise.follow import Followed, FollowedPosition
 from edgevpr.runtime.recognise.judge import AcceptRule
 from edgevpr.runtime.recognise.learn import Learner, check_positions
 from edgevpr.runtime.recognise.opening import meter_of
-from edgevpr.runtime.recognise.recogniser import Recogniser
+from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.techniques import create
 
@@ -49,11 +49,9 @@ class Bench:
         index_positions(self.map)
         self.growing = GrowingIndex(self.map, TECHNIQUE, budget_bytes=10**6, room=places_in_ram)
         self.recogniser = Recogniser(
-            technique=TECHNIQUE,
-            place_map=self.map,
-            index=self.growing.index,
-            rule=AcceptRule(min_score=0.0, min_margin=0.0, neighbour_m=50.0),
-            meter=meter_of(load_config(None), load_board("this")),
+            Matcher(TECHNIQUE, self.growing.index, AcceptRule(min_score=0.0, min_margin=0.0, neighbour_m=50.0)),
+            self.map,
+            meter_of(load_config(None), load_board("this")),
         )
         self.learner = Learner(
             self.recogniser, self.growing, spacing_m=SPACING_M, gap_m=GAP_M, utc_clock=self.clock.utc_s
@@ -173,7 +171,7 @@ def test_nothing_is_learnt_from_what_failed(bench):
 
 def by_flight(lost, mass, north_m=0.0, sd_m=3.0, has_estimate=True):
     """What a flight knows that is likeliest so far to the north."""
-    there = Estimate(Position(50 + north_m * METRE_DEG, 8.0), (sd_m**2, 0.0, sd_m**2), None)
+    there = FollowedPosition(Position(50 + north_m * METRE_DEG, 8.0), (sd_m**2, 0.0, sd_m**2), None)
     return Followed(slot=0, confidence=mass, lost=lost, mass=mass, estimate=there if has_estimate else None)
 
 

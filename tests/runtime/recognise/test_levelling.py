@@ -15,15 +15,15 @@ from edgevpr.core.types import Frame, Position
 from edgevpr.frames.level import UNKNOWN_VIEW, Lens, View
 from edgevpr.frames.mask import Mask
 from edgevpr.lab.simulate.camera import Camera, Light, Pose, ground_to_pixel, photograph
-from edgevpr.mapmaking.mapping import Preparation, build_map
+from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.hints import Prior
 from edgevpr.runtime.recognise.judge import accept_rule
-from edgevpr.runtime.recognise.levelling import Leaning, Levelling, NoLevelling, laid, levelling_of
+from edgevpr.runtime.recognise.levelling import Leaning, Levelling, laid, levelling_of
 from edgevpr.runtime.recognise.opening import meter_of
-from edgevpr.runtime.recognise.recogniser import Recogniser
+from edgevpr.runtime.recognise.recogniser import Matcher, Preparation, Recogniser
 from edgevpr.techniques import create
 
 CAMERA = Camera(noise_sigma=0)
@@ -82,14 +82,13 @@ def place_map(ground, technique, tmp_path_factory):
 def walk(place_map, technique):
     def of(levelling, prior=None, mask=None):
         return Recogniser(
-            technique=technique,
-            place_map=place_map,
-            index=load_index(place_map, technique, 10**6),
-            rule=accept_rule(technique, load_config(None).match),
-            meter=meter_of(load_config(None), load_board("this")),
-            levelling=levelling,
+            Matcher(
+                technique, load_index(place_map, technique, 10**6), accept_rule(technique, load_config(None).match)
+            ),
+            place_map,
+            meter_of(load_config(None), load_board("this")),
+            preparation=Preparation(levelling=levelling, mask=mask),
             prior=prior,
-            mask=mask,
         )
 
     return of
@@ -228,8 +227,8 @@ def test_a_place_without_a_position_has_no_pose():
     [
         ("nadir", {"source.fov_deg": 66.0}, Levelling),
         ("nadir", {}, Leaning),
-        ("nadir", {"source.gimbal": True}, NoLevelling),
-        ("forward", {"source.fov_deg": 66.0}, NoLevelling),
+        ("nadir", {"source.gimbal": True}, type(None)),
+        ("forward", {"source.fov_deg": 66.0}, type(None)),
     ],
 )
 def test_only_a_camera_that_looks_down_through_a_known_lens_is_levelled(camera, settings, kind, caplog):

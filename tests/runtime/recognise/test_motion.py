@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from edgevpr.runtime.recognise.motion import moved
+from edgevpr.runtime.recognise.belief import moved
 
 
 def test_odometry_says_how_far_and_how_surely():

@@ -22,7 +22,7 @@ from edgevpr.power.equations import Pack
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise import hints, judge, learn, opening, recogniser, recognition
 from edgevpr.runtime.recognise.judge import AcceptRule
-from edgevpr.runtime.recognise.recogniser import Recogniser
+from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser, WalkSettings
 from edgevpr.techniques import create
 
 PLACES = 6
@@ -60,13 +60,7 @@ def walk(whole_map, tmp_path, clock):
     with PlaceMap.open(tmp_path / whole_map.name) as place_map:
         index = load_index(place_map, technique, 10**6)
         yield Recogniser(
-            technique=technique,
-            place_map=place_map,
-            index=index,
-            rule=RULE,
-            meter=meter,
-            candidates=42,
-            min_accuracy_m=20.0,
+            Matcher(technique, index, RULE), place_map, meter, WalkSettings(candidates=42, min_accuracy_m=20.0)
         )
 
 
@@ -178,13 +172,13 @@ def test_an_index_that_is_lost_fails_every_frame_until_there_is_one_again(walk):
     walk.lose_index(MapError("the map is gone."))
     event = walk.step(frame(3))
     assert (event.failed, event.reason) == (True, "the map is gone.")
-    walk.take(walk.technique, index, walk.rule, walk.search)
+    walk.take(Matcher(walk.technique, index, walk.rule))
     assert walk.step(frame(3)).accepted
 
 
 def test_a_map_without_a_place_refuses_and_does_not_fail(walk):
     nothing = type(walk.index)(**{name: array[:0] for name, array in walk.index.arrays.items()}, mean=walk.index.mean)
-    walk.take(walk.technique, nothing, walk.rule, walk.search)
+    walk.take(Matcher(walk.technique, nothing, walk.rule))
     event = walk.step(frame(3))
     assert (event.failed, event.accepted, event.reason, event.best) == (False, False, "the map has no place yet", None)
 
@@ -206,6 +200,6 @@ def test_the_walk_takes_no_more_than_it_is_given(walk):
 
 def test_the_accuracy_of_a_map_is_never_below_what_is_claimed_at_least(walk):
     walk.index.lat_deg[:] = np.linspace(50.0, 50.00001, PLACES)
-    walk.take(walk.technique, walk.index, walk.rule, walk.search)
+    walk.take(Matcher(walk.technique, walk.index, walk.rule))
     assert walk.accuracy_m == 20.0
     assert load_config(None).mavlink.min_accuracy_m == 5.0

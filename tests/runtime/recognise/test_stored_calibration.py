@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 
 from edgevpr.runtime.recognise.confidence import prior
-from edgevpr.runtime.recognise.stored_confidence import Calibration, as_text, from_text, not_calibrated
+from edgevpr.runtime.recognise.evidence import MapCalibration, calibration_text, not_calibrated, read_calibration
 
-FOUND = Calibration(
+FOUND = MapCalibration(
     models={"down": prior("down")},
     made="2026-05-01",
     asked=120,
@@ -19,21 +19,21 @@ FOUND = Calibration(
 
 
 def test_a_calibration_comes_back_as_it_was():
-    assert from_text(as_text(FOUND)) == FOUND
+    assert read_calibration(calibration_text(FOUND)) == FOUND
 
 
 @pytest.mark.parametrize("at", [0, 7, 8, 40, 400, -1])
 def test_any_changed_letter_is_seen(at):
-    letters = list(as_text(FOUND))
+    letters = list(calibration_text(FOUND))
     letters[at] = "7" if letters[at] != "7" else "8"
     with pytest.raises(ValueError, match="checksum"):
-        from_text("".join(letters))
+        read_calibration("".join(letters))
 
 
 @pytest.mark.parametrize("text", ["", "0", "00000000", "\ud800" * 9, "[" * 100_000])
 def test_a_text_that_is_none_is_refused(text):
     with pytest.raises(ValueError, match=r"checksum|calibration|Expecting"):
-        from_text(text)
+        read_calibration(text)
 
 
 @pytest.mark.parametrize(
@@ -52,25 +52,25 @@ def test_a_text_that_is_none_is_refused(text):
 )
 def test_figures_that_make_no_sense_are_refused(wrong):
     with pytest.raises(ValueError, match=r"share|calibration|number|invalid"):
-        from_text(as_text(replace(FOUND, **wrong)))
+        read_calibration(calibration_text(replace(FOUND, **wrong)))
 
 
 def test_what_to_expect_is_said_in_words_and_figures():
-    said = FOUND.said()
+    said = FOUND.described()
     assert said.startswith("of 120 changed pictures of its own places 75 % were accepted, at a precision of 99.9 %")
     assert "and 1 wrong match was; 25 % of 4 places are hardly recognisable" in said
     assert "looks alike" not in said
     figures = FOUND.figures()
     assert (figures["asked"], figures["places_asked"], figures["hardly_recognisable"]) == (120, 4, 0.25)
     assert figures["made_of"] == [prior("down").made_of]
-    assert "no wrong match was" in replace(FOUND, accepted_wrong=0).said()
-    assert "5 wrong matches were" in replace(FOUND, accepted_wrong=5).said()
+    assert "no wrong match was" in replace(FOUND, accepted_wrong=0).described()
+    assert "5 wrong matches were" in replace(FOUND, accepted_wrong=5).described()
 
 
 def test_a_map_of_which_most_looks_alike_says_so():
     alike = replace(FOUND, recognisable={1: 0.1, 2: 0.49, 3: 0.9})
     assert alike.looks_alike
-    assert alike.said().endswith("most of this map looks alike: expect few fixes over it")
+    assert alike.described().endswith("most of this map looks alike: expect few fixes over it")
     assert not replace(FOUND, recognisable={}).looks_alike
 
 

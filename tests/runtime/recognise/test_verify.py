@@ -16,11 +16,10 @@ from sureness import landmarks_count, sure_rule
 
 from edgevpr.core.types import Frame, Position
 from edgevpr.frames.mask import Mask
-from edgevpr.mapmaking.mapping import Preparation, build_map
-from edgevpr.places.growing import GrowingIndex
-from edgevpr.places.index import load_index
+from edgevpr.mapmaking.mapping import build_map
+from edgevpr.places.index import GrowingIndex, load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.near import index_positions
+from edgevpr.places.mapinfo import index_positions
 from edgevpr.places.sequence import SequenceSearch
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import Pack
@@ -28,7 +27,7 @@ from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.judge import AcceptRule
 from edgevpr.runtime.recognise.landmarks import describe, packed, unpacked
 from edgevpr.runtime.recognise.learn import Learner
-from edgevpr.runtime.recognise.recogniser import Recogniser
+from edgevpr.runtime.recognise.recogniser import Matcher, Preparation, Recogniser, WalkSettings
 from edgevpr.runtime.recognise.recognition import fields_of
 from edgevpr.runtime.recognise.verify import Verification
 from edgevpr.techniques import create
@@ -80,17 +79,14 @@ def keep(path, landmarks, checksum):
         db.execute("UPDATE places SET landmarks = ?, landmarks_crc32 = ? WHERE place_id = 2", (landmarks, checksum))
 
 
-def asked(path, technique, query, rule=RULE, times=1, **others):
+def asked(path, technique, query, rule=RULE, times=1, search=None, verify=True):
     """The event of a query; of the last, where it is asked several times."""
     with PlaceMap.open(path) as place_map:
         walk = Recogniser(
-            technique=technique,
-            place_map=place_map,
-            index=load_index(place_map, technique, 10**7),
-            rule=rule,
-            meter=meter(),
-            candidates=technique.candidates,
-            **others,
+            Matcher(technique, load_index(place_map, technique, 10**7), rule, search),
+            place_map,
+            meter(),
+            WalkSettings(candidates=technique.candidates, verify=verify),
         )
         return [walk.step(query) for _ in range(times)][-1]
 
@@ -178,7 +174,7 @@ def same_ground(path, technique, query):
     """The best place of a query, and the numbers of the places that show the same ground."""
     with PlaceMap.open(path) as place_map:
         index = load_index(place_map, technique, 10**7)
-        walk = Recogniser(technique=technique, place_map=place_map, index=index, rule=BY_LANDMARKS, meter=meter())
+        walk = Recogniser(Matcher(technique, index, BY_LANDMARKS), place_map, meter())
         event = walk.step(query)
         looked = Verification(technique.spec, event.picture, index, place_map)
         return event, int(index.place_ids[event.ranking.slots[0]]), set(looked.same_ground(event.ranking))
@@ -258,7 +254,7 @@ def test_a_place_that_is_learnt_in_flight_has_landmarks(tmp_path, technique):
     with PlaceMap.create(tmp_path / "m.gpkg", technique.spec) as place_map:
         index_positions(place_map)
         growing = GrowingIndex(place_map, technique, budget_bytes=10**6, room=10)
-        walk = Recogniser(technique=technique, place_map=place_map, index=growing.index, rule=RULE, meter=meter())
+        walk = Recogniser(Matcher(technique, growing.index, RULE), place_map, meter())
         place = Learner(walk, growing, spacing_m=10.0, gap_m=100.0).learn(walk.step(frame(1)))
         assert len(unpacked(place_map.landmarks_of(place.place_id))) > 100
 
@@ -281,12 +277,10 @@ def test_verification_is_a_step_of_its_own_and_counts_as_matching(mapped, techni
     monkeypatch.setattr(Verification, "proof", lambda self, ranking: (clock.work(0.02), look(self, ranking))[1])
     with PlaceMap.open(mapped) as place_map:
         walk = Recogniser(
-            technique=technique,
-            place_map=place_map,
-            index=load_index(place_map, technique, 10**7),
-            rule=replace(RULE, worth_a_look=0.04),
-            meter=meter(clock),
-            candidates=technique.candidates,
+            Matcher(technique, load_index(place_map, technique, 10**7), replace(RULE, worth_a_look=0.04)),
+            place_map,
+            meter(clock),
+            WalkSettings(candidates=technique.candidates),
         )
         event = walk.step(frame(1, 20, -10))
         nothing = walk.step(Frame(image=np.zeros((240, 320), np.uint8), name="nothing", t_mono_s=0.0))

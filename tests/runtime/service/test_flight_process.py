@@ -15,8 +15,8 @@ from flights import PLACES, STEP_DEG, of_kind
 
 from edgevpr.cli.main import main
 from edgevpr.core.appending import numbered
-from edgevpr.places.identity import identity_of
 from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.mapinfo import identity_of
 from edgevpr.runtime.flight import aboard
 from edgevpr.runtime.flight.flightlog import read_log
 
