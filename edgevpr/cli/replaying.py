@@ -12,8 +12,7 @@ from edgevpr.cli.shared import add_json, command, print_json
 from edgevpr.core.text import shown
 
 if TYPE_CHECKING:
-    from edgevpr.review.beside import Seen
-    from edgevpr.review.compare import Difference
+    from edgevpr.review.compare import Difference, QueryResult
     from edgevpr.review.replay import Recorded, Replayed
 
 _SHOWN = 40  # differences
@@ -35,14 +34,14 @@ def add(commands: Any) -> None:
 def run_replay(args: Namespace) -> int:
     """Fly a recorded flight again."""
     from edgevpr.core.text import waiting
-    from edgevpr.review.replay import recorded, replay, suppose
+    from edgevpr.review.replay import recorded, replay
 
     def say(done: int, total: int) -> None:
         waiting(f"replaying  {done}/{total}")
 
     flight = recorded(args.log)
     with _unheard(getattr(args, "debug", False)):
-        again = suppose(flight, say, Path(args.config), args.map) if args.config else replay(flight, say, args.map)
+        again = replay(flight, say, args.map, args.config and Path(args.config))
     waiting("")
     if args.config:
         return _print_beside(flight, again, args.json)
@@ -63,8 +62,7 @@ def _unheard(debug: bool) -> Iterator[None]:
 
 
 def _print_comparison(flight: "Recorded", again: "Replayed", as_json: bool) -> int:
-    from edgevpr.review.compare import compare
-    from edgevpr.review.packets import described
+    from edgevpr.review.compare import compare, described
 
     lines, packets = compare(flight.lines, again.lines), again.packets
     said = [
@@ -106,7 +104,7 @@ def _print_comparison(flight: "Recorded", again: "Replayed", as_json: bool) -> i
 
 
 def _print_beside(flight: "Recorded", again: "Replayed", as_json: bool) -> int:
-    from edgevpr.review.beside import beside, table
+    from edgevpr.review.compare import beside, table
 
     pairs = beside(flight.lines, again.lines)
     rows = table(pairs)
@@ -140,7 +138,7 @@ def _of_line(difference: "Difference") -> list[str]:
     return [f"{where}: {name} was {then}, is {now}" for name, (then, now) in difference.fields.items()]
 
 
-def _in_words(seen: "Seen | None") -> str:
+def _in_words(seen: "QueryResult | None") -> str:
     if seen is None:
         return "no query"
     sure = "" if seen.confidence is None else f" with {seen.confidence:.4f}"

@@ -1,11 +1,17 @@
-"""The log of a flight beside that of its replay."""
+"""A flight beside its replay: the lines of both logs, what was said on the links, to the byte, and the queries."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from statistics import median
 from typing import Any
 
+from edgevpr.core.geodesy import distance_m
+from edgevpr.mavlink.wire import mavlink
+
 Line = dict[str, Any]
+
+_SIGNATURE_BYTES = 13
 
 # Of the first line: they tell of the program that flew, and not of the flight.
 PROGRAM = "version", "machine", "python", "libraries"
@@ -85,3 +91,132 @@ def _differing(then: Any, now: Any, name: str = "") -> Iterator[tuple[str, tuple
             yield from _differing(then.get(key), now.get(key), f"{name}.{key}" if name else key)
     elif then != now or type(then) is not type(now):
         yield name, (then, now)
+
+
+@dataclass(frozen=True, slots=True)
+class PacketDifference:
+    """A packet that differs: the time, the link's name, the packet of the flight and that of the replay (None: there
+    was none)."""
+
+    t_s: float
+    link: str
+    then: bytes | None
+    now: bytes | None
+
+
+class Packets:
+    """Comparison of the packets that were said with those that are said now: how many are `alike`, how many are
+    `renumbered` (the same but for the sequence number, after one that is not), and the others."""
+
+    def __init__(self) -> None:
+        self.alike = self.renumbered = 0
+        self.others: list[PacketDifference] = []
+
+    def compare(self, t_s: float, link: str, then: bytes | None, now: bytes | None) -> None:
+        """Compare two packets. A signature needs the key, which no recording holds: it is not compared."""
+        if then is None and now is None:
+            return
+        if then and now and _unsigned(then) == _unsigned(now):
+            self.alike += 1
+        elif then and now and _unnumbered(then) == _unnumbered(now):
+            self.renumbered += 1
+        else:
+            self.others.append(PacketDifference(t_s, link, then, now))
+
+
+def described(packet: bytes | None) -> str:
+    """Return a packet in words."""
+    if packet is None:
+        return "nothing"
+    (message,) = mavlink.MAVLink(None).parse_buffer(packet)
+    return f"{message} (sequence number {message.get_seq()})"
+
+
+def _unsigned(packet: bytes) -> bytes:
+    is_signed = packet[0] == mavlink.PROTOCOL_MARKER_V2 and packet[2] & mavlink.MAVLINK_IFLAG_SIGNED
+    return packet[:-_SIGNATURE_BYTES] if is_signed else packet
+
+
+def _unnumbered(packet: bytes) -> bytes:
+    """Return a packet without its sequence number, and without the checksum over it."""
+    at = 4 if packet[0] == mavlink.PROTOCOL_MARKER_V2 else 2
+    unsigned = _unsigned(packet)
+    return unsigned[:at] + unsigned[at + 1 : -2]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class QueryResult:
+    """The outcome of a query: whether it was `accepted`, and why (not), its `place` and `confidence`, the
+    position `at` of the match (degrees), `off_gps_m`, how far that is from an autopilot that has GPS, and whether a
+    fix was sent (`has_fix`). None is unknown, of whatever it is."""
+
+    accepted: bool
+    reason: str
+    place: int | None
+    confidence: float | None
+    at: tuple[float, float] | None
+    off_gps_m: float | None
+    has_fix: bool
+
+
+@dataclass(frozen=True, slots=True)
+class QueryPair:
+    """One query of both flights; None where one has none of that name."""
+
+    query: str
+    then: QueryResult | None
+    now: QueryResult | None
+
+    @property
+    def apart_m(self) -> float | None:
+        """Metres from one position to the other; None where one of them is missing."""
+        if not (self.then and self.now and self.then.at and self.now.at):
+            return None
+        return float(distance_m(*self.then.at, *self.now.at))
+
+    @property
+    def is_alike(self) -> bool:
+        """True where both accept the same place, or neither accepts any."""
+        if self.then is None or self.now is None:
+            return False
+        return (self.then.accepted, self.then.accepted and self.then.place) == (
+            self.now.accepted,
+            self.now.accepted and self.now.place,
+        )
+
+
+def beside(then: Sequence[Line], now: Sequence[Line]) -> list[QueryPair]:
+    """Put the queries of two logs side by side, by their names, in the order of the flight."""
+    one, other = (
+        {line["query"]: _result(line) for line in lines if line.get("kind") == "query"} for lines in (then, now)
+    )
+    return [QueryPair(name, one.get(name), other.get(name)) for name in one | other]
+
+
+def table(pairs: Sequence[QueryPair]) -> list[tuple[str, Any, Any]]:
+    """Return the rows of a summary: what, of the flight, of the other one."""
+    both = [[getattr(pair, side) for pair in pairs if getattr(pair, side)] for side in ("then", "now")]
+    off_m = [[each.off_gps_m for each in seen if each.off_gps_m is not None] for seen in both]
+    return [
+        ("queries", *map(len, both)),
+        ("accepted", *(sum(each.accepted for each in seen) for seen in both)),
+        ("fixes sent", *(sum(each.has_fix for each in seen) for seen in both)),
+        ("off GPS, median m", *(round(median(each), 1) if each else None for each in off_m)),
+        ("off GPS, largest m", *(round(max(each), 1) if each else None for each in off_m)),
+    ]
+
+
+def _result(line: Line) -> QueryResult:
+    located, vehicle = line.get("located"), line.get("vehicle") or {}
+    at = (located["lat_deg"], located["lon_deg"]) if located else None
+    truth = vehicle if vehicle.get("has_gps") else None
+    fix = line.get("fix") or {}
+    return QueryResult(
+        accepted=line["accepted"],
+        reason=line["reason"],
+        place=line.get("place"),
+        confidence=line.get("confidence"),
+        at=at,
+        off_gps_m=float(distance_m(*at, truth["lat_deg"], truth["lon_deg"])) if at and truth else None,
+        has_fix=fix.get("lat_deg") is not None and fix.get("sent") is not False,
+    )

@@ -2,15 +2,13 @@
 
 import logging
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
-import numpy as np
-
+from edgevpr.core.arrays import Image
 from edgevpr.core.config import Config, build, changed_config
 from edgevpr.core.errors import EdgevprError, ImageError, UsageError
 from edgevpr.frames.images import read_image
@@ -18,11 +16,9 @@ from edgevpr.frames.taped import ReplayedSource
 from edgevpr.mavlink.signing import NOT_SIGNING
 from edgevpr.mavlink.wire import untapped
 from edgevpr.power.boards import Board
-from edgevpr.review.compare import Line
-from edgevpr.review.links import ReplayedGround, ReplayedLink, ReplayedSigning
-from edgevpr.review.packets import Packets
-from edgevpr.review.supposed import Supposed, SupposedGround, SupposedLink
-from edgevpr.review.tape import Playback, TapeEnded, read_tape
+from edgevpr.review.compare import Line, Packets
+from edgevpr.review.supposed import Supposed
+from edgevpr.review.tape import Playback, ReplayedSigning, TapeEnded, read_tape
 from edgevpr.runtime.flight.clock import Clock, taped
 from edgevpr.runtime.flight.flight import Flight
 from edgevpr.runtime.flight.flightlog import read_log
@@ -55,14 +51,6 @@ class Replayed:
     guessed: int
 
 
-@dataclass(frozen=True, slots=True)
-class _Kinds:
-    """The kinds of the two links."""
-
-    link: type[ReplayedLink]
-    ground: type[ReplayedGround]
-
-
 def recorded(log: str | Path) -> Recorded:
     """Find the last flight of a log, and its recording: where the log says, or in a folder of that name beside it.
     Raises UsageError where there is none, and EdgevprError for a file without a line of a flight."""
@@ -70,68 +58,42 @@ def recorded(log: str | Path) -> Recorded:
     if whole.missing:
         _log.warning("%s", whole.missing)
     lines = list(whole)
-    said = lines[0].get("recording") if lines else None
-    if not said:
+    where = lines[0].get("recording") if lines else None
+    if not where:
         raise UsageError(f"{log}: its last flight was not recorded: fly with `log: {{record: FOLDER}}`.")
-    folder = recording_of(said, log)
+    folder = recording_of(where, log)
     if folder is None:
-        raise UsageError(f"{log}: its recording is neither at {said} nor beside the log: bring it there.")
+        raise UsageError(f"{log}: its recording is neither at {where} nor beside the log: bring it there.")
     return Recorded(lines, folder)
 
 
-def replay(flight: Recorded, say: Say, place_map: str | None = None) -> Replayed:
-    """Fly a recorded flight again. `place_map` is its map, where that is not where it was. Raises an EdgevprError where
-    recording or map cannot be opened."""
-    notes, header = _opened(flight)
-    config = build(Config, header["config"], str(flight.folder))
-    playback = Playback(notes)
-    kinds = _Kinds(ReplayedLink, ReplayedGround)
-    return _flown(flight, header, config, place_map or config.map, playback, kinds, lambda seconds: None, say)
-
-
-def suppose(flight: Recorded, say: Say, changes: Path, place_map: str | None = None) -> Replayed:
-    """Fly with the frames and messages of a recorded flight, and with the keys of a YAML file in place of those that it
-    had. Raises the same."""
-    notes, header = _opened(flight)
-    config = changed_config(build(Config, header["config"], str(flight.folder)), changes)
-    supposed = Supposed(notes)
-    kinds = _Kinds(SupposedLink, SupposedGround)
-    return _flown(flight, header, config, place_map or config.map, supposed, kinds, supposed.sleep, say)
-
-
-def _opened(flight: Recorded) -> tuple[Iterator[list[Any]], dict[str, Any]]:
+def replay(flight: Recorded, say: Say, place_map: str | None = None, changes: Path | None = None) -> Replayed:
+    """Fly a recorded flight again; with `changes`, a YAML file, fly with its frames and messages, and with the keys of
+    that file in place of those that it had. `place_map` is its map, where that is not where it was. Raises an
+    EdgevprError where recording or map cannot be opened."""
     notes = read_tape(flight.folder / TAPE)
     note = next(notes, None)
     if not (note and note[0] == "flight" and isinstance(note[1], dict)):
         raise EdgevprError(
             f"{flight.folder / TAPE} is no tape of a flight, or was cut in its first line: nothing can be replayed."
         )
-    return notes, note[1]
-
-
-def _flown(
-    flight: Recorded,
-    header: dict[str, Any],
-    config: Config,
-    map_path: str | None,
-    playback: Playback,
-    kinds: _Kinds,
-    sleep: Callable[[float], None],
-    say: Say,
-) -> Replayed:
+    header = note[1]
+    config = build(Config, header["config"], str(flight.folder))
+    if changes:
+        config = changed_config(config, changes)
+    playback = Supposed(notes) if changes else Playback(notes)
     why_ended = None
     with TemporaryDirectory(prefix="edgevpr-replay-") as temporary:
-        log = Path(temporary) / "flight.jsonl" if config.log.path else None
-        place_map = _map_of(flight.folder, Path(temporary), config, map_path)
+        log = f"{temporary}/flight.jsonl" if config.log.path else None
         world = World(
             board=build(Board, header["board"], "the board of the flight"),
-            place_map=place_map,
-            log=replace(config.log, path=log and str(log), max_mb=None),
+            place_map=_map_of(flight.folder, Path(temporary), config, place_map or config.map),
+            log=replace(config.log, path=log, max_mb=None),
             tape=playback,
-            clock=taped(Clock(sleep=sleep), playback),
+            clock=taped(Clock(sleep=playback.sleep), playback),
             open_source=lambda step_s: ReplayedSource(playback, _pictures_of(flight.folder, say)),
-            link=kinds.link,
-            ground=kinds.ground,
+            link=playback.link,
+            ground=playback.ground,
             signing=ReplayedSigning() if config.mavlink.signing_key else NOT_SIGNING,
             tap=untapped,
             stop=Stop(playback),
@@ -147,11 +109,11 @@ def _flown(
         return Replayed(list(read_log(log)) if log else [], playback.packets, why_ended, playback.guessed)
 
 
-def _pictures_of(folder: Path, say: Say) -> Callable[[int], np.ndarray]:
+def _pictures_of(folder: Path, say: Say) -> Callable[[int], Image]:
     """Return the function that reads the frame of a number. It raises TapeEnded for one that a power cut has cost."""
     total = sum(1 for _ in (folder / FRAMES).iterdir())
 
-    def picture(number: int) -> np.ndarray:
+    def picture(number: int) -> Image:
         say(number, total)
         try:
             return read_image(frame_path(folder, number))
