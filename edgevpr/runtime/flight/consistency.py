@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgevpr.runtime.flight.navigation import Expected
+from edgevpr.core.arrays import Floats
+from edgevpr.runtime.flight.navigation import ExpectedFix
 from edgevpr.runtime.recognise.locate import in_sd
 
 # In standard deviations of both together. A right fix is farther off than the first once in 3000 times; a second right
@@ -22,13 +23,13 @@ _DRIFT_M_S = 2.5  # between two fixes that agree; more is a contradiction, and t
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Seen:
+class SeenFix:
     """A fix: `off_m` (2,) east and north from the point `path_m` (2,) of the path to it, its covariance (2, 2), the
     time of its frame, and the places that it comes from."""
 
-    off_m: np.ndarray
-    covariance_m2: np.ndarray
-    path_m: np.ndarray
+    off_m: Floats
+    covariance_m2: Floats
+    path_m: Floats
     t_s: float
     places: Collection[int]
 
@@ -47,9 +48,9 @@ class Consistency:
     is believed."""
 
     def __init__(self) -> None:
-        self._held: Seen | None = None
+        self._held: SeenFix | None = None
 
-    def weighed(self, fix: Seen, expected: Expected, has_gps: bool) -> Weighed:
+    def weighed(self, fix: SeenFix, expected: ExpectedFix, has_gps: bool) -> Weighed:
         """Weigh a fix against what was expected of it."""
         step_m = fix.off_m - expected.off_m
         if in_sd(step_m, fix.covariance_m2 + expected.covariance_m2) <= _CONTRADICTS:
@@ -59,26 +60,25 @@ class Consistency:
         if has_gps:
             self._held = None
             return Weighed(f"held back: {off_m:.0f} m from where GPS and the fixes before say that the aircraft is")
-        agrees = self._held is not None and _differ(self._held, fix) <= _AGREES
-        if agrees and _is_independent(self._held, fix):
+        if self._held is None or _differ(self._held, fix) > _AGREES:
+            self._held = fix
+        elif _is_independent(self._held, fix):
             self._held = None
             return Weighed(is_against=True)
-        if not agrees:
-            self._held = fix
         return Weighed(
             f"held back: {off_m:.0f} m from where the aircraft is by the autopilot's reckoning and the fixes before, "
             f"good to {good_to_m:.0f} m: another fix has to agree"
         )
 
 
-def _differ(one: Seen, other: Seen) -> float:
+def _differ(one: SeenFix, other: SeenFix) -> float:
     """Return by how many standard deviations two fixes disagree on where the path is wrong; infinitely where they are
     too far apart in time."""
     apart_s = abs(other.t_s - one.t_s)
     return in_sd(other.off_m - one.off_m, _of_both(one, other)) if apart_s <= _GOOD_FOR_S else math.inf
 
 
-def _is_independent(one: Seen, other: Seen) -> bool:
+def _is_independent(one: SeenFix, other: SeenFix) -> bool:
     """Tell whether a second fix is of other places, or is so far on that one which had stayed behind would no longer
     have agreed."""
     if set(one.places).isdisjoint(other.places):
@@ -86,6 +86,7 @@ def _is_independent(one: Seen, other: Seen) -> bool:
     return in_sd(other.path_m - one.path_m, _of_both(one, other)) > _CONTRADICTS
 
 
-def _of_both(one: Seen, other: Seen) -> np.ndarray:
+def _of_both(one: SeenFix, other: SeenFix) -> Floats:
     drift_m = _DRIFT_M_S * abs(other.t_s - one.t_s)
-    return one.covariance_m2 + other.covariance_m2 + drift_m**2 * np.eye(2)
+    both: Floats = one.covariance_m2 + other.covariance_m2 + drift_m**2 * np.eye(2)
+    return both

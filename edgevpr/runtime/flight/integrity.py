@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from edgevpr.core.arrays import Floats
 from edgevpr.core.geodesy import offset_m
-from edgevpr.core.types import Vehicle
-from edgevpr.runtime.flight.navigation import worst_sd
-from edgevpr.runtime.recognise.locate import in_sd, matrix_of
+from edgevpr.core.types import Receiver, Vehicle
+from edgevpr.runtime.flight.navigation import Sighting, sighting_of, worst_sd
+from edgevpr.runtime.recognise.locate import in_sd
 from edgevpr.runtime.recognise.recognition import Recognition
 
 # Standard deviations of both. What is wrong with map and receiver stays for minutes, so a second look takes nothing off
@@ -28,7 +29,7 @@ class _Against:
 
     t_s: float
     places: Collection[int]
-    off_m: np.ndarray
+    off_m: Floats
 
 
 class Integrity:
@@ -46,11 +47,11 @@ class Integrity:
     def look(self, event: Recognition) -> str | None:
         """Take in an accepted match with a position; return once, in a few words, that GPS is wrong, or right again;
         None: there is no news."""
-        vehicle = event.vehicle
-        if vehicle is None or vehicle.gps is None or not vehicle.is_fresh_at(event.frame.t_mono_s):
+        seen, vehicle = sighting_of(event), event.vehicle
+        if seen is None or vehicle is None or vehicle.gps is None or not vehicle.is_fresh_at(seen.t_s):
             self.off_m = None
             return None
-        off_m, sd_m = _beside(event, vehicle), self._sd_m(event, vehicle)
+        off_m, sd_m = _beside(seen, vehicle, vehicle.gps), self._sd_m(seen, vehicle, vehicle.gps)
         self.off_m = math.hypot(*off_m)
         if self.off_m <= _LEAST_M or in_sd(off_m, sd_m**2 * np.eye(2)) <= _CONTRADICTS:
             self._against.clear()
@@ -60,12 +61,13 @@ class Integrity:
                 return "GPS agrees with the map again"
             return None
         self._agreeing = 0
-        places = event.located.places or (event.best.place.place_id,)
-        this = _Against(event.frame.t_mono_s, places, off_m)
+        this = _Against(seen.t_s, seen.places, off_m)
         self._against = [
             each
             for each in self._against
-            if this.t_s - each.t_s <= _WITHIN_S and _are_alike(each, this, sd_m) and not set(each.places) >= set(places)
+            if this.t_s - each.t_s <= _WITHIN_S
+            and _are_alike(each, this, sd_m)
+            and not set(each.places) >= set(seen.places)
         ]
         self._against.append(this)
         if not self.is_wrong and len(self._against) >= _IN_A_ROW:
@@ -73,18 +75,19 @@ class Integrity:
             return f"GPS is {self.off_m:.0f} m from the map's position"
         return None
 
-    def _sd_m(self, event: Recognition, vehicle: Vehicle) -> float:
+    def _sd_m(self, seen: Sighting, vehicle: Vehicle, gps: Receiver) -> float:
         speed_m_s = math.hypot(*vehicle.velocity_m_s) if vehicle.velocity_m_s else 0.0
-        of_fix_m = worst_sd(matrix_of(event.located.covariance_m2))
+        of_fix_m = worst_sd(seen.covariance_m2)
         tilt_m = _ATTITUDE_SD * (vehicle.height_m or 0.0)
-        return math.hypot(of_fix_m, self._map_sd_m, vehicle.gps.sd_m, tilt_m, _TIME_SD_S * speed_m_s)
+        return math.hypot(of_fix_m, self._map_sd_m, gps.sd_m, tilt_m, _TIME_SD_S * speed_m_s)
 
 
-def _beside(event: Recognition, vehicle: Vehicle) -> np.ndarray:
+def _beside(seen: Sighting, vehicle: Vehicle, gps: Receiver) -> Floats:
     """Return the step (2,), metres, from the receiver's position at the time of the frame to the match."""
-    gps, here = vehicle.gps, event.position
+    here = seen.position
     off_m = np.array(offset_m(gps.lat_deg, gps.lon_deg, here.lat_deg, here.lon_deg))
-    return off_m - (event.frame.t_mono_s - gps.t_s) * np.array(vehicle.velocity_m_s or (0.0, 0.0))
+    flown_m: Floats = (seen.t_s - gps.t_s) * np.array(vehicle.velocity_m_s or (0.0, 0.0))
+    return off_m - flown_m
 
 
 def _are_alike(one: _Against, other: _Against, sd_m: float) -> bool:

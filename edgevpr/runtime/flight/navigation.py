@@ -5,10 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgevpr.core.geodesy import moved, offset_m
+from edgevpr.core.arrays import Floats
+from edgevpr.core.geodesy import moved
 from edgevpr.core.types import Position, Vehicle
-from edgevpr.runtime.flight.filter import INERTIAL, RECKONED, Drift, Filter
-from edgevpr.runtime.flight.path import Path, Point
+from edgevpr.runtime.flight.filter import INERTIAL, RECKONED, Drift, DriftFilter
+from edgevpr.runtime.flight.path import Path
+from edgevpr.runtime.recognise.locate import matrix_of
+from edgevpr.runtime.recognise.recognition import Recognition
 
 _GPS_EVERY_S = 1.0
 _GPS_NEW_S = 0.7  # reports come five times a second; when they stay away, the autopilot has begun to reckon
@@ -20,7 +23,7 @@ _ANY_M_S = 10.0  # of an aircraft of which only a fix is known
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Estimate:
+class Whereabouts:
     """Position and velocity (m/s, east and north) of the aircraft at `t_s`, with standard deviations of one axis along
     the worst direction."""
 
@@ -32,13 +35,14 @@ class Estimate:
 
 
 @dataclass(frozen=True, slots=True)
-class Expected:
+class ExpectedFix:
     """A fix as the navigation expects it: metres (2,) beside the path, with their covariance (2, 2), without that of
-    the fix; and the point of the path, metres (2,)."""
+    the fix; the point of the path, metres (2,); and by how many metres (2,) the fix itself lies beside that."""
 
-    off_m: np.ndarray
-    covariance_m2: np.ndarray
-    path_m: np.ndarray
+    off_m: Floats
+    covariance_m2: Floats
+    path_m: Floats
+    beside_m: Floats
 
 
 class Navigation:
@@ -48,8 +52,8 @@ class Navigation:
 
     def __init__(self, drift: Drift, map_sd_m: float) -> None:
         self._drift = drift
-        self._path, self._filter = Path(), Filter(drift, map_sd_m)
-        self._origin: Position | None = None
+        self._path: Path | None = None
+        self._filter = DriftFilter(drift, map_sd_m)
         self.has_gps, self._gps_s, self._fixed_s = False, -math.inf, -math.inf
 
     @property
@@ -64,51 +68,51 @@ class Navigation:
             return
         had_gps, self.has_gps = self.has_gps, reckons_by_gps(vehicle) and believes_gps
         if self._drift is RECKONED and vehicle.position_sd_m is None:
-            self._origin = None  # it does not know its position any more, and its velocity least of all
+            self._path = None  # it does not know its position any more, and its velocity least of all
             return
         velocity_m_s, t_s = np.array(vehicle.velocity_m_s), vehicle.t_heard_s
-        if self._origin is None or self._path.is_broken:
+        path = self._unbroken
+        if path is None:
             if vehicle.position_sd_m is not None:
                 here = Position(vehicle.lat_deg, vehicle.lon_deg)
                 self._start(here, vehicle.position_sd_m, velocity_m_s, t_s, self._drift.velocity_sd)
             return
         if self._drift is RECKONED:
-            self._filter.go_on(self._path.fly(t_s, velocity_m_s))
+            self._filter.go_on(path.fly(t_s, velocity_m_s))
         if had_gps and not self.has_gps:
             self._filter.lose_gps()
-        here = self._path.at(t_s)
-        if here is None:
+        there = path.at(t_s)
+        if there is None:
             return
         if self.has_gps and t_s - self._gps_s >= _GPS_EVERY_S:
             self._gps_s = t_s
-            off_m = self._from_origin(vehicle.lat_deg, vehicle.lon_deg) - here.at_m
+            off_m = path.from_origin(vehicle.lat_deg, vehicle.lon_deg) - there.at_m
             sd_m = _GPS_ALIKE * (vehicle.position_sd_m or _UNKNOWN_M)
-            self._filter.hear_gps(off_m, sd_m, velocity_m_s - here.velocity_m_s, _GPS_VELOCITY_SD)
+            self._filter.hear_gps(off_m, sd_m, velocity_m_s - there.velocity_m_s, _GPS_VELOCITY_SD)
 
-    def hear_acceleration(self, t_s: float, acceleration_m_s2: np.ndarray) -> None:
+    def hear_acceleration(self, t_s: float, acceleration_m_s2: Floats) -> None:
         """Take in a mean acceleration (2,) over the ground since the last one."""
-        if self._origin and self._drift is INERTIAL and not self._path.is_broken:
-            self._filter.go_on(self._path.accelerate(t_s, acceleration_m_s2))
+        if (path := self._unbroken) and self._drift is INERTIAL:
+            self._filter.go_on(path.accelerate(t_s, acceleration_m_s2))
 
-    def expected(self, t_s: float) -> Expected | None:
-        """Return what a fix of a frame taken at `t_s` is expected to say; None where nothing is known of that time."""
-        there = self._there(t_s)
-        if there is None:
+    def expected(self, position: Position, t_s: float) -> ExpectedFix | None:
+        """Return what was expected of a fix at a position, of a frame taken at `t_s`; None where nothing is known of
+        that time."""
+        path = self._unbroken
+        there = path.at(t_s) if path else None
+        if path is None or there is None:
             return None
-        off_m, covariance_m2 = self._filter.expected_fix(self._path.now.t_s - t_s)
-        return Expected(off_m, covariance_m2, there.at_m)
+        off_m, covariance_m2 = self._filter.expected_fix(path.now.t_s - t_s)
+        beside_m = path.from_origin(position.lat_deg, position.lon_deg) - there.at_m
+        return ExpectedFix(off_m, covariance_m2, there.at_m, beside_m)
 
-    def beside(self, position: Position, expected: Expected) -> np.ndarray:
-        """Return by how many metres (2,) a position lies beside the path."""
-        return self._from_origin(position.lat_deg, position.lon_deg) - expected.path_m
-
-    def hear_fix(self, off_m: np.ndarray, covariance_m2: np.ndarray, t_s: float, is_against: bool = False) -> None:
+    def hear_fix(self, off_m: Floats, covariance_m2: Floats, t_s: float, is_against: bool = False) -> None:
         """Take in a fix that lies `off_m` (2,) beside the path, of a frame taken at `t_s`, with its covariance (2, 2).
         `is_against`: it contradicts what was believed, and is believed all the same."""
-        age_s = self._path.now.t_s - t_s
-        hear = self._filter.trust_fix if is_against else self._filter.hear_fix
-        hear(off_m, covariance_m2, age_s)
-        self._fixed_s = max(self._fixed_s, t_s)
+        if self._path:
+            hear = self._filter.trust_fix if is_against else self._filter.hear_fix
+            hear(off_m, covariance_m2, self._path.now.t_s - t_s)
+            self._fixed_s = max(self._fixed_s, t_s)
 
     def begin(self, position: Position, sd_m: float, t_s: float, now_s: float) -> None:
         """Begin with a fix of a frame taken at `t_s`, where nothing was known of the position before, nor of how fast
@@ -118,17 +122,18 @@ class Navigation:
             self._start(position, sd_m, np.zeros(2), now_s, _ANY_M_S)
             self._fixed_s = t_s
 
-    def at(self, t_s: float) -> Estimate | None:
+    def at(self, t_s: float) -> Whereabouts | None:
         """Return where the aircraft is, or was, at a time; None where that is not known."""
-        there = self._there(t_s)
-        if there is None:
+        path = self._unbroken
+        there = path.at(t_s) if path else None
+        if path is None or there is None:
             return None
-        off_m, off_m_s, covariance = self._filter.errors(self._path.now.t_s - t_s)
+        off_m, off_m_s, covariance = self._filter.errors(path.now.t_s - t_s)
         at_m = there.at_m + off_m
         velocity_m_s = there.velocity_m_s + off_m_s
-        return Estimate(
+        return Whereabouts(
             t_s=t_s,
-            position=Position(*moved(self._origin.lat_deg, self._origin.lon_deg, *at_m.tolist())),
+            position=Position(*moved(path.origin.lat_deg, path.origin.lon_deg, *at_m.tolist())),
             velocity_m_s=(float(velocity_m_s[0]), float(velocity_m_s[1])),
             accuracy_m=worst_sd(covariance[:2, :2]),
             speed_accuracy_m_s=worst_sd(covariance[2:, 2:]),
@@ -140,18 +145,13 @@ class Navigation:
         _, off_m_s, _ = self._filter.errors(0.0)
         return float(off_m_s[0]), float(off_m_s[1])
 
-    def _start(
-        self, position: Position, sd_m: float, velocity_m_s: np.ndarray, t_s: float, velocity_sd_m_s: float
-    ) -> None:
-        self._origin = position
-        self._path.start(t_s, velocity_m_s)
+    def _start(self, position: Position, sd_m: float, velocity_m_s: Floats, t_s: float, velocity_sd_m_s: float) -> None:
+        self._path = Path(position, t_s, velocity_m_s)
         self._filter.start(np.zeros(2), sd_m, velocity_sd_m_s)
 
-    def _there(self, t_s: float) -> Point | None:
-        return None if self._origin is None or self._path.is_broken else self._path.at(t_s)
-
-    def _from_origin(self, lat_deg: float, lon_deg: float) -> np.ndarray:
-        return np.array(offset_m(self._origin.lat_deg, self._origin.lon_deg, lat_deg, lon_deg))
+    @property
+    def _unbroken(self) -> Path | None:
+        return self._path if self._path and not self._path.is_broken else None
 
 
 def reckons_by_gps(vehicle: Vehicle) -> bool:
@@ -159,6 +159,31 @@ def reckons_by_gps(vehicle: Vehicle) -> bool:
     return vehicle.has_gps and vehicle.gps is not None and vehicle.t_heard_s - vehicle.gps.t_s <= _GPS_NEW_S
 
 
-def worst_sd(covariance: np.ndarray) -> float:
+def worst_sd(covariance: Floats) -> float:
     """Return the standard deviation along the worst direction of a covariance (2, 2)."""
     return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sighting:
+    """An accepted match with a position: the time of its frame, where the aircraft was, the accuracy to claim, the
+    covariance (2, 2) without what all fixes of the map have in common, and the places that say so."""
+
+    t_s: float
+    position: Position
+    accuracy_m: float
+    covariance_m2: Floats
+    places: tuple[int, ...]
+
+
+def sighting_of(event: Recognition) -> Sighting | None:
+    """Return the sighting of an event, None where no match with a position was accepted."""
+    if event.frame is None or event.best is None or event.located is None or event.accuracy_m is None:
+        return None
+    return Sighting(
+        t_s=event.frame.t_mono_s,
+        position=event.located.position,
+        accuracy_m=event.accuracy_m,
+        covariance_m2=matrix_of(event.located.covariance_m2),
+        places=event.located.places or (event.best.place.place_id,),
+    )

@@ -10,18 +10,17 @@ from threading import Lock
 
 import numpy as np
 
-from edgevpr.core.geodesy import distance_m, moved
+from edgevpr.core.arrays import Floats
+from edgevpr.core.geodesy import distance_m, moved, offset_m
 from edgevpr.core.types import Vehicle
 from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.positions import MotionState
 from edgevpr.mavlink.vehicle import Attitude
-from edgevpr.runtime.flight.consistency import Consistency, Seen
+from edgevpr.runtime.flight.consistency import Consistency, SeenFix
 from edgevpr.runtime.flight.filter import INERTIAL, RECKONED
-from edgevpr.runtime.flight.navigation import Estimate, Navigation, reckons_by_gps
+from edgevpr.runtime.flight.navigation import Navigation, Sighting, Whereabouts, reckons_by_gps, sighting_of
 from edgevpr.runtime.flight.path import over_ground
-from edgevpr.runtime.flight.slew import Slew
-from edgevpr.runtime.recognise.locate import matrix_of
 from edgevpr.runtime.recognise.recognition import Recognition
 
 # What comes on top of what a fix knows of itself: the attitude is known to half a degree, and the time of a frame to
@@ -34,6 +33,7 @@ _ALT_SD_M = 3.0
 # so each says as little as one of fifty that were independent. Without this it trusted them more than its own gyros:
 # an ArduPilot copter tilted with our errors, which made our errors larger, and was lost after a minute.
 _ALIKE = math.sqrt(50)
+_FASTEST_M_S = 2.0  # of a correction: ArduPilot did not follow a jump of 25 m for 8 s
 _UNHEARD, _UNHEARD_S = "nothing is heard of the vehicle", 5.0
 _CONTINUOUS = "taken into the continuous position"
 # ArduPilot refuses a fix then, and PX4 takes it with a gain that makes its velocity jump.
@@ -104,36 +104,36 @@ class Navigator:
     def advise(self, event: Recognition, now_s: float) -> Advice:
         """Take in an accepted match with a position, and say what is to be sent for it. Raises ValueError for a
         position off the Earth."""
+        seen = sighting_of(event)
+        if seen is None:
+            return Advice(None, "the place has no position")
         if event.view.reason:
             return Advice(None, f"not sent: {event.view.reason}, so it does not show what is under the aircraft")
-        here = event.position
-        fix = Fix(here.lat_deg, here.lon_deg, event.accuracy_m, event.frame.t_mono_s)
+        fix = Fix(seen.position.lat_deg, seen.position.lon_deg, seen.accuracy_m, seen.t_s)
         with self._lock:
             vehicle = self._vehicle
             if vehicle is None or not vehicle.is_fresh_at(now_s):
                 return self._unheard(fix, now_s)
             if vehicle.velocity_m_s is None:
                 return Advice(None, _UNHEARD) if self._channel.is_continuous else Advice(fix)
-            covariance_m2 = _covariance(event, event.vehicle or vehicle)
-            t_s = event.frame.t_mono_s
-            expected = self._navigation.expected(t_s)
+            covariance_m2 = _covariance(seen, event.vehicle or vehicle)
+            expected = self._navigation.expected(seen.position, seen.t_s)
             if expected is None:
                 sd_m = math.sqrt(np.linalg.eigvalsh(covariance_m2)[-1])
-                self._navigation.begin(here, sd_m, t_s, vehicle.t_heard_s)
+                self._navigation.begin(seen.position, sd_m, seen.t_s, vehicle.t_heard_s)
                 return Advice(None, _CONTINUOUS) if self._channel.is_continuous else Advice(fix)
-            off_m = self._navigation.beside(here, expected)
-            seen = Seen(
-                off_m=off_m,
+            seen_fix = SeenFix(
+                off_m=expected.beside_m,
                 covariance_m2=covariance_m2,
                 path_m=expected.path_m,
-                t_s=t_s,
-                places=event.located.places or (event.best.place.place_id,),
+                t_s=seen.t_s,
+                places=seen.places,
             )
-            verdict = self._consistency.weighed(seen, expected, self.has_gps)
+            verdict = self._consistency.weighed(seen_fix, expected, self.has_gps)
             if verdict.objection:
                 return Advice(None, verdict.objection, is_held=True)
-            self._navigation.hear_fix(off_m, covariance_m2, t_s, verdict.is_against)
-            return self._improved(vehicle, now_s)
+            self._navigation.hear_fix(expected.beside_m, covariance_m2, seen.t_s, verdict.is_against)
+            return self._improved(vehicle, vehicle.velocity_m_s, now_s)
 
     def knows_position(self, now_s: float) -> bool:
         """Tell whether the position is known well enough to be sent as a continuous one."""
@@ -144,7 +144,7 @@ class Navigator:
         """Return how well the position is known, the standard deviation of one axis; None: it is not known."""
         with self._lock:
             estimate = self._navigation.at(now_s)
-            return estimate and self._claimed_m(estimate)
+            return None if estimate is None else self._claimed_m(estimate)
 
     def state_at(self, t_s: float) -> MotionState | None:
         """Return where the vehicle is or was, later than at the last call, to be sent as a continuous position; None:
@@ -166,12 +166,7 @@ class Navigator:
                 accuracy_m=_ALIKE * math.hypot(self._claimed_m(estimate), behind_m),
                 alt_accuracy_m=_ALT_SD_M,
                 speed_accuracy_m_s=_ALIKE * estimate.speed_accuracy_m_s,
-                attitude=attitude
-                and (
-                    math.radians(attitude.roll_deg),
-                    math.radians(attitude.pitch_deg),
-                    math.radians(attitude.yaw_deg),
-                ),
+                attitude=None if attitude is None else _in_radians(attitude),
             )
 
     def _unheard(self, fix: Fix, now_s: float) -> Advice:
@@ -182,23 +177,25 @@ class Navigator:
         since_s = max(self._appeared_s, self._vehicle.t_heard_s if self._vehicle else -math.inf)
         return Advice(fix) if now_s - since_s > _UNHEARD_S else Advice(None, f"not sent yet: {_UNHEARD}")
 
-    def _known(self, t_s: float) -> Estimate | None:
+    def _known(self, t_s: float) -> Whereabouts | None:
         estimate = self._navigation.at(t_s)
         if estimate is None or t_s - self._navigation.fixed_s > _LOST_S or estimate.accuracy_m > _LOST_M:
             return None
         return estimate
 
-    def _improved(self, vehicle: Vehicle, now_s: float) -> Advice:
+    def _improved(self, vehicle: Vehicle, velocity_m_s: tuple[float, float], now_s: float) -> Advice:
         """Say what is to be sent so that the autopilot is better off, if it can be."""
         if self._channel.is_continuous:
             return Advice(None, _CONTINUOUS)
         if reckons_by_gps(vehicle):
             return Advice(None, _HAS_GPS if self._believes_gps else _HAS_WRONG_GPS)
         estimate = self._navigation.at(now_s)
+        if estimate is None:
+            return Advice(None, _UNHEARD)
         here, claimed_m = estimate.position, self._claimed_m(estimate)
         if self._channel is Channel.SENSOR:  # PX4 fuses it, and gives its position up where none comes for some seconds
             return Advice(Fix(here.lat_deg, here.lon_deg, claimed_m, now_s))
-        east_m_s, north_m_s = vehicle.velocity_m_s
+        east_m_s, north_m_s = velocity_m_s
         since_s = now_s - vehicle.t_heard_s
         there = moved(vehicle.lat_deg, vehicle.lon_deg, since_s * east_m_s, since_s * north_m_s)
         off_m = float(distance_m(*there, here.lat_deg, here.lon_deg))
@@ -214,9 +211,38 @@ class Navigator:
         at = moved(here.lat_deg, here.lon_deg, *ahead_m)
         return Advice(Fix(*at, math.hypot(claimed_m, math.hypot(*ahead_m) / math.sqrt(2)), now_s))
 
-    def _claimed_m(self, estimate: Estimate) -> float:
+    def _claimed_m(self, estimate: Whereabouts) -> float:
         """Return the accuracy that is claimed for an estimate: never better than what all fixes have in common."""
         return max(self._map_sd_m, estimate.accuracy_m)
+
+
+class Slew:
+    """A position that never jumps, since autopilots follow no jump: it follows estimates at their own velocity, and
+    catches up with them at 2 m/s at most."""
+
+    def __init__(self) -> None:
+        self._said: Whereabouts | None = None
+        self._at = 0.0, 0.0
+
+    def forget(self) -> None:
+        """Begin anew with the next estimate."""
+        self._said = None
+
+    def followed(self, estimate: Whereabouts) -> tuple[float, float, float]:
+        """Return latitude and longitude that follow an estimate, later than the one before, and by how many metres they
+        lie behind it."""
+        here = estimate.position
+        if self._said is None:
+            self._said, self._at = estimate, (here.lat_deg, here.lon_deg)
+            return *self._at, 0.0
+        step_s = max(0.0, estimate.t_s - self._said.t_s)
+        east_m_s, north_m_s = estimate.velocity_m_s
+        carried = moved(*self._at, step_s * east_m_s, step_s * north_m_s)
+        east_m, north_m = offset_m(*carried, here.lat_deg, here.lon_deg)
+        behind_m = math.hypot(east_m, north_m)
+        part = min(1.0, _FASTEST_M_S * step_s / behind_m) if behind_m > 0 else 1.0
+        self._said, self._at = estimate, moved(*carried, part * float(east_m), part * float(north_m))
+        return *self._at, (1 - part) * behind_m
 
 
 class Muted:
@@ -230,10 +256,14 @@ class Muted:
         return None
 
 
-def _covariance(event: Recognition, vehicle: Vehicle) -> np.ndarray:
+def _in_radians(attitude: Attitude) -> tuple[float, float, float]:
+    return math.radians(attitude.roll_deg), math.radians(attitude.pitch_deg), math.radians(attitude.yaw_deg)
+
+
+def _covariance(seen: Sighting, vehicle: Vehicle) -> Floats:
     """Return the covariance (2, 2) of a fix, without what all fixes of the map have in common."""
-    speed_m_s = math.hypot(*vehicle.velocity_m_s)
+    speed_m_s = math.hypot(*(vehicle.velocity_m_s or (0.0, 0.0)))
     height_m = vehicle.height_m or 0.0
     tilt_sd = _ATTITUDE_SD if vehicle.roll_deg is not None else _UNTOLD_ATTITUDE_SD
     more_m2 = (tilt_sd * height_m) ** 2 + (_TIME_SD_S * speed_m_s) ** 2
-    return matrix_of(event.located.covariance_m2) + more_m2 * np.eye(2)
+    return seen.covariance_m2 + more_m2 * np.eye(2)

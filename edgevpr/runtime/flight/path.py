@@ -10,6 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from edgevpr.core.arrays import Floats
+from edgevpr.core.geodesy import offset_m
+from edgevpr.core.types import Position
+
 KEPT_S = 6.0  # a frame is at most 5 s old when it is recognised
 _LONGEST_STEP_S = 1.0  # after a longer silence nobody knows the way that was flown
 
@@ -19,27 +23,28 @@ class Point:
     """A point of a path: time in seconds, metres and m/s, each (2,) east and north."""
 
     t_s: float
-    at_m: np.ndarray
-    velocity_m_s: np.ndarray
+    at_m: Floats
+    velocity_m_s: Floats
 
 
 class Path:
-    """The points of the last seconds; the last one is `now`. `is_broken` tells that there was a silence in it, until
-    `start`."""
+    """The points of the last seconds of a way that began at `origin`, at a velocity (2,); the last one is `now`.
+    `is_broken` tells that there was a silence in it."""
 
-    def __init__(self) -> None:
-        self._points: list[Point] = []
-        self.is_broken = False
+    def __init__(self, origin: Position, t_s: float, velocity_m_s: Floats) -> None:
+        self.origin, self.is_broken = origin, False
+        self._points = [Point(t_s, np.zeros(2), np.asarray(velocity_m_s, float))]
 
     @property
-    def now(self) -> Point | None:
-        return self._points[-1] if self._points else None
+    def now(self) -> Point:
+        """The newest point."""
+        return self._points[-1]
 
-    def start(self, t_s: float, velocity_m_s: np.ndarray) -> None:
-        """Begin a new path, at a velocity (2,)."""
-        self._points, self.is_broken = [Point(t_s, np.zeros(2), np.asarray(velocity_m_s, float))], False
+    def from_origin(self, lat_deg: float, lon_deg: float) -> Floats:
+        """Return the metres (2,) from the origin to a place on the Earth."""
+        return np.array(offset_m(self.origin.lat_deg, self.origin.lon_deg, lat_deg, lon_deg))
 
-    def fly(self, t_s: float, velocity_m_s: np.ndarray) -> float:
+    def fly(self, t_s: float, velocity_m_s: Floats) -> float:
         """Go on to a time at which the velocity (2,) is this one, and return the seconds that it took; 0 for a time
         that is not later."""
         last = self._points[-1]
@@ -54,7 +59,7 @@ class Path:
             del self._points[: bisect_left(self._points, t_s - KEPT_S, key=_time)]
         return step_s
 
-    def accelerate(self, t_s: float, acceleration_m_s2: np.ndarray) -> float:
+    def accelerate(self, t_s: float, acceleration_m_s2: Floats) -> float:
         """Go on to a time with a mean acceleration (2,) over the ground, and return the seconds that it took."""
         last = self._points[-1]
         return self.fly(t_s, last.velocity_m_s + max(0.0, t_s - last.t_s) * np.asarray(acceleration_m_s2, float))
@@ -62,7 +67,7 @@ class Path:
     def at(self, t_s: float) -> Point | None:
         """Return the point at a time; beyond the end the last velocity goes on. None before the first that is kept, and
         more than a second beyond the last."""
-        if not self._points or not self._points[0].t_s <= t_s <= self._points[-1].t_s + _LONGEST_STEP_S:
+        if not self._points[0].t_s <= t_s <= self._points[-1].t_s + _LONGEST_STEP_S:
             return None
         after = bisect_left(self._points, t_s, key=_time)
         if after == len(self._points):
@@ -78,9 +83,7 @@ class Path:
         return Point(t_s, at_m, velocity_m_s)
 
 
-def over_ground(
-    force_m_s2: tuple[float, float, float], roll_deg: float, pitch_deg: float, yaw_deg: float
-) -> np.ndarray:
+def over_ground(force_m_s2: tuple[float, float, float], roll_deg: float, pitch_deg: float, yaw_deg: float) -> Floats:
     """Return the acceleration over the ground (2,), east and north, from what accelerometers feel (nose, right, down)
     at an attitude: gravity has no part in it."""
     roll, pitch, yaw = map(math.radians, (roll_deg, pitch_deg, yaw_deg))

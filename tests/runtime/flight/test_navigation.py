@@ -10,7 +10,7 @@ from edgevpr.core.geodesy import distance_m, moved, offset_m
 from edgevpr.core.types import Position
 from edgevpr.runtime.flight.filter import INERTIAL, RECKONED
 from edgevpr.runtime.flight.navigation import Navigation
-from edgevpr.runtime.flight.slew import Slew
+from edgevpr.runtime.flight.navigator import Slew
 
 HOME = 47.0, 8.0
 STEP_S = 0.02
@@ -65,9 +65,8 @@ class Flown:
     def fix(self, off_m=(0.0, 0.0), is_against=False):
         t_s = (self.step - self.late_steps) * STEP_S
         seen = self.way[self.step - self.late_steps] + self.map_off + self.rng.normal(0, self.fix_sd_m, 2) + off_m
-        expected = self.navigation.expected(t_s)
-        off = self.navigation.beside(Position(*moved(*HOME, *seen)), expected)
-        self.navigation.hear_fix(off, self.fix_sd_m**2 * np.eye(2), t_s, is_against)
+        expected = self.navigation.expected(Position(*moved(*HOME, *seen)), t_s)
+        self.navigation.hear_fix(expected.beside_m, self.fix_sd_m**2 * np.eye(2), t_s, is_against)
 
 
 def lengths(errors_m):
@@ -129,7 +128,7 @@ def test_a_silence_ends_what_is_known_until_the_vehicle_is_heard_with_a_position
     for _ in range(2):
         flown.navigation.hear_vehicle(vehicle_at(*HOME, flown.t_s, velocity_m_s=(0.0, 0.0), position_sd_m=None))
         assert flown.navigation.at(flown.t_s) is None
-        assert flown.navigation.expected(flown.t_s) is None
+        assert flown.navigation.expected(Position(*HOME), flown.t_s) is None
     flown.navigation.hear_vehicle(vehicle_at(*HOME, flown.t_s, velocity_m_s=(0.0, 0.0), position_sd_m=30.0))
     assert flown.navigation.at(flown.t_s).accuracy_m == pytest.approx(30.0)
 

@@ -5,7 +5,10 @@ import math
 import numpy as np
 import pytest
 
+from edgevpr.core.types import Position
 from edgevpr.runtime.flight.path import KEPT_S, Path, over_ground
+
+HOME = Position(47.0, 8.0)
 
 
 def circled(t_s):
@@ -15,8 +18,7 @@ def circled(t_s):
 
 
 def test_velocities_add_up_to_the_way_that_was_flown():
-    path = Path()
-    path.start(0.0, circled(0.0)[1])
+    path = Path(HOME, 0.0, circled(0.0)[1])
     for step in range(1, 301):
         assert path.fly(step / 10, circled(step / 10)[1]) == pytest.approx(0.1)
     at_m, velocity_m_s = circled(30.0)
@@ -28,8 +30,7 @@ def test_velocities_add_up_to_the_way_that_was_flown():
 
 
 def test_accelerations_add_up_to_velocity_and_way():
-    path = Path()
-    path.start(0.0, (3.0, 0.0))
+    path = Path(HOME, 0.0, (3.0, 0.0))
     for step in range(1, 101):
         path.accelerate(step / 50, (0.0, 2.0))
     assert np.allclose(path.now.velocity_m_s, (3.0, 4.0))
@@ -37,9 +38,7 @@ def test_accelerations_add_up_to_velocity_and_way():
 
 
 def test_only_the_last_seconds_are_kept_and_beyond_the_end_the_velocity_goes_on():
-    path = Path()
-    assert path.at(0.0) is None
-    path.start(0.0, (1.0, 0.0))
+    path = Path(HOME, 0.0, (1.0, 0.0))
     for step in range(1, 2001):
         path.fly(step / 10, (1.0, 0.0))
     assert path.at(200.0 - 2 * KEPT_S - 0.2) is None
@@ -48,16 +47,13 @@ def test_only_the_last_seconds_are_kept_and_beyond_the_end_the_velocity_goes_on(
     assert path.at(201.1) is None
 
 
-def test_a_silence_breaks_a_path_until_it_is_started_again():
-    path = Path()
-    path.start(0.0, (1.0, 0.0))
+def test_a_silence_breaks_a_path():
+    path = Path(HOME, 0.0, (1.0, 0.0))
     path.fly(0.9, (1.0, 0.0))
     assert not path.is_broken
     assert path.fly(0.9, (1.0, 0.0)) == path.fly(0.5, (1.0, 0.0)) == 0.0, "no time has passed"
     path.fly(2.5, (1.0, 0.0))
     assert path.is_broken
-    path.start(3.0, (1.0, 0.0))
-    assert not path.is_broken
 
 
 @pytest.mark.parametrize("yaw_deg", [0.0, 77.0, -160.0])
