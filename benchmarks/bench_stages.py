@@ -21,7 +21,7 @@ from big_map import make_big_map
 
 from edgevpr.core.contract import Technique
 from edgevpr.core.types import Position
-from edgevpr.lab.simulate.scene import make_scene
+from edgevpr.lab.simulate.landscape import make_scene
 from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import NOTHING, Expectation, Query, compare, scan

@@ -16,7 +16,7 @@ from from_orthophoto import Ground, ground_of, laid, mosaic_of, write_tif
 
 from edgevpr.core.geodesy import moved, offset_m
 from edgevpr.core.types import Position
-from edgevpr.lab.simulate.camera import Camera, Light, Pose
+from edgevpr.lab.simulate.camera import Camera, CameraPose, Light
 from edgevpr.lab.simulate.rehearsal import seen_from
 from edgevpr.mapmaking.orthophoto import Orthophoto
 
@@ -127,7 +127,7 @@ def _rows(of: Path, folder: Path) -> Site:
         for east in east_m if lane % 2 == 0 else east_m[::-1]:
             at = Position(*moved(photo.middle.lat_deg, photo.middle.lon_deg, float(east), float(north_m)))
             up_deg = 90.0 if lane % 2 == 0 else 270.0
-            pose = Pose(east_m=0, north_m=0, height_m=_height_m(_ROWS_FOOTPRINT_M), heading_deg=up_deg)
+            pose = CameraPose(east_m=0, north_m=0, height_m=_height_m(_ROWS_FOOTPRINT_M), heading_deg=up_deg)
             image = seen_from(photo, at, pose, camera, light, rng)
             if image is not None:
                 file = f"{len(positions):04d}.jpg"

@@ -12,8 +12,8 @@ from flight_sites import Site
 
 from edgevpr.core.geodesy import moved
 from edgevpr.core.types import Vehicle
-from edgevpr.lab.simulate.camera import Camera, Light, Pose
-from edgevpr.lab.simulate.flight import wander
+from edgevpr.lab.simulate.camera import Camera, CameraPose, Light
+from edgevpr.lab.simulate.generated import wander
 from edgevpr.lab.simulate.rehearsal import seen_from
 from edgevpr.mapmaking.orthophoto import Orthophoto
 
@@ -220,7 +220,7 @@ def photographs(
     quality = (cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(70, 95)))
     roll, pitch = (_SWAY_DEG * wander(rng, len(track.at)) for _ in range(2))
     for number, name in enumerate(track.over):
-        pose = Pose(
+        pose = CameraPose(
             east_m=0.0,
             north_m=0.0,
             height_m=float(track.footprints_m[number]) * camera.focal_px / camera.width,

@@ -14,9 +14,9 @@ import numpy as np
 
 from edgevpr.core.types import Frame
 from edgevpr.frames.images import list_images, read_image
-from edgevpr.lab.simulate.camera import Camera, Light, Pose, lit, photograph
-from edgevpr.lab.simulate.flight import SCENE_DEPTH_M, SCENE_WIDTH_M
-from edgevpr.lab.simulate.scene import make_scene
+from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, lit, photograph
+from edgevpr.lab.simulate.generated import SCENE_DEPTH_M, SCENE_WIDTH_M
+from edgevpr.lab.simulate.landscape import make_scene
 
 MIRRORED, GENERATED, OTHER_SET = "mirrored", "generated", "other set"  # how names begin
 # Neither is the ground of a site that is asked for. grief_stromovka_monthly is: it is the park of the seasons.
@@ -70,7 +70,7 @@ def _landscape(seed: int) -> Iterator[Frame]:
     for north_m in np.linspace(_MARGIN_M, SCENE_DEPTH_M - _MARGIN_M, _NORTH):
         for east_m in np.linspace(_MARGIN_M, SCENE_WIDTH_M - _MARGIN_M, _EAST):
             height_m, heading_deg = rng.uniform((50, 0), (80, 360))
-            pose = Pose(east_m=east_m, north_m=north_m, height_m=height_m, heading_deg=heading_deg)
+            pose = CameraPose(east_m=east_m, north_m=north_m, height_m=height_m, heading_deg=heading_deg)
             image = photograph(ground, scene.metres_per_pixel, pose, Camera(), light, rng)
             yield _frame(image, f"{GENERATED}/{seed}/{north_m:.0f}/{east_m:.0f}")
 

@@ -22,8 +22,8 @@ from edgevpr.cli.main import main
 from edgevpr.core.types import Position
 from edgevpr.lab.simulate import camera as simulated
 from edgevpr.lab.simulate.autopilot import ReceivedFix, run_autopilot
-from edgevpr.lab.simulate.flight import Flight, to_metres, to_position, write_flight
-from edgevpr.lab.simulate.scene import make_scene
+from edgevpr.lab.simulate.generated import GeneratedFlight, to_metres, to_position, write_flight
+from edgevpr.lab.simulate.landscape import make_scene
 from edgevpr.runtime.flight.flightlog import read_log
 
 RATE_HZ = 40.0
@@ -81,7 +81,7 @@ def _land(folder: Path, count: int, seed: int) -> tuple[Film, Path]:
     """Make a landscape; return what a later flight over it films, and the map of an earlier one at another hour."""
     scene = make_scene(seed, 2 * _BEGIN_EAST_M + count * _STEP_M, _DEPTH_M, _METRES_PER_PIXEL)
     rng = np.random.default_rng((seed, 1))
-    earlier = Flight(
+    earlier = GeneratedFlight(
         poses=tuple(_mapped_from(number, rng) for number in range(0, count, _PICTURES_A_PLACE)),
         light=simulated.Light(sun_azimuth_deg=48, sun_elevation_deg=52, exposure=1.12),
         camera=_LENS,
@@ -109,12 +109,12 @@ def place_of(number: float) -> Position:
     return to_position(_pose(number))
 
 
-def _pose(number: float) -> simulated.Pose:
+def _pose(number: float) -> simulated.CameraPose:
     east_m = _BEGIN_EAST_M + number * _STEP_M
-    return simulated.Pose(east_m=east_m, north_m=_LINE_NORTH_M, height_m=_HEIGHT_M, heading_deg=90.0)
+    return simulated.CameraPose(east_m=east_m, north_m=_LINE_NORTH_M, height_m=_HEIGHT_M, heading_deg=90.0)
 
 
-def _mapped_from(number: int, rng: np.random.Generator) -> simulated.Pose:
+def _mapped_from(number: int, rng: np.random.Generator) -> simulated.CameraPose:
     north_m, height_m, heading_deg = rng.normal(0, (1.0, 1.0, 1.0))
     exact = _pose(number)
     return replace(

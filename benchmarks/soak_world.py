@@ -20,11 +20,18 @@ import numpy as np
 from rtsp_camera import RtspCamera, free_port
 
 from edgevpr.lab.simulate.autopilot import serve
-from edgevpr.lab.simulate.camera import Pose, lit, photograph
+from edgevpr.lab.simulate.camera import CameraPose, lit, photograph
 from edgevpr.lab.simulate.controller import FlightController
-from edgevpr.lab.simulate.flight import SCENE_DEPTH_M, SCENE_WIDTH_M, Flight, later_flight, mapping_flight, write_flight
+from edgevpr.lab.simulate.generated import (
+    SCENE_DEPTH_M,
+    SCENE_WIDTH_M,
+    GeneratedFlight,
+    later_flight,
+    mapping_flight,
+    write_flight,
+)
+from edgevpr.lab.simulate.landscape import Scene, make_scene
 from edgevpr.lab.simulate.motion import AlongTrack, FlownTrack, TrueState, read_track, truth_at
-from edgevpr.lab.simulate.scene import Scene, make_scene
 
 SEED = 1
 PICTURES_HZ = 8
@@ -59,14 +66,16 @@ def make_world(folder: Path, radius_m: float) -> World:
     return World(places=places, lap=lap / "positions.csv", lap_s=lap_s, film=film)
 
 
-def _poses(radius_m: float, count: int) -> Iterator[Pose]:
+def _poses(radius_m: float, count: int) -> Iterator[CameraPose]:
     for turn in 2 * np.pi * np.arange(count) / count:
         east_m, north_m = _CENTRE_M + radius_m * np.array([np.sin(turn), np.cos(turn)])
         heading_deg = float(np.degrees(turn)) + 90.0
-        yield Pose(east_m=float(east_m), north_m=float(north_m), height_m=_HEIGHT_M, heading_deg=heading_deg % 360)
+        yield CameraPose(
+            east_m=float(east_m), north_m=float(north_m), height_m=_HEIGHT_M, heading_deg=heading_deg % 360
+        )
 
 
-def _shoot(film: Path, scene: Scene, flight: Flight) -> None:
+def _shoot(film: Path, scene: Scene, flight: GeneratedFlight) -> None:
     ground, rng, camera = lit(scene, flight.light, flight.seed), np.random.default_rng(SEED), flight.camera
     picture = ["-f", "rawvideo", "-pix_fmt", "bgr24", "-s", f"{camera.width}x{camera.height}", "-r", f"{PICTURES_HZ}"]
     codec = ["-c:v", "libx264", "-preset", "ultrafast", "-tune", "zerolatency", "-pix_fmt", "yuv420p", "-g", "16"]

@@ -28,7 +28,7 @@ from edgevpr.core.geodesy import moved, offset_m
 from edgevpr.core.types import Place
 from edgevpr.frames.images import read_image
 from edgevpr.frames.positions import read_positions
-from edgevpr.lab.simulate.flight import fly_and_write
+from edgevpr.lab.simulate.generated import fly_and_write
 from edgevpr.mapmaking.graph import Solved, Ties, solve
 from edgevpr.places.mapfile import PlaceMap
 

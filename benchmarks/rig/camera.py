@@ -18,7 +18,7 @@ import ground
 import numpy as np
 from truth import Truth
 
-from edgevpr.lab.simulate.camera import Pose
+from edgevpr.lab.simulate.camera import CameraPose
 
 PICTURES_HZ = 5.0
 _LEAD_S = 0.08  # rendering takes 20 to 60 ms
@@ -94,7 +94,7 @@ class Camera:
         with self._changed:
             self._changed.notify_all()
 
-    def _rendered(self, pose: Pose) -> bytes:
+    def _rendered(self, pose: CameraPose) -> bytes:
         pose = replace(pose, height_m=max(pose.height_m, 1.0))
         if self._is_level:
             pose = replace(pose, roll_deg=0.0, pitch_deg=0.0)

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from edgevpr.lab.simulate.camera import Camera, Pose, ground_to_pixel
-from edgevpr.lab.simulate.flight import to_metres
+from edgevpr.lab.simulate.camera import Camera, CameraPose, ground_to_pixel
+from edgevpr.lab.simulate.generated import to_metres
 from edgevpr.runtime.flight.flightlog import read_log
 
 ROLL_DEG = ((0, 6), (6, 20), (20, 90))
@@ -205,7 +205,7 @@ def _learnt(folder: Path, log: list[Row], loss_s: float) -> Row | None:
 def _looked_at(picture: np.void) -> np.ndarray:
     """Return the point of the ground, east and north, in the middle of a picture."""
     camera = Camera()
-    pose = Pose(**{name: float(picture[name]) for name in _POSE})
+    pose = CameraPose(**{name: float(picture[name]) for name in _POSE})
     middle = (camera.width - 1) / 2, (camera.height - 1) / 2, 1.0
     east, north, scale = np.linalg.solve(ground_to_pixel(pose, camera), middle)
     return np.array((east, north)) / scale

@@ -9,9 +9,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from edgevpr.lab.simulate.camera import Camera, Light, Pose, lit, photograph
-from edgevpr.lab.simulate.flight import ORIGIN, to_position
-from edgevpr.lab.simulate.scene import make_scene
+from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, lit, photograph
+from edgevpr.lab.simulate.generated import ORIGIN, to_position
+from edgevpr.lab.simulate.landscape import make_scene
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 WIDTH_M, DEPTH_M, METRES_PER_PIXEL, SEED = 1400.0, 1000.0, 0.2, 16
@@ -41,7 +41,7 @@ def lit_ground(work: Path, day: str) -> np.ndarray:
     return np.load(files[day], mmap_mode="r")
 
 
-def picture(ground: np.ndarray, pose: Pose, day: str, rng: np.random.Generator) -> bytes:
+def picture(ground: np.ndarray, pose: CameraPose, day: str, rng: np.random.Generator) -> bytes:
     """Take a picture with the camera of that day, as a JPEG."""
     camera = CAMERAS[day]
     frame = photograph(ground, METRES_PER_PIXEL, pose, camera, LIGHTS[day], rng)
@@ -84,7 +84,7 @@ def place_map(work: Path) -> Path:
     return path
 
 
-def _mapping_poses(rng: np.random.Generator) -> list[Pose]:
+def _mapping_poses(rng: np.random.Generator) -> list[CameraPose]:
     """Plan legs to the east and back, a picture every SPACING_M, over all of the ground."""
     east_m = np.arange(EDGE_M, WIDTH_M - EDGE_M + 1, SPACING_M)
     poses = []
@@ -92,7 +92,7 @@ def _mapping_poses(rng: np.random.Generator) -> list[Pose]:
         for east in east_m if leg % 2 == 0 else east_m[::-1]:
             off_east_m, off_north_m, off_height_m, off_deg = rng.normal(0, (1.0, 1.0, 0.7, 1.0))
             poses.append(
-                Pose(
+                CameraPose(
                     east_m=float(east + off_east_m),
                     north_m=float(north_m + off_north_m),
                     height_m=float(MAPPED_FROM_M + off_height_m),

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from truth import Truth
 
-from edgevpr.lab.simulate.flight import to_metres
+from edgevpr.lab.simulate.generated import to_metres
 from edgevpr.mavlink.wire import Message
 
 COLUMNS = (

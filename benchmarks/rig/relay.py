@@ -8,7 +8,7 @@ from pathlib import Path
 
 from truth import Truth
 
-from edgevpr.lab.simulate.flight import to_metres
+from edgevpr.lab.simulate.generated import to_metres
 from edgevpr.mavlink.wire import Message, PacketReader, mavlink
 
 COLUMNS = ("t_s", "kind", "age_s", "east_m", "north_m", "accuracy_m", "true_east_m", "true_north_m")

@@ -15,8 +15,8 @@ from pathlib import Path
 from ground import GROUND_ALT_M
 from link import STREAMS_HZ, Link, Listener
 
-from edgevpr.lab.simulate.camera import Pose
-from edgevpr.lab.simulate.flight import to_position
+from edgevpr.lab.simulate.camera import CameraPose
+from edgevpr.lab.simulate.generated import to_position
 from edgevpr.mavlink.wire import Message, mavlink
 
 VARIABLE = "EDGEVPR_ARDUPILOT"
@@ -48,7 +48,7 @@ def tree() -> Path | None:
 
 def at_degrees(east_m: float, north_m: float) -> tuple[float, float]:
     """Return latitude and longitude of a point of the ground."""
-    where = to_position(Pose(east_m=east_m, north_m=north_m, height_m=0.0, heading_deg=0.0))
+    where = to_position(CameraPose(east_m=east_m, north_m=north_m, height_m=0.0, heading_deg=0.0))
     return where.lat_deg, where.lon_deg
 
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from ground import GROUND_ALT_M
 
-from edgevpr.lab.simulate.camera import Pose
-from edgevpr.lab.simulate.flight import to_metres
+from edgevpr.lab.simulate.camera import CameraPose
+from edgevpr.lab.simulate.generated import to_metres
 from edgevpr.mavlink.wire import Message
 
 _KEPT = 240  # states, six seconds: a fix is 5 s old at the most
@@ -25,11 +25,11 @@ class State:
     angles: np.ndarray  # roll, pitch, yaw
     rates: np.ndarray
 
-    def after(self, seconds: float) -> Pose:
+    def after(self, seconds: float) -> CameraPose:
         """Return the pose so many seconds later, with steady rates."""
         east_m, north_m, up_m = self.place_m + self.velocity_m_s * seconds
         roll_deg, pitch_deg, yaw_deg = np.degrees(self.angles + self.rates * seconds)
-        return Pose(
+        return CameraPose(
             east_m=float(east_m),
             north_m=float(north_m),
             height_m=float(up_m),
@@ -52,7 +52,7 @@ class Truth:
             with self._lock:
                 self._states.append((now_s, _state(message)))
 
-    def at(self, t_mono_s: float) -> Pose | None:
+    def at(self, t_mono_s: float) -> CameraPose | None:
         """Return the true pose at a time; None where nothing is known of it."""
         with self._lock:
             before = next((each for each in reversed(self._states) if each[0] <= t_mono_s), None)

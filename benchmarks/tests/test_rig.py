@@ -10,8 +10,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from edgevpr.lab.simulate.camera import Pose
-from edgevpr.lab.simulate.flight import ORIGIN, to_metres, to_position
+from edgevpr.lab.simulate.camera import CameraPose
+from edgevpr.lab.simulate.generated import ORIGIN, to_metres, to_position
 
 RIG = Path(__file__).parents[1] / "rig"
 
@@ -31,7 +31,7 @@ def rig(monkeypatch) -> SimpleNamespace:
 
 
 def degrees(east_m: float, north_m: float) -> tuple[float, float]:
-    at = to_position(Pose(east_m=east_m, north_m=north_m, height_m=0.0, heading_deg=0.0))
+    at = to_position(CameraPose(east_m=east_m, north_m=north_m, height_m=0.0, heading_deg=0.0))
     return at.lat_deg, at.lon_deg
 
 

@@ -80,7 +80,7 @@ def simulate_flight(args: Namespace) -> int:
     if args.orthophoto is None:
         if said := [name for name in ("track", "light", *_NUMBERS) if getattr(args, name) is not None]:
             raise UsageError(f"--{said[0].replace('_', '-')} goes with --orthophoto: leave it out.")
-        from edgevpr.lab.simulate.flight import fly_and_write
+        from edgevpr.lab.simulate.generated import fly_and_write
 
         print(fly_and_write(Path(args.out), args.which or "map", args.seed))
         return 0
@@ -102,8 +102,7 @@ _NUMBERS = {
 
 def _fly_over(args: Namespace) -> str:
     from edgevpr.core.text import progress
-    from edgevpr.lab.simulate.rehearsal import WEATHERS, none_written, write_rehearsal
-    from edgevpr.lab.simulate.track import read_shots
+    from edgevpr.lab.simulate.rehearsal import WEATHERS, none_written, read_shots, write_rehearsal
     from edgevpr.mapmaking.orthophoto import Orthophoto  # loads GDAL, or says that it is missing
 
     numbers = {}

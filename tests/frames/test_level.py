@@ -9,8 +9,7 @@ import pytest
 
 from edgevpr.core.types import Frame, Pose, Vehicle
 from edgevpr.frames.level import Lens, View, levelled
-from edgevpr.lab.simulate.camera import Camera, Light, photograph
-from edgevpr.lab.simulate.camera import Pose as CameraPose
+from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, photograph
 
 CAMERA = Camera(noise_sigma=0)
 LENS = Lens(2 * math.degrees(math.atan(320 / CAMERA.focal_px)))

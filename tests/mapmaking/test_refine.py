@@ -14,8 +14,8 @@ from edgevpr.cli.main import main
 from edgevpr.core.geodesy import distance_m, metres, moved
 from edgevpr.core.types import Frame, Position
 from edgevpr.lab.simulate.camera import Camera, lit, photograph
-from edgevpr.lab.simulate.flight import mapping_flight, to_position
-from edgevpr.lab.simulate.scene import make_scene
+from edgevpr.lab.simulate.generated import mapping_flight, to_position
+from edgevpr.lab.simulate.landscape import make_scene
 from edgevpr.mapmaking.refine import refine
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapinfo import info_of

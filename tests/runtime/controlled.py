@@ -15,7 +15,7 @@ from edgevpr.core.config import SourceSetsConfig, load_config
 from edgevpr.core.geodesy import moved
 from edgevpr.core.types import Position
 from edgevpr.lab.simulate.controller import FlightController
-from edgevpr.lab.simulate.flight import ORIGIN
+from edgevpr.lab.simulate.generated import ORIGIN
 from edgevpr.mavlink.messages import Health
 from edgevpr.mavlink.wire import PacketReader, mavlink
 from edgevpr.power.load import MachineLoad

@@ -1,11 +1,16 @@
-"""Brushes that paint things on the ground of a scene: noise, ribbons, rows, roofs and crowns of trees."""
+"""Brushes that paint things on the ground of a scene (noise, roofs, crowns of trees), and the lines along which they
+paint: winding ones, and those that cut land into fields. Points are (N, 2) east, north in metres."""
 
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from edgevpr.core.arrays import Array, Doubles, Floats, Image, Singles
 
 Box = tuple[slice, slice]  # rows, columns
+_GRID_M = 8.0
 BASE_CM = 300  # of open ground, so that a river bed and a furrow lie above zero
 
 
@@ -14,46 +19,46 @@ class Canvas:
     """A scene in the making: `albedo` uint8 (H, W, 3) BGR and `height_cm` uint16 (H, W), both painted in place;
     north is up, the south-west corner is (0, 0) m."""
 
-    albedo: np.ndarray
-    height_cm: np.ndarray
+    albedo: Image
+    height_cm: NDArray[np.uint16]
     metres_per_pixel: float
 
     @property
     def shape(self) -> tuple[int, int]:
-        return self.height_cm.shape
+        return self.height_cm.shape[0], self.height_cm.shape[1]
 
-    def pixels(self, points_m: np.ndarray) -> np.ndarray:
+    def pixels(self, points_m: ArrayLike) -> Floats:
         """Convert (N, 2) east, north in metres to float32 (N, 2) column, row."""
         east_m, north_m = np.asarray(points_m, np.float32).T
         return np.column_stack((east_m, self.shape[0] * self.metres_per_pixel - north_m)) / self.metres_per_pixel
 
-    def box(self, points_m: np.ndarray, margin_m: float = 0.0) -> Box:
+    def box(self, points_m: ArrayLike, margin_m: float = 0.0) -> Box:
         """Return the box of pixels around some points, cut off at the edge of the scene (empty outside of it)."""
         margin = margin_m / self.metres_per_pixel
         low, high = self.pixels(points_m).min(axis=0) - margin, self.pixels(points_m).max(axis=0) + margin
         (left, top), (right, bottom) = np.maximum(low, 0).astype(int), np.maximum(np.ceil(high), 0).astype(int)
         return slice(top, max(top, min(bottom, self.shape[0]))), slice(left, max(left, min(right, self.shape[1])))
 
-    def grid_m(self, box: Box) -> tuple[np.ndarray, np.ndarray]:
+    def grid_m(self, box: Box) -> tuple[Floats, Floats]:
         """Return east (1, W) and north (H, 1) in metres of the pixels of a box, float32."""
         rows, columns = (np.arange(part.start, part.stop, dtype=np.float32) + 0.5 for part in box)
         return columns[None] * self.metres_per_pixel, ((self.shape[0] - rows) * self.metres_per_pixel)[:, None]
 
-    def polygon(self, box: Box, points_m: np.ndarray) -> np.ndarray:
+    def polygon(self, box: Box, points_m: ArrayLike) -> Floats:
         """Return the cover, float32 0..1, of a polygon over the pixels of a box, with smooth edges."""
         cover = np.zeros((box[0].stop - box[0].start, box[1].stop - box[1].start), np.uint8)
         corners = (self.pixels(points_m) - (box[1].start, box[0].start)) * 16
         cv2.fillPoly(cover, [corners.round().astype(np.int32)], 255, cv2.LINE_AA, 4)
         return cover.astype(np.float32) / 255
 
-    def distance_m(self, box: Box, line_m: np.ndarray) -> np.ndarray:
+    def distance_m(self, box: Box, line_m: ArrayLike) -> Floats:
         """Return the metres from a polyline, float32, for every pixel of a box."""
         away = np.full((box[0].stop - box[0].start, box[1].stop - box[1].start), 255, np.uint8)
         points = self.pixels(line_m) - (box[1].start, box[0].start)
         cv2.polylines(away, [points.round().astype(np.int32)], False, 0)
         return cv2.distanceTransform(away, cv2.DIST_L2, 5) * self.metres_per_pixel
 
-    def paint(self, box: Box, cover: np.ndarray, colour) -> None:
+    def paint(self, box: Box, cover: Array, colour: ArrayLike) -> None:
         """Paint a colour, (3,) or (H, W, 3) BGR, over a box, with the opacity `cover` 0..1."""
         touched = cover > 0
         below = self.albedo[box][touched].astype(np.float32)
@@ -62,7 +67,7 @@ class Canvas:
         self.albedo[box][touched] = np.clip(below + cover[touched][:, None] * (above - below), 0, 255)
 
 
-def noise(rng: np.random.Generator, shape: tuple[int, int], first_px: float, octaves: int = 3) -> np.ndarray:
+def noise(rng: np.random.Generator, shape: tuple[int, int], first_px: float, octaves: int = 3) -> Singles:
     """Make smooth noise, float32, mean 0 and standard deviation 1; its largest bumps are `first_px` wide."""
     total = np.zeros(shape, np.float32)
     for octave in range(octaves):
@@ -76,20 +81,23 @@ def noise(rng: np.random.Generator, shape: tuple[int, int], first_px: float, oct
     return total
 
 
-def bgr_mix(low: tuple[int, int, int], high: tuple[int, int, int], share: np.ndarray) -> np.ndarray:
+def bgr_mix(low: tuple[int, int, int], high: tuple[int, int, int], share: Array) -> Array:
     """Mix colour `low` (share 0) and colour `high` (share 1): (H, W) -> float32 (H, W, 3)."""
-    low, high = np.float32(low), np.float32(high)
-    return low + share[..., None] * (high - low)
+    first, last = np.asarray(low, np.float32), np.asarray(high, np.float32)
+    mixed: Array = first + share[..., None] * (last - first)
+    return mixed
 
 
-def smooth_step(values: np.ndarray, low: float, high: float) -> np.ndarray:
+def smooth_step(values: Array, low: float, high: float) -> Array:
     """Return 0 below `low`, 1 above `high`, a straight ramp between; the other way round where low > high."""
     return np.clip((values - low) / (high - low), 0, 1)
 
 
-def roof(canvas: Canvas, centre_m, length_m: float, width_m: float, turn_rad: float, wall_m: float, colour) -> None:
+def roof(
+    canvas: Canvas, centre_m: Doubles, length_m: float, width_m: float, turn_rad: float, wall_m: float, colour: Doubles
+) -> None:
     """Paint a building with a gable roof, its ridge along `turn_rad` (anticlockwise from east)."""
-    along, across = np.array([np.cos(turn_rad), np.sin(turn_rad)]), np.array([-np.sin(turn_rad), np.cos(turn_rad)])
+    along, across = axes_of(turn_rad)
     corners = [
         np.asarray(centre_m) + a * along * length_m / 2 + b * across * width_m / 2
         for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))
@@ -105,16 +113,17 @@ def roof(canvas: Canvas, centre_m, length_m: float, width_m: float, turn_rad: fl
     canvas.height_cm[box] = np.where(cover > 0.5, gable_cm, canvas.height_cm[box])
 
 
-def crown(rng: np.random.Generator, radius_px: int) -> np.ndarray:
+def crown(rng: np.random.Generator, radius_px: int) -> Singles:
     """Make the dome of one tree, float32 (2 r + 1, 2 r + 1) in 0..1.2, 0 outside of its ragged outline."""
     axis = np.arange(-radius_px, radius_px + 1, dtype=np.float32) / radius_px
     lumps = noise(rng, (len(axis), len(axis)), max(radius_px * 0.7, 2.0), 2)
     leaves = noise(rng, (len(axis), len(axis)), 2.5, 2)
     dome = 1 - (axis[None] ** 2 + axis[:, None] ** 2) * (1.2 + 0.2 * lumps + 0.12 * leaves)
-    return np.sqrt(np.clip(dome, 0, 1)) * np.clip(1 + 0.08 * lumps + 0.06 * leaves, 0, 1.2)
+    ragged: Singles = np.sqrt(np.clip(dome, 0, 1)) * np.clip(1 + 0.08 * lumps + 0.06 * leaves, 0, 1.2)
+    return ragged
 
 
-def stand(canvas: Canvas, dome: np.ndarray, centre_m, top_m: float, colour) -> None:
+def stand(canvas: Canvas, dome: Singles, centre_m: tuple[float, float], top_m: float, colour: Doubles) -> None:
     """Set one tree (a `crown`) on the canvas; where crowns overlap, the higher one is seen."""
     radius = len(dome) // 2
     column, row = canvas.pixels([centre_m])[0].astype(int)
@@ -125,3 +134,92 @@ def stand(canvas: Canvas, dome: np.ndarray, centre_m, top_m: float, colour) -> N
     seen = (dome > 0.05) & (top_cm > canvas.height_cm[box])
     canvas.height_cm[box][seen] = top_cm[seen]
     canvas.albedo[box][seen] = np.clip(np.asarray(colour) * (0.55 + 0.5 * dome[seen][:, None]), 0, 255)
+
+
+def axes_of(turn_rad: float) -> tuple[Doubles, Doubles]:
+    """Return the unit vectors along a direction, anticlockwise from east, and to the left of it."""
+    return np.array([np.cos(turn_rad), np.sin(turn_rad)]), np.array([-np.sin(turn_rad), np.cos(turn_rad)])
+
+
+def winding(rng: np.random.Generator, start: tuple[float, float], end: tuple[float, float], swing_m: float) -> Doubles:
+    """Make a winding line of 200 points from near `start` to near `end`."""
+    start_m, end_m = np.asarray(start), np.asarray(end)
+    along = (end_m - start_m) / np.linalg.norm(end_m - start_m)
+    t = np.linspace(0, 1, 200)[:, None]
+    swing = sum(swing_m / wave * np.sin(2 * np.pi * (wave * t + rng.random())) for wave in (0.9, 1.8, 3.2))
+    line_m: Doubles = start_m + t * (end_m - start_m) + swing * np.array([-along[1], along[0]])
+    return line_m
+
+
+def parcels(
+    rng: np.random.Generator, width_m: float, depth_m: float, field_m2: float
+) -> tuple[list[Doubles], list[tuple[int, Doubles]]]:
+    """Cut the land by straight lines until every piece is about `field_m2`.
+
+    Returns the pieces (convex polygons) and every cut as (level, its two ends): level 0 crosses all the land.
+    """
+    fields, cuts = [], []
+    todo = [(0, np.array([(-20, -20), (width_m + 20, -20), (width_m + 20, depth_m + 20), (-20, depth_m + 20)]))]
+    while todo:
+        level, piece = todo.pop()
+        if _area_m2(piece) < field_m2 * rng.uniform(0.7, 1.8):
+            fields.append(piece)
+            continue
+        side = longest_side(piece)
+        angle = np.arctan2(side[1], side[0]) + np.pi / 2 + rng.normal(0, 0.16)
+        through = piece.mean(axis=0) + rng.uniform(-0.2, 0.2) * side
+        halves, line = _cut(piece, through, axes_of(angle)[1])
+        cuts.append((level, line))
+        todo += [(level + 1, half) for half in halves]
+    return fields, cuts
+
+
+def longest_side(polygon: Doubles) -> Doubles:
+    """Return the longest side of a polygon as a vector."""
+    sides = np.roll(polygon, -1, axis=0) - polygon
+    longest: Doubles = sides[np.argmax(np.hypot(*sides.T))]
+    return longest
+
+
+class Bend:
+    """Bends straight lines a little, everywhere in the same way, so that lines that touched still touch."""
+
+    def __init__(self, rng: np.random.Generator, width_m: float, depth_m: float, by_m: float) -> None:
+        shape = int(depth_m / _GRID_M) + 8, int(width_m / _GRID_M) + 8
+        self._shift_m = by_m * np.stack([noise(rng, shape, 7, 1), noise(rng, shape, 7, 1)], axis=-1)
+
+    def __call__(self, points_m: Doubles, closed: bool) -> Doubles:
+        """Return the line through the points as a chain of short pieces, bent; `closed` joins its ends."""
+        ends_m = np.roll(points_m, -1, axis=0) if closed else points_m[1:]
+        chain = [
+            np.linspace(a, b, max(2, int(np.hypot(*(b - a)) / 5)), endpoint=False)
+            for a, b in zip(points_m, ends_m, strict=False)
+        ]
+        line_m = np.concatenate(chain if closed else [*chain, points_m[-1:]])
+        column, row = np.clip(line_m / _GRID_M + 3, 0, np.array(self._shift_m.shape[1::-1]) - 1.001).T
+        i, j, di, dj = row.astype(int), column.astype(int), (row % 1)[:, None], (column % 1)[:, None]
+        shift = self._shift_m
+        upper = shift[i, j] * (1 - dj) + shift[i, j + 1] * dj
+        lower = shift[i + 1, j] * (1 - dj) + shift[i + 1, j + 1] * dj
+        bent_m: Doubles = line_m + upper * (1 - di) + lower * di
+        return bent_m
+
+
+def _area_m2(polygon: Doubles) -> float:
+    x, y = polygon.T
+    return abs(float(np.dot(x, np.roll(y, -1)) - np.dot(np.roll(x, -1), y))) / 2
+
+
+def _cut(piece: Doubles, through: Doubles, across: Doubles) -> tuple[list[Doubles], Doubles]:
+    """Return both halves of a convex polygon, and the cut between them."""
+    side = (piece - through) @ across
+    halves: tuple[list[Doubles], list[Doubles]] = ([], [])
+    line: list[Doubles] = []
+    for here, there, s, t in zip(piece, np.roll(piece, -1, axis=0), side, np.roll(side, -1), strict=True):
+        halves[int(s < 0)].append(here)
+        if (s < 0) != (t < 0):
+            crossing = here + (there - here) * s / (s - t)
+            line.append(crossing)
+            for half in halves:
+                half.append(crossing)
+    return [np.array(half) for half in halves], np.array(line)

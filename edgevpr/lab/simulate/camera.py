@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from edgevpr.core.arrays import Array, Doubles, Image
 from edgevpr.lab.simulate.brush import noise, smooth_step
-from edgevpr.lab.simulate.scene import Scene
+from edgevpr.lab.simulate.landscape import Scene
 
 _LONGEST_SHADOW_M = 30.0
 _STRIP = 256  # rows lit at a time: the working memory stays small
@@ -41,7 +42,7 @@ class Camera:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Pose:
+class CameraPose:
     """Position and attitude of the camera: metres from the scene's south-west corner and over its ground, degrees of
     the airframe (heading clockwise from north, roll right wing down, pitch nose up)."""
 
@@ -53,7 +54,7 @@ class Pose:
     pitch_deg: float = 0.0
 
 
-def ground_to_pixel(pose: Pose, camera: Camera) -> np.ndarray:
+def ground_to_pixel(pose: CameraPose, camera: Camera) -> Doubles:
     """Return the homography (3, 3) from the ground plane (east, north in metres, 1) to the picture (column, row, 1)."""
     yaw, pitch, roll = np.radians((pose.heading_deg, pose.pitch_deg, pose.roll_deg))
     about_down = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
@@ -65,10 +66,11 @@ def ground_to_pixel(pose: Pose, camera: Camera) -> np.ndarray:
     pixel_from_lens = np.array(
         [[camera.focal_px, 0, (camera.width - 1) / 2], [0, camera.focal_px, (camera.height - 1) / 2], [0, 0, 1]]
     )
-    return pixel_from_lens @ lens_from_body @ body_from_ned @ ned_from_ground
+    pixel_from_ground: Doubles = pixel_from_lens @ lens_from_body @ body_from_ned @ ned_from_ground
+    return pixel_from_ground
 
 
-def lit(scene: Scene, light: Light, seed: int) -> np.ndarray:
+def lit(scene: Scene, light: Light, seed: int) -> Image:
     """Light the scene: uint8 (H, W, 3) BGR with shaded slopes, cast shadows, and clouds (from `seed`) drifting over."""
     azimuth, elevation = np.radians((light.sun_azimuth_deg, light.sun_elevation_deg))
     towards_sun = float(np.sin(azimuth)), float(-np.cos(azimuth))  # in columns and rows
@@ -80,7 +82,7 @@ def lit(scene: Scene, light: Light, seed: int) -> np.ndarray:
     for top in range(0, len(ground), _STRIP):
         rows = slice(top, top + _STRIP)
         around_cm = scene.height_cm[max(0, top - 1) : top + _STRIP + 1].astype(np.float32)
-        down, right = np.gradient(around_cm, 100 * scene.metres_per_pixel)
+        down, right = (np.gradient(around_cm, 100 * scene.metres_per_pixel, axis=axis) for axis in (0, 1))
         inner = slice(top - max(0, top - 1), None)
         down, right = down[inner][:_STRIP], right[inner][:_STRIP]
         slope = np.sin(elevation) - np.cos(elevation) * (right * towards_sun[0] + down * towards_sun[1])
@@ -90,7 +92,7 @@ def lit(scene: Scene, light: Light, seed: int) -> np.ndarray:
     return ground
 
 
-def _cast_shadows(scene: Scene, towards_sun: tuple[float, float], steepness: float) -> np.ndarray:
+def _cast_shadows(scene: Scene, towards_sun: tuple[float, float], steepness: float) -> Array:
     """Compute the shadows, uint8 (H, W), 255 where something stands between the ground and the sun.
 
     A ray from (x, y) is blocked where max over k of height(k steps on) - k * drop exceeds height(x, y). That maximum
@@ -100,20 +102,20 @@ def _cast_shadows(scene: Scene, towards_sun: tuple[float, float], steepness: flo
     blocking, steps = scene.height_cm, 1
     while steps * scene.metres_per_pixel < _LONGEST_SHADOW_M:
         shift = np.array([[1, 0, steps * towards_sun[0]], [0, 1, steps * towards_sun[1]]])
-        farther = cv2.warpAffine(
+        farther: Array = cv2.warpAffine(
             blocking,
             shift,
             blocking.shape[::-1],
             flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
             borderMode=cv2.BORDER_REPLICATE,
         )
-        blocking = np.maximum(blocking, cv2.subtract(farther, steps * drop_cm, farther), out=farther)
+        blocking = np.maximum(blocking, cv2.subtract(farther, np.array(steps * drop_cm), farther), out=farther)
         steps *= 2
-    hidden = cv2.compare(blocking, cv2.add(scene.height_cm, 25), cv2.CMP_GT)
+    hidden = cv2.compare(blocking, cv2.add(scene.height_cm, np.array(25.0)), cv2.CMP_GT)
     return cv2.GaussianBlur(hidden, (5, 5), 0)
 
 
-def _clouds(scene: Scene, cloud_frac: float, seed: int) -> np.ndarray:
+def _clouds(scene: Scene, cloud_frac: float, seed: int) -> Array:
     """Return the share of sunlight that clouds hold back, uint8 (H, W) of 255."""
     coarse = noise(np.random.default_rng(seed), (64, 64), 16, 3)
     edge = float(np.quantile(coarse, 1 - cloud_frac)) + (0.25 if cloud_frac == 0 else 0)
@@ -121,7 +123,7 @@ def _clouds(scene: Scene, cloud_frac: float, seed: int) -> np.ndarray:
     return cv2.resize(cover, scene.height_cm.shape[::-1], interpolation=cv2.INTER_CUBIC)
 
 
-def view_on_ground(pose: Pose, camera: Camera) -> np.ndarray | None:
+def view_on_ground(pose: CameraPose, camera: Camera) -> Doubles | None:
     """Return where the corners of the picture lie on the ground, (4, 2) metres east and north; None where the picture
     shows the horizon."""
     corners = [(0, 0, 1), (camera.width - 1, 0, 1), (camera.width - 1, camera.height - 1, 1), (0, camera.height - 1, 1)]
@@ -130,7 +132,12 @@ def view_on_ground(pose: Pose, camera: Camera) -> np.ndarray | None:
 
 
 def photograph(
-    ground: np.ndarray, metres_per_pixel: float, pose: Pose, camera: Camera, light: Light, rng: np.random.Generator
+    ground: np.ndarray,
+    metres_per_pixel: float,
+    pose: CameraPose,
+    camera: Camera,
+    light: Light,
+    rng: np.random.Generator,
 ) -> np.ndarray:
     """Take one frame, uint8 (camera.height, camera.width, 3) BGR, of a `lit` ground; `rng` makes the sensor's noise."""
     # The centre of the north-west pixel is half a pixel inside of the scene.
@@ -142,6 +149,6 @@ def photograph(
         frame = cv2.blur(frame, (1, round(camera.blur_px) + 1))  # the ground runs down the picture
     tone = np.linspace(0, 1, 256, dtype=np.float32) ** light.gamma * light.exposure
     tone = tone * (1 - light.haze_frac) + 0.62 * light.haze_frac
-    seen = cv2.LUT(frame, (255 * tone).astype(np.float32))
+    seen: Array = cv2.LUT(frame, (255 * tone).astype(np.float32))
     seen += camera.noise_sigma * rng.standard_normal((camera.height, camera.width, 1), np.float32)
     return np.clip(seen, 0, 255).astype(np.uint8)

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -17,20 +16,22 @@ RIGHT_M = 55.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Answer:
-    """One query: where it was taken, the place that was named, and whether the runtime accepted it. `error_m` is the
-    distance between the two, `nearest_m` that to the nearest place of the map, and `fix_off_m` that to the fix (None:
-    not accepted)."""
+class JudgedAnswer:
+    """One query: where it was taken, and the place that was named. `error_m` is the distance between the two,
+    `nearest_m` that to the nearest place of the map, and `fix_off_m` that to the fix (None: not accepted)."""
 
     query: str
     reference_image: str
     at: Position
     named: Position
     score: float
-    accepted: bool
     error_m: float
     nearest_m: float
     fix_off_m: float | None
+
+    @property
+    def accepted(self) -> bool:
+        return self.fix_off_m is not None
 
     @property
     def right(self) -> bool:
@@ -43,9 +44,9 @@ class Answer:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Outcome:
+class FlightOutcome:
     """Counts, shares and errors of a flight. `recall_at_1` is of the queries on the map. The errors are metres from the
-    point where a picture was taken to the fix, of the accepted queries (NaN without any)."""
+    point where a picture was taken to the fix, of the accepted queries (NaN without any): median, 90 % and largest."""
 
     queries: int
     on_map: int
@@ -53,55 +54,52 @@ class Outcome:
     accepted: int
     accepted_wrong: int
     off_map_rejected: int
-    error_median_m: float
-    error_p90_m: float
-    error_max_m: float
+    errors_m: tuple[float, float, float]
 
 
-def read_answers(log_path: Path, map_images: Path, query_images: Path) -> list[Answer]:
+def read_answers(log_path: Path, map_images: Path, query_images: Path) -> list[JudgedAnswer]:
     """Read the queries of a flight log, and judge them by the positions.csv of the two flights."""
-    places = {name: tag.position for name, tag in read_positions(find_positions(map_images)).items()}
-    taken = {name: tag.position for name, tag in read_positions(find_positions(query_images)).items()}
-    lat_deg, lon_deg = np.array([(place.lat_deg, place.lon_deg) for place in places.values()]).T
+    places, taken = (_positions(images) for images in (map_images, query_images))
     answers = []
     for line in flight_of(log_path):
         if line["kind"] == "query":
-            at, named = taken[line["query"]], places[line["reference_image"]]
-            error_m = distance_m(at.lat_deg, at.lon_deg, named.lat_deg, named.lon_deg)
-            nearest_m = distance_m(at.lat_deg, at.lon_deg, lat_deg, lon_deg).min()
+            at, named, fix = taken[line["query"]], places[line["reference_image"]], line["located"]
             answers.append(
-                Answer(
+                JudgedAnswer(
                     query=line["query"],
                     reference_image=line["reference_image"],
                     at=at,
                     named=named,
                     score=line["score"],
-                    accepted=line["accepted"],
-                    error_m=float(error_m),
-                    fix_off_m=_off_m(line["located"], at) if line["accepted"] else None,
-                    nearest_m=float(nearest_m),
+                    error_m=_apart_m(at, named),
+                    nearest_m=min(_apart_m(at, place) for place in places.values()),
+                    fix_off_m=_apart_m(at, Position(fix["lat_deg"], fix["lon_deg"])) if line["accepted"] else None,
                 )
             )
     return answers
 
 
-def _off_m(located: dict[str, Any], at: Position) -> float:
-    return float(distance_m(at.lat_deg, at.lon_deg, located["lat_deg"], located["lon_deg"]))
-
-
-def outcome(answers: Sequence[Answer]) -> Outcome:
+def outcome(answers: Sequence[JudgedAnswer]) -> FlightOutcome:
     """Sum up the answers of a flight."""
     on_map = [answer for answer in answers if answer.on_map]
     accepted = [answer for answer in answers if answer.accepted]
-    errors_m = [answer.fix_off_m for answer in accepted] or [np.nan]
-    return Outcome(
+    errors_m = [answer.fix_off_m for answer in accepted if answer.fix_off_m is not None] or [np.nan]
+    return FlightOutcome(
         queries=len(answers),
         on_map=len(on_map),
         recall_at_1=sum(answer.right for answer in on_map) / max(len(on_map), 1),
         accepted=len(accepted),
         accepted_wrong=sum(not answer.right for answer in accepted),
         off_map_rejected=sum(not answer.on_map and not answer.accepted for answer in answers),
-        error_median_m=float(np.median(errors_m)),
-        error_p90_m=float(np.quantile(errors_m, 0.9)),
-        error_max_m=float(np.max(errors_m)),
+        errors_m=(float(np.median(errors_m)), float(np.quantile(errors_m, 0.9)), max(errors_m)),
     )
+
+
+def _positions(images: Path) -> dict[str, Position]:
+    table = find_positions(images)
+    tags = read_positions(table) if table else {}
+    return {name: tag.position for name, tag in tags.items() if tag.position}
+
+
+def _apart_m(one: Position, other: Position) -> float:
+    return float(distance_m(one.lat_deg, one.lon_deg, other.lat_deg, other.lon_deg))

@@ -12,7 +12,7 @@ from mavlink_peers import PATIENCE_S
 
 from edgevpr.core.geodesy import distance_m
 from edgevpr.lab.simulate.controller import FlightController
-from edgevpr.lab.simulate.flight import ORIGIN
+from edgevpr.lab.simulate.generated import ORIGIN
 from edgevpr.mavlink.wire import PacketReader, mavlink
 
 ARDUPILOT = os.environ.get("EDGEVPR_ARDUPILOT")  # the folder of a built ArduPilot

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edgevpr.lab.simulate.camera import Camera, Light, Pose, ground_to_pixel, lit, photograph
-from edgevpr.lab.simulate.scene import Scene, make_scene
+from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, ground_to_pixel, lit, photograph
+from edgevpr.lab.simulate.landscape import Scene, make_scene
 
 CAMERA = Camera(noise_sigma=0)
 NOON = Light(sun_azimuth_deg=180, sun_elevation_deg=60)
@@ -33,27 +33,35 @@ def mark_in(frame: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(
     ("pose", "column", "row"),
     [
-        (Pose(east_m=70, north_m=90, height_m=80, heading_deg=0), 0, 0),
+        (CameraPose(east_m=70, north_m=90, height_m=80, heading_deg=0), 0, 0),
         (
-            Pose(east_m=60, north_m=90, height_m=80, heading_deg=0),
+            CameraPose(east_m=60, north_m=90, height_m=80, heading_deg=0),
             F * 10 / 80,
             0,
         ),  # the mark is 10 m to the right of a nose that points north
-        (Pose(east_m=70, north_m=80, height_m=80, heading_deg=0), 0, -F * 10 / 80),  # ... 10 m ahead: up in the picture
-        (Pose(east_m=60, north_m=90, height_m=80, heading_deg=90), 0, -F * 10 / 80),  # nose east: ahead
-        (Pose(east_m=70, north_m=80, height_m=80, heading_deg=90), -F * 10 / 80, 0),  # nose east: 10 m to the left
         (
-            Pose(east_m=70, north_m=80, height_m=40, heading_deg=180),
+            CameraPose(east_m=70, north_m=80, height_m=80, heading_deg=0),
+            0,
+            -F * 10 / 80,
+        ),  # ... 10 m ahead: up in the picture
+        (CameraPose(east_m=60, north_m=90, height_m=80, heading_deg=90), 0, -F * 10 / 80),  # nose east: ahead
+        (
+            CameraPose(east_m=70, north_m=80, height_m=80, heading_deg=90),
+            -F * 10 / 80,
+            0,
+        ),  # nose east: 10 m to the left
+        (
+            CameraPose(east_m=70, north_m=80, height_m=40, heading_deg=180),
             0,
             F * 10 / 40,
         ),  # nose south, half as high: twice as far behind
         (
-            Pose(east_m=70, north_m=90, height_m=80, heading_deg=0, roll_deg=5),
+            CameraPose(east_m=70, north_m=90, height_m=80, heading_deg=0, roll_deg=5),
             F * np.tan(np.radians(5)),
             0,
         ),  # right wing down: the camera looks left
         (
-            Pose(east_m=70, north_m=90, height_m=80, heading_deg=0, pitch_deg=5),
+            CameraPose(east_m=70, north_m=90, height_m=80, heading_deg=0, pitch_deg=5),
             0,
             F * np.tan(np.radians(5)),
         ),  # nose up: it looks ahead
@@ -70,7 +78,7 @@ def test_the_homography_and_the_picture_agree_at_any_pose(marked):
     rng = np.random.default_rng(5)
     for _ in range(10):
         off = rng.uniform(-1, 1, 6)
-        pose = Pose(
+        pose = CameraPose(
             east_m=70 + 15 * off[0],
             north_m=90 + 12 * off[1],
             height_m=80 + 10 * off[2],
@@ -84,7 +92,7 @@ def test_the_homography_and_the_picture_agree_at_any_pose(marked):
 
 
 def test_light_changes_the_picture_and_not_its_geometry(marked):
-    pose = Pose(east_m=75, north_m=84, height_m=78, heading_deg=30, roll_deg=2, pitch_deg=-1)
+    pose = CameraPose(east_m=75, north_m=84, height_m=78, heading_deg=30, roll_deg=2, pitch_deg=-1)
     evening = Light(sun_azimuth_deg=300, sun_elevation_deg=20, warmth=1, haze_frac=0.2, exposure=0.9, gamma=1.2)
     centres, frames = [], []
     for light in (NOON, evening):
@@ -96,7 +104,7 @@ def test_light_changes_the_picture_and_not_its_geometry(marked):
 
 def test_every_part_of_the_light_and_the_camera_has_its_effect():
     scene = make_scene(2, 120, 100, metres_per_pixel=0.4)
-    pose = Pose(east_m=60, north_m=50, height_m=40, heading_deg=0)
+    pose = CameraPose(east_m=60, north_m=50, height_m=40, heading_deg=0)
 
     def frame(light: Light, camera: Camera) -> np.ndarray:
         return photograph(lit(scene, light, 1), 0.4, pose, camera, light, np.random.default_rng(0)).astype(int)
@@ -119,7 +127,7 @@ def test_motion_blurs_along_the_flight_only(marked):
         frame = photograph(
             lit(marked, NOON, 0),
             0.25,
-            Pose(east_m=MARK_M[0], north_m=MARK_M[1], height_m=80, heading_deg=0),
+            CameraPose(east_m=MARK_M[0], north_m=MARK_M[1], height_m=80, heading_deg=0),
             camera,
             NOON,
             np.random.default_rng(0),

@@ -9,8 +9,8 @@ import pytest
 
 from edgevpr.core.errors import EdgevprError
 from edgevpr.lab.simulate import demo
-from edgevpr.lab.simulate.flight import later_flight, mapping_flight
-from edgevpr.lab.simulate.scene import make_scene
+from edgevpr.lab.simulate.generated import later_flight, mapping_flight
+from edgevpr.lab.simulate.landscape import make_scene
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from freeflight import FreeFlight
 
 from edgevpr.core.errors import UsageError
 from edgevpr.lab.simulate.controller import VEHICLES, FlightController
-from edgevpr.lab.simulate.flight import ORIGIN
+from edgevpr.lab.simulate.generated import ORIGIN
 from edgevpr.lab.simulate.motion import Motion
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.messages import Fix

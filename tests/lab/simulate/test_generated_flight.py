@@ -10,21 +10,21 @@ import pytest
 from edgevpr.core.geodesy import distance_m
 from edgevpr.frames.positions import read_positions
 from edgevpr.lab.simulate.camera import ground_to_pixel
-from edgevpr.lab.simulate.flight import (
+from edgevpr.lab.simulate.generated import (
     SCENE_DEPTH_M,
     SCENE_WIDTH_M,
-    Flight,
+    GeneratedFlight,
     later_flight,
     mapping_flight,
     to_metres,
     write_flight,
 )
+from edgevpr.lab.simulate.landscape import make_scene
 from edgevpr.lab.simulate.outcome import outcome, read_answers
-from edgevpr.lab.simulate.scene import make_scene
 from edgevpr.runtime.flight.flightlog import FlightLog
 
 
-def first_frames(flight: Flight, count: int) -> Flight:
+def first_frames(flight: GeneratedFlight, count: int) -> GeneratedFlight:
     return replace(flight, poses=flight.poses[:count])
 
 
@@ -112,9 +112,8 @@ def test_answers_are_judged_by_the_true_positions(tmp_path):
         pytest.approx(88.96, abs=0.1),
         None,
     ]
-    assert got.error_max_m == pytest.approx(88.96, abs=0.1)
-    assert got.error_median_m == pytest.approx((5.56 + 88.96) / 2, abs=0.1)
+    assert got.errors_m == pytest.approx(((5.56 + 88.96) / 2, 80.62, 88.96), abs=0.1)
 
 
 def test_a_flight_without_an_accepted_match_has_no_error(tmp_path):
-    assert np.isnan(outcome([]).error_median_m)
+    assert np.isnan(outcome([]).errors_m).all()

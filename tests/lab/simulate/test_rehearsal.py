@@ -14,14 +14,13 @@ from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import distance_m, moved
 from edgevpr.core.types import Position
 from edgevpr.frames.positions import read_positions
-from edgevpr.lab.simulate.camera import Camera, Pose, ground_to_pixel
-from edgevpr.lab.simulate.rehearsal import WEATHERS, poses_of, seen_from, write_rehearsal
-from edgevpr.lab.simulate.track import Shot, read_shots
+from edgevpr.lab.simulate.camera import Camera, CameraPose, ground_to_pixel
+from edgevpr.lab.simulate.rehearsal import WEATHERS, PlannedPicture, poses_of, read_shots, seen_from, write_rehearsal
 from edgevpr.mapmaking.orthophoto import Orthophoto
 
 CLEAR = WEATHERS["clear"].light
 CAMERA = Camera(noise_sigma=0)
-LEVEL = Pose(east_m=0, north_m=0, height_m=80, heading_deg=0)
+LEVEL = CameraPose(east_m=0, north_m=0, height_m=80, heading_deg=0)
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +129,9 @@ def test_a_track_that_cannot_be_flown_is_refused_in_a_sentence(tmp_path):
 
 def test_a_flight_writes_what_was_true_and_is_the_same_each_time(tmp_path, orthophoto):
     north = [moved(HOME.lat_deg, HOME.lon_deg, 0, 15.0 * step) for step in range(-2, 12)]
-    shots = [Shot(position=Position(*at), height_m=70, t_s=2.0 * n, heading_deg=0) for n, at in enumerate(north)]
+    shots = [
+        PlannedPicture(position=Position(*at), height_m=70, t_s=2.0 * n, heading_deg=0) for n, at in enumerate(north)
+    ]
     written = {}
     for name, weather, seed in (("one", "hazy", 1), ("two", "hazy", 1), ("other", "hazy", 2), ("clear", "clear", 1)):
         flight = write_rehearsal(

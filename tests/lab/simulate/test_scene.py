@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from edgevpr.lab.simulate.camera import Light, lit
-from edgevpr.lab.simulate.scene import Scene, make_scene
+from edgevpr.lab.simulate.landscape import Scene, make_scene
 
 NOON = Light(sun_azimuth_deg=180, sun_elevation_deg=60)
 

@@ -18,7 +18,7 @@ from edgevpr.cli.simulation import _VEHICLES
 from edgevpr.core.errors import LinkError, UsageError
 from edgevpr.lab.simulate.autopilot import run_autopilot, serve
 from edgevpr.lab.simulate.controller import VEHICLES, FlightController
-from edgevpr.lab.simulate.flight import ORIGIN
+from edgevpr.lab.simulate.generated import ORIGIN
 from edgevpr.lab.simulate.motion import FlownTrack, Motion, read_track, truth_at
 from edgevpr.mavlink import messages, reading
 from edgevpr.mavlink.address import parse_link

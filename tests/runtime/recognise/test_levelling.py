@@ -14,7 +14,7 @@ from edgevpr.core.geodesy import offset_m
 from edgevpr.core.types import Frame, Position
 from edgevpr.frames.level import UNKNOWN_VIEW, Lens, View
 from edgevpr.frames.mask import Mask
-from edgevpr.lab.simulate.camera import Camera, Light, Pose, ground_to_pixel, photograph
+from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, ground_to_pixel, photograph
 from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
@@ -49,7 +49,9 @@ def frame(ground, place, t_mono_s=0.0, told=None, **pose):
     pose = STRAIGHT | pose
     heading, pitch = math.radians(pose["heading_deg"]), math.radians(pose["pitch_deg"])
     ahead_m = math.tan(pitch) * pose["height_m"]
-    where = Pose(east_m=300 - ahead_m * math.sin(heading), north_m=NORTH_M[place] - ahead_m * math.cos(heading), **pose)
+    where = CameraPose(
+        east_m=300 - ahead_m * math.sin(heading), north_m=NORTH_M[place] - ahead_m * math.cos(heading), **pose
+    )
     image = photograph(
         ground, 0.25, where, CAMERA, Light(sun_azimuth_deg=0, sun_elevation_deg=60), np.random.default_rng(0)
     )
@@ -243,7 +245,7 @@ def test_only_a_camera_that_looks_down_through_a_known_lens_is_levelled(camera, 
 @pytest.mark.parametrize(("roll_deg", "pitch_deg"), [(0.0, 0.0), (20.0, 0.0), (0.0, -15.0), (-25.0, 10.0)])
 def test_a_picture_of_an_unknown_lens_says_how_far_it_looks_aside(roll_deg, pitch_deg, heading_deg):
     how = {"heading_deg": heading_deg, "roll_deg": roll_deg, "pitch_deg": pitch_deg}
-    pose = Pose(east_m=0.0, north_m=0.0, height_m=80.0, **how)
+    pose = CameraPose(east_m=0.0, north_m=0.0, height_m=80.0, **how)
     camera = Camera()
     to_pixel = ground_to_pixel(pose, camera)
     east, north, scale = np.linalg.solve(to_pixel, (camera.width / 2 - 0.5, camera.height / 2 - 0.5, 1.0))

@@ -15,8 +15,8 @@ from edgevpr.cli.main import main
 from edgevpr.core.geodesy import distance_m
 from edgevpr.frames.positions import read_positions
 from edgevpr.frames.source import open_source
-from edgevpr.lab.simulate.flight import SCENE_DEPTH_M, SCENE_WIDTH_M, later_flight, mapping_flight, write_flight
-from edgevpr.lab.simulate.scene import make_scene
+from edgevpr.lab.simulate.generated import SCENE_DEPTH_M, SCENE_WIDTH_M, later_flight, mapping_flight, write_flight
+from edgevpr.lab.simulate.landscape import make_scene
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.flight.flightlog import read_log
 

@@ -1,13 +1,32 @@
-"""A piece of farmland seen from above, generated from a seed, in place of a real site to fly over."""
+"""A piece of farmland seen from above, generated from a seed, in place of a real site to fly over.
 
+Land is cut into fields along bent lines (points are (N, 2) east, north in metres), each field has a look of its kind,
+and borders, a river, a road, farms and trees are painted over them.
+"""
+
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from edgevpr.lab.simulate.brush import BASE_CM, Canvas, crown, noise, roof, smooth_step, stand
-from edgevpr.lab.simulate.fields import DRY, GRASS, LUSH, MUD, paint_field
-from edgevpr.lab.simulate.layout import Bend, parcels, winding
+from edgevpr.core.arrays import Array, Doubles, Image, Singles
+from edgevpr.lab.simulate.brush import (
+    BASE_CM,
+    Bend,
+    Canvas,
+    axes_of,
+    bgr_mix,
+    crown,
+    longest_side,
+    noise,
+    parcels,
+    roof,
+    smooth_step,
+    stand,
+    winding,
+)
 
 # Colours under even white light, BGR.
 _GRAVEL, _ASPHALT, _WATER, _STONE = (160, 178, 190), (120, 122, 122), (50, 56, 46), (150, 154, 156)
@@ -15,6 +34,8 @@ _ROOFS = ((62, 78, 142), (58, 68, 104), (112, 104, 98), (190, 186, 180), (150, 1
 # Along and beside the road from the middle of the yard, length, width (metres), quarter turns of the ridge.
 _BUILDINGS = ((-9, 8, 17, 8.5, 0), (8, 9, 12, 7, 0), (10, -6, 18, 8, 1), (-8, -8, 11, 7.5, 0), (-16, -1, 5, 4, 0))
 _LEAVES = np.array([(42, 84, 62), (36, 72, 50), (50, 100, 84), (60, 106, 98), (46, 76, 68)], float)
+GRASS, LUSH, DRY, STRAW = (60, 118, 106), (44, 96, 74), (96, 144, 150), (118, 172, 196)
+SOIL, MUD = (78, 100, 126), (92, 130, 156)
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,17 +43,17 @@ class Scene:
     """The ground without light: `albedo` uint8 (H, W, 3) BGR, `height_cm` uint16 (H, W) over a common level; north is
     up and the south-west corner is the point 0 m east, 0 m north."""
 
-    albedo: np.ndarray
-    height_cm: np.ndarray
+    albedo: Image
+    height_cm: NDArray[np.uint16]
     metres_per_pixel: float
 
     @property
     def width_m(self) -> float:
-        return self.height_cm.shape[1] * self.metres_per_pixel
+        return float(self.height_cm.shape[1] * self.metres_per_pixel)
 
     @property
     def depth_m(self) -> float:
-        return self.height_cm.shape[0] * self.metres_per_pixel
+        return float(self.height_cm.shape[0] * self.metres_per_pixel)
 
 
 def make_scene(seed: int, width_m: float, depth_m: float, metres_per_pixel: float = 0.16) -> Scene:
@@ -43,7 +64,7 @@ def make_scene(seed: int, width_m: float, depth_m: float, metres_per_pixel: floa
     river_m = winding(rng, (width_m * 0.55, depth_m * 1.1), (width_m * 0.45, -depth_m * 0.1), 30)
     road_m = winding(rng, (-width_m * 0.1, depth_m * 0.42), (width_m * 1.1, depth_m * 0.60), 14)
     bend = Bend(rng, width_m, depth_m, by_m=2.5)
-    trees: list[np.ndarray] = []  # (N, 4): east, north, radius and top in metres
+    trees: list[Doubles] = []  # (N, 4): east, north, radius and top in metres
 
     fields, cuts = parcels(rng, width_m, depth_m, field_m2=7500)
     for field_m in fields:
@@ -58,7 +79,7 @@ def make_scene(seed: int, width_m: float, depth_m: float, metres_per_pixel: floa
     return Scene(canvas.albedo, canvas.height_cm, metres_per_pixel)
 
 
-def _border(rng: np.random.Generator, canvas: Canvas, line_m: np.ndarray, level: int) -> np.ndarray:
+def _border(rng: np.random.Generator, canvas: Canvas, line_m: Doubles, level: int) -> Doubles:
     """Paint the border of two fields: a lane between large pieces of land, else a hedge, a wall or a grass strip.
     Returns its trees."""
     box = canvas.box(line_m, 5.0)
@@ -85,18 +106,17 @@ def _border(rng: np.random.Generator, canvas: Canvas, line_m: np.ndarray, level:
     return np.empty((0, 4))
 
 
-def _along(rng: np.random.Generator, line_m: np.ndarray, step_m: float, spread_m: float, radius_m: float) -> np.ndarray:
+def _along(rng: np.random.Generator, line_m: Doubles, step_m: float, spread_m: float, radius_m: float) -> Doubles:
     """Place trees along a line, (N, 4) metres: east, north, radius, top."""
     run_m = np.concatenate(([0], np.cumsum(np.hypot(*np.diff(line_m, axis=0).T))))
     at_m = np.arange(rng.uniform(0, step_m), run_m[-1], step_m)
     at_m += rng.normal(0, step_m * 0.25, len(at_m))
     points = np.column_stack([np.interp(at_m, run_m, line_m[:, axis]) for axis in (0, 1)])
     points += rng.normal(0, spread_m, points.shape)
-    radius = radius_m * rng.uniform(0.6, 1.35, len(points))
-    return np.column_stack((points, radius, radius * rng.uniform(1.4, 2.2, len(points))))
+    return _grown(rng, points, radius_m, (1.4, 2.2))
 
 
-def _river(rng: np.random.Generator, canvas: Canvas, line_m: np.ndarray) -> np.ndarray:
+def _river(rng: np.random.Generator, canvas: Canvas, line_m: Doubles) -> Doubles:
     box = canvas.box(line_m, 24.0)
     shape = canvas.height_cm[box].shape
     wide, fine = noise(rng, shape, 40 / canvas.metres_per_pixel, 2), noise(rng, shape, 5 / canvas.metres_per_pixel)
@@ -114,7 +134,7 @@ def _river(rng: np.random.Generator, canvas: Canvas, line_m: np.ndarray) -> np.n
     return np.concatenate([_along(rng, line_m + side * 11 * beside, 8.0, 2.5, 2.6) for side in (-1, 1)])
 
 
-def _road(rng: np.random.Generator, canvas: Canvas, line_m: np.ndarray) -> None:
+def _road(rng: np.random.Generator, canvas: Canvas, line_m: Doubles) -> None:
     box = canvas.box(line_m, 7.0)
     away_m = canvas.distance_m(box, line_m)
     worn = noise(rng, away_m.shape, 12 / canvas.metres_per_pixel)
@@ -126,22 +146,23 @@ def _road(rng: np.random.Generator, canvas: Canvas, line_m: np.ndarray) -> None:
     canvas.height_cm[box] = np.where(away_m < 4.2, BASE_CM + 20, canvas.height_cm[box])
 
 
-def _farms(rng: np.random.Generator, canvas: Canvas, road_m: np.ndarray, river_m: np.ndarray) -> np.ndarray:
+def _farms(rng: np.random.Generator, canvas: Canvas, road_m: Doubles, river_m: Doubles) -> Doubles:
     """Paint farms beside the road, away from the river; return the middles of their yards, (N, 2) metres."""
     yards = []
     for at in range(18, len(road_m) - 18, 13):
         ahead = road_m[at + 1] - road_m[at]
         turn_rad = float(np.arctan2(ahead[1], ahead[0])) + rng.normal(0, 0.12)
-        along, beside = np.array([np.cos(turn_rad), np.sin(turn_rad)]), np.array([-np.sin(turn_rad), np.cos(turn_rad)])
+        along, beside = axes_of(turn_rad)
         middle = road_m[at] + beside * rng.choice([-1, 1]) * 24 + along * rng.normal(0, 4)
         if np.hypot(*(river_m - middle).T).min() > 42 and rng.random() < 0.7:
-            _farm(rng, canvas, middle, turn_rad, along, beside)
+            _farm(rng, canvas, middle, turn_rad)
             yards.append(middle)
     return np.array(yards).reshape(-1, 2)
 
 
-def _farm(rng: np.random.Generator, canvas: Canvas, middle, turn_rad: float, along, beside) -> None:
+def _farm(rng: np.random.Generator, canvas: Canvas, middle: Doubles, turn_rad: float) -> None:
     """Paint a yard with ragged edges, buildings around it and vehicles on it."""
+    along, beside = axes_of(turn_rad)
     yard = np.array([middle + a * along * 19 + b * beside * 17 for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))])
     box = canvas.box(yard, 4.0)
     cover = canvas.polygon(box, yard)
@@ -151,9 +172,10 @@ def _farm(rng: np.random.Generator, canvas: Canvas, middle, turn_rad: float, alo
     for u_m, v_m, length_m, width_m, quarter_turns in _BUILDINGS:
         if rng.random() < 0.8:
             centre = middle + (u_m + rng.normal(0, 1)) * along + (v_m + rng.normal(0, 1)) * beside
-            size_m = np.array((length_m, width_m)) * rng.uniform(0.8, 1.25, 2)
+            length_m, width_m = (np.array((length_m, width_m)) * rng.uniform(0.8, 1.25, 2)).tolist()
             colour = np.array(_ROOFS[rng.integers(len(_ROOFS))]) * rng.uniform(0.85, 1.1)
-            roof(canvas, centre, *size_m, turn_rad + quarter_turns * np.pi / 2, rng.uniform(2.6, 5), colour)
+            ridge_rad = turn_rad + quarter_turns * np.pi / 2
+            roof(canvas, centre, length_m, width_m, ridge_rad, rng.uniform(2.6, 5), colour)
     for _ in range(rng.integers(2, 7)):
         centre = middle + rng.uniform(-14, 14) * along + rng.uniform(-2, 3) * beside
         colour = rng.uniform(60, 225) * rng.uniform(0.6, 1.2, 3)
@@ -173,15 +195,132 @@ def _mottle(rng: np.random.Generator, canvas: Canvas) -> None:
             canvas.albedo[..., channel] = cv2.multiply(canvas.albedo[..., channel], change, scale=1 / 128)
 
 
-def _plant(rng: np.random.Generator, canvas: Canvas, trees: np.ndarray, keep_off_m) -> None:
+def _plant(
+    rng: np.random.Generator, canvas: Canvas, trees: Doubles, keep_off_m: Iterable[tuple[Doubles, float]]
+) -> None:
     """Set the trees, (N, 4) east, north, radius, top, except near the lines (or points) of `keep_off_m`."""
     for line_m, clear_m in keep_off_m:
         gap_m = np.hypot(*(trees[:, None, :2] - line_m[None]).T).T
         trees = trees[(gap_m > clear_m).all(axis=1)]
-    domes: dict[int, list[np.ndarray]] = {}
+    domes: dict[int, list[Singles]] = {}
     for east_m, north_m, radius_m, top_m in trees:
         radius_px = max(2, round(radius_m / canvas.metres_per_pixel))
         if radius_px not in domes:
             domes[radius_px] = [crown(rng, radius_px) for _ in range(4)]
         colour = _LEAVES[rng.integers(len(_LEAVES))] * rng.uniform(0.8, 1.2)
         stand(canvas, domes[radius_px][rng.integers(4)], (east_m, north_m), top_m, colour)
+
+
+@dataclass(frozen=True, slots=True)
+class FieldGround:
+    """The pixels of one field, float32 (H, W): noise with bumps of 22 m (`patches`) and of 2.4 m (`tufts`), and the
+    metres across its rows."""
+
+    patches: Singles
+    tufts: Singles
+    across_m: Array
+
+
+Look = tuple[Array, Array]  # colour (H, W, 3) BGR, relief (H, W) cm
+
+
+def _ploughed(plot: FieldGround) -> Look:
+    furrow = np.sin(plot.across_m * (2 * np.pi / 1.2) + 0.5 * plot.tufts)
+    return bgr_mix(
+        SOIL, MUD, smooth_step(plot.patches + 0.7 * plot.tufts + 0.25 * furrow, -2, 2.4)
+    ), 2 * furrow + 2 * plot.tufts
+
+
+def _cereal(plot: FieldGround) -> Look:
+    wheels = smooth_step(np.abs(np.abs(plot.across_m % 15 - 7.5) - 0.9), 0.45, 0.15)
+    laid = smooth_step(plot.patches + 0.5 * plot.tufts, 1.2, 1.7)
+    drilled = np.sin(plot.across_m * (2 * np.pi / 0.9))
+    share = 0.6 * wheels + 0.2 * smooth_step(plot.tufts - 0.6 * plot.patches + 0.4 * drilled, -1.5, 2.5) + 0.2 * laid
+    return bgr_mix(STRAW, SOIL, share), 50 - 35 * wheels - 12 * laid + 3 * plot.tufts
+
+
+def _row_crop(plot: FieldGround) -> Look:
+    plants = smooth_step(np.sin(plot.across_m * (2 * np.pi / 1.8)) + 0.6 * plot.tufts, -0.9, 0.7)
+    plants = plants * smooth_step(plot.patches + 0.4 * plot.tufts, 1.9, 1.3)
+    return bgr_mix(SOIL, LUSH, 0.9 * plants), 20 * plants + 2 * plot.tufts
+
+
+def _meadow(plot: FieldGround) -> Look:
+    swath = smooth_step(np.sin(plot.across_m * (2 * np.pi / 6.5)), -0.5, 0.5)
+    heap = smooth_step(np.abs(plot.across_m % 6.5 - 3.2) + 0.15 * plot.tufts, 0.8, 0.3)
+    share = 0.15 + 0.3 * swath + 0.12 * plot.patches + 0.2 * plot.tufts + 0.2 * heap
+    return bgr_mix(GRASS, DRY, share), 8 * heap + 2 * plot.tufts
+
+
+def _pasture(plot: FieldGround) -> Look:
+    worn = smooth_step(plot.patches + 0.4 * plot.tufts, 0.4, 2.4)
+    wet = smooth_step(-plot.patches, 0.3, 1.7)
+    rushes = smooth_step(plot.tufts + 0.9 * plot.patches, 1.4, 2.8)
+    # Cattle walk one behind the other: narrow paths wind along the lines of equal noise.
+    path = smooth_step(np.abs(plot.patches + 0.02 * plot.across_m % 2 - 0.9), 0.05, 0.02)
+    colour = bgr_mix(GRASS, DRY, 0.35 + 0.3 * worn - 0.3 * wet + 0.2 * plot.tufts + 0.45 * path)
+    return colour * (1 - 0.3 * rushes[..., None]), 2 * plot.tufts + 10 * rushes
+
+
+def _forest_floor(plot: FieldGround) -> Look:
+    return 0.75 * bgr_mix(LUSH, SOIL, 0.35 + 0.2 * plot.tufts), 10 * plot.tufts
+
+
+@dataclass(frozen=True, slots=True)
+class _Kind:
+    """A kind of field: how often it is found, how it looks, and the trees in it (distance, scatter and radius in
+    metres)."""
+
+    weight: float
+    look: Callable[[FieldGround], Look]
+    trees_m: tuple[float, float, float] | None = None
+
+
+_KINDS = (
+    _Kind(7, _pasture, (31, 40, 2.6)),
+    _Kind(4, _meadow, (60, 60, 2.8)),
+    _Kind(4, _ploughed),
+    _Kind(5, _cereal),
+    _Kind(4, _row_crop),
+    _Kind(2.5, _forest_floor, (4.1, 1.4, 2.8)),
+    _Kind(0.8, _pasture, (6.5, 0.25, 1.7)),  # an orchard
+)
+
+
+def paint_field(rng: np.random.Generator, canvas: Canvas, outline_m: Doubles) -> Doubles:
+    """Paint a field of some kind; return the trees that stand in it, (N, 4) metres: east, north, radius, top."""
+    weights = np.array([kind.weight for kind in _KINDS])
+    kind = _KINDS[rng.choice(len(_KINDS), p=weights / weights.sum())]
+    side = longest_side(outline_m[:: max(1, len(outline_m) // 10)])
+    turn_rad = np.arctan2(side[1], side[0]) + rng.normal(0, 0.06)
+    along, _ = axes_of(turn_rad)
+    box = canvas.box(outline_m)
+    if canvas.height_cm[box].size:
+        cover = canvas.polygon(box, outline_m)
+        east_m, north_m = canvas.grid_m(box)
+        patches = noise(rng, cover.shape, 22 / canvas.metres_per_pixel)
+        tufts = noise(rng, cover.shape, 2.4 / canvas.metres_per_pixel)
+        across_m = -along[1] * east_m + along[0] * north_m + 0.4 * patches
+        colour, relief_cm = kind.look(FieldGround(patches, tufts, across_m))
+        canvas.paint(box, cover, colour * rng.uniform(0.85, 1.12) * rng.normal(1, 0.025, 3))
+        canvas.height_cm[box] = np.where(cover > 0.5, np.clip(BASE_CM + relief_cm, 0, None), canvas.height_cm[box])
+    return _trees(rng, outline_m, turn_rad, *kind.trees_m) if kind.trees_m else np.empty((0, 4))
+
+
+def _trees(
+    rng: np.random.Generator, outline_m: Doubles, turn_rad: float, spacing_m: float, scatter_m: float, radius_m: float
+) -> Doubles:
+    """Place trees in rows over a field, (N, 4) metres: east, north, radius, top."""
+    along, across = axes_of(turn_rad)
+    reach_m = np.arange(-110, 110, spacing_m)
+    u, v = (axis.reshape(-1, 1) for axis in np.meshgrid(reach_m, reach_m))
+    points_m = outline_m.mean(axis=0) + u * along + v * across
+    points_m = points_m + rng.normal(0, scatter_m, points_m.shape)
+    outline = outline_m.astype(np.float32)
+    inside = [cv2.pointPolygonTest(outline, (float(x), float(y)), True) > 2.5 for x, y in points_m]
+    return _grown(rng, points_m[np.array(inside, bool)], radius_m, (1.6, 2.6))
+
+
+def _grown(rng: np.random.Generator, points_m: Doubles, radius_m: float, slender: tuple[float, float]) -> Doubles:
+    radius = radius_m * rng.uniform(0.6, 1.35, len(points_m))
+    return np.column_stack((points_m, radius, radius * rng.uniform(*slender, len(points_m))))
