@@ -56,7 +56,7 @@ def _loader() -> type:
         levels = 0
 
         def compose_node(self, parent: Any, index: Any) -> Any:
-            event = self.peek_event()
+            event = self.peek_event()  # type: ignore[no-untyped-call]  # PyYAML tells no types of it
             if isinstance(event, yaml.AliasEvent):
                 raise _problem(f"the alias `*{event.anchor}`: write its value out", event.start_mark)
             if self.levels > _MOST_LEVELS:
@@ -67,7 +67,7 @@ def _loader() -> type:
             finally:
                 self.levels -= 1
 
-        def construct_mapping(self, node: Any, deep: bool = False) -> dict:
+        def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
             lines: dict[str, int] = {}
             for key, _ in node.value:
                 if key.tag == _MERGE:

@@ -5,7 +5,8 @@ Only what opens a stream or a video file imports this: the library takes room.
 
 import logging
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from fractions import Fraction
+from typing import TYPE_CHECKING, Any
 
 import av
 import av.logging
@@ -50,7 +51,7 @@ def open_pictures(
 class Fetched:
     """A packet; `is_doubtful` where others may be missing before it."""
 
-    packet: "Packet"
+    packet: "Packet[Any]"
     is_doubtful: bool
 
 
@@ -67,6 +68,7 @@ class WholePictures:
 
     def __init__(self, container: "InputContainer", are_missed: bool) -> None:
         self.container, self.stream = container, container.streams.video[0]
+        self.time_base = self.stream.time_base or Fraction(1, 1_000_000)  # seconds of a time stamp's unit
         self.is_stamped = not container.format.flags & _UNSTAMPED
         self._codec = self.stream.codec_context
         self._codec.thread_count = 1  # pictures decoded side by side come late, and each takes memory
@@ -130,7 +132,7 @@ class WholePictures:
         """Close the file or the connection."""
         self.container.close()
 
-    def _decoded(self, packet: "Packet") -> "list[VideoFrame] | Refusal":
+    def _decoded(self, packet: "Packet[Any]") -> "list[VideoFrame] | Refusal":
         with av.logging.Capture():
             try:
                 pictures = self._codec.decode(packet)

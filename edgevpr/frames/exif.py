@@ -181,24 +181,17 @@ def _number(values: dict[str, str], name: str, low: float = -360.0, high: float 
 
 def _from_straight_down(yaw_deg: float, pitch_deg: float, roll_deg: float) -> tuple[float, float, float]:
     """Return heading, roll and pitch from straight down of a gimbal whose pitch is -90 there. Its roll then turns the
-    picture and tilts nothing: a gimbal may tell half a turn in yaw as half a turn in roll."""
+    picture and tilts nothing: a gimbal may tell half a turn in yaw as half a turn in roll.
+
+    They are those of a level airframe whose camera looks straight down like this one: its nose is where the top of the
+    picture points, its right that of the picture, and its down what the camera looks at.
+    """
     yaw, pitch, roll = map(math.radians, (yaw_deg, pitch_deg, roll_deg))
-    # Columns: the axes of a level airframe whose camera looks straight down like this one. Its nose is where the top of
-    # the picture points, its right that of the picture, and its down what the camera looks at.
-    nose = _turned(yaw, pitch, roll, (0.0, 0.0, -1.0))
-    right = _turned(yaw, pitch, roll, (0.0, 1.0, 0.0))
-    down = _turned(yaw, pitch, roll, (1.0, 0.0, 0.0))
-    heading = math.atan2(nose[1], nose[0])
+    # The nose, before it is turned by the yaw. A difference from zero is never -0.0, which turns by half a turn.
+    ahead, aside = 0.0 - math.cos(roll) * math.sin(pitch), 0.0 + math.sin(roll)
+    north, east = ahead * math.cos(yaw) - aside * math.sin(yaw), ahead * math.sin(yaw) + aside * math.cos(yaw)
     return (
-        math.degrees(heading) % 360,
-        math.degrees(math.atan2(right[2], down[2])),
-        math.degrees(math.asin(max(-1.0, min(1.0, -nose[2])))),
+        math.degrees(math.atan2(east, north)) % 360,
+        math.degrees(math.atan2(math.sin(roll) * math.cos(pitch) + 0.0, 0.0 - math.sin(pitch))),
+        math.degrees(math.asin(max(-1.0, min(1.0, math.cos(roll) * math.cos(pitch))))),
     )
-
-
-def _turned(yaw: float, pitch: float, roll: float, axis: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Turn an axis (ahead, right, down) by roll, then pitch, then yaw: (north, east, down)."""
-    ahead, right, down = axis
-    right, down = right * math.cos(roll) - down * math.sin(roll), right * math.sin(roll) + down * math.cos(roll)
-    ahead, down = ahead * math.cos(pitch) + down * math.sin(pitch), down * math.cos(pitch) - ahead * math.sin(pitch)
-    return ahead * math.cos(yaw) - right * math.sin(yaw), ahead * math.sin(yaw) + right * math.cos(yaw), down

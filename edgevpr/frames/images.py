@@ -141,8 +141,13 @@ def small_jpeg(image: Image, longest_px: int = _SMALL_PX) -> bytes:
     scale = min(1.0, longest_px / max(image.shape[:2]))
     if scale < 1:
         width, height = (max(1, round(scale * side)) for side in image.shape[1::-1])
-        image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)  # type: ignore[assignment]  # uint8
+        image = resized(image, (width, height))
     return _encoded(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, _SMALL_QUALITY))
+
+
+def resized(image: Image, size_px: tuple[int, int]) -> Image:
+    """Return a picture in another size (width, height), smaller ones with the mean of the pixels that become one."""
+    return cv2.resize(image, size_px, interpolation=cv2.INTER_AREA)  # type: ignore[return-value]  # of the same dtype
 
 
 def _encoded(extension: str, image: Image, options: Sequence[int] = ()) -> bytes:

@@ -1,14 +1,16 @@
 """Levelling: lays the picture of a camera that looks down on flat ground, north-up and to scale, in one warp."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
+import cv2
 import numpy as np
 
+from edgevpr.core.arrays import Doubles, Image, Mask
 from edgevpr.core.types import Frame, Vehicle
-from edgevpr.frames.images import cv2
+from edgevpr.frames.images import resized
 
 MOST_TILT_DEG = 45.0
 _MOST_OFF_DOWN_DEG = 85.0  # of a corner's ray: beyond it are the horizon and ground that fills no pixel
@@ -66,8 +68,8 @@ class Levelled:
     """A picture as it is encoded: `image` uint8 (H, W[, 3]), `mask` bool (H, W), False where it does not show ground
     (None: it does everywhere), and how it lies on the ground."""
 
-    image: np.ndarray
-    mask: np.ndarray | None
+    image: Image
+    mask: Mask | None
     view: View
 
 
@@ -77,7 +79,7 @@ def levelled(
     lens: Lens,
     footprint_m: float | None = None,
     *,
-    overlay: np.ndarray | None = None,
+    overlay: Mask | None = None,
     below: bool = False,
 ) -> Levelled:
     """Lay a picture on flat ground, as far as the frame, else the vehicle, tells how it was taken.
@@ -91,46 +93,45 @@ def levelled(
     if frame.pose is not None:
         known = View(up_deg=frame.pose.up_deg, footprint_m=frame.pose.footprint_m, aside=(0.0, 0.0))
         return Levelled(frame.image, overlay, known)
-    shot = _Shot(frame, vehicle, lens)
-    if reason := shot.objection:
-        return Levelled(frame.image, overlay, View(up_deg=shot.top_deg, reason=reason))
-    zoom = shot.own_m / footprint_m if shot.own_m and footprint_m else 1.0
+    taking = _Taking(frame, vehicle, lens)
+    if reason := taking.objection:
+        return Levelled(frame.image, overlay, View(up_deg=taking.top_deg, reason=reason))
+    zoom = taking.own_m / footprint_m if taking.own_m and footprint_m else 1.0
     if not _ZOOMS[0] <= zoom <= _ZOOMS[1]:
         zoom = 1.0
-    if shot.tilt_deg < _LEAST_TILT_DEG and shot.turn_deg < _LEAST_TURN_DEG and abs(zoom - 1) < _LEAST_ZOOM:
-        view = View(up_deg=shot.top_deg, footprint_m=shot.own_m, aside=shot.aside(shot.straight, 1.0))
+    if taking.tilt_deg < _LEAST_TILT_DEG and taking.turn_deg < _LEAST_TURN_DEG and abs(zoom - 1) < _LEAST_ZOOM:
+        view = View(up_deg=taking.top_deg, footprint_m=taking.own_m, aside=taking.aside(taking.straight, 1.0))
         return Levelled(frame.image, overlay, view)
 
-    side = min(shot.longest_px, _LONGEST_PX)
-    out_px = shot.focal_px * zoom * side / shot.longest_px  # that the output has for each unit of height
-    turned = shot.straight if shot.heading_deg is None else shot.level_from_lens(-shot.heading_deg)
+    side = min(taking.longest_px, _LONGEST_PX)
+    out_px = taking.focal_px * zoom * side / taking.longest_px  # that the output has for each unit of height
+    turned = taking.straight if taking.heading_deg is None else taking.level_from_lens(-taking.heading_deg)
     middle = np.zeros(2) if below else turned[:2, 2] / turned[2, 2] * out_px
     right, down = (side - 1) / 2 - middle
-    out_from_pixel = np.array([[out_px, 0, right], [0, out_px, down], [0, 0, 1]]) @ turned @ shot.lens_from_pixel
+    out_from_pixel = np.array([[out_px, 0, right], [0, out_px, down], [0, 0, 1]]) @ turned @ taking.lens_from_pixel
 
-    mask = _quadrangle(out_from_pixel @ shot.corners, side)
-    height, width = (min(1.0, zoom * each / shot.longest_px) for each in frame.image.shape[:2])
+    mask = _quadrangle(out_from_pixel @ taking.corners, side)
+    height, width = (min(1.0, zoom * px / taking.longest_px) for px in frame.image.shape[:2])
     if (filled := mask.mean() / (height * width)) < _LEAST_FILLED:
-        reason = f"it shows {filled:.0%} of the ground under it at a tilt of {shot.tilt_deg:.0f} degrees"
-        return Levelled(frame.image, overlay, View(up_deg=shot.top_deg, reason=reason))
+        reason = f"it shows {filled:.0%} of the ground under it at a tilt of {taking.tilt_deg:.0f} degrees"
+        return Levelled(frame.image, overlay, View(up_deg=taking.top_deg, reason=reason))
     if overlay is not None:
-        mask &= _warped(overlay, out_from_pixel, side)
+        size = (side, side)
+        mask &= cv2.warpPerspective(overlay.view(np.uint8), out_from_pixel, size, flags=cv2.INTER_NEAREST).view(bool)
     view = View(
-        up_deg=None if shot.heading_deg is None else 0.0,
-        footprint_m=shot.own_m and shot.own_m / zoom,
+        up_deg=None if taking.heading_deg is None else 0.0,
+        footprint_m=taking.own_m and taking.own_m / zoom,
         zoom=zoom,
-        aside=(0.0, 0.0) if below and shot.is_attitude_known else shot.aside(turned, zoom),
+        aside=(0.0, 0.0) if below and taking.is_attitude_known else taking.aside(turned, zoom),
     )
-    image = _shrunk_and_warped(frame.image, out_from_pixel, side, shot.focal_px / out_px)
+    image = _shrunk_and_warped(frame.image, out_from_pixel, side, taking.focal_px / out_px)
     return Levelled(image, None if mask.all() else mask, view)
 
 
 def leaning(frame: Frame, vehicle: Vehicle | None) -> View:
     """Return how far a picture of an unknown lens looks aside, as far as the frame, else the vehicle, tells how it was
     taken; of a picture that bears no warp, the reason. No value of frame or vehicle raises."""
-    roll_deg, pitch_deg, heading_deg, height_m = (
-        _known(frame, vehicle, name) for name in ("roll_deg", "pitch_deg", "heading_deg", "height_m")
-    )
+    roll_deg, pitch_deg, heading_deg, height_m = _attitude(frame, vehicle)
     if roll_deg is None or pitch_deg is None:
         return UNKNOWN_VIEW
     ahead, right, down = _level_from_body(roll_deg, pitch_deg)[:, 2]
@@ -145,17 +146,17 @@ def leaning(frame: Frame, vehicle: Vehicle | None) -> View:
     return View(lean_m=(-float(east), -float(north)))
 
 
-class _Shot:
-    """The way a picture was taken, as far as it is known. Rotations are (3, 3), between the axes of the
-    lens (right and back in the picture, and ahead of it), of the airframe (nose, right, down), and of the level
-    picture (right, back, down)."""
+class _Taking:
+    """The way in which a picture was taken, as far as it is known. Rotations are (3, 3), between the axes of the lens
+    (right and back in the picture, and ahead of it), of the airframe (nose, right, down), and of the level picture
+    (right, back, down)."""
 
     def __init__(self, frame: Frame, vehicle: Vehicle | None, lens: Lens) -> None:
-        roll_deg, pitch_deg, self.heading_deg, height_m = (
-            _known(frame, vehicle, name) for name in ("roll_deg", "pitch_deg", "heading_deg", "height_m")
-        )
+        roll_deg, pitch_deg, self.heading_deg, height_m = _attitude(frame, vehicle)
         self.is_attitude_known = roll_deg is not None and pitch_deg is not None
-        self._level_from_body = _level_from_body(roll_deg, pitch_deg) if self.is_attitude_known else np.eye(3)
+        self._level_from_body = np.eye(3)
+        if roll_deg is not None and pitch_deg is not None:
+            self._level_from_body = _level_from_body(roll_deg, pitch_deg)
         self._lens = lens
         height, width = frame.image.shape[:2]
         self.longest_px = max(height, width)
@@ -167,6 +168,8 @@ class _Shot:
         across, along = (-0.5, width - 0.5), (-0.5, height - 0.5)
         self.corners = np.array([[*across, *across[::-1]], [along[0], along[0], along[1], along[1]], [1] * 4])
         self.straight = self.level_from_lens(lens.up_deg)
+        # Degrees between what the camera looks at and straight down.
+        self.tilt_deg = math.degrees(math.acos(np.clip(self.straight[2, 2], -1, 1)))
 
     @property
     def top_deg(self) -> float | None:
@@ -178,11 +181,6 @@ class _Shot:
         """Degrees between the top of the picture and north, 0 where the heading is unknown."""
         return 0.0 if self.top_deg is None else abs((self.top_deg + 180) % 360 - 180)
 
-    @cached_property
-    def tilt_deg(self) -> float:
-        """Degrees between what the camera looks at and straight down."""
-        return math.degrees(math.acos(np.clip(self.straight[2, 2], -1, 1)))
-
     @property
     def objection(self) -> str | None:
         """The reason why the picture bears no warp, None where there is none."""
@@ -192,60 +190,60 @@ class _Shot:
             return None
         return f"it is tilted {self.tilt_deg:.0f} degrees"
 
-    def level_from_lens(self, up_deg: float) -> np.ndarray:
+    def level_from_lens(self, up_deg: float) -> Doubles:
         """Return the rotation to a level picture whose top points `up_deg` to the right of the nose."""
-        return _body_from_lens(up_deg).T @ self._level_from_body @ _body_from_lens(self._lens.up_deg)
+        rotation: Doubles = _body_from_lens(up_deg).T @ self._level_from_body @ _body_from_lens(self._lens.up_deg)
+        return rotation
 
-    def aside(self, turned: np.ndarray, zoom: float) -> tuple[float, float] | None:
+    def aside(self, turned: Doubles, zoom: float) -> tuple[float, float] | None:
         """Return `View.aside` of a picture that is turned like this; None where the attitude is unknown."""
         right, back = turned[:2, 2] / turned[2, 2] * zoom * self.focal_px / self.longest_px
         return (float(-right), float(back)) if self.is_attitude_known else None
 
 
-def _known(frame: Frame, vehicle: Vehicle | None, name: str) -> float | None:
-    values = (getattr(frame, name), getattr(vehicle, name, None))
-    return next((value for value in values if value is not None and math.isfinite(value)), None)
+def _attitude(frame: Frame, vehicle: Vehicle | None) -> Iterator[float | None]:
+    """Yield roll, pitch, heading and height of a picture, as the frame, else the vehicle, knows them."""
+    for name in ("roll_deg", "pitch_deg", "heading_deg", "height_m"):
+        values = (getattr(frame, name), getattr(vehicle, name, None))
+        yield next((value for value in values if value is not None and math.isfinite(value)), None)
 
 
-def _level_from_body(roll_deg: float, pitch_deg: float) -> np.ndarray:
+def _level_from_body(roll_deg: float, pitch_deg: float) -> Doubles:
     """Return the rotation (3, 3) from nose, right, down of the airframe to those of a level one with its heading."""
     roll, pitch = math.radians(roll_deg), math.radians(pitch_deg)
     about_right = [[math.cos(pitch), 0, math.sin(pitch)], [0, 1, 0], [-math.sin(pitch), 0, math.cos(pitch)]]
     about_nose = [[1, 0, 0], [0, math.cos(roll), -math.sin(roll)], [0, math.sin(roll), math.cos(roll)]]
-    return np.array(about_right) @ np.array(about_nose)
+    rotation: Doubles = np.array(about_right) @ np.array(about_nose)
+    return rotation
 
 
-def _body_from_lens(up_deg: float) -> np.ndarray:
+def _body_from_lens(up_deg: float) -> Doubles:
     """Return the rotation (3, 3) to nose, right, down from right, back, down of a picture whose top points `up_deg` to
     the right of the nose."""
     up = math.radians(up_deg)
     return np.array([[-math.sin(up), -math.cos(up), 0], [math.cos(up), -math.sin(up), 0], [0, 0, 1]])
 
 
-def _quadrangle(corners: np.ndarray, side: int) -> np.ndarray:
+def _quadrangle(corners: Doubles, side: int) -> Mask:
     """Return bool (side, side), True inside the quadrangle of homogeneous corners (3, 4)."""
     points = np.round((corners[:2] / corners[2]).T * 2**_SUBPIXEL_BITS).astype(np.int32)
-    return cv2.fillConvexPoly(np.zeros((side, side), np.uint8), points, 1, shift=_SUBPIXEL_BITS).view(bool)
+    return cv2.fillConvexPoly(np.zeros((side, side), np.uint8), points, (1,), shift=_SUBPIXEL_BITS).view(np.bool_)
 
 
-def _warped(mask: np.ndarray, out_from_pixel: np.ndarray, side: int) -> np.ndarray:
-    """Warp a mask, bool (H, W), to (side, side); False outside."""
-    return cv2.warpPerspective(mask.view(np.uint8), out_from_pixel, (side, side), flags=cv2.INTER_NEAREST).view(bool)
-
-
-def _shrunk_and_warped(image: np.ndarray, out_from_pixel: np.ndarray, side: int, shrink: float) -> np.ndarray:
+def _shrunk_and_warped(image: Image, out_from_pixel: Doubles, side: int, shrink: float) -> Image:
     """Warp an image to (side, side). Where `shrink` pixels become one, and they are more than two, their mean is taken
     first: a warp alone would leave most of them out."""
     if shrink > 2:
         height, width = image.shape[:2]
         small = max(1, round(width / shrink)), max(1, round(height / shrink))
         across, along = width / small[0], height / small[1]
-        image = cv2.resize(image, small, interpolation=cv2.INTER_AREA)
+        image = resized(image, small)
         out_from_pixel = out_from_pixel @ [[across, 0, (across - 1) / 2], [0, along, (along - 1) / 2], [0, 0, 1]]
     # The edge goes on outside, where the mask is False, so that it makes no gradient inside.
-    return cv2.warpPerspective(
+    warped = cv2.warpPerspective(
         image, out_from_pixel, (side, side), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
+    return warped  # type: ignore[return-value]  # of the same dtype
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,6 +254,11 @@ class Footprint:
     middle_m: tuple[float, float]
     sides_m: tuple[float, float]
     up_deg: float
+
+    @property
+    def rectangle(self) -> tuple[tuple[float, float], tuple[float, float], float]:
+        """The rectangle in the coordinates of a picture, whose rows go south, as OpenCV takes it."""
+        return (self.middle_m[0], -self.middle_m[1]), self.sides_m, self.up_deg
 
 
 def footprint(
@@ -270,13 +273,8 @@ def footprint(
 
 def shared(one: Footprint, other: Footprint) -> float:
     """Return the share of the smaller footprint that lies in the other, 0..1."""
-    _, corners = cv2.rotatedRectangleIntersection(_rectangle(one), _rectangle(other))
-    if corners is None:
+    kind, corners = cv2.rotatedRectangleIntersection(one.rectangle, other.rectangle)
+    if kind == cv2.INTERSECT_NONE:
         return 0.0
     area_m2 = cv2.contourArea(cv2.convexHull(np.asarray(corners, np.float32)))
     return min(1.0, float(area_m2) / min(math.prod(one.sides_m), math.prod(other.sides_m)))
-
-
-def _rectangle(print_: Footprint) -> tuple[tuple[float, float], tuple[float, float], float]:
-    east_m, north_m = print_.middle_m
-    return (east_m, -north_m), print_.sides_m, print_.up_deg  # of a picture whose rows go south

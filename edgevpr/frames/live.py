@@ -5,8 +5,11 @@ import contextlib
 import threading
 from collections.abc import Callable
 
+import cv2
+import numpy as np
+
+from edgevpr.core.arrays import Image
 from edgevpr.core.types import Frame
-from edgevpr.frames.images import cv2
 from edgevpr.frames.shot import Capture, Condition, Newness, Refusal, Shot, coarse
 
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.5, 10.0
@@ -30,8 +33,9 @@ class DeviceCapture:
     def read(self) -> Shot | None:
         """Wait for the next picture and return it; None where the camera is lost: `isOpened` stays true."""
         with contextlib.suppress(cv2.error):  # a picture that cannot be converted counts as a loss
-            there, image = self._capture.read()
+            there, read = self._capture.read()
             if there:
+                image: Image = np.asarray(read, np.uint8)
                 plane = image if image.ndim == 2 else image[:, :, 1]
                 return Shot(t_mono_s=self._clock(), look=coarse(plane), pixels=lambda: image)
         return None
@@ -125,13 +129,14 @@ class LiveSource:
             shot = capture.read()
             if shot is None:
                 return
-            refusal = shot if isinstance(shot, Refusal) else newness.refusal(shot.look)
-            if refusal is None and shot.t_mono_s < self._last_taken_s:
-                refusal = Refusal.LATE
-            if refusal is None:
-                self._put(shot)
-            else:
+            if isinstance(shot, Refusal):
+                self._refuse(shot)
+            elif refusal := newness.refusal(shot.look):
                 self._refuse(refusal)
+            elif shot.t_mono_s < self._last_taken_s:
+                self._refuse(Refusal.LATE)
+            else:
+                self._put(shot)
 
     def _put(self, shot: Shot) -> None:
         now_s = self._clock()

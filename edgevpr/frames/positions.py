@@ -1,13 +1,13 @@
-"""The file positions.csv: where, when and how the images of a folder were taken."""
+"""Tables of positions: where, when and how the images of a folder were taken (positions.csv), or a video at which
+second."""
 
 import csv
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,13 +16,14 @@ from edgevpr.core.files import read_file
 from edgevpr.core.types import Position
 
 _NEEDED_COLUMNS = ("file", "lat", "lon")
-_COLUMNS = (
-    *_NEEDED_COLUMNS, "alt", "heading_deg", "yaw_deg", "roll_deg", "pitch_deg", "height_m", "rel_alt", "time"
-)  # fmt: skip
+_TRACK_COLUMNS = ("time", "lat", "lon")
+_OTHER_COLUMNS = ("alt", "heading_deg", "yaw_deg", "roll_deg", "pitch_deg", "height_m", "rel_alt")
 ALT_M = (-1000.0, 100_000.0)  # of anything that flies
 _MAX_FILE_BYTES = 100_000_000  # a million images
 # 1900 to 2200. Beyond lie times in milliseconds, which are a thousand times too large.
 _FIRST_S, _LAST_S = -2_208_988_800, 7_258_118_400
+MOST_GAP_S = 5.0  # a straight line between fixes that lie further apart says where nobody was
+_ROUNDING_S = 0.001  # Matroska counts in milliseconds
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,20 +69,95 @@ def write_positions(csv_path: str | Path, tags: Mapping[str, GeoTag]) -> None:
 
 
 def rows_of(csv_path: str | Path, needed: Sequence[str] = _NEEDED_COLUMNS) -> list[tuple[str, dict[str, str]]]:
-    """Read the lines of a positions.csv: where each stands, for messages, and its values by the name of the column.
-    Where the column `file` is `needed`, each line names another file. Raises UsageError as `read_positions`."""
+    """Read the lines of a table: where each stands, for messages, and its values by the name of the column. Where the
+    column `file` is `needed`, each line names another file. Raises UsageError as `read_positions`."""
     try:
-        text = io.StringIO(read_file(csv_path, _MAX_FILE_BYTES).decode("utf-8-sig"), newline="")
-        return _read_rows(csv.reader(text, skipinitialspace=True), csv_path, needed)
+        text = read_file(csv_path, _MAX_FILE_BYTES).decode("utf-8-sig")
+        lines = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)
+        header = [name.strip().lower() for name in next(lines, [])]
+        _require_columns(header, csv_path, needed)
+        rows = [(f"{csv_path}, line {lines.line_num}", values) for values in lines if values]
     except OSError as error:
         raise UsageError(f"{csv_path} cannot be read ({error.strerror}): give the path of a CSV file.") from error
     except (UnicodeDecodeError, csv.Error) as error:
         raise UsageError(f"{csv_path} is not a text file of commas ({error}): save it as CSV in UTF-8.") from error
+    return list(_checked(rows, header, "file" in needed))
+
+
+def _require_columns(header: Sequence[str], csv_path: str | Path, needed: Sequence[str]) -> None:
+    if missing := [name for name in needed if name not in header]:
+        raise UsageError(
+            f"{csv_path}, line 1 has no column `{missing[0]}`: it must name {', '.join(needed)}, "
+            "with commas between them."
+        )
+    if twice := [name for name in (*_NEEDED_COLUMNS, *_OTHER_COLUMNS, "time") if header.count(name) > 1]:
+        raise UsageError(f"{csv_path}, line 1 has two columns `{twice[0]}`: keep one of them.")
+
+
+def _checked(
+    rows: Sequence[tuple[str, list[str]]], header: Sequence[str], are_files: bool
+) -> Iterator[tuple[str, dict[str, str]]]:
+    wheres: dict[str, str] = {}
+    for where, values in rows:
+        if len(values) != len(header):
+            raise UsageError(f"{where} has {len(values)} values; line 1 names {len(header)} columns: make them agree.")
+        row = {name: value.strip() for name, value in zip(header, values, strict=True)}
+        if are_files:
+            if not (name := row["file"]):
+                raise UsageError(f"{where} names no file: write the image's file name or delete the line.")
+            if name in wheres:
+                line = wheres[name].rpartition(", ")[2]
+                raise UsageError(f"{where}: {name} stands in {line} already: keep one of the two.")
+            wheres[name] = where
+        yield where, row
+
+
+def tag_of(row: Mapping[str, str], where: str) -> GeoTag:
+    """Return the tag of a line. Raises UsageError for a wrong value."""
+    lat_deg = number_in(row, "lat", -90, 90, where)
+    lon_deg = number_in(row, "lon", -180, 180, where)
+    alt_m = number_in(row, "alt", *ALT_M, where)
+    if (lat_deg is None) != (lon_deg is None):
+        raise UsageError(f"{where} has only one of lat and lon: write both, or leave both empty.")
+    heading_deg = number_in(row, "heading_deg" if row.get("heading_deg") else "yaw_deg", -360, 360, where)
+    return GeoTag(
+        position=None if lat_deg is None or lon_deg is None else position_or_none(lat_deg, lon_deg, alt_m),
+        heading_deg=None if heading_deg is None else heading_deg % 360,
+        t_utc_s=_time_in(row, where),
+        roll_deg=number_in(row, "roll_deg", -180, 180, where),
+        pitch_deg=number_in(row, "pitch_deg", -90, 90, where),
+        height_m=number_in(row, "height_m" if row.get("height_m") else "rel_alt", *ALT_M, where),
+    )
 
 
 def position_or_none(lat_deg: float, lon_deg: float, alt_m: float | None) -> Position | None:
     """Make a position, or None of exactly (0, 0), which a receiver without a fix writes."""
     return None if lat_deg == lon_deg == 0 else Position(lat_deg, lon_deg, alt_m)
+
+
+def number_in(row: Mapping[str, str], column: str, low: float, high: float, where: str) -> float | None:
+    """Return the number in a column of a line, None where there is none. Raises UsageError for one out of range."""
+    text = row.get(column)
+    if not text:
+        return None
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not low <= value <= high:
+        raise UsageError(f"{where}: {column} is `{text}`: write a number from {low:g} to {high:g}.")
+    return value
+
+
+def _time_in(row: Mapping[str, str], where: str) -> float | None:
+    text = row.get("time")
+    try:
+        return parse_time(text) if text else None
+    except (ValueError, OverflowError):
+        raise UsageError(
+            f"{where}: time is `{text}`: write 2016-06-23T16:31:59Z, 2016:06:23 16:31:59 or seconds since 1970, "
+            "between 1900 and 2200."
+        ) from None
 
 
 def parse_time(text: str) -> float:
@@ -100,86 +176,6 @@ def parse_time(text: str) -> float:
     if not _FIRST_S <= seconds < _LAST_S:  # false for NaN too
         raise ValueError(f"{text} is no time between 1900 and 2200")
     return seconds
-
-
-def _read_rows(reader: Any, csv_path: str | Path, needed: Sequence[str]) -> list[tuple[str, dict[str, str]]]:
-    header = [name.strip().lower() for name in next(reader, [])]
-    missing = [name for name in needed if name not in header]
-    if missing:
-        raise UsageError(
-            f"{csv_path}, line 1 has no column `{missing[0]}`: it must name {', '.join(needed)}, "
-            "with commas between them."
-        )
-    if twice := [name for name in _COLUMNS if header.count(name) > 1]:
-        raise UsageError(f"{csv_path}, line 1 has two columns `{twice[0]}`: keep one of them.")
-    rows: list[tuple[str, dict[str, str]]] = []
-    lines: dict[str, int] = {}
-    for values in reader:
-        if not values:
-            continue
-        where = f"{csv_path}, line {reader.line_num}"
-        if len(values) != len(header):
-            raise UsageError(f"{where} has {len(values)} values; line 1 names {len(header)} columns: make them agree.")
-        row = {name: value.strip() for name, value in zip(header, values, strict=True)}
-        if "file" in needed:
-            name = row["file"]
-            if not name:
-                raise UsageError(f"{where} names no file: write the image's file name or delete the line.")
-            if name in lines:
-                raise UsageError(f"{where}: {name} stands in line {lines[name]} already: keep one of the two.")
-            lines[name] = reader.line_num
-        rows.append((where, row))
-    return rows
-
-
-def tag_of(row: Mapping[str, str], where: str) -> GeoTag:
-    """Return the tag of a line. Raises UsageError for a wrong value."""
-    lat_deg = number_in(row, "lat", -90, 90, where)
-    lon_deg = number_in(row, "lon", -180, 180, where)
-    alt_m = number_in(row, "alt", *ALT_M, where)
-    if (lat_deg is None) != (lon_deg is None):
-        raise UsageError(f"{where} has only one of lat and lon: write both, or leave both empty.")
-    heading_deg = number_in(row, "heading_deg" if row.get("heading_deg") else "yaw_deg", -360, 360, where)
-    return GeoTag(
-        position=None if lat_deg is None or lon_deg is None else position_or_none(lat_deg, lon_deg, alt_m),
-        heading_deg=None if heading_deg is None else heading_deg % 360,
-        t_utc_s=_time(row, where),
-        roll_deg=number_in(row, "roll_deg", -180, 180, where),
-        pitch_deg=number_in(row, "pitch_deg", -90, 90, where),
-        height_m=number_in(row, "height_m" if row.get("height_m") else "rel_alt", *ALT_M, where),
-    )
-
-
-def number_in(row: Mapping[str, str], column: str, low: float, high: float, where: str) -> float | None:
-    """Return the number in a column of a line, None where there is none. Raises UsageError for one out of range."""
-    text = row.get(column)
-    if not text:
-        return None
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not low <= value <= high:
-        raise UsageError(f"{where}: {column} is `{text}`: write a number from {low:g} to {high:g}.")
-    return value
-
-
-def _time(row: Mapping[str, str], where: str) -> float | None:
-    text = row.get("time")
-    if not text:
-        return None
-    try:
-        return parse_time(text)
-    except (ValueError, OverflowError):
-        raise UsageError(
-            f"{where}: time is `{text}`: write 2016-06-23T16:31:59Z, 2016:06:23 16:31:59 or seconds since 1970, "
-            "between 1900 and 2200."
-        ) from None
-
-
-NEEDED_COLUMNS = ("time", "lat", "lon")
-MOST_GAP_S = 5.0  # a straight line between fixes that lie further apart says where nobody was
-_ROUNDING_S = 0.001  # Matroska counts in milliseconds
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,7 +200,7 @@ class VideoTrack:
         share = (t_s - self.t_s[after - 1]) / (self.t_s[after] - self.t_s[after - 1])
         heading_deg = _turned(one.heading_deg, other.heading_deg, share)
         return GeoTag(
-            position=_position(one.position, other.position, share),
+            position=_on_the_way(one.position, other.position, share),
             heading_deg=None if heading_deg is None else heading_deg % 360,
             roll_deg=_turned(one.roll_deg, other.roll_deg, share),
             pitch_deg=_between(one.pitch_deg, other.pitch_deg, share),
@@ -224,26 +220,27 @@ def read_track(csv_path: str | Path) -> VideoTrack:
     """Read the positions of a video: the columns time (seconds from its first frame, ascending), lat, lon and, where
     present, those of a positions.csv. A line without a position says nothing. Raises UsageError for a file that cannot
     be read, a wrong value, and one without any position."""
-    times_s: list[float] = []
-    tags: list[GeoTag] = []
-    for where, row in rows_of(csv_path, NEEDED_COLUMNS):
+    tags: dict[float, GeoTag] = {}
+    for where, row in rows_of(csv_path, _TRACK_COLUMNS):
         tag = tag_of(row, where)
         if tag.position is None:
             continue
         if tag.t_utc_s is None:
             raise UsageError(f"{where} has no time: write the seconds from the first frame of the video.")
-        if times_s and tag.t_utc_s <= times_s[-1]:
+        if tags and tag.t_utc_s <= next(reversed(tags)):
             raise UsageError(f"{where}: time is not after that of the line before: sort the lines, one for each time.")
-        times_s.append(tag.t_utc_s)
-        tags.append(replace(tag, t_utc_s=None))
+        tags[tag.t_utc_s] = replace(tag, t_utc_s=None)
     if not tags:
         raise UsageError(f"{csv_path} has no line with time, lat and lon: the positions of a video need them.")
-    return VideoTrack(Path(csv_path), tuple(times_s), tuple(tags))
+    return VideoTrack(Path(csv_path), tuple(tags), tuple(tags.values()))
 
 
-def _position(one: Position, other: Position, share: float) -> Position:
-    lon_deg = (_turned(one.lon_deg, other.lon_deg, share) + 180) % 360 - 180
-    return Position(_between(one.lat_deg, other.lat_deg, share), lon_deg, _between(one.alt_m, other.alt_m, share))
+def _on_the_way(one: Position | None, other: Position | None, share: float) -> Position | None:
+    if one is None or other is None:
+        return None
+    lat_deg, alt_m = one.lat_deg + share * (other.lat_deg - one.lat_deg), _between(one.alt_m, other.alt_m, share)
+    lon_deg = one.lon_deg + share * _turn_deg(one.lon_deg, other.lon_deg)
+    return Position(lat_deg, (lon_deg + 180) % 360 - 180, alt_m)
 
 
 def _between(one: float | None, other: float | None, share: float) -> float | None:
@@ -251,7 +248,9 @@ def _between(one: float | None, other: float | None, share: float) -> float | No
 
 
 def _turned(one_deg: float | None, other_deg: float | None, share: float) -> float | None:
-    """Turn the shorter way from one angle to the other."""
-    if one_deg is None or other_deg is None:
-        return None
-    return one_deg + share * ((other_deg - one_deg + 180) % 360 - 180)
+    return None if one_deg is None or other_deg is None else one_deg + share * _turn_deg(one_deg, other_deg)
+
+
+def _turn_deg(one_deg: float, other_deg: float) -> float:
+    """Return the shorter way from one angle to the other."""
+    return (other_deg - one_deg + 180) % 360 - 180

@@ -1,10 +1,10 @@
-"""A folder of images, read in order to its end."""
+"""A folder of images, read in order to its end, and what all recordings have in common."""
 
 from collections.abc import Callable, Collection
+from dataclasses import fields
 from pathlib import Path
 
-import numpy as np
-
+from edgevpr.core.arrays import Image
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.text import decoded_name
 from edgevpr.core.types import Frame
@@ -15,15 +15,15 @@ from edgevpr.frames.shot import Condition, Refusal
 
 
 class RecordingSource:
-    """The common part of all recordings; a subclass sets `ended`. Frames whose names are not in `only` are passed over
-    (None: all are read)."""
+    """The common part of all recordings. Frames whose names are not in `only` are passed over (None: all are read)."""
 
     is_live = False
-    dropped = latency_s = None
-    ended: bool
+    dropped: int | None = None
+    latency_s: float | None = None
 
     def __init__(self, only: Collection[str] | None = None) -> None:
         self.refused = {Refusal.DAMAGED.value: 0}
+        self._has_ended = False
         self._only = None if only is None else frozenset(only)
 
     def is_wanted(self, name: str) -> bool:
@@ -31,27 +31,28 @@ class RecordingSource:
         return self._only is None or name in self._only
 
     @property
+    def ended(self) -> bool:
+        """True where no more frames will come."""
+        return self._has_ended
+
+    @property
     def condition(self) -> Condition:
+        """The condition of the source, for programs."""
         return Condition.ENDED if self.ended else Condition.RUNNING
 
     @property
     def state(self) -> str:
+        """The condition of the source, for people."""
         return "ended" if self.ended else "reading"
 
+    def close(self) -> None:
+        """Do nothing: no file is held open between images."""
 
-def tagged(image: np.ndarray, name: str, t_mono_s: float, tag: GeoTag) -> Frame:
+
+def tagged(image: Image, name: str, t_mono_s: float, tag: GeoTag) -> Frame:
     """Return a frame with all that its tag knows."""
-    return Frame(
-        image=image,
-        name=name,
-        t_mono_s=t_mono_s,
-        t_utc_s=tag.t_utc_s,
-        position=tag.position,
-        heading_deg=tag.heading_deg,
-        roll_deg=tag.roll_deg,
-        pitch_deg=tag.pitch_deg,
-        height_m=tag.height_m,
-    )
+    known = {field.name: getattr(tag, field.name) for field in fields(tag)}
+    return Frame(image=image, name=name, t_mono_s=t_mono_s, **known)
 
 
 class FolderSource(RecordingSource):
@@ -63,37 +64,31 @@ class FolderSource(RecordingSource):
         positions: Path | None,
         clock: Callable[[], float],
         only: Collection[str] | None = None,
-    ):
+    ) -> None:
         super().__init__(only)
-        paths = list_images(folder)
-        self._paths = [path for path in paths if self.is_wanted(decoded_name(path.name))]
-        self.total = len(self._paths)
-        self._read = 0
-        self._clock = clock
+        paths = {decoded_name(path.name): path for path in list_images(folder)}  # a map and a table hold UTF-8 only
         csv_path = positions or find_positions(folder)
         self._tags = read_positions(csv_path) if csv_path else {}
-        if positions and not any(decoded_name(path.name) in self._tags for path in paths):
+        if positions and not self._tags.keys() & paths:
             raise UsageError(f"{positions} names none of the images in {folder}: its column `file` must.")
+        self._unread = [(name, path) for name, path in paths.items() if self.is_wanted(name)][::-1]
+        self.total = len(self._unread)
+        self._clock = clock
 
     @property
     def ended(self) -> bool:
-        return self._read == self.total
+        """True after the last image."""
+        return not self._unread
 
     def read(self, timeout_s: float) -> Frame | None:
         """Return the next image, None after the last. Raises ImageError for an image that cannot be used; the next call
         goes on with the image after it."""
         if self.ended:
             return None
-        path = self._paths[self._read]
-        self._read += 1
+        name, path = self._unread.pop()
         try:
             image = read_image(path)
         except ImageError:
             self.refused[Refusal.DAMAGED.value] += 1
             raise
-        name = decoded_name(path.name)  # a map and a positions.csv hold UTF-8 only
-        tag = self._tags.get(name) or read_exif(path)
-        return tagged(image, name, self._clock(), tag)
-
-    def close(self) -> None:
-        """Do nothing: no file is held open between images."""
+        return tagged(image, name, self._clock(), self._tags.get(name) or read_exif(path))

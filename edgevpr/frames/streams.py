@@ -52,7 +52,7 @@ class StreamCapture:
 
     def __init__(self, whole: WholePictures, clock: Callable[[], float], opened_s: float) -> None:
         self._whole, self._clock = whole, clock
-        self._unit_s = float(whole.stream.time_base)
+        self._unit_s = float(whole.time_base)
         self._stamped = StampedTime() if whole.is_stamped else None
         self._unstamped = UnstampedTime(opened_s)
         self._ready: deque[Shot | Refusal] = deque()
@@ -102,7 +102,8 @@ class StreamCapture:
         if not picture.format.name.startswith(_BYTES_OF_LUMA) or picture.format.components[0].bits != 8:
             return coarse(self._whole.pixels(picture, "gray"))
         plane = picture.planes[0]
-        return coarse(np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: picture.height, : picture.width])
+        rows = np.frombuffer(memoryview(plane), np.uint8).reshape(-1, plane.line_size)
+        return coarse(rows[: picture.height, : picture.width])
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,6 +168,14 @@ class StampedTime:
     when clocks drift or the sender has paused: delays in a jam waver, and may last. `is_live`: what waited for the
     opening has been fetched."""
 
+    is_live: bool
+    _in_time: int
+    _order_s: float
+    _order_delay_s: float
+    _least_s: float
+    _least_order_delay_s: float
+    _window: list[tuple[float, float, float]]
+
     def __init__(self) -> None:
         self._begin_anew()
 
@@ -200,7 +209,7 @@ class StampedTime:
         self.is_live, self._in_time = False, 0
         self._order_s, self._order_delay_s = -math.inf, math.nan
         self._least_order_delay_s = self._least_s = math.inf
-        self._window: list[tuple[float, float, float]] = []
+        self._window = []
 
 
 class UnstampedTime:

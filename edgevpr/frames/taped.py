@@ -68,13 +68,13 @@ class ReplayedSource:
     def __getattr__(self, name: str) -> Any:
         if name not in _STATE:
             raise AttributeError(name)
-        value = self._tape.read(name, lambda: None)
+        value: Any = self._tape.read(name, lambda: None)
         return Condition[value] if name == "condition" else value
 
     def read(self, timeout_s: float) -> Frame | None:
         """Return the next frame of the tape; None where none had come. Raises ImageError where one could not be
         used."""
-        known = self._tape.read("frame", lambda: None)
+        known: Any = self._tape.read("frame", lambda: None)
         if known is None:
             return None
         if problem := known.get("problem"):

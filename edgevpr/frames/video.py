@@ -38,13 +38,12 @@ class VideoSource(RecordingSource):
         track: VideoTrack | None = None,
     ):
         super().__init__(only)
-        self.ended = False
         self._path, self._step_s, self._clock, self._track = path, step_s, clock, track
         whole = open_pictures(str(path), {})
         if whole is None:
             raise SourceError(f"{path} is not a video that can be decoded: give a video file or a folder of images.")
         self._whole, stream = whole, whole.stream
-        self._unit_s, self._first_stamp = float(stream.time_base), stream.start_time or 0
+        self._unit_s, self._first_stamp = float(whole.time_base), stream.start_time or 0
         self._frame_s = 1 / float(stream.average_rate or _USUAL_RATE_HZ)
         self._promised_s, self._is_stamped = _promised_s(whole), whole.is_stamped
         frames = stream.frames or self._promised_s / self._frame_s
@@ -76,7 +75,7 @@ class VideoSource(RecordingSource):
         return None
 
     def close(self) -> None:
-        self.ended = True
+        self._has_ended = True
         self._whole.close()
 
     def _decode_more(self) -> None:
@@ -114,7 +113,7 @@ class VideoSource(RecordingSource):
     def _end(self) -> None:
         if self._damaged:
             self._tell_damaged(until=", to the end of the file, which may be cut short")
-        self.ended = True
+        self._has_ended = True
         seen_s = self._heard_s + self._frame_s
         if self._promised_s - seen_s > _CUT_S:
             raise ImageError(
@@ -129,4 +128,4 @@ def _promised_s(whole: WholePictures) -> float:
     if not whole.is_stamped:
         return 0.0
     stream = whole.stream
-    return float(stream.duration * stream.time_base) if stream.duration else (whole.container.duration or 0) / 1e6
+    return float(stream.duration * whole.time_base) if stream.duration else (whole.container.duration or 0) / 1e6

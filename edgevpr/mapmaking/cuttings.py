@@ -41,6 +41,7 @@ class OrthophotoSource(RecordingSource):
 
     @property
     def ended(self) -> bool:
+        """True after the last place."""
         return self._read == self.total
 
     def read(self, timeout_s: float) -> Frame | None:

@@ -3,11 +3,11 @@
 from pathlib import Path
 from typing import Protocol
 
+import cv2
 import numpy as np
 
 from edgevpr.core.errors import SourceError
 from edgevpr.core.types import Position
-from edgevpr.frames.images import cv2
 from edgevpr.mapmaking.rasters import CRS, CPLE_BaseError, GeoRaster, RasterioError, TileFolder, rasterio, transform
 
 WGS84 = CRS.from_epsg(4326)

@@ -7,10 +7,10 @@ import os
 import warnings
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from edgevpr.core.errors import ImageError, SourceError
-from edgevpr.frames.images import cv2
 
 # Read when GDAL first keeps a block of a file, in MB. Its default is a twentieth of the RAM.
 os.environ.setdefault("GDAL_CACHEMAX", "64")
