@@ -56,7 +56,7 @@ def _loader() -> type:
         levels = 0
 
         def compose_node(self, parent: Any, index: Any) -> Any:
-            event = self.peek_event()  # type: ignore[no-untyped-call]  # PyYAML tells no types of it
+            event = self.peek_event()  # type: ignore[no-untyped-call]  # PyYAML
             if isinstance(event, yaml.AliasEvent):
                 raise _problem(f"the alias `*{event.anchor}`: write its value out", event.start_mark)
             if self.levels > _MOST_LEVELS:
