@@ -23,15 +23,12 @@ class Speaker:
     address: Sender | None
 
     def __str__(self) -> str:
-        return f"system {self.system_id}" + (f" at {_written(self.address)}" if self.address else "")
+        return f"system {self.system_id}{self.where}"
 
-
-@dataclass(frozen=True, slots=True)
-class _Row:
-    """Heartbeats in a row, without a gap: times of the first and of the last."""
-
-    since_s: float
-    last_s: float
+    @property
+    def where(self) -> str:
+        """The address in words, where there is one."""
+        return f" at {self.address[0]}:{self.address[1]}" if self.address else ""
 
 
 class Identity:
@@ -40,16 +37,17 @@ class Identity:
     It is kept for as long as it speaks. When it has been silent for 30 s, another that beats steadily takes its place:
     the same system at another address, or else another system if it is the only one. A system that was heard between
     two heartbeats of ours is another vehicle, and is never taken; nor is any other than a configured one.
+    `foreign_messages` counts what was refused, since it came from another autopilot or another address.
     """
 
     def __init__(self, system_id: int | None = None) -> None:
         self.kept: Speaker | None = None
-        self.foreign_messages = 0  # refused, since they came from another autopilot or another address
+        self.foreign_messages = 0
         self._configured = system_id
         self._spoke_s = -math.inf
-        self._others: dict[Speaker, _Row] = {}
+        self._others: dict[Speaker, tuple[float, float]] = {}  # unbroken heartbeats: times of the first and of the last
         self._neighbours: set[int] = set()  # system ids of other vehicles
-        self._said: set[str] = set()
+        self._warnings: set[str] = set()
         self._news: str | None = None
 
     def take_news(self) -> str | None:
@@ -78,64 +76,54 @@ class Identity:
         self.foreign_messages += self.kept is not None or self._configured is not None
 
     def _is_next(self, speaker: Speaker, now_s: float) -> bool:
-        """Take note of the heartbeat of another speaker; tell whether it is our autopilot from now on."""
+        """Take note of the heartbeat of another speaker; tell whether it is our autopilot from now on. Two vehicles on
+        one link are dangerous, and warned of."""
+        kept = self.kept
         if self._configured not in (None, speaker.system_id):
-            self._say("configured", f"{speaker} is not system {self._configured}, which is configured: it gets no fix")
+            self._warn("configured", f"{speaker} is not system {self._configured}, which is configured: it gets no fix")
             return False
-        if self.kept is None:
+        if kept is None:
             return True
-        self._say_second(speaker)
-        row = self._noted(speaker, now_s)
-        is_silent = now_s - self._spoke_s >= RETAKEN_AFTER_S
-        return is_silent and row.last_s - row.since_s >= STEADY_S and self._is_only_choice(speaker)
+        if speaker.system_id == kept.system_id:
+            self._warn("address", f"{speaker} is a second autopilot of that number; fixes go to {kept} only")
+        else:
+            self._warn(
+                "system",
+                f"a second autopilot, {speaker}, is on this link; fixes go to {kept} only: give each vehicle a link "
+                "of its own, or set mavlink.system_id",
+            )
+        steady_s = self._steady_s(speaker, now_s)
+        # No other who speaks now may be ours as well: the same system comes before any other.
+        systems = {other.system_id for other in self._others} - self._neighbours
+        is_only_choice = speaker.system_id == kept.system_id or systems == {speaker.system_id}
+        return now_s - self._spoke_s >= RETAKEN_AFTER_S and steady_s >= STEADY_S and is_only_choice
 
-    def _noted(self, speaker: Speaker, now_s: float) -> _Row:
-        """Note a heartbeat in the row of its speaker, and forget the rows that have ended."""
-        row = self._others.pop(speaker, None)
-        self._others = {other: each for other, each in self._others.items() if now_s - each.last_s <= GAP_S}
+    def _steady_s(self, speaker: Speaker, now_s: float) -> float:
+        """Note a heartbeat, and forget the rows of heartbeats that have ended; return how long that of the speaker has
+        gone on."""
+        since_s, last_s = self._others.pop(speaker, (now_s, now_s))
+        self._others = {other: row for other, row in self._others.items() if now_s - row[1] <= GAP_S}
         if len(self._others) == _OTHERS_MAX:
             self._others.pop(next(iter(self._others)))
-        is_unbroken = row is not None and now_s - row.last_s <= GAP_S
-        self._others[speaker] = _Row(row.since_s if is_unbroken else now_s, now_s)
-        return self._others[speaker]
-
-    def _is_only_choice(self, speaker: Speaker) -> bool:
-        """Tell whether no other who speaks now could be ours as well: the same system comes before any other."""
-        if speaker.system_id == self.kept.system_id:
-            return True
-        systems = {other.system_id for other in self._others} - self._neighbours
-        return systems == {speaker.system_id}
+        since_s = since_s if now_s - last_s <= GAP_S else now_s
+        self._others[speaker] = since_s, now_s
+        return now_s - since_s
 
     def _take(self, speaker: Speaker, now_s: float) -> None:
         before, self.kept = self.kept, speaker
         if before is None:
             log.info("autopilot heard: %s", speaker)
         else:
-            log.warning(
-                "the autopilot is %s now: %s has been silent for %.0f s", speaker, before, now_s - self._spoke_s
-            )
+            silent_s = now_s - self._spoke_s
+            log.warning("the autopilot is %s now: %s has been silent for %.0f s", speaker, before, silent_s)
             is_renamed = speaker.system_id != before.system_id
-            where = f"is now system {speaker.system_id}" if is_renamed else f"now at {_written(speaker.address)}"
-            self._news = f"autopilot {where}"
-        self._others.clear()
-        self._said.clear()
-
-    def _say_second(self, speaker: Speaker) -> None:
-        """Warn of a second autopilot: two vehicles on one link are dangerous."""
-        if speaker.system_id == self.kept.system_id:
-            self._say("address", f"{speaker} is a second autopilot of that number; fixes go to {self.kept} only")
-        else:
-            self._say(
-                "system",
-                f"a second autopilot, {speaker}, is on this link; fixes go to {self.kept} only: give each vehicle a "
-                "link of its own, or set mavlink.system_id",
+            self._news = (
+                f"autopilot is now system {speaker.system_id}" if is_renamed else f"autopilot now{speaker.where}"
             )
+        self._others.clear()
+        self._warnings.clear()
 
-    def _say(self, kind: str, text: str) -> None:
-        if kind not in self._said:
-            self._said.add(kind)
+    def _warn(self, kind: str, text: str) -> None:
+        if kind not in self._warnings:
+            self._warnings.add(kind)
             log.warning("%s", text)
-
-
-def _written(address: Sender) -> str:
-    return f"{address[0]}:{address[1]}"

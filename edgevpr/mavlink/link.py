@@ -17,7 +17,7 @@ from edgevpr.mavlink.conversation import Conversation, LinkSettings
 from edgevpr.mavlink.fixes import Sending
 from edgevpr.mavlink.line import Line
 from edgevpr.mavlink.messages import Fix, Health, Severity
-from edgevpr.mavlink.ports import open_port
+from edgevpr.mavlink.ports import Port, open_port
 from edgevpr.mavlink.requests import Wish, Wished
 from edgevpr.mavlink.turns import Turns
 from edgevpr.mavlink.wire import Message
@@ -271,9 +271,10 @@ class Link:
                 self._transmit(line, step)
             self._conversation.tell_of_answers()
             step("answers")
+        reading: list[Port | socket.socket] = [line.port, self._bell]
         writing = [line.port] if line.is_writing else []
         timeout_s = min(timeout_s, WATCH_S) if line.is_watched else self._conversation.wait_s(timeout_s)
-        readable, _, _ = select.select([line.port, self._bell], writing, [], timeout_s)
+        readable, _, _ = select.select(reading, writing, [], timeout_s)
         if self._bell in readable:
             self._bell.recv(4096)
         if line.port in readable:

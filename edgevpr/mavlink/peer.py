@@ -38,15 +38,19 @@ class Listener(Protocol):
 
     def hear_autopilot(self, t_s: float) -> None:
         """Take in that there is an autopilot from `t_s` on, or another one than before."""
+        return
 
     def hear_channel(self, channel: Channel) -> None:
         """Take in by which channel the autopilot is told positions, when that has been found out."""
+        return
 
     def hear_vehicle(self, vehicle: Vehicle) -> None:
         """Take in a report of position and velocity."""
+        return
 
     def hear_force(self, t_s: float, force_m_s2: tuple[float, float, float], attitude: Attitude) -> None:
         """Take in what the accelerometers feel (nose, right, down) at an attitude."""
+        return
 
     def state_at(self, t_s: float) -> MotionState | None:
         """Return where the vehicle is or was, to be sent as a continuous position; None: that is not known well

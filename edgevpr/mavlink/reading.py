@@ -91,7 +91,7 @@ def read_autopilot(asking: Inquiry, wanted: Mapping[str, Iterable[str]]) -> Auto
     bytewise = bool(said.capabilities & _BYTEWISE) if said else is_px4
     names = wanted.get(firmware, ()) if answers else ()
     return AutopilotReading(
-        system_id=asking.system_id,
+        system_id=beat.get_srcSystem(),
         firmware=firmware,
         vehicle=kind_of(beat.type).value,
         is_armed=bool(beat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED),

@@ -266,4 +266,5 @@ def _read_stamp(path: Path) -> int:
 
 
 def _is_of_radio(header: Message) -> bool:
-    return header.msgId == mavlink.MAVLINK_MSG_ID_RADIO_STATUS and header.srcComponent != mavlink.MAV_COMP_ID_AUTOPILOT1
+    is_status = header.msgId == mavlink.MAVLINK_MSG_ID_RADIO_STATUS
+    return bool(is_status and header.srcComponent != mavlink.MAV_COMP_ID_AUTOPILOT1)

@@ -105,7 +105,7 @@ class Tlog:
         disk = os.fstatvfs(self._file.fileno())
         if disk.f_bavail * disk.f_frsize < SPARED_BYTES:
             raise OSError(errno.ENOSPC, f"less than {SPARED_BYTES // 1_000_000} MB are left on the disk")
-        append(self._file, records)
+        append(self._file, bytes(records))
         sync(self._file)
 
     def _reopened(self) -> BinaryIO:

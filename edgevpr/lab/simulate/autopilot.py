@@ -60,7 +60,6 @@ def run_autopilot(
     duration_s: float | None = None,
     stop: threading.Event | None = None,
     *,
-    system_id: int = 1,
     track: FlownTrack | None = None,
     vehicle: str = DEFAULT_VEHICLE,
     gps: bool = False,
@@ -75,7 +74,7 @@ def run_autopilot(
     a value that a parameter cannot have.
     """
     motion = AlongTrack(track) if track else Motion()
-    controller = FlightController(vehicle, motion, gps=gps, system_id=system_id, start_utc_s=time.time())
+    controller = FlightController(vehicle, motion, gps=gps, start_utc_s=time.time())
     for name, text in parameters.items():
         controller.brain.parameters.set_written(name, text)
     return serve(controller, link_url, duration_s, stop)
@@ -176,7 +175,7 @@ class _Port:
 def _is_question(message: Message) -> bool:
     """Tell whether a message only asks, and neither tells nor sets anything."""
     if message.get_type() in ("COMMAND_INT", "COMMAND_LONG"):
-        return message.command == mavlink.MAV_CMD_REQUEST_MESSAGE
+        return bool(message.command == mavlink.MAV_CMD_REQUEST_MESSAGE)
     return message.get_type() in _QUESTIONS
 
 

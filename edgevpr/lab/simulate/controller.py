@@ -2,7 +2,7 @@
 
 import cmath
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from edgevpr.core.errors import UsageError
@@ -46,7 +46,7 @@ class ReceivedFix:
 class Streams:
     """The intervals of a link. `is_known` False leaves out every message that tells where the vehicle is."""
 
-    def __init__(self, default_hz: dict[int, float], filter_report: int, is_known: bool) -> None:
+    def __init__(self, default_hz: Mapping[int, float], filter_report: int, is_known: bool) -> None:
         self._reports = {**REPORTS, filter_report: FILTER_REPORTS[filter_report]}
         if not is_known:
             self._reports = {number: report for number, report in self._reports.items() if number not in _WHERE}

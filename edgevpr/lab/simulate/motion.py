@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import moved, offset_m
-from edgevpr.frames.positions import GeoTag, read_positions
+from edgevpr.frames.positions import read_positions
 
 _FASTEST_M_S = 327.0  # that the message can say
 
@@ -88,15 +88,15 @@ class AlongTrack(Motion):
 def read_track(csv_path: str | Path) -> FlownTrack:
     """Read the rows of a positions.csv that have a position and a time, in the order of time. Raises UsageError where
     there are none."""
-    rows = [
-        (tag.t_utc_s, tag.position.lat_deg, tag.position.lon_deg, tag.position.alt_m or 0.0, *_hanging(tag))
-        for tag in read_positions(csv_path).values()
-        if tag.position and tag.t_utc_s is not None
-    ]
+    rows = []
+    for tag in read_positions(csv_path).values():
+        if tag.position and tag.t_utc_s is not None:
+            at = tag.position.lat_deg, tag.position.lon_deg, tag.position.alt_m or 0.0
+            rows.append([tag.t_utc_s, *at, tag.heading_deg, tag.roll_deg, tag.pitch_deg, tag.height_m])
     if not rows:
         raise UsageError(f"{csv_path} has no row with lat, lon and time: a track needs them.")
-    rows.sort(key=lambda row: row[0])
-    t_s, lat_deg, lon_deg, alt_m, heading_deg, roll_deg, pitch_deg, height_m = np.array(rows, float).T
+    ordered = np.array(sorted(rows, key=lambda row: row[0] or 0.0), float)
+    t_s, lat_deg, lon_deg, alt_m, heading_deg, roll_deg, pitch_deg, height_m = ordered.T
     return FlownTrack(
         t_s=t_s - t_s[0],
         lat_deg=lat_deg,
@@ -107,10 +107,6 @@ def read_track(csv_path: str | Path) -> FlownTrack:
         pitch_deg=pitch_deg,
         height_m=height_m,
     )
-
-
-def _hanging(tag: GeoTag) -> tuple[float | None, ...]:
-    return tag.heading_deg, tag.roll_deg, tag.pitch_deg, tag.height_m
 
 
 def truth_at(track: FlownTrack, t_s: float) -> TrueState:
