@@ -1,0 +1,105 @@
+"""An autopilot that is worked by hand, in a conversation without a port."""
+
+import math
+
+from fakes import FakeClock
+
+from edgevpr.mavlink.conversation import Conversation, LinkSettings
+from edgevpr.mavlink.messages import Fix
+from edgevpr.mavlink.wire import PacketReader, mavlink
+
+ABS = mavlink.EKF_POS_HORIZ_ABS
+FIX_3D = mavlink.GPS_FIX_TYPE_3D_FIX
+
+
+class Autopilot:
+    """Autopilot 7, at 50, 8 unless it says another place; it says what it is told to."""
+
+    def __init__(self) -> None:
+        self.clock = FakeClock()
+        self.conversation = Conversation(LinkSettings(), self.clock)
+        self._packers, self.packets = {}, []
+        self.beat()
+
+    def say(self, message, system_id=7, component_id=1):
+        packer = self._packers.setdefault((system_id, component_id), mavlink.MAVLink(None, system_id, component_id))
+        self.conversation.hear(message.pack(packer), self.clock.now_s, None)
+
+    def beat(self, base_mode=0, **sender):
+        beat = mavlink.MAVLink_heartbeat_message(1, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, base_mode, 0, 4, 3)
+        self.say(beat, **sender)
+
+    def position(self, lat_deg=50.0, lon_deg=8.0, hdg=9050, vx=0, vy=0, **sender):
+        at = round(lat_deg * 1e7), round(lon_deg * 1e7), 312_500, 80_000
+        self.say(mavlink.MAVLink_global_position_int_message(0, *at, vx, vy, 0, hdg), **sender)
+        return self.vehicle
+
+    def gps(self, fix_type=FIX_3D, h_acc=0, message=mavlink.MAVLink_gps_raw_int_message, lat_deg=50.0):
+        second = () if message is mavlink.MAVLink_gps_raw_int_message else (0, 0)
+        self.say(message(0, fix_type, round(lat_deg * 1e7), 80_000_000, 0, 80, 120, 0, 0, 14, *second, h_acc=h_acc))
+
+    def attitude(self, roll_deg=0.0, pitch_deg=0.0, yaw_deg=0.0):
+        self.say(mavlink.MAVLink_attitude_message(0, *map(math.radians, (roll_deg, pitch_deg, yaw_deg)), 0, 0, 0))
+
+    def range(self, distance_m, orientation=25, signal_quality=0):
+        fields = 0, 20, 10_000, round(distance_m * 100), 0, 0, orientation, 0
+        self.say(mavlink.MAVLink_distance_sensor_message(*fields, signal_quality=signal_quality))
+
+    def terrain(self, height_m, spacing=100):
+        self.say(mavlink.MAVLink_terrain_report_message(500_000_000, 80_000_000, spacing, 0.0, height_m, 0, 9))
+
+    def filter(self, flags):
+        self.say(mavlink.MAVLink_ekf_status_report_message(flags, 0.1, 0.1, 0.1, 0.1, 0.1))
+
+    def px4_filter(self, accuracy_m, flags=ABS):
+        self.say(mavlink.MAVLink_estimator_status_message(0, flags, 0, 0, 0, 0, 0, 0, accuracy_m, 1.0))
+
+    def put_fix(self, accuracy_m=12.0, **sender):
+        """Let a fix be sent where one may be; it leaves at once."""
+        self.beat(**sender)
+        sending = self.conversation.fixes.put(Fix(50.0, 8.0, accuracy_m, self.clock.now_s), self.clock.now_s)
+        for packet, fix in iter(self.conversation.next_packet, None):
+            self.packets.append(packet)
+            if fix:
+                fix.settle(True)
+                self.conversation.note_departed([fix])
+        return sending
+
+    def answer(self, result, command=43003, to=197):
+        self.say(mavlink.MAVLink_command_ack_message(command, result, target_system=7, target_component=to))
+
+    def take_fix(self, result, accuracy_m=12.0, after_s=0.0):
+        """Let a fix be sent, and answer it; give what became of it."""
+        sending = self.put_fix(accuracy_m)
+        self.wait(after_s)
+        self.answer(result)
+        return sending.outcome
+
+    def wait(self, seconds):
+        self.clock.now_s += seconds
+
+    def told(self):
+        """The messages that have been sent since the last call."""
+        self.conversation.tell_of_answers()
+        self.packets += [packet for packet, _ in iter(self.conversation.next_packet, None)]
+        packets, self.packets = self.packets, []
+        return list(PacketReader().feed(b"".join(packets)))
+
+    def questions(self):
+        """The commands among them."""
+        return [message for message in self.told() if message.get_type() == "COMMAND_LONG"]
+
+    def texts(self):
+        """The severities and texts among them."""
+        return [(message.severity, message.text) for message in self.told() if message.get_type() == "STATUSTEXT"]
+
+    @property
+    def vehicle(self):
+        return self.conversation.autopilot.vehicle
+
+    def at(self, t_s):
+        return self.conversation.vehicle_at(t_s)
+
+    def sd_m(self):
+        """The certainty that comes with its next report."""
+        return self.position().position_sd_m

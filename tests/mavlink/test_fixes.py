@@ -1,0 +1,303 @@
+"""Which fix an answer belongs to, what becomes of those without one, and what is said of both: five without an answer
+stop the sending, one now and then asks again."""
+
+import logging
+import math
+import socket
+from contextlib import closing
+
+import pytest
+from conversing import FIX_3D
+from mavlink_peers import Peer, TcpServer, free_port, link_to, wait_until
+
+from edgevpr.mavlink import readiness
+from edgevpr.mavlink.fixes import FixAnswer, Fixes, Sending
+from edgevpr.mavlink.messages import Fix
+from edgevpr.mavlink.readiness import GPS_IN_USE, AutopilotState
+from edgevpr.mavlink.wire import mavlink
+
+ACCEPTED, FAILED, DENIED = mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_FAILED, mavlink.MAV_RESULT_DENIED
+LATE = FixAnswer(None, "it had no answer within 1 s", None)
+UNANSWERED = "not sent: five fixes in a row had no answer"
+ARMED = mavlink.MAV_MODE_FLAG_SAFETY_ARMED
+STATE = AutopilotState()
+
+
+@pytest.fixture
+def fixes():
+    return Fixes()
+
+
+def sent(fixes, *times_s, has_answer=True):
+    """Send a fix at each time; give the last."""
+    for t_s in times_s:
+        sending = Sending(Fix(50.0, 8.0, 20.0, t_s), t_s + 1)
+        fixes.note_sent(sending, t_s, has_answer=has_answer)
+        sending.settle(True)
+    return sending
+
+
+def test_one_fix_a_second_has_its_own_answer_though_some_are_lost(fixes):
+    sendings = []
+    for t_s in range(10):
+        sendings.append(sent(fixes, t_s))
+        if t_s not in (3, 4):
+            fixes.hear("ACCEPTED" if t_s % 2 else "FAILED", AutopilotState(gps_age_s=0.0), t_s + 0.02)
+    answers = [sending.answer for sending in sendings]
+    assert answers == [None if t_s in (3, 4) else ("ACCEPTED" if t_s % 2 else "FAILED") for t_s in range(10)]
+    assert sendings[3].outcome == sendings[4].outcome == LATE
+    assert sendings[9].outcome == FixAnswer("ACCEPTED", None, pytest.approx(0.02))
+    assert (fixes.unanswered, len(fixes), fixes.refusal) == (2, 0, GPS_IN_USE)
+
+
+def test_of_several_fixes_under_way_the_oldest_is_answered(fixes):
+    first, second, third = (sent(fixes, t_s) for t_s in (0.0, 0.2, 0.4))
+    assert fixes.hear("FAILED", STATE, 0.5) is first
+    assert fixes.hear("ACCEPTED", STATE, 0.6) is second
+    assert third.outcome is None
+    assert len(fixes) == 1
+
+
+def test_an_answer_that_is_late_or_one_too_many_belongs_to_no_fix(fixes):
+    late = sent(fixes, 0.0)
+    assert fixes.hear("FAILED", STATE, 1.1) is None
+    assert late.outcome == LATE
+    new = sent(fixes, 2.0)
+    assert fixes.hear("FAILED", STATE, 2.1) is new
+    assert fixes.hear("FAILED", STATE, 2.1) is None
+    assert fixes.unanswered == 1
+
+
+def test_a_fix_may_be_in_the_position_unless_it_was_refused(fixes):
+    assert fixes.t_fix_s == -math.inf
+    sent(fixes, 10.0)
+    assert fixes.t_fix_s == 10.0, "it may be taken before the answer comes"
+    fixes.hear("FAILED", STATE, 10.1)
+    assert fixes.t_fix_s == -math.inf
+    sent(fixes, 11.0)
+    fixes.hear("ACCEPTED", STATE, 11.1)
+    assert fixes.t_fix_s == 11.1
+    sent(fixes, 12.0)
+    fixes.hear("DENIED", STATE, 12.1)
+    assert fixes.t_fix_s == 11.1
+    sent(fixes, 13.0)
+    fixes.time_out(14.1)
+    assert fixes.t_fix_s == 13.0, "only the answer may have been lost"
+    sent(fixes, 15.0)
+    fixes.break_off("the link was lost")
+    assert fixes.t_fix_s == 15.0
+
+
+def test_a_message_without_answers_is_waited_for_by_nobody_and_may_be_taken(fixes):
+    assert sent(fixes, 5.0, has_answer=False).outcome.result is None
+    assert (len(fixes), fixes.unanswered, fixes.t_fix_s) == (0, 0, 5.0)
+
+
+def test_answers_that_take_half_a_second_stop_no_quick_fixes_and_nothing_is_said(fixes):
+    due_s, news, count = [], [], 0
+    for step in range(1000):  # ten fixes a second, each answered after half a second
+        now_s = step / 10
+        while due_s and due_s[0] <= now_s:
+            due_s.pop(0)
+            fixes.hear("ACCEPTED", STATE, now_s)
+        if fixes.why_not(now_s) is None:
+            sent(fixes, now_s)
+            due_s.append(now_s + 0.45)
+            count += 1
+        news.append(fixes.news_of_silence(STATE, now_s))
+    assert not any(news)
+    assert count > 900
+
+
+def test_fixes_thrown_away_with_the_port_wait_for_no_answer_but_do_not_end_a_stop(fixes):
+    sent(fixes, 0, 1, 2, 3, 4)
+    fixes.note_lost(3)
+    assert fixes.why_not(5.0) is None
+    sent(fixes, 5, 6, 7)
+    assert fixes.news_of_silence(STATE, 8.5)
+    sent(fixes, 17.5)
+    fixes.note_lost(2)
+    assert (fixes.why_not(20.0), fixes.news_of_silence(STATE, 20.0)) == (UNANSWERED, None)
+
+
+def fly(autopilot, count, every_s=1.0):
+    """Send a fix every so often to an autopilot that is there; give what became of each."""
+    sendings = []
+    for _ in range(count):
+        autopilot.wait(every_s)
+        autopilot.conversation.tell_of_answers()
+        sendings.append(autopilot.put_fix())
+    return sendings
+
+
+def test_five_unanswered_fixes_stop_the_sending_and_one_in_ten_seconds_asks_again(autopilot):
+    sendings = fly(autopilot, 40)
+    assert [number for number, sending in enumerate(sendings) if sending.sent] == [0, 1, 2, 3, 4, 14, 24, 34]
+    assert {sending.why for sending in sendings if not sending.sent} == {UNANSWERED}
+    assert (autopilot.conversation.sent["COMMAND_INT"], autopilot.conversation.fixes.withheld) == (8, 32)
+
+
+def test_the_stop_and_the_recovery_are_said_once_each(autopilot, caplog):
+    fly(autopilot, 30)
+    assert [text for _, text in autopilot.texts()] == ["edgevpr: fixes unanswered: signing? system id?"]
+    autopilot.answer(ACCEPTED)
+    autopilot.wait(5.0)
+    assert [text for _, text in autopilot.texts()] == ["edgevpr: fixes are answered again"]
+    assert caplog.text.count("five fixes") == caplog.text.count("answered again") == 1
+
+
+def test_one_answer_of_any_kind_lets_the_fixes_go_on(autopilot):
+    fly(autopilot, 8)
+    autopilot.answer(FAILED)
+    assert [sending.sent for sending in fly(autopilot, 7)] == [True] * 5 + [False] * 2
+
+
+def test_a_missing_answer_now_and_then_stops_nothing(autopilot):
+    for _ in range(10):
+        assert all(sending.sent for sending in fly(autopilot, 4))
+        autopilot.answer(ACCEPTED)
+    assert autopilot.conversation.fixes.withheld == 0
+
+
+def test_late_answers_to_the_fixes_of_before_do_not_pass_for_one_to_a_new_fix(autopilot):
+    last = fly(autopilot, 6)[4]
+    autopilot.wait(0.1)
+    autopilot.answer(ACCEPTED)
+    (held,) = fly(autopilot, 1, every_s=0.4)
+    assert (held.sent, held.why) == (False, "not sent: the autopilot has only just begun to answer again")
+    for _ in range(4):
+        autopilot.answer(DENIED)
+    (new,) = fly(autopilot, 1, every_s=0.6)
+    assert (new.sent, new.answer) == (True, None)
+    assert last.outcome == LATE
+    assert autopilot.conversation.fixes.unanswered == 5
+
+
+def test_a_refused_fix_says_why_by_what_the_autopilot_has_said(autopilot):
+    def refused(result=FAILED, after_s=1.0):
+        autopilot.wait(after_s)
+        autopilot.beat(ARMED)
+        autopilot.conversation.tell_of_answers()
+        sending = autopilot.put_fix(base_mode=ARMED)
+        autopilot.wait(0.03)
+        autopilot.answer(result)
+        return sending.outcome
+
+    autopilot.gps()
+    assert refused() == FixAnswer("FAILED", GPS_IN_USE.sentence, pytest.approx(0.03))
+    autopilot.wait(2)
+    autopilot.gps(fix_type=1)
+    assert refused().why == readiness.UNKNOWN.sentence
+    (request,) = autopilot.questions()
+    assert (request.command, request.param1) == (512, 49), "it is asked for its origin"
+    why = [refused(after_s=3.0).why] + [refused().why for _ in range(20)]
+    assert set(why) == {readiness.NO_ORIGIN.sentence}, "while it is asked again, too"
+    assert len(autopilot.questions()) == 2
+    autopilot.say(mavlink.MAVLink_gps_global_origin_message(1, 1, 1))
+    autopilot.filter(mavlink.EKF_CONST_POS_MODE)
+    assert refused().why == readiness.NOT_RECKONING.sentence
+    assert refused(ACCEPTED).why is None
+    assert autopilot.conversation.autopilot.acks == {"FAILED": 24, "ACCEPTED": 1}
+    assert autopilot.conversation.fixes.refusal.brief == "nothing to reckon by"
+
+
+def test_the_ground_station_hears_each_reason_once_and_that_fixes_are_taken_again(autopilot, caplog):
+    caplog.set_level(logging.INFO, "edgevpr.mavlink")
+    texts = []
+    for result in (ACCEPTED, FAILED, FAILED, DENIED, ACCEPTED, ACCEPTED):
+        autopilot.wait(5.0)  # the ground is told one thing in five seconds
+        autopilot.gps(FIX_3D)
+        autopilot.take_fix(result)
+        texts += autopilot.texts()
+    assert texts == [
+        (6, "edgevpr: fixes refused: GPS in use"),
+        (4, "edgevpr: fixes refused: wrong form"),
+        (6, "edgevpr: fixes are taken again"),
+    ]
+    assert caplog.text.count("the autopilot's answer") == 4
+
+
+def test_an_answer_in_progress_is_none_yet(autopilot):
+    sending = autopilot.put_fix()
+    autopilot.answer(mavlink.MAV_RESULT_IN_PROGRESS)
+    assert sending.outcome is None
+    autopilot.answer(ACCEPTED)
+    assert (sending.answer, autopilot.conversation.autopilot.acks) == ("ACCEPTED", {"ACCEPTED": 1})
+
+
+@pytest.mark.parametrize(("answers_others", "text"), [(False, "signing? system id?"), (True, "no command 43003?")])
+def test_silence_to_five_fixes_says_whether_other_commands_are_answered(autopilot, answers_others, text):
+    autopilot.answer(ACCEPTED, command=511, to=191)
+    if answers_others:
+        autopilot.answer(ACCEPTED, command=511)
+    fly(autopilot, 7)
+    assert autopilot.texts() == [(4, f"edgevpr: fixes unanswered: {text}")]
+
+
+def test_the_report_of_the_vehicle_says_when_a_fix_may_have_come_into_it(autopilot):
+    now_s = autopilot.clock.now_s
+    autopilot.position()
+    assert autopilot.at(now_s).t_fix_s == -math.inf
+    autopilot.take_fix(FAILED)
+    assert autopilot.at(now_s).t_fix_s == -math.inf
+    autopilot.take_fix(ACCEPTED)
+    assert autopilot.at(now_s).t_fix_s == now_s
+
+
+def beat(link, peer):
+    before = link.stats().received.get("HEARTBEAT", 0)
+    peer.heartbeat()
+    wait_until(lambda: link.stats().received.get("HEARTBEAT", 0) > before and link.listens())
+
+
+@pytest.mark.network
+def test_a_link_that_is_lost_and_a_flight_that_ends_take_the_answers_along(clock):
+    number = free_port(socket.SOCK_STREAM)
+    with closing(TcpServer(number)) as server:
+        with link_to(f"tcp:127.0.0.1:{number}", clock=clock) as link:
+            for how in ("lost", "closed"):
+                peer = Peer(server.accept(), 7)
+                beat(link, peer)
+                sending = link.send_fix(Fix(50.0, 8.0, 20.0, clock.now_s))
+                peer.expect("COMMAND_INT")
+                sending.wait(60)
+                if how == "lost":
+                    peer.port.close()
+                    wait_until(lambda: sending.outcome)  # noqa: B023
+                    assert sending.outcome == FixAnswer(None, "the link was lost before its answer came", None)
+        assert sending.outcome == FixAnswer(None, "the flight ended before its answer came", None)
+
+
+@pytest.mark.network
+@pytest.mark.slow
+def test_a_peer_that_stops_reading_for_a_minute_finds_a_few_fixes_and_not_all(clock):
+    """The autopilot goes on beating, and its system takes what it does not read."""
+    number = free_port(socket.SOCK_STREAM)
+    with closing(TcpServer(number)) as server, link_to(f"tcp:127.0.0.1:{number}", clock=clock) as link:
+        peer, sent_s = Peer(server.accept(), 7), []
+        for _ in range(180):
+            clock.now_s += 1 / 3
+            beat(link, peer)
+            sending = link.send_fix(Fix(50.0, 8.0, 20.0, clock.now_s))
+            sending.wait(60)
+            sent_s += [clock.now_s] if sending.sent else []
+        peer.port.settimeout(1.0)
+        found = []
+        try:
+            while True:
+                peer.read()
+                found += [m.param1 for m in peer.seen if m.get_type() == "COMMAND_INT"]
+                peer.seen.clear()
+        except TimeoutError:
+            pass
+        assert found == pytest.approx(sent_s, abs=0.01)
+        assert len(found) == 10, "five, and one every ten seconds"
+
+
+def test_another_autopilot_starts_with_a_clean_slate(autopilot):
+    fly(autopilot, 8)
+    for _ in range(35):
+        autopilot.wait(1.0)
+        autopilot.beat(system_id=9)
+    assert autopilot.conversation.autopilot.system_id == 9
+    assert all(autopilot.put_fix(system_id=9).sent for _ in range(5))

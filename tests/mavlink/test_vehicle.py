@@ -1,0 +1,240 @@
+"""What the autopilot says of its vehicle: where it is, how it hangs, how high and how sure that is; heard from the
+pinned autopilot only, only while fresh, and never at 0, 0. A conversation without a port."""
+
+import math
+
+import pytest
+
+from edgevpr.core.geodesy import offset_m
+from edgevpr.core.types import Vehicle
+from edgevpr.mavlink.vehicle import DRIFT_M_S, GPS_SD_M
+from edgevpr.mavlink.wire import mavlink
+
+ABS, REL, CONST_POS = mavlink.EKF_POS_HORIZ_ABS, mavlink.EKF_POS_HORIZ_REL, mavlink.EKF_CONST_POS_MODE
+ACCEPTED, FAILED = mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_FAILED
+FIX_2D, FIX_3D = mavlink.GPS_FIX_TYPE_2D_FIX, mavlink.GPS_FIX_TYPE_3D_FIX
+
+
+def test_its_position_is_known_while_it_is_fresh(autopilot):
+    assert autopilot.vehicle is None
+    vehicle = autopilot.position(50.1234567, -14.5, vx=-300, vy=1250)
+    assert vehicle == Vehicle(
+        lat_deg=50.1234567,
+        lon_deg=-14.5,
+        alt_m=312.5,
+        heading_deg=90.5,
+        t_heard_s=autopilot.clock.now_s,
+        has_gps=False,
+        height_m=80.0,
+        velocity_m_s=(12.5, -3.0),
+        sink_m_s=0.0,
+    )
+    assert [vehicle.is_fresh_at(autopilot.clock.now_s + after_s) for after_s in (1.0, 1.1)] == [True, False]
+    assert autopilot.position(hdg=65535).heading_deg is None
+    assert autopilot.position(vx=32_767, vy=32_767).velocity_m_s is None, "no small aircraft has it"
+
+
+def test_at_the_time_of_a_frame_it_is_where_its_velocity_takes_it(autopilot):
+    now_s = autopilot.position(vx=2000, vy=-1000).t_heard_s
+    for seconds in (-0.4, 0.25):
+        there = autopilot.at(now_s + seconds)
+        off_m = offset_m(50.0, 8.0, there.lat_deg, there.lon_deg)
+        assert off_m == pytest.approx((-10 * seconds, 20 * seconds), abs=1e-6)
+    old = autopilot.at(now_s + 1.5)
+    assert (old.lat_deg, old.lon_deg) == (50.0, 8.0), "nobody knows"
+
+
+@pytest.mark.parametrize("sender", [{"system_id": 9}, {"component_id": 190}])
+def test_nobody_else_says_where_we_are(autopilot, sender):
+    assert autopilot.position(1.0, 1.0, **sender) is None
+    autopilot.position(3.0, 3.0)
+    assert autopilot.position(4.0, 4.0, **sender).lat_deg == 3.0
+
+
+@pytest.mark.parametrize("nowhere", [(0.0, 0.0), (91.0, 8.0), (50.0, 181.0)])
+def test_a_position_lost_is_not_remembered(autopilot, nowhere):
+    assert autopilot.position()
+    assert autopilot.position(*nowhere) is None
+
+
+@pytest.mark.parametrize("message", [mavlink.MAVLink_gps_raw_int_message, mavlink.MAVLink_gps2_raw_message])
+def test_a_position_says_whether_gps_stands_behind_it(autopilot, message):
+    autopilot.gps(FIX_2D, message=message)
+    assert not autopilot.position().has_gps
+    autopilot.gps(message=message)
+    assert autopilot.position(50.0003).has_gps, "33 m flown since its last report"
+    assert not autopilot.position(50.001).has_gps, "it does not follow its receiver: jammed, deceived or switched off"
+    autopilot.gps(message=message, lat_deg=50.001)
+    assert autopilot.position(50.0011).has_gps
+    autopilot.gps(mavlink.GPS_FIX_TYPE_NO_FIX, message=message)
+    assert not autopilot.position(50.0012).has_gps, "it reckons where it is, and goes on saying so"
+    autopilot.gps(message=message, lat_deg=50.0012)
+    autopilot.wait(3.0)
+    assert not autopilot.position(50.00121).has_gps, "its receiver has fallen silent"
+
+
+def test_it_is_asked_where_it_is_until_it_says_so(autopilot):
+    assert autopilot.questions() == [], "nobody wants to know"
+    autopilot.conversation.want_position()
+    version, *requests = autopilot.questions()
+    assert (version.command, version.param1) == (mavlink.MAV_CMD_REQUEST_MESSAGE, 148)
+    assert {command.command for command in requests} == {mavlink.MAV_CMD_SET_MESSAGE_INTERVAL}
+    intervals_us = {int(command.param1): command.param2 for command in requests}
+    assert intervals_us == {33: 100_000, 30: 100_000, 24: 200_000} | dict.fromkeys((132, 136, 193), 500_000)
+    assert all(command.target_system == 7 for command in requests)
+    for _ in range(3):  # what is heard needs no asking, but the version, which it does not say
+        autopilot.wait(4.0)
+        autopilot.beat()
+        autopilot.position()
+        autopilot.attitude()
+        assert [each.command for each in autopilot.questions()] == [mavlink.MAV_CMD_REQUEST_MESSAGE]
+    asked = []
+    for _ in range(3):
+        autopilot.wait(4.0)
+        autopilot.beat()
+        autopilot.position()
+        asked += autopilot.questions()
+    assert len(asked) == 6, "it says no attitude any more: it has started anew"
+
+
+def test_the_attitude_is_that_of_the_frame_s_time(autopilot):
+    start_s = autopilot.clock.now_s
+    for attitude in ((-10, 4, 350), (10, 8, 10), (20, 0, 20)):
+        autopilot.attitude(*attitude)
+        autopilot.position()
+        autopilot.wait(0.2)
+    seen = autopilot.at(start_s + 0.05)
+    assert (seen.roll_deg, seen.pitch_deg, seen.heading_deg) == pytest.approx((-5, 5, 355), abs=1e-4)
+    assert autopilot.at(start_s + 0.1).heading_deg % 360 == pytest.approx(0, abs=1e-4), "the short way over north"
+    last = autopilot.at(start_s + 0.65)
+    assert (last.roll_deg, last.heading_deg) == pytest.approx((20, 20), abs=1e-4), "the last one holds for 0.3 s"
+    for away_s in (-0.35, 0.75):
+        other = autopilot.at(start_s + away_s)
+        assert (other.roll_deg, other.pitch_deg, other.heading_deg) == (None, None, 90.5), "the report's own heading"
+    assert autopilot.vehicle.roll_deg is None
+
+
+def test_an_attitude_that_is_no_number_is_not_believed(autopilot):
+    autopilot.attitude(roll_deg=math.nan)
+    autopilot.position()
+    assert autopilot.at(autopilot.clock.now_s).roll_deg is None
+
+
+def test_the_best_height_is_taken(autopilot):
+    assert autopilot.position().height_m == 80.0, "over the take-off point"
+    autopilot.terrain(65.0)
+    assert autopilot.position().height_m == 65.0
+    autopilot.range(60.0)
+    assert autopilot.position().height_m == 60.0
+    autopilot.attitude(roll_deg=60.0)
+    autopilot.range(60.0)
+    assert autopilot.position().height_m == pytest.approx(30.0, abs=0.01), "a range finder looks where it leans"
+    autopilot.wait(1.1)
+    assert autopilot.position().height_m == 65.0, "the range is old"
+    autopilot.wait(2.0)
+    assert autopilot.position().height_m == 80.0, "the terrain is old too"
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"distance_m": 0.1}, {"distance_m": 120.0}, {"orientation": 0}, {"signal_quality": 1}]
+)
+def test_a_range_that_says_nothing_is_not_taken(autopilot, wrong):
+    autopilot.range(**{"distance_m": 60.0} | wrong)
+    assert autopilot.position().height_m == 80.0
+
+
+@pytest.mark.parametrize("report", [(math.nan, 100), (0.0, 0)])
+def test_a_terrain_that_is_unknown_is_not_taken(autopilot, report):
+    autopilot.terrain(*report)
+    assert autopilot.position().height_m == 80.0
+
+
+@pytest.mark.parametrize("message", [mavlink.MAVLink_gps_raw_int_message, mavlink.MAVLink_gps2_raw_message])
+@pytest.mark.parametrize(("h_acc", "sd_m"), [(1800, 1.8), (0, GPS_SD_M), (2**32 - 1, GPS_SD_M)])
+def test_the_certainty_is_with_gps_that_of_the_receiver(autopilot, message, h_acc, sd_m):
+    autopilot.gps(h_acc=h_acc, message=message)
+    assert autopilot.sd_m() == pytest.approx(sd_m)
+
+
+def test_of_two_receivers_the_better_one_counts(autopilot):
+    autopilot.gps(h_acc=9000, message=mavlink.MAVLink_gps2_raw_message)
+    autopilot.gps(h_acc=2000)
+    assert autopilot.sd_m() == pytest.approx(2.0)
+
+
+def test_the_certainty_is_unknown_where_the_position_was_never_known(autopilot):
+    autopilot.filter(ABS | REL)
+    assert autopilot.sd_m() is None
+
+
+def test_the_uncertainty_grows_from_the_loss_of_gps_on(autopilot):
+    autopilot.gps(h_acc=3000)
+    autopilot.sd_m()
+    autopilot.gps(fix_type=1)
+    for after_s in (10.0, 300.0):
+        autopilot.wait(after_s)
+        assert autopilot.sd_m() > 0.9 * DRIFT_M_S * after_s
+    assert autopilot.sd_m() == pytest.approx(math.hypot(3.0, DRIFT_M_S * 310))
+
+
+@pytest.mark.parametrize("flags", [0, CONST_POS, ABS | REL | CONST_POS, mavlink.EKF_ATTITUDE])
+def test_a_filter_that_says_it_has_no_position_ends_the_certainty(autopilot, flags):
+    autopilot.gps()
+    autopilot.sd_m()
+    autopilot.gps(fix_type=1)
+    autopilot.filter(flags)
+    assert autopilot.sd_m() is None
+    autopilot.filter(REL)
+    assert autopilot.sd_m() is None, "where it had stood still meanwhile, it does not know"
+    autopilot.gps()
+    assert autopilot.sd_m() == GPS_SD_M
+
+
+def test_a_filter_that_reckons_has_a_position(autopilot):
+    autopilot.gps()
+    autopilot.sd_m()
+    autopilot.gps(fix_type=1)
+    autopilot.wait(8.0)
+    autopilot.filter(REL)
+    assert autopilot.sd_m() == pytest.approx(math.hypot(GPS_SD_M, DRIFT_M_S * 8))
+
+
+def test_a_fix_that_it_took_is_where_it_reckons_from(autopilot):
+    autopilot.gps()
+    autopilot.sd_m()
+    autopilot.gps(fix_type=1)
+    autopilot.wait(100.0)
+    autopilot.take_fix(FAILED)
+    assert autopilot.sd_m() > 200
+    autopilot.take_fix(ACCEPTED, accuracy_m=12.0)
+    assert autopilot.sd_m() == pytest.approx(12.0)
+    autopilot.wait(4.0)
+    assert autopilot.sd_m() == pytest.approx(math.hypot(12.0, DRIFT_M_S * 4))
+
+
+def test_a_filter_that_says_how_good_it_is_is_believed_while_it_speaks(autopilot):
+    autopilot.gps(h_acc=3000)
+    autopilot.sd_m()
+    autopilot.gps(fix_type=1)
+    autopilot.wait(10.0)
+    autopilot.px4_filter(14.0)
+    assert autopilot.sd_m() == 14.0
+    autopilot.wait(5.0)
+    assert autopilot.sd_m() == pytest.approx(math.hypot(3.0, DRIFT_M_S * 15)), "silent"
+
+
+@pytest.mark.parametrize("nothing", [0.0, math.nan, math.inf])
+def test_an_accuracy_that_is_none_is_not_believed(autopilot, nothing):
+    autopilot.gps(h_acc=3000)
+    autopilot.px4_filter(nothing)
+    assert autopilot.sd_m() == pytest.approx(3.0)
+
+
+def test_another_autopilot_is_not_known_as_well(autopilot):
+    autopilot.gps()
+    assert autopilot.sd_m() == GPS_SD_M
+    for _ in range(60):
+        autopilot.wait(1.0)
+        autopilot.beat(system_id=9)
+    assert autopilot.conversation.autopilot.system_id == 9
+    assert autopilot.position(system_id=9).position_sd_m is None
