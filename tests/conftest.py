@@ -16,7 +16,7 @@ LONGEST = (
     "test_flight_process",
     "test_gate",
     "test_frames_live",
-    "test_mavlink_answers",
+    "test_fixes",
     "test_ground_stations",
     "test_memory",
     "test_demo",

@@ -4,7 +4,7 @@ import struct
 
 import pytest
 from fakes import FakeClock
-from mavlink_peers import Peer, UdpPort, link_to, wait_until
+from mavlink_peers import Peer, link_to, wait_until
 
 from edgevpr.core.types import Position
 from edgevpr.mavlink.address import parse_link
@@ -122,13 +122,6 @@ class Questioned(Peer):
                     value, kind = self.parameters[message.param_id]
                     self.send(mavlink.MAVLink_param_value_message(message.param_id.encode(), value, kind, 1, 0))
             self.seen.clear()
-
-
-@pytest.fixture
-def port():
-    port = UdpPort()
-    yield port
-    port.close()
 
 
 def opened(port, clock, ear, firmware, parameters):

@@ -217,6 +217,15 @@ def test_the_ground_station_hears_each_reason_once_and_that_fixes_are_taken_agai
     assert caplog.text.count("the autopilot's answer") == 4
 
 
+def test_only_answers_of_our_autopilot_to_our_fixes_are_counted(autopilot):
+    autopilot.answer(99)
+    autopilot.answer(ACCEPTED, command=400)
+    autopilot.answer(ACCEPTED, to=191)
+    ack = mavlink.MAVLink_command_ack_message(43003, ACCEPTED, target_system=7, target_component=197)
+    autopilot.say(ack, system_id=9)
+    assert autopilot.conversation.autopilot.acks == {"99": 1}
+
+
 def test_an_answer_in_progress_is_none_yet(autopilot):
     sending = autopilot.put_fix()
     autopilot.answer(mavlink.MAV_RESULT_IN_PROGRESS)

@@ -3,7 +3,6 @@
 from contextlib import closing
 
 import pytest
-from fakes import FakeClock
 from mavlink_peers import Peer, UdpPort, free_port, link_to, wait_until
 
 from edgevpr.core.errors import LinkAddressError
@@ -23,11 +22,6 @@ from edgevpr.mavlink.messages import (
 )
 from edgevpr.mavlink.signing import TO_GROUND, Signing, TimeStamps
 from edgevpr.mavlink.wire import mavlink
-
-
-@pytest.fixture
-def clock():
-    return FakeClock()
 
 
 @pytest.fixture

@@ -9,7 +9,6 @@ import tty
 from contextlib import closing
 
 import pytest
-from fakes import FakeClock
 from mavlink_peers import Peer, TcpServer, UdpPort, free_port, link_to, wait_until
 
 from edgevpr.mavlink.address import parse_link
@@ -20,11 +19,6 @@ from edgevpr.mavlink.ports import open_port
 from edgevpr.mavlink.wire import mavlink
 
 THROWN_AWAY = "the link was lost before it had left"
-
-
-@pytest.fixture
-def clock():
-    return FakeClock()
 
 
 @pytest.fixture

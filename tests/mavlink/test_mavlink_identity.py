@@ -112,11 +112,6 @@ def test_a_flood_of_invented_speakers_fills_no_memory_and_takes_nothing_over():
 
 
 @pytest.fixture
-def clock():
-    return FakeClock()
-
-
-@pytest.fixture
 def listening(clock):
     """A link that listens, and a call that makes an autopilot at a port of its own."""
     number, ports = free_port(), []
@@ -192,55 +187,6 @@ def test_an_autopilot_that_comes_back_from_elsewhere_is_taken_and_the_ground_is_
     after.expect_text(f"edgevpr: autopilot now at 127.0.0.1:{after.port.number}")
     assert after.expect("COMMAND_INT").target_system == 1
     assert names(before).count("COMMAND_INT") == 1
-
-
-def test_our_autopilot_with_a_new_number_is_taken_and_addressed_by_it(listening, clock):
-    link, autopilot = listening
-    peer = autopilot(1)
-    speak(link, peer, clock, 3)
-    speak(link, peer, clock, 29, system_id=7)
-    assert not became_of_a_fix(link, clock)
-    speak(link, peer, clock, 2, system_id=7)
-    assert link.stats().autopilot_system_id == 7
-    assert became_of_a_fix(link, clock)
-    peer.expect_text("edgevpr: autopilot is now system 7")
-    fix = peer.expect("COMMAND_INT")
-    assert (fix.target_system, fix.get_srcSystem()) == (7, 7)
-
-
-def test_a_foreign_autopilot_heard_first_gives_way_to_ours_when_only_ours_is_heard(listening, clock):
-    link, autopilot = listening
-    foreign, ours = autopilot(2), autopilot(1)
-    speak(link, foreign, clock, 10)
-    speak(link, ours, clock, 45)
-    assert became_of_a_fix(link, clock)
-    assert ours.expect("COMMAND_INT").target_system == 1
-    assert "COMMAND_INT" not in names(foreign)
-
-
-def test_where_ours_falls_silent_the_other_vehicle_on_the_bus_gets_no_fix(listening, clock):
-    link, autopilot = listening
-    ours, foreign = autopilot(1), autopilot(2)
-    for _ in range(5):
-        speak(link, ours, clock, 1)
-        speak(link, foreign, clock, 1)
-    speak(link, ours, clock, 1)
-    speak(link, foreign, clock, 60)
-    assert not became_of_a_fix(link, clock)
-    assert names(foreign) == []
-    speak(link, ours, clock, 1)
-    assert became_of_a_fix(link, clock)
-
-
-def test_the_vehicle_of_the_autopilot_before_is_forgotten(listening, clock):
-    link, autopilot = listening
-    peer = autopilot(1)
-    speak(link, peer, clock, 1)
-    peer.send(mavlink.MAVLink_global_position_int_message(0, 10**7, 10**7, 0, 0, 0, 0, 0, 0))
-    wait_until(link.vehicle)
-    speak(link, peer, clock, 31, system_id=7)
-    wait_until(lambda: link.stats().autopilot_system_id == 7)
-    assert link.vehicle() is None
 
 
 def test_the_configured_system_is_our_own_number_from_the_start_and_the_only_one_sent_to(clock):

@@ -1,6 +1,5 @@
 """One link, real sockets, and an autopilot worked by hand at the other end."""
 
-import logging
 import math
 import random
 import re
@@ -9,7 +8,6 @@ import threading
 from contextlib import closing
 
 import pytest
-from fakes import FakeClock
 from mavlink_peers import Peer, TcpServer, UdpPort, free_port, link_to, wait_until
 
 from edgevpr.core.errors import LinkError
@@ -17,31 +15,6 @@ from edgevpr.mavlink.conversation import MESSAGES_MAX
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Fix, Health, Severity, place_match, query_figures, status_text
 from edgevpr.mavlink.wire import mavlink
-
-
-@pytest.fixture
-def clock():
-    return FakeClock()
-
-
-@pytest.fixture
-def port():
-    port = UdpPort()
-    yield port
-    port.close()
-
-
-@pytest.fixture
-def link(port, clock):
-    with link_to(f"udpout:127.0.0.1:{port.number}", clock=clock) as link:
-        yield link
-
-
-@pytest.fixture
-def peer(port, link):
-    peer = Peer(port, system_id=7)
-    peer.expect("HEARTBEAT")
-    return peer
 
 
 def fix_at(t_frame_s: float, lat_deg: float = 50.0) -> Fix:
@@ -80,17 +53,6 @@ def test_a_main_loop_that_falls_silent_is_not_reported_as_healthy(link, peer, cl
     assert peer.expect("HEARTBEAT").system_status == mavlink.MAV_STATE_ACTIVE
 
 
-def test_a_second_autopilot_on_the_link_is_told_once_and_never_addressed(link, peer, clock, port, caplog):
-    heard(link, peer)
-    stranger = Peer(port, system_id=9)
-    stranger.heartbeat()
-    stranger.heartbeat()
-    wait_until(lambda: "a second autopilot, system 9" in caplog.text, "the warning")
-    link.send_fix(fix_at(clock()))
-    assert peer.expect("COMMAND_INT").target_system == 7
-    assert caplog.text.count("a second autopilot") == 1
-
-
 def test_the_link_takes_the_autopilots_system_id_for_its_own_and_addresses_it(link, peer, clock):
     link.send(text("before"))
     assert peer.expect("STATUSTEXT").get_srcSystem() == 1
@@ -112,24 +74,6 @@ def test_only_the_first_autopilot_counts(link, peer, clock):
     assert link.stats().autopilot_system_id == 7
     link.send_fix(fix_at(clock.now_s))
     assert peer.expect("COMMAND_INT").target_system == 7
-
-
-def test_answers_to_fixes_are_counted_by_result_and_explained_when_they_change(link, peer, caplog):
-    caplog.set_level(logging.INFO, "edgevpr.mavlink")
-    peer.answer_fix(mavlink.MAV_RESULT_ACCEPTED)  # before it is known: not ours to believe
-    heard(link, peer)
-    for _ in range(3):
-        peer.answer_fix(mavlink.MAV_RESULT_FAILED)
-    peer.answer_fix(mavlink.MAV_RESULT_ACCEPTED)
-    peer.answer_fix(99)
-    peer.answer_fix(mavlink.MAV_RESULT_ACCEPTED, system_id=9)
-    peer.answer_fix(mavlink.MAV_RESULT_ACCEPTED, command=400)
-    peer.answer_fix(mavlink.MAV_RESULT_ACCEPTED, to=191)
-    wait_until(lambda: link.stats().received.get("COMMAND_ACK") == 9)
-    assert link.stats().acks == {"FAILED": 3, "ACCEPTED": 1, "99": 1}
-    said = [record.getMessage() for record in caplog.records if "FAILED" in record.getMessage()]
-    assert len(said) == 1
-    assert "it is not armed" in said[0]
 
 
 def test_events_and_figures_go_to_anyone_but_a_fix_waits_for_an_autopilot(link, peer, clock):
@@ -258,16 +202,6 @@ def test_a_udp_port_in_use_is_said_at_the_start(clock):
             second.start()
 
 
-def test_a_udp_port_held_by_another_program_of_pymavlink_is_said_at_the_start():
-    from pymavlink import mavutil
-
-    number = free_port()
-    other = mavutil.mavlink_connection(f"udpin:127.0.0.1:{number}")
-    with pytest.raises(LinkError, match=f"port {number} is in use"):
-        link_to(f"udpin:127.0.0.1:{number}").start()
-    other.close()
-
-
 @pytest.mark.parametrize(
     ("kind", "host"),
     [("udpout", "no-such-host.invalid"), ("udpout", "a..b"), ("udpin", "a..b"), ("tcp", "a" * 64 + ".example")],
@@ -374,14 +308,6 @@ def test_a_closing_link_waits_for_the_answer_to_its_last_fix(link, peer, clock):
     peer.answer_fix(mavlink.MAV_RESULT_ACCEPTED)
     closing_link.join()
     assert link.stats().acks == {"ACCEPTED": 1}
-
-
-def test_an_autopilot_that_answers_no_fix_does_not_hold_up_the_end(link, peer, clock):
-    heard(link, peer)
-    link.send_fix(fix_at(clock()))
-    link.close()
-    peer.expect("COMMAND_INT")
-    assert not link.stats().connected
 
 
 def test_a_link_that_was_never_started_can_be_closed():

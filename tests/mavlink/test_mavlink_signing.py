@@ -7,7 +7,6 @@ import time
 from contextlib import closing
 
 import pytest
-from fakes import FakeClock
 from mavlink_peers import Peer, UdpPort, free_port, link_to, wait_until
 
 from edgevpr.core.errors import ConfigError
@@ -33,11 +32,6 @@ from edgevpr.mavlink.wire import PacketReader, mavlink
 KEY, OTHER_KEY = bytes(range(32)), bytes(32)
 NOW = 1_000_000 * TICKS_S  # the time stamp that the clocks of these tests begin with
 UTC_S = 1_420_070_400 + NOW / TICKS_S
-
-
-@pytest.fixture
-def clock():
-    return FakeClock()
 
 
 @pytest.fixture

@@ -236,5 +236,5 @@ def test_another_autopilot_is_not_known_as_well(autopilot):
     for _ in range(60):
         autopilot.wait(1.0)
         autopilot.beat(system_id=9)
-    assert autopilot.conversation.autopilot.system_id == 9
+    assert (autopilot.conversation.autopilot.system_id, autopilot.vehicle) == (9, None)
     assert autopilot.position(system_id=9).position_sd_m is None
