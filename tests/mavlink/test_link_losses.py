@@ -79,7 +79,7 @@ def test_a_device_that_another_program_probes_when_it_appears_is_opened_later(tm
     """A modem manager opens what is plugged in: at the start that is said, in flight it is waited for."""
     device = tmp_path / "ttyACM0"
     with link_to(f"serial:{device}:57600") as link:
-        assert link.stats().trouble == "No such file or directory"
+        assert link.stats().trouble
         master, slave = pty.openpty()
         tty.setraw(slave)
         with serial.Serial(os.ttyname(slave), exclusive=True):

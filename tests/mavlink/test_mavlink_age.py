@@ -81,7 +81,7 @@ def test_a_fix_that_the_system_still_holds_when_it_is_due_is_thrown_away_with_th
     clock.now_s += 0.99
     assert line.departed() == []
     clock.now_s += 0.02
-    with pytest.raises(ConnectionError, match="waited too long"):
+    with pytest.raises(ConnectionError, match="too long"):
         line.departed()
     assert line.close() == 1
     assert (fix.sent, fix.why) == (False, THROWN_AWAY)
@@ -100,7 +100,7 @@ def test_a_fix_that_the_port_does_not_take_in_time_is_never_written(line, clock)
         line.write()
     clock.now_s += 1.01
     far.setblocking(False)
-    with pytest.raises(ConnectionError, match="waited too long"):
+    with pytest.raises(ConnectionError, match="too long"):
         line.departed()
     line.close()
     far.setblocking(True)
@@ -164,7 +164,7 @@ def test_the_longest_wait_is_the_configurations(clock, max_age_s, leaves):
         wait_until(lambda: fix.sent is not None)
         assert fix.sent is leaves
         if not leaves:
-            assert fix.why == "no autopilot was there to take it within 0.3 s"
+            assert "0.3 s" in fix.why
 
 
 def test_a_serial_line_that_is_held_up_gives_no_old_fix_when_it_goes_on():

@@ -264,7 +264,7 @@ def test_a_key_that_others_may_open_is_refused_also_behind_a_link(key_file, mode
 @pytest.mark.parametrize(("content", "says"), [(b"", "only 0"), (KEY[:31], "only 31"), (KEY + b"\n", "more")])
 def test_a_key_of_another_length_is_refused(key_file, content, says):
     key_file.write_bytes(content)
-    with pytest.raises(ConfigError, match=f"has 32 bytes, and this file has {says}"):
+    with pytest.raises(ConfigError, match=says):
         read_key(str(key_file))
 
 
@@ -281,7 +281,7 @@ def test_a_credential_of_systemd_is_taken(key_file, monkeypatch):
     monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(key_file.parent))
     assert read_key(str(key_file)) == KEY
     key_file.chmod(0o444)
-    with pytest.raises(ConfigError, match="others may open"):
+    with pytest.raises(ConfigError, match="chmod"):
         read_key(str(key_file))
 
 

@@ -167,7 +167,7 @@ def test_gps_that_comes_back_ends_the_failsafe():
     flown = lost("arducopter").wait(20)
     flown.controller.set("SIM_GPS1_ENABLE", 1)
     flown.wait(10)
-    assert "EKF Failsafe Cleared" in flown.texts
+    assert any("Cleared" in text for text in flown.texts)
     assert flown.flags & mavlink.EKF_POS_HORIZ_ABS
 
 
@@ -194,7 +194,7 @@ def test_a_copter_flies_by_odometry_without_any_gps():
     assert flown.flags & mavlink.EKF_POS_HORIZ_ABS
     assert flown.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1) == ACCEPTED
     flown.wait(0.5)
-    assert flown.controller.brain.why_not_arm(flown.now_s) == "VisOdom: not healthy"
+    assert "VisOdom" in flown.controller.brain.why_not_arm(flown.now_s)
 
 
 def test_a_source_set_is_chosen_by_command():
