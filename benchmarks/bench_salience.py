@@ -30,8 +30,7 @@ from edgevpr.lab.evaluate import metrics
 from edgevpr.lab.evaluate.dataset import Dataset
 from edgevpr.runtime.recognise.detector import Detector, open_detector
 from edgevpr.runtime.recognise.memorability import Memorability, open_memorability
-from edgevpr.runtime.recognise.salience_gate import Thresholds, worth_of
-from edgevpr.runtime.recognise.salience_maps import maps_of, scores_of
+from edgevpr.runtime.recognise.salience_gate import Thresholds, maps_of, scores_of, worth_of
 
 TECHNIQUES = ("hog", "cohog", "calc", "netvlad")
 FULL = Thresholds(0.3, 0.6, 0.4)

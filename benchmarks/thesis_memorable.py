@@ -15,7 +15,7 @@ from edgevpr.lab.evaluate import metrics
 from edgevpr.lab.evaluate.dataset import Dataset
 from edgevpr.runtime.recognise.detector import Detector, open_detector
 from edgevpr.runtime.recognise.memorability import Memorability, open_memorability
-from edgevpr.runtime.recognise.salience_maps import maps_of, scores_of
+from edgevpr.runtime.recognise.salience_gate import maps_of, scores_of
 from edgevpr.techniques.entropy import filled_bins
 
 STEPS = tuple(round(0.05 * step, 2) for step in range(21))

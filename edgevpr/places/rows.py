@@ -192,37 +192,35 @@ def scan(db: sqlite3.Connection, columns: str, file_bytes: int) -> Iterator[tupl
     A damaged page hides the rows on it, and those after it from a walk through the table. They are then asked for one
     by one. Raises sqlite3.Error where the file cannot be read at all, or has more rows than its size allows.
     """
-    left = most_rows(file_bytes)
-    last, highest = -(2**63), None
-    while True:
+    left, last = most_rows(file_bytes), -(2**63)
+    try:
+        for place_id, *row in db.execute(f"SELECT place_id, {columns} FROM places ORDER BY place_id"):
+            left -= 1
+            if not isinstance(place_id, int) or place_id <= last or left < 0:
+                raise sqlite3.DatabaseError("malformed: the table of places does not end")
+            last = place_id
+            yield place_id, tuple(row)
+        return
+    except sqlite3.Error as error:
+        if left < 0 or not is_of_one_row(error):
+            raise
+        highest = _highest_id(db, error)
+    missing = 0
+    for place_id in range(max(last, 0) + 1, highest + 1):
+        if missing >= _MOST_MISSING or left <= 0:
+            return
+        found: Values | None = None
         try:
-            walk = db.execute(f"SELECT place_id, {columns} FROM places WHERE place_id > ? ORDER BY place_id", (last,))
-            for place_id, *row in walk:
-                left -= 1
-                if not isinstance(place_id, int) or place_id <= last or left < 0:
-                    raise sqlite3.DatabaseError("malformed: the table of places does not end")
-                last = place_id
-                yield place_id, tuple(row)
-            return
+            found = db.execute(f"SELECT {columns} FROM places WHERE place_id = ?", (place_id,)).fetchone()
+            missing += 1
         except sqlite3.Error as error:
-            if left < 0 or not is_of_one_row(error):
+            if not is_of_one_row(error):
                 raise
-            highest = _highest_id(db, error) if highest is None else highest
-        last, missing, one = max(last, 0), 0, None
-        while one is None and last < highest and missing < _MOST_MISSING and left > 0:
-            last += 1
-            try:
-                one = db.execute(f"SELECT {columns} FROM places WHERE place_id = ?", (last,)).fetchone()
-                missing += 1
-            except sqlite3.Error as error:
-                if not is_of_one_row(error):
-                    raise
-                missing, left = 0, left - 1
-                yield last, None
-        if one is None:
-            return
-        left -= 1
-        yield last, one
+            missing, left = 0, left - 1
+            yield place_id, None
+        if found is not None:
+            missing, left = 0, left - 1
+            yield place_id, found
 
 
 def _highest_id(db: sqlite3.Connection, error: sqlite3.Error) -> int:
@@ -249,9 +247,9 @@ def _salience_of(values: Sequence[Any]) -> Salience | None:
     *scores, is_low = values
     if is_low is None:
         return None
-    return Salience(
-        *(score if isinstance(score, float) and 0 <= score <= 1 else None for score in scores), is_low=is_low == 1
-    )
+    known = (score if isinstance(score, float) and 0 <= score <= 1 else None for score in scores)
+    memorability, staticity, entropy = known
+    return Salience(memorability, staticity, entropy, is_low=is_low == 1)
 
 
 def _pose_of(values: Sequence[Any], checksum: object) -> Pose | None:

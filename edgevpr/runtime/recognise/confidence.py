@@ -24,7 +24,6 @@ from edgevpr.core.files import read_file, shipped
 Evidence = Mapping[str, float]
 
 _MAX_FILE_BYTES = 100_000
-_TAILS = "off_map", "off_place"
 _MOST = 40.0  # of a logit: beyond, a probability is 0 or 1 in float64
 # Of the share that may be wrong: without it foreign queries were accepted over grief_michigan_monthly, of five places.
 _NOT_ADAPTED = 0.1
@@ -41,6 +40,12 @@ class Logistic:
     scales: tuple[float, ...]
     bias: float
 
+    def __post_init__(self) -> None:
+        if not len(self.names) == len(self.weights) == len(self.scales):
+            raise ValueError("as many names as weights and scales are needed")
+        if not all(map(math.isfinite, (*self.weights, *self.scales, self.bias))):
+            raise ValueError("a weight is not finite")
+
     def logit(self, evidence: Evidence) -> float:
         return self.bias + sum(w * evidence[name] for w, name in zip(self.weights, self.names, strict=True))
 
@@ -53,6 +58,10 @@ class Tail:
     start: float
     share: float
     scale: float
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.start) and 0 < self.scale < math.inf and 0 < self.share <= 1):
+            raise ValueError("a tail needs a scale above 0, and a share above 0")
 
     def beyond(self, logit: float) -> float:
         """Return the share of matches that are wrong and beyond a logit; 1 at most."""
@@ -68,6 +77,10 @@ class Scale:
     off_place: Tail
     slope: float
     offset: float
+
+    def __post_init__(self) -> None:
+        if not (0 < self.slope < math.inf and math.isfinite(self.offset)):
+            raise ValueError("more evidence must not make a match less probable")
 
     def confidence(self, chance: float) -> float:
         """Return the probability that a match is right, of the chance that a wrong one offers as much."""
@@ -129,16 +142,16 @@ def from_json(text: str) -> Model:
         raise ValueError(f"no model of confidence ({error!r:.80})") from error
 
 
-def model_of(found: Mapping[str, Any]) -> Model:
+def model_of(stored: Mapping[str, Any]) -> Model:
     """Make a model of what JSON holds. Raises ValueError, KeyError or TypeError where that makes no sense."""
-    adapted = found["adapted_scale"]
+    adapted = stored["adapted_scale"]
     return Model(
-        of_map=_logistic(found["of_map"]),
-        of_place=_logistic(found["of_place"]),
-        scale=_scale(found["scale"]),
-        adapted_scale=None if adapted is None else _scale(adapted),
-        made=str(found["made"]),
-        made_of=str(found["made_of"]),
+        of_map=_logistic(**stored["of_map"]),
+        of_place=_logistic(**stored["of_place"]),
+        scale=_scale(**stored["scale"]),
+        adapted_scale=adapted and _scale(**adapted),
+        made=str(stored["made"]),
+        made_of=str(stored["made_of"]),
     )
 
 
@@ -153,26 +166,9 @@ def prior(kind: str) -> Model:
         raise ModelError(f"{path} cannot be used ({error}): install edgevpr again.") from error
 
 
-def _logistic(found: dict[str, Any]) -> Logistic:
-    names = tuple(str(name) for name in found["names"])
-    weights, scales = (tuple(_number(each) for each in found[key]) for key in ("weights", "scales"))
-    if not len(names) == len(weights) == len(scales):
-        raise ValueError("as many names as weights and scales are needed")
-    return Logistic(names, weights, scales, _number(found["bias"]))
+def _logistic(names: list[str], weights: list[float], scales: list[float], bias: float) -> Logistic:
+    return Logistic(tuple(map(str, names)), tuple(weights), tuple(scales), bias)
 
 
-def _scale(found: Mapping[str, Any]) -> Scale:
-    tails = [Tail(*(_number(found[key][part]) for part in ("start", "share", "scale"))) for key in _TAILS]
-    if not all(tail.scale > 0 and 0 < tail.share <= 1 for tail in tails):
-        raise ValueError("a tail needs a scale above 0, and a share above 0")
-    slope = _number(found["slope"])
-    if not slope > 0:
-        raise ValueError("more evidence must not make a match less probable")
-    return Scale(*tails, slope, _number(found["offset"]))
-
-
-def _number(value: Any) -> float:
-    number = float(value)
-    if not math.isfinite(number):
-        raise ValueError(f"{value!r:.80} is no number")
-    return number
+def _scale(off_map: dict[str, float], off_place: dict[str, float], slope: float, offset: float) -> Scale:
+    return Scale(Tail(**off_map), Tail(**off_place), slope, offset)

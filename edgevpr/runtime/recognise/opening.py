@@ -112,14 +112,16 @@ def budget_mb(config: Config, board: Board) -> float:
 
 
 def gate_of(config: SalienceConfig, threads: int = 1) -> Gate | None:
-    """Make the gate of salience that the configuration asks for (None: none), and say which criteria are off for want
-    of a network.
+    """Make the gate of salience where the configuration asks for one. Raises as `gate_with`."""
+    return gate_with(config, threads) if config.use else None
+
+
+def gate_with(config: SalienceConfig, threads: int = 1) -> Gate:
+    """Make a gate of salience, and say which criteria are off for want of a network.
 
     Raises ConfigError for thresholds that nothing can reach, or of which none is above 0, and ModelError for a network
     that cannot be used.
     """
-    if not config.use:
-        return None
     if config.entropy > MOST_ENTROPY:
         raise ConfigError(
             f"`salience.entropy` is {config.entropy:g}, and no picture has more than {MOST_ENTROPY:.3f}: lower it."

@@ -83,20 +83,11 @@ class WalkSettings:
     min_accuracy_m: float = 1.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Judged:
-    """The best place of a query after all that is known, what led to it, and the verdict on it."""
-
-    findings: Findings
-    best: Candidate
-    followed: Followed | None
-    verdict: Verdict
-
-
 @dataclass(slots=True, kw_only=True)
 class _Walk:
-    """State of one frame on its walk; None for the steps that it has not reached. `nothing` is the reason why its
-    picture says too little, `objection` that or why it is not memorable."""
+    """State of one frame on its walk; None for what it has not reached. `nothing` is the reason why its picture says
+    too little, and `objection` that or why it is not memorable. `findings`, `best` and `followed` are those of the last
+    look that was judged."""
 
     frame: Frame
     vehicle: Vehicle | None
@@ -106,7 +97,9 @@ class _Walk:
     nothing: str | None = None
     objection: str | None = None
     hints: Hints | None = None
-    judged: _Judged | None = None
+    findings: Findings | None = None
+    best: Candidate | None = None
+    followed: Followed | None = None
 
 
 class Recogniser:
@@ -132,30 +125,15 @@ class Recogniser:
         self._prior, self._follower = prior, follower
         self._told = 0  # number of places left out that an event has told of
         self._new: deque[tuple[int, float]] = deque()  # place id, and the time it was learnt at
-        self._lost: str | None = None
         self.take(matcher)
 
     def take(self, matcher: Matcher) -> None:
         """Recognise with another matcher from the next frame on."""
-        self._matcher, self._lost = matcher, None
+        self.technique, self.index = matcher.technique, matcher.index
+        self.rule, self.search = matcher.rule, matcher.search
+        self._lost: str | None = None
         # 1-sigma accuracy of a place as a fix: such a match cannot tell where between two places the aircraft is.
         self.accuracy_m = max(self._settings.min_accuracy_m, matcher.index.spacing_m() or 0.0)
-
-    @property
-    def technique(self) -> Technique:
-        return self._matcher.technique
-
-    @property
-    def index(self) -> PlaceIndex:
-        return self._matcher.index
-
-    @property
-    def rule(self) -> AcceptRule:
-        return self._matcher.rule
-
-    @property
-    def search(self) -> SequenceSearch | None:
-        return self._matcher.search
 
     @property
     def sequence(self) -> int:
@@ -164,18 +142,17 @@ class Recogniser:
 
     def accept_with(self, precision: float) -> None:
         """Accept matches with this precision from the next frame on. A rule that goes by limits stays as it is."""
-        if sure := self.rule.sure:
-            rule = replace(self.rule, sure=replace(sure, precision=precision))
-            self._matcher = replace(self._matcher, rule=rule)
+        if self.rule.sure:
+            self.rule = replace(self.rule, sure=replace(self.rule.sure, precision=precision))
 
     def extend(self, index: PlaceIndex, place_id: int, t_mono_s: float) -> None:
         """Recognise in an index that has one place more, learnt from the frame taken at `t_mono_s`."""
         self._new.append((place_id, t_mono_s))
-        self.take(replace(self._matcher, index=index))
+        self.take(Matcher(self.technique, index, self.rule, self.search))
 
     def release_index(self) -> None:
         """Let go of the index, so that another one need not be in memory beside it."""
-        self.take(replace(self._matcher, index=empty_index(self.technique.spec, 0, None)))
+        self.take(Matcher(self.technique, empty_index(self.technique.spec, 0, None), self.rule, self.search))
 
     def lose_index(self, error: Exception) -> None:
         """Fail every frame with this error until there is an index again (see `take`)."""
@@ -198,38 +175,40 @@ class Recogniser:
 
     def _encode(self, walk: _Walk) -> tuple[Levelled, Descriptor]:
         """Prepare the picture of a frame, look at its worth, and encode it."""
-        frame, preparation = walk.frame, self._preparation
+        frame, gate = walk.frame, self._preparation.gate
         with self.meter.step("prepare"):
-            walk.picture = picture = preparation.picture(frame, walk.vehicle)
+            walk.picture = picture = self._preparation.picture(frame, walk.vehicle)
         with self.meter.step("gate"):
-            walk.worth = preparation.gate.look(frame.image) if preparation.gate else None
+            walk.worth = gate.look(frame.image) if gate else None
         with self.meter.step("encode"):
             walk.descriptor = descriptor = encoded(self.technique, picture.image, picture.mask)
         return picture, descriptor
 
     def _recognise(self, walk: _Walk, picture: Levelled, descriptor: Descriptor) -> Verdict:
         """Search the map for a frame that is encoded, and judge what is found."""
+        follower = self._follower
         if self._lost:
             raise MapError(self._lost)
         walk.nothing = says_nothing(descriptor, self.rule.min_quality)
-        walk.objection = walk.nothing or (walk.worth and walk.worth.reason)
-        if self._follower:
-            self._follower.went_on(walk.frame, walk.vehicle)
+        walk.objection = walk.nothing or (walk.worth.reason if walk.worth else None)
+        if follower:
+            follower.went_on(walk.frame, walk.vehicle)
         if not len(self.index):
             return Verdict(False, "the map has no place yet")
         if walk.objection and self.search is None:  # in a sequence it is searched for, to keep the others in step
-            if self._follower:
-                self._follower.saw_nothing(self.index)
+            if follower:
+                follower.saw_nothing(self.index)
             return Verdict(False, walk.objection)
-        walk.judged = judged = self._found(walk, picture, descriptor)
-        if self._follower:
-            self._follower.settle()
-        verdict = Verdict(False, walk.objection) if walk.objection else judged.verdict
+        verdict, best = self._found(walk, picture, descriptor)
+        if follower:
+            follower.settle()
+        if walk.objection:
+            verdict = Verdict(False, walk.objection)
         if self._prior:
-            self._prior.learn(judged.best, verdict.accepted, walk.frame.t_mono_s)
+            self._prior.learn(best, verdict.accepted, walk.frame.t_mono_s)
         return verdict
 
-    def _found(self, walk: _Walk, picture: Levelled, descriptor: Descriptor) -> _Judged:
+    def _found(self, walk: _Walk, picture: Levelled, descriptor: Descriptor) -> tuple[Verdict, Candidate]:
         """Look for a query as it is expected and, where nothing is accepted, from all other heights as well."""
         frame, prior, spec, search = walk.frame, self._prior, self.technique.spec, self.search
         height_ratio = prior.height_ratio if prior else 1.0
@@ -241,42 +220,37 @@ class Recogniser:
         if search:
             ranking = search.follow(ranking, self.index, frame.t_mono_s)
         looked = Verification(spec, picture, self.index, self.place_map)
-        walk.judged = judged = self._judged(frame, ranking, looked)
+        verdict, best = self._judged(walk, ranking, looked)
         others = other_heights(spec.height_ratios, height_ratio)
-        if judged.verdict.accepted or search or not others or (prior and not prior.looks_again):
-            return judged
+        if verdict.accepted or search or not others or (prior and not prior.looks_again):
+            return verdict, best
         for ratio in others:
             # What spoke against the first look counts in the others as well.
             look = self._look(descriptor, replace(expected, height_ratio=ratio), _OF_CANDIDATES)
             ranking = together(ranking, look)
-        return self._judged(frame, ranking, looked)
+        return self._judged(walk, ranking, looked)
 
     def _look(self, descriptor: Descriptor, expected: Expectation, part: float = 1.0) -> Ranking:
         """Search the map for a query, with a `part` of the candidates. Raises MapError and PlaceError as `compare`
         does."""
-        query = Query(
-            technique=self.technique,
-            descriptor=descriptor,
-            place_map=self.place_map,
-            index=self.index,
-            expected=expected,
-        )
+        technique, place_map, index = self.technique, self.place_map, self.index
+        query = Query(technique=technique, descriptor=descriptor, place_map=place_map, index=index, expected=expected)
         with self.meter.step("scan"):
-            self.place_map.require_unchanged()
+            place_map.require_unchanged()
             scanned = scan(query)
         with self.meter.step("compare"):
             candidates = self.candidates and max(1, round(part * self.candidates))
             return compare(query, scanned, candidates, self.rule.neighbour_m)
 
     def _judged(
-        self, frame: Frame, ranking: Ranking, looked: Verification, followed: Followed | None = None
-    ) -> _Judged:
+        self, walk: _Walk, ranking: Ranking, looked: Verification, followed: Followed | None = None
+    ) -> tuple[Verdict, Candidate]:
         """Judge the best place of a ranking, with its landmarks, what the places beside it say, and the flight so far:
         that may know better which place is the best (`followed`: it has been asked)."""
         index, place_map, cells, rule = self.index, self.place_map, self.technique.spec.cells, self.rule
         with self.meter.step("compare"):
             (best,) = named(ranking, index, place_map, first=1)
-            is_new = self._is_new(best.place.place_id, frame.t_mono_s)
+            is_new = self._is_new(best.place.place_id, walk.frame.t_mono_s)
         where = proof = None
         is_worth_it = best.match.score >= rule.worth_a_look
         # The newest query of a sequence need not be sure by itself.
@@ -300,23 +274,23 @@ class Recogniser:
             with self.meter.step("locate"):
                 followed = self._follower.heard(ranking, index, evidence, rule.sure, where)
             if followed.slot is not None and followed.leads_from(int(ranking.slots[0])):
-                return self._judged(frame, ranking.led_by(followed.slot), looked, followed)
+                return self._judged(walk, ranking.led_by(followed.slot), looked, followed)
         rival = 0
         if verifies and proof and is_hardly_ahead(evidence):
             with self.meter.step("verify"):
                 rival = looked.rival(ranking, rule.neighbour_m, same)
-        by_flight = followed and followed.confidence
-        findings = Findings(
+        by_flight = followed.confidence if followed else None
+        walk.best, walk.followed = best, followed
+        walk.findings = findings = Findings(
             ranking, is_new=is_new, proof=proof, rival=rival, where=where, evidence=evidence, by_flight=by_flight
         )
-        verdict = judge(findings, index, rule, self.search)
-        return _Judged(findings=findings, best=best, followed=followed, verdict=verdict)
+        return judge(findings, index, rule, self.search), best
 
     def _event(self, walk: _Walk, verdict: Verdict, failure: Exception | None) -> Recognition:
         """Return the event of a frame, with all that happened to it."""
-        judged, findings = walk.judged, walk.judged and walk.judged.findings
+        findings, sure = walk.findings, self.rule.sure
         where = findings.where if findings and verdict.accepted else None
-        sure, evidence = self.rule.sure, findings and findings.evidence
+        evidence = findings.evidence if findings else None
         return Recognition(
             frame=walk.frame,
             vehicle=walk.vehicle,
@@ -324,11 +298,11 @@ class Recogniser:
             worth=walk.worth,
             descriptor=walk.descriptor,
             hints=walk.hints,
-            ranking=findings and findings.ranking,
-            best=judged and judged.best,
-            proof=findings and findings.proof,
+            ranking=findings.ranking if findings else None,
+            best=walk.best,
+            proof=findings.proof if findings else None,
             evidence=evidence,
-            followed=judged and judged.followed,
+            followed=walk.followed,
             confidence=sure.confidence(evidence) if sure and evidence else None,
             accepted=verdict.accepted,
             reason=verdict.reason,

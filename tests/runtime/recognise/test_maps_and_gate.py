@@ -5,8 +5,16 @@ import pytest
 
 from edgevpr.core.types import Salience
 from edgevpr.frames.images import cv2
-from edgevpr.runtime.recognise.salience_gate import MOST_ENTROPY, Gate, Thresholds, best_of, worth_of
-from edgevpr.runtime.recognise.salience_maps import Maps, maps_of, scores_of
+from edgevpr.runtime.recognise.salience_gate import (
+    MOST_ENTROPY,
+    Gate,
+    Maps,
+    Thresholds,
+    best_of,
+    maps_of,
+    scores_of,
+    worth_of,
+)
 
 RNG = np.random.default_rng(5)
 
