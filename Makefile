@@ -59,16 +59,11 @@ sweeps: $(VENV)/installed
 	$(BIN)/python benchmarks/sweeps.py
 
 # `cohog` beside other ways, into benchmarks/results/: forty minutes. It goes on in peers_work/ (700 MB) where it was
-# interrupted. What cannot be installed is left out; the modern networks are exported by a Python with torch and onnx.
-PEERS := faiss-cpu pydbow
-TORCH ?= $(BIN)/python
+# interrupted. What cannot be installed is left out.
 peers: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[bench]'
-	@for each in $(PEERS); do \
-	    $(BIN)/python -m pip install --quiet --disable-pip-version-check --only-binary :all: $$each || \
-	        $(BIN)/python -m pip install --quiet --disable-pip-version-check $$each || echo "$$each: left out"; \
-	done
-	$(BIN)/python benchmarks/peers/peers.py --torch $(TORCH)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check faiss-cpu || echo "faiss-cpu: left out"
+	$(BIN)/python benchmarks/peers/peers.py
 
 # Speed and memory against the published way, into benchmarks/results/.
 bench: $(VENV)/installed

@@ -145,15 +145,20 @@ def _directory(order: str, tags: list, start: int, chance: random.Random) -> byt
     return entries + struct.pack(order + "I", following) + values
 
 
+def _no_file(path: Path, kind: int, chance: random.Random) -> Path:
+    """Return a pipe at `path`, or a device or a folder elsewhere."""
+    if kind:
+        return Path(chance.choice(("/dev/zero", "/dev/null", "/proc/self/mem", str(path.parent))))
+    os.mkfifo(path)
+    return path
+
+
 def write_table(path: Path, rows: list[list[str]], chance: random.Random) -> Path:
     """Write a CSV of which one cell, one column or the whole is hostile."""
     rows = [list(row) for row in rows]
     kind = chance.randrange(8)
-    if kind == 0:
-        os.mkfifo(path)
-        return path
-    if kind == 1:
-        return Path(chance.choice(("/dev/zero", "/dev/null", "/proc/self/mem", str(path.parent))))
+    if kind < 2:
+        return _no_file(path, kind, chance)
     if kind == 2:
         twice = chance.randrange(len(rows[0]))
         rows = [[*row, row[twice]] for row in rows]
@@ -168,11 +173,8 @@ def write_table(path: Path, rows: list[list[str]], chance: random.Random) -> Pat
 def write_yaml(path: Path, text: str, chance: random.Random) -> Path:
     """Write a YAML file of which one value, one line or the whole is hostile."""
     kind = chance.randrange(10)
-    if kind == 0:
-        os.mkfifo(path)
-        return path
-    if kind == 1:
-        return Path(chance.choice(("/dev/zero", "/dev/null", "/proc/self/mem", str(path.parent))))
+    if kind < 2:
+        return _no_file(path, kind, chance)
     lines = text.splitlines()
     at = chance.randrange(len(lines))
     if kind == 2:
@@ -198,11 +200,9 @@ def write_yaml(path: Path, text: str, chance: random.Random) -> Path:
 def write_network(path: Path, whole: bytes, chance: random.Random) -> Path:
     """Write an ONNX file that is cut, changed or no file at all."""
     kind = chance.randrange(8)
-    if kind == 0:
-        os.mkfifo(path)
-    elif kind == 1:
-        return Path(chance.choice(("/dev/zero", "/dev/null", "/proc/self/mem", str(path.parent))))
-    elif kind == 2:
+    if kind < 2:
+        return _no_file(path, kind, chance)
+    if kind == 2:
         path.write_bytes(whole[: chance.randrange(len(whole))])
     elif kind == 3:
         path.touch()

@@ -170,7 +170,7 @@ row differed by less than a fifth as a rule, by a half at most. `B/place` is wha
 published CoHOG and for the ratio tests that is the whole descriptor of every reference. `cohog` has besides {least:.0f}
 to {most:.0f} KB a place in its map file, of which a match reads the places that it compares. `RAM` is the peak of the
 process above the bare interpreter, with the references in it; maps and words were made before, by another process.
-`import` are the seconds of the processor until the libraries are loaded. Words (bag of words, pydbow, VLAD) are learnt
+`import` are the seconds of the processor until the libraries are loaded. Words (bag of words, VLAD) are learnt
 on the references of corridor, aerial_caliterra and aerial_garfield28. The 95 % are of recall@1: what other queries of
 the same kind would give. Of a set at most 200 queries are asked, evenly spaced.
 """
@@ -216,8 +216,8 @@ On PyPI, for Python 3.11:
 * `vprtempo` 1.1.10: trains a network for every map; needs torchvision, which beside a PyTorch without CUDA cannot be
   imported from PyPI's file; and takes the n-th query for one of the n-th reference.
 * `usearch`, `hnswlib`: find neighbours among vectors, and make none of a picture. The row of FAISS stands for them.
-
-`pydbow` is the one that recognises places as it comes.
+* `pydbow`: recognises places as it comes, a tree of ORB words in Python, whose k-means goes through them one by one.
+  The bag of ORB words stands for it.
 """
 
 if __name__ == "__main__":

@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 
 WORDS_ORB, WORDS_SIFT, FEATURES = 1000, 64, 500
-PYDBOW_EVERY = 8
 RATIO = 0.75
 _CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 20, 1e-3)
 SIDE_PX = 512
@@ -119,37 +118,6 @@ def bag_of_orb_words() -> Way:
     )
 
 
-def pydbow_words() -> Way:
-    """DBoW (Galvez-Lopez and Tardos 2012) as the package pydbow has it, in Python: a tree of 10 x 10 x 10 words of 500
-    ORB features. Its k-means goes through them one by one, so it learns on every eighth picture."""
-    import dbow
-
-    def learn(pictures: Sequence[np.ndarray]) -> dbow.Vocabulary:
-        np.random.seed(0)  # the package draws from NumPy's own generator
-        return dbow.Vocabulary(pictures[::PYDBOW_EVERY], 10, 3)
-
-    def encode(grey: np.ndarray, words: dbow.Vocabulary) -> np.ndarray:
-        try:
-            counts = words.image_to_bow(grey).data
-        except TypeError:  # it does not expect a picture without features
-            return np.zeros(len(words.words))
-        return np.asarray(counts, float)
-
-    def scores(asked: np.ndarray, places: list[dbow.BoW]) -> np.ndarray:
-        if not asked.any():
-            return np.zeros(len(places))
-        asked = dbow.BoW(asked)
-        return np.array([asked.score(place) if place.data.any() else 0.0 for place in places])
-
-    return Way(
-        learn=learn,
-        encode=encode,
-        index=lambda found, _: [dbow.BoW(each) for each in found],
-        scores=scores,
-        nbytes=lambda places, count: sum(each.data.nbytes for each in places) / count,
-    )
-
-
 def sift_vlad() -> Way:
     """RootSIFT (Arandjelovic and Zisserman 2012) in a VLAD of 64 words with intra-normalisation (2013), by cosine."""
     sift = cv2.SIFT_create(FEATURES)
@@ -222,7 +190,6 @@ WAYS: dict[str, Callable[[], Way]] = {
     "ORB, ratio test": orb_with_ratio_test,
     "SIFT, ratio test": sift_with_ratio_test,
     "bag of ORB words": bag_of_orb_words,
-    "pydbow": pydbow_words,
     "SIFT-VLAD": sift_vlad,
     "FAISS on cohog's codes": faiss_on_our_codes,
 }

@@ -15,7 +15,7 @@ from edgevpr.techniques.card import read_card
 sys.path.append(str(REPOSITORY / "benchmarks" / "peers"))
 import ways
 
-NEEDS = {"CoHOG, published": "skimage", "pydbow": "dbow", "FAISS on cohog's codes": "faiss"}
+NEEDS = {"CoHOG, published": "skimage", "FAISS on cohog's codes": "faiss"}
 RECIPES = REPOSITORY / "docs" / "how-to" / "modern-networks.md"
 
 
@@ -26,7 +26,6 @@ def test_every_way_finds_a_picture_that_moved_a_little(name, monkeypatch):
         pytest.importorskip(NEEDS[name])
     monkeypatch.setattr(ways, "WORDS_ORB", 40)
     monkeypatch.setattr(ways, "WORDS_SIFT", 8)
-    monkeypatch.setattr(ways, "PYDBOW_EVERY", 1)
     way = ways.WAYS[name]()
     pictures = [cv2.resize(textured(seed), (320, 240)) for seed in range(8)]
     words = way.learn(pictures)

@@ -13,21 +13,11 @@ import pytest
 from edgevpr.lab.simulate.camera import CameraPose
 from edgevpr.lab.simulate.generated import ORIGIN, to_metres, to_position
 
-RIG = Path(__file__).parents[1] / "rig"
+sys.path.append(str(Path(__file__).parents[1] / "rig"))
+import figures
+import truth
 
-
-@pytest.fixture
-def rig(monkeypatch) -> SimpleNamespace:
-    """Its modules; their plain names are forgotten again."""
-    before = set(sys.modules)
-    monkeypatch.syspath_prepend(str(RIG))
-    import figures
-    import truth
-
-    yield SimpleNamespace(figures=figures, truth=truth)
-    for name in set(sys.modules) - before:
-        if str(RIG) in str(getattr(sys.modules[name], "__file__", "")):
-            del sys.modules[name]
+RIG = Path(figures.__file__).parent
 
 
 def degrees(east_m: float, north_m: float) -> tuple[float, float]:
@@ -46,7 +36,7 @@ def test_without_a_simulator_a_sentence_says_what_to_do():
     assert done.stderr == "rig: build ArduPilot's simulator, and name its folder in EDGEVPR_ARDUPILOT.\n"
 
 
-def test_the_truth_of_a_turn_between_two_states(rig):
+def test_the_truth_of_a_turn_between_two_states():
     """Banked by 30 degrees, the nose turns at g tan(30) / v: 14.7 degrees a second at 22 m/s."""
     roll, turn = np.radians(30.0), 9.81 * np.tan(np.radians(30.0)) / 22.0
     lat_deg, lon_deg = degrees(500.0, 300.0)
@@ -65,16 +55,16 @@ def test_the_truth_of_a_turn_between_two_states(rig):
         vn=22.0,
         vd=1.0,
     )
-    truth = rig.truth.Truth()
-    truth.listen(state, 10.0)
-    at = truth.at(10.1)
+    told = truth.Truth()
+    told.listen(state, 10.0)
+    at = told.at(10.1)
     assert (at.east_m, at.north_m, at.height_m) == pytest.approx((500.0, 302.2, 99.9), abs=0.02)
     assert (at.roll_deg, at.pitch_deg, at.heading_deg) == pytest.approx((30.0, 0.0, 350.0 + np.degrees(turn) / 10))
-    assert truth.at(9.9) is None  # nothing is known of before
-    assert truth.at(10.5) is None  # nor of so long after
+    assert told.at(9.9) is None  # nothing is known of before
+    assert told.at(10.5) is None  # nor of so long after
 
 
-def test_the_figures_of_a_run(rig, tmp_path):
+def test_the_figures_of_a_run(tmp_path):
     """GPS is lost at 100 s; the estimate drifts at 2 m/s for ten seconds, and the pictures were taken at the truth."""
     columns = "t_s,east_m,north_m,height_m,roll_deg,pitch_deg,est_east_m,est_north_m,error_m,mode,ekf_flags,gps_fix"
     lines = [f"{t:.1f},500,300,100,0,0,500,300,{2 * max(t - 100, 0):.2f},10,831,6" for t in np.arange(95, 110.05, 0.1)]
@@ -115,7 +105,7 @@ def test_the_figures_of_a_run(rig, tmp_path):
     }
     (tmp_path / "run.json").write_text(json.dumps(run))
 
-    found = rig.figures.figures_of(tmp_path)
+    found = figures.figures_of(tmp_path)
 
     assert found["estimate"]["before"]["max"] == 0.0
     assert found["estimate"]["after"]["median"] == pytest.approx(10.0, abs=0.2)
@@ -132,6 +122,6 @@ def test_the_figures_of_a_run(rig, tmp_path):
     assert found["answers"] == {"ACCEPTED": 2}
 
 
-def test_worse_than_without_at_the_worst_second(rig):
-    assert rig.figures.worse_by(np.array([1.0, 5.0, 2.0]), np.array([2.0, 1.0, 9.0, 20.0])) == (4.0, 1)
+def test_worse_than_without_at_the_worst_second():
+    assert figures.worse_by(np.array([1.0, 5.0, 2.0]), np.array([2.0, 1.0, 9.0, 20.0])) == (4.0, 1)
     assert to_metres(*degrees(12.0, 34.0)) == pytest.approx((12.0, 34.0), abs=1e-6)
