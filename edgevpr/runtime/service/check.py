@@ -3,7 +3,7 @@
 import os
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 
 import numpy as np
@@ -29,10 +29,10 @@ from edgevpr.runtime.preflight.pick import outlook
 from edgevpr.runtime.recognise.evidence import calibration_of, not_calibrated
 from edgevpr.runtime.recognise.learn import check_positions
 from edgevpr.runtime.recognise.opening import open_recogniser
-from edgevpr.runtime.service import px4
 from edgevpr.runtime.service.board import log_findings
-from edgevpr.runtime.service.doctor import plan_of, silence
-from edgevpr.runtime.service.finding import Finding, looked_at
+from edgevpr.runtime.service.doctor import intent_of, silence
+from edgevpr.runtime.service.finding import Finding, fine, looked_at, wrong
+from edgevpr.runtime.service.rules import is_too_rare, rarity
 
 _FRAME_WAIT_S = 15.0  # longer than any source takes to say that it is lost
 _WITHOUT_FRAMES = (Condition.LOST, Condition.FROZEN, Condition.DAMAGED)
@@ -51,22 +51,22 @@ def check(
     try:
         config = load_config(config_path)
     except EdgevprError as error:
-        return [Finding("configuration", False, str(error))]
+        return [wrong("configuration", str(error))]
     findings = [
-        Finding("configuration", True, str(config_path)),
+        fine("configuration", str(config_path)),
         looked_at("board", lambda: _board(config)),
         looked_at("battery", lambda: _battery(config)),
     ]
     if all(finding.ok for finding in findings):
         findings.append(looked_at("map", lambda: _map(config)))
     else:
-        findings.append(Finding("map", False, "Not looked at: correct the board or the battery first."))
+        findings.append(wrong("map", "Not looked at: correct the board or the battery first."))
     say("waiting for the source of frames")
-    findings.append(looked_at("source", lambda: _source(config, _opened if offline else _with_a_frame)))
+    findings.append(looked_at("source", lambda: _source(config, offline)))
     say("waiting for the flight controller")
-    findings.append(looked_at("link", lambda: _link(config, _only_opened if offline else _with_a_heartbeat)))
+    findings.append(looked_at("link", lambda: _link(config, offline)))
     say("")
-    return [*findings, *log_findings(config)]
+    return [*findings, *log_findings(config.log, has_link=config.mavlink.link is not None)]
 
 
 def learn_mask(config_path: str | Path, out: Path, recording: str | None = None) -> str:
@@ -77,11 +77,8 @@ def learn_mask(config_path: str | Path, out: Path, recording: str | None = None)
     uri = recording or load_config(config_path).source.uri
     if uri is None:
         raise UsageError("There is no source to learn a mask from: name a recording with --source.")
-    source = open_source(uri, step_s=_APART_S, live=recording is None)
-    try:
+    with closing(open_source(uri, step_s=_APART_S, live=recording is None)) as source:
         allowed = learn_overlay(_pictures(source), uri)
-    finally:
-        source.close()
     if allowed.all():
         return f"{uri} shows no display over the ground: no mask is needed, and none was written."
     write_mask(out, allowed)
@@ -122,7 +119,7 @@ def _battery(config: Config) -> str:
 def _map(config: Config) -> str:
     if config.mapping.learn and config.map is not None:
         path = map_path(config.map).absolute()
-        # The map is neither made nor opened for writing, for the same reason as the log in `_log`.
+        # The map is neither made nor opened for writing, for the same reason as a log (`board`).
         if not os.access(path.parent, os.W_OK) or (path.exists() and not os.access(path, os.W_OK)):
             raise MapError(f"{path} or its folder may not be written by this user: learning needs both.")
         if not path.exists():
@@ -137,32 +134,28 @@ def _map(config: Config) -> str:
         if recogniser.rule.sure:
             calibration = calibration_of(place_map)
             sure = f"; {calibration.described() if calibration else not_calibrated(len(place_map))}"
-    if config.mavlink.link and config.mavlink.send_fixes and (found.t_query_s or 0.0) > FIX_MAX_AGE_S:
+    t_query_s = found.t_query_s or 0.0
+    if config.mavlink.link and config.mavlink.send_fixes and t_query_s > FIX_MAX_AGE_S:
         raise UsageError(
-            f"No fix would ever be sent ({too_late(found.t_query_s)}): use a faster board, fewer places or candidates, "
+            f"No fix would ever be sent ({too_late(t_query_s)}): use a faster board, fewer places or candidates, "
             f"or a technique that costs less; {found.reason}."
         )
     return f"{config.map}, {found.reason}{sure}"
 
 
-def _source(config: Config, look: Callable[[Source, str], str]) -> str:
+def _source(config: Config, offline: bool) -> str:
     uri = config.source.uri
     if uri is None:
         raise UsageError("There is no source of frames: write `source: {uri: ...}`.")
     if config.mapping.learn:
         check_positions(config, None)
-    source = open_source(uri, live=True)
-    try:
-        return f"{uri}, {look(source, uri)}"
-    finally:
-        source.close()
-
-
-def _opened(source: Source, uri: str) -> str:
-    # Wait until FFmpeg has given up (5 s at most): a capture that returns while Python ends aborts the process.
-    while source.condition is Condition.OPENING:
-        time.sleep(0.05)
-    return source.state
+    with closing(open_source(uri, live=True)) as source:
+        if not offline:
+            return f"{uri}, {_with_a_frame(source, uri)}"
+        # Wait until FFmpeg has given up (5 s at most): a capture that returns while Python ends aborts the process.
+        while source.condition is Condition.OPENING:
+            time.sleep(0.05)
+        return f"{uri}, {source.state}"
 
 
 def _with_a_frame(source: Source, uri: str) -> str:
@@ -181,31 +174,27 @@ def _with_a_frame(source: Source, uri: str) -> str:
     )
 
 
-def _link(config: Config, look: Callable[[Inquiry, LinkAddress, Config], str]) -> str:
+def _link(config: Config, offline: bool) -> str:
     settings = config.mavlink
     address, ground = parse_links(settings.link, settings.ground)
     if address is None:
         return "none, so what is recognised goes into the log only"
     signing = open_signing(settings.signing_key, settings.signing_state, to_ask=True)
-    with Inquiry(address, settings.component_id, settings.system_id, signing) as asking:
-        said = [f"{address}{look(asking, address, config)}"]
+    with Inquiry(address, settings.component_id, settings.system_id, signing) as inquiry:
+        parts = [str(address)] if offline else [str(address), _heartbeat(inquiry, address, config)]
     if ground:
         with Inquiry(ground, settings.component_id, settings.system_id):
-            said.append(f"ground station at {ground}")
+            parts.append(f"ground station at {ground}")
     if settings.signing_key is not None:
-        said.append("signed")
-    return ", ".join(said if settings.send_fixes else [*said, DRY_RUN])
+        parts.append("signed")
+    return ", ".join(parts if settings.send_fixes else [*parts, DRY_RUN])
 
 
-def _only_opened(asking: Inquiry, address: LinkAddress, config: Config) -> str:
-    return ""
-
-
-def _with_a_heartbeat(asking: Inquiry, address: LinkAddress, config: Config) -> str:
-    beat = asking.heartbeat()
+def _heartbeat(inquiry: Inquiry, address: LinkAddress, config: Config) -> str:
+    beat = inquiry.heartbeat()
     if beat is None:
-        raise LinkError(silence(address, asking.bad_bytes, asking.others, asking.refused).message)
-    said = f", autopilot heard: system {asking.system_id}"
-    if beat.autopilot == mavlink.MAV_AUTOPILOT_PX4 and px4.is_too_rare(every_s := plan_of(config).every_s):
-        said += f" ({px4.rarity(every_s)}: `edgevpr doctor` says more)"
-    return said
+        raise LinkError(silence(address, inquiry.bad_bytes, inquiry.others, inquiry.refused).message)
+    every_s, heard = intent_of(config).every_s, f"autopilot heard: system {inquiry.system_id}"
+    if beat.autopilot == mavlink.MAV_AUTOPILOT_PX4 and is_too_rare(every_s):
+        return f"{heard} ({rarity(every_s)}: `edgevpr doctor` says more)"
+    return heard

@@ -12,17 +12,20 @@ from edgevpr.mavlink.asking import Inquiry
 from edgevpr.mavlink.reading import AutopilotReading, read_autopilot
 from edgevpr.mavlink.signing import MEANING, open_signing
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.service import ardupilot, px4
 from edgevpr.runtime.service.board import board_findings
-from edgevpr.runtime.service.finding import Finding, Plan
+from edgevpr.runtime.service.finding import Finding, FlightIntent, fine, wrong
+from edgevpr.runtime.service.rules import RULES
 
 _SLOW_S = 0.25  # a round trip: fixes would be as late
 _BAD_BYTES = 300  # the rest of a message or two at the start is usual
 _NEEDED = ("GLOBAL_POSITION_INT", "ATTITUDE", "GPS_RAW_INT")
 _CLOCK_S = 60.0
 _GPS_3D = 3
-_ADVICE = {"ardupilot": ardupilot, "px4": px4}
-_NAMES = {"ardupilot": "ArduPilot", "px4": "PX4"}
+_WHERE_SILENT = {
+    "udpin": "let the autopilot, its simulator or a router send to this port",
+    "udpout": "start what listens there, or correct host and port",
+    "tcp": "something answers there that is no flight controller, or one that is still starting",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,24 +48,25 @@ def doctor(config: Config, address: LinkAddress, say: Callable[[str], None], roo
     signing = open_signing(settings.signing_key, settings.signing_state, to_ask=True)
     about_board = list(board_findings(config, address, root))
     say(f"asking the autopilot at {address}")
-    reading, trouble = None, None
+    reading = None
     try:
         with Inquiry(address, settings.component_id, settings.system_id, signing) as asking:
-            reading = read_autopilot(asking, {name: rules.PARAMETERS for name, rules in _ADVICE.items()})
-            if reading is None:
-                trouble = silence(address, asking.bad_bytes, asking.others, asking.refused)
+            reading = read_autopilot(asking, {name: rules.parameters for name, rules in RULES.items()})
+            if reading:
+                about_autopilot = list(autopilot_findings(reading, address, intent_of(config)))
+            else:
+                about_autopilot = [silence(address, asking.bad_bytes, asking.others, asking.refused)]
     except LinkAddressError:
         raise
     except LinkError as error:
-        trouble = Finding("link", False, str(error))
+        reading, about_autopilot = None, [wrong("link", str(error))]
     say("")
-    about_autopilot = [trouble] if trouble else list(autopilot_findings(reading, address, plan_of(config)))
     return Diagnosis(about_autopilot + about_board, reading)
 
 
-def plan_of(config: Config) -> Plan:
+def intent_of(config: Config) -> FlightIntent:
     """Return what a flight with this configuration will do. Raises ConfigError for a board that is unknown."""
-    return Plan(config.mavlink.send_fixes, 1 / (config.source.rate_hz or load_board(config.board).rate_hz))
+    return FlightIntent(config.mavlink.send_fixes, 1 / (config.source.rate_hz or load_board(config.board).rate_hz))
 
 
 def silence(
@@ -70,73 +74,56 @@ def silence(
 ) -> Finding:
     """Explain that no heartbeat was heard, by what else arrived; `refused` counts what is not believed, by reason."""
     if refused:
-        why = max(refused, key=refused.get)
-        return Finding("link", False, f"{address}: messages arrive, and are refused ({why}): {MEANING[why]}.")
+        why = max(refused, key=lambda reason: refused[reason])
+        return wrong("link", f"{address}: messages arrive, and are refused ({why}): {MEANING[why]}.")
     if others:
         systems = " and ".join(map(str, sorted(others)))
-        return Finding(
-            "link",
-            False,
-            f"{address}: the autopilots heard are of system {systems}, none is the one configured.",
-            (f"mavlink: {{system_id: {min(others)}}}",),
-        )
+        unlike = f"{address}: the autopilots heard are of system {systems}, none is the one configured."
+        return wrong("link", unlike, f"mavlink: {{system_id: {min(others)}}}")
     if address.kind == "serial":
         seen = "bytes arrive that are no MAVLink (another baud rate?)" if bad_bytes else "nothing arrives (TX and RX?)"
-        return Finding(
+        return wrong(
             "link",
-            False,
             f"{address}: no heartbeat in 5 s, {seen}: set the port of the flight controller for MAVLink 2 at this "
             "baud rate, and reboot it.",
-            tuple(
-                f"{_NAMES[name]}: {', '.join(rules.port_changes(address.number))}" for name, rules in _ADVICE.items()
-            ),
+            *(f"{rules.name}: {', '.join(rules.port_changes(address.number))}" for rules in RULES.values()),
         )
-    advice = {
-        "udpin": "let the autopilot, its simulator or a router send to this port",
-        "udpout": "start what listens there, or correct host and port",
-        "tcp": "something answers there that is no flight controller, or one that is still starting",
-    }
-    return Finding("link", False, f"{address}: no heartbeat of an autopilot in 5 s: {advice[address.kind]}.")
+    return wrong("link", f"{address}: no heartbeat of an autopilot in 5 s: {_WHERE_SILENT[address.kind]}.")
 
 
-def autopilot_findings(reading: AutopilotReading, address: LinkAddress, plan: Plan) -> Iterator[Finding]:
+def autopilot_findings(reading: AutopilotReading, address: LinkAddress, intent: FlightIntent) -> Iterator[Finding]:
     """Judge what was read for the flight that is to be: first what holds for every autopilot, then the rules of its
     firmware."""
     yield _link(reading, address)
     yield _signing(reading)
     if reading.other_systems:
-        yield Finding(
-            "vehicles",
-            False,
-            f"System {' and '.join(map(str, reading.other_systems))} is on this link too: name the one to fly with.",
-            (f"mavlink: {{system_id: {reading.system_id}}}",),
-        )
-    if reading.firmware not in _ADVICE:
-        yield Finding("firmware", False, "It is neither ArduPilot nor PX4: edgevpr sends no fixes to it.")
+        systems = " and ".join(map(str, reading.other_systems))
+        also = f"System {systems} is on this link too: name the one to fly with."
+        yield wrong("vehicles", also, f"mavlink: {{system_id: {reading.system_id}}}")
+    if reading.firmware not in RULES:
+        yield wrong("firmware", "It is neither ArduPilot nor PX4: edgevpr sends no fixes to it.")
     elif reading.answers:
         yield _firmware(reading)
-        yield from _ADVICE[reading.firmware].findings(reading, plan)
+        yield from RULES[reading.firmware].findings(reading, intent)
     if reading.answers:
         yield from (_streams(reading), _filter(reading), _gps(reading), _origin(reading), _clock(reading))
 
 
 def _firmware(reading: AutopilotReading) -> Finding:
-    name, needed = _NAMES[reading.firmware], _ADVICE[reading.firmware].KNOWS_FIXES
-    least = f"{needed[0]}.{needed[1]} or later"
+    rules = RULES[reading.firmware]
+    least = f"{rules.knows_fixes[0]}.{rules.knows_fixes[1]} or later"
+    named = f"{rules.name} {reading.version_text}"
     if reading.version is None:
-        return Finding("firmware", False, f"{name} does not tell its version: update it to {least}.")
-    if reading.version[:2] < needed:
-        return Finding(
-            "firmware",
-            False,
-            f"{name} {reading.version_text} does not know position fixes (command 43003): update it.",
-            (f"{name} {least}",),
-        )
-    return Finding("firmware", True, f"{name} {reading.version_text}, {reading.vehicle}")
+        return wrong("firmware", f"{rules.name} does not tell its version: update it to {least}.")
+    if reading.version[:2] < rules.knows_fixes:
+        old = f"{named} does not know position fixes (command 43003): update it."
+        return wrong("firmware", old, f"{rules.name} {least}")
+    return fine("firmware", f"{named}, {reading.vehicle}")
 
 
 def _link(reading: AutopilotReading, address: LinkAddress) -> Finding:
-    who = f"{address}: {_NAMES.get(reading.firmware, 'an autopilot')}, system {reading.system_id}"
+    rules = RULES.get(reading.firmware)
+    who = f"{address}: {rules.name if rules else 'an autopilot'}, system {reading.system_id}"
     who += ", armed" if reading.is_armed else ""
     if not reading.answers:
         why = "the wire from the board's TX to its RX, or a signing key, may be the reason"
@@ -144,89 +131,82 @@ def _link(reading: AutopilotReading, address: LinkAddress) -> Finding:
             why = "it signs its packets, so it may want signed requests"
         if reading.is_signed_to:
             why = "the wire from the board's TX to its RX, or the clock of this board, may be the reason"
-        return Finding("link", False, f"{who} is heard, but answers nothing: {why}.")
+        return wrong("link", f"{who} is heard, but answers nothing: {why}.")
     if reading.bad_bytes > _BAD_BYTES:
-        return Finding(
-            "link",
-            False,
-            f"{who}: {reading.bad_bytes} bytes arrived damaged: look at ground wire, cable and baud rate.",
-        )
+        look_at = "look at ground wire, cable and baud rate"
+        return wrong("link", f"{who}: {reading.bad_bytes} bytes arrived damaged: {look_at}.")
     if reading.round_trip_s is None:
-        return Finding("link", True, f"{who}; it does not answer TIMESYNC")
+        return fine("link", f"{who}; it does not answer TIMESYNC")
     trip = f"an answer takes {1000 * reading.round_trip_s:.0f} ms"
     if reading.round_trip_s > _SLOW_S:
-        faster = _ADVICE[reading.firmware].port_changes(921_600) if reading.firmware in _ADVICE else ()
-        return Finding("link", False, f"{who}; {trip}, so every fix comes late: use a faster line.", faster)
-    return Finding("link", True, f"{who}; {trip}")
+        late = f"{who}; {trip}, so every fix comes late: use a faster line."
+        return wrong("link", late, *(rules.port_changes(921_600) if rules else ()))
+    return fine("link", f"{who}; {trip}")
 
 
 def _signing(reading: AutopilotReading) -> Finding:
     if reading.is_signed_to:
-        return Finding("signing", True, "its packets carry the right signature, and so do ours")
+        return fine("signing", "its packets carry the right signature, and so do ours")
     if not reading.signs:
-        return Finding("signing", True, "off: whoever is on this link can send")
+        return fine("signing", "off: whoever is on this link can send")
     if reading.answers:
-        return Finding("signing", True, "it signs its packets, and answers unsigned requests on this port")
-    return Finding(
+        return fine("signing", "it signs its packets, and answers unsigned requests on this port")
+    return wrong(
         "signing",
-        False,
         "It signs its packets and answers no unsigned request: no fix would be taken without its key.",
-        ("mavlink: {signing_key: FILE} with the key of this vehicle, or clear the key of this port",),
+        "mavlink: {signing_key: FILE} with the key of this vehicle, or clear the key of this port",
     )
 
 
 def _streams(reading: AutopilotReading) -> Finding:
-    missing = [name for name in _NEEDED if name not in reading.heard]
-    if missing:
-        return Finding(
+    if missing := [name for name in _NEEDED if name not in reading.heard]:
+        return wrong(
             "streams",
-            False,
             f"No {' and no '.join(missing)} comes, even on request: an autopilot that does not know its position "
             "yet may keep it back; let it have GPS.",
         )
-    said = ", ".join(f"{name} {reading.streams_hz[name]:g} Hz" for name in _NEEDED if name in reading.streams_hz)
-    return Finding("streams", True, f"without being asked: {said or 'none'}; in flight edgevpr asks for what it needs")
+    rates = ", ".join(f"{name} {reading.streams_hz[name]:g} Hz" for name in _NEEDED if name in reading.streams_hz)
+    return fine("streams", f"without being asked: {rates or 'none'}; in flight edgevpr asks for what it needs")
 
 
 def _filter(reading: AutopilotReading) -> Finding:
     state = reading.filter
     if state is None:
-        return Finding("filter", False, "It does not say how its filter is, so no fix could be weighed against it.")
+        return wrong("filter", "It does not say how its filter is, so no fix could be weighed against it.")
     flags = f"flags 0x{state.flags:x}"
     if state.has_attitude and state.has_position and not state.holds_still:
-        return Finding("filter", True, f"attitude and position are known ({flags})")
+        return fine("filter", f"attitude and position are known ({flags})")
     lacks = "position" if state.has_attitude else "attitude"
-    return Finding("filter", False, f"The filter has no {lacks} yet ({flags}): wait, outdoors and standing still.")
+    return wrong("filter", f"The filter has no {lacks} yet ({flags}): wait, outdoors and standing still.")
 
 
 def _gps(reading: AutopilotReading) -> Finding:
     fixes = [fix for fix in reading.gps_fix if fix is not None]
     if any(fix >= _GPS_3D for fix in fixes):
-        return Finding("gps", True, f"fix type {' and '.join(map(str, fixes))}")
-    return Finding("gps", False, "No GPS receiver has a fix: take off only with one, so that the start is known.")
+        return fine("gps", f"fix type {' and '.join(map(str, fixes))}")
+    return wrong("gps", "No GPS receiver has a fix: take off only with one, so that the start is known.")
 
 
 def _origin(reading: AutopilotReading) -> Finding:
-    if reading.origin is None:
-        return Finding(
-            "origin",
-            False,
-            "The filter has no origin, and without one no position on the Earth is taken: wait for a GPS fix, or set "
-            "the EKF origin from the ground station.",
-        )
-    return Finding("origin", True, f"{reading.origin[0]:.6f}, {reading.origin[1]:.6f}")
+    if reading.origin:
+        return fine("origin", f"{reading.origin[0]:.6f}, {reading.origin[1]:.6f}")
+    return wrong(
+        "origin",
+        "The filter has no origin, and without one no position on the Earth is taken: wait for a GPS fix, or set the "
+        "EKF origin from the ground station.",
+    )
 
 
 def _clock(reading: AutopilotReading) -> Finding:
     ahead_s = reading.clock_ahead_s
     if ahead_s is None:
-        return Finding("clock", True, "the autopilot has no time of day yet, so the board's is not compared with it")
-    if abs(ahead_s) > _CLOCK_S:
-        return Finding(
-            "clock",
-            False,
-            f"The board's clock is {abs(ahead_s):.0f} s {'behind' if ahead_s > 0 else 'ahead of'} the autopilot's: "
-            "flight logs and signatures would carry the wrong time.",
-            ("timedatectl set-ntp true, or a clock chip",),
-        )
-    return Finding("clock", True, f"{abs(ahead_s):.1f} s {'behind' if ahead_s > 0 else 'ahead of'} the autopilot's")
+        return fine("clock", "the autopilot has no time of day yet, so the board's is not compared with it")
+    side = "behind" if ahead_s > 0 else "ahead of"
+    if abs(ahead_s) <= _CLOCK_S:
+        return fine("clock", f"{abs(ahead_s):.1f} s {side} the autopilot's")
+    return wrong(
+        "clock",
+        f"The board's clock is {abs(ahead_s):.0f} s {side} the autopilot's: flight logs and signatures would carry the "
+        "wrong time.",
+        "timedatectl set-ntp true, or a clock chip",
+    )

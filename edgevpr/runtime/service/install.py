@@ -46,62 +46,45 @@ def install(config: Path | None, dry_run: bool, say: Callable[[str], None], root
     written = config or (there if there.exists() else None)
     unit = render_unit(load_board(load_config(written).board if written else "this"))
     put = partial(_put, root)
-    walk(
-        (
-            Step(
-                f"system user {NAME}, without a login",
-                lambda: _ids(root) is not None,
-                lambda: command(
-                    "useradd", "--system", "--user-group", "--home-dir", "/" + _MAPS, "--shell", "/usr/sbin/nologin",
-                    NAME,
-                ),
-            ),
-            Step(
-                f"{NAME} in the groups {' and '.join(_GROUPS)}",
-                lambda: all(NAME in _members(root, group) for group in _GROUPS),
-                lambda: command("usermod", "--append", "--groups", ",".join(_GROUPS), NAME),
-            ),
-            _own_folder(root, _MAPS, "maps"),
-            _own_folder(root, _LOGS, "flight logs"),
-            put(_CONFIG, "configuration", written.read_bytes() if written else _FIRST_CONFIG.encode()),
-            *program_steps(root / VENV),
-            put(_UNIT, "unit, with the limits of the board", unit.encode()),
-            put(_RULES, "udev rules", (shipped("deploy") / "99-edgevpr.rules").read_bytes()),
-            Step("systemd has read the unit", lambda: _is_loaded(root), lambda: _reload_units(root)),
-            Step("udev has read its rules, and named what is plugged in", lambda: False, _reload_rules),
+    useradd = ("useradd", "--system", "--user-group", "--home-dir", f"/{_MAPS}", "--shell", "/usr/sbin/nologin", NAME)
+    usermod = ("usermod", "--append", "--groups", ",".join(_GROUPS), NAME)
+    steps = (
+        Step(f"system user {NAME}, without a login", lambda: _ids(root) is not None, partial(command, *useradd)),
+        Step(
+            f"{NAME} in the groups {' and '.join(_GROUPS)}",
+            lambda: all(NAME in _members(root, group) for group in _GROUPS),
+            partial(command, *usermod),
         ),
-        dry_run,
-        say,
-    )  # fmt: skip
+        _own_folder(root, _MAPS, "maps"),
+        _own_folder(root, _LOGS, "flight logs"),
+        put(_CONFIG, "configuration", written.read_bytes() if written else _FIRST_CONFIG.encode()),
+        *program_steps(root / VENV),
+        put(_UNIT, "unit, with the limits of the board", unit.encode()),
+        put(_RULES, "udev rules", (shipped("deploy") / "99-edgevpr.rules").read_bytes()),
+        Step("systemd has read the unit", lambda: _is_loaded(root), lambda: _reload_units(root)),
+        Step("udev has read its rules, and named what is plugged in", lambda: False, _reload_rules),
+    )
+    walk(steps, dry_run, say)
 
 
 def uninstall(dry_run: bool, say: Callable[[str], None], root: Path = Path("/")) -> None:
     """Stop the service, and take away what `install` has made, but for maps, flight logs, configuration and user."""
     if root == Path("/") and not dry_run:
         _require_root()
-    now = ("--now",) if (root / _BOOTED).is_dir() else ()
-    files = [
-        Step(f"no /{name}", partial(_is_gone, root / name), partial(os.unlink, root / name)) for name in (_UNIT, _RULES)
-    ]
-    reloads = [
+    is_booted = (root / _BOOTED).is_dir()
+    stop = ("systemctl", "disable", *(("--now",) if is_booted else ()), NAME)
+    reloads = (
         Step("systemd has read that the unit is gone", lambda: False, lambda: _reload_units(root)),
         Step("udev has read that its rules are gone", lambda: False, _reload_rules),
-    ]
-    walk(
-        (
-            Step(
-                "service stopped and not started any more",
-                lambda: _is_gone(root / _UNIT),
-                lambda: command("systemctl", "disable", *now, NAME),
-            ),
-            *files,
-            # Last, since this may be the very program that runs.
-            *(reloads if now else ()),
-            Step(f"no /{VENV}", partial(_is_gone, root / VENV), lambda: remove_program(root / VENV)),
-        ),
-        dry_run,
-        say,
     )
+    steps = (
+        Step("service stopped and not started any more", partial(_is_gone, root / _UNIT), partial(command, *stop)),
+        *(Step(f"no /{name}", partial(_is_gone, root / name), (root / name).unlink) for name in (_UNIT, _RULES)),
+        *(reloads if is_booted else ()),
+        # Last, since this may be the very program that runs.
+        Step(f"no /{VENV}", partial(_is_gone, root / VENV), lambda: remove_program(root / VENV)),
+    )
+    walk(steps, dry_run, say)
     say(f"kept   /{_CONFIG}, /{_MAPS}, /{_LOGS} and the user {NAME}, to whom they belong")
 
 

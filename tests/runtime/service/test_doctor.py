@@ -18,12 +18,12 @@ from edgevpr.mavlink.positions import SENSOR_ID
 from edgevpr.mavlink.reading import AutopilotReading, FilterState
 from edgevpr.mavlink.signing import UNSIGNED, WRONG
 from edgevpr.mavlink.wire import mavlink
-from edgevpr.runtime.service import ardupilot, px4
 from edgevpr.runtime.service.doctor import autopilot_findings, silence
-from edgevpr.runtime.service.finding import Plan
+from edgevpr.runtime.service.finding import FlightIntent
+from edgevpr.runtime.service.rules import RULES, is_too_rare, rarity
 
 UDP, SERIAL = parse_link("udpin:127.0.0.1:14550"), parse_link("serial:/dev/ttyAMA0:57600")
-FIXES, DRY = Plan(sends_fixes=True, every_s=1.0), Plan(sends_fixes=False, every_s=1.0)
+FIXES, DRY = FlightIntent(sends_fixes=True, every_s=1.0), FlightIntent(sends_fixes=False, every_s=1.0)
 PLAIN = {"GPS1_TYPE": 1, "GPS2_TYPE": 0, "GPS_AUTO_SWITCH": 1, "VISO_TYPE": 0, "FLOW_TYPE": 0, "EK3_SRC1_POSXY": 3}
 READY = FilterState(flags=0x33F, has_attitude=True, has_position=True, has_velocity=True, holds_still=False)
 COPTER = AutopilotReading(
@@ -70,10 +70,47 @@ def said(reading: AutopilotReading, what: str, link=UDP, plan=FIXES) -> str:
     return next(each.message for each in autopilot_findings(reading, link, plan) if each.what == what)
 
 
+# What is said, once each; a `|` parts what must be in the message.
+
+
+BARE, VISUAL = replace(COPTER, parameters=PLAIN), replace(COPTER, parameters=PLAIN | {"VISO_TYPE": 1})
+HOVERING = replace(COPTER, vehicle="plane", parameters=PLAIN | {"Q_ENABLE": 1})
+MUTE = replace(COPTER, answers=False, version=None, parameters={}, heard=(), filter=None, origin=None)
+SIGNED = replace(MUTE, signs=True, is_signed_to=True)
+FUSED = with_parameters(VISUAL, EK3_SRC2_POSXY=6, EK3_SRC2_VELXY=6)
+
+
+@pytest.mark.parametrize(
+    ("reading", "what", "message"),
+    [
+        (PX4, "channel", "Message 296, as its EKF2_AGP0_CTRL fuses positions."),
+        (replace(PX4, vehicle="plane", version=(1, 16, 0)), "channel", "Command 43003, as "),
+        (HOVERING, "channel", "while it hovers (Q_ENABLE=1): without GPS it falls back to QHOVER or QLAND"),
+        (BARE, "channel", "lands by its EKF failsafe after some 9 s"),
+        (with_parameters(BARE, GPS2_TYPE=1), "channel", "takes the place of the second receiver (type 1)"),
+        (with_parameters(BARE, FLOW_TYPE=6), "channel", "the flow is not used"),
+        (replace(BARE, vehicle="rover"), "channel", "stops by its EKF failsafe"),
+        (with_parameters(VISUAL, EK3_SRC2_POSXY=6), "channel", "switches to source set 2."),
+        (with_parameters(VISUAL, EK3_SRC1_POSXY=6), "channel", "ODOMETRY, as its VISO_TYPE is 1."),
+        (replace(VISUAL, vehicle="plane"), "channel", "ODOMETRY, as its VISO_TYPE is 1, but no "),
+        (FUSED, "channel", "trust it more than its gyros"),
+        (replace(BARE, vehicle="plane"), "airspeed", "drifts faster"),
+        (with_parameters(replace(BARE, vehicle="plane"), ARSPD_TYPE=1, ARSPD_USE=0), "airspeed", "drifts faster"),
+        (with_parameters(replace(BARE, vehicle="plane"), ARSPD_TYPE=1, ARSPD_USE=1), "airspeed", "the wind is known"),
+        (replace(COPTER, is_armed=True), "link", ", armed; an answer takes 20 ms"),
+        (MUTE, "link", "is heard, but answers nothing: the wire |, or a signing key"),
+        (replace(MUTE, signs=True), "link", "it may want signed requests"),
+        (SIGNED, "link", "the clock of this board"),
+        (SIGNED, "signing", "its packets carry the right signature, and so do ours"),
+    ],
+)
+def test_what_is_said(reading, what, message):
+    assert all(part in said(reading, what) for part in message.split("|"))
+
+
 def test_a_copter_and_a_px4_that_are_set_up_have_nothing_wrong():
-    assert wrong(COPTER) == {}
-    assert wrong(PX4) == {}
-    assert said(PX4, "channel") == "Message 296, as its EKF2_AGP0_CTRL fuses positions."
+    assert wrong(COPTER) == wrong(PX4) == {}
+    assert "airspeed" not in {each.what for each in autopilot_findings(COPTER, UDP, FIXES)}
 
 
 # The channel of an ArduPilot.
@@ -111,23 +148,16 @@ def test_without_anything_that_carries_it_single_fixes_are_wrong(vehicle, parame
 
 
 def test_a_plane_that_hovers_needs_what_a_copter_needs():
-    hovers = replace(COPTER, vehicle="plane", parameters=PLAIN | {"Q_ENABLE": 1})
-    assert wrong(hovers) == {"channel": ("GPS2_TYPE=14",)}
-    assert "while it hovers (Q_ENABLE=1): without GPS it falls back to QHOVER or QLAND" in said(hovers, "channel")
-    assert wrong(with_parameters(hovers, Q_ENABLE=0)) == {}
-    assert wrong(with_parameters(hovers, FLOW_TYPE=6, EK3_SRC1_VELXY=5)) == {}
+    assert wrong(HOVERING) == {"channel": ("GPS2_TYPE=14",)}
+    assert wrong(with_parameters(HOVERING, Q_ENABLE=0)) == {}
+    assert wrong(with_parameters(HOVERING, FLOW_TYPE=6, EK3_SRC1_VELXY=5)) == {}
 
 
 def test_a_copter_without_a_channel_is_told_what_to_change_for_its_firmware():
-    bare = replace(COPTER, parameters=PLAIN)
-    assert wrong(bare) == {"channel": ("GPS2_TYPE=14",)}
-    assert "lands by its EKF failsafe after some 9 s" in said(bare, "channel")
-    assert wrong(with_parameters(bare, GPS_AUTO_SWITCH=0)) == {"channel": ("GPS2_TYPE=14", "GPS_AUTO_SWITCH=1")}
+    assert wrong(BARE) == {"channel": ("GPS2_TYPE=14",)}
+    assert wrong(with_parameters(BARE, GPS_AUTO_SWITCH=0)) == {"channel": ("GPS2_TYPE=14", "GPS_AUTO_SWITCH=1")}
     older = replace(COPTER, parameters={"GPS_TYPE": 1, "GPS_TYPE2": 0, "GPS_AUTO_SWITCH": 1})
     assert wrong(older) == {"channel": ("GPS_TYPE2=14",)}
-    assert "takes the place of the second receiver (type 1)" in said(with_parameters(bare, GPS2_TYPE=1), "channel")
-    assert "the flow is not used" in said(with_parameters(bare, FLOW_TYPE=6), "channel")
-    assert "stops by its EKF failsafe" in said(replace(bare, vehicle="rover"), "channel")
 
 
 def test_a_receiver_over_mavlink_must_be_switched_to_and_used_by_the_filter():
@@ -140,32 +170,17 @@ def test_a_receiver_over_mavlink_must_be_switched_to_and_used_by_the_filter():
 
 
 def test_odometry_needs_a_source_set_and_an_origin():
-    visual = replace(COPTER, parameters=PLAIN | {"VISO_TYPE": 1})
     changes = ("EK3_SRC2_POSXY=6", "EK3_SRC2_VELXY=0", "EK3_SRC2_POSZ=1", "EK3_SRC2_YAW=1")
-    assert wrong(visual) == {"channel": changes}
-    prepared = with_parameters(visual, EK3_SRC2_POSXY=6)
-    assert said(prepared, "channel").endswith("when GPS is lost, the operator switches to source set 2.")
+    assert wrong(VISUAL) == {"channel": changes}
+    prepared = with_parameters(VISUAL, EK3_SRC2_POSXY=6)
     assert wrong(prepared) == {}
     assert set(wrong(replace(prepared, origin=None))) == {"channel", "origin"}
-    assert said(with_parameters(visual, EK3_SRC1_POSXY=6), "channel") == "ODOMETRY, as its VISO_TYPE is 1."
-    assert said(replace(visual, vehicle="plane"), "channel").startswith("ODOMETRY, as its VISO_TYPE is 1, but no ")
 
 
 def test_the_velocity_of_odometry_must_not_be_fused():
-    fused = replace(COPTER, parameters=PLAIN | {"VISO_TYPE": 1, "EK3_SRC2_POSXY": 6, "EK3_SRC2_VELXY": 6})
-    assert wrong(fused) == {"channel": ("EK3_SRC2_VELXY=0",)}
-    assert "trust it more than its gyros" in said(fused, "channel")
-    elsewhere = with_parameters(fused, EK3_SRC2_VELXY=0, EK3_SRC3_VELXY=6)  # a set without our position
+    assert wrong(FUSED) == {"channel": ("EK3_SRC2_VELXY=0",)}
+    elsewhere = with_parameters(FUSED, EK3_SRC2_VELXY=0, EK3_SRC3_VELXY=6)  # a set without our position
     assert wrong(elsewhere) == {}
-
-
-def test_a_plane_is_told_whether_it_knows_its_airspeed():
-    plane = replace(COPTER, vehicle="plane", parameters=PLAIN)
-    assert wrong(plane) == {}
-    assert "drifts faster" in said(plane, "airspeed")
-    assert "drifts faster" in said(with_parameters(plane, ARSPD_TYPE=1, ARSPD_USE=0), "airspeed")
-    assert "the wind is known" in said(with_parameters(plane, ARSPD_TYPE=1, ARSPD_USE=1), "airspeed")
-    assert "airspeed" not in {each.what for each in autopilot_findings(COPTER, UDP, FIXES)}
 
 
 @pytest.mark.parametrize(
@@ -193,10 +208,6 @@ def test_each_thing_that_is_wrong_is_the_only_one_found(change, what, changes):
     assert wrong(replace(COPTER, **change)) == {what: changes}
 
 
-def test_an_armed_vehicle_is_said():
-    assert ", armed; an answer takes 20 ms" in said(replace(COPTER, is_armed=True), "link")
-
-
 def test_what_the_autopilot_does_not_know_is_not_wrong():
     assert wrong(replace(COPTER, clock_ahead_s=None, round_trip_s=None, gps_fix=(0, 4))) == {}
 
@@ -204,12 +215,6 @@ def test_what_the_autopilot_does_not_know_is_not_wrong():
 def test_the_filter_must_be_the_third():
     assert wrong(with_parameters(COPTER, EK3_ENABLE=0)) == {"EKF3": ("EK3_ENABLE=1",)}
     assert wrong(with_parameters(COPTER, AHRS_EKF_TYPE=2, EK3_ENABLE=1)) == {"EKF3": ("AHRS_EKF_TYPE=3",)}
-
-
-def test_a_port_with_mavlink_1_is_named():
-    ports = {"SERIAL0_PROTOCOL": 2, "SERIAL1_PROTOCOL": 1, "SERIAL2_PROTOCOL": 5, "SERIAL1_BAUD": 57}
-    assert wrong(replace(with_parameters(COPTER, **ports), says_version_1=True)) == {"port": ("SERIAL1_PROTOCOL=2",)}
-    assert said(with_parameters(COPTER, **ports), "port").endswith("SERIAL0 (baud 0), SERIAL1 (baud 57)")
 
 
 def test_a_slow_line_is_to_be_faster():
@@ -220,17 +225,12 @@ def test_a_slow_line_is_to_be_faster():
 
 @pytest.mark.parametrize(("baud", "code"), [(57_600, 57), (111_100, 111), (115_200, 115), (1_500_000, 1500)])
 def test_ardupilot_has_its_own_numbers_for_baud_rates(baud, code):
-    assert ardupilot.port_changes(baud) == ("SERIALn_PROTOCOL=2", f"SERIALn_BAUD={code}")
+    assert RULES["ardupilot"].port_changes(baud) == ("SERIALn_PROTOCOL=2", f"SERIALn_BAUD={code}")
 
 
 def test_who_answers_nothing_is_judged_by_nothing_but_that():
-    mute = replace(COPTER, answers=False, version=None, parameters={}, heard=(), filter=None, origin=None)
-    assert set(wrong(mute)) == {"link"}
-    assert set(wrong(replace(mute, signs=True))) == {"link", "signing"}
-    signed = replace(mute, signs=True, is_signed_to=True)
-    assert set(wrong(signed)) == {"link"}
-    assert "the clock of this board" in said(signed, "link")
-    assert said(signed, "signing") == "its packets carry the right signature, and so do ours"
+    assert set(wrong(MUTE)) == set(wrong(SIGNED)) == {"link"}
+    assert set(wrong(replace(MUTE, signs=True))) == {"link", "signing"}
     assert wrong(replace(COPTER, signs=True)) == {}
 
 
@@ -242,8 +242,7 @@ def test_a_dry_run_needs_no_second_receiver_and_hears_that_the_first_flight_with
     bare = replace(COPTER, vehicle=vehicle, parameters=PLAIN | {"GPS_AUTO_SWITCH": 0})
     assert wrong(bare) == {"channel": ("GPS2_TYPE=14", "GPS_AUTO_SWITCH=1")}
     assert wrong(bare, plan=DRY) == {}
-    message = said(bare, "channel", plan=DRY)
-    assert "The first flight with fixes on needs GPS2_TYPE=14 and GPS_AUTO_SWITCH=1: This " in message
+    assert " GPS2_TYPE=14 and GPS_AUTO_SWITCH=1: This " in said(bare, "channel", plan=DRY)
     plane = replace(COPTER, vehicle="plane", parameters=PLAIN)
     assert said(plane, "channel", plan=DRY) == said(plane, "channel"), "nothing is needed, dry or not"
 
@@ -260,7 +259,6 @@ def test_a_dry_run_could_not_arm_with_what_waits_for_positions(parameters, chang
     ready = replace(COPTER, parameters=PLAIN | parameters)
     assert wrong(ready) == {}
     assert wrong(ready, plan=DRY) == {"channel": (change,)}
-    assert "would not arm" in said(ready, "channel", plan=DRY)
     older = replace(COPTER, parameters={"GPS_TYPE": 1, "GPS_TYPE2": 14})
     assert wrong(older, plan=DRY) == {"channel": ("GPS_TYPE2=0",)}
 
@@ -274,20 +272,20 @@ def test_what_a_dry_run_bears_is_wrong_before_it_too():
 
 
 def test_a_px4_that_is_told_too_rarely_would_keep_no_position():
-    assert "a query every 4.9 s" in said(PX4, "rate", plan=Plan(True, 4.9))
-    for plan in (Plan(True, 5.0), Plan(False, 5.0)):
+    assert said(PX4, "rate", plan=FlightIntent(True, 4.9)) == rarity(4.9)
+    for plan in (FlightIntent(True, 5.0), FlightIntent(False, 5.0)):
         assert set(wrong(PX4, plan=plan)) == {"rate"}
-    assert "source: {rate_hz: 0.4}" in wrong(PX4, plan=Plan(True, 5.0))["rate"][0]
+    assert "source: {rate_hz: 0.4}" in wrong(PX4, plan=FlightIntent(True, 5.0))["rate"][0]
     plane = replace(PX4, vehicle="plane", version=(1, 16, 0))  # command 43003: it reckons from fix to fix
-    assert wrong(plane, plan=Plan(True, 5.0)) == {}
-    assert "rate" not in {each.what for each in autopilot_findings(COPTER, UDP, Plan(True, 5.0))}
+    assert wrong(plane, plan=FlightIntent(True, 5.0)) == {}
+    assert "rate" not in {each.what for each in autopilot_findings(COPTER, UDP, FlightIntent(True, 5.0))}
 
 
 def test_the_page_of_px4_names_the_same_silence():
     page = " ".join((Path(__file__).parents[3] / "docs/how-to/px4.md").read_text().split())
     silence_s = re.search(r"PX4 stops using positions after (\d+) s of silence", page)[1]
-    assert f"PX4 drops positions after {silence_s} s of silence" in px4.rarity(1.0)
-    assert px4.is_too_rare(float(silence_s))
+    assert f"after {silence_s} s" in rarity(1.0)
+    assert is_too_rare(float(silence_s))
 
 
 def test_a_px4_that_can_take_positions_is_told_how():
@@ -302,7 +300,6 @@ def test_a_px4_without_message_296_must_reckon_well_by_itself(change):
     without = replace(PX4, **change)
     assert wrong(without) == {"channel": ("PX4 1.17 or later, with EKF2_AGP0_CTRL", "or EKF2_OF_CTRL=1")}
     assert wrong(replace(without, vehicle="plane")) == {}
-    assert said(replace(without, vehicle="plane"), "channel").startswith("Command 43003, as ")
     assert wrong(with_parameters(without, EKF2_OF_CTRL=1)) == {}
 
 
@@ -314,30 +311,34 @@ def test_an_old_or_a_silent_px4_is_wrong():
     assert wrong(replace(PX4, says_version_1=True)) == {"port": ("MAV_PROTO_VER=2",)}
 
 
-def test_a_px4_that_takes_another_pose_is_told_of():
-    assert "EKF2_EV_CTRL=11" in said(with_parameters(PX4, EKF2_EV_CTRL=11), "vision")
-    assert "MAV_1_CONFIG=102 (mode ?)" in said(PX4, "port")
-
-
 # Nothing heard.
 
 
-def test_a_silent_line_is_explained_by_what_arrives():
-    nothing = silence(SERIAL, 0, set())
-    assert (nothing.ok, "nothing arrives (TX and RX?)" in nothing.message) == (False, True)
-    assert nothing.changes == (
+@pytest.mark.parametrize(
+    ("link", "bad_bytes", "others", "refused", "message"),
+    [
+        (SERIAL, 0, (), {}, "nothing arrives (TX and RX?)"),
+        (SERIAL, 900, (), {}, "another baud rate?"),
+        (UDP, 0, (5, 3), {}, "the autopilots heard are of system 3 and 5, none is the one configured."),
+        (UDP, 0, (), {UNSIGNED: 4, WRONG: 5}, "messages arrive, and are refused (wrong signature): the other end has "),
+        (UDP, 0, (), {}, "no heartbeat of an autopilot in 5 s: let the autopilot, its simulator or a router send "),
+        (parse_link("udpout:10.0.0.2:14550"), 0, (), {}, "start what listens there"),
+        (parse_link("tcp:10.0.0.2:5760"), 0, (), {}, "something answers there"),
+    ],
+)
+def test_silence_is_explained_by_what_arrives(link, bad_bytes, others, refused, message):
+    finding = silence(link, bad_bytes, set(others), refused)
+    assert not finding.ok
+    assert message in finding.message
+    assert finding.message.startswith(f"{link}: ")
+
+
+def test_the_changes_for_a_silent_line():
+    assert silence(SERIAL, 0, set()).changes == (
         "ArduPilot: SERIALn_PROTOCOL=2, SERIALn_BAUD=57",
         "PX4: MAV_1_CONFIG=102, MAV_1_MODE=2, SER_TEL2_BAUD=57600",
     )
-    assert "another baud rate?" in silence(SERIAL, 900, set()).message
     assert silence(UDP, 0, {5, 3}).changes == ("mavlink: {system_id: 3}",)
-    refused = silence(UDP, 0, set(), {UNSIGNED: 4, WRONG: 5}).message
-    assert refused == (
-        f"{UDP}: messages arrive, and are refused (wrong signature): the other end has another key, or somebody forges "
-        "them."
-    )
-    for url in ("udpin:0.0.0.0:14550", "udpout:10.0.0.2:14550", "tcp:10.0.0.2:5760"):
-        assert silence(parse_link(url), 0, set()).message.startswith(f"{url}: no heartbeat of an autopilot in 5 s: ")
 
 
 def test_the_pages_of_the_vehicles_name_what_is_told_to_change():
@@ -350,7 +351,9 @@ def test_the_pages_of_the_vehicles_name_what_is_told_to_change():
         assert f"`{change}`" in copter
     assert "EK3_SRC2_VELXY=6" not in copter
     unset = with_parameters(PX4, EKF2_AGP0_CTRL=0, EKF2_AGP0_ID=0, EKF2_AGP0_DELAY=300.0)
-    for parameter, value in (change.split("=") for change in (*wrong(unset)["channel"], *px4.port_changes(921_600))):
+    for parameter, value in (
+        change.split("=") for change in (*wrong(unset)["channel"], *RULES["px4"].port_changes(921_600))
+    ):
         assert re.search(rf"`{parameter}` \| {value}[ |]", px4_page)
 
 
@@ -376,35 +379,26 @@ def findings_of(printed: str) -> dict[str, tuple[bool, str]]:
     return {what: (verdict == "ok", message) for verdict, what, message in found}
 
 
+@pytest.mark.network
 @pytest.mark.usefixtures("_quick")
 def test_the_command_over_a_link(link, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with peer(link, parameters=PLAIN | {"GPS2_TYPE": 14}) as autopilot:
         code = main(["doctor", "--link", link])
     found = findings_of(capsys.readouterr().out)
-    assert {what: message for what, (ok, message) in found.items() if not ok and what != "bytecode"} == {}
-    assert code == (0 if found["bytecode"][0] else 1)
-    assert found["channel"][1] == "GPS_INPUT as receiver 2, as its GPS2_TYPE is 14."
+    assert {what: message for what, (ok, message) in found.items() if not ok} == {}
+    assert code == 0
     assert list(tmp_path.iterdir()) == []
     assert autopilot.names() == {"HEARTBEAT", "COMMAND_LONG", "PARAM_REQUEST_READ", "TIMESYNC"}
 
 
-@pytest.mark.usefixtures("_quick")
-def test_the_command_prints_the_change_and_exits_with_1(link, capsys):
-    with peer(link, parameters=PLAIN):
-        assert main(["doctor", "--link", link]) == 1
-    printed = capsys.readouterr().out
-    assert not findings_of(printed)["channel"][0]
-    assert "  change: GPS2_TYPE=14\n" in printed
-
-
+@pytest.mark.network
 @pytest.mark.usefixtures("_quick")
 def test_the_command_knows_from_the_configuration_that_the_run_is_dry_and_how_often_it_asks(link, capsys, tmp_path):
     config = tmp_path / "config.yaml"
     config.write_text("board: rpi-zero-2w\nmavlink: {send_fixes: false}\nlog: {path: null}\n")
     with peer(link, parameters=PLAIN):
-        main(["doctor", "--config", str(config), "--link", link])
-    assert "A dry run (`send_fixes: false`) needs no change" in findings_of(capsys.readouterr().out)["channel"][1]
+        assert main(["doctor", "--config", str(config), "--link", link]) == 0
     autopilot = AutopilotThread(link.replace("udpin", "udpout"), vehicle="px4-copter")
     try:
         main(["doctor", "--config", str(config), "--link", link])
@@ -416,9 +410,9 @@ def test_the_command_knows_from_the_configuration_that_the_run_is_dry_and_how_of
         autopilot.finish()
     assert (slow["channel"][0], slow["rate"][0], quick["rate"][0]) == (True, False, True)
     assert quick["clock"][0], "its time is that of this machine"
-    assert "a query every 5 s" in slow["rate"][1]
 
 
+@pytest.mark.network
 @pytest.mark.usefixtures("_quick")
 def test_the_command_prints_json(link, capsys, tmp_path):
     config = tmp_path / "config.yaml"
@@ -431,6 +425,7 @@ def test_the_command_prints_json(link, capsys, tmp_path):
     assert {"what", "ok", "message", "changes"} == set(result["findings"][0])
 
 
+@pytest.mark.network
 @pytest.mark.usefixtures("_quick")
 @pytest.mark.parametrize(("key", "is_heard"), [(bytes(range(32)), True), (bytes(32), False)])
 def test_the_command_signs_with_the_key_of_its_configuration(link, capsys, tmp_path, key, is_heard):
@@ -441,41 +436,37 @@ def test_the_command_signs_with_the_key_of_its_configuration(link, capsys, tmp_p
         main(["doctor", "--config", str(tmp_path / "c.yaml"), "--link", link])
     found = findings_of(capsys.readouterr().out)
     assert ("channel" in found) == is_heard
-    if is_heard:
-        assert found["signing"] == (True, "its packets carry the right signature, and so do ours")
-    else:
-        assert "messages arrive, and are refused (wrong signature)" in found["link"][1]
+    assert ("(wrong signature)" in found["link"][1]) == (not is_heard)
     assert {path.name for path in tmp_path.iterdir()} == {"key", "c.yaml"}, "the time is not written"
 
 
+@pytest.mark.network
 @pytest.mark.usefixtures("_quick")
 def test_where_no_autopilot_is_the_command_says_so_and_looks_at_the_board(link, capsys):
     assert main(["doctor", "--link", link]) == 1
     found = findings_of(capsys.readouterr().out)
-    assert found["link"] == (
-        False,
-        f"{link}: no heartbeat of an autopilot in 5 s: let the autopilot, its simulator or a router send to this port.",
-    )
-    assert "python" in found
+    assert not found["link"][0]
+    assert "memory" in found
     assert "channel" not in found
 
 
+@pytest.mark.network
 def test_a_server_that_is_not_up_is_wrong(capsys):
     link = f"tcp:127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     assert main(["doctor", "--link", link]) == 1
-    assert findings_of(capsys.readouterr().out)["link"][1].startswith(f"{link} is not there (Connection refused)")
+    assert "(Connection refused)" in findings_of(capsys.readouterr().out)["link"][1]
 
 
 @pytest.mark.parametrize(
-    ("arguments", "sentence"),
+    ("arguments", "named"),
     [
-        (["--link", "udp:127.0.0.1"], "is no MAVLink link"),
-        (["--link", "serial:/dev/null:fast"], "the baud rate must be a number"),
-        (["--link", "udpout:no-such-host.invalid:14550"], "there is no host"),
-        ([], "There is no link to the flight controller"),
-        (["--config", "/absent.yaml"], "cannot be read"),
+        (["--link", "udp:127.0.0.1"], "udp:127.0.0.1"),
+        (["--link", "serial:/dev/null:fast"], "baud"),
+        (["--link", "udpout:no-such-host.invalid:14550"], "no-such-host"),
+        ([], "--link"),
+        (["--config", "/absent.yaml"], "/absent.yaml"),
     ],
 )
-def test_a_wrong_request_is_a_sentence_and_exits_with_2(arguments, sentence, capsys):
+def test_a_wrong_request_is_a_sentence_and_exits_with_2(arguments, named, capsys):
     assert main(["doctor", *arguments]) == 2
-    assert sentence in capsys.readouterr().err
+    assert named in capsys.readouterr().err

@@ -1,0 +1,241 @@
+"""Rules of `edgevpr doctor` for each firmware: is the channel that the flight will choose one that carries this
+vehicle, and what is to be changed?
+
+Every rule of ArduPilot has its source in 4.7-dev, flown in simulation with GPS taken away; every rule of PX4 in the
+sources of 1.17-alpha.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+
+from edgevpr.mavlink.channel import (
+    ARDUPILOT,
+    CONTROL,
+    FUSES_POSITION,
+    MAVLINK_GPS,
+    PX4,
+    SECOND,
+    Channel,
+    Choice,
+    Kind,
+    ardupilot_choice,
+    px4_can_fuse,
+    px4_choice,
+    receiver_name,
+)
+from edgevpr.mavlink.positions import SENSOR_ID
+from edgevpr.mavlink.reading import AutopilotReading
+from edgevpr.runtime.service.finding import Finding, FlightIntent, fine, wrong
+
+Parameters = Mapping[str, float | int]
+
+_USE_BEST, _PRIMARY_WHILE_FIXED = 1, 4  # GPS_AUTO_SWITCH: both take the other receiver when the first has no fix
+_FROM_GPS, _FROM_FLOW, _FROM_VISION = 3, 5, 6  # EK3_SRCn_...
+_SWITCH = f"GPS_AUTO_SWITCH={_USE_BEST}"
+_SOURCE_SETS = (1, 2, 3)
+_SHORT_BAUDS = {111_100: 111}  # SERIALn_BAUD is in thousands, rounded down; above 2000 it is the rate itself
+_VISION_SET = tuple(f"EK3_SRC2_{what}={value}" for what, value in (("POSXY", 6), ("VELXY", 0), ("POSZ", 1), ("YAW", 1)))
+_MOST_DELAY_MS = 50  # our position is one of the moment at which it is sent
+_SILENT_S = 5.0  # aux_global_position.cpp: positions of message 296 are used no more
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FirmwareRules:
+    """Knowledge of a firmware: the first version that `knows_fixes`, the `parameters` to read, its rules, and the
+    `port_changes` that the port at the other end of a serial line needs for a baud rate."""
+
+    name: str
+    knows_fixes: tuple[int, int]
+    parameters: tuple[str, ...]
+    findings: Callable[[AutopilotReading, FlightIntent], Iterator[Finding]]
+    port_changes: Callable[[int], tuple[str, ...]]
+
+
+def is_too_rare(every_s: float) -> bool:
+    """Tell whether PX4 drops message 296 between two queries that are so many seconds apart."""
+    return every_s >= _SILENT_S
+
+
+def rarity(every_s: float) -> str:
+    """Say how the rate of the queries stands to the silence that PX4 bears."""
+    return f"a query every {every_s:g} s, and PX4 drops positions after {_SILENT_S:g} s of silence"
+
+
+def _ardupilot_findings(reading: AutopilotReading, intent: FlightIntent) -> Iterator[Finding]:
+    parameters, choice = reading.parameters, ardupilot_choice(reading.asked)
+    wanted = (("EK3_ENABLE", 1), ("AHRS_EKF_TYPE", 3))
+    if changes := [f"{name}={value}" for name, value in wanted if parameters.get(name, value) != value]:
+        yield wrong("EKF3", "Only the third EKF takes fixes: use it, and reboot.", *changes)
+    else:
+        yield fine("EKF3", "the filter that takes fixes is in use")
+    if choice.channel.is_continuous and not intent.sends_fixes:
+        yield _dry(choice, reading)
+    elif choice.channel is Channel.GPS_INPUT:
+        yield _by_gps(choice, parameters)
+    elif choice.channel is Channel.ODOMETRY:
+        yield _by_odometry(choice, reading)
+    else:
+        channel = _single_fixes(choice, reading)
+        if not channel.ok and not intent.sends_fixes:
+            needs = f"The first flight with fixes on needs {' and '.join(channel.changes)}: {channel.message}"
+            channel = fine("channel", f"A dry run (`send_fixes: false`) needs no change. {needs}")
+        yield channel
+        if reading.asked.kind is Kind.PLANE:
+            is_known = parameters.get("ARSPD_TYPE", 0) and parameters.get("ARSPD_USE") == 1
+            drifts = "no sensor is in use (ARSPD_TYPE, ARSPD_USE=1), so it drifts faster between two fixes"
+            yield fine("airspeed", "a sensor is in use, so the wind is known" if is_known else drifts)
+    yield _port(reading, "SERIALn_PROTOCOL=2")
+
+
+def _single_fixes(choice: Choice, reading: AutopilotReading) -> Finding:
+    """Judge command 43003: something else must carry the vehicle from one fix to the next."""
+    parameters, kind = reading.parameters, reading.asked.kind
+    hovers = parameters.get("Q_ENABLE") == 1  # a plane's, whatever type its heartbeat tells
+    if kind is Kind.PLANE and not hovers:
+        return fine("channel", _sentence(choice.reason))
+    flow = parameters.get("FLOW_TYPE", 0)
+    if flow and _sets_with(parameters, "VELXY", _FROM_FLOW):
+        return fine("channel", f"Command 43003: FLOW_TYPE={flow:g} carries it from fix to fix.")
+    # ArduPlane's ekf_check.cpp: the one looks on while the sticks fly it, the other while it flies by itself.
+    end = "falls back to QHOVER or QLAND" if hovers else "stops" if kind is Kind.ROVER else "lands"
+    while_it = " while it hovers (Q_ENABLE=1)" if hovers else ""
+    unused = " FLOW_TYPE is set, but no EK3_SRCn_VELXY is 5, so the flow is not used." if flow else ""
+    second = receiver_name(parameters, SECOND)
+    if taken := parameters.get(second, 0):
+        unused += f" It takes the place of the second receiver (type {taken:g})."
+    return wrong(
+        "channel",
+        f"This {reading.vehicle} has nothing that carries it from one fix to the next{while_it}: without GPS it {end} "
+        f"by its EKF failsafe after some 9 s.{unused} Let it take edgevpr for a second GPS receiver, and reboot.",
+        f"{second}={MAVLINK_GPS}",
+        *(() if _switches(parameters.get("GPS_AUTO_SWITCH")) else (_SWITCH,)),
+    )
+
+
+def _by_gps(choice: Choice, parameters: Parameters) -> Finding:
+    changes = []
+    if choice.receiver == SECOND and not _switches(parameters.get("GPS_AUTO_SWITCH", _USE_BEST)):
+        changes.append(_SWITCH)
+    if not _sets_with(parameters, "POSXY", _FROM_GPS):
+        changes.append(f"EK3_SRC1_POSXY={_FROM_GPS}")
+    if changes:
+        return wrong("channel", f"{choice.reason}, but it would not be used.", *changes)
+    return fine("channel", _sentence(choice.reason))
+
+
+def _by_odometry(choice: Choice, reading: AutopilotReading) -> Finding:
+    sets = _sets_with(reading.parameters, "POSXY", _FROM_VISION)
+    if not sets:
+        no_set = f"{choice.reason}, but no source set of the filter takes its position: prepare the second one."
+        return wrong("channel", no_set, *_VISION_SET)
+    # VISO_VEL_M_NSE: the velocity is taken to be good to 0.1 m/s, whatever accuracy we tell.
+    if fused := [n for n in sets if n in _sets_with(reading.parameters, "VELXY", _FROM_VISION)]:
+        return wrong(
+            "channel",
+            f"{choice.reason}, but its velocity, which comes from the same matches as the position, must not be fused: "
+            "the filter would trust it more than its gyros.",
+            *(f"EK3_SRC{n}_VELXY=0" for n in fused),
+        )
+    if reading.origin is None:
+        no_origin = f"{choice.reason}, but the filter has no origin: it cannot be placed on the Earth."
+        return wrong("channel", no_origin, "wait for a GPS fix, or set the EKF origin from the ground station")
+    switch = "" if 1 in sets else f"; when GPS is lost, the operator switches to source set {sets[0]}"
+    return fine("channel", _sentence(f"{choice.reason}{switch}"))
+
+
+def _dry(choice: Choice, reading: AutopilotReading) -> Finding:
+    """Judge a continuous channel in a dry run, which sends no position: AP_Arming wants one of all that is set up."""
+    change = "VISO_TYPE=0"
+    if choice.channel is Channel.GPS_INPUT:
+        change = f"{receiver_name(reading.parameters, choice.receiver)}={0 if choice.receiver == SECOND else 1}"
+    return wrong(
+        "channel",
+        f"{choice.reason}. A dry run (`send_fixes: false`) sends no position that way, so this {reading.vehicle} would "
+        "not arm: change this until the first flight with fixes on, and reboot.",
+        change,
+    )
+
+
+def _px4_findings(reading: AutopilotReading, intent: FlightIntent) -> Iterator[Finding]:
+    choice = px4_choice(reading.asked)
+    yield _px4_channel(choice, reading)
+    if choice.channel is Channel.SENSOR and is_too_rare(intent.every_s):
+        yield wrong(
+            "rate",
+            f"There is {rarity(intent.every_s)}: it would never keep one. Ask more often, where `edgevpr profile "
+            "--rate-hz` says that the board can, or take a faster board.",
+            f"source: {{rate_hz: {2 / _SILENT_S:g}}}, or more: not every query is a match",
+        )
+    elif choice.channel is Channel.SENSOR:
+        yield fine("rate", rarity(intent.every_s))
+    yield _port(reading, "MAV_PROTO_VER=2")
+
+
+def _px4_channel(choice: Choice, reading: AutopilotReading) -> Finding:
+    parameters = reading.parameters
+    if not px4_can_fuse(reading.asked):
+        if reading.asked.kind is Kind.PLANE or parameters.get("EKF2_OF_CTRL") == 1:
+            return fine("channel", _sentence(choice.reason))
+        return wrong(
+            "channel",
+            f"This {reading.vehicle} has nothing that carries it from one fix to the next: without GPS its position is "
+            "lost after some seconds, and its failsafe decides. Let it take positions as measurements, or give it "
+            "optical flow.",
+            "PX4 1.17 or later, with EKF2_AGP0_CTRL",
+            "or EKF2_OF_CTRL=1",
+        )
+    wanted = (
+        (choice.channel is not Channel.COMMAND, f"{CONTROL}={FUSES_POSITION}"),
+        (parameters.get("EKF2_AGP0_ID", SENSOR_ID) == SENSOR_ID, f"EKF2_AGP0_ID={SENSOR_ID}"),
+        (parameters.get("EKF2_AGP0_DELAY", 0) <= _MOST_DELAY_MS, "EKF2_AGP0_DELAY=0"),
+    )
+    if changes := [change for is_so, change in wanted if not is_so]:
+        return wrong(
+            "channel",
+            "PX4 can take positions as measurements (message 296), but is not set for it as edgevpr sends them: change "
+            "this, and reboot.",
+            *changes,
+        )
+    return fine("channel", _sentence(choice.reason))
+
+
+def _port(reading: AutopilotReading, change: str) -> Finding:
+    if reading.says_version_1:
+        return wrong("port", "It speaks MAVLink 1, which knows neither signatures nor new messages.", change)
+    return fine("port", "MAVLink 2")
+
+
+def _sentence(words: str) -> str:
+    """Make a sentence of a reason in a few words."""
+    return f"{words[0].upper()}{words[1:]}."
+
+
+def _switches(how: float | None) -> bool:
+    return how in (_USE_BEST, _PRIMARY_WHILE_FIXED)
+
+
+def _sets_with(parameters: Parameters, what: str, source: int) -> list[int]:
+    return [n for n in _SOURCE_SETS if parameters.get(f"EK3_SRC{n}_{what}") == source]
+
+
+RULES = {
+    "ardupilot": FirmwareRules(
+        name="ArduPilot",
+        knows_fixes=(4, 5),  # release notes of 4.5.0: MAV_CMD_EXTERNAL_POSITION_ESTIMATE
+        parameters=(
+            *ARDUPILOT.parameters, "GPS_AUTO_SWITCH", "FLOW_TYPE", "ARSPD_TYPE", "ARSPD_USE", "Q_ENABLE",
+            "AHRS_EKF_TYPE", "EK3_ENABLE",
+            *(f"EK3_SRC{n}_{what}" for n in _SOURCE_SETS for what in ("POSXY", "VELXY")),
+        ),
+        findings=_ardupilot_findings,
+        port_changes=lambda baud: ("SERIALn_PROTOCOL=2", f"SERIALn_BAUD={_SHORT_BAUDS.get(baud, baud // 1000)}"),
+    ),
+    "px4": FirmwareRules(
+        name="PX4",
+        knows_fixes=(1, 15),
+        parameters=(*PX4.parameters, "EKF2_AGP0_ID", "EKF2_AGP0_DELAY", "EKF2_OF_CTRL"),
+        findings=_px4_findings,
+        # TELEM 2, the usual port for a companion.
+        port_changes=lambda baud: ("MAV_1_CONFIG=102", "MAV_1_MODE=2", f"SER_TEL2_BAUD={baud}"),
+    ),
+}  # fmt: skip
