@@ -4,8 +4,7 @@ import os
 import sys
 import tempfile
 from argparse import ArgumentTypeError, Namespace
-from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,8 +24,7 @@ from edgevpr.core.errors import ModelError, UsageError
 from edgevpr.core.text import shown
 
 if TYPE_CHECKING:
-    from edgevpr.lab.evaluate.dataset import Dataset
-    from edgevpr.lab.evaluate.plan import EvaluationPlan, SetPlan
+    from edgevpr.lab.evaluate.plan import EvaluationPlan, RowPlan
 
 _MOST_WORKERS = 256
 
@@ -89,9 +87,7 @@ def evaluate(args: Namespace) -> int:
     """Measure stored similarities, or techniques, one after another."""
     if args.similarity:
         return _measure_similarities(args)
-    if args.out:
-        return _measure_many(args)
-    return _measure_techniques(args)
+    return _measure_many(args) if args.out else _measure_techniques(args)
 
 
 def _count(text: str) -> int:
@@ -109,126 +105,74 @@ def _measure_many(args: Namespace) -> int:
 
     if args.plot:
         raise UsageError("--plot goes without --out: the page in that folder has the curves.")
+    if value_of(args, "salience.use"):
+        raise UsageError("--salience goes without --out: measure it on one set at a time.")
     plan = _plan(args)
-    for name, of in plan.sets.items():
-        _say_camera(name, ((row.technique, row.settings(of.camera)) for row in plan.rows.values()))
+    _say_cameras(plan)
     out = Path(args.out)
     out.mkdir(parents=True, exist_ok=True)
     outcome = measure(plan, args.cache or out / "cache", args.workers or len(os.sched_getaffinity(0)), progress)
     write_results(out, outcome)
     for of in outcome.sets:
-        _say_notes(of.dataset)
+        _say(*of.dataset.notes)
     if args.json:
         print_json(as_json(outcome))
     else:
         for of in outcome.sets:
-            if results := [each.result for each in outcome.found if each.set_name == of.name]:
+            if results := [row.result for row in outcome.found if row.set_name == of.name]:
                 print(f"{shown(of.name)}\n\n{quality_text(results)}\n")
         print(f"{out / 'index.html'}: look at it.")
-    for (name, row), why in outcome.failed.items():
-        print(f"edgevpr: {shown(f'{name}, {row} was not measured: {why}')}", file=sys.stderr)
+    _say(*(f"{name}, {row} was not measured: {why}" for (name, row), why in outcome.failed.items()))
     return 1 if outcome.failed else 0
 
 
-def _plan(args: Namespace) -> "EvaluationPlan":
-    from edgevpr.lab.evaluate.plan import RowPlan, of_flags, read_plan
-    from edgevpr.runtime.preflight.trial import offers
-
-    if args.sets:
-        if args.data or args.query or args.ref or args.rate_hz:
-            raise UsageError("--sets names all sets: leave --data, --query, --ref and --rate-hz out.")
-        return read_plan(args.sets)
-    if not (args.data or (args.query and args.ref)):
-        raise UsageError("Name the data sets with --data or --query and --ref, or a file of sets and rows with --sets.")
-    config, wanted, forms = config_of(args, args.config), _wanted(args), _forms(args)
-    if config.salience.use:
-        raise UsageError("--salience goes without --out: measure it on one set at a time.")
-    rows = {
-        offer.label: RowPlan(
-            technique=offer.name,
-            parameters={key: value for key, value in offer.settings.items() if key != "form"},
-            form=offer.settings.get("form"),
-            candidates=config.match.candidates,
-            sequence=config.match.sequence,
-            exact=args.exact,
-            follow=args.follow,
-        )
-        for offer in offers(wanted, forms, _settings(args, wanted))
-    }
-    return of_flags(args.data or (), rows, _set_of(args))
-
-
-def _set_of(args: Namespace) -> "SetPlan":
-    """Return how the flags say that sets are read, and which folders or videos they name themselves."""
-    from edgevpr.lab.evaluate.plan import SetPlan
-
-    return SetPlan(
-        query=args.query,
-        ref=args.ref,
-        ground_truth=args.ground_truth,
-        within_m=args.within_m,
-        within_deg=args.within_deg,
-        overlap=args.overlap,
-        fov_deg=value_of(args, "source.fov_deg"),
-        rate_hz=args.rate_hz,
-    )
-
-
-def _say_camera(name: str, rows: Iterable[tuple[str, Mapping[str, Any]]]) -> None:
-    """Say that a set is taken for one that looks ahead, where nobody has said which way its camera looks."""
-    from edgevpr import techniques
-
-    if any("camera" in techniques.parameters(technique) and "camera" not in settings for technique, settings in rows):
-        print(
-            f"edgevpr: {shown(name)} is taken to look ahead: where its camera looks straight down, say "
-            "`--camera nadir` (`camera: nadir` in a file of sets)",
-            file=sys.stderr,
-        )
-
-
-def _wanted(args: Namespace) -> list[str]:
-    from edgevpr import techniques
-
-    wanted = [name.strip() for name in args.techniques.split(",") if name.strip()]
-    if not wanted:
-        raise UsageError(f"--techniques names none: use some of {', '.join(techniques.names())}.")
-    return wanted
-
-
-def _forms(args: Namespace) -> list[str]:
-    forms = [form.strip() for form in args.form.split(",")]
-    if unknown := [form for form in forms if form not in FORMS]:
-        raise UsageError(f"--form names `{unknown[0]}`: use some of {', '.join(FORMS)}.")
-    return forms
-
-
-def _dataset(args: Namespace, cache: str) -> "Dataset":
-    """Read the data set; the pictures of a video are taken into the folder `cache`."""
-    from edgevpr.core.text import progress
+def _measure_techniques(args: Namespace) -> int:
+    """Measure techniques on one set, without a trace but for what is printed."""
+    from edgevpr.core.text import progress, require_picture
+    from edgevpr.lab.evaluate import evaluate as evaluation
     from edgevpr.lab.evaluate.cache import Cache
+    from edgevpr.lab.evaluate.curves import plot
+    from edgevpr.lab.evaluate.tables import results_text
+    from edgevpr.runtime.recognise.opening import gate_of
+    from edgevpr.techniques import create
 
-    chosen = _set_of(args)
     if args.sets or args.workers or args.cache:
         raise UsageError("Name a folder for the results with --out.")
-    if args.data:
-        if len(args.data) > 1:
-            raise UsageError("Several sets need a folder for the results: name it with --out.")
-        chosen = replace(chosen, folder=args.data[0])
-    elif not (args.query and args.ref):
-        raise UsageError("Name a data set with --data or --query and --ref, or stored similarities with --similarity.")
-    dataset = chosen.open(Cache(cache), progress)
-    _say_notes(dataset)
-    return dataset
-
-
-def _say_notes(dataset: "Dataset") -> None:
-    for note in dataset.notes:
-        print(f"edgevpr: {shown(note)}", file=sys.stderr)
+    if args.data and len(args.data) > 1:
+        raise UsageError("Several sets need a folder for the results: name it with --out.")
+    if args.plot:
+        require_picture(Path(args.plot))
+    plan, errors = _plan(args), {}
+    for label, row in plan.rows.items():
+        try:
+            create(row.technique, row.settings(None))
+        except ModelError as error:  # a network that cannot be used stops no other
+            errors[label] = error
+    if len(errors) == len(plan.rows):
+        raise next(iter(errors.values()))
+    gate = gate_of(config_of(args, args.config).salience)
+    ((name, chosen),) = plan.sets.items()
+    with tempfile.TemporaryDirectory(prefix="edgevpr-eval-") as cache:
+        dataset = chosen.open(Cache(cache), progress)
+        _say(*dataset.notes)
+        _say_cameras(plan)
+        measured = [
+            evaluation.evaluate(row.technique, dataset, row.settings(None), row, progress, gate)
+            for label, row in plan.rows.items()
+            if label not in errors
+        ]
+    results = evaluation.compare(measured)
+    if args.plot:
+        plot({name: results}, Path(args.plot))
+    if args.json:
+        print_json(evaluation.as_json(results))
+    else:
+        print(results_text(results))
+    _say(*(f"{label} was not measured: {error}" for label, error in errors.items()))
+    return 1 if errors else 0
 
 
 def _measure_similarities(args: Namespace) -> int:
-    from dataclasses import asdict
-
     from edgevpr.core.text import decoded_name, require_picture
     from edgevpr.frames.images import list_images
     from edgevpr.lab.evaluate.curves import plot
@@ -256,56 +200,79 @@ def _measure_similarities(args: Namespace) -> int:
     return 0
 
 
-def _measure_techniques(args: Namespace) -> int:
-    from edgevpr.core.text import progress, require_picture
-    from edgevpr.lab.evaluate import evaluate as evaluation
-    from edgevpr.lab.evaluate.asking import MatchOptions
-    from edgevpr.lab.evaluate.curves import plot
-    from edgevpr.lab.evaluate.tables import results_text
-    from edgevpr.runtime.preflight.trial import offers, usable
-    from edgevpr.runtime.recognise.opening import gate_of
+def _plan(args: Namespace) -> "EvaluationPlan":
+    """Return the sets and rows that are named, in a file or by flags."""
+    from edgevpr.lab.evaluate.plan import SetPlan, of_flags, read_plan
 
-    wanted, forms = _wanted(args), _forms(args)
-    config = config_of(args, args.config)
-    options = MatchOptions(
-        candidates=config.match.candidates, sequence=config.match.sequence, exact=args.exact, follow=args.follow
+    if args.sets:
+        if args.data or args.query or args.ref or args.rate_hz:
+            raise UsageError("--sets names all sets: leave --data, --query, --ref and --rate-hz out.")
+        return read_plan(args.sets)
+    if not (args.data or (args.query and args.ref)):
+        raise UsageError(
+            "Name the data sets with --data or --query and --ref, or a file of sets and rows with --sets; or stored "
+            "similarities with --similarity."
+        )
+    common = SetPlan(
+        query=args.query,
+        ref=args.ref,
+        ground_truth=args.ground_truth,
+        within_m=args.within_m,
+        within_deg=args.within_deg,
+        overlap=args.overlap,
+        fov_deg=value_of(args, "source.fov_deg"),
+        rate_hz=args.rate_hz,
     )
-    gate = gate_of(config.salience)
-    if args.plot:
-        require_picture(Path(args.plot))
-    # A wrong setting is reported before the first hour of work; a network that cannot be used stops no other.
-    tried = list(usable(offers(wanted, forms, _settings(args, wanted))))
-    errors = {offer.label: each for offer, each in tried if isinstance(each, ModelError)}
-    if len(errors) == len(tried):
-        raise next(iter(errors.values()))
-    with tempfile.TemporaryDirectory(prefix="edgevpr-eval-") as cache:
-        dataset = _dataset(args, cache)
-        _say_camera("the set", ((offer.name, offer.settings) for offer, _ in tried))
-        results = [
-            evaluation.evaluate(offer.name, dataset, offer.settings, options, progress, gate)
-            for offer, _ in tried
-            if offer.label not in errors
-        ]
-    results = evaluation.compare(results)
-    if args.plot:
-        plot({Path(args.data[0] if args.data else args.query).resolve().name: results}, Path(args.plot))
-    if args.json:
-        print_json(evaluation.as_json(results))
-    else:
-        print(results_text(results))
-    for label, error in errors.items():
-        print(f"edgevpr: {label} was not measured: {shown(str(error))}", file=sys.stderr)
-    return 1 if errors else 0
+    return of_flags(args.data or (), _rows(args), common)
 
 
-def _settings(args: Namespace, wanted: list[str]) -> dict[str, dict[str, str]]:
-    """Read the settings of each technique. Raises UsageError for one of a technique that is not measured."""
+def _rows(args: Namespace) -> "dict[str, RowPlan]":
+    """Return the rows that the flags name. Raises UsageError for a setting of a technique that is not measured."""
+    from edgevpr import techniques
+    from edgevpr.lab.evaluate.plan import RowPlan
     from edgevpr.runtime.preflight.pick import camera_setting
+    from edgevpr.runtime.preflight.trial import offers
 
+    wanted = [name.strip() for name in args.techniques.split(",") if name.strip()]
+    if not wanted:
+        raise UsageError(f"--techniques names none: use some of {', '.join(techniques.names())}.")
+    forms = [form.strip() for form in args.form.split(",")]
+    if unknown := [form for form in forms if form not in FORMS]:
+        raise UsageError(f"--form names `{unknown[0]}`: use some of {', '.join(FORMS)}.")
     settings = {name: camera_setting(name, value_of(args, "source.camera")) for name in wanted}
     for key, value in parameters_of(args.param).items():
         name, _, parameter = key.partition(".")
         if name not in settings or not parameter:
             raise UsageError(f"--param {key}: write TECHNIQUE.KEY=VALUE with a technique of --techniques.")
         settings[name][parameter] = value
-    return settings
+    match = config_of(args, args.config).match
+    return {
+        offer.label: RowPlan(
+            technique=offer.name,
+            parameters={key: value for key, value in offer.settings.items() if key != "form"},
+            form=offer.settings.get("form"),
+            candidates=match.candidates,
+            sequence=match.sequence,
+            exact=args.exact,
+            follow=args.follow,
+        )
+        for offer in offers(wanted, forms, settings)
+    }
+
+
+def _say_cameras(plan: "EvaluationPlan") -> None:
+    """Say which sets are taken for ones that look ahead, where nobody has said which way their cameras look."""
+    from edgevpr import techniques
+
+    for name, of in plan.sets.items():
+        rows = ((techniques.parameters(row.technique), row.settings(of.camera)) for row in plan.rows.values())
+        if any("camera" in known and "camera" not in settings for known, settings in rows):
+            _say(
+                f"{name} is taken to look ahead: where its camera looks straight down, say `--camera nadir` "
+                "(`camera: nadir` in a file of sets)"
+            )
+
+
+def _say(*sentences: str) -> None:
+    for sentence in sentences:
+        print(f"edgevpr: {shown(sentence)}", file=sys.stderr)

@@ -1,7 +1,8 @@
-"""Commands that use a map: `edgevpr match`, `run`, `check` and `service`."""
+"""Commands of a flight: `edgevpr match`, `run`, `check`, `service` and `doctor`."""
 
 import os
 from argparse import Namespace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +72,13 @@ def add(commands: Any) -> None:
     service.add_argument(
         "--dry-run", action="store_true", help="say what install and uninstall would do, and do nothing"
     )
+
+    doctor = command(
+        commands, "doctor", run_doctor, "ask the flight controller, and this board, what to change; nothing is written"
+    )
+    doctor.add_argument("--config", metavar="FILE", help="that of the flight; flags given here override it")
+    add_keys(doctor, "mavlink.link")
+    add_json(doctor)
 
 
 def run_match(args: Namespace) -> int:
@@ -174,3 +182,23 @@ def run_service(args: Namespace) -> int:
 
 def _say(line: str) -> None:
     print(shown(line), flush=True)  # some steps take minutes
+
+
+def run_doctor(args: Namespace) -> int:
+    """Say what is fine, what is wrong, and what to change."""
+    from edgevpr.core.text import waiting
+    from edgevpr.mavlink.address import parse_link
+    from edgevpr.runtime.service.doctor import doctor
+    from edgevpr.runtime.service.finding import lines
+
+    config = config_of(args, args.config)
+    if config.mavlink.link is None:
+        raise UsageError("There is no link to the flight controller: name one with --link, or in --config.")
+    address = parse_link(config.mavlink.link)
+    diagnosis = doctor(config, address, waiting)
+    if args.json:
+        print_json({"link": str(address), "ok": diagnosis.is_fine, **asdict(diagnosis)})
+    else:
+        for line in lines(diagnosis.findings):
+            print(shown(line))
+    return 0 if diagnosis.is_fine else 1

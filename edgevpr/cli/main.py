@@ -9,25 +9,13 @@ import threading
 from functools import cache
 
 from edgevpr import __version__
-from edgevpr.cli import (
-    doctor,
-    evaluation,
-    flying,
-    maps,
-    networks,
-    profile,
-    replaying,
-    review,
-    salience,
-    simulation,
-    top,
-)
+from edgevpr.cli import evaluation, flying, maps, networks, profile, replaying, review, simulation, top
 from edgevpr.cli.screen import LineFormatter, guarded_output
 from edgevpr.core.config import require_sayable
 from edgevpr.core.errors import EdgevprError
 from edgevpr.core.text import shown
 
-_GROUPS = (maps, flying, top, review, replaying, doctor, profile, salience, evaluation, simulation, networks)
+_GROUPS = (maps, flying, top, review, replaying, profile, evaluation, simulation, networks)
 
 
 def program() -> None:
@@ -58,7 +46,8 @@ def _run(argv: list[str]) -> int:
     try:
         for word in argv:
             require_sayable(word, "The command line")
-        return args.run(args)
+        code: int = args.run(args)
+        return code
     except EdgevprError as error:
         return _failed(args, error, str(error), error.exit_code)
     except BrokenPipeError:  # the reader of the output has gone (`edgevpr ... | head`)

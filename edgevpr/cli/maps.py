@@ -1,4 +1,5 @@
-"""`edgevpr map`: look into, check, repair, merge and export place maps; they are made in `building`."""
+"""`edgevpr map`: look into, check, repair, merge and export place maps, which are made in `building`; and `edgevpr
+salience`: what of a picture is worth remembering."""
 
 import sys
 from argparse import ArgumentTypeError, Namespace
@@ -8,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from edgevpr.cli import building
-from edgevpr.cli.shared import add_json, command, group, positive, print_json, watched
+from edgevpr.cli.shared import add_json, command, config_of, group, positive, print_json, watched
 from edgevpr.core.errors import UsageError
 
 if TYPE_CHECKING:
@@ -39,6 +40,12 @@ def add(commands: Any) -> None:
     export = command(maps, "export", map_export, "write the places for a map viewer")
     export.add_argument("map", metavar="MAP")
     export.add_argument("--geojson", required=True, metavar="FILE", help="GeoJSON file to write, - for standard output")
+    worth = command(commands, "salience", run_salience, "say what of a picture is worth remembering")
+    worth.add_argument("image", metavar="IMAGE")
+    worth.add_argument("--config", metavar="FILE", help="YAML; its section `salience` counts")
+    worth.add_argument("--network", metavar="NAME", help="the card of the network of memorability")
+    worth.add_argument("--detector", metavar="NAME", help="the card of the object detector")
+    add_json(worth)
 
 
 def _number_of_places(text: str) -> int:
@@ -195,4 +202,25 @@ def map_export(args: Namespace) -> int:
 
         count = write_whole(out_path, write)
     print(f"{out_path}: {count} places")
+    return 0
+
+
+def run_salience(args: Namespace) -> int:
+    """Print the scores of a picture."""
+    from edgevpr.frames.images import read_image
+    from edgevpr.runtime.recognise.opening import gate_with
+    from edgevpr.runtime.recognise.salience_gate import scores_of, worth_of
+
+    asked = {"salience.use": True, "salience.network": args.network, "salience.detector": args.detector}
+    gate = gate_with(config_of(args, args.config, **asked).salience)
+    maps = gate.maps(read_image(Path(args.image)))
+    worth = worth_of(scores_of(maps), gate.thresholds)
+    if args.json:
+        print_json(
+            {"image": args.image, **asdict(worth.salience), "kept": worth.reason is None, "reason": worth.reason}
+        )
+    else:
+        for name, score in worth.salience.scores.items():
+            print(f"{name:<13} {'off' if score is None else f'{score:.2f}'}")
+        print(worth.reason or "worth remembering")
     return 0

@@ -108,7 +108,7 @@ def _plan(args: Namespace, board: "Board") -> "tuple[FlightPlan, str | None, tup
     from edgevpr.runtime.preflight.trial import offers
 
     places, map_technique, camera = args.places, None, value_of(args, "source.camera")
-    settings = {name: camera_setting(name, camera) for name in techniques.names()}
+    settings: dict[str, dict[str, Any]] = {name: dict(camera_setting(name, camera)) for name in techniques.names()}
     if args.map:
         with PlaceMap.open(args.map) as place_map:
             places, map_technique = len(place_map), place_map.spec.name

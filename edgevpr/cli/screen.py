@@ -5,7 +5,7 @@ import logging
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
-from typing import TextIO
+from typing import Any, TextIO
 
 from edgevpr.core.text import shown
 
@@ -32,7 +32,7 @@ class LineFormatter(logging.Formatter):
     def formatMessage(self, record: logging.LogRecord) -> str:
         return shown(super().formatMessage(record))
 
-    def formatException(self, ei: tuple) -> str:
+    def formatException(self, ei: Any) -> str:
         return shown(super().formatException(ei), keep="\n")
 
 

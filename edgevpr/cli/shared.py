@@ -3,9 +3,9 @@
 import json
 import sys
 from argparse import SUPPRESS, ArgumentParser, Namespace
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from edgevpr.core.config import Config, keys_of, load_config
 from edgevpr.core.errors import ImageError, UsageError
@@ -14,8 +14,8 @@ from edgevpr.core.text import shown
 if TYPE_CHECKING:
     from edgevpr.core.types import Frame
     from edgevpr.frames.source import Source
-    from edgevpr.places.examine import Watch
 
+T = TypeVar("T")
 _KEY = "key "  # begins the name under which argparse keeps the value of a flag that is a key of the configuration
 _RECORDING = "a folder of images or a video file"
 
@@ -33,7 +33,7 @@ def group(commands: Any, name: str, text: str) -> Any:
 
 
 def _parser(commands: Any, name: str, text: str) -> ArgumentParser:
-    parser = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+    parser: ArgumentParser = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
     # Accepted after the command too, where users type it.
     parser.add_argument("--debug", action="store_true", default=SUPPRESS, help=SUPPRESS)
     return parser
@@ -142,8 +142,8 @@ def positive(text: str) -> float:
     return value
 
 
-def watched(label: str) -> "Watch":
+def watched(label: str) -> "Callable[[Iterable[T], int], Iterator[T]]":
     """Return the function that passes things through, of which there are so many, and shows progress."""
     from edgevpr.core.text import progress
 
-    return lambda places, total: progress(places, total, label)
+    return lambda things, total: progress(things, total, label)

@@ -105,7 +105,7 @@ def _fly_over(args: Namespace) -> str:
     from edgevpr.lab.simulate.rehearsal import WEATHERS, none_written, read_shots, write_rehearsal
     from edgevpr.mapmaking.orthophoto import Orthophoto  # loads GDAL, or says that it is missing
 
-    numbers = {}
+    numbers: dict[str, Any] = {}
     for name, (usual, least, most) in _NUMBERS.items():
         numbers[name] = value = usual if getattr(args, name) is None else getattr(args, name)
         if value is not None and not least <= value <= most:  # false for NaN

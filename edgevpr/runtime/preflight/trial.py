@@ -13,13 +13,11 @@ from typing import Any
 from edgevpr import techniques
 from edgevpr.core.child import Ended, ask_child, last_line, serve_parent
 from edgevpr.core.config import FORMS
-from edgevpr.core.contract import Technique
-from edgevpr.core.errors import EdgevprError, ModelError
+from edgevpr.core.errors import EdgevprError
 from edgevpr.core.types import StageCost
 from edgevpr.frames.images import read_image
-from edgevpr.power.boards import Board
 from edgevpr.runtime.preflight.probe import TechniqueCosts, noise, probe
-from edgevpr.runtime.recognise.opening import made_for, made_with
+from edgevpr.runtime.recognise.opening import made_with
 from edgevpr.techniques.card import load_card, weights_of
 
 _TRIED_S = 1.0  # pictures are tried again for so long: a flight that begins has no such time
@@ -65,22 +63,6 @@ def offers(
         else:
             listed += [Offer(techniques.labelled(name, form), name, {**own, "form": form}) for form in forms]
     return tuple(listed)
-
-
-def usable(wanted: Iterable[Offer], board: Board | None = None) -> Iterator[tuple[Offer, Technique | ModelError]]:
-    """Make each technique for `board`, or give the error that says why it cannot be used.
-
-    An error is given once for all forms of a technique, under its name.
-    """
-    refused = set()
-    for offer in wanted:
-        if offer.name in refused:
-            continue
-        try:
-            yield offer, made_for(board, offer.name, offer.settings)
-        except ModelError as error:
-            refused.add(offer.name)
-            yield Offer(offer.name, offer.name, offer.settings), error
 
 
 def try_each(wanted: Iterable[Offer], threads: int, images: Sequence[Path] = (), rounds: int = 0) -> Iterator[Trial]:
