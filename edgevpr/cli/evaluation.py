@@ -142,13 +142,16 @@ def _measure_techniques(args: Namespace) -> int:
         raise UsageError("Several sets need a folder for the results: name it with --out.")
     if args.plot:
         require_picture(Path(args.plot))
-    plan, errors = _plan(args), {}
-    for label, row in plan.rows.items():
+    plan = _plan(args)
+    errors: dict[str, ModelError] = {}  # by technique, for all its forms
+    for row in plan.rows.values():
         try:
-            create(row.technique, row.settings(None))
+            if row.technique not in errors:
+                create(row.technique, row.settings(None))
         except ModelError as error:  # a network that cannot be used stops no other
-            errors[label] = error
-    if len(errors) == len(plan.rows):
+            errors[row.technique] = error
+    rows = [row for row in plan.rows.values() if row.technique not in errors]
+    if not rows:
         raise next(iter(errors.values()))
     gate = gate_of(config_of(args, args.config).salience)
     ((name, chosen),) = plan.sets.items()
@@ -157,9 +160,7 @@ def _measure_techniques(args: Namespace) -> int:
         _say(*dataset.notes)
         _say_cameras(plan)
         measured = [
-            evaluation.evaluate(row.technique, dataset, row.settings(None), row, progress, gate)
-            for label, row in plan.rows.items()
-            if label not in errors
+            evaluation.evaluate(row.technique, dataset, row.settings(None), row, progress, gate) for row in rows
         ]
     results = evaluation.compare(measured)
     if args.plot:
@@ -168,7 +169,7 @@ def _measure_techniques(args: Namespace) -> int:
         print_json(evaluation.as_json(results))
     else:
         print(results_text(results))
-    _say(*(f"{label} was not measured: {error}" for label, error in errors.items()))
+    _say(*(f"{technique} was not measured: {error}" for technique, error in errors.items()))
     return 1 if errors else 0
 
 

@@ -1,7 +1,6 @@
 """Networks and forms through the commands: one map for all forms, and what cannot be used stops nothing else."""
 
 import json
-import sys
 from dataclasses import replace
 
 import cv2
@@ -12,12 +11,11 @@ from tiny_networks import write_network
 
 from edgevpr.cli.main import main
 from edgevpr.core.config import FORMS, load_config
-from edgevpr.core.errors import ConfigError, ModelError, UsageError
+from edgevpr.core.errors import ConfigError, UsageError
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.preflight import stored
 from edgevpr.runtime.preflight.pick import outlook
-from edgevpr.runtime.preflight.trial import offers, usable
 from edgevpr.runtime.recognise.opening import made_for, open_recogniser, technique_of
 from edgevpr.techniques import create, vectors
 
@@ -184,15 +182,6 @@ def test_profile_lists_every_form_and_says_in_a_sentence_what_cannot_be_used(mod
     out = capsys.readouterr().out
     assert "calc, rmac cannot be used: There is no model `calc`" in out
     assert "Weights of tiny: A tiny network" in out
-
-
-def test_offers_and_profile_survive_a_missing_onnxruntime(models, monkeypatch):
-    monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    write_network(models, "unopened", fault="dynamic batch")
-    found = {offer.label: each for offer, each in usable(offers(["hog", "unopened"], ("float", "1bit")))}
-    assert list(found) == ["hog", "hog 1bit", "unopened"]
-    assert isinstance(found["unopened"], ModelError)
-    assert "hog, cohog and seqslam fly without it" in str(found["unopened"])
 
 
 @pytest.mark.usefixtures("models")
