@@ -1,23 +1,37 @@
 """The demonstration: two generated flights, and the real commands between them, each in a process of its own."""
 
 import json
-import logging
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike
+
+from edgevpr.core.arrays import Image
 from edgevpr.core.errors import EdgevprError
+from edgevpr.core.geodesy import distance_m
 from edgevpr.core.text import progress
-from edgevpr.lab.simulate.camera import lit
-from edgevpr.lab.simulate.generated import SCENE_DEPTH_M, SCENE_WIDTH_M, later_flight, mapping_flight, write_flight
+from edgevpr.core.types import Position
+from edgevpr.frames.positions import find_positions, read_positions
+from edgevpr.lab.simulate.camera import lit, view_on_ground
+from edgevpr.lab.simulate.generated import (
+    SCENE_DEPTH_M,
+    SCENE_WIDTH_M,
+    GeneratedFlight,
+    later_flight,
+    mapping_flight,
+    to_metres,
+    write_flight,
+)
 from edgevpr.lab.simulate.landscape import make_scene
-from edgevpr.lab.simulate.outcome import RIGHT_M, FlightOutcome, outcome, read_answers
 from edgevpr.runtime.flight.flightlog import read_log
 from edgevpr.runtime.flight.wholeflight import flight_of
 
@@ -25,6 +39,54 @@ _SEED = 1
 _RATE_HZ = 5.0
 _CAMERA = ("--camera", "nadir", "--fov-deg", 66)  # that of the generated flights
 _END_TIMEOUT_S = 10.0
+# A place is the right one where the two pictures share 30 % of their ground, which is 78 m long from a height of 80 m.
+RIGHT_M = 55.0
+_PICTURE_PX = (1600, 1050)
+# Blue, green, red: of the places, of the later flight, and of answers by what became of them.
+_MAPPED, _LATER = (255, 255, 255), (10, 214, 255)
+_RIGHT, _WRONG, _REJECTED = (91, 191, 47), (59, 56, 229), (36, 165, 245)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JudgedAnswer:
+    """One query: where it was taken, and the place that was named. `error_m` is the distance between the two,
+    `nearest_m` that to the nearest place of the map, and `fix_off_m` that to the fix (None: not accepted)."""
+
+    query: str
+    reference_image: str
+    at: Position
+    named: Position
+    score: float
+    error_m: float
+    nearest_m: float
+    fix_off_m: float | None
+
+    @property
+    def accepted(self) -> bool:
+        return self.fix_off_m is not None
+
+    @property
+    def right(self) -> bool:
+        return self.error_m <= RIGHT_M
+
+    @property
+    def on_map(self) -> bool:
+        """True where the map has a right place for the query."""
+        return self.nearest_m <= RIGHT_M
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlightOutcome:
+    """Counts, shares and errors of a flight. `recall_at_1` is of the queries on the map. The errors are metres from the
+    point where a picture was taken to the fix, of the accepted queries (NaN without any): median, 90 % and largest."""
+
+    queries: int
+    on_map: int
+    recall_at_1: float
+    accepted: int
+    accepted_wrong: int
+    off_map_rejected: int
+    errors_m: tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,15 +131,8 @@ def run_demo(folder: str | Path) -> DemoSummary:
     """Generate both flights, map the first one, fly the second one against a simulated flight controller.
 
     Leaves in `folder`: flight-1/ and flight-2/ (images, positions.csv), map.gpkg, flight.jsonl and demo.png.
-    Raises EdgevprError where a part of it fails or matplotlib is not installed.
+    Raises EdgevprError where a part of it fails.
     """
-    logging.getLogger("matplotlib").setLevel(logging.WARNING)  # its messages about fonts are of no use here
-    try:
-        from edgevpr.lab.simulate.picture import DemoPicture
-    except ModuleNotFoundError as error:
-        raise EdgevprError(
-            f"The demo draws a picture, but {error.name} is not installed: pip install 'edgevpr[plots]'."
-        ) from error
     begin_s = time.monotonic()
     folder = Path(folder)
     log_path, picture_path = folder / "flight.jsonl", folder / "demo.png"
@@ -94,13 +149,7 @@ def run_demo(folder: str | Path) -> DemoSummary:
 
     answers = read_answers(log_path, first / "images", second / "images")
     got = outcome(answers)
-    DemoPicture(answers, mapping, first / "images", second / "images").draw(
-        picture_path,
-        lit(scene, mapping.light, mapping.seed),
-        f"{len(mapping.poses)} places, {got.queries} queries   ·   recall@1 {got.recall_at_1:.2f}   ·   "
-        f"{got.accepted} accepted, {got.accepted_wrong} of them wrong   ·   "
-        f"position error {got.errors_m[0]:.1f} m (median)",
-    )
+    _draw(picture_path, lit(scene, mapping.light, mapping.seed), mapping, answers)
     lines = list(flight_of(log_path))
     costs = [line["costs"] for line in lines if line["kind"] == "query"]
     return DemoSummary(
@@ -177,3 +226,82 @@ def _queries(log_path: Path, flying: subprocess.Popen[str]) -> Iterator[int]:
         yield from range(seen, done)
         seen = done
         time.sleep(0.1)
+
+
+def read_answers(log_path: Path, map_images: Path, query_images: Path) -> list[JudgedAnswer]:
+    """Read the queries of a flight log, and judge them by the positions.csv of the two flights."""
+    places, taken = (_positions(images) for images in (map_images, query_images))
+    answers = []
+    for line in flight_of(log_path):
+        if line["kind"] == "query":
+            at, named, fix = taken[line["query"]], places[line["reference_image"]], line["located"]
+            answers.append(
+                JudgedAnswer(
+                    query=line["query"],
+                    reference_image=line["reference_image"],
+                    at=at,
+                    named=named,
+                    score=line["score"],
+                    error_m=_apart_m(at, named),
+                    nearest_m=min(_apart_m(at, place) for place in places.values()),
+                    fix_off_m=_apart_m(at, Position(fix["lat_deg"], fix["lon_deg"])) if line["accepted"] else None,
+                )
+            )
+    return answers
+
+
+def outcome(answers: Sequence[JudgedAnswer]) -> FlightOutcome:
+    """Sum up the answers of a flight."""
+    on_map = [answer for answer in answers if answer.on_map]
+    accepted = [answer for answer in answers if answer.accepted]
+    errors_m = [answer.fix_off_m for answer in accepted if answer.fix_off_m is not None] or [np.nan]
+    return FlightOutcome(
+        queries=len(answers),
+        on_map=len(on_map),
+        recall_at_1=sum(answer.right for answer in on_map) / max(len(on_map), 1),
+        accepted=len(accepted),
+        accepted_wrong=sum(not answer.right for answer in accepted),
+        off_map_rejected=sum(not answer.on_map and not answer.accepted for answer in answers),
+        errors_m=(float(np.median(errors_m)), float(np.quantile(errors_m, 0.9)), max(errors_m)),
+    )
+
+
+def _positions(images: Path) -> dict[str, Position]:
+    table = find_positions(images)
+    tags = read_positions(table) if table else {}
+    return {name: tag.position for name, tag in tags.items() if tag.position}
+
+
+def _apart_m(one: Position, other: Position) -> float:
+    return float(distance_m(one.lat_deg, one.lon_deg, other.lat_deg, other.lon_deg))
+
+
+def _draw(path: Path, ground: Image, mapping: GeneratedFlight, answers: Sequence[JudgedAnswer]) -> None:
+    """Write a picture of both tracks on the lit landscape, uint8 (H, W, 3) BGR: bright what the map shows, and a line
+    from each query to the place that was named for it."""
+    scale = _PICTURE_PX[0] / SCENE_WIDTH_M
+
+    def pixels(points_m: ArrayLike) -> list[tuple[int, int]]:
+        return [(round(east * scale), round(_PICTURE_PX[1] - north * scale)) for east, north in np.asarray(points_m)]
+
+    seen = np.zeros(_PICTURE_PX[::-1], np.uint8)
+    for pose in mapping.poses:
+        if (corners_m := view_on_ground(pose, mapping.camera)) is not None:
+            cv2.fillConvexPoly(seen, np.array(pixels(corners_m)), 1)
+    picture = cv2.resize(ground, _PICTURE_PX, interpolation=cv2.INTER_AREA)
+    picture = np.where(seen[..., None] > 0, picture, picture // 3 + 20).astype(np.uint8)
+    places = pixels([(pose.east_m, pose.north_m) for pose in mapping.poses])
+    taken = pixels([to_metres(answer.at.lat_deg, answer.at.lon_deg) for answer in answers])
+    named = pixels([to_metres(answer.named.lat_deg, answer.named.lon_deg) for answer in answers])
+    for track, colour in ((places, _MAPPED), (taken, _LATER)):
+        cv2.polylines(picture, [np.array(track)], False, colour, 2, cv2.LINE_AA)
+    for place in places:
+        cv2.circle(picture, place, 4, _MAPPED, -1, cv2.LINE_AA)
+    for answer, here, there in zip(answers, taken, named, strict=True):
+        colour = _REJECTED if not answer.accepted else _RIGHT if answer.right else _WRONG
+        cv2.line(picture, here, there, colour, 3 if answer.accepted else 1, cv2.LINE_AA)
+        cv2.circle(picture, here, 7, colour, -1, cv2.LINE_AA)
+    legend = {"places of flight 1": _MAPPED, "flight 2": _LATER, "accepted": _RIGHT, "accepted, wrong": _WRONG}
+    for row, (text, colour) in enumerate({**legend, "rejected: no position is sent": _REJECTED}.items()):
+        cv2.putText(picture, text, (20, 920 + 28 * row), cv2.FONT_HERSHEY_SIMPLEX, 0.7, colour, 2, cv2.LINE_AA)
+    cv2.imwrite(str(path), picture)

@@ -1,6 +1,5 @@
 """The demonstration on a small landscape: real processes, a real link, a real picture."""
 
-import sys
 from dataclasses import replace
 from functools import partial
 
@@ -12,6 +11,8 @@ from edgevpr.lab.simulate import demo
 from edgevpr.lab.simulate.generated import later_flight, mapping_flight
 from edgevpr.lab.simulate.landscape import make_scene
 
+pytestmark = [pytest.mark.process, pytest.mark.network, pytest.mark.slow]
+
 
 @pytest.fixture
 def small(monkeypatch):
@@ -21,7 +22,6 @@ def small(monkeypatch):
 
 
 def test_the_demo_maps_flies_tells_and_draws(small, tmp_path):
-    pytest.importorskip("matplotlib")
     for left_over in ("map.gpkg", "map.gpkg-wal", "flight.jsonl", "demo.png"):
         (tmp_path / left_over).write_text('{"kind": "query"}\n')
     summary = demo.run_demo(tmp_path)
@@ -31,27 +31,17 @@ def test_the_demo_maps_flies_tells_and_draws(small, tmp_path):
     assert {"HEARTBEAT", "NAMED_VALUE_FLOAT"} <= set(summary.messages)
     assert summary.costs["cpu_s"] > 0
     picture = cv2.imread(str(summary.picture))
-    assert picture.shape == (1080, 1920, 3)
+    assert picture.shape == (1050, 1600, 3)
     assert picture.std() > 20
     assert "recall@1" in str(summary)
 
 
 def test_a_command_that_fails_is_named_and_nothing_is_left_running(small, tmp_path, monkeypatch):
-    pytest.importorskip("matplotlib")
     started = []
     popen = demo.subprocess.Popen
     monkeypatch.setattr(demo.subprocess, "Popen", lambda *a, **k: started.append(popen(*a, **k)) or started[-1])
     monkeypatch.setattr(demo, "_RATE_HZ", "often")
-    with pytest.raises(EdgevprError, match=r"edgevpr run .* ended with exit code 2"):
+    with pytest.raises(EdgevprError, match=r"`edgevpr run.* 2"):
         demo.run_demo(tmp_path / "out")
     assert len(started) == 3
     assert all(process.poll() is not None for process in started)
-
-
-def test_without_matplotlib_one_sentence_says_what_to_install(tmp_path, monkeypatch):
-    monkeypatch.delitem(sys.modules, "edgevpr.lab.simulate.picture", raising=False)
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    monkeypatch.setitem(sys.modules, "matplotlib.axes", None)
-    with pytest.raises(EdgevprError, match=r"pip install 'edgevpr\[plots\]'"):
-        demo.run_demo(tmp_path / "out")
-    assert not (tmp_path / "out").exists()

@@ -10,6 +10,7 @@ import pytest
 from edgevpr.core.geodesy import distance_m
 from edgevpr.frames.positions import read_positions
 from edgevpr.lab.simulate.camera import ground_to_pixel
+from edgevpr.lab.simulate.demo import outcome, read_answers
 from edgevpr.lab.simulate.generated import (
     SCENE_DEPTH_M,
     SCENE_WIDTH_M,
@@ -20,7 +21,6 @@ from edgevpr.lab.simulate.generated import (
     write_flight,
 )
 from edgevpr.lab.simulate.landscape import make_scene
-from edgevpr.lab.simulate.outcome import outcome, read_answers
 from edgevpr.runtime.flight.flightlog import FlightLog
 
 

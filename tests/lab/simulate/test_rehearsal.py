@@ -109,8 +109,8 @@ def test_the_waypoints_of_a_mission_are_flown_one_after_the_other(tmp_path):
 
 def test_a_track_that_cannot_be_flown_is_refused_in_a_sentence(tmp_path):
     for text, said in (
-        ("file,lat,lon\na,50,11.9\n", "line 2 has no height_m .* --height-m"),
-        ("file,lat,lon,height_m\na,,,\n", "no line with lat and lon"),
+        ("file,lat,lon\na,50,11.9\n", "line 2 .*--height-m"),
+        ("file,lat,lon,height_m\na,,,\n", "lat and lon"),
         ("file,lat,lon,height_m\na,50,11,-3\n", "height_m is `-3`"),
         ("file,lat,lon,height_m,roll_deg\na,50,11,30,90\n", "roll_deg is `90`"),
     ):
@@ -118,12 +118,12 @@ def test_a_track_that_cannot_be_flown_is_refused_in_a_sentence(tmp_path):
             read_shots(csv_of(tmp_path, text), None, 20.0, 10.0)
     line = tmp_path / "line.geojson"
     line.write_text('{"type": "LineString", "coordinates": [[11.9, 50], [11.9, 60]]}')
-    with pytest.raises(UsageError, match="no heights over the ground: give --height-m"):
+    with pytest.raises(UsageError, match="--height-m"):
         read_shots(line, None, 20.0, 10.0)
-    with pytest.raises(UsageError, match="1,112 km long"):
+    with pytest.raises(UsageError, match="1,112 km"):
         read_shots(line, 80.0, 1.0, 10.0)
     line.write_text('{"type": "Point", "coordinates": [11.9, 50]}')
-    with pytest.raises(UsageError, match="no path of waypoints"):
+    with pytest.raises(UsageError, match="waypoints"):
         read_shots(line, 80.0, 1.0, 10.0)
 
 

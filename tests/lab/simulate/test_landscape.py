@@ -1,0 +1,152 @@
+"""The generated landscape, lit from where the sun is, and where a point of the ground appears in the picture."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, ground_to_pixel, lit, photograph
+from edgevpr.lab.simulate.landscape import Scene, make_scene
+
+CAMERA = Camera(noise_sigma=0)
+NOON = Light(sun_azimuth_deg=180, sun_elevation_deg=60)
+F = CAMERA.focal_px
+MIDDLE = 319.5, 239.5
+MARK_M = (70.0, 90.0)
+ABOVE = CameraPose(east_m=70, north_m=90, height_m=80, heading_deg=0)
+
+
+@pytest.fixture(scope="module")
+def marked() -> Scene:
+    """Dark ground, 200 m by 160 m, with one white mark of 2 m by 2 m."""
+    albedo = np.full((640, 800, 3), 20, np.uint8)
+    albedo[276:284, 276:284] = 220  # rows count from the north: (160 - 90) / 0.25 = 280
+    return Scene(albedo, np.full((640, 800), 300, np.uint16), 0.25)
+
+
+def mark_in(frame: np.ndarray) -> np.ndarray:
+    """The centre (column, row) of the mark, weighted by brightness."""
+    weight = np.clip(frame.max(axis=2).astype(float) - frame.max() / 2, 0, None)
+    rows, columns = np.indices(weight.shape)
+    return np.array([(columns * weight).sum(), (rows * weight).sum()]) / weight.sum()
+
+
+@pytest.mark.parametrize(
+    ("change", "column", "row"),
+    [
+        ({}, 0, 0),
+        ({"east_m": 60}, F * 10 / 80, 0),  # the mark is 10 m to the right of a nose that points north
+        ({"north_m": 80}, 0, -F * 10 / 80),  # ... 10 m ahead: up in the picture
+        ({"east_m": 60, "heading_deg": 90}, 0, -F * 10 / 80),  # nose east: ahead
+        ({"north_m": 80, "heading_deg": 90}, -F * 10 / 80, 0),  # nose east: 10 m to the left
+        ({"north_m": 80, "heading_deg": 180, "height_m": 40}, 0, F * 10 / 40),  # half as high: twice as far behind
+        ({"roll_deg": 5}, F * np.tan(np.radians(5)), 0),  # right wing down: the camera looks left
+        ({"pitch_deg": 5}, 0, F * np.tan(np.radians(5))),  # nose up: it looks ahead
+    ],
+)
+def test_a_known_point_appears_where_it_must(marked, change, column, row):
+    pose = replace(ABOVE, **change)
+    frame = photograph(lit(marked, NOON, 0), 0.25, pose, CAMERA, NOON, np.random.default_rng(0))
+    assert frame.shape == (480, 640, 3)
+    assert mark_in(frame) == pytest.approx((MIDDLE[0] + column, MIDDLE[1] + row), abs=0.6)
+
+
+def test_the_homography_and_the_picture_agree_at_any_pose(marked):
+    ground = lit(marked, NOON, 0)
+    rng = np.random.default_rng(5)
+    for _ in range(10):
+        off = rng.uniform(-1, 1, 6)
+        pose = CameraPose(
+            east_m=70 + 15 * off[0],
+            north_m=90 + 12 * off[1],
+            height_m=80 + 10 * off[2],
+            heading_deg=180 * off[3],
+            roll_deg=4 * off[4],
+            pitch_deg=4 * off[5],
+        )
+        expected = ground_to_pixel(pose, CAMERA) @ (*MARK_M, 1)
+        frame = photograph(ground, 0.25, pose, CAMERA, NOON, rng)
+        assert mark_in(frame) == pytest.approx(expected[:2] / expected[2], abs=0.6)
+
+
+def test_every_part_of_the_light_and_the_camera_has_its_effect():
+    scene = make_scene(2, 120, 100, metres_per_pixel=0.4)
+    pose = CameraPose(east_m=60, north_m=50, height_m=40, heading_deg=0)
+
+    def frame(light: Light, camera: Camera) -> np.ndarray:
+        return photograph(lit(scene, light, 1), 0.4, pose, camera, light, np.random.default_rng(0)).astype(int)
+
+    plain = frame(NOON, CAMERA)
+    for change in ({"sun_azimuth_deg": 90}, {"sun_elevation_deg": 25}, {"cloud_frac": 0.5}, {"gamma": 1.3}):
+        assert np.abs(frame(replace(NOON, **change), CAMERA) - plain).mean() > 1, change
+    assert frame(replace(NOON, exposure=1.2), CAMERA).mean() > 1.1 * plain.mean()
+    assert frame(replace(NOON, haze_frac=0.4), CAMERA).std() < 0.7 * plain.std()
+    red_over_blue = [
+        image[..., 2].mean() / image[..., 0].mean() for image in (plain, frame(replace(NOON, warmth=1), CAMERA))
+    ]
+    assert red_over_blue[1] > 1.1 * red_over_blue[0]
+    assert (frame(NOON, replace(CAMERA, noise_sigma=5)) - plain).std() == pytest.approx(5, abs=0.5)
+
+
+def test_motion_blurs_along_the_flight_only(marked):
+    def extent(blur_px: float) -> tuple[int, int]:
+        camera = replace(CAMERA, blur_px=blur_px)
+        frame = photograph(lit(marked, NOON, 0), 0.25, ABOVE, camera, NOON, np.random.default_rng(0))
+        rows, columns = np.nonzero(frame.max(axis=2) > 40)
+        return int(np.ptp(columns)), int(np.ptp(rows))
+
+    (wide, high), (wide_blurred, high_blurred) = extent(0), extent(8)
+    assert wide_blurred == wide
+    assert high_blurred >= high + 4
+
+
+def plain(width_m: float = 60, metres_per_pixel: float = 0.5) -> Scene:
+    side = round(width_m / metres_per_pixel)
+    return Scene(np.full((side, side, 3), 120, np.uint8), np.full((side, side), 300, np.uint16), metres_per_pixel)
+
+
+def test_the_same_seed_gives_the_same_scene_and_another_seed_another_one():
+    one, again, other = (make_scene(seed, 160, 120, metres_per_pixel=0.5) for seed in (7, 7, 8))
+    np.testing.assert_array_equal(one.albedo, again.albedo)
+    np.testing.assert_array_equal(one.height_cm, again.height_cm)
+    assert np.mean(one.albedo != other.albedo) > 0.5
+    assert (one.width_m, one.depth_m) == (160, 120)
+
+
+def test_a_scene_has_texture_everywhere_and_things_that_stand_on_it():
+    scene = make_scene(3, 240, 180, metres_per_pixel=0.4)
+    grey = scene.albedo.mean(axis=2)
+    blocks = grey[: 440 // 40 * 40, : 600 // 40 * 40].reshape(11, 40, 15, 40)
+    assert blocks.std(axis=(1, 3)).min() > 2, "no patch of 16 m is of one colour"
+    assert scene.height_cm.max() > 800, "trees"
+    assert scene.height_cm.min() < 200, "a river bed"
+
+
+@pytest.mark.parametrize(
+    ("sun_azimuth_deg", "shaded", "sunny"),
+    [
+        (90, (60, 50), (60, 70)),  # sun in the east: the shadow lies west, at a lower column
+        (270, (60, 70), (60, 50)),
+        (0, (70, 60), (50, 60)),  # sun in the north: the shadow lies south, at a higher row
+        (180, (50, 60), (70, 60)),
+    ],
+)
+def test_a_mast_casts_its_shadow_away_from_the_sun(sun_azimuth_deg, shaded, sunny):
+    scene = plain()
+    scene.height_cm[59:62, 59:62] += 1000
+    ground = lit(scene, Light(sun_azimuth_deg=sun_azimuth_deg, sun_elevation_deg=45), seed=0)
+    assert ground[shaded].max() < 0.6 * ground[sunny].max()
+
+
+def test_a_shadow_is_as_long_as_the_sun_is_low():
+    scene = plain()
+    scene.height_cm[59:62, 59:62] += 1000
+    dark = lit(scene, Light(sun_azimuth_deg=90, sun_elevation_deg=45), seed=0)[60, :59, 0] < 70
+    assert np.count_nonzero(dark) * scene.metres_per_pixel == pytest.approx(10, abs=1)
+
+
+def test_flat_ground_in_full_sun_is_evenly_lit_and_clouds_take_their_share():
+    clear = lit(plain(), NOON, seed=1)
+    assert np.ptp(clear.reshape(-1, 3), axis=0).max() == 0
+    cloudy = lit(plain(), Light(sun_azimuth_deg=180, sun_elevation_deg=60, cloud_frac=0.4), seed=1)
+    assert np.mean(cloudy[..., 1] < 0.85 * clear[0, 0, 1]) == pytest.approx(0.4, abs=0.15)
