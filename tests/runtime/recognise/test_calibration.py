@@ -1,0 +1,177 @@
+"""The calibration that a map brings into a flight: used where it makes sense, and never a reason to stop; and the model
+of confidence in it."""
+
+import contextlib
+import json
+import logging
+import math
+import shutil
+import sqlite3
+import zlib
+from dataclasses import replace
+
+import pytest
+from fakes import FakeClock
+from pictures import textured
+
+from edgevpr.core.config import load_config
+from edgevpr.core.types import Frame, Position
+from edgevpr.mapmaking.mapping import build_map
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.power.boards import load_board
+from edgevpr.power.equations import Pack
+from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.recognise.confidence import as_json, from_json, prior, probability
+from edgevpr.runtime.recognise.evidence import (
+    OF_MAP,
+    OF_PLACE,
+    MapCalibration,
+    calibration_of,
+    calibration_text,
+    not_calibrated,
+    read_calibration,
+    require_usable,
+)
+from edgevpr.runtime.recognise.opening import open_recogniser
+from edgevpr.techniques import create
+
+OWN = replace(prior("ahead"), made_of="this map")
+FOUND = MapCalibration(
+    models={"ahead": OWN},
+    made="2026-05-01",
+    asked=120,
+    precision=0.999,
+    accepted=0.75,
+    accepted_wrong=1,
+    recognisable={3: 0.2, 7: 0.95, 12: 0.5, 40: 1.0},
+)
+
+
+def frame(number):
+    position = Position(50 + 0.001 * number, 8.0)
+    return Frame(image=textured(number, 240, 320), name=str(number), t_mono_s=0.0, position=position)
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    path, technique, clock = tmp_path_factory.mktemp("map") / "m.gpkg", create("cohog", {"w1": 208}), FakeClock()
+    meter = QueryMeter(load_board("rpi-4b"), Pack(4, 5200), 0.85, wall_clock=clock, cpu_clock=clock.clock.process_cpu_s)
+    with PlaceMap.create(path, technique.spec) as place_map:
+        build_map(map(frame, range(3)), technique, place_map, meter)
+    return path
+
+
+@pytest.fixture
+def path(built, tmp_path):
+    return shutil.copy(built, tmp_path / "m.gpkg")
+
+
+def keep(path, text):
+    with PlaceMap.open_for_adding(path) as place_map:
+        place_map.record_calibration(text)
+
+
+def flown(path):
+    """The models by which the flight over a map decides, and whether it recognises its own picture."""
+    recogniser = open_recogniser(load_config(None, {"map": str(path)}), load_board("this"), narrowed=True)
+    with recogniser.place_map:
+        event = recogniser.step(frame(1))
+        assert not event.failed, event.reason
+        assert 0 <= event.confidence <= 1
+        assert event.best.place.source_image == "1"
+        return recogniser.rule.sure.models
+
+
+def test_a_flight_decides_by_the_models_of_its_map(path, caplog):
+    assert flown(path) == {"ahead": prior("ahead")}
+    keep(path, calibration_text(FOUND))
+    assert flown(path) == {"ahead": OWN}
+    with PlaceMap.open(path) as place_map:
+        assert calibration_of(place_map) == FOUND
+    assert not caplog.records
+
+
+def changed(**figures):
+    """The text of the calibration with other figures of its model, and a right checksum."""
+    stored = json.loads(calibration_text(FOUND)[8:])
+    stored["models"]["ahead"]["of_map"].update(figures)
+    body = json.dumps(stored)
+    return f"{zlib.crc32(body.encode()):08x}{body}"
+
+
+DAMAGED = {
+    "empty": "",
+    "no json": "deadbeef{",
+    "changed": calibration_text(FOUND).replace("2026", "2025"),
+    "evidence that there is not": changed(names=["colour", *OWN.of_map.names[1:]]),
+    "a kind that there is not": calibration_text(replace(FOUND, models={"sideways": OWN})),
+    "not a number": changed(bias=math.nan),
+    "a weight too few": changed(weights=OWN.of_map.weights[1:]),
+    "a share of more than all": calibration_text(replace(FOUND, accepted=1.5)),
+    "a share that is no number": calibration_text(replace(FOUND, precision=math.inf)),
+    "a place that is no number": calibration_text(replace(FOUND, recognisable={"x": 0.5})),
+    "no places": calibration_text(replace(FOUND, recognisable=None)),
+    "nothing asked": calibration_text(replace(FOUND, asked=None)),
+    "a wrong surrogate": "\ud800" * 9,
+}
+
+
+@pytest.mark.parametrize("text", DAMAGED.values(), ids=DAMAGED)
+def test_a_damaged_calibration_is_refused(text):
+    with pytest.raises(ValueError, match=r"."):
+        for kind, model in read_calibration(text).models.items():
+            require_usable(kind, model)
+
+
+@pytest.mark.parametrize("text", [DAMAGED["changed"], DAMAGED["not a number"]])
+def test_with_a_damaged_calibration_the_shipped_model_flies_and_it_is_said(path, text, caplog):
+    keep(path, text)
+    with caplog.at_level(logging.WARNING):
+        assert flown(path) == {"ahead": prior("ahead")}
+    (record,) = [each for each in caplog.records if "calibration" in each.message]
+    assert "`edgevpr map calibrate`" in record.message
+    assert len(record.message) < 500
+
+
+@pytest.mark.parametrize("value", [b"\xff", "7", "[" * 5000, json.dumps(["x"]), b"\xa5" * 90_000_000])
+def test_a_row_of_another_form_ends_no_flight(path, value):
+    with contextlib.closing(sqlite3.connect(path)) as db, db:
+        db.execute("INSERT OR REPLACE INTO edgevpr_map (key, value) VALUES ('calibration', ?)", (value,))
+    assert flown(path) == {"ahead": prior("ahead")}
+
+
+def test_what_to_expect_is_said_in_words_and_figures():
+    figures = FOUND.figures()
+    assert (figures["asked"], figures["places_asked"], figures["hardly_recognisable"]) == (120, 4, 0.25)
+    assert figures["made_of"] == [OWN.made_of]
+    for wrong, words in ((0, "no wrong match was"), (1, "1 wrong match was"), (5, "5 wrong matches were")):
+        assert words in replace(FOUND, accepted_wrong=wrong).described()
+    alike = replace(FOUND, recognisable={1: 0.1, 2: 0.49, 3: 0.9})
+    assert (FOUND.looks_alike, alike.looks_alike, replace(FOUND, recognisable={}).looks_alike) == (False, True, False)
+    assert ("alike" in FOUND.described(), "alike" in alike.described()) == (False, True)
+    assert ("12" in not_calibrated(12), "12" in not_calibrated(30)) == (True, False)
+
+
+@pytest.mark.parametrize("kind", OF_MAP)
+def test_a_shipped_model_makes_a_probability_of_any_evidence(kind):
+    model = prior(kind)
+    require_usable(kind, model)
+    assert from_json(as_json(model)) == model
+    evidence = dict.fromkeys(OF_MAP[kind] + OF_PLACE[kind], 0.0)
+    for value in (-3.0, -1.0, 0.0, 1.0, 3.0):
+        assert 0 <= model.confidence(dict.fromkeys(evidence, value)) <= 1
+    for value in (math.nan, math.inf, -math.inf):
+        assert model.confidence(evidence | {"agree": value, "coverage": value}) < model.threshold(0.9), "nothing sure"
+    needed = [model.threshold(precision) for precision in (0.5, 0.9, 0.99, 0.999, 0.999999)]
+    assert needed == sorted(needed)
+    assert needed[0] < needed[-1]
+
+
+@pytest.mark.parametrize("text", ["", "[]", "7", "{}", '{"of_map": 1}', "[" * 100_000, '{"of_map": NaN}'])
+def test_a_text_that_is_no_model_is_refused(text):
+    with pytest.raises(ValueError, match=r"."):
+        from_json(text)
+
+
+def test_a_probability_never_overflows():
+    assert (probability(-1e308), probability(0.0), probability(1e308)) == (pytest.approx(0), 0.5, pytest.approx(1))
