@@ -82,8 +82,8 @@ thesis: $(VENV)/installed
 bench-arm64: $(VENV)/installed
 	$(BIN)/python benchmarks/bench_arm64.py
 
-# edgevpr on an emulated ARM board: the core of the tests, the demonstration, and the same flights as here (as root;
-# Debian's qemu-user-static, debootstrap and gcc), into benchmarks/results/. The system is kept in ~/.cache.
+# edgevpr on an emulated ARM board: the core of the tests (as root; Debian's qemu-user-static, debootstrap and gcc), into
+# benchmarks/results/. The system is kept in ~/.cache.
 test-arm64: $(VENV)/installed
 	$(BIN)/python benchmarks/on_arm64.py
 

@@ -25,13 +25,14 @@ FROM_THE_AIR = ("aerial_", "kite_")  # how the names of such sets begin
 Row = dict[str, Any]
 
 
-def run(main: Callable[[], object]) -> None:
-    """Run a script on one thread of NumPy's library, whose number is read when NumPy is loaded. What edgevpr cannot do
-    ends it with a sentence."""
+def run(main: Callable[[], object], opencv_threads: int | None = 1) -> None:
+    """Run a script on one thread of NumPy's library, whose number is read when NumPy is loaded, and with so many of
+    OpenCV (None: as edgevpr's commands run). What edgevpr cannot do ends it with a sentence."""
     if "OPENBLAS_NUM_THREADS" not in os.environ:
         os.environ["OPENBLAS_NUM_THREADS"] = "1"
         os.execv(sys.executable, sys.orig_argv)
-    cv2.setNumThreads(1)
+    if opencv_threads:
+        cv2.setNumThreads(opencv_threads)
     try:
         sys.exit(main())
     except EdgevprError as error:

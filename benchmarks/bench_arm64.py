@@ -101,4 +101,4 @@ vector instructions. The last column divides by the {mips:g} million instruction
 
 
 if __name__ == "__main__":
-    base.run(main)
+    base.run(main, opencv_threads=None)

@@ -268,4 +268,4 @@ def draw(found: base.Row, path: Path) -> None:
 
 
 if __name__ == "__main__":
-    base.run(main)
+    base.run(main, opencv_threads=None)

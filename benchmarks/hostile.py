@@ -68,4 +68,4 @@ def _shown(value: object) -> str:
 
 
 if __name__ == "__main__":
-    base.run(main)
+    base.run(main, opencv_threads=None)

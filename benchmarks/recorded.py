@@ -74,4 +74,4 @@ many with them as with the pictures as they were, none wrong, and missed one pla
 
 
 if __name__ == "__main__":
-    base.run(main)
+    base.run(main, opencv_threads=None)

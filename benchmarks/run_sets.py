@@ -253,4 +253,4 @@ def write_accuracy(contents: list[dict[str, Any]]) -> None:
 
 
 if __name__ == "__main__":
-    base.run(main)
+    base.run(main, opencv_threads=None)

@@ -269,4 +269,4 @@ def _absences(camera: FilmCamera, autopilot: Autopilot, ground: _Ground, flight:
 
 
 if __name__ == "__main__":
-    base.run(main)
+    base.run(main, opencv_threads=None)

@@ -179,4 +179,4 @@ Places compared with queries of other sets, by how many of their landmarks agree
 
 
 if __name__ == "__main__":
-    base.run(main)
+    base.run(main, opencv_threads=None)
