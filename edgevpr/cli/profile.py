@@ -21,9 +21,7 @@ def add(commands: Any) -> None:
     parser.add_argument("--board", default="this", metavar="NAME", help="a board, or `this` (default); see --list")
     parser.add_argument("--list", action="store_true", help="list the boards")
     _add_plan(parser)
-    parser.add_argument(
-        "--plot", metavar="FILE", help="draw recall against charge, and the map's memory (.png, .pdf, .svg)"
-    )
+    parser.add_argument("--plot", metavar="FILE", help="draw recall against charge (.png, .pdf, .svg)")
     own = parser.add_mutually_exclusive_group()
     own.add_argument("--detect", action="store_true", help="say which board this is, and why; --out writes a profile")
     own.add_argument(

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 from edgevpr import techniques
 from edgevpr.core.config import LOWEST_RATE_HZ
-from edgevpr.core.errors import ConfigError, UsageError
+from edgevpr.core.errors import ConfigError
 from edgevpr.core.types import FIX_MAX_AGE_S
 from edgevpr.power.boards import Board
 from edgevpr.runtime.preflight import accuracy
@@ -203,24 +203,21 @@ def objections(wanted: Iterable[Option]) -> str:
     return "; ".join(option.objection for option in wanted if option.objection)
 
 
-def what_would_fit(wanted: Iterable[Option], board: Board) -> list[str]:
-    """Say what would make those options fit that would then be chosen."""
-    return [
-        f"{option.label} {' or '.join(option.fit.remedies)}"
-        for option in wanted
-        if option.fit.remedies and (option.is_sound or option.name == board.technique)
-    ]
-
-
-def require_best(wanted: Sequence[Option], board: Board, demand: Demand) -> Option:
-    """Choose as `best` does. Raises UsageError where nothing can be chosen; it says what would make something fit."""
-    if chosen := best(wanted, board):
-        return chosen
-    remedies = what_would_fit(wanted, board)
-    raise UsageError(
-        f"No technique fits {board.title} with {demand.places} places at {demand.rate_hz:g} Hz ({objections(wanted)}): "
-        + (f"what would fit is {', or '.join(remedies)}." if remedies else "use a larger board.")
-    )
+def nothing_to_choose(wanted: Sequence[Option], board: Board, min_recall: float | None = None) -> str:
+    """Say why `best` finds nothing, and what would make those options fit that it would then choose."""
+    fitting = [option for option in wanted if not option.fit.shortfalls]
+    if not fitting:
+        remedies = [
+            f"{option.label} {' or '.join(option.fit.remedies)}"
+            for option in wanted
+            if option.fit.remedies and (option.is_sound or option.name == board.technique)
+        ]
+        hint = f"what would fit is {', or '.join(remedies[:3])}" if remedies else "use a larger board"
+        return f"nothing that was tried fits {board.title}; {hint}"
+    if sound := front(fitting):
+        most = max(option.recall for option in sound)
+        return f"nothing that fits has a recall@1 of {min_recall:g}; the most is {most:.2f}"
+    return f"of what fits {board.title} nothing is chosen by itself: {objections(fitting)}"
 
 
 def described(board: Board, found: Fit, demand: Demand) -> str:

@@ -11,7 +11,7 @@ from edgevpr.power.boards import Board
 from edgevpr.power.equations import Pack, endurance_min, pack_ah, queries_ah
 from edgevpr.power.meter import query_cost
 from edgevpr.runtime.preflight.accuracy import Accuracy
-from edgevpr.runtime.preflight.choose import Demand, Option, best, front, objections, options, what_would_fit
+from edgevpr.runtime.preflight.choose import Demand, Option, best, front, nothing_to_choose, options
 from edgevpr.runtime.preflight.scale import UNKNOWN_PRODUCTS, Ratios, counted_work, is_same, on_board, ratios
 from edgevpr.runtime.preflight.trial import Trial
 
@@ -241,7 +241,7 @@ def _recommended(
         return None, f"None: the map was built with {map_technique}, which cannot be used here."
     taken = best(usable, board, plan.min_recall)
     if taken is None:
-        return None, f"None: {served}{_nothing(usable, board, plan)}."
+        return None, f"None: {served}{nothing_to_choose(usable, board, plan.min_recall)}."
     row = next(row for row in rows if row.technique == taken.label)
     if taken.accuracy is None:
         why = "it is what the board's profile names, and it was never measured"
@@ -255,19 +255,6 @@ def _recommended(
         f"{row.flight_marginal_mah:.3g} mAh a flight beside the {row.flight_mah - row.flight_marginal_mah:.3g} of the "
         "idle board."
     )
-
-
-def _nothing(usable: list[Option], board: Board, plan: FlightPlan) -> str:
-    """Say why nothing can be taken, and what could be."""
-    fitting = [option for option in usable if not option.fit.shortfalls]
-    if not fitting:
-        remedies = what_would_fit(usable, board)[:3]
-        hint = f"what would fit is {', or '.join(remedies)}" if remedies else "use a larger board"
-        return f"nothing that was tried fits {board.title}; {hint}"
-    if sound := front(fitting):
-        most = max(option.recall for option in sound)
-        return f"nothing that fits has a recall@1 of {plan.min_recall:g}; the most is {most:.2f}"
-    return f"of what fits {board.title} nothing is chosen by itself: {objections(fitting)}"
 
 
 def _notes_on_times(board: Board, here: Board, ratio: Ratios | None) -> Iterator[str]:

@@ -1,19 +1,37 @@
 """Estimates and stored figures as plain text of at most 120 columns: tables with a line a technique, and notes."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from edgevpr.core.text import aligned, wrapped
 from edgevpr.runtime.preflight.estimate import FlightEstimate, TechniqueEstimate
 from edgevpr.runtime.preflight.probe import TechniqueCosts
 from edgevpr.runtime.preflight.stored import StoredFigures
 
-_FINDS = ("technique", "fits", "recall@1", "accepted", "wrong", "sets", "queries", "chosen by itself")
-_NEEDS = ("technique", "fits", "B/place", "map MB", "disk MB", "peak MB", "t_e s", "t_m s", "U_e", "U_m", "Hz")
-_DRAWS = ("technique", "mAh/query", "marginal", "mAh/flight", "marginal", "of pack")
-_LOSES = ("min lost", "marginal")
-_MEASURED = (
-    "technique", "t_e ms", "CPU ms", "t_m us", "CPU us", "scan us", "peak MB", "encode MB", "RAM B", "disk B",
+# The columns of each table: a heading, and the cell of a row.
+_NEEDS = (
+    ("technique", "{0.technique}"), ("fits", "{fits}"), ("B/place", "{0.ram_bytes_per_place}"),
+    ("map MB", "{0.map_ram_mb:.1f}"), ("disk MB", "{0.map_disk_mb:.1f}"), ("peak MB", "{0.process_ram_mb:.0f}"),
+    ("t_e s", "{0.t_encode_s:.3f}"), ("t_m s", "{0.t_match_s:.3f}"), ("U_e", "{0.u_encode:.2f}"),
+    ("U_m", "{0.u_match:.2f}"), ("Hz", "{0.reachable_hz:.3g}"),
 )  # fmt: skip
+_FINDS = (
+    ("technique", "{0.technique}"), ("fits", "{fits}"), ("recall@1", "{0.accuracy.recall_at_1:.2f}"),
+    ("accepted", "{0.accuracy.accepted} of {0.accuracy.asked}"), ("wrong", "{0.accuracy.accepted_elsewhere}{beside}"),
+    ("sets", "{0.accuracy.sets}"), ("queries", "{0.accuracy.queries}"), ("chosen by itself", "{chosen}"),
+)  # fmt: skip
+_DRAWS = (
+    ("technique", "{0.technique}"), ("mAh/query", "{0.query_mah:.4f}"), ("marginal", "{0.query_marginal_mah:.4f}"),
+    ("mAh/flight", "{0.flight_mah:.1f}"), ("marginal", "{0.flight_marginal_mah:.2f}"),
+    ("of pack", "{0.flight_pack_frac:.1%}"),
+)  # fmt: skip
+_LOSES = (("min lost", "{0.lost_min:.2f}"), ("marginal", "{0.lost_marginal_min:.3f}"))
+_MEASURED = (
+    ("technique", "{label}"), ("t_e ms", "{encode_ms:.2f}"), ("CPU ms", "{encode_cpu_ms:.2f}"),
+    ("t_m us", "{match_us:.3f}"), ("CPU us", "{match_cpu_us:.3f}"), ("scan us", "{scan_us}"),
+    ("peak MB", "{0.process_mb:.1f}"), ("encode MB", "{encode_mb}"), ("RAM B", "{0.ram_bytes_per_place}"),
+    ("disk B", "{0.disk_bytes_per_place}"),
+)  # fmt: skip
+_Columns = Sequence[tuple[str, str]]
 
 
 def format_table(estimate: FlightEstimate) -> str:
@@ -28,11 +46,13 @@ def format_table(estimate: FlightEstimate) -> str:
         f"{since}" + {"measured": "", "scaled": ", scaled", "unscaled": " here, unscaled"}[estimate.times]
     )
     missing = [[name, "n/a"] for name in estimate.unusable]
-    needs = aligned([_NEEDS, *map(_needs, estimate.techniques), *missing], left=2)
-    finds = aligned([_FINDS, *map(_finds, estimate.techniques)], left=2)
-    draws = aligned([_DRAWS + (_LOSES if plan.hover_w else ()), *map(_draws, estimate.techniques)])
+    rows = estimate.techniques
+    needs = aligned([_headings(_NEEDS), *(_cells(_NEEDS, row) for row in rows), *missing], left=2)
+    finds = aligned([_headings(_FINDS), *map(_finds, rows)], left=2)
+    columns = _DRAWS + (_LOSES if plan.hover_w else ())
+    draws = aligned([_headings(columns), *(_cells(columns, row) for row in rows)])
     notes = []
-    for row in estimate.techniques:
+    for row in rows:
         if not row.fits:
             remedy = f"; it would fit {', or '.join(row.remedies)}" if row.remedies else ""
             notes.append(f"{row.technique} does not fit: {' and '.join(row.shortfalls)}{remedy}.")
@@ -56,7 +76,7 @@ def format_stored(figures: StoredFigures) -> str:
         [
             f"{machine['machine']}, {machine['cores']} cores, {machine['RAM in MB']} MB: measured on {figures.date}, "
             f"{figures.pictures}",
-            *aligned([_MEASURED, *rows, *([name, "n/a"] for name in unusable)]),
+            *aligned([_headings(_MEASURED), *rows, *([name, "n/a"] for name in unusable)]),
             "t_m, scan, RAM B and disk B are of one place; peak MB is the process, encode MB what encoding adds.",
             *(line for sentence in _unusable(unusable) for line in wrapped(sentence)),
             f"Beside one core of the reference: products {score.products:g}, passes {score.passes:g}, all cores "
@@ -71,70 +91,37 @@ def _unusable(unusable: Mapping[str, str]) -> list[str]:
     return [f"{', '.join(names)} cannot be used: {why}" for why, names in reasons.items()]
 
 
-def _finds(row: TechniqueEstimate) -> tuple[str, ...]:
-    accuracy, fits = row.accuracy, "yes" if row.fits else "no"
-    if accuracy is None:
-        return (row.technique, fits, "?", "?", "?", "", "", "never measured")
-    beside = accuracy.accepted_wrong - accuracy.accepted_elsewhere
+def _headings(columns: _Columns) -> list[str]:
+    return [heading for heading, _ in columns]
+
+
+def _cells(columns: _Columns, row: TechniqueEstimate, **more: str) -> list[str]:
+    return [cell.format(row, fits="yes" if row.fits else "no", **more) for _, cell in columns]
+
+
+def _finds(row: TechniqueEstimate) -> list[str]:
+    if row.accuracy is None:
+        return [*_cells(_FINDS[:2], row), "?", "?", "?", "", "", "never measured"]
+    beside = row.accuracy.accepted_wrong - row.accuracy.accepted_elsewhere
     if not row.fits:
         chosen = ""
     elif row.on_front:
         chosen = "yes"
-    elif not accuracy.is_trusted:
+    elif not row.accuracy.is_trusted:
         chosen = "wrong places"
     else:
         chosen = "needs a sequence" if row.objection else "another is better"
-    return (
-        row.technique,
-        fits,
-        f"{accuracy.recall_at_1:.2f}",
-        f"{accuracy.accepted} of {accuracy.asked}",
-        f"{accuracy.accepted_elsewhere}" + (f" (+{beside} beside)" if beside else ""),
-        f"{accuracy.sets}",
-        f"{accuracy.queries}",
-        chosen,
-    )
+    return _cells(_FINDS, row, beside=f" (+{beside} beside)" if beside else "", chosen=chosen)
 
 
-def _needs(row: TechniqueEstimate) -> tuple[str, ...]:
-    return (
-        row.technique,
-        "yes" if row.fits else "no",
-        f"{row.ram_bytes_per_place}",
-        f"{row.map_ram_mb:.1f}",
-        f"{row.map_disk_mb:.1f}",
-        f"{row.process_ram_mb:.0f}",
-        f"{row.t_encode_s:.3f}",
-        f"{row.t_match_s:.3f}",
-        f"{row.u_encode:.2f}",
-        f"{row.u_match:.2f}",
-        f"{row.reachable_hz:.3g}",
-    )
-
-
-def _draws(row: TechniqueEstimate) -> tuple[str, ...]:
-    lost = () if row.lost_min is None else (f"{row.lost_min:.2f}", f"{row.lost_marginal_min:.3f}")
-    return (
-        row.technique,
-        f"{row.query_mah:.4f}",
-        f"{row.query_marginal_mah:.4f}",
-        f"{row.flight_mah:.1f}",
-        f"{row.flight_marginal_mah:.2f}",
-        f"{row.flight_pack_frac:.1%}",
-        *lost,
-    )
-
-
-def _measured(label: str, costs: TechniqueCosts) -> tuple[str, ...]:
-    return (
-        label,
-        f"{1e3 * costs.encode.wall_s:.2f}",
-        f"{1e3 * costs.encode.cpu_s:.2f}",
-        f"{1e6 * costs.match_per_place.wall_s:.3f}",
-        f"{1e6 * costs.match_per_place.cpu_s:.3f}",
-        f"{1e6 * costs.scan_per_place.wall_s:.3f}" if costs.candidates else "-",
-        f"{costs.process_mb:.1f}",
-        "-" if costs.encode_mb is None else f"{costs.encode_mb:.1f}",
-        f"{costs.ram_bytes_per_place}",
-        f"{costs.disk_bytes_per_place}",
-    )
+def _measured(label: str, costs: TechniqueCosts) -> list[str]:
+    figures = {
+        "label": label,
+        "encode_ms": 1e3 * costs.encode.wall_s,
+        "encode_cpu_ms": 1e3 * costs.encode.cpu_s,
+        "match_us": 1e6 * costs.match_per_place.wall_s,
+        "match_cpu_us": 1e6 * costs.match_per_place.cpu_s,
+        "scan_us": f"{1e6 * costs.scan_per_place.wall_s:.3f}" if costs.candidates else "-",
+        "encode_mb": "-" if costs.encode_mb is None else f"{costs.encode_mb:.1f}",
+    }
+    return [cell.format(costs, **figures) for _, cell in _MEASURED]

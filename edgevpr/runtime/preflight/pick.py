@@ -7,12 +7,21 @@ from dataclasses import dataclass, replace
 from edgevpr import techniques
 from edgevpr.core.config import Config
 from edgevpr.core.contract import Technique
-from edgevpr.core.errors import MapError, ModelError, UsageError
+from edgevpr.core.errors import MapError, ModelError
 from edgevpr.places.index import bytes_per_place
 from edgevpr.places.sequence import bytes_beside_place
 from edgevpr.power.boards import Board, load_board
 from edgevpr.runtime.preflight import accuracy
-from edgevpr.runtime.preflight.choose import Demand, Option, described, options, preferred, require_best
+from edgevpr.runtime.preflight.choose import (
+    Demand,
+    Option,
+    best,
+    described,
+    nothing_to_choose,
+    objections,
+    options,
+    preferred,
+)
 from edgevpr.runtime.preflight.probe import TechniqueCosts, probe
 from edgevpr.runtime.preflight.scale import counted_work, on_board
 from edgevpr.runtime.recognise.opening import budget_mb, made_for
@@ -48,10 +57,10 @@ def picked_technique(board_name: str, places: int, camera: str | None = None) ->
     ]
     if not wanted:
         raise ModelError("No technique can be used here (see above): correct what it names, or name another one.")
-    try:
-        taken = require_best(wanted, board, demand)
-    except UsageError as error:
-        _log.warning("technique %s is taken all the same: %s", wanted[0].name, error)
+    taken = best(wanted, board)
+    if taken is None:
+        lacks = f"{nothing_to_choose(wanted, board)} ({objections(wanted)})"
+        _log.warning("technique %s is taken all the same: %s", wanted[0].name, lacks)
         return wanted[0].name
     chosen = f"{taken.label}: {taken.accuracy or 'never measured'}; {described(board, taken.fit, demand)}"
     against = [option.objection for option in wanted if option.name != taken.name and option.objection]

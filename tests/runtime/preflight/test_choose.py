@@ -11,13 +11,13 @@ from example_costs import REGIONS, VECTOR
 
 from edgevpr import techniques
 from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
-from edgevpr.core.errors import ConfigError, ModelError, UsageError
+from edgevpr.core.errors import ConfigError, ModelError
 from edgevpr.core.types import StageCost
 from edgevpr.power import machine
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.preflight import accuracy, pick
 from edgevpr.runtime.preflight import choose as choosing
-from edgevpr.runtime.preflight.choose import Demand, best, front, options, preferred, require_best
+from edgevpr.runtime.preflight.choose import Demand, best, front, nothing_to_choose, options, preferred
 from edgevpr.runtime.preflight.probe import TechniqueCosts, noise, probe
 from edgevpr.runtime.preflight.scale import on_board
 
@@ -217,8 +217,10 @@ def test_what_has_accepted_wrong_places_is_never_chosen_by_itself(accuracies):
     assert chosen(board(), COSTS, 100) == "vector"
     assert chosen(board(technique="regions"), COSTS, 100) == "vector"
     accuracies["vector"] = found(0.5, wrong=2)
-    with pytest.raises(UsageError, match=r"regions accepted 1 .*; vector accepted 2 "):
-        require_best(wanted(board(), COSTS, 100), board(), Demand(places=100, rate_hz=1, budget_mb=100))
+    assert chosen(board(), COSTS, 100) is None
+    why = nothing_to_choose(wanted(board(), COSTS, 100), board())
+    assert "regions accepted 1 " in why
+    assert "vector accepted 2 " in why
 
 
 def test_a_wrong_place_beside_the_right_one_is_no_objection(accuracies):
@@ -255,8 +257,7 @@ def test_a_big_board_takes_a_technique_for_a_map_that_a_tiny_one_refuses(accurac
     )
     demand = Demand(places=1000, rate_hz=1, budget_mb=2000)
     assert best(list(options(big, "vector", "vector", on_board(fast, here, big), demand)), big)
-    with pytest.raises(UsageError, match="Zero 2 W"):
-        require_best(list(options(tiny, "vector", "vector", on_board(fast, here, tiny), demand)), tiny, demand)
+    assert best(list(options(tiny, "vector", "vector", on_board(fast, here, tiny), demand)), tiny) is None
 
 
 def test_a_large_map_is_scanned_whole_and_compared_in_part():
@@ -288,16 +289,17 @@ def test_the_whole_map_counts_in_ram_and_only_its_candidates_in_time():
     assert fit(board(), two_stages, 50_000, 8, 100).remedies[0].split()[-2] == "6"
 
 
-def test_where_none_fits_the_sentence_says_what_would(accuracies):
-    with pytest.raises(UsageError) as raised:
-        require_best(wanted(board(), COSTS, 1000), board(), Demand(places=1000, rate_hz=1, budget_mb=100))
-    assert str(raised.value) == (
-        "No technique fits Test board with 1000 places at 1 Hz (regions does not fit, it reaches 0.24 Hz of 1; vector "
-        "does not fit, its map takes 286.0 MB of RAM and 100.0 are allowed and the process takes 376 MB and 300 are "
-        "allowed and it reaches 0.95 Hz of 1): what would fit is regions with up to 225 places or at up to 0.24 Hz, or "
-        "vector with up to 349 places."
+def test_where_none_fits_it_says_why_and_what_would(accuracies):
+    none = wanted(board(), COSTS, 1000)
+    assert best(none, board()) is None
+    assert choosing.objections(none) == (
+        "regions does not fit, it reaches 0.24 Hz of 1; vector does not fit, its map takes 286.0 MB of RAM and 100.0 "
+        "are allowed and the process takes 376 MB and 300 are allowed and it reaches 0.95 Hz of 1"
     )
-    assert raised.value.exit_code == 2
+    assert nothing_to_choose(none, board()) == (
+        "nothing that was tried fits Test board; what would fit is regions with up to 225 places or at up to 0.24 Hz, "
+        "or vector with up to 349 places"
+    )
 
 
 def test_what_is_said_to_fit_fits():
@@ -317,8 +319,7 @@ def test_a_small_budget_is_the_only_thing_in_the_way():
 
 def test_a_board_too_small_for_the_process_itself_has_no_remedy(accuracies):
     small = board(memory_max_mb=64.0)
-    with pytest.raises(UsageError, match=r"90 MB and 64 .* larger board\.$"):
-        require_best(wanted(small, {"regions": REGIONS}, 10), small, Demand(places=10, rate_hz=1, budget_mb=100))
+    assert nothing_to_choose(wanted(small, {"regions": REGIONS}, 10), small).endswith("; use a larger board")
 
 
 def test_the_cpu_share_limits_a_technique_that_keeps_all_cores_busy():
