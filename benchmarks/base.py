@@ -6,6 +6,7 @@ import platform
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -46,9 +47,20 @@ def made_by() -> Row:
     return {"date": provenance.today(), "commit": commit(), "machine": {**provenance.machine(), **versions}}
 
 
+@cache
 def commit() -> str:
     """Return the commit that is measured, and whether something has changed since."""
-    return provenance.commit_of(REPOSITORY) or "unknown"
+
+    def git(*arguments: str) -> str:
+        try:
+            return subprocess.run(
+                ["git", "-C", str(REPOSITORY), *arguments], capture_output=True, text=True
+            ).stdout.strip()
+        except OSError:  # no git on this machine
+            return ""
+
+    changed = git("status", "--porcelain", "--", "edgevpr", "models")
+    return git("rev-parse", "--short", "HEAD") + (" with changes" if changed else "") or "unknown"
 
 
 def read(name: str, folder: Path = RESULTS) -> Row:

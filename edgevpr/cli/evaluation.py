@@ -40,7 +40,7 @@ def add(commands: Any) -> None:
     )
     parser.add_argument("--sets", metavar="FILE", help="YAML: many sets by many rows, with --out")
     parser.add_argument(
-        "--out", metavar="FOLDER", help="write results.json, .csv, .md and a page; an interrupted run goes on there"
+        "--out", metavar="FOLDER", help="write results.json and a page; an interrupted run goes on there"
     )
     parser.add_argument("--workers", type=_count, metavar="N", help="with --out: processes at work (all cores)")
     parser.add_argument("--cache", metavar="FOLDER", help="with --out: where finished work is kept (OUT/cache)")

@@ -37,7 +37,7 @@ from edgevpr.lab.evaluate.evaluate import (
     summary,
 )
 from edgevpr.lab.evaluate.plan import EvaluationPlan, RowPlan, SetPlan
-from edgevpr.lab.evaluate.provenance import commit_of, machine, today, versions
+from edgevpr.lab.evaluate.provenance import machine, today, versions
 from edgevpr.places.sequence import length_of
 from edgevpr.techniques import create
 
@@ -84,14 +84,12 @@ class RowOnSet:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Made:
-    """Story of a result: the date (UTC) of its measurement, the machine, the versions and the commit at that time
-    (None: no checkout), the `workers` that were busy beside each other, and whether it `was_kept` from an earlier
-    run."""
+    """Story of a result: the date (UTC) of its measurement, the machine and the versions at that time, the `workers`
+    that were busy beside each other, and whether it `was_kept` from an earlier run."""
 
     date: str
     machine: dict[str, Any]
     versions: dict[str, str | None]
-    commit: str | None
     workers: int
     was_kept: bool = False
 
@@ -99,7 +97,8 @@ class Made:
     def story(self) -> str:
         """The date and the machine, in a few words."""
         earlier = "earlier, " if self.was_kept else ""
-        return f"{earlier}{self.date}, {self.machine['cpu']}, {self.workers} of {self.machine['cores']} cores"
+        cores = f"{self.machine['cpu']}, {self.workers} of {self.machine['cores']} cores"
+        return f"{earlier}{self.date}, {cores}, edgevpr {self.versions['edgevpr']}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -287,7 +286,7 @@ def _keep(cache: Cache, row: RowOnSet, answers: Sequence[QueryAnswer], workers: 
     """Sum up the answers to all queries, and keep the result."""
     technique, references = row.technique(), len(row.of.dataset.references)
     ranks = np.array([answer.first_right for answer in answers])
-    made = Made(date=today(), machine=machine(), versions=versions(), commit=commit_of(), workers=workers)
+    made = Made(date=today(), machine=machine(), versions=versions(), workers=workers)
     result = summary(technique, references, answers, length_of(technique.spec, row.row.sequence))
     content = {
         "result": asdict(result),

@@ -1,8 +1,7 @@
-"""Origin of a figure: the date, the machine, the versions and the commit."""
+"""Origin of a figure: the date, the machine and the versions."""
 
 import os
 import platform
-import subprocess
 from datetime import datetime, timezone
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -28,11 +27,6 @@ def versions() -> dict[str, str | None]:
     }
 
 
-def program(found: dict[str, str | None], commit: str | None) -> str:
-    """Name the program by its version and, where it is known, its commit."""
-    return f"edgevpr {found['edgevpr']}" + (f" ({commit})" if commit else "")
-
-
 def machine() -> dict[str, Any]:
     """Return the machine: its processor, the cores this process may use, and the threads of NumPy's library."""
     return {
@@ -49,23 +43,6 @@ def cpu_model() -> str:
         if line.startswith(("model name", "Model")):
             return line.partition(":")[2].strip()
     return platform.machine()
-
-
-@cache
-def commit_of(checkout: Path = PACKAGE.parent) -> str | None:
-    """Return the commit of a checkout, and whether something has changed since; None where it is none."""
-
-    def git(*arguments: str) -> str:
-        try:
-            done = subprocess.run(["git", "-C", str(checkout), *arguments], capture_output=True, text=True)
-        except OSError:  # no git on this machine
-            return ""
-        return done.stdout.strip()
-
-    # An installed package may lie in the checkout of something else.
-    if not (checkout / ".git").exists() or not (commit := git("rev-parse", "--short", "HEAD")):
-        return None
-    return commit + (" with changes" if git("status", "--porcelain", "--", "edgevpr", "models") else "")
 
 
 def version_of(package: str) -> str | None:
