@@ -102,7 +102,7 @@ class Controlled:
         raise AssertionError(f"not in {seconds} s; {self.texts}")
 
     def _see(self):
-        truth, now_s = self.controller._truth, self.clock.now_s
+        truth, now_s = self.controller.brain.truth, self.clock.now_s
         here = Position(*moved(truth.lat_deg, truth.lon_deg, *self.rng.normal(0, FIX_SD_M, 2)))
         vehicle = self.link.vehicle_at(now_s)
         event = match_at(here, now_s, vehicle, FIX_SD_M, (self._steps,))

@@ -6,10 +6,9 @@ a copter does without GPS was seen in its own simulator.
 """
 
 import math
-from collections.abc import Callable
 
 from edgevpr.lab.simulate.firmware import ARDUPILOT, ARDUPILOT_KINDS, DENIED, FAILED, OK, SD_GROWS_M_S, Firmware
-from edgevpr.lab.simulate.motion import Motion, TrueState
+from edgevpr.lab.simulate.motion import Motion
 from edgevpr.lab.simulate.sensors import FIX_3D, PositionMeasurement
 from edgevpr.mavlink.wire import Message, mavlink
 
@@ -23,7 +22,6 @@ _BAD_FOR_S = 1.0  # ten checks of the filter in a row, ten a second
 # Of the wind that came without GPS: accelerometers and air speed notice the rest. A plane in ArduPilot's simulator was
 # 767 m off after 150 s in 6 m/s.
 _UNNOTICED_SHARE = 0.85
-_LONGEST_DELAY_S, _DELAY_SAMPLES = 0.5, 100  # JitterCorrection
 
 _GUIDED, _LAND, _HOLD = {"copter": 4, "plane": 15, "rover": 15}, 9, 4
 _TAKEOFF, _AUTO = 13, 10  # of a plane
@@ -47,56 +45,50 @@ class ArduPilot(Firmware):
         self._good_since_s: float | None = None
         self._bad_since_s: float | None = None
         self._frozen: tuple[float, float] | None = None  # the position that is reported without aiding
-        self._clock_offset_s: float | None = None  # of the sender's clock
-        self._least_delay_s, self._delays = math.inf, 0
 
-    def lose_gps(self, truth: TrueState, now_s: float) -> None:
+    def lose_gps(self) -> None:
         self.parameters.set("SIM_GPS1_ENABLE", 0)
-        self._start_aiding(truth, (truth.lat_deg, truth.lon_deg, truth.alt_m), now_s - 2 * _DEAD_RECKONING_S)
+        self._start_aiding(
+            (self.truth.lat_deg, self.truth.lon_deg, self.truth.alt_m), self.now_s - 2 * _DEAD_RECKONING_S
+        )
         self.texts.clear()
 
-    def step(self, truth: TrueState, wind_m_s: complex, now_s: float, dt_s: float) -> None:
-        self.receivers.step(truth, now_s)
-        measured, before, self._used = self._measured(now_s), self._used, self._measured(now_s)
+    def _estimate(self, wind_m_s: complex, dt_s: float) -> None:
+        measured, before, self._used = self._measured(), self._used, self._measured()
         if not self._is_aiding:
-            self._wait_for_aiding(truth, measured, now_s)
+            self._wait_for_aiding(measured)
         elif measured is not None and measured != before:
-            self._fuse(truth, measured, wind_m_s, now_s, _POSITION_LOST_WITH_VELOCITY_S)
-        if self._is_aiding and measured is not None and now_s - measured.t_s < _DEAD_RECKONING_S:
+            self._fuse(measured, wind_m_s, _POSITION_LOST_WITH_VELOCITY_S)
+        if self._is_aiding and measured is not None and self.now_s - measured.t_s < _DEAD_RECKONING_S:
             self.reckoning.drift_m_s = 0j
         elif self._is_aiding:
             self._go_wrong(wind_m_s, dt_s, _UNNOTICED_SHARE)
             self.reckoning.step(dt_s, SD_GROWS_M_S[self.kind])
         elif self._frozen:
-            self.reckoning.reset_to(truth, *self._frozen, self.reckoning.sd_m)
-        self._watch(truth, now_s)
+            self._reset_to(*self._frozen, self.reckoning.sd_m)
 
-    def flags(self, now_s: float) -> int:
+    def flags(self) -> int:
         flags: int = mavlink.EKF_ATTITUDE | mavlink.EKF_VELOCITY_VERT | mavlink.EKF_POS_VERT_ABS
         if not self._is_aiding:
             return flags | int(mavlink.EKF_VELOCITY_HORIZ | mavlink.EKF_CONST_POS_MODE)
         is_plane = self.kind == "plane"
-        is_lost = now_s - self._passed_s > (_POSITION_LOST_WITH_VELOCITY_S if is_plane else _POSITION_LOST_S)
+        is_lost = self.now_s - self._passed_s > (_POSITION_LOST_WITH_VELOCITY_S if is_plane else _POSITION_LOST_S)
         if not is_lost:
             flags |= mavlink.EKF_POS_HORIZ_ABS | mavlink.EKF_PRED_POS_HORIZ_ABS
         if not is_lost or is_plane:  # air speed and no sideslip: relative to the wind
             flags |= mavlink.EKF_VELOCITY_HORIZ | mavlink.EKF_POS_HORIZ_REL | mavlink.EKF_PRED_POS_HORIZ_REL
         return flags | (mavlink.EKF_GPS_GLITCHING if self.test_ratio > 1 else 0)
 
-    def take_fix(self, command: Message, truth: TrueState, now_s: float) -> int:
+    def take_fix(self, command: Message) -> int:
         is_global = command.frame in (mavlink.MAV_FRAME_GLOBAL, mavlink.MAV_FRAME_GLOBAL_INT)
         if not is_global or not math.isnan(command.z):
             return DENIED
-        sent_s = self._by_own_clock(command.param1, now_s)
-        if now_s - self._passed_s < _DEAD_RECKONING_S or not self._is_aiding or self.origin is None:
+        if self.now_s - self._passed_s < _DEAD_RECKONING_S or not self._is_aiding or self.origin is None:
             return FAILED
         # A processing time that is no number moves nothing; C casts it to 0.
-        taken_s = sent_s - (command.param2 if math.isfinite(command.param2) else 0.0)
-        age_s = now_s - max(min(taken_s, now_s), now_s - _OLDEST_FIX_S)
+        age_s = min(max(command.param2, 0.0), _OLDEST_FIX_S) if math.isfinite(command.param2) else 0.0
         sd_m = 0.0 if math.isnan(command.param3) else command.param3
-        moved_m = self.reckoning.velocity_m_s(truth) * age_s
-        self.reckoning.reset_to(truth, command.x / 1e7, command.y / 1e7, max(sd_m, _POSITION_NOISE_M))
-        self.reckoning.error_m += moved_m
+        self._reset_to(command.x / 1e7, command.y / 1e7, max(sd_m, _POSITION_NOISE_M), age_s)
         return OK
 
     def set_origin(self, at: tuple[float, float, float]) -> bool:
@@ -113,92 +105,81 @@ class ArduPilot(Firmware):
         """Change the flight mode; one that needs a position is refused without one."""
         return (mode not in _NEEDS_POSITION[self.kind] or self.origin is not None) and super().set_mode(mode)
 
-    def why_not_arm(self, now_s: float) -> str | None:
+    def why_not_arm(self) -> str | None:
         first, second, has_second = self.receivers.first, self.receivers.second, self.receivers.has_second
-        checks: dict[str, Callable[[], bool]] = {
-            "Need Position Estimate": lambda: not self._is_aiding,
-            "VisOdom: not healthy": lambda: bool(self.parameters["VISO_TYPE"]) and not self.external.is_healthy(now_s),
-            "GPS 1: Bad fix": lambda: self._source == _GPS and first.fix_type < FIX_3D,
-            "GPS 2: Bad fix": lambda: has_second and second.fix_type < FIX_3D,
-            "GPS 2: not healthy": lambda: has_second and not second.is_healthy,
+        needs_vision = self.parameters["VISO_TYPE"] != 0
+        checks = {
+            "Need Position Estimate": not self._is_aiding,
+            "VisOdom: not healthy": needs_vision and not self.external.is_healthy(self.now_s),
+            "GPS 1: Bad fix": self._source == _GPS and first.fix_type < FIX_3D,
+            "GPS 2: Bad fix": has_second and second.fix_type < FIX_3D,
+            "GPS 2: not healthy": has_second and not second.is_healthy,
         }
-        return next((reason for reason, is_so in checks.items() if is_so()), None)
+        return next((reason for reason, is_so in checks.items() if is_so), None)
 
     def take_off(self, height_m: float) -> int:
         """Obey MAV_CMD_NAV_TAKEOFF, whose height is over home; only a copter in GUIDED does."""
         if self.kind != "copter" or self.mode != _GUIDED["copter"] or not self.is_armed:
             return FAILED
-        self._motion.take_off(height_m)
+        self.motion.take_off(height_m)
         return OK
 
     def arm(self, is_armed: bool) -> None:
         """Arm or disarm; a plane whose mode is TAKEOFF or AUTO then takes off."""
         super().arm(is_armed)
         if is_armed and self.kind == "plane" and self.mode in (_TAKEOFF, _AUTO):
-            self._motion.take_off(self.parameters["TKOFF_ALT"])
+            self.motion.take_off(self.parameters["TKOFF_ALT"])
 
     @property
     def _source(self) -> float:
         return self.parameters[f"EK3_SRC{self._source_set}_POSXY"]
 
-    def _measured(self, now_s: float) -> PositionMeasurement | None:
+    def _measured(self) -> PositionMeasurement | None:
         if self._source == _EXTERNAL:
-            return self.external.measured(self.origin, now_s)
+            return self.external.measured(self.origin, self.now_s)
         primary = self.receivers.primary
         return primary.last if self._source == _GPS and primary.fix_type >= FIX_3D else None
 
-    def _by_own_clock(self, sent_s: float, now_s: float) -> float:
-        """Return the time of sending by the autopilot's clock. The message that had the least delay is taken for one
-        without any, and none for more than half a second old."""
-        ahead_s = now_s - sent_s
-        if self._clock_offset_s is None or ahead_s < self._clock_offset_s:
-            self._clock_offset_s = ahead_s
-        self._clock_offset_s = at_offset_s = max(self._clock_offset_s, ahead_s - _LONGEST_DELAY_S)
-        self._least_delay_s, self._delays = min(self._least_delay_s, ahead_s), self._delays + 1
-        if self._delays == _DELAY_SAMPLES:  # the clocks may drift apart
-            self._clock_offset_s, self._least_delay_s, self._delays = self._least_delay_s, math.inf, 0
-        return sent_s + at_offset_s
-
-    def _wait_for_aiding(self, truth: TrueState, measured: PositionMeasurement | None, now_s: float) -> None:
+    def _wait_for_aiding(self, measured: PositionMeasurement | None) -> None:
         if measured is None:
             self._good_since_s = None
             return
-        self._good_since_s = now_s if self._good_since_s is None else self._good_since_s
-        if now_s - self._good_since_s >= (_AGAIN_AFTER_S if self._has_ever_passed else _ALIGNED_AFTER_S):
-            self._start_aiding(truth, (measured.lat_deg, measured.lon_deg, measured.alt_m), now_s)
+        self._good_since_s = self.now_s if self._good_since_s is None else self._good_since_s
+        if self.now_s - self._good_since_s >= (_AGAIN_AFTER_S if self._has_ever_passed else _ALIGNED_AFTER_S):
+            self._start_aiding((measured.lat_deg, measured.lon_deg, measured.alt_m), self.now_s)
 
-    def _start_aiding(self, truth: TrueState, at: tuple[float, float, float], passed_s: float) -> None:
+    def _start_aiding(self, at: tuple[float, float, float], passed_s: float) -> None:
         self._is_aiding, self._passed_s, self._frozen = True, passed_s, None
         if self.set_origin(at):
             self._say(mavlink.MAV_SEVERITY_INFO, "EKF3 IMU0 origin set")
-        self.reckoning.reset_to(truth, at[0], at[1], _POSITION_NOISE_M)
+        self._reset_to(at[0], at[1], _POSITION_NOISE_M)
         self.reckoning.drift_m_s = 0j
         source = "GPS" if self._source == _GPS else "external nav data"
         self._say(mavlink.MAV_SEVERITY_INFO, f"EKF3 IMU0 is using {source}")
 
-    def _watch(self, truth: TrueState, now_s: float) -> None:
+    def _watch(self) -> None:
         """Stop aiding, and land a copter, when the position is lost for too long. Landed, it disarms."""
-        if self.is_armed and self.kind == "copter" and self.mode == _LAND and not self._motion.is_flying:
+        if self.is_armed and self.kind == "copter" and self.mode == _LAND and not self.motion.is_flying:
             self.is_armed = False
-        if self._is_aiding and self.kind != "plane" and now_s - self._passed_s > _AIDING_LOST_S:
-            self._is_aiding, self._good_since_s, self._frozen = False, None, self.reckoning.place(truth)
+        if self._is_aiding and self.kind != "plane" and self.now_s - self._passed_s > _AIDING_LOST_S:
+            self._is_aiding, self._good_since_s, self._frozen = False, None, self.reckoning.place(self.truth)
             self._say(mavlink.MAV_SEVERITY_WARNING, "EKF3 IMU0 stopped aiding")
-        is_good = bool(self.flags(now_s) & _HAS_POSITION)
+        is_good = bool(self.flags() & _HAS_POSITION)
         self._has_ever_passed |= is_good
         if self.kind == "plane" or not self._has_ever_passed:
             return
         if is_good != self._has_failed:
             self._bad_since_s = None
             return
-        self._bad_since_s = now_s if self._bad_since_s is None else self._bad_since_s
-        if now_s - self._bad_since_s < _BAD_FOR_S:
+        self._bad_since_s = self.now_s if self._bad_since_s is None else self._bad_since_s
+        if self.now_s - self._bad_since_s < _BAD_FOR_S:
             return
         self._has_failed, self._bad_since_s = not is_good, None
         self._say(mavlink.MAV_SEVERITY_CRITICAL, "EKF Failsafe Cleared" if is_good else "EKF variance")
         if not is_good and self.is_armed and self.mode in _NEEDS_POSITION[self.kind]:
             self.mode, name = (_LAND, "LAND") if self.kind == "copter" else (_HOLD, "HOLD")
             self._say(mavlink.MAV_SEVERITY_CRITICAL, f"EKF Failsafe: changed to {name} Mode")
-            self._motion.land()
+            self.motion.land()
 
     def _say(self, severity: int, text: str) -> None:
         self.texts.append((severity, text))

@@ -6,7 +6,7 @@ import select
 import signal
 import threading
 import time
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -33,7 +33,6 @@ class AutopilotSummary:
     `failed` came at a time when none is taken, as with GPS; one that is `denied` has the wrong form."""
 
     messages: dict[str, int]
-    messages_by_sender: dict[str, dict[str, int]]
     companion: str | None  # the last onboard computer heard
     fixes_accepted: int
     fixes_failed: int
@@ -85,10 +84,8 @@ def serve(
     link_url: str,
     duration_s: float | None = None,
     stop: threading.Event | None = None,
-    *,
-    speedup: float = 1.0,
 ) -> AutopilotSummary:
-    """Let a flight controller talk at `link_url`, as `run_autopilot` does. Its clock runs `speedup` times as fast."""
+    """Let a flight controller talk at `link_url`, as `run_autopilot` does."""
     stop = stop or threading.Event()
     address = parse_link(link_url)
     try:
@@ -96,7 +93,7 @@ def serve(
     except OSError as error:
         raise LinkError(f"{address}: it cannot be opened ({error.strerror or error}): is the other end up?") from error
     log.info("%s is up at %s", controller, address)
-    port = _Port(transport, controller, speedup)
+    port = _Conversation(transport, controller)
     with _set_by_signals(stop):
         try:
             port.run(lambda t_s: stop.is_set() or (duration_s is not None and t_s >= duration_s))
@@ -107,14 +104,13 @@ def serve(
     return port.summary()
 
 
-class _Port:
+class _Conversation:
     """The link of a flight controller, and the count of what comes over it."""
 
-    def __init__(self, transport: Port, controller: FlightController, speedup: float) -> None:
-        self._transport, self._controller, self._speedup = transport, controller, speedup
+    def __init__(self, transport: Port, controller: FlightController) -> None:
+        self._transport, self._controller = transport, controller
         self._packer = mavlink.MAVLink(None, srcSystem=controller.system_id, srcComponent=AUTOPILOT)
         self._receiver = PacketReader()
-        self._by_sender: defaultdict[str, Counter[str]] = defaultdict(Counter)
         self._companion: str | None = None
         self._next_seq: dict[str, int] = {}
         self._lost_packets = 0
@@ -123,8 +119,8 @@ class _Port:
     def run(self, ended: Callable[[float], bool]) -> None:
         start_s = time.monotonic()
         while not ended(t_s := time.monotonic() - start_s):
-            self._say(self._controller.advance(t_s * self._speedup))
-            readable, _, _ = select.select([self._transport], [], [], STEP_S / self._speedup)
+            self._say(self._controller.advance(t_s))
+            readable, _, _ = select.select([self._transport], [], [], STEP_S)
             if readable:
                 for message in self._receiver.feed(self._transport.read()):
                     self._take(message)
@@ -135,7 +131,6 @@ class _Port:
         accepted, denied = answers[mavlink.MAV_RESULT_ACCEPTED], answers[mavlink.MAV_RESULT_DENIED]
         return AutopilotSummary(
             messages=dict(self._receiver.received),
-            messages_by_sender={sender: dict(counts) for sender, counts in self._by_sender.items()},
             companion=self._companion,
             fixes_accepted=accepted,
             fixes_failed=answers.total() - accepted - denied,
@@ -148,7 +143,6 @@ class _Port:
     def _take(self, message: Message) -> None:
         """Count a message, and answer from now on to the companion that it comes from, else to whoever is heard."""
         sender = f"{message.get_srcSystem()}/{message.get_srcComponent()}"
-        self._by_sender[sender][message.get_type()] += 1
         self._lost_packets += (message.get_seq() - self._next_seq.get(sender, message.get_seq())) % 256
         self._next_seq[sender] = (message.get_seq() + 1) % 256
         if sender == self._companion and not _is_question(message):

@@ -1,8 +1,7 @@
 """A simulated flight controller: what it hears, obeys and says. It knows no port and no clock; time is an argument."""
 
-import cmath
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from edgevpr.core.errors import UsageError
@@ -10,7 +9,7 @@ from edgevpr.lab.simulate.ardupilot_rules import ArduPilot
 from edgevpr.lab.simulate.firmware import FAILED, OK, UNSUPPORTED, Firmware
 from edgevpr.lab.simulate.motion import Motion
 from edgevpr.lab.simulate.px4_rules import Px4
-from edgevpr.lab.simulate.reports import FILTER_REPORTS, REPORTS, SILENT, VehicleMoment, heartbeat
+from edgevpr.lab.simulate.reports import FILTER_REPORTS, REPORTS, SILENT, heartbeat
 from edgevpr.mavlink.messages import AUTOPILOT
 from edgevpr.mavlink.wire import Message, mavlink
 
@@ -44,13 +43,14 @@ class ReceivedFix:
 
 
 class Streams:
-    """The intervals of a link. `is_known` False leaves out every message that tells where the vehicle is."""
+    """The intervals of a link. Where nobody knows where the vehicle flies, no message tells where it is."""
 
-    def __init__(self, default_hz: Mapping[int, float], filter_report: int, is_known: bool) -> None:
-        self._reports = {**REPORTS, filter_report: FILTER_REPORTS[filter_report]}
-        if not is_known:
-            self._reports = {number: report for number, report in self._reports.items() if number not in _WHERE}
-        self._default_s = {number: 1 / hz for number, hz in default_hz.items() if number in self._reports}
+    def __init__(self, brain: Firmware) -> None:
+        known = {**REPORTS, brain.filter_report: FILTER_REPORTS[brain.filter_report]}
+        hidden = set() if brain.motion.is_known else _WHERE
+        self._brain = brain
+        self._reports = {number: report for number, report in known.items() if number not in hidden}
+        self._default_s = {number: 1 / hz for number, hz in brain.default_hz.items() if number in self._reports}
         self._interval_s = dict(self._default_s)
         self._due_s = dict.fromkeys(self._interval_s, 0.0)
         self._beat_due_s = 0.0
@@ -72,20 +72,20 @@ class Streams:
             self._interval_s[number], self._due_s[number] = interval_s, now_s
         return True
 
-    def make(self, number: int, now: VehicleMoment) -> Message | None:
+    def make(self, number: int) -> Message | None:
         """Make a message that somebody asked for once."""
-        return self._reports[number](now) if number in self._reports else None
+        return self._reports[number](self._brain) if number in self._reports else None
 
-    def due(self, now: VehicleMoment) -> list[Message]:
+    def due(self) -> list[Message]:
         """Return what is to be sent now."""
-        messages = []
-        if now.t_s >= self._beat_due_s:
-            self._beat_due_s = max(self._beat_due_s + HEARTBEAT_S, now.t_s)
-            messages.append(heartbeat(now))
+        brain, messages = self._brain, []
+        if brain.now_s >= self._beat_due_s:
+            self._beat_due_s = max(self._beat_due_s + HEARTBEAT_S, brain.now_s)
+            messages.append(heartbeat(brain))
         for number, interval_s in self._interval_s.items():
-            if now.t_s >= self._due_s[number]:
-                self._due_s[number] = max(self._due_s[number] + interval_s, now.t_s)
-                if message := self._reports[number](now):
+            if brain.now_s >= self._due_s[number]:
+                self._due_s[number] = max(self._due_s[number] + interval_s, brain.now_s)
+                if message := self._reports[number](brain):
                     messages.append(message)
         return messages
 
@@ -101,15 +101,13 @@ class FlightController:
             raise UsageError(f"There is no vehicle {vehicle!r}: choose one of {', '.join(VEHICLES)}.")
         self.brain = VEHICLES[vehicle](motion)
         self.vehicle, self.system_id = vehicle, system_id
-        self._start_utc_s = start_utc_s
         self.fixes: list[ReceivedFix] = []
         self.answers: list[int] = []  # to fixes, MAV_RESULT
-        self._motion = motion
-        self._streams = Streams(self.brain.default_hz, self.brain.filter_report, motion.is_known)
-        self._now_s, self._truth = 0.0, motion.step(0.0, 0.0)
+        self._streams = Streams(self.brain)
+        self.brain.start_utc_s = start_utc_s
         self._has_begun = False
         if not gps:
-            self.brain.lose_gps(self._truth, 0.0)
+            self.brain.lose_gps()
 
     def __str__(self) -> str:
         gps = "with GPS" if self.brain.parameters["SIM_GPS1_ENABLE"] else "that has lost GPS"
@@ -128,16 +126,14 @@ class FlightController:
         """Note that a flight is heard; a track starts when it first is."""
         if not self._has_begun:
             self._has_begun = True
-            self._motion.begin(self._now_s)
+            self.brain.motion.begin(self.brain.now_s)
 
     def advance(self, now_s: float) -> list[Message]:
         """Go on to `now_s`, in small steps; return what is said on the way."""
         said = []
-        while self._now_s + STEP_S <= now_s:
-            self._now_s += STEP_S
-            self._truth = self._motion.step(self._now_s, STEP_S)
-            self.brain.step(self._truth, self._wind_m_s(), self._now_s, STEP_S)
-            said += self._streams.due(self._moment())
+        while self.brain.now_s + STEP_S <= now_s:
+            self.brain.step(STEP_S)
+            said += self._streams.due()
             said += [mavlink.MAVLink_statustext_message(each[0], each[1].encode()) for each in self.brain.texts]
             self.brain.texts.clear()
         return said
@@ -155,13 +151,13 @@ class FlightController:
             case "PARAM_REQUEST_READ" | "PARAM_REQUEST_LIST" | "PARAM_SET":
                 return self.brain.parameters.answer(message)
             case "TIMESYNC" if message.tc1 == 0:
-                return [mavlink.MAVLink_timesync_message(round(self._now_s * 1e9) + 1, message.ts1)]
+                return [mavlink.MAVLink_timesync_message(round(self.brain.now_s * 1e9) + 1, message.ts1)]
             case "GPS_INPUT":
-                self.brain.receivers.hear(message, self._now_s)
+                self.brain.receivers.hear(message, self.brain.now_s)
             case "ODOMETRY":
-                self.brain.external.hear(message, self._now_s)
+                self.brain.external.hear(message, self.brain.now_s)
             case "GLOBAL_POSITION_SENSOR":
-                self.brain.take_global_position(message, self._truth, self._now_s)
+                self.brain.take_global_position(message)
             case "SET_GPS_GLOBAL_ORIGIN":
                 return self._set_origin(message)
         return []
@@ -173,13 +169,13 @@ class FlightController:
             case mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE:
                 return self._judge(command), []
             case mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
-                if self._streams.ask(number, command.param2, self._now_s):
+                if self._streams.ask(number, command.param2, self.brain.now_s):
                     return OK, []
                 if self.brain.number == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA:
                     self.brain.texts.append((mavlink.MAV_SEVERITY_INFO, f"No ap_message for mavlink id ({number})"))
                 return mavlink.MAV_RESULT_DENIED, []
             case mavlink.MAV_CMD_REQUEST_MESSAGE:
-                message = self._streams.make(number, self._moment())
+                message = self._streams.make(number)
                 return OK if self._streams.knows(number) else FAILED, [message] if message else []
             case mavlink.MAV_CMD_COMPONENT_ARM_DISARM:
                 return self._arm(command)
@@ -197,7 +193,7 @@ class FlightController:
     def _judge(self, command: Message) -> int:
         if command.get_type() == "COMMAND_LONG":  # PX4 would take that too, with a latitude in float32
             return UNSUPPORTED
-        result = self.brain.take_fix(command, self._truth, self._now_s)
+        result = self.brain.take_fix(command)
         self.answers.append(result)
         if result == OK:
             self.fixes.append(
@@ -213,7 +209,7 @@ class FlightController:
 
     def _arm(self, command: Message) -> tuple[int, list[Message]]:
         is_wanted = command.param1 == 1
-        why_not = self.brain.why_not_arm(self._now_s) if is_wanted and command.param2 != _FORCED else None
+        why_not = self.brain.why_not_arm() if is_wanted and command.param2 != _FORCED else None
         if why_not:
             text = f"Arm: {why_not}" if self.brain.number == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA else why_not
             told = mavlink.MAVLink_statustext_message(mavlink.MAV_SEVERITY_CRITICAL, text.encode())
@@ -227,7 +223,7 @@ class FlightController:
             return []
         if not self.brain.set_origin((lat_deg, lon_deg, message.altitude / 1e3)):
             return []
-        told = self._streams.make(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN, self._moment())
+        told = self._streams.make(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
         return [told] if told else []
 
     def _ack(self, command: Message, result: int) -> Message:
@@ -237,17 +233,3 @@ class FlightController:
             target_system=command.get_srcSystem(),
             target_component=command.get_srcComponent(),
         )
-
-    def _moment(self) -> VehicleMoment:
-        return VehicleMoment(
-            t_s=self._now_s,
-            start_utc_s=self._start_utc_s,
-            truth=self._truth,
-            brain=self.brain,
-            is_known=self._motion.is_known,
-        )
-
-    def _wind_m_s(self) -> complex:
-        parameters = self.brain.parameters
-        from_deg = parameters["SIM_WIND_DIR"]
-        return -cmath.rect(parameters["SIM_WIND_SPD"], math.radians(90 - from_deg))

@@ -3,6 +3,7 @@
 How fast an estimate goes wrong is a plain model.
 """
 
+import cmath
 import difflib
 import math
 import struct
@@ -11,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from typing import ClassVar
 
 from edgevpr.core.errors import UsageError
-from edgevpr.lab.simulate.motion import Motion, TrueState
+from edgevpr.lab.simulate.motion import Motion
 from edgevpr.lab.simulate.sensors import ExternalNavigation, PositionMeasurement, Receivers, Reckoning
 from edgevpr.mavlink.wire import Message, mavlink, parameter_value
 
@@ -43,7 +44,8 @@ class Firmware(ABC):
     default_hz: ClassVar[Mapping[int, float]] = {}
 
     def __init__(self, kind: str, motion: Motion, parameters: dict[str, float], mode: int) -> None:
-        self.kind, self.vehicle_type = kind, _TYPES[kind]
+        self.kind, self.motion = kind, motion
+        self.vehicle_type = _TYPES[kind]
         is_px4 = self.number == mavlink.MAV_AUTOPILOT_PX4
         self.parameters = Parameters({**parameters, **SIMULATOR}, bytewise=is_px4)
         self.receivers, self.external = Receivers(self.parameters), ExternalNavigation(self.parameters)
@@ -52,33 +54,47 @@ class Firmware(ABC):
         self.mode, self.is_armed = mode, motion.is_flying
         self.texts: list[tuple[int, str]] = []
         self.test_ratio = 0.0
-        self._motion = motion
+        self.start_utc_s = 0.0
+        self.now_s, self.truth = 0.0, motion.step(0.0, 0.0)
         self._passed_s = -math.inf  # when a position of a sensor last passed the gate
         self._used: PositionMeasurement | None = None
         self._wind_m_s = 0j  # as the filter knows it
         self._has_failed = False
 
+    def step(self, dt_s: float) -> None:
+        """Go on for a while: let sensors report, and the estimator and its watchers follow."""
+        self.now_s += dt_s
+        self.truth = self.motion.step(self.now_s, dt_s)
+        self.receivers.step(self.truth, self.now_s)
+        from_deg = self.parameters["SIM_WIND_DIR"]
+        self._estimate(-cmath.rect(self.parameters["SIM_WIND_SPD"], math.radians(90 - from_deg)), dt_s)
+        self._watch()
+
     @abstractmethod
-    def lose_gps(self, truth: TrueState, now_s: float) -> None:
+    def lose_gps(self) -> None:
         """Be as one that had GPS until a while ago, and has none any more."""
 
     @abstractmethod
-    def step(self, truth: TrueState, wind_m_s: complex, now_s: float, dt_s: float) -> None:
-        """Let sensors report, and the estimator and its watchers follow."""
-
-    @abstractmethod
-    def flags(self, now_s: float) -> int:
+    def flags(self) -> int:
         """Return the flags of the filter's report."""
 
     @abstractmethod
-    def take_fix(self, command: Message, truth: TrueState, now_s: float) -> int:
+    def take_fix(self, command: Message) -> int:
         """Judge command 43003, and set the position where it is accepted."""
 
     @abstractmethod
-    def why_not_arm(self, now_s: float) -> str | None:
+    def why_not_arm(self) -> str | None:
         """Return the reason of the pre-arm checks, None where they pass."""
 
-    def take_global_position(self, message: Message, truth: TrueState, now_s: float) -> None:  # noqa: B027
+    @abstractmethod
+    def _estimate(self, wind_m_s: complex, dt_s: float) -> None:
+        """Let the estimator go on."""
+
+    @abstractmethod
+    def _watch(self) -> None:
+        """Let the failsafe land a vehicle that has lost its position. Landed, it disarms."""
+
+    def take_global_position(self, message: Message) -> None:  # noqa: B027
         """Take in a GLOBAL_POSITION_SENSOR (296), where the firmware knows it."""
 
     def set_origin(self, at: tuple[float, float, float]) -> bool:
@@ -103,20 +119,18 @@ class Firmware(ABC):
         """Arm or disarm."""
         self.is_armed = is_armed
 
-    def _fuse(
-        self, truth: TrueState, measured: PositionMeasurement, wind_m_s: complex, now_s: float, reset_after_s: float
-    ) -> bool:
+    def _fuse(self, measured: PositionMeasurement, wind_m_s: complex, reset_after_s: float) -> bool:
         """Follow a measurement within the gate, or one outside of it after a while; return whether it was used. One
         that is not used still tells the velocity."""
-        away_m = abs(self.reckoning.innovation_m(truth, measured.lat_deg, measured.lon_deg))
+        away_m = abs(self.reckoning.innovation_m(self.truth, measured.lat_deg, measured.lon_deg))
         self.test_ratio = away_m / (GATE_SD * math.hypot(self.reckoning.sd_m, measured.sd_m))
         if self.test_ratio <= 1:
-            self.reckoning.fuse(truth, measured)
-        elif now_s - self._passed_s > reset_after_s:
-            self.reckoning.reset_to(truth, measured.lat_deg, measured.lon_deg, measured.sd_m)
+            self.reckoning.fuse(self.truth, measured)
+        elif self.now_s - self._passed_s > reset_after_s:
+            self._reset_to(measured.lat_deg, measured.lon_deg, measured.sd_m)
         else:
             return False
-        self._passed_s = now_s
+        self._passed_s = self.now_s
         self._wind_m_s += (wind_m_s - self._wind_m_s) * min(1.0, 0.2 / _WIND_LEARNT_IN_S)
         return True
 
@@ -124,10 +138,16 @@ class Firmware(ABC):
         """Let the reckoning drift: of a plane by the wind that it does not know, of the others by their
         accelerometers."""
         if self.kind == "plane":
-            drift_m_s = unnoticed_share * (self._wind_m_s - wind_m_s) if self._motion.is_flying else 0j
-            self.reckoning.drift_m_s = drift_m_s
-        elif self._motion.is_flying:
+            drift_m_s = unnoticed_share * (self._wind_m_s - wind_m_s)
+            self.reckoning.drift_m_s = drift_m_s if self.motion.is_flying else 0j
+        elif self.motion.is_flying:
             self.reckoning.drift_m_s += _INERTIAL_M_S2 * dt_s
+
+    def _reset_to(self, lat_deg: float, lon_deg: float, sd_m: float, age_s: float = 0.0) -> None:
+        """Be at a point from now on, or where it has flown to since the point was measured."""
+        moved_m = self.reckoning.velocity_m_s(self.truth) * age_s
+        self.reckoning.reset_to(self.truth, lat_deg, lon_deg, sd_m)
+        self.reckoning.error_m += moved_m
 
 
 class Parameters(Mapping[str, float]):

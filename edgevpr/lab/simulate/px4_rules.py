@@ -6,7 +6,7 @@ import math
 
 from edgevpr.lab.simulate.firmware import FAILED, NOT_NOW, OK, SD_GROWS_M_S, Firmware
 from edgevpr.lab.simulate.firmware import PX4 as PX4_PARAMETERS
-from edgevpr.lab.simulate.motion import Motion, TrueState
+from edgevpr.lab.simulate.motion import Motion
 from edgevpr.lab.simulate.sensors import FIX_3D
 from edgevpr.mavlink.wire import Message, mavlink
 
@@ -37,98 +37,94 @@ class Px4(Firmware):
         self._fused_s = self._aided_s = -math.inf  # when anything was last fused; when it was not inertial
         self._other_s = self._other_heard_s = -math.inf  # 296: last fused, last heard
 
-    def lose_gps(self, truth: TrueState, now_s: float) -> None:
+    def lose_gps(self) -> None:
         self.parameters.set("SIM_GPS1_ENABLE", 0)
-        self.origin = truth.lat_deg, truth.lon_deg, truth.alt_m
-        self._passed_s = self._fused_s = now_s - 2 * _AIDING_GONE_S
-        self._aided_s = now_s - _AIDING_GONE_S
+        self.origin = self.truth.lat_deg, self.truth.lon_deg, self.truth.alt_m
+        self._passed_s = self._fused_s = self.now_s - 2 * _AIDING_GONE_S
+        self._aided_s = self.now_s - _AIDING_GONE_S
 
-    def step(self, truth: TrueState, wind_m_s: complex, now_s: float, dt_s: float) -> None:
-        self.receivers.step(truth, now_s)
+    def _estimate(self, wind_m_s: complex, dt_s: float) -> None:
         first = self.receivers.first
         uses_gps = first.fix_type >= FIX_3D and int(self.parameters["EKF2_GPS_CTRL"]) & 1
         measured, before = first.last if uses_gps else None, self._used
         self._used = measured
         if measured is not None and measured != before:
             self.origin = self.origin or (measured.lat_deg, measured.lon_deg, measured.alt_m)
-            if self._fuse(truth, measured, wind_m_s, now_s, _RESET_AFTER_S):
-                self._fused_s = now_s
-        is_aided, is_flying = now_s - self._fused_s < _AIDING_GONE_S, self._motion.is_flying
+            if self._fuse(measured, wind_m_s, _RESET_AFTER_S):
+                self._fused_s = self.now_s
+        is_aided, is_flying = self.now_s - self._fused_s < _AIDING_GONE_S, self.motion.is_flying
         if is_aided:
             self.reckoning.drift_m_s = 0j
         else:
             self._go_wrong(wind_m_s, dt_s, 1.0)
         if is_aided or self.kind == "plane" or not is_flying:
-            self._aided_s = now_s
+            self._aided_s = self.now_s
         self.reckoning.step(dt_s, SD_GROWS_M_S[self.kind] if is_flying and not is_aided else 0.0)
-        self._watch(now_s)
 
-    def flags(self, now_s: float) -> int:
+    def flags(self) -> int:
         flags: int = mavlink.ESTIMATOR_ATTITUDE | mavlink.ESTIMATOR_VELOCITY_VERT | mavlink.ESTIMATOR_POS_VERT_ABS
         if self.origin is None:
             return flags | int(mavlink.ESTIMATOR_CONST_POS_MODE)
-        if self._is_valid(now_s):
+        if self._is_valid():
             flags |= mavlink.ESTIMATOR_VELOCITY_HORIZ | mavlink.ESTIMATOR_POS_HORIZ_REL
             flags |= mavlink.ESTIMATOR_POS_HORIZ_ABS
         return flags | (mavlink.ESTIMATOR_GPS_GLITCH if self.test_ratio > 1 else 0)
 
-    def take_fix(self, command: Message, truth: TrueState, now_s: float) -> int:
+    def take_fix(self, command: Message) -> int:
         """Judge command 43003. Time of sending and frame mean nothing."""
-        since_s = self._fused_s if self._motion.is_flying else self._passed_s  # it reckons, or has no GPS on the ground
-        if now_s - since_s < _AIDING_GONE_S or not math.isfinite(command.param2):
+        since_s = self._fused_s if self.motion.is_flying else self._passed_s  # it reckons, or has no GPS on the ground
+        if self.now_s - since_s < _AIDING_GONE_S or not math.isfinite(command.param2):
             return NOT_NOW
         lat_deg, lon_deg = command.x / 1e7, command.y / 1e7
         if not (abs(lat_deg) <= 90 and abs(lon_deg) <= 180):
             return FAILED
         accuracy_m = command.param3 if math.isfinite(command.param3) and command.param3 > 0 else _DEFAULT_ACCURACY_M
-        self.origin = self.origin or (lat_deg, lon_deg, truth.alt_m)
+        self.origin = self.origin or (lat_deg, lon_deg, self.truth.alt_m)
         # Within the gate PX4 corrects velocity and wind too, which is not simulated; the position follows either way.
-        moved_m = 0j
-        if self._is_valid(now_s):
-            moved_m = self.reckoning.velocity_m_s(truth) * min(max(command.param2, 0.0), _OLDEST_FIX_S)
-        self.reckoning.reset_to(truth, lat_deg, lon_deg, accuracy_m)
-        self.reckoning.error_m += moved_m
+        age_s = min(max(command.param2, 0.0), _OLDEST_FIX_S) if self._is_valid() else 0.0
+        self._reset_to(lat_deg, lon_deg, accuracy_m, age_s)
         return OK
 
-    def take_global_position(self, message: Message, truth: TrueState, now_s: float) -> None:
+    def take_global_position(self, message: Message) -> None:
         """Fuse a GLOBAL_POSITION_SENSOR (296). Its own times are ignored: it is as old as the parameter says."""
         is_ours = message.id == self.parameters["EKF2_AGP0_ID"] != 0  # 0: the slot is off
         if not message.eph > 0 or not is_ours or not int(self.parameters["EKF2_AGP0_CTRL"]) & 1:
             return
-        is_starting = now_s - self._other_heard_s > _SILENT_AFTER_S
-        self._other_heard_s = now_s
+        is_starting = self.now_s - self._other_heard_s > _SILENT_AFTER_S
+        is_late = self.now_s - self._other_s > _RESET_AFTER_S
+        self._other_heard_s = self.now_s
         noise_m = max(message.eph, self.parameters["EKF2_AGP0_NOISE"])
         lat_deg, lon_deg = message.lat / 1e7, message.lon / 1e7
-        moved_m = self.reckoning.velocity_m_s(truth) * self.parameters["EKF2_AGP0_DELAY"] / 1e3
-        innovation_m = self.reckoning.innovation_m(truth, lat_deg, lon_deg) + moved_m
+        delay_s = self.parameters["EKF2_AGP0_DELAY"] / 1e3
+        moved_m = self.reckoning.velocity_m_s(self.truth) * delay_s
+        innovation_m = self.reckoning.innovation_m(self.truth, lat_deg, lon_deg) + moved_m
         variance_m2 = self.reckoning.sd_m**2 + noise_m**2
         if self.origin is None:
             self.origin = lat_deg, lon_deg, message.alt
-            self.reckoning.reset_to(truth, lat_deg, lon_deg, noise_m)
+            self._reset_to(lat_deg, lon_deg, noise_m)
         elif abs(innovation_m) <= self.parameters["EKF2_AGP0_GATE"] * math.sqrt(variance_m2):
             gain = self.reckoning.sd_m**2 / variance_m2
             self.reckoning.error_m += gain * innovation_m
             self.reckoning.sd_m *= math.sqrt(1 - gain)
-        elif now_s - self._passed_s > _AIDING_GONE_S and (is_starting or now_s - self._other_s > _RESET_AFTER_S):
-            self.reckoning.reset_to(truth, lat_deg, lon_deg, noise_m)
-            self.reckoning.error_m += moved_m
+        elif self.now_s - self._passed_s > _AIDING_GONE_S and (is_starting or is_late):
+            self._reset_to(lat_deg, lon_deg, noise_m, delay_s)
         else:
             return
-        self._other_s = self._fused_s = now_s
+        self._other_s = self._fused_s = self.now_s
 
-    def why_not_arm(self, now_s: float) -> str | None:
-        return None if self.origin and self._is_valid(now_s) else "No valid global position"
+    def why_not_arm(self) -> str | None:
+        return None if self.origin and self._is_valid() else "No valid global position"
 
-    def _is_valid(self, now_s: float) -> bool:
-        return now_s - self._aided_s <= self.parameters["EKF2_NOAID_TOUT"] / 1e6
+    def _is_valid(self) -> bool:
+        return self.now_s - self._aided_s <= self.parameters["EKF2_NOAID_TOUT"] / 1e6
 
-    def _watch(self, now_s: float) -> None:
+    def _watch(self) -> None:
         """Land where the position is lost in flight. Landed, it disarms."""
-        if self.is_armed and self.mode == _LAND and not self._motion.is_flying:
+        if self.is_armed and self.mode == _LAND and not self.motion.is_flying:
             self.is_armed = False
-        is_lost = self.origin is not None and not self._is_valid(now_s)
+        is_lost = self.origin is not None and not self._is_valid()
         if is_lost and not self._has_failed and self.is_armed:
             self.texts.append((mavlink.MAV_SEVERITY_CRITICAL, "Failsafe activated: no valid position, landing"))
             self.mode = _LAND
-            self._motion.land()
+            self.motion.land()
         self._has_failed = is_lost

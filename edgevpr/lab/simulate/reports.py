@@ -1,9 +1,8 @@
-"""Reports of a flight controller on itself: one function a message, from a `VehicleMoment` to the message, None where
+"""Reports of a flight controller on itself: one function a message, from a `Firmware` to the message, None where
 there is nothing to say. Messages that a real one knows and this one has nothing to say of are in `SILENT`."""
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 from edgevpr.lab.simulate.firmware import Firmware
 from edgevpr.lab.simulate.motion import TrueState
@@ -19,43 +18,26 @@ _CAPABILITIES = (
 )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class VehicleMoment:
-    """The vehicle at a time, `t_s` seconds after its start, which was at `start_utc_s`: where it truly is, what its
-    firmware makes of it, and whether its position may be told."""
-
-    t_s: float
-    start_utc_s: float
-    truth: TrueState
-    brain: Firmware
-    is_known: bool
-
-    @property
-    def boot_ms(self) -> int:
-        """Milliseconds since the start."""
-        return round(self.t_s * 1000)
-
-
-def heartbeat(now: VehicleMoment) -> Message:
+def heartbeat(brain: Firmware) -> Message:
     """Make the HEARTBEAT of an autopilot."""
-    armed = mavlink.MAV_MODE_FLAG_SAFETY_ARMED if now.brain.is_armed else 0
+    armed = mavlink.MAV_MODE_FLAG_SAFETY_ARMED if brain.is_armed else 0
     return mavlink.MAVLink_heartbeat_message(
-        type=now.brain.vehicle_type,
-        autopilot=now.brain.number,
+        type=brain.vehicle_type,
+        autopilot=brain.number,
         base_mode=mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | armed,
-        custom_mode=now.brain.mode,
-        system_status=mavlink.MAV_STATE_ACTIVE if now.brain.is_armed else mavlink.MAV_STATE_STANDBY,
+        custom_mode=brain.mode,
+        system_status=mavlink.MAV_STATE_ACTIVE if brain.is_armed else mavlink.MAV_STATE_STANDBY,
         mavlink_version=3,
     )
 
 
-def _position(now: VehicleMoment) -> Message | None:
-    if now.brain.origin is None:
+def _position(brain: Firmware) -> Message | None:
+    if brain.origin is None:
         return None
-    truth, (lat_deg, lon_deg) = now.truth, now.brain.reckoning.place(now.truth)
-    velocity_m_s = now.brain.reckoning.velocity_m_s(truth)
+    truth, (lat_deg, lon_deg) = brain.truth, brain.reckoning.place(brain.truth)
+    velocity_m_s = brain.reckoning.velocity_m_s(truth)
     return mavlink.MAVLink_global_position_int_message(
-        time_boot_ms=now.boot_ms,
+        time_boot_ms=_boot_ms(brain),
         lat=round(lat_deg * 1e7),
         lon=round(lon_deg * 1e7),
         alt=round(truth.alt_m * 1e3),
@@ -67,26 +49,26 @@ def _position(now: VehicleMoment) -> Message | None:
     )
 
 
-def _attitude(now: VehicleMoment) -> Message | None:
+def _attitude(brain: Firmware) -> Message | None:
     """Make the message of the attitude, None where a track does not know it."""
-    truth = now.truth
+    truth = brain.truth
     if math.isnan(truth.roll_deg + truth.pitch_deg):
         return None
     yaw = _yaw(truth)
     return mavlink.MAVLink_attitude_message(
-        now.boot_ms, math.radians(truth.roll_deg), math.radians(truth.pitch_deg), yaw, 0, 0, 0
+        _boot_ms(brain), math.radians(truth.roll_deg), math.radians(truth.pitch_deg), yaw, 0, 0, 0
     )
 
 
-def _second_gps(now: VehicleMoment) -> Message | None:
-    if not now.brain.receivers.has_second:
+def _second_gps(brain: Firmware) -> Message | None:
+    if not brain.receivers.has_second:
         return None
-    return mavlink.MAVLink_gps2_raw_message(**_gps(now.brain.receivers.second, now), dgps_numch=0, dgps_age=0)
+    return mavlink.MAVLink_gps2_raw_message(**_gps(brain.receivers.second, brain), dgps_numch=0, dgps_age=0)
 
 
-def _gps(gps: Gps, now: VehicleMoment) -> dict[str, int]:
+def _gps(gps: Gps, brain: Firmware) -> dict[str, int]:
     last = gps.last
-    if last is None or not now.is_known:  # a second GPS that has never been heard, or has been silent for long
+    if last is None or not brain.motion.is_known:  # a second GPS that has never been heard, or has been silent for long
         lost = {"lat": 0, "lon": 0, "alt": 0, "eph": 9999, "epv": 9999, "vel": 0, "cog": 0}
         return {"time_usec": 0, "fix_type": NO_FIX, **lost, "satellites_visible": 0}
     east_m_s, north_m_s = last.velocity_m_s.real, last.velocity_m_s.imag
@@ -106,29 +88,29 @@ def _gps(gps: Gps, now: VehicleMoment) -> dict[str, int]:
     }
 
 
-def _ekf_status(now: VehicleMoment) -> Message:
-    ratio = now.brain.test_ratio
-    return mavlink.MAVLink_ekf_status_report_message(now.brain.flags(now.t_s), 0.05, ratio, 0.05, 0.02, 0.0)
+def _ekf_status(brain: Firmware) -> Message:
+    ratio = brain.test_ratio
+    return mavlink.MAVLink_ekf_status_report_message(brain.flags(), 0.05, ratio, 0.05, 0.02, 0.0)
 
 
-def _estimator_status(now: VehicleMoment) -> Message:
-    both_m = math.sqrt(2) * now.brain.reckoning.sd_m if now.brain.origin else 0.0
+def _estimator_status(brain: Firmware) -> Message:
+    both_m = math.sqrt(2) * brain.reckoning.sd_m if brain.origin else 0.0
     return mavlink.MAVLink_estimator_status_message(
-        round(now.t_s * 1e6), now.brain.flags(now.t_s), 0.1, now.brain.test_ratio, 0.1, 0.1, 0.0, 0.0, both_m, 0.5
+        round(brain.now_s * 1e6), brain.flags(), 0.1, brain.test_ratio, 0.1, 0.1, 0.0, 0.0, both_m, 0.5
     )
 
 
-def _origin(now: VehicleMoment) -> Message | None:
-    if now.brain.origin is None:
+def _origin(brain: Firmware) -> Message | None:
+    if brain.origin is None:
         return None
-    lat_deg, lon_deg, alt_m = now.brain.origin
+    lat_deg, lon_deg, alt_m = brain.origin
     return mavlink.MAVLink_gps_global_origin_message(round(lat_deg * 1e7), round(lon_deg * 1e7), round(alt_m * 1e3))
 
 
-def _truth(now: VehicleMoment) -> Message | None:
+def _truth(brain: Firmware) -> Message | None:
     """Make the SIM_STATE, in which a simulator says where the vehicle truly is."""
-    truth = now.truth
-    if not now.is_known:
+    truth = brain.truth
+    if not brain.motion.is_known:
         return None
     angles = [0.0 if math.isnan(each) else math.radians(each) for each in (truth.roll_deg, truth.pitch_deg)]
     place = truth.lat_deg, truth.lon_deg, truth.alt_m
@@ -139,25 +121,25 @@ def _truth(now: VehicleMoment) -> Message | None:
     )
 
 
-def _version(now: VehicleMoment) -> Message:
+def _version(brain: Firmware) -> Message:
     nothing = [0] * 8
-    is_px4 = now.brain.number == mavlink.MAV_AUTOPILOT_PX4
+    is_px4 = brain.number == mavlink.MAV_AUTOPILOT_PX4
     encoding = mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE if is_px4 else 0
     return mavlink.MAVLink_autopilot_version_message(
-        _CAPABILITIES | encoding, now.brain.version, 0, 0, 0, nothing, nothing, nothing, 0, 0, 0
+        _CAPABILITIES | encoding, brain.version, 0, 0, 0, nothing, nothing, nothing, 0, 0, 0
     )
 
 
-REPORTS: dict[int, Callable[[VehicleMoment], Message | None]] = {
+REPORTS: dict[int, Callable[[Firmware], Message | None]] = {
     mavlink.MAVLINK_MSG_ID_HEARTBEAT: heartbeat,
-    mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: lambda now: mavlink.MAVLink_system_time_message(
-        round((now.start_utc_s + now.t_s) * 1e6), now.boot_ms
+    mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: lambda brain: mavlink.MAVLink_system_time_message(
+        round((brain.start_utc_s + brain.now_s) * 1e6), _boot_ms(brain)
     ),
-    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: lambda now: mavlink.MAVLink_gps_raw_int_message(
-        **_gps(now.brain.receivers.first, now)
+    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: lambda brain: mavlink.MAVLink_gps_raw_int_message(
+        **_gps(brain.receivers.first, brain)
     ),
-    mavlink.MAVLINK_MSG_ID_SCALED_IMU: lambda now: mavlink.MAVLink_scaled_imu_message(
-        now.boot_ms, 0, 0, -_G_MG, *[0] * 6
+    mavlink.MAVLINK_MSG_ID_SCALED_IMU: lambda brain: mavlink.MAVLink_scaled_imu_message(
+        _boot_ms(brain), 0, 0, -_G_MG, *[0] * 6
     ),
     mavlink.MAVLINK_MSG_ID_ATTITUDE: _attitude,
     mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: _position,
@@ -175,6 +157,10 @@ SILENT = {  # known, but there is no such sensor
     mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR,
     mavlink.MAVLINK_MSG_ID_TERRAIN_REPORT,
 }
+
+
+def _boot_ms(brain: Firmware) -> int:
+    return round(brain.now_s * 1000)
 
 
 def _yaw(truth: TrueState) -> float:

@@ -62,7 +62,7 @@ class Flown:
 
     @property
     def truth(self):
-        return self.controller._truth
+        return self.controller.brain.truth
 
     @property
     def error_m(self) -> float:
@@ -70,7 +70,7 @@ class Flown:
 
     @property
     def flags(self) -> int:
-        return self.controller.brain.flags(self.now_s)
+        return self.controller.brain.flags()
 
 
 def lost(vehicle: str, wind_m_s: float = 6.0, **parameters: float) -> Flown:
@@ -194,7 +194,7 @@ def test_a_copter_flies_by_odometry_without_any_gps():
     assert flown.flags & mavlink.EKF_POS_HORIZ_ABS
     assert flown.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1) == ACCEPTED
     flown.wait(0.5)
-    assert "VisOdom" in flown.controller.brain.why_not_arm(flown.now_s)
+    assert "VisOdom" in flown.controller.brain.why_not_arm()
 
 
 def test_a_source_set_is_chosen_by_command():

@@ -13,7 +13,7 @@ OUR_GPS = {"GPS2_TYPE": 14, "GPS_AUTO_SWITCH": 1}
 def hovers_without_gps(flown, checks=True):
     """Let a copter take off, and lose GPS at 20 m."""
     if checks:
-        flown.until(lambda: flown.brain.why_not_arm(flown.now_s) is None)
+        flown.until(lambda: flown.brain.why_not_arm() is None)
     else:
         flown.fly(10)
     flown.brain.set_mode(GUIDED)
@@ -57,7 +57,7 @@ def test_a_plane_gets_single_fixes_after_the_loss_only_and_takes_them():
     with Controlled("arduplane") as flown:
         flown.sees = False  # on the ground
         flown.brain.set_mode(TAKEOFF)
-        flown.until(lambda: flown.brain.why_not_arm(flown.now_s) is None)
+        flown.until(lambda: flown.brain.why_not_arm() is None)
         flown.brain.arm(True)
         flown.sees = True
         flown.fly(30)

@@ -22,7 +22,7 @@ def asked(flown):
 
 def in_air(flown):
     flown.brain.set_mode(13)
-    flown.until(lambda: flown.brain.why_not_arm(flown.now_s) is None)
+    flown.until(lambda: flown.brain.why_not_arm() is None)
     flown.brain.arm(True)
     return flown.fly(20)
 
