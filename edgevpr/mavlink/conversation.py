@@ -5,7 +5,7 @@ import math
 import struct
 import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 
 from edgevpr.core.types import NO_TAPE, Position, Tape, Vehicle
@@ -15,7 +15,7 @@ from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.fixes import MAX_FIX_WAIT_S, Fixes, Sending
 from edgevpr.mavlink.messages import Health, Severity
 from edgevpr.mavlink.peer import Autopilot, Listener, NoListener
-from edgevpr.mavlink.requests import Requests, Wishes
+from edgevpr.mavlink.requests import Requests, Wish, Wished, Wishes
 from edgevpr.mavlink.signing import NOT_SIGNING, NotSigning
 from edgevpr.mavlink.texts import News, Texts
 from edgevpr.mavlink.wire import Message, PacketReader, Tap, mavlink, untapped
@@ -109,6 +109,26 @@ class Conversation:
         has stopped reporting its position or its attitude."""
         self._ask_position_s = self._clock()
 
+    def offer(self, wishes: Collection[Wish]) -> None:
+        """Set the wishes of the ground that can be fulfilled from now on; there are none before the first call."""
+        self.wishes.offered = wishes
+
+    def take_wishes(self) -> tuple[Wished, ...]:
+        """Return the wishes of the ground since the last call."""
+        return self.wishes.take()
+
+    def vehicle(self) -> Vehicle | None:
+        """Return the last report of the autopilot on its vehicle; None where there is none, or it had no position."""
+        return self.autopilot.vehicle
+
+    def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
+        """Return the same with the position, roll, pitch and heading that the vehicle had at the time of a frame; roll
+        and pitch are None where no attitude was heard within 0.3 s of it. It also says when the newest fix that may be
+        in its position was sent: a continuous position may be in it at any time."""
+        vehicle = self.autopilot.vehicle_at(t_mono_s)
+        t_fix_s = self._clock() if self.channel.is_continuous else self.fixes.t_fix_s
+        return vehicle and replace(vehicle, t_fix_s=t_fix_s)
+
     def wait_s(self, longest_s: float) -> float:
         """Return how long the link may sleep, so long at most, until there is something to say."""
         if not self.channel.is_continuous:
@@ -166,13 +186,6 @@ class Conversation:
         self.fixes.time_out(now_s)
         self._tell(self.fixes.news_of_silence(self.autopilot.readiness.state(now_s), now_s))
         self._tell(self.fixes.take_news())
-
-    def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
-        """Return the autopilot's last report, with its attitude at the time of a frame, and the time of the newest fix
-        that may be in its position: a continuous position may be in it at any time."""
-        vehicle = self.autopilot.vehicle_at(t_mono_s)
-        t_fix_s = self._clock() if self.channel.is_continuous else self.fixes.t_fix_s
-        return vehicle and replace(vehicle, t_fix_s=t_fix_s)
 
     def break_off(self, lost_fixes: int) -> None:
         """Forget what ends with the port, with which so many fixes were thrown away."""

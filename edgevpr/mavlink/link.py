@@ -5,20 +5,20 @@ import select
 import socket
 import threading
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
+from functools import wraps
+from typing import Concatenate, ParamSpec, TypeVar
 
 from edgevpr.core.errors import LinkError
-from edgevpr.core.types import Vehicle
 from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.conversation import Conversation, LinkSettings
 from edgevpr.mavlink.fixes import Sending
 from edgevpr.mavlink.line import Line
-from edgevpr.mavlink.messages import Fix, Health, Severity
+from edgevpr.mavlink.messages import Fix, Severity
 from edgevpr.mavlink.ports import Port, open_port
-from edgevpr.mavlink.requests import Wish, Wished
 from edgevpr.mavlink.turns import Turns
 from edgevpr.mavlink.wire import Message
 
@@ -29,6 +29,8 @@ FLUSH_S = 0.5
 
 _USUAL = LinkSettings()
 
+P = ParamSpec("P")
+T = TypeVar("T")
 Step = Callable[..., None]  # takes note of a step of a turn
 
 log = logging.getLogger(__name__)
@@ -68,6 +70,17 @@ class LinkStats:
     def fixes_sent(self) -> int:
         """Number of position fixes sent."""
         return self.sent.get("COMMAND_INT", 0)
+
+
+def _in_turn(method: Callable[Concatenate[Conversation, P], T]) -> Callable[Concatenate["Link", P], T]:
+    """Let a link do in a turn what its conversation does."""
+
+    @wraps(method)
+    def done_in_turn(self: "Link", *values: P.args, **named: P.kwargs) -> T:
+        with self.turn(method.__name__):
+            return method(self._conversation, *values, **named)
+
+    return done_in_turn
 
 
 class Link:
@@ -135,38 +148,12 @@ class Link:
             self._conversation.announce(severity, text, topic)
         self._ring()
 
-    def offer(self, wishes: Collection[Wish]) -> None:
-        """Set the wishes of the ground that can be fulfilled from now on; there are none before the first call."""
-        with self.turn("offer"):
-            self._conversation.wishes.offered = wishes
-
-    def take_wishes(self) -> tuple[Wished, ...]:
-        """Return the wishes of the ground since the last call."""
-        with self.turn("take_wishes"):
-            return self._conversation.wishes.take()
-
-    def set_health(self, health: Health) -> None:
-        """Set the health in the heartbeats of the next ten seconds. After that, without a new call, it is CRITICAL."""
-        with self.turn("set_health"):
-            self._conversation.set_health(health)
-
-    def want_position(self) -> None:
-        """Ask the autopilot for its position, how well it knows it, attitude and height, at once and again whenever it
-        has stopped reporting its position or its attitude."""
-        with self.turn("want_position"):
-            self._conversation.want_position()
-
-    def vehicle(self) -> Vehicle | None:
-        """Return the last report of the autopilot on its vehicle; None where there is none, or it had no position."""
-        with self.turn("vehicle"):
-            return self._conversation.autopilot.vehicle
-
-    def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
-        """Return the same with the position, roll, pitch and heading that the vehicle had at the time of a frame; roll
-        and pitch are None where no attitude was heard within 0.3 s of it. It also says when the newest fix that may be
-        in its position was sent."""
-        with self.turn("vehicle_at"):
-            return self._conversation.vehicle_at(t_mono_s)
+    offer = _in_turn(Conversation.offer)
+    take_wishes = _in_turn(Conversation.take_wishes)
+    set_health = _in_turn(Conversation.set_health)
+    want_position = _in_turn(Conversation.want_position)
+    vehicle = _in_turn(Conversation.vehicle)
+    vehicle_at = _in_turn(Conversation.vehicle_at)
 
     @property
     def channel(self) -> Channel:

@@ -108,18 +108,13 @@ def report_requests(target_system: int, firmware: int, is_continuous: bool = Fal
         wanted_us[mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN] = 1_000_000
     if firmware in _FILTER_REPORTS:
         wanted_us[_FILTER_REPORTS[firmware]] = 500_000
-    return tuple(
-        mavlink.MAVLink_command_long_message(
-            target_system, AUTOPILOT, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, message_id, interval_us, 0, 0, 0, 0, 0
-        )
-        for message_id, interval_us in wanted_us.items()
-    )
+    interval = mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
+    return tuple(_command(target_system, interval, *wanted) for wanted in wanted_us.items())
 
 
 def message_request(target_system: int, message_id: int) -> Message:
     """Make a COMMAND_LONG (76) with REQUEST_MESSAGE (512) for one message."""
-    request = mavlink.MAV_CMD_REQUEST_MESSAGE
-    return mavlink.MAVLink_command_long_message(target_system, AUTOPILOT, request, 0, message_id, 0, 0, 0, 0, 0, 0)
+    return _command(target_system, mavlink.MAV_CMD_REQUEST_MESSAGE, message_id)
 
 
 def parameter_request(target_system: int, name: str) -> Message:
@@ -157,9 +152,7 @@ def gps_distance(t_mono_s: float, off_m: float) -> Message:
 
 def source_set(number: int, target_system: int) -> Message:
     """Make a COMMAND_LONG (76) with SET_EKF_SOURCE_SET (42007)."""
-    return mavlink.MAVLink_command_long_message(
-        target_system, AUTOPILOT, mavlink.MAV_CMD_SET_EKF_SOURCE_SET, 0, number, 0, 0, 0, 0, 0, 0
-    )
+    return _command(target_system, mavlink.MAV_CMD_SET_EKF_SOURCE_SET, number)
 
 
 def computer_status(
@@ -187,14 +180,8 @@ def computer_status(
         gpu_combined=[255] * 10,
         temperature_board=127,
         fan_speed=[32_767] * 4,
-        storage_type=[_UNUSED] * 4,
-        storage_usage=[_UNUSED] * 4,
-        storage_total=[_UNUSED] * 4,
-        link_type=[_UNUSED] * 6,
-        link_tx_rate=[_UNUSED] * 6,
-        link_rx_rate=[_UNUSED] * 6,
-        link_tx_max=[_UNUSED] * 6,
-        link_rx_max=[_UNUSED] * 6,
+        **{f"storage_{what}": [_UNUSED] * 4 for what in ("type", "usage", "total")},
+        **{f"link_{what}": [_UNUSED] * 6 for what in ("type", "tx_rate", "rx_rate", "tx_max", "rx_max")},
     )
 
 
@@ -216,6 +203,10 @@ _FILTER_REPORTS = {
     mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT,
     mavlink.MAV_AUTOPILOT_PX4: mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS,
 }
+
+
+def _command(target_system: int, command: int, first: float, second: float = 0) -> Message:
+    return mavlink.MAVLink_command_long_message(target_system, AUTOPILOT, command, 0, first, second, 0, 0, 0, 0, 0)
 
 
 def _named_float(t_mono_s: float, name: bytes, value: float) -> Message:

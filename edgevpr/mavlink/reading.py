@@ -18,22 +18,11 @@ _BYTEWISE = mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FilterState:
-    """The state of the autopilot's filter (EKF), by the flags that it reports."""
-
-    flags: int
-    has_attitude: bool
-    has_position: bool  # horizontal, absolute
-    has_velocity: bool
-    holds_still: bool  # it takes the vehicle for standing, since it has nothing to navigate by
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class AutopilotReading:
     """The answers of an autopilot; None and empty stand for what it did not say.
 
     `firmware` is "ardupilot", "px4" or "other"; `vehicle` is the value of its `Kind`; `gps_fix` holds the fix type of
-    each receiver; `streams_hz` the messages that came without being asked for, `heard` all that came. `signs`: its
+    each receiver, `filter_flags` are those of EKF_STATUS_REPORT or ESTIMATOR_STATUS; `streams_hz` the messages that came without being asked for, `heard` all that came. `signs`: its
     messages are signed; `is_signed_to`: ours are. `clock_ahead_s` is how far the UTC of the autopilot is ahead of this
     machine's.
     """
@@ -48,7 +37,7 @@ class AutopilotReading:
     streams_hz: dict[str, float]
     heard: tuple[str, ...]
     gps_fix: tuple[int | None, int | None]
-    filter: FilterState | None
+    filter_flags: int | None
     origin: tuple[float, float] | None
     signs: bool
     is_signed_to: bool
@@ -101,7 +90,7 @@ def read_autopilot(asking: Inquiry, wanted: Mapping[str, Iterable[str]]) -> Auto
         streams_hz=streams_hz,
         heard=tuple(sorted(asking.heard)),
         gps_fix=(first and first.fix_type, second and second.fix_type),
-        filter=report and _filter(report),
+        filter_flags=report and report.flags,
         origin=(origin.latitude / 1e7, origin.longitude / 1e7) if origin else None,
         signs=asking.signed > 0,
         is_signed_to=asking.signs,
@@ -117,17 +106,6 @@ def read_autopilot(asking: Inquiry, wanted: Mapping[str, Iterable[str]]) -> Auto
 def _no_message(message_id: int) -> Message | None:
     """Stand in for `Inquiry.message` where the autopilot answers nothing: each question would take three seconds."""
     return None
-
-
-def _filter(report: Message) -> FilterState:
-    """Read EKF_STATUS_REPORT or ESTIMATOR_STATUS: those of the flags that are used here have the same values."""
-    return FilterState(
-        flags=report.flags,
-        has_attitude=bool(report.flags & mavlink.EKF_ATTITUDE),
-        has_position=bool(report.flags & mavlink.EKF_POS_HORIZ_ABS),
-        has_velocity=bool(report.flags & mavlink.EKF_VELOCITY_HORIZ),
-        holds_still=bool(report.flags & mavlink.EKF_CONST_POS_MODE),
-    )
 
 
 def _version(packed: int) -> tuple[int, int, int]:

@@ -11,6 +11,7 @@ from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.asking import Inquiry
 from edgevpr.mavlink.reading import AutopilotReading, read_autopilot
 from edgevpr.mavlink.signing import MEANING, open_signing
+from edgevpr.mavlink.wire import mavlink
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.service.board import board_findings
 from edgevpr.runtime.service.finding import Finding, FlightIntent, fine, wrong
@@ -170,13 +171,13 @@ def _streams(reading: AutopilotReading) -> Finding:
 
 
 def _filter(reading: AutopilotReading) -> Finding:
-    state = reading.filter
-    if state is None:
+    if reading.filter_flags is None:
         return wrong("filter", "It does not say how its filter is, so no fix could be weighed against it.")
-    flags = f"flags 0x{state.flags:x}"
-    if state.has_attitude and state.has_position and not state.holds_still:
+    flags, has = f"flags 0x{reading.filter_flags:x}", reading.filter_flags
+    # It holds still where it takes the vehicle for standing, since it has nothing to navigate by.
+    if has & mavlink.EKF_ATTITUDE and has & mavlink.EKF_POS_HORIZ_ABS and not has & mavlink.EKF_CONST_POS_MODE:
         return fine("filter", f"attitude and position are known ({flags})")
-    lacks = "position" if state.has_attitude else "attitude"
+    lacks = "position" if has & mavlink.EKF_ATTITUDE else "attitude"
     return wrong("filter", f"The filter has no {lacks} yet ({flags}): wait, outdoors and standing still.")
 
 

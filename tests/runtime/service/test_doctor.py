@@ -15,7 +15,7 @@ from edgevpr.mavlink import reading as module
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.channel import ardupilot_choice
 from edgevpr.mavlink.positions import SENSOR_ID
-from edgevpr.mavlink.reading import AutopilotReading, FilterState
+from edgevpr.mavlink.reading import AutopilotReading
 from edgevpr.mavlink.signing import UNSIGNED, WRONG
 from edgevpr.mavlink.wire import mavlink
 from edgevpr.runtime.service.doctor import autopilot_findings, silence
@@ -25,7 +25,7 @@ from edgevpr.runtime.service.rules import RULES, is_too_rare, rarity
 UDP, SERIAL = parse_link("udpin:127.0.0.1:14550"), parse_link("serial:/dev/ttyAMA0:57600")
 FIXES, DRY = FlightIntent(sends_fixes=True, every_s=1.0), FlightIntent(sends_fixes=False, every_s=1.0)
 PLAIN = {"GPS1_TYPE": 1, "GPS2_TYPE": 0, "GPS_AUTO_SWITCH": 1, "VISO_TYPE": 0, "FLOW_TYPE": 0, "EK3_SRC1_POSXY": 3}
-READY = FilterState(flags=0x33F, has_attitude=True, has_position=True, has_velocity=True, holds_still=False)
+READY = 0x33F
 COPTER = AutopilotReading(
     system_id=1,
     firmware="ardupilot",
@@ -37,7 +37,7 @@ COPTER = AutopilotReading(
     streams_hz={"ATTITUDE": 4.0},
     heard=("ATTITUDE", "GLOBAL_POSITION_INT", "GPS_RAW_INT"),
     gps_fix=(3, None),
-    filter=READY,
+    filter_flags=READY,
     origin=(50.0, 14.0),
     signs=False,
     is_signed_to=False,
@@ -75,7 +75,7 @@ def said(reading: AutopilotReading, what: str, link=UDP, plan=FIXES) -> str:
 
 BARE, VISUAL = replace(COPTER, parameters=PLAIN), replace(COPTER, parameters=PLAIN | {"VISO_TYPE": 1})
 HOVERING = replace(COPTER, vehicle="plane", parameters=PLAIN | {"Q_ENABLE": 1})
-MUTE = replace(COPTER, answers=False, version=None, parameters={}, heard=(), filter=None, origin=None)
+MUTE = replace(COPTER, answers=False, version=None, parameters={}, heard=(), filter_flags=None, origin=None)
 SIGNED = replace(MUTE, signs=True, is_signed_to=True)
 FUSED = with_parameters(VISUAL, EK3_SRC2_POSXY=6, EK3_SRC2_VELXY=6)
 
@@ -192,10 +192,10 @@ def test_the_velocity_of_odometry_must_not_be_fused():
         ({"says_version_1": True}, "port", ("SERIALn_PROTOCOL=2",)),
         ({"bad_bytes": 5000}, "link", ()),
         ({"other_systems": (2, 3)}, "vehicles", ("mavlink: {system_id: 1}",)),
-        ({"filter": None}, "filter", ()),
-        ({"filter": replace(READY, has_position=False)}, "filter", ()),
-        ({"filter": replace(READY, has_attitude=False)}, "filter", ()),
-        ({"filter": replace(READY, holds_still=True)}, "filter", ()),
+        ({"filter_flags": None}, "filter", ()),
+        ({"filter_flags": READY & ~mavlink.EKF_POS_HORIZ_ABS}, "filter", ()),
+        ({"filter_flags": READY & ~mavlink.EKF_ATTITUDE}, "filter", ()),
+        ({"filter_flags": READY | mavlink.EKF_CONST_POS_MODE}, "filter", ()),
         ({"gps_fix": (None, None)}, "gps", ()),
         ({"gps_fix": (1, 2)}, "gps", ()),
         ({"origin": None}, "origin", ()),
