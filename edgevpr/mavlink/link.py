@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
-from functools import wraps
 from typing import Concatenate, ParamSpec, TypeVar
 
 from edgevpr.core.errors import LinkError
@@ -75,11 +74,11 @@ class LinkStats:
 def _in_turn(method: Callable[Concatenate[Conversation, P], T]) -> Callable[Concatenate["Link", P], T]:
     """Let a link do in a turn what its conversation does."""
 
-    @wraps(method)
-    def done_in_turn(self: "Link", *values: P.args, **named: P.kwargs) -> T:
-        with self.turn(method.__name__):
-            return method(self._conversation, *values, **named)
+    def done_in_turn(link: "Link", /, *values: P.args, **named: P.kwargs) -> T:
+        with link.turn(method.__name__):
+            return method(link._conversation, *values, **named)
 
+    done_in_turn.__doc__ = method.__doc__
     return done_in_turn
 
 

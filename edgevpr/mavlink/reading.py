@@ -22,9 +22,9 @@ class AutopilotReading:
     """The answers of an autopilot; None and empty stand for what it did not say.
 
     `firmware` is "ardupilot", "px4" or "other"; `vehicle` is the value of its `Kind`; `gps_fix` holds the fix type of
-    each receiver, `filter_flags` are those of EKF_STATUS_REPORT or ESTIMATOR_STATUS; `streams_hz` the messages that came without being asked for, `heard` all that came. `signs`: its
-    messages are signed; `is_signed_to`: ours are. `clock_ahead_s` is how far the UTC of the autopilot is ahead of this
-    machine's.
+    each receiver, `filter_flags` are those of EKF_STATUS_REPORT or ESTIMATOR_STATUS; `streams_hz` the messages that
+    came without being asked for, `heard` all that came. `signs`: its messages are signed; `is_signed_to`: ours are.
+    `clock_ahead_s` is how far the UTC of the autopilot is ahead of this machine's.
     """
 
     system_id: int

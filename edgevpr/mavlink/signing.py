@@ -29,13 +29,12 @@ _KEPT_EVERY = 30 * TICKS_S
 # At a start the time stamps move on by a minute beyond the largest that can have been used. So nothing that was sent
 # before, to us or by us, is less than a minute old, and a replay of it passes for no new stream.
 _MOVED_ON = _KEPT_EVERY + 60 * TICKS_S
-_STREAMS_MAX = 64  # far more than are on the air; invented ones must not fill the memory
 
 KEY_BYTES = 32
 # Link ids: who hears us over two has two streams, each with its own time.
 TO_AUTOPILOT, TO_GROUND, TO_ASK = 1, 2, 3
 UNSIGNED, WRONG = "unsigned", "wrong signature"
-OLD, FUTURE, CROWDED = "old time stamp", "time stamp from the future", "too many senders"
+OLD, FUTURE = "old time stamp", "time stamp from the future"
 _SIGNATURE_BYTES, _STAMP_BYTES = 6, 6
 _BLOCK_BYTES = 1 + _STAMP_BYTES + _SIGNATURE_BYTES  # link id, time stamp, signature
 _MAKE_ONE = "`(umask 077; head -c 32 /dev/urandom > FILE)` makes one"
@@ -45,7 +44,6 @@ MEANING = {
     WRONG: "the other end has another key, or somebody forges them",
     OLD: "usual for a moment after a start; else they are sent again by somebody, or the other end does not hear us",
     FUTURE: "a clock of some sender is wrong, or those of all others are",
-    CROWDED: "there are more of them than an aircraft and its ground have",
 }
 
 Stream = tuple[int, int, int]  # system, component and link id of a sender
@@ -98,22 +96,13 @@ class TimeStamps:
             now = max(self._largest, self._now())
             if stamp <= self._streams.get(stream, now - _NEAR):
                 return OLD
-            if stream not in self._streams:
-                if self._streams and stamp > now + _NEAR:
-                    return FUTURE
-                if self._is_crowded(now):
-                    return CROWDED
+            if self._streams and stream not in self._streams and stamp > now + _NEAR:
+                return FUTURE
             self._streams[stream] = stamp
             if stamp > now:
                 self._rebase(stamp)
                 self._move_on(stamp)
             return None
-
-    def _is_crowded(self, now: int) -> bool:
-        if len(self._streams) >= _STREAMS_MAX:
-            # What these have sent stays refused: as a new stream's it would be older than a minute.
-            self._streams = {stream: last for stream, last in self._streams.items() if last > now - _NEAR}
-        return len(self._streams) >= _STREAMS_MAX
 
     def _now(self) -> int:
         """Return the time of the system's clock, or that which has gone on since the largest time was learnt."""

@@ -4,7 +4,6 @@ How fast an estimate goes wrong is a plain model.
 """
 
 import cmath
-import difflib
 import math
 import struct
 from abc import ABC, abstractmethod
@@ -175,15 +174,13 @@ class Parameters(Mapping[str, float]):
         """Set a parameter to a number as a user writes it. Raises UsageError for a name that does not exist, and for a
         text that is no value of it."""
         if name not in self._values:
-            near = difflib.get_close_matches(name.upper(), self._values, n=1)
-            hint = f"did you mean {near[0]}?" if near else f"it has {', '.join(sorted(self._values))}."
-            raise UsageError(f"The simulated vehicle has no parameter {name}: {hint}")
+            raise UsageError(f"The vehicle has no parameter {name}: it has {', '.join(sorted(self._values))}.")
         kind = type(self._values[name])
         try:
             value = kind(text)
         except ValueError:
-            value = None
-        if value is None or not -_MOST <= value <= _MOST:  # false for NaN
+            value = math.nan
+        if not -_MOST <= value <= _MOST:  # false for NaN
             wanted = "a whole number" if kind is int else "a number"
             raise UsageError(f"{name}={text}: its value is {wanted}, e.g. {self._values[name]}.")
         self.set(name, value)

@@ -250,9 +250,7 @@ def test_the_command_says_what_is_up_and_sets_parameters():
 @pytest.mark.parametrize(
     ("written", "sentence"),
     [
-        ("GPS2_TIPE=14", "no parameter GPS2_TIPE: did you mean GPS2_TYPE?"),
-        ("gps2_type=14", "did you mean GPS2_TYPE?"),
-        ("XYZ=1", "it has AHRS_EKF_TYPE, "),
+        ("GPS2_TIPE=14", "it has AHRS_EKF_TYPE, "),
         ("GPS2_TYPE=1.5", "its value is a whole number"),
         ("GPS2_TYPE=99999999999", "its value is a whole number"),
         ("SIM_WIND_SPD=nan", "its value is a number"),
