@@ -11,7 +11,7 @@ import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
+import cv2 as cv2  # the one that other rooms import from here
 import numpy as np
 
 from edgevpr.core.arrays import Image

@@ -90,14 +90,15 @@ def create(name: str, settings: dict[str, Any] | None = None) -> Technique:
             values[key] = kind(value)
         except ValueError:
             raise UsageError(f"{name}: `{key}` is {value!r}; it must be {_WORDS[kind]}.") from None
-    return _maker(name)(**values)
+    technique: Technique = _maker(name)(**values)
+    return technique
 
 
-def _maker(name: str) -> Callable[..., Technique]:
+def _maker(name: str) -> Callable[..., Any]:
     """Return what makes the technique: its keyword parameters and their defaults are those of the technique."""
     if is_own(name):
         module, maker, _ = _OWN[name]
-        own: Callable[..., Technique] = getattr(importlib.import_module(f"edgevpr.techniques.{module}"), maker)
+        own: Callable[..., Any] = getattr(importlib.import_module(f"edgevpr.techniques.{module}"), maker)
         return own
     if not is_known(name):
         raise UsageError(f"There is no technique `{name}`: use one of {', '.join(names())}.")

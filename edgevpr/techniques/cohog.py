@@ -91,10 +91,10 @@ class CoHog:
         self._query: Descriptor | None = None
         self._views: Views | None = None
         self._regions_of: dict[int, ViewRegions] = {}
-        parameters = {"w1": self.w1, "w2": self.w2, "bins": self.bins, "gt": self.gt, "entropy": self.entropy}
+        numbers = {"w1": self.w1, "w2": self.w2, "bins": self.bins, "gt": self.gt}
         self.spec = TechniqueSpec(
             name="cohog",
-            parameters={**parameters, "camera": self.camera},
+            parameters={**numbers, "entropy": self.entropy, "camera": self.camera},
             coarse=PartSpec((placecode.SIDE, placecode.SIDE, self.bins), "|u1"),
             fine=PartSpec((self._side**2, 4 * self.bins), "|u1"),
             packed=PartSpec((placecode.SIDE**2 * self.bins // 8,), "|u1"),
@@ -143,7 +143,7 @@ class CoHog:
             image, mask = in_square(image, mask)
         grey, allowed = grey_square(image, self.w1), mask_square(mask, self.w1)
         blocks, seen, good = self._blocks(grey, allowed, self.w2)
-        regions = blocks.reshape(self.spec.fine.shape)
+        regions = blocks.reshape(-1, 4 * self.bins)
         # The square root of each value in 8 bits: most values are small, and the root keeps more of their digits.
         stored = np.rint(255 * np.sqrt(regions)).astype(np.uint8)
         if self._is_nadir:
@@ -194,7 +194,8 @@ class CoHog:
         if not self._is_nadir:
             blocks, _ = views.blocks(1.0, 0)
             middle = placecode.seen_grid(_middle(blocks, views.seen), _middle(views.seen, views.seen))
-            hypotheses = placecode.hypotheses(*middle, np.float32(0) if mean is None else mean / 255)
+            mean_grid = np.zeros(1, np.float32) if mean is None else mean / 255
+            hypotheses = placecode.hypotheses(*middle, mean_grid)
             return np.clip(placecode.scan_ahead(hypotheses, rows), 0, 1), None
         expected, needed = None, set(range(WITHIN_QUARTER))
         if turned_deg is not None:

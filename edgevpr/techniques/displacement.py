@@ -16,6 +16,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
+from edgevpr.core.arrays import Array, Bools, Ints, Singles
 from edgevpr.core.contract import Support
 
 _ALONG = 3  # cells: near and far ground move by steps that differ by so much, where the camera looks ahead
@@ -26,7 +27,7 @@ _WITHIN_CELLS = 1.5  # as far as a vote may lie off the peak
 _FURTHEST_TURN_DEG = 16.0
 _FURTHEST_SCALE = 1.6
 _LEAST_PAIRS = 8
-_Grid = tuple[np.ndarray, int]  # numbers of regions, row by row, and the regions along one side
+_Grid = tuple[Ints, int]  # numbers of regions, row by row, and the regions along one side
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,9 +45,7 @@ class Displacement:
 _NOTHING = Displacement(0.0, (0.0, 0.0), (0.0, 0.0, 0.0), 0)
 
 
-def displacement(
-    asking: np.ndarray, best: np.ndarray, sides: tuple[int, int], counts: tuple[float, ...]
-) -> Displacement:
+def displacement(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple[float, ...]) -> Displacement:
     """Count the votes of regions on square grids of these `sides`: of the query and of the reference, both even or both
     odd.
 
@@ -82,13 +81,13 @@ def displacement(
     return Displacement(count / len(asking), shift, covariance, int(np.count_nonzero(agreed)))
 
 
-def share(asking: np.ndarray, best: np.ndarray, sides: tuple[int, int], counts: tuple[float, ...]) -> float:
+def share(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple[float, ...]) -> float:
     """Return the `share` of a `displacement` without the rest of it, in half the time."""
     return float(_piled(asking, best, sides, counts)[2].max()) / len(asking) if len(asking) else 0.0
 
 
 def support(
-    asking: np.ndarray, regions: np.ndarray, reference: np.ndarray, best: np.ndarray, shift_cells: tuple[float, float]
+    asking: Ints, regions: Singles, reference: Singles, best: Ints, shift_cells: tuple[float, float]
 ) -> Support:
     """Ask all regions about a step that a vote has found. `asking` int (G,) are the numbers of the good `regions` of
     the query, float32 (G, P), on the grid of the place, whose regions are `reference`, float32 (side * side, P). `best`
@@ -96,11 +95,12 @@ def support(
     side = math.isqrt(len(reference))
     back = (reference @ regions.T).argmax(axis=1)
     of_y, of_x = np.divmod(asking, side)
-    step_x, step_y = (round(each) for each in shift_cells)
+    step_x, step_y = (round(step) for step in shift_cells)
 
-    def along(query: np.ndarray, place: np.ndarray) -> np.ndarray:
+    def along(query: Ints, place: Ints) -> Bools:
         y, x = np.divmod(place, side)
-        return np.maximum(abs(x - of_x[query] - step_x), abs(y - of_y[query] - step_y)) <= _ALONG
+        off: Ints = np.maximum(abs(x - of_x[query] - step_x), abs(y - of_y[query] - step_y))
+        return off <= _ALONG
 
     mutual = (back[best] == np.arange(len(asking))) & along(np.arange(len(asking)), best)
     return Support(
@@ -111,7 +111,7 @@ def support(
     )
 
 
-def _log_rank(regions: np.ndarray, reference: np.ndarray, x: np.ndarray, y: np.ndarray, side: int) -> float:
+def _log_rank(regions: Singles, reference: Singles, x: Ints, y: Ints, side: int) -> float:
     """Return the mean log rank of the region of the place at (x, y), or of the most similar of those around it, for
     each of `regions` where that is on the grid of the place."""
     rows = np.flatnonzero((x >= 0) & (x < side) & (y >= 0) & (y < side))
@@ -126,9 +126,7 @@ def _log_rank(regions: np.ndarray, reference: np.ndarray, x: np.ndarray, y: np.n
     return float(np.log(1 + np.count_nonzero(alike > there[:, None], axis=1)).mean())
 
 
-def _piled(
-    asking: np.ndarray, best: np.ndarray, sides: tuple[int, int], counts: tuple[float, ...]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _piled(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple[float, ...]) -> tuple[Ints, Singles, Array]:
     """Return the number of the step of each vote, int (G,), the votes by step, float32 (W, W), and the weighted sum
     around each possible step, float32 (W - 2 room, W - 2 room)."""
     # Both numbers are those of a grid as wide as there are steps, so that their difference is the number of the step. A
@@ -144,13 +142,13 @@ def _piled(
 
 
 @lru_cache
-def _numbers(side: int, wide: int) -> np.ndarray:
+def _numbers(side: int, wide: int) -> Ints:
     """Return the numbers of `side` x `side` regions in a grid of width `wide`: int (side * side,)."""
     return np.add.outer(np.arange(side) * wide, np.arange(side)).ravel()
 
 
 @lru_cache
-def _weights(counts: tuple[float, ...]) -> np.ndarray:
+def _weights(counts: tuple[float, ...]) -> Singles:
     """Return the weight of a vote by its distance from the peak: float32 (2 n - 1, 2 n - 1) for n counts."""
     off = np.abs(np.arange(1 - len(counts), len(counts)))
     return np.array(counts, np.float32)[np.maximum.outer(off, off)]
@@ -204,7 +202,7 @@ def align(asking: _Grid, best: _Grid, shift_cells: tuple[float, float]) -> Align
     )
 
 
-def _from_middle(numbers: np.ndarray, side: int) -> np.ndarray:
+def _from_middle(numbers: Ints, side: int) -> Array:
     """Return where regions are, in cells from the middle of their grid: x + iy, complex (G,)."""
     y, x = np.divmod(numbers, side)
     return x + 1j * y - (1 + 1j) * (side - 1) / 2

@@ -7,10 +7,13 @@ the only question that CoHOG asks of such a map (which blocks are good), mostly 
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, reduce
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
+
+from edgevpr.core.arrays import Array, Bools, Bytes, Singles
 
 DISC_RADIUS_PX = 5
 SHANNON_SIDE_PX = 100  # the authors' public code takes the Shannon entropy of a copy of this size
@@ -25,7 +28,7 @@ _LOG2_OVER_8 = _LOG2 / 8
 _COUNT_LOG2 = np.arange(256, dtype=np.float32) * _LOG2[:256]
 
 
-def filled_bins(grey: np.ndarray, radius_px: int = DISC_RADIUS_PX) -> np.ndarray:
+def filled_bins(grey: Bytes, radius_px: int = DISC_RADIUS_PX) -> Singles:
     """Compute log2 of the number of different intensities in each disc, over 8: the algorithm printed in thesis 6.2.1.
 
     `grey` is uint8 (H, W); returns float32 (H, W).
@@ -38,7 +41,7 @@ def filled_bins(grey: np.ndarray, radius_px: int = DISC_RADIUS_PX) -> np.ndarray
     return entropy
 
 
-def shannon(grey: np.ndarray, radius_px: int = DISC_RADIUS_PX) -> np.ndarray:
+def shannon(grey: Bytes, radius_px: int = DISC_RADIUS_PX) -> Array:
     """Compute the Shannon entropy (bits) of the intensities in each disc, over 8, from a 100x100 copy scaled back up.
 
     The authors' public code computes this, where the thesis's text has `filled_bins`. `grey` is uint8 (H, W); returns
@@ -49,15 +52,14 @@ def shannon(grey: np.ndarray, radius_px: int = DISC_RADIUS_PX) -> np.ndarray:
     return cv2.resize(_shannon_of(small, radius_px), (width, height), interpolation=cv2.INTER_LINEAR)
 
 
-def block_means(per_pixel: np.ndarray, cell_px: int) -> np.ndarray:
+def block_means(per_pixel: Array, cell_px: int) -> Array:
     """Average over every block of 2x2 cells, stride one cell: float32 (H, W) to (H/cell_px - 1, W/cell_px - 1)."""
     cell = _cell_means(per_pixel, cell_px)
-    return (cell[:-1, :-1] + cell[:-1, 1:] + cell[1:, :-1] + cell[1:, 1:]) / 4
+    means: Array = (cell[:-1, :-1] + cell[:-1, 1:] + cell[1:, :-1] + cell[1:, 1:]) / 4
+    return means
 
 
-def good_blocks(
-    grey: np.ndarray, which: str, cell_px: int, threshold: float, among: np.ndarray | bool = True
-) -> np.ndarray:
+def good_blocks(grey: Bytes, which: str, cell_px: int, threshold: float, among: Bools | bool = True) -> Bools:
     """Tell which blocks are good (thesis 6.2.1): `block_means(filled_bins(grey), cell_px) >= threshold`, or of
     `shannon`.
 
@@ -83,17 +85,18 @@ class _Bounds:
     and `across` (cols, w), nowhere negative, make the means of the blocks. `exact` computes the entropy at the points
     of a bool (h, w)."""
 
-    low: np.ndarray
-    high: np.ndarray
-    down: np.ndarray
-    across: np.ndarray
-    exact: Callable[[np.ndarray], np.ndarray]
+    low: Array
+    high: Array
+    down: Singles
+    across: Singles
+    exact: Callable[[Bools], Singles]
 
-    def blocks(self, values: np.ndarray) -> np.ndarray:
-        return self.down @ values @ self.across.T
+    def blocks(self, values: Array) -> Singles:
+        means: Singles = self.down @ values @ self.across.T
+        return means
 
 
-def _bound_filled_bins(grey: np.ndarray, cell_px: int) -> _Bounds:
+def _bound_filled_bins(grey: Bytes, cell_px: int) -> _Bounds:
     """Bound the mean of `filled_bins` over each cell, from the last six bits of the intensities.
 
     n intensities never have more than n different endings. If all intensities of a neighbourhood lie within 64 k
@@ -103,11 +106,11 @@ def _bound_filled_bins(grey: np.ndarray, cell_px: int) -> _Bounds:
     padded = _replicated(grey, r)
     at_least = np.empty(grey.shape, np.uint8)
     for top in range(0, len(grey), _STRIP_ROWS):
-        endings = over_disc(_bit(padded[top : top + _STRIP_ROWS + 2 * r]), r, np.bitwise_or)
+        endings = _over_disc(_bit(padded[top : top + _STRIP_ROWS + 2 * r]), r, np.bitwise_or)
         at_least[top : top + _STRIP_ROWS] = np.bitwise_count(endings)
     at_most = cv2.multiply(at_least, (_range(grey) >> 6) + 1)  # saturates at 255
 
-    def exact(cells: np.ndarray) -> np.ndarray:
+    def exact(cells: Bools) -> Singles:
         side = cell_px + 2 * r
         patches = np.lib.stride_tricks.sliding_window_view(padded, (side, side))[::cell_px, ::cell_px][cells]
         means = np.empty(len(patches), np.float32)
@@ -121,7 +124,7 @@ def _bound_filled_bins(grey: np.ndarray, cell_px: int) -> _Bounds:
     return _Bounds(low=low, high=high, down=down, across=across, exact=exact)
 
 
-def _bound_shannon(grey: np.ndarray, cell_px: int) -> _Bounds:
+def _bound_shannon(grey: Bytes, cell_px: int) -> _Bounds:
     """Bound `shannon` at each pixel of the copy, from the last four bits of the intensities.
 
     The entropy of the endings is never more than that of the whole intensities. If all intensities of a neighbourhood
@@ -131,7 +134,7 @@ def _bound_shannon(grey: np.ndarray, cell_px: int) -> _Bounds:
     low = _shannon_of(small & 15, DISC_RADIUS_PX)
     high = low + _LOG2_OVER_8[(_range(small) >> 4) + 1]
 
-    def exact(pixels: np.ndarray) -> np.ndarray:
+    def exact(pixels: Bools) -> Singles:
         return _shannon_at(small, pixels, DISC_RADIUS_PX)
 
     down, across = (_scaled_pairs(side, cell_px) for side in grey.shape)
@@ -142,74 +145,78 @@ _MAPS = {"filled_bins": filled_bins, "shannon": shannon}
 _BOUNDS = {"filled_bins": _bound_filled_bins, "shannon": _bound_shannon}
 
 
-def _cell_means(per_pixel: np.ndarray, cell_px: int) -> np.ndarray:
+def _cell_means(per_pixel: Array, cell_px: int) -> Array:
     height, width = per_pixel.shape
     return cv2.resize(per_pixel, (width // cell_px, height // cell_px), interpolation=cv2.INTER_AREA)
 
 
-def _shannon_copy(grey: np.ndarray) -> np.ndarray:
+def _shannon_copy(grey: Bytes) -> Array:
     # INTER_LINEAR_EXACT: plain INTER_LINEAR differs by a grey level between processors, and a map must work on all.
     return cv2.resize(grey, (SHANNON_SIDE_PX, SHANNON_SIDE_PX), interpolation=cv2.INTER_LINEAR_EXACT)
 
 
 @lru_cache(maxsize=4)
-def _pairs(cells: int) -> np.ndarray:
+def _pairs(cells: int) -> Array:
     """Return float32 (cells - 1, cells): the matrix that averages each cell and the next."""
     return (np.eye(cells - 1, cells, dtype=np.float32) + np.eye(cells - 1, cells, 1, dtype=np.float32)) / 2
 
 
 @lru_cache(maxsize=4)
-def _scaled_pairs(side_px: int, cell_px: int) -> np.ndarray:
+def _scaled_pairs(side_px: int, cell_px: int) -> Singles:
     """Return float32 (cells - 1, SHANNON_SIDE_PX): `_pairs` for the copy, scaled back up to `side_px` pixels."""
     unit = np.eye(SHANNON_SIDE_PX, dtype=np.float32)
     back = cv2.resize(unit, (SHANNON_SIDE_PX, side_px), interpolation=cv2.INTER_LINEAR)
-    return _pairs(side_px // cell_px) @ back.reshape(-1, cell_px, SHANNON_SIDE_PX).mean(axis=1)
+    matrix: Singles = _pairs(side_px // cell_px) @ back.reshape(-1, cell_px, SHANNON_SIDE_PX).mean(axis=1)
+    return matrix
 
 
-def _range(grey: np.ndarray) -> np.ndarray:
+def _range(grey: Bytes) -> Array:
     """Return the largest minus the smallest intensity in the square around each disc."""
     square = np.ones((2 * DISC_RADIUS_PX + 1,) * 2, np.uint8)
     return cv2.subtract(cv2.dilate(grey, square), cv2.erode(grey, square))
 
 
-def _replicated(grey: np.ndarray, radius_px: int) -> np.ndarray:
+def _replicated(grey: Bytes, radius_px: int) -> Array:
     """Repeat the border of `grey` outwards, which adds no intensity to any disc: a pixel outside takes the value of the
     nearest pixel inside, and that one is nearer to the middle of the disc."""
     r = radius_px
     return cv2.copyMakeBorder(grey, r, r, r, r, cv2.BORDER_REPLICATE)
 
 
-def _bit(grey: np.ndarray) -> np.ndarray:
+def _bit(grey: Bytes) -> NDArray[np.uint64]:
     """Return the set that holds one intensity, by its last six bits, as one bit of a 64-bit word."""
-    return np.left_shift(np.uint64(1), grey & 63, dtype=np.uint64)
+    sets: NDArray[np.uint64] = np.left_shift(np.uint64(1), grey & 63, dtype=np.uint64)
+    return sets
 
 
-def _different(padded: np.ndarray, radius_px: int) -> np.ndarray:
+def _different(padded: Bytes, radius_px: int) -> Array:
     """Count the different intensities in each disc: uint8 (..., H + 2r, W + 2r) to int16 (..., H, W).
 
     The set of intensities of a pixel is 256 bits in four words. So the set of a disc is a union of bit sets, and its
     size is a count of bits.
     """
     bit, word_of = _bit(padded), padded >> 6
-    unions = (over_disc(bit * (word_of == word), radius_px, np.bitwise_or) for word in range(4))
-    return sum(np.bitwise_count(union).astype(np.int16) for union in unions)
+    unions = (_over_disc(bit * (word_of == word), radius_px, np.bitwise_or) for word in range(4))
+    sizes: Array = reduce(np.add, (np.bitwise_count(union).astype(np.int16) for union in unions))
+    return sizes
 
 
-def _shannon_of(small: np.ndarray, radius_px: int) -> np.ndarray:
+def _shannon_of(small: Array, radius_px: int) -> Singles:
     """Compute the Shannon entropy over 8 of the disc of every pixel: uint8 (H, W) to float32 (H, W)."""
     padded = np.pad(small.astype(np.int16), radius_px, constant_values=-1)  # -1: outside, no intensity
-    said = np.zeros(small.shape, np.float32)
+    of_counts = np.zeros(small.shape, np.float32)
     present = np.flatnonzero(np.bincount(small.ravel()))[:, None, None]
     for start in range(0, len(present), _STRIP_INTENSITIES):
         one_hot = (padded == present[start : start + _STRIP_INTENSITIES]).view(np.uint8)
-        counts = over_disc(one_hot, radius_px, np.add)
-        said += _COUNT_LOG2.take(counts).sum(axis=0)
-    in_disc = over_disc((padded >= 0).view(np.uint8), radius_px, np.add)
+        counts = _over_disc(one_hot, radius_px, np.add)
+        of_counts += _COUNT_LOG2.take(counts).sum(axis=0)
+    in_disc = _over_disc((padded >= 0).view(np.uint8), radius_px, np.add)
     # -sum p log2 p with p = c/n is log2 n - (sum c log2 c)/n.
-    return (_COUNT_LOG2[in_disc] - said) / in_disc / 8
+    entropy: Singles = (_COUNT_LOG2[in_disc] - of_counts) / in_disc / 8
+    return entropy
 
 
-def _shannon_at(small: np.ndarray, pixels: np.ndarray, radius_px: int) -> np.ndarray:
+def _shannon_at(small: Bytes, pixels: Bools, radius_px: int) -> Singles:
     """Compute `_shannon_of` at the True pixels of a bool (H, W): float32, one value per pixel, from its own
     histogram."""
     r = radius_px
@@ -224,12 +231,12 @@ def _shannon_at(small: np.ndarray, pixels: np.ndarray, radius_px: int) -> np.nda
         bins = padded.take(strip + disc) + 257 * np.arange(len(strip))[:, None]
         counts = np.bincount(bins.ravel(), minlength=257 * len(strip)).reshape(-1, 257)[:, :256]
         in_disc = counts.sum(axis=1)
-        said = _COUNT_LOG2.take(counts).sum(axis=1)
-        entropy[start : start + _STRIP_PIXELS] = (_COUNT_LOG2[in_disc] - said) / in_disc / 8
+        of_counts = _COUNT_LOG2.take(counts).sum(axis=1)
+        entropy[start : start + _STRIP_PIXELS] = (_COUNT_LOG2[in_disc] - of_counts) / in_disc / 8
     return entropy
 
 
-def over_disc(planes: np.ndarray, radius_px: int, combine: np.ufunc) -> np.ndarray:
+def _over_disc(planes: Array, radius_px: int, combine: np.ufunc) -> Array:
     """Combine every plane over a disc by an associative ufunc (add, bitwise_or): (..., H + 2r, W + 2r) to (..., H, W).
 
     The disc is a stack of rows. Each row is widened once for all rows of the disc that have its width. All planes are

@@ -9,7 +9,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from edgevpr.core.arrays import Image, Mask, Singles
+from edgevpr.core.arrays import Array, Bytes, Image, Ints, Mask, Singles
 
 _STRIP_ROWS = 64  # rows computed at once, so that the planes of a strip stay in cache
 _SIGN_BIT = np.uint32(1 << 31)
@@ -39,7 +39,7 @@ _KEPT = (
 )
 
 
-def grey_square(image: np.ndarray, side_px: int) -> np.ndarray:
+def grey_square(image: Image, side_px: int) -> Array:
     """Return a uint8 image, (H, W) grey or (H, W, 3) BGR, as float32 grey of (side_px, side_px), 0 to 255.
 
     The values are not rounded to grey levels. A small picture that is enlarged has steps of fractions of a level, which
@@ -49,19 +49,19 @@ def grey_square(image: np.ndarray, side_px: int) -> np.ndarray:
     return cv2.resize(grey.astype(np.float32), (side_px, side_px), interpolation=cv2.INTER_LINEAR)
 
 
-def levels(grey: np.ndarray) -> np.ndarray:
+def levels(grey: Singles) -> Bytes:
     """Round grey, float32 0 to 255, to the 256 levels of uint8, halves up."""
     return (grey + np.float32(0.5)).astype(np.uint8)
 
 
-def mask_square(mask: np.ndarray | None, side_px: int) -> np.ndarray | None:
+def mask_square(mask: Mask | None, side_px: int) -> Mask | None:
     """Return a bool mask (H, W) as bool (side_px, side_px), nearest neighbour; None stays None (all allowed)."""
     if mask is None:
         return None
     return cv2.resize(mask.astype(np.uint8), (side_px, side_px), interpolation=cv2.INTER_NEAREST).astype(bool)
 
 
-def in_square(image: Image, mask: Mask | None) -> tuple[Image, Mask]:
+def in_square(image: Image, mask: Mask | None) -> tuple[Array, Mask]:
     """Lay a picture into the middle of a square. Returns the square, and bool (side, side): part of the picture and
     allowed."""
     height, width = image.shape[:2]
@@ -75,9 +75,7 @@ def in_square(image: Image, mask: Mask | None) -> tuple[Image, Mask]:
     )
 
 
-def oriented_cells(
-    grey: np.ndarray, cell_px: int, bins: int, signed: bool, allowed: np.ndarray | None = None
-) -> np.ndarray:
+def oriented_cells(grey: Array, cell_px: int, bins: int, signed: bool, allowed: Mask | None = None) -> Singles:
     """Compute histograms of gradient orientation, one per cell (Dalal and Triggs 2005; thesis 6.2.2, steps 1 and 2).
 
     The steps are: the square root of the image over its maximum, central differences, the gradient magnitude, and a
@@ -103,7 +101,7 @@ def oriented_cells(
     return cells
 
 
-def _vote_by_angle(dx: np.ndarray, dy: np.ndarray, cell_px: int, bins: int, signed: bool) -> np.ndarray:
+def _vote_by_angle(dx: Array, dy: Array, cell_px: int, bins: int, signed: bool) -> Array:
     """Vote for any number of orientations: `dx` and `dy` float32 (H, W) to (H/cell_px, W/cell_px, bins)."""
     magnitude, _ = _magnitude(dx, dy)
     at = np.arctan2(dy, dx)
@@ -121,7 +119,7 @@ def _vote_by_angle(dx: np.ndarray, dy: np.ndarray, cell_px: int, bins: int, sign
     return votes.reshape(rows, cols, bins)
 
 
-def _vote_by_octant(dx: np.ndarray, dy: np.ndarray, cell_px: int, *_: object) -> np.ndarray:
+def _vote_by_octant(dx: Array, dy: Array, cell_px: int, *_: object) -> Singles:
     """Cast the same vote for 8 orientations over 360 degrees, without angles, branches or scattered sums.
 
     A gradient of magnitude m lies in a quadrant, at phi = -45..45 degrees from the diagonal of the quadrant. The
@@ -153,7 +151,7 @@ def _vote_by_octant(dx: np.ndarray, dy: np.ndarray, cell_px: int, *_: object) ->
     sums = np.empty((8, height // cell_px, width), np.float32)
     flipped = size_g.view(np.uint32)
 
-    def add_up(at: int, plane: np.ndarray, flip: np.ndarray | None = None) -> None:
+    def add_up(at: int, plane: Singles, flip: Array | None = None) -> None:
         if flip is not None:
             plane = np.bitwise_xor(plane.view(np.uint32), flip, out=flipped).view(np.float32)
         np.add.reduce(plane.reshape(-1, cell_px, width), axis=1, out=sums[at])
@@ -168,17 +166,18 @@ def _vote_by_octant(dx: np.ndarray, dy: np.ndarray, cell_px: int, *_: object) ->
     add_up(7, diagonal, sign_x ^ sign_y)
     of_cells = np.add.reduce(sums.reshape(8, 1, -1, cell_px), axis=3)
     votes = np.add.reduce(of_cells * _ORIENTATIONS[:, :, None], axis=0)
-    return np.maximum(votes, 0, out=votes).T.reshape(height // cell_px, width // cell_px, 8)
+    oriented: Singles = np.maximum(votes, 0, out=votes).T.reshape(height // cell_px, width // cell_px, 8)
+    return oriented
 
 
-def _magnitude(dx: np.ndarray, dy: np.ndarray, out: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+def _magnitude(dx: Array, dy: Array, out: Array | None = None) -> tuple[Array, Array]:
     """Return the length of each gradient, in `out` where that is given, and a plane to use again."""
     squares, spare = np.multiply(dx, dx, out=out), dy * dy
     squares += spare
     return cv2.sqrt(squares, squares), spare
 
 
-def normalised_blocks(cells: np.ndarray) -> np.ndarray:
+def normalised_blocks(cells: Singles) -> Singles:
     """Return the blocks of 2x2 cells, stride one cell, each of Euclidean length 1 (thesis 6.2.2, step 3).
 
     `cells` is float32 (rows, cols, L); returns float32 (rows-1, cols-1, 4L) in the order top left, top right, bottom
@@ -197,7 +196,7 @@ def unit_rows(rows: Singles) -> Singles:
 
 
 @lru_cache
-def slow_patterns(bins: int) -> np.ndarray:
+def slow_patterns(bins: int) -> Singles:
     """Return the patterns that hold most of the information of a block of 2x2 cells of `bins` orientations, each of
     length 1 and at right angles to all others: float32 (4 bins, patterns), one pattern per column.
 
@@ -218,16 +217,17 @@ def slow_patterns(bins: int) -> np.ndarray:
 
 
 @lru_cache
-def waves(bins: int) -> np.ndarray:
+def waves(bins: int) -> Singles:
     """Return the real Fourier series over `bins` orientations: float32 (bins, bins), one wave per row, each of length
     1. The constant comes first, then cosine and sine of each frequency; the highest of an even number of bins has a
     cosine only."""
     turn = 2 * np.pi * np.arange(bins) / bins
     frequency, number = _frequencies(bins), np.arange(bins)
     series = np.cos(frequency[:, None] * turn - np.pi / 2 * (number[:, None] % 2 == 0) * (number[:, None] > 0))
-    return (series / np.linalg.norm(series, axis=1, keepdims=True)).astype(np.float32)
+    unit: Singles = (series / np.linalg.norm(series, axis=1, keepdims=True)).astype(np.float32)
+    return unit
 
 
-def _frequencies(bins: int) -> np.ndarray:
+def _frequencies(bins: int) -> Ints:
     """Return the frequency of each of the `waves`: int (bins,)."""
     return (np.arange(bins) + 1) // 2

@@ -15,7 +15,7 @@ from edgevpr.techniques import pooling
 from edgevpr.techniques.card import Card, digest_of, head_parameters
 from edgevpr.techniques.regions import describe, find_regions, region_backbone
 from edgevpr.techniques.session import Backbone, backbone_of, open_backbone
-from edgevpr.techniques.vectors import NEVER, VectorTechnique
+from edgevpr.techniques.vectors import NEVER, Parameters, VectorTechnique
 from edgevpr.techniques.words import Words, load_words, local_descriptors, sharpness_of, vlad
 
 # Minimum margins in the forms `float`, `8bit` and `1bit`. Beside them the largest margin of a wrong match, with the
@@ -46,7 +46,7 @@ class NetworkVector(VectorTechnique):
     def __init__(
         self,
         name: str,
-        parameters: dict[str, int | float | str],
+        parameters: Parameters,
         backbone: Backbone,
         head: Head,
         *,
@@ -135,7 +135,7 @@ def netvlad(
     backbone = open_backbone(model, "features", threads)
     learned = load_words(model, "vlad", words)
     head = partial(_vlad, learned=learned, sharpness=sharpness_of(learned.words) if assignment == "soft" else None)
-    parameters = {"model": model, "words": words, "assignment": assignment}
+    parameters: Parameters = {"model": model, "words": words, "assignment": assignment}
     return NetworkVector("netvlad", parameters, backbone, head, form=form, model_sha256=learned.sha256)
 
 
@@ -156,7 +156,7 @@ def region_vlad(
     def head(features: Singles) -> Singles:
         return vlad(describe(features, find_regions(features, regions)), learned.words)
 
-    parameters = {"model": model, "regions": regions, "words": words}
+    parameters: Parameters = {"model": model, "regions": regions, "words": words}
     return NetworkVector("region_vlad", parameters, backbone, head, form=form, model_sha256=learned.sha256)
 
 

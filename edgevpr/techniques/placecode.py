@@ -10,7 +10,9 @@ another matrix, and one product compares them all.
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
+from edgevpr.core.arrays import Array, Bools, Bytes, Floats, Ints, Singles
 from edgevpr.techniques.gradients import waves
 
 SIDE = 12  # cells along one side
@@ -23,7 +25,7 @@ _BITS_AT_ONCE = 1 << 19  # of places: 2 MB as float32
 _SIGNS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).astype(np.float32) * 2 - 1
 
 
-def _shifts() -> np.ndarray:
+def _shifts() -> NDArray[np.int8]:
     steps = np.arange(1 - SIDE, SIDE)
     dy, dx = np.meshgrid(steps, steps, indexing="ij")
     enough = (SIDE - abs(dx)) * (SIDE - abs(dy)) >= _MIN_OVERLAP * SIDE**2
@@ -34,13 +36,13 @@ def _shifts() -> np.ndarray:
 SHIFTS = _shifts()
 
 
-def grid(blocks: np.ndarray) -> np.ndarray:
+def grid(blocks: Singles) -> Singles:
     """Average the orientations over the cells of a picture: blocks float32 (n, n, 4L) to float32 (12, 12, L), each cell
     of length 1 (so that contrast and haze do not count)."""
     return seen_grid(blocks, np.ones(blocks.shape[:2], bool))[0]
 
 
-def seen_grid(blocks: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def seen_grid(blocks: Singles, seen: Bools) -> tuple[Singles, Bools]:
     """Make the `grid` of those blocks that bool (n, n) `seen` allows. Also returns bool (12, 12): at least half of the
     cell is seen."""
     n, bins = len(blocks), blocks.shape[2] // 4
@@ -51,19 +53,20 @@ def seen_grid(blocks: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndar
     return cells.reshape(SIDE, SIDE, bins), (seen.ravel()[at].mean(axis=1) >= 0.5).reshape(SIDE, SIDE)
 
 
-def special(grids: np.ndarray, mean: np.ndarray) -> np.ndarray:
+def special(grids: Floats, mean: Floats) -> Array:
     """Return the part of a picture that sets it apart: grids (..., 12, 12, L) less the map's mean (12, 12, L), the
     orientations of each cell as a Fourier series. The result is float32 of the shape of `grids`."""
-    return (np.asarray(grids, np.float32) - mean) @ waves(grids.shape[-1]).T
+    apart: Array = (np.asarray(grids, np.float32) - mean) @ waves(grids.shape[-1]).T
+    return apart
 
 
-def pack(grids: np.ndarray, mean: np.ndarray) -> np.ndarray:
+def pack(grids: Floats, mean: Floats) -> Bytes:
     """Make the rows of the index: grids (N, 12, 12, L) and the map's mean (12, 12, L) to uint8 (N, 18 L), bit by
     bit."""
     return np.packbits((special(grids, mean) >= 0).reshape(len(grids), -1), axis=1)
 
 
-def hypotheses(grid: np.ndarray, seen: np.ndarray, mean: np.ndarray) -> np.ndarray:
+def hypotheses(grid: Singles, seen: Bools, mean: Floats) -> Singles:
     """Make a query's views from elsewhere: its grid and `seen` (by `seen_grid`) and the map's mean to float32
     (S, 144 L). Each is the signs of the query (0 where nothing is seen), moved by one of the S `SHIFTS`."""
     signs = np.where(special(grid, mean) >= 0, np.float32(1), np.float32(-1)) * seen[..., None]
@@ -73,7 +76,7 @@ def hypotheses(grid: np.ndarray, seen: np.ndarray, mean: np.ndarray) -> np.ndarr
     return asked.reshape(len(SHIFTS), -1)
 
 
-def scan(asked: np.ndarray, codes: np.ndarray) -> np.ndarray:
+def scan(asked: Singles, codes: Bytes) -> Singles:
     """Compare every hypothesis, float32 (S, 8 B), with every place, uint8 (N, B). Returns the best score of each place,
     float32 (N,).
 
@@ -94,7 +97,7 @@ def scan(asked: np.ndarray, codes: np.ndarray) -> np.ndarray:
     return best
 
 
-def scan_ahead(asked: np.ndarray, codes: np.ndarray) -> np.ndarray:
+def scan_ahead(asked: Singles, codes: Bytes) -> Singles:
     """Scan all places under a quarter of the shifts, then the best 500 places under all. Each shift of the quarter is
     blurred with those around it, so that none is missed. Takes and returns the same as `scan`."""
     if len(codes) <= _LOOKED_CLOSER:
@@ -106,20 +109,20 @@ def scan_ahead(asked: np.ndarray, codes: np.ndarray) -> np.ndarray:
 
 
 @lru_cache
-def _blurred() -> np.ndarray:
+def _blurred() -> Singles:
     """Return float32 (even shifts, S): the weights of all shifts in the mean around each even one, by distance."""
     kept = SHIFTS[(SHIFTS % 2 == 0).all(axis=1)]
     weight = np.maximum(1 - abs(kept[:, None] - SHIFTS) / 2, 0).prod(axis=2)
-    return (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
+    weights: Singles = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
+    return weights
 
 
 @lru_cache(maxsize=8)
-def _sources(n: int) -> np.ndarray:
+def _sources(n: int) -> Ints:
     """Return int (144, 9): the block that each sample of each cell is taken from."""
-    middle = (np.arange(SIDE * _SAMPLES) + 0.5) / (SIDE * _SAMPLES)
-    y, x = (part.reshape(SIDE, _SAMPLES, SIDE, _SAMPLES) for part in np.meshgrid(middle, middle, indexing="ij"))
-    x, y = (part.swapaxes(1, 2).reshape(SIDE**2, _SAMPLES**2) for part in (x, y))
-    return np.floor(y * n).astype(np.intp) * n + np.floor(x * n).astype(np.intp)
+    at = np.floor((np.arange(SIDE * _SAMPLES) + 0.5) / (SIDE * _SAMPLES) * n).astype(np.intp)
+    numbers = np.add.outer(at * n, at).reshape(SIDE, _SAMPLES, SIDE, _SAMPLES)
+    return numbers.swapaxes(1, 2).reshape(SIDE**2, _SAMPLES**2)
 
 
 def _to(step: int) -> slice:

@@ -17,7 +17,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
+from edgevpr.core.arrays import Array, Bools, Ints, Singles
 from edgevpr.core.errors import ModelError
 from edgevpr.core.files import arrays_of, find_model, read_file
 from edgevpr.techniques.gradients import slow_patterns
@@ -39,18 +41,18 @@ _VOTING_AT_ONCE = 256
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Asked:
+class QueryWords:
     """The words of a query under each of R rotations: `word`, `region` (its number, row by row) and `turn` int (E,) of
     each that counts, and `counts` uint16 (1025, R), how often each word counts. The last row is of no word."""
 
-    word: np.ndarray
-    region: np.ndarray
-    turn: np.ndarray
-    counts: np.ndarray
+    word: Ints
+    region: Ints
+    turn: Ints
+    counts: NDArray[np.uint16]
     sides: tuple[int, int]  # regions along one side, of the query and of a place
 
 
-def of_place(vocabulary: np.ndarray, patterns: np.ndarray, good: np.ndarray) -> np.ndarray:
+def of_place(vocabulary: Singles, patterns: Singles, good: Bools) -> NDArray[np.uint16]:
     """Return the words of a place: patterns float32 (100, 20) of the regions `named`, and which of them are good, bool
     (100,), to uint16 (100,). Regions that are not good, and those of a word that was there before, have none (1024)."""
     words = np.where(good, nearest(vocabulary, patterns), NONE)
@@ -61,8 +63,8 @@ def of_place(vocabulary: np.ndarray, patterns: np.ndarray, good: np.ndarray) -> 
 
 
 def of_query(
-    vocabulary: np.ndarray, asking: dict[int, tuple[np.ndarray, np.ndarray]], within: int, sides: tuple[int, int]
-) -> Asked:
+    vocabulary: Singles, asking: dict[int, tuple[Singles, Ints]], within: int, sides: tuple[int, int]
+) -> QueryWords:
     """Return the words of a query. `asking` has, of the picture turned clockwise by some of the `within` steps of a
     quarter turn, the patterns float32 (G, 20) of the good regions and their numbers int (G,); the other quarters
     follow. Under the steps that it lacks, and those a quarter turn from them, the query has no words. `sides` are the
@@ -83,12 +85,12 @@ def of_query(
             regions.append(here)
             turns.append(np.full(len(here), (turn - within * quarter) % total))
             here = turned_numbers(side)[here]
-    word, region, turn = (np.concatenate(each) for each in (words, regions, turns))
-    counts = np.bincount(word * total + turn, minlength=(NONE + 1) * total).reshape(NONE + 1, total)
-    return Asked(word=word, region=region, turn=turn, counts=counts.astype(np.uint16), sides=sides)
+    word, region, turned = (np.concatenate(parts) for parts in (words, regions, turns))
+    counts = np.bincount(word * total + turned, minlength=(NONE + 1) * total).reshape(NONE + 1, total)
+    return QueryWords(word=word, region=region, turn=turned, counts=counts.astype(np.uint16), sides=sides)
 
 
-def scan(asked: Asked, rows: np.ndarray, expected: np.ndarray | None = None, voting: float = 1.0) -> np.ndarray:
+def scan(asked: QueryWords, rows: Array, expected: Ints | None = None, voting: float = 1.0) -> Singles:
     """Score all places, uint16 (N, 100), under each rotation: float32 (N, R), at most 1 for a query that shows as much
     ground as a place. `voting` is the part of the usual number of pairs that vote.
 
@@ -107,7 +109,7 @@ def scan(asked: Asked, rows: np.ndarray, expected: np.ndarray | None = None, vot
             scores[group[:, None], near] = _shared(asked.counts[:, near], rows[group])
     flat = scores.ravel()
     possible = np.count_nonzero(np.isfinite(flat))
-    voted = round(voting * _VOTED_EACH * max(1, possible // max(1, len(rows))))
+    voted = round(voting * _VOTED_EACH * max(1, int(possible) // max(1, len(rows))))
     best = np.argpartition(-flat, voted)[:voted] if len(flat) > voted else np.arange(len(flat))
     best = best[np.isfinite(flat[best])]
     slots, turned = np.divmod(best, turns)
@@ -118,13 +120,14 @@ def scan(asked: Asked, rows: np.ndarray, expected: np.ndarray | None = None, vot
     return scores
 
 
-def nearest(vocabulary: np.ndarray, patterns: np.ndarray) -> np.ndarray:
+def nearest(vocabulary: Singles, patterns: Singles) -> Ints:
     """Return the number of the word most similar to each of patterns float32 (N, 20): int (N,)."""
-    return (patterns @ vocabulary.T).argmax(axis=1)
+    numbers: Ints = (patterns @ vocabulary.T).argmax(axis=1)
+    return numbers
 
 
 @lru_cache(maxsize=1)
-def load(name: str) -> np.ndarray:
+def load(name: str) -> Singles:
     """Load the words of the file NAME.npz in a folder of models, as `edgevpr train ground` writes it: float32
     (1024, 20), of length 1, number 4 k + q being number 4 k turned by q quarter turns.
 
@@ -144,7 +147,7 @@ def load(name: str) -> np.ndarray:
     return turned_words(words)
 
 
-def turned_words(words: np.ndarray) -> np.ndarray:
+def turned_words(words: Singles) -> Singles:
     """Return each of words float32 (K, 20) turned counter-clockwise by no, one, two and three quarter turns: float32
     (4 K, 20)."""
     quarter = _quarter_turn()
@@ -154,7 +157,7 @@ def turned_words(words: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(np.stack(turned, axis=1).reshape(-1, words.shape[1]))
 
 
-def turned_blocks(blocks: np.ndarray, quarters: int = 1) -> np.ndarray:
+def turned_blocks(blocks: Singles, quarters: int) -> Singles:
     """Turn the blocks of a picture counter-clockwise by quarter turns: (side, side, 4 L) with L a multiple of 4. Equal
     to the blocks of the turned picture, but for rounding."""
     for _ in range(quarters % QUARTERS):
@@ -163,7 +166,7 @@ def turned_blocks(blocks: np.ndarray, quarters: int = 1) -> np.ndarray:
 
 
 @lru_cache
-def turned_numbers(side: int) -> np.ndarray:
+def turned_numbers(side: int) -> Ints:
     """Return where each region, numbered row by row, is after a quarter turn counter-clockwise: int (side * side,)."""
     was = np.rot90(np.arange(side * side).reshape(side, side)).ravel()
     now = np.empty_like(was)
@@ -171,7 +174,7 @@ def turned_numbers(side: int) -> np.ndarray:
     return now
 
 
-def _turned_block(blocks: np.ndarray) -> np.ndarray:
+def _turned_block(blocks: Singles) -> Singles:
     """Turn blocks (..., 4 L) in place: cells top left, top right, bottom left, bottom right, and their orientations,
     which are measured towards y, which points down."""
     cells = blocks.reshape(*blocks.shape[:-1], 4, -1)[..., [1, 3, 0, 2], :]
@@ -179,13 +182,14 @@ def _turned_block(blocks: np.ndarray) -> np.ndarray:
 
 
 @lru_cache
-def _quarter_turn() -> np.ndarray:
+def _quarter_turn() -> Singles:
     """Return the matrix that turns patterns counter-clockwise by a quarter turn: float32 (20, 20)."""
     kept = slow_patterns(BINS)
-    return kept.T @ _turned_block(np.eye(len(kept), dtype=np.float32)) @ kept
+    turn: Array = kept.T @ _turned_block(np.eye(len(kept), dtype=np.float32)) @ kept
+    return turn
 
 
-def _shared(counts: np.ndarray, rows: np.ndarray) -> np.ndarray:
+def _shared(counts: NDArray[np.uint16], rows: Array) -> NDArray[np.uint16]:
     """Count the words that each place, uint16 (N, 100), shares with the query under each rotation: uint16 (N, R)."""
     turns = counts.shape[1]
     # Four counts are one number of 64 bits: no sum of a hundred of at most four runs over into the next.
@@ -202,7 +206,7 @@ def _shared(counts: np.ndarray, rows: np.ndarray) -> np.ndarray:
     return shared.view(np.uint16)[:, :turns]
 
 
-def _votes(asked: Asked, turn: int, rows: np.ndarray) -> np.ndarray:
+def _votes(asked: QueryWords, turn: int, rows: Array) -> Singles:
     """Count the shared words that agree on one shift of the picture, for places uint16 (P, 100) under one rotation:
     float32 (P,)."""
     mine = asked.turn == turn
@@ -228,21 +232,21 @@ def _votes(asked: Asked, turn: int, rows: np.ndarray) -> np.ndarray:
 
 
 @lru_cache
-def named(side: int) -> np.ndarray:
+def named(side: int) -> Ints:
     """Return the numbers of the regions of a place that have words: int (100,) of `side` * `side`."""
     at = np.rint((np.arange(SIDE) + 0.5) * side / SIDE - 0.5).astype(np.intp)
     return np.add.outer(at * side, at).ravel()
 
 
 @lru_cache
-def _shuffled(side: int) -> np.ndarray:
+def _shuffled(side: int) -> Ints:
     """Return a rank of each region, in no order of space: the first of a word that count are then spread over the
     picture."""
     return np.random.default_rng(0).permutation(side * side)
 
 
 @lru_cache
-def _bins(side: int, of_place: int) -> tuple[np.ndarray, int]:
+def _bins(side: int, of_place: int) -> tuple[Ints, int]:
     """Return the bin of the shift from each region of a query to each of a place that has a word, int
     (100, side * side), and the number of bins along one side."""
     y, x = np.divmod(named(of_place)[:, None], of_place)

@@ -53,7 +53,7 @@ def grid(features: Singles, rows: int, columns: int, how: str) -> Singles:
             f"A feature map of {height}x{width} is too small for a grid of {rows}x{columns}: use a coarser grid or a "
             "network with a larger feature map."
         )
-    reduce = {"mean": np.mean, "max": np.max}[how]
+    reduce = np.mean if how == "mean" else np.max
     cells = [
         reduce(features[:, top:bottom, left:right], axis=(1, 2))
         for top, bottom in _cells(height, rows)

@@ -18,7 +18,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from edgevpr.core.arrays import Array, Bools, Image, Ints, Mask, Singles
+from edgevpr.core.arrays import Array, Image, Ints, Mask, Singles
 from edgevpr.core.contract import Descriptor, FineMatch, PartSpec
 from edgevpr.core.errors import ModelError, UsageError
 from edgevpr.techniques.pooling import regional_vectors, square_regions, unit
@@ -38,7 +38,7 @@ class RegionTechnique(VectorTechnique):
 
     candidates = 40
 
-    def __init__(self, backbone: Backbone, describe: Describe, quality: Callable[[Bools], float], **spec: Any) -> None:
+    def __init__(self, backbone: Backbone, describe: Describe, quality: Callable[[Array], Any], **spec: Any) -> None:
         self._backbone, self._describe, self._quality = backbone, describe, quality
         vector, regions = describe(np.zeros(backbone.shape, np.float32))
         super().__init__(length=len(vector), **spec)
@@ -48,7 +48,7 @@ class RegionTechnique(VectorTechnique):
         """Encode uint8 (H, W[, 3]) to coarse float16 (D,) and fine int8 (N, C). For a query there are also the regions
         as float32 of length 1; `good` marks those that were found."""
         vector, regions = self._describe(self._backbone.run(image, mask))
-        good = regions.any(axis=1)
+        good: Array = np.any(regions, axis=1)
         return Descriptor(
             coarse=vector.astype("<f2"),
             fine=to_bytes(regions),
@@ -59,7 +59,7 @@ class RegionTechnique(VectorTechnique):
 
     def match(self, query: Descriptor, fine: Array, hypotheses: None = None) -> FineMatch:
         """Score the mutually best pairs of regions, 0 to 1 (see `mutual_score`)."""
-        return FineMatch(mutual_score(query.regions, from_bytes(fine)))
+        return FineMatch(0.0 if query.regions is None else mutual_score(query.regions, from_bytes(fine)))
 
 
 def rmac(model: str = "calc", form: str = "float", threads: int = 1) -> RegionTechnique:

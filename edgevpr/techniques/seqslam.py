@@ -10,6 +10,7 @@ import math
 import cv2
 import numpy as np
 
+from edgevpr.core.arrays import Array, Doubles, Image, Mask, Singles
 from edgevpr.core.contract import Descriptor, PartSpec, TechniqueSpec
 from edgevpr.core.errors import UsageError
 
@@ -47,7 +48,7 @@ class SeqSlam:
             sequence=sequence,
         )
 
-    def encode(self, image: np.ndarray, mask: np.ndarray | None = None) -> Descriptor:
+    def encode(self, image: Image, mask: Mask | None = None) -> Descriptor:
         """Encode uint8 (H, W[, 3]) to coarse uint8 (height * width,): 128 + 28 times the deviation of a pixel from its
         patch's mean, in standard deviations of the patch.
 
@@ -66,13 +67,13 @@ class SeqSlam:
         coarse = levels.reshape(rows, columns, self._patch, self._patch).swapaxes(1, 2).ravel()
         return Descriptor(coarse=coarse, quality=float(np.mean(spread >= _LEAST_SPREAD)))
 
-    def _patches(self, picture: np.ndarray) -> np.ndarray:
+    def _patches(self, picture: Singles) -> Singles:
         """Cut a picture into patches: (height, width) to (patches, patch * patch)."""
         rows, columns = self._height // self._patch, self._width // self._patch
         blocks = picture.reshape(rows, self._patch, columns, self._patch).swapaxes(1, 2)
         return blocks.reshape(rows * columns, self._patch * self._patch)
 
-    def coarse_scores(self, query: Descriptor, rows: np.ndarray, mean: None = None) -> tuple[np.ndarray, None]:
+    def coarse_scores(self, query: Descriptor, rows: Array, mean: None = None) -> tuple[Singles, None]:
         """Score how much better the query fits each row than the rows around it: uint8 (N, length) to float32 (N,) in
         0..1.
 
@@ -86,7 +87,7 @@ class SeqSlam:
         return (0.5 - enhanced(differences) / (2 * most)).astype(np.float32), None
 
 
-def normalised(pixels: np.ndarray, allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def normalised(pixels: Singles, allowed: Singles) -> tuple[Singles, Singles]:
     """Subtract each patch's mean and divide by its standard deviation: float32 (patches, pixels) and weights 0 or 1 of
     the same shape to float32 (patches, pixels), 0 where the weight is 0 or the patch is flat. Also returns the
     deviations (patches,)."""
@@ -96,7 +97,7 @@ def normalised(pixels: np.ndarray, allowed: np.ndarray) -> tuple[np.ndarray, np.
     return np.divide(centred, spread, out=np.zeros_like(centred), where=spread > 1e-3), spread[:, 0]
 
 
-def enhanced(differences: np.ndarray) -> np.ndarray:
+def enhanced(differences: Array) -> Doubles:
     """Enhance the local contrast of the differences along the map: int32 (N,) to float64 (N,), in standard deviations
     of the window.
 
@@ -112,4 +113,5 @@ def enhanced(differences: np.ndarray) -> np.ndarray:
     total = sums[last] - sums[first]
     variance = (count * (squares[last] - squares[first]) - total**2).astype(np.float64)  # times count * (count - 1)
     scale = np.sqrt((count - 1) / count / np.maximum(variance, 1))  # a variance of 0 leaves nothing to scale
-    return (count * whole - total) * scale
+    deviations: Doubles = (count * whole - total) * scale
+    return deviations

@@ -235,7 +235,7 @@ def _first_line(error: Exception) -> str:
     return (str(error).strip() or type(error).__name__).splitlines()[0][:200]
 
 
-def prepare(image: Image, rule: InputRule) -> Singles:
+def prepare(image: Array, rule: InputRule) -> Singles:
     """Prepare uint8 (H, W) grey or (H, W, 3) BGR as float32 (1, C, height, width), or (1, height, width, C) for NHWC.
 
     Equalising is that of CALC: BGR to YUV, the histogram of Y equalised, back to BGR, all before the picture is made
@@ -257,7 +257,7 @@ def prepare(image: Image, rule: InputRule) -> Singles:
     return np.ascontiguousarray(values[None] if rule.layout == "NHWC" else values.transpose(2, 0, 1)[None])
 
 
-def shares(image: Image, rule: InputRule) -> tuple[float, float]:
+def shares(image: Array, rule: InputRule) -> tuple[float, float]:
     """Return the shares of the input's width and height that `prepare` fills with the picture; the rest is padding."""
     if rule.pad is None:
         return 1.0, 1.0
@@ -266,17 +266,17 @@ def shares(image: Image, rule: InputRule) -> tuple[float, float]:
     return max(1, round(width * scale)) / rule.width, max(1, round(height * scale)) / rule.height
 
 
-def _sized(image: Image, rule: InputRule) -> Image:
+def _sized(image: Array, rule: InputRule) -> Array:
     across, down = shares(image, rule)
     width, height = round(across * rule.width), round(down * rule.height)
     image = cv2.resize(image, (width, height), interpolation=_RESIZE[rule.resize])
     if (width, height) == (rule.width, rule.height):
         return image
     border = (0, rule.height - height, 0, rule.width - width)
-    return cv2.copyMakeBorder(image, *border, cv2.BORDER_CONSTANT, value=(rule.pad,) * 3)
+    return cv2.copyMakeBorder(image, *border, cv2.BORDER_CONSTANT, value=(rule.pad or 0,) * 3)
 
 
-def without_masked(image: Image, mask: Mask | None) -> Image:
+def without_masked(image: Image, mask: Mask | None) -> Array:
     """Set every pixel where the bool (H, W) `mask` is False to the mean of the others (128 if there are none). A
     network needs a whole picture, and a uniform patch adds the least to it."""
     if mask is None or mask.all():
@@ -286,9 +286,9 @@ def without_masked(image: Image, mask: Mask | None) -> Image:
     return filled
 
 
-def _equalised(image: Image) -> Image:
+def _equalised(image: Array) -> Array:
     if image.ndim == 2:
         return cv2.equalizeHist(image)
-    yuv = cv2.cvtColor(image, cv2.COLOR_BGR2YUV)
+    yuv: Array = cv2.cvtColor(image, cv2.COLOR_BGR2YUV)
     yuv[..., 0] = cv2.equalizeHist(np.ascontiguousarray(yuv[..., 0]))
     return cv2.cvtColor(yuv, cv2.COLOR_YUV2BGR)

@@ -7,10 +7,7 @@ takes most of the range of a byte. It changes while a map grows. So the file is 
 serves all forms.
 """
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
 from edgevpr.core.arrays import Array, Bytes, Doubles, Image, Ints, Mask, Singles
 from edgevpr.core.config import FORMS
@@ -18,11 +15,7 @@ from edgevpr.core.contract import Descriptor, PartSpec, TechniqueSpec
 from edgevpr.core.errors import ModelError, UsageError
 from edgevpr.techniques.gradients import grey_square, mask_square, normalised_blocks, oriented_cells
 
-try:
-    import simsimd  # optional: the scan of the form `1bit` takes about half the time, and gives the same numbers
-except ImportError:
-    simsimd = None
-
+Parameters = dict[str, int | float | str]
 # A margin that no match can reach. The margins of wrong matches are known for the weights that edgevpr ships. With
 # other weights no match is accepted until the configuration sets a minimum margin.
 NEVER = 2.0
@@ -31,14 +24,8 @@ _TINY = 1e-6
 _BYTES_AT_ONCE = 4 << 20  # of places converted to float32 together
 _FEWEST_AT_ONCE = 16
 _BESIDE_BYTES = 8  # at the end of a row in 8 bits: its step and its length, both float32
-_WORD_BITS = 64  # a row in 1 bit is padded to whole words, whose bits are counted faster
-# Of binary vectors compared together: about a second-level cache. With smaller blocks the calls cost more than the
-# cache saves.
-_CODE_BYTES_AT_ONCE = 1 << 20
-_GROUP = 64  # places
-_PLACES_AT_ONCE = 1 << 13  # simsimd returns float64: with few places at once there is little to convert
-_EVEN_BYTES = np.uint64(0x00FF00FF00FF00FF)
-_ADD_LANES = np.uint64(0x0001000100010001)
+_WORD_BITS = 64  # a row in 1 bit is padded to whole words, whose bits are counted at once
+_CODE_BYTES_AT_ONCE = 1 << 20  # of binary vectors compared together: about a second-level cache
 
 
 class VectorTechnique:
@@ -58,7 +45,7 @@ class VectorTechnique:
     def __init__(
         self,
         name: str,
-        parameters: dict[str, int | float | str],
+        parameters: Parameters,
         length: int,
         *,
         form: str,
@@ -209,56 +196,13 @@ def _blocks(count: int, length: int) -> list[slice]:
 
 
 def hamming(query: Bytes, codes: Bytes) -> Ints:
-    """Count the bits in which a query uint8 (B,) differs from each place uint8 (N, B): uint16 (N,), or uint32 for more
-    than 8191 bytes."""
-    return hamming_numpy(query, codes) if simsimd is None else hamming_simd(query, codes)
-
-
-def hamming_simd(query: Bytes, codes: Bytes) -> Ints:
-    """Compute `hamming` by simsimd, which must be importable."""
-    asked, places = query[None], np.ascontiguousarray(codes)
-    distances: Ints = np.empty(len(codes), _counts_of(codes))
-    for start in range(0, len(codes), _PLACES_AT_ONCE):
-        here = slice(start, start + _PLACES_AT_ONCE)
-        distances[here] = simsimd.hamming(asked, places[here], dtype="bin8")
+    """Count the bits in which a query uint8 (B,) differs from each place uint8 (N, B), B a multiple of 8: uint16 (N,),
+    or uint32 for more than 8191 bytes."""
+    asked, places = query.view(np.uint64), np.ascontiguousarray(codes).view(np.uint64)
+    distances: Ints = np.empty(len(codes), np.uint16 if 8 * codes.shape[1] < 1 << 16 else np.uint32)
+    ones = np.ones(len(asked), np.float32)  # a product is the fastest sum, and exact for whole numbers below 2^24
+    at_once = max(1, _CODE_BYTES_AT_ONCE // codes.shape[1])
+    for start in range(0, len(codes), at_once):
+        block = slice(start, start + at_once)
+        distances[block] = np.bitwise_count(places[block] ^ asked).astype(np.float32) @ ones
     return distances
-
-
-def hamming_numpy(query: Bytes, codes: Bytes) -> Ints:
-    """Compute `hamming` in NumPy: XOR and count, in the widest words that fit, block by block.
-
-    NumPy is slow along short axes. So a group of places is compared with as many copies of the query at once. The
-    counts of eight words are the bytes of one 64-bit number, and are added inside it.
-    """
-    length = codes.shape[1]
-    word = np.dtype(next(form for form in ("u8", "u4", "u2", "u1") if length % np.dtype(form).itemsize == 0))
-    words = length // word.itemsize
-    group = np.tile(query.view(word), _GROUP)
-    places = np.ascontiguousarray(codes).view(word)
-
-    block = min(max(1, _CODE_BYTES_AT_ONCE // (length * _GROUP)) * _GROUP, len(codes))
-    differ = np.empty((block, words), word)
-    counts = np.zeros((block, -(-words // 8) * 8), np.uint8)  # the words beyond the last stay zero
-    distances: Ints = np.empty(len(codes), _counts_of(codes))
-    for start in range(0, len(codes), max(1, block)):
-        part = places[start : start + block]
-        here, grouped = slice(0, len(part)), len(part) // _GROUP * _GROUP
-        np.bitwise_xor(part[:grouped].reshape(-1, group.size), group, out=differ[:grouped].reshape(-1, group.size))
-        np.bitwise_xor(part[grouped:], group[:words], out=differ[grouped : len(part)])
-        np.bitwise_count(differ[here], out=counts[here, :words])
-        distances[start : start + block] = _sums_of_bytes(counts[here].view(np.uint64))
-    return distances
-
-
-def _counts_of(codes: Bytes) -> type[np.unsignedinteger[Any]]:
-    return np.uint16 if 8 * codes.shape[1] < 1 << 16 else np.uint32
-
-
-def _sums_of_bytes(numbers: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Sum all bytes of each row: uint64 (n, k) to (n,); a byte is at most 64."""
-    sums = numbers >> 8
-    sums &= _EVEN_BYTES
-    sums += numbers & _EVEN_BYTES
-    sums *= _ADD_LANES
-    sums >>= 48
-    return sums[:, 0] if sums.shape[1] == 1 else sums.sum(axis=1)

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from edgevpr.core.arrays import Bools, Bytes, Ints, Mask, Singles
+from edgevpr.core.arrays import Array, Bools, Ints, Mask, Singles
 from edgevpr.core.contract import Picture
 from edgevpr.techniques.placewords import QUARTERS, turned_blocks
 
@@ -77,7 +77,7 @@ class Views:
         self._picture, self._cell_px, self._encode, self.seen = picture, cell_px, encode, picture.seen
         self._side, self._good = len(square[1]), max(int(square[1].sum()), 1)
         self._encoded = {(1.0, 0): square}
-        self._scaled: dict[float, tuple[Singles, Bytes]] = {}
+        self._scaled: dict[float, tuple[Array, Array]] = {}
 
     def blocks(self, ratio: float, turn: int) -> tuple[Singles, Bools]:
         """Return the blocks float32 (n, n, 4 bins) of the view of a hypothesis, and which are good, bool (n, n)."""
@@ -109,12 +109,16 @@ class Views:
             worth_at_glance=_GLANCE_BY_CHANCE[ratio],
         )
 
-    def _picture_of(self, ratio: float, within: int) -> tuple[Singles, Bools, int]:
+    def _picture_of(self, ratio: float, within: int) -> tuple[Array, Array, int]:
         """Return the picture of a view, its allowed pixels, and the pixels of a cell. The picture is not enlarged,
         which would add pixels and nothing to see: its cells are smaller instead."""
         cell_px = self._cell_px if ratio <= 1 else max(2, self._cell_px // 2)
         side = cells_along(self._side + 1, ratio) * cell_px
+        grey: Array
+        allowed: Array
         if ratio not in self._scaled:
+            if self._picture.grey is None or self._picture.allowed is None:
+                raise ValueError("a picture that is not kept cannot be turned")
             grey, allowed = self._picture.grey, self._picture.allowed.astype(np.uint8)
             if side != len(grey):
                 grey = cv2.resize(grey, (side, side), interpolation=cv2.INTER_AREA)

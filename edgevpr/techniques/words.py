@@ -7,6 +7,7 @@ import hashlib
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edgevpr.core.arrays import Ints, Singles
 from edgevpr.core.errors import ModelError
@@ -25,7 +26,7 @@ class Whitening:
     `matrix` int8 (P, K D), to be multiplied by `scale` float32 (P,)."""
 
     mean: Singles
-    matrix: np.ndarray
+    matrix: NDArray[np.int8]
     scale: Singles
 
     def __call__(self, vector: Singles) -> Singles:
@@ -77,9 +78,9 @@ def load_words(model: str, kind: str, count: int) -> Words:
     sha256 = hashlib.sha256((wanted + hashlib.sha256(content).hexdigest()).encode()).hexdigest()
     if "whitening" not in arrays:
         return Words(words, sha256)
-    mean, matrix, scale = (arrays.get(key) for key in ("mean", "whitening", "whitening_scale"))
-    fits = mean is not None and matrix is not None and scale is not None and mean.shape == (words.size,)
-    if not fits or matrix.shape != (scale.size, words.size):
+    nothing = np.empty(0, np.float32)
+    mean, matrix, scale = (arrays.get(key, nothing) for key in ("mean", "whitening", "whitening_scale"))
+    if mean.shape != (words.size,) or matrix.shape != (scale.size, words.size):
         raise ModelError(f"{path} holds a whitening that does not fit its words: {command}.")
     mean, scale = mean.astype(np.float32), scale.astype(np.float32).ravel()
     return Words(words, sha256, Whitening(mean=mean, matrix=matrix, scale=scale))

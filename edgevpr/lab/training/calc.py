@@ -147,13 +147,13 @@ class Training:
         # bfloat16 doubles the speed where the processor has it, and is as good: the weights stay float32.
         self._halves = _has_halves(self._device)
         torch.manual_seed(seed)
-        network = Autoencoder(torch.from_numpy(_mean_target(pictures, seed)))
-        self._network = network.to(self._device).to(memory_format=torch.channels_last)
+        self._network = Autoencoder(torch.from_numpy(_mean_target(pictures, seed))).to(self._device)
         self._optimiser = torch.optim.Adam(self._network.parameters(), _RATE)
 
     def encoder(self) -> Encoder:
         """Return the encoder after the steps done so far, ready to be written."""
-        return self._network.encoder.folded()
+        encoder: Encoder = self._network.encoder
+        return encoder.folded()
 
     def run(self, checkpoint: Path) -> Iterator[int]:
         """Do the steps that are left, yielding the number of those done; save `checkpoint` every 250 steps."""
@@ -172,7 +172,7 @@ class Training:
             seen = self._network(inputs.contiguous(memory_format=torch.channels_last))
         loss = functional.mse_loss(seen.float(), targets)
         self._optimiser.zero_grad()
-        loss.backward()
+        torch.autograd.backward(loss)
         self._optimiser.step()
         self.step += 1
         self.losses.append(loss.item())

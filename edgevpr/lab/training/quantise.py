@@ -67,17 +67,14 @@ def _quantised(source: Path, target: Path, feeds: Any) -> None:
             "what it writes to the board."
         ) from error
 
-    class Pictures(CalibrationDataReader):
-        def get_next(self) -> Any:
-            return next(feeds, None)
-
+    pictures = type("Pictures", (CalibrationDataReader,), {"get_next": lambda _: next(feeds, None)})
     prepared = target.with_name("prepared.onnx")
     try:
         quant_pre_process(str(source), str(prepared), skip_symbolic_shape=True)
         quantize_static(
             str(prepared),
             str(target),
-            Pictures(),
+            pictures(),
             quant_format=QuantFormat.QDQ,
             per_channel=True,
             activation_type=QuantType.QUInt8,
