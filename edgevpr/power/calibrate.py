@@ -49,18 +49,13 @@ class PowerFit:
         return replace(board, idle_w=self.idle_w, full_w=self.full_w, verified=meter.certain, source=source)
 
 
-def calibrate(
-    meter: Meter,
-    measure: Callable[[Meter, float], tuple[float, float]] | None = None,
-    progress: Callable[[float], None] = lambda share: None,
-) -> PowerFit:
+def calibrate(meter: Meter, progress: Callable[[float], None]) -> PowerFit:
     """Hold each of `LOADS` for some seconds and fit a line. Raises MeterError for a meter that fails and for figures
-    that no board can have. `progress` is called with each load before it is held; `measure` stands in for
-    `measure_at`."""
+    that no board can have. `progress` is called with each load before it is held."""
     samples = []
     for share in LOADS:
         progress(share)
-        samples.append((measure or measure_at)(meter, share))
+        samples.append(measure_at(meter, share))
     return fit_power(samples)
 
 
@@ -85,14 +80,11 @@ def fit_power(samples: Sequence[tuple[float, float]]) -> PowerFit:
     u, watts = np.array(samples, np.float64).reshape(-1, 2).T
     if not (np.isfinite(u).all() and np.isfinite(watts).all()):
         raise MeterError("A power measurement is not a number: measure again.")
-    distinct: list[float] = []
-    for load in np.sort(u):
-        if not distinct or load - distinct[-1] > _SAME_LOAD:
-            distinct.append(load)
-    if len(distinct) < _LEAST_LOADS:
+    distinct = len(set(np.round(u / _SAME_LOAD)))
+    if distinct < _LEAST_LOADS:
         raise MeterError(
-            f"Power was measured at {len(distinct)} different loads; a line needs {_LEAST_LOADS}: stop other "
-            "programs, and let this one use all cores."
+            f"Power was measured at {distinct} different loads; a line needs {_LEAST_LOADS}: stop other programs, and "
+            "let this one use all cores."
         )
     (idle_w, span_w), *_ = np.linalg.lstsq(np.column_stack([np.ones_like(u), u]), watts, rcond=None)
     if idle_w < -1e-9:
@@ -118,7 +110,7 @@ def fit_power(samples: Sequence[tuple[float, float]]) -> PowerFit:
 
 
 @contextmanager
-def hold_load(share: float, threads: int | None = None) -> Iterator[None]:
+def hold_load(share: float) -> Iterator[None]:
     """Hold all usable cores at `share` (0..1) while the block runs, with one thread a core.
 
     Each thread multiplies small float32 matrices, as cohog's matching does; NumPy lets the other threads run meanwhile.
@@ -126,7 +118,7 @@ def hold_load(share: float, threads: int | None = None) -> Iterator[None]:
     (OPENBLAS_NUM_THREADS, which edgevpr's command line sets); `measure_at` tells which share was really reached.
     """
     stop = threading.Event()
-    count = (threads or len(os.sched_getaffinity(0))) if share > 0 else 0
+    count = len(os.sched_getaffinity(0)) if share > 0 else 0
 
     def run(first_s: float) -> None:
         left, right = np.ones((256, 32), np.float32), np.ones((32, 256), np.float32)

@@ -13,11 +13,7 @@ from pathlib import Path, PurePosixPath
 _ROOT = Path("/")
 _PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 # Texts that stand in the firmware where the maker has filled in nothing.
-_FILLERS = re.compile(
-    r"to be filled|default string|system (product|manufacturer|version)|not (applicable|specified)|o\.?e\.?m\.?$|none$|"
-    r"unknown|invalid|type\d|x\.x",
-    re.IGNORECASE,
-)
+_FILLERS = re.compile(r"to be filled|default string|system (product|manufacturer)|o\.?e\.?m\.?$|none$|x\.x", re.I)
 # Arm's part numbers in /proc/cpuinfo (implementer 0x41), of the processors that such boards have.
 _ARM_PARTS = {
     "0xc07": "Cortex-A7", "0xc0f": "Cortex-A15", "0xd03": "Cortex-A53", "0xd04": "Cortex-A35", "0xd05": "Cortex-A55",

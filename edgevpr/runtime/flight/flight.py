@@ -111,7 +111,6 @@ class Flight:
                 _say_learning_stopped(herald, aboard.cannot_learn)
             herald.say(Severity.INFO, f"started, {len(recogniser.place_map)} places", topic="start")
             meter = meter_of_flight(config.battery, world.board, world.clock, world.tape)
-            stack.callback(meter.close)
             crew = Crew(
                 recogniser=recogniser,
                 learner=learner,

@@ -21,7 +21,7 @@ from edgevpr.runtime.recognise.recognition import Recognition
 class FlightMeter:
     """Meter of a flight, from the moment it is made. `thermal` is the last look at the board's heat, and `limit_c` the
     temperature from which on it slows itself down; `queries_throttled` counts the queries made meanwhile. What is read
-    of the machine is on the `tape`. `close` it when done."""
+    of the machine is on the `tape`."""
 
     def __init__(
         self,
@@ -129,9 +129,6 @@ class FlightMeter:
             temperature_c=self.thermal.temperature_c,
             throttled=self.thermal.throttled,
         )
-
-    def close(self) -> None:
-        """End the metering: nothing is held open."""
 
     def _mah(self, energy_j: float) -> float:
         return 1000 * pack_ah(energy_j, self._pack, self._regulator_efficiency)

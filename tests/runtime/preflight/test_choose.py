@@ -18,8 +18,7 @@ from edgevpr.power.boards import load_board
 from edgevpr.runtime.preflight import accuracy, pick
 from edgevpr.runtime.preflight import choose as choosing
 from edgevpr.runtime.preflight.choose import Demand, best, front, nothing_to_choose, options, preferred
-from edgevpr.runtime.preflight.probe import TechniqueCosts, noise, probe
-from edgevpr.runtime.preflight.scale import on_board
+from edgevpr.runtime.preflight.probe import noise, probe
 
 COSTS = {"regions": REGIONS, "vector": VECTOR}
 
@@ -141,18 +140,6 @@ def test_what_other_programs_take_does_not_count_and_is_said():
     assert costs.waited == pytest.approx(0.8, abs=0.05)
 
 
-def test_the_least_of_several_tries_counts():
-    technique, clocks = TinyTechnique(fine=True), Clocks()
-    disturbed = itertools.cycle([0.13, 0.1, 0.17, 0.12])
-
-    def slow(image, mask=None):
-        clocks.work(next(disturbed))
-        return TinyTechnique.encode(technique, image, mask)
-
-    technique.encode = slow
-    assert probe(technique, tried_s=0.2, **dict(clocks)).encode == StageCost(pytest.approx(0.1), pytest.approx(0.1))
-
-
 def test_the_peak_is_the_most_that_was_resident_not_what_is_left():
     class Greedy(TinyTechnique):
         def encode(self, image, mask=None):
@@ -245,21 +232,6 @@ def test_the_boards_own_technique_goes_before_a_better_one(accuracies):
     assert chosen(board(technique="vector"), COSTS, 100, min_recall=0.6) == "regions"
 
 
-def test_a_big_board_takes_a_technique_for_a_map_that_a_tiny_one_refuses(accuracies):
-    here = load_board("generic-x86")
-    tiny, big = load_board("rpi-zero-2w"), load_board("thesis-xeon")
-    fast = TechniqueCosts(
-        encode=StageCost(0.02, 0.02),
-        match_per_place=StageCost(0.0001, 0.0001),
-        ram_bytes_per_place=286_000,
-        disk_bytes_per_place=286_000,
-        process_mb=90.0,
-    )
-    demand = Demand(places=1000, rate_hz=1, budget_mb=2000)
-    assert best(list(options(big, "vector", "vector", on_board(fast, here, big), demand)), big)
-    assert best(list(options(tiny, "vector", "vector", on_board(fast, here, tiny), demand)), tiny) is None
-
-
 def test_a_large_map_is_scanned_whole_and_compared_in_part():
     two_stages = dataclasses.replace(REGIONS, candidates=20, scan_per_place=StageCost(1e-6, 1e-6))
     assert two_stages.match(20).wall_s == pytest.approx(20 * 0.004001)
@@ -326,12 +298,6 @@ def test_the_cpu_share_limits_a_technique_that_keeps_all_cores_busy():
     four_threads = dataclasses.replace(REGIONS, encode=StageCost(0.1, 0.4), match_per_place=StageCost(0.001, 0.004))
     assert fit(board(cpu_share=1.0), four_threads, 100, 1, 100).reachable_hz == pytest.approx(1 / 0.2)
     assert fit(board(cpu_share=0.25), four_threads, 100, 1, 100).reachable_hz == pytest.approx(1 / 0.8)
-
-
-def test_what_is_reached_is_never_rounded_up():
-    assert [choosing._rounded_down(value) for value in (0.249, 1.99, 9.99, 123.0)] == pytest.approx(
-        [0.24, 1.9, 9.9, 120]
-    )
 
 
 def test_the_boards_own_technique_is_tried_before_those_offered_to_all():

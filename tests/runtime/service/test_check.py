@@ -19,7 +19,6 @@ from edgevpr import techniques
 from edgevpr.core.types import Frame, StageCost
 from edgevpr.mavlink.address import parse_link
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.runtime.flight.autopilot import DRY_RUN
 from edgevpr.runtime.preflight import pick
 from edgevpr.runtime.preflight.choose import too_late
 from edgevpr.runtime.service.check import Finding, check
@@ -84,14 +83,6 @@ def test_a_query_that_is_too_slow_for_any_fix_is_wrong_unless_no_fixes_are_wante
     assert wrong(config_file, settings | {"board": "this"} | without_fixes) == []
 
 
-def test_a_dry_run_is_said(settings, config_file):
-    settings["mavlink"]["send_fixes"] = False
-    config_file.write_text(yaml.safe_dump(settings))
-    (link,) = [finding for finding in check(config_file, offline=True) if finding.what == "link"]
-    assert link.ok
-    assert link.message.endswith(f", {DRY_RUN}")
-
-
 def test_a_ground_link_and_a_signing_key_are_looked_at(settings, config_file, tmp_path):
     key = tmp_path / "key"
     key.write_bytes(bytes(32))
@@ -142,48 +133,48 @@ def test_all_is_well_and_nothing_is_left_behind(settings, config_file, tmp_path,
     assert sorted(path.name for path in flight_folder.iterdir()) == ["images", "valley.gpkg"]
 
 
-def test_a_configuration_without_link_and_log_may_fly(settings, config_file):
-    settings["mavlink"]["link"] = settings["log"]["path"] = None
-    assert wrong(config_file, settings) == []
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"mavlink": {"link": None}, "log": {"path": None}},
+        {"source": {"uri": "rtsp://127.0.0.1:9/camera"}},  # which may deliver later
+    ],
+)
+def test_what_may_fly(settings, config_file, changes):
+    assert wrong(config_file, settings | changes) == []
 
 
-@pytest.mark.parametrize("text", ["map: [", "mapp: valley.gpkg", "source: {rate_hz: 1000}", "\x00", "- 1"])
+@pytest.mark.parametrize("text", ["map: [", "mapp: valley.gpkg", "source: {rate_hz: 1000}", "\x00", "- 1", None])
 def test_a_configuration_that_cannot_be_read_is_the_only_finding(config_file, text):
-    config_file.write_text(text)
+    if text is not None:
+        config_file.write_text(text)
     (finding,) = check(config_file)
     assert (finding.what, finding.ok) == ("configuration", False)
     assert str(config_file) in finding.message
 
 
-def test_a_configuration_that_is_not_there_is_a_finding(tmp_path):
-    (finding,) = check(tmp_path / "absent.yaml")
-    assert "absent.yaml" in finding.message
-
-
-def test_everything_that_is_wrong_is_found_at_once(settings, config_file, tmp_path):
-    settings["map"] = str(tmp_path / "absent.gpkg")
-    settings["source"]["uri"] = str(tmp_path / "absent")
-    settings["mavlink"]["link"] = "udp:127.0.0.1"
-    settings["log"]["path"] = str(tmp_path / "absent" / "flight.jsonl")
-    assert [finding.what for finding in wrong(config_file, settings)] == ["map", "source", "link", "log"]
-
-
-def test_without_map_and_source_there_is_nothing_to_fly(settings, config_file):
-    settings["map"] = settings["source"]["uri"] = None
-    assert [finding.what for finding in wrong(config_file, settings)] == ["map", "source"]
-
-
-@pytest.mark.parametrize(("key", "value"), [("board", "rpi-zero-2"), ("battery", {"pack": "4x5200"})])
-def test_the_map_waits_for_board_and_battery(settings, config_file, key, value):
-    first, map_finding = wrong(config_file, settings | {key: value})
-    assert first.what == key
-    assert map_finding.what == "map"
-
-
-def test_a_map_of_another_technique_is_found(settings, config_file):
-    (finding,) = wrong(config_file, settings | {"technique": "cohog"})
-    assert finding.what == "map"
-    assert "hog, not cohog" in finding.message
+@pytest.mark.parametrize(
+    ("changes", "wrong_things", "named"),
+    [
+        ({"map": None, "source": {"uri": None}}, ["map", "source"], ""),
+        ({"board": "rpi-zero-2"}, ["board", "map"], "rpi-zero-2w"),
+        ({"battery": {"pack": "4x5200"}}, ["battery", "map"], "4x5200"),
+        ({"technique": "cohog"}, ["map"], "hog, not cohog"),
+        ({"mapping": {"learn": True}, "mavlink": {"link": None}}, ["source"], "--"),
+        ({"source": {"uri": "/dev/video99"}}, ["source"], "/dev/video99"),
+        ({"source": {"uri": "ftp://camera/x"}}, ["source"], "ftp://camera/x"),
+        ({"source": {"uri": "udp://127.0.0.1"}}, ["source"], "udp://127.0.0.1"),
+        ({"mavlink": {"link": "udp:127.0.0.1"}}, ["link"], "udp:127.0.0.1"),
+        ({"mavlink": {"link": "serial:/dev/ttyACM99:921600"}}, ["link"], "serial:/dev/ttyACM99:921600"),
+        ({"mavlink": {"link": "tcp:127.0.0.1:9"}}, ["link"], "Connection refused"),
+        ({"log": {"path": "/"}}, ["log"], "/"),
+        ({"log": {"path": "/absent/flight.jsonl"}}, ["log"], "/absent"),
+    ],
+)
+def test_what_is_wrong_is_found_at_once(settings, config_file, changes, wrong_things, named):
+    findings = wrong(config_file, settings | changes)
+    assert [finding.what for finding in findings] == wrong_things
+    assert named.strip("-") in findings[0].message
 
 
 def test_a_flight_that_learns_needs_no_map_yet_and_none_is_made(settings, config_file, tmp_path):
@@ -195,12 +186,6 @@ def test_a_flight_that_learns_needs_no_map_yet_and_none_is_made(settings, config
     settings["map"] = str(tmp_path / "absent" / "new.gpkg")
     (finding,) = wrong(config_file, settings)
     assert finding.what == "map"
-
-
-def test_learning_without_link_and_positions_is_found(settings, config_file):
-    settings |= {"mapping": {"learn": True}, "mavlink": {"link": None}}
-    (finding,) = wrong(config_file, settings)
-    assert finding.what == "source"
 
 
 def test_places_that_the_budget_does_not_hold_are_told(flight_folder, settings, config_file):
@@ -216,19 +201,6 @@ def test_places_that_the_budget_does_not_hold_are_told(flight_folder, settings, 
     assert " places are left " in finding.message
 
 
-def test_a_camera_that_does_not_deliver_yet_is_no_mistake(settings, config_file):
-    settings["source"]["uri"] = f"rtsp://127.0.0.1:{free_port(socket.SOCK_STREAM)}/camera"
-    assert wrong(config_file, settings) == []
-
-
-@pytest.mark.parametrize("uri", ["/dev/video99", "ftp://camera/x", "udp://127.0.0.1"])
-def test_a_camera_that_cannot_be_is_found(settings, config_file, uri):
-    settings["source"]["uri"] = uri
-    (finding,) = wrong(config_file, settings)
-    assert finding.what == "source"
-    assert uri in finding.message
-
-
 def test_a_port_that_another_program_has_is_found(settings, config_file):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", 0))
@@ -237,27 +209,12 @@ def test_a_port_that_another_program_has_is_found(settings, config_file):
     assert finding.what == "link"
 
 
-def test_a_serial_port_is_looked_for(settings, config_file):
+def test_a_serial_port_is_opened(settings, config_file):
     controller, port = os.openpty()
     settings["mavlink"]["link"] = f"serial:{os.ttyname(port)}:921600"
     assert wrong(config_file, settings) == []
-    settings["mavlink"]["link"] = "serial:/dev/ttyACM99:921600"
-    (finding,) = wrong(config_file, settings)
-    assert finding.message.startswith("serial:/dev/ttyACM99:921600 ")
     os.close(controller)
     os.close(port)
-
-
-def test_a_server_that_is_not_up_is_found(settings, config_file):
-    settings["mavlink"]["link"] = f"tcp:127.0.0.1:{free_port(socket.SOCK_STREAM)}"
-    (finding,) = wrong(config_file, settings)
-    assert "(Connection refused)" in finding.message
-
-
-def test_a_log_that_is_a_folder_is_found(settings, config_file, tmp_path):
-    settings["log"]["path"] = str(tmp_path)
-    (finding,) = wrong(config_file, settings)
-    assert finding.message.startswith(f"{tmp_path} ")
 
 
 @pytest.mark.skipif(os.getuid() == 0, reason="root may write everywhere")
@@ -337,14 +294,6 @@ def test_the_command_prints_a_line_for_each_thing_and_exits_with_0(settings, con
         done = edgevpr_check(config_file)
     assert (done.returncode, done.stderr) == (0, "")
     assert edgevpr_check(config_file).returncode == 1
-
-
-def test_the_command_exits_with_1_and_a_sentence_also_for_a_typo(config_file):
-    config_file.write_text("bord: rpi-5\n")
-    done = edgevpr_check(config_file)
-    assert done.returncode == 1
-    assert "`bord`" in done.stdout
-    assert "Traceback" not in done.stderr
 
 
 def test_a_px4_that_would_be_told_too_rarely_is_said(settings, config_file):

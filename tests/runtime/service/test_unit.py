@@ -41,11 +41,6 @@ def test_systemd_has_nothing_to_say_about_the_unit(tmp_path):
 
 
 @needs_systemd
-def test_systemd_does_notice_what_it_passes_with_exit_code_zero(tmp_path):
-    assert "service type" in verify(UNIT.read_text().replace("Type=notify", "Type=notfy"), tmp_path)
-
-
-@needs_systemd
 def test_every_boards_unit_passes(tmp_path):
     for name in board_names():
         assert verify(render_unit(load_board(name), "/etc/edgevpr/other.yaml"), tmp_path) == ""
@@ -96,17 +91,19 @@ def test_a_configuration_with_an_odd_name_is_handed_over_as_it_is(tmp_path):
     assert verify(unit, tmp_path) == ""
 
 
-@pytest.mark.parametrize("path", ["/home/pi/config.yaml", "/root/c.yaml", "/tmp/c.yaml"])
-def test_a_configuration_that_the_service_cannot_see_is_refused(path):
-    with pytest.raises(UsageError, match=f"^{path} .*/etc/edgevpr/config.yaml"):
-        render_unit(load_board("rpi-zero-2w"), path)
-
-
 @pytest.mark.parametrize(
-    "path", ["/var/../home/pi/c.yaml", "/etc/edgevpr/../../root/c.yaml", "/proc/self/root/home/pi/c.yaml"]
+    "path",
+    [
+        "/home/pi/config.yaml",
+        "/root/c.yaml",
+        "/tmp/c.yaml",
+        "/var/../home/pi/c.yaml",
+        "/etc/edgevpr/../../root/c.yaml",
+        "/proc/self/root/home/pi/c.yaml",
+    ],
 )
-def test_no_way_round_leads_to_what_the_service_cannot_see(path):
-    with pytest.raises(UsageError, match="out of sight"):
+def test_a_configuration_that_the_service_cannot_see_is_refused(path):
+    with pytest.raises(UsageError, match=r"out of sight .* /etc/edgevpr/config\.yaml"):
         render_unit(load_board("rpi-zero-2w"), path)
 
 
@@ -149,10 +146,7 @@ def test_the_unit_keeps_trying_in_flight_but_not_after_a_usage_error():
     assert unit["Restart"] == "always"
     assert unit["StartLimitIntervalSec"] == "0"
     assert unit["RestartPreventExitStatus"] == str(UsageError.exit_code)
-
-
-def test_reloading_asks_the_flight_to_read_its_configuration_again():
-    assert directives(UNIT.read_text())["ExecReload"] == "/bin/kill -HUP $MAINPID"
+    assert unit["ExecReload"] == "/bin/kill -HUP $MAINPID", "the flight reads its configuration again"
 
 
 def test_serial_ports_and_cameras_stay_within_reach():
@@ -173,7 +167,3 @@ def test_every_udev_rule_is_well_formed():
 
 def test_networks_of_ones_own_are_looked_for_where_the_service_can_see():
     assert "\nEnvironment=EDGEVPR_MODELS=/var/lib/edgevpr/models\n" in UNIT.read_text()
-    assert (
-        "EDGEVPR_MODELS=/var/lib/edgevpr/models /opt/edgevpr/bin/edgevpr models add"
-        in (DEPLOY / "README.md").read_text()
-    )
