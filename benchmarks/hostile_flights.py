@@ -19,10 +19,9 @@ from flight_process import start, wait_for
 from rtsp_camera import free_port
 
 from edgevpr.cli.main import main
-from edgevpr.core.types import Position
 from edgevpr.lab.simulate import camera as simulated
 from edgevpr.lab.simulate.autopilot import ReceivedFix, run_autopilot
-from edgevpr.lab.simulate.generated import GeneratedFlight, to_metres, to_position, write_flight
+from edgevpr.lab.simulate.generated import GeneratedFlight, to_metres, write_flight
 from edgevpr.lab.simulate.landscape import make_scene
 from edgevpr.runtime.flight.flightlog import read_log
 
@@ -102,11 +101,6 @@ def _land(folder: Path, count: int, seed: int) -> tuple[Film, Path]:
         return simulated.photograph(ground, scene.metres_per_pixel, _pose(number), _LENS, light, noise)
 
     return Film(picture=picture, count=count, rate_hz=RATE_HZ, whole_at_first=_WHOLE_AT_FIRST), place_map
-
-
-def place_of(number: float) -> Position:
-    """Return the position of the camera at a picture."""
-    return to_position(_pose(number))
 
 
 def _pose(number: float) -> simulated.CameraPose:

@@ -40,7 +40,6 @@ FOR_TESTS = ("pytest", "hypothesis", "matplotlib", "onnx", "scipy", "imageio-ffm
 # What runs the code of compiled libraries: NumPy, SciPy, OpenCV, onnxruntime, PyAV, SQLite. All else is pure Python,
 # which is the same on every processor, or flies in real time, for which emulation is too slow.
 CORE = ("tests/techniques", "tests/runtime/recognise", "tests/frames", "tests/places", "tests/test_tiny.py")
-_TESTS = ("folder", "files run", "passed", "failed", "skipped", "s", "commit")
 _LIMIT_S = 3600.0  # of a file: most take a minute or two on a machine that does nothing else
 
 
