@@ -98,6 +98,7 @@ def tell():
     print(*(zlib.crc32(part) for part in (found.coarse, found.fine, found.regions, found.good)))
 
 
+@pytest.mark.process
 @pytest.mark.parametrize(
     ("camera", "told"),
     [

@@ -3,15 +3,13 @@
 import os
 from pathlib import Path
 
-import numpy as np
 import pytest
-from pictures import textured
-from tiny_networks import write_card, write_network
+from tiny_networks import write_card
 
-from edgevpr import techniques
-from edgevpr.core.errors import ModelError
 from edgevpr.lab.evaluate.dataset import load_dataset
 from edgevpr.lab.evaluate.evaluate import evaluate
+
+pytestmark = [pytest.mark.data, pytest.mark.slow]
 
 SHARED = Path(__file__).resolve().parents[3] / "shared"
 DATA = Path(os.environ.get("EDGEVPR_DATA") or SHARED / "data")
@@ -45,19 +43,3 @@ def test_the_original_weights_find_as_many_places_as_published(models):
     assert result.auc == pytest.approx(0.760, abs=0.01)
     assert result.ep == pytest.approx(0.611, abs=0.01)
     assert result.weights.startswith("original: ")
-
-
-def test_the_model_and_its_hash_are_in_the_spec_and_the_form_is_not(models):
-    write_network(models)
-    spec = techniques.create("calc", {"model": "tiny", "form": "1bit"}).spec
-    assert spec.parameters == {"model": "tiny"}
-    assert spec.model_sha256 == techniques.create("calc", {"model": "tiny"}).spec.model_sha256
-    write_network(models, card={"sha256": "0" * 64})
-    with pytest.raises(ModelError, match="is not the file of its card"):
-        techniques.create("calc", {"model": "tiny"})
-
-
-def test_two_threads_give_what_one_gives(models):
-    write_network(models)
-    one, two = (techniques.create("calc", {"model": "tiny", "threads": threads}) for threads in (1, 2))
-    np.testing.assert_allclose(one.encode(textured(1)).coarse, two.encode(textured(1)).coarse, atol=1e-3)

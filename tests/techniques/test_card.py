@@ -89,11 +89,11 @@ def test_a_wrong_card_is_one_sentence_that_names_it(models, changes, says):
 def test_a_missing_key_and_a_missing_card_are_said(models):
     path = write_card(models / "tiny.yaml", {"sha256": SHA256})
     path.write_text(path.read_text().replace("licence", "#"))
-    with pytest.raises(ModelError, match="the key `licence` is missing"):
+    with pytest.raises(ModelError, match="licence"):
         load_card("tiny")
-    with pytest.raises(ModelError, match="There is no model `tinny`: did you mean `tiny`"):
+    with pytest.raises(ModelError, match=r"`tinny`.*`tiny`"):
         load_card("tinny")
-    with pytest.raises(ModelError, match=r"There is no model `\.\./tiny`"):
+    with pytest.raises(ModelError, match=r"`\.\./tiny`"):
         load_card("../tiny")
 
 

@@ -53,21 +53,6 @@ def test_votes_beside_the_peak_move_it_by_less_than_a_cell():
     assert found.covariance_cells2[0] > found.covariance_cells2[2]
 
 
-def test_regions_that_all_moved_alike_agree_entirely():
-    rows, cols = np.divmod(np.arange(900), 30)
-    inside = (rows < 26) & (cols >= 3)
-    asking = np.arange(900)[inside]
-    found = displacement(asking, asking + 4 * 30 - 3, (30, 30), (1.0, 0.5))
-    assert found.share == 1.0
-    assert found.shift_cells == (-3.0, 4.0)
-    assert found.covariance_cells2 == pytest.approx((1 / 12, 0, 1 / 12))
-
-
-def test_nobody_asking_agrees_on_nothing():
-    nothing = np.array([], int)
-    assert displacement(nothing, nothing, (31, 31), (1.0, 0.5)).share == 0.0
-
-
 def test_cohog_finds_how_far_a_picture_has_moved():
     technique = create("cohog")
     scene = textured(1, 640, 704)
@@ -79,7 +64,8 @@ def test_cohog_finds_how_far_a_picture_has_moved():
     assert match.score > 0.4 > 0.2 > technique.match(stranger, reference.fine).score
 
 
-@pytest.mark.parametrize("turned_deg", [0, 45, 195])
+@pytest.mark.slow
+@pytest.mark.parametrize("turned_deg", [0, 195])
 def test_a_camera_that_looks_down_finds_how_far_it_has_turned(turned_deg):
     technique = create("cohog", {"camera": "nadir"})
     scene = textured(3, 720, 720)
@@ -105,16 +91,6 @@ def test_regions_that_all_moved_alike_are_all_counted():
     asking = np.arange(300)
     assert displacement(asking, asking + 31, (31, 31), (1.0, 1.0)).agreeing == 300
     assert displacement(asking[:0], asking[:0], (31, 31), (1.0, 1.0)).agreeing == 0
-
-
-@pytest.mark.parametrize("camera", ["forward", "nadir"])
-def test_a_match_says_how_much_of_the_place_agrees(camera):
-    technique = create("cohog", {"camera": camera})
-    here, there = (technique.encode(textured(seed, 240, 320)) for seed in (1, 2))
-    own, other = technique.match(here, here.fine), technique.match(here, there.fine)
-    assert own.coverage > 0.4
-    assert other.coverage < 0.06
-    assert create("cohog", {"matching": "thesis"}).match(here, here.fine).coverage is None
 
 
 def support_by_hand(asking, regions, reference, step):

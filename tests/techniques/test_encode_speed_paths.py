@@ -72,6 +72,7 @@ def test_good_blocks_are_those_of_the_whole_map(name, cell_px, which):
     _assert_same_goodness(PICTURES[name], which, cell_px)
 
 
+@pytest.mark.data
 @pytest.mark.parametrize("which", ENTROPIES)
 @pytest.mark.parametrize("set_name", ["corridor", "grief_stromovka_seasons", "aerial_caliterra"])
 def test_good_blocks_of_photographs_are_those_of_the_whole_map(set_name, which):
@@ -80,14 +81,6 @@ def test_good_blocks_of_photographs_are_those_of_the_whole_map(set_name, which):
         pytest.skip(f"no image set {set_name} in {DATA}: name the folder of the sets in EDGEVPR_DATA")
     photograph = cv2.imread(str(paths[len(paths) // 2]), cv2.IMREAD_GRAYSCALE)
     _assert_same_goodness(cv2.resize(photograph, (256, 256)), which, 16)
-
-
-def test_good_blocks_are_those_of_the_equations():
-    grey = _patchwork(7)[:96, :96]
-    good = entropy.good_blocks(grey, "filled_bins", 16, 0.6)
-    expected = literal.good_blocks(literal.filled_bins(grey), 16, 0.6)
-    assert 0 < expected.sum() < len(expected)
-    np.testing.assert_array_equal(good.ravel(), expected)
 
 
 @pytest.mark.parametrize("which", ENTROPIES)
@@ -110,11 +103,6 @@ def test_most_blocks_are_decided_by_bounds_alone():
         assert decided.mean() > 0.5
 
 
-def test_maps_taller_than_a_strip_have_no_seams():
-    grey = textured(9, 150, 30)
-    np.testing.assert_allclose(entropy.filled_bins(grey), literal.filled_bins(grey), atol=1e-6)
-
-
 def test_octants_vote_like_angles_in_every_direction():
     turn = np.concatenate([np.linspace(0, 2 * np.pi, 4001), np.arange(16) * np.pi / 8])
     strength = np.array([[1e-3], [0.7], [1.4]])
@@ -124,13 +112,6 @@ def test_octants_vote_like_angles_in_every_direction():
     error = np.abs(votes - expected).max(axis=2) / np.hypot(dx, dy)
     assert error.max() < 5e-6
     assert votes.min() >= 0
-
-
-def test_no_gradient_no_vote():
-    zero = np.zeros((4, 4), np.float32)
-    for dx, dy in ((zero, zero), (-zero, zero), (-zero, -zero)):
-        assert not gradients._vote_by_octant(dx.copy(), dy.copy(), 2, 8, True).any()
-    assert not gradients.oriented_cells(np.zeros((32, 32), np.uint8), 8, 8, True).any()
 
 
 @pytest.mark.parametrize(("bins", "signed"), [(8, True), (9, False), (8, False), (12, True)])

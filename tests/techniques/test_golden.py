@@ -10,6 +10,8 @@ from pictures import textured
 from edgevpr.techniques import create, entropy
 from edgevpr.techniques.gradients import normalised_blocks, oriented_cells
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_filled_bins_is_the_printed_algorithm(seed):

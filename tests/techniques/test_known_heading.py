@@ -7,6 +7,8 @@ from pictures import textured
 
 from edgevpr.techniques import create
 
+pytestmark = pytest.mark.slow
+
 SIDE_PX = 256
 PLACES = 8
 
@@ -70,26 +72,3 @@ def test_a_heading_loses_no_place(town, wrong_deg):
     without, known = np.sum(recalled, axis=0)
     assert known >= without
     assert known == PLACES
-
-
-def test_a_wrong_heading_finds_nothing_that_the_flight_would_accept(town):
-    technique, headings_deg, places, rows = town
-    heading_deg = 40.0
-    query = technique.encode(view(3, heading_deg))
-    _, by_rotation = technique.coarse_scores(query, rows, None, (heading_deg + 180 - headings_deg) % 360)
-    scores = [
-        technique.match(query, place.fine, np.flatnonzero(np.isfinite(allowed)).tolist()).score
-        for place, allowed in zip(places, by_rotation, strict=True)
-    ]
-    assert max(scores) < technique.min_score
-
-
-def test_a_camera_that_looks_ahead_has_no_rotations_to_choose_from():
-    technique = create("cohog")
-    places = [technique.encode(textured(seed)) for seed in range(3)]
-    coarse = np.stack([place.coarse for place in places])
-    mean = coarse.astype(np.float32).mean(axis=0)
-    rows = technique.pack(coarse, mean)
-    scores, by_rotation = technique.coarse_scores(places[1], rows, mean, np.array([90.0, np.nan, 0.0]))
-    assert by_rotation is None
-    np.testing.assert_array_equal(scores, technique.coarse_scores(places[1], rows, mean)[0])

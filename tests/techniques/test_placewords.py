@@ -180,7 +180,7 @@ def test_words_that_are_missing_or_damaged_are_refused_in_one_sentence(content, 
         np.savez_compressed(tmp_path / "mine.npz", **content)
     with pytest.raises(ModelError, match=complaint):
         CoHog(camera="nadir", words="mine")
-    with pytest.raises(ModelError, match="There are no words"):
+    with pytest.raises(ModelError, match="ground_words"):
         CoHog(camera="nadir", words="../ground_words")
 
 

@@ -107,12 +107,6 @@ def test_a_map_smaller_than_the_window_is_searched(places):
     assert scores.argmax() == places - 1
 
 
-def test_places_that_are_all_alike_are_as_good_as_each_other():
-    technique = SeqSlam()
-    rows = np.repeat(rows_of(technique, 1), 30, axis=0)
-    np.testing.assert_array_equal(technique.coarse_scores(technique.encode(textured(1)), rows, None)[0], 0.5)
-
-
 @pytest.mark.parametrize("wrong", [{"patch": 7}, {"width": 60}, {"height": 4}, {"sequence": 0}, {"sequence": 101}])
 def test_parameters_that_make_no_sense_are_refused(wrong):
     with pytest.raises(UsageError, match="seqslam cannot"):

@@ -6,7 +6,9 @@ import pytest
 
 from edgevpr.core.contract import nearest_height
 from edgevpr.techniques import create
-from edgevpr.techniques.views import HEIGHT_RATIOS, ROTATIONS, cells_along, hypothesis
+from edgevpr.techniques.views import HEIGHT_RATIOS, ROTATIONS, hypothesis
+
+pytestmark = pytest.mark.slow
 
 SIDE_PX = 384
 
@@ -30,11 +32,6 @@ def town():
     technique = create("cohog", {"camera": "nadir"})
     places = [technique.encode(seen(seed)) for seed in range(6)]
     return technique, places, np.stack([place.coarse for place in places])
-
-
-def test_a_view_has_cells_by_its_height_and_its_middle_on_that_of_the_place():
-    assert [cells_along(32, ratio) for ratio in HEIGHT_RATIOS] == [16, 22, 32, 46, 64]
-    assert [cells_along(13, ratio) % 2 for ratio in HEIGHT_RATIOS] == [1] * 5
 
 
 def test_a_hypothesis_is_a_height_and_a_rotation():

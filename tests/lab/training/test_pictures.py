@@ -2,14 +2,13 @@ import numpy as np
 import pytest
 from pictures_on_disk import write_pictures
 
-from edgevpr.core.errors import ImageError, SourceError, UsageError
+from edgevpr.core.errors import ImageError
 from edgevpr.frames.images import cv2
 from edgevpr.lab.training.pictures import (
     TARGET_LENGTH,
     batch,
     gradients_of,
     read_pictures,
-    require_enough,
     small_grey,
     two_sights,
 )
@@ -31,13 +30,6 @@ def test_a_batch_has_the_form_the_network_takes(picture):
     assert inputs.max() == 1  # equalised: the brightest pixel is white
     assert targets.min() >= 0
     assert targets.max() <= 1
-
-
-def test_a_batch_follows_from_the_generator_alone(picture):
-    first, again, other = (batch([picture], 2, np.random.default_rng(seed)) for seed in (1, 1, 2))
-    np.testing.assert_array_equal(first[0], again[0])
-    np.testing.assert_allclose(first[1], again[1], atol=1e-6)
-    assert (first[0] != other[0]).any()
 
 
 def test_the_target_is_the_hog_of_the_unchanged_sight(picture):
@@ -79,13 +71,3 @@ def test_pictures_are_made_small_enough_to_keep(tmp_path):
     (read,) = read_pictures([folder], "reading")
     assert read.shape == (360, 640, 3)
     assert small_grey(read).shape == (180, 320)
-
-
-def test_a_folder_without_images_is_refused(tmp_path):
-    with pytest.raises(SourceError, match="holds no images"):
-        list(read_pictures([tmp_path], "reading"))
-
-
-def test_too_few_pictures_are_refused(picture):
-    with pytest.raises(UsageError, match="3 usable images are too few"):
-        require_enough([picture] * 3)

