@@ -1,18 +1,26 @@
-"""A vehicle that starts on the ground and does what it is told: hovers, circles, drives, lands. Plain kinematics: what
-matters here is where it is, not how its motors feel."""
+"""A vehicle that starts on the ground and does what it is told: hovers, circles, drives, lands; and the simulated
+flight controller in it, which is armed and takes off. Plain kinematics: what matters here is where it is."""
 
 import cmath
 import math
 
 from edgevpr.core.geodesy import moved
 from edgevpr.core.types import Position
+from edgevpr.lab.simulate.ardupilot_rules import _GPS, _NEEDS_POSITION
+from edgevpr.lab.simulate.controller import FlightController
+from edgevpr.lab.simulate.firmware import FAILED, OK
+from edgevpr.lab.simulate.generated import ORIGIN
 from edgevpr.lab.simulate.motion import Motion, TrueState
+from edgevpr.lab.simulate.reports import yaw_of
+from edgevpr.lab.simulate.sensors import FIX_3D
+from edgevpr.mavlink.wire import mavlink
 
 GRAVITY_M_S2 = 9.81
 AIRSPEED_M_S = 22.0  # of a plane
 CIRCLE_M = 80.0  # radius, where a plane waits
 _CLIMB_M_S = {"copter": 3.0, "plane": 4.0, "rover": 0.0}
 _DESCENT_M_S = 0.5
+_TAKEOFF = 13  # a mode of a plane
 _COMMAND_GOOD_FOR_S = 3.0  # a copter that is told no velocity any more stops
 _CRUISE_DEG = 90.0  # the nose at the start
 
@@ -86,3 +94,70 @@ class FreeFlight(Motion):
             self._heading_deg = (self._heading_deg + math.degrees(AIRSPEED_M_S / CIRCLE_M * dt_s)) % 360
             roll_deg = math.degrees(math.atan(AIRSPEED_M_S**2 / (CIRCLE_M * GRAVITY_M_S2)))
         return cmath.rect(AIRSPEED_M_S, math.radians(90 - self._heading_deg)), roll_deg
+
+
+class Piloted(FlightController):
+    """A flight controller that is armed, changes its mode and takes off, and says where it truly is (SIM_STATE). It has
+    GPS at the start."""
+
+    def __init__(self, vehicle: str, **parameters: float) -> None:
+        self.kind = vehicle.removeprefix("ardu").removeprefix("px4-")
+        self.motion = FreeFlight(self.kind, ORIGIN)
+        super().__init__(vehicle, self.motion, gps=True)
+        self._streams._reports[mavlink.MAVLINK_MSG_ID_SIM_STATE] = _truth
+        for name, value in parameters.items():
+            self.set(name, value)
+
+    def set_mode(self, mode: int) -> bool:
+        """Change the flight mode; of an ArduPilot, one that needs a position is refused without one."""
+        needs_position = self._is_ardupilot and mode in _NEEDS_POSITION[self.kind]
+        if needs_position and not self.brain.origin:
+            return False
+        self.brain.mode = mode
+        return True
+
+    def why_not_arm(self) -> str | None:
+        """The reason of the pre-arm checks of an ArduPilot, None where they pass."""
+        brain, receivers = self.brain, self.brain.receivers
+        needs_vision = brain.parameters["VISO_TYPE"] != 0
+        checks = {
+            "Need Position Estimate": not brain._is_aiding,
+            "VisOdom: not healthy": needs_vision and not brain.external.is_healthy(brain.now_s),
+            "GPS 1: Bad fix": brain._source == _GPS and receivers.first.fix_type < FIX_3D,
+            "GPS 2: Bad fix": receivers.has_second and receivers.second.fix_type < FIX_3D,
+            "GPS 2: not healthy": receivers.has_second and not receivers.second.is_healthy,
+        }
+        return next((reason for reason, is_so in checks.items() if is_so), None)
+
+    def arm(self, is_armed: bool = True) -> None:
+        """Arm or disarm; a plane with ArduPilot whose mode is TAKEOFF then takes off."""
+        self.brain.is_armed = is_armed
+        if self._is_ardupilot and self.kind == "plane" and self.brain.mode == _TAKEOFF:
+            self.motion.take_off(self.brain.parameters["TKOFF_ALT"])
+
+    @property
+    def _is_ardupilot(self) -> bool:
+        return self.brain.number == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
+
+    def _obey(self, command):
+        match command.command:
+            case mavlink.MAV_CMD_COMPONENT_ARM_DISARM:
+                if why_not := self.why_not_arm():
+                    return FAILED, [mavlink.MAVLink_statustext_message(2, f"Arm: {why_not}".encode())]
+                self.arm()
+                return OK, []
+            case mavlink.MAV_CMD_NAV_TAKEOFF:
+                self.motion.take_off(command.param7)
+                return OK, []
+            case mavlink.MAV_CMD_DO_SET_MODE:
+                return (OK if self.set_mode(int(command.param2)) else FAILED), []
+        return super()._obey(command)
+
+
+def _truth(brain):
+    truth = brain.truth
+    place = truth.lat_deg, truth.lon_deg, truth.alt_m
+    speeds = truth.velocity_m_s.imag, truth.velocity_m_s.real, -truth.climb_m_s
+    exact = round(truth.lat_deg * 1e7), round(truth.lon_deg * 1e7)
+    angles = math.radians(truth.roll_deg), math.radians(truth.pitch_deg), yaw_of(truth)
+    return mavlink.MAVLink_sim_state_message(1, 0, 0, 0, *angles, 0, 0, -9.81, 0, 0, 0, *place, 0, 0, *speeds, *exact)

@@ -8,14 +8,12 @@ from dataclasses import replace
 import numpy as np
 from air import match_at
 from fakes import FakeClock
-from freeflight import FreeFlight
+from freeflight import Piloted
 from mavlink_peers import link_to, wait_until
 
 from edgevpr.core.config import SourceSetsConfig, load_config
 from edgevpr.core.geodesy import moved
 from edgevpr.core.types import Position
-from edgevpr.lab.simulate.controller import FlightController
-from edgevpr.lab.simulate.generated import ORIGIN
 from edgevpr.mavlink.messages import Health
 from edgevpr.mavlink.wire import PacketReader, mavlink
 from edgevpr.power.load import MachineLoad
@@ -36,10 +34,8 @@ class Controlled:
 
     def __init__(self, vehicle, *, source_sets=NO_SETS, send_fixes=True, **parameters):
         self.kind = vehicle.removeprefix("ardu")
-        self.motion = FreeFlight(self.kind, ORIGIN)
-        self.controller = FlightController(vehicle, self.motion, gps=True)
-        for name, value in parameters.items():
-            self.controller.set(name, value)
+        self.controller = Piloted(vehicle, **parameters)
+        self.motion = self.controller.motion
         self.clock, self.rng = FakeClock(), np.random.default_rng(3)
         self._sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._sock.bind(("127.0.0.1", 0))

@@ -24,7 +24,6 @@ _BAD_FOR_S = 1.0  # ten checks of the filter in a row, ten a second
 _UNNOTICED_SHARE = 0.85
 
 _GUIDED, _LAND, _HOLD = {"copter": 4, "plane": 15, "rover": 15}, 9, 4
-_TAKEOFF, _AUTO = 13, 10  # of a plane
 _NEEDS_POSITION: dict[str, set[int]] = {"copter": {3, 4, 5, 6, 7, 16}, "rover": {10, 11, 12, 15}, "plane": set()}
 _GPS, _EXTERNAL = 3, 6  # EK3_SRCn_POSXY
 _HAS_POSITION = mavlink.EKF_POS_HORIZ_REL | mavlink.EKF_POS_HORIZ_ABS
@@ -100,35 +99,6 @@ class ArduPilot(Firmware):
             return DENIED
         self._source_set = int(number)
         return OK
-
-    def set_mode(self, mode: int) -> bool:
-        """Change the flight mode; one that needs a position is refused without one."""
-        return (mode not in _NEEDS_POSITION[self.kind] or self.origin is not None) and super().set_mode(mode)
-
-    def why_not_arm(self) -> str | None:
-        first, second, has_second = self.receivers.first, self.receivers.second, self.receivers.has_second
-        needs_vision = self.parameters["VISO_TYPE"] != 0
-        checks = {
-            "Need Position Estimate": not self._is_aiding,
-            "VisOdom: not healthy": needs_vision and not self.external.is_healthy(self.now_s),
-            "GPS 1: Bad fix": self._source == _GPS and first.fix_type < FIX_3D,
-            "GPS 2: Bad fix": has_second and second.fix_type < FIX_3D,
-            "GPS 2: not healthy": has_second and not second.is_healthy,
-        }
-        return next((reason for reason, is_so in checks.items() if is_so), None)
-
-    def take_off(self, height_m: float) -> int:
-        """Obey MAV_CMD_NAV_TAKEOFF, whose height is over home; only a copter in GUIDED does."""
-        if self.kind != "copter" or self.mode != _GUIDED["copter"] or not self.is_armed:
-            return FAILED
-        self.motion.take_off(height_m)
-        return OK
-
-    def arm(self, is_armed: bool) -> None:
-        """Arm or disarm; a plane whose mode is TAKEOFF or AUTO then takes off."""
-        super().arm(is_armed)
-        if is_armed and self.kind == "plane" and self.mode in (_TAKEOFF, _AUTO):
-            self.motion.take_off(self.parameters["TKOFF_ALT"])
 
     @property
     def _source(self) -> float:

@@ -22,12 +22,10 @@ VEHICLES: dict[str, Callable[[Motion], Firmware]] = {
     "px4-plane": lambda motion: Px4("plane", motion),
 }
 _START_UTC_S = 1_770_000_000.0  # where nobody says when it starts
-_FORCED = 21_196  # of an arming that passes over the checks
 HEARTBEAT_S = 1.0
 _WHERE = {
     mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
     mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN,
-    mavlink.MAVLINK_MSG_ID_SIM_STATE,
 }
 
 
@@ -177,15 +175,6 @@ class FlightController:
             case mavlink.MAV_CMD_REQUEST_MESSAGE:
                 message = self._streams.make(number)
                 return OK if self._streams.knows(number) else FAILED, [message] if message else []
-            case mavlink.MAV_CMD_COMPONENT_ARM_DISARM:
-                return self._arm(command)
-            case mavlink.MAV_CMD_NAV_TAKEOFF if command.get_type() == "COMMAND_LONG":
-                return self.brain.take_off(command.param7), []
-            case mavlink.MAV_CMD_DO_SET_MODE:
-                mode = int(command.param2)
-                if self.brain.number == mavlink.MAV_AUTOPILOT_PX4:
-                    mode = mode << 16 | int(command.param3) << 24
-                return OK if self.brain.set_mode(mode) else FAILED, []
             case mavlink.MAV_CMD_SET_EKF_SOURCE_SET:
                 return self.brain.use_source_set(command.param1), []
         return UNSUPPORTED, []
@@ -206,16 +195,6 @@ class FlightController:
                 )
             )
         return result
-
-    def _arm(self, command: Message) -> tuple[int, list[Message]]:
-        is_wanted = command.param1 == 1
-        why_not = self.brain.why_not_arm() if is_wanted and command.param2 != _FORCED else None
-        if why_not:
-            text = f"Arm: {why_not}" if self.brain.number == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA else why_not
-            told = mavlink.MAVLink_statustext_message(mavlink.MAV_SEVERITY_CRITICAL, text.encode())
-            return FAILED, [told]
-        self.brain.arm(is_wanted)
-        return OK, []
 
     def _set_origin(self, message: Message) -> list[Message]:
         lat_deg, lon_deg = message.latitude / 1e7, message.longitude / 1e7

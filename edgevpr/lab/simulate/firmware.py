@@ -1,4 +1,4 @@
-"""The common ground of the firmwares of simulated flight controllers: parameters, an estimator, modes and arming.
+"""The common ground of the firmwares of simulated flight controllers: parameters, an estimator, and the failsafe.
 
 How fast an estimate goes wrong is a plain model.
 """
@@ -82,10 +82,6 @@ class Firmware(ABC):
         """Judge command 43003, and set the position where it is accepted."""
 
     @abstractmethod
-    def why_not_arm(self) -> str | None:
-        """Return the reason of the pre-arm checks, None where they pass."""
-
-    @abstractmethod
     def _estimate(self, wind_m_s: complex, dt_s: float) -> None:
         """Let the estimator go on."""
 
@@ -104,19 +100,6 @@ class Firmware(ABC):
     def use_source_set(self, number: float) -> int:
         """Obey MAV_CMD_SET_EKF_SOURCE_SET (42007), where there are source sets."""
         return UNSUPPORTED
-
-    def set_mode(self, mode: int) -> bool:
-        """Change the flight mode; return whether it was changed."""
-        self.mode = mode
-        return True
-
-    def take_off(self, height_m: float) -> int:
-        """Obey MAV_CMD_NAV_TAKEOFF, where the firmware is told to take off by it."""
-        return UNSUPPORTED
-
-    def arm(self, is_armed: bool) -> None:
-        """Arm or disarm."""
-        self.is_armed = is_armed
 
     def _fuse(self, measured: PositionMeasurement, wind_m_s: complex, reset_after_s: float) -> bool:
         """Follow a measurement within the gate, or one outside of it after a while; return whether it was used. One

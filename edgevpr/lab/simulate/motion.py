@@ -60,9 +60,6 @@ class Motion:
         """Move on to `now_s`, and return where that is."""
         return truth_at(_NOWHERE, 0.0)
 
-    def take_off(self, height_m: float) -> None:
-        """Climb to a height over home, where it obeys."""
-
     def land(self) -> None:
         """Sink where it is, where it obeys."""
 

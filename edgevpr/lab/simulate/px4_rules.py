@@ -112,9 +112,6 @@ class Px4(Firmware):
             return
         self._other_s = self._fused_s = self.now_s
 
-    def why_not_arm(self) -> str | None:
-        return None if self.origin and self._is_valid() else "No valid global position"
-
     def _is_valid(self) -> bool:
         return self.now_s - self._aided_s <= self.parameters["EKF2_NOAID_TOUT"] / 1e6
 

@@ -54,7 +54,7 @@ def _attitude(brain: Firmware) -> Message | None:
     truth = brain.truth
     if math.isnan(truth.roll_deg + truth.pitch_deg):
         return None
-    yaw = _yaw(truth)
+    yaw = yaw_of(truth)
     return mavlink.MAVLink_attitude_message(
         _boot_ms(brain), math.radians(truth.roll_deg), math.radians(truth.pitch_deg), yaw, 0, 0, 0
     )
@@ -107,20 +107,6 @@ def _origin(brain: Firmware) -> Message | None:
     return mavlink.MAVLink_gps_global_origin_message(round(lat_deg * 1e7), round(lon_deg * 1e7), round(alt_m * 1e3))
 
 
-def _truth(brain: Firmware) -> Message | None:
-    """Make the SIM_STATE, in which a simulator says where the vehicle truly is."""
-    truth = brain.truth
-    if not brain.motion.is_known:
-        return None
-    angles = [0.0 if math.isnan(each) else math.radians(each) for each in (truth.roll_deg, truth.pitch_deg)]
-    place = truth.lat_deg, truth.lon_deg, truth.alt_m
-    speeds = truth.velocity_m_s.imag, truth.velocity_m_s.real, -truth.climb_m_s
-    exact = round(truth.lat_deg * 1e7), round(truth.lon_deg * 1e7)
-    return mavlink.MAVLink_sim_state_message(
-        1, 0, 0, 0, *angles, _yaw(truth), 0, 0, -9.81, 0, 0, 0, *place, 0, 0, *speeds, *exact
-    )
-
-
 def _version(brain: Firmware) -> Message:
     nothing = [0] * 8
     is_px4 = brain.number == mavlink.MAV_AUTOPILOT_PX4
@@ -144,7 +130,6 @@ REPORTS: dict[int, Callable[[Firmware], Message | None]] = {
     mavlink.MAVLINK_MSG_ID_ATTITUDE: _attitude,
     mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: _position,
     mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN: _origin,
-    mavlink.MAVLINK_MSG_ID_SIM_STATE: _truth,
     mavlink.MAVLINK_MSG_ID_GPS2_RAW: _second_gps,
     mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: _version,
 }
@@ -163,7 +148,7 @@ def _boot_ms(brain: Firmware) -> int:
     return round(brain.now_s * 1000)
 
 
-def _yaw(truth: TrueState) -> float:
+def yaw_of(truth: TrueState) -> float:
     return 0.0 if math.isnan(truth.heading_deg) else math.remainder(math.radians(truth.heading_deg), math.tau)
 
 

@@ -7,11 +7,10 @@ import subprocess
 import time
 from pathlib import Path
 
-from freeflight import FreeFlight
+from freeflight import Piloted
 from mavlink_peers import PATIENCE_S
 
 from edgevpr.core.geodesy import distance_m
-from edgevpr.lab.simulate.controller import FlightController
 from edgevpr.lab.simulate.generated import ORIGIN
 from edgevpr.mavlink.wire import PacketReader, mavlink
 
@@ -155,9 +154,7 @@ class _Simulated:
     """The bytes of a simulated flight controller. Each read turns its clock on."""
 
     def __init__(self, kind: str, parameters: dict[str, float]) -> None:
-        self.controller = FlightController(f"ardu{kind}", FreeFlight(kind, ORIGIN), gps=True)
-        for name, value in parameters.items():
-            self.controller.set(name, value)
+        self.controller = Piloted(f"ardu{kind}", **parameters)
         self._receiver, self._packer = PacketReader(), mavlink.MAVLink(None, 1, 1)
         self._said, self._now_s = b"", 0.0
 

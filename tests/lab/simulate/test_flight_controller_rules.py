@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from freeflight import FreeFlight
+from freeflight import Piloted
 
 from edgevpr.core.errors import UsageError
 from edgevpr.lab.simulate.controller import VEHICLES, FlightController
@@ -22,13 +22,10 @@ class Flown:
     """A vehicle in the air with GPS, and the texts that it has sent."""
 
     def __init__(self, vehicle: str, **parameters: float) -> None:
-        self.kind = vehicle.removeprefix("ardu").removeprefix("px4-")
-        self.motion = FreeFlight(self.kind, ORIGIN)
-        self.controller = FlightController(vehicle, self.motion, gps=True)
+        self.controller = Piloted(vehicle, **parameters)
+        self.kind, self.motion = self.controller.kind, self.controller.motion
         self.texts, self.said = [], []
         self.now_s = 0.0
-        for name, value in parameters.items():
-            self.controller.set(name, value)
 
     def wait(self, seconds: float) -> "Flown":
         self.now_s += seconds
@@ -38,8 +35,8 @@ class Flown:
 
     def in_air(self) -> "Flown":
         self.wait(10)
-        self.controller.brain.set_mode({"copter": GUIDED, "plane": 13, "rover": 15}[self.kind])
-        self.controller.brain.arm(True)
+        self.controller.set_mode({"copter": GUIDED, "plane": 13, "rover": 15}[self.kind])
+        self.controller.arm()
         self.motion.take_off(30)
         return self.wait(30)
 
@@ -194,7 +191,7 @@ def test_a_copter_flies_by_odometry_without_any_gps():
     assert flown.flags & mavlink.EKF_POS_HORIZ_ABS
     assert flown.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1) == ACCEPTED
     flown.wait(0.5)
-    assert "VisOdom" in flown.controller.brain.why_not_arm()
+    assert "VisOdom" in flown.controller.why_not_arm()
 
 
 def test_a_source_set_is_chosen_by_command():

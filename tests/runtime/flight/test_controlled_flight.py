@@ -13,11 +13,11 @@ OUR_GPS = {"GPS2_TYPE": 14, "GPS_AUTO_SWITCH": 1}
 def hovers_without_gps(flown, checks=True):
     """Let a copter take off, and lose GPS at 20 m."""
     if checks:
-        flown.until(lambda: flown.brain.why_not_arm() is None)
+        flown.until(lambda: flown.controller.why_not_arm() is None)
     else:
         flown.fly(10)
-    flown.brain.set_mode(GUIDED)
-    flown.brain.arm(True)
+    flown.controller.set_mode(GUIDED)
+    flown.controller.arm()
     flown.motion.take_off(20)
     flown.fly(10)
     flown.controller.set("SIM_GPS1_ENABLE", 0)
@@ -56,9 +56,9 @@ def test_in_a_dry_run_it_lands():
 def test_a_plane_gets_single_fixes_after_the_loss_only_and_takes_them():
     with Controlled("arduplane") as flown:
         flown.sees = False  # on the ground
-        flown.brain.set_mode(TAKEOFF)
-        flown.until(lambda: flown.brain.why_not_arm() is None)
-        flown.brain.arm(True)
+        flown.controller.set_mode(TAKEOFF)
+        flown.until(lambda: flown.controller.why_not_arm() is None)
+        flown.controller.arm()
         flown.sees = True
         flown.fly(30)
         assert not flown.commands(FIX)

@@ -21,9 +21,9 @@ def asked(flown):
 
 
 def in_air(flown):
-    flown.brain.set_mode(13)
-    flown.until(lambda: flown.brain.why_not_arm() is None)
-    flown.brain.arm(True)
+    flown.controller.set_mode(13)
+    flown.until(lambda: flown.controller.why_not_arm() is None)
+    flown.controller.arm()
     return flown.fly(20)
 
 
