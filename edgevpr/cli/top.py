@@ -6,6 +6,7 @@ import sys
 import time
 from argparse import Namespace
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from edgevpr.cli.screen import erase_lines
@@ -43,19 +44,35 @@ def run_top(args: Namespace) -> int:
             raise EdgevprError(f"N{nobody[1:]}: start one, or name its file with --file.")
         print(_json(found[0]) if args.json else "\n".join(_table(rows(found[0]))))
         return 0
-    screen = _Json() if args.json else _Terminal() if sys.stdout.isatty() else _Lines()
+    drawn, was_silent = 0, False
     try:
         while True:
             found = read_status(args.file)
-            if found is None:
-                screen.show_silence(nobody, None)
-            elif found[1] > _SILENT_S:
-                screen.show_silence(f"the flight has said nothing for {found[1]:.0f} s", found[0])
+            silence = None if found else nobody
+            if found and found[1] > _SILENT_S:
+                silence = f"the flight has said nothing for {found[1]:.0f} s"
+            if args.json or not sys.stdout.isatty():
+                if found and not silence:
+                    status = found[0]
+                    text = f"{status.time} {_mood(status)}; {printable(status.summary)}"
+                    print(_json(status) if args.json else text, flush=True)
+                elif silence and not args.json and not was_silent:
+                    print(silence, flush=True)
+                was_silent = silence is not None
             else:
-                screen.show(found[0])
+                drawn = _redraw([*filter(None, [silence]), *(_table(rows(found[0])) if found else [])], drawn)
             time.sleep(_LOOK_S)
     except KeyboardInterrupt:
         return 0
+
+
+def _redraw(lines: list[str], drawn: int) -> int:
+    """Draw lines over those that were drawn before; return how many there are."""
+    columns, height = shutil.get_terminal_size()
+    erase_lines(drawn)
+    lines = lines[: height - 1]
+    print("\n".join(line[: columns - 1] for line in lines), flush=True)  # at once, so that nothing flickers
+    return len(lines)
 
 
 def rows(status: "Status") -> list[Row]:
@@ -128,52 +145,4 @@ def _table(table: Sequence[Row]) -> list[str]:
 
 
 def _json(status: "Status") -> str:
-    from dataclasses import asdict
-
     return json.dumps(asdict(status))
-
-
-class _Json:
-    """Prints a line of JSON for every status."""
-
-    def show(self, status: "Status") -> None:
-        print(_json(status), flush=True)
-
-    def show_silence(self, why: str, status: "Status | None") -> None:
-        pass
-
-
-class _Lines:
-    """Prints a line for every status, and one when there is none any more."""
-
-    def __init__(self) -> None:
-        self._said = False
-
-    def show(self, status: "Status") -> None:
-        self._said = False
-        print(f"{status.time} {_mood(status)}; {printable(status.summary)}", flush=True)
-
-    def show_silence(self, why: str, status: "Status | None") -> None:
-        if not self._said:
-            print(why, flush=True)
-        self._said = True
-
-
-class _Terminal:
-    """Draws the status over the one before."""
-
-    def __init__(self) -> None:
-        self._drawn = 0
-
-    def show(self, status: "Status") -> None:
-        self._draw(_table(rows(status)))
-
-    def show_silence(self, why: str, status: "Status | None") -> None:
-        self._draw([why, *(_table(rows(status)) if status else [])])
-
-    def _draw(self, lines: list[str]) -> None:
-        columns, height = shutil.get_terminal_size()
-        erase_lines(self._drawn)
-        lines = lines[: height - 1]
-        print("\n".join(line[: columns - 1] for line in lines), flush=True)  # at once, so that nothing flickers
-        self._drawn = len(lines)
