@@ -7,14 +7,16 @@ is what a calibration needs: right and wrong matches that are hard to tell apart
 import cv2
 import numpy as np
 
+from edgevpr.core.arrays import Array, Doubles, Floats, Image, Mask, Singles
+
 _STRENGTH = (0.3, 1.3)  # from a cloud to snow
 _TONES = 6  # points of a curve of tones
 _PATCHES = 2  # at most, of the picture hidden by something that was not there
 
 
 def changed(
-    image: np.ndarray, rng: np.random.Generator, looks_down: bool, shown: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray | None]:
+    image: Image, rng: np.random.Generator, looks_down: bool, shown: Mask | None = None
+) -> tuple[Image, Mask | None]:
     """Return a picture as it might look another time: uint8 (H, W[, 3]) to uint8 (H, W) grey. Looking down, the camera
     may be turned to any heading. `shown`, bool (H, W), is False where the picture shows no ground (None: nowhere); it
     is returned for the new picture."""
@@ -23,14 +25,14 @@ def changed(
     warp = _from_beside(grey.shape, rng, strength, looks_down)
     seen = _warped(grey.astype(np.float32) / 255, warp, cv2.INTER_LINEAR)
     seen = another_season(seen, rng, strength)
-    seen = _another_light(seen, rng, strength)
-    _hide(seen, rng, strength)
+    lit = _another_light(seen, rng, strength)
+    _hide(lit, rng, strength)
     if shown is not None:
         shown = _warped(shown.view(np.uint8), warp, cv2.INTER_NEAREST).view(bool)
-    return (255 * np.clip(seen, 0, 1)).round().astype(np.uint8), shown
+    return (255 * np.clip(lit, 0, 1)).round().astype(np.uint8), shown
 
 
-def _from_beside(shape: tuple[int, int], rng: np.random.Generator, strength: float, looks_down: bool) -> np.ndarray:
+def _from_beside(shape: tuple[int, int], rng: np.random.Generator, strength: float, looks_down: bool) -> Doubles:
     """Look from another spot, height and course, and from a tilted camera: return the warp of pixels, (3, 3)."""
     height, width = shape
     scale = np.exp(rng.uniform(-1, 1) * 0.15 * strength)
@@ -40,14 +42,15 @@ def _from_beside(shape: tuple[int, int], rng: np.random.Generator, strength: flo
     matrix[1, 2] += rng.uniform(-0.15, 0.15) * height * strength * (1.0 if looks_down else 0.4)
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
     moved = corners + (rng.uniform(-0.05, 0.05, (4, 2)) * (width, height) * strength).astype(np.float32)
-    return cv2.getPerspectiveTransform(corners, moved) @ np.vstack([matrix, (0, 0, 1)])
+    warp: Doubles = cv2.getPerspectiveTransform(corners, moved) @ np.vstack([matrix, (0, 0, 1)])
+    return warp
 
 
-def _warped(image: np.ndarray, warp: np.ndarray, flags: int) -> np.ndarray:
+def _warped(image: Array, warp: Doubles, flags: int) -> Array:
     return cv2.warpPerspective(image, warp, image.shape[::-1], flags=flags, borderMode=cv2.BORDER_REFLECT)
 
 
-def another_season(grey: np.ndarray, rng: np.random.Generator, strength: float) -> np.ndarray:
+def another_season(grey: Singles, rng: np.random.Generator, strength: float) -> Singles:
     """Give tones other values, differently in different parts, as leaves and snow do; and a texture of its own.
 
     `grey` is float32 (H, W), 0..1, and so is the result, but for values beyond. `strength` is 0 (hardly anything) to
@@ -58,19 +61,21 @@ def another_season(grey: np.ndarray, rng: np.random.Generator, strength: float) 
     one, other = (_curve(rng, strength)[tones] for _ in range(2))
     part = np.clip(0.5 + _smooth(rng, (height, width), 6), 0, 1)
     texture = cv2.GaussianBlur(rng.normal(size=(height, width)).astype(np.float32), (0, 0), max(1.0, width / 200))
-    return part * one + (1 - part) * other + 0.36 * strength * texture
+    changed: Singles = part * one + (1 - part) * other + 0.36 * strength * texture
+    return changed
 
 
-def _another_light(grey: np.ndarray, rng: np.random.Generator, strength: float) -> np.ndarray:
+def _another_light(grey: Singles, rng: np.random.Generator, strength: float) -> Floats:
     """Cast soft shadows, expose otherwise, blur half of the pictures, and add the noise of a sensor."""
-    lit = np.clip(grey * np.exp(0.5 * strength * _smooth(rng, grey.shape, 3)), 0, 1)
+    lit: Floats = np.clip(grey * np.exp(0.5 * strength * _smooth(rng, grey.shape, 3)), 0, 1)
     lit = lit ** np.exp(rng.uniform(-1, 1) * 0.7 * strength)
     if rng.random() < 0.5:
         lit = cv2.GaussianBlur(lit, (0, 0), 0.3 + strength * grey.shape[1] / 400)
-    return lit + (0.03 * strength * rng.normal(size=grey.shape)).astype(np.float32)
+    lit = lit + (0.03 * strength * rng.normal(size=grey.shape)).astype(np.float32)
+    return lit
 
 
-def _hide(grey: np.ndarray, rng: np.random.Generator, strength: float) -> None:
+def _hide(grey: Floats, rng: np.random.Generator, strength: float) -> None:
     """Hide a part or two behind a plain patch, in place."""
     height, width = grey.shape
     for _ in range(rng.integers(0, _PATCHES + 1)):
@@ -79,14 +84,14 @@ def _hide(grey: np.ndarray, rng: np.random.Generator, strength: float) -> None:
         grey[rows, columns] = rng.uniform(0, 1)
 
 
-def _curve(rng: np.random.Generator, strength: float) -> np.ndarray:
+def _curve(rng: np.random.Generator, strength: float) -> Singles:
     points = np.linspace(0, 1, _TONES)
     bent = np.clip(points + 0.45 * strength * rng.normal(size=_TONES), 0, 1)
     return np.interp(np.linspace(0, 1, 256), points, bent).astype(np.float32)
 
 
-def _smooth(rng: np.random.Generator, shape: tuple[int, int], cells: int) -> np.ndarray:
+def _smooth(rng: np.random.Generator, shape: tuple[int, int], cells: int) -> Singles:
     """Return a smooth field of values within -1..1, float32 of this shape."""
     coarse = rng.normal(size=(cells, cells)).astype(np.float32)
     field = cv2.resize(coarse, shape[::-1], interpolation=cv2.INTER_CUBIC)
-    return field / max(float(np.abs(field).max()), 1e-6)
+    return np.asarray(field / max(float(np.abs(field).max()), 1e-6), np.float32)

@@ -21,6 +21,8 @@ from scipy.sparse import coo_matrix, csc_matrix, identity
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 from scipy.sparse.linalg import splu
 
+from edgevpr.core.arrays import Complexes, Floats
+
 _ROUNDS, _SETTLED = 4, 0.05  # of estimating the scatters, and by how much of themselves they still change
 _MOVES, _STAYS = 40, 1e-4  # of solving, and how far a position still moves, as a share of a footprint
 _LONGEST_MOVE = 0.5  # of a log
@@ -136,8 +138,9 @@ def _settled(
     return position, log, normal, agree
 
 
-def _off_ties(steps: np.ndarray, turns: np.ndarray, ties: Ties) -> np.ndarray:
-    return np.hypot(abs(steps) / ties.step_sd, abs(turns) / ties.turn_sd)
+def _off_ties(steps: Complexes, turns: Complexes, ties: Ties) -> Floats:
+    off: Floats = np.hypot(abs(steps) / ties.step_sd, abs(turns) / ties.turn_sd)
+    return off
 
 
 def _graph(ties: Ties, count: int) -> csc_matrix:

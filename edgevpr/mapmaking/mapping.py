@@ -46,14 +46,15 @@ class Gaps:
         if event.worth is None:
             yield event, None
             return
-        while self._waiting and (len(self._waiting) >= self._most_frames or self._is_too_far(event.frame.position)):
+        frame = _frame_of(event)
+        while self._waiting and (len(self._waiting) >= self._most_frames or self._is_too_far(frame.position)):
             yield from self._best_waiting()
         if event.worth.reason is None:
             self._waiting.clear()
             yield self._kept(event), event.worth.salience
         else:
-            self._last = self._last or event.frame.position
-            self._waiting.append(replace(event, frame=replace(event.frame, image=_NO_PIXELS)))
+            self._last = self._last or frame.position
+            self._waiting.append(replace(event, frame=replace(frame, image=_NO_PIXELS)))
 
     def end(self) -> Iterator[Kept]:
         """Yield what becomes a place at the end: of a recording in which nothing has passed, the best of it."""
@@ -62,20 +63,25 @@ class Gaps:
 
     def _best_waiting(self) -> Iterator[Kept]:
         """Yield the best of those that wait; those after the last of them wait on."""
-        best = best_of([event.worth.short_by for event in self._waiting if event.worth])
-        chosen = [event for event, is_best in zip(self._waiting, best, strict=True) if is_best]
-        self._waiting = self._waiting[max(np.flatnonzero(best)) + 1 :]
-        for event in chosen:
-            yield self._kept(event), replace(event.worth.salience, is_low=True)
+        waiting = [(event, event.worth) for event in self._waiting if event.worth]
+        best = np.flatnonzero(best_of([worth.short_by for _, worth in waiting])).tolist()
+        self._waiting = self._waiting[best[-1] + 1 :]
+        for event, worth in (waiting[at] for at in best):
+            yield self._kept(event), replace(worth.salience, is_low=True)
 
     def _kept(self, event: Recognition) -> Recognition:
-        self._has_begun, self._last = True, event.frame.position or self._last
+        self._has_begun, self._last = True, _frame_of(event).position or self._last
         return event
 
     def _is_too_far(self, position: Position | None) -> bool:
         if self._most_m is None or position is None or self._last is None:
             return False
         return distance_m(self._last.lat_deg, self._last.lon_deg, position.lat_deg, position.lon_deg) > self._most_m
+
+
+def _frame_of(event: Recognition) -> Frame:
+    assert event.frame is not None  # of a walk of frames
+    return event.frame
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -130,16 +136,19 @@ def build_map(
 
     def keep(kept: Iterable[Kept]) -> None:
         for event, salience in kept:
-            place_map.add(laid(event.frame, event.view), event.descriptor, salience, walk.landmarks(event))
+            frame = _frame_of(event)
+            assert event.descriptor is not None  # of a frame that could be encoded
+            place_map.add(laid(frame, event.view), event.descriptor, salience, walk.landmarks(event))
             counts["added"] += 1
-            counts["without_position"] += event.frame.position is None
+            counts["without_position"] += frame.position is None
             if salience and salience.is_low:
                 counts["of_low_quality"] += 1
-                not_memorable[event.worth.lacks] -= 1
+                if event.worth and event.worth.lacks:
+                    not_memorable[event.worth.lacks] -= 1
 
     for frame in frames:
         event = walk.step(frame)
-        if event.failed:
+        if event.failed or event.descriptor is None:
             if unusable is None:
                 raise ModelError(event.reason)
             unusable(ImageError(f"{frame.name}: {event.reason}"))

@@ -2,11 +2,12 @@
 
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from edgevpr.core.arrays import LatLon
 from edgevpr.core.errors import UsageError
 from edgevpr.core.files import read_file
 
@@ -17,7 +18,7 @@ _WAYPOINT_COLUMNS = 12
 _FLOWN_TO = {16, 17, 18, 19, 21, 22, 31, 82, 84, 85}
 _OVER_GROUND = {3, 6, 10, 11}  # MAV_FRAMEs whose altitude is over home or the terrain
 
-Ring = list[tuple[float, float]]
+Ring = list[LatLon]
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +77,7 @@ def _foreign(path: str | Path) -> UsageError:
 
 def _of_lines(lines: list[str]) -> Area:
     """Read a waypoint file: index, current, frame, command, four parameters, lat, lon, alt, autocontinue."""
-    path = []
+    path: list[Waypoint] = []
     for line in lines[1:]:
         values = line.split()
         if values and len(values) != _WAYPOINT_COLUMNS:
@@ -94,46 +95,35 @@ def _waypoint(command: int, frame: int, lat_deg: float, lon_deg: float, alt_m: f
     return [Waypoint(lat_deg, lon_deg, alt_m if frame in _OVER_GROUND and alt_m > 0 else None)]
 
 
-def _of_json(said: Any) -> Area:
-    if said.get("fileType") == "Plan":
-        return _of_plan(said["mission"]["items"])
+def _of_json(content: Any) -> Area:
+    if content.get("fileType") == "Plan":
+        return _of_plan(content["mission"]["items"])
     polygons: list[tuple[Ring, ...]] = []
     paths: list[tuple[Waypoint, ...]] = []
-    for geometry in _geometries(said):
-        within = geometry["coordinates"]
-        if geometry["type"] in ("Polygon", "MultiPolygon"):
-            each_polygon = within if geometry["type"] == "MultiPolygon" else [within]
-            polygons += [tuple(_ring(ring) for ring in rings) for rings in each_polygon]
+    for kind, within in _geometries(content):
+        if kind in ("Polygon", "MultiPolygon"):
+            polygons += [tuple(map(_ring, rings)) for rings in (within if kind == "MultiPolygon" else [within])]
         else:
-            paths += [tuple(Waypoint(*_lat_lon(point)) for point in line) for line in _LINES[geometry["type"]](within)]
-    return Area(tuple(rings for rings in polygons if rings), tuple(path for path in paths if path))
+            points = [[point] for point in within]
+            lines = {"Point": [[within]], "MultiPoint": points, "LineString": [within], "MultiLineString": within}[kind]
+            paths += [tuple(Waypoint(*_lat_lon(point)) for point in line) for line in lines]
+    return Area(tuple(filter(None, polygons)), tuple(filter(None, paths)))
 
 
-# The lines of each kind of geometry that is no polygon; a point is a line of one.
-_LINES: dict[str, Callable[[list], list]] = {
-    "Point": lambda point: [[point]],
-    "MultiPoint": lambda points: [[point] for point in points],
-    "LineString": lambda line: [line],
-    "MultiLineString": lambda lines: lines,
-}
-
-
-def _geometries(said: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """Yield the plain geometries of any object of GeoJSON."""
-    if said["type"] == "FeatureCollection":
-        for feature in said["features"]:
-            yield from _geometries(feature)
-    elif said["type"] == "Feature":
-        if said["geometry"]:
-            yield from _geometries(said["geometry"])
-    elif said["type"] == "GeometryCollection":
-        for geometry in said["geometries"]:
-            yield from _geometries(geometry)
+def _geometries(content: dict[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Yield kind and coordinates of the plain geometries of any object of GeoJSON."""
+    kind = content["type"]
+    if kind == "Feature":
+        if content["geometry"]:
+            yield from _geometries(content["geometry"])
+    elif kind in ("FeatureCollection", "GeometryCollection"):
+        for part in content["features" if kind == "FeatureCollection" else "geometries"]:
+            yield from _geometries(part)
     else:
-        yield said
+        yield kind, content["coordinates"]
 
 
-def _lat_lon(point: list[float]) -> tuple[float, float]:
+def _lat_lon(point: list[float]) -> LatLon:
     """Return the point of GeoJSON, which writes longitude first."""
     return _finite(point[1]), _finite(point[0])
 
@@ -145,27 +135,29 @@ def _ring(points: list[list[float]]) -> Ring:
 
 
 def _of_plan(items: list[dict[str, Any]]) -> Area:
-    """Read the items of a plan: simple ones, and surveys and corridors, whose way is written out beside their shape."""
+    """Read the items of a plan: simple ones, and surveys and corridors, whose way is written out beside their shape. A
+    plan writes null for numbers that it leaves to the autopilot."""
     path: list[Waypoint] = []
     polygons: list[tuple[Ring, ...]] = []
     for item in items:
         if item["type"] == "SimpleItem":
-            path += _waypoint(int(item["command"]), int(item["frame"]), *_numbers(item["params"][4:7]))
+            at = [_finite(value or 0) for value in item["params"][4:7]]
+            path += _waypoint(int(item["command"]), int(item["frame"]), *at)
             continue
         style = item.get("TransectStyleComplexItem", {})
         height_m = style.get("CameraCalc", {}).get("DistanceToSurface")
-        path += [Waypoint(*_numbers(point[:2]), height_m) for point in style.get("VisualTransectPoints", ())]
-        if corners := [tuple(_numbers(point[:2])) for point in item.get("polygon", ())]:
+        path += [Waypoint(*_corner(point), height_m) for point in style.get("VisualTransectPoints", ())]
+        if corners := [_corner(point) for point in item.get("polygon", ())]:
             polygons.append(([*corners, corners[0]],))
     return Area(tuple(polygons), (tuple(path),) if path else ())
 
 
-def _numbers(values: list[Any]) -> list[float]:
-    """Return numbers of a plan, which writes null for those that it leaves to the autopilot."""
-    return [_finite(value or 0) for value in values]
+def _corner(point: list[float | None]) -> LatLon:
+    lat_deg, lon_deg = (_finite(value or 0) for value in point[:2])
+    return lat_deg, lon_deg
 
 
-def _finite(value: float) -> float:
+def _finite(value: float | str) -> float:
     if not math.isfinite(number := float(value)):
         raise ValueError
     return number

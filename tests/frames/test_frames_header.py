@@ -102,9 +102,9 @@ def test_a_header_with_bytes_gone_wrong_is_read_or_refused(tmp_path):
 
 def test_a_pipe_named_like_an_image_is_refused_and_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "a.jpg")
-    with pytest.raises(ImageError, match=r"a\.jpg cannot be read \(it is a pipe or a device and not a regular file\)"):
+    with pytest.raises(ImageError, match=r"a\.jpg.*pipe"):
         read_image(tmp_path / "a.jpg")
-    with pytest.raises(ImageError, match="not a regular file"):
+    with pytest.raises(ImageError, match="device"):
         read_image("/dev/zero")
 
 

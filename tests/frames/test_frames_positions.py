@@ -117,14 +117,14 @@ def test_a_wrong_row_is_refused_with_its_line_and_value(row, complaint, written)
     [("", "file"), ("name,lat,lon\n", "file"), ("file;lat;lon\n", "file"), ("file,lat,lng\n", "lon")],
 )
 def test_a_missing_column_is_named(text, column, written):
-    with pytest.raises(UsageError, match=f"line 1 has no column `{column}`: it must name file, lat, lon"):
+    with pytest.raises(UsageError, match=f"line 1.*`{column}`"):
         read_positions(written(text))
 
 
 def test_a_file_that_is_missing_or_no_text_is_refused(written, tmp_path):
-    with pytest.raises(UsageError, match=r"nothing\.csv cannot be read \(No such file or directory\)"):
+    with pytest.raises(UsageError, match=r"nothing\.csv"):
         read_positions(tmp_path / "nothing.csv")
-    with pytest.raises(UsageError, match="is not a text file of commas"):
+    with pytest.raises(UsageError, match="text file"):
         read_positions(written("file,lat,lon\nö.jpg,1,2\n", "latin-1"))
 
 
@@ -176,12 +176,12 @@ def test_an_attitude_or_height_that_cannot_be_is_refused(written, row, problem):
 
 @pytest.mark.parametrize("column", ["file", "lat", "yaw_deg", "rel_alt", "time"])
 def test_a_column_that_stands_there_twice_is_refused(column, written):
-    with pytest.raises(UsageError, match=f"line 1 has two columns `{column}`: keep one of them"):
+    with pytest.raises(UsageError, match=f"two columns `{column}`"):
         read_positions(written(HEADER.replace("\n", f", {column.upper()}\n")))
     assert read_positions(written("file,lat,lon,note,note\na.jpg,,,,\n")) == {"a.jpg": GeoTag()}
 
 
 def test_a_pipe_in_place_of_the_file_is_refused_and_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "positions.csv")
-    with pytest.raises(UsageError, match=r"cannot be read \(it is a pipe or a device"):
+    with pytest.raises(UsageError, match="pipe"):
         read_positions(tmp_path / "positions.csv")

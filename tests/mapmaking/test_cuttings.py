@@ -147,7 +147,7 @@ def test_an_area_elsewhere_is_refused_with_both_extents(tmp_path):
         with pytest.raises(UsageError, match=r"does not touch .* north, .* east, the orthophoto at 49\.99.* east\.$"):
             lattice_of(orthophoto, 40.0, 10.0, Area((), ((way,),)), 40.0)
     for off_m in (15.5, 4.0):  # between places, and so near to a row that its box holds one of either
-        with pytest.raises(UsageError, match="No place of a grid of 10 m"):
+        with pytest.raises(UsageError, match="10 m"):
             lattice_of(orthophoto, 40.0, 10.0, Area((), ((waypoint(off_m, 15.5),),)), 0.5)
 
 
