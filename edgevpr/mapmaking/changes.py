@@ -70,7 +70,7 @@ def _another_light(grey: Singles, rng: np.random.Generator, strength: float) -> 
     lit: Floats = np.clip(grey * np.exp(0.5 * strength * _smooth(rng, grey.shape, 3)), 0, 1)
     lit = lit ** np.exp(rng.uniform(-1, 1) * 0.7 * strength)
     if rng.random() < 0.5:
-        lit = cv2.GaussianBlur(lit, (0, 0), 0.3 + strength * grey.shape[1] / 400)
+        lit = np.asarray(cv2.GaussianBlur(lit, (0, 0), 0.3 + strength * grey.shape[1] / 400), lit.dtype)
     lit = lit + (0.03 * strength * rng.normal(size=grey.shape)).astype(np.float32)
     return lit
 
