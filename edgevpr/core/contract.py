@@ -66,11 +66,6 @@ class TechniqueSpec:
         """The form of one place in the index in RAM."""
         return self.packed or self.coarse
 
-    @property
-    def smaller_forms(self) -> tuple[str, ...]:
-        """The forms that take less RAM than `form`."""
-        return self.forms[self.forms.index(self.form) + 1 :] if self.form else ()
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Descriptor:

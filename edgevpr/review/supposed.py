@@ -11,7 +11,6 @@ _AS_FOUND = "is_live", "limit_c", "heat", "load", "rss_mb", "memory_mb", "port",
 _ALWAYS: dict[str, Any] = {
     "stop": False,
     "reread": False,
-    "forms": [],
     "log is written": True,
     "process_cpu_s": 0.0,
     "thread_cpu_s": 0.0,

@@ -23,6 +23,8 @@ T = TypeVar("T")
 Note = list[Any]  # a line of the tape: a kind, and its values
 _CLOCKS = "mono_s", "wall_s", "utc_s", "process_cpu_s", "thread_cpu_s"
 
+_RETIRED = ("forms",)  # asked by flights before, and by none now
+
 _log = logging.getLogger(__name__)
 
 
@@ -234,9 +236,11 @@ def read_tape(path: Path) -> Iterator[Note]:
         with open(path, "rb") as file:
             for line in file:
                 try:
-                    yield json.loads(line)
+                    note = json.loads(line)
                 except ValueError:
                     return
+                if note[0] not in _RETIRED:
+                    yield note
     except OSError as error:
         raise EdgevprError(
             f"{path} cannot be read ({error.strerror}): give the log of a flight with `log.record`, and its recording."

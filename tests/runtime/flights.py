@@ -65,7 +65,6 @@ class Flight:
         self,
         source: FakeSource,
         meter: FlightMeter | None = None,
-        smaller_forms: tuple[str, ...] = (),
         fewer_candidates: tuple[int, ...] = (),
         status=None,
     ) -> list[dict]:
@@ -93,7 +92,6 @@ class Flight:
                 reread=self.reread,
                 status=status,
                 fewer_candidates=fewer_candidates,
-                smaller_forms=smaller_forms,
             )
             FlightItself(self.config, crew).run()
         *lines, self.end = read_log(self.log)

@@ -5,7 +5,6 @@ import logging
 import os
 import platform
 import sys
-import time
 from contextlib import ExitStack
 from dataclasses import asdict, astuple, dataclass, replace
 from functools import cache
@@ -23,12 +22,11 @@ from edgevpr.runtime.flight.flightlog import FlightLog
 from edgevpr.runtime.flight.metering import meter_of_queries
 from edgevpr.runtime.flight.world import World
 from edgevpr.runtime.preflight.choose import too_late
-from edgevpr.runtime.preflight.pick import Outlook, outlook, picked_technique, trusted_forms
+from edgevpr.runtime.preflight.pick import Outlook, outlook, picked_technique
 from edgevpr.runtime.recognise.learn import Learner
 from edgevpr.runtime.recognise.opening import has_map, open_learning, open_recogniser
 from edgevpr.runtime.recognise.recogniser import Recogniser
 
-_LOAD_S = 10.0  # a map that takes longer to load is not loaded again in flight: nothing is recognised meanwhile
 _NEW_MAP_PLACES = 1000  # a technique picked for an empty map must be able to fly with so many
 _LIBRARIES = ("numpy", "cv2", "onnxruntime")
 
@@ -38,22 +36,19 @@ _log = logging.getLogger(__name__)
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Aboard:
     """The recogniser, its `learner` (None: nothing is learnt), the reason why it cannot learn (None: it can, or is not
-    to), the log, how the technique will do, and the forms of the index that the governor may take."""
+    to), the log, and how the technique will do."""
 
     recogniser: Recogniser
     learner: Learner | None
     cannot_learn: str | None
     flight_log: FlightLog
     found: Outlook
-    smaller_forms: tuple[str, ...]
 
 
 def come_aboard(config: Config, world: World, stack: ExitStack) -> Aboard:
     """Open the map and the log, which are closed with the `stack`, and try how the technique will do. Raises an
     EdgevprError where one of them cannot be opened."""
-    begin_s = time.monotonic()
     recogniser, learner, cannot_learn = _opened(config, world)
-    load_s = time.monotonic() - begin_s
     stack.callback(recogniser.place_map.close)
     flight_log = FlightLog(
         world.log.path,
@@ -65,7 +60,6 @@ def come_aboard(config: Config, world: World, stack: ExitStack) -> Aboard:
     )
     stack.enter_context(flight_log)
     recogniser.meter = meter_of_queries(config.battery, world.board, world.clock, world.tape)
-    forms = world.tape.read("forms", lambda: smaller_forms(config, recogniser, learner, load_s))
     found = Outlook(*world.tape.read("outlook", lambda: astuple(outlook(recogniser, config))))
     recogniser.candidates = found.candidates
     return Aboard(
@@ -74,7 +68,6 @@ def come_aboard(config: Config, world: World, stack: ExitStack) -> Aboard:
         cannot_learn=cannot_learn,
         flight_log=flight_log,
         found=found,
-        smaller_forms=tuple(forms),
     )
 
 
@@ -121,17 +114,6 @@ def _learning(config: Config, world: World, name: str | None) -> tuple[Recognise
     spacing_m, gap_m = config.mapping.spacing_m, config.salience.gap_m
     learner = Learner(recogniser, growing, spacing_m=spacing_m, gap_m=gap_m, utc_clock=world.clock.utc_s)
     return recogniser, learner
-
-
-def smaller_forms(config: Config, recogniser: Recogniser, learner: Learner | None, load_s: float) -> tuple[str, ...]:
-    """List the forms of the index that the governor may take: only for a map that is wholly in memory, does not grow
-    and loads quickly. Another form has other scores, so a limit of acceptance set by the user holds for one form only,
-    and no other is taken."""
-    own_limits = config.match.min_score is not None or config.match.min_margin is not None
-    is_whole = len(recogniser.index) == len(recogniser.place_map)  # else a smaller form would hold more places
-    if own_limits or learner or not is_whole or load_s > _LOAD_S:
-        return ()
-    return trusted_forms(recogniser.technique)
 
 
 def rate_hz(config: Config, recogniser: Recogniser) -> float:

@@ -26,7 +26,7 @@ from edgevpr.runtime.flight.air import in_the_air
 from edgevpr.runtime.flight.autopilot import DRY_RUN, Autopilot, NoAutopilot, ToAutopilot
 from edgevpr.runtime.flight.clock import Pace
 from edgevpr.runtime.flight.commands import Commands
-from edgevpr.runtime.flight.governing import Governing
+from edgevpr.runtime.flight.governor import Governing
 from edgevpr.runtime.flight.herald import Herald
 from edgevpr.runtime.flight.metering import meter_of_flight
 from edgevpr.runtime.flight.navigator import Muted, Navigator
@@ -63,7 +63,7 @@ class Flight:
         self._config, self._crew, self._opened = config, crew, ExitStack()
         self._map_watch, self._tally = MapWatch(crew.herald), Tally()
         self._pace = Pace(rate_hz(config, crew.recogniser), crew.clock)
-        self._governing = Governing(config, crew, self._pace)
+        self._governing = Governing(crew, self._pace)
         self._commands = Commands(crew)
         remarks = (
             lambda: self._commands.summary,
@@ -126,7 +126,6 @@ class Flight:
                 reread=world.reread,
                 status=world.status,
                 fewer_candidates=() if config.match.candidates else trusted_candidates(recogniser.technique),
-                smaller_forms=aboard.smaller_forms,
             )
             flight = cls(config, crew)
             flight._opened = stack.pop_all()
@@ -257,7 +256,8 @@ class Flight:
         config = reload(self._crew.reread, self._config, self._crew.flight_log)
         if config != self._config:
             self._config = config
-            self._governing.take(config, rate_hz(config, self._crew.recogniser))
+            self._governing.ask_rate(rate_hz(config, self._crew.recogniser))
+            self._crew.recogniser.accept_with(config.match.accept_precision)
 
     def _end(self) -> None:
         crew, totals = self._crew, self.totals()

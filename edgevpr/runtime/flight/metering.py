@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, astuple
+from dataclasses import asdict, astuple, dataclass
 from typing import Any
 
 from edgevpr.core.config import BatteryConfig
@@ -14,8 +14,20 @@ from edgevpr.power.machine import rss_mb
 from edgevpr.power.meter import OwnMemory, QueryMeter, RunningEnergy, Stage, stage
 from edgevpr.power.thermal import ThermalState, ThermalWatch, limit_c
 from edgevpr.runtime.flight.clock import Clock
-from edgevpr.runtime.flight.governor import Reading
 from edgevpr.runtime.recognise.recognition import Recognition
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoadReading:
+    """One measurement. `cpu_share`, of all cores (0..1), and `late_share` are since the last reading. `late_share` is
+    the share of the time that queries took, 0 where nothing kept them waiting. The rest is the present state, None
+    where unknown."""
+
+    cpu_share: float
+    late_share: float
+    rss_mb: float
+    temperature_c: float | None
+    throttled: bool | None
 
 
 class FlightMeter:
@@ -55,7 +67,7 @@ class FlightMeter:
 
     @contextmanager
     def reading_frame(self, is_live: bool) -> Iterator[Stage]:
-        """Meter the reading of a frame. Reading from a live source is mostly waiting for the next frame, and is no
+        """Meter the reading of a frame. LoadReading from a live source is mostly waiting for the next frame, and is no
         work."""
         with stage(self._clock.mono_s, self._clock.process_cpu_s) as reading:
             yield reading
@@ -119,10 +131,10 @@ class FlightMeter:
         """Return the fields of the log: temperature, frequency, whether the board slows itself down, and why."""
         return asdict(self.thermal)
 
-    def reading(self) -> Reading:
+    def reading(self) -> LoadReading:
         """Return the governor's reading: the load since the last one, and the present memory and heat."""
         cpu_share, late_share = self._load.look()
-        return Reading(
+        return LoadReading(
             cpu_share=cpu_share,
             late_share=late_share,
             rss_mb=self.rss_mb(),

@@ -104,8 +104,8 @@ class World:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Crew:
     """All that works together in a flight, opened. `learner` is None where nothing is learnt, the links where there are
-    none, `reread` where the configuration has no file, and `status` where nobody is told. `fewer_candidates`, and
-    `smaller_forms` of the index, are those that the governor may change to."""
+    none, `reread` where the configuration has no file, and `status` where nobody is told. `fewer_candidates` are
+    those that the governor may change to."""
 
     recogniser: Recogniser
     learner: Learner | None = None
@@ -121,7 +121,6 @@ class Crew:
     reread: Reread | None = None
     status: StatusFile | None = None
     fewer_candidates: tuple[int, ...] = ()
-    smaller_forms: tuple[str, ...] = ()
 
 
 @contextmanager

@@ -139,19 +139,6 @@ def trusted_candidates(technique: Technique) -> tuple[int, ...]:
     return tuple(count for count, figures in measured if figures and figures.is_trusted)
 
 
-def trusted_forms(technique: Technique) -> tuple[str, ...]:
-    """Return the smaller forms of a technique that accepted no more wrong places on the image sets than its own form,
-    in the order of their size; all of them where its own form was not measured."""
-    spec, camera = technique.spec, _camera(technique)
-    own = accuracy.of(_label(technique), camera)
-    smaller = {form: accuracy.of(techniques.labelled(spec.name, form), camera) for form in spec.smaller_forms}
-    return tuple(
-        form
-        for form, other in smaller.items()
-        if own is None or (other and other.accepted_elsewhere <= own.accepted_elsewhere)
-    )
-
-
 def camera_setting(name: str, camera: str | None) -> dict[str, str]:
     """Return the setting that tells a technique which way the camera looks, if that is known and the technique has such
     a setting."""

@@ -93,19 +93,6 @@ def has_map(path: Path) -> bool:
     return path.exists() and path.stat().st_size > 0
 
 
-def take_form(recogniser: Recogniser, config: Config, form: str) -> None:
-    """Let a recogniser load its index anew in another form, with the limits of that form.
-
-    Its present index is released first, so that the two are not in memory together. Raises MapError where the map
-    cannot be read any more; nothing is recognised then until a form has been loaded.
-    """
-    board, place_map = recogniser.meter.board, recogniser.place_map
-    recogniser.release_index()
-    technique = technique_of(place_map, config.technique, _wanted(config) | {"form": form}, board)
-    index = _loaded(config, board, technique, place_map)
-    recogniser.take(_matcher(config, technique, None, index))
-
-
 def budget_mb(config: Config, board: Board) -> float:
     """Return how much RAM the index may take, MB: the configuration's figure, else the board's."""
     return config.memory.budget_mb or board.budget_mb

@@ -14,7 +14,7 @@ from edgevpr.core.errors import EdgevprError, MapError, PlaceError
 from edgevpr.core.types import Candidate, Frame, Vehicle
 from edgevpr.frames.level import UNKNOWN_VIEW, Levelled
 from edgevpr.frames.mask import AnyMask, encoded
-from edgevpr.places.index import PlaceIndex, empty_index
+from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Expectation, Query, Ranking, compare, named, scan, together
 from edgevpr.places.sequence import SequenceSearch
@@ -106,7 +106,7 @@ class Recogniser:
     """Recognises places of an open map, frame after frame.
 
     `prior` narrows each query; without it each is searched over the whole map. `follower` follows the flight from query
-    to query. The governor changes `candidates`; the learner and the governor change the index (`take`, `extend`).
+    to query. The governor changes `candidates`, and the learner the index (`take`, `extend`).
     """
 
     def __init__(
@@ -131,7 +131,6 @@ class Recogniser:
         """Recognise with another matcher from the next frame on."""
         self.technique, self.index = matcher.technique, matcher.index
         self.rule, self.search = matcher.rule, matcher.search
-        self._lost: str | None = None
         # 1-sigma accuracy of a place as a fix: such a match cannot tell where between two places the aircraft is.
         self.accuracy_m = max(self._settings.min_accuracy_m, matcher.index.spacing_m() or 0.0)
 
@@ -149,14 +148,6 @@ class Recogniser:
         """Recognise in an index that has one place more, learnt from the frame taken at `t_mono_s`."""
         self._new.append((place_id, t_mono_s))
         self.take(Matcher(self.technique, index, self.rule, self.search))
-
-    def release_index(self) -> None:
-        """Let go of the index, so that another one need not be in memory beside it."""
-        self.take(Matcher(self.technique, empty_index(self.technique.spec, 0, None), self.rule, self.search))
-
-    def lose_index(self, error: Exception) -> None:
-        """Fail every frame with this error until there is an index again (see `take`)."""
-        self._lost = _sentence(error)
 
     def step(self, frame: Frame, vehicle: Vehicle | None = None) -> Recognition:
         """Recognise one frame; `vehicle` is the autopilot's report at that moment.
@@ -187,8 +178,6 @@ class Recogniser:
     def _recognise(self, walk: _Walk, picture: Levelled, descriptor: Descriptor) -> Verdict:
         """Search the map for a frame that is encoded, and judge what is found."""
         follower = self._follower
-        if self._lost:
-            raise MapError(self._lost)
         walk.nothing = says_nothing(descriptor, self.rule.min_quality)
         walk.objection = walk.nothing or (walk.worth.reason if walk.worth else None)
         if follower:

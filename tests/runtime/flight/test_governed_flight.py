@@ -1,28 +1,19 @@
 """Flights that are governed: what a change does, how it is said, and when it is taken back."""
 
-import shutil
-
 import pytest
 from fakes import FakeClock, FakeLink, FakeSource
 from flights import Flight, flight_meter, of_kind
 from pictures import textured
 
-from edgevpr.core.config import load_config
-from edgevpr.core.errors import MapError
 from edgevpr.core.files import shipped
-from edgevpr.places.index import bytes_per_place, load_index
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.flight import systemd
-from edgevpr.runtime.flight.aboard import smaller_forms
-from edgevpr.runtime.flight.governor import Reading
-from edgevpr.runtime.flight.metering import FlightMeter
-from edgevpr.runtime.preflight import accuracy
-from edgevpr.runtime.recognise.opening import open_learning, open_recogniser
-from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser
+from edgevpr.runtime.flight.metering import FlightMeter, LoadReading
+from edgevpr.runtime.recognise.recogniser import Recogniser
 
 TURN_S = 4.0  # more than the governor's patience: each reading can bring a change
-CALM = Reading(cpu_share=0.01, late_share=0.0, rss_mb=100.0, temperature_c=40.0, throttled=False)
-BUSY = Reading(cpu_share=1.0, late_share=0.0, rss_mb=100.0, temperature_c=40.0, throttled=False)
+CALM = LoadReading(cpu_share=0.01, late_share=0.0, rss_mb=100.0, temperature_c=40.0, throttled=False)
+BUSY = LoadReading(cpu_share=1.0, late_share=0.0, rss_mb=100.0, temperature_c=40.0, throttled=False)
 
 
 class Scripted(FlightMeter):
@@ -39,22 +30,12 @@ class Scripted(FlightMeter):
         return self._readings[turn] if turn < len(self._readings) else CALM
 
 
-@pytest.fixture
-def trusted(monkeypatch):
-    """No form of hog has ever accepted a wrong place, but that of a test's choice."""
-    counts = {"recall_at_1": 0.5, "sets": 2, "queries": 90, "asked": 90, "accepted": 9, "accepted_wrong": 0}
-    table = {label: {**counts, "accepted_elsewhere": 0} for label in ("hog", "hog 8bit", "hog 1bit")}
-    monkeypatch.setattr(accuracy, "_content", lambda: {"forward": table, "nadir": {}})
-    return table
-
-
 def governed(place_map, log, readings, count, fewer_candidates=(), **settings):
     """(changes, all lines, announcements, the flight) of a flight of `count` turns of 4 s."""
     clock = FakeClock()
     flight = Flight(place_map, log, clock, FakeLink(clock), **settings)
-    forms = smaller_forms(flight.config, flight.recogniser, None, load_s=0.0)
     source = FakeSource([textured(0, 240, 320)] * count, clock, work=lambda: clock.sleep(TURN_S))
-    lines = flight.fly(source, flight_meter(flight, Scripted, readings=readings), forms, fewer_candidates)
+    lines = flight.fly(source, flight_meter(flight, Scripted, readings=readings), fewer_candidates)
     return of_kind(lines, "governor"), lines, flight.link.texts(), flight
 
 
@@ -104,96 +85,6 @@ def test_fewer_candidates_are_compared_before_the_rate_is_lowered(recording, tmp
     assert changes[-1]["from"] == changes[-1]["to"]
     assert changes[-1]["why"].endswith("nothing is left to lower")
     assert texts[-1][1] == "edgevpr: over a limit of its board, see its log"
-
-
-def full_reading():
-    return Reading(
-        cpu_share=0.01,
-        late_share=0.0,
-        rss_mb=0.97 * load_board("this").memory_max_mb,
-        temperature_c=40.0,
-        throttled=False,
-    )
-
-
-def test_memory_that_runs_short_loads_the_index_in_a_smaller_form_and_places_are_found_as_before(
-    recording, tmp_path, monkeypatch, trusted
-):
-    held = []
-    step = Recogniser.step
-    monkeypatch.setattr(
-        Recogniser, "step", lambda self, *asked: (held.append(self.index.nbytes), step(self, *asked))[1]
-    )
-    script = [full_reading()] * 4 + [CALM] * 6
-    changes, lines, texts, _ = governed(
-        recording / "hog.gpkg", tmp_path / "log", script, 12, **{"source.rate_hz": 60.0}
-    )
-    assert [line["to"]["form"] for line in changes] == ["8bit", "1bit", "8bit", "float"]
-    assert changes[0]["to"]["rate_hz"] == 60.0, "memory is no question of the rate"
-    assert min(held) < max(held) / 10
-    assert texts[1][1] == "edgevpr: held to form 1bit"
-    assert [(line["place"], line["accepted"]) for line in of_kind(lines, "query")] == [(1, True)] * 12
-
-
-def test_an_index_that_cannot_be_loaded_is_tried_again_and_the_flight_goes_on(recording, tmp_path, monkeypatch):
-    from edgevpr.runtime.recognise import opening
-
-    load, tries = opening.load_index, []
-
-    def fails_twice(*asked, **more):
-        tries.append(1)
-        if len(tries) in (1, 2):
-            raise MapError("the map is gone: put it back.")
-        return load(*asked, **more)
-
-    clock = FakeClock()
-    flight = Flight(recording / "hog.gpkg", tmp_path / "log", clock, FakeLink(clock), **{"source.rate_hz": 60.0})
-    monkeypatch.setattr(opening, "load_index", fails_twice)
-    source = FakeSource([textured(0, 240, 320)] * 12, clock, work=lambda: clock.sleep(TURN_S))
-    script = [full_reading()] * 2 + [CALM] * 2
-    lines = flight.fly(source, flight_meter(flight, Scripted, readings=script), ("8bit", "1bit"))
-    queries = of_kind(lines, "query")
-    assert len(queries) == 12
-    assert [line["accepted"] for line in queries][:2] == [True] * 2
-    assert [line["accepted"] for line in queries][-4:] == [True] * 4, "it came back"
-    refused = [line for line in queries if not line["accepted"]]
-    assert {line["reason"] for line in refused} == {"the map is gone: put it back."}
-    (lost,) = of_kind(lines, "index lost")
-    assert (lost["form"], lost["problem"]) == ("8bit", "the map is gone: put it back.")
-    assert (4, "edgevpr: its map cannot be read, see its log") in flight.link.texts()
-
-
-def test_what_a_map_cannot_serve_is_not_offered(recording, tmp_path, trusted):
-    def forms(name, learner=None, load_s=0.0, **settings):
-        config = load_config(None, {"map": str(recording / f"{name}.gpkg"), **settings})
-        recogniser = open_recogniser(config, load_board("this"))
-        with recogniser.place_map:
-            return smaller_forms(config, recogniser, learner, load_s)
-
-    assert forms("hog") == ("8bit", "1bit")
-    assert forms("hog", **{"match.form": "8bit"}) == ("1bit",)
-    trusted["hog 8bit"]["accepted_elsewhere"] = 1
-    assert forms("hog") == ("1bit",), "a form that accepts wrong places is not taken"
-    trusted["hog"]["accepted_elsewhere"] = 1
-    assert forms("hog") == ("8bit", "1bit"), "unless the form asked for does too"
-    assert forms("hog", **{"match.min_margin": 0.05}) == (), "a margin of one form says nothing of another"
-    assert forms("hog", load_s=11.0) == (), "nothing would be recognised for so long"
-    assert forms("cohog") == forms("seqslam") == ()
-    shutil.copy(recording / "hog.gpkg", tmp_path / "grows.gpkg")
-    config = load_config(None, {"map": str(tmp_path / "grows.gpkg")})
-    learning, growing = open_learning(config, load_board("this"), None)
-    with learning.place_map:
-        assert smaller_forms(config, learning, growing, 0.0) == (), "an index that grows does so in one form"
-
-
-def test_of_a_part_of_a_map_no_smaller_form_is_offered(recording):
-    config = load_config(None, {"map": str(recording / "hog.gpkg")})
-    recogniser = open_recogniser(config, load_board("this"))
-    with recogniser.place_map:
-        technique = recogniser.technique
-        part = load_index(recogniser.place_map, technique, 9 * bytes_per_place(technique.spec))
-        recogniser.take(Matcher(technique, part, recogniser.rule))
-        assert smaller_forms(config, recogniser, None, 0.0) == (), "it is as large as it may be"
 
 
 def test_a_sequence_is_asked_as_often_as_its_map_was_made(recording, tmp_path):

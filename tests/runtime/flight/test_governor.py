@@ -5,20 +5,28 @@ import random
 
 import pytest
 
-from edgevpr.runtime.flight.governor import Change, Governor, Limits, Reading, Setting, lowered, steps
+from edgevpr.runtime.flight.governor import Change, Governor, Limits, Setting, lowered, steps
+from edgevpr.runtime.flight.metering import LoadReading
 
 LIMITS = Limits(cpu_share=0.5, memory_max_mb=512, temperature_c=80)
 ASKED = Setting(2.0, 40)
-CALM = Reading(cpu_share=0.05, late_share=0.0, rss_mb=100.0, temperature_c=50.0, throttled=False)
-BUSY = Reading(cpu_share=0.9, late_share=0.0, rss_mb=100.0, temperature_c=50.0, throttled=False)
+
+
+def measured(**values):
+    usual = {"cpu_share": 0.1, "late_share": 0.0, "rss_mb": 100.0, "temperature_c": None, "throttled": None}
+    return LoadReading(**usual | values)
+
+
+CALM = measured(cpu_share=0.05, temperature_c=50.0, throttled=False)
+BUSY = measured(cpu_share=0.9, temperature_c=50.0, throttled=False)
 
 
 class Flight:
     """Looks once a second; `reading` says what is measured of a setting at a time."""
 
-    def __init__(self, reading, settings=None, index_mb=None):
+    def __init__(self, reading, settings=None):
         self.settings = settings or steps(ASKED, keeps_rate=False, fewer=(20,))
-        self.governor = Governor(LIMITS, self.settings, index_mb or {None: 1.0})
+        self.governor = Governor(LIMITS, self.settings)
         self.reading, self.now_s = reading, 0.0
         self.changes = []
 
@@ -39,23 +47,14 @@ def load(setting):
 
 
 def busy(share_at_full):
-    return lambda setting, now_s: Reading(
-        cpu_share=share_at_full * load(setting), late_share=0.0, rss_mb=100.0, temperature_c=None, throttled=None
-    )
+    return lambda setting, now_s: measured(cpu_share=share_at_full * load(setting))
 
 
-def test_the_candidates_are_lowered_first_then_the_rate_then_the_form():
-    settings = steps(Setting(1.0, 40, "float"), keeps_rate=False, fewer=(20,), forms=("8bit", "1bit"))
-    assert settings == (
-        Setting(1.0, 40, "float"),
-        Setting(1.0, 20, "float"),
-        Setting(0.5, 20, "float"),
-        Setting(0.25, 20, "float"),
-        Setting(0.125, 20, "float"),
-        Setting(0.125, 20, "8bit"),
-        Setting(0.125, 20, "1bit"),
-    )
-    flight = Flight(lambda setting, now_s: BUSY, settings, {"float": 4.0, "8bit": 2.0, "1bit": 1.0})
+def test_the_candidates_are_lowered_first_then_the_rate():
+    settings = steps(Setting(1.0, 40, "float"), keeps_rate=False, fewer=(20,))
+    rates_hz = 1.0, 0.5, 0.25, 0.125
+    assert settings == (Setting(1.0, 40, "float"), *(Setting(rate_hz, 20, "float") for rate_hz in rates_hz))
+    flight = Flight(lambda setting, now_s: BUSY, settings)
     changes = flight.fly(60)
     assert [change.after for change in changes[:-1]] == list(settings[1:])
     assert [change.before for change in changes[:-1]] == list(settings[:-1])
@@ -88,7 +87,7 @@ def test_a_sequence_keeps_its_rate_and_a_technique_of_one_stage_has_no_candidate
 
 def test_what_is_lowered_is_said_in_a_few_words():
     assert lowered(ASKED, ASKED) == ""
-    assert lowered(Setting(0.5, 20, "8bit"), Setting(2.0, 40, "float")) == "0.5 of 2 Hz, 20 of 40 candidates, form 8bit"
+    assert lowered(Setting(0.5, 20), Setting(2.0, 40)) == "0.5 of 2 Hz, 20 of 40 candidates"
 
 
 def test_a_short_peak_changes_nothing():
@@ -119,9 +118,7 @@ def test_a_square_wave_load_settles(half_period_s):
 
     def reading(setting, now_s):
         share = 0.8 if now_s % (2 * half_period_s) < half_period_s else 0.2
-        return Reading(
-            cpu_share=share * load(setting), late_share=0.0, rss_mb=100.0, temperature_c=None, throttled=None
-        )
+        return measured(cpu_share=share * load(setting))
 
     flight = Flight(reading)
     flight.fly(7200)
@@ -131,21 +128,9 @@ def test_a_square_wave_load_settles(half_period_s):
 
 def test_noise_around_the_limit_changes_the_rate_once_at_most():
     script = random.Random(3)
-    flight = Flight(
-        lambda setting, now_s: Reading(
-            cpu_share=script.gauss(0.5, 0.05) * load(setting),
-            late_share=0,
-            rss_mb=100.0,
-            temperature_c=None,
-            throttled=None,
-        )
-    )
+    flight = Flight(lambda setting, now_s: measured(cpu_share=script.gauss(0.5, 0.05) * load(setting)))
     assert len(flight.fly(3600)) <= 1
-    flight = Flight(
-        lambda setting, now_s: Reading(
-            cpu_share=0.1, late_share=0.0, rss_mb=100.0, temperature_c=script.gauss(80, 2), throttled=None
-        )
-    )
+    flight = Flight(lambda setting, now_s: measured(temperature_c=script.gauss(80, 2)))
     changes = flight.fly(3600)
     assert all(change.why != "there is room again" for change in changes), "never clearly below the limit"
 
@@ -159,7 +144,7 @@ def test_a_board_that_heats_slowly_is_held_below_its_limit(full_c):
         aim_c = 40 + (full_c - 40) * load(setting)
         temperature_c[0] += (aim_c - temperature_c[0]) / 90
         hottest_c.append(temperature_c[0])
-        return Reading(cpu_share=0.1, late_share=0.0, rss_mb=100.0, temperature_c=temperature_c[0], throttled=False)
+        return measured(temperature_c=temperature_c[0], throttled=False)
 
     flight = Flight(reading)
     first = flight.fly(3600)
@@ -170,20 +155,14 @@ def test_a_board_that_heats_slowly_is_held_below_its_limit(full_c):
 
 
 def test_it_cools_between_two_steps_for_heat():
-    flight = Flight(
-        lambda setting, now_s: Reading(cpu_share=0.1, late_share=0.0, rss_mb=100.0, temperature_c=85.0, throttled=None)
-    )
+    flight = Flight(lambda setting, now_s: measured(temperature_c=85.0))
     flight.fly(60)
     at_s = [at for at, _ in flight.changes]
     assert [b - a for a, b in itertools.pairwise(at_s)] == [20.0, 20.0]
 
 
 def test_after_heat_it_goes_back_no_faster_than_it_went():
-    flight = Flight(
-        lambda setting, now_s: Reading(
-            cpu_share=0.1, late_share=0.0, rss_mb=100.0, temperature_c=85.0 if now_s <= 30 else 60.0, throttled=None
-        )
-    )
+    flight = Flight(lambda setting, now_s: measured(temperature_c=85.0 if now_s <= 30 else 60.0))
     flight.fly(120)
     assert flight.governor.setting == ASKED
     back_at_s = [at for at, change in flight.changes if change.back]
@@ -209,23 +188,15 @@ def test_the_wait_doubles_with_each_failure_and_begins_anew_when_all_was_well_fo
 
 
 def test_without_a_temperature_a_board_that_throttles_is_believed():
-    flight = Flight(
-        lambda setting, now_s: Reading(cpu_share=0.1, late_share=0.0, rss_mb=100.0, temperature_c=None, throttled=None)
-    )
+    flight = Flight(lambda setting, now_s: measured())
     assert flight.fly(600) == []
-    flight.reading = lambda setting, now_s: Reading(
-        cpu_share=0.1, late_share=0.0, rss_mb=100.0, temperature_c=None, throttled=True
-    )
+    flight.reading = lambda setting, now_s: measured(throttled=True)
     (change,) = flight.fly(10)
     assert (change.after.rate_hz, change.why) == (1.0, "the board slows itself down")
 
 
 def test_a_sensor_that_goes_away_while_it_is_hot_does_not_hold_the_rate_down():
-    flight = Flight(
-        lambda setting, now_s: Reading(
-            cpu_share=0.1, late_share=0.0, rss_mb=100.0, temperature_c=85.0 if now_s < 10 else None, throttled=None
-        )
-    )
+    flight = Flight(lambda setting, now_s: measured(temperature_c=85.0 if now_s < 10 else None))
     flight.fly(60)
     assert flight.governor.setting == ASKED
 
@@ -233,13 +204,7 @@ def test_a_sensor_that_goes_away_while_it_is_hot_does_not_hold_the_rate_down():
 def test_queries_that_others_make_late_are_asked_less_often_until_the_others_are_gone():
     def reading(setting, now_s):
         takes = 0.7 * load(setting)  # of the time; another program doubles it until 100 s
-        return Reading(
-            cpu_share=0.2,
-            late_share=min(1.0, 2 * takes) if now_s < 100 else takes,
-            rss_mb=100.0,
-            temperature_c=None,
-            throttled=None,
-        )
+        return measured(cpu_share=0.2, late_share=min(1.0, 2 * takes) if now_s < 100 else takes)
 
     flight = Flight(reading)
     fewer, slower = flight.fly(99)
@@ -248,76 +213,8 @@ def test_queries_that_others_make_late_are_asked_less_often_until_the_others_are
     assert [change.after for change in flight.fly(60)] == [Setting(2.0, 20), ASKED]
 
 
-FORMS = ("float", "8bit", "1bit")
-FORMS_MB = {"float": 300.0, "8bit": 150.0, "1bit": 20.0}
-
-
-def test_memory_that_runs_short_is_saved_by_the_form_alone_and_given_back_when_it_fits():
-    other_mb = [200.0]
-    settings = steps(Setting(1.0, 1, "float"), keeps_rate=False, forms=FORMS[1:])
-    flight = Flight(
-        lambda setting, now_s: Reading(
-            cpu_share=0.1,
-            late_share=0.0,
-            rss_mb=other_mb[0] + FORMS_MB[setting.form],
-            temperature_c=None,
-            throttled=None,
-        ),
-        settings,
-        FORMS_MB,
-    )
-    (change,) = flight.fly(600)
-    assert (change.after, change.why) == (Setting(1.0, 1, "8bit"), "500 MB of memory taken, and 512 allowed")
-    other_mb[0] = 100.0
-    (change,) = flight.fly(600)
-    assert change.after == Setting(1.0, 1, "float")
-    other_mb[0] = 490.0
-    changes = flight.fly(600)
-    assert [change.after.form for change in changes] == ["8bit", "1bit", "1bit"]
-    assert changes[-1].why == "510 MB of memory taken, and 512 allowed, and nothing is left to lower"
-
-
-def test_a_map_that_serves_no_other_form_has_its_memory_said_once():
-    flight = Flight(
-        lambda setting, now_s: Reading(cpu_share=0.1, late_share=0.0, rss_mb=500.0, temperature_c=None, throttled=None)
-    )
+def test_memory_that_runs_short_is_said_once():
+    flight = Flight(lambda setting, now_s: measured(rss_mb=500.0))
     (change,) = flight.fly(600)
     assert change.before == change.after == ASKED
     assert change.why == "500 MB of memory taken, and 512 allowed, and nothing is left to lower"
-
-
-def test_memory_and_load_may_both_ask_for_a_form_and_each_is_given_back_for_itself():
-    settings = steps(Setting(1.0, 1, "float"), keeps_rate=True, forms=FORMS[1:])
-    trouble = {"cpu": 0.9, "mb": 200.0}
-    flight = Flight(
-        lambda setting, now_s: Reading(
-            cpu_share=trouble["cpu"],
-            late_share=0.0,
-            rss_mb=trouble["mb"] + FORMS_MB[setting.form],
-            temperature_c=None,
-            throttled=None,
-        ),
-        settings,
-        FORMS_MB,
-    )
-    flight.fly(60)
-    assert flight.governor.setting.form == "1bit"
-    trouble["cpu"] = 0.1
-    flight.fly(600)
-    assert flight.governor.setting.form == "8bit", "the float form would not fit"
-    trouble["mb"] = 100.0
-    flight.fly(600)
-    assert flight.governor.setting.form == "float"
-
-
-def test_a_form_that_load_took_comes_back_only_where_it_fits():
-    settings = steps(Setting(1.0, 1, "float"), keeps_rate=True, forms=FORMS[1:])
-    flight = Flight(lambda setting, now_s: BUSY, settings, FORMS_MB)
-    flight.fly(60)
-    other_mb = [400.0]  # taken meanwhile
-    flight.reading = lambda setting, now_s: Reading(
-        cpu_share=0.01, late_share=0.0, rss_mb=other_mb[0] + FORMS_MB[setting.form], temperature_c=None, throttled=None
-    )
-    assert flight.fly(600) == []
-    other_mb[0] = 150.0
-    assert [change.after.form for change in flight.fly(600)] == ["8bit", "float"]

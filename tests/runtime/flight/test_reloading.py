@@ -12,7 +12,8 @@ from pictures import textured
 
 from edgevpr.core.config import load_config
 from edgevpr.runtime.flight.flightlog import read_log
-from edgevpr.runtime.flight.governor import Governor, Limits, Reading, Setting, steps
+from edgevpr.runtime.flight.governor import Governor, Limits, Setting, steps
+from edgevpr.runtime.flight.metering import LoadReading
 from edgevpr.runtime.flight.reloading import Reread
 
 
@@ -98,8 +99,8 @@ def test_a_technique_that_goes_by_limits_has_no_precision_to_change(recording, t
 
 
 def test_what_the_governor_has_lowered_stays_lowered():
-    governor = Governor(Limits(0.5, 500, 80), steps(Setting(1.0, 30), keeps_rate=False), {None: 1.0})
-    reading = Reading(cpu_share=0.9, late_share=0.0, rss_mb=100.0, temperature_c=None, throttled=None)
+    governor = Governor(Limits(0.5, 500, 80), steps(Setting(1.0, 30), keeps_rate=False))
+    reading = LoadReading(cpu_share=0.9, late_share=0.0, rss_mb=100.0, temperature_c=None, throttled=None)
     for now_s in range(10):
         if governor.look(now_s, reading):
             break

@@ -167,15 +167,6 @@ def test_a_place_learnt_a_moment_ago_moves_nothing(walk):
     assert walk.step(frame(3, 130.1)).accepted
 
 
-def test_an_index_that_is_lost_fails_every_frame_until_there_is_one_again(walk):
-    index = walk.index
-    walk.lose_index(MapError("the map is gone."))
-    event = walk.step(frame(3))
-    assert (event.failed, event.reason) == (True, "the map is gone.")
-    walk.take(Matcher(walk.technique, index, walk.rule))
-    assert walk.step(frame(3)).accepted
-
-
 def test_a_map_without_a_place_refuses_and_does_not_fail(walk):
     nothing = type(walk.index)(**{name: array[:0] for name, array in walk.index.arrays.items()}, mean=walk.index.mean)
     walk.take(Matcher(walk.technique, nothing, walk.rule))
