@@ -11,8 +11,9 @@ import os
 import re
 import stat
 from contextlib import suppress
+from io import FileIO
 from pathlib import Path
-from typing import BinaryIO, cast
+from typing import BinaryIO
 
 MODE = 0o640  # positions are nobody else's, and a log is for the group that reads logs, whatever the umask
 MOST_FILES = 100  # a service that starts again and again must not bury the logs of flights under its own
@@ -20,7 +21,7 @@ _MOST_NUMBER = 999_999  # eight digits would be a date, and a file of somebody e
 _NUMBERED = re.compile(r"(.+)-(\d{4,6})", re.DOTALL)
 
 
-def open_appending(path: str | Path) -> BinaryIO:
+def open_appending(path: str | Path) -> FileIO:
     """Open a file, or a character device, for appending and reading; a new one gets the mode 0640. It never waits for
     anybody and has no buffer: a write that has returned is safe even if this process is killed next. Raises OSError."""
     flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY
@@ -35,7 +36,7 @@ def open_appending(path: str | Path) -> BinaryIO:
         if is_new:
             with suppress(OSError):  # FAT has no permissions
                 os.fchmod(descriptor, MODE)
-        return cast(BinaryIO, os.fdopen(descriptor, "r+b", buffering=0))
+        return os.fdopen(descriptor, "r+b", buffering=0)
     except BaseException:
         os.close(descriptor)
         raise

@@ -1,9 +1,7 @@
 """Load and memory of the machine, for its flight controller and ground station; and the share of this process."""
 
-import os
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 
 import psutil
@@ -30,15 +28,6 @@ def machine_load() -> MachineLoad:
         memory.total - memory.available,
         memory.total,
     )
-
-
-def cpu_spent_s() -> float:
-    """Return the CPU time in s that this process and all processes that it has started have spent so far."""
-    spent_s = sum(os.times()[:4])  # with those that have ended
-    for child in psutil.Process().children(recursive=True):
-        with suppress(psutil.Error):
-            spent_s += sum(child.cpu_times()[:2])
-    return spent_s
 
 
 class OwnLoad:

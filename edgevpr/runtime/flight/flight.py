@@ -87,8 +87,9 @@ class Flight:
     def open(cls, config: Config, world: World) -> "Flight":
         """Open the map, the log, the links and the source, in this order. Raises an EdgevprError where one of them
         cannot be opened, and StopNow where the flight is to end before it has begun."""
+        systemd.starting()
         with ExitStack() as stack:
-            with systemd.more_time_to_start(), world.stop.beginning():
+            with world.stop.beginning():
                 aboard = come_aboard(config, world, stack)
             say_start(config, world, aboard)
             recogniser, learner = aboard.recogniser, aboard.learner

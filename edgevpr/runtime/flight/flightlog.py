@@ -4,20 +4,32 @@ import json
 import logging
 import math
 import os
+import stat
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from datetime import datetime, timezone
+from io import FileIO
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
-from edgevpr.core.appending import append, is_at, sync, sync_folder
+from edgevpr.core.appending import (
+    append,
+    claim,
+    is_at,
+    keep_within,
+    open_appending,
+    set_aside,
+    sync,
+    sync_folder,
+    try_lock,
+)
 from edgevpr.core.errors import EdgevprError
 from edgevpr.core.text import json_line
 from edgevpr.core.types import NO_TAPE, Tape
-from edgevpr.runtime.flight.logfiles import LogFiles, identity, size_of
 
 _log = logging.getLogger(__name__)
+_PARTS = 4  # of `max_mb`: the file that is written, and three for those that are set aside
 _SYNC_EVERY_S = 1.0
 _MOST_START_BYTES = 1_000_000  # of a file that is looked through for anything but start lines
 
@@ -26,7 +38,7 @@ class FlightLog:
     """An open flight log; `path=None` writes nothing. Close it (it is a context manager).
 
     `path` is the log of the newest flight. What is there of an earlier flight is set aside under the next number
-    (`helpers.numbered`) before the first line is written, unless it is nothing but start lines. So is a file of a
+    (`core.appending`) before the first line is written, unless it is nothing but start lines. So is a file of a
     quarter of `max_mb` (None: without limit). The files with numbers have the other three quarters: the oldest are
     deleted. Every file of a flight but the first begins with the flight's start line again, with `repeated`, and
     `part`, the number of the file among those of the flight. Where another process writes `path`, this flight has files
@@ -57,25 +69,25 @@ class FlightLog:
         self.state: str | None = None
         self.lost_lines = 0
         self._clock, self._utc_s, self._tape = clock, utc_s, tape
-        self._synced_s = -math.inf
-        self._is_synced, self._is_new = True, False
-        self._files = LogFiles(path or "", max_mb)
-        self._file: BinaryIO | None = None
+        self._at = Path(path or "")  # the file to be written: `path`, or one with a number
+        self._part_bytes = math.inf if max_mb is None else 1e6 * max_mb / _PARTS
+        self._file: FileIO | None = None
         self._ours: tuple[int, int] | None = None  # device and inode of the file with lines of this flight
         self._written = 0  # lines in the file that is open
+        self._synced_s, self._is_synced, self._is_new = -math.inf, True, False
         self._start: dict[str, Any] = {}  # the start line, as it is repeated
         self._part, self._has_start = 0, False  # start lines written so far; the open file has one
+        self._warned: set[str] = set()
         if path is not None:
             try:
                 self._open()
             except OSError as error:
-                if wait:
-                    self._note_trouble(error)
-                    return
-                raise EdgevprError(
-                    f"The flight log {path} cannot be opened ({error.strerror}): give a file in a folder that is there "
-                    "and may be written to."
-                ) from error
+                if not wait:
+                    raise EdgevprError(
+                        f"The flight log {path} cannot be opened ({error.strerror}): give a file in a folder that is "
+                        "there and may be written to."
+                    ) from error
+                self._note_trouble(error)
 
     @property
     def is_written(self) -> bool:
@@ -95,32 +107,35 @@ class FlightLog:
         """
         if self.path is None:
             return
-        if self._file is not None and not is_at(self._file, self._files.at):
-            self._note_taken_away()
+        if self._file is not None and not is_at(self._file, self._at):
+            self._note_taken_away(self._file)
         now_s, utc_s = self._clock(), self._utc_s()
-        lines = _line(kind, utc_s, {"t_mono_s": now_s, **fields})
-        if kind == "start":
+        lines, is_start = _line(kind, utc_s, {"t_mono_s": now_s, **fields}), kind == "start"
+        if is_start:
             self._start, self._part = json.loads(lines), 0
         if self.state is not None:
             gap = _line("gap", utc_s, {"t_mono_s": now_s, "lost_lines": self.lost_lines})
-            lines = lines + gap if kind == "start" else gap + lines
+            lines = lines + gap if is_start else gap + lines
         try:
-            if self._file is None:
-                self._open()
-            if self._is_to_be_set_aside(len(lines)):
-                self._begin_anew()
-            is_repeated = bool(self._start) and not self._has_start and kind != "start"
-            if is_repeated:
+            file = self._writable(len(lines))
+            if is_repeated := bool(self._start) and not self._has_start and not is_start:
                 lines = json_line({**self._start, "repeated": True, "part": self._part + 1}) + lines
-            _append(self._file, lines)
-            self._note_written(with_start=is_repeated or kind == "start")
+            _append(file, lines)
+            self._ours, self._is_synced = _identity(file), False
+            self._written += 1
+            self._part += is_repeated or is_start
+            self._has_start |= is_repeated or is_start
             if now_s - self._synced_s >= _SYNC_EVERY_S:
-                self._sync()
-                self._synced_s = now_s
+                self._sync(file, now_s)
         except OSError as error:
-            self._lost_one(kind, error)
+            self.lost_lines += 1
+            self._has_start &= not is_start
+            self._note_trouble(error)
+            self._let_go()  # the medium may be another one when it comes back, so the file is opened anew
         else:
-            self._say_recovered()
+            if self.state is not None:
+                self.state = None
+                _log.warning("The flight log %s is written again; %d lines are missing.", self.path, self.lost_lines)
 
     def restate(self, **fields: Any) -> None:
         """Give fields of the start line another value, where it is repeated from now on."""
@@ -133,8 +148,7 @@ class FlightLog:
         if self._file is None or self._is_synced or now_s - self._synced_s < _SYNC_EVERY_S:
             return
         try:
-            self._sync()
-            self._synced_s = now_s
+            self._sync(self._file, now_s)
         except OSError as error:
             self._note_trouble(error)
             self._let_go()
@@ -144,56 +158,87 @@ class FlightLog:
         if self._file is None:
             return
         try:
-            self._sync()
+            self._sync(self._file, self._synced_s)
             self._file.close()
         except OSError as error:
             _log.warning("The end of the flight log %s may be missing (%s).", self.path, error.strerror)
         self._file = None
 
-    def _open(self) -> None:
-        self._file = self._files.open()
-        self._written, self._is_new = 0, not size_of(self._file)
-        self._has_start &= not self._is_new and identity(self._file) == self._ours
-
-    def _is_to_be_set_aside(self, more_bytes: int) -> bool:
-        size = size_of(self._file)
-        return size > 0 and (identity(self._file) != self._ours or size + more_bytes > self._files.part_bytes)
-
-    def _begin_anew(self) -> None:
-        if self._ours is None and _has_only_starts(self._file):  # of a service that could not start
-            self._file.truncate(0)
-        elif self._files.set_aside():
-            sync(self._file)
+    def _writable(self, more_bytes: int) -> FileIO:
+        """Return the open file, after what has to be set aside for these bytes. Raises OSError."""
+        file = self._file or self._open()
+        size = _size_of(file)
+        if not size or (_identity(file) == self._ours and size + more_bytes <= self._part_bytes):
+            return file
+        if self._ours is None and _has_only_starts(file):  # of a service that could not start
+            file.truncate(0)
+        elif self._is_set_aside():
+            sync(file)
             self._let_go()
-            self._files.delete_oldest()
-            self._open()
+            self._delete_oldest()
+            return self._open()
+        return file
 
-    def _note_written(self, with_start: bool) -> None:
-        self._ours, self._is_synced = identity(self._file), False
-        self._written += 1
-        if with_start:
-            self._part += 1
-            self._has_start = True
+    def _open(self) -> FileIO:
+        """Open the file to be written, which is then locked. Raises OSError."""
+        file = open_appending(self._at)
+        if not try_lock(file):
+            file.close()
+            self._at = claim(self.path or "")
+            file = open_appending(self._at)
+            try_lock(file)
+            self._warn_once(
+                f"The flight log {self.path} is written by another edgevpr: this flight is in {self._at}. Give each "
+                "flight a `log.path` of its own."
+            )
+        self._file, self._written, self._is_new = file, 0, not _size_of(file)
+        self._has_start &= not self._is_new and _identity(file) == self._ours
+        return file
 
-    def _sync(self) -> None:
-        sync(self._file)
+    def _is_set_aside(self) -> bool:
+        """Give the file that is written a number, so that `_open` makes a new one. Return False where it stays as it
+        is: it is then written on, since a line is worth more than a limit."""
+        try:
+            if self._at == Path(self.path or ""):
+                set_aside(self._at)
+            else:
+                self._at = claim(self.path or "")
+        except OSError as error:
+            self._warn_once(
+                f"The flight log {self.path} cannot be set aside ({error.strerror}), so it is written on, and may "
+                "grow past log.max_mb: let the flight write to its folder."
+            )
+            return False
+        return True
+
+    def _delete_oldest(self) -> None:
+        """Delete the oldest files with a number until a new file has its room."""
+        if math.isinf(self._part_bytes):
+            return
+        try:
+            deleted = keep_within(self.path or "", self._part_bytes * (_PARTS - 1))
+        except OSError as error:
+            self._warn_once(
+                f"The oldest flight logs beside {self.path} cannot be deleted ({error.strerror}), so they grow past "
+                "log.max_mb: let the flight write to their folder."
+            )
+            return
+        if deleted and "deleted" not in self._warned:
+            self._warned.add("deleted")
+            _log.warning("Old flight logs are deleted, %s first: all stay within log.max_mb together.", deleted[0])
+
+    def _sync(self, file: FileIO, now_s: float) -> None:
+        sync(file)
         if self._is_new:
-            sync_folder(self._files.at)
-        self._is_synced, self._is_new = True, False
+            sync_folder(self._at)
+        self._is_synced, self._is_new, self._synced_s = True, False, now_s
 
-    def _lost_one(self, kind: str, error: OSError) -> None:
-        self.lost_lines += 1
-        if kind == "start":
-            self._has_start = False
-        self._note_trouble(error)
-        self._let_go()  # the medium may be another one when it comes back, so the file is opened anew
-
-    def _note_taken_away(self) -> None:
-        is_deleted = os.fstat(self._file.fileno()).st_nlink == 0
+    def _note_taken_away(self, file: FileIO) -> None:
+        is_deleted = os.fstat(file.fileno()).st_nlink == 0
         lost = self._written if is_deleted else 0
         self.lost_lines += lost
         self.state = (
-            f"The flight log {self._files.at} was {'deleted' if is_deleted else 'moved or replaced'} in flight, and "
+            f"The flight log {self._at} was {'deleted' if is_deleted else 'moved or replaced'} in flight, and "
             f"{lost} lines of it are lost: it goes on in a new file as soon as there can be one."
         )
         _log.warning("%s", self.state)
@@ -214,10 +259,10 @@ class FlightLog:
             )
             _log.warning("%s", self.state)
 
-    def _say_recovered(self) -> None:
-        if self.state is not None:
-            self.state = None
-            _log.warning("The flight log %s is written again; %d lines are missing.", self.path, self.lost_lines)
+    def _warn_once(self, sentence: str) -> None:
+        if sentence not in self._warned:
+            self._warned.add(sentence)
+            _log.warning("%s", sentence)
 
 
 def read_log(path: str | Path, begin: int = 0, end: float = math.inf) -> Iterator[dict[str, Any]]:
@@ -243,14 +288,14 @@ def record_of(line: bytes) -> dict[str, Any] | None:
     return record if isinstance(record, dict) else None
 
 
-def _has_only_starts(file: BinaryIO) -> bool:
-    if size_of(file) > _MOST_START_BYTES:
+def _has_only_starts(file: FileIO) -> bool:
+    if _size_of(file) > _MOST_START_BYTES:
         return False
     file.seek(0)
     return all((record_of(line) or {}).get("kind") == "start" for line in file.readall().splitlines())
 
 
-def _append(file: BinaryIO, lines: bytes) -> None:
+def _append(file: FileIO, lines: bytes) -> None:
     end = file.seek(0, os.SEEK_END)
     if end:
         file.seek(end - 1)
@@ -262,3 +307,15 @@ def _append(file: BinaryIO, lines: bytes) -> None:
 def _line(kind: str, utc_s: float, fields: dict[str, Any]) -> bytes:
     now = datetime.fromtimestamp(utc_s, timezone.utc).isoformat(timespec="milliseconds").replace("+00:00", "Z")
     return json_line({"kind": kind, "time": now, **fields})
+
+
+def _identity(file: FileIO) -> tuple[int, int]:
+    """Return the device and the number of an open file: those of no other file that is there."""
+    found = os.fstat(file.fileno())
+    return found.st_dev, found.st_ino
+
+
+def _size_of(file: FileIO) -> int:
+    """Return the bytes of an open file, 0 for a device."""
+    found = os.fstat(file.fileno())
+    return found.st_size if stat.S_ISREG(found.st_mode) else 0

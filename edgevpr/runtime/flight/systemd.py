@@ -5,18 +5,11 @@ The protocol is sd_notify(3): `KEY=value` lines in one datagram to the socket th
 
 import os
 import socket
-import threading
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 
 from edgevpr.core.text import shown
-from edgevpr.power.load import cpu_spent_s
 
 _SEND_TIMEOUT_S = 0.5
-_LOOK_S, _MORE_US = 20.0, 60_000_000
-_WORKS = 0.05  # the share of a core below which a start waits for something and does not compute
-_LONGEST_START_S = 1800.0
+_LONGEST_START_US = 1_800_000_000
 
 
 def notify(**assignments: object) -> bool:
@@ -39,6 +32,12 @@ def notify(**assignments: object) -> bool:
     except OSError:
         return False
     return True
+
+
+def starting() -> None:
+    """Ask for half an hour to start in: to try a technique, or to load a map, takes minutes on a slow board, and what
+    is broken off begins again at nothing."""
+    notify(EXTEND_TIMEOUT_USEC=_LONGEST_START_US)
 
 
 def ready() -> None:
@@ -72,38 +71,3 @@ def watchdog_interval_s() -> float | None:
     except (KeyError, ValueError):
         return None
     return timeout_us / 2e6 if watched and timeout_us > 0 else None
-
-
-@contextmanager
-def more_time_to_start(
-    look_s: float = _LOOK_S, spent_s: Callable[[], float] = cpu_spent_s, longest_s: float = _LONGEST_START_S
-) -> Iterator[None]:
-    """Ask systemd for more time, inside this context, for as long as this process or one that it has started computes:
-    to try a technique, or to load a map, takes minutes on a slow board, and a start that is broken off begins again at
-    nothing.
-
-    A start that hangs gets one minute and no more, and none gets more than `longest_s`. `spent_s` gives the CPU time
-    spent so far, which is looked at every `look_s` seconds.
-    """
-    begun = threading.Event()
-
-    def ask() -> None:
-        before_s, until_s = spent_s(), time.monotonic() + longest_s
-        while not begun.wait(look_s) and time.monotonic() < until_s:
-            now_s = spent_s()
-            if now_s - before_s >= _WORKS * look_s:
-                notify(EXTEND_TIMEOUT_USEC=_MORE_US)
-            before_s = now_s
-
-    if "NOTIFY_SOCKET" not in os.environ:
-        yield
-        return
-    if longest_s > 0:
-        notify(EXTEND_TIMEOUT_USEC=_MORE_US)  # at once: to get here took imports, on a slow board half a minute
-    thread = threading.Thread(target=ask, name="start", daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        begun.set()
-        thread.join()

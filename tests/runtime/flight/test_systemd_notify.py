@@ -4,12 +4,11 @@ import os
 import socket
 import subprocess
 import sys
-import threading
 
 import pytest
 
 from edgevpr.runtime.flight import systemd
-from edgevpr.runtime.flight.systemd import more_time_to_start, notify, watchdog_interval_s
+from edgevpr.runtime.flight.systemd import notify, starting, watchdog_interval_s
 
 
 @pytest.fixture
@@ -132,49 +131,6 @@ def test_no_watchdog_without_a_time(monkeypatch, timeout_us):
     assert watchdog_interval_s() is None
 
 
-class Looked:
-    """CPU time of a start, of which so much is spent from look to look; `often` is set once it was looked at often."""
-
-    def __init__(self, each_s: float) -> None:
-        self.often = threading.Event()
-        self._each_s, self._looks = each_s, 0
-
-    def __call__(self) -> float:
-        self._looks += 1
-        if self._looks > 5:
-            self.often.set()
-        return self._looks * self._each_s
-
-
-def test_a_start_that_computes_gets_more_time_and_one_that_hangs_does_not(manager):
-    works, hangs = Looked(0.01), Looked(0.0)
-    with more_time_to_start(look_s=0.01, spent_s=hangs):
-        assert hangs.often.wait(60)
-    assert manager.recv(4096) == b"EXTEND_TIMEOUT_USEC=60000000", "a minute at once"
-    assert notify(STATUS="hung")
-    assert manager.recv(4096) == b"STATUS=hung", "and no more"
-    with more_time_to_start(look_s=0.01, spent_s=works):
-        assert manager.recv(4096) == b"EXTEND_TIMEOUT_USEC=60000000"
-        assert manager.recv(4096) == b"EXTEND_TIMEOUT_USEC=60000000"
-        assert works.often.wait(60)
-    assert notify(READY=1)
-    while (said := manager.recv(4096)) == b"EXTEND_TIMEOUT_USEC=60000000":
-        pass
-    assert said == b"READY=1", "nothing is asked for by a start that is over"
-
-
-def test_no_start_gets_time_without_end(manager):
-    endless = Looked(0.01)
-    with more_time_to_start(look_s=0.01, spent_s=endless, longest_s=0.0):
-        asking = [thread for thread in threading.enumerate() if thread.name == "start"]
-        for thread in asking:
-            thread.join(60)
-        assert not any(thread.is_alive() for thread in asking)
-    assert notify(READY=1)
-    assert manager.recv(4096) == b"READY=1"
-
-
-def test_without_systemd_no_thread_asks_for_time(monkeypatch):
-    monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
-    with more_time_to_start():
-        assert "start" not in [thread.name for thread in threading.enumerate()]
+def test_a_start_is_given_half_an_hour(manager):
+    starting()
+    assert manager.recv(4096) == b"EXTEND_TIMEOUT_USEC=1800000000"
