@@ -80,27 +80,6 @@ def test_every_answer_has_its_own_line_before_the_next_query(recording, tmp_path
     assert "3 fixes sent, 1 taken, 2 refused (GPS in use)" in statuses[-1]
 
 
-def test_a_fix_without_an_answer_has_a_line_that_says_so(recording, tmp_path, monkeypatch):
-    monkeypatch.setattr("edgevpr.runtime.flight.autopilot._SETTLED_WITHIN_S", 60.0)
-    lines = flown(recording, tmp_path, FakeClock(), [None, None, ACCEPTED, ACCEPTED])
-    answers = {line["query"]: line for line in of_kind(lines, "answer")}
-    first = answers["frame 000000"]
-    assert (first["sent"], first["result"], first["latency_ms"]) == (True, None, None)
-    assert first["why"] == "it had no answer within 1 s"
-    assert answers["frame 000002"]["result"] == "ACCEPTED"
-
-
-def test_a_fix_that_was_given_up_after_its_query_has_a_line_too(recording, tmp_path):
-    clock = FakeClock()
-    link = FakeLink(clock, answer=None)
-    lines = Flight(recording / "cohog.gpkg", tmp_path / "log", clock, link, **{"source.rate_hz": 0.5}).fly(
-        FakeSource([textured(number, 240, 320) for number in range(3)], clock, work=link.stats)
-    )
-    first, *_ = of_kind(lines, "answer")
-    assert (first["query"], first["sent"], first["result"], first["t_sent_s"]) == ("frame 000000", False, None, None)
-    assert first["why"] == "no autopilot was there to take it within 1 s"
-
-
 @pytest.mark.parametrize("settings", [{"mavlink.send_fixes": False}, {}])
 def test_what_was_never_sent_waits_for_no_answer(recording, tmp_path, settings):
     clock = FakeClock()

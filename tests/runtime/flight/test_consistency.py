@@ -3,14 +3,11 @@
 import numpy as np
 from fakes import FakeClock, FakeLink, FakeSource, vehicle_at
 from flights import STEP_DEG, Flight, of_kind
-from mavlink_peers import Peer, UdpPort, link_to, wait_until
 from pictures import textured
 
 from edgevpr.core.contract import FineMatch
 from edgevpr.core.geodesy import distance_m, moved
 from edgevpr.core.types import Candidate, Frame, Place, Position, QueryCost, Steps
-from edgevpr.mavlink.wire import mavlink
-from edgevpr.runtime.flight import autopilot
 from edgevpr.runtime.flight.autopilot import DRY_RUN
 from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.recognise.locate import Located
@@ -195,47 +192,6 @@ def test_in_flight_a_fix_held_back_is_in_the_log_and_the_ground_is_told_once(rec
         (6, "edgevpr: fixes agree again"),
     ]
     assert sum(each.name == "vpr_place" for each in link.sent if each.get_type() == "NAMED_VALUE_INT") == 5
-
-
-def test_over_a_real_link_it_is_what_the_autopilot_says_of_itself_that_counts(recording, tmp_path, monkeypatch):
-    monkeypatch.setattr(autopilot, "_SETTLED_WITHIN_S", 60.0)
-    clock, port = FakeClock(), UdpPort()
-    navigator = Navigator(5.0, 1.0)
-    with link_to(f"udpout:127.0.0.1:{port.number}", clock=clock, listener=navigator) as link:
-        peer = Peer(port)
-        peer.expect("HEARTBEAT")
-        peer.heartbeat()
-        wait_until(link.listens)
-        turns = iter(range(4))
-
-        def turn():
-            """GPS at the first frame only; a filter that reckons from then on, and at the last frame has given up."""
-            turn = next(turns)
-            where = round((50 + turn * STEP_DEG) * 1e7), round(8.05 * 1e7)
-            flags = mavlink.EKF_CONST_POS_MODE if turn == 3 else mavlink.EKF_POS_HORIZ_REL
-            peer.heartbeat()
-            peer.send(mavlink.MAVLink_gps_raw_int_message(0, 1 if turn else 3, *where, 0, 80, 120, 0, 0, 14))
-            peer.send(mavlink.MAVLink_ekf_status_report_message(flags, 0.1, 0.1, 0.1, 0.1, 0.1))
-            north_cm_s = round(STEP_DEG * 111_195 * 100)
-            peer.send(mavlink.MAVLink_global_position_int_message(0, *where, 0, 80_000, north_cm_s, 0, 0, 0))
-            wait_until(lambda: link.vehicle() and link.vehicle().t_heard_s == clock.now_s)
-
-        settings = {"source.rate_hz": 1.0}
-        flight = Flight(recording / "cohog.gpkg", tmp_path / "log", clock, link, navigator=navigator, **settings)
-        pictures = [textured(number, 240, 320) for number in (0, 1, 20, 3)]
-        queries = of_kind(flight.fly(FakeSource(pictures, clock, work=turn)), "query")
-        assert peer.expect_text("edgevpr: fix held back, contradicts autopilot")
-    port.close()
-    assert [line["fix"]["sent"] for line in queries] == [False, False, False, True]
-    assert "where GPS and the fixes before say" in queries[0]["fix"]["why"]
-    assert "good to 8 m" in queries[1]["fix"]["why"], "5 m by GPS, 5 m of the map, and a second of drift"
-
-
-def test_in_flight_with_gps_that_agrees_no_fix_is_needed(recording, tmp_path):
-    queries, link = fly(recording, tmp_path, (0, 1), off_deg=0.0, has_gps=True)
-    assert [line["fix"]["sent"] for line in queries] == [False, False]
-    assert queries[0]["fix"]["why"] == "not needed: the autopilot has GPS"
-    assert link.texts() == []
 
 
 def test_a_dry_run_says_which_fixes_would_be_held_back(recording, tmp_path):

@@ -1,14 +1,11 @@
 """The status that a whole flight tells, by a clock that is turned by hand."""
 
-import numpy as np
 import pytest
 from fakes import FakeClock, FakeLink, FakeSource, vehicle_at
 from flights import Flight
 
 from edgevpr.frames.images import read_image
 from edgevpr.mavlink.requests import Wish
-
-GREY = np.full((120, 160), 90, np.uint8)
 
 
 class Kept:
@@ -55,23 +52,6 @@ def test_the_status_counts_what_the_flight_does_and_names_its_match(told):
     assert last.source == "streaming"
     assert last.link is None
     assert last.summary.startswith(f"streaming; {last.queries} queries, {last.accepted} accepted, ")
-
-
-def test_the_last_match_is_kept_while_nothing_is_recognised(told):
-    last = told(4, [GREY] * 12)[-1]
-    assert (last.accepted, last.newest.accepted) == (4, False)
-    assert last.match.query == "frame 000003"
-    assert last.match.age_s > last.newest.age_s + 4
-    assert last.newest.reason
-
-
-def test_the_answers_of_the_autopilot_are_told(told):
-    last = told(link=lambda clock: FakeLink(clock, answer="DENIED"))[-1]
-    assert (last.link.connected, last.link.autopilot, last.link.channel) == (True, 1, "COMMAND")
-    assert last.link.answers["DENIED"] > 5
-    assert "fixes sent, 0 taken" in last.link.fixes
-    assert last.link.fixes in last.summary
-    assert last.link.accuracy_m is None, "without a velocity of the vehicle nothing is reckoned"
 
 
 def test_the_navigation_says_how_well_it_knows_the_position(told):

@@ -59,7 +59,7 @@ def test_the_candidates_are_lowered_first_then_the_rate():
     assert [change.after for change in changes[:-1]] == list(settings[1:])
     assert [change.before for change in changes[:-1]] == list(settings[:-1])
     assert {b - a for (a, _), (b, _) in itertools.pairwise(flight.changes)} == {4.0}, "each step is given time to tell"
-    assert changes[0].why == "90% of all cores taken, and 50% allowed"
+    assert "90%" in changes[0].why
     assert changes[-1] == Change(
         settings[-1], settings[-1], "90% of all cores taken, and 50% allowed, and nothing is left to lower"
     )
@@ -70,9 +70,7 @@ def test_it_goes_back_in_the_opposite_order():
     flight.fly(60)
     assert flight.governor.setting == Setting(0.25, 20)
     flight.fly(600)
-    assert [change.after for _, change in flight.changes if change.why == "there is room again"] == [
-        *reversed(flight.settings[:-1])
-    ]
+    assert [change.after for _, change in flight.changes if change.back] == [*reversed(flight.settings[:-1])]
     assert flight.governor.setting == flight.governor.asked == ASKED
 
 
@@ -132,7 +130,7 @@ def test_noise_around_the_limit_changes_the_rate_once_at_most():
     assert len(flight.fly(3600)) <= 1
     flight = Flight(lambda setting, now_s: measured(temperature_c=script.gauss(80, 2)))
     changes = flight.fly(3600)
-    assert all(change.why != "there is room again" for change in changes), "never clearly below the limit"
+    assert all(not change.back for change in changes), "never clearly below the limit"
 
 
 @pytest.mark.parametrize("full_c", [81, 84, 90, 100])
@@ -149,7 +147,7 @@ def test_a_board_that_heats_slowly_is_held_below_its_limit(full_c):
     flight = Flight(reading)
     first = flight.fly(3600)
     assert first
-    assert "degrees, and 80 are the limit" in first[0].why
+    assert "degrees, and 80" in first[0].why
     assert max(hottest_c) < 81.5
     assert len(flight.fly(3600)) <= 13, "one try every ten minutes"
 
@@ -209,7 +207,7 @@ def test_queries_that_others_make_late_are_asked_less_often_until_the_others_are
     flight = Flight(reading)
     fewer, slower = flight.fly(99)
     assert (fewer.after, slower.after) == (Setting(2.0, 20), Setting(1.0, 20))
-    assert slower.why == "queries come late, kept waiting by other programs or the disk"
+    assert "come late" in slower.why
     assert [change.after for change in flight.fly(60)] == [Setting(2.0, 20), ASKED]
 
 
@@ -217,4 +215,4 @@ def test_memory_that_runs_short_is_said_once():
     flight = Flight(lambda setting, now_s: measured(rss_mb=500.0))
     (change,) = flight.fly(600)
     assert change.before == change.after == ASKED
-    assert change.why == "500 MB of memory taken, and 512 allowed, and nothing is left to lower"
+    assert "500 MB" in change.why

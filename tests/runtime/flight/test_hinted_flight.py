@@ -7,13 +7,11 @@ from fakes import FakeClock, FakeLink, FakeSource, vehicle_at
 from flights import STEP_DEG, Flight, of_kind
 from pictures import textured
 
-from edgevpr.cli.main import main
 from edgevpr.core.config import load_config
 from edgevpr.core.types import Frame, Position
 from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.flight.flightlog import read_log
 from edgevpr.runtime.recognise.opening import meter_of
 from edgevpr.techniques import create
 
@@ -117,33 +115,3 @@ def test_our_own_fix_says_where_to_look_next(place_map, tmp_path):
     assert [line["place"] for line in queries] == [3, 3, 4]
     assert queries[0]["hints"] is None
     assert all(line["hints"]["reach_m"] >= 111 for line in queries[1:])
-
-
-def test_the_speed_is_a_flag(place_map, tmp_path, capsys):
-    (tmp_path / "query").mkdir()
-    for name in ("0.png", "1.png"):
-        cv2.imwrite(str(tmp_path / "query" / name), view(2, MAPPED_DEG))
-    command = ["run", "--map", str(place_map), "--source", str(tmp_path / "query"), "--rate-hz", "60"]
-    assert main([*command, "--log", str(tmp_path / "log"), "--reach-m-s", "10"]) == 0
-    queries = of_kind(read_log(tmp_path / "log"), "query")
-    assert [line["hints"] and line["hints"]["heading"] for line in queries] == [None, False]
-    assert main([*command, "--reach-m-s", "0"]) == 2
-    assert "`match.reach_m_s` is 0; it must be between 0.1 and 100" in capsys.readouterr().err
-
-
-def test_no_speed_no_reach(place_map, tmp_path):
-    queries = fly(place_map, tmp_path / "log", [frame(2, MAPPED_DEG)] * 2, (7, None))
-    assert [line["hints"] for line in queries] == [None, None]
-    assert all(line["accepted"] for line in queries)
-
-
-def test_a_camera_that_looks_ahead_is_told_no_heading(tmp_path):
-    ahead = mapped(tmp_path / "ahead.gpkg")
-    (query,) = fly(ahead, tmp_path / "log", [frame(2, MAPPED_DEG)], (2, MAPPED_DEG + 90))
-    assert (query["place"], query["hints"]) == (3, None)
-
-
-def test_a_sequence_is_told_nothing(place_map, tmp_path):
-    frames = [frame(place, MAPPED_DEG) for place in (2, 3)]
-    queries = fly(place_map, tmp_path / "log", frames, (7, 0.0), 10.0, **{"match.sequence": 2})
-    assert [line["hints"] for line in queries] == [None, None]

@@ -6,13 +6,11 @@ import cv2
 import numpy as np
 import pytest
 from fakes import FakeCapture, FakeClock, FakeLink, FakeSource
-from flight_process import start
 from flights import PLACES, Flight, flight_meter, of_kind
 from pictures import textured
 
 from edgevpr.frames.live import DeviceCapture, LiveSource
 from edgevpr.power.thermal import ThermalState
-from edgevpr.runtime.flight.flightlog import read_log
 
 PICTURE = textured(1, 240, 320)
 
@@ -52,25 +50,6 @@ def test_a_flights_charge_is_the_closed_form(recording, tmp_path):
     assert in_queries_mah + reading_mah == pytest.approx(totals["marginal_mah"], rel=1e-5), "the log has six digits"
     assert sum(line["costs"]["used_mah"] for line in queries) < totals["used_mah"]
     assert queries[-1]["totals"]["used_mah"] == pytest.approx(totals["used_mah"], rel=1e-6)
-
-
-def test_the_stages_account_for_the_cpu_time_of_the_process(recording, tmp_path):
-    """A real flight, by CPU time, which other programs do not take: what is no stage of a query (threads, the loop
-    between queries) is a small part; benchmarks/bench_flight.py says how small."""
-    log = tmp_path / "log"
-    flags = ("--rate-hz", "60", "--link", "udpout:127.0.0.1:9")
-    flight = start(recording / "cohog.gpkg", recording / "blind" / "images", log, *flags)
-    assert flight.wait(timeout=60) == 0
-    flight.stderr.close()
-    lines = list(read_log(log))
-    queries, end = of_kind(lines, "query"), lines[-1]
-    in_queries_s = sum(line["costs"]["cpu_s"] + line["reading"]["cpu_s"] for line in queries)
-    assert 0.8 * end["stages_cpu_s"] < in_queries_s < end["stages_cpu_s"], "the rest is the log and the link"
-    assert 0.8 * end["process_cpu_s"] < end["stages_cpu_s"] < end["process_cpu_s"]
-    assert end["elapsed_s"] > end["process_cpu_s"] / 2
-    assert all(line["costs"]["rss_mb"] > line["costs"]["pss_mb"] > 10 for line in queries)
-    assert queries[0]["totals"]["dropped"] is None, "of a recording every picture is taken"
-    assert set(queries[0]["board"]) == {"temperature_c", "frequency_mhz", "throttled", "why"}
 
 
 def test_nearly_all_cpu_time_of_the_loop_is_some_stage_of_a_query(recording, tmp_path):
@@ -144,21 +123,6 @@ def test_frames_that_nobody_took_are_counted(recording, tmp_path):
     assert flight.end["dropped"] == source.dropped
     assert flight.end["refused"] == source.refused
     assert of_kind(lines, "query")[-1]["totals"].keys() >= {"refused", "latency_s"}
-
-
-def test_the_log_ends_with_what_the_board_has_drawn(recording, tmp_path):
-    """Idle power counts while nothing is recognised: two queries, and two seconds between them."""
-    clock = FakeClock()
-    settings = {"board": "rpi-4b", "source.rate_hz": 0.5}
-    flight = Flight(recording / "hog.gpkg", tmp_path / "log", clock, **settings)
-    encode = flight.recogniser.technique.encode
-    flight.recogniser.technique.encode = lambda image: (clock.work(0.05), encode(image))[1]
-    lines, end = flight.fly(FakeSource([PICTURE] * 2, clock)), flight.end
-    idle_mah = 1000 * 2.29 * end["elapsed_s"] / (14.8 * 0.85 * 3600)
-    assert end["elapsed_s"] > 2
-    assert end["used_mah"] == pytest.approx(idle_mah + end["process_mah"], rel=1e-5)
-    assert sum(line["costs"]["used_mah"] for line in of_kind(lines, "query")) < end["used_mah"] / 2
-    assert 0 < end["marginal_mah"] <= end["process_mah"] < idle_mah
 
 
 def test_a_flight_of_a_recording_takes_every_picture(recording, tmp_path):

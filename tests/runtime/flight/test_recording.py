@@ -57,7 +57,7 @@ def test_a_flight_goes_on_with_the_picture_as_it_is_kept(tmp_path, is_grey):
         replayed = again.read(0.2)
         assert np.array_equal(replayed.image, frame.image)
         assert (replayed.name, replayed.t_mono_s) == (frame.name, frame.t_mono_s)
-    with pytest.raises(ImageError, match="it is torn"):
+    with pytest.raises(ImageError, match="torn"):
         again.read(0.2)
     assert again.ended
     assert again.state == state
@@ -89,7 +89,7 @@ def test_one_that_is_as_large_as_it_may_be_ends_and_says_so(tmp_path, caplog):
         until(lambda: tape.state)
         tape.keep(b"no more")
         tape.note("no more")
-    assert "as large as half of log.record_mb allows" in tape.state
+    assert "log.record_mb" in tape.state
     assert sum("has ended" in each.message for each in caplog.records) == 1
     assert ["no more"] not in notes(tape.path)
     assert len(list((tape.path / FRAMES).iterdir())) <= 4
@@ -113,7 +113,7 @@ def test_a_full_disk_ends_it_and_nothing_else(tmp_path):
             tape.note("frame")
             until(lambda: tape.state)
         tape.note("later")
-    assert "File too large" in tape.state
+    assert "too large" in tape.state
     assert notes(tape.path) == [["x"]]
 
 
@@ -123,14 +123,14 @@ def test_the_last_of_the_disk_is_left_to_logs_and_map(tmp_path, monkeypatch):
     with Recording(tmp_path, 100) as tape:
         tape.note("x")
         until(lambda: tape.state)
-    assert "MB are left on the disk" in tape.state
+    assert "are left" in tape.state
 
 
 def test_where_none_can_be_made_it_says_what_to_do(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(EdgevprError, match=r"leave `log\.record` out"):
+    with pytest.raises(EdgevprError, match=r"log\.record"):
         Recording(tmp_path / "file", 100)
-    with pytest.raises(EdgevprError, match=r"leave `log\.record` out"):
+    with pytest.raises(EdgevprError, match=r"log\.record"):
         Recording(tmp_path / "no" / "such", 100)
 
 

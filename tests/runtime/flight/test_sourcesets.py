@@ -1,16 +1,11 @@
 """The autopilot is asked for another set of sources (42007) where its operator allows it, once, over a real link."""
 
 import pytest
-from air import Air
-from controlled import LOAD, Controlled
-from fakes import FakeClock, FakeLink, to_autopilot
+from controlled import Controlled
 
 from edgevpr.core.config import SourceSetsConfig
-from edgevpr.mavlink.channel import Channel
-from edgevpr.mavlink.messages import Health
 from edgevpr.mavlink.wire import mavlink
 from edgevpr.runtime.flight.autopilot import SourceSets
-from edgevpr.runtime.flight.navigator import Navigator
 
 ASK = mavlink.MAV_CMD_SET_EKF_SOURCE_SET
 ALLOWED = SourceSetsConfig(gps=1, no_gps=2)
@@ -87,20 +82,3 @@ def test_gps_that_comes_and_goes_is_not_asked_for():
     assert sets.wanted(30.0, has_gps=False, has_own=True) == 2
     blinks = [sets.wanted(float(t_s), has_gps=t_s % 9 != 0, has_own=True) for t_s in range(31, 100)]
     assert blinks == [None] * 69
-
-
-def test_looking_whether_to_ask_moves_no_continuous_position():
-    """The autopilot is told positions 0.2 s ago, as ArduPilot takes a receiver to be so late."""
-    plain, asking = (Air(Navigator(1.0, 1.0)) for _ in range(2))
-    clock = FakeClock()
-    link = FakeLink(clock, vehicle=lambda: asking.vehicle)
-    autopilot = to_autopilot(link, asking.navigator, clock)
-    for air in (plain, asking):
-        air.navigator.hear_channel(Channel.GPS_INPUT)
-    for _ in range(20):
-        plain.fly(1)
-        asking.fly(1)
-        clock.now_s = asking.t_s + 0.2
-        autopilot.report(Health.ACTIVE, LOAD, None)
-    assert asking.states == plain.states
-    assert asking.states[-1][1]

@@ -2,12 +2,9 @@
 
 import os
 import socket
-import subprocess
-import sys
 
 import pytest
 
-from edgevpr.runtime.flight import systemd
 from edgevpr.runtime.flight.systemd import notify, starting, watchdog_interval_s
 
 
@@ -34,42 +31,6 @@ def test_an_abstract_socket_is_reached(monkeypatch):
         monkeypatch.setenv("NOTIFY_SOCKET", "@" + name)
         assert notify(WATCHDOG=1)
         assert receiver.recv(4096) == b"WATCHDOG=1"
-
-
-@pytest.fixture
-def open_socket(monkeypatch):
-    """What `notify` opens, held open after it, as if a child were started in between."""
-    opened = []
-    real = socket.socket
-
-    def opens(*kind):
-        made = real(*kind)
-        opened.append(made.dup())
-        os.set_inheritable(opened[-1].fileno(), made.get_inheritable())
-        return made
-
-    monkeypatch.setattr(systemd.socket, "socket", opens)
-    yield opened
-    for each in opened:
-        each.close()
-
-
-def test_no_child_inherits_the_socket(manager, open_socket):
-    assert notify(WATCHDOG=1)
-    (held,) = open_socket
-    script = "import os, sys; print(os.path.exists(f'/proc/self/fd/{sys.argv[1]}'))"
-    for inherits in (False, True):
-        os.set_inheritable(held.fileno(), held.get_inheritable() or inherits)
-        child = subprocess.run(
-            [sys.executable, "-c", script, str(held.fileno())], capture_output=True, text=True, close_fds=False
-        )
-        assert child.stdout == f"{inherits}\n"
-
-
-def test_no_socket_is_left_open(manager):
-    before = os.listdir("/proc/self/fd")
-    assert all(notify(WATCHDOG=1) for _ in range(3))
-    assert len(os.listdir("/proc/self/fd")) == len(before)
 
 
 def test_a_line_break_in_a_value_cannot_become_an_assignment(manager):

@@ -34,7 +34,7 @@ def test_the_keys_of_the_configuration_reach_the_link():
         assert (heartbeat.get_srcSystem(), heartbeat.get_srcComponent()) == (5, 191)
         sending = link.send_fix(Fix(50.0, 8.0, 20.0, link._turns.now_s()))
         wait_until(lambda: sending.sent is not None)
-        assert sending.why == "no autopilot was there to take it within 0.2 s"
+        assert "0.2 s" in sending.why
 
 
 @pytest.mark.parametrize(
