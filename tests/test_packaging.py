@@ -43,7 +43,12 @@ def test_every_module_and_nothing_else_travels(wheel):
     names = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
     code = {path.relative_to(ROOT).as_posix() for path in (ROOT / "edgevpr").rglob("*.py")}
     figures = {f"edgevpr/runtime/preflight/{name}.json" for name in ("accuracy", "counted")}
-    looks = {"edgevpr/review/page.css", "edgevpr/lab/evaluate/page.css", "edgevpr/review/common.css"}
+    looks = {
+        "edgevpr/py.typed",
+        "edgevpr/review/page.css",
+        "edgevpr/lab/evaluate/page.css",
+        "edgevpr/review/common.css",
+    }
     assert {name for name in names if not name.startswith("edgevpr/shipped/")} == code | figures | looks
 
 
