@@ -139,7 +139,7 @@ def _detect(args: Namespace) -> int:
     if args.json:
         print_json(asdict(found))
     else:
-        print("\n".join(describe(found)))
+        print(describe(found))
     if args.out:
         write_profile(Path(args.out), own_profile(micro_benchmark()))
         print(f"edgevpr: {args.out} is written: use it with --board {args.out}.", file=sys.stderr)

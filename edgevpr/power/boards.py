@@ -143,26 +143,13 @@ def detect(root: Path = Path("/")) -> Detected:
     )
 
 
-def describe(found: Detected) -> tuple[str, ...]:
-    """Say what this machine is, and how that was found, a sentence each."""
-    if found.from_device_tree:
-        called = f"The device tree calls it `{found.model}`"
-    elif found.model:
-        called = f"There is no device tree; its firmware (DMI) calls it `{found.model}`"
-    else:
-        called = "There is no device tree, and its firmware (DMI) does not name it"
-    stand_in = f"no board of edgevpr's is that: {_ANY_MACHINE} stands in"
-    cores = f"{found.cores} cores are switched on ({found.cpu})"
-    if found.usable_cores < found.cores:
-        cores += f"; affinity and control groups leave this process {found.usable_cores:.3g}"
-    ram = f"{found.ram_mb:.0f} MB of RAM"
-    if found.ram_limit_mb < found.ram_mb:
-        ram += f"; its control group leaves this process {found.ram_limit_mb:.0f}"
+def describe(found: Detected) -> str:
+    """Say in two sentences what this machine is and has."""
+    known = f"the board {found.board}" if found.board else f"no board of edgevpr's: {_ANY_MACHINE} stands in"
     return (
-        f"{called}: {f'that is the board {found.board}' if found.board else stand_in}.",
-        f"{cores}.",
-        f"{ram}.",
-        f"It begins to slow down at {found.thermal_limit_c:g} degrees Celsius.",
+        f"`{found.title}` is {known}. It has {found.cores} cores and {found.ram_mb:.0f} MB of RAM, of which this "
+        f"process may use {found.usable_cores:.3g} and {found.ram_limit_mb:.0f}, and begins to slow down at "
+        f"{found.thermal_limit_c:g} degrees Celsius."
     )
 
 

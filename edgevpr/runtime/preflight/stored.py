@@ -32,7 +32,6 @@ from edgevpr.runtime.preflight.trial import Offer, Trial, model_of, trial_of, tr
 MEASURED_PICTURES = 8
 _FORMAT = 3  # 1 had no cost of a scan that is paid once, 2 times that passed
 _MAX_FILE_BYTES = 10_000_000
-_SAME_RAM = 0.02  # kernels keep some RAM for themselves, every version another amount
 _PACKAGES = {
     "numpy": ("numpy",),
     "opencv": ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless", "opencv-contrib-python"),
@@ -112,11 +111,9 @@ def require_room(path: Path, make: bool) -> None:
     if path.suffix != ".json":
         raise UsageError(f"{path}: the name of a file of figures ends in .json: choose such a name.")
     folder = path.resolve().parent
+    if make and str(path).startswith("~"):
+        raise UsageError(f"{path}: there is no home to keep figures in: set XDG_DATA_HOME, or give --out FILE.json.")
     if make:
-        if str(path).startswith("~"):
-            raise UsageError(
-                f"{path}: there is no home to keep figures in: set XDG_DATA_HOME, or give --out FILE.json."
-            )
         folder.mkdir(parents=True, exist_ok=True)
     require_folder(path)
     if path.is_dir() or not os.access(path if path.exists() else folder, os.W_OK):
@@ -142,13 +139,15 @@ def load(path: Path) -> tuple[StoredFigures | None, str | None]:
         score = build(MachineSpeed, fields["score"], "score")
         trials = tuple(trial_of(trial) for trial in fields["trials"])
         figures = StoredFigures(**{**fields, "score": score, "trials": trials})
-        different = _differences(figures.identity, identity())
+        # Kernels keep some RAM for themselves, every version another amount: that is no other machine.
+        there, here = figures.identity, identity() | {"RAM in MB": figures.identity["RAM in MB"]}
+        different = [f"{key}: {there.get(key)} there, {here[key]} here" for key in here if there.get(key) != here[key]]
     except FileNotFoundError:
         return None, None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, ConfigError):
         return None, f"{path} holds no figures that can be read: {again}"
     if different:
-        return None, f"The figures in {path} are of another machine or installation ({different}): {again}"
+        return None, f"The figures in {path} are of another machine or installation ({', '.join(different)}): {again}"
     return figures, None
 
 
@@ -225,16 +224,6 @@ def _same_settings(trial: Trial, offer: Offer) -> bool:
     """Tell whether an offer asks for the settings that were tried: a setting that is named may be the default."""
     had = {**techniques.parameters(offer.name), **trial.parameters}
     return {**had, **offer.settings} == {**had, **trial.settings}
-
-
-def _differences(there: dict[str, Any], here: dict[str, Any]) -> str:
-    ram_mb = there.get("RAM in MB")
-    same_ram = isinstance(ram_mb, int) and abs(ram_mb - here["RAM in MB"]) <= _SAME_RAM * here["RAM in MB"]
-    return ", ".join(
-        f"{key}: {there.get(key)} there, {value} here"
-        for key, value in here.items()
-        if there.get(key) != value and not (key == "RAM in MB" and same_ram)
-    )
 
 
 def _version(packages: tuple[str, ...]) -> str | None:

@@ -18,7 +18,6 @@ from edgevpr.frames.source import Source, open_source
 from edgevpr.mavlink.address import LinkAddress, parse_links
 from edgevpr.mavlink.asking import Inquiry
 from edgevpr.mavlink.signing import open_signing
-from edgevpr.mavlink.wire import mavlink
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import map_path
 from edgevpr.power.boards import load_board
@@ -30,9 +29,8 @@ from edgevpr.runtime.recognise.evidence import calibration_of, not_calibrated
 from edgevpr.runtime.recognise.learn import check_positions
 from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.runtime.service.board import log_findings
-from edgevpr.runtime.service.doctor import intent_of, silence
+from edgevpr.runtime.service.doctor import silence
 from edgevpr.runtime.service.finding import Finding, fine, looked_at, wrong
-from edgevpr.runtime.service.rules import is_too_rare, rarity
 
 _FRAME_WAIT_S = 15.0  # longer than any source takes to say that it is lost
 _WITHOUT_FRAMES = (Condition.LOST, Condition.FROZEN, Condition.DAMAGED)
@@ -181,7 +179,7 @@ def _link(config: Config, offline: bool) -> str:
         return "none, so what is recognised goes into the log only"
     signing = open_signing(settings.signing_key, settings.signing_state, to_ask=True)
     with Inquiry(address, settings.component_id, settings.system_id, signing) as inquiry:
-        parts = [str(address)] if offline else [str(address), _heartbeat(inquiry, address, config)]
+        parts = [str(address)] if offline else [str(address), _heartbeat(inquiry, address)]
     if ground:
         with Inquiry(ground, settings.component_id, settings.system_id):
             parts.append(f"ground station at {ground}")
@@ -190,11 +188,7 @@ def _link(config: Config, offline: bool) -> str:
     return ", ".join(parts if settings.send_fixes else [*parts, DRY_RUN])
 
 
-def _heartbeat(inquiry: Inquiry, address: LinkAddress, config: Config) -> str:
-    beat = inquiry.heartbeat()
-    if beat is None:
+def _heartbeat(inquiry: Inquiry, address: LinkAddress) -> str:
+    if inquiry.heartbeat() is None:
         raise LinkError(silence(address, inquiry.bad_bytes, inquiry.others, inquiry.refused).message)
-    every_s, heard = intent_of(config).every_s, f"autopilot heard: system {inquiry.system_id}"
-    if beat.autopilot == mavlink.MAV_AUTOPILOT_PX4 and is_too_rare(every_s):
-        return f"{heard} ({rarity(every_s)}: `edgevpr doctor` says more)"
-    return heard
+    return f"autopilot heard: system {inquiry.system_id}"

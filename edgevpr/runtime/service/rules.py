@@ -36,7 +36,7 @@ _SOURCE_SETS = (1, 2, 3)
 _SHORT_BAUDS = {111_100: 111}  # SERIALn_BAUD is in thousands, rounded down; above 2000 it is the rate itself
 _VISION_SET = tuple(f"EK3_SRC2_{what}={value}" for what, value in (("POSXY", 6), ("VELXY", 0), ("POSZ", 1), ("YAW", 1)))
 _MOST_DELAY_MS = 50  # our position is one of the moment at which it is sent
-_SILENT_S = 5.0  # aux_global_position.cpp: positions of message 296 are used no more
+SILENT_S = 5.0  # aux_global_position.cpp: positions of message 296 are used no more
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,16 +49,6 @@ class FirmwareRules:
     parameters: tuple[str, ...]
     findings: Callable[[AutopilotReading, FlightIntent], Iterator[Finding]]
     port_changes: Callable[[int], tuple[str, ...]]
-
-
-def is_too_rare(every_s: float) -> bool:
-    """Tell whether PX4 drops message 296 between two queries that are so many seconds apart."""
-    return every_s >= _SILENT_S
-
-
-def rarity(every_s: float) -> str:
-    """Say how the rate of the queries stands to the silence that PX4 bears."""
-    return f"a query every {every_s:g} s, and PX4 drops positions after {_SILENT_S:g} s of silence"
 
 
 def _ardupilot_findings(reading: AutopilotReading, intent: FlightIntent) -> Iterator[Finding]:
@@ -159,15 +149,16 @@ def _dry(choice: Choice, reading: AutopilotReading) -> Finding:
 def _px4_findings(reading: AutopilotReading, intent: FlightIntent) -> Iterator[Finding]:
     choice = px4_choice(reading.asked)
     yield _px4_channel(choice, reading)
-    if choice.channel is Channel.SENSOR and is_too_rare(intent.every_s):
+    rarity = f"a query every {intent.every_s:g} s, and PX4 drops positions after {SILENT_S:g} s of silence"
+    if choice.channel is Channel.SENSOR and intent.every_s >= SILENT_S:
         yield wrong(
             "rate",
-            f"There is {rarity(intent.every_s)}: it would never keep one. Ask more often, where `edgevpr profile "
+            f"There is {rarity}: it would never keep one. Ask more often, where `edgevpr profile "
             "--rate-hz` says that the board can, or take a faster board.",
-            f"source: {{rate_hz: {2 / _SILENT_S:g}}}, or more: not every query is a match",
+            f"source: {{rate_hz: {2 / SILENT_S:g}}}, or more: not every query is a match",
         )
     elif choice.channel is Channel.SENSOR:
-        yield fine("rate", rarity(intent.every_s))
+        yield fine("rate", rarity)
     yield _port(reading, "MAV_PROTO_VER=2")
 
 

@@ -12,7 +12,6 @@ import cv2
 import pytest
 import yaml
 from answering_autopilot import AnsweringAutopilot
-from mavlink_peers import AutopilotThread
 from pictures import textured
 
 from edgevpr import techniques
@@ -294,18 +293,3 @@ def test_the_command_prints_a_line_for_each_thing_and_exits_with_0(settings, con
         done = edgevpr_check(config_file)
     assert (done.returncode, done.stderr) == (0, "")
     assert edgevpr_check(config_file).returncode == 1
-
-
-def test_a_px4_that_would_be_told_too_rarely_is_said(settings, config_file):
-    said = []
-    for rate_hz in (None, 0.5):  # that of the board: every 5 s
-        settings["source"]["rate_hz"] = rate_hz
-        config_file.write_text(yaml.safe_dump(settings))
-        autopilot = AutopilotThread(settings["mavlink"]["link"].replace("udpin", "udpout"), vehicle="px4-copter")
-        try:
-            (link,) = [each for each in check(config_file) if each.what == "link"]
-        finally:
-            autopilot.finish()
-        assert link.ok
-        said.append("PX4 drops" in link.message)
-    assert said == [True, False]
