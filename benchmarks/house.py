@@ -102,24 +102,19 @@ def count_tests(root: Path) -> None:
 def asserts_prose(node: ast.AST) -> bool:
     """Tell whether a node asks for a sentence: `match="..."`, or a comparison with one in an assertion."""
     if isinstance(node, ast.keyword):
-        return node.arg == "match" and words_of(node.value) >= _PROSE_WORDS
+        return node.arg == "match" and is_prose(node.value)
     compared = (
         [each for each in ast.walk(node) if isinstance(each, ast.Compare)] if isinstance(node, ast.Assert) else []
     )
-    return any(words_of(side) >= _PROSE_WORDS for each in compared for side in (each.left, *each.comparators))
+    return any(is_prose(side) for each in compared for side in (each.left, *each.comparators))
 
 
-def words_of(node: ast.expr) -> int:
-    return len(re.findall(r"[A-Za-z]{2,}", literal(node)))
-
-
-def literal(node: ast.expr) -> str:
-    """Return the text of a string, or of what one is put together from."""
-    if isinstance(node, ast.Constant):
-        return node.value if isinstance(node.value, str) else ""
-    if isinstance(node, ast.JoinedStr):
-        return " ".join(each.value if isinstance(each, ast.Constant) else "x" for each in node.values)
-    return literal(node.left) + literal(node.right) if isinstance(node, ast.BinOp) else ""
+def is_prose(node: ast.expr) -> bool:
+    """Tell whether a string, or a sum of strings, has three words or more."""
+    sides = [node.left, node.right] if isinstance(node, ast.BinOp) else [node]
+    parts = [part for side in sides for part in (side.values if isinstance(side, ast.JoinedStr) else [side])]
+    texts = [part.value for part in parts if isinstance(part, ast.Constant) and isinstance(part.value, str)]
+    return len(re.findall(r"[A-Za-z]{2,}", " ".join(texts))) >= _PROSE_WORDS
 
 
 if __name__ == "__main__":
