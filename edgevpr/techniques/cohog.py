@@ -230,25 +230,21 @@ class CoHog:
         if not self._is_nadir:
             return match
         ratio, turn = hypothesis(best)
-        match = replace(match, rotation_deg=360 * turn / ROTATIONS, height_ratio=scale_of(self._side + 1, ratio))
-        if match.score < self.min_score:  # most are of other places: no need of the detail
+        scale = scale_of(self._side + 1, ratio)
+        match = replace(match, rotation_deg=360 * turn / ROTATIONS, height_ratio=scale)
+        if match.shift_cells is None or match.score < self.min_score:  # most are of other places: no need of the detail
             return match
-        return self._aligned(match, self._view(query, best), reference)
-
-    def _aligned(self, match: FineMatch, view: ViewRegions, reference: Singles) -> FineMatch:
-        """Return a match by the vote with shift, rotation and height to a fraction of a step."""
-        if match.shift_cells is None or match.rotation_deg is None or match.height_ratio is None:
-            return match
-        best = (view.regions @ reference.T).argmax(axis=1)
-        found = align((view.numbers, view.side), (best, self._side), match.shift_cells)
+        view = self._view(query, best)
+        likest = (view.regions @ reference.T).argmax(axis=1)
+        found = align((view.numbers, view.side), (likest, self._side), match.shift_cells)
         if found is None:
             return match
         return replace(
             match,
             shift_cells=found.shift_cells,
             covariance_cells2=found.covariance_cells2,
-            rotation_deg=(match.rotation_deg + found.turn_deg) % 360,
-            height_ratio=match.height_ratio * found.scale,
+            rotation_deg=(360 * turn / ROTATIONS + found.turn_deg) % 360,
+            height_ratio=scale * found.scale,
         )
 
     def glance(

@@ -76,26 +76,12 @@ class JudgedAnswer:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FlightOutcome:
-    """Counts, shares and errors of a flight. `recall_at_1` is of the queries on the map. The errors are metres from the
-    point where a picture was taken to the fix, of the accepted queries (NaN without any): median, 90 % and largest."""
-
-    queries: int
-    on_map: int
-    recall_at_1: float
-    accepted: int
-    accepted_wrong: int
-    off_map_rejected: int
-    errors_m: tuple[float, float, float]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class DemoSummary:
     """Results of the demonstration. `costs` are means of a query under the names of the flight log; `messages` counts
     what the simulated flight controller decoded, by name."""
 
     places: int
-    outcome: FlightOutcome
+    answers: list[JudgedAnswer]
     costs: dict[str, float]
     used_mah: float
     marginal_mah: float
@@ -106,17 +92,22 @@ class DemoSummary:
     picture: Path
 
     def __str__(self) -> str:
-        got, cost = self.outcome, self.costs
-        off_map = got.queries - got.on_map
-        median_m, most_m, largest_m = got.errors_m
+        cost = self.costs
+        on_map = [answer for answer in self.answers if answer.on_map]
+        accepted = [answer for answer in self.answers if answer.accepted]
+        errors_m = [answer.fix_off_m for answer in accepted if answer.fix_off_m is not None] or [np.nan]
+        off_map = len(self.answers) - len(on_map)
+        off_map_rejected = sum(not answer.on_map and not answer.accepted for answer in self.answers)
+        recall = sum(answer.right for answer in on_map) / max(len(on_map), 1)
         messages = ", ".join(f"{name} {count}" for name, count in sorted(self.messages.items()))
         return f"""
 places            {self.places} in the map
-queries           {got.queries}: {got.on_map} over the map, {off_map} beyond it
-recall@1          {got.recall_at_1:.2f} of those over the map (best place within {RIGHT_M:g} m)
-accepted          {got.accepted}, {got.accepted_wrong} of them wrong
-rejected          {got.queries - got.accepted}, among them {got.off_map_rejected} of the {off_map} beyond the map
-position error    median {median_m:.1f} m, 90 % within {most_m:.1f} m, largest {largest_m:.1f} m \
+queries           {len(self.answers)}: {len(on_map)} over the map, {off_map} beyond it
+recall@1          {recall:.2f} of those over the map (best place within {RIGHT_M:g} m)
+accepted          {len(accepted)}, {sum(not answer.right for answer in accepted)} of them wrong
+rejected          {len(self.answers) - len(accepted)}, among them {off_map_rejected} of the {off_map} beyond the map
+position error    median {np.median(errors_m):.1f} m, 90 % within {np.quantile(errors_m, 0.9):.1f} m, \
+largest {max(errors_m):.1f} m \
 (of the accepted; places are 21 m apart)
 a query           {1000 * cost["cpu_s"]:.0f} ms of CPU (encode {1000 * cost["t_encode_s"]:.0f} ms, \
 match {1000 * cost["t_match_s"]:.0f} ms), {cost["rss_mb"]:.0f} MB of RAM
@@ -148,13 +139,12 @@ def run_demo(folder: str | Path) -> DemoSummary:
     seen = _flown(folder, len(later.poses))
 
     answers = read_answers(log_path, first / "images", second / "images")
-    got = outcome(answers)
     _draw(picture_path, lit(scene, mapping.light, mapping.seed), mapping, answers)
     lines = list(flight_of(log_path))
     costs = [line["costs"] for line in lines if line["kind"] == "query"]
     return DemoSummary(
         places=len(mapping.poses),
-        outcome=got,
+        answers=answers,
         costs={name: sum(cost[name] for cost in costs) / len(costs) for name in costs[0]},
         used_mah=lines[-1]["used_mah"],
         marginal_mah=lines[-1]["marginal_mah"],
@@ -248,22 +238,6 @@ def read_answers(log_path: Path, map_images: Path, query_images: Path) -> list[J
                 )
             )
     return answers
-
-
-def outcome(answers: Sequence[JudgedAnswer]) -> FlightOutcome:
-    """Sum up the answers of a flight."""
-    on_map = [answer for answer in answers if answer.on_map]
-    accepted = [answer for answer in answers if answer.accepted]
-    errors_m = [answer.fix_off_m for answer in accepted if answer.fix_off_m is not None] or [np.nan]
-    return FlightOutcome(
-        queries=len(answers),
-        on_map=len(on_map),
-        recall_at_1=sum(answer.right for answer in on_map) / max(len(on_map), 1),
-        accepted=len(accepted),
-        accepted_wrong=sum(not answer.right for answer in accepted),
-        off_map_rejected=sum(not answer.on_map and not answer.accepted for answer in answers),
-        errors_m=(float(np.median(errors_m)), float(np.quantile(errors_m, 0.9)), max(errors_m)),
-    )
 
 
 def _positions(images: Path) -> dict[str, Position]:
