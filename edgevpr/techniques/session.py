@@ -6,7 +6,6 @@ A model file is not trusted: it is run once before it may fly, and every result 
 
 import os
 import threading
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -70,23 +69,19 @@ def backbone_of(card: Card, output: str, threads: int = 1) -> Backbone:
             f"{card.path} names no output for `{output}`: use another model, or name its ONNX output in "
             f"`outputs: {{{output}: ...}}`."
         )
-    session = open_session(card, [getattr(card.outputs, output)], threads)
+    session = open_session(card, threads)
     # Noise, not a uniform picture: many a correct network gives only zeros for that.
     noise = np.random.default_rng(_SEED).integers(0, 256, (card.input.height, card.input.width), np.uint8)
     result = _run(card, output, session, noise)
     return Backbone(card, output, result.shape, session)
 
 
-def open_session(card: Card, outputs: list[str], threads: int = 1) -> Any:
-    """Open the session of a card's file, and check its input and the outputs of these names; see `open_backbone` for
-    what is raised."""
+def open_session(card: Card, threads: int = 1) -> Any:
+    """Open the session of a card's file; see `open_backbone` for what is raised. Whether its inputs and outputs are
+    those of the card is seen by running it once."""
     if not 1 <= threads <= _MOST_THREADS:
         raise UsageError(f"{card.name} cannot run with threads={threads}: give 1 to {_MOST_THREADS}.")
-    session = _session(card.file_path, card.sha256, threads)
-    _require_input(card, session)
-    for name in outputs:
-        _require_output(card, name, session)
-    return session
+    return _session(card.file_path, card.sha256, threads)
 
 
 def file_sha256(path: Path) -> str:
@@ -123,7 +118,7 @@ def _session(path: Path, sha256: str, threads: int) -> Any:
         return runtime.InferenceSession(read_file(path, MAX_FILE_BYTES), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's own classes, and RuntimeError
         raise ModelError(
-            f"{path} cannot be opened as an ONNX model with its weights inside ({_first_line(error)}): export it again."
+            f"{path} cannot be opened as an ONNX model with its weights inside ({_in_one_line(error)}): export it again."
         ) from error
 
 
@@ -135,42 +130,10 @@ def import_onnxruntime() -> Any:
         import onnxruntime
     except Exception as error:  # a broken installation raises OSError, or an error of NumPy
         raise ModelError(
-            f"onnxruntime cannot be imported ({_first_line(error)}): install it again (`pip install onnxruntime`) for "
+            f"onnxruntime cannot be imported ({_in_one_line(error)}): install it again (`pip install onnxruntime`) for "
             "the techniques with networks; hog, cohog and seqslam fly without it."
         ) from error
     return onnxruntime
-
-
-def _require_input(card: Card, session: Any) -> None:
-    rule, inputs = card.input, session.get_inputs()
-    if len(inputs) != 1:
-        raise ModelError(
-            f"{card.file_path} has {len(inputs)} inputs: only networks with one, the picture, can be used."
-        )
-    (it,) = inputs
-    size = (rule.height, rule.width)
-    wanted = [1, *size, rule.channels] if rule.layout == "NHWC" else [1, rule.channels, *size]
-    shape = list(it.shape)
-    if any(type(axis) is not int for axis in shape[1:]):
-        raise ModelError(
-            f"{card.file_path}: its input {_axes(shape)} has axes without a size (only the first, the batch, may be "
-            f"such): export it with the fixed size {_axes(wanted)}."
-        )
-    if shape[:1] and type(shape[0]) is not int:
-        shape[0] = 1
-    if shape != wanted or it.type != "tensor(float)":
-        raise ModelError(
-            f"{card.file_path}: its input is {it.type} {_axes(shape)} and the card says float {_axes(wanted)}: correct "
-            "`input` of the card, or export the network for it."
-        )
-
-
-def _require_output(card: Card, name: str, session: Any) -> None:
-    types = {output.name: output.type for output in session.get_outputs()}
-    if name not in types:
-        raise ModelError(f"{card.file_path} has no output `{name}`, which its card names: it has {', '.join(types)}.")
-    if types[name] not in ("tensor(float)", "tensor(float16)"):
-        raise ModelError(f"{card.file_path}: its output `{name}` is {types[name]}: it must be float.")
 
 
 def _run(card: Card, output: str, session: Any, image: Image) -> Singles:
@@ -178,7 +141,7 @@ def _run(card: Card, output: str, session: Any, image: Image) -> Singles:
     (result,) = run_outputs(card, session, [name], prepare(image, card.input))
     if result.ndim != _RANKS[output] or len(result) != 1 or not result.size:
         raise ModelError(
-            f"{card.file_path}: its output `{name}` is {_axes(result.shape)} and `{output}` must be {_FORMS[output]}: "
+            f"{card.file_path}: its output `{name}` is {result.shape} and `{output}` must be {_FORMS[output]}: "
             "correct `outputs` of the card."
         )
     values: Singles = result[0].astype(np.float32, copy=False)
@@ -210,10 +173,15 @@ def run_outputs(card: Card, session: Any, names: list[str], pictures: Singles) -
                 f"{card.file_path} had no result for a picture within {_RUN_LIMIT_S:g} s: it loops, or is too slow for "
                 "this board."
             ) from error
-        raise ModelError(f"{card.file_path} cannot be run ({_first_line(error)}): export it again.") from error
+        raise ModelError(
+            f"{card.file_path} cannot be run as its card says ({_in_one_line(error)}): correct `input` or `outputs` of "
+            "the card, or export the network for it."
+        ) from error
     finally:
         limit.cancel()
     for name, result in zip(names, results, strict=True):
+        if result.dtype.kind != "f":
+            raise ModelError(f"{card.file_path}: its output `{name}` is {result.dtype}: it must be float.")
         # Written with `not`, so that NaN is refused as well.
         if result.size and not max(result.max(), -result.min()) <= _LARGEST:
             raise ModelError(
@@ -227,12 +195,8 @@ def _terminate(options: Any) -> None:
     options.terminate = True  # onnxruntime looks at it before each operator, in loops too
 
 
-def _axes(shape: Sequence[object]) -> str:
-    return f"({', '.join(str(axis) if type(axis) is int else '?' for axis in shape)})"
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip() or type(error).__name__).splitlines()[0][:200]
+def _in_one_line(error: Exception) -> str:
+    return " ".join((str(error) or type(error).__name__).split())[:200]
 
 
 def prepare(image: Array, rule: InputRule) -> Singles:

@@ -71,8 +71,6 @@ def _network(fault: str | None):
     if fault == "no bias":
         bias[:] = 0
     size: list = [1, 1, HEIGHT, WIDTH]
-    if fault == "dynamic size":
-        size = [1, 1, "high", "wide"]
     if fault == "dynamic batch":
         size[0] = "batch"
     if fault == "other size":

@@ -95,7 +95,7 @@ def detector_of(card: Card, threads: int = 1) -> Detector:
     whatever keeps it from flying."""
     if card.detector is None:
         raise ModelError(f"{card.path} is of no detector: name one with a section `detector` (models/README.md).")
-    detector = Detector(card, open_session(card, card.outputs.boxes, threads))
+    detector = Detector(card, open_session(card, threads))
     noise = np.random.default_rng(_SEED).integers(0, 256, (card.input.height, card.input.width, 3), np.uint8)
     detector.is_static(noise)
     return detector

@@ -64,6 +64,6 @@ def memorability_of(card: Card, threads: int = 1) -> Memorability:
     for whatever keeps it from flying."""
     if card.outputs.memorability is None:
         raise ModelError(f"{card.path} has no `outputs.memorability`: name the card of a network that has.")
-    network = Memorability(card, open_session(card, [card.outputs.memorability], threads))
+    network = Memorability(card, open_session(card, threads))
     network.matrix(np.random.default_rng(_SEED).integers(0, 256, (480, 640, 3), np.uint8))
     return network
