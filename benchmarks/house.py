@@ -18,8 +18,7 @@ _PROSE_WORDS = 3
 
 
 def main() -> None:
-    root = Path(sys.argv[1] if len(sys.argv) > 1 else ".").resolve()
-    rooms = sys.argv[2:]
+    root, rooms = Path(sys.argv[1] if len(sys.argv) > 1 else ".").resolve(), sys.argv[2:]
     paths = sorted((root / "edgevpr").rglob("*.py"))
     count_rooms(root / "edgevpr", paths)
     for path in paths:
