@@ -15,9 +15,9 @@ FIX_3D = mavlink.GPS_FIX_TYPE_3D_FIX
 class Autopilot:
     """Autopilot 7, at 50, 8 unless it says another place; it says what it is told to."""
 
-    def __init__(self) -> None:
-        self.clock = FakeClock()
-        self.conversation = Conversation(LinkSettings(), self.clock)
+    def __init__(self, firmware=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, **settings) -> None:
+        self.clock, self.firmware = FakeClock(), firmware
+        self.conversation = Conversation(LinkSettings(**settings), self.clock)
         self._packers, self.packets = {}, []
         self.beat()
 
@@ -26,7 +26,7 @@ class Autopilot:
         self.conversation.hear(message.pack(packer), self.clock.now_s, None)
 
     def beat(self, base_mode=0, **sender):
-        beat = mavlink.MAVLink_heartbeat_message(1, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, base_mode, 0, 4, 3)
+        beat = mavlink.MAVLink_heartbeat_message(2, self.firmware, base_mode, 0, 4, 3)
         self.say(beat, **sender)
 
     def position(self, lat_deg=50.0, lon_deg=8.0, hdg=9050, vx=0, vy=0, **sender):

@@ -1,20 +1,17 @@
-"""The channel by which an autopilot is told positions: asked for over a real link, and chosen."""
+"""The channel by which an autopilot is told positions: asked for, chosen, and used."""
 
 import struct
 
 import pytest
-from fakes import FakeClock
-from mavlink_peers import Peer, link_to, wait_until
+from conversing import Autopilot
 
 from edgevpr.core.types import Position
-from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.channel import Answers, Channel, Kind, ardupilot_choice, kind_of, px4_can_fuse, px4_choice
-from edgevpr.mavlink.conversation import LinkSettings
-from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.peer import NoListener
 from edgevpr.mavlink.positions import MotionState
 from edgevpr.mavlink.wire import mavlink
 
+INT8 = mavlink.MAV_PARAM_TYPE_INT8
 ARDUPILOT, PX4 = mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, mavlink.MAV_AUTOPILOT_PX4
 STATE = MotionState(
     t_mono_s=0.0,
@@ -85,7 +82,7 @@ def test_kinds():
 
 class Ear(NoListener):
     def __init__(self):
-        self.channels, self.forces, self.state, self.asked_for = [], [], STATE, []
+        self.channels, self.forces, self.state = [], [], STATE
 
     def hear_channel(self, channel):
         self.channels.append(channel)
@@ -94,138 +91,91 @@ class Ear(NoListener):
         self.forces.append((force_m_s2, attitude.roll_deg))
 
     def state_at(self, t_s):
-        self.asked_for.append(t_s)
         return self.state
 
 
-class Questioned(Peer):
-    """An autopilot that answers what it is asked, but for parameters that it does not have."""
-
-    def __init__(self, port, firmware, parameters, mav_type=mavlink.MAV_TYPE_QUADROTOR):
-        super().__init__(port)
-        self.firmware, self.parameters, self.mav_type = firmware, parameters, mav_type
-
-    def heartbeat(self, **sender):
-        self.send(mavlink.MAVLink_heartbeat_message(self.mav_type, self.firmware, 1, 0, 4, 3), **sender)
-
-    def answer(self):
-        """Read up to the next heartbeat, which comes before all else that is sent in its second, and answer."""
-        beats = False
-        while not beats:
-            self.read()
-            for message in self.seen:
-                beats |= message.get_type() == "HEARTBEAT"
-                if message.get_type() == "COMMAND_LONG" and message.command == mavlink.MAV_CMD_REQUEST_MESSAGE:
-                    version = 1 << 24 | 17 << 16
-                    self.send(mavlink.MAVLink_autopilot_version_message(0, version, 0, 0, 0, *[bytes(8)] * 3, 0, 0, 0))
-                if message.get_type() == "PARAM_REQUEST_READ" and message.param_id in self.parameters:
-                    value, kind = self.parameters[message.param_id]
-                    self.send(mavlink.MAVLink_param_value_message(message.param_id.encode(), value, kind, 1, 0))
-            self.seen.clear()
+def interviewed(firmware=ARDUPILOT, parameters=None, seconds=10, **settings):
+    """An autopilot that is asked where it is, and answers but for parameters that it does not have; the listener."""
+    ear = Ear()
+    autopilot = Autopilot(firmware, listener=ear, **settings)
+    autopilot.conversation.want_position()
+    for _ in range(seconds):
+        autopilot.wait(1.0)
+        autopilot.beat()
+        for message in autopilot.told():
+            if message.get_type() == "COMMAND_LONG" and message.command == mavlink.MAV_CMD_REQUEST_MESSAGE:
+                version = 1 << 24 | 17 << 16
+                nothing = [bytes(8)] * 3
+                autopilot.say(mavlink.MAVLink_autopilot_version_message(0, version, 0, 0, 0, *nothing, 0, 0, 0))
+            if message.get_type() == "PARAM_REQUEST_READ" and message.param_id in (parameters or {}):
+                value, kind = parameters[message.param_id]
+                autopilot.say(mavlink.MAVLink_param_value_message(message.param_id.encode(), value, kind, 1, 0))
+    return autopilot, ear
 
 
-def opened(port, clock, ear, firmware, parameters):
-    link = link_to(f"udpout:127.0.0.1:{port.number}", clock=clock, listener=ear)
-    link.want_position()
-    link.start()
-    peer = Questioned(port, firmware, parameters)
-    peer.expect("HEARTBEAT")
-    return link, peer
+def sent(autopilot, name, seconds=1.0):
+    """The messages of this name that are sent meanwhile."""
+    messages = []
+    for _ in range(round(seconds * 40)):
+        autopilot.wait(0.025)
+        messages += [message for message in autopilot.told() if message.get_type() == name]
+    return messages
 
 
-def told(peer, clock, until):
-    """Let the autopilot beat and answer, a second of the link's clock after the other, until it is so."""
-    for _ in range(100):
-        clock.now_s += 1.0  # so that the link's heartbeat is due
-        peer.heartbeat()
-        peer.answer()
-        if until():
-            return
-    raise AssertionError("it did not come true")
+def test_a_copter_with_our_receiver_gets_a_position_ten_times_a_second():
+    parameters = {"GPS1_TYPE": (1.0, INT8), "GPS2_TYPE": (14.0, INT8), "VISO_TYPE": (0.0, INT8)}
+    autopilot, ear = interviewed(ARDUPILOT, parameters)
+    assert ear.channels == [Channel.GPS_INPUT]
+    positions = sent(autopilot, "GPS_INPUT", 2.0)
+    assert len(positions) == pytest.approx(20, abs=1)
+    assert {(each.gps_id, each.lat, each.time_week, each.fix_type) for each in positions} == {(1, 470_000_000, 0, 3)}
+    autopilot.say(mavlink.MAVLink_system_time_message(1_700_000_000_000_000, 0))
+    ear.state = None
+    last = sent(autopilot, "GPS_INPUT")[-1]
+    assert (last.fix_type, last.time_week) == (mavlink.GPS_FIX_TYPE_NO_FIX, 2288)
+    # What the receiver says that is us is no GPS; what the other says is.
+    autopilot.gps(message=mavlink.MAVLink_gps2_raw_message)
+    assert not autopilot.position().has_gps
+    autopilot.gps()
+    assert autopilot.position().has_gps
 
 
-def test_a_copter_with_our_receiver_gets_a_position_ten_times_a_second(port):
-    clock, ear = FakeClock(), Ear()
-    real = mavlink.MAV_PARAM_TYPE_INT8
-    parameters = {"GPS1_TYPE": (1.0, real), "GPS2_TYPE": (14.0, real), "VISO_TYPE": (0.0, real)}
-    link, peer = opened(port, clock, ear, ARDUPILOT, parameters)
-    try:
-        told(peer, clock, lambda: ear.channels)
-        assert ear.channels == [Channel.GPS_INPUT]
-        heard = peer.expect("GPS_INPUT")
-        assert (heard.gps_id, heard.lat) == (1, 470_000_000)
-        assert (heard.time_week, heard.fix_type) == (0, 3)
-        peer.send(mavlink.MAVLink_system_time_message(1_700_000_000_000_000, 0))
-        ear.state = None
-        wait_until(lambda: link.stats().received.get("SYSTEM_TIME"))
-        while not heard.time_week or heard.fix_type == mavlink.GPS_FIX_TYPE_3D_FIX:  # those that were on their way
-            clock.now_s += 0.1
-            peer.heartbeat()
-            heard = peer.expect("GPS_INPUT")
-        assert (heard.fix_type, heard.time_week) == (mavlink.GPS_FIX_TYPE_NO_FIX, 2288)
-        # What the receiver says that is us is no GPS; what the other says is.
-        for report, kind in ((mavlink.MAVLink_gps2_raw_message, 3), (mavlink.MAVLink_gps_raw_int_message, 1)):
-            more = {"dgps_numch": 0, "dgps_age": 0} if kind == 3 else {}
-            peer.send(report(0, kind, 470_000_000, 80_000_000, 0, 80, 80, 0, 0, 6, **more))
-        peer.send(mavlink.MAVLink_global_position_int_message(0, 470_000_000, 80_000_000, 0, 80_000, 0, 0, 0, 0))
-        assert wait_until(link.vehicle).has_gps is False
-    finally:
-        link.close()
+def test_odometry_waits_for_an_origin_and_sets_one_where_it_may():
+    autopilot, ear = interviewed(parameters={"VISO_TYPE": (1.0, INT8)}, seconds=6, origin=Position(46.5, 7.5, 400.0))
+    assert ear.channels == [Channel.ODOMETRY]
+    assert sent(autopilot, "ODOMETRY", 2.0) == []
+    for _ in range(2):
+        autopilot.beat()
+        sent(autopilot, "ODOMETRY", 4.0)
+    assert autopilot.conversation.sent["SET_GPS_GLOBAL_ORIGIN"] == 1
+    autopilot.say(mavlink.MAVLink_gps_global_origin_message(465_000_000, 75_000_000, 400_000))
+    autopilot.beat()
+    assert len(sent(autopilot, "ODOMETRY")) == pytest.approx(10, abs=1)
+    assert autopilot.conversation.sent["SET_GPS_GLOBAL_ORIGIN"] == 1
 
 
-def test_odometry_waits_for_an_origin_and_sets_one_where_it_may(port):
-    clock, ear = FakeClock(), Ear()
-    address = parse_link(f"udpout:127.0.0.1:{port.number}")
-    link = Link(address, LinkSettings(clock=clock, listener=ear, origin=Position(46.5, 7.5, 400.0)))
-    link.want_position()
-    link.start()
-    peer = Questioned(port, ARDUPILOT, {"VISO_TYPE": (1.0, mavlink.MAV_PARAM_TYPE_INT8)})
-    try:
-        peer.expect("HEARTBEAT")
-        told(peer, clock, lambda: ear.channels)
-        assert ear.channels == [Channel.ODOMETRY]
-        told(peer, clock, lambda: link.stats().sent.get("SET_GPS_GLOBAL_ORIGIN"))
-        assert "ODOMETRY" not in link.stats().sent
-        peer.send(mavlink.MAVLink_gps_global_origin_message(465_000_000, 75_000_000, 400_000))
-        told(peer, clock, lambda: link.stats().sent.get("ODOMETRY", 0) > 3)
-        assert link.stats().sent["SET_GPS_GLOBAL_ORIGIN"] == 1
-    finally:
-        link.close()
+def test_what_the_accelerometers_feel_is_heard_with_the_attitude():
+    autopilot, ear = interviewed()
+    autopilot.say(mavlink.MAVLink_scaled_imu_message(0, 0, 0, -1000, 0, 0, 0, 0, 0, 0))
+    assert ear.forces == []
+    autopilot.attitude(roll_deg=28.65)
+    autopilot.say(mavlink.MAVLink_scaled_imu_message(0, 100, 0, -1000, 0, 0, 0, 0, 0, 0))
+    ((force, roll_deg),) = ear.forces
+    assert force == pytest.approx((0.980665, 0.0, -9.80665))
+    assert roll_deg == pytest.approx(28.65, abs=0.01)
 
 
-def test_what_the_accelerometers_feel_is_heard_with_the_attitude(port):
-    clock, ear = FakeClock(), Ear()
-    link, peer = opened(port, clock, ear, ARDUPILOT, {})
-    try:
-        peer.heartbeat()
-        peer.send(mavlink.MAVLink_scaled_imu_message(0, 0, 0, -1000, 0, 0, 0, 0, 0, 0))
-        wait_until(lambda: link.stats().received.get("SCALED_IMU"))
-        peer.send(mavlink.MAVLink_attitude_message(0, 0.5, 0, 0, 0, 0, 0))
-        peer.send(mavlink.MAVLink_scaled_imu_message(0, 100, 0, -1000, 0, 0, 0, 0, 0, 0))
-        wait_until(lambda: ear.forces)
-        ((force, roll_deg),) = ear.forces
-        assert force == pytest.approx((0.980665, 0.0, -9.80665))
-        assert roll_deg == pytest.approx(28.65, abs=0.01)
-    finally:
-        link.close()
-
-
-def test_a_px4_says_whole_numbers_as_the_bytes_of_a_float(port):
-    clock, ear = FakeClock(), Ear()
+def test_a_px4_says_whole_numbers_as_the_bytes_of_a_float():
     one = struct.unpack("<f", struct.pack("<i", 1))[0]
-    link, peer = opened(port, clock, ear, PX4, {"EKF2_AGP0_CTRL": (one, mavlink.MAV_PARAM_TYPE_INT32)})
-    try:
-        told(peer, clock, lambda: link.channel is Channel.SENSOR)
-    finally:
-        link.close()
+    autopilot, _ = interviewed(PX4, {"EKF2_AGP0_CTRL": (one, mavlink.MAV_PARAM_TYPE_INT32)})
+    assert autopilot.conversation.channel is Channel.SENSOR
+    sending = autopilot.put_fix()
+    assert "GLOBAL_POSITION_SENSOR" in {message.get_type() for message in autopilot.told()}
+    assert sending.outcome.result is None
 
 
-def test_an_autopilot_that_answers_nothing_gets_single_fixes(port, caplog):
-    clock, ear = FakeClock(), Ear()
+def test_an_autopilot_that_answers_nothing_gets_single_fixes(caplog):
     caplog.set_level("INFO")
-    link, peer = opened(port, clock, ear, ARDUPILOT, {})
-    try:
-        told(peer, clock, lambda: "positions go to it by command 43003" in caplog.text)
-        assert link.channel is Channel.COMMAND
-    finally:
-        link.close()
+    autopilot, _ = interviewed()
+    assert autopilot.conversation.channel is Channel.COMMAND
+    assert "command 43003" in caplog.text
