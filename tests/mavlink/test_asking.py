@@ -14,6 +14,8 @@ from edgevpr.mavlink.asking import Inquiry
 from edgevpr.mavlink.reading import read_autopilot
 from edgevpr.mavlink.wire import mavlink
 
+pytestmark = [pytest.mark.network, pytest.mark.slow]
+
 READ_ONLY = {"HEARTBEAT", "COMMAND_LONG", "PARAM_REQUEST_READ", "TIMESYNC"}
 
 

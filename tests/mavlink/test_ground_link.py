@@ -23,6 +23,8 @@ from edgevpr.mavlink.messages import (
 from edgevpr.mavlink.signing import TO_GROUND, Signing, TimeStamps
 from edgevpr.mavlink.wire import mavlink
 
+pytestmark = pytest.mark.network
+
 
 @pytest.fixture
 def two(clock):

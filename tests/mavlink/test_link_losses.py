@@ -14,6 +14,8 @@ from mavlink_peers import UdpPort, free_port, link_to, wait_until
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.wire import mavlink
 
+pytestmark = [pytest.mark.network, pytest.mark.slow]
+
 BEAT = mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 1, 0, 4, 3)
 
 

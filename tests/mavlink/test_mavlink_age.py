@@ -18,6 +18,8 @@ from edgevpr.mavlink.messages import Fix, Severity, status_text
 from edgevpr.mavlink.ports import open_port
 from edgevpr.mavlink.wire import mavlink
 
+pytestmark = [pytest.mark.network, pytest.mark.slow]
+
 THROWN_AWAY = "the link was lost before it had left"
 
 

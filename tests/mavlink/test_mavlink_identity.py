@@ -155,6 +155,7 @@ def names(peer: Peer) -> list[str]:
         return [message.get_type() for message in peer.seen]
 
 
+@pytest.mark.network
 def test_a_second_socket_with_our_autopilots_number_gets_no_fix_while_ours_speaks(listening, clock, caplog):
     link, autopilot = listening
     ours, thief = autopilot(1), autopilot(1)
@@ -173,6 +174,7 @@ def test_a_second_socket_with_our_autopilots_number_gets_no_fix_while_ours_speak
     assert caplog.text.count("a second autopilot of that number") == 1
 
 
+@pytest.mark.network
 def test_an_autopilot_that_comes_back_from_elsewhere_is_taken_and_the_ground_is_told(listening, clock):
     link, autopilot = listening
     before = autopilot(1)
@@ -189,6 +191,7 @@ def test_an_autopilot_that_comes_back_from_elsewhere_is_taken_and_the_ground_is_
     assert names(before).count("COMMAND_INT") == 1
 
 
+@pytest.mark.network
 def test_the_configured_system_is_our_own_number_from_the_start_and_the_only_one_sent_to(clock):
     number = free_port()
     with link_to(f"udpin:127.0.0.1:{number}", clock=clock, system_id=5) as link:
@@ -204,6 +207,7 @@ def test_the_configured_system_is_our_own_number_from_the_start_and_the_only_one
         port.close()
 
 
+@pytest.mark.network
 def test_after_a_reconnection_no_fix_leaves_before_ours_has_spoken(clock, caplog):
     caplog.set_level(logging.INFO, "edgevpr.mavlink")
     number = free_port(socket.SOCK_STREAM)
@@ -221,6 +225,7 @@ def test_after_a_reconnection_no_fix_leaves_before_ours_has_spoken(clock, caplog
     server.close()
 
 
+@pytest.mark.network
 def test_a_sending_link_hears_no_other_port_of_its_peers_host(clock):
     port, thief = UdpPort(), UdpPort()
     with link_to(f"udpout:127.0.0.1:{port.number}", clock=clock) as link:
@@ -236,6 +241,7 @@ def test_a_sending_link_hears_no_other_port_of_its_peers_host(clock):
     thief.close()
 
 
+@pytest.mark.network
 def test_a_message_that_a_stranger_begins_swallows_nothing_of_ours(listening, clock):
     link, autopilot = listening
     ours, stranger = autopilot(1), autopilot(1)

@@ -16,6 +16,8 @@ from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Fix, Health, Severity, place_match, query_figures, status_text
 from edgevpr.mavlink.wire import mavlink
 
+pytestmark = pytest.mark.network
+
 
 def fix_at(t_frame_s: float, lat_deg: float = 50.0) -> Fix:
     return Fix(lat_deg, 14.0, 25.0, t_frame_s)

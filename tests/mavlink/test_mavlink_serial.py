@@ -14,6 +14,8 @@ from edgevpr.core.errors import LinkError
 from edgevpr.mavlink.messages import Fix, Severity, status_text
 from edgevpr.mavlink.wire import PacketReader
 
+pytestmark = [pytest.mark.network, pytest.mark.slow]
+
 
 @pytest.fixture
 def line():

@@ -170,6 +170,7 @@ def key_file(tmp_path):
     return path
 
 
+@pytest.mark.network
 def test_a_link_and_pymavlink_understand_each_other_by_key(key_file, monkeypatch):
     monkeypatch.setenv("MAVLINK20", "1")
     from pymavlink import mavutil
@@ -198,6 +199,7 @@ def test_a_link_and_pymavlink_understand_each_other_by_key(key_file, monkeypatch
 
 
 @pytest.mark.parametrize("key", [None, OTHER_KEY])
+@pytest.mark.network
 def test_no_fix_goes_to_who_has_not_the_key(key, tmp_path, clock):
     signing = Signing(KEY, TimeStamps(tmp_path / "time", clock, lambda: UTC_S))
     with (

@@ -95,6 +95,7 @@ def test_a_flood_drops_notes_first_and_says_which_warnings_it_drops(texts, caplo
     assert [text for _, text in told(texts)] == [f"warning {number}" for number in range(1, WAITING_MAX + 1)]
 
 
+@pytest.mark.network
 def test_over_a_link_the_turns_are_kept_and_at_its_end_nothing_is_left_behind():
     clock = FakeClock()
     with (

@@ -224,6 +224,7 @@ def test_whatever_a_command_holds_it_has_one_answer_that_can_be_sent():
         assert all(each == 0 or each >= SHORTEST_S[number] for number, each in requests._intervals_s.items())
 
 
+@pytest.mark.slow
 def test_every_other_command_is_unsupported():
     for command in set(range(65_536)) - {31010, 511, 512}:
         (ack,), _, _ = react(command_long(command, 1))

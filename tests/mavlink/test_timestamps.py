@@ -76,6 +76,7 @@ while True:
 """
 
 
+@pytest.mark.process
 def test_it_never_goes_back_over_kill_9(path):
     last = 0
     for lines in (1, 5000, 20_000):

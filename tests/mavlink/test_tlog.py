@@ -74,6 +74,8 @@ def dumped(path: Path, *flags: str) -> str:
     ).stdout
 
 
+@pytest.mark.network
+@pytest.mark.process
 def test_both_directions_of_a_link_are_read_by_mavlogdump(path):
     began_us = time.time_ns() // 1000
     with closing(UdpPort()) as port, Tlog(path) as log:
@@ -108,6 +110,7 @@ def test_both_directions_of_a_link_are_read_by_mavlogdump(path):
     assert began_us / 1e6 - 1 < fix._timestamp < time.time() + 1
 
 
+@pytest.mark.network
 def test_a_packet_is_in_the_log_when_the_port_has_taken_all_of_it():
     server, taken = TcpServer(number := free_port()), []
     line = Line(open_port(parse_link(f"tcp:127.0.0.1:{number}")), FakeClock(), taken.append)
@@ -133,6 +136,7 @@ def test_a_log_that_is_there_is_appended_to(path):
     assert os.stat(path).st_mode & 0o777 == 0o640
 
 
+@pytest.mark.slow
 def test_what_comes_after_a_cut_packet_is_read(path):
     record(path, range(20))
     os.truncate(path, os.path.getsize(path) - 7)  # a pulled battery
@@ -171,6 +175,7 @@ def test_the_last_of_a_disk_is_left_to_the_flight_log(path, caplog, monkeypatch)
     assert "MB are" in caplog.text
 
 
+@pytest.mark.slow
 def test_a_slow_disk_keeps_nobody_waiting_and_fills_no_memory(path, caplog, monkeypatch):
     is_slow, go_on = threading.Event(), threading.Event()
 

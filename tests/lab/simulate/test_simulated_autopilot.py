@@ -23,6 +23,8 @@ from edgevpr.mavlink.asking import Inquiry
 from edgevpr.mavlink.messages import Fix, Health
 from edgevpr.mavlink.wire import mavlink
 
+pytestmark = pytest.mark.network
+
 
 def a_fix(**changes):
     command = messages.position_fix(Fix(50.0, 14.0, 25.0, 0.0), 0.5, target_system=1)
@@ -69,6 +71,7 @@ def test_it_answers_counts_and_remembers():
     assert "2 accepted, 0 failed, 1 denied" in str(summary)
 
 
+@pytest.mark.process
 def test_it_is_a_process_that_ends_well_on_sigterm_and_says_what_it_saw():
     number = free_port()
     code = (
@@ -122,6 +125,7 @@ def test_it_flies_along_a_track_from_when_a_companion_is_heard(tmp_path):
     assert (east_m_s, north_m_s) == (0.0, 0.0), "it stays where the track ends"
 
 
+@pytest.mark.slow
 def test_questions_do_not_start_the_track_and_whatever_a_flight_says_does(monkeypatch):
     monkeypatch.setattr(reading, "LISTEN_S", 0.2)
     track = FlownTrack(
@@ -225,6 +229,7 @@ def test_without_a_machine_its_clock_is_handed_in():
     assert told.time_unix_usec / 1e6 == pytest.approx(1_005.0, abs=0.05)
 
 
+@pytest.mark.process
 def test_the_command_says_what_is_up_and_sets_parameters():
     number = free_port()
     link = f"udpin:127.0.0.1:{number}"
