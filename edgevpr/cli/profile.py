@@ -52,7 +52,7 @@ def profile(args: Namespace) -> int:
     from edgevpr.power.boards import board_names, load_board
     from edgevpr.runtime.preflight.choose import require_technique
     from edgevpr.runtime.preflight.estimate import estimate
-    from edgevpr.runtime.preflight.estimate_text import format_table
+    from edgevpr.runtime.preflight.presentation import format_table
     from edgevpr.runtime.preflight.stored import default_path, known_and_tried, load, scaled_from
 
     if args.list:
@@ -85,7 +85,7 @@ def profile(args: Namespace) -> int:
     here = scaled_from(load_board("this"), board, stored)
     result = estimate(board, here, trials, plan, map_technique, stored.date if stored else None)
     if args.plot:
-        from edgevpr.runtime.preflight.chart import plot
+        from edgevpr.runtime.preflight.presentation import plot
 
         plot(result, Path(args.plot))
     if args.json:
@@ -156,7 +156,7 @@ def _measure(args: Namespace, quiet: bool) -> int:
     from edgevpr.power.boards import load_board
     from edgevpr.power.speed import micro_benchmark
     from edgevpr.runtime.preflight import stored
-    from edgevpr.runtime.preflight.estimate_text import format_stored
+    from edgevpr.runtime.preflight.presentation import format_stored
     from edgevpr.runtime.preflight.trial import offers, try_each
 
     path = Path(args.out) if args.out else stored.default_path()

@@ -15,7 +15,7 @@ from edgevpr.power.equations import parse_pack
 from edgevpr.runtime.preflight import accuracy
 from edgevpr.runtime.preflight.estimate import FlightPlan
 from edgevpr.runtime.preflight.estimate import estimate as estimate_of
-from edgevpr.runtime.preflight.estimate_text import format_table
+from edgevpr.runtime.preflight.presentation import format_table
 from edgevpr.runtime.preflight.trial import Trial
 
 VECTOR = replace(ONE_CORE_VECTOR, encode=StageCost(0.05, 0.1), match_per_place=StageCost(0.001, 0.002))
@@ -310,7 +310,7 @@ def test_what_was_tried_now_among_stored_figures_is_said():
 @pytest.mark.parametrize("labels", [[], ["hog", "vector"]])
 def test_techniques_are_on_the_picture(tmp_path, labels):
     pytest.importorskip("matplotlib", reason="pictures need matplotlib")
-    from edgevpr.runtime.preflight.chart import plot
+    from edgevpr.runtime.preflight.presentation import plot
 
     monstrous = replace(VECTOR, ram_bytes_per_place=1_000_000)
     plot(estimate(PI, PI, dict.fromkeys(labels, monstrous), PLAN), tmp_path / "chart.svg")

@@ -14,7 +14,7 @@ from edgevpr.power.boards import MachineSpeed, load_board, own_profile
 from edgevpr.power.sensors import Meter, MeterError
 from edgevpr.runtime.preflight import stored as measured
 from edgevpr.runtime.preflight import trial
-from edgevpr.runtime.preflight.estimate_text import format_stored
+from edgevpr.runtime.preflight.presentation import format_stored
 from edgevpr.runtime.preflight.probe import TechniqueCosts
 from edgevpr.runtime.preflight.stored import (
     default_path,
