@@ -23,7 +23,7 @@ from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.text import shown
 
 if TYPE_CHECKING:
-    from edgevpr.mapmaking.making import Cuttings, MadeMap, Recording
+    from edgevpr.mapmaking.making import Cuttings, FlownPictures, MadeMap
     from edgevpr.mapmaking.refine import Refined
 
 
@@ -90,9 +90,9 @@ def _add_pictures(parser: ArgumentParser) -> None:
     )
 
 
-def _pictures(args: Namespace) -> "Recording | Cuttings":
+def _pictures(args: Namespace) -> "FlownPictures | Cuttings":
     """Return the pictures that the flags name. Raises UsageError for none, both, or flags of the other."""
-    from edgevpr.mapmaking.making import Cuttings, Recording
+    from edgevpr.mapmaking.making import Cuttings, FlownPictures
 
     if (args.source is None) == (args.orthophoto is None):
         raise UsageError("Give either --images (pictures of a flight) or --orthophoto: a map is made of one of them.")
@@ -102,7 +102,7 @@ def _pictures(args: Namespace) -> "Recording | Cuttings":
         raise UsageError(f"--{given[0].replace('_', '-')} goes with {source}: leave it out.")
     if args.source is not None:
         rate_hz = getattr(args, "rate_hz", None)
-        return Recording(source=args.source, positions=path_of(args.positions), rate_hz=rate_hz)
+        return FlownPictures(source=args.source, positions=path_of(args.positions), rate_hz=rate_hz)
     if args.footprint_m is None or args.spacing_m is None:
         raise UsageError("--orthophoto needs --footprint-m (ground along a picture's longest side) and --spacing-m.")
     if args.margin_m is not None and not (args.area and 0 <= args.margin_m < float("inf")):

@@ -32,6 +32,9 @@ Image: TypeAlias = NDArray[np.uint8]
 # bool, (H, W): False where a picture shows something that is not ground, such as a display drawn over it.
 Mask: TypeAlias = NDArray[np.bool_]
 
+# Degrees of WGS 84, one or many.
+Degrees: TypeAlias = float | Floats
+
 # A point (lat_deg, lon_deg) in degrees of WGS 84, without an altitude.
 LatLon: TypeAlias = tuple[float, float]
 

@@ -1,13 +1,11 @@
 """Distances on the Earth, for flights of some metres to some kilometres."""
 
 import math
-from typing import TypeAlias, overload
+from typing import overload
 
 import numpy as np
 
-from edgevpr.core.arrays import Doubles, Floats
-
-Degrees: TypeAlias = float | Floats
+from edgevpr.core.arrays import Degrees, Doubles, Floats
 
 EARTH_RADIUS_M = 6_371_009.0  # mean radius: over a few kilometres a sphere is within 0.5 % of the ellipsoid
 

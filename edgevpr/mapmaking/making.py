@@ -34,7 +34,7 @@ Shown = Callable[[Iterable[Any], int, str], Iterable[Any]]  # passes things thro
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Recording:
+class FlownPictures:
     """Pictures of a flight: a folder or a video, its positions (None: those beside it), and how many pictures a second
     of a video are taken (None: every frame)."""
 
@@ -80,7 +80,7 @@ class MapOrder:
     added to a map that is there, and whether it is refined and calibrated in the end."""
 
     path: str
-    pictures: Recording | Cuttings
+    pictures: FlownPictures | Cuttings
     technique: str | None = None
     parameters: dict[str, str]
     board: str = "this"
@@ -142,7 +142,7 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
             raise
         refined, calibration = None, None
         if order.refine and technique.spec.cells is not None:
-            images = order.pictures.source if isinstance(order.pictures, Recording) else ""
+            images = order.pictures.source if isinstance(order.pictures, FlownPictures) else ""
             refined = _unless_impossible(
                 "refined", lambda: refine_map(place_map, technique, images if Path(images).is_dir() else None, shown)
             )
@@ -177,7 +177,7 @@ def refine_map(place_map: PlaceMap, technique: Technique, images: str | Path | N
 
 
 def calibrate_map(
-    place_map: PlaceMap, technique: Technique, config: Config, pictures: Recording | Cuttings, shown: Shown
+    place_map: PlaceMap, technique: Technique, config: Config, pictures: FlownPictures | Cuttings, shown: Shown
 ) -> MapCalibration:
     """Calibrate an open map with its pictures; one that cannot be read is left out. Raises UsageError where that cannot
     be done, and where SciPy is missing."""
@@ -200,7 +200,7 @@ def calibrate_map(
     )
 
 
-def _preparation(config: Config, pictures: Recording | Cuttings, technique: Technique) -> Preparation:
+def _preparation(config: Config, pictures: FlownPictures | Cuttings, technique: Technique) -> Preparation:
     """Return what is done to pictures. What is cut lies on the ground already: no aircraft hides it, no lens has seen
     it."""
     if isinstance(pictures, Cuttings):

@@ -139,12 +139,10 @@ def build_map(
             frame = _frame_of(event)
             assert event.descriptor is not None  # of a frame that could be encoded
             place_map.add(laid(frame, event.view), event.descriptor, salience, walk.landmarks(event))
-            counts["added"] += 1
-            counts["without_position"] += frame.position is None
-            if salience and salience.is_low:
+            counts.update(added=1, without_position=frame.position is None)
+            if salience and salience.is_low and event.worth:
                 counts["of_low_quality"] += 1
-                if event.worth and event.worth.lacks:
-                    not_memorable[event.worth.lacks] -= 1
+                not_memorable[event.worth.lacks or ""] -= 1
 
     for frame in frames:
         event = walk.step(frame)

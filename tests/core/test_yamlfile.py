@@ -114,6 +114,7 @@ def test_pipes_and_devices_are_not_read(tmp_path):
             read_yaml(path)
 
 
+@pytest.mark.process
 def test_the_same_holds_for_the_command_in_little_memory(tmp_path):
     (tmp_path / "laughs.yaml").write_text(LAUGHS)
 

@@ -60,6 +60,8 @@ def number(frame):
     return int(frame.name.split()[1])
 
 
+@pytest.mark.network
+@pytest.mark.process
 @pytest.mark.parametrize("kind", ["udp", "tcp", "http", "rtsp"])
 def test_a_stream_that_is_lost_is_noticed_and_opened_again_when_it_is_back(kind, cameras, opened, tmp_path):
     camera = cameras.RtspOverRtp(tmp_path) if kind == "rtsp" else cameras.FfmpegCamera(kind)
@@ -87,6 +89,8 @@ def test_a_stream_that_is_lost_is_noticed_and_opened_again_when_it_is_back(kind,
             camera.scrap()
 
 
+@pytest.mark.network
+@pytest.mark.process
 def test_a_slow_reader_gets_the_newest_frame_of_a_stream(cameras, opened):
     camera = cameras.FfmpegCamera("tcp")
     camera.switch_on()
@@ -100,6 +104,8 @@ def test_a_slow_reader_gets_the_newest_frame_of_a_stream(cameras, opened):
         camera.switch_off()
 
 
+@pytest.mark.network
+@pytest.mark.process
 def test_rtp_described_by_an_sdp_file_is_shown(cameras, opened, tmp_path):
     camera = cameras.RtpCamera(tmp_path)
     camera.switch_on()
@@ -109,6 +115,7 @@ def test_rtp_described_by_an_sdp_file_is_shown(cameras, opened, tmp_path):
         camera.switch_off()
 
 
+@pytest.mark.network
 def test_a_stream_that_is_not_there_at_the_start_is_waited_for_in_silence(opened, capfd):
     with socket.socket() as closed:  # bound but not listening: every connection is refused
         closed.bind(("127.0.0.1", 0))
@@ -120,6 +127,7 @@ def test_a_stream_that_is_not_there_at_the_start_is_waited_for_in_silence(opened
     assert capfd.readouterr().err == ""
 
 
+@pytest.mark.slow
 def test_a_device_that_gives_no_pictures_is_tried_again_in_silence(opened, capfd):
     source = opened("/dev/null")
     wait_for(lambda: source.state.startswith("nothing there"))
@@ -127,6 +135,7 @@ def test_a_device_that_gives_no_pictures_is_tried_again_in_silence(opened, capfd
     assert capfd.readouterr().err == ""
 
 
+@pytest.mark.network
 def test_a_stream_that_hangs_does_not_hold_up_read_or_close(opened):
     with socket.create_server(("127.0.0.1", 0)) as server:
         source = opened(f"tcp://127.0.0.1:{server.getsockname()[1]}")
@@ -142,6 +151,8 @@ def test_a_stream_that_hangs_does_not_hold_up_read_or_close(opened):
         assert not thread.is_alive()
 
 
+@pytest.mark.process
+@pytest.mark.network
 def test_python_waits_at_its_end_for_a_stream_that_hangs():
     """A thread that came back from FFmpeg while Python ends would crash the process."""
     program = """

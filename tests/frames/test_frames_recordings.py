@@ -155,7 +155,7 @@ def test_positions_of_another_time_than_the_video_are_refused(video, tmp_path, t
 def test_a_wrong_positions_csv_is_found_out_before_the_first_image(folder):
     write_picture(folder / "a.jpg")
     (folder / "positions.csv").write_text("file,lat,lon\na.jpg,north,4\n")
-    with pytest.raises(UsageError, match="line 2.*`north`"):
+    with pytest.raises(UsageError, match=r"line 2.*`north`"):
         open_source(str(folder), live=False)
 
 
@@ -219,6 +219,7 @@ def test_a_video_without_time_stamps_is_timed_by_its_frame_rate(tmp_path):
     assert frames[1].name == "frame 000005 t=0.200 s"
 
 
+@pytest.mark.process
 def test_a_bare_h264_stream_is_timed_by_its_frame_rate(tmp_path):
     ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="the video is made with ffmpeg (pip install imageio-ffmpeg)")
     path = tmp_path / "bare.h264"
@@ -230,14 +231,15 @@ def test_a_bare_h264_stream_is_timed_by_its_frame_rate(tmp_path):
 
 
 def frames_and_complaints(path):
-    source, frames, complaints = open_source(str(path), live=False), [], []
+    source, frames, complaints, missing = open_source(str(path), live=False), [], [], 0
     while not source.ended:
         try:
             frames.append(source.read(9.0))
         except ImageError as error:
             complaints.append(str(error))
+            missing += error.count
     source.close()
-    return [frame for frame in frames if frame], complaints, source.refused["damaged"]
+    return [frame for frame in frames if frame], complaints, source.refused["damaged"], missing
 
 
 def time_of(frame):
@@ -250,22 +252,24 @@ def films(tmp_path):
     return lambda name, *coding: film(tmp_path / name, *coding)
 
 
+@pytest.mark.process
 def test_damaged_frames_of_a_video_and_those_built_on_them_are_left_out_counted_and_said_once(films):
     path = films("flight.mkv", "-c:v", "libx264", "-bf", "0", "-sc_threshold", "0")
-    whole, complaints, _ = frames_and_complaints(path)
+    whole, complaints, *_ = frames_and_complaints(path)
     assert (len(whole), complaints) == (75, [])
     overwrite_in_the_middle(path)
-    frames, complaints, damaged = frames_and_complaints(path)
+    frames, complaints, damaged, missing = frames_and_complaints(path)
     images = {time_of(frame): frame.image for frame in whole}
     assert all((images[time_of(frame)] == frame.image).all() for frame in frames)
     assert 50 <= len(frames) < 75
     assert time_of(frames[-1]) == time_of(whole[-1]), "it goes on with the next key frame"
-    assert damaged > 0
+    assert damaged == missing == 75 - len(frames)
     (complaint,) = complaints
     assert f"{path}: frame 0000" in complaint
     assert "being damaged or built on damage: copy the video again." in complaint
 
 
+@pytest.mark.process
 def test_frames_predicted_from_one_that_is_missing_are_left_out(films):
     """Of an MPEG transport stream, recorded from a radio link that lost the packets of a whole frame: no decoder finds
     anything wrong with the frames after it."""
@@ -276,20 +280,22 @@ def test_frames_predicted_from_one_that_is_missing_are_left_out(films):
     begins = [index for index in video if packets[index][1] & 0x40]
     lost = [index for index in video if begins[35] <= index < begins[36]]
     path.write_bytes(b"".join(packet for index, packet in enumerate(packets) if index not in lost))
-    frames, complaints, damaged = frames_and_complaints(path)
+    frames, complaints, damaged, _ = frames_and_complaints(path)
     assert all((images[time_of(frame)] == frame.image).all() for frame in frames)
     assert 55 <= len(frames) <= 65
     assert (len(complaints), len(frames) + damaged) == (1, 74)
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("name", ["flight.mkv", "flight.avi", "flight.mp4"])
 def test_a_video_that_is_cut_short_is_said(name, films):
     path = films(
         name, "-c:v", "mpeg4", "-qscale:v", "3", *(["-movflags", "+faststart"] if name.endswith("mp4") else [])
     )
     cut_in_half(path)
-    frames, complaints, _ = frames_and_complaints(path)
+    frames, complaints, _, missing = frames_and_complaints(path)
     assert 10 < len(frames) < 60
+    assert len(frames) + missing == pytest.approx(75, abs=1)
     assert re.search(
         rf"{name} ends after 1\.[0-9] s of 3\.0 s: it is cut short: copy the video again\.", complaints[-1]
     )

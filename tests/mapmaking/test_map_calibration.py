@@ -14,18 +14,22 @@ from edgevpr.core.types import Frame, Position
 from edgevpr.frames.level import UNKNOWN_VIEW, Lens, Levelled
 from edgevpr.frames.mask import Mask
 from edgevpr.mapmaking import calibrate as calibrating
-from edgevpr.mapmaking.calibrate import LEFT_OUT, MIRRORED, THERE, ask, calibrate
+from edgevpr.mapmaking.calibrate import LEFT_OUT, MIRRORED, THERE, ask, calibrate, fitted
+from edgevpr.mapmaking.changes import changed
 from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import Pack
 from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.recognise.confidence import Logistic
 from edgevpr.runtime.recognise.evidence import read_calibration
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.levelling import Levelling
 from edgevpr.runtime.recognise.recogniser import Preparation
 from edgevpr.techniques import create
+
+pytestmark = pytest.mark.slow
 
 PLACES = 8
 CONFIG = load_config(None).match
@@ -181,3 +185,70 @@ def test_a_map_that_looks_alike_everywhere_says_so(tmp_path):
         found = calibrated(place_map, at_hand(*map(water, range(PLACES)))[0])
     assert found.looks_alike
     assert found.accepted < 0.3
+
+
+START = Logistic(("a", "b"), (0.0, 0.0), (1.0, 2.0), 0.0)
+
+
+def rows_of(count, seed=1):
+    """Rows of which `a` tells whether they are right, and `b` nothing."""
+    rng = np.random.default_rng(seed)
+    right = rng.random(count) < 0.5
+    return [{"a": float(is_right + rng.normal(0, 0.5)), "b": float(2 * rng.normal())} for is_right in right], right
+
+
+def test_what_tells_right_from_wrong_weighs_and_the_rest_does_not():
+    rows, right = rows_of(2000)
+    found = fitted(START, rows, right, np.ones(len(rows)), 1.0)
+    # Two normal distributions, 1 apart with the variance 0.25: the logit is 4 (a - 0.5).
+    assert found.weights == (pytest.approx(4, abs=0.5), pytest.approx(0, abs=0.15))
+    assert found.bias == pytest.approx(-2, abs=0.4)
+    assert (found.names, found.scales) == (START.names, START.scales)
+
+
+def test_a_strong_pull_keeps_the_weights_and_only_the_bias_follows():
+    rows, right = rows_of(200)
+    start = fitted(START, *rows_of(2000, seed=2), np.ones(2000), 1.0)
+    found = fitted(start, rows, np.zeros(len(right), bool), np.ones(len(rows)), 1e6)
+    assert found.weights == pytest.approx(start.weights, abs=0.01)
+    assert found.bias < start.bias - 1
+
+
+def test_rows_count_by_their_weights():
+    rows, right = [{"a": 0.0, "b": 0.0}] * 2, np.array([True, False])
+    found = fitted(START, rows, right, np.array([9.0, 1.0]), 1.0)
+    assert found.bias == pytest.approx(np.log(9), abs=1e-3)
+
+
+@pytest.mark.parametrize("shape", [(120, 160), (160, 120), (120, 160, 3)])
+@pytest.mark.parametrize("looks_down", [True, False])
+def test_a_changed_picture_has_the_form_of_one(shape, looks_down):
+    image = np.broadcast_to(textured(1, *shape[:2]).reshape(*shape[:2], *[1] * (len(shape) - 2)), shape).copy()
+    seen, shown = changed(image, np.random.default_rng(3), looks_down)
+    assert (seen.shape, seen.dtype, shown) == (shape[:2], np.uint8, None)
+    assert seen.std() > 5
+
+
+def test_the_same_seed_gives_the_same_picture_and_the_next_another():
+    image, rng = textured(2), np.random.default_rng(5)
+    first, second = (changed(image, rng, True)[0] for _ in range(2))
+    assert np.array_equal(changed(image, np.random.default_rng(5), True)[0], first)
+    assert (first != second).mean() > 0.5
+
+
+def test_the_part_that_shows_ground_moves_with_the_picture():
+    image = textured(4)
+    shown = np.zeros(image.shape, bool)
+    shown[:, 80:] = True
+    image = np.where(shown, 40 + image // 4, 190 + image // 4)
+
+    def apart(picture, part):
+        return abs(float(picture[part].mean()) - float(picture[~part].mean()))
+
+    followed, left = [], []
+    for seed in range(12):
+        seen, now = changed(image, np.random.default_rng(seed), True, shown)
+        assert (now.shape, now.dtype) == (image.shape, bool)
+        followed.append(apart(seen, now))
+        left.append(apart(seen, shown))
+    assert np.mean(followed) > 1.5 * np.mean(left)

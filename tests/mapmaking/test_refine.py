@@ -21,6 +21,8 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapinfo import info_of
 from edgevpr.runtime.recognise.opening import technique_of
 
+pytestmark = pytest.mark.slow
+
 NOISE_M, GLITCH_M = 5.0, 250.0
 FOOTPRINT_M = 80.0 * 640 / 493  # of the generated camera
 EVERY, LEGS = 1, 2  # pictures of the two first legs
