@@ -18,7 +18,7 @@ from edgevpr.lab.evaluate import metrics
 from edgevpr.lab.evaluate.asking import MatchOptions, Progress, QueryAnswer, Walk, answers
 from edgevpr.lab.evaluate.dataset import Dataset
 from edgevpr.lab.evaluate.metrics import Quality, figures
-from edgevpr.mapmaking.making import Recording, calibrate_map, refine_map
+from edgevpr.mapmaking.making import FlownPictures, calibrate_map, refine_map
 from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
@@ -140,7 +140,7 @@ def make_map(
             refine_map(place_map, technique, images, _quietly)
         if images:
             with suppress(UsageError):  # too small a map, or one whose pictures cannot tell: by the shipped model
-                calibrate_map(place_map, technique, load_config(None), Recording(source=str(images)), _quietly)
+                calibrate_map(place_map, technique, load_config(None), FlownPictures(source=str(images)), _quietly)
 
 
 @contextmanager
