@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from edgevpr.cli.shared import add_json, command, exit_code, group, path_of, print_json
-from edgevpr.core.errors import EdgevprError, ImageError, ModelError, UsageError
+from edgevpr.core.errors import EdgevprError, ImageError, ModelError
 from edgevpr.core.text import shown
 
 if TYPE_CHECKING:
@@ -60,9 +60,6 @@ def _add_models(models: Any) -> None:
     quantise = command(models, "quantise", models_quantise, "make NAME_int8 of a network (needs edgevpr[train])")
     quantise.add_argument("name", metavar="NAME")
     quantise.add_argument("--calibrate", required=True, metavar="DIR", help="images like those of the flight")
-    quantise.add_argument("--query", metavar="DIR", help="with --ref and --ground-truth: recall before and after")
-    quantise.add_argument("--ref", metavar="DIR")
-    quantise.add_argument("--ground-truth", metavar="CSV")
     add_json(quantise)
 
 
@@ -176,31 +173,15 @@ def models_add(args: Namespace) -> int:
 
 
 def models_quantise(args: Namespace) -> int:
-    """Make a network of 8-bit integers, and print its costs and, with a data set, its recall, before and after."""
-    from edgevpr.core.text import progress
-    from edgevpr.lab.evaluate.dataset import load_dataset
-    from edgevpr.lab.evaluate.evaluate import evaluate as measured
+    """Make a network of 8-bit integers, and print its costs before and after."""
     from edgevpr.lab.training.quantise import quantise
     from edgevpr.power.boards import load_board
-    from edgevpr.runtime.preflight.networks import technique_with
 
-    data = (args.query, args.ref, args.ground_truth)
-    if any(data) and not all(data):
-        raise UsageError("Recall needs all of --query, --ref and --ground-truth: give those that are missing, or none.")
-    dataset = load_dataset(*data) if all(data) else None
     result = quantise(args.name, Path(args.calibrate), load_board("this").threads)
-    recall = None
-    if dataset:
-        recall = {
-            each.name: measured(technique, dataset, settings, progress=progress).recall_at_1
-            for each in (result.before, result.after)
-            for technique, settings in [technique_with(each.name)]
-        }
     if args.json:
-        print_json({**asdict(result), "recall_at_1": recall})
+        print_json(asdict(result))
         return 0
-    for each in (result.before, result.after):
-        print(_verified_text(each) + (f", recall@1 {recall[each.name]:.3f}" if recall else ""))
+    print(f"{_verified_text(result.before)}\n{_verified_text(result.after)}")
     print(f"calibrated with {result.images} images, written as {result.card}")
     return 0
 

@@ -12,6 +12,14 @@ from edgevpr.core.errors import UsageError
 # Those of edgevpr.lab.simulate.controller, which is not loaded for a page of help.
 _VEHICLES = ("arduplane", "arducopter", "ardurover", "px4-copter", "px4-plane")
 _PARAMETER = "GPS2_TYPE=14"  # an example
+# The numbers of a flight over an orthophoto: the usual one, the least, the most, and what to say of it.
+_NUMBERS = {
+    "height_m": (None, 1.0, 10_000.0, "over the ground (default: that of the track)"),
+    "every_m": (20.0, 0.1, 1e6, "from picture to picture of a mission (20)"),
+    "speed_m_s": (10.0, 0.1, 1000.0, "over the ground (10)"),
+    "fov_deg": (66.0, 5.0, 120.0, "angle of view across the picture (66)"),
+    "sway_deg": (2.0, 0.0, 20.0, "most roll, pitch and yaw off the track (2)"),
+}
 
 
 def add(commands: Any) -> None:
@@ -41,11 +49,8 @@ def add(commands: Any) -> None:
         metavar="FILE",
         help="a mission, or a positions.csv with height_m[, yaw_deg, roll_deg, pitch_deg]",
     )
-    over.add_argument("--height-m", type=float, metavar="M", help="over the ground (default: that of the track)")
-    over.add_argument("--every-m", type=float, metavar="M", help="from picture to picture of a mission (20)")
-    over.add_argument("--speed-m-s", type=float, metavar="V", help="over the ground (10)")
-    over.add_argument("--fov-deg", type=float, metavar="A", help="angle of view across the picture (66)")
-    over.add_argument("--sway-deg", type=float, metavar="A", help="most roll, pitch and yaw off the track (2)")
+    for name, (*_, text) in _NUMBERS.items():
+        over.add_argument(f"--{name.replace('_', '-')}", type=float, metavar="X", help=text)
     over.add_argument("--light", choices=("clear", "hazy"), help="hazy adds veil, blur and noise (clear)")
     demo = command(commands, "demo", run_demo, "the whole job on a generated flight, with a picture")
     demo.add_argument("--out", default="demo_out", metavar="DIR", help="(demo_out)")
@@ -90,23 +95,13 @@ def simulate_flight(args: Namespace) -> int:
     return 0
 
 
-# The numbers of a flight over an orthophoto: the usual one, the least and the most.
-_NUMBERS = {
-    "height_m": (None, 1.0, 10_000.0),
-    "every_m": (20.0, 0.1, 1e6),
-    "speed_m_s": (10.0, 0.1, 1000.0),
-    "fov_deg": (66.0, 5.0, 120.0),
-    "sway_deg": (2.0, 0.0, 20.0),
-}
-
-
 def _fly_over(args: Namespace) -> str:
     from edgevpr.core.text import progress
     from edgevpr.lab.simulate.rehearsal import WEATHERS, none_written, read_shots, write_rehearsal
     from edgevpr.mapmaking.orthophoto import Orthophoto  # loads GDAL, or says that it is missing
 
     numbers: dict[str, Any] = {}
-    for name, (usual, least, most) in _NUMBERS.items():
+    for name, (usual, least, most, _) in _NUMBERS.items():
         numbers[name] = value = usual if getattr(args, name) is None else getattr(args, name)
         if value is not None and not least <= value <= most:  # false for NaN
             raise UsageError(f"--{name.replace('_', '-')} is {value:g}: give {least:g} to {most:g}.")

@@ -3,7 +3,7 @@
 import json
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from html import escape
 from itertools import product
@@ -239,20 +239,20 @@ def _moment(number: int, moment: WorstMoment, frames: Album, references: Album) 
     )
 
 
-def _refusals(flight: LoggedFlight) -> Counter[str]:
-    """Count why matches were refused; figures, which differ every time, are left out."""
-    return Counter(_NUMBER.sub("…", each.reason.partition(":")[0]) for each in flight.queries if not each.accepted)
+def _refusals(flight: LoggedFlight) -> Iterator[str]:
+    return (query.reason.partition(":")[0] for query in flight.queries if not query.accepted)
 
 
-def _objections(flight: LoggedFlight) -> Counter[str]:
-    fixes = [each.fix for each in flight.queries if each.fix and each.fix.outcome is not FixOutcome.CONTINUOUS]
-    return Counter(f"{fix.outcome.value}: {_NUMBER.sub('…', fix.why)}" for fix in fixes if fix.why)
+def _objections(flight: LoggedFlight) -> Iterator[str]:
+    for query in flight.queries:
+        if query.fix and query.fix.why and query.fix.outcome is not FixOutcome.CONTINUOUS:
+            yield f"{query.fix.outcome.value}: {query.fix.why}"
 
 
-def _counts(counter: Counter[str]) -> str:
-    if not counter:
-        return ""
-    return table(("times", "why"), [(str(count), said) for said, count in counter.most_common(20)])
+def _counts(reasons: Iterable[str]) -> str:
+    """Return how often each reason was given; figures, which differ every time, are left out."""
+    counted = Counter(_NUMBER.sub("…", reason) for reason in reasons)
+    return table(("times", "why"), [(str(count), why) for why, count in counted.most_common(20)]) if counted else ""
 
 
 def _remarks(flight: LoggedFlight) -> str:

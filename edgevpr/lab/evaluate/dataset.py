@@ -17,8 +17,8 @@ _MAX_FILE_BYTES = 100_000_000  # a million queries
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """The references that are `right` for a query; a match in `ignored` is neither right nor wrong. `where` it stands
-    in the file, for messages."""
+    """The references that are `right` for a query (none: it is not scored); a match in `ignored` is neither right nor
+    wrong. `where` it stands in the file, for messages."""
 
     right: frozenset[str]
     ignored: frozenset[str]
@@ -27,15 +27,14 @@ class Judged:
 
 @dataclass(frozen=True, slots=True)
 class GroundTruth:
-    """A ground truth: of every query its name, in the order of the file, and None where it is not scored."""
+    """A ground truth: what is right for every query, by its name, in the order of the file."""
 
-    queries: dict[str, Judged | None]
-    places: dict[str, str]  # where each query stands in the file, for messages
+    queries: dict[str, Judged]
 
     @property
     def scored(self) -> dict[str, Judged]:
         """The queries that are scored."""
-        return {name: judged for name, judged in self.queries.items() if judged}
+        return {name: judged for name, judged in self.queries.items() if judged.right}
 
     @property
     def named(self) -> frozenset[str]:
@@ -72,9 +71,11 @@ def load_dataset(query_dir: str | Path, ref_dir: str | Path, ground_truth: str |
     paths = {decoded_name(path.name): path for path in list_images(query_dir)}
     references = tuple(decoded_name(path.name) for path in list_images(ref_dir))
     truth, known = read_truth(ground_truth), frozenset(references)
-    for name, where in truth.places.items():
+    for name, judged in truth.queries.items():
         if name not in paths:
-            raise UsageError(f"{where}: the query `{name}` is not in {query_dir}: correct its name, or drop the row.")
+            raise UsageError(
+                f"{judged.where}: the query `{name}` is not in {query_dir}: correct its name, or drop the row."
+            )
     for judged in truth.scored.values():
         if unknown := sorted((judged.right | judged.ignored) - known):
             raise UsageError(
@@ -90,8 +91,7 @@ def read_truth(path: str | Path) -> GroundTruth:
     """Read a CSV with the columns query_file and ref_files (names separated by spaces). Optional are ref_files_loose
     (ignored unless they are in ref_files too) and status (only `ok` is scored). Raises UsageError with file, line,
     value and what to do."""
-    queries: dict[str, Judged | None] = {}
-    places: dict[str, str] = {}
+    queries: dict[str, Judged] = {}
     for where, row in _rows(Path(path)):
         name = row["query_file"]
         if name in queries:
@@ -103,9 +103,8 @@ def read_truth(path: str | Path) -> GroundTruth:
                 f"{where}: the query `{name}` has no ref_files: name at least one, or give it a status other than "
                 "`ok`, so that it is not scored."
             )
-        places[name] = where
-        queries[name] = Judged(right, loose - right, where) if is_scored else None
-    return GroundTruth(queries, places)
+        queries[name] = Judged(right if is_scored else frozenset(), loose - right, where)
+    return GroundTruth(queries)
 
 
 def _rows(path: Path) -> Iterator[tuple[str, dict[str, str]]]:

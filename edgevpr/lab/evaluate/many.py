@@ -196,27 +196,29 @@ def _rows_on_sets(plan: EvaluationPlan, sets: Iterable[OpenSet]) -> tuple[list[R
 def _measured_by_workers(rows: Sequence[RowOnSet], cache: Cache, workers: int, progress: Progress[Any]) -> Failures:
     """Let workers make the maps and then ask the queries, and keep each result; return why others were not measured."""
     maps = {row.map_key: row for row in rows}
-    failed: dict[str, str] = {}
-    with _pool(min(workers, max(len(rows), len(maps)))) as pool:
-        jobs: dict[Future[Any], str] = {pool.submit(_make_map, row, cache.folder): key for key, row in maps.items()}
+    failed: dict[str, str] = {}  # by the key of a map or of a row
+    with _pool(min(workers, len(rows))) as pool:
+        jobs = {pool.submit(_make_map, row, cache.folder): key for key, row in maps.items()}
         for job in progress(as_completed(jobs), len(jobs), "maps"):
-            if isinstance(made := job.result(), str):
-                failed[jobs[job]] = made
+            if why := job.result():
+                failed[jobs[job]] = why
         left = {row.key: row for row in rows if row.map_key not in failed}
-        parts: dict[str, list[Future[Any]]] = {}
+        parts: dict[str, list[Future[list[QueryAnswer] | str]]] = {}
         for key, row in left.items():
-            parts[key] = [
-                pool.submit(_ask, row, cache.folder, queries)
-                for queries in _shared_out(row, max(1, workers // len(left)))
-            ]
+            shares = _shared_out(row, max(1, workers // len(left)))
+            parts[key] = [pool.submit(_ask, row, cache.folder, queries) for queries in shares]
         asked = {part: key for key, several in parts.items() for part in several}
         for part in progress(as_completed(asked), len(asked), f"rows, {len(left)} of {len(rows)}"):
             key = asked[part]
-            if isinstance(said := part.result(), str):
-                failed[key] = said
-            elif all(each.done() for each in parts[key]) and key not in failed:
-                answers = [answer for each in parts[key] for answer in each.result()]
-                _keep(cache, left[key], answers, workers)
+            if key in parts and all(each.done() for each in parts[key]):
+                answers: list[QueryAnswer] = []
+                for found in (each.result() for each in parts.pop(key)):
+                    if isinstance(found, str):
+                        failed[key] = found
+                    else:
+                        answers += found
+                if key not in failed:
+                    _keep(cache, left[key], answers, workers)
     return {row.name: why for row in rows if (why := failed.get(row.map_key) or failed.get(row.key))}
 
 

@@ -35,11 +35,11 @@ class Numbered:
 
     def named(self, queries: Sequence[str], references: Sequence[str]) -> GroundTruth:
         """Return the same with names in place of numbers; there are as many names as `shape` asks for."""
-        found: dict[str, Judged | None] = dict.fromkeys(queries)
+        found = dict.fromkeys(queries, Judged(frozenset(), frozenset(), str(self.path)))
         for number, both in self.judged.items():
             right, ignored = (frozenset(references[each] for each in part) for part in both)
             found[queries[number]] = Judged(right, ignored, str(self.path))
-        return GroundTruth(found, dict.fromkeys(queries, str(self.path)))
+        return GroundTruth(found)
 
 
 def truth_in(path: str | Path) -> GroundTruth | Numbered:

@@ -89,10 +89,7 @@ def side_of(folder: Path, name: str) -> Path | None:
     none."""
     if (inner := folder / name).is_dir():
         return inner
-    found = [path for path in _videos_in(folder) if path.stem == name]
-    if len(found) > 1:
-        raise UsageError(f"{folder} holds {found[0].name} and {found[1].name}: keep one of them.")
-    return found[0] if found else None
+    return _only([path for path in _videos_in(folder) if path.stem == name], folder)
 
 
 def _video_of(given: Path) -> Path | None:
@@ -100,18 +97,18 @@ def _video_of(given: Path) -> Path | None:
         return None if is_image(given.name) else given
     if not given.is_dir() or any(is_image(path.name) for path in given.iterdir()):
         return None
-    found = _videos_in(given)
-    if len(found) > 1:
-        raise UsageError(f"{given} holds {len(found)} videos ({found[0].name}, {found[1].name}): keep one of them.")
-    return found[0] if found else None
+    return _only(_videos_in(given), given)
+
+
+def _only(videos: list[Path], folder: Path) -> Path | None:
+    if len(videos) > 1:
+        raise UsageError(f"{folder} holds {len(videos)} videos ({videos[0].name}, {videos[1].name}): keep one of them.")
+    return videos[0] if videos else None
 
 
 def _videos_in(folder: Path) -> list[Path]:
-    return sorted(
-        path
-        for path in folder.iterdir()
-        if path.suffix.lower() in _EXTENSIONS and path.name[0] != "." and path.is_file()
-    )
+    found = (path for path in folder.iterdir() if path.suffix.lower() in _EXTENSIONS and path.name[0] != ".")
+    return sorted(path for path in found if path.is_file())
 
 
 def _positions_beside(video: Path) -> Path:

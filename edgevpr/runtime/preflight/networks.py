@@ -158,18 +158,6 @@ def add(file: Path, card_path: Path, threads: int = 1) -> tuple[Verified, Path]:
     return verified, target
 
 
-def technique_with(name: str) -> tuple[str, dict[str, str]]:
-    """Return a technique and its settings that show the quality of a card's network.
-
-    It is the network's own technique, else `calc` for a network that makes descriptors, else `rmac`, which needs only
-    feature maps and nothing learned.
-    """
-    card = load_card(name)
-    if card.is_technique and not techniques.is_own(name):
-        return name, {}
-    return "calc" if card.outputs.descriptor else "rmac", {"model": name}
-
-
 def install(file: Path, sha256: str, card_path: Path, file_name: str, text: str) -> None:
     """Put a file, under `file_name`, and then its card into a folder, each completely or not at all. Raises ModelError
     where another network has either name."""

@@ -37,19 +37,11 @@ def test_the_integers_give_nearly_the_same_descriptor(models, tmp_path):
         assert exact @ rough / np.linalg.norm(exact) / np.linalg.norm(rough) > 0.99
 
 
-def test_recall_before_and_after_on_a_set(models, tmp_path, capsys):
+def test_the_command_says_what_both_take(models, tmp_path, capsys):
     write_network(models, "mine")
     folder = write_pictures(tmp_path / "pictures", 6)
-    truth = tmp_path / "truth.csv"
-    truth.write_text("query_file,ref_files\n" + "".join(f"{n}.jpg,{n}.jpg\n" for n in range(6)))
-    flags = ["--query", str(folder), "--ref", str(folder), "--ground-truth", str(truth)]
-    command = ["models", "quantise", "mine", "--calibrate", str(folder)]
-    assert main([*command, *flags, "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert said["recall_at_1"] == {"mine": 1.0, "mine_int8": 1.0}
-    assert said["after"]["file_mb"] > 0
-    assert main([*command, "--query", str(folder)]) == 2
-    assert "--ground-truth" in capsys.readouterr().err
+    assert main(["models", "quantise", "mine", "--calibrate", str(folder), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["after"]["file_mb"] > 0
 
 
 def test_no_images_and_no_onnx_are_one_sentence(models, tmp_path, monkeypatch):

@@ -17,7 +17,7 @@ from tiny_networks import CARD, write_card, write_network
 from edgevpr.cli.main import main
 from edgevpr.core import child
 from edgevpr.core.errors import EdgevprError, ModelError
-from edgevpr.runtime.preflight.networks import add, list_models, technique_with, verify, verify_here
+from edgevpr.runtime.preflight.networks import add, list_models, verify, verify_here
 from edgevpr.techniques.card import load_card
 
 
@@ -169,13 +169,6 @@ def test_a_network_is_added_before_its_words_are_learned(models, download):
     assert add(download / "mine.onnx", download / "mine.yaml")[0].vector_length == 5 * 4
     with pytest.raises(ModelError, match="words"):
         verify_here(load_card("mine"))
-
-
-def test_which_technique_shows_what_a_network_is_worth(models):
-    write_network(models, "mine")
-    write_network(models, "backbone", card={"outputs": {"features": "features"}})
-    assert technique_with("mine") == ("mine", {})
-    assert technique_with("backbone") == ("rmac", {"model": "backbone"})
 
 
 @pytest.mark.process
