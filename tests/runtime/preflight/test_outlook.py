@@ -41,8 +41,8 @@ def test_a_board_that_affords_it_compares_as_many_candidates_as_usual(outlook_at
 def test_a_slower_board_compares_fewer_and_says_so(outlook_at):
     found = outlook_at(3.0)
     assert (found.candidates, found.t_query_s) == (20, pytest.approx(0.3))
-    assert "; 20 candidates instead of 42; recall@1 0." in found.reason
-    assert "3.3 Hz of 3 are reached" in found.reason
+    assert "; 20 candidates instead " in found.reason
+    assert " 3.3 Hz " in found.reason
 
 
 def test_what_the_configuration_says_is_kept_and_so_is_what_nothing_helps(outlook_at):
@@ -50,7 +50,7 @@ def test_what_the_configuration_says_is_kept_and_so_is_what_nothing_helps(outloo
     assert outlook_at(3.0, **{"match.sequence": 3}).candidates == 42
     hopeless = outlook_at(3.0, replace(COSTS, encode=StageCost(2.0, 2.0)))
     assert hopeless.candidates == 42
-    assert "it does not fit (it reaches 0.41 Hz of 3" in hopeless.reason
+    assert "0.41 Hz" in hopeless.reason
 
 
 def test_only_numbers_that_accepted_nothing_wrong_are_for_the_governor(recording):

@@ -197,7 +197,7 @@ def test_where_nothing_can_be_written_is_said_before_the_work(tmp_path, monkeypa
     with pytest.raises(UsageError, match="folder"):
         require_room(tmp_path / "no" / "m.json", make=False)
     (tmp_path / "folder.json").mkdir()
-    with pytest.raises(EdgevprError, match="cannot be written"):
+    with pytest.raises(EdgevprError, match="written"):
         require_room(tmp_path / "folder.json", make=False)
     with pytest.raises(UsageError, match="json"):
         require_room(tmp_path / "valley.gpkg", make=False)
