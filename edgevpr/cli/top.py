@@ -15,7 +15,7 @@ from edgevpr.core.errors import EdgevprError
 from edgevpr.core.text import printable
 
 if TYPE_CHECKING:
-    from edgevpr.runtime.flight.status import LinkState, Seen, Status
+    from edgevpr.runtime.flight.status import LinkState, SeenQuery, Status
 
 _FILE = "/run/edgevpr/status.json"
 _LOOK_S = 1.0  # a status comes once a second
@@ -107,7 +107,7 @@ def _clock(seconds: float) -> str:
     return f"{int(seconds) // 3600}:{int(seconds) // 60 % 60:02d}:{int(seconds) % 60:02d}"
 
 
-def _match(match: "Seen | None") -> str:
+def _match(match: "SeenQuery | None") -> str:
     if match is None:
         return "none yet"
     sure = f", confidence {match.confidence:.4f}" if match.confidence is not None else ""
@@ -116,7 +116,7 @@ def _match(match: "Seen | None") -> str:
     return f"{match.age_s:.0f} s ago, place {match.place} ({match.reference_image}){sure}{score}{good}"
 
 
-def _newest(newest: "Seen | None") -> str:
+def _newest(newest: "SeenQuery | None") -> str:
     if newest is None:
         return "none yet"
     return f"{newest.age_s:.0f} s ago, {'accepted' if newest.accepted else 'refused'}: {newest.reason}"

@@ -225,7 +225,7 @@ def keys_of(cls: type = Config, prefix: str = "") -> Iterator[Key]:
     hints = typing.get_type_hints(cls)
     for each in fields(cls):
         kind = _kind(hints[each.name])
-        if is_dataclass(kind):
+        if isinstance(kind, type) and is_dataclass(kind):
             yield from keys_of(kind, f"{prefix}{each.name}.")
         else:
             known = each.metadata
@@ -265,11 +265,13 @@ def changed_config(config: Config, path: str | Path) -> Config:
 def with_logs_in(config: Config, folder: str) -> Config:
     """Return a configuration in which the relative paths of all that a flight writes about itself are meant from a
     folder."""
+
+    def meant_from(path: str | None) -> str | None:
+        return path and os.path.join(folder, path)
+
     log = config.log
-    named = {"path": log.path, "tlog": log.tlog, "record": log.record}
-    return replace(
-        config, log=replace(log, **{key: path and os.path.join(folder, path) for key, path in named.items()})
-    )
+    log = replace(log, path=meant_from(log.path), tlog=meant_from(log.tlog), record=meant_from(log.record))
+    return replace(config, log=log)
 
 
 def build(cls: type[T], mapping: dict[str, Any], where: str, prefix: str = "") -> T:

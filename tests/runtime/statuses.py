@@ -2,9 +2,9 @@
 
 from dataclasses import replace
 
-from edgevpr.runtime.flight.status import LinkState, Seen, Status
+from edgevpr.runtime.flight.status import LinkState, SeenQuery, Status
 
-MATCH = Seen(
+MATCH = SeenQuery(
     query="0007.jpg",
     age_s=3.2,
     accepted=True,

@@ -126,7 +126,8 @@ def say_start(config: Config, world: World, aboard: Aboard) -> None:
     board, recogniser, found = world.board, aboard.recogniser, aboard.found
     _log.info("version %s on %s", __version__, board.title)
     _log.info("%s", found.reason)
-    if config.mavlink.link and config.mavlink.send_fixes and (found.t_query_s or 0.0) > FIX_MAX_AGE_S:
+    sends = config.mavlink.link is not None and config.mavlink.send_fixes
+    if sends and found.t_query_s is not None and found.t_query_s > FIX_MAX_AGE_S:
         _log.warning("no fix will be sent: %s", too_late(found.t_query_s))
     if not board.verified:
         _log.warning("mAh are estimates: the power of %s is unverified (%s)", board.title, board.source)

@@ -2,15 +2,13 @@
 
 import logging
 import math
-from collections.abc import Collection
 from dataclasses import replace
 
 from edgevpr.core.config import MavlinkConfig, SourceSetsConfig
-from edgevpr.core.types import FixReport, Vehicle
+from edgevpr.core.types import FixReport
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.fixes import Sending
 from edgevpr.mavlink.link import Link
-from edgevpr.mavlink.requests import Wish, Wished
 from edgevpr.power.load import MachineLoad
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.herald import Herald
@@ -37,9 +35,6 @@ class NoAutopilot:
     def log_answers(self) -> None:
         """Write nothing: no fix is sent."""
 
-    def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
-        """Return None: nothing is known."""
-
     def told(self, event: Recognition, used_mah: float) -> Recognition:
         """Return the event, with a report that the fix of an accepted match was not sent."""
         return replace(event, fix=_unsent(event, "there is no link")) if event.accepted else event
@@ -49,13 +44,6 @@ class NoAutopilot:
 
     def state(self) -> None:
         """Return None: there is no link."""
-
-    def wishes(self) -> tuple[Wished, ...]:
-        """Return none."""
-        return ()
-
-    def offer(self, wishes: Collection[Wish]) -> None:
-        """Offer nothing."""
 
     def report(self, health: messages.Health, load: MachineLoad, temperature_c: float | None) -> None:
         """Report nothing."""
@@ -83,14 +71,15 @@ class ToAutopilot:
         stats = self._link.stats()
         taken = f"{stats.fixes_sent} fixes sent, {stats.acks.get('ACCEPTED', 0)} taken"
         sent = taken if self._send_fixes else DRY_RUN
-        refusals = sum(stats.acks.values()) - stats.acks.get("ACCEPTED", 0)
-        refused = f"{refusals} refused ({stats.refused_why})" if refusals else ""
-        unanswered = f"{stats.unanswered_fixes} unanswered" if stats.unanswered_fixes else ""
-        held = f"{self._held} held back" if self._held else ""
-        late = f"{stats.dropped_stale_fixes} too late to be sent" if stats.dropped_stale_fixes else ""
-        withheld = f"{stats.withheld_fixes} withheld for want of answers" if stats.withheld_fixes else ""
-        foreign = f"{stats.foreign_messages} foreign messages refused" if stats.foreign_messages else ""
-        return ", ".join(filter(None, (sent, refused, unanswered, held, late, withheld, foreign)))
+        counts = (
+            (sum(stats.acks.values()) - stats.acks.get("ACCEPTED", 0), f"refused ({stats.refused_why})"),
+            (stats.unanswered_fixes, "unanswered"),
+            (self._held, "held back"),
+            (stats.dropped_stale_fixes, "too late to be sent"),
+            (stats.withheld_fixes, "withheld for want of answers"),
+            (stats.foreign_messages, "foreign messages refused"),
+        )
+        return ", ".join([sent, *(f"{count} {what}" for count, what in counts if count)])
 
     def state(self) -> LinkState:
         """Return the state of the link, of the autopilot's answers and of the navigation."""
@@ -120,7 +109,7 @@ class ToAutopilot:
             for query, sending in settled:
                 self._unanswered.remove((query, sending))
                 outcome = sending.outcome
-                latency_s = outcome and outcome.latency_s
+                latency_s = outcome.latency_s if outcome else None
                 self._herald.note(
                     "answer",
                     query=query,
@@ -130,11 +119,6 @@ class ToAutopilot:
                     latency_ms=None if latency_s is None else round(latency_s * 1e3, 1),
                     t_sent_s=sending.t_sent_s,
                 )
-
-    def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
-        """Return the autopilot's last report of its vehicle, with the attitude at the time of a frame; None where it
-        has given no position."""
-        return self._link.vehicle_at(t_mono_s)
 
     def told(self, event: Recognition, used_mah: float) -> Recognition:
         """Tell the autopilot of an event; return the event with reports of its fix and of the fix before it.
@@ -148,19 +132,18 @@ class ToAutopilot:
         if sending:
             if is_heard:
                 sending.wait(_SETTLED_WITHIN_S)
-            self._last = _name(event), sending
+            self._last = event.name, sending
         with self._link.turn("told of its fix"):
             if sending:
                 if sending.sent is not False:  # else it has no answer, as the line of its query says
-                    self._unanswered.append(self._last)
-                fix = _reported(*self._last)
+                    self._unanswered.append((event.name, sending))
+                fix = _reported(event.name, sending)
             self._tell(event, used_mah)
         return replace(event, fix=fix, last_fix=last)
 
     def _tell(self, event: Recognition, used_mah: float) -> None:
         now_s = self._clock.mono_s()
-        if event.accepted:
-            best = event.best
+        if event.accepted and (best := event.best):
             match = messages.place_match(now_s, best.place.place_id, best.match.score, confidence_of(event))
             self._link.send(*match)
         if event.is_query:
@@ -172,14 +155,6 @@ class ToAutopilot:
         with self._link.turn("gps"):
             self._link.send(messages.gps_distance(self._clock.mono_s(), off_m))
             self._navigator.believe_gps(not is_wrong)
-
-    def wishes(self) -> tuple[Wished, ...]:
-        """Return the wishes of the ground since the last call."""
-        return self._link.take_wishes()
-
-    def offer(self, wishes: Collection[Wish]) -> None:
-        """Set the wishes that can be fulfilled from now on."""
-        self._link.offer(wishes)
 
     def report(self, health: messages.Health, load: MachineLoad, temperature_c: float | None) -> None:
         """Report the state of this companion computer, once a second, and ask for other sources where that is due."""
@@ -203,12 +178,10 @@ class ToAutopilot:
 
     def _fixed(self, event: Recognition) -> tuple[FixReport | None, Sending | None]:
         """Send the fix of an accepted match, if it has one; return its sending, or the report that there is none."""
-        if event.position is None:
-            return _unsent(event, "the place has no position"), None
         try:
             advice = self._navigator.advise(event, self._clock.mono_s())
         except ValueError as error:  # another program wrote an invalid position
-            _log.warning("place %d: %s; no fix is sent", event.best.place.place_id, error)
+            _log.warning("%s: %s; no fix is sent", event.name, error)
             return _unsent(event, str(error)), None
         self._say_held(advice.why if advice.is_held else None)
         if advice.fix is None or not self._send_fixes:
@@ -271,7 +244,7 @@ def _reported(query: str, sending: Sending) -> FixReport:
 
 
 def _unsent(event: Recognition, why: str) -> FixReport:
-    return FixReport(query=_name(event), sent=False, why=why)
+    return FixReport(query=event.name, sent=False, why=why)
 
 
 def confidence_of(event: Recognition) -> float | None:
@@ -279,7 +252,3 @@ def confidence_of(event: Recognition) -> float | None:
     if event.confidence is None:
         return None
     return max(event.confidence, event.followed.confidence if event.followed else 0.0)
-
-
-def _name(event: Recognition) -> str:
-    return event.frame.name

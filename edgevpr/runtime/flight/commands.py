@@ -18,7 +18,7 @@ class Commands:
 
     def __init__(self, crew: Crew) -> None:
         self.is_paused = False
-        self._autopilot, self._herald, self._learner = crew.autopilot, crew.herald, crew.learner
+        self._link, self._herald, self._learner = crew.link, crew.herald, crew.learner
 
     @property
     def summary(self) -> str | None:
@@ -28,10 +28,12 @@ class Commands:
 
     def obey(self) -> None:
         """Fulfil the wishes since the last call, and say which ones can be fulfilled from now on."""
-        for wished in self._autopilot.wishes():
+        if self._link is None:
+            return
+        for wished in self._link.take_wishes():
             self._fulfil(wished)
         can_learn = self._learner is not None and self._learner.trouble is None
-        self._autopilot.offer(tuple(Wish) if can_learn else (Wish.PAUSE, Wish.RESUME))
+        self._link.offer(tuple(Wish) if can_learn else (Wish.PAUSE, Wish.RESUME))
 
     def _fulfil(self, wished: Wished) -> None:
         before = self.summary

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgevpr.core.arrays import Floats
+from edgevpr.core.arrays import Doubles
 from edgevpr.runtime.flight.navigation import ExpectedFix
 from edgevpr.runtime.recognise.locate import in_sd
 
@@ -27,9 +27,9 @@ class SeenFix:
     """A fix: `off_m` (2,) east and north from the point `path_m` (2,) of the path to it, its covariance (2, 2), the
     time of its frame, and the places that it comes from."""
 
-    off_m: Floats
-    covariance_m2: Floats
-    path_m: Floats
+    off_m: Doubles
+    covariance_m2: Doubles
+    path_m: Doubles
     t_s: float
     places: Collection[int]
 
@@ -86,7 +86,7 @@ def _is_independent(one: SeenFix, other: SeenFix) -> bool:
     return in_sd(other.path_m - one.path_m, _of_both(one, other)) > _CONTRADICTS
 
 
-def _of_both(one: SeenFix, other: SeenFix) -> Floats:
+def _of_both(one: SeenFix, other: SeenFix) -> Doubles:
     drift_m = _DRIFT_M_S * abs(other.t_s - one.t_s)
-    both: Floats = one.covariance_m2 + other.covariance_m2 + drift_m**2 * np.eye(2)
+    both: Doubles = one.covariance_m2 + other.covariance_m2 + drift_m**2 * np.eye(2)
     return both

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgevpr.core.arrays import Floats
+from edgevpr.core.arrays import Doubles
 
 _C, _S, _B, _M = (slice(first, first + 2) for first in (0, 2, 4, 6))
 _EYE = np.eye(2)
@@ -47,7 +47,7 @@ class DriftFilter:
         self._drift, self._map_sd_m = drift, map_sd_m
         self._x, self._p = np.zeros(8), np.zeros((8, 8))
 
-    def start(self, offset_m: Floats, sd_m: float, velocity_sd_m_s: float) -> None:
+    def start(self, offset_m: Doubles, sd_m: float, velocity_sd_m_s: float) -> None:
         """Begin `offset_m` (2,) beside the path, with standard deviations of one axis of that and of the velocity."""
         self._x = np.zeros(8)
         self._x[_C] = offset_m
@@ -69,30 +69,30 @@ class DriftFilter:
         """Note that from now on nothing holds the velocity of the path any more."""
         self._p[_S, _S] += self._drift.velocity_sd**2 * _EYE
 
-    def hear_gps(self, off_m: Floats, sd_m: float, off_m_s: Floats, velocity_sd_m_s: float) -> None:
+    def hear_gps(self, off_m: Doubles, sd_m: float, off_m_s: Doubles, velocity_sd_m_s: float) -> None:
         """Take in that GPS lies `off_m` (2,) beside the path and is `off_m_s` (2,) faster than it."""
         look = np.zeros((4, 8))
         look[:2, _C] = look[2:, _S] = _EYE
         self._correct(look, np.concatenate([off_m, off_m_s]), np.diag([sd_m**2] * 2 + [velocity_sd_m_s**2] * 2))
 
-    def hear_fix(self, off_m: Floats, covariance_m2: Floats, age_s: float) -> None:
+    def hear_fix(self, off_m: Doubles, covariance_m2: Doubles, age_s: float) -> None:
         """Take in a fix that lay `off_m` (2,) beside the path `age_s` seconds ago, with a covariance (2, 2)."""
         self._correct(_seen(age_s), off_m, covariance_m2)
 
-    def trust_fix(self, off_m: Floats, covariance_m2: Floats, age_s: float) -> None:
+    def trust_fix(self, off_m: Doubles, covariance_m2: Doubles, age_s: float) -> None:
         """Take in a fix that is believed although it contradicts: what was known of the position is forgotten."""
         self._p[_C] = self._p[:, _C] = 0.0
         self._p[_C, _C] = 1e6 * _EYE
         self._p[_S, _S] += self._drift.velocity_sd**2 * _EYE
         self.hear_fix(off_m, covariance_m2, age_s)
 
-    def expected_fix(self, age_s: float) -> tuple[Floats, Floats]:
+    def expected_fix(self, age_s: float) -> tuple[Doubles, Doubles]:
         """Return by how much a fix of so many seconds ago is expected to lie beside the path (2,), and the covariance
         (2, 2) of that, without the fix's own."""
         look = _seen(age_s)
         return look @ self._x, look @ self._p @ look.T
 
-    def errors(self, age_s: float) -> tuple[Floats, Floats, Floats]:
+    def errors(self, age_s: float) -> tuple[Doubles, Doubles, Doubles]:
         """Return the errors of the path so many seconds ago (negative: in so many): metres (2,), m/s (2,), and the
         covariance (4, 4) of both."""
         look = np.zeros((4, 8))
@@ -102,13 +102,13 @@ class DriftFilter:
         off = look @ self._x
         return off[:2], off[2:], look @ self._p @ look.T
 
-    def _correct(self, look: Floats, seen: Floats, covariance: Floats) -> None:
+    def _correct(self, look: Doubles, seen: Doubles, covariance: Doubles) -> None:
         gain = np.linalg.solve(look @ self._p @ look.T + covariance, look @ self._p).T
         self._x = self._x + gain @ (seen - look @ self._x)
         kept = np.eye(8) - gain @ look
         self._p = kept @ self._p @ kept.T + gain @ covariance @ gain.T  # Joseph's form: it stays a covariance
 
 
-def _seen(age_s: float) -> Floats:
+def _seen(age_s: float) -> Doubles:
     """Return what a fix of so many seconds ago sees of the state (2, 8)."""
     return np.hstack([_EYE, -age_s * _EYE, age_s**2 / 2 * _EYE, _EYE])

@@ -13,10 +13,9 @@ from typing import Any
 
 from edgevpr.core.config import Config, MavlinkConfig
 from edgevpr.core.errors import ImageError
-from edgevpr.core.types import Position
+from edgevpr.core.types import Frame, Position
 from edgevpr.mavlink.address import parse_links
 from edgevpr.mavlink.conversation import LinkSettings
-from edgevpr.mavlink.groundlink import GroundLink
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Severity
 from edgevpr.places.mapfile import PlaceMap
@@ -30,7 +29,7 @@ from edgevpr.runtime.flight.governor import Governing
 from edgevpr.runtime.flight.herald import Herald
 from edgevpr.runtime.flight.metering import meter_of_flight
 from edgevpr.runtime.flight.navigator import Muted, Navigator
-from edgevpr.runtime.flight.reloading import reload
+from edgevpr.runtime.flight.reloading import Reread, reload
 from edgevpr.runtime.flight.vitals import Vitals
 from edgevpr.runtime.flight.watching import GpsWatch, MapWatch, Sight, Tally
 from edgevpr.runtime.flight.world import Crew, StopNow, World, signals
@@ -164,8 +163,8 @@ class Flight:
         source, clock, meter = self._crew.source, self._crew.clock, self._crew.meter
         self._vitals.beat()
         self._commands.obey()
-        if self._crew.reread and self._crew.reread.take():
-            self._reload()
+        if (reread := self._crew.reread) and reread.take():
+            self._reload(reread)
         if (wait_s := self._pace.wait_s()) > 0:
             clock.sleep(min(wait_s, _TURN_S))
             return
@@ -173,22 +172,21 @@ class Flight:
             self._pass_over()
             self._pace.taken()
             return
-        frame = problem = None
         with meter.reading_frame(source.is_live) as reading:
             try:
-                frame = source.read(_TURN_S)
+                frame: Frame | ImageError | None = source.read(_TURN_S)
             except ImageError as error:
-                problem = error
-        if frame is None and problem is None:
+                frame = error
+        if frame is None:
             return
         self._pace.taken()
-        recogniser, autopilot = self._crew.recogniser, self._crew.autopilot
+        recogniser, link = self._crew.recogniser, self._crew.link
         with meter.working():
             with self._crew.stop.breaks_off():
-                if problem:
-                    event = recogniser.unread(problem)
+                if isinstance(frame, ImageError):
+                    event = recogniser.unread(frame)
                 else:
-                    event = recogniser.step(frame, autopilot.vehicle_at(frame.t_mono_s))
+                    event = recogniser.step(frame, link.vehicle_at(frame.t_mono_s) if link else None)
             self._tell(replace(event, steps=replace(event.steps, read=reading.cost)))
         self._governing.look()  # here, so that each reading covers a whole number of queries
 
@@ -219,7 +217,7 @@ class Flight:
 
     def _log_event(self, event: Recognition) -> None:
         """Write the line of an event: of kind "query", or "unusable" for a frame that never became a query."""
-        if not event.is_query:
+        if event.frame is None or not event.is_query:
             self._crew.flight_log.write("unusable", problem=event.reason)
             return
         self._crew.flight_log.write(
@@ -246,15 +244,15 @@ class Flight:
             self._crew.flight_log.write(
                 "learnt",
                 place=place.place_id,
-                query=event.frame.name,
-                position=asdict(place.position),
+                query=event.name,
+                position=place.position and asdict(place.position),
                 quality=place.quality,
             )
         if well and learner.trouble:
             _say_learning_stopped(self._crew.herald, learner.trouble)
 
-    def _reload(self) -> None:
-        config = reload(self._crew.reread, self._config, self._crew.flight_log)
+    def _reload(self, reread: Reread) -> None:
+        config = reload(reread, self._config, self._crew.flight_log)
         if config != self._config:
             self._config = config
             self._governing.ask_rate(rate_hz(config, self._crew.recogniser))
@@ -289,7 +287,7 @@ class Flight:
 
 def open_links(
     settings: MavlinkConfig, world: World, navigator: Navigator, place_map: PlaceMap, stack: ExitStack
-) -> tuple[Link | None, GroundLink | None]:
+) -> tuple[Link | None, Link | None]:
     """Open the link to the flight controller and the one to the ground, None where there is none."""
     address, ground_address = parse_links(settings.link, settings.ground)
     if address is None:

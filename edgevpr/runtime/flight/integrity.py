@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgevpr.core.arrays import Floats
+from edgevpr.core.arrays import Doubles
 from edgevpr.core.geodesy import offset_m
 from edgevpr.core.types import Receiver, Vehicle
 from edgevpr.runtime.flight.navigation import Sighting, sighting_of, worst_sd
@@ -29,7 +29,7 @@ class _Against:
 
     t_s: float
     places: Collection[int]
-    off_m: Floats
+    off_m: Doubles
 
 
 class Integrity:
@@ -82,11 +82,11 @@ class Integrity:
         return math.hypot(of_fix_m, self._map_sd_m, gps.sd_m, tilt_m, _TIME_SD_S * speed_m_s)
 
 
-def _beside(seen: Sighting, vehicle: Vehicle, gps: Receiver) -> Floats:
+def _beside(seen: Sighting, vehicle: Vehicle, gps: Receiver) -> Doubles:
     """Return the step (2,), metres, from the receiver's position at the time of the frame to the match."""
     here = seen.position
     off_m = np.array(offset_m(gps.lat_deg, gps.lon_deg, here.lat_deg, here.lon_deg))
-    flown_m: Floats = (seen.t_s - gps.t_s) * np.array(vehicle.velocity_m_s or (0.0, 0.0))
+    flown_m: Doubles = (seen.t_s - gps.t_s) * np.array(vehicle.velocity_m_s or (0.0, 0.0))
     return off_m - flown_m
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgevpr.core.arrays import Floats
+from edgevpr.core.arrays import Doubles
 from edgevpr.core.geodesy import moved
 from edgevpr.core.types import Position, Vehicle
 from edgevpr.runtime.flight.filter import INERTIAL, RECKONED, Drift, DriftFilter
@@ -39,10 +39,10 @@ class ExpectedFix:
     """A fix as the navigation expects it: metres (2,) beside the path, with their covariance (2, 2), without that of
     the fix; the point of the path, metres (2,); and by how many metres (2,) the fix itself lies beside that."""
 
-    off_m: Floats
-    covariance_m2: Floats
-    path_m: Floats
-    beside_m: Floats
+    off_m: Doubles
+    covariance_m2: Doubles
+    path_m: Doubles
+    beside_m: Doubles
 
 
 class Navigation:
@@ -90,7 +90,7 @@ class Navigation:
             sd_m = _GPS_ALIKE * (vehicle.position_sd_m or _UNKNOWN_M)
             self._filter.hear_gps(off_m, sd_m, velocity_m_s - there.velocity_m_s, _GPS_VELOCITY_SD)
 
-    def hear_acceleration(self, t_s: float, acceleration_m_s2: Floats) -> None:
+    def hear_acceleration(self, t_s: float, acceleration_m_s2: Doubles) -> None:
         """Take in a mean acceleration (2,) over the ground since the last one."""
         if (path := self._unbroken) and self._drift is INERTIAL:
             self._filter.go_on(path.accelerate(t_s, acceleration_m_s2))
@@ -106,7 +106,7 @@ class Navigation:
         beside_m = path.from_origin(position.lat_deg, position.lon_deg) - there.at_m
         return ExpectedFix(off_m, covariance_m2, there.at_m, beside_m)
 
-    def hear_fix(self, off_m: Floats, covariance_m2: Floats, t_s: float, is_against: bool = False) -> None:
+    def hear_fix(self, off_m: Doubles, covariance_m2: Doubles, t_s: float, is_against: bool = False) -> None:
         """Take in a fix that lies `off_m` (2,) beside the path, of a frame taken at `t_s`, with its covariance (2, 2).
         `is_against`: it contradicts what was believed, and is believed all the same."""
         if self._path:
@@ -145,7 +145,9 @@ class Navigation:
         _, off_m_s, _ = self._filter.errors(0.0)
         return float(off_m_s[0]), float(off_m_s[1])
 
-    def _start(self, position: Position, sd_m: float, velocity_m_s: Floats, t_s: float, velocity_sd_m_s: float) -> None:
+    def _start(
+        self, position: Position, sd_m: float, velocity_m_s: Doubles, t_s: float, velocity_sd_m_s: float
+    ) -> None:
         self._path = Path(position, t_s, velocity_m_s)
         self._filter.start(np.zeros(2), sd_m, velocity_sd_m_s)
 
@@ -159,7 +161,7 @@ def reckons_by_gps(vehicle: Vehicle) -> bool:
     return vehicle.has_gps and vehicle.gps is not None and vehicle.t_heard_s - vehicle.gps.t_s <= _GPS_NEW_S
 
 
-def worst_sd(covariance: Floats) -> float:
+def worst_sd(covariance: Doubles) -> float:
     """Return the standard deviation along the worst direction of a covariance (2, 2)."""
     return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
 
@@ -172,7 +174,7 @@ class Sighting:
     t_s: float
     position: Position
     accuracy_m: float
-    covariance_m2: Floats
+    covariance_m2: Doubles
     places: tuple[int, ...]
 
 

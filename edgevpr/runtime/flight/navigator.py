@@ -10,7 +10,7 @@ from threading import Lock
 
 import numpy as np
 
-from edgevpr.core.arrays import Floats
+from edgevpr.core.arrays import Doubles
 from edgevpr.core.geodesy import distance_m, moved, offset_m
 from edgevpr.core.types import Vehicle
 from edgevpr.mavlink.channel import Channel
@@ -260,7 +260,7 @@ def _in_radians(attitude: Attitude) -> tuple[float, float, float]:
     return math.radians(attitude.roll_deg), math.radians(attitude.pitch_deg), math.radians(attitude.yaw_deg)
 
 
-def _covariance(seen: Sighting, vehicle: Vehicle) -> Floats:
+def _covariance(seen: Sighting, vehicle: Vehicle) -> Doubles:
     """Return the covariance (2, 2) of a fix, without what all fixes of the map have in common."""
     speed_m_s = math.hypot(*(vehicle.velocity_m_s or (0.0, 0.0)))
     height_m = vehicle.height_m or 0.0

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgevpr.core.arrays import Floats
+from edgevpr.core.arrays import Doubles
 from edgevpr.core.geodesy import offset_m
 from edgevpr.core.types import Position
 
@@ -23,15 +23,15 @@ class Point:
     """A point of a path: time in seconds, metres and m/s, each (2,) east and north."""
 
     t_s: float
-    at_m: Floats
-    velocity_m_s: Floats
+    at_m: Doubles
+    velocity_m_s: Doubles
 
 
 class Path:
     """The points of the last seconds of a way that began at `origin`, at a velocity (2,); the last one is `now`.
     `is_broken` tells that there was a silence in it."""
 
-    def __init__(self, origin: Position, t_s: float, velocity_m_s: Floats) -> None:
+    def __init__(self, origin: Position, t_s: float, velocity_m_s: Doubles) -> None:
         self.origin, self.is_broken = origin, False
         self._points = [Point(t_s, np.zeros(2), np.asarray(velocity_m_s, float))]
 
@@ -40,11 +40,11 @@ class Path:
         """The newest point."""
         return self._points[-1]
 
-    def from_origin(self, lat_deg: float, lon_deg: float) -> Floats:
+    def from_origin(self, lat_deg: float, lon_deg: float) -> Doubles:
         """Return the metres (2,) from the origin to a place on the Earth."""
         return np.array(offset_m(self.origin.lat_deg, self.origin.lon_deg, lat_deg, lon_deg))
 
-    def fly(self, t_s: float, velocity_m_s: Floats) -> float:
+    def fly(self, t_s: float, velocity_m_s: Doubles) -> float:
         """Go on to a time at which the velocity (2,) is this one, and return the seconds that it took; 0 for a time
         that is not later."""
         last = self._points[-1]
@@ -59,7 +59,7 @@ class Path:
             del self._points[: bisect_left(self._points, t_s - KEPT_S, key=_time)]
         return step_s
 
-    def accelerate(self, t_s: float, acceleration_m_s2: Floats) -> float:
+    def accelerate(self, t_s: float, acceleration_m_s2: Doubles) -> float:
         """Go on to a time with a mean acceleration (2,) over the ground, and return the seconds that it took."""
         last = self._points[-1]
         return self.fly(t_s, last.velocity_m_s + max(0.0, t_s - last.t_s) * np.asarray(acceleration_m_s2, float))
@@ -83,7 +83,7 @@ class Path:
         return Point(t_s, at_m, velocity_m_s)
 
 
-def over_ground(force_m_s2: tuple[float, float, float], roll_deg: float, pitch_deg: float, yaw_deg: float) -> Floats:
+def over_ground(force_m_s2: tuple[float, float, float], roll_deg: float, pitch_deg: float, yaw_deg: float) -> Doubles:
     """Return the acceleration over the ground (2,), east and north, from what accelerometers feel (nose, right, down)
     at an attitude: gravity has no part in it."""
     roll, pitch, yaw = map(math.radians, (roll_deg, pitch_deg, yaw_deg))

@@ -204,8 +204,8 @@ def recordings(folder: Path) -> list[Path]:
 
 def _new_folder(folder: Path) -> Path:
     while True:
-        last = [int(_FOLDER.fullmatch(each.name)[1]) for each in recordings(folder)[-1:]]
-        path = folder / f"flight-{(last or [0])[0] + 1:04d}"
+        last = max((int(each.name.rpartition("-")[2]) for each in recordings(folder)), default=0)
+        path = folder / f"flight-{last + 1:04d}"
         with suppress(FileExistsError):  # another flight that has begun meanwhile has it
             path.mkdir(mode=0o750)
             return path

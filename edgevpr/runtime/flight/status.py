@@ -19,7 +19,7 @@ _MODE = 0o660  # positions are nobody else's, and the group of the flight may lo
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Seen:
+class SeenQuery:
     """A query and the place found for it. `age_s` is the time since its frame was taken. `place`, `reference_image` and
     `score` are None where no place was found, `confidence` where the technique has none, and the position and its
     `accuracy_m` where no match with a position was accepted."""
@@ -87,8 +87,8 @@ class Status:
     used_mah: float
     temperature_c: float | None
     throttled: bool | None
-    newest: Seen | None
-    match: Seen | None
+    newest: SeenQuery | None
+    match: SeenQuery | None
     link: LinkState | None
     remarks: list[str]
 

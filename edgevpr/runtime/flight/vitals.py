@@ -14,7 +14,7 @@ from edgevpr.runtime.flight.autopilot import confidence_of
 from edgevpr.runtime.flight.clock import Pace
 from edgevpr.runtime.flight.commands import Commands
 from edgevpr.runtime.flight.herald import Trouble
-from edgevpr.runtime.flight.status import Seen, Status
+from edgevpr.runtime.flight.status import SeenQuery, Status
 from edgevpr.runtime.flight.watching import FAILURES_IN_A_ROW, Tally
 from edgevpr.runtime.flight.world import Crew
 from edgevpr.runtime.recognise.recognition import Recognition
@@ -40,14 +40,14 @@ class Vitals:
         failing = f"{FAILURES_IN_A_ROW} frames in a row have failed"
         self._failing = Trouble(crew.herald, "failing", failing, "frames are recognised again")
         self._blind = Trouble(crew.herald, "camera", "camera shows nothing", "camera shows ground again")
-        self._newest: Seen | None = None
-        self._match: Seen | None = None
+        self._newest: SeenQuery | None = None
+        self._match: SeenQuery | None = None
         self._newest_s = self._match_s = 0.0
         self._looks: deque[tuple[float, int, float]] = deque(maxlen=_WINDOW + 1)
 
     def tell(self, event: Recognition) -> None:
         """Take note of an event."""
-        if not event.is_query:
+        if event.frame is None or not event.is_query:
             return
         self._newest, self._newest_s = _seen(event), event.frame.t_mono_s
         if event.accepted:
@@ -151,18 +151,18 @@ class Vitals:
         return (self._tally.queries - queries) / span_s, (cpu_s - begin_cpu_s) / span_s
 
 
-def _seen(event: Recognition) -> Seen:
-    place = event.best and event.best.place
-    return Seen(
-        query=event.frame.name,
+def _seen(event: Recognition) -> SeenQuery:
+    best, here = event.best, event.position
+    return SeenQuery(
+        query=event.name,
         age_s=0.0,
         accepted=event.accepted,
         reason=event.reason,
-        place=place and place.place_id,
-        reference_image=place and place.source_image,
-        score=event.best and event.best.match.score,
+        place=best.place.place_id if best else None,
+        reference_image=best.place.source_image if best else None,
+        score=best.match.score if best else None,
         confidence=confidence_of(event),
-        lat_deg=event.position and event.position.lat_deg,
-        lon_deg=event.position and event.position.lon_deg,
+        lat_deg=here.lat_deg if here else None,
+        lon_deg=here.lon_deg if here else None,
         accuracy_m=event.accuracy_m,
     )

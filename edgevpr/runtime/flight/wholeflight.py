@@ -102,8 +102,8 @@ def _stretches(path: Path) -> list[Stretch]:
     with open(path, "rb") as handle:
         for line in handle:
             # Of the many lines after the first only start lines matter.
-            record = record_of(line) if not begins or b'"start"' in line else None
-            kind = record.get("kind") if record else None
+            record = (record_of(line) if not begins or b'"start"' in line else None) or {}
+            kind = record.get("kind")
             if kind == "start":
                 if not begins or not record.get("repeated") or _flight(record) != _flight(begins[-1][1]):
                     begins.append((end, record, set()))

@@ -111,7 +111,7 @@ class Crew:
     learner: Learner | None = None
     source: Source
     link: Link | None = None
-    ground: GroundLink | None = None
+    ground: Link | None = None
     autopilot: Autopilot
     flight_log: FlightLog
     herald: Herald

@@ -76,6 +76,11 @@ class Recognition:
         return self.located and self.located.position
 
     @property
+    def name(self) -> str:
+        """Name of the frame, "" where there is none."""
+        return self.frame.name if self.frame else ""
+
+    @property
     def is_query(self) -> bool:
         """True where the frame became a query: it could be read and encoded."""
         return self.descriptor is not None
