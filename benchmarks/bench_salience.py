@@ -28,9 +28,10 @@ from edgevpr.core.types import Salience
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.lab.evaluate import metrics
 from edgevpr.lab.evaluate.dataset import Dataset
-from edgevpr.runtime.recognise.detector import Detector, open_detector
-from edgevpr.runtime.recognise.memorability import Memorability, open_memorability
+from edgevpr.runtime.recognise.detector import Detector
+from edgevpr.runtime.recognise.memorability import Memorability
 from edgevpr.runtime.recognise.salience_gate import Thresholds, maps_of, scores_of, worth_of
+from edgevpr.techniques.card import load_card
 
 TECHNIQUES = ("hog", "cohog", "calc", "netvlad")
 FULL = Thresholds(0.3, 0.6, 0.4)
@@ -70,11 +71,11 @@ def main() -> None:
         there = [name for name in detectors.NAMES if detectors.is_there(name)]
         for name in there:
             detectors.write_card(name, Path(temporary))
-        detector = open_detector(DETECTOR) if DETECTOR in there else None
+        detector = Detector(load_card(DETECTOR)) if DETECTOR in there else None
         speed = speeds(f"without_{folders[0].name}", there)
         rows = []
         for folder in folders:
-            memorability = open_memorability(f"without_{folder.name}")
+            memorability = Memorability(load_card(f"without_{folder.name}"))
             dataset = walks.dataset_of(folder)
             queries = [each.path for each in dataset.queries]
             places = list_images(folder / "ref")
@@ -106,8 +107,8 @@ def fit_each(names: list[str], models: Path) -> dict[str, dict[str, dict[str, fl
 def speeds(network: str, there: list[str]) -> dict[str, float]:
     """Return the median milliseconds of a frame of 640x480, one thread."""
     picture = cv2.resize(read_image(list_images(DATA / "aerial_swindale" / "ref")[0]), (640, 480))
-    memorability = open_memorability(network)
-    found = {name: open_detector(name) for name in there}
+    memorability = Memorability(load_card(network))
+    found = {name: Detector(load_card(name)) for name in there}
     ways = {
         "entropy": lambda: scores_of(maps_of(picture, None, None)),
         "entropy and memorability": lambda: scores_of(maps_of(picture, memorability, None)),

@@ -13,9 +13,10 @@ from edgevpr.core.text import progress
 from edgevpr.frames.images import cv2, list_images, read_image
 from edgevpr.lab.evaluate import metrics
 from edgevpr.lab.evaluate.dataset import Dataset
-from edgevpr.runtime.recognise.detector import Detector, open_detector
-from edgevpr.runtime.recognise.memorability import Memorability, open_memorability
+from edgevpr.runtime.recognise.detector import Detector
+from edgevpr.runtime.recognise.memorability import Memorability
 from edgevpr.runtime.recognise.salience_gate import maps_of, scores_of
+from edgevpr.techniques.card import load_card
 from edgevpr.techniques.entropy import filled_bins
 
 STEPS = tuple(round(0.05 * step, 2) for step in range(21))
@@ -32,8 +33,8 @@ def networks(cards: Path) -> tuple[Memorability, Detector | None]:
     detector = None
     if detectors.is_there(DETECTOR):
         detectors.write_card(DETECTOR, cards)
-        detector = open_detector(DETECTOR)
-    return open_memorability("matchability"), detector
+        detector = Detector(load_card(DETECTOR))
+    return Memorability(load_card("matchability")), detector
 
 
 def thresholds(name: str, dataset: Dataset, memorability: Memorability, detector: Detector | None) -> dict:

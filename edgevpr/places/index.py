@@ -5,11 +5,12 @@ An index may take new places while it is in use (`GrowingIndex`): when its array
 
 import logging
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 
 import numpy as np
 
+from edgevpr.core.arrays import Array, Bools, Doubles, Ints, LatLon, Singles
 from edgevpr.core.contract import Technique, TechniqueSpec
 from edgevpr.core.errors import MapError
 from edgevpr.core.geodesy import distance_m
@@ -22,7 +23,7 @@ _BYTES_BESIDE_ROW = 8 + 8 + 8 + 2  # id, latitude, longitude, heading
 _PACKED_AT_ONCE = 32
 _MOVED_AT_ONCE = 256
 
-CoarsePart = tuple[int, tuple[float, float] | None, float | None, np.ndarray]  # of `PlaceMap.coarse_parts`
+CoarsePart = tuple[int, LatLon | None, float | None, Array]  # of `PlaceMap.coarse_parts`
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,26 +36,20 @@ class PlaceIndex:
     `mean` is the mean of the coarse parts, None for a technique that does not pack them.
     """
 
-    place_ids: np.ndarray
-    lat_deg: np.ndarray
-    lon_deg: np.ndarray
-    heading_deg: np.ndarray
-    rows: np.ndarray
-    mean: np.ndarray | None
+    place_ids: Ints
+    lat_deg: Doubles
+    lon_deg: Doubles
+    heading_deg: Array
+    rows: Array
+    mean: Singles | None
 
     def __len__(self) -> int:
         return len(self.place_ids)
 
     @property
-    def arrays(self) -> dict[str, np.ndarray]:
+    def arrays(self) -> dict[str, Array]:
         """The arrays with one entry a place, by name."""
-        return {
-            "place_ids": self.place_ids,
-            "lat_deg": self.lat_deg,
-            "lon_deg": self.lon_deg,
-            "heading_deg": self.heading_deg,
-            "rows": self.rows,
-        }
+        return {name: getattr(self, name) for name in ("place_ids", "lat_deg", "lon_deg", "heading_deg", "rows")}
 
     @property
     def nbytes(self) -> int:
@@ -67,11 +62,7 @@ class PlaceIndex:
 
     def first(self, count: int) -> "PlaceIndex":
         """Return the index of the first `count` places: the same arrays, seen in part."""
-        return self.part(0, count, self.mean)
-
-    def part(self, start: int, end: int, mean: np.ndarray | None) -> "PlaceIndex":
-        """Return the slots from `start` to `end` as an index with another mean: the same arrays, seen in part."""
-        return PlaceIndex(**{name: array[start:end] for name, array in self.arrays.items()}, mean=mean)
+        return replace(self, **{name: array[:count] for name, array in self.arrays.items()})
 
     def spacing_m(self) -> float | None:
         """Return the median distance in metres between places mapped one after the other; None where no such pair has
@@ -80,7 +71,7 @@ class PlaceIndex:
         known = away_m[~np.isnan(away_m)]
         return float(np.median(known)) if len(known) else None
 
-    def within(self, position: Position, radius_m: float) -> np.ndarray:
+    def within(self, position: Position, radius_m: float) -> Bools:
         """Tell which places are within `radius_m` metres of `position`, bool (N,); False for one without a position.
 
         The map file can be searched by area too. But 10 000 distances from these arrays take less than half a
@@ -95,11 +86,7 @@ def bytes_per_place(spec: TechniqueSpec) -> int:
 
 
 def load_index(
-    place_map: PlaceMap,
-    technique: Technique,
-    budget_bytes: int,
-    into: PlaceIndex | None = None,
-    beside_bytes: int = 0,
+    place_map: PlaceMap, technique: Technique, budget_bytes: int, into: PlaceIndex | None = None, beside_bytes: int = 0
 ) -> PlaceIndex:
     """Load the coarse parts of a map, packed by the technique, into new arrays or those of `into`; return the index of
     the places that were loaded.
@@ -113,15 +100,11 @@ def load_index(
     places, each = len(place_map), bytes_per_place(spec) + beside_bytes
     if not places:
         raise MapError(f"{place_map.path} holds no place yet: add some with `edgevpr map build --append`.")
-    capacity = min(places, budget_bytes // each)
-    if not capacity:
-        raise MapError(
-            f"{place_map.path}: a place takes {each} bytes in RAM and the budget is {budget_bytes}: raise --budget-mb."
-        )
+    capacity = _capacity(place_map, each, budget_bytes, places)
     if into is None:
         into = empty_index(spec, capacity, place_map.mean_coarse() if spec.packed else None)
     # Another program may have added places since they were counted: those are left out until the next load.
-    parts = islice(place_map.coarse_parts(), places)
+    parts: Iterator[CoarsePart] = islice(place_map.coarse_parts(), places)
     if capacity < places:
         _log.warning(
             f"{place_map.path} needs {places * each / 1e6:.1f} MB in RAM for its {places} places and the budget is "
@@ -145,7 +128,7 @@ def load_index(
     return into.first(loaded)
 
 
-def empty_index(spec: TechniqueSpec, capacity: int, mean: np.ndarray | None) -> PlaceIndex:
+def empty_index(spec: TechniqueSpec, capacity: int, mean: Singles | None) -> PlaceIndex:
     """Make arrays for `capacity` places. The system provides the memory of ids and rows only as they are written."""
     return PlaceIndex(
         place_ids=np.empty(capacity, np.int64),
@@ -166,7 +149,7 @@ def fill(index: PlaceIndex, parts: Iterator[CoarsePart], technique: Technique) -
     while block := list(islice(parts, min(_PACKED_AT_ONCE, len(index) - filled))):
         for at, (*_, coarse) in enumerate(block):
             waiting[at] = coarse
-        rows = technique.pack(waiting[: len(block)], index.mean) if spec.packed else waiting[: len(block)]
+        rows = waiting[: len(block)] if index.mean is None else technique.pack(waiting[: len(block)], index.mean)
         index.rows[filled : filled + len(block)] = rows
         for at, (place_id, point, heading_deg, _) in enumerate(block, start=filled):
             index.place_ids[at] = place_id
@@ -176,7 +159,17 @@ def fill(index: PlaceIndex, parts: Iterator[CoarsePart], technique: Technique) -
         yield filled
 
 
-def _outlines(place_map: PlaceMap, places: int) -> np.ndarray:
+def _capacity(place_map: PlaceMap, place_bytes: int, budget_bytes: int, wanted: int) -> int:
+    """Return how many places the budget holds, `wanted` at most. Raises MapError for none."""
+    if budget_bytes < place_bytes:
+        raise MapError(
+            f"{place_map.path}: a place takes {place_bytes} bytes in RAM and the budget is {budget_bytes}: "
+            "raise --budget-mb."
+        )
+    return min(wanted, budget_bytes // place_bytes)
+
+
+def _outlines(place_map: PlaceMap, places: int) -> Doubles:
     """Return id, lat_deg, lon_deg and quality of the first `places` places that can be read, float64 (4, N)."""
     columns = np.empty((4, places))
     count = 0
@@ -185,7 +178,7 @@ def _outlines(place_map: PlaceMap, places: int) -> np.ndarray:
     return columns[:, :count]
 
 
-def _holds(ascending: np.ndarray, number: int) -> bool:
+def _holds(ascending: Array, number: int) -> bool:
     at = int(np.searchsorted(ascending, number))
     return at < len(ascending) and ascending[at] == number
 
@@ -207,12 +200,7 @@ class GrowingIndex:
         """
         each = bytes_per_place(technique.spec) + beside_bytes
         self._in_file = len(place_map)
-        capacity = min(budget_bytes // each, self._in_file + room)
-        if not capacity:
-            raise MapError(
-                f"{place_map.path}: a place takes {each} bytes in RAM and the budget is {budget_bytes}: "
-                "raise --budget-mb."
-            )
+        capacity = _capacity(place_map, each, budget_bytes, self._in_file + room)
         self._map, self._technique = place_map, technique
         self._packs = technique.spec.packed is not None
         self._mean = place_map.mean_coarse() if self._packs else None
@@ -220,22 +208,20 @@ class GrowingIndex:
         self._slots = empty_index(technique.spec, capacity, self._mean)
         self._taken = 0
         if self._in_file:
-            free = self._slots.part(0, min(self._in_file, capacity), self._mean)
+            free = self._slots.first(min(self._in_file, capacity))
             loaded = load_index(place_map, technique, len(free) * each, into=free, beside_bytes=beside_bytes)
             self._taken = len(loaded)
 
     @property
     def index(self) -> PlaceIndex:
-        return self._slots.part(0, self._taken, self._mean)
+        return replace(self._slots.first(self._taken), mean=self._mean)
 
     @property
     def nbytes(self) -> int:
         """Bytes of all slots, taken or free: the index never takes more."""
         return self._slots.nbytes
 
-    def add(
-        self, place_id: int, position: Position | None, coarse: np.ndarray, heading_deg: float | None = None
-    ) -> None:
+    def add(self, place_id: int, position: Position | None, coarse: Array, heading_deg: float | None = None) -> None:
         """Add a place that `PlaceMap.add` has confirmed. Its id must be larger than all ids in the index.
 
         Raises MapError where the file cannot be read. The index can still be used after that: it holds the places
@@ -247,7 +233,7 @@ class GrowingIndex:
         slots.place_ids[at] = place_id
         slots.lat_deg[at], slots.lon_deg[at] = (position.lat_deg, position.lon_deg) if position else (np.nan, np.nan)
         slots.heading_deg[at] = np.nan if heading_deg is None else heading_deg
-        slots.rows[at] = self._technique.pack(coarse[None], self._mean)[0] if self._packs else coarse
+        slots.rows[at] = coarse if self._mean is None else self._technique.pack(coarse[None], self._mean)[0]
         self._taken += 1
         self._in_file += 1
         # Rows are packed as differences from the mean, and the first few places are a poor estimate of the mean.
@@ -277,7 +263,7 @@ class GrowingIndex:
         mean = self._map.mean_coarse()
         packed = 0
         try:
-            for written in fill(self._slots.part(0, self._taken, mean), self._held_parts(), self._technique):
+            for written in fill(replace(self.index, mean=mean), self._held_parts(), self._technique):
                 packed = written
         finally:
             if packed:  # rows packed with the old mean and with the new one must not be mixed

@@ -4,7 +4,7 @@ import fcntl
 import os
 import stat
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from edgevpr.core.errors import MapBusyError, MapError, UsageError
@@ -20,10 +20,9 @@ def beside(path: Path) -> list[Path]:
 def map_path(name: str | Path) -> Path:
     """Return the path of a map. Raises UsageError for a name that no file can have."""
     text = str(name)
-    try:
+    possible = False
+    with suppress(UnicodeEncodeError):
         possible = bool(Path(text).name) and b"\0" not in os.fsencode(text)
-    except UnicodeEncodeError:
-        possible = False
     if not possible:
         raise UsageError(f"{text!r} cannot be the name of a map: give the path of a file, e.g. valley.gpkg.")
     return Path(text)

@@ -326,12 +326,12 @@ def _largest(scores: Singles, count: int) -> Ints:
 
 def _unread(scores: Singles, readable: Bools, best: int) -> Ints:
     """Return the slots of the places left out that a query may show (see `Ranking`)."""
-    slots = np.flatnonzero(~readable)
+    slots: Ints = np.flatnonzero(~readable)
     if not len(slots):
         return slots
     likely = min(_LIKELY, len(scores))
     least = min(scores[best], np.partition(scores, -likely)[-likely])
-    return slots[scores[slots] >= least]
+    return np.asarray(slots[scores[slots] >= least])
 
 
 def _require_there(place_map: PlaceMap, index: PlaceIndex, slot: int, point: LatLon | None) -> None:

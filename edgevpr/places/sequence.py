@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from edgevpr.core.arrays import Bools, Floats, Singles
+from edgevpr.core.arrays import Bools, Floats, Ints, Singles
 from edgevpr.core.contract import TechniqueSpec
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.retrieve import Ranking
@@ -88,7 +88,7 @@ class SequenceSearch:
         row = np.full(len(index), usual, np.float32)
         row[ranking.slots] = ranking.scores
         self._rows.appendleft(row)
-        self._known = (len(index), zlib.crc32(index.place_ids))
+        self._known = (len(index), _checksum(index.place_ids))
 
         means = best_means(self._rows, self._trajectories)
         self.rivals = best_means(self._rows, self._other_trajectories)
@@ -129,7 +129,7 @@ class SequenceSearch:
         return (
             self._interval_s > max(_GAP_S, _USUAL_INTERVALS * usual_s)
             or len(index) < places
-            or zlib.crc32(index.place_ids[:places]) != checksum
+            or _checksum(index.place_ids[:places]) != checksum
         )
 
 
@@ -140,7 +140,12 @@ def trajectories(length: int, velocities: Floats) -> list[list[int]]:
     """
     # Halves go up, also where the product has a rounding error in its last bit.
     back = np.floor(velocities[:, None] * np.arange(length) + 0.5 + 1e-9).astype(int)
-    return np.unique(back, axis=0).tolist()
+    unique: list[list[int]] = np.unique(back, axis=0).tolist()
+    return unique
+
+
+def _checksum(place_ids: Ints) -> int:
+    return zlib.crc32(place_ids.data)
 
 
 def best_means(rows: Sequence[Singles], trajectories: Sequence[Sequence[int]]) -> Singles:

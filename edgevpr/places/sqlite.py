@@ -1,9 +1,8 @@
 """Opening and closing of a map file, and SQLite's errors turned into sentences for the user."""
 
 import sqlite3
-import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from edgevpr.core.errors import MapBusyError, MapError
@@ -14,6 +13,21 @@ WAIT_S = 5.0  # for another program that is writing
 # A statement on a table of a million places takes a tenth of this. A view, or a table that refers to itself, may never
 # end.
 _MOST_STEPS = 500_000_000
+
+# Words of SQLite, and what the user can do.
+_ADVICE = (
+    (("full",), "the disk is full: make room; every place confirmed so far is kept"),
+    (("not a database",), "this is not a place map: give a .gpkg file made by `edgevpr map build`"),
+    (("no such module",), "the SQLite of this Python lacks what learning needs ({said}): use the system's own Python"),
+    (
+        ("malformed", "no such", "unsupported file format"),
+        "the file is damaged or no place map ({said}): restore a copy or build it again",
+    ),
+    (("readonly",), "it may not be written: check its permissions and those of its folder"),
+    (("unable to open",), "it cannot be opened: check the path, and the permissions of the file and its folder"),
+    (("interrupted",), "reading its table of places does not end, so this is no place map: restore a copy"),
+)
+_ANY_ADVICE = "SQLite says: {said}: check the disk and its free space"
 
 
 def connect(path: Path, mode: str, options: str = "", wait_s: float = WAIT_S) -> sqlite3.Connection:
@@ -36,17 +50,6 @@ def connect(path: Path, mode: str, options: str = "", wait_s: float = WAIT_S) ->
     return db
 
 
-def wait_at_most(db: sqlite3.Connection, wait_s: float) -> None:
-    """Wait at most so long for another program that is writing."""
-    db.execute(f"PRAGMA busy_timeout = {round(1000 * wait_s)}")
-
-
-def most_bytes(db: sqlite3.Connection, row_bytes: int) -> None:
-    """Refuse to read any row that is larger, before it is in memory. Python 3.10 cannot ask SQLite for this."""
-    if sys.version_info >= (3, 11):
-        db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, row_bytes)
-
-
 def start_log(db: sqlite3.Connection) -> None:
     # A write-ahead log, synced at every commit: a confirmed place survives a power loss.
     db.execute("PRAGMA journal_mode = WAL")
@@ -55,22 +58,18 @@ def start_log(db: sqlite3.Connection) -> None:
 
 def settle(db: sqlite3.Connection) -> None:
     """Fold the write-ahead log into the file. The log stays where another program has the map open: no harm."""
-    try:
+    with suppress(sqlite3.Error):
         db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         db.execute("PRAGMA journal_mode = DELETE")
-    except sqlite3.Error:
-        pass
 
 
 def settle_left_log(path: Path) -> None:
     """Recover a map that was not closed (its log is beside it), where the file and its folder may be written."""
     if beside(path)[0].exists():
-        try:
+        with suppress(sqlite3.Error):  # a read-only medium: `connect_to_read` reads both as they are, or says why not
             db = connect(path, "rw")
             settle(db)
             db.close()
-        except sqlite3.Error:
-            pass  # a read-only medium: `connect_to_read` reads map and log as they are, or says what is wrong
 
 
 def connect_to_read(path: Path, wait_s: float = WAIT_S) -> sqlite3.Connection:
@@ -114,23 +113,8 @@ def sentences(path: Path) -> Iterator[None]:
             raise MapBusyError(
                 f"{path}: another program is writing to it: close that program and try again."
             ) from error
-        if "full" in said:
-            advice = "the disk is full: make room; every place confirmed so far is kept"
-        elif "not a database" in said:
-            advice = "this is not a place map: give a .gpkg file made by `edgevpr map build`"
-        elif "no such module" in said:
-            advice = f"the SQLite of this Python lacks what learning needs ({said}): use the system's own Python"
-        elif "malformed" in said or "no such" in said or "unsupported file format" in said:
-            advice = f"the file is damaged or no place map ({said}): restore a copy or build it again"
-        elif "readonly" in said:
-            advice = "it may not be written: check its permissions and those of its folder"
-        elif "unable to open" in said:
-            advice = "it cannot be opened: check the path, and the permissions of the file and its folder"
-        elif "interrupted" in said:
-            advice = "reading its table of places does not end, so this is no place map: restore a copy"
-        else:
-            advice = f"SQLite says: {said}: check the disk and its free space"
-        raise MapError(f"{path}: {advice}.") from error
+        advice = next((advice for words, advice in _ADVICE if any(word in said for word in words)), _ANY_ADVICE)
+        raise MapError(f"{path}: {advice.format(said=said)}.") from error
 
 
 def _text(raw: bytes) -> str | bytes:

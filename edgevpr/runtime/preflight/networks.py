@@ -21,8 +21,8 @@ from edgevpr.core.errors import EdgevprError, ModelError
 from edgevpr.core.files import own_models, read_file, write_whole
 from edgevpr.core.yamlfile import MAX_FILE_BYTES, read_yaml
 from edgevpr.power.machine import rss_mb
-from edgevpr.runtime.recognise.detector import detector_of
-from edgevpr.runtime.recognise.memorability import CROPS, memorability_of
+from edgevpr.runtime.recognise.detector import Detector
+from edgevpr.runtime.recognise.memorability import CROPS, Memorability
 from edgevpr.techniques.card import Card, card_names, load_card, read_card
 from edgevpr.techniques.session import Backbone, backbone_of, file_sha256, import_onnxruntime
 
@@ -111,9 +111,9 @@ def verify_here(card: Card, threads: int = 1, learned: bool = True) -> Verified:
     shapes = {output: backbone.shape for output, backbone in backbones.items()}
     runs: dict[str, Callable[[Image], object]] = {output: backbone.run for output, backbone in backbones.items()}
     if card.outputs.boxes:
-        runs["boxes"], shapes["boxes"] = detector_of(card, threads).is_static, _FRAME
+        runs["boxes"], shapes["boxes"] = Detector(card, threads).is_static, _FRAME
     if card.outputs.memorability:
-        runs["memorability"], shapes["memorability"] = memorability_of(card, threads).matrix, (CROPS, CROPS)
+        runs["memorability"], shapes["memorability"] = Memorability(card, threads).matrix, (CROPS, CROPS)
     if card.head is not None:
         runs.pop("descriptor", None)  # the head makes its own, of the feature map
     run = next(iter(runs.values()))

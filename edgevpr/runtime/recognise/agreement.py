@@ -178,13 +178,11 @@ def _factor(expected: Overlay) -> float:
 def _is_near(turn_scale: Any, shift: Any, expected: Overlay | None) -> Bools:
     """Tell which ways to lay the query on the place are near to what is expected, bool like `shift`."""
     if expected is None:
-        return (np.abs(turn_scale) >= _LEAST_SCALE) & (np.abs(turn_scale) <= _MOST_SCALE)
+        return np.asarray((np.abs(turn_scale) >= _LEAST_SCALE) & (np.abs(turn_scale) <= _MOST_SCALE))
     beside = turn_scale / _turn_scale(expected)
-    return (
-        (np.abs(np.angle(beside, deg=True)) <= _TURN_DEG)
-        & (np.abs(np.log(np.abs(beside))) <= np.log(_factor(expected)))
-        & (np.abs(shift - complex(*expected.shift_share)) <= _STEP)
-    )
+    turned, stretched = np.abs(np.angle(beside, deg=True)), np.abs(np.log(np.abs(beside)))
+    is_there = np.abs(shift - complex(*expected.shift_share)) <= _STEP
+    return np.asarray((turned <= _TURN_DEG) & (stretched <= np.log(_factor(expected))) & is_there)
 
 
 def _most_followed(asked: Array, known: Array, expected: Overlay | None) -> tuple[complex, complex] | None:

@@ -14,7 +14,7 @@ without history is believed as it stands. Three things keep a history from being
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -62,7 +62,7 @@ class Moved:
     reach: float
     elapsed_s: float
     by: Doubles | None = None
-    covariance: Doubles | None = None
+    covariance: Doubles = field(default_factory=lambda: np.zeros((2, 2)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -112,10 +112,6 @@ class Belief:
         self._lost, self._enters = 1.0, 1 - PRIOR_LOST
         self._now, self._strongest = no_hypotheses(), 0.0
 
-    @property
-    def nbytes(self) -> int:
-        return self._now.nbytes
-
     def update(self, proposed: Proposals | None, moved: Moved, places: int) -> Posterior:
         """Take what a query has seen (None: its picture says nothing), and how the aircraft has moved since the query
         before; `places` is how many the map has now.
@@ -142,9 +138,8 @@ class Belief:
             after = joined(replace(there, w=there.w * max(1.0, kept) ** staleness), unseen)
         share = after.w / (lost + float(after.w.sum()))
         p[numbers] = share[: len(numbers)]
-        kept = np.argsort(-share, kind="stable")[:MOST]
-        kept = kept[share[kept] > _FORGOTTEN]
-        self._now = replace(after, w=share)[kept]
+        strongest = np.argsort(-share, kind="stable")[:MOST]
+        self._now = replace(after, w=share)[strongest[share[strongest] > _FORGOTTEN]]
         self._lost = max(0.0, 1 - float(self._now.w.sum()))
         return self._posterior(p)
 
@@ -211,12 +206,12 @@ class Belief:
         agreement = float(weight.sum()) * rest / max(_LEAST, float(now.w.sum() * proposed.p.sum()))
         alike = (1 - _ALIKE + _ALIKE * agreement) ** (1 - staleness) if len(now.w) else 1.0
 
-        before, of_before = mean_of(
+        at_before, of_before = mean_of(
             np.concatenate(led).T / np.maximum(weight, _LEAST)[:, None],
             np.concatenate([way.at for way in ways]),
             np.concatenate([way.covariance for way in ways]),
         )
-        at_both, of_both = fused(at, of_step, before, of_before)
+        at_both, of_both = fused(at, of_step, at_before, of_before)
         learns = np.where(np.isnan(now.velocity[:, :1]), 1.0, _LEARNS)
         kept = (1 - learns) * np.nan_to_num(now.velocity) - learns * now.at / elapsed_s
         velocity = (by.T @ learns) * at / elapsed_s + by.T @ kept
@@ -262,4 +257,4 @@ def _unseen(now: Hypotheses, ways: list[Way], chance: float) -> Hypotheses:
 
 def _vector(heading_deg: Doubles) -> Doubles:
     heading = np.radians(heading_deg)
-    return np.nan_to_num(np.stack([np.cos(heading), np.sin(heading)], 1))
+    return np.asarray(np.nan_to_num(np.stack([np.cos(heading), np.sin(heading)], 1)))

@@ -10,13 +10,12 @@ shares of the input, and `scores`, float32 (N, C): of each class, 0..1. Boxes ma
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 
 from edgevpr.core.arrays import Floats, Image, Ints, Mask
 from edgevpr.core.errors import ModelError
-from edgevpr.techniques.card import Card, load_card
+from edgevpr.techniques.card import Card
 from edgevpr.techniques.session import open_session, prepare, run_outputs, shares
 
 _CAR_M = 4.5
@@ -34,12 +33,16 @@ Decoded = tuple[Floats, Floats]
 
 
 class Detector:
-    """A detector that has run successfully."""
+    """The detector of a card, which has run successfully. Raises ModelError, one sentence, for a card of no detector
+    and for whatever keeps it from flying."""
 
-    def __init__(self, card: Card, session: Any) -> None:
-        self.card, self._session = card, session
-        self._decode = _DECODERS[card.detector.family]
-        self._numbers = sorted(card.detector.dynamic.values())
+    def __init__(self, card: Card, threads: int = 1) -> None:
+        if card.detector is None or card.outputs.boxes is None:
+            raise ModelError(f"{card.path} is of no detector: name one with a section `detector` (models/README.md).")
+        self.card, self._rule, self._outputs = card, card.detector, card.outputs.boxes
+        self._session = open_session(card, threads)
+        size = card.input.height, card.input.width
+        self.is_static(np.random.default_rng(_SEED).integers(0, 256, (*size, 3), np.uint8))
 
     def is_static(self, image: Image, footprint_m: float | None = None) -> Mask:
         """Tell which pixels of uint8 (H, W[, 3]) lie in no box of a dynamic class: bool (H, W).
@@ -68,37 +71,21 @@ class Detector:
     def _boxes_px(self, image: Image) -> Ints:
         """Return the boxes of dynamic classes, int (N, 4): left, top, right, bottom, clipped to the picture."""
         rule = self.card.input
-        outputs = run_outputs(self.card, self._session, self.card.outputs.boxes, prepare(image, rule))
+        outputs = run_outputs(self.card, self._session, self._outputs, prepare(image, rule))
         try:
-            boxes, scores = self._decode(outputs, (rule.height, rule.width))
-            scores = scores[:, self._numbers].max(_CLASS_AXIS)
+            boxes, scores = _DECODERS[self._rule.family](outputs, (rule.height, rule.width))
+            scores = scores[:, sorted(self._rule.dynamic.values())].max(_CLASS_AXIS)
         except (IndexError, ValueError) as error:
             raise ModelError(
-                f"{self.card.path}: the outputs are not those of a `{self.card.detector.family}` detector with these "
+                f"{self.card.path}: the outputs are not those of a `{self._rule.family}` detector with these "
                 f"classes ({error}): correct `detector` or `outputs.boxes`."
             ) from error
-        found = boxes[scores >= self.card.detector.min_score]
+        found = boxes[scores >= self._rule.min_score]
         height, width = image.shape[:2]
         across, down = shares(image, rule)
         size = np.array([width / across, height / down] * 2)
         least, most = np.floor(found[:, :2] * size[:2]), np.ceil(found[:, 2:] * size[:2])
         return np.hstack([least, most]).clip(0, [width, height] * 2).astype(int)
-
-
-def open_detector(model: str, threads: int = 1) -> Detector:
-    """Open the detector of the card `model` as `detector_of` does."""
-    return detector_of(load_card(model), threads)
-
-
-def detector_of(card: Card, threads: int = 1) -> Detector:
-    """Open the detector of a card, and run it once. Raises ModelError, one sentence, for a card of no detector and for
-    whatever keeps it from flying."""
-    if card.detector is None:
-        raise ModelError(f"{card.path} is of no detector: name one with a section `detector` (models/README.md).")
-    detector = Detector(card, open_session(card, threads))
-    noise = np.random.default_rng(_SEED).integers(0, 256, (card.input.height, card.input.width, 3), np.uint8)
-    detector.is_static(noise)
-    return detector
 
 
 def _tiles(height: int, width: int, count: int) -> list[tuple[int, int, int, int]]:

@@ -113,7 +113,7 @@ class Follower:
         self._belief: Belief | None = None
         self._next: Belief | None = None  # that nobody has settled yet
         self._arrived: tuple[Doubles, float] | None = None  # where the newest ground began, and how sure that was
-        self._arriving = self._arrived
+        self._arriving: tuple[Doubles, float] | None = None
         self._t_now_s: float | None = None
         self._t_settled_s: float | None = None
         self._elapsed_s: float | None = None
@@ -229,4 +229,4 @@ def _shares(votes: Doubles) -> Doubles:
     if not len(votes):
         return votes
     weight: Doubles = (np.maximum(votes, 1e-6) / max(float(votes.max()), 1e-6)) ** _SHARPNESS
-    return weight / weight.sum()
+    return np.asarray(weight / weight.sum())

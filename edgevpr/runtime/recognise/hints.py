@@ -133,7 +133,7 @@ def reach_of(
     seen = own_fix if own_fix and now_s - own_fix.t_mono_s <= _FIX_GOOD_FOR_S else None
     if vehicle and vehicle.has_gps and vehicle.is_fresh_at(now_s):  # without GPS its position drifts: our fix is better
         seen = Sighting(Position(vehicle.lat_deg, vehicle.lon_deg), vehicle.t_heard_s)
-    return seen and Reach(seen.position, margin_m + reach_m_s * abs(now_s - seen.t_mono_s))
+    return Reach(seen.position, margin_m + reach_m_s * abs(now_s - seen.t_mono_s)) if seen else None
 
 
 def expected_of(hints: Hints | None, height_ratio: float, index: PlaceIndex) -> Expectation:

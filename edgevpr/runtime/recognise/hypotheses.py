@@ -31,10 +31,6 @@ class Hypotheses:
     def __getitem__(self, index: Ints) -> "Hypotheses":
         return Hypotheses(**{name: getattr(self, name)[index] for name in self.__slots__})
 
-    @property
-    def nbytes(self) -> int:
-        return sum(getattr(self, name).nbytes for name in self.__slots__)
-
 
 @dataclass(frozen=True, slots=True)
 class Way:
@@ -103,13 +99,14 @@ def density(way: Way, at: Doubles, covariance: Doubles, is_ordinal: bool) -> Dou
         xy, yy, dy = np.zeros(()), np.full((), _FLAT), np.zeros(())
     determinant = np.maximum(xx * yy - xy * xy, _THINNEST * xx * yy)
     squared = (yy * (dx * dx) - 2 * xy * (dx * dy) + xx * (dy * dy)) / determinant
-    return np.maximum(np.exp(-np.maximum(squared, 0) / 2) / (2 * np.pi * np.sqrt(determinant)), way.least)
+    gaussian: Doubles = np.exp(-np.maximum(squared, 0) / 2) / (2 * np.pi * np.sqrt(determinant))
+    return np.maximum(gaussian, way.least)
 
 
 def firm(covariance: Doubles, least: float) -> Doubles:
     """Return covariances (K, 2, 2) that can be inverted: a variance of `least`, and a share of their own, is added to
     each axis."""
-    more = least + _THINNEST * np.abs(np.trace(covariance, axis1=1, axis2=2))
+    more: Doubles = least + _THINNEST * np.abs(np.trace(covariance, axis1=1, axis2=2))
     return covariance + more[:, None, None] * np.eye(2)
 
 
@@ -152,7 +149,8 @@ def usable(proposed: Proposals, scale: MapScale, most: int) -> tuple[Ints, Propo
 def _sound(covariance: Doubles, least_sd: float) -> Doubles:
     """Return covariances (K, 2, 2) with the variance of `least_sd` on top; one that makes no sense is no more than
     that."""
-    covariance = np.where((np.abs(covariance) < _FARTHEST**2).all((1, 2))[:, None, None], covariance, 0.0)
+    is_near = np.asarray((np.abs(covariance) < _FARTHEST**2).all(axis=(1, 2)))
+    covariance = np.where(is_near[:, None, None], covariance, 0.0)
     covariance = (covariance + covariance.transpose(0, 2, 1)) / 2
     xx, xy, yy = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
     is_sound = (xx >= 0) & (yy >= 0) & (xy * xy <= xx * yy)

@@ -58,19 +58,21 @@ def describe(image: Image, mask: Mask | None = None, most: int = OF_PLACE) -> La
     if mask is not None:
         allowed = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
         allowed = cv2.erode(allowed, np.ones((_PATCH_PX, _PATCH_PX), np.uint8), borderValue=1)
-    orb = cv2.ORB_create(max(most, _FOUND), _FACTOR, _LEVELS, fastThreshold=_CORNER, patchSize=_PATCH_PX)
+    orb = cv2.ORB.create(max(most, _FOUND), _FACTOR, _LEVELS, fastThreshold=_CORNER, patchSize=_PATCH_PX)
     found, bits = orb.detectAndCompute(grey, allowed) if min(size) > 2 * _PATCH_PX else ((), None)
     if bits is None:
-        return Landmarks(np.empty((0, 2), np.float32), *np.empty((2, 0), np.float32), np.empty((0, 32), np.uint8))
-    at_px = np.array([point.pt for point in found], np.float32)
+        none = np.empty(0, np.float32)
+        return Landmarks(np.empty((0, 2), np.float32), none, none, np.empty((0, 32), np.uint8))
+    at_px: Singles = np.array([point.pt for point in found], np.float32)
     order = np.argsort([-point.response for point in found], kind="stable")
     chosen = order[_spread(at_px[order], most)]
     middle = (np.array(size, np.float32) - 1) / 2
+    width_px = np.array([point.size for point in found], np.float32)
     return Landmarks(
-        ((at_px - middle) / _LONGEST_SIDE_PX)[chosen],
+        np.asarray(((at_px - middle) / _LONGEST_SIDE_PX)[chosen], np.float32),
         np.array([point.angle for point in found], np.float32)[chosen],
-        np.array([point.size for point in found], np.float32)[chosen] / _LONGEST_SIDE_PX,
-        bits[chosen],
+        np.asarray(width_px[chosen] / _LONGEST_SIDE_PX, np.float32),
+        np.asarray(bits[chosen], np.uint8),
     )
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from edgevpr.core.config import Config
+from edgevpr.core.contract import Descriptor
 from edgevpr.core.errors import MapBusyError, MapError, PlaceError, UsageError
 from edgevpr.core.geodesy import distance_m
 from edgevpr.core.types import Frame, Place, Position, Vehicle
@@ -77,20 +78,21 @@ class Learner:
 
     def learn(self, event: Recognition) -> Place | None:
         """Make a place of an event's frame and return it; None: the frame is left out. Never raises MapError."""
-        if self.trouble is not None or self.is_off or event.failed:
+        frame, seen = event.frame, event.descriptor
+        if self.trouble is not None or self.is_off or event.failed or frame is None or seen is None:
             return None
         place = None
         try:
-            here, objection = self._placed(event.frame, event.vehicle)
+            here, objection = self._placed(frame, event.vehicle)
             here = laid(here, event.view)
-            objection = objection or self._objection(here.position, event)
-            if objection:
-                self.passed_over[objection] += 1
+            if objection or here.position is None or (objection := self._objection(here.position, seen, event)):
+                self.passed_over[objection or "without a position"] += 1
                 return None
             here = self._tied(here, event)
             self._map.require_unchanged()  # a place in a file that was deleted would be lost
-            salience = event.worth and replace(event.worth.salience, is_low=event.worth.reason is not None)
-            place_id = self._map.add(here, event.descriptor, salience, self._recogniser.landmarks(event))
+            worth = event.worth
+            salience = replace(worth.salience, is_low=worth.reason is not None) if worth else None
+            place_id = self._map.add(here, seen, salience, self._recogniser.landmarks(event))
             self.learnt += 1
             place = Place(
                 place_id=place_id,
@@ -98,11 +100,11 @@ class Learner:
                 position=here.position,
                 t_utc_s=here.t_utc_s,
                 heading_deg=here.heading_deg,
-                quality=event.descriptor.quality,
+                quality=seen.quality,
                 salience=salience,
                 pose=here.pose,
             )
-            self._growing.add(place_id, here.position, event.descriptor.coarse, here.heading_deg)
+            self._growing.add(place_id, here.position, seen.coarse, here.heading_deg)
         except MapBusyError:
             if place is None:
                 self.passed_over["while another program was writing"] += 1
@@ -142,8 +144,8 @@ class Learner:
         position = Position(vehicle.lat_deg, vehicle.lon_deg, vehicle.alt_m)
         return replace(frame, position=position, heading_deg=vehicle.heading_deg, t_utc_s=self._utc_clock()), None
 
-    def _objection(self, position: Position, event: Recognition) -> str | None:
-        if event.says_nothing or not event.descriptor.quality >= _QUALITY_MIN:  # `not >=` refuses NaN as well
+    def _objection(self, position: Position, seen: Descriptor, event: Recognition) -> str | None:
+        if event.says_nothing or not seen.quality >= _QUALITY_MIN:  # `not >=` refuses NaN as well
             return "of low quality"
         # Ask the file, not the index: a place that was dropped from RAM must not be learnt again.
         if nearest_m(self._map, position, self._spacing_m) is not None:
@@ -171,7 +173,7 @@ def _unsure(followed: Followed | None, position: Position) -> str | None:
 def check_positions(config: Config, positions: Path | None) -> None:
     """Raise UsageError where no frame can ever have a position: there is neither a link nor a recording with
     positions."""
-    folder = Path(config.source.uri)
+    folder = Path(config.source.uri or "")
     if config.mavlink.link is None and not (folder.is_dir() and (positions or _has_positions(folder))):
         raise UsageError(
             "There is nothing to learn positions from: name the flight controller with --link, or a folder of images "

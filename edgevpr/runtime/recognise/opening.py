@@ -1,7 +1,7 @@
 """Opening: makes a recogniser of a map, the technique that it was made with, and its index in RAM."""
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -19,18 +19,20 @@ from edgevpr.places.sequence import bytes_beside_place, length_of, search_of
 from edgevpr.power.boards import Board
 from edgevpr.power.equations import parse_pack
 from edgevpr.power.meter import QueryMeter
-from edgevpr.runtime.recognise.detector import open_detector
+from edgevpr.runtime.recognise.detector import Detector
 from edgevpr.runtime.recognise.evidence import calibration_of, kinds_of
 from edgevpr.runtime.recognise.follow import Follower
 from edgevpr.runtime.recognise.hints import Prior
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.levelling import levelling_of
-from edgevpr.runtime.recognise.memorability import open_memorability
+from edgevpr.runtime.recognise.memorability import Memorability
 from edgevpr.runtime.recognise.recogniser import Matcher, Preparation, Recogniser, WalkSettings
 from edgevpr.runtime.recognise.salience_gate import MOST_ENTROPY, Gate, Thresholds
+from edgevpr.techniques.card import load_card
 
 _WAIT_S = 0.05  # in flight, for another program that writes to the map: the next query is better than a late one
 _log = logging.getLogger(__name__)
+Settings = Mapping[str, int | float | str]  # parameters of a technique, by their names
 _ROOM = 20_000  # places to learn in a flight: 200 km at the usual spacing; beyond that, RAM keeps the best places
 
 
@@ -70,7 +72,7 @@ def open_learning(config: Config, board: Board, new_technique: str | None) -> tu
     path = map_path(config.map)
     require_regular(path)
     technique = None
-    if not has_map(path):
+    if new_technique and not has_map(path):
         technique = made_for(board, new_technique, _wanted(config))
         _make_map(path, technique, mask_of(config.source.mask))
     place_map = PlaceMap.open_for_adding(path)
@@ -116,12 +118,12 @@ def gate_with(config: SalienceConfig, threads: int = 1) -> Gate:
     memorability = detector = None
     if config.memorability > 0:
         if config.network:
-            memorability = open_memorability(config.network, threads)
+            memorability = Memorability(load_card(config.network), threads)
         else:
             _log.warning("no `salience.network` is named: how memorable a picture is does not count")
     if config.staticity > 0:
         if config.detector:
-            detector = open_detector(config.detector, threads)
+            detector = Detector(load_card(config.detector), threads)
         else:
             _log.warning("no `salience.detector` is named: what moves in a picture does not count")
     if not (memorability or detector or config.entropy > 0):
@@ -140,19 +142,19 @@ def meter_of(config: Config, board: Board) -> QueryMeter:
     return QueryMeter(board, parse_pack(config.battery.pack), config.battery.regulator_efficiency)
 
 
-def made_for(board: Board | None, name: str, settings: dict[str, str] | None = None) -> Technique:
+def made_for(board: Board | None, name: str, settings: Settings | None = None) -> Technique:
     """Make the technique `name`; a network gets as many threads as the board spares for it (None: one)."""
     return made_with(board.threads if board else None, name, settings)
 
 
-def made_with(threads: int | None, name: str, settings: dict[str, str] | None = None) -> Technique:
+def made_with(threads: int | None, name: str, settings: Settings | None = None) -> Technique:
     """Make the technique `name`; a network gets `threads` (None: one), unless `settings` say how many."""
     own = {"threads": threads} if threads and "threads" in techniques.parameters(name) else {}
     return techniques.create(name, {**own, **(settings or {})})
 
 
 def technique_of(
-    place_map: PlaceMap, name: str | None = None, settings: dict[str, str] | None = None, board: Board | None = None
+    place_map: PlaceMap, name: str | None = None, settings: Settings | None = None, board: Board | None = None
 ) -> Technique:
     """Make the technique that a map was built with, for `board`.
 
@@ -184,7 +186,7 @@ def technique_of(
 def _matcher(config: Config, technique: Technique, place_map: PlaceMap | None, index: PlaceIndex) -> Matcher:
     """Return what frames are recognised with; the calibration of a `place_map` counts (None: no map's does)."""
     length = length_of(technique.spec, config.match.sequence)
-    rule = accept_rule(technique, config.match, length, place_map and calibration_of(place_map))
+    rule = accept_rule(technique, config.match, length, calibration_of(place_map) if place_map else None)
     return Matcher(technique, index, rule, search_of(length))
 
 

@@ -1,6 +1,6 @@
 """The event of one frame: everything that happened to it, in one value."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -49,7 +49,7 @@ class Recognition:
     ranking: Ranking | None = None
     best: Candidate | None = None
     proof: Agreement | None = None
-    evidence: dict[str, float] | None = None
+    evidence: Mapping[str, float] | None = None
     confidence: float | None = None
     followed: Followed | None = None
     accepted: bool = False
@@ -73,7 +73,7 @@ class Recognition:
     @property
     def position(self) -> Position | None:
         """Position of the aircraft, of an accepted match only."""
-        return self.located and self.located.position
+        return self.located.position if self.located else None
 
     @property
     def name(self) -> str:

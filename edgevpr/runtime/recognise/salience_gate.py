@@ -97,7 +97,7 @@ class Gate:
     def worth(self, maps: Maps) -> Worth:
         """Tell what the frame of these maps is worth."""
         scores = scores_of(maps)
-        self._entropies.append(scores.entropy)
+        self._entropies.append(scores.entropy or 0.0)
         usual = usual_entropy(self._entropies)
         # The first frames of a flight at night: their light is not known yet, and a picture of nothing has none at all.
         return worth_of(scores, self.thresholds, self.thresholds.entropy / 2 if usual is None else usual)
@@ -137,7 +137,7 @@ def worth_of(salience: Salience, thresholds: Thresholds, usual: float = 1.0) -> 
     }
     known = salience.scores
     short = {name: least[name] - score for name, score in known.items() if least[name] > 0 and score is not None}
-    worst = max(short, key=short.get, default=None)
+    worst = max(short, key=lambda name: short[name], default=None)
     if worst is None or short[worst] <= 0:
         return Worth(salience)
     reason = f"not memorable: {worst} {known[worst]:.2f}, {least[worst]:.2f} needed"
@@ -147,7 +147,7 @@ def worth_of(salience: Salience, thresholds: Thresholds, usual: float = 1.0) -> 
 def best_of(shortfalls: list[float]) -> list[bool]:
     """Lower all thresholds in steps of 0.03 until some of these frames pass; tell which do then."""
     steps = np.ceil(np.round(np.array(shortfalls) / STEP, 6))
-    return (steps == steps.min()).tolist()
+    return [bool(step == steps.min()) for step in steps]
 
 
 def maps_of(image: Image, memorability: Memorability | None, is_static: Mask | None) -> Maps:
@@ -181,5 +181,5 @@ def _small_grey(image: Image) -> Image:
     shrink = _LONGEST_PX / max(image.shape[:2])
     if shrink < 1:
         size = tuple(max(1, round(side * shrink)) for side in image.shape[1::-1])
-        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)

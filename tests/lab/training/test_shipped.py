@@ -9,7 +9,7 @@ import pytest
 
 from edgevpr.core.config import load_config
 from edgevpr.core.files import shipped
-from edgevpr.runtime.recognise.memorability import memorability_of
+from edgevpr.runtime.recognise.memorability import Memorability
 from edgevpr.techniques.card import load_card
 from edgevpr.techniques.session import open_backbone
 from edgevpr.techniques.words import load_words
@@ -85,7 +85,7 @@ def test_matchability_keeps_a_picture_and_leaves_it_out_in_the_dark_in_fog_and_w
     card = load_card("matchability")
     assert "edgevpr train matchability" in card.source
     assert card.file_path.stat().st_size < 1_000_000
-    network = memorability_of(card)
+    network = Memorability(card)
     ground = cv2.GaussianBlur(np.random.default_rng(1).normal(0, 1, (480, 640)), (0, 0), 2)
     ground = np.clip(128 + 45 * ground / ground.std(), 0, 255)
 

@@ -8,7 +8,8 @@ pytest.importorskip("onnx", reason="the test networks are written with onnx (pip
 from tiny_detectors import CELLS, write_detector
 
 from edgevpr.core.errors import ModelError
-from edgevpr.runtime.recognise.detector import open_detector
+from edgevpr.runtime.recognise.detector import Detector
+from edgevpr.techniques.card import load_card
 
 PICTURE = np.full((128, 256), 90, np.uint8)
 
@@ -19,7 +20,7 @@ def opened(tmp_path, monkeypatch):
 
     def open_it(*args, **kwargs):
         write_detector(tmp_path, *args, **kwargs)
-        return open_detector("tiny")
+        return Detector(load_card("tiny"))
 
     return open_it
 
@@ -71,4 +72,4 @@ def test_a_detector_that_cannot_be_used_is_refused_in_one_sentence(opened, raw, 
 
 def test_the_card_of_another_network_is_no_detector(monkeypatch):
     with pytest.raises(ModelError, match="is of no detector"):
-        open_detector("calc")
+        Detector(load_card("calc"))
