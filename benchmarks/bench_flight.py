@@ -107,7 +107,6 @@ def metering_row(log: Path) -> Row:
         meter.look_at_heat()
         meter.reading()
         taken_s.append(time.process_time() - begin_s)
-    meter.close()
     return row_of("metering, of a query", 100 * statistics.mean(taken_s) / query_s, "%", 1.0)
 
 
