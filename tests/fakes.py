@@ -18,7 +18,7 @@ from edgevpr.mavlink.fixes import Fixes, Sending
 from edgevpr.mavlink.link import LinkStats
 from edgevpr.mavlink.messages import Fix, Health, Severity, status_text
 from edgevpr.mavlink.peer import NoListener
-from edgevpr.mavlink.readiness import AutopilotState
+from edgevpr.mavlink.readiness import Readiness
 from edgevpr.mavlink.requests import Wish, Wished
 from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.clock import Clock
@@ -252,7 +252,7 @@ class FakeLink:
             self._fixes.append(sending.fix)
             self._waiting.note_sent(sending, self._clock(), has_answer=True)
             sending.settle(True)
-            self._waiting.hear(self.answer, AutopilotState(gps_age_s=0.0), self._clock())
+            self._waiting.hear(self.answer, Readiness(gps_s=0.0).why(self.answer, 0.0), self._clock())
             self._acks[self.answer] += 1
 
 

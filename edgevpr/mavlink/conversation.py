@@ -184,7 +184,7 @@ class Conversation:
         now_s = self._clock()
         self._tell(self._news_of_presence(now_s))
         self.fixes.time_out(now_s)
-        self._tell(self.fixes.news_of_silence(self.autopilot.readiness.state(now_s), now_s))
+        self._tell(self.fixes.news_of_silence(self.autopilot.readiness.why_silent(), now_s))
         self._tell(self.fixes.take_news())
 
     def break_off(self, lost_fixes: int) -> None:
@@ -273,7 +273,7 @@ class Conversation:
 
     def _hear_answer(self, answer: str, now_s: float) -> None:
         readiness = self.autopilot.readiness
-        sending = self.fixes.hear(answer, readiness.state(now_s), now_s)
+        sending = self.fixes.hear(answer, readiness.why(answer, now_s), now_s)
         if sending and answer == "ACCEPTED":
             self.autopilot.certainty.note_known(sending.fix.accuracy_m, now_s)
         if answer == "FAILED" and readiness.asks_origin(now_s):

@@ -15,7 +15,7 @@ from threading import Event
 
 from edgevpr.core.types import FIX_MAX_AGE_S
 from edgevpr.mavlink.messages import Fix
-from edgevpr.mavlink.readiness import GPS_IN_USE, TAKEN, AutopilotState, Reason, why, why_silent
+from edgevpr.mavlink.readiness import GPS_IN_USE, TAKEN, Reason
 from edgevpr.mavlink.texts import News
 
 FIXES_MAX = 8
@@ -160,15 +160,14 @@ class Fixes:
             self._row -= count
         self.break_off("the link was lost before its answer came")
 
-    def hear(self, result: str, state: AutopilotState, now_s: float) -> Sending | None:
-        """Take in an answer, the name of a MAV_RESULT, of an autopilot in this state; return the fix that it answers,
-        None where there is none. An answer names no fix, so any one ends the row of those without."""
+    def hear(self, result: str, reason: Reason, now_s: float) -> Sending | None:
+        """Take in an answer, the name of a MAV_RESULT, and the reason for it; return the fix that it answers, None
+        where there is none. An answer names no fix, so any one ends the row of those without."""
         if self._is_stopped:
             # All those fixes may be answered now, and these answers must not pass for one to a new fix.
             self._resumes_s = now_s + ANSWERED_WITHIN_S
         self._row = 0
         self.time_out(now_s)
-        reason = why(result, state)
         self._note_answer(result, reason)
         if result == "ACCEPTED":
             self._taken_s = now_s
@@ -188,8 +187,8 @@ class Fixes:
         while self._under_way:
             self._give_up(reason)
 
-    def news_of_silence(self, state: AutopilotState, now_s: float) -> News | None:
-        """Return once that the sending has stopped, since no fix is answered, or that it goes on."""
+    def news_of_silence(self, reason: Reason, now_s: float) -> News | None:
+        """Return once that the sending has stopped, since no fix is answered (for this reason), or that it goes on."""
         is_stopped = self._row >= UNANSWERED_MAX
         if is_stopped == self._is_stopped or (is_stopped and now_s - self._sent_s < ANSWERED_WITHIN_S):
             return None
@@ -197,7 +196,6 @@ class Fixes:
         if not is_stopped:
             log.warning("position fixes are answered again: they are sent again")
             return News(False, "fixes are answered again", "answers")
-        reason = why_silent(state)
         log.warning(
             "five fixes in a row had no answer, and only one every %g s is sent until one is answered: %s",
             TRIED_AGAIN_AFTER_S,

@@ -6,8 +6,8 @@ import os
 import struct
 import threading
 import time
+from io import FileIO
 from pathlib import Path
-from typing import BinaryIO
 
 from edgevpr.core.appending import append, is_at, keep_as_earlier, open_appending, sync
 from edgevpr.core.errors import EdgevprError
@@ -108,6 +108,6 @@ class Tlog:
         append(self._file, bytes(records))
         sync(self._file)
 
-    def _reopened(self) -> BinaryIO:
+    def _reopened(self) -> FileIO:
         self._file.close()
         return open_appending(self._path)

@@ -13,14 +13,13 @@ from mavlink_peers import Peer, TcpServer, free_port, link_to, wait_until
 from edgevpr.mavlink import readiness
 from edgevpr.mavlink.fixes import FixAnswer, Fixes, Sending
 from edgevpr.mavlink.messages import Fix
-from edgevpr.mavlink.readiness import GPS_IN_USE, AutopilotState
+from edgevpr.mavlink.readiness import GPS_IN_USE, Readiness
 from edgevpr.mavlink.wire import mavlink
 
 ACCEPTED, FAILED, DENIED = mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_FAILED, mavlink.MAV_RESULT_DENIED
 LATE = FixAnswer(None, "it had no answer within 1 s", None)
 UNANSWERED = "not sent: five fixes in a row had no answer"
 ARMED = mavlink.MAV_MODE_FLAG_SAFETY_ARMED
-STATE = AutopilotState()
 
 
 @pytest.fixture
@@ -37,12 +36,17 @@ def sent(fixes, *times_s, has_answer=True):
     return sending
 
 
+def hear(fixes, result, t_s):
+    """Let an autopilot that has GPS answer."""
+    return fixes.hear(result, Readiness(gps_s=t_s).why(result, t_s), t_s)
+
+
 def test_one_fix_a_second_has_its_own_answer_though_some_are_lost(fixes):
     sendings = []
     for t_s in range(10):
         sendings.append(sent(fixes, t_s))
         if t_s not in (3, 4):
-            fixes.hear("ACCEPTED" if t_s % 2 else "FAILED", AutopilotState(gps_age_s=0.0), t_s + 0.02)
+            hear(fixes, "ACCEPTED" if t_s % 2 else "FAILED", t_s + 0.02)
     answers = [sending.answer for sending in sendings]
     assert answers == [None if t_s in (3, 4) else ("ACCEPTED" if t_s % 2 else "FAILED") for t_s in range(10)]
     assert sendings[3].outcome == sendings[4].outcome == LATE
@@ -52,19 +56,19 @@ def test_one_fix_a_second_has_its_own_answer_though_some_are_lost(fixes):
 
 def test_of_several_fixes_under_way_the_oldest_is_answered(fixes):
     first, second, third = (sent(fixes, t_s) for t_s in (0.0, 0.2, 0.4))
-    assert fixes.hear("FAILED", STATE, 0.5) is first
-    assert fixes.hear("ACCEPTED", STATE, 0.6) is second
+    assert hear(fixes, "FAILED", 0.5) is first
+    assert hear(fixes, "ACCEPTED", 0.6) is second
     assert third.outcome is None
     assert len(fixes) == 1
 
 
 def test_an_answer_that_is_late_or_one_too_many_belongs_to_no_fix(fixes):
     late = sent(fixes, 0.0)
-    assert fixes.hear("FAILED", STATE, 1.1) is None
+    assert hear(fixes, "FAILED", 1.1) is None
     assert late.outcome == LATE
     new = sent(fixes, 2.0)
-    assert fixes.hear("FAILED", STATE, 2.1) is new
-    assert fixes.hear("FAILED", STATE, 2.1) is None
+    assert hear(fixes, "FAILED", 2.1) is new
+    assert hear(fixes, "FAILED", 2.1) is None
     assert fixes.unanswered == 1
 
 
@@ -72,13 +76,13 @@ def test_a_fix_may_be_in_the_position_unless_it_was_refused(fixes):
     assert fixes.t_fix_s == -math.inf
     sent(fixes, 10.0)
     assert fixes.t_fix_s == 10.0, "it may be taken before the answer comes"
-    fixes.hear("FAILED", STATE, 10.1)
+    hear(fixes, "FAILED", 10.1)
     assert fixes.t_fix_s == -math.inf
     sent(fixes, 11.0)
-    fixes.hear("ACCEPTED", STATE, 11.1)
+    hear(fixes, "ACCEPTED", 11.1)
     assert fixes.t_fix_s == 11.1
     sent(fixes, 12.0)
-    fixes.hear("DENIED", STATE, 12.1)
+    hear(fixes, "DENIED", 12.1)
     assert fixes.t_fix_s == 11.1
     sent(fixes, 13.0)
     fixes.time_out(14.1)
@@ -99,12 +103,12 @@ def test_answers_that_take_half_a_second_stop_no_quick_fixes_and_nothing_is_said
         now_s = step / 10
         while due_s and due_s[0] <= now_s:
             due_s.pop(0)
-            fixes.hear("ACCEPTED", STATE, now_s)
+            hear(fixes, "ACCEPTED", now_s)
         if fixes.why_not(now_s) is None:
             sent(fixes, now_s)
             due_s.append(now_s + 0.45)
             count += 1
-        news.append(fixes.news_of_silence(STATE, now_s))
+        news.append(fixes.news_of_silence(readiness.NO_COMMAND_ANSWERED, now_s))
     assert not any(news)
     assert count > 900
 
@@ -114,10 +118,10 @@ def test_fixes_thrown_away_with_the_port_wait_for_no_answer_but_do_not_end_a_sto
     fixes.note_lost(3)
     assert fixes.why_not(5.0) is None
     sent(fixes, 5, 6, 7)
-    assert fixes.news_of_silence(STATE, 8.5)
+    assert fixes.news_of_silence(readiness.NO_COMMAND_ANSWERED, 8.5)
     sent(fixes, 17.5)
     fixes.note_lost(2)
-    assert (fixes.why_not(20.0), fixes.news_of_silence(STATE, 20.0)) == (UNANSWERED, None)
+    assert (fixes.why_not(20.0), fixes.news_of_silence(readiness.NO_COMMAND_ANSWERED, 20.0)) == (UNANSWERED, None)
 
 
 def fly(autopilot, count, every_s=1.0):

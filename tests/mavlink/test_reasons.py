@@ -1,64 +1,68 @@
-"""Why an autopilot refuses a fix, from what is known of it: each cause, and which of them comes first."""
+"""Why an autopilot refuses a fix, or says nothing to it: by what is known of it at second 0."""
+
+from dataclasses import replace
 
 import pytest
 
 from edgevpr.mavlink import readiness as reasons
 from edgevpr.mavlink.messages import TEXT_BYTES
-from edgevpr.mavlink.readiness import AutopilotState, Reason, why, why_silent
+from edgevpr.mavlink.readiness import Readiness, Reason
 from edgevpr.mavlink.wire import mavlink
 
-CONST, UNINITIALIZED = mavlink.EKF_CONST_POS_MODE, mavlink.EKF_UNINITIALIZED
-AIRBORNE = AutopilotState(is_armed=True, gps_age_s=60.0, has_origin=True, filter_flags=0)
+AIRBORNE = Readiness(is_armed=True, gps_s=-60.0, origin_s=-1.0, flags_s=0.0)
+NO_ORIGIN = {"origin_s": -100.0, "asked_s": -3.0}
+EMPTY = Readiness()
+CONST, UNINITIALIZED = {"flags": mavlink.EKF_CONST_POS_MODE}, {"flags": mavlink.EKF_UNINITIALIZED}
 
 
 @pytest.mark.parametrize(
     ("state", "reason"),
     [
-        (AutopilotState(), reasons.UNKNOWN),
-        (AutopilotState(gps_age_s=0.0), reasons.GPS_IN_USE),
-        (AutopilotState(gps_age_s=2.5, is_armed=False), reasons.GPS_IN_USE),
-        (AutopilotState(gps_age_s=2.6), reasons.UNKNOWN),
+        (EMPTY, reasons.UNKNOWN),
+        (Readiness(gps_s=0.0), reasons.GPS_IN_USE),
+        (Readiness(gps_s=-2.5, is_armed=False), reasons.GPS_IN_USE),
+        (Readiness(gps_s=-2.6), reasons.UNKNOWN),
         (AIRBORNE, reasons.UNKNOWN),
-        (AIRBORNE._replace(gps_age_s=1.0), reasons.GPS_IN_USE),
-        (AIRBORNE._replace(has_origin=False, is_armed=False), reasons.NO_ORIGIN),
-        (AIRBORNE._replace(is_armed=False), reasons.NOT_ARMED),
-        (AIRBORNE._replace(is_armed=False, filter_flags=CONST), reasons.NOT_ARMED),
-        (AIRBORNE._replace(filter_flags=CONST), reasons.NOT_RECKONING),
-        (AIRBORNE._replace(is_armed=None, filter_flags=CONST), reasons.NOT_RECKONING),
-        (AIRBORNE._replace(gps_age_s=0.0, filter_flags=UNINITIALIZED), reasons.NOT_STARTED),
-        (AIRBORNE._replace(has_origin=False, filter_flags=UNINITIALIZED), reasons.NO_ORIGIN),
-        (AIRBORNE._replace(gps_age_s=0.0, has_origin=False), reasons.GPS_IN_USE),
-        (AIRBORNE._replace(is_px4=True, filter_flags=UNINITIALIZED), reasons.NOT_PLAUSIBLE),
-        (AutopilotState(is_px4=True, has_origin=False), reasons.NO_ORIGIN),
+        (replace(AIRBORNE, gps_s=-1.0), reasons.GPS_IN_USE),
+        (replace(AIRBORNE, is_armed=False, **NO_ORIGIN), reasons.NO_ORIGIN),
+        (replace(AIRBORNE, is_armed=False), reasons.NOT_ARMED),
+        (replace(AIRBORNE, is_armed=False, **CONST), reasons.NOT_ARMED),
+        (replace(AIRBORNE, **CONST), reasons.NOT_RECKONING),
+        (replace(AIRBORNE, flags_s=-4.0, **CONST), reasons.UNKNOWN),
+        (replace(AIRBORNE, is_armed=None, **CONST), reasons.NOT_RECKONING),
+        (replace(AIRBORNE, gps_s=0.0, **UNINITIALIZED), reasons.NOT_STARTED),
+        (replace(AIRBORNE, **NO_ORIGIN, **UNINITIALIZED), reasons.NO_ORIGIN),
+        (replace(AIRBORNE, gps_s=0.0, **NO_ORIGIN), reasons.GPS_IN_USE),
+        (replace(AIRBORNE, is_px4=True, **UNINITIALIZED), reasons.NOT_PLAUSIBLE),
+        (Readiness(is_px4=True, **NO_ORIGIN), reasons.NO_ORIGIN),
     ],
 )
-def test_a_fix_failed_for_the_first_cause_that_is_known(state, reason):
-    assert why("FAILED", state) == reason
+def test_a_failed_fix_has_the_first_reason_that_is_known_to_be_there(state, reason):
+    assert state.why("FAILED", 0.0) == reason
 
 
 @pytest.mark.parametrize(
     ("result", "state", "reason"),
     [
-        ("ACCEPTED", AutopilotState(), reasons.TAKEN),
-        ("DENIED", AutopilotState(gps_age_s=0.0), reasons.WRONG_FORM),
-        ("UNSUPPORTED", AutopilotState(), reasons.NO_COMMAND),
-        ("TEMPORARILY_REJECTED", AutopilotState(is_px4=True, gps_age_s=0.0), reasons.GPS_IN_USE),
-        ("TEMPORARILY_REJECTED", AutopilotState(is_px4=True, gps_age_s=9.0), reasons.OTHER_AID),
-        ("TEMPORARILY_REJECTED", AutopilotState(), reasons.UNKNOWN),
-        ("99", AutopilotState(), Reason("see its log", "it answers 99")),
+        ("ACCEPTED", EMPTY, reasons.TAKEN),
+        ("DENIED", Readiness(gps_s=0.0), reasons.WRONG_FORM),
+        ("UNSUPPORTED", EMPTY, reasons.NO_COMMAND),
+        ("TEMPORARILY_REJECTED", Readiness(is_px4=True, gps_s=0.0), reasons.GPS_IN_USE),
+        ("TEMPORARILY_REJECTED", Readiness(is_px4=True, gps_s=-9.0), reasons.OTHER_AID),
+        ("TEMPORARILY_REJECTED", EMPTY, reasons.UNKNOWN),
+        ("99", EMPTY, Reason("see its log", "it answers 99")),
     ],
 )
-def test_every_answer_has_a_reason(result, state, reason):
-    assert why(result, state) == reason
+def test_every_answer_has_its_reason(result, state, reason):
+    assert state.why(result, 0.0) == reason
 
 
-def test_silence_to_all_commands_is_another_matter_than_silence_to_fixes():
-    assert "signed" in why_silent(AutopilotState()).sentence
-    assert "43003" in why_silent(AutopilotState(answers_others=True)).sentence
+def test_silence_is_explained_by_whether_other_commands_are_answered():
+    assert "signed" in EMPTY.why_silent().sentence
+    assert "43003" in Readiness(answers_others=True).why_silent().sentence
 
 
-def test_every_reason_fits_the_text_for_the_ground_station():
+def test_every_reason_fits_a_status_text():
     known = [each for each in vars(reasons).values() if isinstance(each, Reason)]
     assert len(known) > 10
-    for each in known:
-        assert len(f"edgevpr: fixes refused: {each.brief}".encode()) <= TEXT_BYTES
+    assert all(len(f"edgevpr: fixes unanswered: {each.brief}".encode()) <= TEXT_BYTES for each in known)
