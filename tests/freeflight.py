@@ -3,6 +3,8 @@ flight controller in it, which is armed and takes off. Plain kinematics: what ma
 
 import cmath
 import math
+from itertools import pairwise
+from statistics import fmean
 
 from edgevpr.core.geodesy import moved
 from edgevpr.core.types import Position
@@ -104,6 +106,7 @@ class Piloted(FlightController):
         self.kind = vehicle.removeprefix("ardu").removeprefix("px4-")
         self.motion = FreeFlight(self.kind, ORIGIN)
         super().__init__(vehicle, self.motion, gps=True)
+        self._gps_s, self._vision_s = [], -math.inf  # when the companion's messages were heard
         self._streams._reports[mavlink.MAVLINK_MSG_ID_SIM_STATE] = _truth
         for name, value in parameters.items():
             self.set(name, value)
@@ -122,12 +125,25 @@ class Piloted(FlightController):
         needs_vision = brain.parameters["VISO_TYPE"] != 0
         checks = {
             "Need Position Estimate": not brain._is_aiding,
-            "VisOdom: not healthy": needs_vision and not brain.external.is_healthy(brain.now_s),
+            "VisOdom: not healthy": needs_vision and brain.now_s - self._vision_s > 0.3,
             "GPS 1: Bad fix": brain._source == _GPS and receivers.first.fix_type < FIX_3D,
             "GPS 2: Bad fix": receivers.has_second and receivers.second.fix_type < FIX_3D,
-            "GPS 2: not healthy": receivers.has_second and not receivers.second.is_healthy,
+            "GPS 2: not healthy": receivers.has_second and not self.is_second_healthy,
         }
         return next((reason for reason, is_so in checks.items() if is_so), None)
+
+    @property
+    def is_second_healthy(self) -> bool:
+        """True while the second GPS reports at about 5 Hz or more, and was not late twice in a row (AP_GPS)."""
+        intervals_s = [after - before for before, after in pairwise(self._gps_s[-50:])]
+        return bool(intervals_s) and fmean(intervals_s) < 0.215 and min(intervals_s[-2:]) < 0.245
+
+    def hear(self, message):
+        if message.get_type() == "GPS_INPUT":
+            self._gps_s.append(self.brain.now_s)
+        if message.get_type() == "ODOMETRY" and message.frame_id == mavlink.MAV_FRAME_LOCAL_FRD:
+            self._vision_s = self.brain.now_s
+        return super().hear(message)
 
     def arm(self, is_armed: bool = True) -> None:
         """Arm or disarm; a plane with ArduPilot whose mode is TAKEOFF then takes off."""

@@ -7,7 +7,7 @@ a copter does without GPS was seen in its own simulator.
 
 import math
 
-from edgevpr.lab.simulate.firmware import ARDUPILOT, ARDUPILOT_KINDS, DENIED, FAILED, OK, SD_GROWS_M_S, Firmware
+from edgevpr.lab.simulate.firmware import ARDUPILOT, ARDUPILOT_PLANE, DENIED, FAILED, OK, SD_GROWS_M_S, Firmware
 from edgevpr.lab.simulate.motion import Motion
 from edgevpr.lab.simulate.sensors import FIX_3D, PositionMeasurement
 from edgevpr.mavlink.wire import Message, mavlink
@@ -38,7 +38,7 @@ class ArduPilot(Firmware):
 
     def __init__(self, kind: str, motion: Motion) -> None:
         mode = _GUIDED[kind] if motion.is_flying else 0
-        super().__init__(kind, motion, {**ARDUPILOT, **ARDUPILOT_KINDS[kind]}, mode)
+        super().__init__(kind, motion, {**ARDUPILOT, **(ARDUPILOT_PLANE if kind == "plane" else {})}, mode)
         self._source_set = 1
         self._is_aiding = self._has_ever_passed = False
         self._good_since_s: float | None = None

@@ -1,6 +1,5 @@
 """A simulated flight controller, as strict as the real thing: the other end of a link, for tests and demonstrations."""
 
-import json
 import logging
 import select
 import signal
@@ -9,7 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from types import MappingProxyType
 
 from edgevpr.core.errors import LinkError
@@ -40,9 +39,6 @@ class AutopilotSummary:
     fixes: tuple[ReceivedFix, ...]
     lost_packets: int
     bad_bytes: int
-
-    def to_json(self) -> str:
-        return json.dumps(asdict(self))
 
     def __str__(self) -> str:
         counts = ", ".join(f"{name} {count}" for name, count in sorted(self.messages.items())) or "none"

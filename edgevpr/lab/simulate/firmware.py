@@ -203,7 +203,6 @@ SIMULATOR = {
 
 ARDUPILOT = {
     "AHRS_EKF_TYPE": 3,
-    "ARMING_CHECK": 1,
     "EK3_ENABLE": 1,
     **{f"EK3_SRC{number}_POSXY": 3 if number == 1 else 0 for number in (1, 2, 3)},
     **{f"EK3_SRC{number}_VELXY": 3 if number == 1 else 0 for number in (1, 2, 3)},
@@ -221,11 +220,7 @@ ARDUPILOT = {
     "VISO_QUAL_MIN": 0,
     "VISO_TYPE": 0,
 }
-ARDUPILOT_KINDS = {
-    "copter": {"FS_EKF_ACTION": 1, "FS_EKF_THRESH": 0.8},
-    "plane": {"ARSPD_TYPE": 2, "ARSPD_USE": 1, "FS_LONG_ACTN": 0, "FS_SHORT_ACTN": 3, "TKOFF_ALT": 50.0},
-    "rover": {"FS_EKF_ACTION": 1, "FS_EKF_THRESH": 0.8},
-}
+ARDUPILOT_PLANE = {"ARSPD_TYPE": 2, "ARSPD_USE": 1, "TKOFF_ALT": 50.0}
 
 PX4 = {
     "EKF2_AGP0_ID": 1,

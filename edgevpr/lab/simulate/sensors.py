@@ -15,9 +15,6 @@ _BY_MAVLINK = 14  # of GPS1_TYPE and GPS2_TYPE
 GPS_S = 0.2  # from one report of the simulated GPS to the next
 _SIMULATED_SD_M = 0.3
 _TIMEOUT_S = 4.0
-_MEAN_INTERVAL_S = 0.215  # a receiver that reports more rarely is not healthy, nor is one that is late twice in a row
-_LATE_S, _LATE_TIMES = 0.245, 2
-_MEAN_OVER = 50  # reports
 _LEAST_NOISE_M, _MOST_NOISE_M = 0.2, 100.0  # VISO_POS_M_NSE, and the most
 _EXTERNAL_GOOD_FOR_S = 0.3
 _TAKEN_SHARE = 0.3  # of an innovation, by each measurement
@@ -39,34 +36,21 @@ class PositionMeasurement:
 
 
 class Gps:
-    """A receiver as the autopilot sees it: its last report, and whether it comes often enough."""
+    """A receiver as the autopilot sees it: its last report."""
 
     def __init__(self) -> None:
         self.fix_type: int = NO_FIX
         self.last: PositionMeasurement | None = None
         self._heard_s = -math.inf
-        self._mean_s = 0.0
-        self._late = 0
-
-    @property
-    def is_healthy(self) -> bool:
-        """True while reports come at about 5 Hz or more."""
-        return self.fix_type >= FIX_3D and 0 < self._mean_s < _MEAN_INTERVAL_S and self._late < _LATE_TIMES
 
     def report(self, fix_type: int, measured: PositionMeasurement) -> None:
         """Take in a report."""
-        interval_s = measured.t_s - self._heard_s
         self._heard_s, self.fix_type, self.last = measured.t_s, fix_type, measured
-        if interval_s > _TIMEOUT_S:
-            self._mean_s, self._late = 0.0, 0
-            return
-        self._late = self._late + 1 if interval_s > _LATE_S else 0
-        self._mean_s = self._mean_s + (interval_s - self._mean_s) / _MEAN_OVER if self._mean_s else interval_s
 
     def age(self, now_s: float) -> None:
         """Give up a receiver that has been silent for four seconds."""
         if now_s - self._heard_s > _TIMEOUT_S:
-            self.fix_type, self.last, self._mean_s = NO_FIX, None, 0.0
+            self.fix_type, self.last = NO_FIX, None
 
 
 class Receivers:
@@ -123,19 +107,13 @@ class ExternalNavigation:
 
     def __init__(self, parameters: Values) -> None:
         self._parameters = parameters
-        self._heard_s = -math.inf
         self._last: tuple[complex, float, float] | None = None  # position, standard deviation, time
-
-    def is_healthy(self, now_s: float) -> bool:
-        """Tell whether a message came in the last 0.3 s; it may be one of too low a quality."""
-        return now_s - self._heard_s < _EXTERNAL_GOOD_FOR_S
 
     def hear(self, message: Message, now_s: float) -> None:
         """Take in an ODOMETRY."""
         frames = (mavlink.MAV_FRAME_LOCAL_FRD, mavlink.MAV_FRAME_BODY_FRD)
         if not self._parameters.get("VISO_TYPE", 0) or (message.frame_id, message.child_frame_id) != frames:
             return
-        self._heard_s = now_s
         if message.quality >= self._parameters["VISO_QUAL_MIN"]:
             variances = [message.pose_covariance[number] for number in (0, 6, 11)]
             # The cube root is ArduPilot's own.

@@ -209,7 +209,7 @@ def test_a_second_gps_has_to_report_often_enough(rate_hz, is_healthy):
     for _ in range(10 * rate_hz):
         flown.tell(mavlink.MAVLink_gps_input_message(0, 1, 0, 0, 0, 3, 0, 0, 0, 1, 1, 0, 0, 0, 1, 1, 1, 12))
         flown.wait(1 / rate_hz)
-    assert flown.controller.brain.receivers.second.is_healthy == is_healthy
+    assert flown.controller.is_second_healthy == is_healthy
     flown.wait(5)
     assert flown.controller.brain.receivers.second.fix_type == 1
 
