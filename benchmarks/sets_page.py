@@ -9,8 +9,8 @@ import base
 
 from edgevpr.core.text import markdown
 from edgevpr.lab.evaluate import tables
-from edgevpr.lab.evaluate.curves import plot
 from edgevpr.lab.evaluate.evaluate import TechniqueResult, from_json
+from edgevpr.lab.evaluate.tables import plot
 
 CURVES = "curves.png"
 # What is drawn: the forms of a vector, and what is the same technique under other conditions, would hide the rest.

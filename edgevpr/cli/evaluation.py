@@ -100,7 +100,7 @@ def _measure_many(args: Namespace) -> int:
     """Measure many rows on many sets, with all that an earlier run has left."""
     from edgevpr.core.text import progress
     from edgevpr.lab.evaluate.many import measure
-    from edgevpr.lab.evaluate.output import as_json, write_results
+    from edgevpr.lab.evaluate.page import as_json, write_results
     from edgevpr.lab.evaluate.tables import quality_text
 
     if args.plot:
@@ -131,8 +131,7 @@ def _measure_techniques(args: Namespace) -> int:
     from edgevpr.core.text import progress, require_picture
     from edgevpr.lab.evaluate import evaluate as evaluation
     from edgevpr.lab.evaluate.cache import Cache
-    from edgevpr.lab.evaluate.curves import plot
-    from edgevpr.lab.evaluate.tables import results_text
+    from edgevpr.lab.evaluate.tables import plot, results_text
     from edgevpr.runtime.recognise.opening import gate_of
     from edgevpr.techniques import create
 
@@ -176,10 +175,9 @@ def _measure_techniques(args: Namespace) -> int:
 def _measure_similarities(args: Namespace) -> int:
     from edgevpr.core.text import decoded_name, require_picture
     from edgevpr.frames.images import list_images
-    from edgevpr.lab.evaluate.curves import plot
     from edgevpr.lab.evaluate.numbered import truth_in
     from edgevpr.lab.evaluate.similarity import measure, read_similarities
-    from edgevpr.lab.evaluate.tables import quality_text
+    from edgevpr.lab.evaluate.tables import plot, quality_text
 
     def names_in(folder: str | None) -> list[str] | None:
         return [decoded_name(path.name) for path in list_images(folder)] if folder else None

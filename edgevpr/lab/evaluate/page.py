@@ -1,18 +1,24 @@
-"""The page of an evaluation: tables, curves, costs, and the matches that went wrong, to look at."""
+"""The results of an evaluation as files: JSON for programs, and a page of tables, curves, costs, and the matches that
+went wrong, to look at."""
 
+import json
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from edgevpr.core.errors import ImageError
+from edgevpr.core.files import write_whole
 from edgevpr.core.text import decoded_name
 from edgevpr.frames.images import counting_order, list_images, read_image, small_jpeg
 from edgevpr.lab.evaluate import tables
 from edgevpr.lab.evaluate.asking import QueryAnswer
 from edgevpr.lab.evaluate.many import CURVE_TO, MeasuredRow, Measurements, OpenSet
 from edgevpr.lab.evaluate.metrics import RESAMPLES, SEED
-from edgevpr.lab.evaluate.provenance import today, versions
+from edgevpr.lab.evaluate.provenance import machine, today, versions
 from edgevpr.review.html import foreign, heading, notes, page, picture, section, table
 from edgevpr.review.svg import Axis, Series, chart, figure, scatter
 
@@ -26,6 +32,42 @@ _HEADINGS = ("row", "recall@1", "95 %", "@5", "@10", "AUC", "P@100%R", "R@100%P"
 _COSTS = ("row", "encode ms", "match ms", "RAM B/place", "disk B/place", "mAh/query", "measured")
 
 Numbered = tuple[int, MeasuredRow]  # every row has its number on the whole page
+
+
+def write_results(folder: Path, outcome: Measurements) -> None:
+    """Write results.json and index.html into a folder."""
+    contents = {"results.json": json.dumps(as_json(outcome), indent=1) + "\n", "index.html": page_of(outcome)}
+    for name, content in contents.items():
+        write_whole(folder / name, partial(Path.write_text, data=content, encoding="utf-8", errors="backslashreplace"))
+
+
+def as_json(outcome: Measurements) -> dict[str, Any]:
+    """Return all results, with who made them, as JSON holds them."""
+    return {
+        "date": today(),
+        "machine": machine(),
+        "versions": versions(),
+        "seeds": {"intervals": SEED, "resamples": RESAMPLES},
+        "sets": {
+            of.name: {
+                **{key: value for key, value in asdict(of.plan).items() if value is not None},
+                "queries": len(of.dataset.queries),
+                "references": len(of.dataset.references),
+            }
+            for of in outcome.sets
+        },
+        "results": [
+            {
+                "set": row.set_name,
+                "row": row.label,
+                **asdict(row.result),
+                "recall_at_k": row.recalls,
+                "made": asdict(row.made),
+            }
+            for row in outcome.found
+        ],
+        "failed": [{"set": of, "row": row, "why": why} for (of, row), why in outcome.failed.items()],
+    }
 
 
 def page_of(outcome: Measurements) -> str:

@@ -7,8 +7,8 @@ import pytest
 
 from edgevpr.core.errors import UsageError
 from edgevpr.core.text import require_picture
-from edgevpr.lab.evaluate.curves import plot
 from edgevpr.lab.evaluate.evaluate import TechniqueResult
+from edgevpr.lab.evaluate.tables import plot
 
 pytest.importorskip("matplotlib", reason="pictures need the extra `plots`")
 

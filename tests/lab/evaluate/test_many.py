@@ -16,7 +16,7 @@ from edgevpr.cli.main import main
 from edgevpr.lab.evaluate.dataset import load_dataset
 from edgevpr.lab.evaluate.evaluate import evaluate
 from edgevpr.lab.evaluate.many import measure
-from edgevpr.lab.evaluate.output import as_json
+from edgevpr.lab.evaluate.page import as_json
 from edgevpr.lab.evaluate.plan import EvaluationPlan, RowPlan, SetPlan
 
 pytestmark = [pytest.mark.process, pytest.mark.slow]
