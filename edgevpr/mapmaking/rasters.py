@@ -18,13 +18,14 @@ from edgevpr.frames.images import resized
 os.environ.setdefault("GDAL_CACHEMAX", "64")
 
 try:
-    import rasterio
-    from rasterio._err import CPLE_BaseError
-    from rasterio.crs import CRS
+    import rasterio as rasterio
+    from rasterio._err import CPLE_BaseError as CPLE_BaseError
+    from rasterio.crs import CRS as CRS
     from rasterio.enums import ColorInterp, Resampling
-    from rasterio.errors import NotGeoreferencedWarning, RasterioError
-    from rasterio.features import geometry_mask
-    from rasterio.warp import transform
+    from rasterio.errors import NotGeoreferencedWarning
+    from rasterio.errors import RasterioError as RasterioError
+    from rasterio.features import geometry_mask as geometry_mask
+    from rasterio.warp import transform as transform
     from rasterio.windows import Window
 except ModuleNotFoundError as error:
     raise SourceError(
@@ -32,20 +33,6 @@ except ModuleNotFoundError as error:
     ) from error
 
 logging.getLogger("rasterio").setLevel(logging.CRITICAL)  # edgevpr reports each fault once, in its own words
-
-__all__ = [
-    "CRS",
-    "CPLE_BaseError",
-    "ColorInterp",
-    "NotGeoreferencedWarning",
-    "RasterioError",
-    "Resampling",
-    "Window",
-    "geometry_mask",
-    "rasterio",
-    "transform",
-]
-
 
 _DTYPES = ("uint8", "uint16")
 _COLOURS = (ColorInterp.blue, ColorInterp.green, ColorInterp.red)
