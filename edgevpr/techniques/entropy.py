@@ -7,7 +7,7 @@ the only question that CoHOG asks of such a map (which blocks are good), mostly 
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache, reduce
+from functools import lru_cache, partial, reduce
 
 import cv2
 import numpy as np
@@ -133,12 +133,8 @@ def _bound_shannon(grey: Bytes, cell_px: int) -> _Bounds:
     small = _shannon_copy(grey)
     low = _shannon_of(small & 15, DISC_RADIUS_PX)
     high = low + _LOG2_OVER_8[(_range(small) >> 4) + 1]
-
-    def exact(pixels: Bools) -> Singles:
-        return _shannon_at(small, pixels, DISC_RADIUS_PX)
-
     down, across = (_scaled_pairs(side, cell_px) for side in grey.shape)
-    return _Bounds(low=low, high=high, down=down, across=across, exact=exact)
+    return _Bounds(low=low, high=high, down=down, across=across, exact=partial(_shannon_at, small))
 
 
 _MAPS = {"filled_bins": filled_bins, "shannon": shannon}
@@ -216,10 +212,10 @@ def _shannon_of(small: Array, radius_px: int) -> Singles:
     return entropy
 
 
-def _shannon_at(small: Bytes, pixels: Bools, radius_px: int) -> Singles:
+def _shannon_at(small: Bytes, pixels: Bools) -> Singles:
     """Compute `_shannon_of` at the True pixels of a bool (H, W): float32, one value per pixel, from its own
     histogram."""
-    r = radius_px
+    r = DISC_RADIUS_PX
     padded = np.pad(small.astype(np.int16), r, constant_values=256)  # 256: outside
     down, right = np.nonzero(np.hypot(*np.mgrid[-r : r + 1, -r : r + 1]) <= r)
     disc = down * padded.shape[1] + right

@@ -118,7 +118,8 @@ def _session(path: Path, sha256: str, threads: int) -> Any:
         return runtime.InferenceSession(read_file(path, MAX_FILE_BYTES), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's own classes, and RuntimeError
         raise ModelError(
-            f"{path} cannot be opened as an ONNX model with its weights inside ({_in_one_line(error)}): export it again."
+            f"{path} cannot be opened as an ONNX model with its weights inside ({_in_one_line(error)}): export it "
+            "again."
         ) from error
 
 
