@@ -202,7 +202,7 @@ def test_a_refused_fix_says_why_by_what_the_autopilot_has_said(autopilot):
     assert refused().why == readiness.NOT_RECKONING.sentence
     assert refused(ACCEPTED).why is None
     assert autopilot.conversation.autopilot.acks == {"FAILED": 24, "ACCEPTED": 1}
-    assert autopilot.conversation.fixes.refusal.brief == "nothing to reckon by"
+    assert autopilot.conversation.fixes.refusal is readiness.NOT_RECKONING
 
 
 def test_the_ground_station_hears_each_reason_once_and_that_fixes_are_taken_again(autopilot, caplog):

@@ -54,17 +54,6 @@ def test_a_tcp_server_of_pymavlink_closes_refuses_and_comes_back(mavutil):
     other.listen.close()
 
 
-def test_a_udp_end_of_pymavlink_starts_again_at_its_port(mavutil):
-    url = f"udpin:127.0.0.1:{free_port()}"
-    with link_to(url.replace("udpin", "udpout")) as link:
-        for _ in range(3):
-            with closing(mavutil.mavlink_connection(url, dialect="all", source_system=7, source_component=1)) as other:
-                first = other.recv_match(type="HEARTBEAT", blocking=True, timeout=60)
-                assert first.get_srcComponent() == 197
-                beat_until_heard(other, link, beats=link.stats().received.get("HEARTBEAT", 0) + 1)
-        assert (link.stats().reopened, link.stats().bad_bytes) == (0, 0)
-
-
 def test_a_program_of_pymavlink_cannot_take_our_port_away(mavutil):
     """Two of pymavlink's own bind to one port without a word, and the first then hears nothing."""
     number = free_port()

@@ -261,7 +261,7 @@ def test_a_key_of_another_length_is_refused(key_file, content, says):
 def test_a_key_that_is_no_file_is_refused(tmp_path):
     os.mkfifo(tmp_path / "pipe", 0o600)
     for name in ("missing", "pipe", "."):
-        with pytest.raises(ConfigError, match=r"cannot be read .* makes one"):
+        with pytest.raises(ConfigError, match="urandom"):
             read_key(str(tmp_path / name))
 
 
