@@ -22,6 +22,7 @@ from base import Row
 from big_map import make_big_map
 from flight_process import cpu_s, start, wait_for, watch_memory, write_frames
 
+from edgevpr.core.config import BatteryConfig
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import Pack
 from edgevpr.power.meter import QueryMeter
@@ -87,7 +88,7 @@ def metering_row(log: Path) -> Row:
     queries = [line for line in read_log(log) if line["kind"] == "query"]
     query_s = statistics.median(line["costs"]["cpu_s"] + line["reading"]["cpu_s"] for line in queries)
     board, pack = load_board("this"), Pack(4, 5200)
-    meter, of_query = FlightMeter(board, pack, 0.85, clock=Clock()), QueryMeter(board, pack, 0.85)
+    meter, of_query = FlightMeter(BatteryConfig("4S5200", 0.85), board, Clock()), QueryMeter(board, pack, 0.85)
     elsewhere = np.ones(8_000_000, np.float32)
     taken_s = []
     for _ in range(MEASURED):
@@ -103,7 +104,7 @@ def metering_row(log: Path) -> Row:
             steps = replace(of_query.steps(), read=reading.cost)
             meter.count(Recognition(frame=None, reason="", steps=steps, cost=of_query.cost()))
             with meter.telling():
-                json.dumps([asdict(of_query.cost()), asdict(reading.cost), meter.heat_fields(), meter.totals()])
+                json.dumps([asdict(of_query.cost()), asdict(reading.cost), asdict(meter.thermal), meter.totals()])
         meter.look_at_heat()
         meter.reading()
         taken_s.append(time.process_time() - begin_s)

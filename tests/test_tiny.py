@@ -4,7 +4,7 @@ from fakes import FakeClock, FakeLink, FakeSource, to_autopilot
 from pictures import textured
 
 from edgevpr.core.config import load_config
-from edgevpr.core.types import NO_TAPE, Frame, Position
+from edgevpr.core.types import Frame, Position
 from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
@@ -12,7 +12,7 @@ from edgevpr.power.boards import load_board
 from edgevpr.runtime.flight.flight import Flight
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log
 from edgevpr.runtime.flight.herald import Herald
-from edgevpr.runtime.flight.metering import meter_of_flight
+from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.flight.world import Crew, Stop
 from edgevpr.runtime.recognise.judge import accept_rule
@@ -44,7 +44,7 @@ def test_the_whole_walk(tmp_path):
             autopilot=to_autopilot(link, Navigator(5.0, 1.0), clock, flight_log),
             flight_log=flight_log,
             herald=Herald(flight_log, link),
-            meter=meter_of_flight(config.battery, board, clock.clock, NO_TAPE),
+            meter=FlightMeter(config.battery, board, clock.clock),
             clock=clock.clock,
             stop=Stop(),
         )

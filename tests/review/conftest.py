@@ -10,13 +10,13 @@ from pictures import textured
 
 from edgevpr.cli.main import main
 from edgevpr.core.config import load_config
-from edgevpr.core.types import NO_TAPE, Frame, Receiver, Vehicle
+from edgevpr.core.types import Frame, Receiver, Vehicle
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.flight.aboard import start_fields
 from edgevpr.runtime.flight.flight import Flight
 from edgevpr.runtime.flight.flightlog import FlightLog
 from edgevpr.runtime.flight.herald import Herald
-from edgevpr.runtime.flight.metering import meter_of_flight
+from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.flight.world import Crew, Stop
 from edgevpr.runtime.recognise.opening import open_recogniser
@@ -67,7 +67,7 @@ def flown(tmp_path_factory):
             autopilot=to_autopilot(link, link.listener, clock, log),
             flight_log=log,
             herald=Herald(log, link),
-            meter=meter_of_flight(config.battery, board, clock.clock, NO_TAPE),
+            meter=FlightMeter(config.battery, board, clock.clock),
             clock=clock.clock,
             stop=Stop(),
         )

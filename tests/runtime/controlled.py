@@ -20,7 +20,7 @@ from edgevpr.power.load import MachineLoad
 from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.flightlog import FlightLog
 from edgevpr.runtime.flight.herald import Herald
-from edgevpr.runtime.flight.navigator import Muted, Navigator
+from edgevpr.runtime.flight.navigator import Navigator
 
 STEP_S = 0.025
 FIX_SD_M = 1.0
@@ -39,10 +39,9 @@ class Controlled:
         self.clock, self.rng = FakeClock(), np.random.default_rng(3)
         self._sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._sock.bind(("127.0.0.1", 0))
-        self.navigator = Navigator(1.0, 1.0)
-        listener = self.navigator if send_fixes else Muted(self.navigator)
+        self.navigator = Navigator(1.0, 1.0, is_muted=not send_fixes)
         url = f"udpout:127.0.0.1:{self._sock.getsockname()[1]}"
-        self.link = link_to(url, clock=self.clock, listener=listener)
+        self.link = link_to(url, clock=self.clock, listener=self.navigator)
         settings = replace(load_config(None).mavlink, send_fixes=send_fixes, source_sets=source_sets)
         herald = Herald(FlightLog(None), self.link)
         self.autopilot = ToAutopilot(

@@ -5,7 +5,6 @@ from pathlib import Path
 from fakes import FakeClock, FakeLink, FakeSource
 
 from edgevpr.core.config import Config, load_config
-from edgevpr.core.types import NO_TAPE
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import parse_pack
 from edgevpr.power.meter import QueryMeter
@@ -13,7 +12,7 @@ from edgevpr.runtime.flight.autopilot import NoAutopilot, ToAutopilot
 from edgevpr.runtime.flight.flight import Flight as FlightItself
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log
 from edgevpr.runtime.flight.herald import Herald
-from edgevpr.runtime.flight.metering import FlightMeter, meter_of_flight
+from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.flight.reloading import Reread
 from edgevpr.runtime.flight.world import Crew, Stop
@@ -86,7 +85,7 @@ class Flight:
                 autopilot=autopilot,
                 flight_log=flight_log,
                 herald=herald,
-                meter=meter or meter_of_flight(self.config.battery, self.board, clock, NO_TAPE),
+                meter=meter or FlightMeter(self.config.battery, self.board, clock),
                 clock=clock,
                 stop=self.stop,
                 reread=self.reread,
@@ -106,8 +105,7 @@ def metered(config: Config, recogniser: Recogniser, clock: FakeClock) -> QueryMe
 
 def flight_meter(flight: Flight, kind: type[FlightMeter] = FlightMeter, **more) -> FlightMeter:
     """A meter of the flight as a whole, for a test that looks into it."""
-    battery = flight.config.battery
-    return kind(flight.board, parse_pack(battery.pack), battery.regulator_efficiency, clock=flight.clock.clock, **more)
+    return kind(flight.config.battery, flight.board, flight.clock.clock, **more)
 
 
 def of_kind(lines: list[dict], kind: str) -> list[dict]:

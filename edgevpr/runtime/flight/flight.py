@@ -27,8 +27,8 @@ from edgevpr.runtime.flight.clock import Pace
 from edgevpr.runtime.flight.commands import Commands
 from edgevpr.runtime.flight.governor import Governing
 from edgevpr.runtime.flight.herald import Herald
-from edgevpr.runtime.flight.metering import meter_of_flight
-from edgevpr.runtime.flight.navigator import Muted, Navigator
+from edgevpr.runtime.flight.metering import FlightMeter
+from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.flight.reloading import Reread, reload
 from edgevpr.runtime.flight.vitals import Vitals
 from edgevpr.runtime.flight.watching import GpsWatch, MapWatch, Sight, Tally
@@ -93,7 +93,7 @@ class Flight:
             say_start(config, world, aboard)
             recogniser, learner = aboard.recogniser, aboard.learner
             step_s = 1 / rate_hz(config, recogniser)
-            navigator = Navigator(config.mavlink.min_accuracy_m, step_s)
+            navigator = Navigator(config.mavlink.min_accuracy_m, step_s, is_muted=not config.mavlink.send_fixes)
             link, ground = open_links(config.mavlink, world, navigator, recogniser.place_map, stack)
             source = world.open_source(step_s)
             stack.callback(source.close)
@@ -110,7 +110,7 @@ class Flight:
             if aboard.cannot_learn:
                 _say_learning_stopped(herald, aboard.cannot_learn)
             herald.say(Severity.INFO, f"started, {len(recogniser.place_map)} places", topic="start")
-            meter = meter_of_flight(config.battery, world.board, world.clock, world.tape)
+            meter = FlightMeter(config.battery, world.board, world.clock, tape=world.tape)
             crew = Crew(
                 recogniser=recogniser,
                 learner=learner,
@@ -228,7 +228,7 @@ class Flight:
             last_fix=event.last_fix,
             reading=event.steps.read,
             vehicle=event.vehicle,
-            board=self._crew.meter.heat_fields(),
+            board=self._crew.meter.thermal,
             hints=event.hints.fields() if event.hints else None,
             totals=self.totals(),
         )
@@ -296,7 +296,7 @@ def open_links(
         component_id=settings.component_id,
         system_id=settings.system_id,
         max_fix_age_s=settings.max_fix_age_s,
-        listener=navigator if settings.send_fixes else Muted(navigator),
+        listener=navigator,
         tap=world.tap,
         origin=_first_position(place_map) if settings.set_origin else None,
         signing=world.signing,

@@ -2,13 +2,12 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, astuple, dataclass
-from typing import Any
+from dataclasses import astuple, dataclass
 
 from edgevpr.core.config import BatteryConfig
 from edgevpr.core.types import NO_TAPE, StageCost, Tape
 from edgevpr.power.boards import Board
-from edgevpr.power.equations import Pack, marginal_energy_j, pack_ah, parse_pack
+from edgevpr.power.equations import marginal_energy_j, pack_ah, parse_pack
 from edgevpr.power.load import MachineLoad, OwnLoad, machine_load
 from edgevpr.power.machine import rss_mb
 from edgevpr.power.meter import OwnMemory, QueryMeter, RunningEnergy, Stage, stage
@@ -37,17 +36,15 @@ class FlightMeter:
 
     def __init__(
         self,
+        battery: BatteryConfig,
         board: Board,
-        pack: Pack,
-        regulator_efficiency: float,
-        *,
         clock: Clock,
+        *,
         watch: ThermalWatch | None = None,
         tape: Tape = NO_TAPE,
     ) -> None:
-        self._tape = tape
-        self._board, self._pack, self._regulator_efficiency = board, pack, regulator_efficiency
-        self._clock = clock
+        self._board, self._clock, self._tape = board, clock, tape
+        self._pack, self._regulator_efficiency = parse_pack(battery.pack), battery.regulator_efficiency
         self._energy = RunningEnergy(board, clock.mono_s, clock.process_cpu_s)
         self._load = OwnLoad(board.cores, clock.mono_s, clock.process_cpu_s)
         self._watch = watch or ThermalWatch()
@@ -67,8 +64,8 @@ class FlightMeter:
 
     @contextmanager
     def reading_frame(self, is_live: bool) -> Iterator[Stage]:
-        """Meter the reading of a frame. LoadReading from a live source is mostly waiting for the next frame, and is no
-        work."""
+        """Meter the reading of a frame. Of a live source that is mostly waiting for the next frame, and
+        no work."""
         with stage(self._clock.mono_s, self._clock.process_cpu_s) as reading:
             yield reading
         if not is_live:
@@ -127,10 +124,6 @@ class FlightMeter:
         """Return the memory of this process, MB."""
         return self._tape.read("rss_mb", rss_mb)
 
-    def heat_fields(self) -> dict[str, Any]:
-        """Return the fields of the log: temperature, frequency, whether the board slows itself down, and why."""
-        return asdict(self.thermal)
-
     def reading(self) -> LoadReading:
         """Return the governor's reading: the load since the last one, and the present memory and heat."""
         cpu_share, late_share = self._load.look()
@@ -144,11 +137,6 @@ class FlightMeter:
 
     def _mah(self, energy_j: float) -> float:
         return 1000 * pack_ah(energy_j, self._pack, self._regulator_efficiency)
-
-
-def meter_of_flight(battery: BatteryConfig, board: Board, clock: Clock, tape: Tape) -> FlightMeter:
-    """Make the meter of a flight on a board that is fed by the configured pack."""
-    return FlightMeter(board, parse_pack(battery.pack), battery.regulator_efficiency, clock=clock, tape=tape)
 
 
 def meter_of_queries(battery: BatteryConfig, board: Board, clock: Clock, tape: Tape) -> QueryMeter:

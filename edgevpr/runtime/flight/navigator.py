@@ -53,9 +53,10 @@ class Advice:
 
 class Navigator:
     """Navigates by one autopilot. `map_sd_m` is by how much all fixes may be off together, `every_s` the time between
-    two queries."""
+    two queries. In a dry run it `is_muted`, and gives no continuous position."""
 
-    def __init__(self, map_sd_m: float, every_s: float) -> None:
+    def __init__(self, map_sd_m: float, every_s: float, is_muted: bool = False) -> None:
+        self._is_muted = is_muted
         self._lock = Lock()
         self._map_sd_m, self._every_s = map_sd_m, every_s
         self._navigation = Navigation(RECKONED, map_sd_m)
@@ -149,6 +150,8 @@ class Navigator:
     def state_at(self, t_s: float) -> MotionState | None:
         """Return where the vehicle is or was, later than at the last call, to be sent as a continuous position; None:
         that is not known well enough."""
+        if self._is_muted:
+            return None
         with self._lock:
             vehicle, estimate = self._vehicle, self._known(t_s)
             if estimate is None or vehicle is None:
@@ -243,17 +246,6 @@ class Slew:
         part = min(1.0, _FASTEST_M_S * step_s / behind_m) if behind_m > 0 else 1.0
         self._said, self._at = estimate, moved(*carried, part * float(east_m), part * float(north_m))
         return *self._at, (1 - part) * behind_m
-
-
-class Muted:
-    """Navigates as a `Navigator` does, and gives no continuous position: for a dry run."""
-
-    def __init__(self, navigator: Navigator) -> None:
-        self.hear_autopilot, self.hear_channel = navigator.hear_autopilot, navigator.hear_channel
-        self.hear_vehicle, self.hear_force = navigator.hear_vehicle, navigator.hear_force
-
-    def state_at(self, t_s: float) -> None:
-        return None
 
 
 def _in_radians(attitude: Attitude) -> tuple[float, float, float]:

@@ -15,7 +15,7 @@ from edgevpr.runtime.flight.clock import Pace
 from edgevpr.runtime.flight.commands import Commands
 from edgevpr.runtime.flight.herald import Trouble
 from edgevpr.runtime.flight.status import SeenQuery, Status
-from edgevpr.runtime.flight.watching import FAILURES_IN_A_ROW, Tally
+from edgevpr.runtime.flight.watching import FAILURES_IN_A_ROW, NOTHING_IN_A_ROW, Tally
 from edgevpr.runtime.flight.world import Crew
 from edgevpr.runtime.recognise.recognition import Recognition
 
@@ -69,9 +69,9 @@ class Vitals:
         meter = self._crew.meter
         meter.look_at_heat()
         self._look_at_source()
-        self._failing.note(self._tally.is_failing)
+        self._failing.note(self._tally.failed_in_a_row >= FAILURES_IN_A_ROW)
         self._look_at_log()
-        self._blind.note(self._tally.sees_nothing)
+        self._blind.note(self._tally.nothing_in_a_row >= NOTHING_IN_A_ROW)
         health, load = self._health(), meter.machine_load()
         status = self._status(health, load)
         systemd.status(status.summary)

@@ -46,16 +46,6 @@ class Tally:
         self.failed_in_a_row = self.failed_in_a_row + 1 if event.failed else 0
         self.nothing_in_a_row = self.nothing_in_a_row + 1 if event.says_nothing else 0
 
-    @property
-    def is_failing(self) -> bool:
-        """True where the last `FAILURES_IN_A_ROW` events, or more, have all failed."""
-        return self.failed_in_a_row >= FAILURES_IN_A_ROW
-
-    @property
-    def sees_nothing(self) -> bool:
-        """True where the last `NOTHING_IN_A_ROW` pictures, or more, have all said nothing."""
-        return self.nothing_in_a_row >= NOTHING_IN_A_ROW
-
 
 class MapWatch:
     """Watches the map: each place that is left out has a line of kind "left out" in the log, and the ground is told

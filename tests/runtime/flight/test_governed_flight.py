@@ -19,8 +19,8 @@ class Scripted(FlightMeter):
 
     age_s = 1.0
 
-    def __init__(self, *board, clock, readings):
-        super().__init__(*board, clock=clock)
+    def __init__(self, battery, board, clock, *, readings):
+        super().__init__(battery, board, clock)
         self._readings, self._begin_s, self._now = readings, clock.mono_s(), clock.mono_s
 
     def reading(self):

@@ -11,7 +11,7 @@ from edgevpr.core.geodesy import distance_m
 from edgevpr.frames.level import View
 from edgevpr.mavlink.channel import Channel
 from edgevpr.runtime.flight import navigator
-from edgevpr.runtime.flight.navigator import Muted, Navigator
+from edgevpr.runtime.flight.navigator import Navigator
 
 WIND = 6.0, 0.0
 LIKE_ONE = math.sqrt(50)  # by so much more a continuous position says that it is wrong
@@ -233,9 +233,6 @@ def test_without_anything_heard_there_is_no_continuous_position():
 
 
 def test_muted_it_hears_and_gives_no_state():
-    flown = Air(inertial(Navigator(1.0, 1.0)))
-    muted = Muted(flown.navigator)
-    flown.fly(10)
-    muted.hear_vehicle(flown.vehicle)
-    assert flown.navigator.state_at(flown.t_s)
-    assert muted.state_at(flown.t_s) is None
+    flown = Air(inertial(Navigator(1.0, 1.0, is_muted=True))).fly(10)
+    assert flown.navigator.knows_position(flown.t_s)
+    assert flown.navigator.state_at(flown.t_s) is None
