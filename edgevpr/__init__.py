@@ -7,4 +7,4 @@ __version__ = "0.1.0"
 # The largest survey cameras that are flown have 100 megapixels (11664 x 8750); decoded that is 300 MB. Without a limit
 # a picture of 1 MB, which compresses well, takes gigabytes. OpenCV reads this once, when the first module imports it,
 # and then compares it with the header of a picture before any pixel is decoded.
-os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", "102100000")
+os.environ["OPENCV_IO_MAX_IMAGE_PIXELS"] = "102100000"
