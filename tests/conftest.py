@@ -4,6 +4,8 @@ import os
 
 import pytest
 
+import edgevpr  # noqa: F401  # it sets OpenCV's limit of pixels, which counts when OpenCV is imported
+
 # As edgevpr's command line does, before anything imports NumPy.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 

@@ -96,16 +96,17 @@ def read_image(path: str | Path) -> Image:
         raise ImageError(f"{path} is empty: copy it again from the camera.")
     if _is_incomplete(data):
         raise ImageError(f"{path} is cut short or damaged: copy it again from the camera.")
-    image = None
+    image, is_too_large = None, False
     try:
         if _STARTS.match(data):
             image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
     except cv2.error as error:
-        if "MAX_IMAGE" in str(error):
-            raise ImageError(
-                f"{path} has too many pixels; edgevpr reads up to {MAX_PIXELS / 1e6:.0f} megapixels: give a smaller "
-                "image."
-            ) from error
+        is_too_large = "MAX_IMAGE" in str(error)
+    # The second is of a program that has imported OpenCV before edgevpr: its limit is another then.
+    if is_too_large or (image is not None and image.shape[0] * image.shape[1] > MAX_PIXELS):
+        raise ImageError(
+            f"{path} has too many pixels; edgevpr reads up to {MAX_PIXELS / 1e6:.0f} megapixels: give a smaller image."
+        )
     if image is None:
         raise ImageError(f"{path} is not an image edgevpr can decode: give a JPEG, PNG, TIFF, BMP or WebP file.")
     if image.dtype != np.uint8:
