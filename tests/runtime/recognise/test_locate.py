@@ -114,7 +114,7 @@ def test_places_of_the_same_ground_are_heard_together():
 
 def test_places_that_contradict_each_other_are_refused():
     found = located([candidate(1, shift=(4, 0)), candidate(2, shift=(8, 10), east_m=10)], CELLS)
-    assert "positions that are" in found.objection
+    assert "positions" in found.objection
 
 
 def test_a_place_a_little_amiss_is_not_heard_and_no_objection():
@@ -134,11 +134,6 @@ def test_a_place_a_little_amiss_is_not_heard_and_no_objection():
 def test_what_does_not_show_the_same_ground_is_not_heard(other):
     found = located([candidate(1, shift=(4, 0)), other], CELLS)
     assert (found.places, found.objection) == ((1,), None)
-
-
-def test_an_unknown_tilt_makes_a_fix_less_exact():
-    known, unknown = located([candidate()], CELLS, View(aside=(0.0, 0.0))), located([candidate()], CELLS)
-    assert unknown.accuracy_m > known.accuracy_m + 0.5
 
 
 def test_without_a_pose_or_a_step_there_is_nothing_to_say():

@@ -8,7 +8,6 @@ from edgevpr.frames.images import cv2
 from edgevpr.runtime.recognise.salience_gate import (
     MOST_ENTROPY,
     Gate,
-    Maps,
     Thresholds,
     best_of,
     maps_of,
@@ -64,12 +63,6 @@ def test_scores_are_means_over_the_whole_picture_and_masked_pixels_count_as_noth
     alone = scores_of(maps_of(picture, None, None))
     assert (alone.memorability, alone.staticity) == (None, None)
     assert alone.entropy > scores.entropy
-
-
-def test_between_the_crops_the_memorability_is_interpolated():
-    across = maps_of(texture(), Half(), None).memorability[60]
-    assert np.all(np.diff(across) <= 1e-6)
-    assert (across[16], across[80], across[-16]) == pytest.approx((1.0, 0.5, 0.0), abs=0.02)
 
 
 def test_a_large_picture_and_one_of_a_single_pixel_have_maps():
@@ -130,13 +123,6 @@ def test_a_long_stretch_without_information_does_not_become_usual():
     assert all(gate.look(empty).lacks == "entropy" for _ in range(70))
 
 
-def test_a_picture_of_one_colour_passes_no_gate_of_entropy():
-    gate = Gate(Thresholds(entropy=0.4))
-    for _ in range(12):
-        gate.look(texture())
-    assert gate.look(np.full((120, 160), 77, np.uint8)).lacks == "entropy"
-
-
 def test_the_detector_looks_at_every_kth_frame_only():
     class Counting:
         looks = 0
@@ -158,9 +144,3 @@ def test_lowering_the_thresholds_step_by_step_lets_the_best_pass():
     assert best_of([0.05, 0.031, 0.2, 0.059]) == [True, True, False, True]  # two steps of 0.03
     assert best_of([0.03]) == [True]
     assert best_of([0.5, 0.02, 0.03, 0.031]) == [False, True, True, False]
-
-
-def test_maps_are_of_one_size():
-    maps = maps_of(texture(300, 500), Half(), np.ones((300, 500), bool))
-    assert isinstance(maps, Maps)
-    assert maps.memorability.shape == maps.is_static.shape == maps.entropy.shape == (192, 320)
