@@ -9,12 +9,15 @@ import typing
 from collections.abc import Iterator
 from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from edgevpr.core.errors import ConfigError
 from edgevpr.core.files import shipped
 from edgevpr.core.text import meant
 from edgevpr.core.yamlfile import read_yaml
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 FORMS = ("float", "8bit", "1bit")  # of a vector in RAM, each smaller than the one before: see techniques.vectors
 LOWEST_RATE_HZ, HIGHEST_RATE_HZ = 0.01, 60.0  # of queries
@@ -25,15 +28,8 @@ SOURCES = (
 
 _SHOWN = 80  # characters of a wrong value in a message
 
-T = TypeVar("T")
-_WORDS = {
-    float: "a number",
-    int: "a whole number",
-    str: "a text",
-    bool: "true or false",
-    list: "a list",
-    dict: "a section",
-}
+T = TypeVar("T", bound="DataclassInstance")
+_WORDS = {float: "a number", int: "a whole number", str: "a text", bool: "true or false", dict: "a section"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -280,7 +276,7 @@ def build(cls: type[T], mapping: dict[str, Any], where: str, prefix: str = "") -
     Raises ConfigError for a key that is unknown or missing, and for a value of a wrong type or out of range.
     """
     hints = typing.get_type_hints(cls)
-    known = {f.name: f for f in fields(cls)}  # type: ignore[arg-type]
+    known = {f.name: f for f in fields(cls)}
     for key in mapping:
         if key not in known:
             raise _unknown(key, known, where, prefix)
@@ -298,9 +294,7 @@ def _overlaid(base: dict[str, Any], over: dict[str, Any], where: str, prefix: st
     for key, value in over.items():
         if key not in base:
             raise _unknown(key, base, where, prefix)
-        if isinstance(base[key], dict):
-            if not isinstance(value, dict):
-                raise ConfigError(f"{where}: `{prefix}{key}` is a section: write its keys below it, indented.")
+        if isinstance(base[key], dict) and isinstance(value, dict):
             value = _overlaid(base[key], value, where, f"{prefix}{key}.")
         merged[key] = value
     return merged
@@ -314,21 +308,21 @@ def _unknown(key: object, known: typing.Iterable[str], where: str, prefix: str) 
 
 def _converted(value: Any, hint: Any, limits: tuple[float, float] | None, where: str, key: str) -> Any:
     wanted = _kind(hint)
+    if isinstance(wanted, type) and is_dataclass(wanted):
+        if not isinstance(value, dict):
+            raise ConfigError(f"{where}: `{key}` is a section: write its keys below it, indented.")
+        return build(wanted, value, where, f"{key}.")
     if value is None:
         if wanted is not hint:
             return None
         raise ConfigError(f"{where}: `{key}` has no value: write one.")
-    if is_dataclass(wanted):
-        if not isinstance(value, dict):
-            raise ConfigError(f"{where}: `{key}` is a section: write its keys below it, indented.")
-        return build(wanted, value, where, f"{key}.")  # type: ignore[arg-type]
     if wanted is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if isinstance(value, str):
         require_sayable(value, f"{where}: `{key}`")
     if not isinstance(value, wanted) or (isinstance(value, bool) and wanted is not bool):
         word = _WORDS.get(wanted, str(wanted))
-        raise ConfigError(f"{where}: `{key}` must be {word}, not {_shortened(value)}.")
+        raise ConfigError(f"{where}: `{key}` must be {word}, not {value!r:.{_SHOWN}}.")
     if limits and not limits[0] <= value <= limits[1]:
         raise ConfigError(f"{where}: `{key}` is {value:g}; it must be between {limits[0]:g} and {limits[1]:g}.")
     return value
@@ -337,17 +331,13 @@ def _converted(value: Any, hint: Any, limits: tuple[float, float] | None, where:
 def require_sayable(text: str, what: str) -> None:
     """Check that a text can be the name of a file; raises ConfigError for one with NUL or half a character (a lone
     surrogate), which no file has and no output takes. `what` begins the sentence."""
+    problem = "a NUL character" if "\0" in text else None
     try:
         os.fsencode(text)
     except UnicodeEncodeError:
-        raise ConfigError(f"{what} holds half a character ({text!a:.60}): write it anew.") from None
-    if "\0" in text:
-        raise ConfigError(f"{what} holds a NUL character ({text!a:.60}): write it anew.")
-
-
-def _shortened(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= _SHOWN else text[:_SHOWN] + "..."
+        problem = "half a character"
+    if problem:
+        raise ConfigError(f"{what} holds {problem} ({text!a:.60}): write it anew.")
 
 
 def _kind(hint: Any) -> Any:

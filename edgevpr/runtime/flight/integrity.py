@@ -9,7 +9,7 @@ import numpy as np
 from edgevpr.core.arrays import Doubles
 from edgevpr.core.geodesy import offset_m
 from edgevpr.core.types import Receiver, Vehicle
-from edgevpr.runtime.flight.navigation import Sighting, sighting_of, worst_sd
+from edgevpr.runtime.flight.navigation import PositionedMatch, positioned, worst_sd
 from edgevpr.runtime.recognise.locate import in_sd
 from edgevpr.runtime.recognise.recognition import Recognition
 
@@ -47,7 +47,7 @@ class Integrity:
     def look(self, event: Recognition) -> str | None:
         """Take in an accepted match with a position; return once, in a few words, that GPS is wrong, or right again;
         None: there is no news."""
-        seen, vehicle = sighting_of(event), event.vehicle
+        seen, vehicle = positioned(event), event.vehicle
         if seen is None or vehicle is None or vehicle.gps is None or not vehicle.is_fresh_at(seen.t_s):
             self.off_m = None
             return None
@@ -75,14 +75,14 @@ class Integrity:
             return f"GPS is {self.off_m:.0f} m from the map's position"
         return None
 
-    def _sd_m(self, seen: Sighting, vehicle: Vehicle, gps: Receiver) -> float:
+    def _sd_m(self, seen: PositionedMatch, vehicle: Vehicle, gps: Receiver) -> float:
         speed_m_s = math.hypot(*vehicle.velocity_m_s) if vehicle.velocity_m_s else 0.0
         of_fix_m = worst_sd(seen.covariance_m2)
         tilt_m = _ATTITUDE_SD * (vehicle.height_m or 0.0)
         return math.hypot(of_fix_m, self._map_sd_m, gps.sd_m, tilt_m, _TIME_SD_S * speed_m_s)
 
 
-def _beside(seen: Sighting, vehicle: Vehicle, gps: Receiver) -> Doubles:
+def _beside(seen: PositionedMatch, vehicle: Vehicle, gps: Receiver) -> Doubles:
     """Return the step (2,), metres, from the receiver's position at the time of the frame to the match."""
     here = seen.position
     off_m = np.array(offset_m(gps.lat_deg, gps.lon_deg, here.lat_deg, here.lon_deg))

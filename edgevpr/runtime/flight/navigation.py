@@ -167,7 +167,7 @@ def worst_sd(covariance: Doubles) -> float:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Sighting:
+class PositionedMatch:
     """An accepted match with a position: the time of its frame, where the aircraft was, the accuracy to claim, the
     covariance (2, 2) without what all fixes of the map have in common, and the places that say so."""
 
@@ -178,11 +178,11 @@ class Sighting:
     places: tuple[int, ...]
 
 
-def sighting_of(event: Recognition) -> Sighting | None:
+def positioned(event: Recognition) -> PositionedMatch | None:
     """Return the sighting of an event, None where no match with a position was accepted."""
     if event.frame is None or event.best is None or event.located is None or event.accuracy_m is None:
         return None
-    return Sighting(
+    return PositionedMatch(
         t_s=event.frame.t_mono_s,
         position=event.located.position,
         accuracy_m=event.accuracy_m,

@@ -19,7 +19,7 @@ from edgevpr.mavlink.positions import MotionState
 from edgevpr.mavlink.vehicle import Attitude
 from edgevpr.runtime.flight.consistency import Consistency, SeenFix
 from edgevpr.runtime.flight.filter import INERTIAL, RECKONED
-from edgevpr.runtime.flight.navigation import Navigation, Sighting, Whereabouts, reckons_by_gps, sighting_of
+from edgevpr.runtime.flight.navigation import Navigation, PositionedMatch, Whereabouts, positioned, reckons_by_gps
 from edgevpr.runtime.flight.path import over_ground
 from edgevpr.runtime.recognise.recognition import Recognition
 
@@ -105,7 +105,7 @@ class Navigator:
     def advise(self, event: Recognition, now_s: float) -> Advice:
         """Take in an accepted match with a position, and say what is to be sent for it. Raises ValueError for a
         position off the Earth."""
-        seen = sighting_of(event)
+        seen = positioned(event)
         if seen is None:
             return Advice(None, "the place has no position")
         if event.view.reason:
@@ -252,7 +252,7 @@ def _in_radians(attitude: Attitude) -> tuple[float, float, float]:
     return math.radians(attitude.roll_deg), math.radians(attitude.pitch_deg), math.radians(attitude.yaw_deg)
 
 
-def _covariance(seen: Sighting, vehicle: Vehicle) -> Doubles:
+def _covariance(seen: PositionedMatch, vehicle: Vehicle) -> Doubles:
     """Return the covariance (2, 2) of a fix, without what all fixes of the map have in common."""
     speed_m_s = math.hypot(*(vehicle.velocity_m_s or (0.0, 0.0)))
     height_m = vehicle.height_m or 0.0
