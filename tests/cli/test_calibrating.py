@@ -73,6 +73,7 @@ def calibration_in(path):
     return None if text is None else read_calibration(text)
 
 
+@pytest.mark.slow
 def test_a_build_ends_with_what_to_expect(flight, tmp_path, capsys):
     path = tmp_path / "m.gpkg"
     assert built(path, flight / "ref") == 0
@@ -110,6 +111,7 @@ def test_a_technique_without_a_confidence_is_built_in_silence(flight, tmp_path, 
     assert "margin" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_map_is_calibrated_later_and_says_so(bare, flight, capsys):
     assert main(["map", "calibrate", str(bare), "--images", str(flight / "ref")]) == 0
     found = calibration_in(bare)
@@ -120,6 +122,7 @@ def test_a_map_is_calibrated_later_and_says_so(bare, flight, capsys):
     assert json.loads(capsys.readouterr().out)["calibration"] == found.figures()
 
 
+@pytest.mark.slow
 def test_a_map_of_a_video_is_calibrated_with_its_frames(flight, tmp_path):
     path = tmp_path / "m.gpkg"
     assert built(path, flight / "film.avi", "--no-calibrate") == 0
@@ -154,6 +157,7 @@ def test_an_export_colours_the_places_that_were_asked_for(mapped, tmp_path):
     assert all(each["marker-color"].startswith("#") for each in found.values())
 
 
+@pytest.mark.slow
 def test_a_smaller_map_keeps_its_calibration_and_a_merged_one_has_none(mapped, bare_map, tmp_path, capsys):
     assert main(["map", "shrink", str(mapped), str(tmp_path / "small.gpkg"), "--places", "4"]) == 0
     assert calibration_in(tmp_path / "small.gpkg") == calibration_in(mapped)
@@ -165,6 +169,7 @@ def test_a_smaller_map_keeps_its_calibration_and_a_merged_one_has_none(mapped, b
     assert "calibrate" not in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_check_before_the_flight_says_what_to_expect(mapped, bare_map, flight, tmp_path, capsys):
     for path, said in ((mapped, calibration_in(mapped).described()), (bare_map, "not calibrated (8 places")):
         config = tmp_path / "c.yaml"

@@ -62,6 +62,7 @@ def test_map_info_tells_what_is_inside(capsys, valley):
     assert "6 with" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_match_finds_every_place_and_says_what_it_cost(capsys, flight, valley):
     found = run_json(capsys, "match", valley, "--images", flight / "query", "--json")
     assert [each["query"] for each in found] == [f"{n}.png" for n in range(6)]
@@ -77,11 +78,13 @@ def test_match_finds_every_place_and_says_what_it_cost(capsys, flight, valley):
     assert "6 queries, 6 accepted" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_match_below_the_threshold_is_not_accepted(capsys, flight, valley):
     found = run_json(capsys, "match", valley, "--images", flight / "query", "--min-score", "0.9999", "--json")
     assert not any(each["accepted"] for each in found)
 
 
+@pytest.mark.slow
 def test_more_precision_accepts_no_more(capsys, flight, valley):
     def accepted(precision):
         flags = ("--images", flight / "query", "--accept-precision", precision, "--json")
@@ -99,12 +102,14 @@ def test_a_precision_that_nothing_can_have_is_refused(capsys, flight, valley, pr
     assert "`match.accept_precision` is" in said
 
 
+@pytest.mark.slow
 def test_a_setting_of_the_technique_is_used_for_matching(capsys, flight, valley):
     by_flag = run_json(capsys, "match", valley, "--images", flight / "query", "--matching", "thesis", "--json")
     by_param = run_json(capsys, "match", valley, "--images", flight / "query", "--param", "matching=thesis", "--json")
     assert [each["score"] for each in by_param] == [each["score"] for each in by_flag]
 
 
+@pytest.mark.slow
 def test_eval_prints_the_promised_keys(capsys, flight):
     result = run_json(
         capsys, "eval", "--query", flight / "query", "--ref", flight / "ref",
@@ -122,6 +127,7 @@ def test_eval_prints_the_promised_keys(capsys, flight):
     assert result["cohog"]["parameters"]["entropy"] == "filled_bins"
 
 
+@pytest.mark.slow
 def test_the_technique_is_picked_and_the_reason_logged(capsys, caplog, flight, tmp_path):
     with caplog.at_level("INFO"):
         built = run_json(capsys, "map", "build", tmp_path / "m.gpkg", "--images", flight / "ref", "--json")
@@ -131,6 +137,7 @@ def test_the_technique_is_picked_and_the_reason_logged(capsys, caplog, flight, t
     assert "6 places take" in said
 
 
+@pytest.mark.slow
 def test_a_machine_too_slow_for_the_best_technique_makes_the_map_of_the_readme_all_the_same(
     capsys, caplog, flight, tmp_path, monkeypatch
 ):

@@ -202,6 +202,8 @@ def test_a_full_disk_leaves_no_half_of_a_merge_or_repair(valley, tmp_path, capsy
     assert not list(out.parent.iterdir())
 
 
+@pytest.mark.process
+@pytest.mark.slow
 def test_of_two_builders_on_the_same_images_one_is_refused(flight, tmp_path):
     path = tmp_path / "m.gpkg"
     shutil.copytree(flight, tmp_path / "many")
@@ -222,6 +224,8 @@ def test_of_two_builders_on_the_same_images_one_is_refused(flight, tmp_path):
         assert any("another program" in each for each in said)
 
 
+@pytest.mark.process
+@pytest.mark.slow
 def test_a_second_builder_is_refused_while_the_first_one_works(flight, tmp_path, capsys):
     path = tmp_path / "m.gpkg"
     assert main(built(path, flight)) == 0
@@ -231,6 +235,8 @@ def test_a_second_builder_is_refused_while_the_first_one_works(flight, tmp_path,
     assert main(built(path, flight, "--append")) == 0
 
 
+@pytest.mark.process
+@pytest.mark.slow
 def test_a_builder_that_is_killed_leaves_no_lock(flight, tmp_path):
     path = tmp_path / "m.gpkg"
     code = f"""

@@ -112,6 +112,7 @@ def test_a_map_of_a_network_that_is_not_here_says_how_to_get_it(models, flight, 
     assert "models add" in said
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("models")
 def test_eval_measures_each_form_in_a_row_of_its_own(capsys, flight):
     flags = ["--techniques", "tiny,hog,cohog", "--form", "float,1bit", "--param", "hog.w1=64"]
@@ -135,6 +136,7 @@ def test_eval_goes_on_without_a_network_that_cannot_be_used(models, capsys, flig
     assert "not finite" in said
 
 
+@pytest.mark.slow
 def test_eval_goes_on_without_a_network_whose_card_is_wrong(models, capsys, flight):
     (models / "calc.yaml").write_text("title: x\ntitel: y\n")
     code, found, said = evaluated(capsys, flight, "--techniques", "calc,cohog")
@@ -162,6 +164,8 @@ def tried_once(try_each):
     return known
 
 
+@pytest.mark.process
+@pytest.mark.slow
 def test_profile_lists_every_form_and_says_in_a_sentence_what_cannot_be_used(models, capsys, monkeypatch):
     wanted = ("cohog", "seqslam", "tiny", "calc", "rmac")
     monkeypatch.setattr("edgevpr.techniques.names", lambda: wanted)

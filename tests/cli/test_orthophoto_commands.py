@@ -37,6 +37,7 @@ def run(*command: str) -> int:
     return main(list(map(str, command)))
 
 
+@pytest.mark.slow
 def test_a_map_of_an_orthophoto_finds_a_flight_over_it(tmp_path, ground, track, capsys):
     place_map, flight = tmp_path / "m.gpkg", tmp_path / "flight"
     cut = ("--orthophoto", ground, "--footprint-m", 100, "--spacing-m", 25)
@@ -71,6 +72,7 @@ def test_a_map_of_an_orthophoto_finds_a_flight_over_it(tmp_path, ground, track, 
     assert rest["places"] == rest["added"] + built["places"]
 
 
+@pytest.mark.slow
 def test_water_and_what_is_not_known_are_left_out_and_said(tmp_path, capsys, caplog):
     with rasterio.open(textured_raster(tmp_path / "land.tif")) as data:
         land, to_crs = data.read(), data.transform
@@ -145,6 +147,7 @@ def test_a_track_elsewhere_names_both_extents(tmp_path, ground, capsys):
     assert "-35.3600..-35.3600" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_without_rasterio_the_sentence_says_what_to_install(tmp_path, ground):
     script = (
         "import sys; sys.modules['rasterio'] = None\n"
@@ -158,6 +161,7 @@ def test_without_rasterio_the_sentence_says_what_to_install(tmp_path, ground):
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_a_map_of_an_orthophoto_is_calibrated_with_what_is_cut_again(tmp_path, ground, track, capsys, monkeypatch):
     monkeypatch.setattr(calibrate, "FEWEST_PLACES", 6)
     monkeypatch.setattr(calibrate, "asked_of", lambda technique: 6)

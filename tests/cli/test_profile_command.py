@@ -91,6 +91,8 @@ def a_map(tmp_path, technique="hog"):
     return path, folder
 
 
+@pytest.mark.process
+@pytest.mark.slow
 def test_the_real_techniques_are_tried_and_said(capsys, monkeypatch):
     monkeypatch.setattr(techniques, "names", lambda: ("cohog", "hog"))
     found = json.loads(run(capsys, "--board", "rpi-zero-2w", "--places", 10_000, "--hover-w", 90, "--json").out)
@@ -135,6 +137,8 @@ def test_with_a_map_its_places_count_and_only_its_forms_are_recommended(capsys, 
     assert small["recommended"] is None
 
 
+@pytest.mark.process
+@pytest.mark.slow
 def test_what_was_measured_is_kept_used_and_dated(capsys, tmp_path, monkeypatch):
     monkeypatch.setattr(techniques, "names", lambda: ("cohog", "seqslam"))
     _, folder = a_map(tmp_path, "seqslam")
@@ -222,6 +226,8 @@ def test_it_says_which_board_this_is_and_writes_a_profile_that_can_be_flown(caps
     assert set(json.loads(run(capsys, "--detect", "--json").out)) >= {"board", "cpu", "usable_cores", "ram_limit_mb"}
 
 
+@pytest.mark.process
+@pytest.mark.slow
 def test_the_picture_is_written(capsys, tmp_path, tried):
     pytest.importorskip("matplotlib", reason="pictures need matplotlib")
     run(capsys, "--places", 50, "--board", "rpi-4b", "--plot", tmp_path / "chart.png")

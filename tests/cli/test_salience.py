@@ -61,6 +61,7 @@ def test_a_picture_is_scored(networks, tmp_path, capsys):
     assert (said["kept"], said["staticity"]) == (False, pytest.approx(0.5, abs=0.01))
 
 
+@pytest.mark.slow
 def test_frames_of_little_worth_are_left_out_and_a_gap_is_bounded_by_the_best_of_them(recording, tmp_path, capsys):
     place_map = tmp_path / "m.gpkg"
     command = ["map", "build", str(place_map), "--images", str(recording), "--technique", "hog", "--salience"]
@@ -89,6 +90,7 @@ def test_frames_of_little_worth_are_left_out_and_a_gap_is_bounded_by_the_best_of
     assert f"{len(low)} of low" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_query_that_is_not_memorable_is_not_asked_for(recording, tmp_path, capsys):
     place_map = str(tmp_path / "m.gpkg")
     assert main(["map", "build", place_map, "--images", str(recording), "--technique", "hog"]) == 0
@@ -137,6 +139,7 @@ def test_a_criterion_without_its_network_is_off_and_says_so(tmp_path, capsys, ca
     assert "`salience.detector`" in caplog.text
 
 
+@pytest.mark.slow
 def test_a_map_shrinks_to_its_best_places(recording, tmp_path, capsys):
     place_map, smaller = tmp_path / "m.gpkg", tmp_path / "s.gpkg"
     command = ["map", "build", str(place_map), "--images", str(recording), "--technique", "hog", "--salience"]
@@ -155,6 +158,7 @@ def test_a_map_shrinks_to_its_best_places(recording, tmp_path, capsys):
     assert "--mb" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_eval_counts_what_the_gate_discards_as_missed(recording, tmp_path, capsys):
     names = [path.name for path in sorted(recording.iterdir())]
     truth = tmp_path / "truth.csv"

@@ -69,6 +69,7 @@ def test_a_message_is_one_line_and_a_traceback_keeps_its_own():
     assert len(text.splitlines()) > 3
 
 
+@pytest.mark.slow
 def test_the_name_of_an_image_is_escaped_in_errors_and_tables(tmp_path):
     for number, folder in enumerate(("ref", "query")):
         (tmp_path / folder).mkdir()
@@ -83,6 +84,7 @@ def test_the_name_of_an_image_is_escaped_in_errors_and_tables(tmp_path):
     assert b"\x1b" not in built.stdout + built.stderr + matched.stdout + matched.stderr
 
 
+@pytest.mark.slow
 def test_the_password_of_a_camera_is_not_printed(tmp_path):
     (tmp_path / "c.yaml").write_text("source: {uri: 'http://pilot:secret@127.0.0.1:9/cam'}\n")
     checked = said(["check", "--config", tmp_path / "c.yaml"])
@@ -99,6 +101,7 @@ def test_a_wrong_flag_is_repeated_without_its_escapes():
     assert b"\x1b" not in refused.stderr
 
 
+@pytest.mark.slow
 def test_names_that_are_not_utf_8_are_mapped_and_matched(tmp_path):
     (tmp_path / "ref").mkdir()
     path = os.path.join(os.fsencode(tmp_path / "ref"), b"caf\xe9.jpg")

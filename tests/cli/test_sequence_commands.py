@@ -92,6 +92,7 @@ def test_run_takes_the_sequence_and_logs_it(flight, maps, tmp_path):
     assert queries[3]["accepted"]
 
 
+@pytest.mark.slow
 def test_eval_asks_in_the_order_of_the_flight_and_scores_what_the_truth_names(capsys, flight):
     results = evaluated(capsys, flight, "--techniques", "hog,seqslam", "--param", "hog.w1=64", "--sequence", "4")
     for result in results.values():

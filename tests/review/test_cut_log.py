@@ -20,6 +20,7 @@ def log(tmp_path_factory):
     return write_log(folder / "whole.jsonl", *(("query", query(name, located=located)) for name in "abc"))
 
 
+@pytest.mark.slow
 def test_a_log_that_was_cut_at_any_byte_is_read_and_exported_up_to_its_last_whole_line(log, tmp_path):
     whole, cut_log = log.read_bytes(), tmp_path / "cut.jsonl"
     ends = [place for place, byte in enumerate(whole) if byte == ord("\n")]

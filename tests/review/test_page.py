@@ -44,6 +44,8 @@ def made(flown, tmp_path_factory):
     return out
 
 
+@pytest.mark.process
+@pytest.mark.slow
 def test_a_page_of_a_real_flight_has_all_parts(made):
     content = made.read_text("utf-8")
     for part in ("Over the ground", "every query", "Over time", "Worst moments", "Why matches were refused"):
@@ -176,6 +178,8 @@ def test_what_cannot_be_done_is_said_in_a_sentence(tmp_path, monkeypatch, capsys
     assert not (tmp_path / "out.html").exists()
 
 
+@pytest.mark.process
+@pytest.mark.slow
 def test_a_browser_asks_for_nothing_and_complains_of_nothing(made, tmp_path):
     nasty = query(NASTY, reason=NASTY, accepted=False)
     (tmp_path / "nasty.html").write_text(
@@ -187,6 +191,8 @@ def test_a_browser_asks_for_nothing_and_complains_of_nothing(made, tmp_path):
         assert (shown.console, shown.requests) == ([], [])
 
 
+@pytest.mark.process
+@pytest.mark.slow
 def test_the_test_with_a_browser_sees_requests_and_errors(tmp_path):
     bad = tmp_path / "bad.html"
     bad.write_text('<!doctype html><img src="http://example.test/x.png"><script>console.error("oh no")</script>')
@@ -203,12 +209,16 @@ def measured(made, folder, measure, width_px):
     return re.search("<title>([^<]*)<", show(folder / "measured.html", width_px).content)[1]
 
 
+@pytest.mark.process
+@pytest.mark.slow
 def test_a_page_fits_a_phone(made, tmp_path):
     measure = "`${document.documentElement.scrollWidth} ${innerWidth}`"
     wide, room = map(int, measured(made, tmp_path, measure, 360).split())
     assert wide <= room <= 500
 
 
+@pytest.mark.process
+@pytest.mark.slow
 @pytest.mark.parametrize("width_px", [360, 1200])
 def test_the_view_of_the_ground_has_the_shape_of_its_drawing(made, tmp_path, width_px):
     of = "document.querySelector('.view')"

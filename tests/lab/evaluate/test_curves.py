@@ -51,6 +51,7 @@ def test_a_panel_a_set_and_also_a_curve_of_one_point_is_drawn(tmp_path):
     assert width > 1.5 * height, "two sets stand side by side"
 
 
+@pytest.mark.slow
 def test_every_technique_has_a_curve_of_its_own(tmp_path):
     many = [replace(_RESULT, technique=f"technique{number}") for number in range(15)]
     plot({"valley": many}, tmp_path / "curves.svg")

@@ -22,6 +22,7 @@ def arrays(queries):
     return scores, ranks
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(QUERIES)
 def test_every_figure_is_a_share_and_they_fit_each_other(queries):
@@ -41,6 +42,7 @@ def test_every_figure_is_a_share_and_they_fit_each_other(queries):
     assert (found["roc_auc"] is None) == (right.all() or not right.any())
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(QUERIES)
 def test_they_depend_on_the_order_of_the_scores_alone(queries):
@@ -84,6 +86,7 @@ def test_more_queries_make_an_interval_narrower_and_all_right_of_few_is_not_all_
     assert low == pytest.approx(0.918, abs=1e-3), "Clopper and Pearson"
 
 
+@pytest.mark.slow
 def test_an_interval_covers_what_the_queries_were_drawn_from():
     random = np.random.default_rng(5)
     covered = 0

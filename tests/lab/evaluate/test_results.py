@@ -10,6 +10,8 @@ from generated_sets import make_set
 
 from edgevpr.cli.main import main
 
+pytestmark = [pytest.mark.process, pytest.mark.slow]
+
 NASTY = "<script>alert(1)</script><img src=http://example.test/x.png>"
 PLAN = f"""
 sets:

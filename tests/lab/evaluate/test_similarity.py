@@ -26,6 +26,7 @@ def truth(tmp_path):
     return path
 
 
+@pytest.mark.data
 def test_eight_published_matrices_come_out_as_published(capsys):
     if not _PUBLISHED.is_dir():
         pytest.skip("the published matrices are not here")
@@ -187,6 +188,7 @@ def test_a_ground_truth_of_numbers_scores_as_the_same_in_names(seed, tmp_path, c
     assert softly["recall_at_1"] > expected["recall_at_1"], "what is soft counts neither way"
 
 
+@pytest.mark.data
 def test_published_matrices_score_the_same_by_the_numbers_of_their_ground_truth(tmp_path, capsys):
     if not _PUBLISHED.is_dir():
         pytest.skip("the published matrices are not here")

@@ -21,6 +21,8 @@ from edgevpr.lab.evaluate.cache import Cache
 from edgevpr.lab.evaluate.layouts import Nearness, of_positions, open_folder
 from edgevpr.lab.evaluate.videos import VideoPictures
 
+pytestmark = [pytest.mark.process, pytest.mark.slow]
+
 PLACES, RATE_HZ, APART_M = 6, 2, 30
 HOG = ("--techniques", "hog", "--param", "hog.w1=64")
 RULES = [
