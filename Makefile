@@ -36,6 +36,7 @@ package: $(VENV)/installed
 lint: $(VENV)/installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache
 
 # Figures on real image sets (../shared/data, or the folder named in EDGEVPR_DATA) into benchmarks/results/.
