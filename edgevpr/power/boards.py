@@ -1,7 +1,7 @@
-"""The boards that edgevpr knows, one YAML file each in `profiles/`: what they have, draw, and may spend on edgevpr; and
-the machine that this runs on, which is one of them or gets a profile of its own.
+"""Profiles of boards: hardware, power, and what edgevpr may use of them. Each is a YAML file in `profiles/`. This
+module also detects the machine that it runs on. The flight, `edgevpr profile` and `edgevpr service` use it.
 
-`root` is where the machine's /proc and /sys are: another tree can stand in its place.
+`root` is the root of the file system with /proc and /sys: another tree can stand in.
 """
 
 import json
@@ -16,18 +16,16 @@ from edgevpr.core.yamlfile import read_yaml
 from edgevpr.power import machine, thermal
 
 _ANY_MACHINE = "generic-x86"
-_SAME_RAM = 1.02  # kernels keep some RAM for themselves, every version another amount
+_SAME_RAM = 1.02  # a factor, since each version of the kernel reserves a different amount of RAM
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MachineSpeed:
-    """Speed of a machine relative to one core of the reference, which `profiles/generic-x86.yaml` names (None:
-    unknown).
+    """Speed of a machine relative to one core of the reference machine of `profiles/generic-x86.yaml` (None: unknown).
 
-    `single` is one thread at integer code and bytes, `multi` all cores together at the same; `products` and `passes`
-    are one thread at matrix products and at passes over bytes, where they are known apart. `arm64_mips` is how many
-    million instructions a second one thread of an aarch64 board runs. `verified` tells whether `source` measured it on
-    this very board.
+    `single`: one thread at integer and byte operations. `multi`: all cores together at such operations. `products`: one
+    thread at matrix products. `passes`: one thread at passes over bytes. `arm64_mips`: million instructions per second
+    of one thread of an aarch64 board. `verified`: True if `source` measured the figures on this very board.
     """
 
     single: float | None = bounded(0.0001, 100)
@@ -41,15 +39,17 @@ class MachineSpeed:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Board:
-    """A board's profile.
+    """Profile of a board.
 
-    `idle_w` and `full_w` are the thesis's a and a + s in watts at the board's input; `verified` tells whether `source`
-    measured them on this very board. `cpu_share` (of all cores), `budget_mb` (index of the map) and `memory_max_mb`
-    (whole process) are what edgevpr may take. `rate_hz` is the number of queries a second, unless the user says
-    otherwise. `technique` is flown where none is named, if it fits (None: the best that fits). `threads` is how many a
-    network may use. From `thermal_limit_c` on the board slows itself down (None: its kernel says where). A machine is
-    this board if the model in its device tree contains `recognised_by`, or if its own title is `machine`: a profile
-    that was written on a machine contains its title.
+    `idle_w`, `full_w`: power at the board's input, idle and with all cores busy (a and a + s in the thesis).
+    `verified`: True if `source` measured this power on this very board.
+    `rate_hz`: queries per second, unless the user sets another rate.
+    `cpu_share` (of all cores), `budget_mb` (index of the map), `memory_max_mb` (whole process): what edgevpr may use.
+    `thermal_limit_c`: degrees Celsius at which the board begins to slow down (None: read from its kernel).
+    `technique`: used if the user names none, provided that it fits (None: the best that fits).
+    `threads`: number of threads that a network may use.
+    `recognised_by`, `machine`: a machine is this board if the model in its device tree contains the first text, or if
+    its `machine.title` is the second (None: this test does not apply).
     """
 
     name: str
@@ -78,10 +78,10 @@ def board_names() -> tuple[str, ...]:
 
 
 def load_board(name: str, root: Path = Path("/")) -> Board:
-    """Load the board called `name`: "this" (the machine itself), one of `board_names()`, or the path of a YAML file.
+    """Load the profile called `name`: "this" (the machine itself), one of `board_names()`, or the path of a YAML file.
 
-    Raises ConfigError for a board that does not exist, for an incomplete or invalid file, and for a file of this very
-    machine that promises more memory than there is.
+    Raises ConfigError if there is no such board, if the file is incomplete or invalid, or if it is a profile of this
+    machine with more memory than the machine has.
     """
     if name == "this":
         return _this_machine(root)
@@ -101,7 +101,7 @@ def load_board(name: str, root: Path = Path("/")) -> Board:
 
 
 def is_this_machine(board: Board, root: Path = Path("/")) -> bool:
-    """Tell whether a profile is of the machine that this runs on."""
+    """Tell whether `board` is a profile of the machine that this process runs on."""
     return _is_called(board, machine.model(root)) or (
         board.machine is not None and board.machine == machine.title(root)
     )
@@ -109,9 +109,10 @@ def is_this_machine(board: Board, root: Path = Path("/")) -> bool:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Detected:
-    """Description of this machine. `board` is the name of its profile, None where it has none. `model` is its name in
-    the device tree or DMI. `usable_cores` and `ram_limit_mb` are what affinity and control groups leave of `cores` and
-    `ram_mb`. It begins to slow down at `thermal_limit_c`."""
+    """Description of this machine. `board`: name of its profile in `profiles/` (None: it has none). `model`: its name
+    in the device tree, or else in the firmware's DMI table (None: in neither). `usable_cores`, `ram_limit_mb`: what CPU
+    affinity and control groups leave of `cores` and `ram_mb`. `thermal_limit_c`: degrees Celsius at which it begins to
+    slow down."""
 
     board: str | None
     model: str | None
@@ -126,7 +127,7 @@ class Detected:
 
 
 def detect(root: Path = Path("/")) -> Detected:
-    """Look at this machine. Never guesses: a value that is found nowhere is None or says "unknown"."""
+    """Describe this machine. No name is guessed: an unknown `model` is None, an unknown `cpu` begins with "unknown"."""
     model, cores = machine.model(root), machine.cores_online(root)
     recognised = _recognised(model)
     return Detected(
@@ -144,7 +145,7 @@ def detect(root: Path = Path("/")) -> Detected:
 
 
 def describe(found: Detected) -> str:
-    """Say in two sentences what this machine is and has."""
+    """Return two sentences about the machine: its profile, and its cores, memory and thermal limit."""
     known = f"the board {found.board}" if found.board else f"no board of edgevpr's: {_ANY_MACHINE} stands in"
     return (
         f"`{found.title}` is {known}. It has {found.cores} cores and {found.ram_mb:.0f} MB of RAM, of which this "
@@ -154,8 +155,9 @@ def describe(found: Detected) -> str:
 
 
 def own_profile(speed: MachineSpeed, root: Path = Path("/")) -> Board:
-    """Return a profile for this machine, as fast as `speed`, under the name by which it is recognised again. Its power
-    is that of the known board, else relative figures; memory and shares are those that `load_board` gives `this`."""
+    """Return a profile of this machine with the score `speed`, which `load_board` recognises as this machine's own. Its
+    power is that of the shipped profile of its board, else relative (idle 0 W, full load 1 W). Memory and shares are
+    those of `load_board("this")`."""
     board, model = _this_machine(root), machine.model(root)
     source = board.source
     if not _is_called(board, model):
@@ -165,22 +167,22 @@ def own_profile(speed: MachineSpeed, root: Path = Path("/")) -> Board:
 
 
 def profile_text(board: Board) -> str:
-    """Write a profile as YAML, which `load_board` accepts."""
+    """Return a profile as YAML text, which `load_board` can read."""
     values = asdict(board)
-    del values["name"]  # that of the file
-    # JSON values are YAML's too, whatever a board is called.
+    del values["name"]  # it is the name of the file
+    # JSON values are valid YAML, whatever characters they contain.
     texts = {key: json.dumps(_printable(value), ensure_ascii=False) for key, value in values.items()}
     lines = "".join(f"{key}: {text}\n" for key, text in texts.items())
     return f"# Written by edgevpr for the machine it ran on; profiles/{_ANY_MACHINE}.yaml explains it.\n\n{lines}"
 
 
 def _is_called(board: Board, model: str | None) -> bool:
-    """Tell whether the model in a device tree is that of a board."""
+    """Tell whether `model`, from a device tree (None: there is none), names a board of this profile."""
     return bool(board.recognised_by and model) and str(board.recognised_by).lower() in str(model).lower()
 
 
 def _recognised(model: str | None) -> Board | None:
-    """Return the profile of the board with this model in its device tree; None where there is none."""
+    """Return the shipped profile of the board with this model in its device tree; None if there is none."""
     known = (_read(shipped("profiles") / f"{name}.yaml") for name in board_names() if model)
     return next((board for board in known if _is_called(board, model)), None)
 
@@ -205,8 +207,8 @@ def _read(path: Path) -> Board:
 
 
 def _this_machine(root: Path) -> Board:
-    """Return the profile of this machine's board, or of any machine, with the cores and the memory that are really
-    there."""
+    """Return the shipped profile of this machine's board (generic-x86 if it has none), with the cores and memory that
+    the machine really has."""
     model = machine.model(root)
     recognised = _recognised(model)
     profile = recognised or _read(shipped("profiles") / f"{_ANY_MACHINE}.yaml")
@@ -216,9 +218,9 @@ def _this_machine(root: Path) -> Board:
         unknown = f"nobody has measured a {model}"
         speed = MachineSpeed(single=None, multi=None, products=None, passes=None, verified=False, source=unknown)
     ram_mb = machine.ram_mb(root)
-    # The profile's shares of the memory that is really there; a control group may allow less.
+    # Keep the profile's shares, but of the memory that the machine really has; a control group may allow less.
     memory_max_mb = min(profile.memory_max_mb / profile.ram_mb * ram_mb, machine.ram_limit_mb(root))
-    # The power model speaks of all cores of the machine, so a quota lowers the share and not their number.
+    # The power model counts all cores of the machine, so a CPU quota lowers `cpu_share` and not the number of cores.
     cores = machine.cores_online(root)
     cpu_share = min(profile.cpu_share, machine.cores(root) / cores)
     return replace(

@@ -1,6 +1,6 @@
-"""The two constants of a board's power, a and s of equation 5.2, from its own power meter.
+"""Calibration of a board's power model, the constants a and s of equation 5.2, with its own power meter.
 
-The machine is held at several loads; the straight line P = a + s U through (U, W) is the board's profile.
+The machine is held at several loads. A line P = a + s U is fitted to the points (utilisation U, watts) for its profile.
 """
 
 import os
@@ -17,17 +17,17 @@ from edgevpr.power.boards import Board
 from edgevpr.power.sensors import Meter, MeterError, mean_power
 
 LOADS = (0.0, 0.25, 0.5, 0.75, 1.0)
-DUTY_PERIOD_S = 0.1  # short beside a power meter's window, long beside one product
+DUTY_PERIOD_S = 0.1  # short compared with a power meter's window, long compared with one product
 _SETTLE_S, _WINDOW_S = 5.0, 20.0
-_LEAST_LOADS = 3  # any two loads lie on a line: the third shows whether power follows one
-_SAME_LOAD = 0.05  # utilisations nearer than this are one load
-_LEAST_R2 = 0.5  # below it, most changes of the power do not follow the load
+_LEAST_LOADS = 3  # any two points lie on a line; a third shows whether power follows it
+_SAME_LOAD = 0.05  # utilisations closer than this count as one load
+_LEAST_R2 = 0.5  # below it, the load explains less than half of the changes of power
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PowerFit:
-    """Straight line P = `idle_w` + `span_w` U (a and s), with the root mean square of its residuals in watts, and R2;
-    `samples` are its points (U, W)."""
+    """Straight line P = `idle_w` + `span_w` U (a and s of the thesis; U: utilisation, 0..1), fitted to the points
+    `samples` (U, W). `residual_w`: root mean square of the residuals. `r2`: coefficient of determination."""
 
     idle_w: float
     span_w: float
@@ -37,11 +37,11 @@ class PowerFit:
 
     @property
     def full_w(self) -> float:
-        """Watts with every core busy, as a profile wants them."""
+        """Watts with every core busy: `full_w` of a profile."""
         return self.idle_w + self.span_w
 
     def applied_to(self, board: Board, meter: Meter) -> Board:
-        """Return a board with these watts. They are verified where nobody had to assume how the meter is wired."""
+        """Return a copy of `board` with this power. It is marked as verified if the wiring of `meter` is certain."""
         source = (
             f"straight line through {len(self.samples)} loads measured on this machine with its {meter.title}; "
             f"residual {self.residual_w:.2g} W, R2 {self.r2:.3f}"
@@ -50,8 +50,8 @@ class PowerFit:
 
 
 def calibrate(meter: Meter, progress: Callable[[float], None]) -> PowerFit:
-    """Hold each of `LOADS` for some seconds and fit a line. Raises MeterError for a meter that fails and for figures
-    that no board can have. `progress` is called with each load before it is held."""
+    """Hold each load of `LOADS` for 25 s, measure the power, and fit a line. `progress` is called with each load (0..1)
+    before it is held. Raises MeterError if the meter fails, or if no board can have such a line."""
     samples = []
     for share in LOADS:
         progress(share)
@@ -62,21 +62,22 @@ def calibrate(meter: Meter, progress: Callable[[float], None]) -> PowerFit:
 def measure_at(
     meter: Meter, share: float, settle_s: float = _SETTLE_S, window_s: float = _WINDOW_S
 ) -> tuple[float, float]:
-    """Hold a load and measure, once the meter has settled.
+    """Hold the load `share` (0..1), let the meter settle for `settle_s` seconds, and measure for `window_s` seconds.
 
-    Returns the utilisation of the whole machine (0..1), other programs included, since the meter measures them too, and
-    the mean power in watts. Raises MeterError.
+    Returns two numbers (raises MeterError):
+    - the utilisation of the whole machine, 0..1, including other programs, since the meter measures them too;
+    - the mean power in watts.
     """
     with hold_load(share):
         time.sleep(settle_s)
-        psutil.cpu_percent()  # from here on
+        psutil.cpu_percent()  # starts the interval of the next call
         mean_w = mean_power(meter, window_s)
         return psutil.cpu_percent() / 100, mean_w
 
 
 def fit_power(samples: Sequence[tuple[float, float]]) -> PowerFit:
-    """Fit W = a + s U by least squares to samples (U, W), U in 0..1. Raises MeterError where the result cannot be a
-    board's."""
+    """Fit W = a + s U by least squares to `samples` (U, W), U in 0..1. Raises MeterError if no board can have this
+    line."""
     u, watts = np.array(samples, np.float64).reshape(-1, 2).T
     if not (np.isfinite(u).all() and np.isfinite(watts).all()):
         raise MeterError("A power measurement is not a number: measure again.")
@@ -111,11 +112,11 @@ def fit_power(samples: Sequence[tuple[float, float]]) -> PowerFit:
 
 @contextmanager
 def hold_load(share: float) -> Iterator[None]:
-    """Hold all usable cores at `share` (0..1) while the block runs, with one thread a core.
+    """Hold all usable cores at `share` (0..1) while the block of the `with` statement runs, with one thread per core.
 
     Each thread multiplies small float32 matrices, as cohog's matching does; NumPy lets the other threads run meanwhile.
-    Threads start their periods at different times, so that the sum is level. Give NumPy's library one thread
-    (OPENBLAS_NUM_THREADS, which edgevpr's command line sets); `measure_at` tells which share was really reached.
+    The threads start their periods at different times, so that the total load is steady. NumPy's library must have one
+    thread (OPENBLAS_NUM_THREADS=1, set by edgevpr's command line). `measure_at` returns the load really reached.
     """
     stop = threading.Event()
     count = len(os.sched_getaffinity(0)) if share > 0 else 0
@@ -139,8 +140,8 @@ def hold_load(share: float) -> Iterator[None]:
 
 
 def work_a_period(share: float, work: Callable[[], object], clock: Callable[[], float] = time.perf_counter) -> float:
-    """Work for `share` of one period, in whole calls of `work`, and return the seconds to rest (0 at full load). The
-    ratio of work to rest is as asked, however long the last call took."""
+    """Call `work` again and again for `share` (above 0, up to 1) of one duty period, and return the seconds to rest
+    then (0 at full load). After a last call that took longer, the rest is longer too, so that the ratio stays right."""
     start_s = clock()
     while clock() - start_s < share * DUTY_PERIOD_S:
         work()

@@ -1,7 +1,8 @@
-"""The power model of chapter 5 of the thesis, and what it means for the battery pack. Plain arithmetic.
+"""Power model of chapter 5 of the thesis, and the charge that it means for the battery pack. Plain arithmetic.
 
-Equation 5.3 of the thesis, P_q = P_e + P_m, is left out: encoding and matching follow one another, and powers at
-different times do not add. Their energies do, as 5.6 says.
+Symbols of the thesis: U, utilisation of the whole machine (0..1); a, idle power; s, what full load adds to it; P,
+power; t, time; indices e, m and q for encoding, matching and a whole query. Equation 5.3, P_q = P_e + P_m, is left out:
+encoding and matching run one after the other, so their powers do not add up. Their energies do, as in equation 5.6.
 """
 
 import re
@@ -9,7 +10,7 @@ from dataclasses import dataclass
 
 from edgevpr.core.errors import ConfigError
 
-CPU_RAIL_V = 2.5  # the thesis's V: it counts the charge drawn from the CPU's rail
+CPU_RAIL_V = 2.5  # V in the thesis, which counts the charge drawn from the CPU's supply rail
 _CELL_V = 3.7  # nominal voltage of a lithium-polymer cell
 _S_PER_H = 3600.0
 
@@ -40,33 +41,33 @@ def parse_pack(text: str) -> Pack:
 
 
 def power_w(idle_w: float, full_w: float, utilisation: float) -> float:
-    """Return the power at a utilisation of 0..1 of the whole machine: P = P_i + (P_b - P_i) U (5.1), or a + s U (5.2).
+    """Return the power in watts at `utilisation` (0..1): P = P_i + (P_b - P_i) U (5.1), which is a + s U (5.2).
 
-    With U_e it is the power of encoding, P_e (5.4); with U_m that of matching, P_m (5.5).
+    With the utilisation of encoding it is P_e (5.4), with that of matching P_m (5.5). P_i is `idle_w`, P_b is `full_w`.
     """
     return idle_w + (full_w - idle_w) * utilisation
 
 
 def stage_energy_j(idle_w: float, full_w: float, utilisation: float, t_s: float) -> float:
-    """Return the energy at the board's input during a stage of `t_s` seconds: (a + s U) t, one term of 5.6 before it is
-    divided by the voltage."""
+    """Return the energy in joules at the board's input during a stage of `t_s` seconds: (a + s U) t. It is one term of
+    equation 5.6, before the division by the voltage."""
     return power_w(idle_w, full_w, utilisation) * t_s
 
 
 def marginal_energy_j(idle_w: float, full_w: float, utilisation: float, t_s: float) -> float:
-    """Return the energy that the stage adds to a board that is powered anyway: s U t."""
+    """Return the energy in joules that a stage of `t_s` seconds adds to a board that is switched on anyway: s U t."""
     return (full_w - idle_w) * utilisation * t_s
 
 
 def rail_ah(energy_j: float, rail_v: float = CPU_RAIL_V) -> float:
-    """Return the thesis's form of 5.6, Ah_q = (P_e t_e + P_m t_m) / V with times in hours: ampere-hours of the CPU's
-    rail."""
+    """Return the ampere-hours drawn from the CPU's rail, as the thesis counts them (5.6): Ah_q = (P_e t_e + P_m t_m) /
+    V, with times in hours."""
     return energy_j / (rail_v * _S_PER_H)
 
 
 def pack_ah(energy_j: float, pack: Pack, regulator_efficiency: float) -> float:
-    """Return 5.6 as the battery sees it: ampere-hours drawn from the pack, Ah = P t / (V_pack x regulator
-    efficiency)."""
+    """Return the ampere-hours drawn from the pack, equation 5.6 with the pack's voltage: Ah = P t / (V_pack x regulator
+    efficiency). The efficiency is a share, 0..1."""
     return energy_j / (pack.nominal_v * regulator_efficiency * _S_PER_H)
 
 
@@ -76,5 +77,5 @@ def endurance_min(pack: Pack, load_w: float) -> float:
 
 
 def queries_ah(queries: float, query_ah: float) -> float:
-    """Return the ampere-hours of `queries` queries: Ah_t = N Ah_q (5.7)."""
+    """Return the ampere-hours of `queries` queries of `query_ah` each: Ah_t = N Ah_q (5.7)."""
     return queries * query_ah

@@ -1,4 +1,4 @@
-"""Load and memory of the machine, for its flight controller and ground station; and the share of this process."""
+"""CPU load and memory of the machine, for flight controller and ground station; and the CPU share of this process."""
 
 import time
 from collections.abc import Callable
@@ -8,12 +8,13 @@ import psutil
 
 from edgevpr.core.types import StageCost
 
-_KEPT_WAITING = 0.15  # of busy time: a thread that did not run for longer was kept waiting (its own waits are shorter)
+_KEPT_WAITING = 0.15  # of busy time; a thread off the CPU for more was kept waiting by other programs
 
 
 @dataclass(frozen=True, slots=True)
 class MachineLoad:
-    """`core_shares` (0..1, one a core) since the last look, and RAM in bytes."""
+    """Load of the machine: the busy share of each core, 0..1, since the last call of `machine_load`, and RAM in
+    bytes."""
 
     core_shares: tuple[float, ...]
     ram_used_bytes: int
@@ -21,7 +22,7 @@ class MachineLoad:
 
 
 def machine_load() -> MachineLoad:
-    """Look at the machine; the first look has nothing to compare with and reports idle cores."""
+    """Measure the load of the machine. The first call has no earlier one to compare with and reports idle cores."""
     memory = psutil.virtual_memory()
     return MachineLoad(
         tuple(percent / 100 for percent in psutil.cpu_percent(percpu=True)),
@@ -31,10 +32,8 @@ def machine_load() -> MachineLoad:
 
 
 class OwnLoad:
-    """Share of all cores that this process takes, and whether other programs keep it waiting, from look to look.
-
-    `clock` and `cpu_clock` (all threads) give wall and CPU-seconds.
-    """
+    """Share of all `cores` that this process uses, and of its time in which other programs keep it waiting, between two
+    calls of `look`. `clock` gives wall seconds, `cpu_clock` CPU-seconds of all threads of this process."""
 
     def __init__(
         self,
@@ -48,17 +47,19 @@ class OwnLoad:
 
     @property
     def age_s(self) -> float:
-        """Seconds since the last look."""
+        """Seconds since the last call of `look`."""
         return self._clock() - self._looked_s
 
     def busy(self, work: StageCost) -> None:
-        """Count work; `work.cpu_s` is the CPU time of the thread that did it or waited for it (`time.thread_time`)."""
+        """Record a piece of work. Its `cpu_s` is that of the thread that did it or waited for it
+        (`time.thread_time`)."""
         self._busy_s += work.wall_s
         self._ran_s += work.cpu_s
 
     def look(self) -> tuple[float, float]:
-        """Return, since the last look, this process's share of all cores, 0..1, and the share of the time that its work
-        took, 0 where the thread could run when it wanted to."""
+        """Return two shares since the last call, 0..1:
+        - the share of all cores that this process used;
+        - the share of the time that its recorded work took; 0 if other programs did not keep it waiting."""
         now_s, cpu_s = self._clock(), self._cpu_clock()
         span = StageCost(now_s - self._looked_s, cpu_s - self._cpu_s)
         waited = self._ran_s < (1 - _KEPT_WAITING) * self._busy_s

@@ -1,6 +1,7 @@
-"""Hardware of this machine and memory that this process takes, as the kernel reports them in /proc and /sys.
+"""Hardware of this machine and memory of this process, as the kernel reports them in /proc and /sys.
 
-`root` is the root of the file system: another tree can stand in its place. A megabyte is 10^6 bytes.
+Board profiles, power meters and trials of techniques use it. `root` is the root of the file system: another tree can
+stand in. A megabyte (MB) is 10^6 bytes.
 """
 
 import os
@@ -12,9 +13,9 @@ from pathlib import Path, PurePosixPath
 
 _ROOT = Path("/")
 _PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
-# Texts that stand in the firmware where the maker has filled in nothing.
+# Placeholder texts of firmware whose maker has filled in nothing.
 _FILLERS = re.compile(r"to be filled|default string|system (product|manufacturer)|o\.?e\.?m\.?$|none$|x\.x", re.I)
-# Arm's part numbers in /proc/cpuinfo (implementer 0x41), of the processors that such boards have.
+# Arm's part numbers in /proc/cpuinfo (implementer 0x41), of processors that companion computers have.
 _ARM_PARTS = {
     "0xc07": "Cortex-A7", "0xc0f": "Cortex-A15", "0xd03": "Cortex-A53", "0xd04": "Cortex-A35", "0xd05": "Cortex-A55",
     "0xd07": "Cortex-A57", "0xd08": "Cortex-A72", "0xd09": "Cortex-A73", "0xd0a": "Cortex-A75", "0xd0b": "Cortex-A76",
@@ -23,14 +24,14 @@ _ARM_PARTS = {
 
 
 def model(root: Path = _ROOT) -> str | None:
-    """Return the board's name in the device tree, e.g. "Raspberry Pi 4 Model B Rev 1.4"; None where there is none
+    """Return the board's name in the device tree, e.g. "Raspberry Pi 4 Model B Rev 1.4"; None without a device tree
     (x86)."""
     return text(root / "proc/device-tree/model")
 
 
 def dmi_model(root: Path = _ROOT) -> str | None:
-    """Return maker and product by the firmware of an x86 machine; its mainboard where the product is not filled in,
-    else None."""
+    """Return maker and product from the firmware (DMI) of an x86 machine, or those of its mainboard if the product is
+    not filled in. None if neither is."""
     for names in (("sys_vendor", "product_name"), ("board_vendor", "board_name")):
         maker, product = (text(root / "sys/class/dmi/id" / name) or "none" for name in names)
         if not _FILLERS.search(product):
@@ -40,8 +41,8 @@ def dmi_model(root: Path = _ROOT) -> str | None:
 
 
 def cpu(root: Path = _ROOT) -> str:
-    """Return the processor by /proc/cpuinfo: its name (x86, 32-bit ARM), or its kinds of cores by Arm's part
-    numbers."""
+    """Return the processor's name from /proc/cpuinfo: the model (x86, 32-bit ARM), or the number and name of each kind
+    of Arm core, e.g. "4 x Cortex-A72"."""
     info = text(root / "proc/cpuinfo") or ""
     if name := re.search(r"^model name\s*:\s*(.+)$", info, re.MULTILINE):
         return " ".join(name[1].split())
@@ -51,27 +52,26 @@ def cpu(root: Path = _ROOT) -> str:
 
 
 def title(root: Path = _ROOT) -> str:
-    """Return a name of this machine, with its processor: the same text every time, so that the machine is recognised
-    again."""
+    """Return the machine's name and processor as one text, which is always the same and so identifies the machine."""
     words = f"{model(root) or dmi_model(root) or 'a machine without a name'} ({cpu(root)})"
     return "".join(c if c.isprintable() else " " for c in words)
 
 
 def cores_online(root: Path = _ROOT) -> int:
-    """Count the cores of the machine that are switched on, whatever this process may use of them."""
+    """Count the cores of the machine that are switched on, including those that this process may not use."""
     spans = re.findall(r"(\d+)(?:-(\d+))?", text(root / "sys/devices/system/cpu/online") or "")
     return sum(int(last or first) - int(first) + 1 for first, last in spans) or os.cpu_count() or 1
 
 
 def vcgencmd(root: Path = _ROOT) -> Path | None:
-    """Find the Raspberry Pi's program for asking its firmware; None on another board. Older systems keep it in
-    /opt/vc."""
+    """Return the path of the program that asks a Raspberry Pi's firmware (older systems: /opt/vc); None on other
+    boards."""
     places = (root / "usr/bin/vcgencmd", root / "opt/vc/bin/vcgencmd")
     return next((place for place in places if place.exists()), None)
 
 
 def cores(root: Path = _ROOT) -> float:
-    """Return the cores that this process may use: its CPU affinity, and the quota (cpu.max) of its control groups."""
+    """Return how many cores this process may use, by CPU affinity and the quotas (cpu.max) of its control groups."""
     usable = float(len(os.sched_getaffinity(0)))
     for quota_us, period_us in _cgroup_limits("cpu.max", root):
         usable = min(usable, int(quota_us) / int(period_us))
@@ -79,27 +79,26 @@ def cores(root: Path = _ROOT) -> float:
 
 
 def ram_mb(root: Path = _ROOT) -> float:
-    """Return the memory of the machine, MB."""
+    """Return the RAM of the machine in MB."""
     return _kib_line(root / "proc/meminfo", "MemTotal:")
 
 
 def ram_limit_mb(root: Path = _ROOT) -> float:
-    """Return the memory that this process may use, MB: the machine's, and the limit (memory.max) of its control
+    """Return the RAM in MB that this process may use: the machine's, or the lowest limit (memory.max) of its control
     groups."""
     return min([ram_mb(root), *(int(limit) / 1e6 for (limit,) in _cgroup_limits("memory.max", root))])
 
 
 def rss_mb(root: Path = _ROOT) -> float:
-    """Return the resident memory of this process, MB, pages that it shares with others included."""
-    # Every query asks twice: `read_text` would take three times as long.
+    """Return the resident memory (RSS) of this process in MB, including pages that it shares with other processes."""
+    # Called twice per query: `read_text` would take three times as long.
     with open(f"{root}/proc/self/statm", "rb", buffering=0) as statm:
         resident_pages = int(statm.read(256).split()[1])
     return resident_pages * _PAGE_BYTES / 1e6
 
 
 def forget_peak(root: Path = _ROOT) -> bool:
-    """Let `peak_mb` begin anew with the memory that is resident now; return False where the kernel does not allow
-    it."""
+    """Reset the peak that `peak_mb` returns to what is resident now. Returns False if the kernel does not allow it."""
     try:
         (root / "proc/self/clear_refs").write_text("5")
     except OSError:
@@ -108,13 +107,12 @@ def forget_peak(root: Path = _ROOT) -> bool:
 
 
 def peak_mb(root: Path = _ROOT) -> float:
-    """Return the most memory that this process had resident at once, MB."""
+    """Return the largest resident memory that this process has had, in MB, since it started or since `forget_peak`."""
     return _kib_line(root / "proc/self/status", "VmHWM:")
 
 
 def pss_mb(root: Path = _ROOT) -> float | None:
-    """Return the memory of this process, MB, with shared pages counted in proportion; None where the kernel does not
-    say."""
+    """Return the memory of this process in MB, with shared pages in proportion (PSS); None if the kernel gives none."""
     try:
         return _kib_line(root / "proc/self/smaps_rollup", "Pss:")
     except OSError:
@@ -122,7 +120,7 @@ def pss_mb(root: Path = _ROOT) -> float | None:
 
 
 def text(path: Path) -> str | None:
-    """Read a small file and strip zero bytes, line ends and blanks from both ends; None where it cannot be read."""
+    """Read a small file and strip zero bytes, line ends and blanks from both ends; None if it cannot be read."""
     try:
         return path.read_text(errors="replace").strip("\0\n ")
     except OSError:
@@ -130,18 +128,18 @@ def text(path: Path) -> str | None:
 
 
 def _kib_line(path: Path, label: str) -> float:
-    """Read the figure of a line "label 1234 kB", in MB."""
+    """Return the number of the line "LABEL 1234 kB" of a file, converted to MB."""
     line = next(line for line in path.read_text().splitlines() if line.startswith(label))
     return int(line.split()[1]) * 1024 / 1e6
 
 
 def _cgroup_limits(name: str, root: Path) -> Iterator[list[str]]:
-    """Yield the words of a limit file (cgroup v2) of this process's group and of every group above it: each limit
-    binds."""
+    """Yield the fields of the limit file `name` (cgroup v2) of this process's control group and of every group above
+    it, where they set a limit. All of these limits apply."""
     memberships = (text(root / "proc/self/cgroup") or "").splitlines()
     for group in (PurePosixPath(line.removeprefix("0::")) for line in memberships if line.startswith("0::")):
         for level in (group, *group.parents):
-            # The group of the root has no limits, and not every kernel has every controller.
+            # The root group has no limit files, and not every kernel has every controller.
             words = (text(root / "sys/fs/cgroup" / level.relative_to("/") / name) or "max").split()
             if words[0] != "max":
                 yield words

@@ -1,7 +1,7 @@
-"""Metering of what queries cost: seconds, CPU-seconds, utilisation and charge of each, and the totals of a flight.
+"""Metering of queries: wall and CPU seconds, utilisation and charge of each, and the totals of a flight.
 
-Energies add up, powers do not (see `equations`). The sum of a T and of s U t over all stages is exactly the integral of
-5.1 over the flight, in whatever order the stages come.
+Energies add up, powers do not (see `equations`, which explains a, s and U). The idle energy a T of a flight of T
+seconds, plus s U t of every stage, is exactly the integral of 5.1 over the flight, in whatever order the stages run.
 """
 
 import math
@@ -21,15 +21,15 @@ _PSS_EVERY_S = 20.0
 
 @dataclass(slots=True)
 class Stage:
-    """A stage that is being metered; `cost` is set once the stage is over. A signal that breaks it off while it is
-    being set leaves none."""
+    """A stage that is being metered. `cost` is set when the stage ends, unless a signal interrupts just then."""
 
     cost: StageCost = NO_COST
 
 
 @contextmanager
 def stage(wall_clock: Clock = time.perf_counter, cpu_clock: Clock = time.process_time) -> Iterator[Stage]:
-    """Meter a stage: `with stage() as encoding: ...`, then `encoding.cost`. The CPU time is that of all threads."""
+    """Meter a block of code: `with stage() as encoding: ...`, then read `encoding.cost`. It counts the CPU time of all
+    threads."""
     metered = Stage()
     wall_s, cpu_s = wall_clock(), cpu_clock()
     try:
@@ -39,8 +39,8 @@ def stage(wall_clock: Clock = time.perf_counter, cpu_clock: Clock = time.process
 
 
 class OwnMemory:
-    """Memory of this process. PSS (with shared pages in proportion) is read at most once in twenty seconds: the kernel
-    walks through all pages for it, which takes some hundredths of a query's time."""
+    """Memory of this process: RSS, and PSS (with shared pages in proportion). PSS is read at most once in twenty
+    seconds: the kernel walks through all pages for it, which takes some hundredths of the time of a query."""
 
     def __init__(self, clock: Clock = time.monotonic, read: Callable[[], float | None] = machine.pss_mb) -> None:
         self._clock, self._read = clock, read
@@ -48,7 +48,9 @@ class OwnMemory:
         self._pss_mb: float | None = None
 
     def look(self) -> tuple[float, float | None]:
-        """Return RSS now, and the PSS that was read last, both MB; None where the kernel does not say."""
+        """Return two numbers in MB:
+        - the RSS now;
+        - the PSS that was read last; None if the kernel does not report it."""
         now_s = self._clock()
         if now_s - self._read_s >= _PSS_EVERY_S:
             self._read_s, self._pss_mb = now_s, self._read()
@@ -56,8 +58,8 @@ class OwnMemory:
 
 
 class QueryMeter:
-    """Meters the steps of query after query, and computes the charge that each query draws from the pack of a board.
-    `wall_clock` and `cpu_clock` (all threads) give seconds, `memory_mb` RSS and PSS of this process."""
+    """Meter of the steps of one query after another, and of the charge that each query draws from the pack of a board.
+    `wall_clock` and `cpu_clock` (all threads) give seconds; `memory_mb` is like `OwnMemory.look` (None: that one)."""
 
     def __init__(
         self,
@@ -76,13 +78,12 @@ class QueryMeter:
         self._taken: dict[str, StageCost] = {}
 
     def begin(self) -> None:
-        """Begin a new query."""
+        """Begin a new query, without the steps of the last one."""
         self._taken = {}
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:
-        """Meter a step of the query (a field of `Steps`): `with meter.step("encode"): ...`. A step that is taken again
-        adds to the first."""
+        """Meter a step of the query (a field of `Steps`): `with meter.step("encode"): ...`. A repeated step adds up."""
         metered = Stage()
         try:
             with stage(self._wall_clock, self._cpu_clock) as metered:
@@ -91,7 +92,7 @@ class QueryMeter:
             self._taken[name] = self._taken.get(name, NO_COST) + metered.cost
 
     def steps(self) -> Steps:
-        """Return the cost of every step that the query has reached."""
+        """Return the cost of every step of the query so far."""
         return Steps(**self._taken)
 
     def cost(self) -> QueryCost:
@@ -118,10 +119,9 @@ def query_cost(
     rss_mb: float,
     pss_mb: float | None = None,
 ) -> QueryCost:
-    """Compute the cost of one query by 5.1-5.6, as the pack sees it: the energies of both stages are added, not their
-    powers.
+    """Compute the cost of one query by equations 5.1-5.6. The energies of both stages are added, not their powers.
 
-    `used_mah` is (a + s U) t, `marginal_mah` s U t: the charge that the query adds to a board that is powered anyway.
+    Charges are drawn from the pack. `used_mah` is (a + s U) t. `marginal_mah` is s U t, what is added to an idle board.
     """
     stages = [(each.utilisation(board.cores), each.wall_s) for each in (encode, match)]
     used_j = sum(stage_energy_j(board.idle_w, board.full_w, u, t_s) for u, t_s in stages)
@@ -141,8 +141,8 @@ def query_cost(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EnergySoFar:
-    """Totals since the start: seconds, joules at the board's input, CPU-seconds of the stages and of the whole
-    process."""
+    """Totals since the start: wall seconds; idle and marginal energy in joules at the board's input; CPU-seconds of the
+    metered stages and of the whole process."""
 
     elapsed_s: float
     idle_j: float
@@ -152,7 +152,7 @@ class EnergySoFar:
 
 
 class RunningEnergy:
-    """Adds up stages as they end. `clock` and `cpu_clock` give wall and CPU-seconds (all threads) in flight."""
+    """Sum of the energy of stages, in flight. `clock` gives wall seconds, `cpu_clock` CPU-seconds of all threads."""
 
     def __init__(
         self,
@@ -165,7 +165,8 @@ class RunningEnergy:
         self._marginal_j = self._stages_cpu_s = 0.0
 
     def add(self, *stages: StageCost) -> None:
-        """Count stages that have ended; the time between them costs idle power, which needs no counting."""
+        """Add stages that have ended. The time between stages costs idle power only; `so_far` adds it from the
+        clock."""
         for stage in stages:
             u = stage.utilisation(self._board.cores)
             self._marginal_j += marginal_energy_j(self._board.idle_w, self._board.full_w, u, stage.wall_s)

@@ -1,8 +1,8 @@
-"""Power meters at a board's input: INA chips (hwmon) of Jetsons and of hats, and the power chip of the Pi 5.
+"""Power meters at a board's input: INA chips (hwmon) of Jetsons and add-on boards, and the power chip of the Pi 5.
 
-A meter gives one number, or raises MeterError with a sentence: a missing file, a text, a negative or an absurd value is
-never passed on as a figure. What measures less than all that the board draws (RAPL: the processor alone; the other
-rails of a Jetson) is no meter here: a profile's watts are those at the board's input.
+A meter returns a number, or raises MeterError with a sentence: a missing file, text, a negative or an absurd value is
+never passed on as a figure. Sensors of a part of the board (RAPL: the processor alone; the other rails of a Jetson) are
+not used, since a profile's watts are those at the board's input. `calibrate` reads these meters.
 """
 
 import re
@@ -22,8 +22,8 @@ NO_METER = (
     "/sys/class/hwmon, or the power chip of a Raspberry Pi 5): write its watts into a profile by hand, from a meter in "
     "its supply."
 )
-_ABSURD_W = 1000.0  # no companion computer draws this: the reading is wrong (the bound of `full_w` in a profile)
-_MOST_FAILURES = 3  # in a row: the meter is gone, and a mean from before would hide it
+_ABSURD_W = 1000.0  # no companion computer draws this: the reading is wrong (also the bound of `full_w` in a profile)
+_MOST_FAILURES = 3  # in a row: the meter is gone, which a mean of the readings before would hide
 # Channels that carry everything the module draws, by NVIDIA's rail names: Orin and Xavier NX; Nano.
 _INPUT_RAILS = ("VDD_IN", "POM_5V_IN")
 _ONE_CHANNEL = ("ina219", "ina220", "ina226", "ina230", "ina231", "ina260")
@@ -35,8 +35,8 @@ class MeterError(EdgevprError):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Meter:
-    """A power meter: `look` gives watts, and more often than every `period_s` seconds makes no sense. `certain` is
-    False where the title contains an assumption."""
+    """A power meter. `look` returns watts; calling it more often than every `period_s` seconds is no use. `certain` is
+    False if `title` contains an assumption, such as how the meter is wired."""
 
     title: str
     period_s: float
@@ -44,7 +44,7 @@ class Meter:
     certain: bool = True
 
     def read_w(self) -> float:
-        """Read the power in watts. Raises MeterError."""
+        """Read the power in watts. Raises MeterError if that fails or the value is impossible."""
         watts = self.look()
         if not 0 <= watts < _ABSURD_W:
             raise MeterError(f"{self.title} says {watts:g} W, which cannot be: check its wiring and its driver.")
@@ -52,7 +52,7 @@ class Meter:
 
 
 def find_meters(root: Path = Path("/")) -> tuple[Meter, ...]:
-    """Find the power meters at the input of this machine. `root` is where its /proc and /sys are."""
+    """Find the power meters at the input of this machine. `root` is the root of the file system with /proc and /sys."""
     return (*_ina_meters(root), *_pmic_meters(root))
 
 
@@ -62,11 +62,11 @@ def mean_power(
     clock: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], None] = time.sleep,
 ) -> float:
-    """Read `meter` every `meter.period_s` for `window_s` seconds and return the mean watts, by trapezoids.
+    """Read `meter` every `meter.period_s` for `window_s` seconds and return the mean in watts, by the trapezoidal rule.
 
-    A reading that fails is left out and counted; its neighbours bridge the gap. Raises MeterError when three fail in a
-    row, when fewer than two are good, or when more than half have failed. Short windows say little: one study had to
-    read at 350 Hz to trust them, so let the same work run for many seconds.
+    A reading that fails is left out, and the readings before and after it are joined. Raises MeterError if three fail
+    in a row, if fewer than two succeed, or if more than half fail. Short windows are unreliable: one study needed
+    readings at 350 Hz. So let the same work run for many seconds.
     """
     start_s = clock()
     steps = max(1, round(window_s / meter.period_s))  # at least two readings, the last one at the very end
@@ -115,7 +115,7 @@ def _ina_channel(folder: Path, channel: int, title: str, certain: bool = True) -
     def look() -> float:
         if power.exists():
             return _number(power) / 1e6
-        # An INA3221 gives no power. A small negative current (-1 mA at no load) is its offset and counts as none.
+        # An INA3221 reports volts and amperes only. A small negative current (-1 mA at no load) is its offset: zero.
         current_ma = _number(folder / f"curr{channel}_input")
         return _number(folder / f"in{channel}_input") * (0.0 if -5 < current_ma < 0 else current_ma) / 1e6
 
@@ -134,10 +134,10 @@ def _pmic_meters(root: Path) -> Iterator[Meter]:
 
 
 def _pmic_w(program: Path) -> float:
-    """Return the watts at the board's input from volts and amperes of all rails that have both.
+    """Return the watts at the board's input, computed from the volts and amperes of all rails that report both.
 
-    The rails leave out the losses of converters; 1.1451 x + 0.5879 W is the public fit to a meter in the supply
-    (project jfikar/RPi5-power).
+    The rails do not include the losses of converters. 1.1451 x + 0.5879 W, x being the sum over the rails, is the
+    public fit to a meter in the supply (project jfikar/RPi5-power).
     """
     try:
         done = subprocess.run([program, "pmic_read_adc"], capture_output=True, timeout=2, check=True)

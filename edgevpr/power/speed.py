@@ -1,7 +1,7 @@
-"""Speed of this machine at edgevpr's work, relative to the machine that `profiles/generic-x86.yaml` names.
+"""Micro-benchmark: speed of this machine relative to the reference machine of `profiles/generic-x86.yaml`.
 
-Two figures are kept apart, because they do not scale alike: matrix products (cohog's matching) depend on wide vector
-units, passes over bytes (encoding an image, scanning a map) do not. A small ARM core loses far more at the first.
+Two figures are measured, because machines differ in them: matrix products (cohog's matching) depend on wide vector
+units, passes over bytes (encoding an image, scanning a map) do not. Small ARM cores fall behind more at products.
 """
 
 import math
@@ -15,21 +15,21 @@ import numpy as np
 
 from edgevpr.power.boards import MachineSpeed
 
-# Rounds a second of one core of the reference, an AMD EPYC (Zen 4) in a virtual machine, by `_round_times_s` below with
+# Rounds per second of one core of the reference machine, an AMD EPYC (Zen 4) in a virtual machine, by `_rates_hz` with
 # OPENBLAS_NUM_THREADS=1, Python 3.11 and NumPy 2.4 (OpenBLAS 0.3.31).
 REFERENCE_PRODUCTS_HZ = 1585.0
 REFERENCE_PASSES_HZ = 1960.0
 
-_LEAST_S = 0.4  # of each of the four measurements
+_LEAST_S = 0.4  # the shortest time of each of the four measurements
 _LEAST_ROUNDS = 5
 
 
 def micro_benchmark() -> MachineSpeed:
-    """Measure the speed, in about two seconds (a slow board: some more). The machine should have nothing else to do.
+    """Measure the speed of this machine, in about two seconds (longer on a slow board). Nothing else should run.
 
     NumPy's library must have one thread (OPENBLAS_NUM_THREADS=1, which edgevpr's command line sets before NumPy is
-    imported). Then one thread is one core, and all cores are loaded by as many threads of our own. `single` and `multi`
-    are the geometric means of both kinds of work.
+    imported), so that each thread of ours is one core. `single` (one thread) and `multi` (one a core) are the geometric
+    means of the speeds at products and at passes.
     """
     cores = len(os.sched_getaffinity(0))
     products, all_products = (hz / REFERENCE_PRODUCTS_HZ for hz in _rates_hz(product_round, cores))
@@ -46,8 +46,8 @@ def micro_benchmark() -> MachineSpeed:
 
 
 def product_round() -> Callable[[], object]:
-    """Return a function that makes one float32 product of 961 x 32 by 32 x 961: the regions of a query with those of a
-    place."""
+    """Return a function that computes one float32 product of 961 x 32 by 32 x 961, which compares the regions of a
+    query with those of a place."""
     random = np.random.default_rng(1)
     query = random.random((961, 32), np.float32)
     place = random.random((961, 32), np.float32)
@@ -56,8 +56,8 @@ def product_round() -> Callable[[], object]:
 
 
 def pass_round() -> Callable[[], object]:
-    """Return a function that makes gradient magnitudes of a 512 x 512 picture, and a scan of 4096 codes of 512 bits
-    with two queries."""
+    """Return a function that computes gradient magnitudes of a 512 x 512 picture, and scans 4096 codes of 512 bits for
+    two queries."""
     random = np.random.default_rng(2)
     grey = random.integers(0, 256, (512, 512), np.uint8)
     codes = random.integers(0, 2**63, (4096, 8), np.uint64)
@@ -75,8 +75,9 @@ def pass_round() -> Callable[[], object]:
 
 
 def _rates_hz(make: Callable[[], Callable[[], object]], threads: int) -> tuple[float, float]:
-    """Return the rounds a second of one thread, by its quickest round, since disturbances of other rounds are not the
-    machine's speed; and those of `threads` threads at once, in all. NumPy lets them run in parallel."""
+    """Return two rates in rounds per second. `make` returns the work of one round, once for each thread.
+    - The rate of one thread, by its quickest round, since a slower one was disturbed by something else.
+    - The total rate of `threads` threads at once, which NumPy lets run in parallel."""
     alone_hz = 1 / min(_round_times_s(make(), Barrier(1)))
     start = Barrier(threads)
     with ThreadPoolExecutor(threads) as pool:
@@ -85,7 +86,8 @@ def _rates_hz(make: Callable[[], Callable[[], object]], threads: int) -> tuple[f
 
 
 def _round_times_s(work: Callable[[], object], start: Barrier) -> list[float]:
-    """Return how long each round took, after a first one that does not count and a wait for all to be ready."""
+    """Return the seconds of each round of `work`, after an uncounted first one and the barrier `start` of all
+    threads."""
     work()
     start.wait()
     times_s: list[float] = []

@@ -1,6 +1,6 @@
-"""Temperature and frequency of the machine, and whether it slows itself down, in one cheap look.
+"""Temperature and CPU frequency of the machine, and signs that it slows itself down, for the flight.
 
-A look opens two or three files of /sys: microseconds. The Raspberry Pi's firmware, which is slower, is asked once in
+A reading opens two or three files of /sys: microseconds. The Raspberry Pi's firmware is slower and is asked once in
 `SLOW_S` seconds.
 """
 
@@ -12,17 +12,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 SLOW_S = 5.0
-_UNKNOWN_LIMIT_C = 80.0  # here a Raspberry Pi's firmware begins to slow down; cautious for other boards
+_UNKNOWN_LIMIT_C = 80.0  # a Raspberry Pi's firmware slows the board down from here; cautious for other boards
 _CPU_ZONE = re.compile(r"cpu|soc|pkg|tj|acpitz|bigcore|littlecore", re.IGNORECASE)
-# Bits of the firmware's answer: the present state. The same bits, 16 places higher: any time since start.
+# Bits of the firmware's answer that tell the present state. 16 places higher they tell it for any time since start.
 _BITS = ((1, "under-voltage"), (2, "frequency capped"), (4, "throttled"), (8, "soft temperature limit"))
 _SLOWS = 2 | 4 | 8
 
 
 @dataclass(frozen=True, slots=True)
 class ThermalState:
-    """Result of a look: `temperature_c` of the hottest CPU sensor and `frequency_mhz` of the fastest cluster, None
-    where unknown. `throttled` is None where the machine cannot tell; `why` says what was seen, "" for nothing."""
+    """State at one reading: `temperature_c` of the hottest CPU sensor, `frequency_mhz` of the fastest cluster of cores
+    (None: unknown), `throttled`, True if the machine slows itself down (None: it cannot tell), and `why`, the signs
+    ("": none)."""
 
     temperature_c: float | None
     frequency_mhz: float | None
@@ -31,7 +32,7 @@ class ThermalState:
 
 
 class ThermalWatch:
-    """Watch over the sensors that are found when it is made."""
+    """Reader of the temperature and frequency sensors, which are searched for once, when it is created."""
 
     def __init__(self, root: Path = Path("/"), clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -46,7 +47,8 @@ class ThermalWatch:
         self._slow_at_s = float("-inf")
 
     def look(self) -> ThermalState:
-        """Look once; never raises: a sensor that has gone, or gives an impossible value, is None."""
+        """Read the sensors. Never raises: the value of a sensor that has gone, or reads an impossible value, is
+        None."""
         now_s = self._clock()
         if self._firmware and now_s - self._slow_at_s >= SLOW_S:
             self._slow_at_s, self._bits = now_s, _hexadecimal(_content(self._firmware))
@@ -60,14 +62,14 @@ class ThermalWatch:
         return ThermalState(temperature_c, frequency_mhz, throttled, "; ".join(why for _, why in reasons))
 
     def _reasons(self, temperature_c: float | None, khz: float | None) -> Iterator[tuple[bool, str]]:
-        """Yield (True if it slows the machine down, what it is) for everything seen."""
+        """Yield (slows, what) for everything seen: True if it slows the machine down now, and a text about it."""
         bits = self._bits or 0
         if now := [word for bit, word in _BITS if bits & bit]:
             yield bool(bits & _SLOWS), f"{', '.join(now)} now"
         if before := [word for bit, word in _BITS if bits >> 16 & bit and not bits & bit]:
             yield False, f"{', '.join(before)} since start"
         if self._policy:
-            # Cooling lowers this limit. A power mode may hold it low for good, so the highest one seen is normal.
+            # The kernel lowers this limit to cool the CPU. A power mode may keep it low, so the highest seen is normal.
             allowed_khz = _number(self._policy / "scaling_max_freq") or 0.0
             self._allowed_khz = max(self._allowed_khz, allowed_khz)
             normal_khz = self._allowed_khz or self._top_khz
@@ -83,8 +85,8 @@ def limit_c(root: Path = Path("/")) -> float:
     """Return the degrees Celsius at which this machine begins to slow down: the lowest passive trip point of its CPU's
     zones.
 
-    A board whose kernel has none (Raspberry Pi: its firmware does it) is held at 80 degrees, or 10 below the point
-    where it switches off if that is lower.
+    If the kernel has none (Raspberry Pi: its firmware slows it down), it is 80 degrees, or 10 below the point where the
+    machine switches off if that is lower.
     """
     trips: dict[str, list[float]] = {}
     for zone in _cpu_zones(root):
@@ -103,7 +105,7 @@ def _cpu_zones(root: Path) -> list[Path]:
 
 
 def _content(path: Path) -> str | None:
-    """Read the first 64 bytes of a small file, None where that fails. Opened by hand: a third of the time of
+    """Return the first 64 bytes of a small file as text, None if that fails. `os.open`: a third of the time of
     `read_text`."""
     try:
         handle = os.open(path, os.O_RDONLY)
