@@ -42,6 +42,7 @@ def add(commands: Any) -> None:
     export.add_argument("--geojson", required=True, metavar="FILE", help="GeoJSON file to write, - for standard output")
     worth = command(commands, "salience", run_salience, "say what of a picture is worth remembering")
     worth.add_argument("image", metavar="IMAGE")
+    worth.add_argument("--out", metavar="PNG", help="draw the picture with its three maps")
     worth.add_argument("--config", metavar="FILE", help="YAML; its section `salience` counts")
     worth.add_argument("--network", metavar="NAME", help="the card of the network of memorability")
     worth.add_argument("--detector", metavar="NAME", help="the card of the object detector")
@@ -206,15 +207,21 @@ def map_export(args: Namespace) -> int:
 
 
 def run_salience(args: Namespace) -> int:
-    """Print the scores of a picture."""
+    """Print the scores of a picture, and draw its maps."""
+    from edgevpr.core.files import require_folder, write_whole
     from edgevpr.frames.images import read_image
     from edgevpr.runtime.recognise.opening import gate_with
-    from edgevpr.runtime.recognise.salience_gate import scores_of, worth_of
+    from edgevpr.runtime.recognise.salience_gate import drawn_as_png, scores_of, worth_of
 
     asked = {"salience.use": True, "salience.network": args.network, "salience.detector": args.detector}
     gate = gate_with(config_of(args, args.config, **asked).salience)
-    maps = gate.maps(read_image(Path(args.image)))
+    if args.out:
+        require_folder(Path(args.out))
+    image = read_image(Path(args.image))
+    maps = gate.maps(image)
     worth = worth_of(scores_of(maps), gate.thresholds)
+    if args.out:
+        write_whole(Path(args.out), lambda path: path.write_bytes(drawn_as_png(image, maps, worth.salience)))
     if args.json:
         print_json(
             {"image": args.image, **asdict(worth.salience), "kept": worth.reason is None, "reason": worth.reason}

@@ -14,7 +14,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "runtime/recognise"))
 from tiny_detectors import write_detector, write_memorability
 
 from edgevpr.cli.main import main
-from edgevpr.frames.images import cv2
+from edgevpr.frames.images import cv2, read_image
 from edgevpr.places.mapfile import PlaceMap
 
 
@@ -48,15 +48,16 @@ def config(tmp_path, **keys):
     return str(path)
 
 
-def test_a_picture_is_scored(networks, tmp_path, capsys):
-    picture = tmp_path / "p.png"
+def test_a_picture_is_scored_and_drawn(networks, tmp_path, capsys):
+    picture, out = tmp_path / "p.png", tmp_path / "maps.png"
     cv2.imwrite(str(picture), texture(1))
-    command = ["salience", str(picture), "--network", "bright", "--detector", "tiny"]
+    command = ["salience", str(picture), "--network", "bright", "--detector", "tiny", "--out", str(out)]
     assert main(command) == 0
     said = capsys.readouterr().out
     assert "staticity     0.50" in said
     assert "staticity 0.50" in said
-    assert main([*command, "--json"]) == 0
+    assert read_image(out).shape == (2 * (360 + 34 + 6), 2 * (480 + 12), 3)
+    assert main([*command[:-2], "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert (said["kept"], said["staticity"]) == (False, pytest.approx(0.5, abs=0.01))
 

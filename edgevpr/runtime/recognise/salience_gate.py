@@ -31,6 +31,7 @@ _STEPS_BELOW = 3.2
 _LEAST_STEP = 0.005
 # Of the longer side on which entropy is computed: a larger copy costs more and says the same.
 _LONGEST_PX = 320
+_WIDTH_PX, _CAPTION_PX, _WEIGHT = 480, 34, 0.55  # of a panel that is drawn, and of the colours over the picture
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,3 +184,29 @@ def _small_grey(image: Image) -> Image:
         size = tuple(max(1, round(side * shrink)) for side in image.shape[1::-1])
         image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
     return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
+
+
+def drawn_as_png(image: Image, maps: Maps, salience: Salience) -> bytes:
+    """Draw a picture and its three maps over it, two by two, as a PNG file. Blue is little, red is much."""
+    size = _WIDTH_PX, round(_WIDTH_PX * image.shape[0] / image.shape[1])
+    colour = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+    ground = np.asarray(cv2.resize(colour, size, interpolation=cv2.INTER_AREA), np.uint8)
+    panels = {"picture": ground}
+    for (name, score), values, full in zip(
+        salience.scores.items(),
+        (maps.memorability, maps.is_static, maps.entropy),
+        (1.0, 1.0, MOST_ENTROPY),
+        strict=True,
+    ):
+        drawn = ground
+        if values is not None:
+            levels = cv2.resize(np.clip(values / full * 255, 0, 255).astype(np.uint8), size)
+            coloured = cv2.applyColorMap(np.asarray(levels, np.uint8), cv2.COLORMAP_TURBO)
+            drawn = np.asarray(cv2.addWeighted(coloured, _WEIGHT, ground, 1 - _WEIGHT, 0), np.uint8)
+        panels[f"{name} {'off' if score is None else f'{score:.2f}'}"] = drawn
+    framed = []
+    for caption, drawn in panels.items():
+        panel = cv2.copyMakeBorder(drawn, _CAPTION_PX, 6, 6, 6, cv2.BORDER_CONSTANT, value=(255,) * 3)
+        cv2.putText(panel, caption, (10, _CAPTION_PX - 10), cv2.FONT_HERSHEY_SIMPLEX, 0.7, (40,) * 3, 1, cv2.LINE_AA)
+        framed.append(panel)
+    return cv2.imencode(".png", np.vstack([np.hstack(framed[:2]), np.hstack(framed[2:])]))[1].tobytes()
