@@ -1,4 +1,5 @@
-"""The address of a MAVLink link, as the user writes it."""
+"""Addresses of MAVLink links, parsed from the text in which the user writes them (`mavlink.link`, `mavlink.ground`).
+Used by the flight, by `edgevpr check` and `doctor`, and by the simulated autopilot."""
 
 from dataclasses import dataclass
 
@@ -12,7 +13,8 @@ Sender = tuple[str, int]  # host and port
 
 @dataclass(frozen=True, slots=True)
 class LinkAddress:
-    """The address of the other end: `where` is a host or a serial device, `number` a port or a baud rate."""
+    """The parsed address of a link. `where` is a host (of udpin: the own address at which it listens) or the path of a
+    serial device; `number` is a UDP or TCP port, or the baud rate of the serial device."""
 
     kind: str  # "udpout", "udpin", "tcp" or "serial"
     where: str
@@ -23,8 +25,8 @@ class LinkAddress:
 
 
 def parse_link(url: str) -> LinkAddress:
-    """Read a link such as `udpout:127.0.0.1:14550`; raises LinkAddressError, one sentence, for
-    anything else."""
+    """Parse the text of a link, such as `udpout:127.0.0.1:14550`. Raises LinkAddressError, with a message of one
+    sentence, for any text that has none of the forms in FORMS."""
     kind, _, rest = url.partition(":")
     where, _, number = rest.rpartition(":")  # from the right: names in /dev/serial/by-path hold colons
     if kind not in ("udpout", "udpin", "tcp", "serial") or not where.strip() or not number:
@@ -40,8 +42,9 @@ def parse_link(url: str) -> LinkAddress:
 
 
 def parse_links(flight: str | None, ground: str | None) -> tuple[LinkAddress | None, LinkAddress | None]:
-    """Read the links to the flight controller and to the ground, None where there is none. Raises LinkAddressError for
-    one that is wrong, and for one to the ground alone."""
+    """Parse the texts of the links to the flight controller (`flight`) and to the ground station (`ground`) and return
+    both addresses in this order; None stands for no link. Raises LinkAddressError for a text that is no address, and
+    for a `ground` without a `flight`."""
     if flight is None and ground is not None:
         raise LinkAddressError("`mavlink.ground` is a second link: name the flight controller's as `mavlink.link`.")
     return (None if flight is None else parse_link(flight)), (None if ground is None else parse_link(ground))

@@ -1,4 +1,6 @@
-"""Questions to an autopilot on the ground: bounded in time and tries, over a link of any kind. Nothing is ever set."""
+"""Questions to an autopilot before the flight: the caller asks, and waits for each answer. Time and retries are
+limited, the link may be of any kind, and no setting of the autopilot is changed. Used by `edgevpr check` and `doctor`.
+"""
 
 import select
 import time
@@ -24,13 +26,14 @@ _SIGNED = mavlink.MAVLINK_IFLAG_SIGNED
 
 
 class Inquiry:
-    """A conversation with one autopilot by a caller that waits for each answer. As every companion it sends a heartbeat
-    a second, without which some ports do not answer.
+    """A link to one autopilot, for a caller that waits for each answer. It sends a heartbeat once a second, as every
+    companion computer does, since some ports of autopilots do not answer without. Use it as a context manager. Every
+    method raises LinkError when the connection is lost.
 
-    `heard` counts the autopilot's messages by name, `signed` those of them that carry a signature, `others` are the
-    system ids of further autopilots on the link, `bad_bytes` are bytes that are no message, `refused` counts messages
-    without the right signature by reason (`signs`: there is a key). Every method raises LinkError where the link is
-    lost.
+    - `system_id`: that of the autopilot; None until its first heartbeat, if none was given.
+    - `heard`: number of messages from the autopilot, by message name.
+    - `signed`: how many of these messages carry a signature.
+    - `others`: system ids of any other autopilots on the link.
     """
 
     def __init__(
@@ -40,19 +43,19 @@ class Inquiry:
         system_id: int | None = None,
         signing: NotSigning = NOT_SIGNING,
     ) -> None:
-        """Open the link; raises LinkError where it cannot be opened, as `open_port` does, and where nothing is
-        there."""
+        """Open the link. `component_id` is our own, `system_id` that of the autopilot (None: the first one that is
+        heard). Raises LinkError where the link cannot be opened: see `open_port`, or its other end is missing."""
         self.system_id = system_id
         self.heard: Counter[str] = Counter()
         self.signed = 0
         self.others: set[int] = set()
-        self.says_version_1 = False  # of its last message
+        self.says_version_1 = False  # True if its last message was MAVLink 1
         self._address = address
         self._signing = signing
         self._reader = PacketReader(signing.admits)
         self._packer = mavlink.MAVLink(None, srcSystem=system_id or 1, srcComponent=component_id)
         self._waiting: deque[bytes] = deque(maxlen=_WAITING_MAX)  # packets to be written, one datagram each
-        self._arrived: deque[Message] = deque()  # not looked at yet
+        self._arrived: deque[Message] = deque()  # from the autopilot, not yet returned to the caller
         self._heartbeat_due_s = 0.0
         self._autopilot_heard = False
         try:
@@ -74,29 +77,31 @@ class Inquiry:
 
     @property
     def bad_bytes(self) -> int:
-        """The number of bytes that were no message."""
+        """The number of received bytes that belong to no valid message."""
         return self._reader.bad_bytes
 
     @property
     def signs(self) -> bool:
-        """True where there is a key."""
+        """True if there is a signing key, so that our messages are signed."""
         return self._signing is not NOT_SIGNING
 
     @property
     def refused(self) -> Mapping[str, int]:
-        """The messages without the right signature, by reason."""
+        """The number of messages refused since their signature is missing or wrong, by reason. Empty without a key."""
         return self._signing.refused
 
     def heartbeat(self, wait_s: float = HEARTBEAT_WAIT_S) -> Message | None:
-        """Wait for a heartbeat of the autopilot; from then on only that one is listened to. None: none came."""
+        """Wait up to `wait_s` seconds for the heartbeat of an autopilot and return it, or None if none came. From then
+        on the messages of all other autopilots are ignored."""
         return self._first(wait_s, lambda message: bool(message.get_type() == "HEARTBEAT"))
 
     def listen(self, wait_s: float) -> None:
-        """Count what the autopilot sends without being asked."""
+        """Receive for `wait_s` seconds, only to count in `heard` the messages that the autopilot sends unasked."""
         self._first(wait_s, lambda message: False)
 
     def message(self, message_id: int) -> Message | None:
-        """Ask for one message (MAV_CMD_REQUEST_MESSAGE); None where the autopilot refuses it, or nothing comes."""
+        """Request one message by its number (MAV_CMD_REQUEST_MESSAGE) and return it. Returns None if the autopilot
+        refuses the request, or does not answer three requests."""
         name = mavlink.mavlink_map[message_id].msgname
         for _ in range(TRIES):
             self._put(messages.message_request(self.system_id or 0, message_id))
@@ -106,10 +111,11 @@ class Inquiry:
         return None
 
     def parameters(self, names: Iterable[str], bytewise: bool) -> dict[str, float | int]:
-        """Read parameters by name (PARAM_REQUEST_READ); those that the autopilot does not have, and those that are no
-        number, are left out.
+        """Read parameters by name (PARAM_REQUEST_READ) and return their values by name. Parameters that the autopilot
+        does not have, and values that are not finite, are left out.
 
-        `bytewise`: it packs whole numbers into the bytes of the float (PX4), as AUTOPILOT_VERSION says.
+        `bytewise`: the autopilot stores the bytes of a whole number in the float field of the message (PX4 does), which
+        it announces in AUTOPILOT_VERSION.
         """
         values: dict[str, float | int] = {}
         missing = list(dict.fromkeys(names))
@@ -120,7 +126,8 @@ class Inquiry:
         return values
 
     def round_trips_s(self, count: int) -> list[float]:
-        """Measure by TIMESYNC, so many times, the seconds from a question to its answer; a lost one is left out."""
+        """Send `count` TIMESYNC requests, one after another, and return the seconds that each took to be answered. A
+        request without an answer within a second is left out."""
         times_s = []
         for _ in range(count):
             sent_ns = time.monotonic_ns()
@@ -134,7 +141,8 @@ class Inquiry:
         return times_s
 
     def _read_parameters(self, names: Collection[str], values: dict[str, float | int], bytewise: bool) -> None:
-        """Ask for a few parameters, and put into `values` what comes until all are there or a second is quiet."""
+        """Request the parameters `names`, and store the answers in `values`. Ends when each is answered, or no answer
+        has come for a second."""
         waiting = set(names)
         for name in names:
             self._put(messages.parameter_request(self.system_id or 0, name))
@@ -153,7 +161,8 @@ class Inquiry:
         return next((message for message in self._messages(wait_s) if is_wanted(message)), None)
 
     def _messages(self, wait_s: float) -> Iterator[Message]:
-        """Yield the autopilot's messages of the next `wait_s` seconds, those that have arrived already first."""
+        """Yield the messages of the autopilot: first those received already, then those that arrive within `wait_s`
+        seconds."""
         end_s = time.monotonic() + wait_s
         while True:
             while self._arrived:
@@ -167,7 +176,8 @@ class Inquiry:
                 raise LinkError(f"{self._address} was lost ({error.strerror or error}): look at the cable.") from error
 
     def _turn(self, now_s: float, wait_s: float) -> None:
-        """Write what the port takes at once, and read what comes within `wait_s`."""
+        """Queue a heartbeat if one is due, write as much as the port accepts without blocking, then receive for up to
+        `wait_s` seconds."""
         if self._port.connected:
             if now_s >= self._heartbeat_due_s:
                 self._heartbeat_due_s = now_s + HEARTBEAT_S

@@ -1,6 +1,8 @@
-"""Channels by which an autopilot can be told a position, and which one a firmware takes on which vehicle.
+"""Channels: the ways in which an autopilot can be told a position, and the rule that chooses one for a firmware and a
+kind of vehicle. Used by the link in flight, and by `edgevpr doctor` for its advice.
 
-The rules are read off ArduPilot 4.7-dev, and tried on it in simulation, and off PX4 1.17-alpha.
+The rules were read in the source code of ArduPilot 4.7-dev, and tried on it in simulation, and in that of PX4
+1.17-alpha.
 """
 
 import logging
@@ -15,12 +17,12 @@ from edgevpr.mavlink.wire import Message, mavlink, parameter_value
 _ASK_EVERY_S, _MOST_TIMES = 1.0, 4
 
 # ArduPilot. The names of the receivers' parameters are those since 4.6, and those before.
-MAVLINK_GPS = 14  # of GPSn_TYPE: positions come as GPS_INPUT
-SECOND = 1  # the number of the receiver that we are to be
+MAVLINK_GPS = 14  # value of GPSn_TYPE: the receiver's positions come as GPS_INPUT
+SECOND = 1  # index of the receiver that we advise the user to give to us
 _RECEIVERS = (("GPS1_TYPE", "GPS_TYPE"), ("GPS2_TYPE", "GPS_TYPE2"))
 _DELAYS = (("GPS1_DELAY_MS", "GPS_DELAY_MS"), ("GPS2_DELAY_MS", "GPS_DELAY_MS2"))
 _VISION, _MAVLINK_VISION = "VISO_TYPE", 1
-# AP_GPS takes the positions of a receiver that does not say how late they are to be so old (GPS_Backend::get_lag).
+# AP_GPS assumes this age for the positions of a receiver whose delay is not configured (GPS_Backend::get_lag).
 _GPS_LAG_S = 0.2
 
 # PX4
@@ -32,8 +34,8 @@ log = logging.getLogger(__name__)
 
 
 class Channel(Enum):
-    """A way to tell an autopilot a position. The first two are for single fixes, rare and late; the last two ask for an
-    estimate ten times a second, without a gap."""
+    """A way to tell an autopilot a position. COMMAND and SENSOR carry single fixes, which may be rare and late.
+    GPS_INPUT and ODOMETRY need an estimate ten times a second without a gap."""
 
     COMMAND = auto()  # 43003, EXTERNAL_POSITION_ESTIMATE
     SENSOR = auto()  # message 296, GLOBAL_POSITION_SENSOR
@@ -42,12 +44,12 @@ class Channel(Enum):
 
     @property
     def is_continuous(self) -> bool:
-        """True for a channel that asks for an estimate without a gap."""
+        """True for a channel that needs an estimate ten times a second without a gap."""
         return self in (Channel.GPS_INPUT, Channel.ODOMETRY)
 
 
 class Kind(Enum):
-    """A kind of vehicle, as far as it matters to how it flies without GPS."""
+    """A kind of vehicle; it decides what the autopilot can do without GPS."""
 
     PLANE = "plane"
     COPTER = "copter"
@@ -57,8 +59,9 @@ class Kind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """The channel of an autopilot, and the `reason` for it in a few words. `receiver` is the number of the GPS receiver
-    that GPS_INPUT plays (0: the first), and `lag_s` how old the autopilot takes its positions to be."""
+    """The channel chosen for an autopilot, and the `reason` for it in a few words. For GPS_INPUT, `receiver` is the
+    index of the GPS receiver that we replace (0: the first), and `lag_s` the age in seconds that the autopilot assumes
+    our positions to have."""
 
     channel: Channel
     reason: str
@@ -68,8 +71,9 @@ class Choice:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Answers:
-    """Answers of an autopilot: the kind of its vehicle, its `version` (major, minor; None: unknown) and those of the
-    parameters asked for that it has."""
+    """Answers of an autopilot on which the choice of a channel depends: the `kind` of its vehicle, the `version` of its
+    firmware (major, minor; None: unknown), and the values of `parameters` by name, without those that it does not have.
+    """
 
     kind: Kind
     version: tuple[int, int] | None
@@ -77,19 +81,20 @@ class Answers:
 
 
 def kind_of(mav_type: int) -> Kind:
-    """Return the kind of a vehicle by the type in its HEARTBEAT (MAV_TYPE).
+    """Return the kind of vehicle for the `type` field of its HEARTBEAT (a MAV_TYPE).
 
-    What takes off upright and flies on wings is a plane: on its wings it reckons by airspeed and without sideslip, as a
-    plane does. While it hovers it has no more than a copter has; its type does not tell which it does.
+    A VTOL aircraft counts as a plane: in forward flight it dead-reckons by airspeed and without sideslip, as a plane
+    does. While it hovers it can do no more than a copter, but its type does not tell whether it hovers.
     """
     return next((kind for kind, types in _MAV_TYPES.items() if mav_type in types), Kind.OTHER)
 
 
 def ardupilot_choice(answers: Answers) -> Choice:
-    """Choose the channel for an ArduPilot: what its operator has set up for us, else single fixes.
+    """Choose the channel for an ArduPilot: GPS_INPUT or ODOMETRY if its parameters are set for it, else command 43003.
 
-    A plane reckons without GPS for as long as it flies, and takes a fix at any time (`NavEKF3_core::setLatLng`). A
-    copter without GPS and optical flow lands some seconds later, a rover stops, and no single fix prevents that.
+    A plane dead-reckons without GPS for as long as it flies, and accepts a fix at any time (`NavEKF3_core::setLatLng`).
+    Without GPS and optical flow a copter lands after some seconds and a rover stops, and single fixes do not prevent
+    that.
     """
     parameters = answers.parameters
     for number in range(len(_RECEIVERS)):
@@ -110,13 +115,15 @@ def ardupilot_choice(answers: Answers) -> Choice:
 
 
 def receiver_name(parameters: Mapping[str, float], number: int) -> str:
-    """Return the name that this ArduPilot has for the type of a receiver (0: the first)."""
+    """Return the parameter that holds the type of GPS receiver `number` (0: the first): GPS1_TYPE or, before ArduPilot
+    4.6, GPS_TYPE."""
     return _known_name(parameters, _RECEIVERS[number])
 
 
 def px4_choice(answers: Answers) -> Choice:
-    """Choose the channel for a PX4: message 296 where it has been told to fuse it, else command 43003. It fuses both,
-    and falls back to single fixes by itself; it drops a 296 that says no accuracy, and its own delay is a parameter."""
+    """Choose the channel for a PX4: message 296 if its version knows it and its parameter CONTROL lets it fuse
+    positions, else command 43003. It ignores a message 296 without an accuracy, and takes the delay of its position
+    from a parameter of its own."""
     if answers.version and answers.version < _SENSOR_SINCE:
         major, minor = answers.version
         return Choice(Channel.COMMAND, f"command 43003, as version {major}.{minor} knows no message 296 (1.17 does)")
@@ -126,7 +133,7 @@ def px4_choice(answers: Answers) -> Choice:
 
 
 def px4_can_fuse(answers: Answers) -> bool:
-    """Tell whether this PX4 can be told to fuse message 296."""
+    """Return True if this PX4 has message 296 in its firmware, so that its parameter CONTROL can switch it on."""
     return CONTROL in answers.parameters and (answers.version is None or answers.version >= _SENSOR_SINCE)
 
 
@@ -136,7 +143,8 @@ def _known_name(parameters: Mapping[str, float], names: tuple[str, ...]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _Firmware:
-    """A firmware that is known: the parameters that are asked of it, and its rule."""
+    """A firmware: the names of the `parameters` on which its channel depends, and the function that chooses the channel
+    from the answers (None: always command 43003)."""
 
     name: str
     parameters: tuple[str, ...] = ()
@@ -152,10 +160,12 @@ _FIRMWARES = {mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: ARDUPILOT, mavlink.MAV_AUTOPI
 
 
 class Interview:
-    """Asks an autopilot for its version and a few parameters, a few times where answers are missing (an autopilot does
-    not answer for a parameter that it does not have). `choice` is the channel: until all has been asked, that of an
-    autopilot that has answered nothing. A first answer that comes late still counts, a second one does not: a parameter
-    that is changed in flight changes no channel."""
+    """Asks an autopilot for its version and a few parameters, and chooses the channel from the answers.
+
+    Missing answers are requested four times, a second apart, since an autopilot is silent about a parameter that it
+    does not have. `choice` is command 43003 until then. The first answer to a question counts even if it comes later;
+    further answers are ignored, so that changing a parameter in flight does not change the channel.
+    """
 
     def __init__(self) -> None:
         self.choice = Choice(Channel.COMMAND, "command 43003, the only one that is asked of an unknown firmware")
@@ -167,7 +177,7 @@ class Interview:
         self._is_over = False
 
     def hear(self, message: Message) -> None:
-        """Take in a message of the autopilot."""
+        """Process a message from the autopilot; most kinds are ignored."""
         match message.get_type():
             case "HEARTBEAT":
                 self._firmware = _FIRMWARES.get(message.autopilot, _UNKNOWN)
@@ -182,8 +192,8 @@ class Interview:
                     self._parameters[message.param_id] = value
 
     def questions(self, now_s: float, target_system: int) -> Iterator[Message]:
-        """Yield the questions that are due. After the last of them, and a while for the answers, the channel is
-        chosen."""
+        """Yield the requests to be sent at `now_s` to the autopilot `target_system`. When nothing is missing, or the
+        last request is a second old, choose the channel."""
         if self._is_over or now_s - self._ask_s < _ASK_EVERY_S:
             return
         missing = self._missing()

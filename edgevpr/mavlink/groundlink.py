@@ -1,7 +1,8 @@
-"""The second link, to a ground station: what the first one says to people is said there too, and never a fix.
+"""The second link, to a ground station. It gets copies of the status messages and texts of the first link, and never a
+position fix. Used by the flight where `mavlink.ground` is set.
 
-Nothing is forwarded from one link to the other. That is a router's work: here it would let a stranger on the ground
-speak to the flight controller.
+No message is forwarded from one link to the other. That is the work of a router: here it would let a stranger on the
+ground speak to the flight controller.
 """
 
 import math
@@ -17,13 +18,14 @@ from edgevpr.mavlink.requests import Requests
 from edgevpr.mavlink.wire import Message, mavlink
 
 FOR_PEOPLE = frozenset(("STATUSTEXT", "NAMED_VALUE_FLOAT", "NAMED_VALUE_INT", "ONBOARD_COMPUTER_STATUS"))
-# Of two stations at one listening port, the first is answered for as long as it beats; it does so once a second.
+# Of two stations at one listening port, the first is answered until its heartbeats (one a second) stop for so long.
 SILENT_AFTER_S = 5.0
 
 
 class GroundLink(Link):
-    """The link to the ground beside the one to the `flight` controller. It has the same identity and health, and its
-    own thread and port, so that a ground station that is lost holds up no fix; the turns it shares."""
+    """The link to the ground station, beside the link `flight` to the flight controller. It has the same identity and
+    health as `flight`. It has its own thread and port, so that a lost ground station delays no fix, but shares the
+    turns of `flight` (see `turns`)."""
 
     name = "ground"
 
@@ -47,7 +49,8 @@ class GroundLink(Link):
 
 
 class GroundConversation(Conversation):
-    """The conversation with a ground station: heartbeats and what is queued. Nobody who is heard is an autopilot."""
+    """The conversation with a ground station: it sends heartbeats and what is queued, and obeys requests. No sender on
+    this link is taken for the autopilot."""
 
     def __init__(self, flight: Conversation, settings: LinkSettings, clock: Callable[[], float]) -> None:
         super().__init__(settings, clock)
@@ -57,14 +60,15 @@ class GroundConversation(Conversation):
         self._station_heard_s = -math.inf
 
     def next_packet(self) -> tuple[bytes, Sending | None] | None:
-        """Choose and pack the next message, as the vehicle that the flight controller says we are."""
+        """Choose and pack the next message, with the health and the system id of the link to the flight controller.
+        Returns (packet, None), or None if there is nothing to send."""
         self._health, self._health_set_s = self._flight._health, self._flight._health_set_s
         self._packer.srcSystem = self._flight._packer.srcSystem
         return super().next_packet()
 
     def hear(self, data: bytes, now_s: float, sender: Sender | None) -> bool:
-        """Take in bytes that arrived from `sender`; return True where they hold a heartbeat of the ground station that
-        is answered. Whatever else is to be heard on the ground's link is heard here."""
+        """Process bytes received from `sender` at `now_s`. Returns True if they contain a heartbeat of the ground
+        station to which we answer. Requests are obeyed from every sender."""
         beats = False
         for message in self.reader.feed(data, sender):
             if message.get_type() == "HEARTBEAT" and message.type == mavlink.MAV_TYPE_GCS:

@@ -1,4 +1,5 @@
-"""The one autopilot that a link talks to, and the rule by which another speaker becomes it."""
+"""The identity of the one autopilot that a link talks to, and the rule by which another sender may take its place. Used
+by `peer`."""
 
 import logging
 import math
@@ -6,10 +7,10 @@ from dataclasses import dataclass
 
 from edgevpr.mavlink.address import Sender
 
-# A flight controller that restarts is back within 20 s; what speaks meanwhile is not it.
+# A flight controller that restarts is back within 20 s; other senders in the meantime are not it.
 RETAKEN_AFTER_S = 30.0
-STEADY_S = 5.0  # one stray packet takes nothing over: another speaker must have beaten for so long,
-GAP_S = 2.5  # and without a longer gap: heartbeats come once a second, and one may be lost
+STEADY_S = 5.0  # another sender must have sent heartbeats for so long, which one stray packet does not,
+GAP_S = 2.5  # and without a longer gap: they come once a second, and one may be lost
 _OTHERS_MAX = 32  # speakers remembered; a flood of invented ones must not fill the memory
 
 log = logging.getLogger(__name__)
@@ -17,7 +18,8 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Speaker:
-    """An autopilot as it is heard: its system id, and its address where there can be several (else None)."""
+    """The sender of an autopilot's messages: its system id, and its network address (None on a link that can have only
+    one sender)."""
 
     system_id: int
     address: Sender | None
@@ -27,17 +29,19 @@ class Speaker:
 
     @property
     def where(self) -> str:
-        """The address in words, where there is one."""
+        """The address as text with a space before it (" at HOST:PORT"); empty without an address."""
         return f" at {self.address[0]}:{self.address[1]}" if self.address else ""
 
 
 class Identity:
-    """The speaker that is our autopilot: the first heard, or the first heard with the configured `system_id`.
+    """Decides which sender is our autopilot: the first one heard or, with `system_id` set, the first with that system
+    id.
 
-    It is kept for as long as it speaks. When it has been silent for 30 s, another that beats steadily takes its place:
-    the same system at another address, or else another system if it is the only one. A system that was heard between
-    two heartbeats of ours is another vehicle, and is never taken; nor is any other than a configured one.
-    `foreign_messages` counts what was refused, since it came from another autopilot or another address.
+    It stays our autopilot for as long as it sends. After 30 s of silence, another sender with steady heartbeats takes
+    its place: the same system id at another address, or else another system id if only one is there. A system id from
+    which a heartbeat came between two heartbeats of ours is another vehicle and is never taken; with `system_id` set,
+    no other is. `kept` is our autopilot (None: not heard yet). `foreign_messages` counts the messages refused since
+    they came from another autopilot or another address.
     """
 
     def __init__(self, system_id: int | None = None) -> None:
@@ -45,39 +49,40 @@ class Identity:
         self.foreign_messages = 0
         self._configured = system_id
         self._spoke_s = -math.inf
-        self._others: dict[Speaker, tuple[float, float]] = {}  # unbroken heartbeats: times of the first and of the last
+        self._others: dict[Speaker, tuple[float, float]] = {}  # unbroken heartbeats: times of first and last
         self._neighbours: set[int] = set()  # system ids of other vehicles
         self._warnings: set[str] = set()
         self._news: str | None = None
 
     def take_news(self) -> str | None:
-        """Return once, in a few words, that another speaker has become our autopilot; None: there is no news."""
+        """Return a short text if another sender has become our autopilot since the last call, else None."""
         news, self._news = self._news, None
         return news
 
     def admits(self, speaker: Speaker, beats: bool, now_s: float) -> bool:
-        """Tell whether a message comes from our autopilot. `beats`: the message is an autopilot's heartbeat."""
+        """Return True if a message of this speaker comes from our autopilot. `beats`: the message is the heartbeat of
+        an autopilot, by which the speaker may become ours. Messages of others are counted."""
         if beats and speaker != self.kept and self._is_next(speaker, now_s):
             self._take(speaker, now_s)
         if speaker != self.kept:
             self.refuse()
             return False
         self._spoke_s = now_s
-        if beats:  # whoever has beaten since the last beat of ours cannot be ours under another number
+        if beats:  # a sender of heartbeats while ours still sends cannot be ours under another number
             self._neighbours |= {other.system_id for other in self._others} - {speaker.system_id}
         return True
 
     def is_elsewhere(self, address: Sender | None) -> bool:
-        """Tell whether bytes from this address cannot be from our autopilot."""
+        """Return True if bytes from this address cannot come from our autopilot, whose address is another one."""
         return self.kept is not None and address != self.kept.address
 
     def refuse(self) -> None:
-        """Count a message of somebody else, where it is known who our autopilot is."""
+        """Count a message of another sender in `foreign_messages`, unless any sender may still become our autopilot."""
         self.foreign_messages += self.kept is not None or self._configured is not None
 
     def _is_next(self, speaker: Speaker, now_s: float) -> bool:
-        """Take note of the heartbeat of another speaker; tell whether it is our autopilot from now on. Two vehicles on
-        one link are dangerous, and warned of."""
+        """Note the heartbeat of a speaker that is not our autopilot; return True if it becomes ours now. Log a warning
+        about a second vehicle, since two on one link are dangerous."""
         kept = self.kept
         if self._configured not in (None, speaker.system_id):
             self._warn("configured", f"{speaker} is not system {self._configured}, which is configured: it gets no fix")
@@ -93,14 +98,14 @@ class Identity:
                 "of its own, or set mavlink.system_id",
             )
         steady_s = self._steady_s(speaker, now_s)
-        # No other who speaks now may be ours as well: the same system comes before any other.
+        # Another system id is taken only if it is the only candidate; our own system id may always be taken.
         systems = {other.system_id for other in self._others} - self._neighbours
         is_only_choice = speaker.system_id == kept.system_id or systems == {speaker.system_id}
         return now_s - self._spoke_s >= RETAKEN_AFTER_S and steady_s >= STEADY_S and is_only_choice
 
     def _steady_s(self, speaker: Speaker, now_s: float) -> float:
-        """Note a heartbeat, and forget the rows of heartbeats that have ended; return how long that of the speaker has
-        gone on."""
+        """Note a heartbeat of `speaker`, and forget the speakers whose heartbeats have stopped. Returns for how many
+        seconds those of `speaker` have come without a gap."""
         since_s, last_s = self._others.pop(speaker, (now_s, now_s))
         self._others = {other: row for other, row in self._others.items() if now_s - row[1] <= GAP_S}
         if len(self._others) == _OTHERS_MAX:

@@ -1,4 +1,5 @@
-"""An open port, and what was written into it: no fix leaves a buffer late, be it ours or the system's."""
+"""The `Line`: an open port together with the packets written into it. It makes sure that no position fix leaves late
+from a buffer, be it ours or that of the operating system. Used by `link`."""
 
 from collections import deque
 from collections.abc import Callable
@@ -9,50 +10,52 @@ from edgevpr.mavlink.ports import Port
 from edgevpr.mavlink.wire import Tap, untapped
 
 LOST = "the link was lost before it had left"
-STUCK_S = 0.5  # a port that has taken no byte for this time is reopened: bytes that wait in it would leave late
+STUCK_S = 0.5  # a port that has accepted no byte for this time is reopened: bytes that wait in it would leave late
 
 
 class Line:
-    """A port into which one packet after another is written.
+    """Writes packets to a port, one after another.
 
-    A fix counts as sent when its bytes have left the system (over TCP: when the other end has confirmed them). One that
-    has not left when it is due makes the line fail: the bytes are thrown away with the port. `tap` gets each
-    packet that the port has taken in full.
+    A fix counts as sent when all its bytes have left the operating system (over TCP: when the other end has confirmed
+    them). If that has not happened at the fix's `due_s`, `departed` raises ConnectionError; closing the port then
+    throws the bytes away. `tap` is called with each packet that the port has accepted in full.
     """
 
     def __init__(self, port: Port, clock: Callable[[], float], tap: Tap = untapped) -> None:
         self.port = port
         self._tap = tap
         self._clock = clock
-        self._packet = b""  # the last one put
-        self._unsent = b""  # the rest of it, where the port has not taken it in full
-        self._taken = 0  # bytes that the port has taken so far
-        self._leaving: deque[tuple[int, Sending]] = deque()  # fixes on their way out, and where in the bytes each ends
+        self._packet = b""  # the packet that was put last
+        self._unsent = b""  # the bytes of it that the port has not accepted yet
+        self._taken = 0  # number of bytes that the port has accepted so far
+        self._leaving: deque[tuple[int, Sending]] = deque()  # fixes not sent yet; `_taken` at their last byte
         self._blocked_since_s: float | None = None
 
     @property
     def is_writing(self) -> bool:
-        """True where a packet is not yet taken in full."""
+        """True if the port has not yet accepted the last packet in full."""
         return bool(self._unsent)
 
     @property
     def is_watched(self) -> bool:
-        """True where a fix is on its way out."""
+        """True if a fix has been put and has not left yet."""
         return bool(self._leaving)
 
     @property
     def is_idle(self) -> bool:
-        """True where every byte has left."""
+        """True if every byte has left the operating system."""
         return not self._unsent and self.port.unsent() == 0
 
     def put(self, packet: bytes, sending: Sending | None) -> None:
-        """Take the next packet, with the fix in it if it holds one. The packet before must have been taken in full."""
+        """Set the next packet to be written, and `sending`, the fix that it contains (None: it contains none). The port
+        must have accepted the previous packet in full."""
         self._packet = self._unsent = packet
         if sending:
             self._leaving.append((self._taken + len(packet), sending))
 
     def write(self) -> None:
-        """Write what the port takes at once. Raises OSError where the connection is lost, or takes nothing for long."""
+        """Write as much of the packet as the port accepts without blocking. Raises OSError if the connection is lost,
+        and if the port has accepted no byte for STUCK_S seconds."""
         if not self._unsent:
             return
         taken = self.port.write(self._unsent)
@@ -68,8 +71,8 @@ class Line:
             raise ConnectionError("the port takes no more bytes")
 
     def departed(self) -> list[Sending]:
-        """Return the fixes that have left since the last call, settled as sent. Raises ConnectionError where there are
-        none, and one has waited too long."""
+        """Return the fixes that have left since the last call; they are marked as sent. Raises ConnectionError if none
+        has left and the oldest one is past its `due_s`."""
         departed = []
         # Read before the bytes are asked for: a clock that jumps meanwhile must not condemn what has just left.
         now_s = self._clock()
@@ -82,7 +85,8 @@ class Line:
         return departed
 
     def close(self) -> int:
-        """Close the port, throw away what has not left, and return the number of fixes in it."""
+        """Close the port, throw away all bytes that have not left, mark their fixes as not sent, and return the number
+        of these fixes."""
         with suppress(OSError):
             if not self.is_idle:
                 self.port.throw_away()
