@@ -1,4 +1,9 @@
-"""The techniques, by name. The module of a technique is imported only when the technique is asked for."""
+"""The registry of the techniques of place recognition: their names, their parameters, and how to make one.
+
+Map building, flights and evaluations make every technique here. The module of a technique is imported only when the
+technique is asked for. In this package "the thesis" is Mubariz Zaffar, *Visual Place Recognition for Autonomous
+Robots*.
+"""
 
 import importlib
 import inspect
@@ -10,8 +15,8 @@ from edgevpr.core.contract import Technique
 from edgevpr.core.errors import EdgevprError, UsageError
 from edgevpr.core.text import meant
 
-# The module of each technique of edgevpr itself, what makes it, and the output of its `model` that it uses (None: it
-# has no model). The first ones are offered to a board automatically, best first: see AUTOMATIC.
+# Each technique of edgevpr itself: its module, the class or function there that makes it, and the output of its network
+# that it uses (None: it has no network).
 _OWN: dict[str, tuple[str, str, str | None]] = {
     "cohog": ("cohog", "CoHog", None),
     "hog": ("vectors", "Hog", None),
@@ -25,17 +30,17 @@ _OWN: dict[str, tuple[str, str, str | None]] = {
     "region_vlad": ("network", "region_vlad", "features"),
     "cross_region_bow": ("regions", "cross_region_bow", "features"),
 }
-# If several fit a board, the first is taken. Networks must be asked for: they need onnxruntime in RAM, and weights that
-# a person has chosen. So must `seqslam`: a sequence needs a flight along the mapped route.
+# Chosen without being asked for: the first that fits the board. Networks must be asked for: they need onnxruntime in
+# RAM, and weights that a person has chosen. So must `seqslam`: a sequence needs a flight along the mapped route.
 AUTOMATIC = ("cohog", "hog")
 _WORDS = {int: "a whole number", float: "a number", str: "a word"}
 
 
 def names() -> tuple[str, ...]:
-    """Return the names of all techniques: those of edgevpr, then the networks whose cards make a descriptor by
-    themselves.
+    """Return the names of all techniques: those of edgevpr, then the networks whose cards alone make a technique (see
+    `network.of_card`).
 
-    A card that cannot be read is left out here. Asking for it by name raises an error that says what is wrong.
+    A card that cannot be read is left out. To `create` it by name raises an error that says what is wrong.
     """
     from edgevpr.techniques.card import card_names
 
@@ -43,38 +48,38 @@ def names() -> tuple[str, ...]:
 
 
 def is_own(name: str) -> bool:
-    """Tell whether edgevpr itself has a technique of this name. A card of the same name is then only its `model`."""
+    """Tell whether `name` is one of edgevpr's own techniques. A card of that name then only supplies its weights."""
     return name in _OWN
 
 
 def is_known(name: str) -> bool:
-    """Tell whether there is a technique, or the card of a network, of this name."""
+    """Tell whether `name` is a technique or the card of a network."""
     from edgevpr.techniques.card import card_names
 
     return name in _OWN or name in card_names()
 
 
 def parameters(name: str) -> dict[str, Any]:
-    """Return the parameters of the technique `name` and their defaults. Raises UsageError for an unknown technique or a
-    network that gives feature maps only, ModelError for a card that cannot be read."""
+    """Return the parameters of the technique `name`, each with its default. Raises UsageError for an unknown technique
+    or a network that gives feature maps only, ModelError for a card that cannot be read."""
     return {key: p.default for key, p in inspect.signature(_maker(name)).parameters.items()}
 
 
 def labelled(name: str, form: str | None) -> str:
-    """Return a technique and its form as one name. The form `float`, and None (the technique has no forms), are left
-    out."""
+    """Return the technique and its `form` (see the glossary) as one name, such as "hog 8bit". The form is left out if
+    it is `float`, the default, or None (the technique has no forms)."""
     return name if form in (None, "float") else f"{name} {form}"
 
 
 def network_output(name: str) -> str | None:
-    """Return the output of its `model` that the technique `name` uses, "features" or "descriptor"; None: it has no
-    model."""
+    """Return the output of its network that the technique `name` uses, "features" or "descriptor". None for a technique
+    of edgevpr without a network, and for one made from a card alone."""
     return _OWN[name][2] if is_own(name) else None
 
 
 def create(name: str, settings: dict[str, Any] | None = None) -> Technique:
-    """Make the technique `name` with `settings`. A text is converted to the type of its parameter; parameters that are
-    not in `settings` keep their defaults.
+    """Make the technique `name`. `settings` are values of its parameters by name (None: all defaults); a text is
+    converted to the type of its parameter. Parameters that are not in `settings` keep their defaults.
 
     Raises UsageError for an unknown technique or parameter, a value that cannot be read, or one out of range, and
     ModelError for a network that cannot be used.
@@ -95,7 +100,8 @@ def create(name: str, settings: dict[str, Any] | None = None) -> Technique:
 
 
 def _maker(name: str) -> Callable[..., Any]:
-    """Return what makes the technique: its keyword parameters and their defaults are those of the technique."""
+    """Return the class or function that makes the technique `name`. The parameters in its signature are those of the
+    technique. Raises as `parameters` does."""
     if is_own(name):
         module, maker, _ = _OWN[name]
         own: Callable[..., Any] = getattr(importlib.import_module(f"edgevpr.techniques.{module}"), maker)

@@ -1,8 +1,8 @@
-"""Information in an image, pixel by pixel: the two entropy maps of CoHOG (thesis 6.2.1), both in 0..1.
+"""Entropy of an image around each pixel, and the blocks of high entropy: the good blocks of CoHOG (thesis 6.2.1).
 
-Both take the histogram of the intensities inside a disc around each pixel (81 pixels for radius 5), counting only
-pixels inside the image. They divide the result by 8 bits, the most that 256 intensities can have. `good_blocks` answers
-the only question that CoHOG asks of such a map (which blocks are good), mostly without computing the map.
+There are two entropy maps, both in 0..1. Both take the histogram of the intensities inside a disc around each pixel (81
+pixels for radius 5), counting only pixels inside the image. They divide the result by 8 bits, the most that 256
+intensities can have. `cohog` asks only which blocks are good, and `good_blocks` answers mostly without computing a map.
 """
 
 from collections.abc import Callable
@@ -31,7 +31,7 @@ _COUNT_LOG2 = np.arange(256, dtype=np.float32) * _LOG2[:256]
 def filled_bins(grey: Bytes, radius_px: int = DISC_RADIUS_PX) -> Singles:
     """Compute log2 of the number of different intensities in each disc, over 8: the algorithm printed in thesis 6.2.1.
 
-    `grey` is uint8 (H, W); returns float32 (H, W).
+    `grey` is uint8 (H, W); the result is float32 (H, W) in 0..1.
     """
     padded = _replicated(grey, radius_px)
     entropy = np.empty(grey.shape, np.float32)
@@ -44,8 +44,8 @@ def filled_bins(grey: Bytes, radius_px: int = DISC_RADIUS_PX) -> Singles:
 def shannon(grey: Bytes, radius_px: int = DISC_RADIUS_PX) -> Array:
     """Compute the Shannon entropy (bits) of the intensities in each disc, over 8, from a 100x100 copy scaled back up.
 
-    The authors' public code computes this, where the thesis's text has `filled_bins`. `grey` is uint8 (H, W); returns
-    float32 (H, W).
+    The authors' public code computes this, while the thesis's text has `filled_bins`. `grey` is uint8 (H, W); the
+    result is float32 (H, W) in 0..1.
     """
     height, width = grey.shape
     small = _shannon_copy(grey)
@@ -53,19 +53,20 @@ def shannon(grey: Bytes, radius_px: int = DISC_RADIUS_PX) -> Array:
 
 
 def block_means(per_pixel: Array, cell_px: int) -> Array:
-    """Average over every block of 2x2 cells, stride one cell: float32 (H, W) to (H/cell_px - 1, W/cell_px - 1)."""
+    """Average a map over every block of 2x2 cells of `cell_px` pixels. The blocks start one cell apart: float32 (H, W)
+    to (H/cell_px - 1, W/cell_px - 1)."""
     cell = _cell_means(per_pixel, cell_px)
     means: Array = (cell[:-1, :-1] + cell[:-1, 1:] + cell[1:, :-1] + cell[1:, 1:]) / 4
     return means
 
 
 def good_blocks(grey: Bytes, which: str, cell_px: int, threshold: float, among: Bools | bool = True) -> Bools:
-    """Tell which blocks are good (thesis 6.2.1): `block_means(filled_bins(grey), cell_px) >= threshold`, or of
-    `shannon`.
+    """Tell which blocks are good (thesis 6.2.1): those whose mean entropy is at least `threshold` (0..1). The result
+    equals `block_means(filled_bins(grey), cell_px) >= threshold`, or that of `shannon`, as `which` names.
 
-    Nearly every block is decided by bounds of its entropy, which cost a tenth of the map; only the pixels under the
-    other blocks are computed exactly. `which` is "filled_bins" or "shannon"; `grey` is uint8 (H, W) with sides that are
-    multiples of `cell_px`. Returns bool (H/cell_px - 1, W/cell_px - 1), False where `among` of the same shape is False.
+    Cheap bounds of the entropy decide nearly every block; they cost a tenth of the map. Only the pixels under the other
+    blocks are computed exactly. `grey` is uint8 (H, W) with sides that are multiples of `cell_px`. Returns bool
+    (H/cell_px - 1, W/cell_px - 1), False where `among`, bool of this shape, is False (True: consider all).
     """
     bounds = _BOUNDS[which](grey, cell_px)
     low = bounds.low
@@ -81,9 +82,9 @@ def good_blocks(grey: Bytes, which: str, cell_px: int, threshold: float, among: 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Bounds:
-    """Lower and upper bound of an entropy, float32 (h, w), on some grid over the image. The matrices `down` (rows, h)
-    and `across` (cols, w), nowhere negative, make the means of the blocks. `exact` computes the entropy at the points
-    of a bool (h, w)."""
+    """Lower and upper bounds `low` and `high` of an entropy, float32 (h, w), at the points of a grid over the image.
+    The means over the blocks are `down` @ values @ `across`.T, with `down` (rows, h) and `across` (columns, w) nowhere
+    negative. `exact` computes the entropy at the True points of a bool (h, w), one value each."""
 
     low: Array
     high: Array
@@ -97,9 +98,9 @@ class _Bounds:
 
 
 def _bound_filled_bins(grey: Bytes, cell_px: int) -> _Bounds:
-    """Bound the mean of `filled_bins` over each cell, from the last six bits of the intensities.
+    """Bound the mean of `filled_bins` over each cell, from the last six bits of the intensities, their *endings*.
 
-    n intensities never have more than n different endings. If all intensities of a neighbourhood lie within 64 k
+    n different intensities never have more than n different endings. If all intensities around a pixel lie within 64 k
     values, at most k of them share an ending.
     """
     r = DISC_RADIUS_PX
@@ -125,10 +126,10 @@ def _bound_filled_bins(grey: Bytes, cell_px: int) -> _Bounds:
 
 
 def _bound_shannon(grey: Bytes, cell_px: int) -> _Bounds:
-    """Bound `shannon` at each pixel of the copy, from the last four bits of the intensities.
+    """Bound `shannon` at each pixel of its 100x100 copy, from the last four bits of the intensities, their *endings*.
 
-    The entropy of the endings is never more than that of the whole intensities. If all intensities of a neighbourhood
-    lie within 16 k values, the other bits add at most log2 k bits.
+    The entropy of the endings is never more than that of the whole intensities. If all intensities around a pixel lie
+    within 16 k values, the other bits add at most log2 k bits.
     """
     small = _shannon_copy(grey)
     low = _shannon_of(small & 15, DISC_RADIUS_PX)
@@ -153,13 +154,14 @@ def _shannon_copy(grey: Bytes) -> Array:
 
 @lru_cache(maxsize=4)
 def _pairs(cells: int) -> Array:
-    """Return float32 (cells - 1, cells): the matrix that averages each cell and the next."""
+    """Return the matrix float32 (cells - 1, cells) that averages each cell and the next one."""
     return (np.eye(cells - 1, cells, dtype=np.float32) + np.eye(cells - 1, cells, 1, dtype=np.float32)) / 2
 
 
 @lru_cache(maxsize=4)
 def _scaled_pairs(side_px: int, cell_px: int) -> Singles:
-    """Return float32 (cells - 1, SHANNON_SIDE_PX): `_pairs` for the copy, scaled back up to `side_px` pixels."""
+    """Return the matrix float32 (cells - 1, 100) that enlarges the 100 pixels of the copy to `side_px` pixels, averages
+    them in cells of `cell_px` pixels, and averages each cell and the next one."""
     unit = np.eye(SHANNON_SIDE_PX, dtype=np.float32)
     back = cv2.resize(unit, (SHANNON_SIDE_PX, side_px), interpolation=cv2.INTER_LINEAR)
     matrix: Singles = _pairs(side_px // cell_px) @ back.reshape(-1, cell_px, SHANNON_SIDE_PX).mean(axis=1)
@@ -167,20 +169,21 @@ def _scaled_pairs(side_px: int, cell_px: int) -> Singles:
 
 
 def _range(grey: Bytes) -> Array:
-    """Return the largest minus the smallest intensity in the square around each disc."""
+    """Return, for each pixel, the largest minus the smallest intensity in the square around its disc: uint8 (H, W)."""
     square = np.ones((2 * DISC_RADIUS_PX + 1,) * 2, np.uint8)
     return cv2.subtract(cv2.dilate(grey, square), cv2.erode(grey, square))
 
 
 def _replicated(grey: Bytes, radius_px: int) -> Array:
-    """Repeat the border of `grey` outwards, which adds no intensity to any disc: a pixel outside takes the value of the
-    nearest pixel inside, and that one is nearer to the middle of the disc."""
+    """Pad `grey` with copies of its border. This adds no intensity to any disc: a pixel outside takes the value of the
+    nearest pixel inside, which is nearer to the middle of the disc."""
     r = radius_px
     return cv2.copyMakeBorder(grey, r, r, r, r, cv2.BORDER_REPLICATE)
 
 
 def _bit(grey: Bytes) -> NDArray[np.uint64]:
-    """Return the set that holds one intensity, by its last six bits, as one bit of a 64-bit word."""
+    """Return, for each pixel, a set with one member as a 64-bit word: bit n is set, n being the last six bits of the
+    intensity."""
     sets: NDArray[np.uint64] = np.left_shift(np.uint64(1), grey & 63, dtype=np.uint64)
     return sets
 
@@ -188,8 +191,8 @@ def _bit(grey: Bytes) -> NDArray[np.uint64]:
 def _different(padded: Bytes, radius_px: int) -> Array:
     """Count the different intensities in each disc: uint8 (..., H + 2r, W + 2r) to int16 (..., H, W).
 
-    The set of intensities of a pixel is 256 bits in four words. So the set of a disc is a union of bit sets, and its
-    size is a count of bits.
+    A set of intensities is 256 bits in four words. The set of a disc is the union of those of its pixels, and the
+    number of its bits is the count.
     """
     bit, word_of = _bit(padded), padded >> 6
     unions = (_over_disc(bit * (word_of == word), radius_px, np.bitwise_or) for word in range(4))
@@ -198,7 +201,7 @@ def _different(padded: Bytes, radius_px: int) -> Array:
 
 
 def _shannon_of(small: Array, radius_px: int) -> Singles:
-    """Compute the Shannon entropy over 8 of the disc of every pixel: uint8 (H, W) to float32 (H, W)."""
+    """Compute the Shannon entropy of the disc of every pixel, in bits over 8: uint8 (H, W) to float32 (H, W)."""
     padded = np.pad(small.astype(np.int16), radius_px, constant_values=-1)  # -1: outside, no intensity
     of_counts = np.zeros(small.shape, np.float32)
     present = np.flatnonzero(np.bincount(small.ravel()))[:, None, None]
@@ -213,8 +216,8 @@ def _shannon_of(small: Array, radius_px: int) -> Singles:
 
 
 def _shannon_at(small: Bytes, pixels: Bools) -> Singles:
-    """Compute `_shannon_of` at the True pixels of a bool (H, W): float32, one value per pixel, from its own
-    histogram."""
+    """Compute `_shannon_of` only at the True pixels of bool (H, W), each from its own histogram: float32, one value per
+    True pixel."""
     r = DISC_RADIUS_PX
     padded = np.pad(small.astype(np.int16), r, constant_values=256)  # 256: outside
     down, right = np.nonzero(np.hypot(*np.mgrid[-r : r + 1, -r : r + 1]) <= r)
@@ -233,10 +236,11 @@ def _shannon_at(small: Bytes, pixels: Bools) -> Singles:
 
 
 def _over_disc(planes: Array, radius_px: int, combine: np.ufunc) -> Array:
-    """Combine every plane over a disc by an associative ufunc (add, bitwise_or): (..., H + 2r, W + 2r) to (..., H, W).
+    """Combine the values in a disc around each pixel by an associative ufunc (add, bitwise_or), plane by plane: (..., H
+    + 2r, W + 2r) to (..., H, W).
 
     The disc is a stack of rows. Each row is widened once for all rows of the disc that have its width. All planes are
-    one flat array here, so that a row runs on into the next; everything that this spoils lies in the padding.
+    treated as one flat array, in which a row runs on into the next. This gives wrong values in the padding only.
     """
     r, pitch = radius_px, planes.shape[-1]
     half_width = [int((r * r - dy * dy) ** 0.5) for dy in range(r + 1)]

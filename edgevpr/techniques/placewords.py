@@ -1,16 +1,18 @@
-"""A place in a hundred words: the coarse stage of `cohog` for a camera that looks straight down.
+"""The coarse stage of `cohog` for a camera that looks straight down: a place is a hundred visual words.
 
-Of 10x10 regions of a place each is named by the most similar of 1024 *words*, which are typical regions of the ground.
-A place is found by the words that it shares with the query, however the camera has moved or turned: ground without
-large structures, such as woods and roofs, has few shapes that a coarse picture of it would keep, and many words.
+Of each place, 10x10 regions are named by the most similar of 1024 *words*, which are typical regions of the ground
+(`edgevpr train ground` learns them). A place is found by the words that it shares with the query, wherever they lie and
+however the camera has turned. Ground without large structures, such as woods and roofs, has few shapes that a coarse
+picture of it would keep, and many words.
 
-A query has words under each of 24 rotations. Words come in fours, each the one before turned by a quarter turn, so only
-six of the rotations are looked up, and the others follow. A word that is everywhere says little: of a place it counts
-once, of a query four times, and more often where the query shows more ground than a place (see `views`).
+A query is looked up under 24 rotations, 15 degrees apart. Words come in fours, each the one before turned by 90
+degrees, so only six rotations are computed and the others follow. A word that is everywhere says little. It counts once
+in a place and at most four times in a query, or more where the query shows more ground than a place (see `views`).
 
-The scan is two steps. All places are scored by how many words they share with the query under each rotation, wherever
-the words are (a bag of words: Sivic and Zisserman 2003). For the best pairs of a place and a rotation, the shared words
-then vote for the shift of the picture, as all regions do in the full comparison (see `displacement`).
+The scan has two steps. First, all places are scored by how many words they share with the query under each rotation,
+wherever the words are (a bag of words: Sivic and Zisserman 2003). Then, for the best pairs of a place and a rotation,
+the shared words vote for the shift of the picture, as all regions do in the full comparison (see `displacement`). The
+regions of a picture are numbered row by row.
 """
 
 from dataclasses import dataclass
@@ -28,22 +30,23 @@ DTYPE = "<u2"  # of a word
 SIDE = 10  # regions along one side
 QUARTERS = 4
 BINS = 8  # orientations of the regions that the words are of
-COUNT = 256  # words, each of four turns
+COUNT = 256  # words in the file; each gives four, by quarter turns
 NONE = COUNT * QUARTERS  # the number of no word
 _MAX_FILE_BYTES = 1_000_000
-_ROUNDED = 0.01  # of a length of 1
+_ROUNDED = 0.01  # tolerance of a length of 1
 _AT_MOST = 4  # times that a word of a query counts, for as much ground as a place shows
-_VOTED_EACH = 125  # places of each rotation that is possible: pairs of a place and a rotation
-_BIN_REGIONS = 4  # side of a bin of shifts; two by two of them agree
-_VOTE_COUNTS = 5.0  # as many shared words as one that agrees on the shift; about the ratio of how much both scatter
+_VOTED_EACH = 125  # pairs of a place and a rotation that vote, for each possible rotation
+_BIN_REGIONS = 4  # side of a bin of shifts, in regions; shifts within 2x2 bins agree
+_VOTE_COUNTS = 5.0  # weight of a shared word that agrees on the shift, over that of any; about as both scatter
 _ROWS_AT_ONCE = 2048  # 100 KB of counts for 24 rotations
 _VOTING_AT_ONCE = 256
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class QueryWords:
-    """The words of a query under each of R rotations: `word`, `region` (its number, row by row) and `turn` int (E,) of
-    each that counts, and `counts` uint16 (1025, R), how often each word counts. The last row is of no word."""
+    """The words of a query under each of R rotations. Each of E entries is a `word`, the number of its `region`, and
+    the rotation `turn` in steps: int (E,) each. `counts` uint16 (1025, R) is how often each word occurs under each
+    rotation; its last row, of no word, is 0."""
 
     word: Ints
     region: Ints
@@ -53,8 +56,9 @@ class QueryWords:
 
 
 def of_place(vocabulary: Singles, patterns: Singles, good: Bools) -> NDArray[np.uint16]:
-    """Return the words of a place: patterns float32 (100, 20) of the regions `named`, and which of them are good, bool
-    (100,), to uint16 (100,). Regions that are not good, and those of a word that was there before, have none (1024)."""
+    """Return the words of a place, uint16 (100,). `patterns` float32 (100, 20) are those of the regions `named`, and
+    `good` bool (100,) tells which regions count. A region that is not good, or whose word an earlier region has, gets
+    no word (1024)."""
     words = np.where(good, nearest(vocabulary, patterns), NONE)
     _, first = np.unique(words, return_index=True)
     once = np.full(len(words), NONE, np.uint16)
@@ -65,10 +69,11 @@ def of_place(vocabulary: Singles, patterns: Singles, good: Bools) -> NDArray[np.
 def of_query(
     vocabulary: Singles, asking: dict[int, tuple[Singles, Ints]], within: int, sides: tuple[int, int]
 ) -> QueryWords:
-    """Return the words of a query. `asking` has, of the picture turned clockwise by some of the `within` steps of a
-    quarter turn, the patterns float32 (G, 20) of the good regions and their numbers int (G,); the other quarters
-    follow. Under the steps that it lacks, and those a quarter turn from them, the query has no words. `sides` are the
-    regions along one side of the query and of a place, which has no more."""
+    """Return the words of a query under all rotations. The keys of `asking` are rotation steps, clockwise, below
+    `within`, the steps in a quarter turn. The values are the patterns float32 (G, 20) of the good regions of the
+    picture so turned, and their numbers int (G,). The rotations by further quarter turns follow from these; those of
+    missing keys have no words. `sides` are the regions along one side of the query and of a place, which has no
+    more."""
     total = within * QUARTERS
     side, of_place = sides
     at_most = _AT_MOST * side**2 // of_place**2
@@ -91,14 +96,14 @@ def of_query(
 
 
 def scan(asked: QueryWords, rows: Array, expected: Ints | None = None, voting: float = 1.0) -> Singles:
-    """Score all places, uint16 (N, 100), under each rotation: float32 (N, R), at most 1 for a query that shows as much
-    ground as a place. `voting` is the part of the usual number of pairs that vote.
+    """Score all places, `rows` uint16 (N, 100), under each rotation: float32 (N, R), at most 1 for a query that shows
+    as much ground as a place. `voting` is the share of the usual number of pairs (place, rotation) that vote.
 
-    Where the heading is known, place n is scored only under rotation `expected[n]` and the two beside it, with -inf for
-    the others. `expected` is int (N,), below 0 where the heading is unknown: such a place is scored under all.
+    `expected` int (N,) is the rotation of each place where the heading is known: it and the two beside it are scored,
+    and the others are -inf. A place with a number below 0 is scored under all rotations (None: every place is).
     """
     turns = asked.counts.shape[1]
-    rows = np.minimum(rows, NONE)  # what no program of ours has written may hold any number
+    rows = np.minimum(rows, NONE)  # a file that edgevpr has not written may hold any number
     if expected is None:
         scores = _shared(asked.counts, rows).astype(np.float32)
     else:
@@ -121,17 +126,17 @@ def scan(asked: QueryWords, rows: Array, expected: Ints | None = None, voting: f
 
 
 def nearest(vocabulary: Singles, patterns: Singles) -> Ints:
-    """Return the number of the word most similar to each of patterns float32 (N, 20): int (N,)."""
+    """Return the number of the word most similar to each of `patterns` float32 (N, 20): int (N,)."""
     numbers: Ints = (patterns @ vocabulary.T).argmax(axis=1)
     return numbers
 
 
 @lru_cache(maxsize=1)
 def load(name: str) -> Singles:
-    """Load the words of the file NAME.npz in a folder of models, as `edgevpr train ground` writes it: float32
-    (1024, 20), of length 1, number 4 k + q being number 4 k turned by q quarter turns.
+    """Load the words of the file NAME.npz in a folder of models, as `edgevpr train ground` writes it: float32 (1024,
+    20), of length 1. Word 4 k + q is word 4 k turned counter-clockwise by q quarter turns.
 
-    Raises ModelError for a file that is missing or damaged, and names the command that makes it.
+    Raises ModelError, with the command that makes the file, if it is missing or damaged.
     """
     path = find_model(f"{name}.npz")
     command = f"make it with `edgevpr train ground --images DIR --out {name}.npz`"
@@ -148,8 +153,8 @@ def load(name: str) -> Singles:
 
 
 def turned_words(words: Singles) -> Singles:
-    """Return each of words float32 (K, 20) turned counter-clockwise by no, one, two and three quarter turns: float32
-    (4 K, 20)."""
+    """Return each of `words` float32 (K, 20) turned counter-clockwise by 0, 90, 180 and 270 degrees: float32 (4 K,
+    20)."""
     quarter = _quarter_turn()
     turned = [words]
     for _ in range(1, QUARTERS):
@@ -158,8 +163,8 @@ def turned_words(words: Singles) -> Singles:
 
 
 def turned_blocks(blocks: Singles, quarters: int) -> Singles:
-    """Turn the blocks of a picture counter-clockwise by quarter turns: (side, side, 4 L) with L a multiple of 4. Equal
-    to the blocks of the turned picture, but for rounding."""
+    """Turn the blocks (side, side, 4 L) of a picture counter-clockwise by `quarters` quarter turns; the number L of
+    orientations must be a multiple of 4. The result equals the blocks of the turned picture, but for rounding."""
     for _ in range(quarters % QUARTERS):
         blocks = np.rot90(_turned_block(blocks))
     return np.ascontiguousarray(blocks)
@@ -167,7 +172,7 @@ def turned_blocks(blocks: Singles, quarters: int) -> Singles:
 
 @lru_cache
 def turned_numbers(side: int) -> Ints:
-    """Return where each region, numbered row by row, is after a quarter turn counter-clockwise: int (side * side,)."""
+    """Return the new number of each region after a quarter turn counter-clockwise: int (side * side,)."""
     was = np.rot90(np.arange(side * side).reshape(side, side)).ravel()
     now = np.empty_like(was)
     now[was] = np.arange(side * side)
@@ -175,22 +180,24 @@ def turned_numbers(side: int) -> Ints:
 
 
 def _turned_block(blocks: Singles) -> Singles:
-    """Turn blocks (..., 4 L) in place: cells top left, top right, bottom left, bottom right, and their orientations,
-    which are measured towards y, which points down."""
+    """Turn each of the blocks (..., 4 L) counter-clockwise by a quarter turn. The cells of a block are top left, top
+    right, bottom left, bottom right; orientations are measured from x towards y, which points down."""
     cells = blocks.reshape(*blocks.shape[:-1], 4, -1)[..., [1, 3, 0, 2], :]
     return np.roll(cells, -(cells.shape[-1] // QUARTERS), axis=-1).reshape(blocks.shape)
 
 
 @lru_cache
 def _quarter_turn() -> Singles:
-    """Return the matrix that turns patterns counter-clockwise by a quarter turn: float32 (20, 20)."""
+    """Return the matrix float32 (20, 20) that turns `patterns` by a quarter turn counter-clockwise: patterns @
+    matrix."""
     kept = slow_patterns(BINS)
     turn: Array = kept.T @ _turned_block(np.eye(len(kept), dtype=np.float32)) @ kept
     return turn
 
 
 def _shared(counts: NDArray[np.uint16], rows: Array) -> NDArray[np.uint16]:
-    """Count the words that each place, uint16 (N, 100), shares with the query under each rotation: uint16 (N, R)."""
+    """Count the words that each place of `rows`, uint16 (N, 100), shares with the query under each rotation, from the
+    `counts` of `QueryWords`: uint16 (N, R)."""
     turns = counts.shape[1]
     # Four counts are one number of 64 bits: no sum of a hundred of at most four runs over into the next.
     padded = np.zeros((len(counts), turns + -turns % 4), np.uint16)
@@ -207,8 +214,8 @@ def _shared(counts: NDArray[np.uint16], rows: Array) -> NDArray[np.uint16]:
 
 
 def _votes(asked: QueryWords, turn: int, rows: Array) -> Singles:
-    """Count the shared words that agree on one shift of the picture, for places uint16 (P, 100) under one rotation:
-    float32 (P,)."""
+    """Count the shared words that agree on one shift of the picture under the rotation `turn`, for each place of
+    `rows`, uint16 (P, 100): float32 (P,)."""
     mine = asked.turn == turn
     order = np.argsort(asked.word[mine], kind="stable")
     region = asked.region[mine][order]
@@ -233,22 +240,25 @@ def _votes(asked: QueryWords, turn: int, rows: Array) -> Singles:
 
 @lru_cache
 def named(side: int) -> Ints:
-    """Return the numbers of the regions of a place that have words: int (100,) of `side` * `side`."""
+    """Return the numbers of the regions of a place that get words: int (100,), spread evenly over `side` x `side`."""
     at = np.rint((np.arange(SIDE) + 0.5) * side / SIDE - 0.5).astype(np.intp)
     return np.add.outer(at * side, at).ravel()
 
 
 @lru_cache
 def _shuffled(side: int) -> Ints:
-    """Return a rank of each region, in no order of space: the first of a word that count are then spread over the
-    picture."""
+    """Return a fixed random rank of each region, int (side * side,). If a word occurs too often in a query, the regions
+    of lowest rank keep it, and so are spread over the picture."""
     return np.random.default_rng(0).permutation(side * side)
 
 
 @lru_cache
 def _bins(side: int, of_place: int) -> tuple[Ints, int]:
-    """Return the bin of the shift from each region of a query to each of a place that has a word, int
-    (100, side * side), and the number of bins along one side."""
+    """Sort the shifts from a region of the query to a region of a place with a word into bins. Returns
+
+    * the bin of each shift, int (100, side * side),
+    * the number of bins along one side.
+    """
     y, x = np.divmod(named(of_place)[:, None], of_place)
     query_y, query_x = np.divmod(np.arange(side * side), side)
     along = (side + of_place - 2) // _BIN_REGIONS + 1

@@ -1,14 +1,17 @@
-"""Techniques that match regions of a feature map: `rmac` its squares, `cross_region_bow` what the network marks.
+"""Techniques that match regions of a feature map: `rmac` takes squares, `cross_region_bow` takes active areas.
 
-Both scan by one vector of a picture, and compare the best places region by region: the score sums over the mutually
-best pairs. Cross-Region-BoW (Chen, Maffra, Sa and Chli, IROS 2017) and Region-VLAD (Khaliq et al., T-RO 2019) find
+Both scan the map by one vector per picture, then compare the best places region by region. The score sums the cosines
+of the pairs of regions that are each other's best match.
+
+Cross-Region-BoW (Chen, Maffra, Sa and Chli, IROS 2017) and Region-VLAD (Khaliq et al., T-RO 2019; see `network`) find
 regions in the same way. In each channel, activations above zero that touch one another, corners included, make a
-region. Its energy is their mean. The most energetic regions over all channels are kept.
+region. Its energy is their mean. The regions of the highest energy over all channels are kept.
 
-Both describe a region by the activations of all channels under it, summed or averaged. Here these are the activations
-in the box around the region, as in the public code of Region-VLAD. The result has length 1, which makes sum and mean
-the same. Without that a large region outweighs all others, and both techniques are worse on corridor and
-aerial_caliterra, the data sets used for tuning. The pixels of the region alone do worse there than its box.
+Both describe a region by the activations of all channels under it, summed or averaged. Here the activations in the box
+around the region are summed, as in the public code of Region-VLAD. The result is scaled to length 1, which makes sum
+and mean equal. Without this scaling a large region outweighs all others, and both techniques find fewer places on
+corridor and aerial_caliterra, the data sets used for tuning. Using only the pixels of the region, not its box, is worse
+there too.
 """
 
 from collections.abc import Callable
@@ -32,9 +35,10 @@ Describe = Callable[[Singles], tuple[Singles, Singles]]
 
 
 class RegionTechnique(VectorTechnique):
-    """A technique that scans by one vector, and has a fine part of regions, int8 (N, C): 8 bits per number, zeros where
-    fewer are found. `describe` makes of a feature map the vector float32 (D,), and the regions float32 (N, C), each of
-    length 1; `quality` is taken of which regions are found, bool (N,)."""
+    """Base of the techniques that scan by one vector and compare the best places by their regions. `describe` turns a
+    feature map float32 (C, H, W) into the vector float32 (D,) and the regions float32 (N, C), each of length 1 (zeros
+    where fewer are found). The fine part is the regions as int8 (N, C). `quality` computes the quality, 0 to 1, from
+    bool (N,), True for each region that was found."""
 
     candidates = 40
 
@@ -45,8 +49,9 @@ class RegionTechnique(VectorTechnique):
         self.spec = replace(self.spec, fine=PartSpec(regions.shape, "|i1"))
 
     def encode(self, image: Image, mask: Mask | None = None) -> Descriptor:
-        """Encode uint8 (H, W[, 3]) to coarse float16 (D,) and fine int8 (N, C). For a query there are also the regions
-        as float32 of length 1; `good` marks those that were found."""
+        """Encode uint8 (H, W[, 3]) to coarse float16 (D,), fine int8 (N, C), `regions` float32 (N, C) of length 1, and
+        `good` bool (N,), True for each region that was found. Pixels where `mask` is False are filled with the mean of
+        the others."""
         vector, regions = self._describe(self._backbone.run(image, mask))
         good: Array = np.any(regions, axis=1)
         return Descriptor(
@@ -58,17 +63,19 @@ class RegionTechnique(VectorTechnique):
         )
 
     def match(self, query: Descriptor, fine: Array, hypotheses: None = None) -> FineMatch:
-        """Score the mutually best pairs of regions, 0 to 1 (see `mutual_score`)."""
+        """Score a place by its stored regions `fine`, int8 (N, C), from 0 to 1 (see `mutual_score`). A descriptor that
+        was read from a map has no float regions, and scores 0. `hypotheses` are not used."""
         return FineMatch(0.0 if query.regions is None else mutual_score(query.regions, from_bytes(fine)))
 
 
 def rmac(model: str = "calc", form: str = "float", threads: int = 1) -> RegionTechnique:
-    """Make `rmac`: the largest activations in squares of the feature map of the card `model`, at three scales.
+    """Make `rmac`: each square region of a feature map is described by its largest activations, at three scales.
+    `model` is the card of the network, `form` the form of the vector in RAM, `threads` those of onnxruntime.
 
     Tolias, Sicre and Jégou, "Particular object retrieval with integral max-pooling of CNN activations", ICLR 2016, in
     the form of thesis 4.2.1: `conv5_2` of VGG-16, power- and L2-normalised. The squares of two pictures are matched
     mutually, and the cosines of the mutual pairs are summed, without a check of geometry. The coarse part is the sum of
-    the squares, which the paper compares by cosine. The quality is the share of squares with any activation.
+    the squares' vectors, which the paper compares by cosine. The quality is the share of squares with any activation.
     """
     backbone = open_backbone(model, "features", threads)
     squares = square_regions(*backbone.shape[1:])
@@ -85,8 +92,9 @@ def rmac(model: str = "calc", form: str = "float", threads: int = 1) -> RegionTe
 def cross_region_bow(
     *, model: str = "calc", form: str = "float", threads: int = 1, regions: int = 200, words: int = 10_000
 ) -> RegionTechnique:
-    """Make `cross_region_bow`: the `regions` most energetic regions of the feature map of the card `model`, and a bag
-    of `words` visual words.
+    """Make `cross_region_bow`: the `regions` regions of the highest energy of a feature map, scanned as a bag of
+    `words` visual words. `model` is the card of the network, `form` the form of the bag in RAM, `threads` those of
+    onnxruntime.
 
     Chen, Maffra, Sa and Chli, "Only Look Once, Mining Distinctive Landmarks from ConvNet for Visual Place Recognition",
     IROS 2017, in the form of thesis 4.2.1. The paper finds regions in `conv5_3` of VGG-16 and describes them from
@@ -108,9 +116,9 @@ def cross_region_bow(
 
 
 def region_backbone(technique: str, model: str, threads: int, regions: int) -> Backbone:
-    """Open the network of the card `model`, to find regions in its feature map. Raises ModelError for a feature map
-    that is too small for regions or has no activation above zero, and UsageError for a number of regions outside 1 to
-    10 000."""
+    """Open the network of the card `model` for a `technique` that finds `regions` regions in its feature map. Raises
+    ModelError for a feature map that is too small for regions or has no activation above zero, and UsageError for a
+    number of regions outside 1 to 10 000."""
     if not 1 <= regions <= 10_000:
         raise UsageError(f"{technique}: regions is {regions}; it must be 1 to 10000.")
     backbone = open_backbone(model, "features", threads)
@@ -130,11 +138,11 @@ def region_backbone(technique: str, model: str, threads: int, regions: int) -> B
 
 
 def find_regions(features: Singles, count: int) -> Ints:
-    """Return the `count` most energetic regions of a feature map float32 (C, H, W), or all if there are fewer.
+    """Find the `count` regions of the highest energy in a feature map float32 (C, H, W), or all if there are fewer.
 
-    They are boxes int (N, 4) as (top, left, bottom, right), bottom and right excluded, those of the largest energy
-    first. Regions with the same energy are ordered by channel, then from the top, then from the left, whatever the
-    order in which they are found.
+    Returns boxes int (N, 4) in cells of the feature map, highest energy first: (top, left, bottom, right), bottom and
+    right excluded. Regions of equal energy are ordered by channel, then from the top, then from the left, so that the
+    result does not depend on the order in which OpenCV finds them.
     """
     channels, height, width = features.shape
     # All channels in one tall picture, an empty row between them: one search instead of one per channel.
@@ -151,7 +159,8 @@ def find_regions(features: Singles, count: int) -> Ints:
 
 
 def describe(features: Singles, boxes: Ints) -> Singles:
-    """Sum the activations of all channels under each box, and L2-normalise: (C, H, W), (N, 4) to float32 (N, C)."""
+    """Sum the activations of `features` (C, H, W) in each of `boxes` (N, 4) by channel, and L2-normalise: float32 (N,
+    C)."""
     channels, height, width = features.shape
     sums = np.zeros((height + 1, width + 1, channels), np.float64)  # of everything above and to the left
     sums[1:, 1:] = features.transpose(1, 2, 0)
@@ -165,13 +174,13 @@ def describe(features: Singles, boxes: Ints) -> Singles:
 
 
 def mutual_score(query: Singles, place: Singles) -> float:
-    """Score two sets of L2-normalised regions (N, D), (M, D), 0 to 1: the sum of the cosines (below 0: 0) of the
-    mutually best pairs, over the larger number of regions. A pair is mutually best if each is the other's best match.
-    All-zero rows are not regions.
+    """Score two sets of regions of length 1, `query` (N, D) and `place` (M, D), from 0 to 1. A pair is mutual if each
+    is the other's best match. The score is the sum of the cosines of the mutual pairs (negative ones count 0), divided
+    by the larger number of regions. All-zero rows are not regions.
 
-    Both papers sum over mutually best pairs. Dividing by the number of regions keeps pictures with few regions from
-    scoring low, and the score in 0..1. Several channels often mark the same box. Only one of such equal regions finds a
-    partner, so a picture may score below 1 with itself.
+    Both papers sum over mutual pairs. Dividing by the number of regions keeps pictures with few regions from scoring
+    low, and the score in 0..1. Several channels often mark the same box. Only one of such equal regions finds a
+    partner, so a picture may score below 1 against itself.
     """
     regions_of_query, regions_of_place = (int(regions.any(axis=1).sum()) for regions in (query, place))
     if not regions_of_query or not regions_of_place:
@@ -184,7 +193,8 @@ def mutual_score(query: Singles, place: Singles) -> float:
 
 
 def to_bytes(vectors: Singles) -> Array:
-    """Store directions in 8 bits: float32 (N, D) to int8 (N, D), each row over its own largest magnitude."""
+    """Store the directions of vectors in 8 bits: float32 (N, D) to int8 (N, D), each row scaled by its largest
+    magnitude."""
     largest = np.maximum(np.abs(vectors).max(axis=1, keepdims=True), _TINY)
     stored: Array = np.rint(127 / largest * vectors).astype(np.int8)
     return stored

@@ -1,6 +1,7 @@
-"""Learned visual words: the file that `edgevpr train words` writes, VLAD about them, and the bag of them.
+"""Learned visual words of a network's feature map, and the vectors made with them: VLAD and the bag of words.
 
-VLAD is the sum of the residuals of a picture's local descriptors to the words (Jégou et al., CVPR 2010).
+`edgevpr train words` writes the file of the words; the techniques in `network` and `regions` load it. VLAD sums, word
+by word, the differences between a picture's local descriptors and their words (Jégou et al., CVPR 2010).
 """
 
 import hashlib
@@ -22,15 +23,15 @@ _TINY = 1e-12
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Whitening:
-    """A learned whitening W (v - mean) of VLAD vectors (Jégou and Chum, ECCV 2012): `mean` float32 (K D,), and W as
-    `matrix` int8 (P, K D), to be multiplied by `scale` float32 (P,)."""
+    """A learned whitening W (v - mean) of VLAD vectors v (Jégou and Chum, ECCV 2012), for K words of D numbers. `mean`
+    is float32 (K D,). W is `matrix` int8 (P, K D) with each row multiplied by its number in `scale` float32 (P,)."""
 
     mean: Singles
     matrix: NDArray[np.int8]
     scale: Singles
 
     def __call__(self, vector: Singles) -> Singles:
-        """Whiten and L2-normalise: (K D,) to float32 (P,)."""
+        """Whiten a VLAD vector (K D,) and scale it to length 1: float32 (P,)."""
         centred = vector - self.mean
         product = np.empty(len(self.matrix), np.float32)
         for start in range(0, len(product), _ROWS_AT_ONCE):
@@ -41,8 +42,8 @@ class Whitening:
 
 @dataclass(frozen=True, slots=True)
 class Words:
-    """Learned words: `words` float32 (K, D), the `sha256` of model and words together, for the map, and the
-    `whitening` of the descriptor made of them (None: it is not whitened)."""
+    """Learned words `words` float32 (K, D). `sha256` is the hash of network and words together, which a map stores.
+    `whitening` is that of the VLAD vectors made with them (None: they are not whitened)."""
 
     words: Singles
     sha256: str
@@ -52,8 +53,8 @@ class Words:
 def load_words(model: str, kind: str, count: int) -> Words:
     """Load the `count` words of `kind` ("vlad", "regions", "bow") learned on the feature map of the card `model`.
 
-    Raises ModelError for a file that is missing, damaged or learned on another network, and names the command that
-    makes it. The fingerprint of the card tells networks apart: weights, preparation of the picture, and outputs.
+    Raises ModelError, with the command that makes the file, if it is missing, damaged or learned on another network.
+    Networks are told apart by `Card.fingerprint`: weights, preparation of the picture, and outputs.
     """
     name = f"{model}_{kind}{count}.npz"
     command = f"make them with `edgevpr train words --images DIR --model {model} --kind {kind} --count {count}`"
@@ -87,19 +88,20 @@ def load_words(model: str, kind: str, count: int) -> Words:
 
 
 def local_descriptors(features: Singles) -> Singles:
-    """Return the activations at each position as one L2-normalised descriptor: (C, H, W) to float32 (H * W, C).
+    """Return the activations at each position as one descriptor of length 1: (C, H, W) to float32 (H * W, C), row by
+    row.
 
-    NetVLAD collects the same (Arandjelović et al. 2016, section 3.1). The positions are in rows from the top left.
+    NetVLAD takes the same descriptors (Arandjelović et al. 2016, section 3.1).
     """
     return unit(features.reshape(len(features), -1).T)
 
 
 def vlad(local: Singles, words: Singles, sharpness: float | None = None) -> Singles:
-    """Compute VLAD of descriptors (N, D) about words (K, D): float32 (K * D,).
+    """Compute VLAD of the descriptors `local` (N, D) about `words` (K, D): float32 (K * D,).
 
-    The residuals are V(k) = sum over descriptors of a_k(x) (x - c_k) (Arandjelović et al. 2016, equation 1). Each
-    word's residual is scaled to length 1 (Arandjelović and Zisserman 2013), then the whole. The weights a_k are 1 for
-    the nearest word and 0 for the others; with a `sharpness` they are those of `soft_weights`.
+    The part of word k is V(k) = sum over descriptors x of a_k(x) (x - c_k) (Arandjelović et al. 2016, equation 1). Each
+    part is scaled to length 1 (Arandjelović and Zisserman 2013), then the whole. The weight a_k is 1 for the word
+    nearest to x and 0 for the others (`sharpness` None), or that of `soft_weights`.
     """
     if sharpness is None:
         weights = np.zeros((len(local), len(words)), np.float32)
@@ -110,8 +112,8 @@ def vlad(local: Singles, words: Singles, sharpness: float | None = None) -> Sing
 
 
 def soft_weights(local: Singles, words: Singles, sharpness: float) -> Singles:
-    """Compute the softmax over the words of -sharpness |x - c|^2 (Arandjelović et al. 2016, equation 2): (N, D), (K, D)
-    to float32 (N, K)."""
+    """Compute the softmax over the words c of -sharpness |x - c|^2 for each descriptor x (Arandjelović et al. 2016,
+    equation 2): `local` (N, D), `words` (K, D) to float32 (N, K)."""
     closeness = sharpness * _closeness(local, words)
     closeness -= closeness.max(axis=1, keepdims=True)
     weights: Singles = np.exp(closeness, out=closeness)
@@ -120,7 +122,8 @@ def soft_weights(local: Singles, words: Singles, sharpness: float) -> Singles:
 
 
 def sharpness_of(words: Singles) -> float:
-    """Compute the sharpness of `soft_weights`: at a word, its own weight is on average 100 times that of the next word.
+    """Compute a sharpness for `soft_weights`: a descriptor equal to a word then gives it, on average, 100 times the
+    weight of the next word.
 
     NetVLAD asks for that ratio over the training descriptors (section 5, "Training"). Only the words are kept here, so
     the ratio is taken over the words.
@@ -132,11 +135,12 @@ def sharpness_of(words: Singles) -> float:
 
 
 def bag_of_words(local: Singles, words: Singles) -> Singles:
-    """Mark the words (K, D) that are nearest to any of the descriptors (N, D), and L2-normalise: float32 (K,).
+    """Return 1 for each of `words` (K, D) that is nearest to any descriptor of `local` (N, D) and 0 for the others,
+    L2-normalised: float32 (K,).
 
-    A word counts once, however often it occurs. Many channels mark the same part of a picture, so that counts say
-    little; on corridor and aerial_caliterra, the data sets used for tuning, they find fewer places. The inverse
-    document frequency is left out too, since it would weigh words by a map that is still being made.
+    A word counts once, however often it occurs. Many channels mark the same part of a picture, so counts say little; on
+    corridor and aerial_caliterra, the data sets used for tuning, they find fewer places. The inverse document frequency
+    is left out too, since it would weigh words by a map that is still being made.
     """
     present = np.zeros(len(words), np.float32)
     present[nearest(local, words)] = 1
@@ -144,13 +148,14 @@ def bag_of_words(local: Singles, words: Singles) -> Singles:
 
 
 def nearest(local: Singles, words: Singles) -> Ints:
-    """Return the number of the word nearest to each descriptor: (N, D), (K, D) to int (N,); of equally near words the
-    first."""
+    """Return the number of the word nearest to each descriptor: `local` (N, D), `words` (K, D) to int (N,). Of equally
+    near words the first is taken."""
     numbers: Ints = _closeness(local, words).argmax(axis=1)
     return numbers
 
 
 def _closeness(local: Singles, words: Singles) -> Singles:
-    """Compute -|x - c|^2, up to a term that is the same for all words of a descriptor: (N, K)."""
+    """Compute -|x - c|^2, plus a constant for each descriptor x, of `local` (N, D) and `words` (K, D): float32 (N,
+    K)."""
     closeness: Singles = 2 * local @ words.T - np.einsum("kd,kd->k", words, words)
     return closeness
