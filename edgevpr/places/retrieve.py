@@ -111,16 +111,13 @@ def compare(query: Query, scanned: Scan, candidates: int | None = None, neighbou
     """Compare the `candidates` places with the best scan scores, and rank them.
 
     Of more than the technique's `in_full` of them, those that look best at a glance are compared in full.
-
     Where `candidates` is None, or is at least the number of places and more than the technique's own number, all
     places are compared under every hypothesis of the expected height, unless `expected` says more: exact, but slow.
     Neighbours of the best place are the places within `neighbour_m` metres of it. Where all candidates are its
     neighbours, the best-scanned places elsewhere are compared as well, because the margin needs one of them. A
     technique without a fine part is ranked by the scan.
-
     Where the scan counts (see `TechniqueSpec.scan_counts`), the score is that of the comparison times the mean of the
     scan score and 1: for a wrong place the two scores have little to do with each other.
-
     Where `expected.in_reach` is known, the candidates are places in reach, and five places out of reach are compared
     as well: a false expectation would otherwise hide the right place behind the best of the wrong ones. At least five
     places elsewhere are then compared, because a margin over fewer says little.
@@ -221,8 +218,7 @@ class _Comparison:
 
     def _look_at(self, chosen: list[Choice], look: Callable[[int, Array, list[int] | None], T]) -> list[T]:
         found: list[T] = []
-        unreadable = []
-        place_map, index = self._query.place_map, self._query.index
+        unreadable, place_map, index = [], self._query.place_map, self._query.index
         for slot, hypotheses in chosen:
             try:
                 fine, point = place_map.fine_part(index.place_ids[slot])
@@ -243,8 +239,7 @@ def together(one: Ranking, other: Ranking) -> Ranking:
     for slot, match in other.compared.items():
         if slot not in compared or match.score > compared[slot].score:
             compared[slot] = match
-    best = sorted(compared, key=lambda slot: -compared[slot].score)
-    last: dict[int, float] = {}
+    best, last = sorted(compared, key=lambda slot: -compared[slot].score), dict[int, float]()
     for ranking in (one, other):
         for slot, score in zip(ranking.slots.tolist(), ranking.scores.tolist(), strict=True):
             if slot not in compared:

@@ -17,7 +17,7 @@ _FIX_GOOD_FOR_S = 60.0
 
 
 @dataclass(frozen=True, slots=True)
-class Sighting:
+class KnownPosition:
     """A position, and the time at which the aircraft was there, on the clock of the frames."""
 
     position: Position
@@ -69,7 +69,7 @@ class Prior:
 
     def __init__(self, reach_m_s: float | None, heading_within_deg: float | None, is_live: bool) -> None:
         self._reach_m_s, self._heading_within_deg, self._is_live = reach_m_s, heading_within_deg, is_live
-        self._last_fix: Sighting | None = None
+        self._last_fix: KnownPosition | None = None
         self.height_ratio = 1.0  # of the last accepted match; until there is one, that of the map
         self.looks_again = True
         self._known: Hints | None = None
@@ -109,7 +109,7 @@ class Prior:
         if accepted and found.match.height_ratio:
             self.height_ratio = found.match.height_ratio
         if accepted and found.place.position:
-            self._last_fix = Sighting(found.place.position, t_mono_s)
+            self._last_fix = KnownPosition(found.place.position, t_mono_s)
 
 
 def hints_of(index: PlaceIndex, around: Reach | None, heading_deg: float | None) -> Hints | None:
@@ -123,7 +123,7 @@ def hints_of(index: PlaceIndex, around: Reach | None, heading_deg: float | None)
 
 
 def reach_of(
-    now_s: float, vehicle: Vehicle | None, own_fix: Sighting | None, reach_m_s: float, margin_m: float
+    now_s: float, vehicle: Vehicle | None, own_fix: KnownPosition | None, reach_m_s: float, margin_m: float
 ) -> Reach | None:
     """Return where the aircraft must be at `now_s`, by how far it may have flown since its last known position.
 
@@ -132,7 +132,7 @@ def reach_of(
     """
     seen = own_fix if own_fix and now_s - own_fix.t_mono_s <= _FIX_GOOD_FOR_S else None
     if vehicle and vehicle.has_gps and vehicle.is_fresh_at(now_s):  # without GPS its position drifts: our fix is better
-        seen = Sighting(Position(vehicle.lat_deg, vehicle.lon_deg), vehicle.t_heard_s)
+        seen = KnownPosition(Position(vehicle.lat_deg, vehicle.lon_deg), vehicle.t_heard_s)
     return Reach(seen.position, margin_m + reach_m_s * abs(now_s - seen.t_mono_s)) if seen else None
 
 

@@ -6,7 +6,7 @@ import pytest
 from edgevpr.core.contract import FineMatch
 from edgevpr.core.types import Candidate, Frame, Place, Position, Vehicle
 from edgevpr.places.index import PlaceIndex
-from edgevpr.runtime.recognise.hints import Hints, Prior, Reach, Sighting, expected_of, hints_of, reach_of
+from edgevpr.runtime.recognise.hints import Hints, KnownPosition, Prior, Reach, expected_of, hints_of, reach_of
 
 HOME = Position(50.0, 8.0)
 WITHIN_DEG = 22.5
@@ -52,12 +52,12 @@ def found(metres=0.0, heading_deg=None, rotation_deg=None):
 
 
 def test_reach_grows_with_the_time_since_the_position_was_known():
-    assert reach_of(10.0, None, Sighting(HOME, 8.0), 15.0, 50.0) == Reach(HOME, 80.0)
-    assert reach_of(10.0, None, Sighting(HOME, 10.0), 15.0, 50.0) == Reach(HOME, 50.0)
+    assert reach_of(10.0, None, KnownPosition(HOME, 8.0), 15.0, 50.0) == Reach(HOME, 80.0)
+    assert reach_of(10.0, None, KnownPosition(HOME, 10.0), 15.0, 50.0) == Reach(HOME, 50.0)
 
 
 def test_a_fresh_autopilot_goes_before_our_own_fix_and_both_grow_old():
-    autopilot, fix = vehicle(north(500), 9.5), Sighting(HOME, 0.0)
+    autopilot, fix = vehicle(north(500), 9.5), KnownPosition(HOME, 0.0)
     assert reach_of(10.0, autopilot, fix, 10.0, 50.0) == Reach(north(500), 55.0)
     assert reach_of(10.6, autopilot, fix, 10.0, 50.0) == Reach(HOME, pytest.approx(156.0))
     assert reach_of(60.1, None, fix, 10.0, 50.0) is None
