@@ -1,12 +1,13 @@
-"""The displacement vote: regions that belong to the same place have all moved by the same step.
+"""The displacement vote of `cohog`: regions that show the same place have all moved by the same shift.
 
-Every good region of the query finds its most similar region in the reference. The step between the two, in cells, is
-one vote. If the place is the same, the votes pile up on one step; if it is another place, they scatter. The score is
-the share of the votes at the peak: it says how many regions agree, which a mean of cosines does not.
+Every good region of the query finds its most similar region of the place, the *reference*. The shift between the two,
+in cells, is its vote. If the place is the same, the votes pile up on one shift; if it is another place, they scatter.
+The score is the share of the votes at the peak: it says how many regions agree, which a mean of cosines does not.
 
 A picture of another kind (a screen, a test card, a view ahead in a map made looking down) has many regions that
 resemble the same few regions of the place: a line here and a line there. Their votes can pile up as well. So the
-regions of the place that agree are counted too, each of them once.
+regions of the place that the agreeing votes lead to are counted too, each once. Regions form square grids and are
+numbered row by row.
 """
 
 import math
@@ -19,10 +20,10 @@ import numpy as np
 from edgevpr.core.arrays import Array, Bools, Ints, Singles
 from edgevpr.core.contract import Support
 
-_ALONG = 3  # cells: near and far ground move by steps that differ by so much, where the camera looks ahead
-_RANKED = 4  # of so many regions one is ranked: ranks cost more than all the rest
+_ALONG = 3  # cells by which the shifts of near and far ground differ, where the camera looks ahead
+_RANKED = 4  # one of so many regions is ranked: ranks cost more than all the rest
 _ROUNDS = 8
-_WITHIN_CELLS = 1.5  # as far as a vote may lie off the peak
+_WITHIN_CELLS = 1.5  # largest distance of an agreeing region from the fit
 # Beyond these another hypothesis is nearer, or the pairs are of different places.
 _FURTHEST_TURN_DEG = 16.0
 _FURTHEST_SCALE = 1.6
@@ -32,9 +33,9 @@ _Grid = tuple[Ints, int]  # numbers of regions, row by row, and the regions alon
 
 @dataclass(frozen=True, slots=True)
 class Displacement:
-    """Result of a vote. `share` (0..1) of the regions agrees on the step `shift_cells` (dx, dy), from the query to the
-    reference; `covariance_cells2` (var x, cov xy, var y) is the covariance of the votes around the peak. `agreeing` is
-    the number of different regions of the reference that the agreeing votes lead to."""
+    """Result of a vote. A weighted `share` (0..1) of the regions agrees on the shift `shift_cells` (dx, dy) from the
+    query to the reference. `covariance_cells2` (var x, cov xy, var y) is that of the votes around the peak. `agreeing`
+    is the number of different regions of the reference that the agreeing votes lead to."""
 
     share: float
     shift_cells: tuple[float, float]
@@ -46,13 +47,13 @@ _NOTHING = Displacement(0.0, (0.0, 0.0), (0.0, 0.0, 0.0), 0)
 
 
 def displacement(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple[float, ...]) -> Displacement:
-    """Count the votes of regions on square grids of these `sides`: of the query and of the reference, both even or both
-    odd.
+    """Find the shift on which most regions agree. `asking` and `best` are int (G,): the good regions of the query, and
+    for each the most similar region of the reference. `sides` are the regions along one side of the query's grid and of
+    the reference's, both even or both odd.
 
-    `asking` and `best` are int (G,): each good region of the query, and the region of the reference most similar to it.
-    Both are numbered row by row. A step is counted from the middle of one grid to that of the other. A vote that is n
-    cells off a step, along the rows or along the columns, has the weight `counts[n]`; one further off has none. The
-    peak is the step with the largest sum of weighted votes. Without any region the share is 0.
+    A shift is counted from the middle of one grid to that of the other. For each shift, a vote that is n cells off it,
+    along rows or columns, has the weight `counts[n]`; one further off has none. The peak is the shift with the largest
+    sum of weights. Without any region the share is 0.
     """
     if not len(asking):
         return _NOTHING
@@ -66,13 +67,13 @@ def displacement(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple
     shares_x, shares_y = agreeing.sum(axis=0) / count, agreeing.sum(axis=1) / count
     off = np.arange(-room, room + 1)
     mean_x, mean_y = float(shares_x @ off), float(shares_y @ off)
-    # A step is known to one cell at best: 1/12 is the variance of a uniform distribution over one cell.
+    # A shift is known to one cell at best: 1/12 is the variance of a uniform distribution over one cell.
     covariance = (
         float(shares_x @ (off - mean_x) ** 2) + 1 / 12,
         float((off - mean_y) @ agreeing @ (off - mean_x)) / count,
         float(shares_y @ (off - mean_y) ** 2) + 1 / 12,
     )
-    none = sum(sides) // 2 - 1  # the number of no step, along one side
+    none = sum(sides) // 2 - 1  # the index of a shift of 0, along one side
     shift = (peak_x - none + mean_x, peak_y - none + mean_y)
     near = np.zeros((wide, wide), bool)
     near[peak_y : peak_y + len(weights), peak_x : peak_x + len(weights)] = True
@@ -82,16 +83,17 @@ def displacement(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple
 
 
 def share(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple[float, ...]) -> float:
-    """Return the `share` of a `displacement` without the rest of it, in half the time."""
+    """Return only the `share` of a `displacement`, which takes the same arguments, in half the time."""
     return float(_piled(asking, best, sides, counts)[2].max()) / len(asking) if len(asking) else 0.0
 
 
 def support(
     asking: Ints, regions: Singles, reference: Singles, best: Ints, shift_cells: tuple[float, float]
 ) -> Support:
-    """Ask all regions about a step that a vote has found. `asking` int (G,) are the numbers of the good `regions` of
-    the query, float32 (G, P), on the grid of the place, whose regions are `reference`, float32 (side * side, P). `best`
-    int (G,) is the most similar region of the place for each."""
+    """Measure how all regions of query and place support the shift that a vote has found (see `Support`). `asking` int
+    (G,) are the numbers of the good regions of the query and `regions` float32 (G, P) their vectors, on a grid as large
+    as the place's. `reference` float32 (side * side, P) are the place's regions, and `best` int (G,) the most similar
+    one for each."""
     side = math.isqrt(len(reference))
     back = (reference @ regions.T).argmax(axis=1)
     of_y, of_x = np.divmod(asking, side)
@@ -112,8 +114,9 @@ def support(
 
 
 def _log_rank(regions: Singles, reference: Singles, x: Ints, y: Ints, side: int) -> float:
-    """Return the mean log rank of the region of the place at (x, y), or of the most similar of those around it, for
-    each of `regions` where that is on the grid of the place."""
+    """Return the mean natural log of a rank: that of the place's region at column `x` and row `y`, int (n,), among all
+    of the place by similarity to each of `regions` float32 (n, P). The most similar of the 3x3 regions there counts.
+    Positions that are not on the place's grid are left out."""
     rows = np.flatnonzero((x >= 0) & (x < side) & (y >= 0) & (y < side))
     if not len(rows):
         return math.log(len(reference))
@@ -127,10 +130,14 @@ def _log_rank(regions: Singles, reference: Singles, x: Ints, y: Ints, side: int)
 
 
 def _piled(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple[float, ...]) -> tuple[Ints, Singles, Array]:
-    """Return the number of the step of each vote, int (G,), the votes by step, float32 (W, W), and the weighted sum
-    around each possible step, float32 (W - 2 room, W - 2 room)."""
-    # Both numbers are those of a grid as wide as there are steps, so that their difference is the number of the step. A
-    # border around the possible steps leaves room for the square around the peak.
+    """Count the votes by shift; `room` is one less than the number of `counts`. Returns
+
+    * the number of the shift of each vote, int (G,),
+    * the votes of each shift, float32 (W, W),
+    * the weighted sum around each possible shift, float32 (W - 2 room, W - 2 room).
+    """
+    # Both are numbered on a grid as wide as there are shifts, so that their difference is the number of the shift. A
+    # border around the possible shifts leaves room for the square around the peak.
     room = len(counts) - 1
     of_query, of_reference = sides
     wide = of_query + of_reference - 1 + 2 * room
@@ -143,7 +150,7 @@ def _piled(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple[float
 
 @lru_cache
 def _numbers(side: int, wide: int) -> Ints:
-    """Return the numbers of `side` x `side` regions in a grid of width `wide`: int (side * side,)."""
+    """Return the numbers that `side` x `side` regions have in a grid of width `wide`: int (side * side,)."""
     return np.add.outer(np.arange(side) * wide, np.arange(side)).ravel()
 
 
@@ -156,9 +163,9 @@ def _weights(counts: tuple[float, ...]) -> Singles:
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """The query, turned by `turn_deg` and scaled by `scale` about its middle, lies on the place with its middle at
-    `shift_cells` (x, y), in cells from that of the place. `covariance_cells2` (var x, cov xy, var y) is the covariance
-    of how far single regions lie off."""
+    """Exact position of a query's picture on a place. Turned clockwise by `turn_deg` and scaled by `scale` about its
+    middle, it lies with its middle at `shift_cells` (x, y) from that of the place. `covariance_cells2` (var x, cov xy,
+    var y) is that of the distances by which single regions miss this fit."""
 
     shift_cells: tuple[float, float]
     turn_deg: float
@@ -167,13 +174,13 @@ class Alignment:
 
 
 def align(asking: _Grid, best: _Grid, shift_cells: tuple[float, float]) -> Alignment | None:
-    """Fit a shift, a rotation and a scale, by least squares, to pairs of a region of the query and the most similar
-    region of the place, int (G,) each, some of which agree about this shift. None where too few agree, or on a rotation
-    or scale that is none of this hypothesis.
+    """Fit a shift, a rotation and a scale, by least squares, to pairs of a region of the query (`asking`) and the most
+    similar region of the place (`best`); each argument is the numbers int (G,) and the side of the grid. Only pairs
+    that agree with the shift are used, at first `shift_cells`. Returns None if fewer than 8 agree, or if the rotation
+    or scale found belongs to another hypothesis.
 
-    The vote knows the step in whole cells, and the rotation and the height in steps of the hypotheses. With the fit
-    more regions agree, since those far from the middle no longer miss by what the hypothesis is off, and it is repeated
-    with these.
+    The vote knows the shift in whole cells, and rotation and scale only as those of the hypothesis. Regions far from
+    the middle miss by that error. So the fit is repeated with all the regions that agree with the fit before.
     """
     # In complex numbers a rotation and a scale are one factor, and least squares one division.
     mine, there = _from_middle(*asking), _from_middle(*best)
@@ -203,6 +210,6 @@ def align(asking: _Grid, best: _Grid, shift_cells: tuple[float, float]) -> Align
 
 
 def _from_middle(numbers: Ints, side: int) -> Array:
-    """Return where regions are, in cells from the middle of their grid: x + iy, complex (G,)."""
+    """Return the positions of regions in cells from the middle of their grid: x + iy, y downwards, complex (G,)."""
     y, x = np.divmod(numbers, side)
     return x + 1j * y - (1 + 1j) * (side - 1) / 2

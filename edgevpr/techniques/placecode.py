@@ -1,10 +1,10 @@
-"""A place in 144 bytes that is still found when the camera has moved: the coarse stage of `cohog` looking ahead.
+"""The coarse stage of `cohog` for a camera that looks ahead: a place is 144 bytes, found even if the camera has moved.
 
-The block-normalised HOG is averaged over 12x12 cells (its *grid*), and the map's mean is subtracted. The L orientations
-of each cell are written as a Fourier series, and only the signs stay, one bit for each of its L numbers. Without the
-series the signs would repeat half of their information, since neighbouring orientations rise and fall together. A query
-is compared under every shift of the grid. Each such *hypothesis* is one row of a matrix, the places of the map are
-another matrix, and one product compares them all.
+The block-normalised HOG is averaged over 12x12 cells (its *grid*), and the map's mean grid is subtracted. The L
+orientations of each cell are written as a Fourier series of L numbers, and only their signs are kept, one bit each.
+Without the series the signs would repeat half of their information, since neighbouring orientations rise and fall
+together. A query is compared under every shift of its grid. Each such *hypothesis* is one row of a matrix, the places
+of the map are another matrix, and one product compares them all.
 """
 
 from functools import lru_cache
@@ -18,7 +18,7 @@ from edgevpr.techniques.gradients import waves
 SIDE = 12  # cells along one side
 _SAMPLES = 3  # along one side of a cell: about one per block, for 31 blocks
 _MIN_OVERLAP = 0.5  # a smaller overlap costs more shifts, and found no further place on any data set
-_LOOKED_CLOSER = 500  # places; comparing them takes a tenth of the time of a scan of 10 000
+_LOOKED_CLOSER = 500  # places compared under all shifts: a tenth of the time of a scan of 10 000
 _BITS_AT_ONCE = 1 << 19  # of places: 2 MB as float32
 
 # Each byte as its eight bits, first bit first, +1 or -1: one look-up instead of `unpackbits`, conversion and offset.
@@ -37,14 +37,14 @@ SHIFTS = _shifts()
 
 
 def grid(blocks: Singles) -> Singles:
-    """Average the orientations over the cells of a picture: blocks float32 (n, n, 4L) to float32 (12, 12, L), each cell
-    of length 1 (so that contrast and haze do not count)."""
+    """Average the blocks of a picture over cells: float32 (n, n, 4 L), L orientations, to float32 (12, 12, L). Each
+    cell has length 1, so that contrast and haze do not count."""
     return seen_grid(blocks, np.ones(blocks.shape[:2], bool))[0]
 
 
 def seen_grid(blocks: Singles, seen: Bools) -> tuple[Singles, Bools]:
-    """Make the `grid` of those blocks that bool (n, n) `seen` allows. Also returns bool (12, 12): at least half of the
-    cell is seen."""
+    """Make the `grid` from the blocks where `seen`, bool (n, n), is True. Also returns bool (12, 12), True where at
+    least half of a cell is seen."""
     n, bins = len(blocks), blocks.shape[2] // 4
     source = blocks.reshape(n * n, 4, bins).mean(axis=1) * seen.reshape(-1, 1)
     at = _sources(n)
@@ -54,21 +54,21 @@ def seen_grid(blocks: Singles, seen: Bools) -> tuple[Singles, Bools]:
 
 
 def special(grids: Floats, mean: Floats) -> Array:
-    """Return the part of a picture that sets it apart: grids (..., 12, 12, L) less the map's mean (12, 12, L), the
-    orientations of each cell as a Fourier series. The result is float32 of the shape of `grids`."""
+    """Subtract the map's mean (12, 12, L) from `grids` (..., 12, 12, L), which leaves what sets a picture apart, and
+    write the orientations of each cell as a Fourier series. The result is float32 of the shape of `grids`."""
     apart: Array = (np.asarray(grids, np.float32) - mean) @ waves(grids.shape[-1]).T
     return apart
 
 
 def pack(grids: Floats, mean: Floats) -> Bytes:
-    """Make the rows of the index: grids (N, 12, 12, L) and the map's mean (12, 12, L) to uint8 (N, 18 L), bit by
-    bit."""
+    """Make the rows of the index from `grids` (N, 12, 12, L) and the map's mean (12, 12, L): uint8 (N, 18 L), the sign
+    of each number of `special` as one bit."""
     return np.packbits((special(grids, mean) >= 0).reshape(len(grids), -1), axis=1)
 
 
 def hypotheses(grid: Singles, seen: Bools, mean: Floats) -> Singles:
-    """Make a query's views from elsewhere: its grid and `seen` (by `seen_grid`) and the map's mean to float32
-    (S, 144 L). Each is the signs of the query (0 where nothing is seen), moved by one of the S `SHIFTS`."""
+    """Make the hypotheses of a query, float32 (S, 144 L), from its `grid` and `seen` (see `seen_grid`) and the map's
+    mean (12, 12, L). Row s is the signs of the query (0 where nothing is seen), moved by shift s of `SHIFTS`."""
     signs = np.where(special(grid, mean) >= 0, np.float32(1), np.float32(-1)) * seen[..., None]
     asked = np.zeros((len(SHIFTS), *signs.shape), np.float32)
     for at, (dx, dy) in enumerate(SHIFTS.tolist()):
@@ -77,10 +77,10 @@ def hypotheses(grid: Singles, seen: Bools, mean: Floats) -> Singles:
 
 
 def scan(asked: Singles, codes: Bytes) -> Singles:
-    """Compare every hypothesis, float32 (S, 8 B), with every place, uint8 (N, B). Returns the best score of each place,
-    float32 (N,).
+    """Compare every hypothesis, `asked` float32 (S, 8 B), with every place, `codes` uint8 (N, B). Returns the best
+    score of each place, float32 (N,).
 
-    A score is the bits that agree less those that do not, over all bits: 1 is the same picture, 0 is chance.
+    A score is the number of equal bits less that of different ones, over all bits: 1 is the same picture, 0 is chance.
     """
     by_bit = asked.T
     best = np.empty(len(codes), np.float32)
@@ -98,8 +98,8 @@ def scan(asked: Singles, codes: Bytes) -> Singles:
 
 
 def scan_ahead(asked: Singles, codes: Bytes) -> Singles:
-    """Scan all places under a quarter of the shifts, then the best 500 places under all. Each shift of the quarter is
-    blurred with those around it, so that none is missed. Takes and returns the same as `scan`."""
+    """Compare as `scan` does, but faster: all places under a quarter of the shifts, then the best 500 places under all.
+    Each shift of the quarter is averaged with those around it, so that none is missed."""
     if len(codes) <= _LOOKED_CLOSER:
         return scan(asked, codes)
     scores = scan(_blurred() @ asked, codes)
@@ -110,7 +110,8 @@ def scan_ahead(asked: Singles, codes: Bytes) -> Singles:
 
 @lru_cache
 def _blurred() -> Singles:
-    """Return float32 (even shifts, S): the weights of all shifts in the mean around each even one, by distance."""
+    """Return the weights by which all S shifts are averaged around each shift with even dx and dy: float32 (even
+    shifts, S)."""
     kept = SHIFTS[(SHIFTS % 2 == 0).all(axis=1)]
     weight = np.maximum(1 - abs(kept[:, None] - SHIFTS) / 2, 0).prod(axis=2)
     weights: Singles = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
@@ -119,12 +120,13 @@ def _blurred() -> Singles:
 
 @lru_cache(maxsize=8)
 def _sources(n: int) -> Ints:
-    """Return int (144, 9): the block that each sample of each cell is taken from."""
+    """Return the number of the block, of n x n, that each of the 9 samples of each cell is taken from: int (144, 9)."""
     at = np.floor((np.arange(SIDE * _SAMPLES) + 0.5) / (SIDE * _SAMPLES) * n).astype(np.intp)
     numbers = np.add.outer(at * n, at).reshape(SIDE, _SAMPLES, SIDE, _SAMPLES)
     return numbers.swapaxes(1, 2).reshape(SIDE**2, _SAMPLES**2)
 
 
 def _to(step: int) -> slice:
-    """Return the slice of one side that its own cells cover after a move by `step` cells."""
+    """Return the slice of one side of a grid that its cells still cover after a move by `step` cells. They come from
+    `_to(-step)`."""
     return slice(max(0, step), SIDE + min(0, step))

@@ -1,4 +1,5 @@
-"""Pooling of a feature map to one vector. A feature map is float32 (channels, height, width) throughout."""
+"""Pooling of a feature map to one vector, for `network` and `regions`. A feature map is float32 (channels, height,
+width)."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -31,8 +32,9 @@ def maximum(features: Singles) -> Singles:
 def gem(features: Singles, p: float) -> Singles:
     """Compute the generalised mean of each channel (Radenović et al. 2018, equation 3): (C, H, W) to float32 (C,).
 
-    p = 1 is the mean, p towards infinity the maximum. Activations below 1e-6 count as 1e-6, so that any p is defined.
-    Each channel is divided by its maximum first: the result is the same, and no power leaves the range of float32.
+    p = 1 gives the mean, and p towards infinity the maximum. Activations below 1e-6 count as 1e-6, so that any p is
+    defined. Each channel is divided by its maximum first: this does not change the result, and no power leaves the
+    range of float32.
     """
     positive = np.maximum(features, 1e-6)
     largest = positive.max(axis=(1, 2))
@@ -42,7 +44,8 @@ def gem(features: Singles, p: float) -> Singles:
 
 
 def grid(features: Singles, rows: int, columns: int, how: str) -> Singles:
-    """Pool ("mean" or "max") over each cell of a grid: (C, H, W) to float32 (rows * columns * C,), cell by cell.
+    """Pool each channel over each cell of a grid, `how` being "mean" or "max": (C, H, W) to float32 (rows * columns *
+    C,), cell by cell.
 
     Cell i of n covers floor(i H / n) to ceil((i + 1) H / n) (He et al. 2014, section 2.2), so that no activation is
     left out and no cell is empty. Raises ModelError for a feature map with fewer rows or columns than the grid.
@@ -63,8 +66,8 @@ def grid(features: Singles, rows: int, columns: int, how: str) -> Singles:
 
 
 def pyramid(features: Singles, levels: Iterable[int]) -> Singles:
-    """Pool the maxima of a spatial pyramid (He et al. 2014, section 2.2): grids of n x n cells for each n of `levels`,
-    one after the other: (C, H, W) to float32 (sum of n^2, times C,).
+    """Pool the maxima of a spatial pyramid (He et al. 2014, section 2.2), one grid of n x n cells after the other for
+    each n of `levels`: (C, H, W) to float32 (C * sum of n^2,).
 
     The levels 1 to 4 (30 cells) are those of the public benchmark code of the thesis's author for AMOSNet and HybridNet
     (Chen et al. 2017). That code leaves out the row and column between two cells; here nothing is left out. Raises
@@ -75,8 +78,9 @@ def pyramid(features: Singles, levels: Iterable[int]) -> Singles:
 
 @dataclass(frozen=True, slots=True)
 class Projection:
-    """Gaussian random projection to fewer dimensions, in a form that fits a small board: `spectrum` complex128
-    (n // 2 + 1,) of the Gaussian row, `signs` float32 (n,), `length` of the result.
+    """Gaussian random projection of n values to `length` values, in a form that fits a small board: `spectrum`
+    complex128 (n // 2 + 1,) is the conjugate Fourier transform of the Gaussian vector, and `signs` float32 (n,) are +1
+    or -1.
 
     A matrix of Gaussian values keeps the angles between vectors to about 1 / sqrt(dimensions). For the 43 008
     activations of CALC and 1064 dimensions it takes 183 MB, and drawing it anew for each picture takes far longer than
@@ -90,7 +94,7 @@ class Projection:
     length: int
 
     def __call__(self, features: Singles) -> Singles:
-        """Project float32 of n values in any shape to (length,); the Euclidean length is kept on average."""
+        """Project float32 of n values in any shape to (length,). The Euclidean length is kept on average."""
         size = len(self.signs)
         shifted = np.fft.irfft(self.spectrum * np.fft.rfft(features.ravel() * self.signs, size), size)
         projected: Singles = (shifted[: self.length] / np.sqrt(self.length)).astype(np.float32)
@@ -98,7 +102,7 @@ class Projection:
 
 
 def gaussian_projection(size: int, length: int, seed: int) -> Projection:
-    """Make the projection from `size` to `length` values that belongs to `seed`.
+    """Make the projection from `size` to `length` values. The same `seed` always gives the same projection.
 
     Raises ModelError if `length` is larger than `size`.
     """
@@ -112,7 +116,7 @@ def gaussian_projection(size: int, length: int, seed: int) -> Projection:
 
 
 def gaussian_row(size: int, seed: int) -> tuple[Doubles, Singles]:
-    """Make the Gaussian vector float64 (size,) and the signs float32 (size,) of a seed.
+    """Make the Gaussian vector float64 (size,) and the signs float32 (size,), +1 or -1, of a seed.
 
     The same seed must give the same matrix for as long as a map is used. NumPy promises that for the raw numbers of its
     bit generators, not for `standard_normal` (NEP 19). So both come from the raw 64-bit numbers of PCG64: first two for
@@ -129,7 +133,8 @@ def gaussian_row(size: int, seed: int) -> tuple[Doubles, Singles]:
 
 
 def square_regions(height: int, width: int) -> list[Square]:
-    """Return the squares of R-MAC at three scales over a feature map (Tolias et al. 2016, section 3.2).
+    """Return the squares (top, left, side) of R-MAC at three scales over a feature map, in cells of it (Tolias et al.
+    2016, section 3.2).
 
     At scale l the squares are 2 min(H, W) / (l + 1) wide. There are l along the short side and l + m - 1 along the long
     one, evenly spaced. m is the number that brings the overlap of two neighbours at the first scale closest to 40 %.
@@ -155,8 +160,8 @@ def square_regions(height: int, width: int) -> list[Square]:
 
 
 def regional_vectors(features: Singles, regions: list[Square]) -> Singles:
-    """Return the largest activation of each channel in each region, power- and L2-normalised: (C, H, W) to float32
-    (R, C).
+    """Return the largest activation of each channel in each of R `regions`, power- and L2-normalised: (C, H, W) to
+    float32 (R, C).
 
     The power normalisation is the signed square root, as the thesis uses it (4.2). The paper whitens by PCA instead,
     which would have to be learned.

@@ -1,10 +1,10 @@
-"""Techniques that make one vector of a picture, and `hog`, which needs no network for it: the three forms of a vector
-in RAM, and the comparison of two vectors.
+"""Base of the techniques that describe a picture by one vector (also those in `network` and `regions`): the three forms
+of a vector in RAM, and the comparison of vectors. `hog` here needs no network.
 
-The map file keeps each vector in half precision. In RAM it is kept so (`float`) or, less the mean of the map, as one
-byte (`8bit`) or one bit (`1bit`) a number. The mean is common to all places: it does not help to tell them apart, and
-takes most of the range of a byte. It changes while a map grows. So the file is independent of the form, and one map
-serves all forms.
+The map file keeps each vector in half precision. In RAM its *form* is `float` (half precision too), or one byte
+(`8bit`) or one bit (`1bit`) per number, after the mean of the map is subtracted. The mean is common to all places: it
+does not help to tell them apart, and takes most of the range of a byte. It changes while a map grows. So the file is
+independent of the form, and one map serves all forms.
 """
 
 import numpy as np
@@ -29,13 +29,13 @@ _CODE_BYTES_AT_ONCE = 1 << 20  # of binary vectors compared together: about a se
 
 
 class VectorTechnique:
-    """Base class of the techniques that make one vector; a subclass gives `vector`.
+    """Base class of the techniques that make one vector; a subclass implements `vector`.
 
     `similarity` is "cosine", "l1" or "l2"; the form `1bit` always compares by Hamming distance. All scores are 0 to 1.
-    For "cosine" the score in `float` is the cosine (0 where it is negative: unrelated), in `8bit` (1 + cosine) / 2 of
-    the vectors less the mean. For "l1" and "l2" it is 1 / (1 + distance). In `1bit` it is the share of equal bits.
-    `margins` are the minimum margins of the forms `float`, `8bit` and `1bit`. With another `model` than the shipped
-    one, no match is accepted until the configuration sets a minimum margin.
+    For "cosine" the score is the cosine in the form `float` (negative ones count 0), and (1 + cosine) / 2 of the
+    vectors less the mean in `8bit`. For "l1" and "l2" it is 1 / (1 + distance). In `1bit` it is the share of equal
+    bits. `margins` are the minimum margins of an accepted match in the forms `float`, `8bit` and `1bit`, known for the
+    shipped weights. With another `model` no match is accepted until the configuration sets a minimum margin.
     """
 
     candidates = 1  # there is no fine part to compare
@@ -75,13 +75,14 @@ class VectorTechnique:
         )
 
     def vector(self, image: Image, mask: Mask | None) -> Singles:
-        """Make the vector of a uint8 image (H, W[, 3]): float32 (D,). Pixels where `mask` bool (H, W) is False must not
-        count."""
+        """Make the vector of a uint8 image (H, W[, 3]): float32 (D,). Pixels where `mask` bool (H, W) is False must
+        have no influence (None: all count)."""
         raise NotImplementedError
 
     def encode(self, image: Image, mask: Mask | None = None) -> Descriptor:
-        """Encode uint8 (H, W[, 3]) to coarse float16 (D,), of length 1 if the similarity is the cosine. A vector that
-        is all zeros in half precision has quality 0. Raises ModelError for numbers beyond half precision."""
+        """Encode uint8 (H, W[, 3]) to coarse float16 (D,), of length 1 if the similarity is the cosine. The quality is
+        0 for a vector that is all zeros in half precision, else 1. Raises ModelError for numbers beyond half
+        precision."""
         vector = self.vector(image, mask)
         length = float(np.linalg.norm(vector))
         if self._similarity == "cosine":
@@ -95,7 +96,9 @@ class VectorTechnique:
         return Descriptor(coarse=coarse, quality=float(coarse.any()))
 
     def pack(self, coarse: Array, mean: Singles) -> Array:
-        """Make the rows of the index in 8 or 1 bit: coarse float16 (N, D), the map's mean (D,) to (N, *row shape)."""
+        """Make the rows in RAM of the forms `8bit` and `1bit`: `coarse` float16 (N, D), the map's `mean` (D,) to (N,
+        *row shape). A row of `8bit` is D int8 numbers, then the bytes of two float32: the step of the numbers, and the
+        vector's length."""
         rows = np.zeros((len(coarse), *self.spec.row.shape), self.spec.row.dtype)
         for block in _blocks(len(coarse), self._length):
             left = coarse[block].astype(np.float32)
@@ -118,9 +121,9 @@ class VectorTechnique:
         turned_deg: Doubles | None = None,
         height_ratio: float | None = None,
     ) -> tuple[Singles, None]:
-        """Compare a query with all places: `rows` (N, *row shape) and the map's mean (D,), unless the form is `float`,
-        to scores float32 (N,), all 0 for a query of zeros. `turned_deg` and `height_ratio` are ignored: these vectors
-        know neither."""
+        """Compare a query with all places, `rows` (N, *row shape). Returns scores float32 (N,), all 0 for a query of
+        zeros, and None: there are no hypotheses. `mean` is the map's mean (D,), which the form `float` does not need.
+        `turned_deg` and `height_ratio` are ignored: these vectors know neither."""
         vector = query.coarse.astype(np.float32)
         if not vector.any():  # less the mean, zeros would resemble some place, and equal another picture of zeros
             return np.zeros(len(rows), np.float32), None
@@ -141,8 +144,9 @@ class VectorTechnique:
         return scores, None
 
     def _compared(self, vector: Singles, values: Singles, beside: Singles) -> Singles:
-        """Score some places, float32 (n, D), which are overwritten. In 8 bits a place is `values` times its step, less
-        the mean as `vector` is, and `beside` float32 (2, n) are the steps and the lengths; else it is (0, n)."""
+        """Score n places against `vector` (D,): float32 (n,). `values` float32 (n, D) are overwritten. In the form
+        `8bit` a place less the map's mean is `values` times its step, and `beside` float32 (2, n) holds the steps and
+        the lengths. In `float`, `beside` is (0, n)."""
         if self._similarity == "cosine":
             scores: Singles = values @ vector
             if not len(beside):
@@ -165,8 +169,8 @@ class Hog(VectorTechnique):
     """`hog`: one histogram-of-oriented-gradients vector for the whole image, compared by cosine. It has length 1 and is
     kept in half precision (286 KB per place by default).
 
-    Dalal and Triggs 2005, in the form of thesis 4.2.1: 512x512 grey, cells of 8x8 pixels, blocks of 16x16 with a stride
-    of one cell, 9 orientations over 180 degrees.
+    Dalal and Triggs 2005, in the form of thesis 4.2.1: 512x512 grey (`w1`), cells of 8x8 pixels (`cell`), blocks of 2x2
+    cells with a stride of one cell, 9 orientations (`bins`) over 180 degrees.
     """
 
     def __init__(self, w1: int = 512, cell: int = 8, bins: int = 9, form: str = "float") -> None:
@@ -196,8 +200,8 @@ def _blocks(count: int, length: int) -> list[slice]:
 
 
 def hamming(query: Bytes, codes: Bytes) -> Ints:
-    """Count the bits in which a query uint8 (B,) differs from each place uint8 (N, B), B a multiple of 8: uint16 (N,),
-    or uint32 for more than 8191 bytes."""
+    """Count the bits in which `query` uint8 (B,) differs from each of `codes` uint8 (N, B), with B a multiple of 8:
+    uint16 (N,), or uint32 for more than 8191 bytes."""
     asked, places = query.view(np.uint64), np.ascontiguousarray(codes).view(np.uint64)
     distances: Ints = np.empty(len(codes), np.uint16 if 8 * codes.shape[1] < 1 << 16 else np.uint32)
     ones = np.ones(len(asked), np.float32)  # a product is the fastest sum, and exact for whole numbers below 2^24
