@@ -1,6 +1,6 @@
-"""Accuracy of each technique: the figures of `make results`, by the way the camera looks.
+"""Accuracy of each technique on image sets, as `make results` measured it, for a camera that looks down or forward.
 
-They travel with the program, so that what a technique costs is never said without what it finds.
+The figures (accuracy.json) are installed with the program, so that no cost is ever shown without accuracy.
 """
 
 import json
@@ -15,9 +15,13 @@ _FEWER = "{}, {} candidates"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Accuracy:
-    """Accuracy of a technique in one form: `recall_at_1` (0..1) is the mean over the `sets` that nothing was tuned on,
-    which have `queries` in all. Of `asked` queries of all sets `accepted` were accepted, `accepted_wrong` of them
-    wrongly, `accepted_elsewhere` of these as a place that is no neighbour of the right one."""
+    """Accuracy of a technique in one form. `recall_at_1`: share of queries whose best place is right, 0..1, the mean
+    over the `sets` image sets that nothing was tuned on, with `queries` queries in total.
+
+    `asked`: queries of all image sets. `accepted`: those whose best place was accepted. `accepted_wrong`: those whose
+    accepted place was wrong. `accepted_elsewhere`: those whose accepted place was not even a neighbour of the right
+    one.
+    """
 
     recall_at_1: float
     sets: int
@@ -29,7 +33,7 @@ class Accuracy:
 
     @property
     def is_trusted(self) -> bool:
-        """Tell whether no place far from the right one was ever accepted."""
+        """Tell whether no query was accepted as a place far from the right one."""
         return self.accepted_elsewhere == 0
 
     def __str__(self) -> str:
@@ -40,19 +44,22 @@ class Accuracy:
 
 
 def labelled(label: str, candidates: int | None) -> str:
-    """Name a technique with fewer candidates than its own (None: its own)."""
+    """Return `label` (technique and form), followed by the number of candidates unless that is the default (None)."""
     return label if candidates is None else _FEWER.format(label, candidates)
 
 
 def of(label: str, camera: str | None, candidates: int | None = None) -> Accuracy | None:
-    """Return the accuracy of a technique in a form (see `techniques.labelled`), for a `camera` that looks "nadir" or
-    "forward" (None: forward), with fewer `candidates` than its own (None: its own); None where it was not measured."""
+    """Return the accuracy of `label` (technique and form, see `techniques.labelled`); None if it was not measured.
+
+    `camera`: "nadir" (looks down) or "forward" (None: forward). `candidates`: fewer than the default (None: the
+    default).
+    """
     figures = _content()[camera or "forward"].get(labelled(label, candidates))
     return Accuracy(**figures) if figures else None
 
 
 def fewer_candidates(label: str, camera: str | None) -> tuple[int, ...]:
-    """Return the numbers of candidates, fewer than its own, with which a technique was measured, largest first."""
+    """Return the numbers of candidates, below the default, with which a technique was measured, largest first."""
     before, after = _FEWER.format(label, "|").split("|")
     names = (name for name in _content()[camera or "forward"] if name.startswith(before) and name.endswith(after))
     return tuple(sorted((int(name[len(before) : -len(after)]) for name in names), reverse=True))

@@ -1,8 +1,8 @@
-"""Choice of a technique: what each finds beside what it costs, on the board.
+"""Choice of a technique for a board, by accuracy and cost.
 
-All that fit and can be trusted make a front: none of it is both less accurate and dearer than another. Where no
-accuracy is asked for, the most accurate of the front is taken; else the cheapest that reaches it. A technique that has
-accepted a wrong place on the image sets is never chosen by itself, since its fixes would be sent.
+The front is the list of all options that fit the board, can be trusted, and are not both less accurate and dearer than
+another. If a least accuracy is asked for, the cheapest of the front that reaches it is chosen, else the most accurate.
+A technique that accepted a wrong place on the image sets is never chosen automatically: its fixes would be sent.
 """
 
 import math
@@ -21,8 +21,8 @@ from edgevpr.runtime.preflight.probe import TechniqueCosts
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Demand:
-    """Demands of a flight: places of the map, queries a second, MB for the index, and the way the camera looks
-    ("nadir" or "forward"; None: forward)."""
+    """Requirements of a flight: places in the map, queries per second, MB of RAM for the map's index, and the direction
+    of the camera ("nadir" or "forward"; None: forward)."""
 
     places: int
     rate_hz: float
@@ -32,8 +32,9 @@ class Demand:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fit:
-    """Fit of a technique on a board; `t_query_s` is the time of one query, and `cpu_s` that of all cores together. It
-    fits where there are no `shortfalls`; `remedies` would make it fit."""
+    """Fit of a technique on a board. `t_query_s`: wall seconds of a query. `cpu_s`: its CPU-seconds of all cores
+    together. `map_ram_mb`: RAM of the map's index. `process_ram_mb`: RAM of the process with it. `reachable_hz`: most
+    queries per second. `shortfalls`: why it does not fit (empty: it fits). `remedies`: what would make it fit."""
 
     t_query_s: float
     cpu_s: float
@@ -46,8 +47,9 @@ class Fit:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Option:
-    """One way to recognise: a technique in a form, its costs on the board and its `fit`. `label` tells it from others.
-    `candidates` are fewer than the technique's own (None: its own). `accuracy` is None where it was not measured."""
+    """An option to choose: a technique in one form, with its costs on the board and its `fit`. `label` is its unique
+    name, `name` that of the technique. `candidates` are fewer than the default (None: the default). `accuracy` is None
+    if it was not measured."""
 
     label: str
     name: str
@@ -58,18 +60,18 @@ class Option:
 
     @property
     def is_sound(self) -> bool:
-        """Tell whether it may be chosen by itself: a sequence needs a flight along the mapped way, which nobody has
-        promised, and where accuracy was not measured nothing is known."""
+        """Tell whether the option may be chosen automatically: its accuracy is measured and trusted, and it matches
+        single queries. To match a sequence, a flight must follow the mapped route, which is not certain."""
         return self.accuracy is not None and self.accuracy.is_trusted and self.costs.sequence == 1
 
     @property
     def recall(self) -> float:
-        """Recall@1, 0 where it was not measured."""
+        """Recall@1, 0..1, or 0 if it was not measured."""
         return self.accuracy.recall_at_1 if self.accuracy else 0.0
 
     @property
     def objection(self) -> str | None:
-        """Reason for which it is not chosen by itself; None where nothing is against it."""
+        """Reason not to choose the option automatically, as text; None if there is none."""
         if self.fit.shortfalls:
             return f"{self.label} does not fit, {' and '.join(self.fit.shortfalls)}"
         if self.accuracy is None:
@@ -83,7 +85,8 @@ class Option:
 
 
 def options(board: Board, label: str, name: str, costs: TechniqueCosts, demand: Demand) -> Iterator[Option]:
-    """Yield a technique of these costs on `board` as it is, then with the fewer candidates that were measured."""
+    """Yield the technique `name` with its default number of candidates, then with each smaller number that was
+    measured. `label` is technique and form; `costs` are those on `board`."""
     for candidates in (None, *accuracy.fewer_candidates(label, demand.camera)):
         if candidates is not None and (costs.candidates is None or candidates >= costs.candidates):
             continue
@@ -99,7 +102,8 @@ def options(board: Board, label: str, name: str, costs: TechniqueCosts, demand: 
 
 
 def front(wanted: Iterable[Option]) -> list[Option]:
-    """Return those that fit, can be trusted, and are not both less accurate and dearer than another, cheapest first."""
+    """Return the options of the front (see above): fitting, trusted, and not both less accurate and dearer than
+    another. The cheapest is first."""
     best_so_far: list[Option] = []
     sound = [option for option in wanted if not option.fit.shortfalls and option.is_sound]
     for option in sorted(sound, key=lambda option: (option.fit.cpu_s, -option.recall)):
@@ -109,10 +113,10 @@ def front(wanted: Iterable[Option]) -> list[Option]:
 
 
 def best(wanted: Sequence[Option], board: Board, min_recall: float | None = None) -> Option | None:
-    """Choose from the front: the most accurate, or the cheapest with a recall of at least `min_recall`. Ways to use the
-    board's own technique go before all others. None where nothing on the front reaches it.
+    """Choose an option of the front: the most accurate, or the cheapest with a recall@1 of at least `min_recall`.
+    Options of the board's own technique (`board.technique`) go before all others. None if there is no such option.
 
-    The board's own technique is taken without measured accuracy too: its profile names it.
+    Without `min_recall`, the board's own technique is chosen even if it was not measured, since the profile names it.
     """
     own = [option for option in wanted if option.name == board.technique]
     unmeasured = [option for option in own if option.accuracy is None and not option.fit.shortfalls]
@@ -126,11 +130,11 @@ def best(wanted: Sequence[Option], board: Board, min_recall: float | None = None
 
 
 def fit(board: Board, costs: TechniqueCosts, demand: Demand) -> Fit:
-    """Check whether a technique fits: its map in the budget, its process in the board's memory, its queries in the
-    CPU's time.
+    """Check whether a technique fits: index into the budget, process into the board's memory, queries into the CPU
+    time.
 
-    A query must be over before the next one begins and before its fix is too old to be sent. All queries together may
-    take `cpu_share` of the cores at most.
+    A query must end before the next one begins, and before its fix is too old to be sent. All queries together may use
+    the share `cpu_share` of the cores.
     """
     rate_hz, budget_mb = demand.rate_hz, demand.budget_mb
     usable_cores = board.cores * board.cpu_share
@@ -173,12 +177,12 @@ def fit(board: Board, costs: TechniqueCosts, demand: Demand) -> Fit:
 
 
 def too_late(t_query_s: float) -> str:
-    """Say that no fix of such slow queries would be sent."""
+    """Return a text that says that queries of `t_query_s` seconds are too slow for their fixes to be sent."""
     return f"a query takes {t_query_s:.1f} s, and no fix of a frame older than {FIX_MAX_AGE_S:g} s is ever sent"
 
 
 def require_technique(board: Board) -> None:
-    """Raise ConfigError for a board whose profile names a technique that does not exist."""
+    """Raise ConfigError if the board's profile names a technique that does not exist."""
     if board.technique is not None and not techniques.is_known(board.technique):
         raise ConfigError(
             f"The profile of {board.title} names the technique `{board.technique}`, which is not there: use one of "
@@ -187,10 +191,11 @@ def require_technique(board: Board) -> None:
 
 
 def preferred(board: Board, camera: str | None = None) -> tuple[str, ...]:
-    """List the techniques to try for a board where none is named, best first: its own, then those offered to any board.
+    """Return the techniques to try if the user names none, best first: the board's own, then those offered to any
+    board.
 
-    For a `camera` that looks down ("nadir") only techniques with a camera setting are listed. Raises ConfigError where
-    the board's own technique does not exist.
+    For a `camera` that looks down ("nadir"), only techniques with a parameter `camera` are listed. Raises ConfigError
+    if the board's own technique does not exist.
     """
     require_technique(board)
     own = () if board.technique is None else (board.technique,)
@@ -199,12 +204,12 @@ def preferred(board: Board, camera: str | None = None) -> tuple[str, ...]:
 
 
 def objections(wanted: Iterable[Option]) -> str:
-    """Say why none of several options is chosen by itself."""
+    """Return the objections to all `wanted` options as one text."""
     return "; ".join(option.objection for option in wanted if option.objection)
 
 
 def nothing_to_choose(wanted: Sequence[Option], board: Board, min_recall: float | None = None) -> str:
-    """Say why `best` finds nothing, and what would make those options fit that it would then choose."""
+    """Return the reason why `best` returned None. If no option fits, it names what would make an eligible one fit."""
     fitting = [option for option in wanted if not option.fit.shortfalls]
     if not fitting:
         remedies = [
@@ -221,7 +226,7 @@ def nothing_to_choose(wanted: Sequence[Option], board: Board, min_recall: float 
 
 
 def described(board: Board, found: Fit, demand: Demand) -> str:
-    """Describe a fit in one line of figures; where the technique does not fit, add why and what would make it fit."""
+    """Return a line of figures about a fit and, if the technique does not fit, why not and what would make it fit."""
     figures = (
         f"{demand.places} places take {found.map_ram_mb:.1f} of {demand.budget_mb:.1f} MB, the process "
         f"{found.process_ram_mb:.0f} of {board.memory_max_mb:.0f} MB, and {_rounded_down(found.reachable_hz):g} Hz of "
@@ -234,6 +239,6 @@ def described(board: Board, found: Fit, demand: Demand) -> str:
 
 
 def _rounded_down(value: float) -> float:
-    """Round down to two digits, so that a rate said to be reached is really reached."""
+    """Round down to two significant digits, so that a rate reported as reached is really reached."""
     step = 10.0 ** (math.floor(math.log10(value)) - 1)
     return math.floor(value / step) * step

@@ -1,6 +1,7 @@
-"""Estimate of a flight: what each technique will cost a board, before take-off, from costs measured on some machine.
+"""Estimate of a flight before take-off: memory, time, charge and accuracy of each technique on a board, from costs
+measured on some machine. `edgevpr profile` shows it.
 
-`dataclasses.asdict` of a FlightEstimate is ready for JSON.
+`dataclasses.asdict` of a FlightEstimate can be written as JSON.
 """
 
 from collections.abc import Iterable, Iterator
@@ -15,15 +16,18 @@ from edgevpr.runtime.preflight.choose import Demand, Option, best, front, nothin
 from edgevpr.runtime.preflight.scale import UNKNOWN_PRODUCTS, Ratios, counted_work, is_same, on_board, ratios
 from edgevpr.runtime.preflight.trial import Trial
 
-_BUSY_SHARE = 0.1  # of the time of a trial, in which other programs had the processor
+_BUSY_SHARE = 0.1  # of the time of a trial; if other programs had the processor for more, a note says so
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightPlan:
-    """Plan of a flight: places in the map, queries a second, minutes in the air, the pack, the memory that the map's
-    index may take, the watts that the aircraft draws to hover (None: not given), the way the camera looks (None:
-    ahead), and the least recall@1 that is asked for (None: the most that fits). Raises UsageError for a number that is
-    not finite and above 0."""
+    """Plan of a flight.
+
+    `places`: in the map. `rate_hz`: queries per second. `flight_min`: minutes in the air. `budget_mb`: RAM for the
+    map's index. `regulator_efficiency`: share of the pack's energy that reaches the board, 0..1. `hover_w`: watts that
+    the aircraft draws to hover (None: not given). `camera`: "nadir" or "forward" (None: forward). `min_recall`: least
+    recall@1 asked for (None: the highest that fits). Raises UsageError for a number that is not finite or not above 0.
+    """
 
     places: int
     rate_hz: float
@@ -37,7 +41,7 @@ class FlightPlan:
 
     @property
     def demand(self) -> Demand:
-        """Demands of this flight on a technique."""
+        """Requirements of this flight on a technique."""
         return Demand(places=self.places, rate_hz=self.rate_hz, budget_mb=self.budget_mb, camera=self.camera)
 
     def __post_init__(self) -> None:
@@ -58,17 +62,19 @@ class FlightPlan:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TechniqueEstimate:
-    """One technique, in one form, on the board.
+    """Estimate of one technique, in one form, on the board. Symbols (a, s, U, t) and equations: see `power.equations`.
 
-    `process_ram_mb` is the peak with the map, and `encode_ram_mb` the part of it that encoding takes for a moment.
-    `query_mah` is (a + s U) t over encoding and matching, and `query_marginal_mah` is s U t (5.6). `u_query` is U over
-    a whole query. `flight_mah` is what the board draws from start to end, and `flight_marginal_mah` what the queries
-    add to it (5.7). All charges are drawn from the pack. `lost_min` is how many minutes less a full pack hovers with
-    the board on the aircraft, and `lost_marginal_min` the part of them that recognising costs (None: the hover power is
-    unknown). `shortfalls` say why the technique does not fit, `remedies` what would make it fit. `measured` is True for
-    stored costs, False for costs tried just now. `accuracy` is that of `make results` (None: it was not measured),
-    `candidates` how many places are compared where they are fewer than usual. A row `on_front` fits, can be trusted,
-    and is not both less accurate and dearer than another.
+    `technique`: label of the option (see `choose.Option`). `candidates`: number of places compared, if below the
+    default (None: the default). `accuracy`: by `make results` (None: not measured). `on_front`: the front of `choose`.
+    `objection`: why it is not chosen automatically (None: no reason, or it does not fit). `shortfalls`: why it does not
+    fit. `remedies`: what would make it fit.
+    `process_ram_mb`: peak with the map. `encode_ram_mb`: its part that encoding takes for a moment (None: unknown).
+    `u_query`: U over a whole query. `measured`: True for stored costs, False for costs measured just now.
+    `query_mah`: (a + s U) t of encoding and matching. `query_marginal_mah`: s U t (5.6). `flight_mah`: what the board
+    draws in the flight. `flight_marginal_mah`: its part that the queries add (5.7). All charges are drawn from the
+    pack, and `flight_pack_frac` is `flight_mah` as a share of its capacity.
+    `lost_min`: minutes of hovering on a full pack that the board costs. `lost_marginal_min`: its part that recognising
+    costs (both None: hover power unknown).
     """
 
     technique: str
@@ -104,13 +110,13 @@ class TechniqueEstimate:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightEstimate:
-    """All techniques on one board.
+    """Estimates of all techniques on one board.
 
-    `times` is "measured" (on this machine, for this machine), "scaled" (from this machine to the board, by `ratios`) or
-    "unscaled" (this machine's, since a figure is missing). `measured_on` is the date of stored figures. `recommended`
-    is the technique to take (None: none can be; see `choose`), and `reason` says why in a sentence. `notes` are remarks
-    on the estimate; `unusable` are techniques that cannot be used here, each with the reason; `weights` name the
-    weights of networks.
+    `times`: "measured" (on this machine, for this machine), "scaled" (from this machine to the board, by `ratios`) or
+    "unscaled" (this machine's, since a score is missing). `measured_on`: date of the stored figures (None: none were
+    used). `recommended`: label of the technique to use (None: none can be; see `choose`). `reason`: why, in a sentence.
+    `notes`: remarks on the estimate. `unusable`: techniques that cannot be used here, each with the reason. `weights`:
+    names of the weights of networks.
     """
 
     board: str
@@ -136,10 +142,11 @@ def estimate(
     map_technique: str | None = None,
     measured_on: str | None = None,
 ) -> FlightEstimate:
-    """Estimate every technique of `trials`, best first, for a flight of `board`.
+    """Estimate every technique of `trials`, in their order, for a flight of `board`.
 
-    The trials were made on the machine `here`; each is paired with True if it was stored, on `measured_on`.
-    `map_technique` is the technique that an existing map was built with (None: there is no map).
+    The trials were made on the machine `here`. Each is paired with True if its costs were stored, on the date
+    `measured_on`, and with False if it was made just now. `map_technique` is the technique that an existing map was
+    built with (None: no map).
     """
     trials = list(trials)
     wanted: dict[str, Option] = {}
@@ -179,7 +186,7 @@ def _technique(option: Option, board: Board, plan: FlightPlan, stored: bool, on_
     query = query_cost(encode, match, board, plan.pack, plan.regulator_efficiency, rss_mb=costs.process_mb)
     flight_s = 60 * plan.flight_min
     marginal_mah = queries_ah(min(plan.rate_hz, fit.reachable_hz) * flight_s, query.marginal_mah)
-    # Equation 5.7 leaves out the idle power between two queries; the pack supplies it all the same.
+    # Equation 5.7 leaves out the idle power between two queries, which the pack supplies too.
     idle_mah = 1000 * pack_ah(board.idle_w * flight_s, plan.pack, plan.regulator_efficiency)
     lost_min, lost_marginal_min = _lost_min(plan, idle_mah, marginal_mah)
     return TechniqueEstimate(
@@ -216,7 +223,9 @@ def _technique(option: Option, board: Board, plan: FlightPlan, stored: bool, on_
 
 
 def _lost_min(plan: FlightPlan, idle_mah: float, marginal_mah: float) -> tuple[float | None, float | None]:
-    """Return the minutes of hovering on a full pack that the board costs, and those of them that recognising costs."""
+    """Return two durations in minutes (None: the hover power is unknown):
+    - by how much the board shortens hovering on a full pack;
+    - the part of it that recognising causes."""
     if plan.hover_w is None:
         return None, None
     w_per_mah = plan.pack.nominal_v / 1000 * 60 / plan.flight_min
@@ -234,7 +243,9 @@ def _recommended(
     plan: FlightPlan,
     map_technique: str | None,
 ) -> tuple[str | None, str]:
-    """Return the technique to take, of those that the map can serve, and the reason."""
+    """Choose among the options of `map_technique` (None: among all) and return two texts:
+    - the label of the technique to use (None: none can be);
+    - the reason, in a sentence."""
     usable = [option for option in wanted if map_technique in (None, option.name)]
     served = f"the map was built with {map_technique}, and " if map_technique else ""
     if not usable:

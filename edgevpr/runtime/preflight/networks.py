@@ -1,6 +1,6 @@
-"""Networks, as `edgevpr models` handles them: list them, try one, add one.
+"""Networks, as `edgevpr models` handles them: list them, try one, add one. A card is the YAML file that describes one.
 
-`dataclasses.asdict` of every result is ready for JSON.
+`dataclasses.asdict` of every result can be written as JSON.
 """
 
 import json
@@ -28,13 +28,14 @@ from edgevpr.techniques.session import Backbone, backbone_of, file_sha256, impor
 
 _ROUNDS = 10
 _FRAME = (480, 640)
-_LIMIT_S = 120.0  # of a trial: its ten pictures would come every twelve seconds
+_LIMIT_S = 120.0  # of a trial: at this limit, each of its ten pictures takes twelve seconds
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Listed:
-    """One card. `ok` tells whether card and file agree, and `problem` why not, in one sentence. `techniques` use it
-    unless told otherwise. For a card that cannot be read, nothing else is known."""
+    """One card in a listing. `ok`: card and network file agree. `problem`: why not, in a sentence (None: they do
+    agree). `techniques`: those that use it by default. Of a card that cannot be read, only `name`, `ok` and `problem`
+    are set."""
 
     name: str
     ok: bool
@@ -50,10 +51,10 @@ class Listed:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Verified:
-    """A network that works here. `shapes` are those of its outputs (of a detector's mask, and of the crops of
-    memorability, those of one picture), and `vector_length` that of its own technique
-    (None: it has none). `image_ms` is the quickest of ten images of 640x480. `runtime_mb` is the memory that importing
-    onnxruntime took, and `network_mb` what the network took beside it, in MB."""
+    """Figures of a network that works here. `shapes`: of each output, for one picture (of a detector: its mask; of
+    memorability: its crops). `vector_length`: numbers in the descriptor of the technique of that name (None: the
+    network is no technique). `image_ms`: time of the quickest of ten images of 640x480. `runtime_mb`: memory that
+    importing onnxruntime took. `network_mb`: memory that the network took in addition."""
 
     name: str
     title: str
@@ -67,15 +68,15 @@ class Verified:
 
 
 def list_models() -> tuple[Listed, ...]:
-    """List every card, whether or not it can be read; nothing is run."""
+    """List all cards, including those that cannot be read. No network is run."""
     return tuple(_listed(name) for name in card_names())
 
 
 def verify(card: Card, threads: int = 1, learned: bool = True, limit_s: float = _LIMIT_S) -> Verified:
-    """Run `verify_here` in a process of its own, for at most `limit_s` seconds.
+    """Run `verify_here` in a child process, for at most `limit_s` seconds.
 
-    There no other network has loaded anything that would be missing from the figures, and a network too large for the
-    board, or one that never ends, ends that process and not ours. Raises ModelError where it does.
+    No other network has loaded anything there that would be missing from the figures. A network that is too large for
+    the board, or never ends, ends the child process instead of this one. Raises ModelError if that happens.
     """
     job = {"card": asdict(card) | {"path": str(card.path)}, "threads": threads, "learned": learned}
     ended = ask_child("edgevpr.runtime.preflight.networks", job, limit_s)
@@ -97,10 +98,10 @@ def verify(card: Card, threads: int = 1, learned: bool = True, limit_s: float = 
 
 
 def verify_here(card: Card, threads: int = 1, learned: bool = True) -> Verified:
-    """Open the network of a card, run it, and return what it takes.
+    """Load the network of a card, run it on ten random pictures, and return its figures.
 
-    Raises ModelError, one sentence, for anything that would keep it from flying. With `learned` False the words of a
-    VLAD head may be missing, since they are learned on the network after it has been added.
+    Raises ModelError, one sentence, for anything that would prevent its use in flight. With `learned` False, the words
+    of a VLAD head may be missing, since they are learned with the network after it has been added.
     """
     rng = np.random.default_rng(0)
     before_mb = rss_mb()
@@ -115,7 +116,7 @@ def verify_here(card: Card, threads: int = 1, learned: bool = True) -> Verified:
     if card.outputs.memorability:
         runs["memorability"], shapes["memorability"] = Memorability(card, threads).matrix, (CROPS, CROPS)
     if card.head is not None:
-        runs.pop("descriptor", None)  # the head makes its own, of the feature map
+        runs.pop("descriptor", None)  # the head computes the descriptor from the feature map
     run = next(iter(runs.values()))
     times_s = []
     for _ in range(_ROUNDS):
@@ -137,10 +138,12 @@ def verify_here(card: Card, threads: int = 1, learned: bool = True) -> Verified:
 
 
 def add(file: Path, card_path: Path, threads: int = 1) -> tuple[Verified, Path]:
-    """Copy a network and its card to the user's models folder, if it works; return its figures and the path of the new
-    card.
+    """Copy a network's file and card to the user's models folder, if the network works.
 
-    The hash of the card must be that of the file; a card without one gets it. Raises ModelError or ConfigError.
+    The SHA-256 on the card must be that of the file; a card without one gets it. Raises ModelError or ConfigError.
+    Returns two things:
+    - the figures of the network;
+    - the path of the new card.
     """
     card = read_card(card_path, needs_hash=False)
     found = file_sha256(file)
@@ -150,7 +153,7 @@ def add(file: Path, card_path: Path, threads: int = 1) -> tuple[Verified, Path]:
             "right file, or correct the card."
         )
     target = own_models() / f"{card.name}.yaml"
-    # Try the file where it is: its name on the card counts only in the folder that both are copied to.
+    # Try the file where it is. The file name on the card is used only in the folder that both are copied to.
     tried = replace(card, sha256=found, path=file.absolute().with_name(target.name), file=file.name)
     verified = verify(tried, threads, learned=False)
     text = _text_of(card_path) if card.sha256 else card_text({**read_yaml(card_path), "sha256": found})
@@ -159,8 +162,8 @@ def add(file: Path, card_path: Path, threads: int = 1) -> tuple[Verified, Path]:
 
 
 def install(file: Path, sha256: str, card_path: Path, file_name: str, text: str) -> None:
-    """Put a file, under `file_name`, and then its card into a folder, each completely or not at all. Raises ModelError
-    where another network has either name."""
+    """Copy a network's `file`, whose hash is `sha256`, as `file_name` into the folder of `card_path`, then write the
+    card's `text` there, each completely or not at all. Raises ModelError if another network has either name."""
     folder, target = card_path.parent, card_path.parent / file_name
     if card_path.exists() and _text_of(card_path) != text:
         raise ModelError(
@@ -179,7 +182,7 @@ def _text_of(card_path: Path) -> str:
 
 
 def card_text(values: dict[str, Any]) -> str:
-    """Write a card as YAML, one line a key: JSON values are valid YAML."""
+    """Return a card as YAML text, one line per key. JSON values are valid YAML."""
     return "".join(f"{key}: {json.dumps(value, ensure_ascii=False)}\n" for key, value in values.items())
 
 
@@ -211,7 +214,7 @@ def _listed(name: str) -> Listed:
 
 
 def _users(card: Card, outputs: tuple[str, ...]) -> Iterator[str]:
-    """Yield what uses a network unless told otherwise: its own technique, others, and the gate."""
+    """Yield what uses a network by default: its own technique, other techniques, settings of the salience gate."""
     if card.is_technique and not techniques.is_own(card.name):
         yield card.name
     for technique in techniques.names():

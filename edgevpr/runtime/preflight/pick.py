@@ -1,4 +1,4 @@
-"""Picking a technique where none is named, and telling whether the board can afford the one that flies."""
+"""Automatic choice of a technique if none is named, and the check whether the board can afford the one that flies."""
 
 import logging
 from collections.abc import Iterator
@@ -33,8 +33,8 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Outlook:
-    """The technique that flies and why, in one line, the places to compare a query with, and the seconds that it will
-    take (None: it could not be tried)."""
+    """Outlook on a flight. `reason`: which technique flies and why, in one line. `candidates`: number of places to
+    compare a query with. `t_query_s`: seconds that a query will take (None: the technique could not be tried)."""
 
     reason: str
     candidates: int
@@ -42,11 +42,11 @@ class Outlook:
 
 
 def picked_technique(board_name: str, places: int, camera: str | None = None) -> str:
-    """Pick the technique by what it finds and what the board can afford, for a `camera` that looks down or ahead; log
-    the reason in one line (see `choose`).
+    """Choose a technique for a new map of `places` places by its accuracy and its cost on the board, and log the reason
+    (see `choose`). `camera`: "nadir" or "forward" (None: forward).
 
-    Where the board can afford none, the best is picked all the same, and the log says what is lacking: a map is made
-    once, and may be flown on a larger board. Raises ModelError where no technique can be used at all.
+    If the board can afford none, the first usable one of `preferred` is taken, and the log says what is lacking: a map
+    is built once, and may be flown on a larger board. Raises ModelError if no technique can be used at all.
     """
     board = load_board(board_name)
     demand = Demand(places=places, rate_hz=board.rate_hz, budget_mb=board.budget_mb, camera=camera)
@@ -69,16 +69,16 @@ def picked_technique(board_name: str, places: int, camera: str | None = None) ->
 
 
 def outlook(recogniser: Recogniser, config: Config) -> Outlook:
-    """Say which technique flies and why, and try here and now whether its board can afford it. Where it cannot, and the
-    configuration does not say how many candidates are compared, fewer are taken that fit (see `choose`). Never a reason
-    not to fly."""
+    """Report which technique flies and why, and measure now whether the board can afford it. If it cannot, fewer
+    candidates are taken that fit, unless the configuration sets their number (see `choose`). A failed measurement is
+    only reported: it must not prevent a flight."""
     technique, board = recogniser.technique, recogniser.meter.board
     usual = candidates = recogniser.candidates or technique.candidates
     t_query_s = None
     try:
         taken, afforded = _afforded(recogniser, config, board)
         t_query_s, candidates = taken.fit.t_query_s, taken.candidates or candidates
-    except (MapError, ModelError, OSError) as error:  # the trial map needs a little room for temporary files
+    except (MapError, ModelError, OSError) as error:  # OSError: the trial map needs a little room for temporary files
         afforded = f"what it takes could not be tried ({error})"
     parts = ["the map was built with it" if config.technique is None else "it was named"]
     if weights := weights_of(technique.spec):
@@ -91,7 +91,9 @@ def outlook(recogniser: Recogniser, config: Config) -> Outlook:
 
 
 def _afforded(recogniser: Recogniser, config: Config, board: Board) -> tuple[Option, str]:
-    """Return how to recognise, and what it finds and costs in a few words."""
+    """Return how the flight will recognise places:
+    - the technique with its number of candidates;
+    - its accuracy and cost, as a short text."""
     technique = recogniser.technique
     costs = _costs_on(technique, board)
     beside_bytes = bytes_beside_place(recogniser.sequence)
@@ -113,40 +115,40 @@ def _afforded(recogniser: Recogniser, config: Config, board: Board) -> tuple[Opt
 
 
 def _label(technique: Technique) -> str:
-    """Name a technique in its form; a way to match that was not measured is named too."""
+    """Return the name and form of a technique. If it matches in a way that was not measured, the label says so too."""
     spec = technique.spec
     other = ", thesis" if spec.name == "cohog" and not spec.in_full else ""
     return techniques.labelled(spec.name, spec.form) + other
 
 
 def _camera(technique: Technique) -> str | None:
-    """Return the way a technique was told that the camera looks; None where it has no such setting."""
+    """Return the camera direction that a technique is set to, "nadir" or "forward"; None if it has no such setting."""
     camera = technique.spec.parameters.get("camera")
     return None if camera is None else str(camera)
 
 
 def _costs_on(technique: Technique, board: Board) -> TechniqueCosts:
-    """Try a technique here, and convert its costs to `board`."""
+    """Measure the costs of a technique here, and convert them to `board`."""
     work = counted_work(technique.spec.name, technique.spec.parameters) if technique.spec.in_full else None
     return on_board(probe(technique), load_board("this"), board, work)
 
 
 def trusted_candidates(technique: Technique) -> tuple[int, ...]:
-    """Return the numbers of candidates, fewer than the technique's own, with which no wrong place was accepted on the
-    image sets, largest first."""
+    """Return the numbers of candidates, below the technique's default, with which it accepted no query as a place far
+    from the right one on the image sets, largest first."""
     label, camera = _label(technique), _camera(technique)
     measured = ((count, accuracy.of(label, camera, count)) for count in accuracy.fewer_candidates(label, camera))
     return tuple(count for count, figures in measured if figures and figures.is_trusted)
 
 
 def camera_setting(name: str, camera: str | None) -> dict[str, str]:
-    """Return the setting that tells a technique which way the camera looks, if that is known and the technique has such
-    a setting."""
+    """Return the setting that tells the technique `name` the direction of the camera; empty if the direction is unknown
+    (None) or the technique has no such parameter."""
     return {"camera": camera} if camera and "camera" in techniques.parameters(name) else {}
 
 
 def _usable(board: Board, names: tuple[str, ...], camera: str | None) -> Iterator[Technique]:
-    """Make each technique; one whose network cannot be used here is passed over and logged."""
+    """Create and yield each technique. If its network cannot be used here, it is left out and logged."""
     for name in names:
         try:
             yield made_for(board, name, camera_setting(name, camera))

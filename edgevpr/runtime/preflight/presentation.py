@@ -1,5 +1,5 @@
-"""Estimates and stored figures as people see them: tables of at most 120 columns with a line a technique and notes, and
-a picture (which needs matplotlib, extra `plots`)."""
+"""Estimates and stored figures for people: tables of at most 120 columns with a line per technique, notes, and a
+picture (which needs matplotlib, extra `plots`)."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -9,7 +9,7 @@ from edgevpr.runtime.preflight.estimate import FlightEstimate, TechniqueEstimate
 from edgevpr.runtime.preflight.probe import TechniqueCosts
 from edgevpr.runtime.preflight.stored import StoredFigures
 
-# The columns of each table: a heading, and the cell of a row.
+# The columns of each table: (heading, format of a cell), where {0} is the row.
 _NEEDS = (
     ("technique", "{0.technique}"), ("fits", "{fits}"), ("B/place", "{0.ram_bytes_per_place}"),
     ("map MB", "{0.map_ram_mb:.1f}"), ("disk MB", "{0.map_disk_mb:.1f}"), ("peak MB", "{0.process_ram_mb:.0f}"),
@@ -37,8 +37,8 @@ _Columns = Sequence[tuple[str, str]]
 
 
 def format_table(estimate: FlightEstimate) -> str:
-    """Format the estimate as text: what each technique needs, finds and draws, why any does not fit, notes, and what is
-    recommended."""
+    """Format an estimate as text: tables of what each technique needs, finds and draws, why techniques do not fit,
+    notes, and the recommended technique."""
     plan = estimate.plan
     since = f" on {estimate.measured_on}" if estimate.measured_on else ""
     hovers = f", hovering at {plan.hover_w:g} W" if plan.hover_w else ""
@@ -69,8 +69,8 @@ def format_table(estimate: FlightEstimate) -> str:
 
 
 def format_stored(figures: StoredFigures) -> str:
-    """Format figures measured on this machine, a line for each technique and form. The time of matching is that of one
-    place: of its full comparison where all places are scanned before, else of the scan itself."""
+    """Format the figures stored on this machine, with a line for each technique and form. The time of matching is that
+    of one place: of its full comparison if the technique scans all places before, else of the scan."""
     machine, score = figures.identity, figures.score
     unusable = {trial.label: trial.problem for trial in figures.trials if trial.problem}
     rows = [_measured(trial.label, trial.costs) for trial in figures.trials if trial.costs]
@@ -88,8 +88,8 @@ def format_stored(figures: StoredFigures) -> str:
 
 
 def plot(estimate: FlightEstimate, path: Path) -> None:
-    """Draw what each technique finds beside what it costs: blue where it fits, else red, and pale where another one
-    beats it; a cross where wrong places were accepted, a ring around what is recommended, a line through the front."""
+    """Draw the recall@1 of each technique against its charge, and save the picture. Blue: fits. Red: does not fit.
+    Pale: not on the front. Cross: has accepted wrong places. Ring: recommended. The line joins the front."""
     drawn = figure(9, 6)
     axes = drawn.add_subplot()
     plan, front = estimate.plan, []
@@ -118,7 +118,7 @@ def plot(estimate: FlightEstimate, path: Path) -> None:
 
 
 def _unusable(unusable: Mapping[str, str]) -> list[str]:
-    """Say why techniques cannot be used, once for all with the same reason."""
+    """Return a sentence for each reason, with the names of all techniques that cannot be used for that reason."""
     reasons = {why: [name for name in unusable if unusable[name] == why] for why in unusable.values()}
     return [f"{', '.join(names)} cannot be used: {why}" for why, names in reasons.items()]
 

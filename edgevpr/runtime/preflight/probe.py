@@ -1,4 +1,4 @@
-"""Costs of a technique on this machine: it is tried for a moment, on generated or on real pictures."""
+"""Costs of a technique on this machine, measured in a short trial on generated or real pictures."""
 
 import itertools
 import math
@@ -30,7 +30,7 @@ from edgevpr.runtime.recognise.recognition import Recognition
 
 _PICTURES = 2
 _PLACES = 6
-_TRIES = 8  # of a picture, at most
+_TRIES = 8  # of each picture, at most
 _STEPS = ("encode", "scan", "compare", "verify")
 _SCANNED = 4096
 _SCANNED_BYTES = 8 << 20  # at most: a small board has no more to spare before the map is loaded
@@ -40,14 +40,17 @@ _LINK_MB = 12.0  # what importing pymavlink adds to the resident memory (measure
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TechniqueCosts:
-    """Costs of a technique on one machine: to encode a frame, to compare it in full with one place (read from the map
-    file), bytes of a place in RAM and on disk, and the peak resident memory of the process without a map
-    (`process_mb`). `encode_mb` is the part of that peak that encoding a frame takes for a moment (None: the kernel does
-    not say). `is_network` tells whether its pictures go through a network.
+    """Costs of a technique on one machine.
 
-    In a map of more than `candidates` places, all are scanned in RAM and only `candidates` are compared (None:
-    the technique has one stage, and compares all of them). `scan_once` is what a scan costs however small the map: what
-    is made of the query for it.
+    `encode`: of one frame. `match_per_place`: of comparing one place, read from the map file. `compare_once`: part of
+    comparing that does not grow with the number of places; less for fewer than `in_full` places.
+    `candidates`: number of places compared in a larger map, after all its places are scanned in RAM (None: the
+    technique has one stage, and compares all). `scan_per_place`: of scanning one place. `scan_once`: of preparing the
+    query for it.
+    `process_mb`: peak resident memory of the process without a map. `encode_mb`: part of it that encoding takes for a
+    moment (None: the kernel does not report it).
+    `is_network`: pictures go through a network. `sequence`: number of queries matched together. `waited`: share of the
+    time of the trial in which other programs had the processor.
     """
 
     encode: StageCost
@@ -66,7 +69,7 @@ class TechniqueCosts:
     sequence: int = 1
 
     def match(self, places: int) -> StageCost:
-        """Return the cost of finding one query in a map of `places` places."""
+        """Return the cost of matching one query in a map of `places` places."""
         if self.candidates is None:
             return self.match_per_place * places
         compared = min(places, self.candidates)
@@ -74,7 +77,7 @@ class TechniqueCosts:
         return self.scan_once + full + self.match_per_place * compared + self.scan_per_place * places
 
     def places_within(self, wall_s: float, cpu_s: float) -> float:
-        """Return how many places a map may have for a query to be found in it within both times, in seconds."""
+        """Return how many places a map may have if matching may take `wall_s` wall seconds and `cpu_s` CPU-seconds."""
         once = self.scan_once + self.compare_once
         wall_s, cpu_s = wall_s - once.wall_s, cpu_s - once.cpu_s
         full, scan = self.match_per_place, self.scan_per_place
@@ -87,9 +90,9 @@ class TechniqueCosts:
 
 
 def noise(count: int) -> list[Image]:
-    """Make `count` pictures, uint8 (480, 640), in which every region has structure, so that matching costs the most it
+    """Return `count` random pictures, uint8 (480, 640). Every region has structure, so that matching costs the most it
     can."""
-    rng = Random(0)  # not NumPy's, which a flight needs for nothing else: it would keep 2.5 MB for it
+    rng = Random(0)  # not NumPy's: it takes 2.5 MB, and a flight needs it for nothing else
     return [np.frombuffer(rng.randbytes(480 * 640), np.uint8).reshape(480, 640) for _ in range(count)]
 
 
@@ -101,13 +104,13 @@ def probe(
     wall_clock: Callable[[], float] = time.perf_counter,
     cpu_clock: Callable[[], float] = time.process_time,
 ) -> TechniqueCosts:
-    """Try a technique here and now: some pictures go through the steps of a query, first with nothing to find, then in
-    a small map on disk, then in a large index.
+    """Measure the costs of a technique here and now. Pictures go through the steps of a query, first with an empty map,
+    then with a small map on disk, then with a large index.
 
-    `images` (uint8, (H, W[, 3])) are all tried, and the median counts, since a real picture may be quick or slow.
-    Without them a few pictures of `noise` are tried, all alike, and the quickest counts. The pictures are tried again
-    for about `tried_s` seconds a map, and the least time of the processor counts: what other programs take is no cost
-    of the technique. Raises ModelError for a technique that fails on a picture.
+    `images`: uint8 (H, W[, 3]). All are tried and the median counts, since some real pictures are quick and some slow.
+    None: a few pictures of `noise` are tried, and the quickest counts. Each is tried again for about `tried_s` seconds
+    per map, and the least CPU time counts, since the time of other programs is no cost of the technique. Raises
+    ModelError for a technique that fails on a picture.
     """
     meter = QueryMeter(load_board("this"), _ANY_PACK, 1.0, wall_clock=wall_clock, cpu_clock=cpu_clock)
     bench = _Bench(technique, noise(_PICTURES) if images is None else images, meter, tried_s)
@@ -125,12 +128,12 @@ def probe(
         half = bench.tries(trial_map, many, fewer) if spec.in_full else large
     whole = typical([steps.scan if spec.fine else steps.match for steps in large])
     once = typical([steps.scan for steps in small]) if spec.fine else NO_COST
-    # What a scan of six places takes is not of these places: it is what is made of the query, and of calling at all.
+    # The time of scanning six places is not spent on them, but on preparing the query and on the call.
     scan = _beyond(whole, once) * (1 / len(many))
     compare, part = (typical([steps.compare for steps in tries]) for tries in (large, half))
     if spec.in_full:
         one_more = _beyond(compare, part) * (1 / max(1, technique.candidates - fewer))
-        # Only a picture that is found is verified, and of pictures of noise that is the one in the map.
+        # Only a query that is found is verified: of the pictures of noise, the one that is in the map.
         verify = max((steps.verify for steps in large), key=lambda cost: cost.wall_s)
         compare_once = _beyond(compare, one_more * technique.candidates) + verify
     else:
@@ -155,7 +158,7 @@ def probe(
 
 
 class _Bench:
-    """A technique at work on some pictures, again and again; `sequence` is the number of queries that it matches
+    """A technique at work on the same pictures, again and again. `sequence`: number of queries that it matches
     together."""
 
     def __init__(self, technique: Technique, pictures: Sequence[Image], meter: QueryMeter, tried_s: float) -> None:
@@ -166,12 +169,12 @@ class _Bench:
 
     @property
     def waited(self) -> float:
-        """Share of the time of all tries in which other programs had the processor."""
+        """Share of the time of all tries, 0..1, in which other programs had the processor."""
         return max(0.0, 1 - self._spent.cpu_s / self._spent.wall_s) if self._spent.wall_s else 0.0
 
     def fill(self, trial_map: PlaceMap) -> float:
-        """Fill a map with the first picture, and return the MB by which the peak of the memory rose above what was
-        resident before it was encoded. The first picture also starts threads and causes late imports."""
+        """Fill a map with copies of the first picture. Return the MB by which the peak of memory rose above what was
+        resident before the picture was encoded, with the threads and late imports that a first picture causes."""
         before_mb = machine.rss_mb()
         alone = self._walk(trial_map, empty_index(self._technique.spec, 0, None), 1)
         first = _stepped(alone, self._frames[0])
@@ -183,7 +186,7 @@ class _Bench:
         return rise_mb
 
     def tries(self, place_map: PlaceMap, index: PlaceIndex, candidates: int) -> list[Steps]:
-        """Return what each picture takes at least, of several tries."""
+        """Let each picture be matched several times; return the least cost of every step, one `Steps` per picture."""
         walk = self._walk(place_map, index, candidates)
         times_s = (0.1 * number for number in itertools.count())
 
@@ -224,7 +227,7 @@ def _stepped(walk: Recogniser, frame: Frame) -> Recognition:
 
 
 def _many(technique: Technique, index: PlaceIndex) -> PlaceIndex:
-    """Make an index of some thousand places by repeating the places of `index`."""
+    """Return an index of some thousand places without positions, by repeating the places of `index`."""
     count = max(_PLACES, min(_SCANNED, _SCANNED_BYTES // technique.spec.row.nbytes))
     unknown = np.full(count, np.nan)
     return PlaceIndex(
@@ -238,14 +241,14 @@ def _many(technique: Technique, index: PlaceIndex) -> PlaceIndex:
 
 
 def _beyond(cost: StageCost, part: StageCost) -> StageCost:
-    """Return a cost less a part of it; a thousandth of it at least, since clocks jump."""
+    """Return `cost` minus `part`, but at least a thousandth of `cost`, since clocks are not exact."""
     least = cost * 0.001
     return StageCost(max(cost.wall_s - part.wall_s, least.wall_s), max(cost.cpu_s - part.cpu_s, least.cpu_s))
 
 
 def _least(costs: list[StageCost]) -> StageCost:
-    """Return the least time of the processor, which passes at least where one core works; where several do, the least
-    time that passed."""
+    """Return the least CPU time, and as wall time the same or, if less, the least wall time. While one core works, less
+    wall than CPU time cannot pass, so that waiting for other programs is left out; with several cores it can."""
     cpu_s = min(cost.cpu_s for cost in costs)
     return StageCost(min(cpu_s, *(cost.wall_s for cost in costs)), cpu_s)
 

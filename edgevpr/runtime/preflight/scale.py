@@ -1,8 +1,8 @@
-"""Costs measured on one machine, converted to another; memory stays unchanged.
+"""Conversion of costs measured on one machine to another machine. Memory stays unchanged.
 
-Times are converted by the ratio of two scores. A board whose profile says how many instructions a second one of its
-cores runs (`arm64_mips`) is estimated by the instructions that `make bench-arm64` counted: they are of its own
-instruction set, and no busy moment of this machine is in them.
+Times are converted by the ratio of the machines' scores (`MachineSpeed`). For cohog on a board whose profile gives
+instructions per second of one core (`arm64_mips`), they are computed from the instructions that `make bench-arm64`
+counted: these are of the board's own instruction set, and other programs cannot disturb the count.
 """
 
 import json
@@ -17,7 +17,7 @@ from edgevpr.power.boards import Board, MachineSpeed
 from edgevpr.power.speed import REFERENCE_PASSES_HZ, REFERENCE_PRODUCTS_HZ
 from edgevpr.runtime.preflight.probe import TechniqueCosts
 
-# Share of a single thread's score, for boards whose products have not been measured: that of the Raspberry Pi 4, the
+# Score at products as a share of `single`, for boards where it was not measured: that of the Raspberry Pi 4, the
 # lowest that is known (Pi 5: 0.21), so that the estimate does not promise too much.
 UNKNOWN_PRODUCTS = 0.15
 COUNTED_PATH = Path(__file__).with_name("counted.json")
@@ -26,8 +26,8 @@ _COUNTED_SETTINGS = {"w1": 512, "w2": 16, "bins": 8, "entropy": "shannon", "matc
 
 @dataclass(frozen=True, slots=True)
 class Ratios:
-    """Speed of one thread of a board relative to one of the machine that measured: at matrix `products` (pictures
-    through a network, and full comparisons of candidates) and at `passes` over bytes (everything else)."""
+    """Speed of one thread of a board divided by that of one thread of the machine that measured. `products`: at matrix
+    products (networks, and full comparisons of candidates). `passes`: at passes over bytes (everything else)."""
 
     products: float
     passes: float
@@ -35,7 +35,7 @@ class Ratios:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CountedWork:
-    """Instructions of `cohog` on an ARM core, by the fields of `TechniqueCosts` of the same names."""
+    """Instructions of `cohog` on an ARM core, counted for the fields of `TechniqueCosts` of the same names."""
 
     encode: float
     match_per_place: float
@@ -45,22 +45,22 @@ class CountedWork:
 
 
 def counted_work(name: str, parameters: Mapping[str, Any]) -> CountedWork | None:
-    """Return the counted work of a technique with these parameters; None where it was not counted."""
+    """Return the counted instructions of the technique `name` with these parameters; None if they were not counted."""
     if name != "cohog" or any(parameters.get(key, value) != value for key, value in _COUNTED_SETTINGS.items()):
         return None
     return CountedWork(**_counted()[parameters.get("camera", "forward")])
 
 
 def is_same(here: Board, board: Board) -> bool:
-    """Tell whether `board` is the machine `here`, so that nothing has to be scaled."""
+    """Tell whether `board` is the machine `here`, so that nothing has to be converted."""
     return here.name == board.name or (board.machine is not None and board.machine == here.machine)
 
 
 def ratios(here: Board, board: Board) -> Ratios | None:
-    """Return the ratios of `board` to `here`, the machine that measured; None where a score is unknown.
+    """Return the ratios of `board` to `here`, the machine that measured; None if a score is unknown.
 
-    Where products or passes have no figure, the counted instructions of such work stand in for it, on a board that says
-    how many a second it runs. On others the single thread's score stands in for passes, and a modest share of it for
+    If the score at products or passes is missing, it is computed from `arm64_mips` and the instructions counted for
+    that part of the micro-benchmark. Without `arm64_mips`, `single` stands in for passes, and a modest share of it for
     products.
     """
     if is_same(here, board):
@@ -73,9 +73,8 @@ def ratios(here: Board, board: Board) -> Ratios | None:
 
 
 def on_board(costs: TechniqueCosts, here: Board, board: Board, work: CountedWork | None = None) -> TechniqueCosts:
-    """Convert costs measured `here` to `board`: by the counted `work` of the technique, where it is known and the board
-    says how many instructions a second it runs, else by the ratios. The times stay as they are where no ratio is
-    known."""
+    """Convert costs measured on the machine `here` to `board`: by the counted instructions (`work`) if they and the
+    board's `arm64_mips` are known, else by the ratios. Without ratios the times stay unchanged."""
     if is_same(here, board):
         return costs
     if work and (mips := board.benchmark_score.arm64_mips):
@@ -112,12 +111,13 @@ def _passes(score: MachineSpeed) -> float | None:
 
 
 def _rounds_hz(kind: str, mips: float) -> float:
-    """Return how often a second a core of `mips` million instructions a second does a round of the micro-benchmark."""
+    """Return the rounds per second of one part (`kind`) of the micro-benchmark on a core of `mips` million a second."""
     return 1e6 * mips / float(_counted()[kind])
 
 
 def _scaled(cost: StageCost, ratio: float, board: Board, threads: int | None = None) -> StageCost:
-    """Scale a stage to `board`, where it may use `threads` (None: as many as it did)."""
+    """Return the cost of a stage on `board`, one thread of which is `ratio` times as fast. It may use `threads` threads
+    there (None: as many as it did)."""
     busy_cores = cost.cpu_s / cost.wall_s if cost.wall_s else 0.0
     if busy_cores <= 1:
         return StageCost(cost.wall_s / ratio, cost.cpu_s / ratio)
@@ -127,7 +127,7 @@ def _scaled(cost: StageCost, ratio: float, board: Board, threads: int | None = N
 
 
 def _kept(score: MachineSpeed, busy_cores: float) -> float:
-    """Return the share of a single core's speed that each of `busy_cores` keeps: they share memory, heat and
+    """Return the share of a single core's speed that each of `busy_cores` keeps, since they share memory and
     current."""
     if score.single is None or score.multi is None:
         return 1.0
@@ -136,6 +136,6 @@ def _kept(score: MachineSpeed, busy_cores: float) -> float:
 
 @lru_cache(maxsize=1)
 def _counted() -> dict[str, Any]:
-    """Return the instructions that were counted: of cohog by camera, and of a round of each micro-benchmark."""
+    """Return the counted instructions: of cohog by camera direction, and of a round of each micro-benchmark."""
     content: dict[str, Any] = json.loads(COUNTED_PATH.read_text("utf-8"))
     return content

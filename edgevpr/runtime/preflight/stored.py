@@ -1,5 +1,5 @@
-"""Figures that `edgevpr profile --measure` has found on this machine, kept in a file with a description of the machine,
-and the profile that it writes.
+"""Figures that `edgevpr profile --measure` has measured on this machine, stored in a file with a description of the
+machine; and the profile that it writes.
 
 Figures of another machine, or of other versions of the measured software, are never used: the user is told, and the
 techniques are tried anew.
@@ -30,7 +30,7 @@ from edgevpr.runtime.preflight.scale import is_same
 from edgevpr.runtime.preflight.trial import Offer, Trial, model_of, trial_of, try_each
 
 MEASURED_PICTURES = 8
-_FORMAT = 3  # 1 had no cost of a scan that is paid once, 2 times that passed
+_FORMAT = 3  # format 1 had no `scan_once`; 2 had wall times, waiting for other programs included
 _MAX_FILE_BYTES = 10_000_000
 _PACKAGES = {
     "numpy": ("numpy",),
@@ -41,8 +41,8 @@ _PACKAGES = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredFigures:
-    """Figures of all techniques on one machine: the `date` (local time), the `pictures`, the `threads` of a network,
-    what the machine is (`identity`) and how fast (`score`, by the micro-benchmark)."""
+    """Figures of all techniques on one machine. `date`: local time of the measurement. `identity`: see `identity()`.
+    `pictures`: a description of those used. `threads`: of a network. `score`: speed by the micro-benchmark."""
 
     date: str
     identity: dict[str, Any]
@@ -52,7 +52,7 @@ class StoredFigures:
     trials: tuple[Trial, ...]
 
     def of(self, offer: Offer) -> Trial | None:
-        """Return the stored trial of an offer; None where it was not measured, could not be used then, or has another
+        """Return the stored trial of an offer. None if it was not measured, could not be used then, or has another
         network now."""
         for trial in self.trials:
             if trial.costs and trial.label == offer.label and _same_settings(trial, offer):
@@ -64,12 +64,12 @@ class StoredFigures:
 
 
 def default_path() -> Path:
-    """Return the file in which figures are kept unless the user says otherwise."""
+    """Return the file in which figures are stored by default."""
     return own_folder() / "measured.json"
 
 
 def identity(root: Path = Path("/")) -> dict[str, Any]:
-    """Return everything that the figures of a machine depend on."""
+    """Return everything that the figures of this machine depend on: hardware, kernel, and versions of software."""
     return {
         "machine": machine.title(root),
         "cores": os.cpu_count(),
@@ -82,11 +82,10 @@ def identity(root: Path = Path("/")) -> dict[str, Any]:
 
 
 def pictures_of(folder: str | None) -> tuple[list[Path], str]:
-    """Choose up to eight images of a folder, spread over it; without a folder, none, for generated ones.
-
-    Returns their paths, and a text that names them. Raises SourceError for a folder without images, ImageError for one
-    that cannot be used.
-    """
+    """Choose up to eight images, spread over a folder. Raises SourceError for a folder without images, ImageError for
+    an image that cannot be used. Returns two things:
+    - the paths (empty without a folder: pictures will be generated);
+    - a text that describes the pictures."""
     if folder is None:
         return [], f"{MEASURED_PICTURES} generated pictures"
     images = list_images(folder)
@@ -98,7 +97,7 @@ def pictures_of(folder: str | None) -> tuple[list[Path], str]:
 
 
 def gathered(trials: Iterable[Trial], pictures: str, threads: int, score: MachineSpeed) -> StoredFigures:
-    """Put together the figures of trials made just now on this machine."""
+    """Combine trials made just now with the date and the identity of this machine."""
     now = datetime.now(timezone.utc).astimezone().isoformat(timespec="minutes")
     return StoredFigures(
         date=now, identity=identity(), pictures=pictures, threads=threads, score=score, trials=tuple(trials)
@@ -106,8 +105,8 @@ def gathered(trials: Iterable[Trial], pictures: str, threads: int, score: Machin
 
 
 def require_room(path: Path, make: bool) -> None:
-    """Raise UsageError or EdgevprError where `save` could not write to `path`: before the measuring, not after it. With
-    `make` the folder may be made."""
+    """Raise UsageError or EdgevprError if `save` could not write to `path`; for a check before the measurement. With
+    `make`, the folder is made if needed."""
     if path.suffix != ".json":
         raise UsageError(f"{path}: the name of a file of figures ends in .json: choose such a name.")
     folder = path.resolve().parent
@@ -127,10 +126,9 @@ def save(figures: StoredFigures, path: Path) -> None:
 
 
 def load(path: Path) -> tuple[StoredFigures | None, str | None]:
-    """Read the figures of this machine; return None for figures that cannot be used, with a sentence that says why.
-
-    Both are None where there is no file.
-    """
+    """Read the figures stored for this machine. Returns two things, both None if there is no file:
+    - the figures (None: they cannot be used);
+    - a sentence that says why they cannot be used (None: they can)."""
     again = "the techniques are tried anew; `edgevpr profile --measure` replaces them."
     try:
         fields = json.loads(read_file(path, _MAX_FILE_BYTES))
@@ -154,8 +152,8 @@ def load(path: Path) -> tuple[StoredFigures | None, str | None]:
 def known_and_tried(
     wanted: Iterable[Offer], board: Board, stored: StoredFigures | None
 ) -> Iterator[tuple[Trial, bool]]:
-    """Yield each offer's trial, in the order of `wanted`, and True if it was stored; any other is tried now,
-    quickly."""
+    """Yield each offer's trial, in the order of `wanted`, with True if it was stored. Without a stored one, the offer
+    is tried now, quickly, and paired with False."""
     for _, forms in groupby(wanted, key=lambda offer: offer.name):
         known = [(offer, stored.of(offer) if stored else None) for offer in forms]
         tried = try_each([offer for offer, trial in known if trial is None], board.threads)
@@ -167,10 +165,10 @@ def known_and_tried(
 
 
 def scaled_from(here: Board, board: Board, stored: StoredFigures | None) -> Board:
-    """Return the machine `here` with the score that its figures are scaled from, of the same kind as that of `board`.
+    """Return the machine `here` with the score from which its figures are scaled: of the same kind as that of `board`.
 
-    If `board` has a published score only (no `passes`) and that of `here` is verified, it is the profile's. Otherwise
-    it is the micro-benchmark's, stored or run (two seconds).
+    If `board` has a published score only (no `passes`) and that of `here` is verified, it is the one of the profile.
+    Otherwise it is that of the micro-benchmark, stored or run now (two seconds).
     """
     published = here.benchmark_score.verified and board.benchmark_score.passes is None
     if is_same(here, board) or published:
@@ -179,7 +177,7 @@ def scaled_from(here: Board, board: Board, stored: StoredFigures | None) -> Boar
 
 
 def require_new_profile(path: Path) -> None:
-    """Raise UsageError where `write_profile` could not write."""
+    """Raise UsageError if `write_profile` could not write to `path`."""
     if path.suffix not in (".yaml", ".yml"):
         raise UsageError(f"{path}: a profile's name ends in .yaml: choose such a name.")
     require_folder(path)
@@ -188,8 +186,7 @@ def require_new_profile(path: Path) -> None:
 
 
 def write_profile(path: Path, board: Board) -> None:
-    """Write a profile that does not exist yet, completely or not at all. Raises EdgevprError where the file has
-    appeared meanwhile."""
+    """Write a profile to a new file, completely or not at all. Raises EdgevprError if the file exists by then."""
     try:
         write_whole(path, lambda unfinished: unfinished.write_text(profile_text(board), "utf-8"), instead=False)
     except FileExistsError:
@@ -197,8 +194,10 @@ def write_profile(path: Path, board: Board) -> None:
 
 
 def measured_profile(figures: Path, score: MachineSpeed) -> tuple[Path | None, str]:
-    """Measure idle and load power (minutes), where this machine has a power meter, and write a profile beside the file
-    `figures`. Returns the path of the profile (None: no meter can be read) and a sentence. Raises MeterError."""
+    """Measure idle and load power with this machine's power meter (minutes), and write a profile beside the file
+    `figures`. Raises MeterError. Returns two things:
+    - the path of the profile (None: there is no meter);
+    - a sentence for the user."""
     from edgevpr.power.calibrate import LOADS, calibrate
     from edgevpr.power.sensors import NO_METER, find_meters
 
@@ -221,7 +220,7 @@ def measured_profile(figures: Path, score: MachineSpeed) -> tuple[Path | None, s
 
 
 def _same_settings(trial: Trial, offer: Offer) -> bool:
-    """Tell whether an offer asks for the settings that were tried: a setting that is named may be the default."""
+    """Tell whether an offer asks for the settings that were tried. A setting that is not named has its default."""
     had = {**techniques.parameters(offer.name), **trial.parameters}
     return {**had, **offer.settings} == {**had, **trial.settings}
 

@@ -1,7 +1,7 @@
-"""Trials of techniques, each in a process of its own: what one has loaded is not counted as another's memory, and a
-library that crashes on this processor loses only its own row.
+"""Trials of techniques, each in a child process: the memory that one has loaded is not counted for another, and a
+library that crashes on this processor fails only its own trial.
 
-`python -m edgevpr.runtime.preflight.trial` is such a process: it reads a job as JSON and prints a Trial as JSON.
+`python -m edgevpr.runtime.preflight.trial` is that child process: it reads a job as JSON and prints a Trial as JSON.
 """
 
 import signal
@@ -20,13 +20,13 @@ from edgevpr.runtime.preflight.probe import TechniqueCosts, noise, probe
 from edgevpr.runtime.recognise.opening import made_with
 from edgevpr.techniques.card import load_card, weights_of
 
-_TRIED_S = 1.0  # pictures are tried again for so long: a flight that begins has no such time
+_TRIED_S = 1.0  # pictures are tried again for so long; the check before a flight has no time for that
 _LIMIT_S = 900.0  # ten times what the slowest technique takes on the slowest board
 
 
 @dataclass(frozen=True, slots=True)
 class Offer:
-    """A technique with its settings, one of which may be its form; `label` tells it from other offers."""
+    """A technique to try, with its settings, one of which may be its form. `label` tells it from other offers."""
 
     label: str
     name: str
@@ -35,8 +35,11 @@ class Offer:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trial:
-    """Result of trying an offer: its costs, or in one sentence why it cannot be used here. `model` is the fingerprint
-    of its network, `weights` names the network's weights; `parameters` are all that the technique then had."""
+    """Result of trying an offer: its `costs`, or the `problem`, a sentence that says why it cannot be used here.
+
+    `settings`: those of the offer. `parameters`: all that the technique then had. `model`: fingerprint of its network.
+    `weights`: name of the network's weights (both None: no network).
+    """
 
     label: str
     name: str
@@ -51,9 +54,9 @@ class Trial:
 def offers(
     names: Iterable[str], forms: Iterable[str] = FORMS, settings: Mapping[str, Mapping[str, Any]] | None = None
 ) -> tuple[Offer, ...]:
-    """List each technique in each of `forms`, or once where it has none; `settings` are by technique name.
+    """Return an offer for each technique in each of `forms`; one only if it has no forms or its `settings` name one.
 
-    Raises UsageError for an unknown name, and ModelError for a card that is incomplete.
+    `settings` are by technique name. Raises UsageError for an unknown name, ModelError for a card that is incomplete.
     """
     listed = []
     for name in names:
@@ -66,9 +69,9 @@ def offers(
 
 
 def try_each(wanted: Iterable[Offer], threads: int, images: Sequence[Path] = (), rounds: int = 0) -> Iterator[Trial]:
-    """Try each offer in a process of its own; a technique that cannot be used is one row, under its name.
+    """Try each offer in a child process, and yield the results. An unusable technique has one result, under its name.
 
-    The pictures are `images`; without them `rounds` pictures of noise are made (0: a quick look). `threads` are those
+    The pictures are `images`; without them `rounds` pictures of noise are made (0: a quick trial). `threads` are those
     of a network.
     """
     refused = set()
@@ -76,7 +79,7 @@ def try_each(wanted: Iterable[Offer], threads: int, images: Sequence[Path] = (),
         if offer.name in refused:
             continue
         try:
-            model_of(offer.name, offer.settings)  # where its card shows already that it cannot, no process is needed
+            model_of(offer.name, offer.settings)  # raises if the card already shows that it cannot be used
             trial = _in_a_process(offer, threads, images, rounds)
         except EdgevprError as error:
             trial = _refused(offer, str(error))
@@ -86,7 +89,7 @@ def try_each(wanted: Iterable[Offer], threads: int, images: Sequence[Path] = (),
 
 
 def model_of(name: str, settings: dict[str, Any]) -> str | None:
-    """Return the fingerprint of the network that a technique would use now; None for one without. Raises ModelError."""
+    """Return the fingerprint of the network that a technique would use now; None if it uses none. Raises ModelError."""
     parameters = techniques.parameters(name)
     if "threads" not in parameters:  # every network has this parameter, and nothing else has
         return None
