@@ -1,7 +1,5 @@
-"""The card of a network: a YAML file that names the weights, the preparation of a picture, and the outputs.
-
-Every error in a card is reported when the card is read, not in flight.
-"""
+"""The card of a network: a YAML file that names the weights, the preparation of a picture, and the outputs. Techniques,
+training and the commands for models use it. Every error in a card is reported when the card is read, not in flight."""
 
 import hashlib
 import json
@@ -18,7 +16,7 @@ from edgevpr.core.files import find_model, model_folders
 from edgevpr.core.text import meant
 from edgevpr.core.yamlfile import read_yaml
 
-_ADDED_LATER = ("pad", "boxes", "memorability")
+_ADDED_LATER = ("pad", "boxes", "memorability")  # keys, see _used
 _CHOICES = {
     "input.layout": ("NCHW", "NHWC"),
     "input.colour": ("grey", "bgr", "rgb"),
@@ -41,10 +39,11 @@ _HEADS: dict[str, tuple[tuple[Any, ...], ...]] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InputRule:
-    """Preparation of a picture for the network: (pixel * `scale` - `mean`) / `std`. `mean` and `std` are one number, or
-    one per channel. With `equalise` the histogram of the brightness is equalised first. `resize` is the interpolation
-    by which the picture is stretched to the size; with `pad`, it keeps its shape in the upper left corner, and the rest
-    has that grey level. With `layout` NHWC feature maps are (1, H, W, C) as well."""
+    """Preparation of a picture for the network: (pixel * `scale` - `mean`) / `std` (None: 1). `mean` and `std` are one
+    number, or one per channel. With `equalise` the histogram of the brightness is equalised first. `resize` is the
+    interpolation by which the picture is stretched to `height` x `width`. With `pad`, a grey level, it keeps its
+    proportions in the upper left corner, and the rest has that level. With `layout` NHWC feature maps are (1, H, W, C)
+    too."""
 
     layout: str
     height: int = bounded(8, 4096)
@@ -64,8 +63,9 @@ class InputRule:
 
 @dataclass(frozen=True, slots=True)
 class Outputs:
-    """Names in the ONNX file of a vector (1, D), of a feature map (1, C, H, W), of all that the family of a detector
-    decodes its boxes from, and of the memorability of a picture (1, 1) in 0..1; None: the card names none."""
+    """Names of the network's outputs in the ONNX file (None: the card names none): a vector (1, D), a feature map (1,
+    C, H, W), all outputs from which the boxes of a detector are decoded, and the memorability of a picture (1, 1) in
+    0..1."""
 
     descriptor: str | None = None
     features: str | None = None
@@ -75,8 +75,9 @@ class Outputs:
 
 @dataclass(frozen=True, slots=True)
 class DetectorRule:
-    """Reading of the outputs `boxes`: by the decoder of a `family` of detectors. `dynamic` are the classes of what does
-    not stay where it is, each with its number in the outputs; a box counts from `min_score` on."""
+    """Decoding of the outputs `boxes` of an object detector; `family` selects the decoder. `dynamic` are the classes of
+    movable things, such as cars, each with its number in the outputs. A box counts if its score is at least
+    `min_score`."""
 
     family: str
     dynamic: dict[str, int]
@@ -85,7 +86,8 @@ class DetectorRule:
 
 @dataclass(frozen=True, kw_only=True)
 class Card:
-    """One network. `path` is that of the card itself; `head` has the name of a head and its parameters, or is None."""
+    """One network. `path` is that of the card itself, `file` and `sha256` are the name and hash of the ONNX file beside
+    it. `head` has the name of a head (see `network`) and its parameters (None: no head)."""
 
     path: Path
     title: str
@@ -109,7 +111,7 @@ class Card:
 
     @property
     def is_technique(self) -> bool:
-        """True where the card makes a descriptor by itself, and does not only serve techniques that take a `model`."""
+        """True if the card makes a descriptor by itself. Other cards only serve techniques that take a `model`."""
         return self.head is not None or self.outputs.descriptor is not None
 
     @cached_property
@@ -120,18 +122,18 @@ class Card:
 
 
 def digest_of(values: list[Any]) -> str:
-    """Compute the SHA-256 of values that JSON can write, 64 hexadecimal digits."""
+    """Compute the SHA-256 of values that can be written as JSON: 64 hexadecimal digits."""
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 
 def _used(part: InputRule | Outputs) -> dict[str, Any]:
-    """Return a section of a card without the keys that were added later and are not used: words and maps made before
-    then have the fingerprint without them."""
+    """Return a section of a card without unused keys that were added to cards later. Words and maps made before then
+    keep their fingerprint."""
     return {key: value for key, value in asdict(part).items() if value is not None or key not in _ADDED_LATER}
 
 
 def card_names() -> tuple[str, ...]:
-    """Return the names of all cards in the user's folder and the shipped one, also of cards that cannot be read."""
+    """Return the names of all cards in the user's folder and the shipped one, including cards that cannot be read."""
     return tuple(sorted({path.stem for folder in model_folders() for path in folder.glob("*.yaml")}))
 
 
@@ -149,7 +151,8 @@ def load_card(name: str) -> Card:
 
 
 def weights_of(spec: TechniqueSpec) -> str | None:
-    """Return the weights that a technique uses, in the words of its card; None for a technique without a network."""
+    """Return a line on the weights that a technique uses: name, title, licence and source of its card. None for a
+    technique without a network."""
     if spec.model_sha256 is None:
         return None
     card = load_card(str(spec.parameters.get("model", spec.name)))
@@ -200,7 +203,8 @@ def _require_detector(card: Card) -> None:
 
 
 def _require_numbers(card: Card, key: str, values: list[float] | None) -> None:
-    """Require one number, or one per channel; those of `std` are divided by, and so must be above 0."""
+    """Require that `values` are None, one number, or one per channel; those of the key `std` must be above 0, since
+    they divide."""
     channels, positive = card.input.channels, key == "std"
     if values is None or (
         len(values) in (1, channels)
@@ -214,8 +218,8 @@ def _require_numbers(card: Card, key: str, values: list[float] | None) -> None:
 
 
 def head_parameters(card: Card) -> dict[str, Any]:
-    """Return the parameters of the card's head by name; nothing for a card without a head. Raises ModelError for a head
-    that does not exist, lacks a feature map or has wrong `levels` or `how`, ConfigError for other parameters."""
+    """Return the parameters of the card's head by name (empty: the card has no head). Raises ModelError for a head that
+    does not exist, lacks a feature map or has wrong `levels` or `how`, ConfigError for other parameters."""
     if card.head is None:
         return {}
     name = card.head.get("name")

@@ -1,14 +1,14 @@
 """`cohog`: HOG descriptors of the informative regions of a picture, matched by one product (thesis, chapter 6).
 
-A place is 31x31 overlapping blocks, each described by the histograms of its 2x2 cells. A query uses only its *good*
-blocks, those of high entropy. Each of them finds its most similar block in the reference. In the thesis the score is
-the mean of these cosines (`matching: thesis`). Here, by default, each good block also votes for the displacement of the
-picture, and the score is the share of votes that agree (`matching: displacement`, see `displacement`). With a forward
-camera the score of the scan counts too.
+A place is 31x31 overlapping blocks, also called regions, each described by the histograms of its 2x2 cells. A query
+uses only its *good* blocks, those of high entropy. Each of them finds its most similar block in the place. In the
+thesis the score is the mean of these cosines (`matching: thesis`). Here, by default, each good block also votes for the
+displacement of the picture, and the score is the share of votes that agree (`matching: displacement`, see
+`displacement`). With a forward camera the score of the scan counts too.
 
 The blocks are the fine part: 8 bits per value, 31 KB per place, on disk. The coarse part stays in RAM and selects the
-places that are compared in full. Ahead it is the same blocks averaged over a grid, in 144 bytes (see `placecode`);
-looking down it is a hundred words, in 200 (see `placewords`).
+places that are compared in full. With a forward camera it is the same blocks averaged over a grid, 144 bytes (see
+`placecode`). With a nadir camera (one that looks straight down) it is a hundred words, 200 bytes (see `placewords`).
 """
 
 from collections.abc import Collection, Sequence
@@ -49,23 +49,24 @@ _ACCEPT = {"forward": (0.07, 0.035), "nadir": (0.08, 0.03), "thesis": (0.0, 0.02
 # other sets .72, and .47 where pictures have 64 x 32 pixels). With `filled_bins` it was .14, .18 and .30.
 _MIN_QUALITY = {"shannon": 0.4, "filled_bins": 0.2}
 _CANDIDATES = {"forward": 42, "nadir": 50}
-# Places compared in full, those that look best at a glance. On corridor, the seasons and nordland_tiny 12 of 42, and on
-# all aerial sets and the kite joined into one map 20 of 300 pairs, find as many places as all of them compared in full
-# (of the 994 of nordland_tiny four fewer).
+# Places compared in full, those with the best `glance`. On corridor, the seasons and nordland_tiny 12 of 42, and on all
+# aerial sets and the kite joined into one map 20 of 300 pairs, find as many places as all of them compared in full (of
+# the 994 of nordland_tiny four fewer).
 _IN_FULL = {"forward": 12, "nadir": 20}
-_VOTING_BESIDE = 0.4  # part of the pairs of places and rotations that vote, from another height than the map's
+_VOTING_BESIDE = 0.4  # share of the usual pairs (place, rotation) that vote, from another height than the map's
 _HEADING_WITHIN_DEG = 1.5 * 360 / ROTATIONS  # the expected rotation, and one on either side
 
 
 @dataclass(eq=False, kw_only=True)
 class CoHog:
-    """CoHOG. Parameters of the thesis: W1 = H1 is `w1` (pixels), W2 = H2 is `w2` (pixels), L is `bins`, GT is `gt`
-    (below 0: the default for the entropy). `entropy` is "shannon" or "filled_bins".
+    """CoHOG. Parameters of the thesis: W1 = H1 is `w1` (pixels), W2 = H2 is `w2` (pixels), L is `bins` (orientations),
+    GT is `gt`, the least entropy of a good block, 0 to 1 (below 0: the default for the entropy). `entropy` is "shannon"
+    or "filled_bins".
 
-    With `camera` "nadir" the picture is laid into a square with its shape kept, so that a rotated picture shows the
-    same ground, and a query is tried from five heights (with "thesis" from one) in 24 rotations; places are named by
-    `words` (see `placewords.load`). The map records `camera` and `words`. It does not record `matching`, "displacement"
-    or "thesis": both read the same map.
+    With `camera` "nadir" the picture is put into a square with its proportions kept, so that a rotated picture shows
+    the same ground. A query is tried from five heights (with `matching` "thesis" from one) in 24 rotations, and `words`
+    is the file of words (see `placewords.load`). The map records `camera` and `words`. It does not record `matching`,
+    "displacement" or "thesis": both read the same map.
     """
 
     w1: int = 512
@@ -135,9 +136,9 @@ class CoHog:
     def encode(self, image: Image, mask: Mask | None = None) -> Descriptor:
         """Encode uint8 (H, W[, 3]); a block that touches a pixel where `mask` bool (H, W) is False is never good.
 
-        Returns coarse uint8 (12, 12, bins), with a nadir camera uint16 (100,), fine uint8 (blocks, 4 bins) and, for a
-        query, regions float32 (blocks, 4 bins) and good bool (blocks,): the good ones are the rows of matrix A of
-        6.2.3.
+        Returns coarse uint8 (12, 12, bins), or uint16 (100,) with a nadir camera, fine uint8 (blocks, 4 bins) and, for
+        a query, regions float32 (blocks, 4 bins) and good bool (blocks,). The good regions are the rows of matrix A of
+        thesis 6.2.3.
         """
         if self._is_nadir:
             image, mask = in_square(image, mask)
@@ -158,10 +159,11 @@ class CoHog:
         )
 
     def _blocks(self, grey: Singles, allowed: Mask | None, cell_px: int) -> tuple[Singles, Bools, Bools]:
-        """Compute the blocks of a square picture in cells of so many pixels. Returns
+        """Compute the blocks of a square picture in cells of `cell_px` pixels; `allowed` is its mask (None: all).
+        Returns
 
         * the blocks float32 (n, n, 4 bins),
-        * which of them are wholly allowed, bool (n, n),
+        * which of them lie on allowed pixels only, bool (n, n),
         * which of these are good, bool (n, n).
         """
         blocks = normalised_blocks(oriented_cells(grey, cell_px, self.bins, signed=True, allowed=allowed))
@@ -172,8 +174,8 @@ class CoHog:
         return blocks, seen, good_blocks(levels(grey), self.entropy, cell_px, self.gt, among=seen)
 
     def pack(self, coarse: Bytes, mean: Singles) -> Bytes:
-        """Make the rows of the index, uint8 (N, B), of coarse uint8 (N, 12, 12, bins) and the map's mean
-        (12, 12, bins)."""
+        """Make the rows in RAM for a forward camera: uint8 (N, B) from coarse uint8 (N, 12, 12, bins) and the map's
+        mean (12, 12, bins)."""
         return placecode.pack(coarse.astype(np.float32) / 255, mean / 255)
 
     def coarse_scores(
@@ -184,11 +186,14 @@ class CoHog:
         turned_deg: Doubles | None = None,
         height_ratio: float | None = None,
     ) -> tuple[Singles, Singles | None]:
-        """Compare the query with the place codes `rows`, uint8 (N, B), under shifts. With a nadir camera compare its
-        words with those of the places, uint16 (N, 100), under all rotations or those within `spec.heading_within_deg`
-        of `turned_deg` (N,), from the one of five heights that is nearest to `height_ratio`. Returns scores float32
-        (N,) in 0..1 and, as float32 (N, 120), those of each hypothesis (None with a forward camera): 24 rotations from
-        each height.
+        """Score all places. With a forward camera `rows` are place codes uint8 (N, B), compared under shifts. With a
+        nadir camera they are words uint16 (N, 100), compared from the one of five heights that is nearest to
+        `height_ratio` (None: 1). `turned_deg` (N,) is the expected rotation of the camera against each place: only
+        rotations within `spec.heading_within_deg` of it are tried (None or NaN: all). Returns
+
+        * scores float32 (N,) in 0..1,
+        * with a nadir camera the score of each hypothesis, 24 rotations from each height, -inf if not tried: float32
+          (N, 120); with a forward camera None.
         """
         views = self._views_of(query)
         if not self._is_nadir:
@@ -214,15 +219,16 @@ class CoHog:
         return np.clip(of_ratio.max(axis=1), 0, 1), scores
 
     def good_patterns(self, query: Descriptor, turn: int, ratio: float = 1.0) -> tuple[Singles, Ints]:
-        """Return the slow patterns float32 (G, 20) of the good regions of a view of the query (see `views`),
-        and their numbers int (G,) on its grid."""
+        """Return, of the good regions of a view of the query (see `views`), the slow patterns float32 (G, 20) and the
+        numbers int (G,) on its grid. `turn` is the rotation in steps of 15 degrees, `ratio` that of the heights."""
         view = self._views_of(query).regions(ratio, turn, self._patterns)
         return view.regions, view.numbers
 
     def match(self, query: Descriptor, fine: Bytes, hypotheses: Sequence[int] | None = None) -> FineMatch:
-        """Compute C = A B^T (thesis 6.2.3), with A the good regions of the query and B those of the place, then the
-        score by `matching`. A query without a good region scores 0. A nadir query is tried under `hypotheses` (None:
-        all), and the best one counts, with shift, rotation and height as its agreeing regions lie (see `align`)."""
+        """Compare the query with a place: compute C = A B^T (thesis 6.2.3), with A the good regions of the query and B
+        those of the place, stored in `fine`, then the score by `matching`. A query without a good region scores 0. A
+        nadir query is tried under `hypotheses`, numbers as in `views.hypothesis` (None: all). The best one counts, and
+        `align` refines its shift, rotation and height."""
         reference = self._reference(fine)
         matches = {each: self._matched(self._view(query, each), reference) for each in self._tried(hypotheses)}
         best = max(matches, key=lambda each: matches[each].score)
@@ -250,9 +256,12 @@ class CoHog:
     def glance(
         self, query: Descriptor, fine: Bytes, hypotheses: Sequence[int] | None = None
     ) -> tuple[float, list[int] | None]:
-        """Compare a part of the good regions with those of one place, as `match` does all of them: a quarter, or of a
-        nadir query about as many from each height. Returns about the score and, with a nadir camera, the hypothesis
-        under which the most agree."""
+        """Estimate the score of `match` from a part of the good regions: a quarter or, of a nadir query, about the same
+        number from each height. Returns
+
+        * the estimated score,
+        * with a nadir camera the hypothesis of that score, as a list of one; else None.
+        """
         reference = self._reference(fine)
         scores = {}
         for number in self._tried(hypotheses):
@@ -268,14 +277,14 @@ class CoHog:
         return hypotheses if hypotheses is not None and self._is_nadir else self._hypotheses
 
     def _reference(self, fine: Bytes) -> Singles:
-        """Return the fine part of a place as `_comparable` blocks: the stored values are square roots."""
+        """Return the stored fine part of a place, which is square roots, as `_comparable` blocks."""
         blocks = fine.astype(np.float32)
         blocks *= blocks
         return self._comparable(blocks)
 
     def _view(self, query: Descriptor, number: int) -> ViewRegions:
-        """Return the good regions of a query under a hypothesis. Those of the newest query are kept, since it is
-        compared with many places."""
+        """Return the good regions of a query under the hypothesis `number`. They are cached for the newest query, since
+        it is compared with many places."""
         views = self._views_of(query)
         if number not in self._regions_of:
             self._regions_of[number] = views.regions(*hypothesis(number), self._comparable)
@@ -292,8 +301,8 @@ class CoHog:
         return self._views
 
     def _comparable(self, blocks: Singles) -> Singles:
-        """Return blocks float32 (N, 4 bins), or for the displacement vote their slow patterns (N, patterns), each of
-        length 1."""
+        """Return blocks float32 (N, 4 bins) in the form that is compared, each of length 1: as slow patterns (N,
+        patterns) for the displacement vote, as they are for the thesis's score."""
         return self._patterns(blocks) if self._votes else unit_rows(blocks)
 
     def _patterns(self, regions: Singles) -> Singles:
@@ -323,8 +332,8 @@ def _require(what: str, value: str, allowed: Collection[str]) -> None:
 
 
 def _middle(per_block: Array, seen: Bools) -> Array:
-    """Cut out the largest square in the middle that the picture fills, if it was laid into a larger one:
-    (side, side, ...) to (n, n, ...)."""
+    """Cut the largest square that the picture fills out of the middle, if the picture was put into a larger one: (side,
+    side, ...) to (n, n, ...), n at least 12. `seen` bool (side, side) is True where there is picture."""
     n = max(min(int(seen.any(axis=0).sum()), int(seen.any(axis=1).sum())), placecode.SIDE)
     start = (len(seen) - n) // 2
     return per_block[start : start + n, start : start + n]

@@ -1,7 +1,8 @@
-"""Oriented gradient histograms over cells and blocks, shared by `hog` and `cohog`, and the slow patterns of blocks.
+"""Histograms of oriented gradients over cells and blocks, for `hog`, `cohog` and the training of CALC, and the
+low-frequency ("slow") patterns of blocks.
 
-A map made on one processor flies on another, so all steps are rounded alike on all of them: products, sums and roots
-one by one. Fused steps of OpenCV, and products of matrices, would be rounded otherwise on each.
+A map made on one processor flies on another, so all operations must be rounded alike on all of them: products, sums and
+roots are computed one by one. Fused operations of OpenCV, and products of matrices, are rounded differently.
 """
 
 from functools import lru_cache
@@ -40,9 +41,9 @@ _KEPT = (
 
 
 def grey_square(image: Image, side_px: int) -> Array:
-    """Return a uint8 image, (H, W) grey or (H, W, 3) BGR, as float32 grey of (side_px, side_px), 0 to 255.
+    """Convert a uint8 image, (H, W) grey or (H, W, 3) BGR, to float32 grey (side_px, side_px), 0 to 255.
 
-    The values are not rounded to grey levels. A small picture that is enlarged has steps of fractions of a level, which
+    The values are not rounded to grey levels. A small picture that is enlarged has values between the levels, which
     processors round differently, and a map must work on any of them.
     """
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
@@ -50,20 +51,20 @@ def grey_square(image: Image, side_px: int) -> Array:
 
 
 def levels(grey: Singles) -> Bytes:
-    """Round grey, float32 0 to 255, to the 256 levels of uint8, halves up."""
+    """Round grey, float32 0 to 255, to uint8, halves up."""
     return (grey + np.float32(0.5)).astype(np.uint8)
 
 
 def mask_square(mask: Mask | None, side_px: int) -> Mask | None:
-    """Return a bool mask (H, W) as bool (side_px, side_px), nearest neighbour; None stays None (all allowed)."""
+    """Scale a bool mask (H, W) to bool (side_px, side_px), by nearest neighbour; None stays None (all allowed)."""
     if mask is None:
         return None
     return cv2.resize(mask.astype(np.uint8), (side_px, side_px), interpolation=cv2.INTER_NEAREST).astype(bool)
 
 
 def in_square(image: Image, mask: Mask | None) -> tuple[Array, Mask]:
-    """Lay a picture into the middle of a square. Returns the square, and bool (side, side): part of the picture and
-    allowed."""
+    """Put a picture into the middle of a square, its border repeated outwards. Returns the square, and bool (side,
+    side), True for pixels of the picture that `mask` allows (None: all of them)."""
     height, width = image.shape[:2]
     side = max(height, width)
     top, left = (side - height) // 2, (side - width) // 2
@@ -78,10 +79,10 @@ def in_square(image: Image, mask: Mask | None) -> tuple[Array, Mask]:
 def oriented_cells(grey: Array, cell_px: int, bins: int, signed: bool, allowed: Mask | None = None) -> Singles:
     """Compute histograms of gradient orientation, one per cell (Dalal and Triggs 2005; thesis 6.2.2, steps 1 and 2).
 
-    The steps are: the square root of the image over its maximum, central differences, the gradient magnitude, and a
-    linear vote into the two nearest of `bins` orientations over 360 degrees (`signed`) or 180. `grey` is float32 or
-    uint8 (H, W), 0 to 255, with sides that are multiples of `cell_px`; pixels where the bool (H, W) `allowed` is False
-    do not vote. Returns float32 (H/cell_px, W/cell_px, bins), sums of magnitude, all >= 0.
+    The steps are: the square root of the image over its maximum, central differences, and the gradient magnitude, which
+    is shared between the two nearest of `bins` orientations over 360 degrees (`signed`) or 180. `grey` is float32 or
+    uint8 (H, W), 0 to 255, with sides that are multiples of `cell_px`. Pixels where the bool (H, W) `allowed` is False
+    do not count (None: all do). Returns float32 (H/cell_px, W/cell_px, bins), sums of magnitude, all >= 0.
     """
     rows, cols = grey.shape[0] // cell_px, grey.shape[1] // cell_px
     vote = _vote_by_octant if signed and bins == 8 else _vote_by_angle
@@ -102,7 +103,8 @@ def oriented_cells(grey: Array, cell_px: int, bins: int, signed: bool, allowed: 
 
 
 def _vote_by_angle(dx: Array, dy: Array, cell_px: int, bins: int, signed: bool) -> Array:
-    """Vote for any number of orientations: `dx` and `dy` float32 (H, W) to (H/cell_px, W/cell_px, bins)."""
+    """Sum gradient magnitudes by cell and orientation, for any number of orientations: `dx` and `dy` float32 (H, W) to
+    (H/cell_px, W/cell_px, bins)."""
     magnitude, _ = _magnitude(dx, dy)
     at = np.arctan2(dy, dx)
     at *= np.float32(bins / (2 * np.pi if signed else np.pi))  # in bins; whole numbers are the centres of orientations
@@ -120,14 +122,14 @@ def _vote_by_angle(dx: Array, dy: Array, cell_px: int, bins: int, signed: bool) 
 
 
 def _vote_by_octant(dx: Array, dy: Array, cell_px: int, *_: object) -> Singles:
-    """Cast the same vote for 8 orientations over 360 degrees, without angles, branches or scattered sums.
+    """Compute `_vote_by_angle` for 8 orientations over 360 degrees, without angles, branches or scattered sums.
 
     A gradient of magnitude m lies in a quadrant, at phi = -45..45 degrees from the diagonal of the quadrant. The
     orientation of the diagonal gets m - |g|, where g = m phi / 45 degrees. The rest goes to the y axis if g > 0, to the
     x axis if g < 0. v = sqrt(2) m sin(phi) and u = sqrt(2) m cos(phi) need no angle, and g = v (_P m + _R u) / (_Q m +
-    u) to 2e-6 m. The signs of dx and dy say which of the four diagonals it is, and which direction of an axis. So each
-    plane is summed over the cells once as it is, and once with its sign bits flipped by those of dx, dy or both. Sums
-    and differences of these sums are the orientations.
+    u) to 2e-6 m. The signs of dx and dy tell the diagonal, of four, and the direction of an axis. So each plane is
+    summed over the cells once as it is, and once with its sign bits flipped by those of dx, dy or both. Sums and
+    differences of these sums are the orientations.
     """
     across, along = np.abs(dx), np.abs(dy)
     u = across + along
@@ -171,7 +173,8 @@ def _vote_by_octant(dx: Array, dy: Array, cell_px: int, *_: object) -> Singles:
 
 
 def _magnitude(dx: Array, dy: Array, out: Array | None = None) -> tuple[Array, Array]:
-    """Return the length of each gradient, in `out` where that is given, and a plane to use again."""
+    """Return the length of each gradient, written to `out` if given, and an array of the same shape that may be
+    overwritten."""
     squares, spare = np.multiply(dx, dx, out=out), dy * dy
     squares += spare
     return cv2.sqrt(squares, squares), spare
@@ -197,13 +200,13 @@ def unit_rows(rows: Singles) -> Singles:
 
 @lru_cache
 def slow_patterns(bins: int) -> Singles:
-    """Return the patterns that hold most of the information of a block of 2x2 cells of `bins` orientations, each of
-    length 1 and at right angles to all others: float32 (4 bins, patterns), one pattern per column.
+    """Return the patterns of low frequency, which hold most of the information of a block of 2x2 cells of `bins`
+    orientations. They are orthonormal: float32 (4 bins, patterns), one pattern per column.
 
     A block is written as waves over the cells (their mean, left against right, top against bottom, and diagonal against
-    diagonal) and over the orientations (the frequencies of a Fourier series). Most of its power lies in the slow waves.
-    Of the 32 patterns of 8 orientations, the 20 with the most power on the data sets used for tuning are kept. This
-    shortens the product that compares all blocks with all blocks by as much, and recall does not fall.
+    diagonal) and over the orientations (the frequencies of a Fourier series). Most of its power lies in the low
+    frequencies. Of the 32 patterns of 8 orientations, the 20 with the most power on the data sets used for tuning are
+    kept. This shortens the product that compares all blocks with all blocks by as much, and recall does not fall.
     """
     frequency = _frequencies(bins)
     return np.vstack(
@@ -219,8 +222,8 @@ def slow_patterns(bins: int) -> Singles:
 @lru_cache
 def waves(bins: int) -> Singles:
     """Return the real Fourier series over `bins` orientations: float32 (bins, bins), one wave per row, each of length
-    1. The constant comes first, then cosine and sine of each frequency; the highest of an even number of bins has a
-    cosine only."""
+    1. The constant comes first, then cosine and sine of each frequency; the highest frequency of an even number of bins
+    has a cosine only."""
     turn = 2 * np.pi * np.arange(bins) / bins
     frequency, number = _frequencies(bins), np.arange(bins)
     series = np.cos(frequency[:, None] * turn - np.pi / 2 * (number[:, None] % 2 == 0) * (number[:, None] > 0))
@@ -229,5 +232,5 @@ def waves(bins: int) -> Singles:
 
 
 def _frequencies(bins: int) -> Ints:
-    """Return the frequency of each of the `waves`: int (bins,)."""
+    """Return the frequency of each row of `waves`: int (bins,)."""
     return (np.arange(bins) + 1) // 2

@@ -1,7 +1,9 @@
-"""Techniques that make one vector by a network: a head on its feature map, or the vector that it gives by itself.
+"""Techniques that describe a picture by one vector of a network. Either the network gives the vector by itself, or a
+*head*, such as a pooling, makes it from the feature map.
 
 A card that makes a vector by itself is a technique of the card's name, without any code. The techniques of the thesis
-take their parameters: `model` is the card of the weights, and `form` and `threads` are of this machine.
+take parameters: `model` is the card of the weights. `form` (see `vectors`) and `threads` belong to this machine, not to
+the map.
 """
 
 from collections.abc import Callable
@@ -41,7 +43,7 @@ _POOLING: dict[str, Callable[..., Singles]] = {
 
 class NetworkVector(VectorTechnique):
     """The vector that a `head` makes of one output of a network. The head raises ModelError for a feature map that is
-    too small for it. `model_sha256` is that of all that a vector depends on (None: the network alone)."""
+    too small for it. `model_sha256` is the hash of all that a vector depends on (None: that of the network alone)."""
 
     def __init__(
         self,
@@ -70,8 +72,8 @@ class NetworkVector(VectorTechnique):
 
 
 def calc(model: str = "calc", form: str = "float", threads: int = 1) -> NetworkVector:
-    """Make `calc`: the vector of a convolutional autoencoder that learned to give the HOG of a picture from a changed
-    copy of it, the output `descriptor` of the card `model`, compared by cosine.
+    """Make `calc`: the output `descriptor` of the card `model`, a convolutional autoencoder that learned to give the
+    HOG of a picture from a changed copy of it. Vectors are compared by cosine.
 
     Merrill and Huang, "Lightweight Unsupervised Deep Loop Closure", RSS 2018: 1064 numbers from a grey,
     histogram-equalised picture of 160x120. The card of the network says how the picture is prepared.
@@ -101,8 +103,8 @@ def amosnet(model: str = "calc", form: str = "float", threads: int = 1, levels: 
     L1 difference.
 
     Chen et al., "Deep Learning Features at Scale for Visual Place Recognition", ICRA 2017, in the form of thesis 4.2.1:
-    `conv5` of a network trained on the places of SPED, with spatial pyramid pooling. Only its weights, trained from
-    scratch, make a network AMOSNet: give their card as `model`.
+    `conv5` of a network trained on the places of SPED, with spatial pyramid pooling. A network is AMOSNet only with its
+    weights, trained from scratch: give their card as `model`.
 
     The vector is divided by its sum. The L1 difference then compares the distribution of the activations, not their
     total, and lies in 0..2. On corridor and aerial_caliterra, the data sets used for tuning, this finds more places.
@@ -111,10 +113,11 @@ def amosnet(model: str = "calc", form: str = "float", threads: int = 1, levels: 
 
 
 def hybridnet(model: str = "calc", form: str = "float", threads: int = 1, levels: int = 4) -> NetworkVector:
-    """Make `hybridnet`: as `amosnet`, with other weights (Chen et al., ICRA 2017; thesis 4.2.1).
+    """Make `hybridnet`: `amosnet` with other weights (Chen et al., ICRA 2017; thesis 4.2.1).
 
-    HybridNet has the layers of AMOSNet. Its top five convolutional layers were started from CaffeNet instead of from
-    scratch. Only the weights differ, so give their card as `model`. With the same card both techniques are the same.
+    HybridNet has the layers of AMOSNet, but its top five convolutional layers were started from CaffeNet instead of
+    from scratch. Only the weights differ, so give their card as `model`. With the same card both techniques are the
+    same.
     """
     return _pyramid("hybridnet", model, form, threads, levels)
 
@@ -142,8 +145,8 @@ def netvlad(
 def region_vlad(
     *, model: str = "calc", form: str = "float", threads: int = 1, regions: int = 400, words: int = 256
 ) -> NetworkVector:
-    """Make `region_vlad`: VLAD of the `regions` that the network marks, about `words` learned visual words, compared by
-    cosine; zeros for a picture without any region.
+    """Make `region_vlad`: VLAD of the `regions` regions of the highest energy (see `find_regions`) about `words`
+    learned visual words, compared by cosine; zeros for a picture without any region.
 
     Khaliq et al., "A Holistic Visual Place Recognition Approach Using Lightweight CNNs for Significant ViewPoint and
     Appearance Changes", T-RO 2019, in the form of thesis 4.2.1: 400 regions of `conv4`, 256 words. Regions have length
@@ -162,7 +165,7 @@ def region_vlad(
 
 def of_card(card: Card, form: str = "float", threads: int = 1) -> NetworkVector:
     """Make the technique of a card: the vector of the network or, if the card names a head, the result of the head on
-    the feature map. The model hash of a map covers all of this, so there are no parameters.
+    the feature map. The technique has no parameters, since the model hash in a map covers all of this.
 
     The margins of its wrong matches are unknown: no match is accepted until the configuration sets a minimum margin.
     """
@@ -176,7 +179,7 @@ def of_card(card: Card, form: str = "float", threads: int = 1) -> NetworkVector:
 
 
 def _head_of_card(card: Card, backbone: Backbone) -> tuple[Head, str | None]:
-    """Return the head of a card, and the hash of its learned words (None: it has none)."""
+    """Return the head of a card, and the hash of its learned words (None: it uses none)."""
     if card.head is None:
         return _itself, None
     parameters, shape = head_parameters(card), backbone.shape

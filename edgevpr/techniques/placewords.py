@@ -1,9 +1,9 @@
 """The coarse stage of `cohog` for a camera that looks straight down: a place is a hundred visual words.
 
 Of each place, 10x10 regions are named by the most similar of 1024 *words*, which are typical regions of the ground
-(`edgevpr train ground` learns them). A place is found by the words that it shares with the query, wherever they lie and
-however the camera has turned. Ground without large structures, such as woods and roofs, has few shapes that a coarse
-picture of it would keep, and many words.
+(`edgevpr train ground` learns them). A region or word is 20 numbers, its *patterns* (see `slow_patterns`). A place is
+found by the words that it shares with the query, wherever they lie and however the camera has turned. Ground without
+large structures, such as woods and roofs, has few shapes that a coarse picture would keep, and many words.
 
 A query is looked up under 24 rotations, 15 degrees apart. Words come in fours, each the one before turned by 90
 degrees, so only six rotations are computed and the others follow. A word that is everywhere says little. It counts once
@@ -72,8 +72,8 @@ def of_query(
     """Return the words of a query under all rotations. The keys of `asking` are rotation steps, clockwise, below
     `within`, the steps in a quarter turn. The values are the patterns float32 (G, 20) of the good regions of the
     picture so turned, and their numbers int (G,). The rotations by further quarter turns follow from these; those of
-    missing keys have no words. `sides` are the regions along one side of the query and of a place, which has no
-    more."""
+    missing keys have no words. `sides` are the regions along one side of the query and of a place; the query has as
+    many or more."""
     total = within * QUARTERS
     side, of_place = sides
     at_most = _AT_MOST * side**2 // of_place**2
@@ -188,8 +188,8 @@ def _turned_block(blocks: Singles) -> Singles:
 
 @lru_cache
 def _quarter_turn() -> Singles:
-    """Return the matrix float32 (20, 20) that turns `patterns` by a quarter turn counter-clockwise: patterns @
-    matrix."""
+    """Return the matrix float32 (20, 20) by which rows of patterns are multiplied to turn them counter-clockwise by 90
+    degrees."""
     kept = slow_patterns(BINS)
     turn: Array = kept.T @ _turned_block(np.eye(len(kept), dtype=np.float32)) @ kept
     return turn

@@ -21,10 +21,11 @@ _LEAST_SPREAD = 1.0  # grey levels: a patch with a smaller standard deviation do
 
 
 class SeqSlam:
-    """Down-sampled pictures of `width` x `height` pixels, a byte each (2 KB per place by default).
+    """SeqSLAM: a place is a small picture of `width` x `height` pixels, a byte each (2 KB by default), normalised in
+    patches of `patch` x `patch` pixels.
 
-    `sequence` is the number of queries that are matched together. It belongs to the query, so one map serves all
-    lengths.
+    `sequence` is the number of successive queries that are matched together. It belongs to the query, so one map serves
+    all lengths.
     """
 
     candidates = 1  # it has no fine part to compare
@@ -74,11 +75,11 @@ class SeqSlam:
         return blocks.reshape(rows * columns, self._patch * self._patch)
 
     def coarse_scores(self, query: Descriptor, rows: Array, mean: None = None) -> tuple[Singles, None]:
-        """Score how much better the query fits each row than the rows around it: uint8 (N, length) to float32 (N,) in
-        0..1.
+        """Score each place by how much better the query fits it than the places around it in the map: `rows` uint8 (N,
+        length) to float32 (N,) in 0..1, and None (no hypotheses). `mean` is not used.
 
-        0.5 means as well as they do. The score is linear in the enhanced difference, so that the best mean score of a
-        trajectory is its least summed difference.
+        0.5 means that it fits as well as they do. The score is linear in the enhanced difference, so the best mean
+        score of a trajectory (a run of places) is its least summed difference.
         """
         # With one query, the nearest neighbour of each row is that query: K=1 is the fastest way to all sums of
         # absolute differences.
@@ -88,9 +89,9 @@ class SeqSlam:
 
 
 def normalised(pixels: Singles, allowed: Singles) -> tuple[Singles, Singles]:
-    """Subtract each patch's mean and divide by its standard deviation: float32 (patches, pixels) and weights 0 or 1 of
-    the same shape to float32 (patches, pixels), 0 where the weight is 0 or the patch is flat. Also returns the
-    deviations (patches,)."""
+    """Subtract each patch's mean and divide by its standard deviation. `pixels` and `allowed` (1, or 0 for pixels that
+    do not count) are float32 (patches, pixels). Returns float32 (patches, pixels), 0 where not allowed or where the
+    patch is flat, and the standard deviations (patches,)."""
     count = np.maximum(allowed.sum(axis=1, keepdims=True), 1)
     centred = (pixels - (pixels * allowed).sum(axis=1, keepdims=True) / count) * allowed
     spread = np.sqrt((centred**2).sum(axis=1, keepdims=True) / count)
@@ -98,12 +99,12 @@ def normalised(pixels: Singles, allowed: Singles) -> tuple[Singles, Singles]:
 
 
 def enhanced(differences: Array) -> Doubles:
-    """Enhance the local contrast of the differences along the map: int32 (N,) to float64 (N,), in standard deviations
-    of the window.
+    """Enhance the local contrast of the query's differences from the places along the map: int32 (N,) to float64 (N,),
+    in standard deviations of the window.
 
     The mean of the differences up to five places away is subtracted from each difference, and the rest is divided by
-    their (sample) standard deviation; 0 where they are all the same. The sums are whole numbers, so that a long map
-    costs no precision.
+    their (sample) standard deviation; 0 where they are all equal. The sums are whole numbers, so that a long map costs
+    no precision.
     """
     whole = differences.astype(np.int64)
     first = np.maximum(np.arange(len(whole)) - _WINDOW // 2, 0)

@@ -1,5 +1,5 @@
-"""Running a network, from a picture to its outputs: the only module that uses onnxruntime in flight, and imports it
-only with the first network.
+"""Running a network, from a picture to its outputs, for techniques, detectors and the commands for models. It is the
+only module that uses onnxruntime in flight, and imports it only with the first network.
 
 A model file is not trusted: it is run once before it may fly, and every result is checked.
 """
@@ -32,8 +32,8 @@ _NOTHING_ALLOWED = 128
 
 @dataclass(frozen=True, slots=True)
 class Backbone:
-    """One output, "features" or "descriptor", of a network that has run successfully. `shape` is (C, H, W) of features,
-    (D,) of a descriptor."""
+    """One `output`, "features" or "descriptor", of a network that has run successfully. `shape` is (C, H, W) for
+    features, (D,) for a descriptor. `session` is that of onnxruntime."""
 
     card: Card
     output: str
@@ -55,9 +55,9 @@ class Backbone:
 def open_backbone(model: str, output: str, threads: int = 1) -> Backbone:
     """Open the network of the card `model`, for its output "features" or "descriptor".
 
-    Raises ModelError, one sentence, for any of: no onnxruntime, no card, no file or another one than the card's, no
-    ONNX, inputs or outputs of another form, axes without a size, a result that is not finite or all zeros. Raises
-    UsageError for a number of threads outside 1 to 256.
+    Raises ModelError, one sentence, if onnxruntime, the card or its file is missing, if the file is not that of the
+    card or no ONNX, if inputs or outputs have another form or axes without a size, or if a result is not finite or all
+    zeros. Raises UsageError for a number of threads outside 1 to 256.
     """
     return backbone_of(load_card(model), output, threads)
 
@@ -77,8 +77,8 @@ def backbone_of(card: Card, output: str, threads: int = 1) -> Backbone:
 
 
 def open_session(card: Card, threads: int = 1) -> Any:
-    """Open the session of a card's file; see `open_backbone` for what is raised. Whether its inputs and outputs are
-    those of the card is seen by running it once."""
+    """Open the onnxruntime session of a card's file; raises as `open_backbone` does. The network is not run, so its
+    inputs and outputs are not yet compared with the card."""
     if not 1 <= threads <= _MOST_THREADS:
         raise UsageError(f"{card.name} cannot run with threads={threads}: give 1 to {_MOST_THREADS}.")
     return _session(card.file_path, card.sha256, threads)
@@ -96,7 +96,8 @@ def file_sha256(path: Path) -> str:
 
 @cache
 def _session(path: Path, sha256: str, threads: int) -> Any:
-    """Open the session of a file: one in the process, however many techniques use it."""
+    """Check the hash of a network's file and open its session. The process keeps one session of a file for all
+    techniques."""
     found = file_sha256(path)
     if found != sha256:
         raise ModelError(
@@ -157,9 +158,10 @@ def _run(card: Card, output: str, session: Any, image: Image) -> Singles:
 
 
 def run_outputs(card: Card, session: Any, names: list[str], pictures: Singles) -> list[Array]:
-    """Run a session of `open_session` on prepared pictures, float32 (N, ...); return the outputs named.
+    """Run a session of `open_session` on prepared pictures, float32 (N, ...). Returns the outputs called `names`, in
+    order.
 
-    Raises ModelError for a run that fails or takes too long, and for numbers that are not finite or beyond 1e12.
+    Raises ModelError for a run that fails or takes more than 30 s, and for numbers that are not finite or beyond 1e12.
     """
     feed = {session.get_inputs()[0].name: pictures}
     options = import_onnxruntime().RunOptions()
@@ -201,10 +203,11 @@ def _in_one_line(error: Exception) -> str:
 
 
 def prepare(image: Array, rule: InputRule) -> Singles:
-    """Prepare uint8 (H, W) grey or (H, W, 3) BGR as float32 (1, C, height, width), or (1, height, width, C) for NHWC.
+    """Convert a picture, uint8 (H, W) grey or (H, W, 3) BGR, to the input that `rule` describes: float32 (1, C, height,
+    width), or (1, height, width, C) for the layout NHWC.
 
-    Equalising is that of CALC: BGR to YUV, the histogram of Y equalised, back to BGR, all before the picture is made
-    grey and smaller. A grey picture has no U and V: its own histogram is equalised.
+    Histogram equalisation is that of CALC: BGR to YUV, the histogram of Y equalised, back to BGR, all before the
+    picture is made grey and smaller. A grey picture has no U and V: its own histogram is equalised.
     """
     if rule.equalise:
         image = _equalised(image)
@@ -223,7 +226,8 @@ def prepare(image: Array, rule: InputRule) -> Singles:
 
 
 def shares(image: Array, rule: InputRule) -> tuple[float, float]:
-    """Return the shares of the input's width and height that `prepare` fills with the picture; the rest is padding."""
+    """Return the share of the input's width, and that of its height, that `prepare` fills with the picture; the rest is
+    padding."""
     if rule.pad is None:
         return 1.0, 1.0
     height, width = image.shape[:2]

@@ -1,4 +1,4 @@
-"""Views of a query: its picture as it would look from other heights and under other headings.
+"""Views of a query: its picture as it would look from other heights and under other headings, for `cohog`.
 
 A nadir query (of a camera that looks straight down) is compared with a place under each of several *hypotheses*: a
 height ratio (the camera's height above the ground over that when the place was mapped) and a rotation of the camera
@@ -6,9 +6,9 @@ since then. A view undoes both: the picture is scaled until a cell shows as much
 turned back. A query from half the height has a quarter of the cells of a place, and one from twice the height four
 times as many.
 
-Few regions agree by chance more easily than many, so the shares of agreeing votes of different views are not the same
-evidence. They are made comparable by what foreign pictures reach under each (measured between the two tuning sets from
-the air), and so that a view from the mapped height keeps its share.
+Few regions agree by chance more easily than many, so the same share of agreeing votes is different evidence under
+different views. Factors make the shares comparable: they follow from the shares that foreign pictures reach under each
+view (measured between the two tuning sets from the air). A view from the mapped height keeps its share.
 """
 
 from collections.abc import Callable
@@ -25,24 +25,24 @@ from edgevpr.techniques.placewords import QUARTERS, turned_blocks
 HEIGHT_RATIOS = (0.5, 0.7, 1.0, 1.42, 2.0)
 ROTATIONS = 24  # 15 degrees apart
 WITHIN_QUARTER = ROTATIONS // QUARTERS
-# Of so many good regions of a view one, where a view has as many as one from the mapped height: a larger view needs
-# more of them, since it shows less of a place with each.
+# A glance takes one of so many good regions, if a view has as many as that from the mapped height. A larger view needs
+# more of them, since each region shows less of a place.
 _GLANCE = {0.5: 4, 0.7: 4, 1.0: 4, 1.42: 2, 2.0: 2}
 _BY_CHANCE = 0.72  # the share that agrees by chance falls with this power of the number of regions
 _LARGER_BY_CHANCE = {1.42: 0.87, 2.0: 0.8}  # a larger view has more places to agree on
 # At a glance the views differ less by how many regions they have than by the room that their votes scatter in.
 _GLANCE_BY_CHANCE = {0.5: 0.53, 0.7: 0.73, 1.0: 1.0, 1.42: 1.8, 2.0: 2.4}
 
-# Encodes a square picture, float32 (side, side), with its allowed pixels, bool of the same shape or None, in cells of
-# so many pixels: blocks float32 (n, n, 4 bins), and which of them are good, bool (n, n).
+# Encodes a square picture, float32 (side, side), with its allowed pixels, bool of the same shape or None, in cells of a
+# number of pixels. Returns blocks float32 (n, n, 4 bins), and which of them are good, bool (n, n).
 Encode = Callable[[Singles, Mask | None, int], tuple[Singles, Bools]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ViewRegions:
     """The good regions of a view: their `numbers` int (G,), row by row on a grid of `side` x `side`, and `regions`
-    float32 (G, P), each of length 1. A share of agreeing votes times `worth` is a score, and one of every `step`-th
-    region times `worth_at_glance`."""
+    float32 (G, P), each of length 1. A share of agreeing votes times `worth` is a score. A glance takes every `step`-th
+    region, and its share is multiplied by `worth_at_glance`."""
 
     numbers: Ints
     regions: Singles
@@ -53,25 +53,26 @@ class ViewRegions:
 
 
 def hypothesis(number: int) -> tuple[float, int]:
-    """Return the height ratio of a hypothesis and the steps that the camera has turned by."""
+    """Return the height ratio of the hypothesis `number`, and its rotation in steps of 15 degrees."""
     return HEIGHT_RATIOS[number // ROTATIONS], number % ROTATIONS
 
 
 def cells_along(cells: int, ratio: float) -> int:
-    """Return the cells along one side of a view for a place with so many. The numbers differ by an even one, so that
-    the middle region of the view lies on one of the place."""
+    """Return the cells along one side of a view from the height ratio `ratio`, for a place with `cells`. The two
+    numbers differ by an even one, so that the middle region of the view lies on that of the place."""
     return cells + 2 * round(cells * (ratio - 1) / 2)
 
 
 def scale_of(cells: int, ratio: float) -> float:
-    """Return the exact height ratio of a view: of its cells along one side to those of a place."""
+    """Return the exact height ratio of a view: its whole number of cells along one side over the `cells` of a place."""
     return cells_along(cells, ratio) / cells
 
 
 class Views:
-    """The views of one query, each made when it is first asked for. `square` is that of the query as it is: its blocks
-    float32 (n, n, 4 bins), and which of them are good, bool (n, n). Only views within a quarter turn are encoded: the
-    others have the same cells, turned. `seen` are the blocks that are wholly allowed, bool (n, n)."""
+    """The views of one query, each made when it is first asked for. `square` is the unchanged view: its blocks float32
+    (n, n, 4 bins), and which of them are good, bool (n, n). `encode` makes the same of another view, with cells of
+    `cell_px` pixels. Only views within a quarter turn are encoded: the others have the same cells, turned. `seen` bool
+    (n, n) is True for blocks that lie on allowed pixels only."""
 
     def __init__(self, picture: Picture, square: tuple[Singles, Bools], cell_px: int, encode: Encode) -> None:
         self._picture, self._cell_px, self._encode, self.seen = picture, cell_px, encode, picture.seen
@@ -80,7 +81,8 @@ class Views:
         self._scaled: dict[float, tuple[Array, Array]] = {}
 
     def blocks(self, ratio: float, turn: int) -> tuple[Singles, Bools]:
-        """Return the blocks float32 (n, n, 4 bins) of the view of a hypothesis, and which are good, bool (n, n)."""
+        """Return the blocks float32 (n, n, 4 bins) of the view of a height ratio and a rotation step, and which are
+        good, bool (n, n)."""
         quarters, within = divmod(turn, WITHIN_QUARTER)
         if (ratio, within) not in self._encoded:
             self._encoded[ratio, within] = self._encode(*self._picture_of(ratio, within))
@@ -88,11 +90,12 @@ class Views:
         return turned_blocks(blocks, -quarters), np.rot90(good, -quarters)
 
     def side_of(self, ratio: float) -> int:
-        """Return the regions along one side of the grid of a view, no fewer than those of a place."""
+        """Return the regions along one side of the grid of a view: at least as many as a place has."""
         return max(cells_along(self._side + 1, ratio) - 1, self._side)
 
     def regions(self, ratio: float, turn: int, described: Callable[[Singles], Singles]) -> ViewRegions:
-        """Return all good regions of a view, `described` by (G, P) for (G, 4 bins)."""
+        """Return all good regions of a view. `described` converts their blocks (G, 4 bins) to the vectors (G, P) to be
+        compared."""
         blocks, good = self.blocks(ratio, turn)
         side = self.side_of(ratio)
         if ratio > 1:
@@ -110,8 +113,9 @@ class Views:
         )
 
     def _picture_of(self, ratio: float, within: int) -> tuple[Array, Array, int]:
-        """Return the picture of a view, its allowed pixels, and the pixels of a cell. The picture is not enlarged,
-        which would add pixels and nothing to see: its cells are smaller instead."""
+        """Return the picture of a view float32 (side, side), its allowed pixels bool (side, side), and the pixels of a
+        cell. `within` is the rotation in steps, less than a quarter turn. The picture is not enlarged, which would add
+        pixels and no detail: for a ratio above 1 its cells are smaller instead."""
         cell_px = self._cell_px if ratio <= 1 else max(2, self._cell_px // 2)
         side = cells_along(self._side + 1, ratio) * cell_px
         grey: Array
