@@ -1,4 +1,5 @@
-"""The conversation with the autopilot: what is said next, and what the answers mean. It knows no port and no thread."""
+"""The conversation with the autopilot: it chooses the next message to be sent, and processes those received. It knows
+no port and no thread, and is used by `link` inside turns only (see `turns`)."""
 
 import logging
 import math
@@ -25,7 +26,7 @@ HEARTBEAT_S = 1.0
 STATE_S = 0.1  # ArduPilot calls a receiver unhealthy whose positions come more than 215 ms apart
 HEALTH_GOOD_FOR_S = 10.0  # a hung main loop must not look healthy because the link's thread still runs
 ASK_AGAIN_S = 5.0
-ORIGIN_WITHIN_S = 5.0  # an autopilot that has one tells it once a second when asked to
+ORIGIN_WITHIN_S = 5.0  # an autopilot that has an origin sends it once a second when asked to
 
 _NOBODY = NoListener()
 
@@ -34,10 +35,15 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkSettings:
-    """The settings of a link. `system_id` is that of the autopilot (None: that of the first heard); a fix that has
-    waited for `max_fix_age_s` is never sent. `listener` hears how the vehicle moves, and gives the positions of a
-    continuous channel. `tap` gets each packet written and each packet heard, in the link's thread. `origin` is set
-    where an autopilot that flies by ODOMETRY has none. The `tape` takes note of all that is heard and said."""
+    """The settings of a link.
+
+    - `component_id`: our own; `system_id`: that of the autopilot (None: of the first one heard).
+    - `max_fix_age_s`: a fix that has waited longer is never sent.
+    - `listener`: is called with the reports of the vehicle, and gives the positions of a continuous channel.
+    - `tap`: is called with each packet written and each packet received, in the link's thread.
+    - `origin`: is sent to an autopilot that takes ODOMETRY and has no origin (None: never).
+    - `tape`: records, or plays back, all that is received and sent.
+    """
 
     component_id: int = 197
     system_id: int | None = None
@@ -51,11 +57,10 @@ class LinkSettings:
 
 
 class Conversation:
-    """Packets to be sent, one after another, and the messages that arrive. It holds the state of the `autopilot`, the
-    `fixes` on their way, the `texts` for the ground, the `requests` to us and the `wishes` among them, and the count of
-    messages `sent`. It is used in turns only. `copy_message` gets every message that is queued, and no fix;
-    `copy_text` every text.
-    """
+    """Makes the packets to be sent, one after another, and processes those received. It holds the state of the
+    `autopilot`, the `fixes` and `texts` to be sent, the `requests` made to us, the `wishes` among them that only the
+    flight can fulfil, and the count of messages `sent`, by name. Use it inside turns only. `copy_message` is called
+    with every queued message but the fixes, `copy_text` with every text: for the link to the ground."""
 
     def __init__(self, settings: LinkSettings, clock: Callable[[], float]) -> None:
         self.settings = settings
@@ -72,9 +77,9 @@ class Conversation:
         self._health, self._health_set_s = Health.BOOT, clock()
         self._packer = mavlink.MAVLink(None, srcSystem=settings.system_id or 1, srcComponent=settings.component_id)
         self._heartbeat_due_s = self._state_due_s = clock()
-        self._ask_position_s: float | None = None  # when to ask next; None: not wanted
+        self._ask_position_s: float | None = None  # when to request its reports next; None: not wanted
         self._asked_for_state = False
-        self._told_channel = self.channel  # the one that the listener knows
+        self._told_channel = self.channel  # the channel that the listener knows
         self._odometry_since_s = math.inf
         self._origin = settings.origin
         self._is_there = self._was_there = False
@@ -86,7 +91,7 @@ class Conversation:
 
     @property
     def waits(self) -> bool:
-        """True where a message or a text waits to be sent."""
+        """True if a message or a text waits to be sent."""
         return bool(self._messages or self.texts)
 
     def put(self, message: Message) -> None:
@@ -96,47 +101,47 @@ class Conversation:
         self.copy_message(message)
 
     def announce(self, severity: Severity, text: str, topic: str | None = None) -> None:
-        """Let a text for the people on the ground wait for its turn (see `Texts`)."""
+        """Queue a text for the people on the ground. `topic` names what it is about (see `Texts`)."""
         self.texts.put(severity, text, topic)
         self.copy_text(severity, text, topic)
 
     def set_health(self, health: Health) -> None:
-        """Set the health in the heartbeats of the next ten seconds. After that, without a new call, it is CRITICAL."""
+        """Set the health to be sent in heartbeats. It holds for ten seconds; without a new call it is then CRITICAL."""
         self._health, self._health_set_s = health, self._clock()
 
     def want_position(self) -> None:
-        """Ask the autopilot for its position, how well it knows it, attitude and height, at once and again whenever it
-        has stopped reporting its position or its attitude."""
+        """From now on request the autopilot's reports of position, its accuracy, attitude and height: at once, and
+        again whenever the reports of position or attitude have stopped."""
         self._ask_position_s = self._clock()
 
     def offer(self, wishes: Collection[Wish]) -> None:
-        """Set the wishes of the ground that can be fulfilled from now on; there are none before the first call."""
+        """Set the wishes of the ground that the flight can fulfil from now on; before the first call there are none."""
         self.wishes.offered = wishes
 
     def take_wishes(self) -> tuple[Wished, ...]:
-        """Return the wishes of the ground since the last call."""
+        """Return the wishes of the ground that have arrived since the last call."""
         return self.wishes.take()
 
     def vehicle(self) -> Vehicle | None:
-        """Return the last report of the autopilot on its vehicle; None where there is none, or it had no position."""
+        """Return the autopilot's last report of its vehicle; None before the first, and if the last had no position."""
         return self.autopilot.vehicle
 
     def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
-        """Return the same with the position, roll, pitch and heading that the vehicle had at the time of a frame; roll
-        and pitch are None where no attitude was heard within 0.3 s of it. It also says when the newest fix that may be
-        in its position was sent: a continuous position may be in it at any time."""
+        """Return the last report, with position, roll, pitch and heading moved to `t_mono_s`, the time of a frame. Roll
+        and pitch are None if no attitude was received within 0.3 s of it. `t_fix_s` is when the newest fix was sent
+        that may be part of the reported position; on a continuous channel it is now. None: as in `vehicle`."""
         vehicle = self.autopilot.vehicle_at(t_mono_s)
         t_fix_s = self._clock() if self.channel.is_continuous else self.fixes.t_fix_s
         return vehicle and replace(vehicle, t_fix_s=t_fix_s)
 
     def wait_s(self, longest_s: float) -> float:
-        """Return how long the link may sleep, so long at most, until there is something to say."""
+        """Return for how many seconds, `longest_s` at most, the link may sleep before something is due to be sent."""
         if not self.channel.is_continuous:
             return longest_s
         return min(longest_s, max(0.0, self._state_due_s - self._clock()))
 
     def next_packet(self) -> tuple[bytes, Sending | None] | None:
-        """Choose and pack the next message; return it with the fix in it, if it holds one. None: there is none."""
+        """Choose and pack the next message. Returns (packet, the fix in it or None), or None if nothing is due."""
         while (chosen := self._next_message(self._clock())) is not None:
             message, sending = chosen
             self.settings.signing.stamp(self._packer)
@@ -156,12 +161,12 @@ class Conversation:
         return None
 
     def note_departed(self, fixes: list[Sending]) -> None:
-        """Note the fixes that have left. This comes before `hear` takes in the answer to one of them."""
+        """Count the fixes that have left the port. Call it before `hear` processes the answer to one of them."""
         self.sent["COMMAND_INT"] += len(fixes)
 
     def hear(self, data: bytes, now_s: float, sender: Sender | None) -> bool:
-        """Take in bytes that arrived from `sender` (None: there is only one); return True where they hold a heartbeat
-        of the autopilot."""
+        """Process bytes received from `sender` (None: a link with one sender only) at `now_s`. Returns True if they
+        contain a heartbeat of the autopilot."""
         is_ours = False
         for message in self.reader.feed(data, sender):
             if self.autopilot.hear(message, now_s, sender):
@@ -178,8 +183,8 @@ class Conversation:
         return is_ours
 
     def tell_of_answers(self) -> None:
-        """Give up the fixes that have waited too long for their answers, and say once to the ground that the autopilot
-        is silent, or back, and that fixes have no answers any more, or have them again, or are refused, or taken
+        """Stop waiting for answers to fixes that are more than a second late. Queue a text for the ground for each
+        change: the autopilot is silent or back, fixes are no longer answered or answered again, refused or accepted
         again."""
         now_s = self._clock()
         self._tell(self._news_of_presence(now_s))
@@ -188,18 +193,18 @@ class Conversation:
         self._tell(self.fixes.take_news())
 
     def break_off(self, lost_fixes: int) -> None:
-        """Forget what ends with the port, with which so many fixes were thrown away."""
+        """Forget what the loss of the port ends. `lost_fixes` is the number of fixes thrown away with the port."""
         self.fixes.note_lost(lost_fixes)
         self.autopilot.forget_presence()
         self.reader.forget_partial_message()
 
     def end(self) -> None:
-        """Give up all fixes: those that wait for their answers, and those that wait to be sent."""
+        """Give up all fixes, whether they wait for an answer or wait to be sent."""
         self.fixes.break_off("the flight ended before its answer came")
         self.fixes.drop_stale(math.inf)
 
     def _next_message(self, now_s: float) -> tuple[Message, Sending | None] | None:
-        """Return the message that is next and the fix in it, if it holds one; None: there is no message."""
+        """Choose the next message. Returns (message, the fix in it or None), or None if nothing is due."""
         late_s = now_s - self._heartbeat_due_s
         if late_s >= 0:
             self._heartbeat_due_s = now_s + HEARTBEAT_S - late_s % HEARTBEAT_S  # keeps the rhythm after missed beats
@@ -218,7 +223,7 @@ class Conversation:
         else:
             self.fixes.drop_stale(now_s)
         if text := self.texts.next(now_s):
-            return text, None  # not by `put`, of which the ground's link gets a copy: it has its own texts
+            return text, None  # not by `put`, which copies to the ground's link: that has its own texts
         while self._messages:
             message = self._messages.popleft()
             if self.requests.admits(message, now_s):
@@ -230,7 +235,7 @@ class Conversation:
         return messages.heartbeat(Health.CRITICAL if is_stuck else self._health)
 
     def _state(self, system_id: int, now_s: float) -> Message | None:
-        """Make the next message of a continuous position, where it is due."""
+        """Make the next message of a continuous channel. None: it is not due yet, or nothing can be said."""
         if now_s < self._state_due_s:
             return None
         self._state_due_s = max(self._state_due_s + STATE_S, now_s)
@@ -248,7 +253,8 @@ class Conversation:
         return None
 
     def _ask_for_position(self, system_id: int, now_s: float) -> None:
-        """Ask again where no reports came: an autopilot that has restarted has forgotten the request."""
+        """Queue the questions that choose the channel, and request reports again if they have stopped: an autopilot
+        that has restarted has forgotten the request."""
         if self._ask_position_s is None:
             return
         for question in self.autopilot.interview.questions(now_s, system_id):

@@ -1,10 +1,10 @@
-"""Position fixes on their way to the autopilot: those that wait, those under way, and what their answers say.
+"""Position fixes on their way to the autopilot: the fixes that wait to be sent, those that wait for an answer, and the
+processing of the answers. Used by `conversation` inside turns only (see `turns`).
 
-A fix is never sent late, and an autopilot that answers none is sent none. COMMAND_ACK does not say which fix it
-answers. It is taken for the answer to the oldest fix that has been sent and has waited for less than a second. With one
-fix a second, and an answer in some tens of milliseconds, there is only one such fix. After a second a fix counts as
-unanswered, so that a lost answer shifts those that follow for a second at most where fixes are that far apart. An
-answer that finds no fix (too late, or one of several to the same fix) is counted, and belongs to none.
+A fix is never sent late, and after five unanswered ones almost none is sent. COMMAND_ACK does not say which fix it
+answers, so it is matched to the oldest fix sent less than a second ago. With one fix a second, and an answer within
+some tens of milliseconds, there is only one such fix. After a second a fix counts as unanswered, so that a lost answer
+can cause wrong matches for a second at most. An answer that matches no fix is counted, and ignored otherwise.
 """
 
 import logging
@@ -23,10 +23,10 @@ FIXES_MAX = 8
 # This limits what the link adds to the age of a frame; types.FIX_MAX_AGE_S limits the age itself, which is mostly the
 # time that matching took and which the autopilot is told. A fix must keep both limits.
 MAX_FIX_WAIT_S = 1.0
-UNANSWERED_MAX = 5  # so many fixes in a row without an answer stop the sending, until one is answered again
-TRIED_AGAIN_AFTER_S = 10.0  # while the sending is stopped, one fix in so long asks whether it is answered again
-# An answer takes some tens of milliseconds, over a radio up to half a second. So long after the last fix it is said
-# that the sending is stopped; and so long after the first answer, those to the fixes before it have arrived, too.
+UNANSWERED_MAX = 5  # so many fixes in a row without an answer stop the sending, until one is answered
+TRIED_AGAIN_AFTER_S = 10.0  # while the sending is stopped, one fix is sent each time so long has passed
+# An answer takes some tens of milliseconds, over a radio up to half a second. The ground is told so long after the last
+# fix that the sending has stopped. So long after the first answer, the answers to all earlier fixes have arrived, too.
 ANSWERED_WITHIN_S = 1.0
 
 log = logging.getLogger(__name__)
@@ -34,8 +34,9 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class FixAnswer:
-    """Answer of the autopilot to a fix: the name of a MAV_RESULT, why it was refused in words (None: it was taken), and
-    the time from sending to answer. Both `result` and `latency_s` are None for a fix that was not answered in time."""
+    """The autopilot's answer to a fix: `result` is the name of a MAV_RESULT, `why` the reason for a refusal in words
+    (None: accepted), `latency_s` the time from sending to answer. `result` and `latency_s` are None if no answer came
+    in time."""
 
     result: str | None
     why: str | None
@@ -43,9 +44,9 @@ class FixAnswer:
 
 
 class Sending:
-    """A fix to be sent by `due_s`, and its outcome. `sent` is None while the fix waits, then True, or False (`why`
-    gives the reason). `t_sent_s` is when the port was given it, and `outcome` the answer of the autopilot, each None
-    until then. Once the fix is queued, only the link's thread changes these."""
+    """A fix to be sent by `due_s`, and its outcome. `sent` is None while the fix waits, then True, or False with the
+    reason in `why`. `t_sent_s` is when the fix was handed to the port, `outcome` the answer of the autopilot; both are
+    None until then. Once the fix is queued, only the link's thread changes these."""
 
     def __init__(self, fix: Fix, due_s: float) -> None:
         self.fix, self.due_s = fix, due_s
@@ -57,11 +58,11 @@ class Sending:
 
     @property
     def answer(self) -> str | None:
-        """The answer of the autopilot, the name of a MAV_RESULT; None: no answer (yet)."""
+        """The autopilot's answer, the name of a MAV_RESULT; None if there is none (yet)."""
         return self.outcome.result if self.outcome else None
 
     def settle(self, sent: bool, why: str | None = None) -> None:
-        """Set the outcome: sent, or not sent and why."""
+        """Set the outcome: sent, or not sent and `why`. This wakes the threads in `wait`."""
         self.sent, self.why = sent, why
         self._settled.set()
 
@@ -71,17 +72,17 @@ class Sending:
 
 
 class Fixes:
-    """The fixes of a link, used in its turns only. It counts those `dropped` since they were too old, those `withheld`
-    for a reason that is the autopilot's, and those `unanswered`. `refusal` is the reason of the last answer that
-    refused a fix (None: none was refused)."""
+    """The fixes of one link. It counts the fixes `dropped` since they were too old, `withheld` for a reason that
+    `why_not` or a pause gives, and `unanswered`. `refusal` is the reason for the last refusal (None: there was none).
+    """
 
     def __init__(self, max_wait_s: float = MAX_FIX_WAIT_S) -> None:
         self.dropped = self.withheld = self.unanswered = 0
         self.refusal: Reason | None = None
         self._max_wait_s = max_wait_s
         self._waiting: deque[Sending] = deque()
-        self._under_way: deque[tuple[float, Sending]] = deque()  # with the time at which the port was given it
-        self._taken_s = -math.inf  # the newest that was taken, or perhaps taken
+        self._under_way: deque[tuple[float, Sending]] = deque()  # sent, without an answer; with the time of sending
+        self._taken_s = -math.inf  # time of the newest fix that was accepted, or perhaps was
         self._last_answer: tuple[str, Reason] | None = None
         self._news: News | None = None
         self._sent_s = -math.inf
@@ -92,19 +93,19 @@ class Fixes:
         return len(self._under_way)
 
     def forget_row(self) -> None:
-        """Begin a new row of fixes without an answer: those before went to another autopilot."""
+        """Restart the count of unanswered fixes in a row: the fixes so far went to another autopilot."""
         self._row = 0
-        self._is_stopped = False  # as it was last said
+        self._is_stopped = False  # as the ground was last told
         self._resumes_s = -math.inf
 
     @property
     def t_fix_s(self) -> float:
-        """The time of the newest fix that the autopilot may have taken: it said so, has not answered yet, or never did
-        (-inf: there is none)."""
+        """The time of the newest fix that the autopilot may be using: one that it accepted, has not answered yet, or
+        never answered. -inf: there is none."""
         return max(self._taken_s, self._under_way[-1][0] if self._under_way else -math.inf)
 
     def put(self, fix: Fix, now_s: float) -> Sending:
-        """Queue a fix, to be sent within the longest wait and before its frame is 5 s old, or not at all."""
+        """Queue a fix. It is sent within the longest wait and before its frame is 5 s old, or not at all."""
         sending = Sending(fix, min(now_s + self._max_wait_s, fix.t_frame_s + FIX_MAX_AGE_S))
         age_s = now_s - fix.t_frame_s
         if age_s > FIX_MAX_AGE_S:
@@ -116,7 +117,7 @@ class Fixes:
         return sending
 
     def next(self, now_s: float) -> Sending | None:
-        """Return the oldest fix that may still be sent (None: no fix), and drop those that have waited too long."""
+        """Drop the fixes that have waited too long; return the oldest of the others, or None if there is none."""
         self.drop_stale(now_s)
         return self._waiting.popleft() if self._waiting else None
 
@@ -128,14 +129,14 @@ class Fixes:
         self._waiting = deque(sending for sending in self._waiting if sending.sent is None)
 
     def withhold(self, why: str) -> None:
-        """Drop all fixes that wait, for a reason that is the autopilot's."""
+        """Give up all fixes that wait to be sent, for the reason `why`."""
         self.withheld += len(self._waiting)
         for sending in self._waiting:
             sending.settle(False, why)
         self._waiting.clear()
 
     def why_not(self, now_s: float) -> str | None:
-        """Return the reason why a fix must not be sent at this moment, None where it may be sent."""
+        """Return the reason why no fix may be sent now, or None if one may be sent."""
         if self._row >= UNANSWERED_MAX and now_s - self._sent_s < TRIED_AGAIN_AFTER_S:
             return "not sent: five fixes in a row had no answer"
         if now_s < self._resumes_s:
@@ -143,7 +144,8 @@ class Fixes:
         return None
 
     def note_sent(self, sending: Sending, now_s: float, has_answer: bool) -> None:
-        """Note that a fix was handed to the port; in a message that has no answer it may be taken."""
+        """Note that a fix was handed to the port. Without `has_answer` its message is one that is never answered, and
+        the autopilot is assumed to use it."""
         sending.t_sent_s = now_s
         if has_answer:
             self._row += 1
@@ -154,17 +156,17 @@ class Fixes:
             sending.outcome = FixAnswer(None, "its message has no answer", None)
 
     def note_lost(self, count: int) -> None:
-        """Note that so many fixes were thrown away with the port: nobody could answer them. Once the sending is
-        stopped, only an answer changes that."""
+        """Note that `count` fixes were thrown away with the port: they do not count as unanswered in a row, unless the
+        sending is stopped already, which only an answer ends."""
         if not self._is_stopped:
             self._row -= count
         self.break_off("the link was lost before its answer came")
 
     def hear(self, result: str, reason: Reason, now_s: float) -> Sending | None:
-        """Take in an answer, the name of a MAV_RESULT, and the reason for it; return the fix that it answers, None
-        where there is none. An answer names no fix, so any one ends the row of those without."""
+        """Process an answer: `result` is the name of a MAV_RESULT, `reason` explains it. Returns the fix that it is
+        matched to, or None if no fix waits. Any answer ends the series of unanswered fixes."""
         if self._is_stopped:
-            # All those fixes may be answered now, and these answers must not pass for one to a new fix.
+            # The answers to all those fixes may arrive now, and must not be matched to a new fix.
             self._resumes_s = now_s + ANSWERED_WITHIN_S
         self._row = 0
         self.time_out(now_s)
@@ -178,17 +180,18 @@ class Fixes:
         return sending
 
     def time_out(self, now_s: float) -> None:
-        """Give up the fixes that have waited for their answers for too long."""
+        """Stop waiting for the answers to the fixes sent more than a second ago; they count as unanswered."""
         while self._under_way and self._under_way[0][1].sent and now_s - self._under_way[0][0] > ANSWERED_WITHIN_S:
             self._give_up(f"it had no answer within {ANSWERED_WITHIN_S:g} s")
 
     def break_off(self, reason: str) -> None:
-        """Give up all fixes under way."""
+        """Stop waiting for the answers to all fixes sent, for `reason`."""
         while self._under_way:
             self._give_up(reason)
 
     def news_of_silence(self, reason: Reason, now_s: float) -> News | None:
-        """Return once that the sending has stopped, since no fix is answered (for this reason), or that it goes on."""
+        """Return a text for the ground when sending has stopped, as no fix is answered for `reason`, and another when
+        it is resumed; each once. None: nothing has changed."""
         is_stopped = self._row >= UNANSWERED_MAX
         if is_stopped == self._is_stopped or (is_stopped and now_s - self._sent_s < ANSWERED_WITHIN_S):
             return None
@@ -204,7 +207,8 @@ class Fixes:
         return News(True, f"fixes unanswered: {reason.brief}", "answers")
 
     def take_news(self) -> News | None:
-        """Return once that fixes are refused now, or for another reason, or taken again."""
+        """Return once a text for the ground when answers have changed: refused, refused for another reason, or accepted
+        again. None: nothing has changed."""
         news, self._news = self._news, None
         return news
 
@@ -213,7 +217,7 @@ class Fixes:
         sending.settle(False, why)
 
     def _give_up(self, reason: str) -> None:
-        """Give up the fix that waits longest for its answer; the other end may have it all the same."""
+        """Stop waiting for the answer to the oldest fix sent; the autopilot may use that fix all the same."""
         sent_s, sending = self._under_way.popleft()
         self._taken_s = max(self._taken_s, sent_s)
         if sending.sent:

@@ -1,4 +1,5 @@
-"""The link to the flight controller: one thread, the only one to touch the socket or serial port."""
+"""The link to the flight controller: its methods may be called from any thread, but only its own thread reads and
+writes the socket or serial port. Used by the flight. For turns, see `turns`."""
 
 import logging
 import select
@@ -23,27 +24,28 @@ from edgevpr.mavlink.wire import Message
 
 TURN_S = 0.25  # longest sleep of the thread when nothing wakes it
 RETRY_FIRST_S, RETRY_MAX_S = 0.2, 2.0
-WATCH_S = 0.01  # between two looks whether a fix has left
+WATCH_S = 0.01  # between two checks whether a fix has left the operating system
 FLUSH_S = 0.5
 
 _USUAL = LinkSettings()
 
 P = ParamSpec("P")
 T = TypeVar("T")
-Step = Callable[..., None]  # takes note of a step of a turn
+Step = Callable[..., None]  # records one event of a turn on the tape: its name, and its values
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkStats:
-    """Counts and state of a link. `trouble` is the reason why it is or last was not open, None once data arrives.
+    """Counts and state of a link since its start; messages are counted by name, answers (`acks`) by name of the result.
 
-    `foreign_messages` came from another autopilot or another address than ours and were refused. `withheld_fixes` were
-    not sent because those before had no answer, or the ground has paused the flight. `unanswered_fixes` were sent and
-    had no answer within a second, and `refused_why` is why the last one was refused (None: none was), in a few words.
-    `commands` counts those that were for us, by result, and `ignored_requests` what else was for us and had no effect.
-    With a signing key, `refused_signatures` counts the messages without a right signature or time stamp, by reason.
+    `trouble` is why the link is not open, or last was not; None once data arrives. `foreign_messages` were refused
+    since they came from another autopilot or another address. `withheld_fixes` were not sent since earlier ones had no
+    answer, or the ground has paused the flight. `unanswered_fixes` had no answer within a second; `refused_why` says in
+    a few words why the last refused fix was refused (None: none was). `commands` counts the commands addressed to us,
+    by result, and `ignored_requests` the other messages to us that had no effect. With a signing key,
+    `refused_signatures` counts the messages whose signature or time stamp is wrong, by reason.
     """
 
     connected: bool
@@ -67,12 +69,12 @@ class LinkStats:
 
     @property
     def fixes_sent(self) -> int:
-        """Number of position fixes sent."""
+        """Number of position fixes sent by command 43003."""
         return self.sent.get("COMMAND_INT", 0)
 
 
 def _in_turn(method: Callable[Concatenate[Conversation, P], T]) -> Callable[Concatenate["Link", P], T]:
-    """Let a link do in a turn what its conversation does."""
+    """Make a method of `Link` from one of `Conversation`: it calls that method inside a turn."""
 
     def done_in_turn(link: "Link", /, *values: P.args, **named: P.kwargs) -> T:
         with link.turn(method.__name__):
@@ -83,10 +85,11 @@ def _in_turn(method: Callable[Concatenate[Conversation, P], T]) -> Callable[Conc
 
 
 class Link:
-    """The link to one flight controller. It sends the queued messages and one heartbeat a second, listens, and reopens
-    the port after every loss of the other end. What is said and heard is the `Conversation`'s.
+    """The link to one flight controller. It sends the queued messages and a heartbeat once a second, receives, and
+    reopens the port whenever the connection is lost. `Conversation` decides what is sent, and processes what is
+    received.
 
-    All but `start` and `close` may be called from any thread; none waits for the other end, and none raises.
+    All methods but `start` and `close` may be called from any thread; none waits for the other end, and none raises.
     """
 
     name = "link"
@@ -109,8 +112,8 @@ class Link:
     def start(self) -> None:
         """Open the port and start the thread.
 
-        Raises LinkError for a fault that the user must correct. A missing device or server is no error: the link tries
-        to open it again and again, and `stats` gives the reason.
+        Raises LinkError for a fault that only the user can correct. A missing device or server is no error: the thread
+        tries to open it again and again, and `stats` gives the reason.
         """
         try:
             self._line = self._opened()
@@ -122,27 +125,27 @@ class Link:
         self._thread.start()
 
     def turn(self, what: str) -> AbstractContextManager[None]:
-        """Let the link say and hear nothing inside this context, in which time stands still: what is done there with
-        the link and with its listener is done at once. `what` names it on the tape."""
+        """Return a context manager that takes a turn: until it ends, the link sends and processes nothing and its time
+        stands still, so that several calls act at the same moment. `what` names the turn on the tape."""
         return self._turns.taken(what)
 
     def send(self, *outgoing: Message) -> None:
-        """Queue messages. If the queue is full, the oldest messages are dropped and counted."""
+        """Queue messages to be sent. If the queue is full, the oldest messages are dropped and counted."""
         with self.turn("send"):
             for message in outgoing:
                 self._conversation.put(message)
         self._ring()
 
     def send_fix(self, fix: Fix) -> Sending:
-        """Queue a position fix, to be sent within `max_fix_age_s` and only to an autopilot that is there, or never. The
-        returned `Sending` gives the outcome as soon as it is known."""
+        """Queue a position fix. It is sent within `max_fix_age_s` seconds, and only while the autopilot is heard, or
+        never. The returned `Sending` holds the outcome as soon as that is known."""
         with self.turn("send_fix"):
             sending = self._conversation.fixes.put(fix, self._turns.now_s())
         self._ring()
         return sending
 
     def announce(self, severity: Severity, text: str, topic: str | None = None) -> None:
-        """Let a text for the people on the ground wait for its turn (see `Texts`)."""
+        """Queue a text for the people on the ground; texts are sent at most every five seconds (see `Texts`)."""
         with self.turn("announce"):
             self._conversation.announce(severity, text, topic)
         self._ring()
@@ -160,18 +163,18 @@ class Link:
         return self._conversation.channel
 
     def listens(self) -> bool:
-        """Tell whether there is an autopilot that a fix can be sent to at this moment."""
+        """Return True if a fix can be sent now: the port is connected and the autopilot has been heard lately."""
         with self.turn("listens"):
             is_connected, *_ = self._tape.read("port", self._port)
             return is_connected and self._conversation.autopilot.listens(self._turns.now_s())
 
     def stats(self) -> LinkStats:
-        """Return counts and state of the link."""
+        """Return the counts and the state of the link."""
         with self.turn("stats"):
             return self._stats()
 
     def close(self) -> None:
-        """Send the queued messages and texts, receive the answers to the fixes sent, both for half a second at most,
+        """Send the queued messages and texts, wait for the answers to the fixes sent, both for half a second at most,
         and close the port."""
         with self.turn("close"):
             self._conversation.texts.hurry()
@@ -251,7 +254,7 @@ class Link:
         self._reopened += 1
 
     def _turn(self, line: Line, timeout_s: float) -> None:
-        """Write what the port takes, wait until there is something to do or the time is up, and read."""
+        """Write as much as the port accepts, wait until there is something to do or `timeout_s` is over, and read."""
         with self._turns.of_link(self.name) as step:
             if line.port.connected:
                 self._transmit(line, step)

@@ -1,7 +1,8 @@
-"""One pure function for each message: values in, a pymavlink message out. No I/O, no clock.
+"""Functions that make the messages we send, one for each kind: values in, a pymavlink message out; no I/O and no clock.
+Used by the link and the flight.
 
-`t_mono_s` is seconds of the system's monotonic clock, the only clock of a link: an autopilot keeps one time correction
-for all messages of a link.
+`t_mono_s` is a time of the system's monotonic clock in seconds, the only clock of a link: an autopilot keeps a single
+time correction for all messages of a link.
 """
 
 import math
@@ -17,7 +18,7 @@ TEXT_BYTES = 50
 
 
 class Health(IntEnum):
-    """The state of this companion in its heartbeat (MAV_STATE)."""
+    """The state of this companion computer that its heartbeat reports (MAV_STATE)."""
 
     BOOT = mavlink.MAV_STATE_BOOT
     STANDBY = mavlink.MAV_STATE_STANDBY  # paused by the ground
@@ -34,10 +35,11 @@ class Severity(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Fix:
-    """A position fix: position of the vehicle when the frame was taken, at `t_frame_s` of the monotonic clock.
+    """A position fix: latitude and longitude of the vehicle at `t_frame_s`, when the frame was taken (monotonic clock),
+    and `accuracy_m`, the standard deviation of one axis.
 
-    Raises ValueError for a position off the Earth, for an accuracy (1 sigma) that is not finite and above zero, and
-    for a time that is not finite.
+    Raises ValueError for a position off the Earth, for an accuracy that is not finite and above zero, and for a time
+    that is not finite.
     """
 
     lat_deg: float
@@ -69,8 +71,8 @@ def heartbeat(health: Health) -> Message:
 def position_fix(fix: Fix, t_sent_s: float, target_system: int) -> Message:
     """Make a COMMAND_INT (75) with command 43003, in the form that ArduPilot accepts: global frame, no altitude (NaN).
 
-    The time from `fix.t_frame_s` to `t_sent_s` is sent as the processing time, so that the autopilot knows when the
-    vehicle was there. As a float32, `t_sent_s` is accurate to 8 ms after one day, to 60 ms after ten days.
+    The time from `fix.t_frame_s` to `t_sent_s` is sent as the processing time, which tells the autopilot how old the
+    position is. `t_sent_s` is sent as a float32: accurate to 8 ms after one day, to 60 ms after ten days.
     """
     return mavlink.MAVLink_command_int_message(
         target_system=target_system,
@@ -90,11 +92,14 @@ def position_fix(fix: Fix, t_sent_s: float, target_system: int) -> Message:
 
 
 def report_requests(target_system: int, firmware: int, is_continuous: bool = False) -> tuple[Message, ...]:
-    """Make a COMMAND_LONG (76) with SET_MESSAGE_INTERVAL (511) for every report that is wanted: GLOBAL_POSITION_INT
-    (33) and ATTITUDE (30) ten times a second, GPS_RAW_INT (24) five times, and twice DISTANCE_SENSOR (132),
-    TERRAIN_REPORT (136) and what the filter of a `firmware` (MAV_AUTOPILOT) says of itself. A continuous position also
-    takes ATTITUDE and SCALED_IMU (26) twenty-five times a second, and SYSTEM_TIME (2) and GPS_GLOBAL_ORIGIN (49) once.
-    On many autopilots the companion's port streams none of them unless asked."""
+    """Make the requests for all reports that the flight needs, each a COMMAND_LONG (76) with SET_MESSAGE_INTERVAL
+    (511). On many autopilots the companion's port sends none of them unless asked. `firmware` is a MAV_AUTOPILOT; a
+    continuous channel (`is_continuous`) needs more.
+
+    - 10 Hz: GLOBAL_POSITION_INT (33) and ATTITUDE (30); 5 Hz: GPS_RAW_INT (24).
+    - 2 Hz: DISTANCE_SENSOR (132), TERRAIN_REPORT (136), and the status of the position filter of a known firmware.
+    - Continuous: ATTITUDE and SCALED_IMU (26) at 25 Hz; SYSTEM_TIME (2) and GPS_GLOBAL_ORIGIN (49) at 1 Hz.
+    """
     wanted_us = {
         mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 100_000,
         mavlink.MAVLINK_MSG_ID_ATTITUDE: _DENSE_US if is_continuous else 100_000,
@@ -113,25 +118,25 @@ def report_requests(target_system: int, firmware: int, is_continuous: bool = Fal
 
 
 def message_request(target_system: int, message_id: int) -> Message:
-    """Make a COMMAND_LONG (76) with REQUEST_MESSAGE (512) for one message."""
+    """Make a COMMAND_LONG (76) with REQUEST_MESSAGE (512): the autopilot shall send message `message_id` once."""
     return _command(target_system, mavlink.MAV_CMD_REQUEST_MESSAGE, message_id)
 
 
 def parameter_request(target_system: int, name: str) -> Message:
-    """Make a PARAM_REQUEST_READ (20) for a parameter by its name."""
+    """Make a PARAM_REQUEST_READ (20) for the parameter of this name."""
     return mavlink.MAVLink_param_request_read_message(target_system, AUTOPILOT, name.encode(), -1)
 
 
 def origin(target_system: int, lat_deg: float, lon_deg: float, alt_m: float) -> Message:
-    """Make a SET_GPS_GLOBAL_ORIGIN (48)."""
+    """Make a SET_GPS_GLOBAL_ORIGIN (48): the origin of the autopilot's local frame, `alt_m` above sea level."""
     return mavlink.MAVLink_set_gps_global_origin_message(
         target_system, round(lat_deg * 1e7), round(lon_deg * 1e7), round(alt_m * 1e3)
     )
 
 
 def place_match(t_mono_s: float, place_id: int, score: float, confidence: float | None = None) -> tuple[Message, ...]:
-    """Make the event of an accepted match: NAMED_VALUE_INT (252) `vpr_place`, NAMED_VALUE_FLOAT (251) `vpr_score`, and
-    `vpr_conf`, the probability that it is right, where that is known."""
+    """Make the messages for an accepted match: NAMED_VALUE_INT (252) `vpr_place`, NAMED_VALUE_FLOAT (251) `vpr_score`
+    and, if `confidence` (0..1) is known, `vpr_conf`, the probability that the match is right."""
     return (
         mavlink.MAVLink_named_value_int_message(_boot_ms(t_mono_s), b"vpr_place", place_id),
         _named_float(t_mono_s, b"vpr_score", score),
@@ -140,18 +145,19 @@ def place_match(t_mono_s: float, place_id: int, score: float, confidence: float 
 
 
 def query_figures(t_mono_s: float, cpu_share: float, used_mah: float) -> tuple[Message, Message]:
-    """Make the cost of a query, two NAMED_VALUE_FLOAT (251): `vpr_cpu`, the share of the whole machine (0..1), and
-    `vpr_mah`, the charge used so far (mAh)."""
+    """Make two NAMED_VALUE_FLOAT (251) with the cost of a query: `vpr_cpu`, its share of all processor cores (0..1),
+    and `vpr_mah`, the charge used so far in the flight (mAh)."""
     return (_named_float(t_mono_s, b"vpr_cpu", cpu_share), _named_float(t_mono_s, b"vpr_mah", used_mah))
 
 
 def gps_distance(t_mono_s: float, off_m: float) -> Message:
-    """Make the distance between GPS and an accepted match, NAMED_VALUE_FLOAT (251) `vpr_gps_m`."""
+    """Make a NAMED_VALUE_FLOAT (251) `vpr_gps_m`: the distance between GPS and an accepted match, metres."""
     return _named_float(t_mono_s, b"vpr_gps_m", off_m)
 
 
 def source_set(number: int, target_system: int) -> Message:
-    """Make a COMMAND_LONG (76) with SET_EKF_SOURCE_SET (42007)."""
+    """Make a COMMAND_LONG (76) with SET_EKF_SOURCE_SET (42007): `number` is the source set (1..3) that ArduPilot shall
+    use."""
     return _command(target_system, mavlink.MAV_CMD_SET_EKF_SOURCE_SET, number)
 
 
@@ -162,8 +168,8 @@ def computer_status(
     ram_total_bytes: int,
     temperature_c: float | None = None,
 ) -> Message:
-    """Make an ONBOARD_COMPUTER_STATUS (390): the load of each core (0..1; the first eight are sent), RAM (sent in MiB),
-    and temperature (None: unknown)."""
+    """Make an ONBOARD_COMPUTER_STATUS (390): the load of each core (0..1; the first eight are sent), used and total RAM
+    (sent in MiB), and the temperature in degrees Celsius (None: unknown)."""
     percents = [min(100, max(0, round(100 * share))) for share in core_shares[:8]]
     temperature = 127 if temperature_c is None else min(126, max(-128, round(temperature_c)))
     return mavlink.MAVLink_onboard_computer_status_message(
@@ -196,9 +202,9 @@ def status_text(severity: Severity, text: str) -> Message:
     return mavlink.MAVLink_statustext_message(severity, data)
 
 
-_DENSE_US = 40_000  # an ArduPilot plane, whose loop turns fifty times a second, denies more than forty messages
+_DENSE_US = 40_000  # an ArduPilot plane, whose loop runs fifty times a second, denies more than forty messages a second
 _UNUSED = 2**32 - 1
-# ArduPilot tells the pilot, in a text, of every request for a message that it does not know.
+# Only the right one: ArduPilot sends the pilot a text for each request of a message that it does not know.
 _FILTER_REPORTS = {
     mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT,
     mavlink.MAV_AUTOPILOT_PX4: mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS,

@@ -1,4 +1,5 @@
-"""The autopilot at the other end of the link: its system id, its presence, where and how it flies, its answers."""
+"""The state of the autopilot at the other end of the link, collected from its messages: its system id, presence,
+answers to fixes, and the position and motion of its vehicle. Used by `conversation`."""
 
 import math
 from collections import Counter
@@ -27,48 +28,53 @@ from edgevpr.mavlink.wire import Message, mavlink
 
 GPS_GONE_AFTER_S = 2.5  # GPS reports come at least once a second, and one may be lost
 GPS_AGREES_WITHIN_M = 50.0  # at 25 m/s, with one or two seconds between the two reports
-FASTEST_M_S = 150.0  # over ground: a report of more is none of a small aircraft
+FASTEST_M_S = 150.0  # over ground: a small aircraft is never faster, so such a report is wrong
 SILENT_AFTER_S = 5.0  # heartbeats come once a second, and this many may be lost
 _MILLI_G_M_S2 = 9.80665e-3
 
 
 class Listener(Protocol):
-    """Navigates by what the autopilot says, and gives the positions of a continuous channel. Its methods are called in
-    the thread of the link; they never block and never raise."""
+    """Navigates by the reports of the autopilot, and gives the positions that a continuous channel sends. Its methods
+    are called in the link's thread; they never block and never raise. All times are of the monotonic clock, in seconds.
+    """
 
     def hear_autopilot(self, t_s: float) -> None:
-        """Take in that there is an autopilot from `t_s` on, or another one than before."""
+        """Note that at `t_s` an autopilot was first heard, or that another one has taken its place."""
         return
 
     def hear_channel(self, channel: Channel) -> None:
-        """Take in by which channel the autopilot is told positions, when that has been found out."""
+        """Note the channel by which the autopilot is told positions. Called when it is first chosen, and when it
+        changes."""
         return
 
     def hear_vehicle(self, vehicle: Vehicle) -> None:
-        """Take in a report of position and velocity."""
+        """Process a report of the vehicle's position and velocity."""
         return
 
     def hear_force(self, t_s: float, force_m_s2: tuple[float, float, float], attitude: Attitude) -> None:
-        """Take in what the accelerometers feel (nose, right, down) at an attitude."""
+        """Process the specific force that the accelerometers measure, m/s^2 along nose, right and down, and the
+        attitude at `t_s`."""
         return
 
     def state_at(self, t_s: float) -> MotionState | None:
-        """Return where the vehicle is or was, to be sent as a continuous position; None: that is not known well
-        enough."""
+        """Return position and motion of the vehicle at `t_s`, to be sent on a continuous channel. None: they are not
+        known well enough."""
         return None
 
 
 class NoListener(Listener):
-    """Stands in for a `Listener` where nobody navigates."""
+    """A `Listener` that does nothing, for a link without navigation."""
 
 
 class Autopilot:
-    """The state of the autopilot, from all messages that arrive. `Identity` says which of them are its own."""
+    """The state of the autopilot and its vehicle, from all messages received. `identity` decides which messages come
+    from our autopilot; the others are ignored. `own_component` is our component id, `system_id` that of the autopilot
+    (None: of the first one heard)."""
 
     def __init__(self, own_component: int, system_id: int | None, listener: Listener) -> None:
         self.identity = Identity(system_id)
         self.acks: Counter[str] = Counter()  # answers to our fixes, by name of the result
-        self.firmware: int = mavlink.MAV_AUTOPILOT_GENERIC  # until it is heard
+        self.firmware: int = mavlink.MAV_AUTOPILOT_GENERIC  # MAV_AUTOPILOT; this until its heartbeat
         self._listener = listener
         self._own_component = own_component
         self._heard_s = -math.inf
@@ -76,30 +82,32 @@ class Autopilot:
         self._forget()
 
     def _forget(self) -> None:
-        """Know nothing of the autopilot and its vehicle."""
+        """Reset all that was known of the autopilot and its vehicle."""
         self.interview, self.readiness = Interview(), Readiness()
         self.origin: tuple[float, float, float] | None = None  # of its local frame: degrees, metres above sea level
         self.vehicle: Vehicle | None = None  # the last report, of any age, without attitude
         self.attitudes, self._heights, self.certainty = Attitudes(), Heights(), Certainty()
-        self._utc_ahead_s: float | None = None  # its clock, seconds since 1970, over ours
-        self._gps: dict[str, tuple[int, Receiver]] = {}  # those with a fix, and their own time of it
+        self._utc_ahead_s: float | None = None  # its clock (seconds since 1970) less our monotonic one
+        self._gps: dict[str, tuple[int, Receiver]] = {}  # receivers with a fix, each with the time stamp of its report
 
     @property
     def system_id(self) -> int | None:
-        """System id of the autopilot, None until it is heard."""
+        """System id of the autopilot; None until its first heartbeat."""
         return self.identity.kept.system_id if self.identity.kept else None
 
     def listens(self, now_s: float) -> bool:
-        """Tell whether a heartbeat of the autopilot was heard in the last five seconds, over the port as it is open."""
+        """Return True if a heartbeat of the autopilot came in the last five seconds, and since the port was last
+        opened."""
         return now_s - self._heard_s <= SILENT_AFTER_S
 
     def forget_presence(self) -> None:
-        """Regard the autopilot as absent until its next heartbeat, as after a reconnection to who knows whom."""
+        """Regard the autopilot as absent until its next heartbeat: after the port is reopened, the other end may be
+        another one."""
         self._heard_s = -math.inf
 
     def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
-        """Return the last report, with position, roll, pitch and heading at the time of a frame as far as they are
-        known."""
+        """Return the last report with position, roll, pitch and heading moved to `t_mono_s`, the time of a frame, as
+        far as velocity and attitude are known. None: there is no report, or it had no position."""
         vehicle, attitude = self.vehicle, self.attitudes.at(t_mono_s)
         if vehicle and vehicle.velocity_m_s and vehicle.is_fresh_at(t_mono_s):
             east_m, north_m = ((t_mono_s - vehicle.t_heard_s) * speed_m_s for speed_m_s in vehicle.velocity_m_s)
@@ -111,13 +119,13 @@ class Autopilot:
         return replace(vehicle, roll_deg=attitude.roll_deg, pitch_deg=attitude.pitch_deg, heading_deg=heading_deg)
 
     def take_answer(self) -> str | None:
-        """Return the newest answer to a fix (name of a MAV_RESULT) once, then None until the next answer."""
+        """Return the newest answer to a fix (name of a MAV_RESULT) once; None until the next answer."""
         answer, self._answer = self._answer, None
         return answer
 
     def hear(self, message: Message, now_s: float, address: Sender | None = None) -> bool:
-        """Take in a message heard at `now_s` from `address` (None: there is only one sender); return True for the
-        autopilot's heartbeat."""
+        """Process a message received at `now_s` from `address` (None: the link has one sender only). Returns True if it
+        is a heartbeat of our autopilot."""
         if message.get_srcComponent() != AUTOPILOT or message.get_srcSystem() == 0:
             if self.identity.is_elsewhere(address):
                 self.identity.refuse()
@@ -160,12 +168,13 @@ class Autopilot:
         return False
 
     def unix_s(self, t_mono_s: float) -> float | None:
-        """Return a time of ours by the clock of the autopilot, seconds since 1970; None where it has told none."""
+        """Convert a time of our monotonic clock to the autopilot's UTC, seconds since 1970. None: it has not sent its
+        time."""
         return None if self._utc_ahead_s is None else t_mono_s + self._utc_ahead_s
 
     def _hear_position(self, message: Message, now_s: float) -> None:
-        """Take in a GLOBAL_POSITION_INT. It says no position where it is 0, 0, which an autopilot without one sends, or
-        off the Earth."""
+        """Process a GLOBAL_POSITION_INT. A position off the Earth, or at 0, 0, which an autopilot sends that has none,
+        sets `vehicle` to None."""
         gps, lat_deg, lon_deg = self._best_gps(now_s), message.lat / 1e7, message.lon / 1e7
         has_gps = False
         if gps and distance_m(gps.lat_deg, gps.lon_deg, lat_deg, lon_deg) <= GPS_AGREES_WITHIN_M:
@@ -193,17 +202,17 @@ class Autopilot:
     def _hear_gps(self, message: Message, now_s: float) -> None:
         choice, name = self.interview.choice, message.get_type()
         if choice.channel is Channel.GPS_INPUT and name == GPS_REPORTS[choice.receiver]:
-            return  # the receiver that we play: it says what we have said
+            return  # this report is of the positions that we have sent ourselves
         if message.fix_type < mavlink.GPS_FIX_TYPE_3D_FIX:
             self._gps.pop(name, None)
             return
         time_usec, before = self._gps.get(name, (0, None))
-        # A receiver that is lost is reported on for seconds, with its last position and the time of that.
+        # After a receiver is lost, its last position is reported for some seconds more, with an unchanged time stamp.
         t_s = before.t_s if before and message.time_usec and message.time_usec == time_usec else now_s
         self._gps[name] = message.time_usec, Receiver(message.lat / 1e7, message.lon / 1e7, gps_sd_m(message), t_s)
 
     def _best_gps(self, now_s: float) -> Receiver | None:
-        """Return the most exact receiver; None where there is none."""
+        """Return the newest report of the most accurate GPS receiver; None if none had a fix in the last 2.5 s."""
         new = (receiver for _, receiver in self._gps.values() if now_s - receiver.t_s <= GPS_GONE_AFTER_S)
         return min(new, key=lambda receiver: receiver.sd_m, default=None)
 

@@ -1,7 +1,8 @@
-"""Ports of four kinds, none of which ever blocks once it is open: UDP out and in, TCP, serial.
+"""Ports of four kinds: UDP out, UDP in, TCP and serial. None of them blocks once it is open. Used by `link`, `asking`
+and the simulated autopilot.
 
-This thin layer over `socket` and pyserial behaves the same in every fault. pymavlink's own connections may spin, hang
-or raise.
+This thin layer over `socket` and pyserial has the same behaviour after every fault. pymavlink's own connections may
+spin, hang or raise.
 """
 
 import errno
@@ -24,8 +25,9 @@ READ_BYTES = 65_536
 
 
 class Port:
-    """A port, as a link needs it; its owner closes one that is lost, and opens another. `connected`: there is a
-    receiver to send to; `sender` is that of the last bytes read, None where there can be only one."""
+    """The base of all ports. After an error the owner closes the port and opens a new one. `connected`: there is a
+    receiver to which `write` can send. `sender`: the address from which the last bytes came; None if there can be only
+    one."""
 
     connected = True
     sender: Sender | None = None
@@ -36,11 +38,11 @@ class Port:
         self._sock = sock
 
     def fileno(self) -> int:
-        """Return the file descriptor, to wait for."""
+        """Return the file descriptor, for `select`."""
         return self._sock.fileno()
 
     def read(self) -> bytes:
-        """Return the bytes that have arrived, b"" for none; raises OSError where the connection is lost."""
+        """Return the bytes that have arrived (b"": none), without waiting. Raises OSError if the connection is lost."""
         with suppress(BlockingIOError):
             data = os.read(self.fileno(), READ_BYTES)
             if not data:
@@ -49,20 +51,21 @@ class Port:
         return b""
 
     def write(self, data: bytes) -> int:
-        """Take as many bytes as fit at once and return their number; raises OSError where the connection is lost."""
+        """Write as many bytes as fit without waiting, and return their number. Raises OSError if the connection is
+        lost."""
         with suppress(BlockingIOError):
             return os.write(self.fileno(), data)
         return 0
 
     def answer_sender(self) -> None:
-        """Send from this call on to the sender of the last bytes (where there can be several senders)."""
+        """From now on send to the sender of the last bytes read. No effect if there can be only one sender."""
 
     def unsent(self) -> int:
-        """Return the number of bytes taken that have not left the system yet, or are not confirmed (TCP)."""
+        """Return the number of bytes written that have not left the operating system, or (TCP) are not confirmed."""
         return 0
 
     def throw_away(self) -> None:
-        """Let `close` throw away the bytes that have not left, instead of sending them later."""
+        """Make `close` discard the bytes that have not left, instead of letting them leave later."""
 
     def close(self) -> None:
         """Close the port."""
@@ -70,12 +73,12 @@ class Port:
 
 
 class UdpOutPort(Port):
-    """A UDP socket that is connected to one peer: the system drops what comes from any other address."""
+    """A UDP socket that is connected to one address: the operating system drops packets from any other."""
 
     def __init__(self, host: str, port: int) -> None:
         super().__init__(_udp_socket(socket.socket.connect, host, port))
 
-    # A datagram that nobody took makes the next call fail, once.
+    # A datagram that no program received makes the next call fail, once; so `write` tries twice.
 
     def read(self) -> bytes:
         with suppress(BlockingIOError, ConnectionRefusedError):
@@ -90,7 +93,7 @@ class UdpOutPort(Port):
 
 
 class UdpInPort(Port):
-    """A UDP socket that listens. It sends to the first sender heard, until `answer_sender` selects another."""
+    """A UDP socket that listens. It sends to the first sender, until `answer_sender` selects another."""
 
     def __init__(self, host: str, port: int) -> None:
         # No SO_REUSEADDR: with it, a second program on the port would silently take the first one's datagrams.
@@ -139,8 +142,8 @@ class TcpPort(Port):
 
 
 class SerialPort(Port):
-    """A serial line. It is read and written by its descriptor: when the buffer is full, pyserial's own non-blocking
-    write spins."""
+    """A serial line. It is read and written by its file descriptor, since pyserial's own non-blocking write spins when
+    the buffer is full."""
 
     _end = "the device is gone"
 
@@ -167,7 +170,7 @@ class SerialPort(Port):
     def close(self) -> None:
         with suppress(OSError, termios.error):
             if self.unsent():
-                # Bytes that the line has not taken must neither leave later nor delay the close (for up to 30 s).
+                # Bytes still in the buffer must neither leave later nor delay the close (for up to 30 s).
                 self._port.reset_output_buffer()
         self._port.close()
 
@@ -182,7 +185,7 @@ def open_port(address: LinkAddress) -> Port:
     try:
         return _OPENERS[address.kind](address.where, address.number)
     except (socket.gaierror, UnicodeError) as error:
-        # A host may be found later where no name server answers, or where it announces itself.
+        # The host may be found later: no name server has answered, or a .local host announces itself.
         is_unasked = isinstance(error, socket.gaierror) and error.errno != socket.EAI_NONAME
         kind = LinkError if is_unasked or address.where.endswith(".local") else LinkAddressError
         raise kind(f"{address}: there is no host {address.where!r}: correct it, or give an IP address.") from error
@@ -215,7 +218,7 @@ _OPENERS: dict[str, Callable[[str, int], Port]] = {
 
 
 def _udp_socket(attach: Callable[[socket.socket, Sender], None], host: str, port: int) -> socket.socket:
-    """Make a UDP socket, and bind or connect it."""
+    """Make a UDP socket, and attach it to `host` and `port` by `attach`: socket.bind or socket.connect."""
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         address = socket.getaddrinfo(host, port, socket.AF_INET, socket.SOCK_DGRAM)[0][4]

@@ -1,4 +1,5 @@
-"""Messages of a continuous position, and of one that is not a command: pure functions, as in `messages`."""
+"""Functions that make the messages of the channels other than command 43003: message 296 for single fixes, GPS_INPUT
+and ODOMETRY for a continuous position. Like `messages`: values in, a message out. Used by `conversation`."""
 
 import math
 from dataclasses import dataclass
@@ -7,16 +8,16 @@ from edgevpr.core.geodesy import offset_m
 from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.wire import Message, mavlink
 
-SENSOR_ID = 1  # in our messages 296, and of EKF2_AGP0_ID: 0 switches the slot off
+SENSOR_ID = 1  # the `id` in our messages 296, equal to EKF2_AGP0_ID, whose value 0 would switch the slot off
 _YAW_SD = math.radians(5.0)
 _GPS_EPOCH_S, _LEAP_S = 315_964_800, 18  # 1980-01-06; leap seconds since then, as of 2017
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MotionState:
-    """Position and motion of the vehicle at `t_mono_s`: altitude above sea level, velocity east, north and down, and
-    standard deviations (1 sigma of one axis; `alt_accuracy_m` of the altitude). `attitude` is roll, pitch and yaw in
-    radians."""
+    """Position and motion of the vehicle at `t_mono_s`: altitude above sea level, velocity (east, north, down), and
+    standard deviations (`accuracy_m` and `speed_accuracy_m_s` of one axis, `alt_accuracy_m` of the altitude).
+    `attitude` is (roll, pitch, yaw) in radians, None if unknown."""
 
     t_mono_s: float
     lat_deg: float
@@ -30,8 +31,8 @@ class MotionState:
 
 
 def position_sensor(fix: Fix, t_sent_s: float) -> Message:
-    """Make a GLOBAL_POSITION_SENSOR (296): a position by vision, without altitude. PX4 takes it to be of the moment at
-    which it arrives, less a parameter of its own."""
+    """Make a GLOBAL_POSITION_SENSOR (296): a position found by vision, without altitude. PX4 ignores its time stamp: it
+    subtracts a delay, a parameter of its own, from the time of arrival."""
     return mavlink.MAVLink_global_position_sensor_message(
         target_system=0,
         target_component=0,
@@ -50,8 +51,9 @@ def position_sensor(fix: Fix, t_sent_s: float) -> Message:
 
 
 def gps_input(state: MotionState | None, receiver: int, t_mono_s: float, t_unix_s: float | None) -> Message:
-    """Make a GPS_INPUT (232) as the receiver of this number; a `state` of None says that there is no fix. `t_unix_s` is
-    the time of the state by the vehicle's clock, seconds since 1970 (None: unknown)."""
+    """Make a GPS_INPUT (232) as GPS receiver number `receiver` (0: the first). A `state` of None is sent as "no fix".
+    `t_mono_s` is the time of the state, `t_unix_s` the same time by the vehicle's clock, seconds since 1970 (None:
+    unknown)."""
     week, week_ms = _gps_time(t_unix_s)
     ignored = mavlink.GPS_INPUT_IGNORE_FLAG_HDOP | mavlink.GPS_INPUT_IGNORE_FLAG_VDOP
     east, north, down = state.velocity_m_s if state else (0, 0, 0)
@@ -64,7 +66,7 @@ def gps_input(state: MotionState | None, receiver: int, t_mono_s: float, t_unix_
         fix_type=mavlink.GPS_FIX_TYPE_3D_FIX if state else mavlink.GPS_FIX_TYPE_NO_FIX,
         hdop=0.0,
         vdop=0.0,
-        # The fewest with which a filter begins, so that a real receiver is always preferred.
+        # The smallest number with which a filter starts, so that a real receiver is always preferred.
         satellites_visible=6 if state else 0,
         lat=round(state.lat_deg * 1e7) if state else 0,
         lon=round(state.lon_deg * 1e7) if state else 0,
@@ -79,12 +81,13 @@ def gps_input(state: MotionState | None, receiver: int, t_mono_s: float, t_unix_
 
 
 def odometry(state: MotionState, attitude: tuple[float, float, float], origin: tuple[float, float, float]) -> Message:
-    """Make an ODOMETRY (331) in the only frames that ArduPilot takes: position north, east, down of an `origin`
-    (degrees, metres above sea level), velocity along the airframe at an `attitude` (roll, pitch, yaw in radians).
+    """Make an ODOMETRY (331) in the only frames that ArduPilot accepts: position north, east, down of `origin`
+    (latitude, longitude in degrees, altitude in metres above sea level), velocity along the axes of the airframe.
+    `attitude` is (roll, pitch, yaw) in radians and must not contain NaN.
 
-    ArduPilot takes the cube root of the sum of the squared variances of a position for its standard deviation
-    (`GCS_MAVLINK::handle_odometry`, 4.7-dev), and the same of the angles; so the variances are those that give it the
-    right one. No angle may be NaN. The height's own is none of ours, and zero.
+    ArduPilot computes a standard deviation as the cube root of the sum of the squared variances
+    (`GCS_MAVLINK::handle_odometry`, 4.7-dev); the variances sent are those from which it gets the right one. That of
+    the height is sent as zero, since the height is not measured by us.
     """
     east_m, north_m = offset_m(origin[0], origin[1], state.lat_deg, state.lon_deg)
     roll, pitch, yaw = attitude
@@ -118,7 +121,7 @@ def odometry(state: MotionState, attitude: tuple[float, float, float], origin: t
 
 
 def _gps_time(t_unix_s: float | None) -> tuple[int, int]:
-    """Return week and millisecond of the week of GPS; 0, 0 where the time is unknown."""
+    """Return (GPS week, millisecond of the week); (0, 0) if the time is unknown."""
     if t_unix_s is None:
         return 0, 0
     weeks, rest_s = divmod(t_unix_s - _GPS_EPOCH_S + _LEAP_S, 604_800)
@@ -126,7 +129,7 @@ def _gps_time(t_unix_s: float | None) -> tuple[int, int]:
 
 
 def _quaternion(roll: float, pitch: float, yaw: float) -> list[float]:
-    """Return the rotation from the airframe to north, east, down (w, x, y, z)."""
+    """Return the rotation from the airframe to north, east, down as a quaternion [w, x, y, z]. Angles in radians."""
     (cr, sr), (cp, sp), (cy, sy) = ((math.cos(each / 2), math.sin(each / 2)) for each in (roll, pitch, yaw))
     return [
         cr * cp * cy + sr * sp * sy,
@@ -139,7 +142,7 @@ def _quaternion(roll: float, pitch: float, yaw: float) -> list[float]:
 def _along_airframe(
     velocity: tuple[float, float, float], roll: float, pitch: float, yaw: float
 ) -> tuple[float, float, float]:
-    """Turn a velocity north, east, down to nose, right, down of the airframe."""
+    """Rotate a velocity (north, east, down) to the axes of the airframe (nose, right, down). Angles in radians."""
     north, east, down = velocity
     ahead, right = north * math.cos(yaw) + east * math.sin(yaw), east * math.cos(yaw) - north * math.sin(yaw)
     ahead, down = ahead * math.cos(pitch) - down * math.sin(pitch), ahead * math.sin(pitch) + down * math.cos(pitch)

@@ -1,6 +1,8 @@
-"""Readiness of the autopilot to take a fix: its state, as far as it tells it, and the reasons for its answers.
+"""The readiness of the autopilot to accept a fix: its state, as far as its messages tell it, and the likely reasons for
+its answers. Used by `peer`, `fixes` and `conversation`.
 
-The reasons are read off ArduPilot 4.7-dev (`setLatLng` of its NavEKF3) and PX4 1.17-alpha (`EKF2.cpp`).
+The reasons were read in the source code of ArduPilot 4.7-dev (`setLatLng` of its NavEKF3) and PX4 1.17-alpha
+(`EKF2.cpp`).
 """
 
 import math
@@ -14,16 +16,16 @@ from edgevpr.mavlink.wire import Message, mavlink
 # ArduPilot refuses fixes until its GPS has said nothing useful for one second, and a receiver reports twice a second or
 # less often.
 _GPS_COUNTS_S = 2.5
-_FLAGS_FRESH_S = 3.0  # they are asked for twice a second
-_ORIGIN_WITHIN_S = 2.0  # of asking for it: later there is none
+_FLAGS_FRESH_S = 3.0  # they are requested twice a second
+_ORIGIN_WITHIN_S = 2.0  # of the request: an autopilot that has not answered by then has no origin
 _ASK_AGAIN_S = 10.0
 
 
 @dataclass(slots=True, kw_only=True)
 class Readiness:
-    """Everything that the autopilot's messages tell of whether it takes a fix; None: unknown. Times are those of when
-    something was last heard (-inf: never). `answers_others`: it has answered another command of ours; `had_origin` is
-    what was known when its origin was last asked for, at `asked_s`."""
+    """All that the autopilot's messages tell about its readiness; None: unknown. Fields that end in `_s` are the time
+    at which something was last received (-inf: never). `answers_others`: it has answered another command of ours.
+    `asked_s` is when its origin was last requested, `had_origin` what was known of the origin before that."""
 
     is_px4: bool = False
     is_armed: bool | None = None
@@ -36,7 +38,7 @@ class Readiness:
     had_origin: bool | None = None
 
     def hear(self, message: Message, now_s: float) -> None:
-        """Take in a message of the autopilot, of any kind."""
+        """Process a message of the autopilot, of any kind."""
         kind = message.get_type()
         if kind == "HEARTBEAT":
             self.is_px4 = message.autopilot == mavlink.MAV_AUTOPILOT_PX4
@@ -51,26 +53,27 @@ class Readiness:
             self.answers_others = True
 
     def has_gps(self, now_s: float) -> bool:
-        """Tell whether a receiver had a 3D fix a moment ago."""
+        """Return True if a GPS receiver of the autopilot has reported a 3D fix in the last 2.5 s."""
         return now_s - self.gps_s <= _GPS_COUNTS_S
 
     def has_origin(self, now_s: float) -> bool | None:
-        """Tell whether it has an origin: it says so when it is asked."""
+        """Return True if the autopilot has an origin, False if it did not answer a request for it within two seconds,
+        None if that is unknown."""
         if self.origin_s > -math.inf and self.origin_s >= self.asked_s:
             return True
         is_asked = self.asked_s > -math.inf
         return False if is_asked and now_s - self.asked_s > _ORIGIN_WITHIN_S else self.had_origin
 
     def asks_origin(self, now_s: float) -> bool:
-        """Tell whether to ask for the origin after a fix was refused, and take note that it is asked for then. It is
-        asked for again from time to time: an autopilot that has restarted has lost it."""
+        """Return True if the origin is to be requested now, after a refused fix, and note the time. It is requested
+        every ten seconds at most, and again and again: an autopilot that has restarted has lost its origin."""
         if self.has_gps(now_s) or now_s - self.asked_s < _ASK_AGAIN_S:
             return False
         self.had_origin, self.asked_s = self.has_origin(now_s), now_s
         return True
 
     def why(self, result: str, now_s: float) -> "Reason":
-        """Explain an answer to a fix, the name of a MAV_RESULT."""
+        """Return the likely reason for an answer to a fix; `result` is the name of a MAV_RESULT."""
         match result:
             case "ACCEPTED":
                 return TAKEN
@@ -85,11 +88,11 @@ class Readiness:
         return Reason("see its log", f"it answers {result}")
 
     def why_silent(self) -> "Reason":
-        """Explain that no fix is answered."""
+        """Return the likely reason why the autopilot does not answer fixes."""
         return FIXES_NOT_ANSWERED if self.answers_others else NO_COMMAND_ANSWERED
 
     def _why_failed(self, now_s: float) -> "Reason":
-        """Explain the answer FAILED: the first cause that is known to be there."""
+        """Return the likely reason for the answer FAILED: the first one in order that is known to apply."""
         has_gps, lacks_origin = self.has_gps(now_s), self.has_origin(now_s) is False
         # PX4 answers with TEMPORARILY_REJECTED while it has GPS, and uses this flag for glitches of it.
         if self.is_px4:
@@ -106,7 +109,8 @@ class Readiness:
 
 
 class Reason(NamedTuple):
-    """A reason in a few words, 26 bytes at most so that they fit a status text, and in a sentence's part."""
+    """The reason for an answer in two forms: `brief` has at most 26 bytes, to fit a status text; `sentence` is a part
+    of a sentence about the autopilot ("it")."""
 
     brief: str
     sentence: str

@@ -1,4 +1,5 @@
-"""All that an autopilot says of itself on the ground, asked for once and put into plain values."""
+"""All that an autopilot tells about itself before the flight, requested once and put into plain values. Used by
+`edgevpr doctor`."""
 
 import statistics
 import time
@@ -19,12 +20,13 @@ _BYTEWISE = mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AutopilotReading:
-    """The answers of an autopilot; None and empty stand for what it did not say.
+    """The answers of an autopilot; None and empty stand for what it did not answer.
 
-    `firmware` is "ardupilot", "px4" or "other"; `vehicle` is the value of its `Kind`; `gps_fix` holds the fix type of
-    each receiver, `filter_flags` are those of EKF_STATUS_REPORT or ESTIMATOR_STATUS; `streams_hz` the messages that
-    came without being asked for, `heard` all that came. `signs`: its messages are signed; `is_signed_to`: ours are.
-    `clock_ahead_s` is how far the UTC of the autopilot is ahead of this machine's.
+    `firmware` is "ardupilot", "px4" or "other"; `vehicle` is the value of a `Kind`. `streams_hz` is the rate of the
+    messages that came unasked, `heard` the names of all that came. `gps_fix` is the fix type of the first and second
+    receiver. `filter_flags` are those of EKF_STATUS_REPORT or ESTIMATOR_STATUS. `origin` is (latitude, longitude) in
+    degrees. `signs`: its messages are signed; `is_signed_to`: ours are. `answers`: it has answered any question;
+    `says_version_1`: it sends MAVLink 1. `clock_ahead_s` is its UTC less that of this machine.
     """
 
     system_id: int
@@ -50,14 +52,14 @@ class AutopilotReading:
 
     @property
     def asked(self) -> Answers:
-        """Answers by which the flight chooses the channel."""
+        """The answers on which the flight bases its choice of the channel."""
         return Answers(kind=Kind(self.vehicle), version=self.version and self.version[:2], parameters=self.parameters)
 
 
 def read_autopilot(asking: Inquiry, wanted: Mapping[str, Iterable[str]]) -> AutopilotReading | None:
-    """Read all that can be read; None where no heartbeat comes. `wanted` are the names of parameters by firmware.
+    """Read all that can be read; return None if no heartbeat comes. `wanted`: names of parameters, by firmware.
 
-    It takes ten seconds, half a minute where the autopilot does not answer. Raises LinkError where the link is lost.
+    It takes ten seconds, or half a minute if the autopilot does not answer. Raises LinkError when the link is lost.
     """
     beat = asking.heartbeat()
     if beat is None:
@@ -104,7 +106,8 @@ def read_autopilot(asking: Inquiry, wanted: Mapping[str, Iterable[str]]) -> Auto
 
 
 def _no_message(message_id: int) -> Message | None:
-    """Stand in for `Inquiry.message` where the autopilot answers nothing: each question would take three seconds."""
+    """Return None, in place of `Inquiry.message`, for an autopilot that answers nothing: each question would take three
+    seconds."""
     return None
 
 

@@ -1,7 +1,6 @@
-"""Requests that arrive over a link: all that the ground, or anybody else, may ask of this companion.
-
-What is not on the list here is not obeyed. There are no parameters to be written.
-"""
+"""Requests that arrive over a link: all that the ground station, or any other sender, may ask of this companion
+computer. A request that is not handled here has no effect; there are no parameters that could be set. A wish is a
+request that only the flight itself can fulfil, such as a pause. Used by `conversation` and the flight."""
 
 import math
 import re
@@ -14,17 +13,17 @@ from edgevpr import __version__
 from edgevpr.mavlink.wire import Message, mavlink
 
 STATUS = mavlink.MAVLINK_MSG_ID_ONBOARD_COMPUTER_STATUS
-# The messages whose interval may be set, and the shortest one in seconds. A longer one leaves messages out; none is
-# made more often than it is.
+# The messages whose interval may be set, and the shortest interval in seconds. A long one leaves messages out; a short
+# one does not make them more frequent than they are.
 SHORTEST_S = {STATUS: 1.0, mavlink.MAVLINK_MSG_ID_NAMED_VALUE_FLOAT: 0.1}
 LONGEST_S = 3600.0
-ANSWERED_MAX = 50  # requests a second; a flood of them must not push out what we have to say ourselves
+ANSWERED_MAX = 50  # requests a second; the answers to a flood of them must not displace our own messages
 PAUSED = "not sent: paused by the ground"
-_EARLY_SHARE = 0.1  # of an interval: messages that are made once in an interval are not made to the millisecond
+_EARLY_SHARE = 0.1  # of an interval: a message may come so much early, since its maker keeps no exact time
 
 
 class Wish(IntEnum):
-    """A wish for the flight: the first parameter of MAV_CMD_USER_1 (31010)."""
+    """A request to the flight; the value is the first parameter of MAV_CMD_USER_1 (31010)."""
 
     PAUSE = 1
     RESUME = 2
@@ -34,7 +33,7 @@ class Wish(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Wished:
-    """A wish, and who has it."""
+    """A wish, with the system and component id of the sender that made it."""
 
     wish: Wish
     system_id: int
@@ -42,39 +41,40 @@ class Wished:
 
     @property
     def sender(self) -> str:
-        """The sender as system/component."""
+        """The sender as the text "system/component"."""
         return f"{self.system_id}/{self.component_id}"
 
 
 class Wishes:
-    """The wishes that wait to be fulfilled, on their way from the links to the loop of the flight. `offered` are those
-    that can be fulfilled; there are none before a flight says so. They are used in turns only."""
+    """The wishes that wait until the main loop of the flight takes them; all links put theirs here. `offered` are those
+    that the flight can fulfil, none at first; others are refused. Use it inside turns only (see `turns`)."""
 
     def __init__(self) -> None:
         self.offered: Collection[Wish] = ()
-        self._waiting: dict[bool, Wished] = {}  # the newest about learning, and the newest about the flight itself
+        self._waiting: dict[bool, Wished] = {}  # the newest about learning (True), and about pausing (False)
         self._is_paused = False
 
     def put(self, wished: Wished) -> None:
-        """Let a wish wait. Of two that contradict each other only the newer is left."""
+        """Add a wish. It replaces a waiting one of the same subject: pause and resume, or learning and not learning."""
         is_about_learning = wished.wish in (Wish.LEARN, Wish.LEARN_NOTHING)
         if not is_about_learning:
             self._is_paused = wished.wish is Wish.PAUSE
         self._waiting[is_about_learning] = wished
 
     def take(self) -> tuple[Wished, ...]:
-        """Return the wishes since the last call."""
+        """Return the wishes put since the last call."""
         waiting, self._waiting = tuple(self._waiting.values()), {}
         return waiting
 
     def why_no_fix(self) -> str | None:
-        """Return the reason why no fix may be sent, from the acknowledgement of a pause on; None: there is none."""
+        """Return the reason why no fix may be sent, as soon as a pause has been accepted; None: fixes may be sent."""
         return PAUSED if self._is_paused else None
 
 
 class Requests:
-    """The requests that come over one link; `wishes` are handed on. `results` counts commands by the name of their
-    result, `ignored` the messages that were for us and had no effect: not on the list, or too many."""
+    """Answers the requests of one link, and puts its wishes into `wishes`. `results` counts commands by the name of
+    their result. `ignored` counts the other messages addressed to us that had no effect: an unknown kind, or too many a
+    second."""
 
     def __init__(self, wishes: Wishes) -> None:
         self.results: Counter[str] = Counter()
@@ -88,8 +88,8 @@ class Requests:
     def hear(
         self, message: Message, us: tuple[int, int], now_s: float, heartbeat: Callable[[], Message]
     ) -> tuple[Message, ...]:
-        """Take in a message; return the replies. `us` is our system and component id, `heartbeat` makes ours. A
-        TIMESYNC is answered with the time of the clock that stamps our messages."""
+        """Process a message and return the replies to be sent. `us` is our (system id, component id); `heartbeat` makes
+        our heartbeat, should it be requested. A TIMESYNC is answered with `now_s`, the clock of all our time stamps."""
         sender = message.get_srcSystem(), message.get_srcComponent()
         if sender[0] == 0 or sender == us or not _asks(message, us):
             return ()
@@ -109,7 +109,7 @@ class Requests:
         return (ack, *replies)
 
     def admits(self, message: Message, now_s: float) -> bool:
-        """Tell whether one of our own messages may be sent at this moment, by the interval that was asked for."""
+        """Return True if one of our own messages may be sent now, by the interval requested for its kind."""
         number = message.get_msgId()
         if number == STATUS:
             self._status = message
@@ -122,8 +122,8 @@ class Requests:
         return True
 
     def _obey(self, command: Message, heartbeat: Callable[[], Message]) -> tuple[int, tuple[Message, ...]]:
-        """Obey a command; return the result (MAV_RESULT), and the message that was asked for, where one was."""
-        wanted = command.param1  # a whole float is the key that its integer is, and NaN is none
+        """Execute a command. Returns (its MAV_RESULT, the messages that it requested)."""
+        wanted = command.param1  # a float: as a key, a whole one equals its integer, and NaN equals none
         match command.command:
             case mavlink.MAV_CMD_USER_1:
                 return self._take_wish(command, wanted), ()
@@ -150,7 +150,8 @@ class Requests:
         return _ACCEPTED
 
     def _set_interval(self, number: int, interval_us: float) -> int:
-        """Set an interval in microseconds: 0 is the default, -1 switches off."""
+        """Set the interval of message `number` and return a MAV_RESULT. `interval_us` is in microseconds; 0: default,
+        -1: never."""
         interval_s = math.inf if interval_us == -1 else interval_us / 1e6
         if interval_us not in (0, -1) and not SHORTEST_S[number] <= interval_s <= LONGEST_S:
             return _DENIED
@@ -165,8 +166,8 @@ class Requests:
 
 
 def _asks(message: Message, us: tuple[int, int]) -> bool:
-    """Tell whether a message asks something of us: a PING to nobody, a TIMESYNC without `tc1`, and what is addressed to
-    exactly us. A command to all would be acknowledged by everybody."""
+    """Return True if a message asks something of us: a PING to nobody in particular, a TIMESYNC without `tc1`, or a
+    message addressed to exactly us. A command to all is not for us, since every component would acknowledge it."""
     target = getattr(message, "target_system", None), getattr(message, "target_component", None)
     match message.get_type():
         case "PING":
@@ -179,8 +180,8 @@ def _asks(message: Message, us: tuple[int, int]) -> bool:
 
 
 def version() -> Message:
-    """Make the AUTOPILOT_VERSION (148) of this companion: the version of edgevpr, and that it speaks MAVLink 2 and
-    takes COMMAND_INT."""
+    """Make the AUTOPILOT_VERSION (148) of this companion: the version of edgevpr, and the abilities to use MAVLink 2
+    and COMMAND_INT."""
     major, minor, patch = (int(each) for each in re.findall(r"\d+", f"{__version__}.0.0")[:3])
     nothing = [0] * 8
     return mavlink.MAVLink_autopilot_version_message(
