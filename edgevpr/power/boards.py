@@ -23,9 +23,10 @@ _SAME_RAM = 1.02  # a factor, since each version of the kernel reserves a differ
 class MachineSpeed:
     """Speed of a machine relative to one core of the reference machine of `profiles/generic-x86.yaml` (None: unknown).
 
-    `single`: one thread at integer and byte operations. `multi`: all cores together at such operations. `products`: one
-    thread at matrix products. `passes`: one thread at passes over bytes. `arm64_mips`: million instructions per second
-    of one thread of an aarch64 board. `verified`: True if `source` measured the figures on this very board.
+    `single`: one thread at integer and byte operations. `multi`: all cores together at such operations.
+    `products`: one thread at matrix products. `passes`: one thread at passes over bytes.
+    `arm64_mips`: million instructions per second of one thread of an aarch64 board (not relative).
+    `verified`: True if `source` measured the figures on this very board.
     """
 
     single: float | None = bounded(0.0001, 100)
@@ -109,10 +110,13 @@ def is_this_machine(board: Board, root: Path = Path("/")) -> bool:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Detected:
-    """Description of this machine. `board`: name of its profile in `profiles/` (None: it has none). `model`: its name
-    in the device tree, or else in the firmware's DMI table (None: in neither). `usable_cores`, `ram_limit_mb`: what CPU
-    affinity and control groups leave of `cores` and `ram_mb`. `thermal_limit_c`: degrees Celsius at which it begins to
-    slow down."""
+    """Description of this machine.
+
+    `board`: name of its profile in `profiles/` (None: it has none).
+    `model`: its name in the device tree, or else in the firmware's DMI table (None: in neither).
+    `usable_cores`, `ram_limit_mb`: what CPU affinity and control groups leave of `cores` and `ram_mb` to this process.
+    `thermal_limit_c`: degrees Celsius at which it begins to slow down. `title`: see `machine.title`.
+    """
 
     board: str | None
     model: str | None

@@ -141,8 +141,8 @@ def query_cost(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EnergySoFar:
-    """Totals since the start: wall seconds; idle and marginal energy in joules at the board's input; CPU-seconds of the
-    metered stages and of the whole process."""
+    """Totals since the start: wall seconds; energy in joules at the board's input (`idle_j`: of the idle board,
+    `marginal_j`: what the stages add); CPU-seconds of the stages and of the whole process."""
 
     elapsed_s: float
     idle_j: float

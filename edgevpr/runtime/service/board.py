@@ -1,4 +1,4 @@
-"""This machine, as `edgevpr doctor` finds it: limits of its control groups, devices, room on disk."""
+"""Checks of this machine for `edgevpr doctor`: limits of its control groups, devices, and free room on disk."""
 
 import getpass
 import grp
@@ -23,8 +23,8 @@ _MAP_ROOM_MB = 100  # a thousand places of cohog, learnt in flight
 
 
 def board_findings(config: Config, address: LinkAddress | None, root: Path = Path("/")) -> Iterator[Finding]:
-    """Examine this machine for a flight with a configuration over a link. Raises ConfigError for a board that
-    is unknown."""
+    """Check this machine for a flight with `config` over the link `address` (None: no link). `root` is the root of the
+    file system with /proc, /sys and /dev. Raises ConfigError if the board is unknown."""
     yield _memory(load_board(config.board).memory_max_mb, root)
     yield fine("cores", f"{machine.cores(root):g} for this process")
     if address and address.kind == "serial":
@@ -37,7 +37,8 @@ def board_findings(config: Config, address: LinkAddress | None, root: Path = Pat
 
 
 def device(what: str, path: str, root: Path = Path("/")) -> Finding:
-    """Judge a device file: is it there, may this user use it, does the kernel's console have it?"""
+    """Check that a device file exists, that this user may use it, and that it is not the kernel's console. `what` names
+    the check in the finding."""
     file = root / path.lstrip("/")
     try:
         status = file.stat()
@@ -63,7 +64,7 @@ def device(what: str, path: str, root: Path = Path("/")) -> Finding:
 
 
 def log_findings(log: LogConfig, has_link: bool) -> Iterator[Finding]:
-    """Tell where the flight log goes, and the tlog if there is to be one, and whether they can be written."""
+    """Check that the flight log can be written and, if there is a link, the tlog (the log of all MAVLink packets)."""
     if path := log.path:
         yield looked_at("log", lambda: _room(path, "path", LOG_ROOM_MB))
     else:
@@ -75,7 +76,7 @@ def log_findings(log: LogConfig, has_link: bool) -> Iterator[Finding]:
 
 
 def _room(file: str, key: str, needed_mb: float) -> str:
-    # Unlike all else, a log is not opened: a check as root would leave a file that the service may not write.
+    # A log is not opened for the check: if root checked, it would leave a file that the service may not write.
     path = Path(file).absolute()
     if path.is_dir() or not path.parent.is_dir():
         raise UsageError(f"{path} is no file in a folder that is there: correct `log: {{{key}: ...}}`.")
@@ -110,7 +111,7 @@ def _memory(needed_mb: float, root: Path) -> Finding:
 
 
 def _console_on(device_file: Path, root: Path) -> str | None:
-    """Return the name by which the kernel has its console on a device, None where it has not."""
+    """Return the name of a device as the kernel's console, e.g. "ttyS0"; None if the kernel has no console on it."""
     words = (machine.text(root / "proc/cmdline") or "").split()
     consoles = (word.removeprefix("console=").split(",")[0] for word in words if word.startswith("console="))
     return next((console for console in consoles if (root / "dev" / console).resolve() == device_file), None)

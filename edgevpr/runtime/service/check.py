@@ -1,4 +1,5 @@
-"""`edgevpr check`: would this configuration fly? Everything is opened as `edgevpr run` opens it, and closed again."""
+"""`edgevpr check`: checks whether a configuration is ready to fly. It opens everything that `edgevpr run` opens, and
+closes it again. This file also learns the mask of what the camera shows besides the ground."""
 
 import os
 import time
@@ -34,17 +35,17 @@ from edgevpr.runtime.service.finding import Finding, fine, looked_at, wrong
 
 _FRAME_WAIT_S = 15.0  # longer than any source takes to say that it is lost
 _WITHOUT_FRAMES = (Condition.LOST, Condition.FROZEN, Condition.DAMAGED)
-# Pictures that a mask is learnt from: so far apart that the ground has moved, and of a minute of flight at most.
+# Pictures that a mask is learnt from, and the seconds between two: so many that the ground has moved meanwhile.
 _LEARNT_FROM, _APART_S = 3 * FEWEST_FRAMES, 0.5
 
 
 def check(
     config_path: str | Path, *, offline: bool = False, say: Callable[[str], None] = lambda text: None
 ) -> list[Finding]:
-    """Check everything that a flight needs; never raises for an error that the user can correct.
+    """Check everything that a flight needs. An error that the user can correct becomes a finding and is never raised.
 
     A frame of the source and a heartbeat of the autopilot are waited for, unless `offline`: then it is enough that
-    source and link can be opened. `say` is told in a few words what is waited for.
+    source and link can be opened. `say` is called with a short text about what is waited for, and with "" after it.
     """
     try:
         config = load_config(config_path)
@@ -68,8 +69,8 @@ def check(
 
 
 def learn_mask(config_path: str | Path, out: Path, recording: str | None = None) -> str:
-    """Learn which part of the frames shows no ground, from the configured source or a `recording`, and write the mask
-    to `out`. Return a sentence about it. Raises an EdgevprError where there is nothing to learn from."""
+    """Learn which part of the frames never shows ground, from a `recording` or else the configured source, and write
+    the mask to `out` (PNG). Return a sentence about it. Raises an EdgevprError if there is nothing to learn from."""
     require_png(out)
     require_folder(out)
     uri = recording or load_config(config_path).source.uri
@@ -87,8 +88,8 @@ def learn_mask(config_path: str | Path, out: Path, recording: str | None = None)
 
 
 def _pictures(source: Source) -> Iterator[np.ndarray]:
-    """Yield pictures of a source, `_APART_S` seconds apart where it is live, as long as any come and enough were
-    yielded."""
+    """Yield pictures of a source, `_LEARNT_FROM` at most. They are `_APART_S` seconds apart if the source is live. End
+    early if the source ends or the pictures take too long to come."""
     end_s = time.monotonic() + 2 * _LEARNT_FROM * _APART_S
     count = 0
     while count < _LEARNT_FROM and not source.ended and time.monotonic() < end_s:
@@ -117,7 +118,7 @@ def _battery(config: Config) -> str:
 def _map(config: Config) -> str:
     if config.mapping.learn and config.map is not None:
         path = map_path(config.map).absolute()
-        # The map is neither made nor opened for writing, for the same reason as a log (`board`).
+        # The map is neither made nor opened for writing: root would leave a file that the service may not write.
         if not os.access(path.parent, os.W_OK) or (path.exists() and not os.access(path, os.W_OK)):
             raise MapError(f"{path} or its folder may not be written by this user: learning needs both.")
         if not path.exists():
@@ -157,11 +158,11 @@ def _source(config: Config, offline: bool) -> str:
 
 
 def _with_a_frame(source: Source, uri: str) -> str:
-    """Wait for a frame until the source itself says that none comes, 15 s at most."""
+    """Wait for a frame, 15 s at most; return a text about source and frame. Raises SourceError if no frame comes."""
     end_s = time.monotonic() + _FRAME_WAIT_S
     is_hopeless = False
     while not (is_hopeless or source.ended) and time.monotonic() < end_s:
-        is_hopeless = source.condition in _WITHOUT_FRAMES  # before the look: a last frame may wait
+        is_hopeless = source.condition in _WITHOUT_FRAMES  # asked before the frame is read: a last one may wait
         with suppress(ImageError):
             if frame := source.read(0.25):
                 height, width = frame.image.shape[:2]

@@ -1,4 +1,4 @@
-"""`edgevpr doctor`: is this flight controller, with this board, set up for edgevpr? It reads, and never writes."""
+"""`edgevpr doctor`: checks whether flight controller and board are set up for edgevpr. It only reads, never writes."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -17,8 +17,8 @@ from edgevpr.runtime.service.board import board_findings
 from edgevpr.runtime.service.finding import Finding, FlightIntent, fine, wrong
 from edgevpr.runtime.service.rules import RULES
 
-_SLOW_S = 0.25  # a round trip: fixes would be as late
-_BAD_BYTES = 300  # the rest of a message or two at the start is usual
+_SLOW_S = 0.25  # for a round trip: fixes would come as late
+_BAD_BYTES = 300  # fewer are usual: the rest of a message or two at the start
 _NEEDED = ("GLOBAL_POSITION_INT", "ATTITUDE", "GPS_RAW_INT")
 _CLOCK_S = 60.0
 _GPS_3D = 3
@@ -31,7 +31,7 @@ _WHERE_SILENT = {
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """All findings, and what was read of the autopilot (None: nothing)."""
+    """Result of `doctor`: all findings, and what was read from the autopilot (None: nothing could be read)."""
 
     findings: list[Finding]
     reading: AutopilotReading | None
@@ -42,9 +42,11 @@ class Diagnosis:
 
 
 def doctor(config: Config, address: LinkAddress, say: Callable[[str], None], root: Path = Path("/")) -> Diagnosis:
-    """Examine the autopilot at the other end of a link, and this machine (its files below `root`). `say` is told in a
-    few words what is waited for. Raises LinkAddressError for an address that is wrong, and ConfigError for a board that
-    is unknown or a signing key that cannot be used."""
+    """Check the autopilot at the other end of the link `address`, and this machine (its files below `root`).
+
+    `say` is called with a short text about what is waited for, and with "" after it. Raises LinkAddressError for an
+    address that is wrong, and ConfigError for a board that is unknown or a signing key that cannot be used.
+    """
     settings = config.mavlink
     signing = open_signing(settings.signing_key, settings.signing_state, to_ask=True)
     about_board = list(board_findings(config, address, root))
@@ -66,14 +68,18 @@ def doctor(config: Config, address: LinkAddress, say: Callable[[str], None], roo
 
 
 def intent_of(config: Config) -> FlightIntent:
-    """Return what a flight with this configuration will do. Raises ConfigError for a board that is unknown."""
+    """Return what a flight with this configuration will do. Raises ConfigError if the board is unknown."""
     return FlightIntent(config.mavlink.send_fixes, 1 / (config.source.rate_hz or load_board(config.board).rate_hz))
 
 
 def silence(
     address: LinkAddress, bad_bytes: int, others: set[int], refused: Mapping[str, int] = MappingProxyType({})
 ) -> Finding:
-    """Explain that no heartbeat was heard, by what else arrived; `refused` counts what is not believed, by reason."""
+    """Return the finding that explains why no heartbeat was received, by what else arrived.
+
+    `bad_bytes`: number of bytes that are no MAVLink. `others`: system ids of other autopilots. `refused`: number of
+    messages that failed the check of signatures, by reason.
+    """
     if refused:
         why = max(refused, key=lambda reason: refused[reason])
         return wrong("link", f"{address}: messages arrive, and are refused ({why}): {MEANING[why]}.")
@@ -93,8 +99,8 @@ def silence(
 
 
 def autopilot_findings(reading: AutopilotReading, address: LinkAddress, intent: FlightIntent) -> Iterator[Finding]:
-    """Judge what was read for the flight that is to be: first what holds for every autopilot, then the rules of its
-    firmware."""
+    """Check what was read from the autopilot against what the flight will do: some findings hold for every autopilot,
+    others follow the rules of its firmware."""
     yield _link(reading, address)
     yield _signing(reading)
     if reading.other_systems:
@@ -174,7 +180,7 @@ def _filter(reading: AutopilotReading) -> Finding:
     if reading.filter_flags is None:
         return wrong("filter", "It does not say how its filter is, so no fix could be weighed against it.")
     flags, has = f"flags 0x{reading.filter_flags:x}", reading.filter_flags
-    # It holds still where it takes the vehicle for standing, since it has nothing to navigate by.
+    # In constant-position mode the filter takes the vehicle to stand still, since it has nothing to navigate by.
     if has & mavlink.EKF_ATTITUDE and has & mavlink.EKF_POS_HORIZ_ABS and not has & mavlink.EKF_CONST_POS_MODE:
         return fine("filter", f"attitude and position are known ({flags})")
     lacks = "position" if has & mavlink.EKF_ATTITUDE else "attitude"

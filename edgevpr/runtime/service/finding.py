@@ -1,4 +1,4 @@
-"""Findings of `edgevpr check` and `edgevpr doctor`: what was looked at, whether it is fine, and what to change."""
+"""Findings of `edgevpr check` and `edgevpr doctor`: what was checked, whether it is fine, and what to change."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from edgevpr.core.errors import EdgevprError
 
 @dataclass(frozen=True, slots=True)
 class FlightIntent:
-    """The flight that is to be: whether it sends fixes (else it is a dry run), and the seconds between two queries."""
+    """What a flight will do: whether it sends fixes (else it is a dry run), and the seconds between two queries."""
 
     sends_fixes: bool
     every_s: float
@@ -16,8 +16,8 @@ class FlightIntent:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that was checked; `message` says what it is or, in one sentence, what is wrong with it. `changes` are
-    the exact changes that put it right, such as `GPS2_TYPE=14`."""
+    """Result of one check. `what`: name of what was checked. `message`: a description of it or, if it is not `ok`, one
+    sentence that says what is wrong. `changes`: the exact changes that put it right, such as `GPS2_TYPE=14`."""
 
     what: str
     ok: bool
@@ -26,17 +26,18 @@ class Finding:
 
 
 def fine(what: str, message: str) -> Finding:
-    """Say what a thing is that needs no change."""
+    """Return a finding without anything to change; `message` describes what was checked."""
     return Finding(what, True, message)
 
 
 def wrong(what: str, message: str, *changes: str) -> Finding:
-    """Say in a sentence what is wrong with a thing, and which changes put it right."""
+    """Return a finding with something wrong; `message` says what in one sentence, and `changes` put it right."""
     return Finding(what, False, message, changes)
 
 
 def looked_at(what: str, look: Callable[[], str]) -> Finding:
-    """Look at one thing: what `look` returns is fine, and what it raises for the user is wrong."""
+    """Run a check and return its finding: fine with the text that `look` returns, wrong with the error that it
+    raises."""
     try:
         return fine(what, look())
     except EdgevprError as error:
@@ -46,7 +47,7 @@ def looked_at(what: str, look: Callable[[], str]) -> Finding:
 
 
 def lines(findings: Iterable[Finding]) -> Iterator[str]:
-    """Write findings for people: a line each, and below it a line for every change."""
+    """Yield the findings as lines of text: one for each finding, then one for each of its changes."""
     for finding in findings:
         yield f"{'ok   ' if finding.ok else 'WRONG'}  {finding.what:<14} {finding.message}"
         yield from (f"{'':<22}change: {change}" for change in finding.changes)

@@ -1,5 +1,5 @@
-"""edgevpr as a service of this machine: user, folders, program, configuration, unit and udev rules are made,
-and taken away again. Maps, flight logs and the configuration stay."""
+"""`edgevpr service install` and `uninstall`: make user, folders, program, configuration, unit and udev rules of the
+service, and remove them again. Maps, flight logs and the configuration stay."""
 
 import os
 import platform
@@ -34,8 +34,11 @@ log: {path: /var/log/edgevpr/flight.jsonl}
 
 
 def install(config: Path | None, dry_run: bool, say: Callable[[str], None], root: Path = Path("/")) -> None:
-    """Make this machine ready to fly as a service, with `config` as its configuration (None: the one there, or
-    a first one). `root` is the folder that holds the system. Raises EdgevprError, one sentence, where that fails."""
+    """Install the service on this machine. Raises EdgevprError, one sentence, if a step fails.
+
+    `config` becomes its configuration (None: an existing one stays, else a first one is written). With `dry_run`
+    nothing is changed. `say` is called with a line about each step. `root` is the folder that holds the system.
+    """
     if root == Path("/") and not dry_run:
         _require_root()
         _require_visible_python()
@@ -67,7 +70,7 @@ def install(config: Path | None, dry_run: bool, say: Callable[[str], None], root
 
 
 def uninstall(dry_run: bool, say: Callable[[str], None], root: Path = Path("/")) -> None:
-    """Stop the service, and take away what `install` has made, but for maps, flight logs, configuration and user."""
+    """Stop the service and remove what `install` has made, except maps, flight logs, the configuration and the user."""
     if root == Path("/") and not dry_run:
         _require_root()
     is_booted = (root / _BOOTED).is_dir()
@@ -102,7 +105,8 @@ def _require_visible_python() -> None:
 
 
 def _put(root: Path, name: str, what: str, content: bytes) -> Step:
-    """Return the step that writes a file as a whole; another one in its place is kept beside it."""
+    """Return the step that writes a file, completely or not at all. A different file in its place is kept, as
+    NAME.old."""
     path = root / name
     old = path.with_name(f"{path.name}.old")
 
@@ -135,7 +139,7 @@ def _is_gone(path: Path) -> bool:
 
 
 def _ids(root: Path) -> tuple[int, int] | None:
-    """Return the numbers of the service's user and of the user's group; None where there is no such user."""
+    """Return (user id, group id) of the service's user; None if there is no such user."""
     entry = _entry(root / "etc/passwd", NAME)
     return (int(entry[2]), int(entry[3])) if entry else None
 
@@ -151,7 +155,7 @@ def _entry(path: Path, name: str) -> list[str] | None:
 
 
 def _is_loaded(root: Path) -> bool:
-    """Tell whether systemd runs and knows the unit as it is on the disk."""
+    """Tell whether systemd runs and has read the unit as it is on the disk."""
     if not (root / _BOOTED).is_dir():
         return False
     show = ["systemctl", "show", "--property=LoadState,NeedDaemonReload", NAME]

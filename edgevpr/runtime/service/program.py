@@ -1,7 +1,7 @@
-"""The program of the service: a virtual environment of its own, with the edgevpr that runs and what it needs.
+"""The program of the service: a virtual environment with a copy of the running edgevpr and the packages that it needs.
 
-It is made in steps: each says what it does, or that it is so already, and a run that was broken off goes on where it
-stopped.
+It is made in steps, which `install` takes. Each says what it does, or that this is done already, so that a run after an
+interrupted one continues where that stopped.
 """
 
 import filecmp
@@ -27,7 +27,8 @@ _SCRIPT = "#!{python}\nimport sys\n\nfrom edgevpr.cli.main import program\n\nsys
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One step: in words, what is so after it; `is_so` tells whether it is so already, and `do` makes it so."""
+    """One step of an installation. `what`: the state after it, in words. `is_so` tells whether that state is reached
+    already, and `do` reaches it."""
 
     what: str
     is_so: Callable[[], bool]
@@ -35,8 +36,8 @@ class Step:
 
 
 def walk(steps: Iterable[Step], dry_run: bool, say: Callable[[str], None]) -> None:
-    """Take the steps that are not so already, and say each before it is taken. With `dry_run` the same is said and
-    nothing done. Raises EdgevprError for the first step that fails."""
+    """Take each step whose state is not reached yet. `say` is called with a line about each step, before it is taken.
+    With `dry_run` none is taken. Raises EdgevprError for the first step that fails."""
     before = os.umask(0o022)  # the service's user is to read what root writes
     try:
         for step in steps:
@@ -46,7 +47,7 @@ def walk(steps: Iterable[Step], dry_run: bool, say: Callable[[str], None]) -> No
                 continue
             try:
                 step.do()
-                os.sync()  # what another run will find so, is so after a power cut too
+                os.sync()  # so that a finished step stays finished after a power cut
             except OSError as error:
                 where = f"{error.filename}: " if error.filename else ""
                 raise EdgevprError(f"{step.what}: {where}{error.strerror or error}; {_AGAIN}.") from error
@@ -55,7 +56,8 @@ def walk(steps: Iterable[Step], dry_run: bool, say: Callable[[str], None]) -> No
 
 
 def command(*words: str | Path, **environment: str) -> None:
-    """Run a program of the system; raises EdgevprError with the last that it said where it fails."""
+    """Run a program with `environment` added to ours. If it fails, raise EdgevprError with the last line of its
+    output."""
     path = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"  # `su` leaves those two out
     name = Path(words[0]).name
     try:
@@ -71,13 +73,13 @@ def command(*words: str | Path, **environment: str) -> None:
         raise EdgevprError(f"{name} is not on this machine; {_AGAIN}.") from error
     if done.returncode:
         lines = [line.strip() for line in (done.stdout + done.stderr).splitlines() if line.strip()]
-        errors = [line for line in lines if line.startswith("ERROR: ")]  # pip's, which may go on to advise an upgrade
+        errors = [line for line in lines if line.startswith("ERROR: ")]  # pip's: its last line may advise an upgrade
         said = (errors or lines or [f"exit code {done.returncode}"])[-1]
         raise EdgevprError(f"{name}: {said.removeprefix('ERROR: ').rstrip('.')}; {_AGAIN}.")
 
 
 def is_told(*words: str | Path) -> bool:
-    """Run a program that tells by its exit code; False where it is not there."""
+    """Run a program and tell whether its exit code is 0; False also if the program is not installed."""
     try:
         return subprocess.run(words, stdin=subprocess.DEVNULL, capture_output=True).returncode == 0
     except OSError:
@@ -85,8 +87,8 @@ def is_told(*words: str | Path) -> bool:
 
 
 def program_steps(venv: Path) -> tuple[Step, ...]:
-    """Return the steps to a virtual environment with the packages that edgevpr needs, this edgevpr, and compiled
-    bytecode."""
+    """Return the steps that make the virtual environment `venv`, with the packages that edgevpr needs, a copy of the
+    running edgevpr, and compiled bytecode."""
     lock = shipped("deploy") / "requirements.lock"
     compileall = (venv / "bin" / "python", "-I", "-m", "compileall", "-q")
     return (
@@ -106,7 +108,7 @@ def program_steps(venv: Path) -> tuple[Step, ...]:
 
 
 def remove_program(path: Path) -> None:
-    """Remove the virtual environment; raises EdgevprError for something else in its place."""
+    """Remove the virtual environment at `path`. Raises EdgevprError if something else is there."""
     if not (path / "pyvenv.cfg").is_file():
         raise EdgevprError(f"{path} is no virtual environment: look at it, and remove it by hand.")
     shutil.rmtree(path)
@@ -117,7 +119,7 @@ def _pip(venv: Path) -> tuple[str | Path, ...]:
 
 
 def _site(venv: Path) -> Path:
-    """Return the folder of packages; a path that is not there where there is none."""
+    """Return the site-packages folder of an environment; if it has none, its `lib`, in which nothing will be found."""
     return next(venv.glob("lib/python3*/site-packages"), venv / "lib")
 
 
@@ -128,25 +130,25 @@ def _make_venv(path: Path) -> None:
     if not is_own and path.exists() and any(path.iterdir()):
         raise EdgevprError(f"{path} holds something that is no virtual environment: move it away.")
     _require_stopped()
-    # One whose Python has gone with an upgrade of the system cannot be mended.
+    # If an upgrade of the system has removed the environment's Python, it cannot be mended: it is made anew.
     clear = ("--clear",) if is_own and Path(sys.prefix).resolve() != path.resolve() else ()
     command(sys.executable, "-I", "-m", "venv", *clear, path)
 
 
 def _require_stopped() -> None:
-    """Raise EdgevprError while the service runs: what it imports later would be another version's."""
+    """Raise EdgevprError while the service runs: what it imports later would be of another version."""
     if is_told("systemctl", "is-active", "--quiet", NAME):
         raise EdgevprError(f"The service runs: `systemctl stop {NAME}` on the ground, then run it again.")
 
 
 def _broken(venv: Path) -> list[Path]:
-    """List packages of which a run that was broken off has left a part: pip takes them for whole."""
+    """List the packages that an interrupted run has left incomplete (without RECORD), which pip takes for complete."""
     return [folder for folder in _site(venv).glob("*.dist-info") if not (folder / "RECORD").is_file()]
 
 
 def _has_packages(venv: Path, lock: Path) -> bool:
-    """Tell whether all that the lock names for this Python is there, installed to the end: then pip, which is shown no
-    place to get any from, has nothing to complain of."""
+    """Tell whether all packages of the file `lock` for this Python are completely installed. If so, pip succeeds
+    although it is given no place to get packages from."""
     asked = ("--isolated", "install", "--no-index", "--require-hashes", "--requirement", lock)
     return not _broken(venv) and is_told(*_pip(venv), *asked)
 
@@ -166,8 +168,8 @@ def _install_packages(venv: Path, lock: Path) -> None:
 
 
 def _own_files() -> dict[str, Path]:
-    """Return the files of the edgevpr that runs by their names in a folder of packages. What is shipped may lie beside
-    the package, in a checkout."""
+    """Return the files of the running edgevpr, by their path relative to site-packages. Shipped data files may lie
+    beside the package, in a checkout."""
     package = Path(edgevpr.__file__).parent
     folders = {NAME: package} | {f"{NAME}/shipped/{kind}": shipped(kind) for kind in _SHIPPED}
     return {
@@ -186,8 +188,8 @@ def _is_copied(venv: Path) -> bool:
 
 
 def _copy_edgevpr(venv: Path) -> None:
-    """Copy the edgevpr that runs, which may be a checkout, an installed one, or that of the service itself: no network
-    and no tool to build it is needed."""
+    """Copy the running edgevpr into the environment. It may be a checkout, an installed one, or that of the service
+    itself. No network and no tool to build it is needed."""
     _require_stopped()
     site, room = _site(venv), venv / "unfinished"
     shutil.rmtree(room, ignore_errors=True)

@@ -1,8 +1,8 @@
-"""Rules of `edgevpr doctor` for each firmware: is the channel that the flight will choose one that carries this
-vehicle, and what is to be changed?
+"""Rules of `edgevpr doctor` for each firmware: whether the channel that the flight will choose can carry positions to
+this vehicle, and which parameters to change if not.
 
-Every rule of ArduPilot has its source in 4.7-dev, flown in simulation with GPS taken away; every rule of PX4 in the
-sources of 1.17-alpha.
+Every rule of ArduPilot is based on the sources of 4.7-dev and was flown in simulation with GPS taken away; every rule
+of PX4 is based on the sources of 1.17-alpha.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -29,20 +29,24 @@ from edgevpr.runtime.service.finding import Finding, FlightIntent, fine, wrong
 
 Parameters = Mapping[str, float | int]
 
-_USE_BEST, _PRIMARY_WHILE_FIXED = 1, 4  # GPS_AUTO_SWITCH: both take the other receiver when the first has no fix
-_FROM_GPS, _FROM_FLOW, _FROM_VISION = 3, 5, 6  # EK3_SRCn_...
+_USE_BEST, _PRIMARY_WHILE_FIXED = 1, 4  # values of GPS_AUTO_SWITCH that use the other receiver if the first has no fix
+_FROM_GPS, _FROM_FLOW, _FROM_VISION = 3, 5, 6  # values of EK3_SRCn_...
 _SWITCH = f"GPS_AUTO_SWITCH={_USE_BEST}"
 _SOURCE_SETS = (1, 2, 3)
 _SHORT_BAUDS = {111_100: 111}  # SERIALn_BAUD is in thousands, rounded down; above 2000 it is the rate itself
 _VISION_SET = tuple(f"EK3_SRC2_{what}={value}" for what, value in (("POSXY", 6), ("VELXY", 0), ("POSZ", 1), ("YAW", 1)))
-_MOST_DELAY_MS = 50  # our position is one of the moment at which it is sent
-SILENT_S = 5.0  # aux_global_position.cpp: positions of message 296 are used no more
+_MOST_DELAY_MS = 50  # edgevpr sends its position for the moment of sending
+SILENT_S = 5.0  # aux_global_position.cpp: after so long without message 296, PX4 no longer uses its positions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FirmwareRules:
-    """Knowledge of a firmware: the first version that `knows_fixes`, the `parameters` to read, its rules, and the
-    `port_changes` that the port at the other end of a serial line needs for a baud rate."""
+    """Rules of one firmware.
+
+    `knows_fixes`: first version (major, minor) that takes position fixes. `parameters`: names of those to read.
+    `findings`: function that checks the answers of an autopilot for a flight. `port_changes`: function that returns the
+    settings that the autopilot's serial port needs at a baud rate (`SERIALn`: n is the number of the port).
+    """
 
     name: str
     knows_fixes: tuple[int, int]
@@ -78,15 +82,16 @@ def _ardupilot_findings(reading: AutopilotReading, intent: FlightIntent) -> Iter
 
 
 def _single_fixes(choice: Choice, reading: AutopilotReading) -> Finding:
-    """Judge command 43003: something else must carry the vehicle from one fix to the next."""
+    """Check the use of command 43003, which sends single fixes: something else, such as airspeed or optical flow, must
+    carry the vehicle's position from one fix to the next."""
     parameters, kind = reading.parameters, reading.asked.kind
-    hovers = parameters.get("Q_ENABLE") == 1  # a plane's, whatever type its heartbeat tells
+    hovers = parameters.get("Q_ENABLE") == 1  # only planes have it, whatever type the heartbeat reports
     if kind is Kind.PLANE and not hovers:
         return fine("channel", _sentence(choice.reason))
     flow = parameters.get("FLOW_TYPE", 0)
     if flow and _sets_with(parameters, "VELXY", _FROM_FLOW):
         return fine("channel", f"Command 43003: FLOW_TYPE={flow:g} carries it from fix to fix.")
-    # ArduPlane's ekf_check.cpp: the one looks on while the sticks fly it, the other while it flies by itself.
+    # ArduPlane's ekf_check.cpp: QHOVER while the pilot flies it with the sticks, QLAND while it flies by itself.
     end = "falls back to QHOVER or QLAND" if hovers else "stops" if kind is Kind.ROVER else "lands"
     while_it = " while it hovers (Q_ENABLE=1)" if hovers else ""
     unused = " FLOW_TYPE is set, but no EK3_SRCn_VELXY is 5, so the flow is not used." if flow else ""
@@ -118,7 +123,7 @@ def _by_odometry(choice: Choice, reading: AutopilotReading) -> Finding:
     if not sets:
         no_set = f"{choice.reason}, but no source set of the filter takes its position: prepare the second one."
         return wrong("channel", no_set, *_VISION_SET)
-    # VISO_VEL_M_NSE: the velocity is taken to be good to 0.1 m/s, whatever accuracy we tell.
+    # VISO_VEL_M_NSE: the filter assumes that the velocity is good to 0.1 m/s, whatever accuracy edgevpr sends.
     if fused := [n for n in sets if n in _sets_with(reading.parameters, "VELXY", _FROM_VISION)]:
         return wrong(
             "channel",
@@ -134,7 +139,8 @@ def _by_odometry(choice: Choice, reading: AutopilotReading) -> Finding:
 
 
 def _dry(choice: Choice, reading: AutopilotReading) -> Finding:
-    """Judge a continuous channel in a dry run, which sends no position: AP_Arming wants one of all that is set up."""
+    """Return the finding about a continuous channel in a dry run, which sends no positions: ArduPilot does not arm
+    without positions on every channel that is set up."""
     change = "VISO_TYPE=0"
     if choice.channel is Channel.GPS_INPUT:
         change = f"{receiver_name(reading.parameters, choice.receiver)}={0 if choice.receiver == SECOND else 1}"
@@ -197,7 +203,7 @@ def _port(reading: AutopilotReading, change: str) -> Finding:
 
 
 def _sentence(words: str) -> str:
-    """Make a sentence of a reason in a few words."""
+    """Return a reason of a few words as a sentence, with a capital letter and a full stop."""
     return f"{words[0].upper()}{words[1:]}."
 
 

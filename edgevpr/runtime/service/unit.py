@@ -1,4 +1,4 @@
-"""The systemd unit for a board: deploy/edgevpr.service with the board's limits and the user's configuration file."""
+"""The systemd unit of the service: deploy/edgevpr.service with a board's limits and the user's configuration file."""
 
 import re
 from pathlib import Path
@@ -8,15 +8,14 @@ from edgevpr.core.files import shipped
 from edgevpr.core.text import printable
 from edgevpr.power.boards import Board
 
-# ProtectHome and PrivateTmp put empty folders in their place.
+# The unit's ProtectHome and PrivateTmp show the service empty folders instead of these.
 HIDDEN_FROM_THE_SERVICE = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")
 USUAL_CONFIG = "/etc/edgevpr/config.yaml"
 
 
 def render_unit(board: Board, config_path: str | Path | None = None) -> str:
-    """Write the text of edgevpr.service for a board and a configuration file (None: the one that the shipped unit
-    names). Raises UsageError for a configuration file that the service would not see, or whose name would be more than
-    a word of its command line."""
+    """Return the text of edgevpr.service for a board and a configuration file (None: the one that the shipped unit
+    names). Raises UsageError if the service cannot see the file, or if the unit cannot hold its name."""
     text = (shipped("deploy") / "edgevpr.service").read_text(encoding="utf-8")
     visible = _visible(Path(config_path or USUAL_CONFIG))
     text = text.replace(f" --config {USUAL_CONFIG}\n", f" --config {_quoted(str(visible))}\n")
@@ -30,8 +29,9 @@ def render_unit(board: Board, config_path: str | Path | None = None) -> str:
 
 
 def _visible(path: Path) -> Path:
-    """Return the absolute path of a configuration file that the service sees and that a unit can name, else raise
-    UsageError. Links and `..` are followed to tell; where there is a `..`, the path that they lead to is written."""
+    """Return the absolute path of a configuration file. Raises UsageError if the service cannot see the file, or if a
+    unit cannot hold its name. Links are followed for the check, and stay in the returned path unless that has a
+    `..`."""
     if not str(path).isprintable():  # a line break would begin a line of its own in the unit
         raise UsageError(
             f"{path} holds a character that a unit cannot hold: give it another name, e.g. {USUAL_CONFIG}."
@@ -50,7 +50,7 @@ def _visible(path: Path) -> Path:
 
 
 def _quoted(argument: str) -> str:
-    """Quote one argument of a command line in a unit: systemd.service(5), "Command lines"."""
+    """Quote one argument of a command line in a unit, by systemd.service(5), "Command lines"."""
     argument = argument.replace("%", "%%").replace("$", "$$")
     if re.search(r"[\s\"'\\]", argument):
         argument = '"' + argument.replace("\\", "\\\\").replace('"', '\\"') + '"'
