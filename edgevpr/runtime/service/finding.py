@@ -8,7 +8,7 @@ from edgevpr.core.errors import EdgevprError
 
 @dataclass(frozen=True, slots=True)
 class FlightIntent:
-    """What a flight will do: whether it sends fixes (else it is a dry run), and the seconds between two queries."""
+    """Intent of a flight: whether it sends fixes (else it is a dry run), and the seconds between two queries."""
 
     sends_fixes: bool
     every_s: float
