@@ -44,9 +44,9 @@ _VOTES_COUNT = {"forward": (1.0, 1.0, 0.75, 0.5), "nadir": (1.0, 1.0)}
 # aerial_caliterra. The thesis's score has no safe threshold: its margin rejects those queries of other sites, and most
 # right matches too.
 _ACCEPT = {"forward": (0.07, 0.035), "nadir": (0.08, 0.03), "thesis": (0.0, 0.02)}
-# Least quality. Without it, the pictures of nothing that were accepted on the tuning sets had .39 or less, and real
-# ones, washed out or covered, that were taken for a wrong place .43 or less; right matches had .91 or more (on the
-# other sets .72, and .47 where pictures have 64 x 32 pixels). With `filled_bins` it was .14, .18 and .30.
+# Least quality. On the tuning sets, accepted pictures that show nothing had .39 or less, and real ones, washed out or
+# covered, that were taken for a wrong place .43 or less; right matches had .91 or more (on the other sites .72 or more,
+# and .47 where pictures have 64 x 32 pixels). With `filled_bins` it was .14, .18 and .30.
 _MIN_QUALITY = {"shannon": 0.4, "filled_bins": 0.2}
 _CANDIDATES = {"forward": 42, "nadir": 50}
 # Places compared in full, those with the best `glance`. On corridor, the seasons and nordland_tiny 12 of 42, and on all

@@ -160,8 +160,8 @@ def _pairs(cells: int) -> Array:
 
 @lru_cache(maxsize=4)
 def _scaled_pairs(side_px: int, cell_px: int) -> Singles:
-    """Return the matrix float32 (cells - 1, 100) that enlarges the 100 pixels of the copy to `side_px` pixels, averages
-    them in cells of `cell_px` pixels, and averages each cell and the next one."""
+    """Return the matrix float32 (cells - 1, 100) that does three things to a row of the copy: enlarge it to `side_px`
+    pixels, average it in cells of `cell_px` pixels, and average each cell and the next one."""
     unit = np.eye(SHANNON_SIDE_PX, dtype=np.float32)
     back = cv2.resize(unit, (SHANNON_SIDE_PX, side_px), interpolation=cv2.INTER_LINEAR)
     matrix: Singles = _pairs(side_px // cell_px) @ back.reshape(-1, cell_px, SHANNON_SIDE_PX).mean(axis=1)

@@ -1,4 +1,6 @@
-"""Training on one's own pictures: the CALC autoencoder (`calc`) and the words of VLAD and bag-of-words (`words`).
+"""Training from one's own pictures: the CALC autoencoder (`calc`), the words of VLAD and bag-of-words (`words`), and
+networks in 8-bit integers (`quantise`).
 
-It runs on a workstation, never in flight. PyTorch and onnx come with the extra `train` and are imported only here.
+All of it runs on a workstation, never in flight. PyTorch and onnx come with the extra `train`; only this package
+imports them.
 """

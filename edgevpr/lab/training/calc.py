@@ -2,16 +2,16 @@
 
 The encoder learns to ignore a change of view and light (Merrill and Huang 2018, section III, and their public network
 definition). The target is the HOG of a picture. The input is the same ground from elsewhere in other light. The encoder
-and the L2 loss are the paper's. Different are the target (see `pictures`), the decoder, and Adam with a rate that falls
-like a cosine instead of plain momentum.
+and the L2 loss are the paper's. The target differs (see `pictures`), and so do the decoder and the optimiser: Adam with
+a rate that falls like a cosine instead of plain momentum.
 
-Two things of the network differ, because the paper's saw 2.5 million pictures 42 times. First, batch normalisation
+The network differs in three things, because the paper's saw 2.5 million pictures 42 times. First, batch normalisation
 follows each convolution: without it one or more of the four channels of the code become zero for good. It is folded
 into the weights after training, so the network that flies has the paper's layers and no others. Second, the decoder is
 three small convolutions, where the paper's is fully connected (1064, 1064, 2048, 3648). A change of view moves things
-near where they were, and 130 000 numbers learn that from fewer pictures than 11 million. The second layer of the
-encoder also has a threshold, so that fewer of its activations are above zero: regions are made of activations that
-touch, and where most are above zero, everything is one region.
+only a little, and 130 000 weights learn that from fewer pictures than 11 million. Third, the second layer of the
+encoder has a threshold, so that fewer of its activations are above zero: regions are made of activations that touch,
+and where most are above zero, everything is one region.
 """
 
 import copy
@@ -44,14 +44,14 @@ _STEPS_BETWEEN_CHECKPOINTS = 250
 
 
 class Encoder(nn.Module):
-    """The encoder: image float32 (N, 1, 120, 160) in 0..1 to descriptor (N, 1064) of length 1 and features
-    (N, 128, 16, 21).
+    """The encoder: image float32 (N, 1, 120, 160) in 0..1 to descriptor (N, 1064) of length 1 and features (N, 128, 16,
+    21).
 
-    Pooling rounds up, as Caffe does: this gives the 1064 values.
+    Pooling rounds sizes up, as Caffe does: this gives the 1064 values.
     """
 
     def __init__(self, normalised: bool = False) -> None:
-        """Make the layers; `normalised` adds batch normalisation, for training."""
+        """Make the layers; `normalised` adds batch normalisation and the threshold, for training."""
         super().__init__()
         self.conv1 = nn.Conv2d(1, 64, 5, stride=2, padding=4)
         self.conv2 = nn.Conv2d(64, 128, 4, padding=2)
@@ -68,7 +68,8 @@ class Encoder(nn.Module):
         return _response_normalised(functional.max_pool2d(x, 3, 2, ceil_mode=True))
 
     def code(self, features: torch.Tensor) -> torch.Tensor:
-        """Compute the input of the decoder, (N, 4, 14, 19): the descriptor before it is flat and of length 1."""
+        """Compute the input of the decoder, (N, 4, 14, 19): the descriptor before it is flattened and scaled to length
+        1."""
         return functional.relu(self.norm3(self.conv3(features)))
 
     def forward(self, image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -90,7 +91,7 @@ class Encoder(nn.Module):
 class Autoencoder(nn.Module):
     """The autoencoder: changed image to the HOG of the unchanged one, (N, 14 * 19 * M) in 0..1, M values per block.
 
-    The last bias starts at the mean target, so that the first steps need not learn what all pictures share.
+    The last bias, `offset`, starts at the mean target, so that the first steps need not learn what all pictures share.
     """
 
     def __init__(self, mean_target: torch.Tensor) -> None:
@@ -131,15 +132,15 @@ def _response_normalised(x: torch.Tensor) -> torch.Tensor:
 
 
 class Training:
-    """One training, step by step. `step` is the number of steps done, `losses` are those of this run.
+    """One training, step by step. `step` is the number of steps done, `losses` are those of the steps of this run.
 
-    The pictures of a step follow from the seed and the number of the step alone. So a training that was stopped and
-    goes on from its checkpoint ends as one that was not (but for the last bit: OpenCV's sums depend on where an array
-    lies).
+    The pictures of a step follow from the seed and the number of the step alone. So a training that is stopped and
+    continued from its checkpoint gives the same result as one without a stop (but for the last bit: OpenCV's sums
+    depend on the address of an array).
     """
 
     def __init__(self, pictures: Sequence[Image], steps: int, seed: int) -> None:
-        """Prepare the training; `pictures` are uint8 grey. Raises UsageError for too few of them."""
+        """Prepare the training of `steps` steps; `pictures` are uint8 grey. Raises UsageError for too few of them."""
         require_enough(pictures)
         self.pictures, self.steps, self.seed, self.step = pictures, steps, seed, 0
         self.losses: list[float] = []
@@ -156,7 +157,8 @@ class Training:
         return encoder.folded()
 
     def run(self, checkpoint: Path) -> Iterator[int]:
-        """Do the steps that are left, yielding the number of those done; save `checkpoint` every 250 steps."""
+        """Do the remaining steps. Yields the number of steps done after each, and saves `checkpoint` every 250
+        steps."""
         while self.step < self.steps:
             self._one_step()
             if self.step % _STEPS_BETWEEN_CHECKPOINTS == 0:
@@ -178,7 +180,7 @@ class Training:
         self.losses.append(loss.item())
 
     def save(self, path: Path) -> None:
-        """Write everything that is needed to go on. A failure leaves the file as it was before."""
+        """Write everything that is needed to continue to `path`. A failure leaves the file as it was before."""
         state = {
             "key": self._key(),
             "step": self.step,
@@ -190,7 +192,7 @@ class Training:
         write_whole(path, lambda unfinished: unfinished.write_bytes(content.getbuffer()))
 
     def load(self, path: Path) -> None:
-        """Go on from a checkpoint. Raises UsageError for a file that cannot be read or is of another training."""
+        """Continue from a checkpoint. Raises UsageError for a file that cannot be read or is of another training."""
         try:
             state: dict[str, Any] = torch.load(path, map_location=self._device, weights_only=True)
             same = state["key"] == self._key()
@@ -217,7 +219,7 @@ class Training:
 
 
 def _has_halves(device: torch.device) -> bool:
-    """Tell whether bfloat16 is fast on this device, and not only possible."""
+    """Tell whether bfloat16 arithmetic is fast on this device, not merely possible."""
     if device.type == "cuda":
         return torch.cuda.get_device_capability(device)[0] >= 8
     try:
@@ -234,5 +236,6 @@ def _mean_target(pictures: Sequence[Image], seed: int) -> Singles:
 
 
 def _rate(step: int, steps: int) -> float:
-    """Return the learning rate of a step: it rises over the first steps, then falls like half a cosine to zero."""
+    """Return the learning rate of step `step` of `steps`: it rises over 100 steps, then falls like half a cosine to
+    zero."""
     return _RATE * min(1, (step + 1) / _WARM_UP_STEPS) * (0.5 + 0.5 * math.cos(math.pi * step / steps))

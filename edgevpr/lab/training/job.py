@@ -1,6 +1,6 @@
-"""The whole job of `edgevpr train calc`: pictures in, a checked ONNX file and its card out.
+"""The whole job of `edgevpr train calc`: from folders of pictures to a checked ONNX file and its card.
 
-PyTorch is imported only when all that can be wrong without it has been checked.
+PyTorch is imported only after everything has been checked that can be checked without it.
 """
 
 from collections.abc import Sequence
@@ -35,13 +35,14 @@ _INPUT = InputRule(
     scale=1 / 255,
     mean=[0.0],
 )
-_LOSSES_SAID = 50  # the reported loss is the mean of as many steps: one batch says little
+_LOSSES_SAID = 50  # steps over which a reported loss is averaged: one batch says little
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrainingResult:
-    """Result of a training: the pictures learned from, the steps, the mean loss of the first and last 50 steps of this
-    run (None if the checkpoint was of the last step), and the largest difference between the file and PyTorch."""
+    """Result of a training: paths of network and card, the numbers of pictures and steps, the mean loss of the first
+    and last 50 steps of this run (None if the checkpoint was of the last step), and the largest difference between the
+    outputs of the file and of PyTorch."""
 
     model: str
     card: str
@@ -55,11 +56,11 @@ class TrainingResult:
 def train_calc(
     folders: Sequence[str], out: Path, steps: int, seed: int, resume: bool, unusable: list[ImageError]
 ) -> TrainingResult:
-    """Train on the images of `folders` and write `out` (ONNX) and its card beside it; see `calc.Training`.
+    """Train on the images of `folders` and write `out` (ONNX) and its card beside it; see `calc.Training`. `resume`
+    continues from the checkpoint beside `out`, which is kept until both are written.
 
-    A checkpoint beside `out` is kept until both are written. Images that cannot be used are added to `unusable`. Raises
-    UsageError for settings that make no sense or files that exist already, and what `read_pictures`,
-    `require_packages`, `Training` and `write_model` raise.
+    Images that cannot be used are added to `unusable`. Raises UsageError for settings that make no sense or files that
+    exist already, and what `read_pictures`, `require_packages`, `Training` and `write_model` raise.
     """
     if steps < 1 or seed < 0:
         raise UsageError(f"--steps {steps} --seed {seed}: give at least 1 step and a seed of 0 or more.")

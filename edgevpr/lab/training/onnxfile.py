@@ -1,4 +1,4 @@
-"""A trained network as an ONNX file with its card, checked against PyTorch."""
+"""Writing a trained network as an ONNX file with its card, checked against PyTorch; `job` uses it."""
 
 import logging
 import warnings
@@ -23,8 +23,8 @@ _OPSET, _IR_VERSION = 18, 8  # that every onnxruntime since 1.17 reads
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModelFile:
-    """An ONNX file to be made, and what its card says: the name of its `input` and its preparation, and the names of
-    its `outputs`, each under the key of the card that it is of."""
+    """An ONNX file to be made, and its card. `input` is the name of the network's input and `rule` the preparation of a
+    picture. `outputs` are the names of the network's outputs by the key of the card, such as "descriptor"."""
 
     path: Path
     title: str
@@ -38,11 +38,12 @@ class ModelFile:
 
 
 def write_model(file: ModelFile, network: torch.nn.Module, samples: Sequence[Singles], source: str, then: str) -> float:
-    """Write a network and its card. A sample is float32 (N, ...), an input; where it holds several pictures, the file
-    takes any number of them.
+    """Write a network and its card. Each of `samples` is an input to compare with, float32 (N, ...); if the first has N
+    > 1, the file takes any number of pictures. `source` is written into the card.
 
     Returns the largest difference between the outputs of the file and of PyTorch, as a share of the largest value (of
-    1, if that is larger). Raises EdgevprError with what to do `then`, and leaves no file, if it is more than 1e-4.
+    1, if that is larger). If it is more than 1e-4, raises EdgevprError, which ends with the advice `then`, and leaves
+    no file.
     """
     _write_onnx(file, network, samples[0])
     try:

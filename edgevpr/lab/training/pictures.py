@@ -1,9 +1,10 @@
-"""Training pairs of CALC: a changed view of a picture as input, the gradients of the unchanged view as target.
+"""Training pairs of CALC: a changed view of a picture as input, the gradients of the unchanged view as target. Also the
+reading of pictures, for all kinds of training.
 
-Merrill and Huang 2018, section III. In the paper the corners of a view are moved at random. Here more is random,
-because a flight has thousands of pictures and not millions. The view itself is a random part of the picture, mirrored
-half of the time. Corners move outwards as well as inwards, so that the changed view is not always zoomed. Light falls
-unevenly, which histogram equalisation (part of the network's input here as in flight) cannot undo.
+The pairs follow Merrill and Huang 2018, section III. In the paper the corners of a view are moved at random. Here more
+is random, because a flight has thousands of pictures and not millions. The view itself is a random part of the picture,
+mirrored half of the time. Corners move outwards as well as inwards, so that the changed view is not always zoomed. The
+light is uneven, which histogram equalisation (part of the network's input here as in flight) cannot undo.
 """
 
 import importlib
@@ -39,8 +40,8 @@ def read_pictures(
     folders: Sequence[str | Path], label: str, unusable: list[ImageError] | None = None
 ) -> Iterator[Image]:
     """Yield each image of `folders`, uint8 grey or BGR, the longer side at most 640 pixels, and print the progress
-    under `label`. Images that cannot be used are printed to stderr and added to `unusable` (None: that was done
-    before).
+    under `label`. Images that cannot be used are printed to stderr and added to `unusable` (None: they are skipped
+    silently, as an earlier pass has reported them).
 
     Raises SourceError for a folder that is missing or holds no images.
     """
@@ -67,7 +68,7 @@ def _at_most(image: Array, longest_px: int) -> Image:
 
 
 def require_enough(pictures: Sequence[Image]) -> None:
-    """Raise UsageError for too few pictures to learn from."""
+    """Raise UsageError for fewer than 16 pictures, too few to learn from."""
     if len(pictures) < MIN_PICTURES:
         raise UsageError(
             f"{len(pictures)} usable images are too few to learn from: give folders with {MIN_PICTURES} at the very "
@@ -76,7 +77,7 @@ def require_enough(pictures: Sequence[Image]) -> None:
 
 
 def require_new(out: Path) -> None:
-    """Raise UsageError where `out` is no name for a new ONNX file with a card beside it."""
+    """Raise UsageError unless `out` ends in .onnx and neither it nor a card beside it exists yet."""
     if out.suffix != ".onnx":
         raise UsageError(f"--out {out}: give a name that ends in .onnx.")
     for path in (out, out.with_suffix(".yaml")):
@@ -97,7 +98,8 @@ def require_packages() -> None:
 
 
 def batch(pictures: Sequence[Image], size: int, rng: np.random.Generator) -> tuple[Singles, Singles]:
-    """Return `size` inputs, float32 (size, 1, 120, 160) in 0..1, and their targets, float32 (size, TARGET_LENGTH)."""
+    """Make a random batch: `size` inputs, float32 (size, 1, 120, 160) in 0..1, and targets, float32 (size,
+    TARGET_LENGTH)."""
     inputs = np.empty((size, 1, HEIGHT, WIDTH), np.float32)
     targets = np.empty((size, TARGET_LENGTH), np.float32)
     for row in range(size):
@@ -115,7 +117,8 @@ def gradients_of(sight: Image) -> Singles:
 
 
 def two_sights(picture: Image, rng: np.random.Generator) -> tuple[Image, Image]:
-    """Return a random part of a grey picture as uint8 (120, 160), and the same ground from elsewhere in other light."""
+    """Return two views of a grey picture, uint8 (120, 160) each: a random part of it, and about the same ground seen
+    from elsewhere in other light."""
     height, width = picture.shape
     largest = min(width / WIDTH, height / HEIGHT)
     scale = largest * rng.uniform(_SMALLEST_PART, 1)
@@ -138,8 +141,8 @@ def _seen(picture: Image, corners: Doubles) -> Image:
 
 
 def _relit(sight: Image, rng: np.random.Generator) -> Image:
-    """Change the light of a view: another gamma, mostly darker, light that varies over the view (shadows of clouds),
-    and noise of the sensor."""
+    """Change the light of a view: its gamma, its brightness (mostly darker), light that varies over the view like
+    shadows of clouds, and noise of the sensor."""
     light: Array = rng.normal(0, _LIGHT_VARIES * rng.random(), (3, 4)).astype(np.float32)
     light = np.exp(cv2.resize(light, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC))
     changed = (sight / np.float32(255)) ** np.float32(rng.uniform(0.6, 1.6))

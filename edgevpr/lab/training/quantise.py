@@ -1,4 +1,5 @@
-"""A network in 8-bit integers: a quarter of the file, and faster where the processor multiplies bytes fast."""
+"""`edgevpr models quantise`: a network in 8-bit integers, a quarter of the file, and faster where the processor
+multiplies bytes fast."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,8 +19,8 @@ _MOST_IMAGES = 200
 
 @dataclass(frozen=True, slots=True)
 class Quantised:
-    """Result of quantising a network: the new card, the number of images it was calibrated with, and the trials of both
-    networks on this machine."""
+    """Result of quantising a network: the path of the new card, the number of images used for calibration, and the
+    trials of both networks on this machine."""
 
     card: str
     images: int
@@ -28,10 +29,11 @@ class Quantised:
 
 
 def quantise(name: str, calibration: Path, threads: int = 1) -> Quantised:
-    """Write the network of the card `name` in static INT8, as NAME_int8, to the user's models folder.
+    """Write the network of the card `name` in 8-bit integers (static INT8), as NAME_int8, to the user's models folder.
 
-    The ranges of its activations are those met in (at most 200 of) the images of `calibration`. Raises ModelError if
-    the package `onnx` is missing or the network cannot be quantised, SourceError for a folder without images.
+    The ranges of its activations are measured on at most 200 of the images in the folder `calibration`. Raises
+    ModelError if the package `onnx` is missing or the network cannot be quantised, SourceError for a folder without
+    images.
     """
     card = load_card(name)
     before = verify(card, threads)

@@ -5,9 +5,9 @@ reads their file. It holds `words` float16 (K, D), rounded to steps of 1/256 so 
 room, and `model_sha256`, the fingerprint of the card whose feature map they describe. If asked for, it also holds the
 whitening of the VLAD vectors made of the words (Jégou and Chum, ECCV 2012).
 
-The words of the ground are those by which `cohog` names places, looking down (see `techniques.placewords`). The regions
-of the pictures, under several headings, are turned by quarter turns until they all run the same way. So a word stands
-for four: itself, and itself turned.
+The words of the ground are those by which `cohog` names places with a nadir camera (see `techniques.placewords`). The
+regions of the pictures, under several headings, are turned by quarter turns until their main directions agree. So a
+word stands for four: itself, and itself turned.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -44,8 +44,9 @@ _BLOCK_VALUES = 8_000_000  # distances held at once: 32 MB
 
 @dataclass(frozen=True, slots=True)
 class WordsWanted:
-    """The words to learn: `count` of a `kind` ("vlad", "regions", "bow") on the feature map of the card `model`.
-    `whiten` is the length of the whitened VLAD vectors (None: no whitening)."""
+    """The words to learn: `count` of a `kind` ("vlad" for `netvlad`, "regions" for `region_vlad`, "bow" for
+    `cross_region_bow`) on the feature map of the card `model`. `whiten` is the length of the whitened VLAD vectors
+    (None: no whitening)."""
 
     model: str
     kind: str
@@ -56,7 +57,7 @@ class WordsWanted:
 @dataclass(frozen=True, slots=True)
 class WordsResult:
     """Result of a training of words: the file, the numbers of pictures and local descriptors it was learned from, and
-    the mean square distance of a descriptor to its word (2: nothing in common)."""
+    the mean square distance of a descriptor to its nearest word (2: nothing in common)."""
 
     file: str
     pictures: int
@@ -66,8 +67,8 @@ class WordsResult:
 
 @dataclass(frozen=True, slots=True)
 class GroundResult:
-    """Result of a training: the file, the numbers of pictures and regions it was learned from, and the mean cosine of a
-    region and its word."""
+    """Result of a training of words of the ground: the file, the numbers of pictures and regions it was learned from,
+    and the mean cosine of a region and its most similar word."""
 
     file: str
     pictures: int
@@ -123,7 +124,7 @@ def train_words(
 
 
 def train_ground(folders: Sequence[str], out: Path, seed: int, unusable: list[ImageError]) -> GroundResult:
-    """Learn 256 words of the ground, each of four turns, and write them to `out` (.npz).
+    """Learn 256 words of the ground and write them to `out` (.npz). Each stands for four, itself and its quarter turns.
 
     Raises UsageError for a file that exists already or too few regions, SourceError for a folder without images.
     """
@@ -150,8 +151,8 @@ def train_ground(folders: Sequence[str], out: Path, seed: int, unusable: list[Im
 
 
 def aligned(patterns: Singles) -> Singles:
-    """Turn patterns float32 (N, 20) by quarter turns until their main direction is within 45 degrees of the first
-    orientation."""
+    """Turn each of `patterns` float32 (N, 20) by quarter turns until its main direction is within 45 degrees of the
+    first orientation."""
     # The second and third pattern are the cosine and sine of the first frequency over the orientations.
     quarters = np.rint(np.arctan2(patterns[:, 2], patterns[:, 1]) / (np.pi / 2)).astype(np.intp) % placewords.QUARTERS
     turned = placewords.turned_words(patterns).reshape(len(patterns), placewords.QUARTERS, -1)
@@ -161,8 +162,8 @@ def aligned(patterns: Singles) -> Singles:
 def kmeans(points: Singles, count: int, rounds: int, rng: np.random.Generator) -> Iterator[Singles]:
     """Yield `count` centres, float32 (count, D), of `points` float32 (N, D), after each of `rounds` (Lloyd 1982).
 
-    The centres start as points drawn at random. A centre to which no point belongs moves to one of the points that lie
-    furthest from their centres. N must be at least `count`.
+    The centres start as points drawn at random. A centre that is nearest to no point moves to one of the points that
+    lie furthest from their centres. N must be at least `count`.
     """
     centres = points[np.sort(rng.choice(len(points), count, replace=False))].copy()
     for _ in range(rounds):
@@ -196,7 +197,7 @@ def _assigned(points: Singles, centres: Singles) -> tuple[Ints, Singles]:
 
 
 def _share(points: float, folders: Sequence[str]) -> int:
-    """Return how many of so many points one picture gives."""
+    """Return the number of points to take from each picture of `folders` to have `points` in total, rounded up."""
     return int(-(-points // sum(len(list_images(name)) for name in folders)))
 
 
@@ -205,7 +206,8 @@ def _some(points: Singles, count: int, rng: np.random.Generator) -> Singles:
 
 
 def _locals(backbone: Backbone, kind: str) -> Callable[[Image], Singles]:
-    """Make the function from a picture to its local descriptors, float32 (N, C), each of length 1."""
+    """Make the function from a picture to its local descriptors, float32 (N, C), each of length 1: for the kind "vlad"
+    one per position, else one per region."""
     if kind == "vlad":
         return lambda picture: local_descriptors(backbone.run(picture))
 
@@ -227,8 +229,9 @@ def _write(path: Path, arrays: dict[str, Array]) -> None:
 def _whitening(
     backbone: Backbone, folders: Sequence[str], pictures: int, words: Singles, length: int
 ) -> dict[str, Array]:
-    """Learn the whitening: the principal components of the pictures' VLAD vectors over the root of their variance.
-    Returns the mean float32 (K D,), the matrix int8 (length, K D) and the scale of its rows float32 (length,)."""
+    """Learn the whitening of `length` values: the principal components of the pictures' VLAD vectors, each over the
+    root of its variance. Returns the arrays `mean` float32 (K D,), `whitening` int8 (length, K D) and `whitening_scale`
+    float32 (length,)."""
     sharpness = sharpness_of(words)
     vectors = np.empty((pictures, words.size), np.float32)
     for row, picture in enumerate(read_pictures(folders, "whitening")):
