@@ -15,8 +15,8 @@ import numpy as np
 
 from edgevpr.power.boards import MachineSpeed
 
-# Rounds per second of one core of the reference machine, an AMD EPYC (Zen 4) in a virtual machine, by `_rates_hz` with
-# OPENBLAS_NUM_THREADS=1, Python 3.11 and NumPy 2.4 (OpenBLAS 0.3.31).
+# Rounds per second of one core of the reference machine, an AMD EPYC (Zen 4) in a virtual machine. Measured by
+# `_round_times_s` with OPENBLAS_NUM_THREADS=1, Python 3.11 and NumPy 2.4 (OpenBLAS 0.3.31).
 REFERENCE_PRODUCTS_HZ = 1585.0
 REFERENCE_PASSES_HZ = 1960.0
 
