@@ -1,5 +1,5 @@
-"""Brushes that paint things on the ground of a scene (noise, roofs, crowns of trees), and the lines along which they
-paint: winding ones, and those that cut land into fields. Points are (N, 2) east, north in metres."""
+"""Brushes that paint things on the ground of a scene (noise, roofs, crowns of trees), and the lines along which
+`landscape` paints them: winding ones, and those that cut land into fields. Points are (N, 2): east, north in metres."""
 
 from dataclasses import dataclass
 
@@ -16,8 +16,8 @@ BASE_CM = 300  # of open ground, so that a river bed and a furrow lie above zero
 
 @dataclass(frozen=True, slots=True)
 class Canvas:
-    """A scene in the making: `albedo` uint8 (H, W, 3) BGR and `height_cm` uint16 (H, W), both painted in place;
-    north is up, the south-west corner is (0, 0) m."""
+    """A scene in the making: `albedo` uint8 (H, W, 3) BGR and `height_cm` uint16 (H, W), both painted in place. North
+    is up; the south-west corner is (0, 0) m. A *box* is a rectangle of pixels, as slices of rows and columns."""
 
     albedo: Image
     height_cm: NDArray[np.uint16]
@@ -33,33 +33,35 @@ class Canvas:
         return np.column_stack((east_m, self.shape[0] * self.metres_per_pixel - north_m)) / self.metres_per_pixel
 
     def box(self, points_m: ArrayLike, margin_m: float = 0.0) -> Box:
-        """Return the box of pixels around some points, cut off at the edge of the scene (empty outside of it)."""
+        """Return the box of pixels around some points and `margin_m` beyond them, cut off at the edge of the scene
+        (empty outside of it)."""
         margin = margin_m / self.metres_per_pixel
         low, high = self.pixels(points_m).min(axis=0) - margin, self.pixels(points_m).max(axis=0) + margin
         (left, top), (right, bottom) = np.maximum(low, 0).astype(int), np.maximum(np.ceil(high), 0).astype(int)
         return slice(top, max(top, min(bottom, self.shape[0]))), slice(left, max(left, min(right, self.shape[1])))
 
     def grid_m(self, box: Box) -> tuple[Floats, Floats]:
-        """Return east (1, W) and north (H, 1) in metres of the pixels of a box, float32."""
+        """Return east (1, W) and north (H, 1) of the pixels of a box, float32 in metres."""
         rows, columns = (np.arange(part.start, part.stop, dtype=np.float32) + 0.5 for part in box)
         return columns[None] * self.metres_per_pixel, ((self.shape[0] - rows) * self.metres_per_pixel)[:, None]
 
     def polygon(self, box: Box, points_m: ArrayLike) -> Floats:
-        """Return the cover, float32 0..1, of a polygon over the pixels of a box, with smooth edges."""
+        """Return the share of each pixel of a box that a polygon covers, float32 (H, W) in 0..1: its edges are
+        smooth."""
         cover = np.zeros((box[0].stop - box[0].start, box[1].stop - box[1].start), np.uint8)
         corners = (self.pixels(points_m) - (box[1].start, box[0].start)) * 16
         cv2.fillPoly(cover, [corners.round().astype(np.int32)], 255, cv2.LINE_AA, 4)
         return cover.astype(np.float32) / 255
 
     def distance_m(self, box: Box, line_m: ArrayLike) -> Floats:
-        """Return the metres from a polyline, float32, for every pixel of a box."""
+        """Return the distance of each pixel of a box from a polyline, float32 (H, W) in metres."""
         away = np.full((box[0].stop - box[0].start, box[1].stop - box[1].start), 255, np.uint8)
         points = self.pixels(line_m) - (box[1].start, box[0].start)
         cv2.polylines(away, [points.round().astype(np.int32)], False, 0)
         return cv2.distanceTransform(away, cv2.DIST_L2, 5) * self.metres_per_pixel
 
     def paint(self, box: Box, cover: Array, colour: ArrayLike) -> None:
-        """Paint a colour, (3,) or (H, W, 3) BGR, over a box, with the opacity `cover` 0..1."""
+        """Paint a colour, (3,) or (H, W, 3) BGR, over a box, with the opacity `cover`, (H, W) in 0..1."""
         touched = cover > 0
         below = self.albedo[box][touched].astype(np.float32)
         above = np.asarray(colour, np.float32)
@@ -68,7 +70,8 @@ class Canvas:
 
 
 def noise(rng: np.random.Generator, shape: tuple[int, int], first_px: float, octaves: int = 3) -> Singles:
-    """Make smooth noise, float32, mean 0 and standard deviation 1; its largest bumps are `first_px` wide."""
+    """Make smooth noise, float32 of `shape`, mean 0 and standard deviation 1. Its largest bumps are `first_px` wide;
+    each further octave halves the width."""
     total = np.zeros(shape, np.float32)
     for octave in range(octaves):
         step = max(first_px / 2**octave, 1.0)
@@ -89,14 +92,16 @@ def bgr_mix(low: tuple[int, int, int], high: tuple[int, int, int], share: Array)
 
 
 def smooth_step(values: Array, low: float, high: float) -> Array:
-    """Return 0 below `low`, 1 above `high`, a straight ramp between; the other way round where low > high."""
+    """Return 0 below `low`, 1 above `high`, and a straight ramp between. If low > high, return 1 below `high` and 0
+    above `low`."""
     return np.clip((values - low) / (high - low), 0, 1)
 
 
 def roof(
     canvas: Canvas, centre_m: Doubles, length_m: float, width_m: float, turn_rad: float, wall_m: float, colour: Doubles
 ) -> None:
-    """Paint a building with a gable roof, its ridge along `turn_rad` (anticlockwise from east)."""
+    """Paint a building with walls `wall_m` high and a gable roof, its ridge along `turn_rad` (anticlockwise from
+    east)."""
     along, across = axes_of(turn_rad)
     corners = [
         np.asarray(centre_m) + a * along * length_m / 2 + b * across * width_m / 2
@@ -114,7 +119,8 @@ def roof(
 
 
 def crown(rng: np.random.Generator, radius_px: int) -> Singles:
-    """Make the dome of one tree, float32 (2 r + 1, 2 r + 1) in 0..1.2, 0 outside of its ragged outline."""
+    """Make the dome of one tree, float32 (2 r + 1, 2 r + 1) in 0..1.2, r = `radius_px`, and 0 outside of its ragged
+    outline."""
     axis = np.arange(-radius_px, radius_px + 1, dtype=np.float32) / radius_px
     lumps = noise(rng, (len(axis), len(axis)), max(radius_px * 0.7, 2.0), 2)
     leaves = noise(rng, (len(axis), len(axis)), 2.5, 2)
@@ -124,7 +130,8 @@ def crown(rng: np.random.Generator, radius_px: int) -> Singles:
 
 
 def stand(canvas: Canvas, dome: Singles, centre_m: tuple[float, float], top_m: float, colour: Doubles) -> None:
-    """Set one tree (a `crown`) on the canvas; where crowns overlap, the higher one is seen."""
+    """Paint one tree, a `crown` that rises `top_m` metres over the ground. Where crowns overlap, the higher one is
+    seen."""
     radius = len(dome) // 2
     column, row = canvas.pixels([centre_m])[0].astype(int)
     if not (radius <= column < canvas.shape[1] - radius and radius <= row < canvas.shape[0] - radius):
@@ -137,12 +144,12 @@ def stand(canvas: Canvas, dome: Singles, centre_m: tuple[float, float], top_m: f
 
 
 def axes_of(turn_rad: float) -> tuple[Doubles, Doubles]:
-    """Return the unit vectors along a direction, anticlockwise from east, and to the left of it."""
+    """Return two unit vectors (2,): along the direction `turn_rad`, anticlockwise from east, and to the left of it."""
     return np.array([np.cos(turn_rad), np.sin(turn_rad)]), np.array([-np.sin(turn_rad), np.cos(turn_rad)])
 
 
 def winding(rng: np.random.Generator, start: tuple[float, float], end: tuple[float, float], swing_m: float) -> Doubles:
-    """Make a winding line of 200 points from near `start` to near `end`."""
+    """Make a line of 200 points from near `start` to near `end` that swings about `swing_m` metres to either side."""
     start_m, end_m = np.asarray(start), np.asarray(end)
     along = (end_m - start_m) / np.linalg.norm(end_m - start_m)
     t = np.linspace(0, 1, 200)[:, None]
@@ -154,9 +161,10 @@ def winding(rng: np.random.Generator, start: tuple[float, float], end: tuple[flo
 def parcels(
     rng: np.random.Generator, width_m: float, depth_m: float, field_m2: float
 ) -> tuple[list[Doubles], list[tuple[int, Doubles]]]:
-    """Cut the land by straight lines until every piece is about `field_m2`.
+    """Cut the land by straight lines until every piece has about `field_m2` square metres. Returns
 
-    Returns the pieces (convex polygons) and every cut as (level, its two ends): level 0 crosses all the land.
+    * the pieces, convex polygons (N, 2),
+    * the cuts, each as its level and its two ends: level 0 crosses all the land, and each further level one piece.
     """
     fields, cuts = [], []
     todo = [(0, np.array([(-20, -20), (width_m + 20, -20), (width_m + 20, depth_m + 20), (-20, depth_m + 20)]))]
@@ -175,14 +183,15 @@ def parcels(
 
 
 def longest_side(polygon: Doubles) -> Doubles:
-    """Return the longest side of a polygon as a vector."""
+    """Return the longest side of a polygon (N, 2) as a vector (2,)."""
     sides = np.roll(polygon, -1, axis=0) - polygon
     longest: Doubles = sides[np.argmax(np.hypot(*sides.T))]
     return longest
 
 
 class Bend:
-    """Bends straight lines a little, everywhere in the same way, so that lines that touched still touch."""
+    """Bends straight lines by about `by_m` metres. All points near one another are moved alike, so lines that touched
+    still touch."""
 
     def __init__(self, rng: np.random.Generator, width_m: float, depth_m: float, by_m: float) -> None:
         shape = int(depth_m / _GRID_M) + 8, int(width_m / _GRID_M) + 8
@@ -211,7 +220,8 @@ def _area_m2(polygon: Doubles) -> float:
 
 
 def _cut(piece: Doubles, through: Doubles, across: Doubles) -> tuple[list[Doubles], Doubles]:
-    """Return both halves of a convex polygon, and the cut between them."""
+    """Cut a convex polygon by the line through the point `through`, at right angles to `across`. Returns both halves,
+    and the ends of the cut."""
     side = (piece - through) @ across
     halves: tuple[list[Doubles], list[Doubles]] = ([], [])
     line: list[Doubles] = []

@@ -1,5 +1,5 @@
-"""Pictures of a scene by a camera under a drone: light on the ground, a pinhole camera, and the faults of its
-sensor."""
+"""Pictures of a scene by a camera under a drone: light on the ground, a pinhole camera, and the faults of its sensor.
+`generated` and `rehearsal` take their pictures with it."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ _STRIP = 256  # rows lit at a time: the working memory stays small
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Light:
     """Light of the hour and the weather. `warmth` shifts sunlight from blue (-1) to orange (+1). `cloud_frac` of the
-    ground lies in the shadow of clouds, and `haze_frac` of the picture is grey veil. `exposure` is a factor of
+    ground lies in the shadow of clouds, and `haze_frac` (0..1) of the picture is grey haze. `exposure` is a factor of
     brightness, `gamma` an exponent."""
 
     sun_azimuth_deg: float
@@ -31,7 +31,8 @@ class Light:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Camera:
-    """A pinhole camera that looks straight down, the top of its picture towards the nose, and its faults."""
+    """A pinhole camera that looks straight down, the top of its picture towards the nose of the aircraft, and its
+    faults: `noise_sigma` in grey levels, and `blur_px` along the direction of flight."""
 
     width: int = 640
     height: int = 480
@@ -43,8 +44,8 @@ class Camera:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraPose:
-    """Position and attitude of the camera: metres from the scene's south-west corner and over its ground, degrees of
-    the airframe (heading clockwise from north, roll right wing down, pitch nose up)."""
+    """Position and attitude of the camera. Positions are metres from the scene's south-west corner and over its ground.
+    Angles are degrees of the airframe: heading clockwise from north, roll right wing down, pitch nose up."""
 
     east_m: float
     north_m: float
@@ -71,7 +72,8 @@ def ground_to_pixel(pose: CameraPose, camera: Camera) -> Doubles:
 
 
 def lit(scene: Scene, light: Light, seed: int) -> Image:
-    """Light the scene: uint8 (H, W, 3) BGR with shaded slopes, cast shadows, and clouds (from `seed`) drifting over."""
+    """Light the scene: uint8 (H, W, 3) BGR with shaded slopes, cast shadows, and the shadows of clouds (made from
+    `seed`)."""
     azimuth, elevation = np.radians((light.sun_azimuth_deg, light.sun_elevation_deg))
     towards_sun = float(np.sin(azimuth)), float(-np.cos(azimuth))  # in columns and rows
     shadow = _cast_shadows(scene, towards_sun, float(np.tan(elevation)))
@@ -95,8 +97,9 @@ def lit(scene: Scene, light: Light, seed: int) -> Image:
 def _cast_shadows(scene: Scene, towards_sun: tuple[float, float], steepness: float) -> Array:
     """Compute the shadows, uint8 (H, W), 255 where something stands between the ground and the sun.
 
-    A ray from (x, y) is blocked where max over k of height(k steps on) - k * drop exceeds height(x, y). That maximum
-    over 2k steps is the larger of itself over k steps here, and k steps on: eight passes look 256 pixels far.
+    The ray from (x, y) to the sun is blocked where the maximum, over k, of the height k pixels towards the sun less k *
+    drop exceeds height(x, y). The maximum over 2k pixels is the larger of that over k pixels from here, and that from k
+    pixels further on: eight passes look 256 pixels far.
     """
     drop_cm = 100 * scene.metres_per_pixel * steepness
     blocking, steps = scene.height_cm, 1
@@ -116,7 +119,7 @@ def _cast_shadows(scene: Scene, towards_sun: tuple[float, float], steepness: flo
 
 
 def _clouds(scene: Scene, cloud_frac: float, seed: int) -> Array:
-    """Return the share of sunlight that clouds hold back, uint8 (H, W) of 255."""
+    """Return the share of sunlight that clouds hold back, uint8 (H, W); 255 is all of it."""
     coarse = noise(np.random.default_rng(seed), (64, 64), 16, 3)
     edge = float(np.quantile(coarse, 1 - cloud_frac)) + (0.25 if cloud_frac == 0 else 0)
     cover = (150 * smooth_step(coarse, edge - 0.25, edge + 0.25)).astype(np.uint8)
@@ -124,8 +127,8 @@ def _clouds(scene: Scene, cloud_frac: float, seed: int) -> Array:
 
 
 def view_on_ground(pose: CameraPose, camera: Camera) -> Doubles | None:
-    """Return where the corners of the picture lie on the ground, (4, 2) metres east and north; None where the picture
-    shows the horizon."""
+    """Return the corners of the picture on the ground, float64 (4, 2) metres east and north; None if the picture shows
+    the horizon."""
     corners = [(0, 0, 1), (camera.width - 1, 0, 1), (camera.width - 1, camera.height - 1, 1), (0, camera.height - 1, 1)]
     ground = np.linalg.solve(ground_to_pixel(pose, camera), np.array(corners, float).T).T
     return ground[:, :2] / ground[:, 2:] if (ground[:, 2] > 0).all() else None  # one over the distance ahead
@@ -139,7 +142,8 @@ def photograph(
     light: Light,
     rng: np.random.Generator,
 ) -> np.ndarray:
-    """Take one frame, uint8 (camera.height, camera.width, 3) BGR, of a `lit` ground; `rng` makes the sensor's noise."""
+    """Take one frame, uint8 (camera.height, camera.width, 3) BGR, of a ground uint8 (H, W, 3) made by `lit`; `rng`
+    makes the sensor's noise."""
     # The centre of the north-west pixel is half a pixel inside of the scene.
     half, depth_m = metres_per_pixel / 2, len(ground) * metres_per_pixel
     metres_from_pixel = np.array([[metres_per_pixel, 0, half], [0, -metres_per_pixel, depth_m - half], [0, 0, 1]])

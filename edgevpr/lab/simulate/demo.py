@@ -1,4 +1,5 @@
-"""The demonstration: two generated flights, and the real commands between them, each in a process of its own."""
+"""The demonstration `edgevpr demo`: two generated flights, and the real commands between them, each in a process of its
+own."""
 
 import json
 import socket
@@ -42,15 +43,16 @@ _END_TIMEOUT_S = 10.0
 # A place is the right one where the two pictures share 30 % of their ground, which is 78 m long from a height of 80 m.
 RIGHT_M = 55.0
 _PICTURE_PX = (1600, 1050)
-# Blue, green, red: of the places, of the later flight, and of answers by what became of them.
+# Colours (blue, green, red) of the places, of the later flight, and of the answers by their outcome.
 _MAPPED, _LATER = (255, 255, 255), (10, 214, 255)
 _RIGHT, _WRONG, _REJECTED = (91, 191, 47), (59, 56, 229), (36, 165, 245)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JudgedAnswer:
-    """One query: where it was taken, and the place that was named. `error_m` is the distance between the two,
-    `nearest_m` that to the nearest place of the map, and `fix_off_m` that to the fix (None: not accepted)."""
+    """One query: `at`, where it was taken, and `named`, the place that was recognised. Distances from `at` in metres:
+    `error_m` to that place, `nearest_m` to the nearest place of the map, and `fix_off_m` to the fix (None: the match
+    was not accepted)."""
 
     query: str
     reference_image: str
@@ -77,8 +79,8 @@ class JudgedAnswer:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DemoSummary:
-    """Results of the demonstration. `costs` are means of a query under the names of the flight log; `messages` counts
-    what the simulated flight controller decoded, by name."""
+    """Results of the demonstration. `costs` are means over the queries, by the names in the flight log. `messages`
+    counts, by name, the messages that the simulated flight controller decoded."""
 
     places: int
     answers: list[JudgedAnswer]
@@ -157,7 +159,8 @@ def run_demo(folder: str | Path) -> DemoSummary:
 
 
 def _flown(folder: Path, queries: int) -> dict[str, Any]:
-    """Map the first flight of a demonstration and fly the second one; return what the flight controller saw."""
+    """Map the first flight of a demonstration and fly the second one, of `queries` pictures; return the JSON report of
+    the simulated flight controller."""
     map_path, log_path, port = folder / "map.gpkg", folder / "flight.jsonl", _free_udp_port()
     first, second = folder / "flight-1" / "images", folder / "flight-2" / "images"
     # The flight controller is started first: it listens long before the map is built.
@@ -184,7 +187,8 @@ def _free_udp_port() -> int:
 
 @contextmanager
 def _edgevpr(*arguments: object) -> Iterator[subprocess.Popen[str]]:
-    """Run the real program in a process of its own, which ends with the block at the latest."""
+    """Context manager: run the real program with `arguments` as a process of its own, which is ended with the block at
+    the latest."""
     command = [sys.executable, "-m", "edgevpr", *map(str, arguments)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     with process:
@@ -199,7 +203,7 @@ def _edgevpr(*arguments: object) -> Iterator[subprocess.Popen[str]]:
 
 
 def _output(process: subprocess.Popen[str]) -> str:
-    """Return everything that a process writes until its end. Raises EdgevprError where it fails."""
+    """Wait for a process and return everything that it has written. Raises EdgevprError if it fails."""
     output, _ = process.communicate()
     if process.returncode:
         command = " ".join(process.args[2:]) if isinstance(process.args, list) else process.args
@@ -208,7 +212,7 @@ def _output(process: subprocess.Popen[str]) -> str:
 
 
 def _queries(log_path: Path, flying: subprocess.Popen[str]) -> Iterator[int]:
-    """Count the queries in the growing flight log, yielding each number, until the flight ends."""
+    """Follow the growing flight log until the flight ends, and yield the number of each query in it, from 0."""
     seen, ended = 0, False
     while not ended:
         ended = flying.poll() is not None
@@ -251,8 +255,8 @@ def _apart_m(one: Position, other: Position) -> float:
 
 
 def _draw(path: Path, ground: Image, mapping: GeneratedFlight, answers: Sequence[JudgedAnswer]) -> None:
-    """Write a picture of both tracks on the lit landscape, uint8 (H, W, 3) BGR: bright what the map shows, and a line
-    from each query to the place that was named for it."""
+    """Write a picture of both tracks on the lit landscape, uint8 (H, W, 3) BGR. Land outside of the map is darkened,
+    and a line joins each query to the place that was recognised."""
     scale = _PICTURE_PX[0] / SCENE_WIDTH_M
 
     def pixels(points_m: ArrayLike) -> list[tuple[int, int]]:

@@ -1,5 +1,5 @@
-"""Two flights over one generated landscape: the first makes a map; the second comes back later, and leaves the mapped
-land."""
+"""Two flights over one generated landscape: the first makes a map; the second comes back hours later and also leaves
+the mapped land. `edgevpr simulate flight` writes them, and `demo` flies them."""
 
 import csv
 from collections.abc import Callable, Iterator
@@ -29,8 +29,8 @@ _HEIGHT_M = 80.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GeneratedFlight:
-    """A flight with one picture at each pose, every `interval_s` from `start_utc` on; `seed` makes its clouds and its
-    sensor's noise."""
+    """A flight with one picture at each pose, every `interval_s` from `start_utc` on; `seed` makes its clouds and the
+    noise of its sensor."""
 
     poses: tuple[CameraPose, ...]
     light: Light
@@ -41,7 +41,7 @@ class GeneratedFlight:
 
 
 def mapping_flight(seed: int) -> GeneratedFlight:
-    """Plan 70 places on five parallel legs, flown to and fro on a clear morning, the nose in the direction of
+    """Plan 70 pictures on five parallel legs, flown to and fro on a clear morning, the nose in the direction of
     flight."""
     rng = np.random.default_rng((seed, 1))
     poses = []
@@ -110,8 +110,9 @@ def write_flight(folder: str | Path, scene: Scene, flight: GeneratedFlight) -> I
 
 @contextmanager
 def picture_table(folder: Path, columns: tuple[str, ...]) -> Iterator[Callable[[Image, int, tuple[str, ...]], None]]:
-    """Open `folder`/positions.csv with these columns. Gives a function that writes a picture, uint8 (H, W, 3), as JPEG
-    of a quality to `folder`/images, and its row; the row begins with its name."""
+    """Context manager: open `folder`/positions.csv with a header of `columns`. Yields a function of a picture, uint8
+    (H, W, 3) BGR, a JPEG quality and a row, which begins with the picture's file name. It writes the picture to
+    `folder`/images, and the row."""
     images = folder / "images"
     images.mkdir(parents=True, exist_ok=True)
     with open(folder / "positions.csv", "w", encoding="utf-8", newline="") as handle:
@@ -127,21 +128,21 @@ def picture_table(folder: Path, columns: tuple[str, ...]) -> Iterator[Callable[[
 
 
 def fly_and_write(folder: Path, which: str, seed: int) -> str:
-    """Write the "map" or the "query" flight over the landscape of a seed; return a sentence about it."""
+    """Write the flight `which`, "map" or "query", over the landscape of a seed; return a sentence about it."""
     flight = mapping_flight(seed) if which == "map" else later_flight(seed)
     written = list(write_flight(folder, make_scene(seed, SCENE_WIDTH_M, SCENE_DEPTH_M), flight))
     return f"{folder}: {len(written)} images in images/, where they were taken in positions.csv"
 
 
 def to_position(pose: CameraPose) -> Position:
-    """Return the position of a pose on the globe: the scene is a plane that touches it at ORIGIN."""
+    """Return the geographic position of a pose in the scene, a plane that touches the globe at ORIGIN."""
     lat_deg = ORIGIN.lat_deg + np.degrees(pose.north_m / EARTH_RADIUS_M)
     lon_deg = ORIGIN.lon_deg + np.degrees(pose.east_m / _radius_of_latitude_m())
     return Position(float(lat_deg), float(lon_deg), _ORIGIN_ALT_M + pose.height_m)
 
 
 def to_metres(lat_deg: float, lon_deg: float) -> tuple[float, float]:
-    """Return the metres (east, north) of a position in the scene, the inverse of `to_position`."""
+    """Return east and north, in metres, of a position in the scene: the inverse of `to_position`."""
     north_m = np.radians(lat_deg - ORIGIN.lat_deg) * EARTH_RADIUS_M
     return float(np.radians(lon_deg - ORIGIN.lon_deg) * _radius_of_latitude_m()), float(north_m)
 
@@ -151,7 +152,7 @@ def _radius_of_latitude_m() -> float:
 
 
 def wander(rng: np.random.Generator, count: int) -> Doubles:
-    """Make a slow random swing between -1 and 1, float64 (count,)."""
+    """Make a slow random oscillation between -1 and 1, float64 (count,)."""
     t = np.arange(count)[:, None] / 9
     waves = np.sin(2 * np.pi * (t * (1, 2.3) + rng.random(2)))
     swing: Doubles = waves @ (0.75, 0.25)

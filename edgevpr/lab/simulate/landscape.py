@@ -1,7 +1,9 @@
-"""A piece of farmland seen from above, generated from a seed, in place of a real site to fly over.
+"""A piece of farmland seen from above, generated from a seed, in place of a real site to fly over; `camera` photographs
+it.
 
-Land is cut into fields along bent lines (points are (N, 2) east, north in metres), each field has a look of its kind,
-and borders, a river, a road, farms and trees are painted over them.
+Land is cut into fields along bent lines (points are (N, 2): east, north in metres). Each field is painted as one kind,
+such as meadow. Borders, a river, a road, farms and trees are painted over the fields. Trees are (N, 4) in metres: east,
+north, radius, top.
 """
 
 from collections.abc import Callable, Iterable
@@ -40,8 +42,8 @@ SOIL, MUD = (78, 100, 126), (92, 130, 156)
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """The ground without light: `albedo` uint8 (H, W, 3) BGR, `height_cm` uint16 (H, W) over a common level; north is
-    up and the south-west corner is the point 0 m east, 0 m north."""
+    """The ground without light: `albedo` uint8 (H, W, 3) BGR, and `height_cm` uint16 (H, W) over a common level. North
+    is up, and the south-west corner is the point 0 m east, 0 m north."""
 
     albedo: Image
     height_cm: NDArray[np.uint16]
@@ -80,8 +82,8 @@ def make_scene(seed: int, width_m: float, depth_m: float, metres_per_pixel: floa
 
 
 def _border(rng: np.random.Generator, canvas: Canvas, line_m: Doubles, level: int) -> Doubles:
-    """Paint the border of two fields: a lane between large pieces of land, else a hedge, a wall or a grass strip.
-    Returns its trees."""
+    """Paint the border of two fields: a lane if `level` (see `parcels`) is 0 or 1, else a hedge, a wall or a grass
+    strip. Returns its trees."""
     box = canvas.box(line_m, 5.0)
     if canvas.height_cm[box].size == 0:
         return np.empty((0, 4))
@@ -107,7 +109,7 @@ def _border(rng: np.random.Generator, canvas: Canvas, line_m: Doubles, level: in
 
 
 def _along(rng: np.random.Generator, line_m: Doubles, step_m: float, spread_m: float, radius_m: float) -> Doubles:
-    """Place trees along a line, (N, 4) metres: east, north, radius, top."""
+    """Place trees about every `step_m` along a line, up to about `spread_m` off it, with radii of about `radius_m`."""
     run_m = np.concatenate(([0], np.cumsum(np.hypot(*np.diff(line_m, axis=0).T))))
     at_m = np.arange(rng.uniform(0, step_m), run_m[-1], step_m)
     at_m += rng.normal(0, step_m * 0.25, len(at_m))
@@ -183,8 +185,7 @@ def _farm(rng: np.random.Generator, canvas: Canvas, middle: Doubles, turn_rad: f
 
 
 def _mottle(rng: np.random.Generator, canvas: Canvas) -> None:
-    """Vary the brightness of the ground at 60 m, at a few metres, and from pixel to pixel: ground is never of one
-    colour."""
+    """Vary the brightness of the ground in bumps of 60 m, of 5 m and of 1 m: real ground is never of one colour."""
     for share, bump_m in ((0.06, 60.0), (0.07, 5.0), (0.08, 1.0)):
         bump_px = max(bump_m / canvas.metres_per_pixel, 2.0)
         coarse = max(2, int(bump_px / 8))
@@ -214,7 +215,7 @@ def _plant(
 @dataclass(frozen=True, slots=True)
 class FieldGround:
     """The pixels of one field, float32 (H, W): noise with bumps of 22 m (`patches`) and of 2.4 m (`tufts`), and the
-    metres across its rows."""
+    distance in metres across the rows of the field (`across_m`)."""
 
     patches: Singles
     tufts: Singles
@@ -268,8 +269,8 @@ def _forest_floor(plot: FieldGround) -> Look:
 
 @dataclass(frozen=True, slots=True)
 class _Kind:
-    """A kind of field: how often it is found, how it looks, and the trees in it (distance, scatter and radius in
-    metres)."""
+    """A kind of field: its relative frequency, the function that paints it, and the trees in it (spacing, scatter and
+    radius in metres; None: no trees)."""
 
     weight: float
     look: Callable[[FieldGround], Look]
@@ -288,7 +289,7 @@ _KINDS = (
 
 
 def paint_field(rng: np.random.Generator, canvas: Canvas, outline_m: Doubles) -> Doubles:
-    """Paint a field of some kind; return the trees that stand in it, (N, 4) metres: east, north, radius, top."""
+    """Paint a field of a random kind within its outline (N, 2); return the trees that stand in it."""
     weights = np.array([kind.weight for kind in _KINDS])
     kind = _KINDS[rng.choice(len(_KINDS), p=weights / weights.sum())]
     side = longest_side(outline_m[:: max(1, len(outline_m) // 10)])
@@ -310,7 +311,8 @@ def paint_field(rng: np.random.Generator, canvas: Canvas, outline_m: Doubles) ->
 def _trees(
     rng: np.random.Generator, outline_m: Doubles, turn_rad: float, spacing_m: float, scatter_m: float, radius_m: float
 ) -> Doubles:
-    """Place trees in rows over a field, (N, 4) metres: east, north, radius, top."""
+    """Place trees in rows along `turn_rad` over a field, `spacing_m` apart, each moved at random by about
+    `scatter_m`."""
     along, across = axes_of(turn_rad)
     reach_m = np.arange(-110, 110, spacing_m)
     u, v = (axis.reshape(-1, 1) for axis in np.meshgrid(reach_m, reach_m))

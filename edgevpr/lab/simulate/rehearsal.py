@@ -1,7 +1,5 @@
-"""A flight over an orthophoto, as a rehearsal before the real one: pictures, and where they were taken.
-
-Its track is that of a positions.csv, or goes along the waypoints of a mission.
-"""
+"""A flight over an orthophoto, as a rehearsal before the real one: pictures, and where they were taken. The track is
+read from a positions.csv, or follows the waypoints of a mission. `edgevpr simulate flight` writes it."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -33,8 +31,8 @@ _COLUMNS = ("file", "lat", "lon", "alt", "roll_deg", "pitch_deg", "yaw_deg", "he
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlannedPicture:
-    """One picture to be taken: `height_m` over the ground, attitude in degrees as of `CameraPose` (None: not told), and
-    `t_s` from the start of the flight."""
+    """One picture to be taken: `height_m` over the ground, attitude in degrees as in `CameraPose` (roll and pitch None:
+    unknown), and `t_s`, the seconds from the start of the flight."""
 
     position: Position
     height_m: float
@@ -45,9 +43,10 @@ class PlannedPicture:
 
 
 def read_shots(path: str | Path, height_m: float | None, every_m: float, speed_m_s: float) -> list[PlannedPicture]:
-    """Read a track. Each line of a positions.csv is a picture (columns lat and lon, and where present height_m,
-    roll_deg, pitch_deg, yaw_deg); along the waypoints of a mission file there is one `every_m`. `height_m` goes before
-    the heights of the file. Raises UsageError for a track that cannot be read, has no height or no picture."""
+    """Read a track from `path`. A positions.csv gives a picture for each line (columns lat and lon, and where present
+    height_m, roll_deg, pitch_deg, yaw_deg); a mission file gives one `every_m` along its waypoints. `height_m`
+    overrides the heights of the file (None: use them). Raises UsageError for a track that cannot be read, has no height
+    or no picture."""
     if Path(path).suffix.lower() == ".csv":
         planned = _of_lines(path, height_m)
     else:
@@ -103,7 +102,7 @@ def _of_mission(path: str | Path, height_m: float | None, every_m: float) -> lis
 
 
 def _flown(planned: list[PlannedPicture], speed_m_s: float) -> list[PlannedPicture]:
-    """Give each picture its time, at a constant speed, and the course as its heading where none is told."""
+    """Give each picture its time, at a constant speed, and the course as its heading where that is NaN (unknown)."""
     flown, t_s, course_deg = [], 0.0, 0.0
     for at, picture in enumerate(planned):
         here, there = (planned[at - 1], picture) if at else (picture, planned[min(1, len(planned) - 1)])
@@ -127,8 +126,8 @@ def _course_deg(one: Position | Waypoint, other: Position | Waypoint) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Weather:
-    """Differences of the flight from the orthophoto: the light, and the faults of the camera. The shadows are those of
-    the orthophoto."""
+    """Light, and faults of the camera, by which the flight's pictures differ from the orthophoto. The shadows stay
+    those of the orthophoto."""
 
     light: Light
     camera: Camera
@@ -144,8 +143,8 @@ WEATHERS = {
 
 
 def poses_of(planned: list[PlannedPicture], sway_deg: float, seed: int) -> list[CameraPose]:
-    """Return how the camera is held at each picture (0 m east and north: over its position). Where the track does not
-    tell roll and pitch, the aircraft sways slowly by up to `sway_deg`, and so does its nose."""
+    """Return the pose of the camera for each picture, at 0 m east and north of its position. Where the track has
+    neither roll nor pitch, they vary slowly by up to `sway_deg`, and so does the heading."""
     rng = np.random.default_rng((seed, 4))
     sways = sway_deg * np.stack([wander(rng, len(planned)) for _ in range(3)])
     poses = []
@@ -167,8 +166,8 @@ def poses_of(planned: list[PlannedPicture], sway_deg: float, seed: int) -> list[
 def seen_from(
     orthophoto: Orthophoto, at: Position, pose: CameraPose, camera: Camera, light: Light, rng: np.random.Generator
 ) -> Image | None:
-    """Take one picture over `at`, uint8 (camera.height, camera.width, 3) BGR; None where a tenth of it or more has no
-    ground in the orthophoto. Raises UsageError where it shows the horizon."""
+    """Take one picture over `at`, uint8 (camera.height, camera.width, 3) BGR. Returns None if the orthophoto lacks a
+    tenth or more of its ground. Raises UsageError if it shows the horizon."""
     corners_m = view_on_ground(pose, camera)
     if corners_m is None or (reach_m := float(np.abs(corners_m).max())) > _FARTHEST * pose.height_m:
         raise UsageError(
@@ -199,8 +198,8 @@ def write_rehearsal(
 ) -> Iterator[str | None]:
     """Write `folder`/images/*.jpg, and `folder`/positions.csv with the true position and attitude of every picture.
 
-    Yields the name of each picture once it is written, None for one that would show ground beyond the orthophoto.
-    Raises OSError where the folder cannot be written.
+    Yields the name of each picture once it is written, or None for one that would show ground beyond the orthophoto.
+    Raises OSError if the folder cannot be written.
     """
     camera = replace(weather.camera, focal_px=weather.camera.width / 2 / np.tan(np.radians(fov_deg / 2)))
     rng = np.random.default_rng((seed, 3))
@@ -220,7 +219,7 @@ def write_rehearsal(
 
 
 def none_written(orthophoto: Orthophoto, planned: list[PlannedPicture]) -> UsageError:
-    """Return the error of a track that is nowhere over the orthophoto."""
+    """Return the error for a track of which no picture lies on the orthophoto."""
     lat_deg, lon_deg = zip(*((shot.position.lat_deg, shot.position.lon_deg) for shot in planned), strict=True)
     track = extent_words((min(lat_deg), min(lon_deg), max(lat_deg), max(lon_deg)))
     return UsageError(
