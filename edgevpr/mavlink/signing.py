@@ -1,8 +1,10 @@
-"""Signing of MAVLink 2: the key, the signature of what is sent, the check of what arrives, and their time stamps.
+"""Signing of MAVLink 2: the key, the signatures of sent and received messages, and their time stamps. Used by the links
+and by `edgevpr check` and `doctor`.
 
-pymavlink signs what is sent. It does not check what arrives: it would store the time stamp of a message before it
-compares the signature, so that one forged message from the far future would shut out all true ones. Time stamps never
-go back, neither in a flight nor from one flight to the next.
+pymavlink signs what is sent. Its check of what arrives is not used: it would store the time stamp of a message before
+it compares the signature, so that one forged message from the far future would shut out all true ones. Time stamps
+never go back, neither in a flight nor from one flight to the next. All are integers in units of 10 microseconds since
+2015.
 """
 
 import hashlib
@@ -26,12 +28,12 @@ _EPOCH_S = 1_420_070_400
 _LATEST = 2**48 - 1  # it has six bytes
 _NEAR = 60 * TICKS_S
 _KEPT_EVERY = 30 * TICKS_S
-# At a start the time stamps move on by a minute beyond the largest that can have been used. So nothing that was sent
-# before, to us or by us, is less than a minute old, and a replay of it passes for no new stream.
+# Each start adds a minute to the largest time stamp that can have been used. So all earlier messages, ours and those to
+# us, are more than a minute old, and are not accepted as a new stream when somebody sends them again.
 _MOVED_ON = _KEPT_EVERY + 60 * TICKS_S
 
 KEY_BYTES = 32
-# Link ids: who hears us over two has two streams, each with its own time.
+# Link ids. A receiver checks the time stamps of each stream (system, component and link id) on their own.
 TO_AUTOPILOT, TO_GROUND, TO_ASK = 1, 2, 3
 UNSIGNED, WRONG = "unsigned", "wrong signature"
 OLD, FUTURE = "old time stamp", "time stamp from the future"
@@ -52,15 +54,15 @@ log = logging.getLogger(__name__)
 
 
 class TimeStamps:
-    """The largest time stamp that was ever sent or received, and the last of every stream; any thread may ask.
+    """The largest time stamp ever sent or received, and the last one of every stream. Any thread may call it.
 
-    The largest is kept in a file, since a board without a clock chip begins with an old time: it is written at the
-    start, raises ConfigError where it is damaged or cannot be made, and from then on every half minute.
+    The largest is kept in the file `path`, since a board without a clock chip starts with an old time. It is written at
+    the start, which raises ConfigError if the file is damaged or cannot be made, and from then on every half minute.
 
-    A program that only asks reads the file and never writes it (`is_kept` False): it may run as root, whose file the
-    service could not write. So the next flight does not know what was sent meanwhile. It need not: with a link id of
-    its own the program is another stream, which the autopilot compares with the flight's only for whether a new one is
-    a minute old. Both begin at the same kept time, and the program ends within that minute.
+    With `is_kept` False the file is only read, for a program that asks before the flight: that may run as root, and the
+    service could not overwrite a file of root. So the next flight does not know the time stamps sent meanwhile, and
+    need not: the program has a link id, and so a stream, of its own. The autopilot requires only that a new stream is
+    not more than a minute old. Both start at the same kept time, and the program ends within that minute.
     """
 
     def __init__(
@@ -80,17 +82,17 @@ class TimeStamps:
         self._keep(self._kept, may_fail=not path.exists())
 
     def next(self) -> int:
-        """Return the time stamp of the next message to be sent, which is larger than any before."""
+        """Return the time stamp for the next message to be sent; it is larger than all before."""
         with self._lock:
             self._move_on(max(self._largest + 1, self._now()))
             return min(self._largest, _LATEST)
 
     def refusal(self, stream: Stream, stamp: int) -> str | None:
-        """Return why a message with this time stamp is refused, in a few words. Return None where it is admitted, and
-        take note of it: so this must be asked only of a message whose signature is right.
+        """Return in a few words why a message with this time stamp is refused. Return None if it is admitted, and note
+        the time stamp: so call this only for a message whose signature is right.
 
-        A stream must go on. A new one must be within a minute of the largest time stamp, except that the first of all
-        may be ahead by any time: it is how a board without a clock chip learns the time.
+        Time stamps of a stream must increase. The first of a new stream must be within a minute of the largest, but the
+        very first stream may be ahead by any time: so a board without a clock chip learns the time.
         """
         with self._lock:
             now = max(self._largest, self._now())
@@ -105,7 +107,8 @@ class TimeStamps:
             return None
 
     def _now(self) -> int:
-        """Return the time of the system's clock, or that which has gone on since the largest time was learnt."""
+        """Return the current time stamp: the later of the system's clock, and the largest time learnt plus the time
+        since."""
         by_system = int((self._utc_s() - _EPOCH_S) * TICKS_S)
         return max(by_system, self._base + int((self._mono_s() - self._base_s) * TICKS_S))
 
@@ -120,10 +123,10 @@ class TimeStamps:
             Thread(target=self._keep, args=(stamp,), name="signing time", daemon=True).start()
 
     def _keep(self, stamp: int, may_fail: bool = False) -> None:
-        """Write a time stamp. That this is not possible is said once; where it `may_fail`, it raises ConfigError."""
+        """Write a time stamp to the file. If that fails, log one warning or, with `may_fail`, raise ConfigError."""
         try:
             with self._writing:
-                if self._is_kept and stamp > self._written:  # two that are written at once may come in any order
+                if self._is_kept and stamp > self._written:  # two threads may come here in any order
                     write_whole(self._path, lambda path: path.write_text(f"{stamp}\n"))
                     self._written = stamp
         except OSError as error:
@@ -138,23 +141,23 @@ class TimeStamps:
 
 
 class NotSigning:
-    """Stands in for a `Signing` where there is no key: nothing is signed, and everything is admitted."""
+    """Signs nothing and admits every message: in place of `Signing` where there is no key."""
 
     refused: Mapping[str, int] = MappingProxyType({})
 
     def of_ground(self) -> "NotSigning":
-        """Return that of the link to the ground."""
+        """Return the signing object for the link to the ground."""
         return self
 
     def take_verdicts(self) -> list[str | None]:
-        """Return of every message since the last call why it was refused, None where it was admitted."""
+        """Return, for each message since the last call, why it was refused, or None if it was admitted."""
         return []
 
     def stamp(self, packer: Message) -> None:
-        """Let a packer sign its next message."""
+        """Prepare a pymavlink packer, so that it signs its next message."""
 
     def admits(self, message: Message) -> bool:
-        """Tell whether a message is to be believed."""
+        """Return True if a received message may be processed."""
         return True
 
 
@@ -162,8 +165,8 @@ NOT_SIGNING = NotSigning()
 
 
 class Signing(NotSigning):
-    """Signs what one link sends, and admits what is signed with the same key and not older than what came before.
-    `refused` counts the rest by reason; each reason is said once."""
+    """Signs the messages that one link sends. Admits received messages that are signed with the same key and are not
+    older than earlier ones. `refused` counts the others by reason; each reason is logged once."""
 
     def __init__(self, key: bytes, stamps: TimeStamps, link_id: int = TO_AUTOPILOT) -> None:
         self.refused: Counter[str] = Counter()
@@ -171,7 +174,7 @@ class Signing(NotSigning):
         self._verdicts: list[str | None] = []
 
     def of_ground(self) -> "Signing":
-        """Return one with the same key and time, and another link id."""
+        """Return a new object with the same key and time stamps, and the link id of the link to the ground."""
         return Signing(self._key, self._stamps, TO_GROUND)
 
     def take_verdicts(self) -> list[str | None]:
@@ -184,8 +187,8 @@ class Signing(NotSigning):
         signing.timestamp = self._stamps.next()
 
     def admits(self, message: Message) -> bool:
-        """Tell whether a message is to be believed, and count it where it is not. A RADIO_STATUS needs no signature,
-        since a radio has no key; but it must not speak for an autopilot."""
+        """Return True if a received message may be processed; count it if not. A RADIO_STATUS needs no signature, since
+        a radio has no key, but must not have the component id of an autopilot."""
         header = message.get_header()
         reason = self._refusal(message.get_msgbuf(), header)
         if reason == UNSIGNED and _is_of_radio(header):
@@ -210,8 +213,9 @@ class Signing(NotSigning):
 
 
 def open_signing(key_path: str | None, state_path: str | None, to_ask: bool = False) -> NotSigning:
-    """Read the key and the time kept; without a key there is no signing. `state_path` is where the time is kept, None:
-    beside the key. For questions on the ground (`to_ask`) the time is read, and not written. Raises ConfigError."""
+    """Read the key and the kept time, and return the object that signs; without a key, one that does not. `state_path`
+    is the file of the kept time (None: beside the key); with `to_ask` (questions before the flight) it is only read.
+    Raises ConfigError."""
     if key_path is None:
         return NOT_SIGNING
     key = read_key(key_path)
@@ -220,7 +224,7 @@ def open_signing(key_path: str | None, state_path: str | None, to_ask: bool = Fa
 
 
 def read_key(path: str) -> bytes:
-    """Read a key of 32 bytes that nobody but its owner may read; raises ConfigError."""
+    """Read the key, 32 bytes, from a file that only its owner may read. Raises ConfigError."""
     try:
         with open_file(path, 1_000_000) as handle:
             mode, key = stat.S_IMODE(os.fstat(handle.fileno()).st_mode), handle.read(KEY_BYTES + 1)
@@ -235,14 +239,14 @@ def read_key(path: str) -> bytes:
 
 
 def _is_credential(path: str, mode: int) -> bool:
-    """Tell whether systemd gives this file to this service alone. It lets the service's user read it by an access list,
-    which shows as the right of a group to read; the folder is open to nobody else."""
+    """Return True if the file is a credential that systemd gives to this service alone. Its mode shows a right of the
+    group to read: that is an access list for the user of the service; the folder is closed to all others."""
     folder = os.environ.get("CREDENTIALS_DIRECTORY")
     return folder is not None and Path(path).absolute().parent == Path(folder) and not mode & 0o037
 
 
 def _read_stamp(path: Path) -> int:
-    """Read the kept time stamp, 0 where there is none."""
+    """Read the kept time stamp from the file; 0 if there is no file. Raises ConfigError if it is damaged."""
     try:
         text = read_file(path, 64).decode("ascii", "replace").strip()
     except FileNotFoundError:

@@ -1,4 +1,5 @@
-"""The texts that wait for their turn to be told to the people on the ground: they hate a flood of them."""
+"""The queue of texts for the people on the ground. It spaces them out, drops repetitions, and replaces what is out of
+date. Used by `conversation`."""
 
 import logging
 import math
@@ -14,7 +15,7 @@ log = logging.getLogger(__name__)
 
 
 class News(NamedTuple):
-    """A change that the ground is told of: whether it is alarming, and its text and topic."""
+    """A change to be announced to the ground: if it is alarming (a warning, else a note), its text, and its topic."""
 
     is_alarming: bool
     text: str
@@ -22,11 +23,11 @@ class News(NamedTuple):
 
 
 class Texts:
-    """The waiting texts: one in five seconds is sent, a warning before a note. They are used in turns only.
+    """The texts that wait to be sent, one in five seconds, warnings before notes. Use it inside turns only (see
+    `turns`).
 
-    Texts of one `topic` are about the same thing, and the newest of them counts: it takes the place of one that waits,
-    and says nothing where the ground has heard the same last. A warning is not lost in this way: the note that it is
-    over comes after it.
+    Texts of one `topic` are about the same subject, and the newest counts. It replaces a waiting text of its topic, and
+    is dropped if it equals the last text sent of its topic. A note does not replace a waiting warning: it follows it.
     """
 
     def __init__(self) -> None:
@@ -40,7 +41,7 @@ class Texts:
         return len(self._waiting)
 
     def put(self, severity: Severity, text: str, topic: str | None = None) -> None:
-        """Let a text wait. One without a topic is about nothing else (it is its own topic, and may be said again)."""
+        """Queue a text. A text without a `topic` is a topic of its own, and may be sent again."""
         topic = topic or text
         warning, note = (topic, Severity.WARNING), (topic, Severity.INFO)
         if severity is Severity.WARNING:
@@ -58,7 +59,7 @@ class Texts:
                 log.warning("the ground is not told, since too many texts wait: %s", lost_text)
 
     def next(self, now_s: float) -> Message | None:
-        """Return the text that is to be sent at this moment, None where there is none or it is too early."""
+        """Return the STATUSTEXT that is to be sent now; None if no text waits, or the last one was too recent."""
         if not self._waiting or now_s - self._sent_s < self._spacing_s:
             return None
         topic, severity = chosen = self._oldest(Severity.WARNING)
@@ -69,9 +70,9 @@ class Texts:
         return status_text(severity, f"edgevpr: {text}")
 
     def hurry(self) -> None:
-        """Let no text wait any more: the link is about to be closed."""
+        """Send the remaining texts without pauses: the link is about to be closed."""
         self._spacing_s = 0.0
 
     def _oldest(self, severity: Severity) -> tuple[str, Severity]:
-        """Return the key of the oldest text of a severity, of the oldest text of all where there is none."""
+        """Return the key of the oldest waiting text of this severity, or of the oldest of all if there is none."""
         return next((key for key in self._waiting if key[1] is severity), next(iter(self._waiting)))

@@ -1,4 +1,5 @@
-"""The telemetry log (tlog): every packet of a link, as ground stations keep it. mavlogdump of pymavlink reads it."""
+"""The telemetry log (tlog): a file of every packet of a link, in the format of ground stations, which `mavlogdump` of
+pymavlink reads. Used by the flight."""
 
 import errno
 import logging
@@ -22,19 +23,19 @@ _log = logging.getLogger(__name__)
 
 
 class Tlog:
-    """An open tlog: of each packet the microseconds since 1970 (8 bytes, big endian), then the packet. Close it (it is
-    a context manager).
+    """An open tlog. For each packet it holds the microseconds since 1970 (8 bytes, big endian), then the packet. Close
+    it, or use it as a context manager.
 
-    A file that is there is appended to. The log has a thread of its own, which writes once a second: a slow disk keeps
-    nobody waiting, and costs packets when too many wait. A full disk ends the log, and nothing else.
+    An existing file is appended to. A thread of its own writes once a second: with a slow disk no caller waits, but
+    packets are left out when too many wait. A full disk ends the log, but not the flight.
     """
 
     def __init__(self, path: str | Path) -> None:
-        """Open the file. Raises EdgevprError where it cannot be opened."""
+        """Open the file. Raises EdgevprError if it cannot be opened."""
         self._path = Path(os.path.realpath(path))
         self._waiting = bytearray()
-        self._missing = 0  # packets
-        self._lock = threading.Lock()  # of these two, and held for no longer than a copy takes
+        self._missing = 0  # number of packets left out
+        self._lock = threading.Lock()  # guards these two, and is held for no longer than a copy takes
         self._closing, self._ended = threading.Event(), False
         try:
             self._file = open_appending(self._path)
@@ -53,7 +54,7 @@ class Tlog:
         self.close()
 
     def record(self, packet: bytes) -> None:
-        """Take a packet, to be written soon. May be called from any thread; it never blocks and never raises."""
+        """Queue a packet to be written. Any thread may call this; it never blocks and never raises."""
         stamp = struct.pack(">Q", time.time_ns() // 1000 & ~3)  # the last two bits would be the number of a link
         with self._lock:
             if self._ended:
@@ -64,7 +65,7 @@ class Tlog:
                 self._waiting += stamp + packet
 
     def close(self) -> None:
-        """Write what waits, for two seconds at most, and close the file."""
+        """Write the queued packets, for two seconds at most, and close the file."""
         self._closing.set()
         self._thread.join(CLOSE_S)
         if self._thread.is_alive():

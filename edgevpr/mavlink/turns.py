@@ -1,4 +1,5 @@
-"""Turns: the threads of the links and that of the flight use one conversation, one after another."""
+"""Turns: the lock of a conversation. A turn is the time in which one thread, that of a link or of the flight, uses the
+conversation alone, while its clock stands still. Turns are recorded on the tape, so that a flight can be replayed."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -9,22 +10,23 @@ from edgevpr.core.types import NO_TAPE, Tape
 
 
 class Turns:
-    """One turn at a time. During a turn time stands still, so that what is said and heard follows from its time, and
-    from what came in, alone. The `tape` takes note of the turns in their order."""
+    """Gives turns to one thread at a time. All that happens in a turn has the same time, so a conversation depends only
+    on that time and on its input, and a replay gives the same result. `tape` records the turns in their order."""
 
     def __init__(self, clock: Callable[[], float], tape: Tape = NO_TAPE) -> None:
         self._clock, self._tape = clock, tape
         self._lock = RLock()
-        self._t_s: float | None = None  # of the turn that is taken
+        self._t_s: float | None = None  # time of the current turn; None between turns
 
     def now_s(self) -> float:
-        """Return the time of the turn, between two turns that of the clock."""
+        """Return the time of the current turn, or that of the clock between turns."""
         t_s = self._t_s
         return self._clock() if t_s is None else t_s
 
     @contextmanager
     def taken(self, what: str) -> Iterator[None]:
-        """Take a turn in the thread of the flight. Inside another one this is a part of it."""
+        """Context manager: take a turn in the flight's thread. `what` is its name on the tape. Inside another turn this
+        has no effect: it is part of that turn."""
         with self._lock:
             if self._t_s is not None:
                 yield
@@ -37,7 +39,7 @@ class Turns:
 
     @contextmanager
     def again(self, t_s: float) -> Iterator[None]:
-        """Take the turn of a link again that was taken at `t_s`."""
+        """Context manager, for a replay: repeat a link's turn that was taken at `t_s`."""
         self._t_s = t_s
         try:
             yield
@@ -46,8 +48,8 @@ class Turns:
 
     @contextmanager
     def of_link(self, name: str) -> Iterator[Callable[..., None]]:
-        """Take a turn in the thread of the link of this name. What is yielded takes note of each step of it: a word,
-        and what belongs to it."""
+        """Context manager: take a turn in the thread of the link `name`. It yields a function `step(event, *values)`,
+        which records on the tape an event of this turn."""
         steps: list[tuple[Any, ...]] = []
         with self._lock:
             self._t_s = t_s = self._clock()

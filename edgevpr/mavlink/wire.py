@@ -1,8 +1,8 @@
-"""The one import of pymavlink's dialect, and the parser from bytes to messages.
+"""The one import of pymavlink's dialect, and the parser from bytes to messages. Used by the whole package.
 
-`ardupilotmega` holds all that ArduPilot and PX4 say to a companion computer; the dialect `all` would take another 1 MB
-of RAM. `mavutil` is not imported: it would take another 20 MB, and its connections hang, spin or raise where a link of
-this package must not.
+`ardupilotmega` has all messages that ArduPilot and PX4 exchange with a companion computer; the dialect `all` would take
+another 1 MB of RAM. `mavutil` is not imported: it would take another 20 MB, and its connections hang, spin or raise
+where a link of this package must not. A tap is a function that gets a copy of each packet, such as that of the tlog.
 """
 
 import math
@@ -15,19 +15,20 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 __all__ = ["Message", "PacketReader", "Tap", "mavlink", "parameter_value", "untapped"]
 
-Message: TypeAlias = Any  # mavlink.MAVLink_message, of which every kind has fields of its own
-Tap = Callable[[bytes], object]  # gets every whole packet, as it is on the wire
+Message: TypeAlias = Any  # a mavlink.MAVLink_message; each kind has its own fields
+Tap = Callable[[bytes], object]  # gets the bytes of every whole packet, sent or received
 
-_SENDERS_MAX = 8  # whose unfinished messages are kept; a flood from invented addresses must not fill the memory
+_SENDERS_MAX = 8  # senders whose incomplete messages are kept; a flood from invented addresses must not fill the memory
 
 
 def untapped(packet: bytes) -> None:
-    """Do nothing with a packet: the tap of a link that has no tlog."""
+    """Do nothing: the tap of a link without a tlog."""
 
 
 class PacketReader:
-    """The parser of what arrives, apart for each sender: a message that one begins swallows nothing of another's. It
-    yields the messages that are admitted; bytes that are no message are dropped and counted."""
+    """Parses received bytes, separately for each sender, so that an incomplete message of one does not swallow the
+    bytes of another. `admits` decides which messages are yielded; `tap` gets each packet. Invalid bytes are dropped and
+    counted."""
 
     def __init__(self, admits: Callable[[Message], bool] = lambda message: True, *, tap: Tap = untapped) -> None:
         self._admits, self._tap = admits, tap
@@ -36,11 +37,11 @@ class PacketReader:
         self.forget_partial_message()
 
     def forget_partial_message(self) -> None:
-        """Start again with an empty buffer, as after a link was lost in the middle of a message."""
-        self._parsers: dict[Hashable, mavlink.MAVLink] = {}  # by sender, the one heard last at the end
+        """Drop incomplete messages, as after the link was lost in the middle of one."""
+        self._parsers: dict[Hashable, mavlink.MAVLink] = {}  # by sender, the latest at the end
 
     def feed(self, data: bytes, sender: Hashable = None) -> Iterator[Message]:
-        """Yield the messages that `data` completes. `sender`: where it comes from, where there can be several."""
+        """Yield the admitted messages that `data` completes. `sender` is its source, if there can be several."""
         parser = self._parser_of(sender)
         while data:
             # The portions end where a message ends, so the parser's buffer is emptied each time and never grows.
@@ -72,8 +73,8 @@ class PacketReader:
 
 
 def parameter_value(message: Message, bytewise: bool) -> float | int | None:
-    """Read a PARAM_VALUE: its float32 is the number itself or, where the autopilot works `bytewise` (PX4), holds the
-    bytes of a whole number. Return None where it is no number."""
+    """Return the number in a PARAM_VALUE, or None if it is not finite. Its float32 field holds the number itself or,
+    with `bytewise` (PX4), the four bytes of a whole number."""
     is_whole = message.param_type < mavlink.MAV_PARAM_TYPE_REAL32
     if is_whole and bytewise:
         return int.from_bytes(struct.pack("<f", message.param_value), "little", signed=True)
