@@ -1,8 +1,9 @@
-"""The rules of ArduPilot 4.7-dev (October 2025): NavEKF3, the failsafe of the copter, arming, command 43003.
+"""The simulated ArduPilot: the rules of 4.7-dev (October 2025) for its filter NavEKF3, its failsafe and command 43003.
+Used by `controller`.
 
-Times and limits are those of the source: AP_NavEKF3.h (deadReckonDeclare_ms, posRetryTimeNoVel_ms,
-posRetryTimeUseVel_ms, tiltDriftTimeMax_ms), AP_NavEKF3_PosVelFusion.cpp (setLatLng), ekf_check.cpp, AP_Arming.cpp. What
-a copter does without GPS was seen in its own simulator.
+Times and limits are from the source code: AP_NavEKF3.h (deadReckonDeclare_ms, posRetryTimeNoVel_ms,
+posRetryTimeUseVel_ms, tiltDriftTimeMax_ms), AP_NavEKF3_PosVelFusion.cpp (setLatLng), ekf_check.cpp, AP_Arming.cpp. The
+behaviour of a copter without GPS was observed in ArduPilot's own simulator.
 """
 
 import math
@@ -17,10 +18,10 @@ _POSITION_LOST_S, _POSITION_LOST_WITH_VELOCITY_S = 7.0, 10.0
 _AIDING_LOST_S = 15.0
 _OLDEST_FIX_S = 5.0
 _POSITION_NOISE_M = 0.5  # EK3_POSNE_M_NSE
-_ALIGNED_AFTER_S, _AGAIN_AFTER_S = 5.0, 0.5  # with GPS, from the start and later; a real one starts in half a minute
+_ALIGNED_AFTER_S, _AGAIN_AFTER_S = 5.0, 0.5  # of GPS, at the start and later; a real one needs half a minute
 _BAD_FOR_S = 1.0  # ten checks of the filter in a row, ten a second
-# Of the wind that came without GPS: accelerometers and air speed notice the rest. A plane in ArduPilot's simulator was
-# 767 m off after 150 s in 6 m/s.
+# The share of a wind that comes up without GPS which neither accelerometers nor airspeed reveal to the filter. A plane
+# in ArduPilot's simulator was 767 m off after 150 s in 6 m/s.
 _UNNOTICED_SHARE = 0.85
 
 _GUIDED, _LAND, _HOLD = {"copter": 4, "plane": 15, "rover": 15}, 9, 4
@@ -84,14 +85,14 @@ class ArduPilot(Firmware):
             return DENIED
         if self.now_s - self._passed_s < _DEAD_RECKONING_S or not self._is_aiding or self.origin is None:
             return FAILED
-        # A processing time that is no number moves nothing; C casts it to 0.
+        # A processing time that is not finite counts as 0, as ArduPilot casts it.
         age_s = min(max(command.param2, 0.0), _OLDEST_FIX_S) if math.isfinite(command.param2) else 0.0
         sd_m = 0.0 if math.isnan(command.param3) else command.param3
         self._reset_to(command.x / 1e7, command.y / 1e7, max(sd_m, _POSITION_NOISE_M), age_s)
         return OK
 
     def set_origin(self, at: tuple[float, float, float]) -> bool:
-        """Set the origin, once."""
+        """Set the origin, unless there is one. Returns True if it was set."""
         return self.origin is None and super().set_origin(at)
 
     def use_source_set(self, number: float) -> int:
@@ -128,7 +129,7 @@ class ArduPilot(Firmware):
         self._say(mavlink.MAV_SEVERITY_INFO, f"EKF3 IMU0 is using {source}")
 
     def _watch(self) -> None:
-        """Stop aiding, and land a copter, when the position is lost for too long. Landed, it disarms."""
+        """Stop aiding, and land a copter, when the position is lost for too long. After landing, disarm."""
         if self.is_armed and self.kind == "copter" and self.mode == _LAND and not self.motion.is_flying:
             self.is_armed = False
         if self._is_aiding and self.kind != "plane" and self.now_s - self._passed_s > _AIDING_LOST_S:

@@ -1,4 +1,5 @@
-"""A simulated flight controller, as strict as the real thing: the other end of a link, for tests and demonstrations."""
+"""A simulated autopilot at the other end of a MAVLink link, as strict as a real one: `FlightController` connected to a
+port and to the clock. Used by `edgevpr simulate` and by tests."""
 
 import logging
 import select
@@ -21,18 +22,19 @@ from edgevpr.mavlink.wire import Message, PacketReader, mavlink
 
 DEFAULT_VEHICLE = "arduplane"
 _QUESTIONS = {"HEARTBEAT", "PARAM_REQUEST_LIST", "PARAM_REQUEST_READ", "PING", "TIMESYNC"}
-_WAITING_BYTES = 65_536  # of a line that takes none: what is said beyond that is lost
+_WAITING_BYTES = 65_536  # of a port that accepts none: messages beyond that are lost
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AutopilotSummary:
-    """Everything that the simulated flight controller received. Senders are written "system/component". A fix that is
-    `failed` came at a time when none is taken, as with GPS; one that is `denied` has the wrong form."""
+    """Everything that the simulated autopilot received. `messages` counts them by name. `companion` is the last onboard
+    computer heard, as "system/component" (None: none). `fixes_failed` came at a time when none is accepted, as while
+    there is GPS; `fixes_denied` had a wrong form; `fixes` are the accepted ones."""
 
     messages: dict[str, int]
-    companion: str | None  # the last onboard computer heard
+    companion: str | None
     fixes_accepted: int
     fixes_failed: int
     fixes_denied: int
@@ -60,13 +62,14 @@ def run_autopilot(
     gps: bool = False,
     parameters: Mapping[str, str] = MappingProxyType({}),
 ) -> AutopilotSummary:
-    """Act as a flight controller at `link_url` until the time is up, `stop` is set, a signal comes or the line is cut.
+    """Simulate an autopilot at `link_url` until `duration_s` is over, `stop` is set, SIGINT or SIGTERM comes, or the
+    link is lost. Its UTC is that of this machine.
 
-    With a `track` it flies along the track from the moment a companion first says more than a question, as a flight
-    does and `check` and `doctor` do not, and stays where the track ends; without, it flies nobody knows where, and
-    tells no position. With `gps` it takes no fix. Its time of day is that of this machine; `parameters` are set before
-    it starts. Raises LinkError where the link cannot be opened, UsageError for an unknown vehicle or parameter, and for
-    a value that a parameter cannot have.
+    With a `track` the vehicle flies along it from the first message of a companion that is more than a question, as a
+    flight sends and `check` and `doctor` do not, and stays at its end. Without one, its position is unknown and never
+    reported. With `gps` it has GPS, and accepts no fix. `parameters` (name to value as text) are set before the start.
+    Raises LinkError if the link cannot be opened, UsageError for an unknown vehicle or parameter, and for a wrong
+    value.
     """
     motion = AlongTrack(track) if track else Motion()
     controller = FlightController(vehicle, motion, gps=gps, start_utc_s=time.time())
@@ -81,7 +84,7 @@ def serve(
     duration_s: float | None = None,
     stop: threading.Event | None = None,
 ) -> AutopilotSummary:
-    """Let a flight controller talk at `link_url`, as `run_autopilot` does."""
+    """Connect `controller` to `link_url` until the same events as in `run_autopilot`; return what it received."""
     stop = stop or threading.Event()
     address = parse_link(link_url)
     try:
@@ -101,7 +104,7 @@ def serve(
 
 
 class _Conversation:
-    """The link of a flight controller, and the count of what comes over it."""
+    """The link of a simulated autopilot: sends its messages, passes on and counts those received."""
 
     def __init__(self, transport: Port, controller: FlightController) -> None:
         self._transport, self._controller = transport, controller
@@ -137,7 +140,8 @@ class _Conversation:
         )
 
     def _take(self, message: Message) -> None:
-        """Count a message, and answer from now on to the companion that it comes from, else to whoever is heard."""
+        """Count a message, start the track if it is more than a question, and choose the receiver of our messages: the
+        last companion heard or, before there is one, any sender of heartbeats."""
         sender = f"{message.get_srcSystem()}/{message.get_srcComponent()}"
         self._lost_packets += (message.get_seq() - self._next_seq.get(sender, message.get_seq())) % 256
         self._next_seq[sender] = (message.get_seq() + 1) % 256
@@ -163,7 +167,7 @@ class _Conversation:
 
 
 def _is_question(message: Message) -> bool:
-    """Tell whether a message only asks, and neither tells nor sets anything."""
+    """Return True if a message only requests information, and neither reports nor sets anything."""
     if message.get_type() in ("COMMAND_INT", "COMMAND_LONG"):
         return bool(message.command == mavlink.MAV_CMD_REQUEST_MESSAGE)
     return message.get_type() in _QUESTIONS
@@ -171,7 +175,8 @@ def _is_question(message: Message) -> bool:
 
 @contextmanager
 def _set_by_signals(stop: threading.Event) -> Iterator[None]:
-    """Let SIGTERM and SIGINT set `stop`, where this is the main thread (no other may handle signals)."""
+    """Context manager: SIGTERM and SIGINT set `stop`. No effect outside the main thread, which alone may handle
+    signals."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

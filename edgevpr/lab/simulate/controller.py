@@ -1,4 +1,5 @@
-"""A simulated flight controller: what it hears, obeys and says. It knows no port and no clock; time is an argument."""
+"""A simulated flight controller: the messages that it understands, obeys and sends. It has no port and no clock; time
+is an argument, in seconds from its start. Used by `autopilot` and by tests."""
 
 import math
 from collections.abc import Callable
@@ -21,7 +22,7 @@ VEHICLES: dict[str, Callable[[Motion], Firmware]] = {
     "px4-copter": lambda motion: Px4("copter", motion),
     "px4-plane": lambda motion: Px4("plane", motion),
 }
-_START_UTC_S = 1_770_000_000.0  # where nobody says when it starts
+_START_UTC_S = 1_770_000_000.0  # the UTC at its start, unless given
 HEARTBEAT_S = 1.0
 _WHERE = {
     mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
@@ -31,7 +32,8 @@ _WHERE = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReceivedFix:
-    """An accepted position fix as it arrived; `t_sent_s` and `processing_s` are the sender's."""
+    """An accepted position fix as it arrived. `t_sent_s` and `processing_s` are as sent: the sender's clock at sending,
+    and the age of the position then."""
 
     lat_deg: float
     lon_deg: float
@@ -41,7 +43,8 @@ class ReceivedFix:
 
 
 class Streams:
-    """The intervals of a link. Where nobody knows where the vehicle flies, no message tells where it is."""
+    """The messages that are sent at intervals, and their intervals. If the position of the vehicle is unknown, messages
+    that contain it do not exist."""
 
     def __init__(self, brain: Firmware) -> None:
         known = {**REPORTS, brain.filter_report: FILTER_REPORTS[brain.filter_report]}
@@ -54,11 +57,12 @@ class Streams:
         self._beat_due_s = 0.0
 
     def knows(self, number: int) -> bool:
-        """Tell whether there is such a message."""
+        """Return True if message `number` exists in this autopilot."""
         return number in self._reports or number in SILENT
 
     def ask(self, number: int, interval_us: float, now_s: float) -> bool:
-        """Set an interval: -1 ends the stream, 0 is the default; return whether there is such a message."""
+        """Set the interval of message `number` in microseconds (-1: never, 0: default). Returns True if that message
+        exists."""
         if not self.knows(number):
             return False
         if number in SILENT or not math.isfinite(interval_us):
@@ -71,11 +75,11 @@ class Streams:
         return True
 
     def make(self, number: int) -> Message | None:
-        """Make a message that somebody asked for once."""
+        """Make message `number` once, as requested. None: it does not exist, or has nothing to report."""
         return self._reports[number](self._brain) if number in self._reports else None
 
     def due(self) -> list[Message]:
-        """Return what is to be sent now."""
+        """Return the messages that are due now."""
         brain, messages = self._brain, []
         if brain.now_s >= self._beat_due_s:
             self._beat_due_s = max(self._beat_due_s + HEARTBEAT_S, brain.now_s)
@@ -89,8 +93,8 @@ class Streams:
 
 
 class FlightController:
-    """One vehicle of a firmware, of those in VEHICLES. Without `gps` it has lost GPS in flight, before the start, which
-    is at `start_utc_s` by its clock."""
+    """A simulated vehicle, one of VEHICLES, that moves by `motion`. Without `gps` it has lost GPS in flight, before the
+    start. `start_utc_s` is its UTC at the start, seconds since 1970."""
 
     def __init__(
         self, vehicle: str, motion: Motion, *, gps: bool, system_id: int = 1, start_utc_s: float = _START_UTC_S
@@ -100,7 +104,7 @@ class FlightController:
         self.brain = VEHICLES[vehicle](motion)
         self.vehicle, self.system_id = vehicle, system_id
         self.fixes: list[ReceivedFix] = []
-        self.answers: list[int] = []  # to fixes, MAV_RESULT
+        self.answers: list[int] = []  # its answers to fixes, each a MAV_RESULT
         self._streams = Streams(self.brain)
         self.brain.start_utc_s = start_utc_s
         self._has_begun = False
@@ -113,21 +117,21 @@ class FlightController:
 
     @property
     def error_m(self) -> float:
-        """Distance of the estimate from the truth."""
+        """Distance in metres between the estimated and the true position."""
         return abs(self.brain.reckoning.error_m)
 
     def set(self, name: str, value: float) -> None:
-        """Set a parameter, as PARAM_SET does: SIM_GPS1_ENABLE 0 takes GPS away."""
+        """Set a parameter, as PARAM_SET does. For example, SIM_GPS1_ENABLE 0 switches GPS off."""
         self.brain.parameters.set(name, value)
 
     def begin(self) -> None:
-        """Note that a flight is heard; a track starts when it first is."""
+        """Note that a companion in flight has been heard. The first call starts the motion along the track."""
         if not self._has_begun:
             self._has_begun = True
             self.brain.motion.begin(self.brain.now_s)
 
     def advance(self, now_s: float) -> list[Message]:
-        """Go on to `now_s`, in small steps; return what is said on the way."""
+        """Simulate up to `now_s` in steps of STEP_S seconds; return the messages sent meanwhile."""
         said = []
         while self.brain.now_s + STEP_S <= now_s:
             self.brain.step(STEP_S)
@@ -137,7 +141,7 @@ class FlightController:
         return said
 
     def hear(self, message: Message) -> list[Message]:
-        """Take in a message; return the answers."""
+        """Process a received message; return the replies."""
         if getattr(message, "target_system", 0) not in (0, self.system_id):
             return []
         if getattr(message, "target_component", 0) not in (0, AUTOPILOT):

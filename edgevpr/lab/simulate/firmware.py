@@ -1,7 +1,5 @@
-"""The common ground of the firmwares of simulated flight controllers: parameters, an estimator, and the failsafe.
-
-How fast an estimate goes wrong is a plain model.
-"""
+"""The common part of the simulated firmwares, ArduPilot and PX4: parameters, a position estimator, and its failsafe.
+The error of the estimate grows by a simple model. East and north are one complex number, east + 1j * north."""
 
 import cmath
 import math
@@ -15,14 +13,16 @@ from edgevpr.lab.simulate.motion import Motion
 from edgevpr.lab.simulate.sensors import ExternalNavigation, PositionMeasurement, Receivers, Reckoning
 from edgevpr.mavlink.wire import Message, mavlink, parameter_value
 
-GATE_SD = 5.0  # of an innovation; ArduPilot: EK3_POS_I_GATE, EK3_VEL_I_GATE
+GATE_SD = (
+    5.0  # the largest innovation, in standard deviations, that is accepted; ArduPilot: EK3_POS_I_GATE, EK3_VEL_I_GATE
+)
 OK: int = mavlink.MAV_RESULT_ACCEPTED
 FAILED: int = mavlink.MAV_RESULT_FAILED
 DENIED: int = mavlink.MAV_RESULT_DENIED
 NOT_NOW: int = mavlink.MAV_RESULT_TEMPORARILY_REJECTED
 UNSUPPORTED: int = mavlink.MAV_RESULT_UNSUPPORTED
 SD_GROWS_M_S = {"plane": 1.0, "copter": 3.0, "rover": 3.0}
-_INERTIAL_M_S2 = 0.05 + 0j  # the error of the acceleration that a copter or a rover reckons with
+_INERTIAL_M_S2 = 0.05 + 0j  # error of the acceleration from which a copter or a rover dead-reckons
 _WIND_LEARNT_IN_S = 5.0
 _NAME_BYTES = 16
 _MOST = 2**31 - 1
@@ -34,8 +34,9 @@ _TYPES = {
 
 
 class Firmware(ABC):
-    """The estimator of a vehicle and what hangs on it. `motion` is landed where the failsafe says so; `texts` are the
-    severities and words that are to be told."""
+    """The position estimator of a vehicle, and all that depends on it. The failsafe lands `motion`. `texts` are the
+    (severity, text) of the status texts to be sent. `origin` is (latitude, longitude, altitude above sea level) or
+    None."""
 
     number: ClassVar[int]  # MAV_AUTOPILOT
     version: ClassVar[int]
@@ -55,13 +56,13 @@ class Firmware(ABC):
         self.test_ratio = 0.0
         self.start_utc_s = 0.0
         self.now_s, self.truth = 0.0, motion.step(0.0, 0.0)
-        self._passed_s = -math.inf  # when a position of a sensor last passed the gate
+        self._passed_s = -math.inf  # when a measured position was last within the gate
         self._used: PositionMeasurement | None = None
-        self._wind_m_s = 0j  # as the filter knows it
+        self._wind_m_s = 0j  # as the filter has learnt it
         self._has_failed = False
 
     def step(self, dt_s: float) -> None:
-        """Go on for a while: let sensors report, and the estimator and its watchers follow."""
+        """Advance by `dt_s` seconds: motion, sensors, estimator, then the failsafe."""
         self.now_s += dt_s
         self.truth = self.motion.step(self.now_s, dt_s)
         self.receivers.step(self.truth, self.now_s)
@@ -71,39 +72,39 @@ class Firmware(ABC):
 
     @abstractmethod
     def lose_gps(self) -> None:
-        """Be as one that had GPS until a while ago, and has none any more."""
+        """Set the state of a vehicle that had GPS until a moment ago, and has none any more."""
 
     @abstractmethod
     def flags(self) -> int:
-        """Return the flags of the filter's report."""
+        """Return the flags of the filter's report (EKF_STATUS_REPORT or ESTIMATOR_STATUS)."""
 
     @abstractmethod
     def take_fix(self, command: Message) -> int:
-        """Judge command 43003, and set the position where it is accepted."""
+        """Process command 43003: correct the position if it is accepted. Returns a MAV_RESULT."""
 
     @abstractmethod
     def _estimate(self, wind_m_s: complex, dt_s: float) -> None:
-        """Let the estimator go on."""
+        """Advance the estimator by `dt_s` seconds. `wind_m_s` is the true wind, complex."""
 
     @abstractmethod
     def _watch(self) -> None:
-        """Let the failsafe land a vehicle that has lost its position. Landed, it disarms."""
+        """Let the failsafe land a vehicle that has lost its position. After landing, disarm."""
 
     def take_global_position(self, message: Message) -> None:  # noqa: B027
-        """Take in a GLOBAL_POSITION_SENSOR (296), where the firmware knows it."""
+        """Process a GLOBAL_POSITION_SENSOR (296), if the firmware knows it."""
 
     def set_origin(self, at: tuple[float, float, float]) -> bool:
-        """Move the origin; the vehicle stays where it is. Return whether it was set."""
+        """Set the origin (latitude, longitude, altitude); the vehicle does not move. Returns True if it was set."""
         self.origin = at
         return True
 
     def use_source_set(self, number: float) -> int:
-        """Obey MAV_CMD_SET_EKF_SOURCE_SET (42007), where there are source sets."""
+        """Execute MAV_CMD_SET_EKF_SOURCE_SET (42007), if the firmware has source sets. Returns a MAV_RESULT."""
         return UNSUPPORTED
 
     def _fuse(self, measured: PositionMeasurement, wind_m_s: complex, reset_after_s: float) -> bool:
-        """Follow a measurement within the gate, or one outside of it after a while; return whether it was used. One
-        that is not used still tells the velocity."""
+        """Fuse a measurement that is within the gate; reset the position to one outside of it if none was within for
+        `reset_after_s` seconds. Returns True in both cases; then the filter also learns the true `wind_m_s`."""
         away_m = abs(self.reckoning.innovation_m(self.truth, measured.lat_deg, measured.lon_deg))
         self.test_ratio = away_m / (GATE_SD * math.hypot(self.reckoning.sd_m, measured.sd_m))
         if self.test_ratio <= 1:
@@ -117,8 +118,8 @@ class Firmware(ABC):
         return True
 
     def _go_wrong(self, wind_m_s: complex, dt_s: float, unnoticed_share: float) -> None:
-        """Let the reckoning drift: of a plane by the wind that it does not know, of the others by their
-        accelerometers."""
+        """Increase the velocity error of the dead reckoning: of a plane by `unnoticed_share` of the change of wind
+        since the filter learnt it, of the others by the error of their accelerometers."""
         if self.kind == "plane":
             drift_m_s = unnoticed_share * (self._wind_m_s - wind_m_s)
             self.reckoning.drift_m_s = drift_m_s if self.motion.is_flying else 0j
@@ -126,15 +127,15 @@ class Firmware(ABC):
             self.reckoning.drift_m_s += _INERTIAL_M_S2 * dt_s
 
     def _reset_to(self, lat_deg: float, lon_deg: float, sd_m: float, age_s: float = 0.0) -> None:
-        """Be at a point from now on, or where it has flown to since the point was measured."""
+        """Set the estimate to a point that was measured `age_s` seconds ago, plus the distance flown since."""
         moved_m = self.reckoning.velocity_m_s(self.truth) * age_s
         self.reckoning.reset_to(self.truth, lat_deg, lon_deg, sd_m)
         self.reckoning.error_m += moved_m
 
 
 class Parameters(Mapping[str, float]):
-    """Named values, each an int or a float for good. `bytewise` (PX4): the bytes of an integer stand in the float of
-    the message; else (ArduPilot) the float has the integer's value."""
+    """Parameters by name; each stays an int or a float. With `bytewise` (PX4) the bytes of an integer are sent in the
+    float of the message, else (ArduPilot) the integer's value."""
 
     def __init__(self, values: dict[str, float], bytewise: bool) -> None:
         self._values = dict(values)
@@ -150,12 +151,12 @@ class Parameters(Mapping[str, float]):
         return len(self._values)
 
     def set(self, name: str, value: float) -> None:
-        """Set the value of a parameter, which must exist."""
+        """Set the value of an existing parameter."""
         self._values[name] = type(self._values[name])(value)
 
     def set_written(self, name: str, text: str) -> None:
-        """Set a parameter to a number as a user writes it. Raises UsageError for a name that does not exist, and for a
-        text that is no value of it."""
+        """Set a parameter from text that the user wrote. Raises UsageError for an unknown name, and for a text that is
+        no valid value."""
         if name not in self._values:
             raise UsageError(f"The vehicle has no parameter {name}: it has {', '.join(sorted(self._values))}.")
         kind = type(self._values[name])
@@ -169,7 +170,7 @@ class Parameters(Mapping[str, float]):
         self.set(name, value)
 
     def answer(self, message: Message) -> list[Message]:
-        """Return the answers to a PARAM_REQUEST_READ, PARAM_REQUEST_LIST or PARAM_SET; none for an unknown name."""
+        """Return the replies to a PARAM_REQUEST_READ, PARAM_REQUEST_LIST or PARAM_SET; none for an unknown name."""
         names = list(self._values)
         if message.get_type() == "PARAM_REQUEST_LIST":
             return [self._message(name, index) for index, name in enumerate(names)]
@@ -192,13 +193,13 @@ class Parameters(Mapping[str, float]):
         )
 
 
-# Those of the simulator itself, under the names of ArduPilot's: the same test can drive both.
+# Parameters of the simulation, named as in ArduPilot's own simulator, so that one test can drive both.
 SIMULATOR = {
     "SIM_GPS1_ENABLE": 1,
     "SIM_GPS1_GLTCH_X": 0.0,  # degrees of latitude
     "SIM_GPS1_GLTCH_Y": 0.0,  # degrees of longitude
     "SIM_WIND_SPD": 0.0,
-    "SIM_WIND_DIR": 180.0,  # where it comes from
+    "SIM_WIND_DIR": 180.0,  # degrees: where the wind comes from
 }
 
 ARDUPILOT = {

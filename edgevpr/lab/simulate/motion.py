@@ -1,5 +1,5 @@
-"""The motion of a simulated vehicle: along a recorded track, or nobody knows where. East and north are one complex
-number, east + 1j * north."""
+"""The motion of a simulated vehicle: along a recorded track, or at an unknown place. Used by the simulated autopilots.
+East and north are one complex number, east + 1j * north."""
 
 import math
 from dataclasses import dataclass
@@ -12,13 +12,13 @@ from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import moved, offset_m
 from edgevpr.frames.positions import read_positions
 
-_FASTEST_M_S = 327.0  # that the message can say
+_FASTEST_M_S = 327.0  # the largest that GLOBAL_POSITION_INT can hold
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrueState:
-    """The vehicle as it truly is: degrees, metres above sea level and above the ground, m/s over the ground (east + 1j
-    * north) and upwards. Angles are NaN where nobody knows them."""
+    """The true state of the vehicle: position in degrees, `alt_m` above sea level, `height_m` above the ground,
+    velocity over the ground (east + 1j * north) and climb rate upwards. Angles and height are NaN where unknown."""
 
     lat_deg: float
     lon_deg: float
@@ -33,8 +33,8 @@ class TrueState:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlownTrack:
-    """Path of the simulated vehicle: seconds from its start on, degrees, metres above sea level, each (N,) float64;
-    heading, roll, pitch and height above the ground are NaN where unknown (None: everywhere)."""
+    """The path of the simulated vehicle, arrays (N,) float64: seconds from its start, degrees, metres above sea level.
+    Heading, roll, pitch and height above the ground are NaN where unknown (None: everywhere)."""
 
     t_s: NDArray[np.float64]
     lat_deg: NDArray[np.float64]
@@ -47,25 +47,25 @@ class FlownTrack:
 
 
 class Motion:
-    """A vehicle that flies at a place that is never told, and obeys nobody. `is_flying`: from take-off to landing;
-    `is_known`: its position is reported."""
+    """A vehicle at an unknown place that obeys no command. `is_flying`: it is between take-off and landing; `is_known`:
+    its position is known, and reported."""
 
     is_flying = True
     is_known = False
 
     def begin(self, now_s: float) -> None:
-        """Note that a flight is heard for the first time."""
+        """Note that at `now_s` a companion in flight was first heard."""
 
     def step(self, now_s: float, dt_s: float) -> TrueState:
-        """Move on to `now_s`, and return where that is."""
+        """Move for `dt_s` seconds, up to `now_s`, and return the state then."""
         return truth_at(_NOWHERE, 0.0)
 
     def land(self) -> None:
-        """Sink where it is, where it obeys."""
+        """Land at the present place, if the vehicle obeys commands."""
 
 
 class AlongTrack(Motion):
-    """Flies along a track from the moment a flight is first heard, stays where it ends, and obeys nobody."""
+    """A vehicle that flies along a track once a companion in flight is heard, stays at its end, and obeys nothing."""
 
     is_known = True
 
@@ -78,13 +78,13 @@ class AlongTrack(Motion):
         self._start_s = now_s
 
     def step(self, now_s: float, dt_s: float) -> TrueState:
-        """Return the point of the track that belongs to `now_s`."""
+        """Return the state at the point of the track for `now_s`."""
         return truth_at(self._track, 0.0 if self._start_s is None else now_s - self._start_s)
 
 
 def read_track(csv_path: str | Path) -> FlownTrack:
-    """Read the rows of a positions.csv that have a position and a time, in the order of time. Raises UsageError where
-    there are none."""
+    """Read the rows of a positions.csv that have a position and a time, sorted by time. Raises UsageError if there are
+    none."""
     rows = []
     for tag in read_positions(csv_path).values():
         if tag.position and tag.t_utc_s is not None:
@@ -107,9 +107,9 @@ def read_track(csv_path: str | Path) -> FlownTrack:
 
 
 def truth_at(track: FlownTrack, t_s: float) -> TrueState:
-    """Return the point of a track at a time, seconds from its start on. Outside the track the vehicle stands. Height
-    and angles are those of the point that was passed last."""
-    leg = int(np.searchsorted(track.t_s, t_s, side="right"))  # the one that is being flown
+    """Return the state on a track at `t_s` seconds from its start. Before and after the track the vehicle stands still.
+    Height and angles are not interpolated: they are those of the point passed last."""
+    leg = int(np.searchsorted(track.t_s, t_s, side="right"))  # number of the leg: it ends at the point of this index
     velocity = 0j
     if 0 < leg < len(track.t_s):
         ends = track.lat_deg[leg - 1], track.lon_deg[leg - 1], track.lat_deg[leg], track.lon_deg[leg]
@@ -133,13 +133,13 @@ def truth_at(track: FlownTrack, t_s: float) -> TrueState:
 
 
 def from_to(lat_deg: float, lon_deg: float, other_lat_deg: float, other_lon_deg: float) -> complex:
-    """Return the metres from one point to another, east + 1j * north."""
+    """Return the vector from one point to another, metres (east + 1j * north)."""
     east_m, north_m = offset_m(lat_deg, lon_deg, other_lat_deg, other_lon_deg)
     return complex(float(east_m), float(north_m))
 
 
 def beside(lat_deg: float, lon_deg: float, step_m: complex) -> tuple[float, float]:
-    """Return the point so many metres (east + 1j * north) from a point: the reverse of `from_to`."""
+    """Return (latitude, longitude) at `step_m` metres (east + 1j * north) from a point: the inverse of `from_to`."""
     return moved(lat_deg, lon_deg, step_m.real, step_m.imag) if step_m else (lat_deg, lon_deg)
 
 

@@ -1,6 +1,6 @@
-"""The rules of PX4 1.17-alpha (February 2026): EKF2 and command 43003 (EKF2.cpp, ekf.cpp
-resetGlobalPosToExternalObservation, ekf_helper.cpp updateHorizontalDeadReckoningstatus), message 296
-(aux_global_position.cpp)."""
+"""The simulated PX4: the rules of 1.17-alpha (February 2026) for its filter EKF2, command 43003 and message 296. Used
+by `controller`. They are from EKF2.cpp, ekf.cpp (resetGlobalPosToExternalObservation), ekf_helper.cpp
+(updateHorizontalDeadReckoningstatus) and aux_global_position.cpp."""
 
 import math
 
@@ -34,8 +34,8 @@ class Px4(Firmware):
 
     def __init__(self, kind: str, motion: Motion) -> None:
         super().__init__(kind, motion, PX4_PARAMETERS, _POSITION)
-        self._fused_s = self._aided_s = -math.inf  # when anything was last fused; when it was not inertial
-        self._other_s = self._other_heard_s = -math.inf  # 296: last fused, last heard
+        self._fused_s = self._aided_s = -math.inf  # last fused; last not purely inertial
+        self._other_s = self._other_heard_s = -math.inf  # message 296: last fused, last received
 
     def lose_gps(self) -> None:
         self.parameters.set("SIM_GPS1_ENABLE", 0)
@@ -71,8 +71,8 @@ class Px4(Firmware):
         return flags | (mavlink.ESTIMATOR_GPS_GLITCH if self.test_ratio > 1 else 0)
 
     def take_fix(self, command: Message) -> int:
-        """Judge command 43003. Time of sending and frame mean nothing."""
-        since_s = self._fused_s if self.motion.is_flying else self._passed_s  # it reckons, or has no GPS on the ground
+        """Process command 43003 and return a MAV_RESULT. The command's time of sending and frame are ignored."""
+        since_s = self._fused_s if self.motion.is_flying else self._passed_s  # dead-reckons; landed: lacks GPS
         if self.now_s - since_s < _AIDING_GONE_S or not math.isfinite(command.param2):
             return NOT_NOW
         lat_deg, lon_deg = command.x / 1e7, command.y / 1e7
@@ -86,7 +86,8 @@ class Px4(Firmware):
         return OK
 
     def take_global_position(self, message: Message) -> None:
-        """Fuse a GLOBAL_POSITION_SENSOR (296). Its own times are ignored: it is as old as the parameter says."""
+        """Fuse a GLOBAL_POSITION_SENSOR (296). The times in it are ignored: its age is the parameter EKF2_AGP0_DELAY
+        (ms)."""
         is_ours = message.id == self.parameters["EKF2_AGP0_ID"] != 0  # 0: the slot is off
         if not message.eph > 0 or not is_ours or not int(self.parameters["EKF2_AGP0_CTRL"]) & 1:
             return
@@ -116,7 +117,7 @@ class Px4(Firmware):
         return self.now_s - self._aided_s <= self.parameters["EKF2_NOAID_TOUT"] / 1e6
 
     def _watch(self) -> None:
-        """Land where the position is lost in flight. Landed, it disarms."""
+        """Land when the position is lost in flight. After landing, disarm."""
         if self.is_armed and self.mode == _LAND and not self.motion.is_flying:
             self.is_armed = False
         is_lost = self.origin is not None and not self._is_valid()

@@ -1,5 +1,6 @@
-"""Reports of a flight controller on itself: one function a message, from a `Firmware` to the message, None where
-there is nothing to say. Messages that a real one knows and this one has nothing to say of are in `SILENT`."""
+"""The messages in which a simulated autopilot reports its state: one function for each, from a `Firmware` to the
+message, or None if there is nothing to report. `SILENT` are messages that exist but are never sent. Used by
+`controller`."""
 
 import math
 from collections.abc import Callable
@@ -19,7 +20,7 @@ _CAPABILITIES = (
 
 
 def heartbeat(brain: Firmware) -> Message:
-    """Make the HEARTBEAT of an autopilot."""
+    """Make the HEARTBEAT of the simulated autopilot."""
     armed = mavlink.MAV_MODE_FLAG_SAFETY_ARMED if brain.is_armed else 0
     return mavlink.MAVLink_heartbeat_message(
         type=brain.vehicle_type,
@@ -50,7 +51,7 @@ def _position(brain: Firmware) -> Message | None:
 
 
 def _attitude(brain: Firmware) -> Message | None:
-    """Make the message of the attitude, None where a track does not know it."""
+    """Make an ATTITUDE; None if the track does not contain the angles."""
     truth = brain.truth
     if math.isnan(truth.roll_deg + truth.pitch_deg):
         return None
@@ -68,7 +69,7 @@ def _second_gps(brain: Firmware) -> Message | None:
 
 def _gps(gps: Gps, brain: Firmware) -> dict[str, int]:
     last = gps.last
-    if last is None or not brain.motion.is_known:  # a second GPS that has never been heard, or has been silent for long
+    if last is None or not brain.motion.is_known:  # a second GPS that is silent
         lost = {"lat": 0, "lon": 0, "alt": 0, "eph": 9999, "epv": 9999, "vel": 0, "cog": 0}
         return {"time_usec": 0, "fix_type": NO_FIX, **lost, "satellites_visible": 0}
     east_m_s, north_m_s = last.velocity_m_s.real, last.velocity_m_s.imag
@@ -133,7 +134,7 @@ REPORTS: dict[int, Callable[[Firmware], Message | None]] = {
     mavlink.MAVLINK_MSG_ID_GPS2_RAW: _second_gps,
     mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: _version,
 }
-# Each firmware has its own report of its filter, and knows nothing of the other's.
+# Each firmware has its own report of its filter, and does not know the other's.
 FILTER_REPORTS = {
     mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: _ekf_status,
     mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: _estimator_status,

@@ -1,6 +1,6 @@
-"""Sensors of a simulated flight controller: its GPS, a second one that a companion plays (GPS_INPUT), external
-navigation (ODOMETRY), and its own reckoning. Rules and numbers are those of ArduPilot 4.7-dev: AP_GPS, AP_GPS_MAV and
-AP_VisualOdom."""
+"""Sensors of a simulated flight controller: its GPS, a second GPS by GPS_INPUT messages, external navigation by
+ODOMETRY messages, and its dead reckoning. Used by `firmware`. Rules and numbers are those of ArduPilot 4.7-dev: AP_GPS,
+AP_GPS_MAV and AP_VisualOdom."""
 
 import math
 from collections.abc import Mapping
@@ -10,14 +10,14 @@ from edgevpr.lab.simulate.motion import TrueState, beside, from_to
 from edgevpr.mavlink.wire import Message, mavlink
 
 NO_FIX, FIX_3D = mavlink.GPS_FIX_TYPE_NO_FIX, mavlink.GPS_FIX_TYPE_3D_FIX
-_BEST_FIX = mavlink.GPS_FIX_TYPE_RTK_FIXED  # so good is that of ArduPilot's simulator
-_BY_MAVLINK = 14  # of GPS1_TYPE and GPS2_TYPE
+_BEST_FIX = mavlink.GPS_FIX_TYPE_RTK_FIXED  # as ArduPilot's simulator has it
+_BY_MAVLINK = 14  # value of GPS1_TYPE and GPS2_TYPE
 GPS_S = 0.2  # from one report of the simulated GPS to the next
 _SIMULATED_SD_M = 0.3
 _TIMEOUT_S = 4.0
-_LEAST_NOISE_M, _MOST_NOISE_M = 0.2, 100.0  # VISO_POS_M_NSE, and the most
+_LEAST_NOISE_M, _MOST_NOISE_M = 0.2, 100.0  # VISO_POS_M_NSE, and the upper limit
 _EXTERNAL_GOOD_FOR_S = 0.3
-_TAKEN_SHARE = 0.3  # of an innovation, by each measurement
+_TAKEN_SHARE = 0.3  # of an innovation, that each measurement corrects
 _LEAST_SD_M = 0.3
 
 Values = Mapping[str, float]
@@ -25,7 +25,8 @@ Values = Mapping[str, float]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PositionMeasurement:
-    """A measured position, degrees, its standard deviation, and when it was measured."""
+    """A measured position: degrees, altitude above sea level, the standard deviation of one axis, the time `t_s` of the
+    measurement, and the velocity (east + 1j * north)."""
 
     lat_deg: float
     lon_deg: float
@@ -36,7 +37,7 @@ class PositionMeasurement:
 
 
 class Gps:
-    """A receiver as the autopilot sees it: its last report."""
+    """A GPS receiver as the autopilot sees it: its last report, None if there is none that is recent."""
 
     def __init__(self) -> None:
         self.fix_type: int = NO_FIX
@@ -44,31 +45,32 @@ class Gps:
         self._heard_s = -math.inf
 
     def report(self, fix_type: int, measured: PositionMeasurement) -> None:
-        """Take in a report."""
+        """Process a report of the receiver."""
         self._heard_s, self.fix_type, self.last = measured.t_s, fix_type, measured
 
     def age(self, now_s: float) -> None:
-        """Give up a receiver that has been silent for four seconds."""
+        """Forget the report of a receiver that has been silent for four seconds."""
         if now_s - self._heard_s > _TIMEOUT_S:
             self.fix_type, self.last = NO_FIX, None
 
 
 class Receivers:
-    """The first GPS, which sees the true position (and its glitch) while it is enabled, and the second one."""
+    """The two GPS receivers. The first measures the true position plus the glitch that the parameters set, while
+    enabled; the second is fed by GPS_INPUT."""
 
     def __init__(self, parameters: Values) -> None:
         self.first, self.second = Gps(), Gps()
-        self.primary = self.first  # the one in use: another one takes over when it has the better fix
+        self.primary = self.first  # the one in use; the other takes over when it has the better fix
         self._parameters = parameters
         self._due_s = 0.0
 
     @property
     def has_second(self) -> bool:
-        """True where the second GPS is one that comes by MAVLink."""
+        """True if the parameters set the second receiver to GPS_INPUT messages."""
         return self._parameters.get("GPS2_TYPE", 0) == _BY_MAVLINK
 
     def step(self, truth: TrueState, now_s: float) -> None:
-        """Let the simulated receiver report, and the silent ones be given up."""
+        """Let the first receiver report if it is due, forget a silent second one, and choose the one in use."""
         if now_s >= self._due_s:
             self._due_s = now_s + GPS_S - 1e-6
             seen = PositionMeasurement(
@@ -89,7 +91,7 @@ class Receivers:
             self.primary = other
 
     def hear(self, message: Message, now_s: float) -> None:
-        """Take in a GPS_INPUT, where it is for the second receiver."""
+        """Process a GPS_INPUT, if it is for the second receiver."""
         if self.has_second and message.gps_id == 1:
             measured = PositionMeasurement(
                 lat_deg=message.lat / 1e7,
@@ -103,14 +105,14 @@ class Receivers:
 
 
 class ExternalNavigation:
-    """Positions relative to the origin of the estimator, metres north, east and down."""
+    """Receives positions relative to the estimator's origin: metres north, east and down, in ODOMETRY messages."""
 
     def __init__(self, parameters: Values) -> None:
         self._parameters = parameters
         self._last: tuple[complex, float, float] | None = None  # position, standard deviation, time
 
     def hear(self, message: Message, now_s: float) -> None:
-        """Take in an ODOMETRY."""
+        """Process an ODOMETRY; one with wrong frames or low quality is ignored, and all are unless VISO_TYPE is set."""
         frames = (mavlink.MAV_FRAME_LOCAL_FRD, mavlink.MAV_FRAME_BODY_FRD)
         if not self._parameters.get("VISO_TYPE", 0) or (message.frame_id, message.child_frame_id) != frames:
             return
@@ -122,7 +124,7 @@ class ExternalNavigation:
             self._last = complex(message.y, message.x), sd_m, now_s
 
     def measured(self, origin: tuple[float, float, float] | None, now_s: float) -> PositionMeasurement | None:
-        """Return the last position on the Earth; None where there is none, or no origin."""
+        """Return the last position in degrees; None if there is no recent one, or `origin` is None."""
         if self._last is None or origin is None or now_s - self._last[2] > _EXTERNAL_GOOD_FOR_S:
             return None
         step_m, sd_m, t_s = self._last
@@ -131,8 +133,8 @@ class ExternalNavigation:
 
 
 class Reckoning:
-    """The estimate of the position, as its error against the truth: metres by which it is off, how fast that grows, and
-    the standard deviation that the estimator gives itself."""
+    """The estimated position, kept as its error against the truth: `error_m` (complex, east + 1j * north), `drift_m_s`
+    (the growth of that error), and `sd_m`, the standard deviation that the estimator assumes."""
 
     def __init__(self) -> None:
         self.error_m = 0j
@@ -140,29 +142,29 @@ class Reckoning:
         self.sd_m = _LEAST_SD_M
 
     def step(self, dt_s: float, sd_m_s: float) -> None:
-        """Reckon on for a while, in which the standard deviation grows by so much a second."""
+        """Dead-reckon for `dt_s` seconds; the standard deviation grows by `sd_m_s` metres a second."""
         self.error_m += self.drift_m_s * dt_s
         self.sd_m += sd_m_s * dt_s
 
     def place(self, truth: TrueState) -> tuple[float, float]:
-        """Return the estimated latitude and longitude, degrees."""
+        """Return the estimated (latitude, longitude) in degrees."""
         return beside(truth.lat_deg, truth.lon_deg, self.error_m)
 
     def velocity_m_s(self, truth: TrueState) -> complex:
-        """Return the estimated velocity."""
+        """Return the estimated velocity, east + 1j * north."""
         return truth.velocity_m_s + self.drift_m_s
 
     def innovation_m(self, truth: TrueState, lat_deg: float, lon_deg: float) -> complex:
-        """Return the step from the estimate to a point."""
+        """Return the vector from the estimate to a point, metres (east + 1j * north)."""
         return from_to(truth.lat_deg, truth.lon_deg, lat_deg, lon_deg) - self.error_m
 
     def fuse(self, truth: TrueState, measured: PositionMeasurement) -> None:
-        """Follow a measurement; velocities are right from then on."""
+        """Move the estimate towards a measurement; the velocity is right from then on."""
         self.error_m += _TAKEN_SHARE * self.innovation_m(truth, measured.lat_deg, measured.lon_deg)
         self.drift_m_s = 0j
         self.sd_m = max(_LEAST_SD_M, min(self.sd_m, measured.sd_m))
 
     def reset_to(self, truth: TrueState, lat_deg: float, lon_deg: float, sd_m: float) -> None:
-        """Be at a point from now on."""
+        """Set the estimate to a point, with the standard deviation `sd_m`."""
         self.error_m += self.innovation_m(truth, lat_deg, lon_deg)
         self.sd_m = max(_LEAST_SD_M, sd_m)
