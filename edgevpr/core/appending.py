@@ -1,8 +1,8 @@
-"""Files that are appended to in flight, each write as a whole or not at all, and set aside under numbers when full.
+"""Log files that grow in flight: each write is done completely or not at all, and a full file is renamed.
 
-NAME-0001.jsonl, NAME-0002.jsonl, ... stand beside NAME.jsonl. The number is one more than the highest there, so
-numbers say what came after what. Names have no dates: the clock of an aircraft may be wrong. Links are followed: the
-numbers stand beside the file that a link leads to.
+Renamed files are called NAME-0001.jsonl, NAME-0002.jsonl, ... in the folder of NAME.jsonl ("numbered files" below). A
+new number is one more than the highest, so numbers show the order. Names have no dates: the clock of an aircraft may
+be wrong. Symbolic links are followed: the numbered files are in the folder of the link's target.
 """
 
 import errno
@@ -15,15 +15,15 @@ from io import FileIO
 from pathlib import Path
 from typing import BinaryIO
 
-MODE = 0o640  # positions are nobody else's, and a log is for the group that reads logs, whatever the umask
-MOST_FILES = 100  # a service that starts again and again must not bury the logs of flights under its own
-_MOST_NUMBER = 999_999  # eight digits would be a date, and a file of somebody else
+MODE = 0o640  # whatever the umask: positions are private, but the group that reads logs may read them
+MOST_FILES = 100  # limits the many short logs of a service that restarts again and again
+_MOST_NUMBER = 999_999  # a file name with eight digits has a date, and is not one of these
 _NUMBERED = re.compile(r"(.+)-(\d{4,6})", re.DOTALL)
 
 
 def open_appending(path: str | Path) -> FileIO:
-    """Open a file, or a character device, for appending and reading; a new one gets the mode 0640. It never waits for
-    anybody and has no buffer: a write that has returned is safe even if this process is killed next. Raises OSError."""
+    """Open a file, or a character device, for appending and reading, without blocking. A new file gets the mode 0640.
+    The result has no buffer: a write that has returned is safe even if this process is killed next. Raises OSError."""
     flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY
     try:
         descriptor, is_new = os.open(path, flags | os.O_EXCL, MODE), True
@@ -43,7 +43,7 @@ def open_appending(path: str | Path) -> FileIO:
 
 
 def append(file: BinaryIO, data: bytes) -> None:
-    """Append all of `data` or, as far as the medium allows, nothing. Raises OSError."""
+    """Append all of `data`. If that fails, cut the file back to its old length, where possible, and raise OSError."""
     end = file.seek(0, os.SEEK_END)
     try:
         rest = memoryview(data)
@@ -59,13 +59,14 @@ def append(file: BinaryIO, data: bytes) -> None:
 
 
 def sync(file: BinaryIO) -> None:
-    """Bring what was written to the disk, where there is one. Raises OSError."""
+    """Flush a regular file's data from the system's cache to the disk; do nothing for a device. Raises OSError."""
     if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
         os.fdatasync(file.fileno())
 
 
 def sync_folder(path: str | Path) -> None:
-    """Bring the name of a file to the disk, where the folder can be synced: with links followed, and not on FAT."""
+    """Flush the folder of `path`, and so the file's name, to the disk. Links are followed. Errors are ignored, such as
+    those of FAT, whose folders cannot be flushed."""
     with suppress(OSError):
         folder = os.open(os.path.dirname(os.path.realpath(path)), os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:
@@ -75,8 +76,8 @@ def sync_folder(path: str | Path) -> None:
 
 
 def try_lock(file: BinaryIO) -> bool:
-    """Lock an open file until it is closed. Return False where another process has it; a medium that has no locks, and
-    what is no file, is locked by nobody."""
+    """Lock an open file until it is closed. Return False if another process holds the lock, else True: also for a
+    device, and on a file system without locks."""
     if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
         try:
             fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -88,7 +89,7 @@ def try_lock(file: BinaryIO) -> bool:
 
 
 def is_at(file: BinaryIO, path: str | Path) -> bool:
-    """Tell whether an open file is still the one that is found under `path`."""
+    """Return True if the open `file` is still the one at `path`: it was not renamed, replaced or deleted."""
     try:
         return os.path.samestat(os.fstat(file.fileno()), os.stat(path))
     except OSError:
@@ -96,27 +97,28 @@ def is_at(file: BinaryIO, path: str | Path) -> bool:
 
 
 def keep_as_earlier(path: str | Path) -> None:
-    """Rename a file that is full to NAME.1.jsonl beside NAME.jsonl, in place of the one before. Raises OSError."""
+    """Rename the full file NAME.jsonl to NAME.1.jsonl in its folder, replacing an older one. Raises OSError."""
     path = Path(os.path.realpath(path))
     os.replace(path, path.with_name(f"{path.stem}.1{path.suffix}"))
     sync_folder(path)
 
 
 def numbered(path: str | Path) -> list[Path]:
-    """List what has a number beside `path`, the lowest first. Raises OSError."""
+    """List the numbered files of `path` (see the module), the lowest number first. Raises OSError."""
     return [file for _, file in _numbered(Path(os.path.realpath(path)))]
 
 
 def relatives(path: str | Path) -> list[Path]:
-    """List what has a number beside `path`, and beside the file that `path` was before it was set aside, if its name
-    has a number. Raises OSError."""
+    """List the numbered files of `path`. If `path` is a numbered file itself (NAME-0003.jsonl), list those of
+    NAME.jsonl as well. Raises OSError."""
     path = Path(os.path.realpath(path))
     match = _NUMBERED.fullmatch(path.stem)
     return numbered(path) + (numbered(path.with_name(match[1] + path.suffix)) if match else [])
 
 
 def claim(path: str | Path) -> Path:
-    """Make an empty file under the next number, which is then nobody else's, and return it. Raises OSError."""
+    """Create an empty file with the next number, so that no other process takes the number. Return its path. Raises
+    OSError."""
     path = Path(os.path.realpath(path))
     for number in range(max((number for number, _ in _numbered(path)), default=0) + 1, _MOST_NUMBER + 1):
         claimed = path.with_name(f"{path.stem}-{number:04d}{path.suffix}")
@@ -127,7 +129,7 @@ def claim(path: str | Path) -> Path:
 
 
 def set_aside(path: str | Path) -> Path:
-    """Rename a file to the next number, and return its new name. Raises OSError."""
+    """Rename a file to a numbered file with the next number, and return its new path. Raises OSError."""
     target = claim(path)  # FAT has no hard links, and a plain rename would replace what is there
     try:
         os.replace(os.path.realpath(path), target)
@@ -139,9 +141,9 @@ def set_aside(path: str | Path) -> Path:
 
 
 def keep_within(path: str | Path, most_bytes: float) -> list[Path]:
-    """Delete of the files that have a number beside `path` the smallest where there are more than `MOST_FILES`, then
-    the oldest until they have at most `most_bytes`. One that a process writes (see `try_lock`) stays. Return what was
-    deleted. Raises OSError."""
+    """Delete numbered files of `path`: the smallest of more than `MOST_FILES`, then the oldest until the others take
+    at most `most_bytes` together. A file that a process has locked (see `try_lock`) stays. Return the paths of the
+    deleted files. Raises OSError."""
     sizes, deleted = {}, []
     for file in numbered(path):
         with suppress(FileNotFoundError):  # another process deletes as well
@@ -155,7 +157,7 @@ def keep_within(path: str | Path, most_bytes: float) -> list[Path]:
             del sizes[file]
             deleted.append(file)
 
-    # Of about the same size the oldest; and never the newest, whose number would be given again.
+    # Among files of about the same size the oldest goes first. The newest stays: its number would be used again.
     smallest = sorted(list(sizes)[:-1], key=lambda file: sizes[file].bit_length())
     for file in smallest[: max(0, len(sizes) - MOST_FILES)]:
         delete(file)

@@ -1,7 +1,7 @@
-"""Names of the kinds of arrays that functions take and return. What an array holds, and its shape, a docstring says.
+"""Type aliases of the arrays that functions take and return. Docstrings of the functions give contents and shapes.
 
-`Floats` stands for float32 and float64 alike, where a function cares for the numbers and not for their width;
-`Singles` and `Doubles` where the width is part of a format or of a memory budget.
+`Floats` is float32 or float64, for functions that work with both. `Singles` and `Doubles` are used where the width is
+part of a format or of a memory budget.
 
 An array whose dtype is only known when the program runs, such as a part of a descriptor, is an `Array`.
 """
@@ -20,10 +20,10 @@ Bools: TypeAlias = NDArray[np.bool_]
 # Points and directions on the ground or in a picture: east + i north, or right + i up.
 Complexes: TypeAlias = NDArray[np.complexfloating[Any, Any]]
 
-# Numbers of things: slots of an index, ids of places, regions of a picture.
+# Numbers that identify something: rows ("slots") of an index, ids of places, regions of a picture.
 Ints: TypeAlias = NDArray[np.integer[Any]]
 
-# Packed bits, and what is read from a file as it stands there.
+# Packed bits, and raw bytes read from a file.
 Bytes: TypeAlias = NDArray[np.uint8]
 
 # uint8, (H, W) grey or (H, W, 3) blue, green, red.

@@ -1,7 +1,8 @@
-"""Work in a child process that may crash, hang or fill the memory without harm: it has a limit of time, and never
-outlives its parent.
+"""Work in a child process, which may crash, hang or fill its memory without harm to the parent. The child has a time
+limit and is killed when its parent ends.
 
-The child is a module run by `python -m`, which calls `serve_parent` with the function that does the work.
+The parent calls `ask_child` with the name of a module. The child is that module, run by `python -m`; it calls
+`serve_parent` with the function that does the work.
 """
 
 import json
@@ -18,8 +19,8 @@ _PR_SET_PDEATHSIG = 1  # prctl(2)
 
 @dataclass(frozen=True, slots=True)
 class Ended:
-    """End of a child: its exit code (0: it has an answer; below zero: minus the signal that ended it; None: it was
-    killed at the limit of time), its answer, and what else was said in it."""
+    """Result of a child process. `code` is its exit code (0: it has answered; negative: minus the signal that ended it;
+    None: it was killed at the time limit), `answer` its answer (any JSON; None: no answer), and `said` its stderr."""
 
     code: int | None
     answer: Any
@@ -27,7 +28,7 @@ class Ended:
 
 
 def ask_child(module: str, job: Any, limit_s: float) -> Ended:
-    """Let `python -m MODULE` work on a job (any JSON) for at most `limit_s` seconds."""
+    """Run `python -m MODULE` on a job (any JSON) for at most `limit_s` seconds, and return how it ended."""
     # A session of its own: only the parent process is to act on Ctrl-C.
     process = subprocess.Popen(
         [sys.executable, "-m", module],
@@ -52,8 +53,8 @@ def ask_child(module: str, job: Any, limit_s: float) -> Ended:
 
 
 def serve_parent(work: Callable[[Any], Any]) -> None:
-    """Do the work in the child: read the job, and print what `work` makes of it. What a library prints goes to stderr,
-    and not into the answer."""
+    """Serve one request, in the child: read the job from stdin, call `work` with it, and write the result to stdout as
+    JSON. Text that a library prints goes to stderr, not into the answer."""
     request = json.load(sys.stdin)
     end_with_parent(request["parent_pid"])
     with os.fdopen(os.dup(1), "w", encoding="utf-8") as answer:
@@ -62,7 +63,8 @@ def serve_parent(work: Callable[[Any], Any]) -> None:
 
 
 def end_with_parent(parent_pid: int) -> None:
-    """Let the kernel kill this process when its parent ends, however that ends, even while a library loops for ever."""
+    """Make the kernel kill this process when its parent ends in any way, even if a library here is in an endless loop.
+    `parent_pid` is the process id of the parent. Exits at once if the parent has ended already."""
     import ctypes  # not at the top: the parent may be a flight, which has no use for it
 
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
@@ -71,5 +73,5 @@ def end_with_parent(parent_pid: int) -> None:
 
 
 def last_line(ended: Ended) -> str:
-    """Return the last line that a failed child has said, for a message."""
+    """Return the last line of a failed child's stderr (else its exit code), at most 200 characters, for a message."""
     return (ended.said.strip().splitlines() or [f"exit code {ended.code}"])[-1][:200]

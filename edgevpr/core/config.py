@@ -1,4 +1,4 @@
-"""The configuration, and the strict making of frozen dataclasses from the mappings of a YAML file.
+"""The configuration of all commands, and `build`, which makes frozen dataclasses from YAML mappings and checks them.
 
 An unknown key, a wrong type or a value out of range raises ConfigError with one clear sentence.
 """
@@ -19,7 +19,7 @@ from edgevpr.core.yamlfile import read_yaml
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-FORMS = ("float", "8bit", "1bit")  # of a vector in RAM, each smaller than the one before: see techniques.vectors
+FORMS = ("float", "8bit", "1bit")  # number formats of vectors in RAM, from large to small: see techniques.vectors
 LOWEST_RATE_HZ, HIGHEST_RATE_HZ = 0.01, 60.0  # of queries
 BUDGET_MB = (1, 65_536)  # of the index in RAM
 SOURCES = (
@@ -34,8 +34,8 @@ _WORDS = {float: "a number", int: "a whole number", str: "a text", bool: "true o
 
 @dataclass(frozen=True, slots=True)
 class Flag:
-    """A key of the configuration as a command-line flag: its names, the placeholder of its value in the help, the help
-    text, and the allowed values (empty: any). The type and the range of the value belong to the key."""
+    """Command-line flag of a configuration key: its names, the placeholder of its value in the help (None: argparse's
+    own), the help text, and the allowed values (empty: any). `Key` has the type and the range of the value."""
 
     names: tuple[str, ...]
     metavar: str | None
@@ -44,13 +44,13 @@ class Flag:
 
 
 def keyed(flag: Flag | None = None, sets: bool = True) -> Any:
-    """Make a dataclass field that may be a flag. The flag of a key that is true or false takes no value: it `sets`
-    one."""
+    """Make a dataclass field that `flag` (None: no flag) sets on the command line. The flag of a boolean key takes no
+    value: giving it sets the key to `sets`."""
     return field(metadata={"flag": flag, "sets": sets})
 
 
 def bounded(low: float, high: float, flag: Flag | None = None) -> Any:
-    """Make a dataclass field whose value, unless it is None, must lie in low..high, and that may be a flag."""
+    """Make a dataclass field whose value must be None or within low..high, set by `flag` (None: no flag)."""
     return field(metadata={"range": (low, high), "flag": flag})
 
 
@@ -206,8 +206,8 @@ class Config:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Key:
-    """A key of the configuration: its dotted name, the type of its value (None apart), its lowest and highest value,
-    its command-line flag, and what the flag `sets` where that is true or false."""
+    """A configuration key: its dotted name ("source.rate_hz"), the type of its value (besides None), its lowest and
+    highest value, its command-line flag (None: there is none), and the value that a boolean flag `sets`."""
 
     name: str
     kind: type
@@ -217,7 +217,7 @@ class Key:
 
 
 def keys_of(cls: type = Config, prefix: str = "") -> Iterator[Key]:
-    """Yield every key of the configuration in the order of the fields."""
+    """Yield the keys of the dataclass `cls` and its sections in the order of the fields; names begin with `prefix`."""
     hints = typing.get_type_hints(cls)
     for each in fields(cls):
         kind = _kind(hints[each.name])
@@ -235,9 +235,10 @@ def keys_of(cls: type = Config, prefix: str = "") -> Iterator[Key]:
 
 
 def load_config(path: str | Path | None, overrides: dict[str, Any] | None = None) -> Config:
-    """Load the defaults, then the user's file, then `overrides` ({"source.rate_hz": 2.0}; None values are left out).
+    """Load the shipped defaults, replace values by those of the file `path` (None: no file), then by `overrides`
+    ({"source.rate_hz": 2.0}; None values are ignored).
 
-    Each of these replaces values of the ones before. Raises ConfigError with the file, the key and what to do.
+    Raises ConfigError, whose message names the file, the key and what to do.
     """
     defaults_path = shipped("deploy") / "config.yaml"
     merged = read_yaml(defaults_path)
@@ -254,13 +255,13 @@ def load_config(path: str | Path | None, overrides: dict[str, Any] | None = None
 
 
 def changed_config(config: Config, path: str | Path) -> Config:
-    """Return a configuration with the keys of a YAML file in place of its own. Raises ConfigError."""
+    """Return a copy of `config` with the values of the YAML file `path` in place of its own. Raises ConfigError."""
     return build(Config, _overlaid(asdict(config), read_yaml(path), str(path), ""), str(path))
 
 
 def with_logs_in(config: Config, folder: str) -> Config:
-    """Return a configuration in which the relative paths of all that a flight writes about itself are meant from a
-    folder."""
+    """Return a copy of `config` in which the paths of logs and recordings of a flight, where relative, are relative to
+    `folder`."""
 
     def meant_from(path: str | None) -> str | None:
         return path and os.path.join(folder, path)
@@ -271,7 +272,7 @@ def with_logs_in(config: Config, folder: str) -> Config:
 
 
 def build(cls: type[T], mapping: dict[str, Any], where: str, prefix: str = "") -> T:
-    """Build the frozen dataclass `cls` from a mapping, strictly. `where` names the file in messages.
+    """Build the frozen dataclass `cls` from a mapping. In messages, `where` is the file and `prefix` begins each key.
 
     Raises ConfigError for a key that is unknown or missing, and for a value of a wrong type or out of range.
     """
@@ -329,8 +330,8 @@ def _converted(value: Any, hint: Any, limits: tuple[float, float] | None, where:
 
 
 def require_sayable(text: str, what: str) -> None:
-    """Check that a text can be the name of a file; raises ConfigError for one with NUL or half a character (a lone
-    surrogate), which no file has and no output takes. `what` begins the sentence."""
+    """Check that `text` can be a file name and be printed. Raises ConfigError for a NUL character or half a character
+    (a lone surrogate). `what` is the beginning of the message, such as the file and the key."""
     problem = "a NUL character" if "\0" in text else None
     try:
         os.fsencode(text)
@@ -341,7 +342,8 @@ def require_sayable(text: str, what: str) -> None:
 
 
 def _kind(hint: Any) -> Any:
-    """Return the type of a value without its None: float for `float | None`, dict for `dict[str, Any]`."""
+    """Return the class of a type hint without None and parameters: float for `float | None`, dict for
+    `dict[str, Any]`."""
     options = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
     kind = next(option for option in options if option is not type(None))
     return typing.get_origin(kind) or kind

@@ -1,4 +1,8 @@
-"""The contract of a technique: its specification, its descriptor of an image, and its comparison of query and place."""
+"""The contract of a technique: its specification, its descriptor of an image, and its comparison of query and place.
+
+A technique recognises places. It splits a picture into regions and scores hypotheses, such as rotations of the query.
+All of edgevpr uses techniques only through these types; `edgevpr/techniques` implements them.
+"""
 
 import math
 from collections.abc import Sequence
@@ -10,7 +14,7 @@ import numpy as np
 
 @dataclass(frozen=True, slots=True)
 class PartSpec:
-    """Shape and little-endian dtype ("<f4", "<i1", ...) of one part of a descriptor."""
+    """Array shape and little-endian NumPy dtype ("<f4", "<i1", ...) of one part of a descriptor."""
 
     shape: tuple[int, ...]
     dtype: str
@@ -24,7 +28,7 @@ class PartSpec:
 
 
 def nearest_height(height_ratios: Sequence[float], height_ratio: float) -> float:
-    """Return the one of some height ratios that is nearest to another, by their quotient."""
+    """Return the member of `height_ratios` whose quotient with `height_ratio` is nearest to 1."""
     return min(height_ratios, key=lambda ratio: abs(math.log(ratio / height_ratio)))
 
 
@@ -32,18 +36,21 @@ def nearest_height(height_ratios: Sequence[float], height_ratio: float) -> float
 class TechniqueSpec:
     """The specification of a technique.
 
-    A map file stores the fields from `name` to `packed`. The map is used only by a technique of the same name, the same
-    value of every parameter, the same model, and the same form of both parts. `packed` is the form of a place in RAM,
-    made by `Technique.pack`. None: a place in RAM is its coarse part, unchanged.
+    A map file stores the fields from `name` to `packed`. Only a technique with equal name, parameters, model and
+    shapes and dtypes of both parts can use the map.
+    `coarse`, `fine`: the two parts of a place's descriptor. `fine` None: there is no fine part.
+    `model_sha256`: hash of the network file. None: no network is used.
+    `packed`: the row of a place in the index in RAM, made by `Technique.pack`. None: the row is the coarse part.
 
-    The other fields describe abilities beyond the contract; a map does not store them. `form` is the form of the
-    vectors in RAM. It is one of `forms`, each smaller than the one before (None and empty: there is one form only).
-    `sequence` is the usual number of queries matched together. With `scan_counts` the score of the scan is part of the
-    final score (see `places.retrieve`). A technique that tries a query in several rotations tries only those within
-    `heading_within_deg` of the rotation that known headings give (None: it does not use headings). One that has
-    `height_ratios` finds a query from another height than the map's, when it is asked for from the nearest of them.
-    `cells` is how many cells of a `FineMatch` the longest side of a picture has (None: a shift says nothing about
-    metres). Of more places than `in_full`, those that look best at a glance are compared in full (None: all are).
+    A map does not store the other fields. They describe optional abilities:
+    `form`: how numbers of vectors are stored in RAM, one of `forms`, which go from large to small. None: no choice.
+    `sequence`: default number of queries that are matched together.
+    `scan_counts`: the score of the scan is a part of the final score (see `places.retrieve`).
+    `heading_within_deg`: only rotations of the query within so many degrees of the expected one are tried, where the
+    headings are known. None: headings are not used.
+    `cells`: number of cells of `FineMatch.shift_cells` along a picture's longest side. None: shifts give no metres.
+    `height_ratios`: heights of the camera, over that of the map, at which a query can be recognised.
+    `in_full`: of more candidates than so many, only the best by `Technique.glance` go to `match`. None: all do.
     """
 
     name: str
@@ -63,7 +70,7 @@ class TechniqueSpec:
 
     @property
     def row(self) -> PartSpec:
-        """The form of one place in the index in RAM."""
+        """Shape and dtype of the row of one place in the index in RAM."""
         return self.packed or self.coarse
 
 
@@ -71,10 +78,12 @@ class TechniqueSpec:
 class Descriptor:
     """The descriptor of one image.
 
-    `coarse` becomes one row of the index in RAM (see `Technique.pack`). `fine` stays in the map file and is read for
-    candidates only. `regions` are the region descriptors of a query. `good` (bool, one a region) tells which of them
-    are compared. `quality` (0..1) is the share of the image that holds information. `picture` is kept for a query that
-    may have to be turned.
+    `coarse`: becomes one row of the index in RAM (see `Technique.pack`). `fine`: stays in the map file and is read for
+    candidates only (None: the technique has none).
+    `regions`: the region descriptors of a query. `good`: bool, one for each region, True if it is compared. None: the
+    technique does not use them.
+    `quality`: share of the image that holds information, 0..1.
+    `picture`: the prepared query, for a technique that encodes it again in other rotations (else None).
     """
 
     coarse: np.ndarray
@@ -87,9 +96,9 @@ class Descriptor:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """The prepared picture that a descriptor was made from. `grey` is float32 (side, side), None where the picture is
-    never turned. `allowed` is a bool mask of the same shape (None: all pixels). `seen` is bool, True for each block
-    that is wholly allowed."""
+    """The prepared picture that a descriptor was made from. `grey` is float32 (side, side), None if the picture is
+    never rotated. `allowed` is bool (side, side), True for pixels that may be used (None: all). `seen` is bool, one
+    for each block of cells, True if all of its pixels are allowed."""
 
     grey: np.ndarray | None
     allowed: np.ndarray | None
@@ -98,11 +107,13 @@ class Picture:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Support:
-    """Support of a step by all regions of query and place, beside those that voted for it. `back` is the share of
-    the place's regions that find their most similar region of the query at this step, and `mutual` the share of those
-    that are also found by it. `likeness` (cosine) is the mean similarity of the query's regions to the most similar one
-    of the place, wherever it is. `log_rank` is the mean natural logarithm of the rank that the region at this step has
-    among all of the place, by similarity: 0 where it is always the most similar."""
+    """Agreement of all regions of query and place with one displacement: the shift that `FineMatch.shift_cells` gives.
+
+    `back`: share (0..1) of the place's regions whose most similar region of the query lies at this displacement.
+    `mutual`: share (0..1) where, in addition, the query's region finds the place's region as its most similar one.
+    `likeness`: mean cosine similarity of each region of the query to the most similar one of the place, anywhere.
+    `log_rank`: for each region of the query, the place's regions are ranked by similarity; mean natural logarithm of
+    the rank (from 1) of the region at this displacement. 0: it is always the most similar."""
 
     back: float
     mutual: float
@@ -112,12 +123,14 @@ class Support:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FineMatch:
-    """The result of comparing one place with the query: `score` in 0..1, and values that only some techniques give
-    (else None). `shift_cells` is the step from the query to the place (dx, dy in cells), with its covariance (var x,
-    cov xy, var y). `rotation_deg` is the rotation of the camera since the map was made (clockwise, 0..360), and
-    `height_ratio` the camera's height above the ground over that of then. `coverage`
-    (0..1) is the share of the place's regions that agree with this step, each counted once, however many regions of the
-    query resemble it. `support` is what the other regions say."""
+    """Result of comparing the query with one place: `score`, 0..1. Only some techniques give the rest (else None).
+
+    `shift_cells`: middle of the query from the middle of the place, (dx right, dy down), in cells of the place.
+    `covariance_cells2`: its covariance (var x, cov xy, var y).
+    `rotation_deg`: rotation of the camera since the place was mapped, clockwise, 0..360.
+    `height_ratio`: height of the camera above the ground, divided by its height when the place was mapped.
+    `coverage`: share (0..1) of the place's regions that agree with this shift, each counted once.
+    `support`: agreement of all other regions with this shift."""
 
     score: float = field(kw_only=False)
     shift_cells: tuple[float, float] | None = None
@@ -129,21 +142,21 @@ class FineMatch:
 
 
 class Technique(Protocol):
-    """The contract of `edgevpr/techniques/*.py`. A technique without a fine part needs no `match`. A technique whose
-    spec has no `packed` needs no `pack`, and one whose spec has no `in_full` needs no `glance`."""
+    """The methods of a technique. Those whose `spec.fine` is None need no `match`, those whose `spec.packed` is None
+    no `pack`, and those whose `spec.in_full` is None no `glance`."""
 
     spec: TechniqueSpec
     candidates: int  # places compared after the scan, unless the configuration sets another number
     min_score: float  # least score of an accepted match, unless the configuration sets another
     min_margin: float  # least margin of an accepted match over the best place elsewhere, likewise
-    min_quality: float  # least `Descriptor.quality` of a query that says enough to be recognised
+    min_quality: float  # least `Descriptor.quality` of a query that holds enough to be recognised
 
     def encode(self, image: np.ndarray, mask: np.ndarray | None = None) -> Descriptor:
-        """Encode a uint8 image; `mask` (H, W) bool is False where the image must not be used."""
+        """Encode an image, uint8 (H, W[, 3]). `mask`, bool (H, W), is False for pixels to be ignored (None: none)."""
         ...
 
     def pack(self, coarse: np.ndarray, mean: np.ndarray) -> np.ndarray:
-        """Pack coarse parts (N, *coarse.shape) into rows of the index (N, *row.shape); `mean` is that of the map."""
+        """Pack coarse parts (N, *coarse.shape) to rows of the index (N, *row.shape); `mean` is the map's mean part."""
         ...
 
     def coarse_scores(
@@ -154,24 +167,25 @@ class Technique(Protocol):
         turned_deg: np.ndarray | None = None,
         height_ratio: float | None = None,
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Score all places at once: `rows` (N, *row.shape) -> scores (N,) float32 and the scores by hypothesis.
+        """Score all places of the index, given as `rows` (N, *row.shape). Returns
+        * the scores, float32 (N,), and
+        * the score of each hypothesis that `match` can try, float32 (N, H), -inf if it is ruled out; None: no choice.
 
-        Where `match` has several hypotheses to try, the second value is the score of each, float32 (N, H), -inf for
-        one that is ruled out; else None. `mean` is the mean coarse part of the map for a technique that packs, else
-        None. `turned_deg` float (N,) is the expected rotation of the camera since each place was mapped, in the sense
-        of `FineMatch.rotation_deg` (NaN: unknown). Only a technique with `spec.heading_within_deg` is given
-        `turned_deg`; it then allows only rotations near the expected one. Likewise only one with
-        `spec.height_ratios` is given `height_ratio`, in the sense of `FineMatch.height_ratio` (None: that of the
-        map)."""
+        `mean`: mean coarse part of the map, for a technique that packs (else None).
+        `turned_deg`: expected `FineMatch.rotation_deg` of each place, float (N,), NaN: unknown. Other rotations are
+        ruled out. None: nothing is expected. Given only to a technique with `spec.heading_within_deg`.
+        `height_ratio`: expected `FineMatch.height_ratio` (None: 1). Given only to one with `spec.height_ratios`."""
         ...
 
     def match(self, query: Descriptor, fine: np.ndarray, hypotheses: Sequence[int] | None) -> FineMatch:
-        """Compare the query with the fine part of one place, under the given hypotheses (None: under all)."""
+        """Compare the query with the fine part of one place under `hypotheses`, columns of `coarse_scores` (None:
+        all)."""
         ...
 
     def glance(
         self, query: Descriptor, fine: np.ndarray, hypotheses: Sequence[int] | None
     ) -> tuple[float, list[int] | None]:
-        """Compare a part of the query with one place: about the score that `match` would give, and which of the
-        hypotheses is best (None where there is none to choose)."""
+        """Compare only a part of the query's regions with one place; arguments as of `match`. Returns
+        * an estimate of the score that `match` would give, and
+        * the best of the hypotheses, as the list for `match` (None: there is nothing to choose)."""
         ...

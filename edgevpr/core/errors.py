@@ -1,14 +1,15 @@
-"""The errors that a user can meet. Every message is one sentence that names the cause and says what to do."""
+"""The errors that a user can meet. Every message is one sentence that names the cause and says what to do. `exit_code`
+is the exit status of the command line."""
 
 
 class EdgevprError(Exception):
-    """Something that the program works with is wrong (a file, a link, a map): exit code 1."""
+    """Base class: something that the program works with (a file, a link, a map) cannot be used. Exit code 1."""
 
     exit_code = 1
 
 
 class UsageError(EdgevprError):
-    """The user asked for something that makes no sense (an option, a configuration key): exit code 2."""
+    """The user's request (an option, a configuration key) is wrong. Exit code 2."""
 
     exit_code = 2
 
@@ -38,7 +39,8 @@ class MapBusyError(MapError):
 
 
 class PlaceError(MapError):
-    """One place of a map cannot be used; others may be usable. `place_id` is its number, `problem` a few words."""
+    """One place of a map cannot be used; others may be usable. `place_id` is the place's number in the map file `path`,
+    and `problem` says in a few words what is wrong."""
 
     def __init__(self, path: object, place_id: int, problem: str) -> None:
         super().__init__(f"{path}: place {place_id} is damaged ({problem}): `edgevpr map check` says what else is.")
@@ -50,10 +52,11 @@ class LinkError(EdgevprError):
 
 
 class LinkAddressError(LinkError):
-    """The address of a MAVLink link is wrong, and no waiting will change that: a wrong request, exit code 2."""
+    """The address of a MAVLink link is wrong, so that opening it again will not help. Exit code 2."""
 
     exit_code = 2
 
 
 class ModelError(EdgevprError):
-    """A network cannot be used because of its card, its file, its output, the words learned on it, or onnxruntime."""
+    """A network cannot be used. The cause is its card (the YAML file that describes it), its file, its output, the
+    words (learnt region descriptors) made with it, or onnxruntime."""

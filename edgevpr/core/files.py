@@ -1,5 +1,5 @@
-"""Files: the shipped and the user's own folders; files of foreign origin, opened only where they are files and no
-larger than expected; files that are written as a whole or not at all."""
+"""Files: the shipped and the user's own folders; safe reading of files of any origin, which must be regular files of
+limited size; and writing of files that are complete or not there at all."""
 
 import errno
 import hashlib
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import numpy as np
 
 T = TypeVar("T")
-_KERNEL_FILE_BYTES = 1_000_000  # those of /proc and /sys say that they have none
+_KERNEL_FILE_BYTES = 1_000_000  # read at most of a file of /proc or /sys, which report a size of 0
 
 
 def shipped(kind: str) -> Path:
@@ -40,20 +40,21 @@ def own_models() -> Path:
 
 
 def model_folders() -> tuple[Path, ...]:
-    """Return the folders that are searched for a model: the user's own, then the shipped one. The first match wins."""
+    """Return the folders that are searched for a model, in this order: the user's own, the shipped one."""
     return own_models(), shipped("models")
 
 
 def find_model(file: str) -> Path | None:
-    """Return the path of a file in the `model_folders`, None where none has it or the name leads out of them."""
+    """Return the path of the file named `file` in the first of the `model_folders` that has it. None: no folder has
+    it, or the name contains "/"."""
     return next((folder / file for folder in model_folders() if "/" not in file and (folder / file).is_file()), None)
 
 
 def open_file(path: str | Path, most_bytes: int) -> BinaryIO:
-    """Open a regular file of at most `most_bytes` for reading, without waiting for anybody.
+    """Open a regular file of at most `most_bytes` for reading, without blocking.
 
-    Raises OSError with a `strerror` fit for a sentence: also for a pipe, which would wait for a writer, for a device,
-    which may never end, and for a larger file.
+    Raises OSError, with a `strerror` that fits into a sentence, also for a larger file, for a pipe, which would wait
+    for a writer, and for a device, which may never end.
     """
     handle = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
     try:
@@ -72,7 +73,7 @@ def open_file(path: str | Path, most_bytes: int) -> BinaryIO:
 def read_file(path: str | Path, most_bytes: int) -> bytes:
     """Read a regular file of at most `most_bytes`; raises OSError as `open_file` does."""
     with open_file(path, most_bytes) as handle:
-        # Never more at once than the file has: Python makes room first for all that is asked for.
+        # Never ask for more than the file has: Python allocates the requested size first.
         size = os.fstat(handle.fileno()).st_size or min(most_bytes, _KERNEL_FILE_BYTES)
         return handle.read(size) or b""  # None: a file of the kernel that would have to be waited for
 
@@ -87,8 +88,8 @@ def sha256_of(path: str | Path, most_bytes: int = sys.maxsize) -> str:
 
 
 def arrays_of(content: bytes, most_bytes: int) -> "dict[str, np.ndarray[Any, Any]]":
-    """Unpack an archive (.npz) of foreign origin to its arrays by name. Raises ValueError for one that is damaged,
-    holds objects of Python, or takes more than `most_bytes` unpacked."""
+    """Unpack the `content` of an .npz file of any origin to its arrays by name. Raises ValueError for one that is
+    damaged, holds Python objects, or takes more than `most_bytes` unpacked."""
     import zipfile  # not at the top: only networks and sets of researchers come in archives
 
     import numpy as np
@@ -104,16 +105,17 @@ def arrays_of(content: bytes, most_bytes: int) -> "dict[str, np.ndarray[Any, Any
 
 
 def require_folder(path: Path) -> None:
-    """Check that the folder of a file to be written exists, before the work and not after it; else raise UsageError."""
+    """Check, before the work, that the folder of the file `path` to be written exists; else raise UsageError."""
     if not path.resolve().parent.is_dir():
         raise UsageError(f"{path}: there is no such folder: make it first.")
 
 
 def write_whole(path: Path, write: Callable[[Path], T], instead: bool = True) -> T:
-    """Let `write` write a temporary file, sync it to the disk, and rename it to `path`; return the result of `write`.
+    """Write a file completely or not at all. Call `write` with the path of a temporary file that it must write, flush
+    that to the disk, and rename it to `path`. Return the result of `write`.
 
-    If anything fails, as on a full disk, the temporary file is deleted. With `instead`, a file of that name is
-    replaced; without it, FileExistsError is raised.
+    If anything fails, as on a full disk, the temporary file is deleted. With `instead`, an existing file is replaced;
+    without it, FileExistsError is raised.
     """
     unfinished = path.with_name(f".{path.name}.{os.getpid()}")
     try:

@@ -1,4 +1,4 @@
-"""Distances on the Earth, for flights of some metres to some kilometres."""
+"""Distances and projections on the Earth, for flights of some metres to some kilometres. Angles are in degrees."""
 
 import math
 from typing import overload
@@ -15,7 +15,7 @@ def distance_m(lat_deg: float, lon_deg: float, other_lat_deg: float, other_lon_d
 @overload
 def distance_m(lat_deg: Degrees, lon_deg: Degrees, other_lat_deg: Floats, other_lon_deg: Floats) -> Floats: ...
 def distance_m(lat_deg: Degrees, lon_deg: Degrees, other_lat_deg: Degrees, other_lon_deg: Degrees) -> Degrees:
-    """Return the metres between points given in degrees (scalars, or arrays that broadcast); NaN stays NaN."""
+    """Return the distance in metres between points (scalars, or arrays that broadcast); NaN where one is NaN."""
     north_m, turn = _north_m_and_turn(lat_deg, lon_deg, other_lat_deg, other_lon_deg)
     middle_deg = np.add(lat_deg, other_lat_deg) / 2
     distance: Floats = np.hypot(north_m, turn * EARTH_RADIUS_M * np.cos(np.radians(middle_deg)))
@@ -31,8 +31,8 @@ def offset_m(
 def offset_m(
     lat_deg: Degrees, lon_deg: Degrees, other_lat_deg: Degrees, other_lon_deg: Degrees
 ) -> tuple[Degrees, Degrees]:
-    """Return the metres (east, north) from a point to others (scalars, or arrays that broadcast), on the plane that
-    touches the Earth at the point; NaN stays NaN."""
+    """Return the offset (east, north) in metres from the first point to the other (scalars, or arrays that broadcast),
+    on the plane that touches the Earth at the first point; NaN where one is NaN."""
     north_m, turn = _north_m_and_turn(lat_deg, lon_deg, other_lat_deg, other_lon_deg)
     return turn * EARTH_RADIUS_M * np.cos(np.radians(lat_deg)), north_m
 
@@ -46,15 +46,15 @@ def _north_m_and_turn(
 
 
 def metres(lat_deg: Floats, lon_deg: Floats) -> tuple[Floats, Floats]:
-    """Project places (N,), degrees, to metres (east, north) on the plane that touches the Earth at the first known
-    place; NaN stays NaN."""
+    """Project points, float (N,) each, to metres (east, north), float (N,) each, on the plane that touches the Earth at
+    the first point that is not NaN. NaN stays NaN."""
     known = np.flatnonzero(~np.isnan(lat_deg))
     lat_0_deg, lon_0_deg = (lat_deg[known[0]], lon_deg[known[0]]) if len(known) else (0.0, 0.0)
     return offset_m(lat_0_deg, lon_0_deg, lat_deg, lon_deg)
 
 
 def moved(lat_deg: float, lon_deg: float, east_m: float, north_m: float) -> tuple[float, float]:
-    """Return the point (lat_deg, lon_deg) that is so many metres east and north of a point: the reverse of
+    """Return the point (lat_deg, lon_deg) that lies `east_m` and `north_m` metres from the given point: the reverse of
     `offset_m`."""
     north_deg = math.degrees(north_m / EARTH_RADIUS_M)
     east_deg = math.degrees(east_m / (EARTH_RADIUS_M * max(math.cos(math.radians(lat_deg)), 1e-9)))
@@ -62,7 +62,7 @@ def moved(lat_deg: float, lon_deg: float, east_m: float, north_m: float) -> tupl
 
 
 def axes_of(up_deg: float) -> Doubles:
-    """Return the directions on the ground of the right and of the top of a picture, as the columns of a matrix (2, 2):
-    east and north of each. The top points to the compass direction `up_deg`."""
+    """Return a picture's axes on the ground, for a picture whose top points to the compass direction `up_deg`: float64
+    (2, 2). The first column is the unit vector (east, north) of the picture's right, the second that of its top."""
     up = math.radians(up_deg)
     return np.array([[math.cos(up), math.sin(up)], [-math.sin(up), math.cos(up)]])

@@ -1,5 +1,5 @@
-"""Text for people and programs: what is foreign made fit to be shown, tables, lines of JSON, progress, and the check
-that a picture of figures can be drawn."""
+"""Text output of all commands: escaping of text of foreign origin, tables, lines of JSON, progress, and figures drawn
+with matplotlib."""
 
 import json
 import logging
@@ -22,19 +22,19 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 T = TypeVar("T")
-# user:password@ of an address. A password may hold `@` and, wrongly, `/`: all up to the last @ of the word is left out.
-# An address that was taken for a path has one `/` only.
+# user:password@ of an address. A password may hold `@` and, wrongly, `/`: all up to the last @ of the word is replaced.
+# An address that was handled as a path has one `/` only.
 _PASSWORD = re.compile(r"(\w:/{1,2}[^\s/:@]*):\S*@")
 # Cameras take their secrets in the query of an address, too.
 _SECRET = re.compile(r"(?i)([?&](?:password|passwd|passwort|pass|pwd|token|secret|api_?key|key|auth)=)[^&\s#]*")
 _COLUMNS, _TERMINAL_COLUMNS = 120, 79
-_SOON_S = 10.0  # less is not worth a word, and too short to judge by
+_SOON_S = 10.0  # no remaining time is shown if it, or the time since the start, is shorter
 _PICTURE_ENDINGS = (".png", ".pdf", ".svg")
 
 
 def printable(text: str, keep: str = "") -> str:
-    """Escape what a terminal would act on or cannot show: control characters, line breaks, marks that turn the
-    direction of writing, bytes that are not UTF-8. The characters in `keep` stay."""
+    """Escape characters that a terminal acts on or cannot show: control characters, line breaks, marks that change the
+    direction of writing, bytes that are not UTF-8. The characters in `keep` stay as they are."""
     if text.isprintable():  # false for all of these
         return text
     return "".join(char if char.isprintable() or char in keep else _escape(char) for char in text)
@@ -47,31 +47,32 @@ def _escape(char: str) -> str:
 
 
 def without_passwords(text: str) -> str:
-    """Replace the passwords of the addresses in a text: rtsp://user:***@host/path."""
+    """Replace passwords and keys in the addresses of a text by ***: rtsp://user:***@host/path?token=***."""
     if ":/" not in text:
         return text
     return _SECRET.sub(r"\1***", _PASSWORD.sub(r"\1:***@", text))
 
 
 def shown(text: str, keep: str = "") -> str:
-    """Return a text as every message shows it: without passwords, and printable."""
+    """Make a text fit for messages: see `without_passwords` and `printable`, which also explains `keep`."""
     return printable(without_passwords(text), keep)
 
 
 def decoded_name(name: str) -> str:
-    """Return the name of a file as UTF-8 can hold it: bytes that are not UTF-8 become \\xNN."""
+    """Return a file name as valid UTF-8 text: bytes that are not UTF-8 become \\xNN."""
     return os.fsencode(name).decode("utf-8", "backslashreplace")
 
 
 def meant(name: str, known: Iterable[str], otherwise: str) -> str:
-    """Ask whether the most similar of the `known` names was meant; `otherwise` where none is similar."""
+    """Return "did you mean `X`?" with the one of the `known` names that is most similar to `name`; `otherwise` if none
+    is similar."""
     near = get_close_matches(name, list(known), n=1)
     return f"did you mean `{near[0]}`?" if near else otherwise
 
 
 def aligned(rows: Sequence[Sequence[str]], left: int = 1) -> list[str]:
-    """Lay out rows in columns, one line for each row. The first `left` columns are flush left, the others flush right.
-    A short row ends early."""
+    """Format rows of cells as a table, one line for each row. The first `left` columns are flush left, the others flush
+    right. Rows may have fewer cells than others."""
     columns = range(max(len(row) for row in rows))
     widths = [max(len(row[column]) for row in rows if column < len(row)) for column in columns]
     return [
@@ -102,8 +103,8 @@ def json_line(value: Any) -> bytes:
 
 
 def _plain(value: Any) -> Any:
-    """Return `value` in JSON's types. Numbers are rounded to seven decimals (a centimetre of latitude, and what MAVLink
-    carries) or seven digits, whichever is more."""
+    """Convert `value` to types of JSON. Numbers are rounded to seven decimals (a centimetre of latitude, as in MAVLink)
+    or, below 1, to seven significant digits."""
     if isinstance(value, str):
         return without_passwords(value)
     if value is None or isinstance(value, (bool, int)):
@@ -131,8 +132,8 @@ def progress(
     clock: Callable[[], float] = time.monotonic,
 ) -> Iterator[T]:
     """Yield the items of `iterable`; write to `stream` (None: stderr) how many of `total` (0: unknown) are done, and
-    how long the others will take if they take as long. On a terminal one line is redrawn; elsewhere a line is written
-    for every tenth of the work."""
+    an estimate of the remaining time. `label` begins the line. On a terminal the line is redrawn; elsewhere a new line
+    is written for every tenth of the work (of unknown total: for every 100 items)."""
     stream = stream or sys.stderr
     terminal = stream.isatty()
     last_step, width, began_s = None, 0, clock()
@@ -162,8 +163,8 @@ def _time_left(passed_s: float, done: int, total: int) -> str:
 
 
 def waiting(text: str, stream: TextIO | None = None) -> None:
-    """Show on a terminal what is waited for, in a line that the next call replaces; "" clears it. Elsewhere nothing is
-    written: the result says what came of it."""
+    """Show on a terminal what the program waits for, in a line that the next call replaces; "" clears the line. If
+    `stream` (None: stderr) is no terminal, write nothing."""
     stream = stream or sys.stderr
     if stream.isatty():
         stream.write(f"{text[:_TERMINAL_COLUMNS]:<{_TERMINAL_COLUMNS}}\r")
@@ -171,9 +172,9 @@ def waiting(text: str, stream: TextIO | None = None) -> None:
 
 
 def require_picture(path: Path) -> None:
-    """Check that a picture of figures can be written to `path`, before the work and not after it.
+    """Check, before the work, that a figure can be written to `path` (.png, .pdf or .svg).
 
-    Raises UsageError for a wrong file name or a missing folder, EdgevprError where matplotlib is missing.
+    Raises UsageError for a wrong file name or a missing folder, EdgevprError if matplotlib is missing.
     """
     if path.suffix.lower() not in _PICTURE_ENDINGS:
         raise UsageError(f"{path}: a picture's name ends in {', '.join(_PICTURE_ENDINGS)}: choose one of these.")

@@ -1,5 +1,5 @@
-"""YAML files of foreign origin: the owner of PyYAML. Read without aliases and within limits of size, depth and digits,
-so that no file takes more than its own length in time and memory; a key that stands there twice is an error."""
+"""Reading of YAML files of any origin; the only module that imports PyYAML. Aliases and duplicate keys are errors, and
+size, depth and digits are limited, so that time and memory grow only with the length of the file."""
 
 from copy import deepcopy
 from functools import cache, lru_cache
@@ -16,8 +16,8 @@ _MERGE = "tag:yaml.org,2002:merge"
 
 
 def read_yaml(path: str | Path) -> dict[str, Any]:
-    """Read a YAML mapping; raises ConfigError for a file that is missing, unreadable, too large or not a mapping, for a
-    key that stands there twice, and for aliases (`*name`, `<<`), which can multiply a small file without end."""
+    """Read a YAML mapping; an empty file gives {}. Raises ConfigError for a file that is missing, unreadable, too large
+    or not a mapping, for a duplicate key, and for aliases (`*name`, `<<`), which can make a small file huge."""
     import yaml  # not at the top: the command line lists its flags without it
 
     try:
@@ -39,7 +39,7 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
 # Commands read some files several times, all boards above all, and PyYAML takes 3 to 8 ms for each on a workstation.
 @lru_cache(maxsize=32)
 def _content(text: str) -> Any:
-    """Return what a YAML text holds, the same object each time. Raises yaml.YAMLError, ValueError, OverflowError."""
+    """Parse a YAML text. Cached: the caller must not change the result. Raises YAMLError, ValueError, OverflowError."""
     import yaml
 
     return yaml.load(text, _loader())
@@ -47,11 +47,11 @@ def _content(text: str) -> Any:
 
 @cache
 def _loader() -> type:
-    """Make PyYAML's safe loader strict. A function, because PyYAML is imported with the first file."""
+    """Return a strict subclass of PyYAML's safe loader. PyYAML is imported here, when the first file is read."""
     import yaml
 
     class StrictLoader(yaml.SafeLoader):
-        """Reads what a person would write in a configuration, and nothing else."""
+        """Loader that refuses aliases, merges, duplicate keys, deep nesting and huge whole numbers."""
 
         levels = 0
 
