@@ -65,8 +65,7 @@ def sync(file: BinaryIO) -> None:
 
 
 def sync_folder(path: str | Path) -> None:
-    """Flush the folder of `path`, and so the file's name, to the disk. Links are followed. Errors are ignored, such as
-    those of FAT, whose folders cannot be flushed."""
+    """Flush the folder of the file `path` (links followed), and so its name, to the disk. Errors are ignored."""
     with suppress(OSError):
         folder = os.open(os.path.dirname(os.path.realpath(path)), os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:

@@ -342,8 +342,7 @@ def require_sayable(text: str, what: str) -> None:
 
 
 def _kind(hint: Any) -> Any:
-    """Return the class of a type hint without None and parameters: float for `float | None`, dict for
-    `dict[str, Any]`."""
+    """Return the class of a type hint, without None or parameters: dict for `dict[str, Any] | None`."""
     options = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
     kind = next(option for option in options if option is not type(None))
     return typing.get_origin(kind) or kind

@@ -1,5 +1,4 @@
-"""The errors that a user can meet. Every message is one sentence that names the cause and says what to do. `exit_code`
-is the exit status of the command line."""
+"""The errors that a user can meet. Every message is one sentence that names the cause and says what to do."""
 
 
 class EdgevprError(Exception):

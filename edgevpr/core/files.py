@@ -45,8 +45,7 @@ def model_folders() -> tuple[Path, ...]:
 
 
 def find_model(file: str) -> Path | None:
-    """Return the path of the file named `file` in the first of the `model_folders` that has it. None: no folder has
-    it, or the name contains "/"."""
+    """Return the path of `file` in the first of the `model_folders` that has it. None: none has it, or it has a "/"."""
     return next((folder / file for folder in model_folders() if "/" not in file and (folder / file).is_file()), None)
 
 

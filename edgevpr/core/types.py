@@ -25,11 +25,13 @@ class Position:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pose:
-    """The way in which a picture lies on the ground, for a camera that looks straight down. `up_deg` is the compass
-    direction (0..360) of the top of the picture, and `footprint_m` the length on the ground of its longest side. The
-    middle of the picture is the place's position, with `covariance_m2` (variance east, covariance, variance north).
-    `is_surveyed`: cut from a geo-referenced picture, so that nothing is left to refine. `recorded` is the position as
-    it was before it was refined (None: it was not moved)."""
+    """Direction and size on the ground of a place's picture, for a camera that looks straight down.
+
+    `up_deg`: compass direction (0..360) of the picture's top. `footprint_m`: ground length of its longest side.
+    `covariance_m2`: covariance of the place's position, which is the middle of the picture (variance east, covariance,
+    variance north).
+    `is_surveyed`: True if the picture was cut from an orthophoto, so that the pose needs no refinement.
+    `recorded`: the place's position before refinement (None: refinement did not move it)."""
 
     up_deg: float
     footprint_m: float
@@ -40,7 +42,8 @@ class Pose:
 
 @dataclass(frozen=True, slots=True)
 class Receiver:
-    """Position of a GPS receiver, with the standard deviation of one axis, and the time at which it was new."""
+    """Position from a GPS receiver: degrees, standard deviation `sd_m` of one axis, and `t_s`, the time of its arrival
+    (seconds on the clock of the frames)."""
 
     lat_deg: float
     lon_deg: float
@@ -50,16 +53,17 @@ class Receiver:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Vehicle:
-    """The state of the aircraft as the autopilot reports it: estimated position (degrees, metres above sea level),
-    heading of the nose (0..360 clockwise from north, None: unknown), and `t_heard_s`, the time of the report on the
-    clock of the frames. `has_gps`: at that time a receiver had a 3D fix near that position. Without `has_gps` the
-    position may be wrong: an autopilot goes on reporting its estimate long after it has lost GPS, and it does not
-    follow a receiver that it does not trust. `roll_deg` (right wing down is positive), `pitch_deg` (nose up),
-    `height_m` above the ground, `velocity_m_s` over it (east, north) and `sink_m_s` (down) are None where unknown.
-    `position_sd_m` is the standard deviation of one axis of the position, None where it is unknown or the autopilot has
-    no position of its own to rely on. `gps` is the newest position of a receiver, near
-    that position or not (None: there is none that is new), and `t_fix_s` when the newest fix of ours was sent or taken
-    that may be in the position (-inf: none is)."""
+    """The state of the aircraft as the autopilot reports it. None: unknown.
+
+    `lat_deg`, `lon_deg`, `alt_m`: its estimated position (metres above sea level).
+    `heading_deg`: compass direction of the nose, 0..360. `t_heard_s`: when the report came, on the clock of the frames.
+    `has_gps`: True if a GPS receiver had a 3D fix near the estimated position then. If False, the position may be
+    wrong: an autopilot reports its estimate long after GPS is lost, and ignores a receiver that it does not trust.
+    `roll_deg`, `pitch_deg`: positive with the right wing down, and with the nose up. `height_m`: above the ground.
+    `velocity_m_s`: over the ground (east, north). `sink_m_s`: speed downwards.
+    `position_sd_m`: standard deviation of one axis of the position; also None if the autopilot does not rely on it.
+    `gps`: newest position of a receiver, near the estimate or not (None: none is recent).
+    `t_fix_s`: time of the newest fix from edgevpr that may already affect the position (-inf: none does)."""
 
     lat_deg: float
     lon_deg: float
@@ -77,17 +81,18 @@ class Vehicle:
     t_fix_s: float = -math.inf
 
     def is_fresh_at(self, t_mono_s: float) -> bool:
-        """Tell whether the report came within one second of `t_mono_s`, such as the time of a frame."""
+        """Return True if the report came within one second of `t_mono_s`, such as the time of a frame."""
         return abs(t_mono_s - self.t_heard_s) <= _FRESH_S
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Frame:
-    """One picture and its known data (None: unknown). `image` is uint8, (H, W) grey or (H, W, 3) BGR. `t_mono_s` is
-    seconds of the monotonic clock, `t_utc_s` seconds since 1970, `heading_deg` 0..360 clockwise from true north.
-    `roll_deg` (right wing down is positive) and `pitch_deg` (nose up) are those of the airframe or, of a camera on a
-    gimbal, its deviation from straight down; `height_m` is above the ground. `pose` is how the picture lies on the
-    ground."""
+    """One picture and the data known of it (None: unknown).
+
+    `image`: uint8, (H, W) grey or (H, W, 3) BGR. `t_mono_s`: seconds of the monotonic clock. `t_utc_s`: seconds since
+    1970. `heading_deg`: 0..360 clockwise from true north.
+    `roll_deg`, `pitch_deg`: of the airframe, positive with the right wing down, and with the nose up; of a camera on a
+    gimbal, its deviation from straight down. `height_m`: above the ground."""
 
     image: np.ndarray
     name: str
@@ -103,8 +108,8 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class Salience:
-    """MS, SS and ES of a frame (thesis 3.2.4), each 0..1: how memorable, static and full of information it is; None for
-    what was not looked at. `is_low`: it passed only because there would have been too wide a gap without it."""
+    """MS, SS and ES of a frame (thesis 3.2.4), each 0..1: how memorable, static and full of information it is (None:
+    not computed). `is_low`: the frame is below a threshold, and is a place only to close a long gap between places."""
 
     memorability: float | None
     staticity: float | None
@@ -117,15 +122,15 @@ class Salience:
         return {"memorability": self.memorability, "staticity": self.staticity, "entropy": self.entropy}
 
     def rounded(self) -> dict[str, float | None]:
-        """Return the scores as they are written for people and programs: four digits."""
+        """Return the three scores by their names, rounded to four decimals for output."""
         return {name: score if score is None else round(score, 4) for name, score in self.scores.items()}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Place:
-    """A place of the map without its descriptors, which are read separately. Units are those of `Frame`. `salience` is
-    None where the map was made without that gate, and `pose` where it is not known how the picture lies on the
-    ground."""
+    """A place of the map without its descriptors, which are read separately. Units are those of `Frame`. `place_id` is
+    its number in the map, `source_image` the name of its picture, `quality` that of its `Descriptor`. `salience` is
+    None if the map was made without the salience criteria. Others: None is unknown."""
 
     place_id: int
     source_image: str
@@ -139,7 +144,7 @@ class Place:
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A place that may be the one in the query, and its match. Retrieval returns candidates best first."""
+    """A place that the query may show, and the result of comparing the two. Retrieval returns candidates best first."""
 
     place: Place
     match: FineMatch
@@ -147,7 +152,7 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True)
 class StageCost:
-    """Cost of one stage: wall seconds, and CPU-seconds of all threads of the process."""
+    """Cost of one stage of the work: elapsed (wall) seconds, and CPU-seconds of all threads of the process."""
 
     wall_s: float
     cpu_s: float
@@ -168,9 +173,9 @@ NO_COST = StageCost(0.0, 0.0)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Steps:
-    """Costs of the steps of one query: `read` the picture (in a flight only), `prepare` it (level it on the ground),
-    look whether it passes the `gate`, `encode` it, `scan` all places, `compare` and judge the candidates, `verify` the
-    best one by its landmarks, and `locate` the aircraft. A step that the query did not reach has no cost."""
+    """Costs of the steps of one query: `read` the picture (in a flight only), `prepare` it (warp it as seen from
+    straight above), test its salience (`gate`), `encode` it, `scan` all places, `compare` and judge the candidates,
+    `verify` the best one by its landmarks, `locate` the aircraft. A step that the query did not reach has no cost."""
 
     read: StageCost = NO_COST
     prepare: StageCost = NO_COST
@@ -194,10 +199,12 @@ class Steps:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class QueryCost:
-    """Cost of one query by equations 5.1-5.7: times, utilisations of all cores, memory, charge drawn from the pack.
+    """Cost of one query by equations 5.1-5.7 of the thesis, for the stages of encoding and matching.
 
-    `rss_mb` is read at the query. `pss_mb`, with shared pages in proportion, may be some seconds old (None: the kernel
-    does not report it).
+    `t_*_s`: elapsed seconds. `u_*`: utilisation of all cores, 0..1. `cpu_s`: CPU-seconds of both.
+    `rss_mb`: memory of the process now. `pss_mb`: memory with shared pages in proportion, some seconds old (None: the
+    kernel does not report it).
+    `used_mah`: charge drawn from the battery; `marginal_mah`: the part that would not be drawn without the query.
     """
 
     t_encode_s: float
@@ -218,10 +225,12 @@ class QueryCost:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FixReport:
-    """The outcome of the position fix of a `query`. `sent` is True, False (`why` gives the reason), or None while the
-    fix waits to be sent or, over TCP, to be confirmed by the other end. `answer` is the answer of the autopilot, the
-    name of a MAV_RESULT; None: no answer (yet). `lat_deg`, `lon_deg` and `accuracy_m` are what it says (None: there was
-    nothing to be sent)."""
+    """The outcome of the position fix of one query.
+
+    `query`: name of the frame. `sent`: True, False (`why` gives the reason), or None while the fix waits to be sent or,
+    over TCP, for the acknowledgement of the receiver.
+    `answer`: the autopilot's answer, the name of a MAV_RESULT (None: no answer, or none yet).
+    `lat_deg`, `lon_deg`, `accuracy_m`: position and accuracy in the fix (None: there was nothing to send)."""
 
     query: str
     sent: bool | None
@@ -236,26 +245,27 @@ T = TypeVar("T")
 
 
 class Tape(Protocol):
-    """Takes note of what comes in, or gives it back. All values are those of JSON, or bytes."""
+    """Records all values that enter a flight from outside, or plays a recording back. Values are JSON types or bytes.
+    `kind` is the name of the input, such as "frame"."""
 
     def read(self, kind: str, look: Callable[[], T]) -> T:
-        """Return what `look` finds; or, of a flight that is run again, what it found then."""
+        """Call `look` and record and return its result; in a replay, return the recorded result instead."""
         ...
 
     def note(self, kind: str, *values: Any) -> None:
-        """Take note of what has happened without being asked for, in another thread."""
+        """Record values that came without being asked for through `read`, also from another thread."""
         ...
 
 
 class NoTape:
-    """Stands in for a `Tape` where nothing is recorded."""
+    """A `Tape` that records nothing and replays nothing."""
 
     def read(self, kind: str, look: Callable[[], T]) -> T:
-        """Return what `look` finds."""
+        """Call `look` and return its result."""
         return look()
 
     def note(self, kind: str, *values: Any) -> None:
-        """Take note of nothing."""
+        """Do nothing."""
 
 
 NO_TAPE = NoTape()
