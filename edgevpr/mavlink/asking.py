@@ -87,7 +87,7 @@ class Inquiry:
 
     @property
     def refused(self) -> Mapping[str, int]:
-        """The number of messages refused since their signature is missing or wrong, by reason. Empty without a key."""
+        """The number of messages refused for their signature or its time stamp, by reason. Empty without a key."""
         return self._signing.refused
 
     def heartbeat(self, wait_s: float = HEARTBEAT_WAIT_S) -> Message | None:
@@ -126,8 +126,8 @@ class Inquiry:
         return values
 
     def round_trips_s(self, count: int) -> list[float]:
-        """Send `count` TIMESYNC requests, one after another, and return the seconds that each took to be answered. A
-        request without an answer within a second is left out."""
+        """Send `count` TIMESYNC requests, one after another, and return the round-trip time of each in seconds. Those
+        without an answer within a second are left out."""
         times_s = []
         for _ in range(count):
             sent_ns = time.monotonic_ns()
@@ -141,8 +141,7 @@ class Inquiry:
         return times_s
 
     def _read_parameters(self, names: Collection[str], values: dict[str, float | int], bytewise: bool) -> None:
-        """Request the parameters `names`, and store the answers in `values`. Ends when each is answered, or no answer
-        has come for a second."""
+        """Request the parameters `names`, and store the answers in `values`, until no answer has come for a second."""
         waiting = set(names)
         for name in names:
             self._put(messages.parameter_request(self.system_id or 0, name))
@@ -161,8 +160,7 @@ class Inquiry:
         return next((message for message in self._messages(wait_s) if is_wanted(message)), None)
 
     def _messages(self, wait_s: float) -> Iterator[Message]:
-        """Yield the messages of the autopilot: first those received already, then those that arrive within `wait_s`
-        seconds."""
+        """Yield the autopilot's messages: those received already, then those that arrive within `wait_s` seconds."""
         end_s = time.monotonic() + wait_s
         while True:
             while self._arrived:

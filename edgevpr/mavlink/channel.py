@@ -1,8 +1,7 @@
 """Channels: the ways in which an autopilot can be told a position, and the rule that chooses one for a firmware and a
 kind of vehicle. Used by the link in flight, and by `edgevpr doctor` for its advice.
 
-The rules were read in the source code of ArduPilot 4.7-dev, and tried on it in simulation, and in that of PX4
-1.17-alpha.
+The rules were read in the source code of PX4 1.17-alpha and of ArduPilot 4.7-dev, and tried on ArduPilot's simulator.
 """
 
 import logging
@@ -115,8 +114,7 @@ def ardupilot_choice(answers: Answers) -> Choice:
 
 
 def receiver_name(parameters: Mapping[str, float], number: int) -> str:
-    """Return the parameter that holds the type of GPS receiver `number` (0: the first): GPS1_TYPE or, before ArduPilot
-    4.6, GPS_TYPE."""
+    """Return the parameter with the type of GPS receiver `number` (0: the first): GPS1_TYPE, before 4.6 GPS_TYPE."""
     return _known_name(parameters, _RECEIVERS[number])
 
 

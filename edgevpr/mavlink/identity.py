@@ -1,5 +1,4 @@
-"""The identity of the one autopilot that a link talks to, and the rule by which another sender may take its place. Used
-by `peer`."""
+"""The identity of the one autopilot that a link talks to, and the rule by which another sender may take its place."""
 
 import logging
 import math
@@ -18,8 +17,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Speaker:
-    """The sender of an autopilot's messages: its system id, and its network address (None on a link that can have only
-    one sender)."""
+    """The sender of an autopilot's messages: its system id, and its address (None if the link has one sender only)."""
 
     system_id: int
     address: Sender | None

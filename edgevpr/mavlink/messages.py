@@ -156,8 +156,7 @@ def gps_distance(t_mono_s: float, off_m: float) -> Message:
 
 
 def source_set(number: int, target_system: int) -> Message:
-    """Make a COMMAND_LONG (76) with SET_EKF_SOURCE_SET (42007): `number` is the source set (1..3) that ArduPilot shall
-    use."""
+    """Make a COMMAND_LONG (76) with SET_EKF_SOURCE_SET (42007): ArduPilot shall use source set `number` (1..3)."""
     return _command(target_system, mavlink.MAV_CMD_SET_EKF_SOURCE_SET, number)
 
 

@@ -43,8 +43,7 @@ class Listener(Protocol):
         return
 
     def hear_channel(self, channel: Channel) -> None:
-        """Note the channel by which the autopilot is told positions. Called when it is first chosen, and when it
-        changes."""
+        """Note the channel by which the autopilot is told positions: when first chosen, and when it changes."""
         return
 
     def hear_vehicle(self, vehicle: Vehicle) -> None:
@@ -57,8 +56,7 @@ class Listener(Protocol):
         return
 
     def state_at(self, t_s: float) -> MotionState | None:
-        """Return position and motion of the vehicle at `t_s`, to be sent on a continuous channel. None: they are not
-        known well enough."""
+        """Return the vehicle's position and motion at `t_s`, for a continuous channel; None: not known well enough."""
         return None
 
 
@@ -96,8 +94,7 @@ class Autopilot:
         return self.identity.kept.system_id if self.identity.kept else None
 
     def listens(self, now_s: float) -> bool:
-        """Return True if a heartbeat of the autopilot came in the last five seconds, and since the port was last
-        opened."""
+        """Return True if the autopilot's heartbeat came in the last five seconds, through the port now open."""
         return now_s - self._heard_s <= SILENT_AFTER_S
 
     def forget_presence(self) -> None:
@@ -168,8 +165,7 @@ class Autopilot:
         return False
 
     def unix_s(self, t_mono_s: float) -> float | None:
-        """Convert a time of our monotonic clock to the autopilot's UTC, seconds since 1970. None: it has not sent its
-        time."""
+        """Convert a time of our monotonic clock to the autopilot's UTC, seconds since 1970; None if that is unknown."""
         return None if self._utc_ahead_s is None else t_mono_s + self._utc_ahead_s
 
     def _hear_position(self, message: Message, now_s: float) -> None:

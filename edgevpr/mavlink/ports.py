@@ -51,8 +51,7 @@ class Port:
         return b""
 
     def write(self, data: bytes) -> int:
-        """Write as many bytes as fit without waiting, and return their number. Raises OSError if the connection is
-        lost."""
+        """Write the bytes that fit without waiting; return their number. Raises OSError if the connection is lost."""
         with suppress(BlockingIOError):
             return os.write(self.fileno(), data)
         return 0

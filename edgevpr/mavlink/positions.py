@@ -52,8 +52,7 @@ def position_sensor(fix: Fix, t_sent_s: float) -> Message:
 
 def gps_input(state: MotionState | None, receiver: int, t_mono_s: float, t_unix_s: float | None) -> Message:
     """Make a GPS_INPUT (232) as GPS receiver number `receiver` (0: the first). A `state` of None is sent as "no fix".
-    `t_mono_s` is the time of the state, `t_unix_s` the same time by the vehicle's clock, seconds since 1970 (None:
-    unknown)."""
+    `t_mono_s` is the time of the state, `t_unix_s` the same time in UTC, seconds since 1970 (None: unknown)."""
     week, week_ms = _gps_time(t_unix_s)
     ignored = mavlink.GPS_INPUT_IGNORE_FLAG_HDOP | mavlink.GPS_INPUT_IGNORE_FLAG_VDOP
     east, north, down = state.velocity_m_s if state else (0, 0, 0)

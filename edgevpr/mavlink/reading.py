@@ -1,5 +1,4 @@
-"""All that an autopilot tells about itself before the flight, requested once and put into plain values. Used by
-`edgevpr doctor`."""
+"""All that an autopilot tells about itself before the flight, as plain values. Used by `edgevpr doctor`."""
 
 import statistics
 import time
@@ -106,8 +105,7 @@ def read_autopilot(asking: Inquiry, wanted: Mapping[str, Iterable[str]]) -> Auto
 
 
 def _no_message(message_id: int) -> Message | None:
-    """Return None, in place of `Inquiry.message`, for an autopilot that answers nothing: each question would take three
-    seconds."""
+    """Stand in for `Inquiry.message` if the autopilot answers nothing: each question would take three seconds."""
     return None
 
 

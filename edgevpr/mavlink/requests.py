@@ -180,8 +180,7 @@ def _asks(message: Message, us: tuple[int, int]) -> bool:
 
 
 def version() -> Message:
-    """Make the AUTOPILOT_VERSION (148) of this companion: the version of edgevpr, and the abilities to use MAVLink 2
-    and COMMAND_INT."""
+    """Make the AUTOPILOT_VERSION (148) of this companion: the version of edgevpr, and that it uses MAVLink 2."""
     major, minor, patch = (int(each) for each in re.findall(r"\d+", f"{__version__}.0.0")[:3])
     nothing = [0] * 8
     return mavlink.MAVLink_autopilot_version_message(

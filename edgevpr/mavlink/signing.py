@@ -3,8 +3,7 @@ and by `edgevpr check` and `doctor`.
 
 pymavlink signs what is sent. Its check of what arrives is not used: it would store the time stamp of a message before
 it compares the signature, so that one forged message from the far future would shut out all true ones. Time stamps
-never go back, neither in a flight nor from one flight to the next. All are integers in units of 10 microseconds since
-2015.
+(integers, in units of TICKS_S) never go back, neither in a flight nor from one flight to the next.
 """
 
 import hashlib
@@ -23,7 +22,7 @@ from edgevpr.core.errors import ConfigError
 from edgevpr.core.files import open_file, read_file, write_whole
 from edgevpr.mavlink.wire import Message, mavlink
 
-TICKS_S = 100_000  # a time stamp counts units of 10 microseconds since the beginning of 2015, UTC
+TICKS_S = 100_000  # per second: a time stamp counts units of 10 microseconds since the beginning of 2015, UTC
 _EPOCH_S = 1_420_070_400
 _LATEST = 2**48 - 1  # it has six bytes
 _NEAR = 60 * TICKS_S
@@ -107,8 +106,7 @@ class TimeStamps:
             return None
 
     def _now(self) -> int:
-        """Return the current time stamp: the later of the system's clock, and the largest time learnt plus the time
-        since."""
+        """Return the current time stamp, by the system's clock or, if later, counted from the largest one learnt."""
         by_system = int((self._utc_s() - _EPOCH_S) * TICKS_S)
         return max(by_system, self._base + int((self._mono_s() - self._base_s) * TICKS_S))
 

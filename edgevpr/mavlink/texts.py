@@ -1,5 +1,4 @@
-"""The queue of texts for the people on the ground. It spaces them out, drops repetitions, and replaces what is out of
-date. Used by `conversation`."""
+"""The queue of texts for the people on the ground: it spaces them out, and drops repeated and outdated ones."""
 
 import logging
 import math

@@ -1,5 +1,4 @@
-"""Attitude, height and position accuracy of the vehicle, from the autopilot's messages of the last seconds. Used by
-`peer`."""
+"""Attitude, height and position accuracy of the vehicle, from the autopilot's messages of the last seconds."""
 
 import math
 from dataclasses import dataclass
@@ -101,8 +100,7 @@ class Heights:
             self._range = (message.current_distance / 100 * max(0.0, lean), now_s) if is_good else None
 
     def now(self, over_takeoff_m: float, now_s: float) -> float:
-        """Return the height in metres; it is `over_takeoff_m`, that over the take-off point, if nothing better is
-        recent."""
+        """Return the height in metres: `over_takeoff_m`, that over the take-off point, if nothing better is recent."""
         for measured, good_for_s in ((self._range, _RANGE_FRESH_S), (self._terrain, _TERRAIN_FRESH_S)):
             if measured and now_s - measured[1] <= good_for_s and math.isfinite(measured[0]):
                 return measured[0]

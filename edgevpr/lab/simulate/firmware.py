@@ -13,9 +13,7 @@ from edgevpr.lab.simulate.motion import Motion
 from edgevpr.lab.simulate.sensors import ExternalNavigation, PositionMeasurement, Receivers, Reckoning
 from edgevpr.mavlink.wire import Message, mavlink, parameter_value
 
-GATE_SD = (
-    5.0  # the largest innovation, in standard deviations, that is accepted; ArduPilot: EK3_POS_I_GATE, EK3_VEL_I_GATE
-)
+GATE_SD = 5.0  # standard deviations that an innovation may have; ArduPilot: EK3_POS_I_GATE, EK3_VEL_I_GATE
 OK: int = mavlink.MAV_RESULT_ACCEPTED
 FAILED: int = mavlink.MAV_RESULT_FAILED
 DENIED: int = mavlink.MAV_RESULT_DENIED
@@ -155,8 +153,7 @@ class Parameters(Mapping[str, float]):
         self._values[name] = type(self._values[name])(value)
 
     def set_written(self, name: str, text: str) -> None:
-        """Set a parameter from text that the user wrote. Raises UsageError for an unknown name, and for a text that is
-        no valid value."""
+        """Set a parameter from the user's text. Raises UsageError for an unknown name, and for an invalid value."""
         if name not in self._values:
             raise UsageError(f"The vehicle has no parameter {name}: it has {', '.join(sorted(self._values))}.")
         kind = type(self._values[name])

@@ -83,8 +83,7 @@ class AlongTrack(Motion):
 
 
 def read_track(csv_path: str | Path) -> FlownTrack:
-    """Read the rows of a positions.csv that have a position and a time, sorted by time. Raises UsageError if there are
-    none."""
+    """Read the rows of a positions.csv with position and time, sorted by time. Raises UsageError if there are none."""
     rows = []
     for tag in read_positions(csv_path).values():
         if tag.position and tag.t_utc_s is not None:

@@ -86,8 +86,7 @@ class Px4(Firmware):
         return OK
 
     def take_global_position(self, message: Message) -> None:
-        """Fuse a GLOBAL_POSITION_SENSOR (296). The times in it are ignored: its age is the parameter EKF2_AGP0_DELAY
-        (ms)."""
+        """Fuse a GLOBAL_POSITION_SENSOR (296). Its time stamps are ignored: EKF2_AGP0_DELAY (ms) is its age."""
         is_ours = message.id == self.parameters["EKF2_AGP0_ID"] != 0  # 0: the slot is off
         if not message.eph > 0 or not is_ours or not int(self.parameters["EKF2_AGP0_CTRL"]) & 1:
             return
