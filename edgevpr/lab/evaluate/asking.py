@@ -1,4 +1,7 @@
-"""The queries of a data set, asked one by one by the code that flies, and what each answer is worth."""
+"""Asks the queries of a data set one by one, with the recogniser of a flight, and judges each answer by ground truth.
+
+`evaluate`, and through it the workers of `many`, use this module.
+"""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -27,20 +30,21 @@ from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.runtime.recognise.salience_gate import Gate
 
 T = TypeVar("T")
-Progress = Callable[[Iterable[T], int, str], Iterable[T]]
-_NOTHING_FOUND = Ranking(np.empty(0, np.intp), np.empty(0, np.float32), {})  # a picture that says nothing
+Progress = Callable[[Iterable[T], int, str], Iterable[T]]  # yields the items, of that number, and shows it with a label
+_NOTHING_FOUND = Ranking(np.empty(0, np.intp), np.empty(0, np.float32), {})  # e.g. of a discarded query
 
 
 def optional(low: float, high: float) -> Any:
-    """Make a field that is None unless it is given, and then lies in low..high."""
+    """Make a dataclass field whose default is None. A value that a configuration gives must lie in low..high."""
     return field(default=None, metadata=bounded(low, high).metadata)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MatchOptions:
-    """Manner of matching: `candidates` places are compared (None: the technique's own number, as it flies); with
-    `exact` all are, and the scan chooses none. `sequence` queries are matched together, in the order of their names
-    (None: the technique's own number); with `follow` they are followed as those of one flight."""
+    """Options of matching. `candidates`: how many places are compared in full (None: the technique's own number, as in
+    flight); with `exact` all are, without a scan. `sequence`: how many successive queries, in the order of their names,
+    are matched together (None: the technique's own number). `follow`: the filter follows them as one flight's frames.
+    """
 
     candidates: int | None = optional(1, 1_000_000)
     sequence: int | None = optional(1, 100)
@@ -50,10 +54,13 @@ class MatchOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class QueryAnswer:
-    """The answer to one query: the reference that was `found`, its score and the rank of the first right one (from 0,
-    infinite: there is none), all among the references that count. `accepted`: the flight would have accepted the match;
-    `accepted_wrong`: it would have, and the match is wrong; `accepted_elsewhere`: and not beside a right one either.
-    `discarded`: the query was not memorable. `encoding` and `matching` are the costs of the two stages."""
+    """The judged answer to one query. `found` is the name of the best reference that is not ignored (None: there is
+    none) and `score` its score; `first_right` is the rank of the first right reference, from 0 (infinite: none).
+
+    `accepted`: a flight would have accepted the match; `accepted_wrong`: and it is wrong; `accepted_elsewhere`: and it
+    is no neighbour of a right or ignored reference (`places.retrieve.elsewhere`). `discarded`: the salience gate
+    dropped the query as not memorable. `encoding` and `matching` are the costs of the two stages.
+    """
 
     query: str
     found: str | None
@@ -73,8 +80,8 @@ class QueryAnswer:
 
 
 class Walk:
-    """A recogniser that is ready to be asked, and how it is asked. `length` queries are matched together, and where
-    `is_in_order` an answer depends on the queries before it."""
+    """A recogniser that is open on a map, set up by `options`. `length` is the number of queries that are matched
+    together. `is_in_order` is True if an answer depends on the queries before it."""
 
     def __init__(
         self,
@@ -105,17 +112,17 @@ class Walk:
         self.recogniser = recogniser(self.length, follows)
 
     def warm_up(self, path: Path) -> None:
-        """Ask a query that is not counted: the first one pays for lazy imports, tables and a cold disk."""
+        """Recognise the image `path` without counting it: the first query pays for lazy imports and a cold disk."""
         asked(self._once, path)
         if self._gate:
             self._gate.forget()
 
 
 def answer_of(event: Recognition, query: ScoredQuery, references: Sequence[str], index: PlaceIndex) -> QueryAnswer:
-    """Judge what was recognised. `references` are the names of all places, in the order in which they were mapped."""
+    """Judge the recognition `event` of `query`. `references` are the names of all places, in the order of mapping."""
     discarded = event.worth is not None and event.worth.reason is not None
     ranking = (None if discarded else event.ranking) or _NOTHING_FOUND
-    # Slots of the index follow the order of mapping, which is that of the references' names.
+    # The slots of the index are in the order of mapping, as `references` are.
     right = np.array([name in query.right for name in references])
     ignored = np.array([name in query.ignored for name in references])
     at = metrics.counting(ranking.slots, ignored)
@@ -136,7 +143,7 @@ def answer_of(event: Recognition, query: ScoredQuery, references: Sequence[str],
 
 
 def answers(walk: Walk, dataset: Dataset, progress: Progress[Path]) -> Iterator[QueryAnswer]:
-    """Ask all queries of a data set, and yield the answers of those that are scored."""
+    """Ask all queries of `dataset`, and yield one judged answer for each that is scored."""
     recogniser = walk.recogniser
     scored = {query.path.name: query for query in dataset.queries}
     paths = [query.path for query in dataset.queries]
@@ -149,8 +156,8 @@ def answers(walk: Walk, dataset: Dataset, progress: Progress[Path]) -> Iterator[
 
 
 def asked(recogniser: Recogniser, path: Path) -> Recognition:
-    """Recognise one image. A failure ends the evaluation (ModelError): a set with holes measures nothing."""
-    event = recogniser.step(Frame(image=read_image(path), name=path.name, t_mono_s=0.0))  # a folder has no gaps
+    """Recognise the image `path`. Raises ModelError if that fails: figures without some queries would mislead."""
+    event = recogniser.step(Frame(image=read_image(path), name=path.name, t_mono_s=0.0))  # without gaps in time
     if event.failed:
         raise ModelError(event.reason)
     return event

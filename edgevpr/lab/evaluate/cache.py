@@ -1,4 +1,5 @@
-"""Work that was done once and is kept: files and folders named by the hash of all that decides their content."""
+"""Cache on disk for the maps, results and video pictures of evaluations. Each is a file or folder that is named by the
+hash of all that decides its content."""
 
 import hashlib
 import json
@@ -21,7 +22,8 @@ _DAY_S = 86_400
 
 
 class Cache:
-    """A folder of finished work. Two programs may write to it: whatever stands under a key is whole."""
+    """A cache folder, with an entry (a file or folder) at KIND/KEY. Several programs may write to it at once: an entry
+    appears only when it is complete."""
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
@@ -29,19 +31,19 @@ class Cache:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise EdgevprError(f"{folder} cannot be made ({error.strerror}): name another folder.") from error
-        # What killed programs have left; what is younger than a day may still be at work.
+        # Delete unfinished entries of killed programs. Those younger than a day may still be written.
         for path in self.folder.glob(f"{_UNFINISHED}*"):
             with suppress(OSError):
                 if time.time() - path.stat().st_mtime > _DAY_S:
                     shutil.rmtree(path)
 
     def path(self, kind: str, key: str) -> Path:
-        """Return where the work of a kind is kept, whether it is there or not."""
+        """Return the path of the entry of this `kind` (such as "maps") and `key`; it need not exist."""
         return self.folder / kind / key
 
     def keep(self, kind: str, key: str, make: Callable[[Path], object]) -> Path:
-        """Return the path of what is kept under a key; where nothing is, `make` makes that file or folder first. Raises
-        EdgevprError where the disk does not take it, and what `make` raises."""
+        """Return the path of the entry of this `kind` and `key`. If there is none, `make` is called first, with the
+        path to write it to. Raises EdgevprError if the disk cannot be written, and what `make` raises."""
         path = self.path(kind, key)
         if path.exists():
             return path
@@ -50,7 +52,7 @@ class Cache:
             with tempfile.TemporaryDirectory(prefix=_UNFINISHED, dir=self.folder) as unfinished:
                 made = Path(unfinished) / "made"
                 make(made)
-                if not path.exists():  # another program may have kept the same meanwhile, and have it open
+                if not path.exists():  # another program may have made it meanwhile, and have it open
                     os.replace(made, path)
         except OSError as error:
             raise EdgevprError(
@@ -61,20 +63,20 @@ class Cache:
 
 
 def key_of(*parts: Any) -> str:
-    """Return the key of work that all of `parts` decide (anything that JSON holds)."""
+    """Return the key of an entry that `parts`, any values that JSON can hold, decide: their SHA-256 in hex."""
     return hashlib.sha256(json.dumps(parts, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
 @cache
 def code_of_everything() -> str:
-    """Return the hash of all that makes an answer: the package, what it ships, and the versions of the libraries."""
+    """Return a hash of all code that decides an answer: the package, the files it ships, the libraries' versions."""
     shipped_files = [path for kind in ("models", "profiles", "deploy") for path in shipped(kind).rglob("*")]
     return _hash_of([*PACKAGE.rglob("*.py"), *PACKAGE.rglob("*.json"), *shipped_files])
 
 
 @cache
 def code_of_frames() -> str:
-    """Return the hash of all that takes the frames of a video: the room of the frames, and the version of PyAV."""
+    """Return a hash of all code that decodes a video: the package `frames`, and the versions of PyAV and others."""
     return key_of(_hash_of([*(PACKAGE / "frames").rglob("*.py")]), version_of("av"))
 
 

@@ -1,4 +1,5 @@
-"""A data set: a folder of queries, a folder of references, and a ground truth that says which references are right."""
+"""A data set: a folder of queries, a folder of references (the images to map), and a ground truth, which names the
+right references of each query. `evaluate` measures techniques on it; `layouts` reads other forms of data sets."""
 
 import csv
 import io
@@ -17,8 +18,8 @@ _MAX_FILE_BYTES = 100_000_000  # a million queries
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """The references that are `right` for a query (none: it is not scored); a match in `ignored` is neither right nor
-    wrong. `where` it stands in the file, for messages."""
+    """Ground truth of one query: file names of the references that are `right` (none: the query is not scored), and of
+    those `ignored`, where a match counts as neither right nor wrong. `where` is its file and line, for messages."""
 
     right: frozenset[str]
     ignored: frozenset[str]
@@ -27,25 +28,25 @@ class Judged:
 
 @dataclass(frozen=True, slots=True)
 class GroundTruth:
-    """A ground truth: what is right for every query, by its name, in the order of the file."""
+    """Ground truth of a data set, by the file name of each query, in the order of the file."""
 
     queries: dict[str, Judged]
 
     @property
     def scored(self) -> dict[str, Judged]:
-        """The queries that are scored."""
+        """The queries that have a right reference: only these are scored."""
         return {name: judged for name, judged in self.queries.items() if judged.right}
 
     @property
     def named(self) -> frozenset[str]:
-        """All references that it names for queries that are scored."""
+        """The names of all references that are right or ignored for a scored query."""
         return frozenset().union(*(judged.right | judged.ignored for judged in self.scored.values()))
 
 
 @dataclass(frozen=True, slots=True)
 class ScoredQuery:
-    """A query that is scored: `right` are file names of references that count as correct; a match in `ignored` is
-    neither right nor wrong."""
+    """A query that is scored: the `path` of its image, and the file names of the references that are `right` and of
+    those `ignored`, where a match counts as neither right nor wrong."""
 
     path: Path
     right: frozenset[str]
@@ -54,8 +55,8 @@ class ScoredQuery:
 
 @dataclass(frozen=True, slots=True)
 class Dataset:
-    """A data set: its scored queries and the folder of its references. `references` are the names of all images of
-    `ref_dir`, in the order in which they are mapped. `notes` say what of it is left out."""
+    """A data set: its scored `queries`, and the folder `ref_dir` of its references. `references` are the file names of
+    all images there, in the order of mapping. `notes` are sentences on what is left out."""
 
     queries: tuple[ScoredQuery, ...]
     ref_dir: Path
@@ -64,7 +65,7 @@ class Dataset:
 
 
 def load_dataset(query_dir: str | Path, ref_dir: str | Path, ground_truth: str | Path) -> Dataset:
-    """Read a data set and check it against its folders. Queries that the ground truth does not name are left alone.
+    """Read a data set and check it against its folders. Images of queries that `ground_truth` lacks are left out.
 
     Raises UsageError with file, line, value and what to do, and SourceError for a folder without images.
     """
@@ -88,9 +89,9 @@ def load_dataset(query_dir: str | Path, ref_dir: str | Path, ground_truth: str |
 
 
 def read_truth(path: str | Path) -> GroundTruth:
-    """Read a CSV with the columns query_file and ref_files (names separated by spaces). Optional are ref_files_loose
-    (ignored unless they are in ref_files too) and status (only `ok` is scored). Raises UsageError with file, line,
-    value and what to do."""
+    """Read a CSV with the columns query_file and ref_files (file names separated by spaces). Optional columns are
+    ref_files_loose (references to ignore, unless they are in ref_files too) and status (only `ok` is scored). Raises
+    UsageError with file, line, value and what to do."""
     queries: dict[str, Judged] = {}
     for where, row in _rows(Path(path)):
         name = row["query_file"]
@@ -108,7 +109,7 @@ def read_truth(path: str | Path) -> GroundTruth:
 
 
 def _rows(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
-    """Yield each row of the CSV, stripped, with its place in the file for messages."""
+    """Yield each row of the CSV as (its file and line for messages, its values by column without outer spaces)."""
     try:
         reader = csv.DictReader(io.StringIO(read_file(path, _MAX_FILE_BYTES).decode("utf-8-sig"), newline=""))
         columns = list(reader.fieldnames or ())

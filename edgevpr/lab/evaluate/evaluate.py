@@ -1,4 +1,8 @@
-"""Measurement of a technique on a data set by the code that flies: map file, index, retrieval, stage meter."""
+"""Measurement of one technique on a data set: map the references, ask every query, sum up quality and costs.
+
+Map file, index, retrieval and meter are those of a flight. `edgevpr eval` and `many` use this module. Numbers in
+parentheses are sections and equations of the thesis (Mubariz Zaffar, *Visual Place Recognition for Autonomous Robots*).
+"""
 
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
@@ -36,14 +40,14 @@ from edgevpr.techniques.card import weights_of
 class TechniqueResult(Quality):
     """Result of a technique (in one form) on a data set: its quality, its weights and its cost.
 
-    Times are means over the queries: `t_match_s` is for all references, `t_match_per_ref_s` for one. `u_encode` and
-    `u_match` are shares of all cores over those times (5.1). A place takes `descriptor_bytes` in RAM, and its fine part
-    `fine_bytes` on disk. `ah_total` (5.7) is drawn from the pack, `ah_total_cpu_rail` from the thesis's rail of 2.5 V,
-    both for all queries; `ah_assumes` names board, pack and efficiency. `accepted` queries would have moved the
-    aircraft by the technique's own rule, `accepted_wrong` of them to a wrong place, `accepted_elsewhere` of these to
-    one that is no neighbour of a right place (see `places.retrieve.elsewhere`). `pcu` depends on all techniques that
-    are compared: `compare` fills it in, with the `t_encode_max_s` it used. `sequence` is the
-    number of queries that were matched together. `discarded` queries were not memorable, and count as missed.
+    `accepted`, `accepted_wrong`, `accepted_elsewhere` and `discarded` count queries by the fields of `QueryAnswer`;
+    a discarded query counts as missed. Times are means over the queries: `t_match_s` is for all references,
+    `t_match_per_ref_s` for one. `u_encode` and `u_match` are the shares of all cores that were busy, 0..1 (5.1).
+    `descriptor_bytes` is the RAM of a place, `fine_bytes` the size of its fine part on disk. Charges are for all
+    queries, in Ah: `ah_total` (5.7) from the battery pack, `ah_total_cpu_rail` from the thesis's rail of 2.5 V;
+    `ah_assumes` names board, pack and efficiency. `sequence`: how many queries were matched together. `weights`:
+    origin of the network's weights (None: no network). `pcu` and `t_encode_max_s`: filled in by `compare`, since they
+    depend on all techniques compared.
     """
 
     parameters: dict[str, int | float | str]
@@ -79,8 +83,9 @@ def evaluate(
     progress: Progress[Any] = _quietly,
     gate: Gate | None = None,
 ) -> TechniqueResult:
-    """Map the references, ask every query, and score the answers. `gate` discards queries; the map has all references,
-    as in the thesis (3.3).
+    """Map the references of `dataset` in a temporary file, ask every query, and score the answers. `parameters` are
+    those of the technique (None: its defaults). `gate` discards queries that are not memorable (None: none are); the
+    map has all references, as in the thesis (3.3).
 
     Raises UsageError for an unknown technique or parameter, ImageError for an image that cannot be used, MapError if
     the temporary map cannot be written, and ModelError for a network that cannot be used or a query that fails.
@@ -103,7 +108,7 @@ def answers_on(
     progress: Progress[Any] = _quietly,
     gate: Gate | None = None,
 ) -> list[QueryAnswer]:
-    """Ask every query of a data set in the map of its references."""
+    """Ask every query of `dataset` in the map file `path` of its references, and return the judged answers."""
     with opened(path, technique) as (place_map, index):
         walk = Walk(technique, place_map, index, own_meter(), options=options, gate=gate)
         walk.warm_up(dataset.queries[0].path)
@@ -111,7 +116,7 @@ def answers_on(
 
 
 def own_meter() -> QueryMeter:
-    """Return the meter of this machine."""
+    """Return a meter that measures the stages of a query on this machine."""
     return meter_of(load_config(None), load_board("this"))
 
 
@@ -119,8 +124,9 @@ def own_meter() -> QueryMeter:
 def mapped(
     frames: Iterable[Frame], technique: Technique, meter: QueryMeter, images: Path | None = None
 ) -> Iterator[tuple[PlaceMap, PlaceIndex]]:
-    """Map frames in a temporary folder, refine and calibrate the map as `map build` does. Give it, open to read, and
-    an index with all its places. `images` is the folder that the frames come from."""
+    """Context manager: make a temporary map as `make_map` does. Gives two parts:
+    the map, open to read;
+    an index with all its places."""
     with tempfile.TemporaryDirectory(prefix="edgevpr-eval-") as folder:
         path = Path(folder) / "references.gpkg"
         make_map(path, frames, technique, images, meter)
@@ -131,27 +137,27 @@ def mapped(
 def make_map(
     path: Path, frames: Iterable[Frame], technique: Technique, images: Path | None, meter: QueryMeter | None = None
 ) -> None:
-    """Map frames in a new file, refine and calibrate the map as `map build` does. `images` is the folder that the
-    frames come from."""
+    """Map `frames` in the new file `path`, then refine and calibrate the map as `map build` does. `images` is the
+    folder that the frames come from (None: the map is not calibrated); `meter` None: that of `own_meter`."""
     meter = meter or own_meter()
     with PlaceMap.create(path, technique.spec) as place_map:
         build_map(frames, technique, place_map, meter)
-        with suppress(UsageError):  # nothing to refine, or no SciPy: it flies as it was recorded
+        with suppress(UsageError):  # nothing to refine, or no SciPy: positions stay as they were recorded
             refine_map(place_map, technique, images, _quietly)
         if images:
-            with suppress(UsageError):  # too small a map, or one whose pictures cannot tell: by the shipped model
+            with suppress(UsageError):  # too few pictures to calibrate by: the shipped model of confidence applies
                 calibrate_map(place_map, technique, load_config(None), FlownPictures(source=str(images)), _quietly)
 
 
 @contextmanager
 def opened(path: Path, technique: Technique) -> Iterator[tuple[PlaceMap, PlaceIndex]]:
-    """Give a map, open to read, and an index with all its places."""
+    """Context manager: open the map file `path`. Gives (the map, open to read; an index with all its places)."""
     with PlaceMap.open(path) as place_map:
         yield place_map, load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
 
 
 def compare(results: Iterable[TechniqueResult]) -> list[TechniqueResult]:
-    """Fill in the PCU, which measures each technique against the slowest encoder among them."""
+    """Return the results with the PCU filled in, which rates each technique against the slowest encoder among them."""
     results = list(results)
     slowest_s = max(result.t_encode_s for result in results)
     return [
@@ -170,7 +176,7 @@ def as_json(results: Iterable[TechniqueResult]) -> dict[str, Any]:
 
 
 def from_json(row: dict[str, Any]) -> TechniqueResult:
-    """Return a result that JSON has held, whatever stands beside it."""
+    """Return the result whose fields are in `row`, as read from JSON. Other keys of `row` are left out."""
     known = {each.name: row[each.name] for each in fields(TechniqueResult) if each.name in row}
     for name, value in known.items():
         if name.endswith("_interval") and value:
@@ -179,8 +185,8 @@ def from_json(row: dict[str, Any]) -> TechniqueResult:
 
 
 def all_frames(source: Source) -> Iterator[Frame]:
-    """Yield all frames of a folder. Raises ImageError for the first that cannot be used: a set with holes measures
-    nothing."""
+    """Yield all frames of a folder. Raises ImageError for the first that cannot be used: figures without some images
+    would mislead."""
     while not source.ended:
         if frame := source.read(timeout_s=0):
             yield frame
@@ -189,7 +195,8 @@ def all_frames(source: Source) -> Iterator[Frame]:
 def summary(
     technique: Technique, references: int, answers: Sequence[QueryAnswer], sequence: int = 1
 ) -> TechniqueResult:
-    """Return the result of a technique from its answers to all queries, without the PCU."""
+    """Return the result of `technique`, without the PCU, from its answers to all queries. `references` is the number of
+    references, `sequence` the number of queries that were matched together."""
     queries = len(answers)
     scores = np.array([answer.score for answer in answers])
     ranks = np.array([answer.first_right for answer in answers])

@@ -1,14 +1,13 @@
-"""Data sets as they lie on a researcher's disk: each layout is told by its files.
+"""Reads data sets in the layouts in which they are published. A layout is recognised by its files:
 
 * query/, ref/ and ground_truth.csv: edgevpr's own.
-* query/, ref/ and ground_truth_new.npy: VPR-Bench (Zaffar et al., IJCV 2021); a row for each query, its number and the
-  numbers of the right references.
-* two folders of images and GT.npz: VPR_Tutorial (Schubert et al., 2023); GThard is right, and what is in GTsoft only
-  does not count. The first folder by name is the map's.
+* query/, ref/ and ground_truth_new.npy: VPR-Bench (Zaffar et al., IJCV 2021), read by `numbered`.
+* two folders of images and GT.npz: VPR_Tutorial (Schubert et al., 2023), read by `numbered`. The first folder by name
+  holds the references.
 * database/ and queries/, or images/test/ with both: file names like @EASTING@NORTHING@...jpg, metres of UTM (Pitts30k,
-  GSV-Cities and others in that form); right is what is near.
-* query/ and ref/ with positions (positions.csv or EXIF): right is what is near. Either may be a video with positions
-  beside it, query.mp4 with query.csv, or a folder that holds one.
+  GSV-Cities and others in that form). References near the query are right (`Nearness`).
+* query/ and ref/ with positions (positions.csv or EXIF): references near the query are right. Either side may be a
+  video with positions beside it, query.mp4 with query.csv, or a folder that holds one.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -35,9 +34,10 @@ _FORMS = "query/, ref/ and ground_truth.csv; ground_truth_new.npy; GT.npz; datab
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Nearness:
-    """A reference is right where it was taken within `within_m` metres of the query; where they are given, also with a
-    heading within `within_deg`, and with a share of at least `overlap` of the smaller picture's ground in common, by
-    height above the ground and `fov_deg`."""
+    """Rule by which a reference is right for a query: it was taken within `within_m` metres of it. Two more conditions
+    apply if they are not None: the headings differ by at most `within_deg` degrees; the two pictures have at least the
+    share `overlap` (0..1) of the smaller one's ground in common. For `overlap`, `fov_deg` is the camera's field of view
+    along the longest side, and each picture needs its height above the ground."""
 
     within_m: float = field(default=25.0, metadata=bounded(0.01, 1_000_000).metadata)
     within_deg: float | None = optional(0.1, 180)
@@ -46,9 +46,9 @@ class Nearness:
 
 
 def open_folder(folder: str | Path, rule: Nearness, pictures: Callable[[Path], Path] = Path) -> Dataset:
-    """Read the data set in a folder, whatever its layout. `pictures` finds the folder of pictures of a side that may be
-    a video (default: there are none). Raises UsageError for one that is none of them, or does not
-    fit together, and SourceError for a folder without images."""
+    """Read the data set in `folder`, in any layout above. `pictures` returns the folder of pictures of a side (query or
+    ref), given the path of a folder or a video (default: the path itself, for sets without videos). Raises UsageError
+    for an unknown layout or parts that do not fit together, and SourceError for a folder without images."""
     folder = Path(folder)
     if not folder.is_dir():
         raise UsageError(f"{folder}: there is no such folder: give one of a data set ({_FORMS}).")
@@ -71,9 +71,9 @@ def open_folder(folder: str | Path, rule: Nearness, pictures: Callable[[Path], P
 def of_positions(
     query: str | Path, ref: str | Path, rule: Nearness, pictures: Callable[[Path], Path] = Path
 ) -> Dataset:
-    """Make the data set of two folders of images, or videos, with positions; `pictures` as of `open_folder`. Raises
+    """Make a data set of two folders of images, or videos, with positions. `pictures` is that of `open_folder`. Raises
     UsageError where there are no positions, and what `pictures` raises."""
-    # One side after the other: nobody waits for the pictures of a video to hear that the other side is not there.
+    # One side after the other: an error in the first shows before the video of the second is decoded.
     query_dir = pictures(Path(query))
     queries = _tagged(query_dir)
     ref_dir = pictures(Path(ref))
@@ -154,7 +154,8 @@ def _utm_m(path: Path) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class _Shot:
-    """A picture and where it was taken, metres, and what else is known of it."""
+    """A picture: its file, its position in metres from an origin that all share, and the `tag` with its heading and
+    height."""
 
     path: Path
     east_m: float
@@ -163,7 +164,7 @@ class _Shot:
 
 
 def _tagged(folder: Path) -> list[tuple[Path, Position, GeoTag]]:
-    """Return the pictures of a folder that have a position, with it and all else that is known of them."""
+    """Return the pictures of a folder that have a position, each as (its file, its position, its whole tag)."""
     csv_path = find_positions(folder)
     known = read_positions(csv_path) if csv_path else {}
     tags = ((path, known.get(path.name) or read_exif(path)) for path in list_images(folder))
@@ -178,8 +179,8 @@ def _shots(tagged: Sequence[tuple[Path, Position, GeoTag]], origin: Position) ->
 
 
 def _near(queries: Sequence[_Shot], references: Sequence[_Shot], rule: Nearness) -> dict[str, Judged]:
-    """Return what is right for each query that has any right reference. Raises UsageError where a figure that the rule
-    needs is not known."""
+    """Return the ground truth of each query that has a right reference, by its name. Raises UsageError where no query
+    has one, or where a heading or height that `rule` needs is unknown."""
     there_m = np.array([(shot.east_m, shot.north_m) for shot in references])
     prints = [_print(shot, rule) for shot in references] if rule.overlap is not None else []
     judged = {}

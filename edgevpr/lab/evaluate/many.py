@@ -1,5 +1,5 @@
-"""Many rows on many sets, shared out to workers. Each result is a file of its own: one that is there is not measured
-again, so a run that was interrupted goes on."""
+"""Measures many rows (a technique with its settings) on many data sets in worker processes: `edgevpr eval --out`. Each
+result is a file in a cache and is not measured again, so a run that was interrupted can be continued."""
 
 import json
 import multiprocessing
@@ -41,17 +41,17 @@ from edgevpr.lab.evaluate.provenance import machine, today, versions
 from edgevpr.places.sequence import length_of
 from edgevpr.techniques import create
 
-CURVE_TO = 25  # the curve of recall@K ends there
-# Products are small here: more threads make them slower. And a result must not depend on the number of workers.
+CURVE_TO = 25  # the largest K of the curve of recall@K
+# Matrix products are small here: more threads make them slower. And a result must not depend on the number of workers.
 _ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 
-Failures = dict[tuple[str, str], str]
+Failures = dict[tuple[str, str], str]  # by the names of set and row: a sentence on why it was not measured
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OpenSet:
-    """A data set that was read: its name, the plan of it, its queries and references, and the hashes of what decides
-    its map, and of what is asked."""
+    """A data set that was read, with two parts of cache keys: `references_key` hashes all of the set that decides its
+    map, `queries_key` the queries and their ground truth."""
 
     name: str
     plan: SetPlan
@@ -62,8 +62,8 @@ class OpenSet:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RowOnSet:
-    """A row on a set, its technique, and the keys under which its result is kept, and its map, which other rows may
-    share. Where it `is_in_order` an answer may depend on the queries before it."""
+    """One row (named `label`) to measure on one set, `of`. `key` is the cache key of its result, `map_key` that of its
+    map, which other rows may share. `is_in_order` is True if an answer may depend on the queries before it."""
 
     of: OpenSet
     label: str
@@ -78,14 +78,14 @@ class RowOnSet:
         return self.of.name, self.label
 
     def technique(self) -> Technique:
-        """Open the technique, as it is set for this set."""
+        """Make the technique, with its settings for this set."""
         return create(self.row.technique, self.row.settings(self.of.plan.camera))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Made:
-    """Story of a result: the date (UTC) of its measurement, the machine and the versions at that time, the `workers`
-    that were busy beside each other, and whether it `was_kept` from an earlier run."""
+    """Origin of a result: the date (UTC) of its measurement, the machine and the versions at that time, the number of
+    `workers` that ran at once, and whether it `was_kept` in the cache by an earlier run."""
 
     date: str
     machine: dict[str, Any]
@@ -95,7 +95,7 @@ class Made:
 
     @property
     def story(self) -> str:
-        """The date and the machine, in a few words."""
+        """The date, the machine and the version of edgevpr, in a few words."""
         earlier = "earlier, " if self.was_kept else ""
         cores = f"{self.machine['cpu']}, {self.workers} of {self.machine['cores']} cores"
         return f"{earlier}{self.date}, {cores}, edgevpr {self.versions['edgevpr']}"
@@ -103,7 +103,8 @@ class Made:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MeasuredRow:
-    """The result of a row on a set, `recalls` at K from 1 on, all answers, and how it was made."""
+    """The result of the row `label` on a set. `recalls` are recall@1, recall@2 and so on to recall@`CURVE_TO`, or to as
+    many as there are references. `answers` are those to all scored queries."""
 
     set_name: str
     label: str
@@ -115,7 +116,7 @@ class MeasuredRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Measurements:
-    """All that was measured, the sets it was measured on, and by (set, row) why others were not."""
+    """Outcome of a run: its sets, the rows on sets that were measured (`found`), and why others `failed`."""
 
     sets: tuple[OpenSet, ...]
     found: tuple[MeasuredRow, ...]
@@ -123,9 +124,9 @@ class Measurements:
 
 
 def measure(plan: EvaluationPlan, folder: str | Path, workers: int, progress: Progress[Any]) -> Measurements:
-    """Measure every row of a plan on every set; finished work is kept in `folder`. Raises EdgevprError for a set that
-    cannot be read, and where a worker dies. A row whose technique, or a picture for it, cannot be used fails by
-    itself."""
+    """Measure every row of `plan` on every set by `workers` processes, with the cache in `folder`. Raises EdgevprError
+    for a set that cannot be read, and where a worker dies. A technique or picture that cannot be used only makes its
+    row fail."""
     cache = Cache(folder)
     sets = tuple(_open_set(name, each, cache, progress) for name, each in plan.sets.items())
     rows, failed = _rows_on_sets(plan, sets)
@@ -146,7 +147,7 @@ def measure(plan: EvaluationPlan, folder: str | Path, workers: int, progress: Pr
 
 
 def _open_set(name: str, plan: SetPlan, cache: Cache, progress: Progress[Any]) -> OpenSet:
-    """Read a data set; the pictures of a video are kept. Raises EdgevprError for one that cannot be used."""
+    """Read a data set and hash it; pictures of its videos are cached. Raises EdgevprError if it cannot be used."""
     dataset = plan.open(cache, progress)
     positions = find_positions(dataset.ref_dir)
     asked = list_images(dataset.queries[0].path.parent)
@@ -165,7 +166,7 @@ def _open_set(name: str, plan: SetPlan, cache: Cache, progress: Progress[Any]) -
 
 
 def _rows_on_sets(plan: EvaluationPlan, sets: Iterable[OpenSet]) -> tuple[list[RowOnSet], Failures]:
-    """Return the rows on sets that can be measured, and why others cannot."""
+    """Return (the rows on sets that can be measured; why others cannot)."""
     rows, failed = [], {}
     techniques: dict[str, Technique] = {}
     for of in sets:
@@ -178,7 +179,7 @@ def _rows_on_sets(plan: EvaluationPlan, sets: Iterable[OpenSet]) -> tuple[list[R
                 failed[of.name, label] = str(error)
                 continue
             spec = technique.spec
-            # The form is left out: the vectors of all forms are made from one map.
+            # Without the form of the vectors: all forms are made from one map.
             map_parts = [code_of_everything(), spec.name, spec.parameters, spec.model_sha256, of.references_key]
             rows.append(
                 RowOnSet(
@@ -194,7 +195,7 @@ def _rows_on_sets(plan: EvaluationPlan, sets: Iterable[OpenSet]) -> tuple[list[R
 
 
 def _measured_by_workers(rows: Sequence[RowOnSet], cache: Cache, workers: int, progress: Progress[Any]) -> Failures:
-    """Let workers make the maps and then ask the queries, and keep each result; return why others were not measured."""
+    """Let workers make the maps and then ask the queries; cache each result. Return why some rows have none."""
     maps = {row.map_key: row for row in rows}
     failed: dict[str, str] = {}  # by the key of a map or of a row
     with _pool(min(workers, len(rows))) as pool:
@@ -223,7 +224,7 @@ def _measured_by_workers(rows: Sequence[RowOnSet], cache: Cache, workers: int, p
 
 
 def _shared_out(row: RowOnSet, count: int) -> list[tuple[ScoredQuery, ...]]:
-    """Share out the queries of a row to several workers, where an answer does not depend on the queries before it."""
+    """Split the queries of a row into at most `count` parts, one a worker. There is one part if their order matters."""
     queries = row.of.dataset.queries
     size = len(queries) if row.is_in_order else -(-len(queries) // count)
     return [queries[at : at + size] for at in range(0, len(queries), size)]
@@ -231,7 +232,7 @@ def _shared_out(row: RowOnSet, count: int) -> list[tuple[ScoredQuery, ...]]:
 
 @contextmanager
 def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
-    """Start workers that die with this process, and are killed at once where it is interrupted."""
+    """Context manager: a pool of workers that die with this process and are killed at once if it is interrupted."""
     os.environ.update(_ENVIRONMENT)
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(workers, context, _begin, (os.getpid(),))
@@ -254,7 +255,7 @@ def _begin(parent_pid: int) -> None:
 
 
 def _make_map(row: RowOnSet, folder: Path) -> str | None:
-    """Make the map of a row in a worker, where it is not there; return what went wrong."""
+    """In a worker: make the map of a row if the cache (`folder`) lacks it. Return what went wrong, None if nothing."""
     images = row.of.dataset.ref_dir
 
     def make(path: Path) -> None:
@@ -268,7 +269,7 @@ def _make_map(row: RowOnSet, folder: Path) -> str | None:
 
 
 def _ask(row: RowOnSet, folder: Path, queries: tuple[ScoredQuery, ...]) -> list[QueryAnswer] | str:
-    """Ask queries in a worker; return the answers, or what went wrong."""
+    """In a worker: ask `queries` on the cached map of a row. Return the answers, or a text on what went wrong."""
     try:
         path = Cache(folder).path("maps", row.map_key)
         dataset = replace(row.of.dataset, queries=queries)
@@ -278,14 +279,14 @@ def _ask(row: RowOnSet, folder: Path, queries: tuple[ScoredQuery, ...]) -> list[
 
 
 def _sentence(problem: Exception) -> str:
-    """Say what went wrong: a fault of a technique, a picture or a library ends one row, and not all."""
+    """Describe `problem` as a text. Even an unexpected exception, such as one of a library, ends one row only."""
     if isinstance(problem, EdgevprError):
         return str(problem)
     return f"an unforeseen {type(problem).__name__} ({problem}): report it."
 
 
 def _keep(cache: Cache, row: RowOnSet, answers: Sequence[QueryAnswer], workers: int) -> None:
-    """Sum up the answers to all queries, and keep the result."""
+    """Sum up the answers to all queries of a row, and cache the result."""
     technique, references = row.technique(), len(row.of.dataset.references)
     ranks = np.array([answer.first_right for answer in answers])
     made = Made(date=today(), machine=machine(), versions=versions(), workers=workers)
@@ -300,7 +301,7 @@ def _keep(cache: Cache, row: RowOnSet, answers: Sequence[QueryAnswer], workers: 
 
 
 def _kept(cache: Cache, row: RowOnSet) -> MeasuredRow | None:
-    """Return the result that is kept for a row on a set; None where there is none, or none that can be read."""
+    """Return the cached result of a row on a set; None if there is none. A damaged file is deleted: None as well."""
     path = cache.path("results", row.key)
     try:
         content = json.loads(path.read_text("utf-8"))
@@ -324,7 +325,7 @@ def _answer(content: dict[str, Any]) -> QueryAnswer:
 
 
 def _compared(found: Sequence[MeasuredRow]) -> tuple[MeasuredRow, ...]:
-    """Fill in the PCU, which measures each row against the slowest encoder on its set."""
+    """Return the rows with the PCU filled in, which rates each row against the slowest encoder on its set."""
     done: list[MeasuredRow] = []
     for name in dict.fromkeys(row.set_name for row in found):
         of_set = [row for row in found if row.set_name == name]

@@ -1,7 +1,8 @@
-"""The figures of thesis 2.7 and 6.3.1, as pure functions of the best match of every query.
+"""Quality figures of an evaluation (thesis 2.7 and 6.3.1), as pure functions of the best match of every query.
 
 `scores` is float (N,): the score of each query's best match. `correct` is bool (N,): whether that match is right. A
-match is accepted when its score is at least the threshold; false negatives are right matches below the threshold.
+match is accepted when its score is at least the threshold; false negatives are right matches below the threshold. So
+each threshold gives a precision and a recall, and these are the curve. Numbers like (2.1) are equations of the thesis.
 """
 
 import math
@@ -10,16 +11,16 @@ from typing import Any
 
 import numpy as np
 
-Interval = tuple[float, float]
-SEED, RESAMPLES = 0, 2000  # of the intervals
+Interval = tuple[float, float]  # lower end, upper end
+SEED, RESAMPLES = 0, 2000  # of the bootstrap that gives the intervals
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Quality:
-    """Quality of a technique on a data set. Each recall has the 95 % interval of what other queries of the same kind
-    would give (None: without SciPy). `auc` is by 2.3, and `auc_from_zero` as scikit-learn has it. `precision_recall`
-    are the points of the curve, from the highest threshold down. `roc_auc` is None if all best matches are right, or
-    none is."""
+    """Quality of a technique on a data set; all shares are 0..1. Each recall has its 95 % confidence interval (None: no
+    SciPy, see `interval`). `auc` is by equation 2.3, `auc_from_zero` as scikit-learn computes it, `ep` the extended
+    precision. `precision_recall` are the points (precision, recall) of the curve, from the highest threshold down.
+    `roc_auc` is None if all best matches are right, or none is."""
 
     technique: str
     queries: int
@@ -40,27 +41,29 @@ class Quality:
 
 
 def counting(ranked: np.ndarray, ignored: np.ndarray) -> np.ndarray:
-    """Return the positions in a ranking of the references that count, skipping those neither right nor wrong.
+    """Return the positions in `ranked`, int, of the references that count, which are those not ignored.
 
-    `ranked` is int (K,), numbers of references, best first; `ignored` is bool (references,).
+    `ranked` is int (K,), numbers of references, best first; `ignored` is bool (references,), True where a match counts
+    as neither right nor wrong.
     """
     return np.flatnonzero(~ignored[ranked])
 
 
 def first_right(ranked: np.ndarray, right: np.ndarray) -> float:
-    """Return the rank, from 0, of the first right reference of a ranking; infinite if there is none. `ranked` is int
-    (K,), `right` is bool (references,)."""
+    """Return the rank, from 0, of the first right reference; infinite if there is none. `ranked` is int (K,), numbers
+    of references, best first; `right` is bool (references,)."""
     hits = np.flatnonzero(right[ranked])
     return float(hits[0]) if len(hits) else math.inf
 
 
 def recall_at(k: int, ranks: np.ndarray) -> float:
-    """Return the share of the queries with a right reference among their first `k`; `ranks` (N,) by `first_right`."""
+    """Return the share of queries with a right reference among their first `k`. `ranks` (N,) are by `first_right`."""
     return float(np.mean(np.asarray(ranks) < k))
 
 
 def precision_recall(scores: np.ndarray, correct: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute precision and recall (2.1, 2.2) with the threshold at every score that occurs, from the highest down.
+    """Compute the curve with the threshold at every score that occurs, from the highest down. Returns (precision (2.1),
+    recall (2.2)), each float (points,).
 
     Queries with the same score are accepted together, so there is one point per distinct score. If no match at all is
     right, recall is taken to be 0.
@@ -74,7 +77,7 @@ def precision_recall(scores: np.ndarray, correct: np.ndarray) -> tuple[np.ndarra
 
 
 def auc(precision: np.ndarray, recall: np.ndarray) -> float:
-    """Compute the area under the precision-recall curve by 2.3: only the points that occur, no extra one at recall 0.
+    """Compute the area under the precision-recall curve (2.3): only the points that occur, no extra one at recall 0.
 
     It is at most (N-1)/N. It is 0 if all scores are the same: one point spans no area.
     """
@@ -82,8 +85,8 @@ def auc(precision: np.ndarray, recall: np.ndarray) -> float:
 
 
 def auc_from_zero(precision: np.ndarray, recall: np.ndarray) -> float:
-    """Compute the area under the same curve, begun at recall 0 and precision 1: the figure of scikit-learn, and of most
-    papers."""
+    """Compute the area under the precision-recall curve with an extra first point at recall 0 and precision 1, as
+    scikit-learn and most papers do."""
     return float((1 + precision[0]) / 2 * recall[0]) + auc(precision, recall)
 
 
@@ -125,8 +128,8 @@ def pcu(precision: float, t_encode_s: float, t_encode_max_s: float) -> float:
 
 
 def figures(scores: np.ndarray, ranks: np.ndarray) -> dict[str, Any]:
-    """Return all figures of a `Quality` but its names and counts. `scores`, float (N,), are those of the best matches,
-    `ranks`, float (N,), the ranks of the first right references (see `first_right`)."""
+    """Return the fields of a `Quality`, by name, except `technique` and the counts. `ranks`, float (N,), are the ranks
+    of the first right references (see `first_right`)."""
     precision, recall = precision_recall(scores, ranks == 0)
     recalls = {f"recall_at_{k}": recall_at(k, ranks) for k in (1, 5, 10)}
     return {
@@ -143,8 +146,9 @@ def figures(scores: np.ndarray, ranks: np.ndarray) -> dict[str, Any]:
 
 
 def interval(hits: np.ndarray) -> Interval | None:
-    """Return the 95 % interval of the share of hits, bool (N,), by resampling the queries. Where all hit, or none does,
-    no resampling knows better, and the interval is the exact one of Clopper and Pearson. None without SciPy."""
+    """Return the 95 % confidence interval of the share of `hits`, bool (N,), by resampling the queries (bootstrap). If
+    all or none hit, every resample gives the same share; then it is the exact interval of Clopper and Pearson. None if
+    SciPy is not installed."""
     try:
         from scipy import stats
     except ModuleNotFoundError:

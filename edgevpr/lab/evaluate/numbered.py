@@ -1,6 +1,6 @@
-"""Ground truths that number their images, from 0 in counting order of the file names.
+"""Reads ground truths that number their images, from 0 in counting order of the file names (2.png before 10.png).
 
-* GT.npz: VPR_Tutorial (Schubert et al., 2023); GThard is right, and what is in GTsoft only does not count.
+* GT.npz: VPR_Tutorial (Schubert et al., 2023); pairs in GThard are right, those in GTsoft only are ignored.
 * ground_truth_new.npy: VPR-Bench (Zaffar et al., IJCV 2021); a row for each query, its number and the numbers of the
   right references.
 """
@@ -25,8 +25,9 @@ _WHAT_IT_IS = {".npz": "GT.npz of VPR_Tutorial", ".npy": "ground truth of VPR-Be
 
 @dataclass(frozen=True, slots=True)
 class Numbered:
-    """The numbers of the references that are right, and of those that are ignored, by the number of the query that is
-    scored. `shape` is (references, queries): all there are where `is_whole`, else the least that there must be."""
+    """A ground truth with numbers for images. `judged` has, by the number of each scored query, (the numbers of the
+    right references; those of the ignored ones). `shape` is (references, queries): how many images there are if
+    `is_whole`, else how many there must be at least. `path` is its file."""
 
     path: Path
     judged: dict[int, tuple[tuple[int, ...], tuple[int, ...]]]
@@ -34,7 +35,8 @@ class Numbered:
     is_whole: bool
 
     def named(self, queries: Sequence[str], references: Sequence[str]) -> GroundTruth:
-        """Return the same with names in place of numbers; there are as many names as `shape` asks for."""
+        """Return this ground truth with names in place of numbers. `queries` and `references` are all file names in the
+        order of the numbers, at least as many as `shape` says."""
         found = dict.fromkeys(queries, Judged(frozenset(), frozenset(), str(self.path)))
         for number, both in self.judged.items():
             right, ignored = (frozenset(references[each] for each in part) for part in both)
@@ -43,12 +45,12 @@ class Numbered:
 
 
 def truth_in(path: str | Path) -> GroundTruth | Numbered:
-    """Read a ground truth of any form. Raises UsageError for one that cannot be read."""
+    """Read a ground truth: .npz and .npy by `read_numbered`, others as CSV. Raises UsageError if it cannot be read."""
     return read_numbered(path) if Path(path).suffix.lower() in _WHAT_IT_IS else read_truth(path)
 
 
 def read_numbered(path: str | Path) -> Numbered:
-    """Read a ground truth that numbers its images. Raises UsageError for a file that is none."""
+    """Read a GT.npz, or a .npy of VPR-Bench. Raises UsageError for a file that is neither."""
     path = Path(path)
     kind = path.suffix.lower()
     try:
@@ -98,7 +100,7 @@ def _numbers(values: Any) -> tuple[int, ...]:
 
 
 class _NumbersOnly(pickle.Unpickler):
-    """Reads an array of lists of numbers, as NumPy stores it by pickle, and nothing that could run a program."""
+    """Unpickler for an array of lists of numbers, as NumPy pickles it. It refuses all else: no foreign code can run."""
 
     def find_class(self, module: str, name: str) -> Any:
         if name in ("_reconstruct", "scalar") and module in ("numpy.core.multiarray", "numpy._core.multiarray"):
@@ -109,7 +111,7 @@ class _NumbersOnly(pickle.Unpickler):
 
 
 def _objects(path: Path) -> np.ndarray:
-    """Read the array of objects in a .npy file."""
+    """Read the array of objects, shape (queries, 2), in a .npy file. Raises ValueError where there is none."""
     with open_file(path, _MOST_BYTES) as handle:
         version = np.lib.format.read_magic(handle)
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0

@@ -1,5 +1,5 @@
-"""The results of an evaluation as files: JSON for programs, and a page of tables, curves, costs, and the matches that
-went wrong, to look at."""
+"""Writes the results of `many` as files: results.json for programs, and index.html for people, a page of tables,
+curves, costs and examples of matches. Functions that return a str return HTML."""
 
 import json
 import math
@@ -22,27 +22,27 @@ from edgevpr.lab.evaluate.provenance import machine, today, versions
 from edgevpr.review.html import foreign, heading, notes, page, picture, section, table
 from edgevpr.review.svg import Axis, Series, chart, figure, scatter
 
-_COLOURS = 8  # then the lines are dashed
+_COLOURS = 8  # of lines; those after the eighth are dashed
 _PICTURE_PX = 240
-_MOST_MATCHES = 90  # of the page: each has three pictures of some 8 KB
-_FEWEST_OF_A_ROW, _MOST_OF_A_ROW = 2, 8  # matches
+_MOST_MATCHES = 90  # on the page: each has three pictures of some 8 KB
+_FEWEST_OF_A_ROW, _MOST_OF_A_ROW = 2, 8  # matches shown of one row
 
 _SHARES = Axis(0.0, 1.0, [(0.0, "0"), (0.2, "0.2"), (0.4, "0.4"), (0.6, "0.6"), (0.8, "0.8"), (1.0, "1")])
 _HEADINGS = ("row", "recall@1", "95 %", "@5", "@10", "AUC", "P@100%R", "R@100%P", "PCU", "accepted (wrong)")
 _COSTS = ("row", "encode ms", "match ms", "RAM B/place", "disk B/place", "mAh/query", "measured")
 
-Numbered = tuple[int, MeasuredRow]  # every row has its number on the whole page
+Numbered = tuple[int, MeasuredRow]  # a row after its number, which is the same on the whole page
 
 
 def write_results(folder: Path, outcome: Measurements) -> None:
-    """Write results.json and index.html into a folder."""
+    """Write results.json and index.html into `folder`."""
     contents = {"results.json": json.dumps(as_json(outcome), indent=1) + "\n", "index.html": page_of(outcome)}
     for name, content in contents.items():
         write_whole(folder / name, partial(Path.write_text, data=content, encoding="utf-8", errors="backslashreplace"))
 
 
 def as_json(outcome: Measurements) -> dict[str, Any]:
-    """Return all results, with who made them, as JSON holds them."""
+    """Return all results, with date, machine and versions, for `json.dumps`."""
     return {
         "date": today(),
         "machine": machine(),
@@ -71,7 +71,7 @@ def as_json(outcome: Measurements) -> dict[str, Any]:
 
 
 def page_of(outcome: Measurements) -> str:
-    """Return the page: HTML with all that it shows inside."""
+    """Return the whole page. Its style and pictures are inside: it loads no other file."""
     sets = [_of_set(number, of, outcome) for number, of in enumerate(outcome.sets, start=1)]
     known = [f"sets: {len(outcome.sets)}", f"rows: {len(_labels(outcome))}", f"written on {today()}"]
     body = [
@@ -101,7 +101,7 @@ def _notes(outcome: Measurements) -> Iterator[str]:
 
 
 def _over_sets(outcome: Measurements) -> str:
-    """Return recall@1 of every row on every set; nothing for one set, which says so itself."""
+    """Return a table of recall@1 of every row on every set; "" if there is one set, whose own table has it."""
     if len(outcome.sets) < 2:
         return ""
     found = {(row.label, row.set_name): row.result.recall_at_1 for row in outcome.found}
@@ -152,7 +152,7 @@ def _charts(rows: Sequence[Numbered]) -> Iterator[str]:
 
 
 def _against(title: str, unit: str, rows: Sequence[Numbered], cost: Callable[[MeasuredRow], float]) -> str:
-    """Draw recall@1 over a cost, which has an axis of powers of ten."""
+    """Draw recall@1 over `cost` on a logarithmic axis. Rows with a cost of 0 are left out."""
     points = sorted(
         (math.log10(cost(row)), row.result.recall_at_1, str(number), _look(number))
         for number, row in rows
@@ -186,7 +186,7 @@ def _costs(row: MeasuredRow, number: int) -> list[str]:
 
 
 def _matches(of: OpenSet, row: MeasuredRow, number: int, most: int) -> str:
-    """Show matches of a row: the wrong ones with the highest scores first, then the right ones with the lowest."""
+    """Return about `most` matches of a row: wrong ones, highest scores first, then right ones, lowest scores first."""
     wrong = sorted((answer for answer in row.answers if not answer.is_right), key=lambda answer: -answer.score)
     right = sorted((answer for answer in row.answers if answer.is_right), key=lambda answer: answer.score)
     shown = "".join(_match(of, answer) for answer in [*wrong[:most], *right[: max(1, most - len(wrong))]])

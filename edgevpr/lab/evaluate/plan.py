@@ -1,4 +1,5 @@
-"""Plan of a measurement, many sets by many rows: a YAML file with the sections `sets` and `rows`, read strictly."""
+"""Plan of an evaluation: every row (a technique with its settings) is measured on every data set. A plan is read from
+the sections `sets` and `rows` of a YAML file, or made from flags of `edgevpr eval`; `many` carries it out."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -23,10 +24,10 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SetPlan(Nearness):
-    """A data set: a `folder` of any layout that is known, or the folders or videos `query` and `ref`. Right is what
-    `ground_truth` names (a CSV, with `query` and `ref`) or the folder itself does, else what was taken near. Of a
-    video, `rate_hz` pictures a second are taken (None: every frame). `camera` looks straight down (nadir) or ahead
-    (forward)."""
+    """A data set of a plan: either a `folder` of any known layout, or the folders or videos `query` and `ref`. The
+    right references are those in `ground_truth` (a CSV, only with `query` and `ref`) or in the folder's own ground
+    truth; if there is neither, those near the query. `rate_hz` pictures a second are taken from a video (None: every
+    frame). `camera` is "nadir" (looks straight down), "forward" (looks ahead) or None (unknown)."""
 
     folder: str | None = None
     query: str | None = None
@@ -36,8 +37,8 @@ class SetPlan(Nearness):
     rate_hz: float | None = optional(0.001, 1000)
 
     def open(self, cache: Cache, progress: Progress[Any]) -> Dataset:
-        """Read the set; the pictures of a video are taken once, and kept. Raises UsageError and SourceError as
-        `open_folder` does, and EdgevprError as `VideoPictures`."""
+        """Read the data set; pictures of a video are kept in `cache`. Raises UsageError and SourceError as
+        `open_folder` does, and EdgevprError as `VideoPictures` does."""
         pictures = VideoPictures(cache, self.rate_hz, progress)
         if self.folder:
             return open_folder(self.folder, self, pictures)
@@ -48,31 +49,31 @@ class SetPlan(Nearness):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RowPlan(MatchOptions):
-    """A row of the tables: a technique with its parameters and, where it has forms, the form of its vectors, and how it
-    is asked."""
+    """A row of the result tables: a technique, its parameters, the `form` of its vectors (see the glossary; None: that
+    of the technique), and the options of matching."""
 
     technique: str
     parameters: dict[str, Any] = field(default_factory=dict)
     form: str | None = None
 
     def settings(self, camera: str | None) -> dict[str, Any]:
-        """Return the settings of the technique on a set whose `camera` is known, or not (None). A parameter of the row
-        comes before that."""
+        """Return the settings of the technique, by name, for a set with this `camera` (None: unknown). A parameter of
+        the row overrides the setting that follows from the camera."""
         form = {"form": self.form} if self.form else {}
         return {**camera_setting(self.technique, camera), **self.parameters, **form}
 
 
 @dataclass(frozen=True, slots=True)
 class EvaluationPlan:
-    """All that is measured: every row on every set, each by its name."""
+    """All that is measured: every row on every set. Rows and sets are by their names."""
 
     sets: dict[str, SetPlan]
     rows: dict[str, RowPlan]
 
 
 def read_plan(path: str | Path) -> EvaluationPlan:
-    """Read a plan. A path in it that is not absolute begins at the folder of the file. Raises ConfigError with file,
-    key and what to do, and UsageError for a technique or parameter that there is not."""
+    """Read a plan from a YAML file; relative paths in it start at the folder of the file. Raises ConfigError with file,
+    key and what to do, and UsageError for an unknown technique or parameter."""
     content, where = read_yaml(path), str(path)
     for key in content:
         _require_one_of(key, ("sets", "rows"), f"{where}: unknown section")
@@ -83,8 +84,8 @@ def read_plan(path: str | Path) -> EvaluationPlan:
 
 
 def checked(plan: EvaluationPlan, where: str) -> EvaluationPlan:
-    """Return a plan that can be measured. Raises ConfigError for one that cannot, and UsageError for a technique or a
-    parameter that there is not."""
+    """Return `plan` if it can be measured. Raises ConfigError if not, with `where` (its file), and UsageError for an
+    unknown technique or parameter."""
     for name, each in plan.sets.items():
         if bool(each.folder) == bool(each.query and each.ref) or (each.folder and (each.query or each.ref)):
             raise ConfigError(f"{where}: the set `{name}` needs either `folder`, or `query` and `ref`: name them.")
@@ -113,8 +114,9 @@ def checked(plan: EvaluationPlan, where: str) -> EvaluationPlan:
 
 
 def of_flags(folders: Sequence[str], chosen: dict[str, RowPlan], common: SetPlan) -> EvaluationPlan:
-    """Make the plan of folders named on the command line, each measured by the rows `chosen`. `common` says how all
-    sets are read, and may name `query` and `ref` of a set of its own. Sets are named by their folders."""
+    """Make the plan of the command line: each of `folders` is a data set, and the rows `chosen` are measured on all.
+    `common` has the settings of all sets; its `query` and `ref`, if given, are one more set. Sets are named by their
+    folders."""
     sets: dict[str, SetPlan] = {}
     if common.query and common.ref:
         query, ref = (str(Path(each).resolve()) for each in (common.query, common.ref))

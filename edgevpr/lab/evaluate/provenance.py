@@ -1,4 +1,4 @@
-"""Origin of a figure: the date, the machine and the versions."""
+"""Provenance of a measurement, which is stored with every result: the date, the machine and the versions."""
 
 import os
 import platform
@@ -15,7 +15,7 @@ _LIBRARIES = {"numpy": "numpy", "opencv": "opencv-python-headless", "onnxruntime
 
 
 def today() -> str:
-    """Return the date, UTC."""
+    """Return the date in UTC, like 2026-01-31."""
     return datetime.now(timezone.utc).strftime("%Y-%m-%d")
 
 
@@ -28,7 +28,7 @@ def versions() -> dict[str, str | None]:
 
 
 def machine() -> dict[str, Any]:
-    """Return the machine: its processor, the cores this process may use, and the threads of NumPy's library."""
+    """Return the machine: its processor, the cores this process may use, and the threads of NumPy's BLAS library."""
     return {
         "cpu": cpu_model(),
         "cores": len(os.sched_getaffinity(0)),
@@ -38,7 +38,7 @@ def machine() -> dict[str, Any]:
 
 @cache
 def cpu_model() -> str:
-    """Return the name of the processor, or its kind where it has none."""
+    """Return the name of the processor, or its architecture (such as aarch64) if the system gives no name."""
     for line in Path("/proc/cpuinfo").read_text().splitlines():
         if line.startswith(("model name", "Model")):
             return line.partition(":")[2].strip()

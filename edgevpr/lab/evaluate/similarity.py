@@ -1,8 +1,8 @@
-"""Stored similarities: the scores that a technique gave every reference for every query, measured without its images.
+"""Measures stored similarities, the scores that a technique gave every reference for every query, without any image.
 
-Three forms: .npy, float (queries, references); .npz with the same as `similarity` and, where they are known, the names
-as `queries` and `references`; .csv with the references' names in the first line and a query's name before its scores,
-or with scores alone. Higher is more alike.
+`edgevpr eval --similarity` uses it. A file has one of three forms: .npy, float (queries, references); .npz with such an
+array as `similarity` and, if known, the names as `queries` and `references`; .csv with the references' names in the
+first line and a query's name before its scores, or with scores alone. Higher is more alike.
 """
 
 import csv
@@ -22,7 +22,7 @@ from edgevpr.lab.evaluate.numbered import Numbered
 
 @dataclass(frozen=True, slots=True)
 class Similarities:
-    """The scores, float (queries, references), and the names of both; None where the file does not name them."""
+    """`scores`, float (queries, references), and the names of `queries` and `references`; None: the file has none."""
 
     scores: np.ndarray
     queries: tuple[str, ...] | None
@@ -30,7 +30,7 @@ class Similarities:
 
 
 def read_similarities(path: str | Path) -> Similarities:
-    """Read a file of similarities. Raises UsageError for one that holds none, or NaN."""
+    """Read a file of similarities. Raises UsageError for one that holds no similarities, or NaN among them."""
     path = Path(path)
     try:
         if path.suffix == ".npz":
@@ -72,10 +72,13 @@ def measure(
     references: Sequence[str] | None = None,
     queries: Sequence[str] | None = None,
 ) -> Quality:
-    """Score similarities by a ground truth. Where the file names no queries, its rows are `queries`, else those of the
-    ground truth, in their order; where it names no references, they are `references`, else all that the ground truth
-    names, in counting order. The numbers of a ground truth count `queries` and `references`, else the names in the
-    file, else its rows and columns. Raises UsageError where that does not fit."""
+    """Compute the quality of the similarities `found` by the ground truth `truth`. `label` names them in messages.
+
+    If the file has no names, its rows are `queries` (None: the queries of `truth`, in their order), and its columns
+    `references` (None: all that `truth` names, in counting order). A ground truth of numbers numbers `queries` and
+    `references`; where one is None, the names in the file, or else its rows or columns. Raises UsageError where names
+    and counts do not fit together.
+    """
     listed = queries
     if isinstance(truth, Numbered):
         truth, references = _named(label, found, truth, references, queries)
@@ -122,7 +125,7 @@ def _named(
     references: Sequence[str] | None,
     queries: Sequence[str] | None,
 ) -> tuple[GroundTruth, Sequence[str]]:
-    """Return a ground truth of numbers with names, and the names of the references in the order of the numbers."""
+    """Return (`truth` with names in place of numbers; the names of the references in the order of the numbers)."""
     rows, columns = found.scores.shape
     queries = queries or _in_order(label, found.queries, "queries", "--query") or tuple(map(str, range(rows)))
     references = (
@@ -140,7 +143,8 @@ def _named(
 
 
 def _in_order(label: str, names: tuple[str, ...] | None, what: str, flag: str) -> tuple[str, ...] | None:
-    """Return the names of a file, which numbers can count where they stand in counting order."""
+    """Return `names` (None: the file has none). Raises UsageError if they are not in counting order, as the numbers of
+    a ground truth are; the message names `what` they are and the `flag` that helps."""
     if names and list(names) != sorted(names, key=counting_order):
         raise UsageError(
             f"{label} does not name its {what} in the order in which a ground truth numbers them: name the folder of "

@@ -1,4 +1,5 @@
-"""Results as tables, plain text for a terminal and cells for a page, and as curves (matplotlib, extra `plots`)."""
+"""Formats results of evaluations: as text tables for a terminal, as cells for the tables of `page`, and as a plot of
+curves (matplotlib, extra `plots`)."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -10,7 +11,7 @@ from edgevpr.lab.evaluate.metrics import Interval, Quality
 _PANELS_A_ROW = 3
 # More than ten colours cannot be told apart: after ten curves the line style changes.
 _LINES = ("-", "--", ":", "-.")
-# Headings, and the fields that stand below them.
+# Pairs of a column's heading and the field of `Quality` below it.
 _RECALLS = (
     ("recall@1", "recall_at_1"), ("95 %", "recall_at_1_interval"), ("@5", "recall_at_5"),
     ("95 %", "recall_at_5_interval"), ("@10", "recall_at_10"), ("95 %", "recall_at_10_interval"),
@@ -35,14 +36,14 @@ COSTS = tuple(_COSTS)
 
 
 def share_text(share: float | Interval | None) -> str:
-    """Return a share, or the interval of one, as a text; a dash where it is unknown."""
+    """Return a share (0..1) or an interval as text; "-" for None, which is unknown."""
     if isinstance(share, tuple):
         return f"{share[0]:.2f}-{share[1]:.2f}"
     return "-" if share is None else f"{share:.3f}"
 
 
 def decided(result: TechniqueResult) -> list[str]:
-    """Return what a flight would make of a technique as texts: its PCU, and the queries that it accepts."""
+    """Return the cells below `_DECIDED`: the PCU, and how many matches a flight would accept, with the wrong ones."""
     return [share_text(result.pcu), f"{result.accepted} ({result.accepted_wrong})"]
 
 
@@ -57,7 +58,7 @@ def costs(result: TechniqueResult) -> list[str]:
 
 
 def quality_text(results: Sequence[Quality]) -> str:
-    """Make the text for stored similarities."""
+    """Make the text that `edgevpr eval` prints for stored similarities."""
     first = results[0]
     return "\n".join(
         [
@@ -70,7 +71,8 @@ def quality_text(results: Sequence[Quality]) -> str:
 
 
 def results_text(results: Sequence[TechniqueResult]) -> str:
-    """Make the text that `edgevpr eval` prints: tables, and what their figures rest on; `results` by `compare`."""
+    """Make the text that `edgevpr eval` prints: tables, then the assumptions of their figures. `results` come from
+    `evaluate.compare`."""
     first = results[0]
     sequences = [f"{result.technique} of {result.sequence}" for result in results if result.sequence > 1]
     lines = [
@@ -95,7 +97,8 @@ def _table(
     headings: Sequence[str] = (),
     more: Sequence[list[str]] = (),
 ) -> list[str]:
-    """Lay out a table with a row for each result: its shares, then the cells `more`; an empty line ends it."""
+    """Return the lines of a table, the last one empty, with a row for each result: its name, the fields in `shares`
+    (pairs of heading and field), then its cells in `more`, below `headings`."""
     rows = [[result.technique, *(share_text(getattr(result, field)) for _, field in shares)] for result in results]
     if more:
         rows = [[*row, *cells] for row, cells in zip(rows, more, strict=True)]

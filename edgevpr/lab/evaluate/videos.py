@@ -1,7 +1,7 @@
-"""Videos with positions as folders of a data set: the frames are taken once, and kept as pictures.
+"""Makes folders of pictures from videos with positions, for data sets: each video is decoded once, and cached.
 
 The positions of a video lie beside it: a table of its name (later.csv of later.mp4), or positions.csv where it is the
-only video of its folder. `frames.track` says what stands in it.
+only video of its folder. `frames.track` explains its columns. A side of a data set is its queries or its references.
 """
 
 from collections.abc import Iterator
@@ -19,7 +19,7 @@ from edgevpr.frames.source import Source, open_source
 from edgevpr.lab.evaluate.asking import Progress
 from edgevpr.lab.evaluate.cache import Cache, code_of_frames, key_of
 
-# Of a folder that may hold other files as well; a video that is named itself may be called anything.
+# Videos looked for in a folder, which may hold other files. A video that is given by its own path may have any ending.
 _EXTENSIONS = frozenset(".mp4 .mov .mkv .avi .m4v .webm .ts .mts .m2ts .mpg .mpeg .mjpeg .h264".split())  # noqa: SIM905
 _POSITIONS = "positions.csv"
 _FORM = "time,lat,lon[,alt,yaw_deg,roll_deg,pitch_deg,height_m], `time` in seconds from its first frame"
@@ -28,17 +28,17 @@ _READ_TIMEOUT_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class VideoPictures:
-    """Finds the folder of pictures of a side of a data set. Those of a video are taken at `rate_hz` (None: every frame)
-    and kept in `cache`; `progress` shows it."""
+    """Function object that turns a side of a data set, a folder or a video, into a folder of pictures. From a video
+    `rate_hz` pictures a second are taken (None: every frame) and kept in `cache`; `progress` shows it."""
 
     cache: Cache
     rate_hz: float | None
     progress: Progress[Any]
 
     def __call__(self, given: Path) -> Path:
-        """Return the folder of pictures of `given`, which is one, or a video, or a folder that holds one video and no
-        picture. Raises UsageError for a video without positions, ImageError for one that is damaged, SourceError for
-        one that is none, and EdgevprError for a full disk."""
+        """Return `given` if it is a folder of pictures. If it is a video, or a folder with one video and no picture,
+        return the cached folder of that video's pictures. Raises UsageError for a video without positions, ImageError
+        for a damaged one, SourceError for a file that is no video, and EdgevprError for a full disk."""
         video = _video_of(given)
         if video is None:
             return given
@@ -47,7 +47,8 @@ class VideoPictures:
         return self.cache.keep("videos", key, partial(self._take, video, table))
 
     def _take(self, video: Path, table: Path, made: Path) -> None:
-        """Write each frame that has a position as a picture without losses, and positions.csv of all frames."""
+        """Write to the new folder `made` each frame of `video` that has a position by `table`, as a PNG, and
+        positions.csv with all frames."""
         source = open_source(str(video), step_s=1 / self.rate_hz if self.rate_hz else None, positions=table, live=False)
         tags: dict[str, GeoTag] = {}
         made.mkdir()
@@ -79,14 +80,14 @@ class VideoPictures:
 
 
 def without_position(folder: Path) -> tuple[int, int]:
-    """Return how many frames of a video had no position, and are no pictures in its folder, and how many it had."""
+    """Return (the number of a video's frames without position; that of all frames). `folder` holds its pictures."""
     tags = read_positions(folder / _POSITIONS)
     return sum(tag.position is None for tag in tags.values()), len(tags)
 
 
 def side_of(folder: Path, name: str) -> Path | None:
-    """Return the folder or the video of this name (query, ref) in the folder of a data set; None where there is
-    none."""
+    """Return the side `name` (query, ref) of the data set in `folder`: the folder or the video of that name; None if
+    there is neither."""
     if (inner := folder / name).is_dir():
         return inner
     return _only([path for path in _videos_in(folder) if path.stem == name], folder)
@@ -127,5 +128,6 @@ def _frames(source: Source) -> Iterator[Frame]:
 
 
 def _file_name(frame: Frame) -> str:
-    """Return the name of the frame without what separates names in a ground truth: frame_000006_t0.240_s.png."""
+    """Return a file name for the frame, like frame_000006_t0.240_s.png. It has no space: those separate names in a
+    ground truth."""
     return frame.name.replace("=", "").replace(" ", "_") + ".png"
