@@ -1,8 +1,7 @@
 """The registry of the techniques of place recognition: their names, their parameters, and how to make one.
 
-Map building, flights and evaluations make every technique here. The module of a technique is imported only when the
-technique is asked for. In this package "the thesis" is Mubariz Zaffar, *Visual Place Recognition for Autonomous
-Robots*.
+Map building, flights and evaluations make every technique here; its module is imported only then. "The thesis", in this
+package, is Mubariz Zaffar, *Visual Place Recognition for Autonomous Robots*.
 """
 
 import importlib
@@ -37,8 +36,7 @@ _WORDS = {int: "a whole number", float: "a number", str: "a word"}
 
 
 def names() -> tuple[str, ...]:
-    """Return the names of all techniques: those of edgevpr, then the networks whose cards alone make a technique (see
-    `network.of_card`).
+    """Return the names of all techniques: those of edgevpr, then the networks whose cards make a vector by themselves.
 
     A card that cannot be read is left out. To `create` it by name raises an error that says what is wrong.
     """

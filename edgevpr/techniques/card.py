@@ -41,9 +41,8 @@ _HEADS: dict[str, tuple[tuple[Any, ...], ...]] = {
 class InputRule:
     """Preparation of a picture for the network: (pixel * `scale` - `mean`) / `std` (None: 1). `mean` and `std` are one
     number, or one per channel. With `equalise` the histogram of the brightness is equalised first. `resize` is the
-    interpolation by which the picture is stretched to `height` x `width`. With `pad`, a grey level, it keeps its
-    proportions in the upper left corner, and the rest has that level. With `layout` NHWC feature maps are (1, H, W, C)
-    too."""
+    interpolation by which the picture is stretched to `height` x `width`. With `pad`, a grey level, it keeps its shape
+    in the upper left corner, and the rest has that level. With `layout` NHWC feature maps are (1, H, W, C) too."""
 
     layout: str
     height: int = bounded(8, 4096)
@@ -64,8 +63,7 @@ class InputRule:
 @dataclass(frozen=True, slots=True)
 class Outputs:
     """Names of the network's outputs in the ONNX file (None: the card names none): a vector (1, D), a feature map (1,
-    C, H, W), all outputs from which the boxes of a detector are decoded, and the memorability of a picture (1, 1) in
-    0..1."""
+    C, H, W), all that the boxes of a detector are decoded from, and the memorability of a picture (1, 1) in 0..1."""
 
     descriptor: str | None = None
     features: str | None = None
@@ -75,9 +73,8 @@ class Outputs:
 
 @dataclass(frozen=True, slots=True)
 class DetectorRule:
-    """Decoding of the outputs `boxes` of an object detector; `family` selects the decoder. `dynamic` are the classes of
-    movable things, such as cars, each with its number in the outputs. A box counts if its score is at least
-    `min_score`."""
+    """Decoding of the outputs `boxes` of an object detector, by the decoder of its `family`. `dynamic` are the classes
+    of movable things, such as cars, each with its number in the outputs. A box counts from the score `min_score` on."""
 
     family: str
     dynamic: dict[str, int]
@@ -127,8 +124,8 @@ def digest_of(values: list[Any]) -> str:
 
 
 def _used(part: InputRule | Outputs) -> dict[str, Any]:
-    """Return a section of a card without unused keys that were added to cards later. Words and maps made before then
-    keep their fingerprint."""
+    """Return a section of a card as a dict, without keys that were added to cards later and are not used here: words
+    and maps made before then keep their fingerprint."""
     return {key: value for key, value in asdict(part).items() if value is not None or key not in _ADDED_LATER}
 
 
@@ -151,8 +148,8 @@ def load_card(name: str) -> Card:
 
 
 def weights_of(spec: TechniqueSpec) -> str | None:
-    """Return a line on the weights that a technique uses: name, title, licence and source of its card. None for a
-    technique without a network."""
+    """Return a line on the weights of a technique: name, title, licence and source of the card (None: it has no
+    network)."""
     if spec.model_sha256 is None:
         return None
     card = load_card(str(spec.parameters.get("model", spec.name)))
@@ -203,8 +200,7 @@ def _require_detector(card: Card) -> None:
 
 
 def _require_numbers(card: Card, key: str, values: list[float] | None) -> None:
-    """Require that `values` are None, one number, or one per channel; those of the key `std` must be above 0, since
-    they divide."""
+    """Require that `values` are None, one number, or one per channel. Those of the key `std` are divisors: above 0."""
     channels, positive = card.input.channels, key == "std"
     if values is None or (
         len(values) in (1, channels)

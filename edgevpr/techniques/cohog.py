@@ -59,14 +59,13 @@ _HEADING_WITHIN_DEG = 1.5 * 360 / ROTATIONS  # the expected rotation, and one on
 
 @dataclass(eq=False, kw_only=True)
 class CoHog:
-    """CoHOG. Parameters of the thesis: W1 = H1 is `w1` (pixels), W2 = H2 is `w2` (pixels), L is `bins` (orientations),
-    GT is `gt`, the least entropy of a good block, 0 to 1 (below 0: the default for the entropy). `entropy` is "shannon"
-    or "filled_bins".
+    """The technique CoHOG. Its parameters in the thesis: W1 = H1 is `w1` (pixels), W2 = H2 is `w2` (pixels), L is
+    `bins` (orientations), GT is `gt`, the least entropy of a good block, 0 to 1 (below 0: the default for `entropy`).
 
-    With `camera` "nadir" the picture is put into a square with its proportions kept, so that a rotated picture shows
-    the same ground. A query is tried from five heights (with `matching` "thesis" from one) in 24 rotations, and `words`
-    is the file of words (see `placewords.load`). The map records `camera` and `words`. It does not record `matching`,
-    "displacement" or "thesis": both read the same map.
+    `entropy` is "shannon" or "filled_bins". With `camera` "nadir" the picture is put into a square with its proportions
+    kept, so that a rotated picture shows the same ground. A query is tried from five heights (with `matching` "thesis"
+    from one) in 24 rotations, and `words` is the file of words (see `placewords.load`). The map records `camera` and
+    `words`. It does not record `matching`, "displacement" or "thesis": both read the same map.
     """
 
     w1: int = 512
@@ -159,8 +158,7 @@ class CoHog:
         )
 
     def _blocks(self, grey: Singles, allowed: Mask | None, cell_px: int) -> tuple[Singles, Bools, Bools]:
-        """Compute the blocks of a square picture in cells of `cell_px` pixels; `allowed` is its mask (None: all).
-        Returns
+        """Compute the blocks of a square picture in cells of `cell_px` pixels (`allowed` None: all pixels are). Returns
 
         * the blocks float32 (n, n, 4 bins),
         * which of them lie on allowed pixels only, bool (n, n),
@@ -174,8 +172,7 @@ class CoHog:
         return blocks, seen, good_blocks(levels(grey), self.entropy, cell_px, self.gt, among=seen)
 
     def pack(self, coarse: Bytes, mean: Singles) -> Bytes:
-        """Make the rows in RAM for a forward camera: uint8 (N, B) from coarse uint8 (N, 12, 12, bins) and the map's
-        mean (12, 12, bins)."""
+        """Make rows in RAM, uint8 (N, B), from coarse uint8 (N, 12, 12, bins) and the map's mean (12, 12, bins)."""
         return placecode.pack(coarse.astype(np.float32) / 255, mean / 255)
 
     def coarse_scores(
@@ -188,12 +185,12 @@ class CoHog:
     ) -> tuple[Singles, Singles | None]:
         """Score all places. With a forward camera `rows` are place codes uint8 (N, B), compared under shifts. With a
         nadir camera they are words uint16 (N, 100), compared from the one of five heights that is nearest to
-        `height_ratio` (None: 1). `turned_deg` (N,) is the expected rotation of the camera against each place: only
-        rotations within `spec.heading_within_deg` of it are tried (None or NaN: all). Returns
+        `height_ratio` (None: 1). `turned_deg` (N,) is the expected rotation of the camera since each place was mapped:
+        only rotations within `spec.heading_within_deg` of it are tried (None or NaN: all). Returns
 
         * scores float32 (N,) in 0..1,
-        * with a nadir camera the score of each hypothesis, 24 rotations from each height, -inf if not tried: float32
-          (N, 120); with a forward camera None.
+        * the score of each hypothesis, float32 (N, 120): 24 rotations from each height, -inf where not tried. None with
+          a forward camera.
         """
         views = self._views_of(query)
         if not self._is_nadir:
@@ -219,16 +216,17 @@ class CoHog:
         return np.clip(of_ratio.max(axis=1), 0, 1), scores
 
     def good_patterns(self, query: Descriptor, turn: int, ratio: float = 1.0) -> tuple[Singles, Ints]:
-        """Return, of the good regions of a view of the query (see `views`), the slow patterns float32 (G, 20) and the
-        numbers int (G,) on its grid. `turn` is the rotation in steps of 15 degrees, `ratio` that of the heights."""
+        """Return the good regions of a view of the query (see `views`), from the height ratio `ratio` and with a
+        rotation of `turn` steps of 15 degrees: their slow patterns float32 (G, 20), and their numbers int (G,) on its
+        grid."""
         view = self._views_of(query).regions(ratio, turn, self._patterns)
         return view.regions, view.numbers
 
     def match(self, query: Descriptor, fine: Bytes, hypotheses: Sequence[int] | None = None) -> FineMatch:
-        """Compare the query with a place: compute C = A B^T (thesis 6.2.3), with A the good regions of the query and B
-        those of the place, stored in `fine`, then the score by `matching`. A query without a good region scores 0. A
-        nadir query is tried under `hypotheses`, numbers as in `views.hypothesis` (None: all). The best one counts, and
-        `align` refines its shift, rotation and height."""
+        """Compare the query with a place, whose blocks are `fine`: compute C = A B^T (thesis 6.2.3), with A the good
+        regions of the query and B those of the place, then the score by `matching`. Without a good region the score is
+        0. A nadir query is tried under `hypotheses`, numbers as in `views.hypothesis` (None: all). The best one counts,
+        and `align` refines its shift, rotation and height."""
         reference = self._reference(fine)
         matches = {each: self._matched(self._view(query, each), reference) for each in self._tried(hypotheses)}
         best = max(matches, key=lambda each: matches[each].score)
@@ -256,11 +254,11 @@ class CoHog:
     def glance(
         self, query: Descriptor, fine: Bytes, hypotheses: Sequence[int] | None = None
     ) -> tuple[float, list[int] | None]:
-        """Estimate the score of `match` from a part of the good regions: a quarter or, of a nadir query, about the same
-        number from each height. Returns
+        """Estimate the score of `match` from some of the good regions: a quarter, or for a nadir query as many at each
+        height. Returns
 
         * the estimated score,
-        * with a nadir camera the hypothesis of that score, as a list of one; else None.
+        * the hypothesis of that score, as a list of one. None with a forward camera.
         """
         reference = self._reference(fine)
         scores = {}
@@ -283,8 +281,8 @@ class CoHog:
         return self._comparable(blocks)
 
     def _view(self, query: Descriptor, number: int) -> ViewRegions:
-        """Return the good regions of a query under the hypothesis `number`. They are cached for the newest query, since
-        it is compared with many places."""
+        """Return the good regions of a query under a hypothesis. Those of the newest query are cached: many places need
+        them."""
         views = self._views_of(query)
         if number not in self._regions_of:
             self._regions_of[number] = views.regions(*hypothesis(number), self._comparable)
@@ -301,8 +299,8 @@ class CoHog:
         return self._views
 
     def _comparable(self, blocks: Singles) -> Singles:
-        """Return blocks float32 (N, 4 bins) in the form that is compared, each of length 1: as slow patterns (N,
-        patterns) for the displacement vote, as they are for the thesis's score."""
+        """Convert blocks float32 (N, 4 bins) to the form in which they are compared, each of length 1. For the
+        displacement vote that is their slow patterns (N, patterns); for the thesis's score they stay as they are."""
         return self._patterns(blocks) if self._votes else unit_rows(blocks)
 
     def _patterns(self, regions: Singles) -> Singles:
@@ -332,8 +330,8 @@ def _require(what: str, value: str, allowed: Collection[str]) -> None:
 
 
 def _middle(per_block: Array, seen: Bools) -> Array:
-    """Cut the largest square that the picture fills out of the middle, if the picture was put into a larger one: (side,
-    side, ...) to (n, n, ...), n at least 12. `seen` bool (side, side) is True where there is picture."""
+    """Cut out the middle square (n, n, ...), n at least 12, of values per block (side, side, ...), so that it holds no
+    border where the picture was put into a larger square. `seen` bool (side, side) is True where there is picture."""
     n = max(min(int(seen.any(axis=0).sum()), int(seen.any(axis=1).sum())), placecode.SIDE)
     start = (len(seen) - n) // 2
     return per_block[start : start + n, start : start + n]

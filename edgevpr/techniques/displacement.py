@@ -6,8 +6,7 @@ The score is the share of the votes at the peak: it says how many regions agree,
 
 A picture of another kind (a screen, a test card, a view ahead in a map made looking down) has many regions that
 resemble the same few regions of the place: a line here and a line there. Their votes can pile up as well. So the
-regions of the place that the agreeing votes lead to are counted too, each once. Regions form square grids and are
-numbered row by row.
+regions of the place that the agreeing votes lead to are counted, each once. Regions are numbered row by row.
 """
 
 import math
@@ -91,9 +90,9 @@ def support(
     asking: Ints, regions: Singles, reference: Singles, best: Ints, shift_cells: tuple[float, float]
 ) -> Support:
     """Measure how all regions of query and place support the shift that a vote has found (see `Support`). `asking` int
-    (G,) are the numbers of the good regions of the query and `regions` float32 (G, P) their vectors, on a grid as large
-    as the place's. `reference` float32 (side * side, P) are the place's regions, and `best` int (G,) the most similar
-    one for each."""
+    (G,) and `regions` float32 (G, P) are the numbers and vectors of the good regions of the query. `reference` float32
+    (side * side, P) are all regions of the place, and `best` int (G,) the most similar of them for each. Both have
+    grids of one size."""
     side = math.isqrt(len(reference))
     back = (reference @ regions.T).argmax(axis=1)
     of_y, of_x = np.divmod(asking, side)
@@ -114,9 +113,9 @@ def support(
 
 
 def _log_rank(regions: Singles, reference: Singles, x: Ints, y: Ints, side: int) -> float:
-    """Return the mean natural log of a rank: that of the place's region at column `x` and row `y`, int (n,), among all
-    of the place by similarity to each of `regions` float32 (n, P). The most similar of the 3x3 regions there counts.
-    Positions that are not on the place's grid are left out."""
+    """Rank all regions of the place, `reference`, by similarity to each of `regions` float32 (n, P). Return the mean
+    natural logarithm of the rank of the region expected at column `x` and row `y`, int (n,), or of the most similar of
+    the eight around it, from 0 (always the most similar). Positions that are not on the grid are left out."""
     rows = np.flatnonzero((x >= 0) & (x < side) & (y >= 0) & (y < side))
     if not len(rows):
         return math.log(len(reference))
@@ -163,9 +162,9 @@ def _weights(counts: tuple[float, ...]) -> Singles:
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """Exact position of a query's picture on a place. Turned clockwise by `turn_deg` and scaled by `scale` about its
-    middle, it lies with its middle at `shift_cells` (x, y) from that of the place. `covariance_cells2` (var x, cov xy,
-    var y) is that of the distances by which single regions miss this fit."""
+    """Exact position of a query's picture on a place. After turning it by `turn_deg` (clockwise) and scaling it by
+    `scale`, its middle lies at `shift_cells` (x, y) from that of the place. `covariance_cells2` (var x, cov xy, var y)
+    is that of the distances by which single regions miss this fit."""
 
     shift_cells: tuple[float, float]
     turn_deg: float
@@ -174,13 +173,13 @@ class Alignment:
 
 
 def align(asking: _Grid, best: _Grid, shift_cells: tuple[float, float]) -> Alignment | None:
-    """Fit a shift, a rotation and a scale, by least squares, to pairs of a region of the query (`asking`) and the most
-    similar region of the place (`best`); each argument is the numbers int (G,) and the side of the grid. Only pairs
-    that agree with the shift are used, at first `shift_cells`. Returns None if fewer than 8 agree, or if the rotation
-    or scale found belongs to another hypothesis.
+    """Fit a shift, a rotation and a scale, by least squares, to pairs of a region of the query and its most similar
+    region of the place. `asking` and `best` each hold the numbers of these regions, int (G,), and the side of their
+    grid. Only pairs that agree on the shift `shift_cells` are used. Returns None if fewer than 8 agree, or if the
+    rotation or scale found belongs to another hypothesis.
 
-    The vote knows the shift in whole cells, and rotation and scale only as those of the hypothesis. Regions far from
-    the middle miss by that error. So the fit is repeated with all the regions that agree with the fit before.
+    The vote knows the shift in whole cells, and rotation and scale only as those of the hypothesis. This error makes
+    regions far from the middle miss. So the fit is repeated, each time with the regions that agree with the last one.
     """
     # In complex numbers a rotation and a scale are one factor, and least squares one division.
     mine, there = _from_middle(*asking), _from_middle(*best)

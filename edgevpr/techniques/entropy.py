@@ -44,8 +44,8 @@ def filled_bins(grey: Bytes, radius_px: int = DISC_RADIUS_PX) -> Singles:
 def shannon(grey: Bytes, radius_px: int = DISC_RADIUS_PX) -> Array:
     """Compute the Shannon entropy (bits) of the intensities in each disc, over 8, from a 100x100 copy scaled back up.
 
-    The authors' public code computes this, while the thesis's text has `filled_bins`. `grey` is uint8 (H, W); the
-    result is float32 (H, W) in 0..1.
+    The authors' public code computes this, but the thesis's text `filled_bins`. `grey` is uint8 (H, W); returns
+    float32.
     """
     height, width = grey.shape
     small = _shannon_copy(grey)
@@ -182,8 +182,7 @@ def _replicated(grey: Bytes, radius_px: int) -> Array:
 
 
 def _bit(grey: Bytes) -> NDArray[np.uint64]:
-    """Return, for each pixel, a set with one member as a 64-bit word: bit n is set, n being the last six bits of the
-    intensity."""
+    """Return a set for each pixel, as a 64-bit word: only bit n is set, n being the last six bits of the intensity."""
     sets: NDArray[np.uint64] = np.left_shift(np.uint64(1), grey & 63, dtype=np.uint64)
     return sets
 
@@ -191,8 +190,7 @@ def _bit(grey: Bytes) -> NDArray[np.uint64]:
 def _different(padded: Bytes, radius_px: int) -> Array:
     """Count the different intensities in each disc: uint8 (..., H + 2r, W + 2r) to int16 (..., H, W).
 
-    A set of intensities is 256 bits in four words. The set of a disc is the union of those of its pixels, and the
-    number of its bits is the count.
+    A set of intensities is 256 bits in four words. The union of the sets of a disc's pixels has one bit per intensity.
     """
     bit, word_of = _bit(padded), padded >> 6
     unions = (_over_disc(bit * (word_of == word), radius_px, np.bitwise_or) for word in range(4))
@@ -216,8 +214,7 @@ def _shannon_of(small: Array, radius_px: int) -> Singles:
 
 
 def _shannon_at(small: Bytes, pixels: Bools) -> Singles:
-    """Compute `_shannon_of` only at the True pixels of bool (H, W), each from its own histogram: float32, one value per
-    True pixel."""
+    """Compute `_shannon_of` at the P True pixels of a bool (H, W) only, each from its own histogram: float32 (P,)."""
     r = DISC_RADIUS_PX
     padded = np.pad(small.astype(np.int16), r, constant_values=256)  # 256: outside
     down, right = np.nonzero(np.hypot(*np.mgrid[-r : r + 1, -r : r + 1]) <= r)
@@ -236,8 +233,7 @@ def _shannon_at(small: Bytes, pixels: Bools) -> Singles:
 
 
 def _over_disc(planes: Array, radius_px: int, combine: np.ufunc) -> Array:
-    """Combine the values in a disc around each pixel by an associative ufunc (add, bitwise_or), plane by plane: (..., H
-    + 2r, W + 2r) to (..., H, W).
+    """Combine each plane over discs by an associative ufunc (add, bitwise_or): (..., H + 2r, W + 2r) to (..., H, W).
 
     The disc is a stack of rows. Each row is widened once for all rows of the disc that have its width. All planes are
     treated as one flat array, in which a row runs on into the next. This gives wrong values in the padding only.

@@ -63,8 +63,11 @@ def mask_square(mask: Mask | None, side_px: int) -> Mask | None:
 
 
 def in_square(image: Image, mask: Mask | None) -> tuple[Array, Mask]:
-    """Put a picture into the middle of a square, its border repeated outwards. Returns the square, and bool (side,
-    side), True for pixels of the picture that `mask` allows (None: all of them)."""
+    """Put a picture into the middle of a square, its border repeated outwards. Returns
+
+    * the square,
+    * bool (side, side), True for pixels of the picture that `mask` allows (None: all).
+    """
     height, width = image.shape[:2]
     side = max(height, width)
     top, left = (side - height) // 2, (side - width) // 2
@@ -103,8 +106,7 @@ def oriented_cells(grey: Array, cell_px: int, bins: int, signed: bool, allowed: 
 
 
 def _vote_by_angle(dx: Array, dy: Array, cell_px: int, bins: int, signed: bool) -> Array:
-    """Sum gradient magnitudes by cell and orientation, for any number of orientations: `dx` and `dy` float32 (H, W) to
-    (H/cell_px, W/cell_px, bins)."""
+    """Sum the gradients `dx` and `dy`, float32 (H, W), by cell and orientation: float (H/cell_px, W/cell_px, bins)."""
     magnitude, _ = _magnitude(dx, dy)
     at = np.arctan2(dy, dx)
     at *= np.float32(bins / (2 * np.pi if signed else np.pi))  # in bins; whole numbers are the centres of orientations
@@ -173,8 +175,7 @@ def _vote_by_octant(dx: Array, dy: Array, cell_px: int, *_: object) -> Singles:
 
 
 def _magnitude(dx: Array, dy: Array, out: Array | None = None) -> tuple[Array, Array]:
-    """Return the length of each gradient, written to `out` if given, and an array of the same shape that may be
-    overwritten."""
+    """Return the length of each gradient, written to `out` if given, and a spare array of the same shape."""
     squares, spare = np.multiply(dx, dx, out=out), dy * dy
     squares += spare
     return cv2.sqrt(squares, squares), spare
@@ -222,8 +223,8 @@ def slow_patterns(bins: int) -> Singles:
 @lru_cache
 def waves(bins: int) -> Singles:
     """Return the real Fourier series over `bins` orientations: float32 (bins, bins), one wave per row, each of length
-    1. The constant comes first, then cosine and sine of each frequency; the highest frequency of an even number of bins
-    has a cosine only."""
+    1. The constant comes first, then cosine and sine of each frequency. The highest of an even number of bins is a
+    cosine only."""
     turn = 2 * np.pi * np.arange(bins) / bins
     frequency, number = _frequencies(bins), np.arange(bins)
     series = np.cos(frequency[:, None] * turn - np.pi / 2 * (number[:, None] % 2 == 0) * (number[:, None] > 0))

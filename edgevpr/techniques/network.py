@@ -2,8 +2,7 @@
 *head*, such as a pooling, makes it from the feature map.
 
 A card that makes a vector by itself is a technique of the card's name, without any code. The techniques of the thesis
-take parameters: `model` is the card of the weights. `form` (see `vectors`) and `threads` belong to this machine, not to
-the map.
+take parameters: `model` is the card of the weights, while `form` (see `vectors`) and `threads` are not part of a map.
 """
 
 from collections.abc import Callable
@@ -116,8 +115,7 @@ def hybridnet(model: str = "calc", form: str = "float", threads: int = 1, levels
     """Make `hybridnet`: `amosnet` with other weights (Chen et al., ICRA 2017; thesis 4.2.1).
 
     HybridNet has the layers of AMOSNet, but its top five convolutional layers were started from CaffeNet instead of
-    from scratch. Only the weights differ, so give their card as `model`. With the same card both techniques are the
-    same.
+    from scratch. Only the weights differ, so give their card as `model`. With the same card both techniques are equal.
     """
     return _pyramid("hybridnet", model, form, threads, levels)
 

@@ -43,8 +43,11 @@ def grid(blocks: Singles) -> Singles:
 
 
 def seen_grid(blocks: Singles, seen: Bools) -> tuple[Singles, Bools]:
-    """Make the `grid` from the blocks where `seen`, bool (n, n), is True. Also returns bool (12, 12), True where at
-    least half of a cell is seen."""
+    """Make the `grid` from the blocks where `seen`, bool (n, n), is True. Returns
+
+    * the grid float32 (12, 12, L),
+    * bool (12, 12), True where at least half of the cell is seen.
+    """
     n, bins = len(blocks), blocks.shape[2] // 4
     source = blocks.reshape(n * n, 4, bins).mean(axis=1) * seen.reshape(-1, 1)
     at = _sources(n)
@@ -110,8 +113,8 @@ def scan_ahead(asked: Singles, codes: Bytes) -> Singles:
 
 @lru_cache
 def _blurred() -> Singles:
-    """Return the weights by which all S shifts are averaged around each shift with even dx and dy: float32 (even
-    shifts, S)."""
+    """Return float32 (E, S): the weights by which all S shifts are averaged around each of the E with even dx and
+    dy."""
     kept = SHIFTS[(SHIFTS % 2 == 0).all(axis=1)]
     weight = np.maximum(1 - abs(kept[:, None] - SHIFTS) / 2, 0).prod(axis=2)
     weights: Singles = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
@@ -127,6 +130,5 @@ def _sources(n: int) -> Ints:
 
 
 def _to(step: int) -> slice:
-    """Return the slice of one side of a grid that its cells still cover after a move by `step` cells. They come from
-    `_to(-step)`."""
+    """Return the part of one side that a grid moved by `step` cells still covers; its cells come from `_to(-step)`."""
     return slice(max(0, step), SIDE + min(0, step))

@@ -56,9 +56,8 @@ class QueryWords:
 
 
 def of_place(vocabulary: Singles, patterns: Singles, good: Bools) -> NDArray[np.uint16]:
-    """Return the words of a place, uint16 (100,). `patterns` float32 (100, 20) are those of the regions `named`, and
-    `good` bool (100,) tells which regions count. A region that is not good, or whose word an earlier region has, gets
-    no word (1024)."""
+    """Return the words of a place, uint16 (100,). `patterns` float32 (100, 20) are those of the regions `named`. A
+    region gets no word (1024) if it is not `good`, bool (100,), or if an earlier region has the same word."""
     words = np.where(good, nearest(vocabulary, patterns), NONE)
     _, first = np.unique(words, return_index=True)
     once = np.full(len(words), NONE, np.uint16)
@@ -69,11 +68,10 @@ def of_place(vocabulary: Singles, patterns: Singles, good: Bools) -> NDArray[np.
 def of_query(
     vocabulary: Singles, asking: dict[int, tuple[Singles, Ints]], within: int, sides: tuple[int, int]
 ) -> QueryWords:
-    """Return the words of a query under all rotations. The keys of `asking` are rotation steps, clockwise, below
-    `within`, the steps in a quarter turn. The values are the patterns float32 (G, 20) of the good regions of the
-    picture so turned, and their numbers int (G,). The rotations by further quarter turns follow from these; those of
-    missing keys have no words. `sides` are the regions along one side of the query and of a place; the query has as
-    many or more."""
+    """Return the words of a query under all rotations. A key of `asking` is a rotation in steps, clockwise, below
+    `within`, the steps in a quarter turn. Its value describes the good regions of the picture so turned: patterns
+    float32 (G, 20) and numbers int (G,). The rotations by further quarter turns follow from these; without a key they
+    have no words. `sides` are the regions along one side of the query and of a place, at most as many."""
     total = within * QUARTERS
     side, of_place = sides
     at_most = _AT_MOST * side**2 // of_place**2
@@ -97,10 +95,10 @@ def of_query(
 
 def scan(asked: QueryWords, rows: Array, expected: Ints | None = None, voting: float = 1.0) -> Singles:
     """Score all places, `rows` uint16 (N, 100), under each rotation: float32 (N, R), at most 1 for a query that shows
-    as much ground as a place. `voting` is the share of the usual number of pairs (place, rotation) that vote.
+    as much ground as a place. `voting` scales the number of the pairs (place, rotation) that vote for shifts.
 
     `expected` int (N,) is the rotation of each place where the heading is known: it and the two beside it are scored,
-    and the others are -inf. A place with a number below 0 is scored under all rotations (None: every place is).
+    and the others are -inf. A place with a number below 0 is scored under all rotations (None: all places are).
     """
     turns = asked.counts.shape[1]
     rows = np.minimum(rows, NONE)  # a file that edgevpr has not written may hold any number
@@ -153,7 +151,7 @@ def load(name: str) -> Singles:
 
 
 def turned_words(words: Singles) -> Singles:
-    """Return each of `words` float32 (K, 20) turned counter-clockwise by 0, 90, 180 and 270 degrees: float32 (4 K,
+    """Return `words` float32 (K, 20), each turned counter-clockwise by 0, 90, 180 and 270 degrees: float32 (4 K,
     20)."""
     quarter = _quarter_turn()
     turned = [words]
@@ -188,8 +186,8 @@ def _turned_block(blocks: Singles) -> Singles:
 
 @lru_cache
 def _quarter_turn() -> Singles:
-    """Return the matrix float32 (20, 20) by which rows of patterns are multiplied to turn them counter-clockwise by 90
-    degrees."""
+    """Return the matrix that turns patterns counter-clockwise by 90 degrees, multiplied from the right: float32 (20,
+    20)."""
     kept = slow_patterns(BINS)
     turn: Array = kept.T @ _turned_block(np.eye(len(kept), dtype=np.float32)) @ kept
     return turn

@@ -1,4 +1,4 @@
-"""Pooling of a feature map to one vector, for `network` and `regions`. A feature map is float32 (channels, height,
+"""Pooling of a feature map to one vector, for `network` and `regions`. Feature maps are float32 (channels, height,
 width)."""
 
 from collections.abc import Iterable
@@ -23,8 +23,7 @@ def unit(vectors: Array) -> Array:
 
 
 def maximum(features: Singles) -> Singles:
-    """Compute MAC, the largest activation of each channel (Tolias et al. 2016, equation 1): (C, H, W) to float32
-    (C,)."""
+    """Compute MAC, the largest activation per channel (Tolias et al. 2016, equation 1): (C, H, W) to float32 (C,)."""
     largest: Singles = features.max(axis=(1, 2))
     return largest
 
@@ -33,8 +32,7 @@ def gem(features: Singles, p: float) -> Singles:
     """Compute the generalised mean of each channel (Radenović et al. 2018, equation 3): (C, H, W) to float32 (C,).
 
     p = 1 gives the mean, and p towards infinity the maximum. Activations below 1e-6 count as 1e-6, so that any p is
-    defined. Each channel is divided by its maximum first: this does not change the result, and no power leaves the
-    range of float32.
+    defined. Each channel is divided by its maximum first, so that no power leaves the range of float32.
     """
     positive = np.maximum(features, 1e-6)
     largest = positive.max(axis=(1, 2))
@@ -44,11 +42,11 @@ def gem(features: Singles, p: float) -> Singles:
 
 
 def grid(features: Singles, rows: int, columns: int, how: str) -> Singles:
-    """Pool each channel over each cell of a grid, `how` being "mean" or "max": (C, H, W) to float32 (rows * columns *
-    C,), cell by cell.
+    """Pool ("mean" or "max") each channel over each cell of a grid: (C, H, W) to float32 (rows * columns * C,).
 
-    Cell i of n covers floor(i H / n) to ceil((i + 1) H / n) (He et al. 2014, section 2.2), so that no activation is
-    left out and no cell is empty. Raises ModelError for a feature map with fewer rows or columns than the grid.
+    The result is ordered by cell. Cell i of n covers floor(i H / n) to ceil((i + 1) H / n) (He et al. 2014, section
+    2.2), so that no activation is left out and no cell is empty. Raises ModelError for a feature map with fewer rows or
+    columns than the grid.
     """
     _, height, width = features.shape
     if rows > height or columns > width:
@@ -79,8 +77,8 @@ def pyramid(features: Singles, levels: Iterable[int]) -> Singles:
 @dataclass(frozen=True, slots=True)
 class Projection:
     """Gaussian random projection of n values to `length` values, in a form that fits a small board: `spectrum`
-    complex128 (n // 2 + 1,) is the conjugate Fourier transform of the Gaussian vector, and `signs` float32 (n,) are +1
-    or -1.
+    complex128 (n // 2 + 1,), the conjugate Fourier transform of a Gaussian vector, and `signs` float32 (n,) of -1 and
+    1.
 
     A matrix of Gaussian values keeps the angles between vectors to about 1 / sqrt(dimensions). For the 43 008
     activations of CALC and 1064 dimensions it takes 183 MB, and drawing it anew for each picture takes far longer than
@@ -133,8 +131,8 @@ def gaussian_row(size: int, seed: int) -> tuple[Doubles, Singles]:
 
 
 def square_regions(height: int, width: int) -> list[Square]:
-    """Return the squares (top, left, side) of R-MAC at three scales over a feature map, in cells of it (Tolias et al.
-    2016, section 3.2).
+    """Return the squares (top, left, side) of R-MAC at three scales over a feature map (Tolias et al. 2016, section
+    3.2).
 
     At scale l the squares are 2 min(H, W) / (l + 1) wide. There are l along the short side and l + m - 1 along the long
     one, evenly spaced. m is the number that brings the overlap of two neighbours at the first scale closest to 40 %.
@@ -160,11 +158,10 @@ def square_regions(height: int, width: int) -> list[Square]:
 
 
 def regional_vectors(features: Singles, regions: list[Square]) -> Singles:
-    """Return the largest activation of each channel in each of R `regions`, power- and L2-normalised: (C, H, W) to
-    float32 (R, C).
+    """Return the largest activation of each channel in each of R squares, of length 1: (C, H, W) to float32 (R, C).
 
-    The power normalisation is the signed square root, as the thesis uses it (4.2). The paper whitens by PCA instead,
-    which would have to be learned.
+    The signed square root is taken first, the power normalisation of the thesis (4.2). The paper whitens by PCA
+    instead, which would have to be learned.
     """
     vectors = np.stack([features[:, y : y + side, x : x + side].max(axis=(1, 2)) for y, x, side in regions])
     return unit(np.sign(vectors) * np.sqrt(np.abs(vectors)))

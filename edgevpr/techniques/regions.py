@@ -10,8 +10,8 @@ region. Its energy is their mean. The regions of the highest energy over all cha
 Both describe a region by the activations of all channels under it, summed or averaged. Here the activations in the box
 around the region are summed, as in the public code of Region-VLAD. The result is scaled to length 1, which makes sum
 and mean equal. Without this scaling a large region outweighs all others, and both techniques find fewer places on
-corridor and aerial_caliterra, the data sets used for tuning. Using only the pixels of the region, not its box, is worse
-there too.
+corridor and aerial_caliterra, the data sets used for tuning. The pixels of the region alone do worse there than its
+box.
 """
 
 from collections.abc import Callable
@@ -50,8 +50,7 @@ class RegionTechnique(VectorTechnique):
 
     def encode(self, image: Image, mask: Mask | None = None) -> Descriptor:
         """Encode uint8 (H, W[, 3]) to coarse float16 (D,), fine int8 (N, C), `regions` float32 (N, C) of length 1, and
-        `good` bool (N,), True for each region that was found. Pixels where `mask` is False are filled with the mean of
-        the others."""
+        `good` bool (N,), True for each region found. Where `mask` is False, pixels get the mean of the others."""
         vector, regions = self._describe(self._backbone.run(image, mask))
         good: Array = np.any(regions, axis=1)
         return Descriptor(
@@ -93,8 +92,8 @@ def cross_region_bow(
     *, model: str = "calc", form: str = "float", threads: int = 1, regions: int = 200, words: int = 10_000
 ) -> RegionTechnique:
     """Make `cross_region_bow`: the `regions` regions of the highest energy of a feature map, scanned as a bag of
-    `words` visual words. `model` is the card of the network, `form` the form of the bag in RAM, `threads` those of
-    onnxruntime.
+    `words` visual words. `model` is the card of the network, `form` that of the bag in RAM; `threads` are
+    onnxruntime's.
 
     Chen, Maffra, Sa and Chli, "Only Look Once, Mining Distinctive Landmarks from ConvNet for Visual Place Recognition",
     IROS 2017, in the form of thesis 4.2.1. The paper finds regions in `conv5_3` of VGG-16 and describes them from
@@ -159,8 +158,7 @@ def find_regions(features: Singles, count: int) -> Ints:
 
 
 def describe(features: Singles, boxes: Ints) -> Singles:
-    """Sum the activations of `features` (C, H, W) in each of `boxes` (N, 4) by channel, and L2-normalise: float32 (N,
-    C)."""
+    """Sum the activations (C, H, W) in each of `boxes` (N, 4) by channel, and L2-normalise: float32 (N, C)."""
     channels, height, width = features.shape
     sums = np.zeros((height + 1, width + 1, channels), np.float64)  # of everything above and to the left
     sums[1:, 1:] = features.transpose(1, 2, 0)
@@ -193,8 +191,7 @@ def mutual_score(query: Singles, place: Singles) -> float:
 
 
 def to_bytes(vectors: Singles) -> Array:
-    """Store the directions of vectors in 8 bits: float32 (N, D) to int8 (N, D), each row scaled by its largest
-    magnitude."""
+    """Store directions in 8 bits: float32 (N, D) to int8 (N, D), each row scaled by its largest magnitude."""
     largest = np.maximum(np.abs(vectors).max(axis=1, keepdims=True), _TINY)
     stored: Array = np.rint(127 / largest * vectors).astype(np.int8)
     return stored

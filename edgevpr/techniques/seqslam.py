@@ -22,11 +22,8 @@ _LEAST_SPREAD = 1.0  # grey levels: a patch with a smaller standard deviation do
 
 class SeqSlam:
     """SeqSLAM: a place is a small picture of `width` x `height` pixels, a byte each (2 KB by default), normalised in
-    patches of `patch` x `patch` pixels.
-
-    `sequence` is the number of successive queries that are matched together. It belongs to the query, so one map serves
-    all lengths.
-    """
+    patches of `patch` x `patch` pixels. `sequence` is the number of successive queries that are matched together. It
+    belongs to the query, so one map serves all lengths."""
 
     candidates = 1  # it has no fine part to compare
     min_score = 0.0
@@ -90,8 +87,11 @@ class SeqSlam:
 
 def normalised(pixels: Singles, allowed: Singles) -> tuple[Singles, Singles]:
     """Subtract each patch's mean and divide by its standard deviation. `pixels` and `allowed` (1, or 0 for pixels that
-    do not count) are float32 (patches, pixels). Returns float32 (patches, pixels), 0 where not allowed or where the
-    patch is flat, and the standard deviations (patches,)."""
+    do not count) are float32 (patches, pixels). Returns
+
+    * float32 (patches, pixels), 0 where not allowed or where the patch is flat,
+    * the standard deviations float32 (patches,).
+    """
     count = np.maximum(allowed.sum(axis=1, keepdims=True), 1)
     centred = (pixels - (pixels * allowed).sum(axis=1, keepdims=True) / count) * allowed
     spread = np.sqrt((centred**2).sum(axis=1, keepdims=True) / count)
@@ -103,8 +103,7 @@ def enhanced(differences: Array) -> Doubles:
     in standard deviations of the window.
 
     The mean of the differences up to five places away is subtracted from each difference, and the rest is divided by
-    their (sample) standard deviation; 0 where they are all equal. The sums are whole numbers, so that a long map costs
-    no precision.
+    their (sample) standard deviation; 0 where they are all equal. Sums of whole numbers keep a long map precise.
     """
     whole = differences.astype(np.int64)
     first = np.maximum(np.arange(len(whole)) - _WINDOW // 2, 0)

@@ -47,8 +47,7 @@ class Backbone:
 
     def run(self, image: Image, mask: Mask | None = None) -> Singles:
         """Run the network on uint8 (H, W[, 3]); returns float32 of `shape`. Pixels where bool (H, W) `mask` is False
-        are filled with the mean of the others. Raises ModelError for a result with NaN or numbers beyond 1e12, and for
-        one of zeros only."""
+        get the mean of the others. Raises ModelError for results with NaN, numbers beyond 1e12, or zeros only."""
         return _run(self.card, self.output, self.session, without_masked(image, mask))
 
 
@@ -56,8 +55,8 @@ def open_backbone(model: str, output: str, threads: int = 1) -> Backbone:
     """Open the network of the card `model`, for its output "features" or "descriptor".
 
     Raises ModelError, one sentence, if onnxruntime, the card or its file is missing, if the file is not that of the
-    card or no ONNX, if inputs or outputs have another form or axes without a size, or if a result is not finite or all
-    zeros. Raises UsageError for a number of threads outside 1 to 256.
+    card or no ONNX, if inputs or outputs have another form or axes without a size, or if the result of a trial is not
+    finite or all zeros. Raises UsageError for a number of threads outside 1 to 256.
     """
     return backbone_of(load_card(model), output, threads)
 
@@ -96,8 +95,7 @@ def file_sha256(path: Path) -> str:
 
 @cache
 def _session(path: Path, sha256: str, threads: int) -> Any:
-    """Check the hash of a network's file and open its session. The process keeps one session of a file for all
-    techniques."""
+    """Check the hash of a network's file and open its session, one in the process for all techniques that use it."""
     found = file_sha256(path)
     if found != sha256:
         raise ModelError(
@@ -158,8 +156,8 @@ def _run(card: Card, output: str, session: Any, image: Image) -> Singles:
 
 
 def run_outputs(card: Card, session: Any, names: list[str], pictures: Singles) -> list[Array]:
-    """Run a session of `open_session` on prepared pictures, float32 (N, ...). Returns the outputs called `names`, in
-    order.
+    """Run a session of `open_session` on prepared pictures, float32 (N, ...); return the outputs in the order of
+    `names`.
 
     Raises ModelError for a run that fails or takes more than 30 s, and for numbers that are not finite or beyond 1e12.
     """
@@ -226,7 +224,7 @@ def prepare(image: Array, rule: InputRule) -> Singles:
 
 
 def shares(image: Array, rule: InputRule) -> tuple[float, float]:
-    """Return the share of the input's width, and that of its height, that `prepare` fills with the picture; the rest is
+    """Return the shares of the input's width and of its height that `prepare` fills with the picture, not with
     padding."""
     if rule.pad is None:
         return 1.0, 1.0

@@ -81,8 +81,7 @@ class VectorTechnique:
 
     def encode(self, image: Image, mask: Mask | None = None) -> Descriptor:
         """Encode uint8 (H, W[, 3]) to coarse float16 (D,), of length 1 if the similarity is the cosine. The quality is
-        0 for a vector that is all zeros in half precision, else 1. Raises ModelError for numbers beyond half
-        precision."""
+        1, or 0 if all numbers are 0 in half precision. Raises ModelError for numbers beyond half precision."""
         vector = self.vector(image, mask)
         length = float(np.linalg.norm(vector))
         if self._similarity == "cosine":
@@ -96,9 +95,9 @@ class VectorTechnique:
         return Descriptor(coarse=coarse, quality=float(coarse.any()))
 
     def pack(self, coarse: Array, mean: Singles) -> Array:
-        """Make the rows in RAM of the forms `8bit` and `1bit`: `coarse` float16 (N, D), the map's `mean` (D,) to (N,
-        *row shape). A row of `8bit` is D int8 numbers, then the bytes of two float32: the step of the numbers, and the
-        vector's length."""
+        """Make the rows in RAM of the forms `8bit` and `1bit`, (N, *row shape), from `coarse` float16 (N, D) and the
+        map's mean (D,). A row of `8bit` is D int8 numbers, then two float32: the step of the numbers, and the vector's
+        length."""
         rows = np.zeros((len(coarse), *self.spec.row.shape), self.spec.row.dtype)
         for block in _blocks(len(coarse), self._length):
             left = coarse[block].astype(np.float32)
@@ -121,9 +120,12 @@ class VectorTechnique:
         turned_deg: Doubles | None = None,
         height_ratio: float | None = None,
     ) -> tuple[Singles, None]:
-        """Compare a query with all places, `rows` (N, *row shape). Returns scores float32 (N,), all 0 for a query of
-        zeros, and None: there are no hypotheses. `mean` is the map's mean (D,), which the form `float` does not need.
-        `turned_deg` and `height_ratio` are ignored: these vectors know neither."""
+        """Compare a query with all places, `rows` (N, *row shape). `mean` is the map's (D,), which the form `float`
+        does not need. `turned_deg` and `height_ratio` are ignored: these vectors know neither. Returns
+
+        * scores float32 (N,), all 0 for a query of zeros,
+        * None, since there are no hypotheses.
+        """
         vector = query.coarse.astype(np.float32)
         if not vector.any():  # less the mean, zeros would resemble some place, and equal another picture of zeros
             return np.zeros(len(rows), np.float32), None

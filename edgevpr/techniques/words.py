@@ -88,8 +88,7 @@ def load_words(model: str, kind: str, count: int) -> Words:
 
 
 def local_descriptors(features: Singles) -> Singles:
-    """Return the activations at each position as one descriptor of length 1: (C, H, W) to float32 (H * W, C), row by
-    row.
+    """Return the activations at each position, row by row, as descriptors of length 1: (C, H, W) to float32 (H * W, C).
 
     NetVLAD takes the same descriptors (Arandjelović et al. 2016, section 3.1).
     """
@@ -148,14 +147,13 @@ def bag_of_words(local: Singles, words: Singles) -> Singles:
 
 
 def nearest(local: Singles, words: Singles) -> Ints:
-    """Return the number of the word nearest to each descriptor: `local` (N, D), `words` (K, D) to int (N,). Of equally
-    near words the first is taken."""
+    """Return the number of the word nearest to each descriptor (the first of equally near ones): (N, D), (K, D) to int
+    (N,)."""
     numbers: Ints = _closeness(local, words).argmax(axis=1)
     return numbers
 
 
 def _closeness(local: Singles, words: Singles) -> Singles:
-    """Compute -|x - c|^2, plus a constant for each descriptor x, of `local` (N, D) and `words` (K, D): float32 (N,
-    K)."""
+    """Compute -|x - c|^2, plus a constant for each descriptor x: (N, D) and words (K, D) to float32 (N, K)."""
     closeness: Singles = 2 * local @ words.T - np.einsum("kd,kd->k", words, words)
     return closeness

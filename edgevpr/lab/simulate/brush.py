@@ -46,8 +46,8 @@ class Canvas:
         return columns[None] * self.metres_per_pixel, ((self.shape[0] - rows) * self.metres_per_pixel)[:, None]
 
     def polygon(self, box: Box, points_m: ArrayLike) -> Floats:
-        """Return the share of each pixel of a box that a polygon covers, float32 (H, W) in 0..1: its edges are
-        smooth."""
+        """Return the share of each pixel of a box that a polygon covers (its edges are smooth): float32 (H, W) in
+        0..1."""
         cover = np.zeros((box[0].stop - box[0].start, box[1].stop - box[1].start), np.uint8)
         corners = (self.pixels(points_m) - (box[1].start, box[0].start)) * 16
         cv2.fillPoly(cover, [corners.round().astype(np.int32)], 255, cv2.LINE_AA, 4)
@@ -92,16 +92,15 @@ def bgr_mix(low: tuple[int, int, int], high: tuple[int, int, int], share: Array)
 
 
 def smooth_step(values: Array, low: float, high: float) -> Array:
-    """Return 0 below `low`, 1 above `high`, and a straight ramp between. If low > high, return 1 below `high` and 0
-    above `low`."""
+    """Return 0 below `low`, 1 above `high`, and a straight ramp between. With low > high, the ramp falls from 1 to
+    0."""
     return np.clip((values - low) / (high - low), 0, 1)
 
 
 def roof(
     canvas: Canvas, centre_m: Doubles, length_m: float, width_m: float, turn_rad: float, wall_m: float, colour: Doubles
 ) -> None:
-    """Paint a building with walls `wall_m` high and a gable roof, its ridge along `turn_rad` (anticlockwise from
-    east)."""
+    """Paint a building with walls `wall_m` high and a gable roof. Its ridge is `turn_rad` anticlockwise from east."""
     along, across = axes_of(turn_rad)
     corners = [
         np.asarray(centre_m) + a * along * length_m / 2 + b * across * width_m / 2
@@ -119,8 +118,8 @@ def roof(
 
 
 def crown(rng: np.random.Generator, radius_px: int) -> Singles:
-    """Make the dome of one tree, float32 (2 r + 1, 2 r + 1) in 0..1.2, r = `radius_px`, and 0 outside of its ragged
-    outline."""
+    """Make the dome of one tree, float32 (2 r + 1, 2 r + 1) in 0..1.2, and 0 outside of its ragged outline; r is
+    `radius_px`."""
     axis = np.arange(-radius_px, radius_px + 1, dtype=np.float32) / radius_px
     lumps = noise(rng, (len(axis), len(axis)), max(radius_px * 0.7, 2.0), 2)
     leaves = noise(rng, (len(axis), len(axis)), 2.5, 2)
@@ -130,8 +129,7 @@ def crown(rng: np.random.Generator, radius_px: int) -> Singles:
 
 
 def stand(canvas: Canvas, dome: Singles, centre_m: tuple[float, float], top_m: float, colour: Doubles) -> None:
-    """Paint one tree, a `crown` that rises `top_m` metres over the ground. Where crowns overlap, the higher one is
-    seen."""
+    """Paint one tree, a `crown` that rises to `top_m` metres. Where crowns overlap, the higher one is seen."""
     radius = len(dome) // 2
     column, row = canvas.pixels([centre_m])[0].astype(int)
     if not (radius <= column < canvas.shape[1] - radius and radius <= row < canvas.shape[0] - radius):
@@ -190,8 +188,8 @@ def longest_side(polygon: Doubles) -> Doubles:
 
 
 class Bend:
-    """Bends straight lines by about `by_m` metres. All points near one another are moved alike, so lines that touched
-    still touch."""
+    """Bends straight lines by about `by_m` metres, everywhere in the same way, so that lines that touched still
+    touch."""
 
     def __init__(self, rng: np.random.Generator, width_m: float, depth_m: float, by_m: float) -> None:
         shape = int(depth_m / _GRID_M) + 8, int(width_m / _GRID_M) + 8
@@ -220,8 +218,11 @@ def _area_m2(polygon: Doubles) -> float:
 
 
 def _cut(piece: Doubles, through: Doubles, across: Doubles) -> tuple[list[Doubles], Doubles]:
-    """Cut a convex polygon by the line through the point `through`, at right angles to `across`. Returns both halves,
-    and the ends of the cut."""
+    """Cut a convex polygon by the line through the point `through` at right angles to `across`. Returns
+
+    * its two halves,
+    * the ends of the cut.
+    """
     side = (piece - through) @ across
     halves: tuple[list[Doubles], list[Doubles]] = ([], [])
     line: list[Doubles] = []

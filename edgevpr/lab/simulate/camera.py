@@ -72,7 +72,7 @@ def ground_to_pixel(pose: CameraPose, camera: Camera) -> Doubles:
 
 
 def lit(scene: Scene, light: Light, seed: int) -> Image:
-    """Light the scene: uint8 (H, W, 3) BGR with shaded slopes, cast shadows, and the shadows of clouds (made from
+    """Light the scene: uint8 (H, W, 3) BGR with shaded slopes, cast shadows, and shadows of random clouds (by
     `seed`)."""
     azimuth, elevation = np.radians((light.sun_azimuth_deg, light.sun_elevation_deg))
     towards_sun = float(np.sin(azimuth)), float(-np.cos(azimuth))  # in columns and rows
@@ -127,8 +127,8 @@ def _clouds(scene: Scene, cloud_frac: float, seed: int) -> Array:
 
 
 def view_on_ground(pose: CameraPose, camera: Camera) -> Doubles | None:
-    """Return the corners of the picture on the ground, float64 (4, 2) metres east and north; None if the picture shows
-    the horizon."""
+    """Return the corners of the picture on the ground, (4, 2) metres east and north (None: the picture shows the
+    horizon)."""
     corners = [(0, 0, 1), (camera.width - 1, 0, 1), (camera.width - 1, camera.height - 1, 1), (0, camera.height - 1, 1)]
     ground = np.linalg.solve(ground_to_pixel(pose, camera), np.array(corners, float).T).T
     return ground[:, :2] / ground[:, 2:] if (ground[:, 2] > 0).all() else None  # one over the distance ahead
@@ -142,8 +142,7 @@ def photograph(
     light: Light,
     rng: np.random.Generator,
 ) -> np.ndarray:
-    """Take one frame, uint8 (camera.height, camera.width, 3) BGR, of a ground uint8 (H, W, 3) made by `lit`; `rng`
-    makes the sensor's noise."""
+    """Take one frame, uint8 (camera.height, camera.width, 3) BGR, of a `lit` ground; `rng` makes the sensor's noise."""
     # The centre of the north-west pixel is half a pixel inside of the scene.
     half, depth_m = metres_per_pixel / 2, len(ground) * metres_per_pixel
     metres_from_pixel = np.array([[metres_per_pixel, 0, half], [0, -metres_per_pixel, depth_m - half], [0, 0, 1]])

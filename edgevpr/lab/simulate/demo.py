@@ -1,5 +1,4 @@
-"""The demonstration `edgevpr demo`: two generated flights, and the real commands between them, each in a process of its
-own."""
+"""The demonstration `edgevpr demo`: two generated flights, and the real commands between them, each as a process."""
 
 import json
 import socket
@@ -159,8 +158,8 @@ def run_demo(folder: str | Path) -> DemoSummary:
 
 
 def _flown(folder: Path, queries: int) -> dict[str, Any]:
-    """Map the first flight of a demonstration and fly the second one, of `queries` pictures; return the JSON report of
-    the simulated flight controller."""
+    """Map the first flight of a demonstration and fly the second one; return the JSON report of the flight
+    controller."""
     map_path, log_path, port = folder / "map.gpkg", folder / "flight.jsonl", _free_udp_port()
     first, second = folder / "flight-1" / "images", folder / "flight-2" / "images"
     # The flight controller is started first: it listens long before the map is built.
@@ -187,8 +186,7 @@ def _free_udp_port() -> int:
 
 @contextmanager
 def _edgevpr(*arguments: object) -> Iterator[subprocess.Popen[str]]:
-    """Context manager: run the real program with `arguments` as a process of its own, which is ended with the block at
-    the latest."""
+    """Context manager: run the real program in a process of its own, which ends with the block at the latest."""
     command = [sys.executable, "-m", "edgevpr", *map(str, arguments)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     with process:

@@ -41,8 +41,7 @@ class GeneratedFlight:
 
 
 def mapping_flight(seed: int) -> GeneratedFlight:
-    """Plan 70 pictures on five parallel legs, flown to and fro on a clear morning, the nose in the direction of
-    flight."""
+    """Plan 70 pictures on five parallel legs, flown to and fro on a clear morning with the nose ahead."""
     rng = np.random.default_rng((seed, 1))
     poses = []
     for leg, north_m in enumerate(_LEGS_NORTH_M):

@@ -1,9 +1,7 @@
-"""A piece of farmland seen from above, generated from a seed, in place of a real site to fly over; `camera` photographs
-it.
+"""A piece of farmland seen from above, generated from a seed, in place of a real site; `camera` photographs it.
 
 Land is cut into fields along bent lines (points are (N, 2): east, north in metres). Each field is painted as one kind,
-such as meadow. Borders, a river, a road, farms and trees are painted over the fields. Trees are (N, 4) in metres: east,
-north, radius, top.
+such as meadow. A river, a road, farms and trees, (N, 4) metres: east, north, radius, top, are painted over them.
 """
 
 from collections.abc import Callable, Iterable
@@ -311,8 +309,7 @@ def paint_field(rng: np.random.Generator, canvas: Canvas, outline_m: Doubles) ->
 def _trees(
     rng: np.random.Generator, outline_m: Doubles, turn_rad: float, spacing_m: float, scatter_m: float, radius_m: float
 ) -> Doubles:
-    """Place trees in rows along `turn_rad` over a field, `spacing_m` apart, each moved at random by about
-    `scatter_m`."""
+    """Place trees in rows along `turn_rad` over a field, `spacing_m` apart and moved at random by about `scatter_m`."""
     along, across = axes_of(turn_rad)
     reach_m = np.arange(-110, 110, spacing_m)
     u, v = (axis.reshape(-1, 1) for axis in np.meshgrid(reach_m, reach_m))

@@ -45,10 +45,7 @@ _STEPS_BETWEEN_CHECKPOINTS = 250
 
 class Encoder(nn.Module):
     """The encoder: image float32 (N, 1, 120, 160) in 0..1 to descriptor (N, 1064) of length 1 and features (N, 128, 16,
-    21).
-
-    Pooling rounds sizes up, as Caffe does: this gives the 1064 values.
-    """
+    21). Pooling rounds sizes up, as Caffe does: this gives the 1064 values."""
 
     def __init__(self, normalised: bool = False) -> None:
         """Make the layers; `normalised` adds batch normalisation and the threshold, for training."""
@@ -68,8 +65,7 @@ class Encoder(nn.Module):
         return _response_normalised(functional.max_pool2d(x, 3, 2, ceil_mode=True))
 
     def code(self, features: torch.Tensor) -> torch.Tensor:
-        """Compute the input of the decoder, (N, 4, 14, 19): the descriptor before it is flattened and scaled to length
-        1."""
+        """Compute the input of the decoder, (N, 4, 14, 19): the descriptor before it is flat and of length 1."""
         return functional.relu(self.norm3(self.conv3(features)))
 
     def forward(self, image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -157,8 +153,7 @@ class Training:
         return encoder.folded()
 
     def run(self, checkpoint: Path) -> Iterator[int]:
-        """Do the remaining steps. Yields the number of steps done after each, and saves `checkpoint` every 250
-        steps."""
+        """Do the remaining steps, yielding the number done after each; save `checkpoint` every 250 steps."""
         while self.step < self.steps:
             self._one_step()
             if self.step % _STEPS_BETWEEN_CHECKPOINTS == 0:
@@ -236,6 +231,6 @@ def _mean_target(pictures: Sequence[Image], seed: int) -> Singles:
 
 
 def _rate(step: int, steps: int) -> float:
-    """Return the learning rate of step `step` of `steps`: it rises over 100 steps, then falls like half a cosine to
-    zero."""
+    """Return the learning rate of a step: it rises over the first 100, then falls like half a cosine to zero at
+    `steps`."""
     return _RATE * min(1, (step + 1) / _WARM_UP_STEPS) * (0.5 + 0.5 * math.cos(math.pi * step / steps))

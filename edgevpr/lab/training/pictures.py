@@ -98,8 +98,7 @@ def require_packages() -> None:
 
 
 def batch(pictures: Sequence[Image], size: int, rng: np.random.Generator) -> tuple[Singles, Singles]:
-    """Make a random batch: `size` inputs, float32 (size, 1, 120, 160) in 0..1, and targets, float32 (size,
-    TARGET_LENGTH)."""
+    """Make a random batch: inputs float32 (size, 1, 120, 160) in 0..1, and targets float32 (size, TARGET_LENGTH)."""
     inputs = np.empty((size, 1, HEIGHT, WIDTH), np.float32)
     targets = np.empty((size, TARGET_LENGTH), np.float32)
     for row in range(size):
@@ -117,8 +116,11 @@ def gradients_of(sight: Image) -> Singles:
 
 
 def two_sights(picture: Image, rng: np.random.Generator) -> tuple[Image, Image]:
-    """Return two views of a grey picture, uint8 (120, 160) each: a random part of it, and about the same ground seen
-    from elsewhere in other light."""
+    """Return two views of a grey picture, uint8 (120, 160) each. Returns
+
+    * a random part of it,
+    * about the same ground, seen from elsewhere in other light.
+    """
     height, width = picture.shape
     largest = min(width / WIDTH, height / HEIGHT)
     scale = largest * rng.uniform(_SMALLEST_PART, 1)

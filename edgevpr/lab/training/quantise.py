@@ -1,5 +1,5 @@
-"""`edgevpr models quantise`: a network in 8-bit integers, a quarter of the file, and faster where the processor
-multiplies bytes fast."""
+"""`edgevpr models quantise`: a network in 8-bit integers, a quarter of the size, faster on processors made for
+bytes."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,9 +31,8 @@ class Quantised:
 def quantise(name: str, calibration: Path, threads: int = 1) -> Quantised:
     """Write the network of the card `name` in 8-bit integers (static INT8), as NAME_int8, to the user's models folder.
 
-    The ranges of its activations are measured on at most 200 of the images in the folder `calibration`. Raises
-    ModelError if the package `onnx` is missing or the network cannot be quantised, SourceError for a folder without
-    images.
+    The ranges of its activations are measured on at most 200 images of the folder `calibration`. Raises ModelError if
+    `onnx` is missing or the network cannot be quantised, SourceError for a folder without images.
     """
     card = load_card(name)
     before = verify(card, threads)

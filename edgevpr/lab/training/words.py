@@ -151,8 +151,8 @@ def train_ground(folders: Sequence[str], out: Path, seed: int, unusable: list[Im
 
 
 def aligned(patterns: Singles) -> Singles:
-    """Turn each of `patterns` float32 (N, 20) by quarter turns until its main direction is within 45 degrees of the
-    first orientation."""
+    """Turn `patterns` float32 (N, 20) by quarter turns until their main direction is within 45 degrees of orientation
+    0."""
     # The second and third pattern are the cosine and sine of the first frequency over the orientations.
     quarters = np.rint(np.arctan2(patterns[:, 2], patterns[:, 1]) / (np.pi / 2)).astype(np.intp) % placewords.QUARTERS
     turned = placewords.turned_words(patterns).reshape(len(patterns), placewords.QUARTERS, -1)
