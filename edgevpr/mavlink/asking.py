@@ -21,13 +21,13 @@ HEARTBEAT_WAIT_S = 5.0  # an autopilot sends one each second
 TRIES, ANSWER_WAIT_S = 3, 1.0
 IN_FLIGHT = 10  # parameters asked for at once; ArduPilot drops what comes on top of 20
 _FINAL = (mavlink.MAV_RESULT_DENIED, mavlink.MAV_RESULT_UNSUPPORTED, mavlink.MAV_RESULT_FAILED)
-_WAITING_MAX = 64  # a port that takes nothing must not fill the memory
+_WAITING_MAX = 64  # packets; a port that accepts nothing must not fill the memory
 _SIGNED = mavlink.MAVLINK_IFLAG_SIGNED
 
 
 class Inquiry:
     """A link to one autopilot, for a caller that waits for each answer. It sends a heartbeat once a second, as every
-    companion computer does, since some ports of autopilots do not answer without. Use it as a context manager. Every
+    companion computer does, because some ports of autopilots do not answer without. Use it as a context manager. Every
     method raises LinkError when the connection is lost.
 
     - `system_id`: that of the autopilot; None until its first heartbeat, if none was given.
@@ -71,7 +71,7 @@ class Inquiry:
 
     def __exit__(self, *_: object) -> None:
         with suppress(OSError):
-            if self._waiting or self._port.unsent():  # a line that takes nothing must not delay the end
+            if self._waiting or self._port.unsent():  # a port that accepts nothing must not delay the end
                 self._port.throw_away()
         self._port.close()
 

@@ -38,7 +38,7 @@ class LinkSettings:
     """The settings of a link.
 
     - `component_id`: our own; `system_id`: that of the autopilot (None: of the first one heard).
-    - `max_fix_age_s`: a fix that has waited longer is never sent.
+    - `max_fix_age_s`: a fix that has waited longer, in seconds, is never sent.
     - `listener`: is called with the reports of the vehicle, and gives the positions of a continuous channel.
     - `tap`: is called with each packet written and each packet received, in the link's thread.
     - `origin`: is sent to an autopilot that takes ODOMETRY and has no origin (None: never).
@@ -115,11 +115,11 @@ class Conversation:
         self._ask_position_s = self._clock()
 
     def offer(self, wishes: Collection[Wish]) -> None:
-        """Set the wishes of the ground that the flight can fulfil from now on; before the first call there are none."""
+        """Set the wishes of the ground station that the flight can fulfil; before the first call there are none."""
         self.wishes.offered = wishes
 
     def take_wishes(self) -> tuple[Wished, ...]:
-        """Return the wishes of the ground that have arrived since the last call."""
+        """Return the wishes of the ground station that have arrived since the last call."""
         return self.wishes.take()
 
     def vehicle(self) -> Vehicle | None:
@@ -183,9 +183,8 @@ class Conversation:
         return is_ours
 
     def tell_of_answers(self) -> None:
-        """Stop waiting for answers to fixes that are more than a second late. Queue a text for the ground for each
-        change: the autopilot is silent or back, fixes are no longer answered or answered again, refused or accepted
-        again."""
+        """Stop waiting for answers that take more than a second. Queue a text for the ground station for each change:
+        autopilot silent or back; fixes unanswered or answered again, refused or accepted again."""
         now_s = self._clock()
         self._tell(self._news_of_presence(now_s))
         self.fixes.time_out(now_s)
@@ -207,7 +206,7 @@ class Conversation:
         """Choose the next message. Returns (message, the fix in it or None), or None if nothing is due."""
         late_s = now_s - self._heartbeat_due_s
         if late_s >= 0:
-            self._heartbeat_due_s = now_s + HEARTBEAT_S - late_s % HEARTBEAT_S  # keeps the rhythm after missed beats
+            self._heartbeat_due_s = now_s + HEARTBEAT_S - late_s % HEARTBEAT_S  # keeps the rhythm after delays
             return self._heartbeat(now_s), None
         system_id = self.autopilot.system_id
         if system_id is not None and self.autopilot.listens(now_s):

@@ -3,8 +3,8 @@ processing of the answers. Used by `conversation` inside turns only (see `turns`
 
 A fix is never sent late, and after five unanswered ones almost none is sent. COMMAND_ACK does not say which fix it
 answers, so it is matched to the oldest fix sent less than a second ago. With one fix a second, and an answer within
-some tens of milliseconds, there is only one such fix. After a second a fix counts as unanswered, so that a lost answer
-can cause wrong matches for a second at most. An answer that matches no fix is counted, and ignored otherwise.
+some tens of milliseconds, there is only one such fix. After a second a fix counts as unanswered, so that after a
+lost answer others are matched wrongly for a second at most. An answer that matches no fix is only counted.
 """
 
 import logging
@@ -23,10 +23,10 @@ FIXES_MAX = 8
 # This limits what the link adds to the age of a frame; types.FIX_MAX_AGE_S limits the age itself, which is mostly the
 # time that matching took and which the autopilot is told. A fix must keep both limits.
 MAX_FIX_WAIT_S = 1.0
-UNANSWERED_MAX = 5  # so many fixes in a row without an answer stop the sending, until one is answered
-TRIED_AGAIN_AFTER_S = 10.0  # while the sending is stopped, one fix is sent each time so long has passed
-# An answer takes some tens of milliseconds, over a radio up to half a second. The ground is told so long after the last
-# fix that the sending has stopped. So long after the first answer, the answers to all earlier fixes have arrived, too.
+UNANSWERED_MAX = 5  # this number of unanswered fixes in a row stops the sending, until one is answered
+TRIED_AGAIN_AFTER_S = 10.0  # while the sending is stopped, one fix is sent at this interval
+# An answer takes some tens of milliseconds, over a radio up to half a second. This time after
+# the last fix, the stop of the sending is announced; this time after the first answer, all older answers have arrived.
 ANSWERED_WITHIN_S = 1.0
 
 log = logging.getLogger(__name__)
@@ -72,9 +72,8 @@ class Sending:
 
 
 class Fixes:
-    """The fixes of one link. It counts the fixes `dropped` since they were too old, `withheld` for a reason that
-    `why_not` or a pause gives, and `unanswered`. `refusal` is the reason for the last refusal (None: there was none).
-    """
+    """The fixes of one link. It counts the fixes `dropped` because they were too old, `withheld` because of `why_not`
+    or a pause, and `unanswered`. `refusal` is the reason for the last refusal (None: there was none)."""
 
     def __init__(self, max_wait_s: float = MAX_FIX_WAIT_S) -> None:
         self.dropped = self.withheld = self.unanswered = 0
@@ -95,7 +94,7 @@ class Fixes:
     def forget_row(self) -> None:
         """Restart the count of unanswered fixes in a row: the fixes so far went to another autopilot."""
         self._row = 0
-        self._is_stopped = False  # as the ground was last told
+        self._is_stopped = False  # as the ground station was last told
         self._resumes_s = -math.inf
 
     @property
@@ -105,7 +104,7 @@ class Fixes:
         return max(self._taken_s, self._under_way[-1][0] if self._under_way else -math.inf)
 
     def put(self, fix: Fix, now_s: float) -> Sending:
-        """Queue a fix. It is sent within the longest wait and before its frame is 5 s old, or not at all."""
+        """Queue a fix. It is sent within `max_wait_s` seconds and before its frame is 5 s old, or not at all."""
         sending = Sending(fix, min(now_s + self._max_wait_s, fix.t_frame_s + FIX_MAX_AGE_S))
         age_s = now_s - fix.t_frame_s
         if age_s > FIX_MAX_AGE_S:
@@ -190,8 +189,8 @@ class Fixes:
             self._give_up(reason)
 
     def news_of_silence(self, reason: Reason, now_s: float) -> News | None:
-        """Return a text for the ground when sending has stopped, as no fix is answered for `reason`, and another when
-        it is resumed; each once. None: nothing has changed."""
+        """Return once a text for the ground station when sending stops, because no fix is answered (for `reason`), and
+        once when it resumes. None: nothing has changed."""
         is_stopped = self._row >= UNANSWERED_MAX
         if is_stopped == self._is_stopped or (is_stopped and now_s - self._sent_s < ANSWERED_WITHIN_S):
             return None
@@ -207,8 +206,8 @@ class Fixes:
         return News(True, f"fixes unanswered: {reason.brief}", "answers")
 
     def take_news(self) -> News | None:
-        """Return once a text for the ground when answers have changed: refused, refused for another reason, or accepted
-        again. None: nothing has changed."""
+        """Return once a text for the ground station when the answers change: refused, refused for another reason, or
+        accepted again. None: nothing has changed."""
         news, self._news = self._news, None
         return news
 

@@ -18,7 +18,7 @@ from edgevpr.mavlink.requests import Requests
 from edgevpr.mavlink.wire import Message, mavlink
 
 FOR_PEOPLE = frozenset(("STATUSTEXT", "NAMED_VALUE_FLOAT", "NAMED_VALUE_INT", "ONBOARD_COMPUTER_STATUS"))
-# Of two stations at one listening port, the first is answered until its heartbeats (one a second) stop for so long.
+# With two stations at one listening port, the first is answered until its heartbeats (1 Hz) have stopped for this time.
 SILENT_AFTER_S = 5.0
 
 
@@ -40,7 +40,7 @@ class GroundLink(Link):
         with self.turn("ground link"):
             self._conversation = GroundConversation(told, settings, self._turns.now_s)
         told.copy_message = self._tell
-        # Texts wait for their turn on each link by itself: on one that is lost they wait for ever.
+        # Each link has its own queue of texts: while a link is lost, its texts wait.
         told.copy_text = self.announce
 
     def _tell(self, message: Message) -> None:

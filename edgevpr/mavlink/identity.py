@@ -8,8 +8,8 @@ from edgevpr.mavlink.address import Sender
 
 # A flight controller that restarts is back within 20 s; other senders in the meantime are not it.
 RETAKEN_AFTER_S = 30.0
-STEADY_S = 5.0  # another sender must have sent heartbeats for so long, which one stray packet does not,
-GAP_S = 2.5  # and without a longer gap: they come once a second, and one may be lost
+STEADY_S = 5.0  # another sender takes over after heartbeats for this time (not after one stray packet),
+GAP_S = 2.5  # without a longer gap: they come once a second, and one may be lost
 _OTHERS_MAX = 32  # speakers remembered; a flood of invented ones must not fill the memory
 
 log = logging.getLogger(__name__)

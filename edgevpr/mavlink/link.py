@@ -41,7 +41,7 @@ class LinkStats:
     """Counts and state of a link since its start; messages are counted by name, answers (`acks`) by name of the result.
 
     `trouble` is why the link is not open, or last was not; None once data arrives. `foreign_messages` were refused
-    since they came from another autopilot or another address. `withheld_fixes` were not sent since earlier ones had no
+    because they came from another autopilot or address. `withheld_fixes` were not sent because earlier ones had no
     answer, or the ground has paused the flight. `unanswered_fixes` had no answer within a second; `refused_why` says in
     a few words why the last refused fix was refused (None: none was). `commands` counts the commands addressed to us,
     by result, and `ignored_requests` the other messages to us that had no effect. With a signing key,
@@ -69,7 +69,7 @@ class LinkStats:
 
     @property
     def fixes_sent(self) -> int:
-        """Number of position fixes sent by command 43003."""
+        """Number of position fixes sent."""
         return self.sent.get("COMMAND_INT", 0)
 
 

@@ -86,7 +86,7 @@ def odometry(state: MotionState, attitude: tuple[float, float, float], origin: t
 
     ArduPilot computes a standard deviation as the cube root of the sum of the squared variances
     (`GCS_MAVLINK::handle_odometry`, 4.7-dev); the variances sent are those from which it gets the right one. That of
-    the height is sent as zero, since the height is not measured by us.
+    the height is sent as zero, because the height is not measured by us.
     """
     east_m, north_m = offset_m(origin[0], origin[1], state.lat_deg, state.lon_deg)
     roll, pitch, yaw = attitude

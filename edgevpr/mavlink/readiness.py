@@ -13,8 +13,8 @@ from edgevpr.mavlink.messages import POSITION_FIX
 from edgevpr.mavlink.vehicle import FILTER_REPORTS, GPS_REPORTS
 from edgevpr.mavlink.wire import Message, mavlink
 
-# ArduPilot refuses fixes until its GPS has said nothing useful for one second, and a receiver reports twice a second or
-# less often.
+# ArduPilot refuses fixes until its GPS has had no fix for one second, and a receiver reports twice a second or less
+# often.
 _GPS_COUNTS_S = 2.5
 _FLAGS_FRESH_S = 3.0  # they are requested twice a second
 _ORIGIN_WITHIN_S = 2.0  # of the request: an autopilot that has not answered by then has no origin

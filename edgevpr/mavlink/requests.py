@@ -19,7 +19,7 @@ SHORTEST_S = {STATUS: 1.0, mavlink.MAVLINK_MSG_ID_NAMED_VALUE_FLOAT: 0.1}
 LONGEST_S = 3600.0
 ANSWERED_MAX = 50  # requests a second; the answers to a flood of them must not displace our own messages
 PAUSED = "not sent: paused by the ground"
-_EARLY_SHARE = 0.1  # of an interval: a message may come so much early, since its maker keeps no exact time
+_EARLY_SHARE = 0.1  # of an interval: a message may come early by this much, because its timing is not exact
 
 
 class Wish(IntEnum):

@@ -14,7 +14,7 @@ log = logging.getLogger(__name__)
 
 
 class News(NamedTuple):
-    """A change to be announced to the ground: if it is alarming (a warning, else a note), its text, and its topic."""
+    """A change to be announced to the ground station: a warning if `is_alarming`, else a note; its text and topic."""
 
     is_alarming: bool
     text: str

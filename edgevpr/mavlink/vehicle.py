@@ -119,7 +119,7 @@ class Certainty:
     def hear(self, message: Message, now_s: float) -> None:
         """Process one of the `FILTER_REPORTS`."""
         if message.flags & mavlink.EKF_CONST_POS_MODE or not message.flags & _HAS_POSITION:
-            self._known = self._own = None  # it goes on to report a position, but an old one
+            self._known = self._own = None  # the position is still reported, but is an old one
         elif message.get_type() == "ESTIMATOR_STATUS":
             # PX4 reports that of both axes together, larger than that of one: a cautious value. 0: it has none.
             sd_m = message.pos_horiz_accuracy

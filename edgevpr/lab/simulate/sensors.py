@@ -83,7 +83,7 @@ class Receivers:
             )
             if self._parameters["SIM_GPS1_ENABLE"]:
                 self.first.report(_BEST_FIX, seen)
-            else:  # it goes on to report, without a fix
+            else:  # reports continue, without a fix
                 self.first.report(NO_FIX, replace(self.first.last or seen, t_s=now_s))
         self.second.age(now_s)
         other = self.second if self.primary is self.first else self.first
