@@ -1,10 +1,12 @@
-"""Agreement of two pictures: how many of their landmarks lie over each other after one turn, one scaling and one step.
+"""Agreement of two pictures: how many of their landmarks coincide after one rotation, one scaling and one shift.
 
-Points are complex numbers here, x + iy: turning and scaling by a product, moving by a sum.
+Used by `verify` to check a match: the query is the picture that is looked for, a place a picture of the map. Points are
+complex numbers here, x + iy (to the right, down), as shares of the longest side from the picture's middle. A *way* to
+lay the query on the place is two of them: a point is multiplied by the first (rotation and scale), then the second (the
+shift) is added.
 
-Landmarks that resemble each other most, either way, are matched. Every two of the best matches say how one picture lies
-on the other, and the way that most of all matches follow counts. Nothing is drawn at random, so that the same two
-pictures always agree alike.
+Two landmarks match if each is the most similar one of the other picture. Every two of the best matches define one way.
+The way that most of all matches follow is taken. Nothing is random: the same pictures always give the same result.
 """
 
 from dataclasses import dataclass, replace
@@ -15,32 +17,32 @@ import numpy as np
 from edgevpr.core.arrays import Array, Bools, Bytes, Covariance, Singles
 from edgevpr.runtime.recognise.landmarks import Landmarks
 
-# Inliers. Of 14,799 pairs of a query and a place of another site, laid as the match says, 31 had four, 7 five, 3 six
-# and none more (benchmarks/verification.py); of 50,940 laid at random 111, 22 and 2. So fewer than one in 10,000 has
-# eight by chance. Where nothing is expected, 3 of 2500 had seven.
+# Inliers with which an agreement is confirmed, and proven. Of 14,799 pairs of a query and a place of another site,
+# expected as their match says, 31 had four inliers, 7 five, 3 six
+# and none more (benchmarks/verification.py); of 50,940 expected at random, 111, 22 and 2. So fewer than one in 10,000
+# has eight by chance. Where nothing is expected, 3 of 2500 had seven.
 CONFIRMED, PROVEN = 8, 10
-# How far the landmarks may be from what is expected: shares of the longest side, degrees, a factor.
+# Largest deviations from the expected shift (share of the longest side), rotation (degrees) and scale (a factor).
 _STEP, _TURN_DEG, _SCALE = 3.5 / 32, 25.0, 1.35
 _ANY_SCALE = 1.9  # the same factor where no ratio of heights is expected
-_LEAST_SCALE, _MOST_SCALE = 0.4, 2.5  # where nothing is expected
-_ANGLE_DEG = 30.0  # between the directions of two landmarks that are the same; the corners of ORB turn by a few degrees
-_SIZE_BEYOND = 1.2  # one level of the pyramid: sizes are known no better
+_LEAST_SCALE, _MOST_SCALE = 0.4, 2.5  # limits of the scale where nothing is expected
+_ANGLE_DEG = 30.0  # largest difference of the directions of two matching landmarks; those of ORB err by a few degrees
+_SIZE_BEYOND = 1.2  # one level of the image pyramid: sizes are not known more exactly
 
-_MOST_BITS = 64  # of 256 that differ: of unrelated landmarks one in some thousand differs in so few
-_TOLERANCE = 10 / 640  # of the longest side: relief and tilt move what does lie on the same spot by about so much
-_BEST_MATCHES = 60  # of which every two are tried
-_APART = 0.06  # two landmarks nearer to each other say little about the turn
+_MOST_BITS = 64  # of 256 may differ; one in some thousand pairs of unrelated landmarks differs in so few
+_TOLERANCE = 10 / 640  # of the longest side: relief and tilt move landmarks of the same spot by about so much
+_BEST_MATCHES = 60  # so many: every two of them define a way that is tried
+_APART = 0.06  # share of the longest side; two landmarks nearer to each other say little about the rotation
 _FEWEST = 3
-# Relief and tilt move neighbouring landmarks alike, so that so many of them say as much as one. With it, half of the
-# errors on aerial_caliterra and aerial_garfield28 are within what the covariance says of half of them.
+# Relief and tilt move neighbouring landmarks alike: so many of them count as one independent landmark. With this, half
+# of the errors on aerial_caliterra and aerial_garfield28 are within the bound that the covariance gives for half.
 _ALIKE = 40.0
 
 
 @dataclass(frozen=True, slots=True)
 class Overlay:
-    """Guess of how one picture lies on another, such as the query on a place: `shift_share` (dx, dy) of its middle,
-    `rotation_deg` and `scale`
-    (None: unknown), as in `Agreement`."""
+    """Guess of how one picture lies on another, such as the query on a place. `shift_share` (dx, dy), `rotation_deg`
+    and `scale` (None: unknown) have the same meaning as in `Agreement`."""
 
     shift_share: tuple[float, float]
     rotation_deg: float
@@ -48,7 +50,8 @@ class Overlay:
 
 
 def onto(one: Overlay, other: Overlay) -> Overlay:
-    """Return how one place lies on another, of how the same query lies on both."""
+    """Return how the place of `one` lies on the place of `other`, where both say how the same query lies on their
+    place."""
     turn_scale = _turn_scale(other) / _turn_scale(one)
     shift = complex(*other.shift_share) - turn_scale * complex(*one.shift_share)
     scale = None if None in (one.scale, other.scale) else float(abs(turn_scale))
@@ -58,13 +61,15 @@ def onto(one: Overlay, other: Overlay) -> Overlay:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Agreement:
-    """Result of a comparison: `inliers` of the `matched` landmarks lie over each other; `possible` is the number of
-    landmarks of the picture that has fewer.
+    """Result of comparing the landmarks of query and place. `matched` is the number of landmarks that match, `inliers`
+    the number of those that coincide, and `possible` the number of landmarks of the picture that has fewer.
 
-    The query, turned by `rotation_deg` (clockwise, 0..360) about its middle and scaled by `scale`, lies over the place
-    when its middle is moved by `shift_share` (dx to the right, dy down) from the place's middle, as shares of the
-    place's longest side, with `covariance_share2` (var x, cov xy, var y). `scale` is above 1 for a query from higher
-    up. All of them are None without inliers. `is_expected` is False where they agree, but otherwise than expected."""
+    The query is turned by `rotation_deg` (clockwise, 0..360) about its middle, scaled by `scale` (above 1 if it was
+    taken from higher up), and its middle is moved from the place's middle by `shift_share` (dx to the right, dy down),
+    as shares of the place's longest side. It then lies over the place. `covariance_share2` (var x, cov xy, var y) is
+    that of the shift. All four are None without inliers. `is_expected` is False if the pictures agree, but not in the
+    expected way.
+    """
 
     inliers: int
     matched: int
@@ -77,14 +82,14 @@ class Agreement:
 
     @property
     def way(self) -> tuple[complex, complex] | None:
-        """The turn with the scale, and the step, that lay the query on the place."""
+        """The way to lay the query on the place, as two complex numbers (see the module); None without inliers."""
         if self.shift_share is None or self.rotation_deg is None or self.scale is None:
             return None
         return complex(self.scale * np.exp(1j * np.radians(self.rotation_deg))), complex(*self.shift_share)
 
     @property
     def is_at_rest(self) -> bool:
-        """True where one picture lies on the other without any step, as a display over all pictures does."""
+        """True if the pictures coincide without shift, rotation and scaling, as a display drawn over all does."""
         if self.shift_share is None or self.rotation_deg is None or self.scale is None:
             return False
         turned_deg = min(self.rotation_deg, 360 - self.rotation_deg)
@@ -92,20 +97,21 @@ class Agreement:
 
 
 def held_against(query: Landmarks, place: Landmarks, expected: Overlay) -> Agreement:
-    """Return how two pictures agree as `expected`; where few of their landmarks do, and many agree otherwise, that."""
+    """Compare two pictures near the `expected` overlay. If few landmarks agree there and many agree elsewhere, return
+    that other agreement, with `is_expected` False."""
     found = agreement(query, place, expected)
     if found.inliers >= CONFIRMED:
         return found
     otherwise = agreement(query, place)
     way = otherwise.way
     if way is None or otherwise.inliers < PROVEN or otherwise.is_at_rest or _is_near(*way, expected):
-        return found  # what is at rest may be a display, and says nothing of the ground
+        return found  # an agreement at rest may come from a display, not from the ground
     return replace(otherwise, is_expected=False)
 
 
 def agreement(query: Landmarks, place: Landmarks, expected: Overlay | None = None) -> Agreement:
-    """Compare the landmarks of two pictures. Only ways in which the query may lie near to what is `expected` are tried;
-    None: all."""
+    """Compare the landmarks of two pictures. Only ways to lay the query on the place that are near to the `expected`
+    one are tried (None: all)."""
     possible = min(len(query), len(place))
     if possible < _FEWEST:
         return Agreement(inliers=0, matched=0, possible=possible)
@@ -145,22 +151,24 @@ def agreement(query: Landmarks, place: Landmarks, expected: Overlay | None = Non
 
 
 def _complex(landmarks: Landmarks) -> Array:
+    """Return the points of landmarks as complex64 (K,), x + iy."""
     return np.ascontiguousarray(landmarks.points, np.float32).view(np.complex64).ravel()
 
 
 def _differing_bits(one: Bytes, other: Bytes) -> Singles:
-    """Count the bits in which descriptions differ, uint8 (N, 32) and (M, 32) -> float32 (N, M)."""
+    """Count the bits in which each two descriptions differ: uint8 (N, 32) and (M, 32) -> float32 (N, M)."""
     ours, theirs = (2 * np.unpackbits(bits, axis=1).astype(np.float32) - 1 for bits in (one, other))
     return np.asarray((ours.shape[1] - ours @ theirs.T) / 2)
 
 
 def _turn_scale(expected: Overlay) -> np.complex64:
+    """Return rotation and scale of an overlay as one complex factor."""
     return np.complex64((expected.scale or 1.0) * np.exp(1j * np.deg2rad(expected.rotation_deg)))
 
 
 def _plausible(query: Landmarks, place: Landmarks, asked: Array, known: Array, expected: Overlay) -> Bools:
-    """Tell which landmarks of the place (M,) those of the query (N,) can be, bool (N, M): by where they lie, their
-    directions and sizes."""
+    """Return bool (N, M): which landmark of the place (M) each of the query (N) can be, judged by the expected
+    position, direction and size. `asked` (N,) and `known` (M,) are their points, complex."""
     factor = _factor(expected)
     laid = _turn_scale(expected) * asked + np.complex64(complex(*expected.shift_share))
     room = _STEP + np.abs(asked) * (factor - 1 + np.radians(_TURN_DEG) / 2)
@@ -172,11 +180,13 @@ def _plausible(query: Landmarks, place: Landmarks, asked: Array, known: Array, e
 
 
 def _factor(expected: Overlay) -> float:
+    """Return the largest factor between the scale and the expected one."""
     return _ANY_SCALE if expected.scale is None else _SCALE
 
 
 def _is_near(turn_scale: Any, shift: Any, expected: Overlay | None) -> Bools:
-    """Tell which ways to lay the query on the place are near to what is expected, bool like `shift`."""
+    """Return which of N ways, complex (N,) each or one number each, are near to the expected one: bool like `shift`.
+    Without an expectation (None), only the scale is limited."""
     if expected is None:
         return np.asarray((np.abs(turn_scale) >= _LEAST_SCALE) & (np.abs(turn_scale) <= _MOST_SCALE))
     beside = turn_scale / _turn_scale(expected)
@@ -186,13 +196,14 @@ def _is_near(turn_scale: Any, shift: Any, expected: Overlay | None) -> Bools:
 
 
 def _most_followed(asked: Array, known: Array, expected: Overlay | None) -> tuple[complex, complex] | None:
-    """Return the turn with the scale, and the step, of two matches, that most of the matches follow; None where there
-    is none. The nearer they come, the more they count."""
+    """Return the way, defined by two matches, that most matches follow; None if no way is near to the expected one.
+    `asked` and `known` are the points of the matches, complex (n,). The more closely a match follows a way, the more it
+    counts."""
     one, other = np.triu_indices(min(_BEST_MATCHES, len(asked)), 1)
     apart = np.abs(asked[other] - asked[one]) > _APART
     one, other = one[apart], other[apart]
     turn_scale = (known[other] - known[one]) / (asked[other] - asked[one])
-    turn_scale = np.where(turn_scale == 0, np.finfo(float).tiny, turn_scale)  # two landmarks on one spot: no scale
+    turn_scale = np.where(turn_scale == 0, np.finfo(float).tiny, turn_scale)  # two landmarks on one spot: avoid zero
     shift = known[one] - turn_scale * asked[one]
     near = _is_near(turn_scale, shift, expected)
     if not near.any():
@@ -205,7 +216,7 @@ def _most_followed(asked: Array, known: Array, expected: Overlay | None) -> tupl
 
 
 def _fitted(asked: Array, known: Array) -> tuple[complex, complex]:
-    """Return the turn with the scale, and the step, that lay `asked` over `known` by least squares."""
+    """Return the way that lays `asked` over `known`, complex (n,) each, by least squares."""
     middle, there = asked.mean(), known.mean()
     spread = np.vdot(asked - middle, asked - middle).real
     turn_scale = np.vdot(asked - middle, known - there) / spread if spread > 0 else 1.0 + 0j
@@ -213,8 +224,8 @@ def _fitted(asked: Array, known: Array) -> tuple[complex, complex]:
 
 
 def _variance(asked: Array, known: Array, turn_scale: complex, shift: complex) -> float:
-    """Return the variance of the step of the query's middle, along x as along y: the farther the landmarks are from the
-    middle, the more a wrong turn moves it."""
+    """Return the variance of the shift along each axis, shares squared, from the inliers `asked` and `known`, complex
+    (n,). The farther they are from the picture's middle, the more a wrong rotation moves the middle."""
     left = np.abs(turn_scale * asked + shift - known) ** 2
     per_axis = max(float(left.sum()) / max(2 * len(asked) - 4, 1), (_TOLERANCE / 10) ** 2)
     middle = asked.mean()

@@ -1,16 +1,16 @@
-"""Belief where the aircraft is, followed from query to query: a Bayes filter over the places of a map.
+"""Belief where the aircraft is, updated from query to query by a Bayes filter over the places of a map (see `follow`).
 
-The aircraft is lost (off the map, or on it where no query has seen it), or near one of at most `MOST` hypotheses, each
-a Gaussian on the scale. Being lost is a state like any other, and explains what the map does not.
+The aircraft is *lost* (off the map, or on it where no query has recognised it), or near one of at most `MOST`
+hypotheses. Each is a Gaussian position, in the units of the map's `MapScale`. Being lost has a probability of its own.
 
-A query is heard by its own probabilities. Divided by the prior they were made with they are likelihoods, so a query
-without history is believed as it stands. Three things keep a history from being believed too much:
+The probabilities of a query alone are divided by the prior they were made with, which gives likelihoods. Without
+history the result is thus that of the query. Three things keep a history from being believed too much:
 
-* Between two queries the aircraft may have left the map or be anywhere, so the newest query must always speak for it.
-* Pictures of the same ground are no new evidence. A hypothesis remembers what it was credited with on the ground where
-  it now is, and another look replaces that. During a hover only the newest look counts.
-* Ground that is not in the map, once it was taken for a place, may well look like the way on from there. So a place
-  that fits the history speaks for the map only by so much.
+* Between two queries the aircraft may have left the map or be anywhere, so the newest query must always support it.
+* Pictures of the same ground are no new evidence. A hypothesis stores the evidence it was already given (`credited`)
+  for the ground where it is (`anchor`), and the next query there replaces it. In a hover only the newest query counts.
+* Ground outside the map that was once mistaken for a place may well resemble the places that follow it. So a place that
+  fits the history supports being on the map by a limited factor only.
 """
 
 import math
@@ -34,30 +34,31 @@ from edgevpr.runtime.recognise.hypotheses import (
 )  # fmt: skip
 
 MOST = 64  # hypotheses kept
-PRIOR_LOST = 0.5  # of the probabilities that are handed in
+PRIOR_LOST = 0.5  # the prior with which the probabilities of a query are made
 
-# Chances between two queries. The first two are also the most that a history can be believed: odds of 1 to their sum.
+# Chances between two queries to leave the map, to be anywhere on it, and to enter it. The odds for a history are at
+# most 1 to the sum of the first two.
 _LEAVES, _JUMPS, _ENTERS = 0.01, 0.01, 0.02
-_MISSED = 0.2  # how likely a place is unseen by a query over it, against one over ground that is not in the map
-_ALIKE = 0.1  # how likely ground that is not in the map, once taken for a place, looks like the way on from there
-_LEAST_REST = 1e-4  # of the probability that it is none of the candidates
-_GOES_ON, _ODOMETRY = 0.75, 0.6  # shares of these ways to move; odometry comes before going on as before
+_MISSED = 0.2  # how likely a query misses the place below it, relative to one over ground that is not in the map
+_ALIKE = 0.1  # how likely ground outside the map, once taken for a place, resembles the next places as well
+_LEAST_REST = 1e-4  # least probability that no candidate is right
+_GOES_ON, _ODOMETRY = 0.75, 0.6  # probabilities of going on as before, and of moving by odometry, which comes first
 _GOES_ON_SD, _ODOMETRY_SD = 0.5, 0.25  # in spacings of the map
-_REACH_SD = 1.5  # standard deviations that the reach is
-_LEARNS = 0.2  # share of the newest step in a velocity
-_SCATTERS = 2.0  # standard deviations of a position: a step as short as that may be none
-_FORGOTTEN = 1e-9  # a hypothesis of less weight
-_MOSTLY = 0.5  # of a share
+_REACH_SD = 1.5  # the reach in standard deviations
+_LEARNS = 0.2  # weight of the newest displacement in the mean velocity
+_SCATTERS = 2.0  # standard deviations of a position: a shorter displacement may be none
+_FORGOTTEN = 1e-9  # a hypothesis of less weight is dropped
+_MOSTLY = 0.5  # a larger share is most of it
 _LEAST = 1e-300  # instead of zero, where a number divides
-_OF_LENGTH_SD = 0.15  # of the length of a displacement by odometry that can be believed
-_LONGEST_S = 3600.0  # after which an aircraft may be anywhere
+_OF_LENGTH_SD = 0.15  # standard deviation of a credible displacement by odometry, as a share of its length
+_LONGEST_S = 3600.0  # longest time that counts
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Moved:
-    """Knowledge of how an aircraft has moved since the query before. `reach` is how far it can have moved, in the unit
-    of the map (metres, or places), and `elapsed_s` the time it had. `by` (2,) is the displacement by odometry, with its
-    `covariance` (2, 2); None: there is none."""
+    """Motion of the aircraft since the previous query. `reach` is how far it can have moved, in the unit of the map
+    (metres, or places), in `elapsed_s` seconds. `by` (2,) is its displacement by odometry (None: unknown), with the
+    `covariance` (2, 2), in the same unit."""
 
     reach: float
     elapsed_s: float
@@ -67,7 +68,7 @@ class Moved:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlaneEstimate:
-    """Position (2,) in the plane of the map with its covariance (2, 2), and the heading (None: unknown)."""
+    """Position `at` (2,) in the plane of the map, its `covariance` (2, 2), and the heading (degrees, None: unknown)."""
 
     at: Doubles
     covariance: Doubles
@@ -76,8 +77,8 @@ class PlaneEstimate:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Posterior:
-    """Belief after a query: the probability to be `lost`; `p` (K,) of the candidates of the query; and the `mass` of
-    all hypotheses near the `estimate` (None: there is no hypothesis)."""
+    """Belief after a query: the probability of being `lost`, the probability `p` (K,) of each candidate of the query,
+    and the `estimate` of the position (None: no hypothesis). `mass` is the probability of all hypotheses near it."""
 
     lost: float
     p: Doubles
@@ -88,11 +89,11 @@ class Posterior:
 def moved(
     elapsed_s: float | None, usual_s: float, speed_max: float, velocity: tuple[float, float] | None = None
 ) -> Moved:
-    """Return what is known of the motion in `elapsed_s` seconds (None: unknown), usually `usual_s`.
+    """Return the motion in `elapsed_s` seconds (None: unknown; then `usual_s` is taken).
 
     `speed_max` is the highest speed, in units of the map a second, and `velocity` (east, north) that of odometry (None:
-    unknown). A clock that has gone back, or stood still, says nothing of the time; then odometry says nothing of the
-    way.
+    unknown). If `elapsed_s` is not above 0, because the clock stood still or was set back, the time counts as unknown.
+    If the time is unknown, or the velocity is too high to be true, odometry is not used.
     """
     if elapsed_s is None or not elapsed_s > 0:
         return Moved(reach=speed_max * usual_s, elapsed_s=usual_s)
@@ -105,7 +106,7 @@ def moved(
 
 
 class Belief:
-    """The belief of one flight over one map, taken on with each query by `update`."""
+    """Belief of one flight over one map. It begins as lost; `update` is called once for each query."""
 
     def __init__(self, scale: MapScale) -> None:
         self._scale = scale
@@ -113,10 +114,10 @@ class Belief:
         self._now, self._strongest = no_hypotheses(), 0.0
 
     def update(self, proposed: Proposals | None, moved: Moved, places: int) -> Posterior:
-        """Take what a query has seen (None: its picture says nothing), and how the aircraft has moved since the query
-        before; `places` is how many the map has now.
+        """Update the belief with the candidates that a query proposes (None: its picture shows too little), the motion
+        since the previous query, and the number of places in the map now.
 
-        Never raises for numbers that make no sense: a candidate that is not finite counts as not proposed.
+        Never raises for invalid numbers: a candidate that is not finite counts as not proposed.
         """
         odds = (1 - self._lost) / max(self._lost, _FORGOTTEN)
         now, lost, appears = self._left()
@@ -125,7 +126,7 @@ class Belief:
         p = np.zeros(0 if proposed is None else len(proposed.p))
         numbers: Ints = np.zeros(0, int)
         if proposed is None:
-            lost += appears  # nobody knows where
+            lost += appears  # whoever enters the map now is at an unknown place
             after = _unseen(now, ways, 1.0)
         else:
             self._enters = _ENTERS
@@ -133,7 +134,7 @@ class Belief:
             there, alike, staleness, left = self._credit(proposed, now, ways, moved.elapsed_s, appears, places)
             lost *= alike
             unseen = _unseen(now, ways, _MISSED)
-            # One who is lost and sees the same again has not moved on either, so staying here is no evidence for it.
+            # A lost aircraft that sees the same ground again has not moved either, so staying is no evidence for it.
             kept = (left * odds * lost - float(unseen.w.sum())) / max(float(there.w.sum()), _FORGOTTEN)
             after = joined(replace(there, w=there.w * max(1.0, kept) ** staleness), unseen)
         share = after.w / (lost + float(after.w.sum()))
@@ -144,8 +145,12 @@ class Belief:
         return self._posterior(p)
 
     def _left(self) -> tuple[Hypotheses, float, float]:
-        """Return the hypotheses, and the probabilities to be lost and to have come anywhere on the map, after the time
-        between two queries. What leaks away is credited no more."""
+        """Apply the chances of leaving, entering and jumping between two queries. Returns
+
+        * the hypotheses, with less weight; the evidence credited to them shrinks as being lost becomes more probable,
+        * the probability of being lost,
+        * the probability of having appeared anywhere on the map.
+        """
         held = float(self._now.w.sum())
         lost = (1 - self._enters) * self._lost + _LEAVES * held
         stays = 1 - _LEAVES - _JUMPS
@@ -181,23 +186,28 @@ class Belief:
     def _credit(
         self, proposed: Proposals, now: Hypotheses, ways: list[Way], elapsed_s: float, appears: float, places: int
     ) -> tuple[Hypotheses, float, float, float]:
-        """Return one hypothesis for each candidate of a query, whose weight has come from the hypotheses before, each
-        by the ways that lead here, and from nowhere; how much likelier one who is lost sees the query than if
-        nothing out there were like the map; how far the query shows the same ground as the one before (0..1), and what
-        is then left of the odds: 1 at most, less where this look says less."""
+        """Weigh the candidates by the hypotheses that can have moved to them. `appears` is the probability of having
+        appeared anywhere, and `places` the size of the map. Returns
+
+        * one hypothesis for each candidate,
+        * the likelihood of the query if lost, relative to that on ground that never resembles the map,
+        * the share (0..1) of the weight that comes from pictures of the same ground as the query before,
+        * the factor, 1 at most, by which the odds of not being lost shrink if this query is weaker evidence for that
+          ground.
+        """
         scale, at, of_step = self._scale, proposed.at, proposed.covariance
         rest = max(_LEAST_REST, 1 - float(proposed.p.sum()))
         ratio = np.log(np.maximum(proposed.p, _LEAST) * places * PRIOR_LOST / ((1 - PRIOR_LOST) * rest))
         born = appears / places * np.exp(ratio)
 
-        # A picture of the same ground says what the one before has said, to whoever was there: also to one who is lost.
+        # A picture of the same ground repeats the evidence of the one before. This holds for a lost aircraft as well.
         strongest, before = max(0.0, float(ratio.max(initial=0))), self._strongest
         same, self._strongest = min(before, strongest), strongest
         scatter = np.sqrt(of_step[:, 0, 0] if scale.is_ordinal else np.trace(of_step, axis1=1, axis2=2) / 2)
         fresh = np.clip((apart(now.anchor, at) - _SCATTERS * scatter) / scale.spacing, 0, 1)
         evidence = np.exp(ratio + (1 - fresh) * (same - now.credited[:, None])) * (scale.cell * now.w[:, None])
         led = [way.share[:, None] * evidence * density(way, at, of_step, scale.is_ordinal) for way in ways]
-        weight = sum(each.sum(0) for each in led)  # of what has come from hypotheses
+        weight = sum(each.sum(0) for each in led)  # of the hypotheses that lead to each candidate
         by = sum(led) / np.maximum(weight, _LEAST)
         stale = by * (1 - fresh)
         staleness = float(weight @ stale.sum(0)) / max(_LEAST, float((weight + born).sum()))
@@ -229,6 +239,8 @@ class Belief:
         return there, alike, staleness, left
 
     def _posterior(self, p: Doubles) -> Posterior:
+        """Return the belief with an estimate: the mean of the hypotheses around the one that has most weight near
+        it."""
         now = self._now
         if not len(now.w):
             return Posterior(lost=self._lost, p=p, mass=0.0, estimate=None)
@@ -245,7 +257,7 @@ class Belief:
 
 
 def _unseen(now: Hypotheses, ways: list[Way], chance: float) -> Hypotheses:
-    """Return the hypotheses after they have moved, where a query does not see them, which has this chance."""
+    """Return the hypotheses after their motion, if the query sees none of them, which has the probability `chance`."""
     share = np.stack([way.share for way in ways], 1)[..., None]
     at = np.stack([way.at for way in ways], 1)
     covariance = np.stack([way.covariance for way in ways], 1)
@@ -256,5 +268,6 @@ def _unseen(now: Hypotheses, ways: list[Way], chance: float) -> Hypotheses:
 
 
 def _vector(heading_deg: Doubles) -> Doubles:
+    """Return headings (K,) in degrees as unit vectors (K, 2), north and east; zeros where the heading is NaN."""
     heading = np.radians(heading_deg)
     return np.asarray(np.nan_to_num(np.stack([np.cos(heading), np.sin(heading)], 1)))
