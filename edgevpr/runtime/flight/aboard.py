@@ -1,5 +1,5 @@
-"""All that is aboard before the links and the source are opened: map, recogniser and learner, and the log, whose
-first line says all that identifies a flight."""
+"""Opening of the map, the recogniser, the learner and the flight log, and the first line of that log, which records all
+that a flight depends on. `flight` does this before it opens the links and the source of frames."""
 
 import logging
 import os
@@ -27,7 +27,7 @@ from edgevpr.runtime.recognise.learn import Learner
 from edgevpr.runtime.recognise.opening import has_map, open_learning, open_recogniser
 from edgevpr.runtime.recognise.recogniser import Recogniser
 
-_NEW_MAP_PLACES = 1000  # a technique picked for an empty map must be able to fly with so many
+_NEW_MAP_PLACES = 1000  # places that a technique chosen for an empty map must be fast enough for
 _LIBRARIES = ("numpy", "cv2", "onnxruntime")
 
 _log = logging.getLogger(__name__)
@@ -35,8 +35,9 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Aboard:
-    """The recogniser, its `learner` (None: nothing is learnt), the reason why it cannot learn (None: it can, or is not
-    to), the log, and how the technique will do."""
+    """Result of `come_aboard`. `learner` is None if no places are learnt. `cannot_learn` is why there is no learner
+    although the configuration asks for one (None: there is one, or none is asked for). `found` is the expected
+    performance."""
 
     recogniser: Recogniser
     learner: Learner | None
@@ -46,8 +47,8 @@ class Aboard:
 
 
 def come_aboard(config: Config, world: World, stack: ExitStack) -> Aboard:
-    """Open the map and the log, which are closed with the `stack`, and try how the technique will do. Raises an
-    EdgevprError where one of them cannot be opened."""
+    """Open the map and the log, which `stack` closes, and measure how fast the technique is on this board. Raises an
+    EdgevprError if the map or the log cannot be opened."""
     recogniser, learner, cannot_learn = _opened(config, world)
     stack.callback(recogniser.place_map.close)
     flight_log = FlightLog(
@@ -72,10 +73,13 @@ def come_aboard(config: Config, world: World, stack: ExitStack) -> Aboard:
 
 
 def _opened(config: Config, world: World) -> tuple[Recogniser, Learner | None, str | None]:
-    """Open the recogniser of a flight, its learner if it is to have one, and say why it has none.
+    """Open the recogniser of a flight. Returns
+    - the recogniser,
+    - its learner (None: no places are learnt),
+    - why it cannot learn (None: it can, or is not asked to).
 
-    Where the map cannot be written (a card that has become read-only, a full disk), the recogniser alone is opened: the
-    places of the map are recognised all the same.
+    If the map cannot be written (a memory card that has become read-only, a full disk), only the recogniser is opened:
+    the places of the map can still be recognised.
     """
     here = replace(config, map=world.place_map)
     name = world.tape.read("picked", lambda: _picked(config))
@@ -102,14 +106,15 @@ def _opened(config: Config, world: World) -> tuple[Recogniser, Learner | None, s
 
 
 def _picked(config: Config) -> str | None:
-    """Return the technique that is asked for; one is picked for a new map."""
+    """Return the configured technique (None: that of the map). If a new map is to be learnt and no technique is
+    configured, choose one for the board."""
     if config.mapping.learn and config.technique is None and config.map is not None and not has_map(Path(config.map)):
         return picked_technique(config.board, _NEW_MAP_PLACES, config.source.camera)
     return config.technique
 
 
 def _learning(config: Config, world: World, name: str | None) -> tuple[Recogniser, Learner]:
-    """Open the recogniser of a flight and its learner; a new map is made for the technique of this name."""
+    """Open the recogniser of a flight and its learner. `name` is the technique for which a new map is made."""
     recogniser, growing = open_learning(config, world.board, name)
     spacing_m, gap_m = config.mapping.spacing_m, config.salience.gap_m
     learner = Learner(recogniser, growing, spacing_m=spacing_m, gap_m=gap_m, utc_clock=world.clock.utc_s)
@@ -117,12 +122,13 @@ def _learning(config: Config, world: World, name: str | None) -> tuple[Recognise
 
 
 def rate_hz(config: Config, recogniser: Recogniser) -> float:
-    """Return the queries a second: the configuration's figure, else that of the board's profile."""
+    """Return the queries per second: the configured rate, or else that of the board's profile."""
     return config.source.rate_hz or recogniser.meter.board.rate_hz
 
 
 def say_start(config: Config, world: World, aboard: Aboard) -> None:
-    """Say which technique flies, and write the first line of the log."""
+    """Report which technique flies, warn if fixes would be too late or the board's power is unverified, and write the
+    first line of the flight log."""
     board, recogniser, found = world.board, aboard.recogniser, aboard.found
     _log.info("version %s on %s", __version__, board.title)
     _log.info("%s", found.reason)
@@ -148,8 +154,8 @@ def say_start(config: Config, world: World, aboard: Aboard) -> None:
 
 
 def start_fields(config: Config, board_name: str, spec: TechniqueSpec, place_map: PlaceMap) -> dict[str, Any]:
-    """Return the fields of a flight's first line, of kind "start": all that a flight depends on, but for its pictures
-    and its autopilot. Of the libraries those are named that are loaded."""
+    """Return the fields of the first line of a flight log (kind "start"): all that a flight depends on, except its
+    pictures and its autopilot. Only libraries that are loaded have their version listed."""
     loaded = {name: getattr(sys.modules.get(name), "__version__", None) for name in _LIBRARIES}
     return {
         "version": __version__,
@@ -167,10 +173,10 @@ def start_fields(config: Config, board_name: str, spec: TechniqueSpec, place_map
 
 
 def _identity(place_map: PlaceMap) -> MapIdentity | None:
-    """Return the identity of a map, None for one without places: each of those is a new one."""
+    """Return the identity of a map; None if it has no places yet, or cannot be identified."""
     try:
         found = identity_of(place_map)
         return found if found.places else None
-    except MapError as error:  # the places that can be read are flown with
+    except MapError as error:  # the flight uses the places that can be read
         _log.warning("the log does not say which map it is: %s", error)
         return None

@@ -1,5 +1,5 @@
-"""The world of a flight in the air: what comes in from real cameras, clocks and links, recorded where that is asked
-for."""
+"""Making of the `World` of a real flight: its cameras, clocks and links, and a recording of all input if one is
+configured. `flight.fly` uses it; a replay makes a `World` of its own."""
 
 import logging
 import os
@@ -39,9 +39,9 @@ _log = logging.getLogger(__name__)
 def in_the_air(
     config: Config, positions: Path | None = None, read_again: Callable[[], Config] | None = None
 ) -> Iterator[World]:
-    """Open what a flight takes in and speaks to in the air, and close it at the end. `positions` is a file with those
-    of the frames of a recording, and `read_again` reads the configuration anew. Raises an EdgevprError where something
-    cannot be opened."""
+    """Open all inputs and outputs of a real flight, yield them, and close them at the end. `positions` is a file with
+    the positions of the frames, if the source is a recording (None: there is none). `read_again` reads the
+    configuration again (None: it has no file). Raises an EdgevprError if something cannot be opened."""
     if config.source.uri is None:
         raise UsageError("There is no source of frames: name one with --source, or `source: {uri: ...}`.")
     parse_links(config.mavlink.link, config.mavlink.ground)
@@ -92,7 +92,7 @@ def in_the_air(
 
 
 def _recording(config: Config, stack: ExitStack) -> Recording | None:
-    """Begin the recording, if there is to be one."""
+    """Begin the recording, which `stack` closes; return None if none is configured."""
     if config.log.record is None:
         return None
     recording = stack.enter_context(Recording(config.log.record, config.log.record_mb))
@@ -102,7 +102,8 @@ def _recording(config: Config, stack: ExitStack) -> Recording | None:
 
 
 def _or_without(opened: Callable[[], T]) -> T | None:
-    """Return what is opened. A service, which may restart in the air, flies without what cannot be opened."""
+    """Return the result of `opened`. If that raises an EdgevprError in a systemd service, which may be restarted in the
+    air, log it and return None, so that the flight goes on without."""
     try:
         return opened()
     except EdgevprError as error:

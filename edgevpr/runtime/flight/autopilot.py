@@ -1,4 +1,5 @@
-"""The channel to the autopilot: tells it of every event, and gives what it says of its vehicle."""
+"""Exchange of a flight with its autopilot: sends fixes and messages over the link, logs the answers, and gives the
+state of the link. The loop of `flight` uses `ToAutopilot`, or `NoAutopilot` if there is no link."""
 
 import logging
 import math
@@ -16,44 +17,44 @@ from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.flight.status import LinkState
 from edgevpr.runtime.recognise.recognition import Recognition
 
-# Where an autopilot listens, a fix leaves within a fraction of a millisecond. The loop waits for that, at most so long,
-# so that the log can tell what became of the fix.
+# While an autopilot is heard, a fix is sent within a fraction of a millisecond. The loop waits for that, at most this
+# long, so that the log line of the query can say whether the fix was sent.
 _SETTLED_WITHIN_S = 0.02
 
 DRY_RUN = "dry run: no fix is sent"
 
-_GPS_GOOD_FOR_S = 10.0  # before the sources with GPS are asked for again
+_GPS_GOOD_FOR_S = 10.0  # so long GPS must be good before the source set with GPS is asked for again
 
 _log = logging.getLogger(__name__)
 
 
 class NoAutopilot:
-    """Stands in for a `ToAutopilot` where there is no link."""
+    """Replaces `ToAutopilot` in a flight without a link."""
 
     summary = None
 
     def log_answers(self) -> None:
-        """Write nothing: no fix is sent."""
+        """Do nothing: no fix is sent, so none is answered."""
 
     def told(self, event: Recognition, used_mah: float) -> Recognition:
-        """Return the event, with a report that the fix of an accepted match was not sent."""
+        """Return the event; an accepted match gets a report that its fix was not sent."""
         return replace(event, fix=_unsent(event, "there is no link")) if event.accepted else event
 
     def compare_gps(self, off_m: float, is_wrong: bool) -> None:
-        """Tell nobody."""
+        """Do nothing."""
 
     def state(self) -> None:
         """Return None: there is no link."""
 
     def report(self, health: messages.Health, load: MachineLoad, temperature_c: float | None) -> None:
-        """Report nothing."""
+        """Do nothing."""
 
 
 class ToAutopilot:
-    """Tells an autopilot of events over an open link. With `mavlink.send_fixes` an accepted match with a position is
-    sent as a fix, where the `navigator` says that the autopilot is better off with it; without, all else is as with it.
-    `cores` is the number of the board's cores. Whatever is done with what the link's thread uses too is done in a turn
-    of its own."""
+    """Sends fixes and other messages over an open link. An accepted match with a position is sent as a fix if the
+    `navigator` advises to send one; without `mavlink.send_fixes` (a dry run) only the sending itself is left out.
+    `cores` is the number of the board's cores. State that the link's thread uses too is accessed inside turns only
+    (`Link.turn`), during which that thread does nothing."""
 
     def __init__(
         self, link: Link, navigator: Navigator, herald: Herald, *, settings: MavlinkConfig, cores: int, clock: Clock
@@ -66,8 +67,8 @@ class ToAutopilot:
 
     @property
     def summary(self) -> str:
-        """Counts so far, in a few words: fixes sent, taken, refused, unanswered, held back, too late, withheld;
-        messages of others refused."""
+        """Counts so far, in a few words: fixes sent, accepted by the autopilot, refused by it, unanswered, held back,
+        too late, and withheld; and refused messages from other systems."""
         stats = self._link.stats()
         taken = f"{stats.fixes_sent} fixes sent, {stats.acks.get('ACCEPTED', 0)} taken"
         sent = taken if self._send_fixes else DRY_RUN
@@ -82,7 +83,7 @@ class ToAutopilot:
         return ", ".join([sent, *(f"{count} {what}" for count, what in counts if count)])
 
     def state(self) -> LinkState:
-        """Return the state of the link, of the autopilot's answers and of the navigation."""
+        """Return the state of the link, the counts of the autopilot's answers, and the accuracy of the navigation."""
         with self._link.turn("state"):
             stats = self._link.stats()
             return LinkState(
@@ -97,14 +98,14 @@ class ToAutopilot:
             )
 
     def log_answers(self) -> None:
-        """Write a line of kind "answer" for every fix that was answered since the last call, was not answered in time,
-        or was given up before it was sent.
-
-        Its fields are: query, sent, result (the name of a MAV_RESULT; null: no answer), why (null: it was taken),
-        latency_ms from sending to answer, t_sent_s on the clock of t_mono_s.
+        """Write a log line of kind "answer" for each fix that, since the last call, was answered, was not answered in
+        time, or was given up before it was sent. Its fields:
+        - query: name of the frame; sent: whether the fix was sent
+        - result: name of a MAV_RESULT (null: no answer); why: the reason, in words (null: the fix was accepted)
+        - latency_ms: from sending to answer (null: no answer); t_sent_s: time of sending, on the clock of t_mono_s.
         """
         with self._link.turn("answers"):
-            # An answer can be there a moment before the link has noted that the fix has left.
+            # An answer can arrive a moment before the link has noted that the fix was sent.
             settled = [each for each in self._unanswered if each[1].sent is False or (each[1].sent and each[1].outcome)]
             for query, sending in settled:
                 self._unanswered.remove((query, sending))
@@ -121,7 +122,8 @@ class ToAutopilot:
                 )
 
     def told(self, event: Recognition, used_mah: float) -> Recognition:
-        """Tell the autopilot of an event; return the event with reports of its fix and of the fix before it.
+        """Send the messages about an event, and its fix if there is one to send. Return the event with the reports of
+        this fix (`fix`) and of the fix before it (`last_fix`), each None if there is none.
 
         `used_mah` is the charge that the board has drawn so far.
         """
@@ -135,7 +137,7 @@ class ToAutopilot:
             self._last = event.name, sending
         with self._link.turn("told of its fix"):
             if sending:
-                if sending.sent is not False:  # else it has no answer, as the line of its query says
+                if sending.sent is not False:  # a fix that was not sent gets no answer; the line of its query says why
                     self._unanswered.append((event.name, sending))
                 fix = _reported(event.name, sending)
             self._tell(event, used_mah)
@@ -151,13 +153,15 @@ class ToAutopilot:
             self._link.send(*messages.query_figures(now_s, cpu_share, used_mah))
 
     def compare_gps(self, off_m: float, is_wrong: bool) -> None:
-        """Tell by how many metres a match lies off GPS, and navigate by GPS no longer while it is wrong."""
+        """Send the distance `off_m` (metres) from the GPS position to a match. The navigator does not use GPS while it
+        `is_wrong`."""
         with self._link.turn("gps"):
             self._link.send(messages.gps_distance(self._clock.mono_s(), off_m))
             self._navigator.believe_gps(not is_wrong)
 
     def report(self, health: messages.Health, load: MachineLoad, temperature_c: float | None) -> None:
-        """Report the state of this companion computer, once a second, and ask for other sources where that is due."""
+        """Send the state of this companion computer (temperature None: unknown), and ask the autopilot for another
+        source set if that is wanted (see `SourceSets`). Call it once a second."""
         with self._link.turn("report"):
             self._link.set_health(health)
             self._ask_for_sources()
@@ -177,7 +181,8 @@ class ToAutopilot:
             self._link.send(messages.source_set(number, self._link.stats().autopilot_system_id or 0))
 
     def _fixed(self, event: Recognition) -> tuple[FixReport | None, Sending | None]:
-        """Send the fix of an accepted match, if it has one; return its sending, or the report that there is none."""
+        """Send the fix of an accepted match, unless something is against it. Return (None, the sending) if it is sent,
+        else (a report that says why not, None)."""
         try:
             advice = self._navigator.advise(event, self._clock.mono_s())
         except ValueError as error:  # another program wrote an invalid position
@@ -189,7 +194,8 @@ class ToAutopilot:
         return None, self._link.send_fix(advice.fix)
 
     def _say_held(self, objection: str | None) -> None:
-        """Count a fix that is held back, and tell the ground where that begins or is over."""
+        """Count a fix that is held back because of `objection` (None: it is not), and report when holding back begins
+        and ends."""
         is_holding = objection is not None
         self._held += is_holding
         if is_holding == self._is_holding:
@@ -206,9 +212,9 @@ Autopilot = NoAutopilot | ToAutopilot
 
 
 class SourceSets:
-    """Decides which set of sources the autopilot is asked to navigate by, where its operator has allowed that: the one
-    without GPS as soon as GPS is lost or wrong and there is a position of ours, the one with GPS when it has been good
-    for ten seconds. Without both numbers nothing is ever asked for."""
+    """Decides which source set, a numbered choice of sensors in the autopilot, the autopilot is asked to navigate by.
+    The set `no_gps` is asked for when GPS is lost or wrong and we know the position; the set `gps`, after that, once
+    GPS has been good for ten seconds. Unless both numbers are configured, nothing is asked for."""
 
     def __init__(self, settings: SourceSetsConfig) -> None:
         self._with_gps, self._without = settings.gps, settings.no_gps
@@ -216,7 +222,8 @@ class SourceSets:
         self._bad_s = -math.inf
 
     def wanted(self, now_s: float, has_gps: bool, has_own: bool) -> int | None:
-        """Return the number of the set to ask for now; None: there is nothing to ask."""
+        """Return the number of the set to ask for now (None: ask for nothing). `has_gps`: the autopilot has a GPS that
+        is believed; `has_own`: our own position is known well enough."""
         if self._with_gps is None or self._without is None:
             return None
         if not has_gps:
@@ -248,7 +255,8 @@ def _unsent(event: Recognition, why: str) -> FixReport:
 
 
 def confidence_of(event: Recognition) -> float | None:
-    """Return the confidence of an accepted match: its own, or by the flight so far where that is higher."""
+    """Return the confidence of an accepted match: that of the match alone or, if higher, that of the belief over the
+    flight so far. None: the technique has no model of confidence."""
     if event.confidence is None:
         return None
     return max(event.confidence, event.followed.confidence if event.followed else 0.0)

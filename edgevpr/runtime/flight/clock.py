@@ -1,4 +1,4 @@
-"""The clocks of a flight in one value, so that a test or a replay hands in its own; and the pace of its frames."""
+"""The clocks of a flight as one value, which a test or a replay can replace, and the pace at which frames are taken."""
 
 import time
 from collections.abc import Callable
@@ -10,9 +10,9 @@ from edgevpr.core.types import Tape
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Clock:
-    """Clocks in seconds: `mono_s` since the start of the machine, which stamps every frame and message of a flight;
-    `wall_s` the one by which the steps of a query are timed; `utc_s` since 1970; `process_cpu_s` CPU time of all
-    threads; `thread_cpu_s` that of the calling thread. `sleep` waits."""
+    """Clocks, in seconds. `mono_s` is the monotonic clock, which stamps every frame and message of a flight; `wall_s`
+    times the steps of a query; `utc_s` counts from 1970; `process_cpu_s` is the CPU time of all threads of this
+    process, and `thread_cpu_s` that of the calling thread. `sleep` waits for some seconds."""
 
     mono_s: Callable[[], float] = time.monotonic
     wall_s: Callable[[], float] = time.perf_counter
@@ -23,13 +23,14 @@ class Clock:
 
 
 def taped(clock: Clock, tape: Tape) -> Clock:
-    """Return the same clocks, each look at which is on the tape."""
+    """Return clocks whose every reading is recorded on the `tape`, or played back from it; `sleep` stays as it is."""
     names = [each.name for each in fields(clock) if each.name != "sleep"]
     return replace(clock, **{name: partial(tape.read, name, getattr(clock, name)) for name in names})
 
 
 class Pace:
-    """Frames at `rate_hz`, evenly spaced; a frame that comes late does not make the frames after it come sooner."""
+    """Decides when to take the next frame: `rate_hz` frames per second, evenly spaced. After a delay, missed frames are
+    not made up for."""
 
     def __init__(self, rate_hz: float, clock: Clock) -> None:
         self._clock = clock
@@ -37,9 +38,9 @@ class Pace:
         self.rate_hz = rate_hz
 
     def wait_s(self) -> float:
-        """Return the seconds until the next frame is due, 0 or below where it is due already."""
+        """Return the seconds until the next frame is due; 0 or less if it is due already."""
         return self._due_s - self._clock.mono_s()
 
     def taken(self) -> None:
-        """Note that a frame has been taken."""
+        """Note that a frame has been taken, and set the time at which the next one is due."""
         self._due_s = max(self._due_s + 1 / self.rate_hz, self._clock.mono_s())

@@ -1,4 +1,5 @@
-"""The wishes of the ground, and what becomes of them: the flight pauses and goes on, learning stops and goes on."""
+"""Carrying out of what ground stations request in flight: recognition pauses and resumes, learning stops and resumes.
+The loop of `flight` and `vitals` use it."""
 
 from edgevpr.mavlink.messages import Severity
 from edgevpr.mavlink.requests import Wish, Wished
@@ -13,8 +14,8 @@ _TEXTS = {
 
 
 class Commands:
-    """Fulfils the wishes of the ground. While the flight `is_paused` nothing is recognised and no fix is sent. Learning
-    can be switched only where there is a learner that has no trouble."""
+    """Carries out the requests (`Wish`) of ground stations. While the flight `is_paused`, nothing is recognised and no
+    fix is sent. Learning can be switched only if there is a learner and it works."""
 
     def __init__(self, crew: Crew) -> None:
         self.is_paused = False
@@ -22,12 +23,13 @@ class Commands:
 
     @property
     def summary(self) -> str | None:
-        """Name what the ground has switched off, in a few words; None where it is nothing."""
+        """Features that a ground station has switched off, in a few words; None if there are none."""
         off = ("paused" if self.is_paused else "", "learning off" if self._learner and self._learner.is_off else "")
         return ", ".join(filter(None, off)) or None
 
     def obey(self) -> None:
-        """Fulfil the wishes since the last call, and say which ones can be fulfilled from now on."""
+        """Carry out the requests received since the last call, and tell the link which requests to accept from now
+        on."""
         if self._link is None:
             return
         for wished in self._link.take_wishes():
@@ -45,5 +47,5 @@ class Commands:
         is_new = before != self.summary
         text, topic = _TEXTS[wished.wish]
         self._herald.note("command", wish=wished.wish.name, sender=wished.sender, said=text, is_new=is_new)
-        if is_new:  # a command that is sent once more, since its answer was lost, changes nothing
+        if is_new:  # a command repeated because its answer was lost changes nothing
             self._herald.say(Severity.INFO, f"{text}, as {wished.sender} wishes", ground=text, topic=topic)

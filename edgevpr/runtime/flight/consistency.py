@@ -1,8 +1,9 @@
-"""Fixes that contradict what is known of the position: one alone is not believed.
+"""Check of fixes against the expected position: a fix that contradicts it is not believed until a second one agrees.
+`navigator` uses it.
 
-The aircraft's path, by the autopilot's reckoning, drifts slowly, so a fix far outside of that is either wrong or says
-that the reckoning is: only another fix can tell. Path and fixes move together, so two right fixes lie beside the path
-by the same step, and two wrong ones hardly ever do.
+The path (see `path`) is summed up from the autopilot's velocities and drifts slowly. If a fix lies far outside of that
+drift, either the fix is wrong or the path is: only another fix can tell. The path moves with the aircraft, so two right
+fixes have the same offset from it, and two wrong ones hardly ever do.
 """
 
 import math
@@ -15,17 +16,18 @@ from edgevpr.core.arrays import Doubles
 from edgevpr.runtime.flight.navigation import ExpectedFix
 from edgevpr.runtime.recognise.locate import in_sd
 
-# In standard deviations of both together. A right fix is farther off than the first once in 3000 times; a second right
-# one agrees with it within the second seven times in eight, else the next does.
+# Limits in standard deviations. A right fix is more than _CONTRADICTS from the expected position once in 3000 times. A
+# second right fix is within _AGREES of the first seven times in eight; otherwise the one after it is.
 _CONTRADICTS, _AGREES = 4.0, 2.0
-_GOOD_FOR_S = 30.0  # after that the reckoning may have drifted anywhere
-_DRIFT_M_S = 2.5  # between two fixes that agree; more is a contradiction, and the next fix tells
+_GOOD_FOR_S = 30.0  # a fix held back for longer is not compared: the path may have drifted too far
+_DRIFT_M_S = 2.5  # drift of the path that is allowed for between two fixes that agree
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SeenFix:
-    """A fix: `off_m` (2,) east and north from the point `path_m` (2,) of the path to it, its covariance (2, 2), the
-    time of its frame, and the places that it comes from."""
+    """A fix to be judged. `off_m` (2,): metres east and north from the path to the fix; `covariance_m2` (2, 2): that of
+    the fix; `path_m` (2,): point of the path when its frame was taken, metres from the path's origin; `t_s`: time of
+    the frame; `places`: numbers of the places that it comes from."""
 
     off_m: Doubles
     covariance_m2: Doubles
@@ -36,22 +38,22 @@ class SeenFix:
 
 @dataclass(frozen=True, slots=True)
 class Weighed:
-    """Verdict on a fix: the `objection` to it (None: it may be believed), and whether it `is_against` what was known
-    before, and believed since others say the same."""
+    """Verdict on a fix. `objection` is why it is not believed (None: it is believed). `is_against`: it contradicts the
+    expected position, and is believed because an earlier fix agrees with it."""
 
     objection: str | None = None
     is_against: bool = False
 
 
 class Consistency:
-    """Holds back a fix that contradicts what is known until a second, independent one says the same; against GPS none
-    is believed."""
+    """Holds back a fix that contradicts the expected position, until a second, independent fix agrees with it. With
+    GPS, a contradicting fix is never believed."""
 
     def __init__(self) -> None:
         self._held: SeenFix | None = None
 
     def weighed(self, fix: SeenFix, expected: ExpectedFix, has_gps: bool) -> Weighed:
-        """Weigh a fix against what was expected of it."""
+        """Judge a fix by the one that was `expected`. `has_gps`: the autopilot has a GPS that is believed."""
         step_m = fix.off_m - expected.off_m
         if in_sd(step_m, fix.covariance_m2 + expected.covariance_m2) <= _CONTRADICTS:
             self._held = None
@@ -72,15 +74,15 @@ class Consistency:
 
 
 def _differ(one: SeenFix, other: SeenFix) -> float:
-    """Return by how many standard deviations two fixes disagree on where the path is wrong; infinitely where they are
-    too far apart in time."""
+    """Return by how many standard deviations the offsets of two fixes from the path differ; infinity if more than 30 s
+    lie between the fixes."""
     apart_s = abs(other.t_s - one.t_s)
     return in_sd(other.off_m - one.off_m, _of_both(one, other)) if apart_s <= _GOOD_FOR_S else math.inf
 
 
 def _is_independent(one: SeenFix, other: SeenFix) -> bool:
-    """Tell whether a second fix is of other places, or is so far on that one which had stayed behind would no longer
-    have agreed."""
+    """Return True if two fixes are of different places, or if the aircraft has flown so far in between that the same
+    wrong position, found twice, would not agree."""
     if set(one.places).isdisjoint(other.places):
         return True
     return in_sd(other.path_m - one.path_m, _of_both(one, other)) > _CONTRADICTS

@@ -1,9 +1,9 @@
-"""A Kalman filter of how wrong a path is, and with it of where the aircraft is.
+"""Kalman filter of the errors of a path (see `path`), which gives the position of the aircraft. `navigation` uses it.
 
-The state has four parts, each east and north: `c`, by how many metres the aircraft is beside its path; `s`, by how many
-m/s it is faster; `b`, how fast that changes; and `m`, by how many metres fixes lie beside the positions of GPS, which
-the map shares with every fix. Three kinds of news correct it: positions and velocities of an autopilot that has GPS,
-and fixes. A fix may be seconds old: the path knows where it was then, so the state of now explains it.
+The state has four parts, each east and north: `c` (m), the offset from the path to the aircraft; `s` (m/s), by how much
+the aircraft is faster than the path; `b` (m/s2), the rate of change of `s`; and `m` (m), the offset from GPS positions
+to fixes, an error of the map that all fixes share. Positions and velocities of an autopilot that has GPS correct the
+state, and so do fixes. A fix may be of a frame taken seconds ago: it is compared with the path at that time.
 """
 
 from dataclasses import dataclass
@@ -18,9 +18,9 @@ _EYE = np.eye(2)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Drift:
-    """Knowledge of a path's errors. `velocity_sd` (m/s) and `acceleration_sd` (m/s2) are those to expect of a path that
-    nothing corrects; `position_noise`, `velocity_noise` and `acceleration_noise` are by how much they change in a
-    second (standard deviations of one axis)."""
+    """Size of the errors of a path. `velocity_sd` (m/s) and `acceleration_sd` (m/s2) are the standard deviations, of
+    one axis, for a path that nothing corrects. `position_noise` (m), `velocity_noise` (m/s) and `acceleration_noise`
+    (m/s2) are those of the random change of each error in one second."""
 
     velocity_sd: float
     acceleration_sd: float
@@ -34,28 +34,30 @@ class Drift:
 RECKONED = Drift(
     velocity_sd=4.0, acceleration_sd=0.0, position_noise=0.3, velocity_noise=0.5, acceleration_noise=0.0
 )  # fmt: skip
-# Accelerations turned by the autopilot's attitude: half a degree of tilt is 0.09 m/s2.
+# Accelerations, rotated into east and north by the autopilot's attitude: an error of half a degree is 0.09 m/s2.
 INERTIAL = Drift(
     velocity_sd=0.5, acceleration_sd=0.1, position_noise=0.05, velocity_noise=0.1, acceleration_noise=0.02
 )  # fmt: skip
 
 
 class DriftFilter:
-    """The errors of one path. `map_sd_m` is the standard deviation of one axis of what all fixes have in common."""
+    """Estimate of the errors of one path. `map_sd_m` is the standard deviation, of one axis, of the error that all
+    fixes share."""
 
     def __init__(self, drift: Drift, map_sd_m: float) -> None:
         self._drift, self._map_sd_m = drift, map_sd_m
         self._x, self._p = np.zeros(8), np.zeros((8, 8))
 
     def start(self, offset_m: Doubles, sd_m: float, velocity_sd_m_s: float) -> None:
-        """Begin `offset_m` (2,) beside the path, with standard deviations of one axis of that and of the velocity."""
+        """Begin with the aircraft `offset_m` (2,) beside the path. `sd_m` and `velocity_sd_m_s` are the standard
+        deviations, of one axis, of this offset and of the error of velocity."""
         self._x = np.zeros(8)
         self._x[_C] = offset_m
         of_parts = sd_m, velocity_sd_m_s, self._drift.acceleration_sd, self._map_sd_m
         self._p = np.diag(np.repeat(np.square(of_parts), 2))
 
     def go_on(self, step_s: float) -> None:
-        """Let some seconds pass."""
+        """Predict the state `step_s` seconds later."""
         move = np.eye(8)
         move[_C, _S] = step_s * _EYE
         move[_C, _B] = step_s**2 / 2 * _EYE
@@ -66,35 +68,41 @@ class DriftFilter:
         self._p = move @ self._p @ move.T + step_s * np.diag(np.repeat(np.square(noise), 2))
 
     def lose_gps(self) -> None:
-        """Note that from now on nothing holds the velocity of the path any more."""
+        """Note that GPS is lost: the error of velocity becomes more uncertain, since nothing corrects it any more."""
         self._p[_S, _S] += self._drift.velocity_sd**2 * _EYE
 
     def hear_gps(self, off_m: Doubles, sd_m: float, off_m_s: Doubles, velocity_sd_m_s: float) -> None:
-        """Take in that GPS lies `off_m` (2,) beside the path and is `off_m_s` (2,) faster than it."""
+        """Correct the state by GPS, whose position is `off_m` (2,) beside the path and whose velocity exceeds that of
+        the path by `off_m_s` (2,). The standard deviations are those of one axis."""
         look = np.zeros((4, 8))
         look[:2, _C] = look[2:, _S] = _EYE
         self._correct(look, np.concatenate([off_m, off_m_s]), np.diag([sd_m**2] * 2 + [velocity_sd_m_s**2] * 2))
 
     def hear_fix(self, off_m: Doubles, covariance_m2: Doubles, age_s: float) -> None:
-        """Take in a fix that lay `off_m` (2,) beside the path `age_s` seconds ago, with a covariance (2, 2)."""
+        """Correct the state by a fix with a covariance (2, 2) that lay `off_m` (2,) beside the path `age_s` seconds
+        ago."""
         self._correct(_seen(age_s), off_m, covariance_m2)
 
     def trust_fix(self, off_m: Doubles, covariance_m2: Doubles, age_s: float) -> None:
-        """Take in a fix that is believed although it contradicts: what was known of the position is forgotten."""
+        """Correct the state by a fix (as `hear_fix`) that is believed although it contradicts the state. The position
+        known so far is forgotten, and the error of velocity becomes more uncertain."""
         self._p[_C] = self._p[:, _C] = 0.0
         self._p[_C, _C] = 1e6 * _EYE
         self._p[_S, _S] += self._drift.velocity_sd**2 * _EYE
         self.hear_fix(off_m, covariance_m2, age_s)
 
     def expected_fix(self, age_s: float) -> tuple[Doubles, Doubles]:
-        """Return by how much a fix of so many seconds ago is expected to lie beside the path (2,), and the covariance
-        (2, 2) of that, without the fix's own."""
+        """Predict a fix of a frame taken `age_s` seconds ago. Returns its offset (2,) from the path, metres, and the
+        covariance (2, 2) of this prediction, without that of the fix itself."""
         look = _seen(age_s)
         return look @ self._x, look @ self._p @ look.T
 
     def errors(self, age_s: float) -> tuple[Doubles, Doubles, Doubles]:
-        """Return the errors of the path so many seconds ago (negative: in so many): metres (2,), m/s (2,), and the
-        covariance (4, 4) of both."""
+        """Return the errors of the path `age_s` seconds ago (negative: in the future):
+        - offset (2,) from the path to the aircraft, metres
+        - error of velocity (2,), m/s
+        - covariance (4, 4) of both.
+        """
         look = np.zeros((4, 8))
         look[:2] = _seen(age_s)
         look[:2, _M] = 0.0
@@ -103,12 +111,14 @@ class DriftFilter:
         return off[:2], off[2:], look @ self._p @ look.T
 
     def _correct(self, look: Doubles, seen: Doubles, covariance: Doubles) -> None:
+        """Do a Kalman update: `look` (n, 8) is the measurement matrix, `seen` (n,) what was measured, with its
+        `covariance`."""
         gain = np.linalg.solve(look @ self._p @ look.T + covariance, look @ self._p).T
         self._x = self._x + gain @ (seen - look @ self._x)
         kept = np.eye(8) - gain @ look
-        self._p = kept @ self._p @ kept.T + gain @ covariance @ gain.T  # Joseph's form: it stays a covariance
+        self._p = kept @ self._p @ kept.T + gain @ covariance @ gain.T  # Joseph form: keeps it positive semidefinite
 
 
 def _seen(age_s: float) -> Doubles:
-    """Return what a fix of so many seconds ago sees of the state (2, 8)."""
+    """Return the measurement matrix (2, 8) of a fix of a frame taken `age_s` seconds ago."""
     return np.hstack([_EYE, -age_s * _EYE, age_s**2 / 2 * _EYE, _EYE])
