@@ -42,9 +42,11 @@ def parse_link(url: str) -> LinkAddress:
 
 
 def parse_links(flight: str | None, ground: str | None) -> tuple[LinkAddress | None, LinkAddress | None]:
-    """Parse the texts of the links to the flight controller (`flight`) and to the ground station (`ground`) and return
-    both addresses in this order; None stands for no link. Raises LinkAddressError for a text that is no address, and
-    for a `ground` without a `flight`."""
+    """Parse the texts of both links; None stands for no link. Raises LinkAddressError for a text that is no address,
+    and for a `ground` without a `flight`. Returns two addresses:
+    - that of the link to the flight controller, or None;
+    - that of the link to the ground station, or None.
+    """
     if flight is None and ground is not None:
         raise LinkAddressError("`mavlink.ground` is a second link: name the flight controller's as `mavlink.link`.")
     return (None if flight is None else parse_link(flight)), (None if ground is None else parse_link(ground))

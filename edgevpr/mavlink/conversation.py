@@ -141,7 +141,10 @@ class Conversation:
         return min(longest_s, max(0.0, self._state_due_s - self._clock()))
 
     def next_packet(self) -> tuple[bytes, Sending | None] | None:
-        """Choose and pack the next message. Returns (packet, the fix in it or None), or None if nothing is due."""
+        """Choose and pack the next message. Returns None if nothing is due, else:
+        - the packet;
+        - the fix that it contains, or None.
+        """
         while (chosen := self._next_message(self._clock())) is not None:
             message, sending = chosen
             self.settings.signing.stamp(self._packer)
@@ -203,7 +206,10 @@ class Conversation:
         self.fixes.drop_stale(math.inf)
 
     def _next_message(self, now_s: float) -> tuple[Message, Sending | None] | None:
-        """Choose the next message. Returns (message, the fix in it or None), or None if nothing is due."""
+        """Choose the next message. Returns None if nothing is due, else:
+        - the message;
+        - the fix that it contains, or None.
+        """
         late_s = now_s - self._heartbeat_due_s
         if late_s >= 0:
             self._heartbeat_due_s = now_s + HEARTBEAT_S - late_s % HEARTBEAT_S  # keeps the rhythm after delays

@@ -61,7 +61,7 @@ class GroundConversation(Conversation):
 
     def next_packet(self) -> tuple[bytes, Sending | None] | None:
         """Choose and pack the next message, with the health and the system id of the link to the flight controller.
-        Returns (packet, None), or None if there is nothing to send."""
+        Returns None if nothing is due, else the packet, and None in place of a fix."""
         self._health, self._health_set_s = self._flight._health, self._flight._health_set_s
         self._packer.srcSystem = self._flight._packer.srcSystem
         return super().next_packet()

@@ -120,7 +120,10 @@ def odometry(state: MotionState, attitude: tuple[float, float, float], origin: t
 
 
 def _gps_time(t_unix_s: float | None) -> tuple[int, int]:
-    """Return (GPS week, millisecond of the week); (0, 0) if the time is unknown."""
+    """Return the time of GPS (0, 0 if `t_unix_s` is None):
+    - number of the week;
+    - millisecond in the week.
+    """
     if t_unix_s is None:
         return 0, 0
     weeks, rest_s = divmod(t_unix_s - _GPS_EPOCH_S + _LEAP_S, 604_800)

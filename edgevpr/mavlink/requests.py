@@ -122,7 +122,10 @@ class Requests:
         return True
 
     def _obey(self, command: Message, heartbeat: Callable[[], Message]) -> tuple[int, tuple[Message, ...]]:
-        """Execute a command. Returns (its MAV_RESULT, the messages that it requested)."""
+        """Execute a command. Returns:
+        - its result, a MAV_RESULT;
+        - the messages that it requested.
+        """
         wanted = command.param1  # a float: as a key, a whole one equals its integer, and NaN equals none
         match command.command:
             case mavlink.MAV_CMD_USER_1:
