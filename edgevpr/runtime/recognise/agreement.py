@@ -50,8 +50,7 @@ class Overlay:
 
 
 def onto(one: Overlay, other: Overlay) -> Overlay:
-    """Return how the place of `one` lies on the place of `other`, where both say how the same query lies on their
-    place."""
+    """Return how the place of `one` lies on that of `other`, if both say how the same query lies on their place."""
     turn_scale = _turn_scale(other) / _turn_scale(one)
     shift = complex(*other.shift_share) - turn_scale * complex(*one.shift_share)
     scale = None if None in (one.scale, other.scale) else float(abs(turn_scale))
@@ -197,8 +196,8 @@ def _is_near(turn_scale: Any, shift: Any, expected: Overlay | None) -> Bools:
 
 def _most_followed(asked: Array, known: Array, expected: Overlay | None) -> tuple[complex, complex] | None:
     """Return the way, defined by two matches, that most matches follow; None if no way is near to the expected one.
-    `asked` and `known` are the points of the matches, complex (n,). The more closely a match follows a way, the more it
-    counts."""
+    `asked` and `known` are the points of the matches, complex (n,). A match counts the more, the more closely it
+    follows a way."""
     one, other = np.triu_indices(min(_BEST_MATCHES, len(asked)), 1)
     apart = np.abs(asked[other] - asked[one]) > _APART
     one, other = one[apart], other[apart]

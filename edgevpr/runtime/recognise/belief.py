@@ -239,8 +239,7 @@ class Belief:
         return there, alike, staleness, left
 
     def _posterior(self, p: Doubles) -> Posterior:
-        """Return the belief with an estimate: the mean of the hypotheses around the one that has most weight near
-        it."""
+        """Return the belief with an estimate: the mean of the hypotheses around the one with most weight near it."""
         now = self._now
         if not len(now.w):
             return Posterior(lost=self._lost, p=p, mass=0.0, estimate=None)

@@ -1,14 +1,15 @@
-"""The model of confidence: evidence of a match in, the probability that the match is right out.
+"""The model of confidence: takes the evidence of a match (see `evidence`), gives the probability that the match is
+right.
 
-A match can be wrong in two ways: the query shows no ground of the map at all, or it does, and the best place is another
-one. How well pictures agree by chance is much the same for every map; how much its places look alike is not. So there
-is one logistic regression for each way. Both start from the shipped ones and are adapted to a map that is large enough
+A match can be wrong in two ways: the query shows no ground of the map at all, or it does, and the best place is not the
+right one. Pictures agree by chance to much the same degree in every map, but maps differ in how much their places look
+alike. So there is one logistic regression for each way. Both are shipped, and are adapted to a map that is large enough
 (see `calibrate`).
 
-How many wrong matches go beyond a logit is known from many sites: the highest fall off as an exponential distribution
-does (peaks over a threshold: Pickands 1975). Both ways together are the chance that a wrong match offers as much. The
-threshold that a precision asks for is where that chance is what is left of 1, and the confidence is a probability made
-of its logarithm (Platt 1999).
+The distribution of the logits of wrong matches was measured on many sites: the highest are distributed exponentially
+(peaks over a threshold: Pickands 1975). The *chance* of a match is the probability that a wrong match has logits as
+high, summed over both ways. For a precision p, matches with a chance of at most 1 - p are accepted. The confidence is a
+logistic function of the logarithm of the chance (Platt 1999).
 """
 
 import json
@@ -24,16 +25,17 @@ from edgevpr.core.files import read_file, shipped
 Evidence = Mapping[str, float]
 
 _MAX_FILE_BYTES = 100_000
-_MOST = 40.0  # of a logit: beyond, a probability is 0 or 1 in float64
-# Of the share that may be wrong: without it foreign queries were accepted over grief_michigan_monthly, of five places.
+_MOST = 40.0  # limit of a logit: beyond it, a probability is 0 or 1 in float64
+# Factor to the share of matches that may be wrong, for a model that is not adapted to its map: without it foreign
+# queries were accepted over grief_michigan_monthly, of five places.
 _NOT_ADAPTED = 0.1
-_LEAST = 1e-15  # of a chance whose logarithm is taken
+_LEAST = 1e-15  # least chance, so that its logarithm exists
 
 
 @dataclass(frozen=True, slots=True)
 class Logistic:
-    """A logistic regression: the logit is `bias` plus the sum of `weights` times evidence, by their `names`. `scales`
-    are the standard deviations of that evidence, over many sites."""
+    """A logistic regression. The logit is `bias` plus the sum of each of the `weights` times the evidence of the name
+    in `names`. `scales` are the standard deviations of that evidence over many sites."""
 
     names: tuple[str, ...]
     weights: tuple[float, ...]
@@ -47,13 +49,14 @@ class Logistic:
             raise ValueError("a weight is not finite")
 
     def logit(self, evidence: Evidence) -> float:
+        """Return the logit of a match with this evidence."""
         return self.bias + sum(w * evidence[name] for w, name in zip(self.weights, self.names, strict=True))
 
 
 @dataclass(frozen=True, slots=True)
 class Tail:
-    """The highest logits of wrong matches: the `share` of all matches is wrong and beyond `start`, and less by the
-    factor e with every `scale` more."""
+    """Distribution of the highest logits of wrong matches. The share of all matches that are wrong and have a logit
+    above `start` is `share`; above `start` + n * `scale` it is `share` times exp(-n)."""
 
     start: float
     share: float
@@ -64,14 +67,14 @@ class Tail:
             raise ValueError("a tail needs a scale above 0, and a share above 0")
 
     def beyond(self, logit: float) -> float:
-        """Return the share of matches that are wrong and beyond a logit; 1 at most."""
+        """Return the share of all matches that are wrong and have a logit above this one; 1 at most."""
         return math.exp(min(0.0, math.log(self.share) + (self.start - logit) / self.scale))
 
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """Meaning of logits: the tails of wrong matches `off_map` and `off_place`, and the line that makes the logit of the
-    confidence of the logarithm of the chance."""
+    """Meaning of the logits of a model. `off_map` and `off_place` are the tails of wrong matches of both ways. `slope`
+    and `offset` are those of the line from -log(chance) to the logit of the confidence."""
 
     off_map: Tail
     off_place: Tail
@@ -83,16 +86,16 @@ class Scale:
             raise ValueError("more evidence must not make a match less probable")
 
     def confidence(self, chance: float) -> float:
-        """Return the probability that a match is right, of the chance that a wrong one offers as much."""
+        """Return the probability that a match is right, given the chance that a wrong match offers as much evidence."""
         return probability(self.offset - self.slope * math.log(max(chance, _LEAST)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Model:
-    """Confidence of the matches of one technique and kind of evidence. `of_map` tells whether the query shows ground of
-    the map, `of_place` whether the best place is the right one of it, and `scale` what these logits mean;
-    `adapted_scale` is that of a model that is adapted to its map (None: this one is). `made` is the date, and `made_of`
-    what it was fitted to, in words."""
+    """Confidence of the matches of one technique and kind of evidence. `of_map` is the regression that tells whether
+    the query shows ground of the map, `of_place` whether the best place is the right one, and `scale` the meaning of
+    their logits. `adapted_scale` is the scale for a model adapted to its map (None: this model is adapted). `made` is
+    its date, and `made_of` describes in words the data it was fitted to."""
 
     of_map: Logistic
     of_place: Logistic
@@ -102,7 +105,8 @@ class Model:
     made_of: str
 
     def chance(self, evidence: Evidence) -> float:
-        """Return how likely a wrong match offers as much as this evidence, 0..1; 1 where some of it is not finite."""
+        """Return the probability (0..1) that a wrong match offers as much evidence; 1 if some evidence is not
+        finite."""
         logits = self.of_map.logit(evidence), self.of_place.logit(evidence)
         if not all(map(math.isfinite, logits)):
             return 1.0
@@ -113,29 +117,29 @@ class Model:
         return self.scale.confidence(self.chance(evidence))
 
     def confidence_of_map(self, evidence: Evidence) -> float:
-        """Return the probability that the query shows ground of the map, whichever place of it, 0..1."""
+        """Return the probability, 0..1, that the query shows ground of the map, no matter which place."""
         logit = self.of_map.logit(evidence)
         return self.scale.confidence(self.scale.off_map.beyond(logit) if math.isfinite(logit) else 1.0)
 
     def threshold(self, precision: float) -> float:
-        """Return the confidence from which on `precision` (below 1) of the matches are right. A model that is not
-        adapted to its map knows nothing of the look-alikes there, and asks for more."""
+        """Return the confidence at and above which the share `precision` (below 1) of the matches is right. A model
+        that is not adapted to its map does not know how alike places look there, so its threshold is higher."""
         wrong = 1 - precision
         return self.scale.confidence(wrong if self.adapted_scale is None else _NOT_ADAPTED * wrong)
 
 
 def probability(logit: float) -> float:
-    """Return the probability of a logit."""
+    """Return the probability that belongs to a logit."""
     return 1 / (1 + math.exp(-max(-_MOST, min(_MOST, logit))))
 
 
 def as_json(model: Model) -> str:
-    """Write a model as JSON, as map files and shipped files have it."""
+    """Write a model as JSON, as `from_json` reads it."""
     return json.dumps(asdict(model))
 
 
 def from_json(text: str) -> Model:
-    """Read a model. Raises ValueError for a text that is none."""
+    """Read a model from JSON text. Raises ValueError for a text that is no model."""
     try:
         return model_of(json.loads(text))
     except (KeyError, TypeError, AttributeError, RecursionError) as error:
@@ -143,7 +147,7 @@ def from_json(text: str) -> Model:
 
 
 def model_of(stored: Mapping[str, Any]) -> Model:
-    """Make a model of what JSON holds. Raises ValueError, KeyError or TypeError where that makes no sense."""
+    """Make a model from decoded JSON. Raises ValueError, KeyError or TypeError for invalid contents."""
     adapted = stored["adapted_scale"]
     return Model(
         of_map=_logistic(**stored["of_map"]),
@@ -157,8 +161,8 @@ def model_of(stored: Mapping[str, Any]) -> Model:
 
 @lru_cache
 def prior(kind: str) -> Model:
-    """Return the shipped model of a kind of evidence (see `runtime.recognise.evidence`). Raises ModelError where the
-    file is missing or damaged."""
+    """Return the shipped model for a kind of evidence, such as "down" (see `evidence`). Raises ModelError if its file
+    is missing or damaged."""
     path = shipped("models") / f"confidence_{kind}.json"
     try:
         return from_json(read_file(path, _MAX_FILE_BYTES).decode())

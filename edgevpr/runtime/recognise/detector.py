@@ -1,11 +1,13 @@
-"""Staticity: the pixels of a frame that will be there again, by an object detector (thesis 3.2.2).
+"""Staticity, for the gate: the pixels of a frame that show nothing movable, by an object detector (thesis 3.2.2).
 
-The detector is a network with a card, whose section `detector` names the dynamic classes. Which pixels their boxes
-cover is all that counts, so boxes that overlap are not thinned out.
+The detector is a network with a card, whose section `detector` names the dynamic classes, such as cars. Only the pixels
+that their boxes cover count, so overlapping boxes are kept.
 
-Detectors of one family write their raw outputs alike; each family has a decoder here. It takes the outputs in the order
-of the card and the input's (height, width) in pixels. It returns `boxes`, float32 (N, 4): left, top, right, bottom as
-shares of the input, and `scores`, float32 (N, C): of each class, 0..1. Boxes may reach beyond the input.
+Detectors of one family have outputs of the same form, and each family has a decoder here. A decoder takes the outputs
+in the order of the card and the input's (height, width) in pixels, and returns
+
+* `boxes`, float32 (N, 4): left, top, right, bottom as shares of the input; they may reach beyond it,
+* `scores`, float32 (N, C): the score of each class, 0..1.
 """
 
 import math
@@ -19,22 +21,22 @@ from edgevpr.techniques.card import Card
 from edgevpr.techniques.session import open_session, prepare, run_outputs, shares
 
 _CAR_M = 4.5
-_CAR_PX = 24  # on the input of a detector: these small ones find little that is smaller
-_LARGEST_M = 25.0  # no lorry or boat that comes and goes is longer
-_MOST_TILES = 4  # a side: each tile costs a run
+_CAR_PX = 24  # least length of a car on the input: small detectors find little that is smaller
+_LARGEST_M = 25.0  # no vehicle or boat that moves about is longer
+_MOST_TILES = 4  # along each side; each tile is a run of the network
 _OVERLAP = 0.1  # of a tile's side, so that what lies across a border is whole in one of them
 _CLASS_AXIS = 1
 _SEED = 7
 _YOLOX_STRIDES_PX = (8, 16, 32)
 _NANODET_STRIDES_PX = (8, 16, 32)
-_LARGEST_LOG = 20.0  # exp of more is no side of a box, and overflows
+_LARGEST_LOG = 20.0  # of the side of a box in cells; the exponential of more would overflow
 
 Decoded = tuple[Floats, Floats]
 
 
 class Detector:
-    """The detector of a card, which has run successfully. Raises ModelError, one sentence, for a card of no detector
-    and for whatever keeps it from flying."""
+    """The detector that a card describes; the constructor runs it once as a test. Raises ModelError, in one sentence,
+    for a card without a section `detector` and for anything that makes the network unusable."""
 
     def __init__(self, card: Card, threads: int = 1) -> None:
         if card.detector is None or card.outputs.boxes is None:
@@ -45,11 +47,11 @@ class Detector:
         self.is_static(np.random.default_rng(_SEED).integers(0, 256, (*size, 3), np.uint8))
 
     def is_static(self, image: Image, footprint_m: float | None = None) -> Mask:
-        """Tell which pixels of uint8 (H, W[, 3]) lie in no box of a dynamic class: bool (H, W).
+        """Return bool (H, W): True for the pixels of uint8 (H, W[, 3]) that lie in no box of a dynamic class.
 
-        `footprint_m` is the width of the ground in the picture, metres (None: unknown). Where it is wide, the picture
-        is looked at in tiles, so that a car has enough pixels; and a box too long for anything that moves is passed
-        over. Raises ModelError for numbers that are not finite, and for outputs of another form than the family's.
+        `footprint_m` is the width of the ground in the picture, metres (None: unknown). If it is wide, the picture is
+        cut into tiles, so that a car has enough pixels. A box too long for anything that moves is ignored. Raises
+        ModelError for numbers that are not finite, and for outputs of another form than the family's.
         """
         height, width = image.shape[:2]
         static = np.ones((height, width), bool)
@@ -62,7 +64,8 @@ class Detector:
         return static
 
     def tiles(self, footprint_m: float | None) -> int:
-        """Return in how many tiles a side a picture is looked at whose ground is `footprint_m` wide."""
+        """Return the number of tiles along each side of a picture whose ground is `footprint_m` wide (None:
+        unknown)."""
         if footprint_m is None:
             return 1
         car_px = _CAR_M / footprint_m * self.card.input.width
@@ -89,20 +92,21 @@ class Detector:
 
 
 def _tiles(height: int, width: int, count: int) -> list[tuple[int, int, int, int]]:
+    """Return (top, bottom, left, right) in pixels of each of `count` x `count` tiles of a picture."""
     downs, acrosses = (_cuts(side, count) for side in (height, width))
     return [(top, bottom, left, right) for top, bottom in downs for left, right in acrosses]
 
 
 def _cuts(side: int, count: int) -> list[tuple[int, int]]:
-    """Cut a side into `count` parts that overlap."""
+    """Cut a side into `count` overlapping parts; returns (start, end) of each, in pixels."""
     part = side / (count - (count - 1) * _OVERLAP)
     starts = [part * (1 - _OVERLAP) * number for number in range(count)]
     return [(round(start), min(side, round(start + part))) for start in starts]
 
 
 def yolox(outputs: Sequence[Floats], size_px: tuple[int, int]) -> Decoded:
-    """Decode (1, N, 5 + C), the cells of three grids one after the other (Ge et al. 2021, arXiv 2107.08430): centre in
-    cells from the cell, logarithm of the sides in cells, score of an object, scores of the classes."""
+    """Decode (1, N, 5 + C), the cells of three grids in turn (Ge et al. 2021, arXiv 2107.08430). Each has the offset of
+    the centre in cells, the logarithms of the sides in cells, the score of an object, and the scores of the classes."""
     values = outputs[0][0]
     cells, stride_px = _grids(size_px, _YOLOX_STRIDES_PX)
     centre_px = (values[:, :2] + cells) * stride_px
@@ -124,8 +128,9 @@ def fastestdet(outputs: Sequence[Floats], size_px: tuple[int, int]) -> Decoded:
 
 
 def nanodet(outputs: Sequence[Floats], size_px: tuple[int, int]) -> Decoded:
-    """Decode, for the strides 8, 16 and 32, scores (1, N, C), then distances (1, N, 4 x bins): of each side from the
-    cell's middle a distribution over whole strides (Li et al. 2020, arXiv 2006.04388)."""
+    """Decode scores (1, N, C) for each of the strides 8, 16 and 32, then distances (1, N, 4 x bins) for each (Li et al.
+    2020, arXiv 2006.04388). A distance, from the cell's middle to a side, is a distribution over whole numbers of
+    strides."""
     levels = len(_NANODET_STRIDES_PX)
     scores = np.concatenate([part[0] for part in outputs[:levels]])
     said = np.concatenate([part[0] for part in outputs[levels:]])
@@ -145,7 +150,11 @@ _DECODERS: dict[str, Callable[[Sequence[Floats], tuple[int, int]], Decoded]] = {
 
 
 def _grids(size_px: tuple[int, int], strides_px: Sequence[int]) -> tuple[Floats, Floats]:
-    """Return the column and row of every cell of the grids, float32 (N, 2), and its stride, float32 (N, 1)."""
+    """Return for all cells of the grids with these strides
+
+    * column and row, float32 (N, 2),
+    * the stride in pixels, float32 (N, 1).
+    """
     cells, strides = [], []
     for stride in strides_px:
         rows, columns = (-(-side // stride) for side in size_px)
@@ -156,5 +165,6 @@ def _grids(size_px: tuple[int, int], strides_px: Sequence[int]) -> tuple[Floats,
 
 
 def _boxes(least_px: Floats, most_px: Floats, size_px: tuple[int, int]) -> Floats:
+    """Return boxes float32 (N, 4), as shares of the input, of left top and right bottom corners (N, 2) in pixels."""
     height, width = size_px
     return (np.concatenate([least_px, most_px], 1) / (width, height, width, height)).astype(np.float32)

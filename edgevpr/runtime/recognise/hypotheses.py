@@ -1,4 +1,8 @@
-"""Hypotheses of where an aircraft is, as arrays, what one query proposes, and the arithmetic of their Gaussians."""
+"""Arrays of hypotheses where an aircraft is, and the arithmetic of their Gaussians. Used by `belief`.
+
+Positions are in the plane of the map: metres east and north of a fixed origin or, in a map without positions (an
+*ordinal* one), the number of the place and 0.
+"""
 
 from dataclasses import dataclass
 
@@ -6,19 +10,19 @@ import numpy as np
 
 from edgevpr.core.arrays import Doubles, Ints
 
-_ROUNDING = 1e-12  # share of squares that their difference may lose
-_THINNEST = 1e-6  # ratio of the axes of a covariance, as variances, with which can still be calculated
+_ROUNDING = 1e-12  # relative error of the difference of two squares
+_THINNEST = 1e-6  # least ratio of the variances along both axes of a covariance that can be inverted
 _FARTHEST = 1e8  # metres or places: farther than any two points on the Earth
-_LEAST_SD = 0.25  # of a position, in spacings of the map
-_FLAT = 1 / (2 * np.pi)  # a variance whose Gaussian has the density 1 in its middle: a direction that does not exist
+_LEAST_SD = 0.25  # least standard deviation of a position, in spacings of the map
+_FLAT = 1 / (2 * np.pi)  # variance of a Gaussian with the density 1 in its middle, for the second axis of ordinal maps
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Hypotheses:
-    """M places where the aircraft may be: weights `w` (M,), positions `at` (M, 2) with `covariance` (M, 2, 2),
-    `velocity` (M, 2) in units of the map a second (NaN: unknown), and `heading` (M, 2), north and east of a vector (0:
-    unknown). `credited` (M,) is the logarithm of the likelihood ratio that the ground about `anchor` (M, 2) was given.
-    """
+    """M positions where the aircraft may be: weights `w` (M,), positions `at` (M, 2) with `covariance` (M, 2, 2),
+    `velocity` (M, 2) in units of the map a second (NaN: unknown), and `heading` (M, 2), a vector north and east (0:
+    unknown). `credited` (M,) is the evidence, a log likelihood ratio, already counted for the ground around `anchor`
+    (M, 2)."""
 
     w: Doubles
     at: Doubles
@@ -34,8 +38,8 @@ class Hypotheses:
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """One way in which each of M hypotheses can have moved: its `share` (M,), and where it ends: mean `at` (M, 2) with
-    `covariance` (M, 2, 2). No place of the map has less than the density `least`."""
+    """One way in which each of M hypotheses can have moved: its probability `share` (M,), and the Gaussian of the new
+    position, mean `at` (M, 2) and `covariance` (M, 2, 2). The density is nowhere below `least`."""
 
     share: Doubles
     at: Doubles
@@ -45,9 +49,8 @@ class Way:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapScale:
-    """Measure of a map. `spacing` is the distance after which a picture is new evidence: about half a footprint, or 1
-    for a map of places in order (`is_ordinal`), whose second coordinate is 0. Hypotheses within `near` of each other
-    are one position."""
+    """Distances that count in a map. `spacing` is the distance after which a picture is new evidence: about half a
+    footprint, or 1 in an ordinal map (`is_ordinal`). Hypotheses within `near` of each other count as one position."""
 
     spacing: float
     near: float
@@ -55,17 +58,15 @@ class MapScale:
 
     @property
     def cell(self) -> float:
-        """Ground of one place: an area, or a length where places are in order."""
+        """Extent of one place: an area, or a length in an ordinal map."""
         return self.spacing if self.is_ordinal else self.spacing**2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Proposals:
-    """Positions that one query proposes by itself, K of them. `p` (K,) is the probability of each, by this query alone;
-    the rest of 1 is the probability of none. It was made with the prior that the aircraft is off the map as likely as
-    on it, and there at any place. `at` (K, 2) is where the aircraft then is, east and north of a fixed origin in
-    metres, or the number of the place and 0. `covariance` (K, 2, 2) is that of `at`, and `heading_deg` (K,) is NaN
-    where unknown."""
+    """Positions that one query proposes by itself, K of them. `p` (K,) is the probability of each; the rest up to 1 is
+    that of none. They assume the prior that the aircraft is off the map with probability 1/2, else at any place alike.
+    `at` (K, 2) is the position with its `covariance` (K, 2, 2), and `heading_deg` (K,) the heading (NaN: unknown)."""
 
     p: Doubles
     at: Doubles
@@ -74,25 +75,25 @@ class Proposals:
 
 
 def no_hypotheses() -> Hypotheses:
-    """Return no hypothesis."""
+    """Return an empty set of hypotheses."""
     one, pairs, covariance = np.zeros(0), np.zeros((0, 2)), np.zeros((0, 2, 2))
     return Hypotheses(w=one, at=pairs, covariance=covariance, velocity=pairs, heading=pairs, credited=one, anchor=pairs)
 
 
 def joined(one: Hypotheses, other: Hypotheses) -> Hypotheses:
-    """Return the hypotheses of both."""
+    """Return the hypotheses of `one`, then those of `other`."""
     return Hypotheses(
         **{name: np.concatenate([getattr(one, name), getattr(other, name)]) for name in Hypotheses.__slots__}
     )
 
 
 def apart(one: Doubles, other: Doubles) -> Doubles:
-    """Return the distances (M, K) between positions (M, 2) and others (K, 2)."""
+    """Return the distance between each of `one` (M, 2) and each of `other` (K, 2): (M, K)."""
     return np.sqrt((one[:, None, 0] - other[None, :, 0]) ** 2 + (one[:, None, 1] - other[None, :, 1]) ** 2)
 
 
 def density(way: Way, at: Doubles, covariance: Doubles, is_ordinal: bool) -> Doubles:
-    """Return the density (M, K) of each of K positions `at` (K, 2), known to `covariance` (K, 2, 2), by a way."""
+    """Return the density (M, K), by a way of M hypotheses, of positions `at` (K, 2) with `covariance` (K, 2, 2)."""
     xx, xy, yy = (way.covariance[:, None, i, j] + covariance[None, :, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
     dx, dy = (at[None, :, i] - way.at[:, None, i] for i in (0, 1))
     if is_ordinal:
@@ -104,15 +105,14 @@ def density(way: Way, at: Doubles, covariance: Doubles, is_ordinal: bool) -> Dou
 
 
 def firm(covariance: Doubles, least: float) -> Doubles:
-    """Return covariances (K, 2, 2) that can be inverted: a variance of `least`, and a share of their own, is added to
-    each axis."""
+    """Make covariances (K, 2, 2) invertible: add the variance `least`, and a small share of their own, to each axis."""
     more: Doubles = least + _THINNEST * np.abs(np.trace(covariance, axis1=1, axis2=2))
     return covariance + more[:, None, None] * np.eye(2)
 
 
 def fused(one: Doubles, of_one: Doubles, other: Doubles, of_other: Doubles) -> tuple[Doubles, Doubles]:
-    """Join two estimates each of K positions (K, 2), with their covariances (K, 2, 2), by covariance intersection
-    (Julier and Uhlmann 1997): what is wrong with the map is common to both, so that two make no error smaller."""
+    """Combine two estimates of K positions, `one` and `other` (K, 2) with covariances (K, 2, 2), by covariance
+    intersection (Julier and Uhlmann 1997): errors of the map are common to both. Returns positions and covariances."""
     traces = [np.trace(each, axis1=1, axis2=2) for each in (of_one, of_other)]
     share = (traces[1] / (traces[0] + traces[1]))[:, None, None]
     by_one, by_other = share * np.linalg.inv(of_one), (1 - share) * np.linalg.inv(of_other)
@@ -122,7 +122,8 @@ def fused(one: Doubles, of_one: Doubles, other: Doubles, of_other: Doubles) -> t
 
 
 def mean_of(share: Doubles, at: Doubles, covariance: Doubles) -> tuple[Doubles, Doubles]:
-    """Return means (K, 2) and covariances (K, 2, 2) of mixtures: `share` (K, M) of Gaussians `at` (M, 2)."""
+    """Return the means (K, 2) and covariances (K, 2, 2) of K mixtures of M Gaussians with means `at` (M, 2) and
+    `covariance` (M, 2, 2), weighted by `share` (K, M)."""
     middle = at.mean(0) if len(at) else np.zeros(2)  # coordinates far from zero would lose digits in their squares
     off = at - middle
     second = covariance + off[:, :, None] * off[:, None]
@@ -132,8 +133,11 @@ def mean_of(share: Doubles, at: Doubles, covariance: Doubles) -> tuple[Doubles, 
 
 
 def usable(proposed: Proposals, scale: MapScale, most: int) -> tuple[Ints, Proposals]:
-    """Return the numbers of the likeliest candidates of a query, at most `most`, and these candidates. Left out is what
-    makes no sense; the probabilities have a sum of 1 at most."""
+    """Keep at most the `most` likeliest valid proposals of a query. Returns
+
+    * their indices, int (n,),
+    * these proposals, with valid covariances and probabilities that sum to 1 at most.
+    """
     numbers = np.flatnonzero((proposed.p > 0) & (proposed.p < np.inf) & (np.abs(proposed.at) < _FARTHEST).all(1))
     numbers = numbers[np.argsort(-proposed.p[numbers], kind="stable")[:most]]
     p = proposed.p[numbers].astype(float)
@@ -147,8 +151,7 @@ def usable(proposed: Proposals, scale: MapScale, most: int) -> tuple[Ints, Propo
 
 
 def _sound(covariance: Doubles, least_sd: float) -> Doubles:
-    """Return covariances (K, 2, 2) with the variance of `least_sd` on top; one that makes no sense is no more than
-    that."""
+    """Return covariances (K, 2, 2) with the variance of `least_sd` added; an invalid one becomes just that variance."""
     is_near = np.asarray((np.abs(covariance) < _FARTHEST**2).all(axis=(1, 2)))
     covariance = np.where(is_near[:, None, None], covariance, 0.0)
     covariance = (covariance + covariance.transpose(0, 2, 1)) / 2
