@@ -148,8 +148,7 @@ def load_card(name: str) -> Card:
 
 
 def weights_of(spec: TechniqueSpec) -> str | None:
-    """Return a line on the weights of a technique: name, title, licence and source of the card (None: it has no
-    network)."""
+    """Return a line on the weights of a technique: name, title, licence and source of the card (None: no network)."""
     if spec.model_sha256 is None:
         return None
     card = load_card(str(spec.parameters.get("model", spec.name)))

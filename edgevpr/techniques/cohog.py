@@ -135,9 +135,8 @@ class CoHog:
     def encode(self, image: Image, mask: Mask | None = None) -> Descriptor:
         """Encode uint8 (H, W[, 3]); a block that touches a pixel where `mask` bool (H, W) is False is never good.
 
-        Returns coarse uint8 (12, 12, bins), or uint16 (100,) with a nadir camera, fine uint8 (blocks, 4 bins) and, for
-        a query, regions float32 (blocks, 4 bins) and good bool (blocks,). The good regions are the rows of matrix A of
-        thesis 6.2.3.
+        Returns coarse uint8 (12, 12, bins), or uint16 (100,) with a nadir camera, fine uint8 (blocks, 4 bins), regions
+        float32 (blocks, 4 bins) and good bool (blocks,). The good regions are the rows of matrix A of thesis 6.2.3.
         """
         if self._is_nadir:
             image, mask = in_square(image, mask)
@@ -189,8 +188,8 @@ class CoHog:
         only rotations within `spec.heading_within_deg` of it are tried (None or NaN: all). Returns
 
         * scores float32 (N,) in 0..1,
-        * the score of each hypothesis, float32 (N, 120): 24 rotations from each height, -inf where not tried. None with
-          a forward camera.
+        * the score of each hypothesis, float32 (N, 120): 24 rotations from each height, -inf where not tried (None:
+          forward).
         """
         views = self._views_of(query)
         if not self._is_nadir:
@@ -216,9 +215,9 @@ class CoHog:
         return np.clip(of_ratio.max(axis=1), 0, 1), scores
 
     def good_patterns(self, query: Descriptor, turn: int, ratio: float = 1.0) -> tuple[Singles, Ints]:
-        """Return the good regions of a view of the query (see `views`), from the height ratio `ratio` and with a
-        rotation of `turn` steps of 15 degrees: their slow patterns float32 (G, 20), and their numbers int (G,) on its
-        grid."""
+        """Return the slow patterns float32 (G, 20) of the good regions of a view of the query (see `views`), and their
+        numbers int (G,) on its grid. The view has the height ratio `ratio` and a rotation of `turn` steps of 15
+        degrees."""
         view = self._views_of(query).regions(ratio, turn, self._patterns)
         return view.regions, view.numbers
 
@@ -254,8 +253,7 @@ class CoHog:
     def glance(
         self, query: Descriptor, fine: Bytes, hypotheses: Sequence[int] | None = None
     ) -> tuple[float, list[int] | None]:
-        """Estimate the score of `match` from some of the good regions: a quarter, or for a nadir query as many at each
-        height. Returns
+        """Estimate the score of `match` from a quarter of the good regions or, at other heights, about as many. Returns
 
         * the estimated score,
         * the hypothesis of that score, as a list of one. None with a forward camera.
@@ -281,8 +279,7 @@ class CoHog:
         return self._comparable(blocks)
 
     def _view(self, query: Descriptor, number: int) -> ViewRegions:
-        """Return the good regions of a query under a hypothesis. Those of the newest query are cached: many places need
-        them."""
+        """Return the good regions of a query under a hypothesis. They are cached for the newest query."""
         views = self._views_of(query)
         if number not in self._regions_of:
             self._regions_of[number] = views.regions(*hypothesis(number), self._comparable)
@@ -313,7 +310,7 @@ class CoHog:
             return FineMatch(float(np.clip(likeness.max(axis=1).mean(), 0, 1)) if len(likeness) else 0.0)
         best = likeness.argmax(axis=1)
         found = displacement(view.numbers, best, (view.side, self._side), _VOTES_COUNT[self.camera])
-        # Looking down, landmarks say more than the other regions do.
+        # With a nadir camera, landmarks tell more than the other regions do.
         asks_all = not self._is_nadir and len(view.numbers)
         return FineMatch(
             min(1.0, found.share * view.worth),

@@ -90,9 +90,9 @@ def support(
     asking: Ints, regions: Singles, reference: Singles, best: Ints, shift_cells: tuple[float, float]
 ) -> Support:
     """Measure how all regions of query and place support the shift that a vote has found (see `Support`). `asking` int
-    (G,) and `regions` float32 (G, P) are the numbers and vectors of the good regions of the query. `reference` float32
-    (side * side, P) are all regions of the place, and `best` int (G,) the most similar of them for each. Both have
-    grids of one size."""
+    (G,) and `regions` float32 (G, P) are the numbers and vectors of the query's good regions. `reference` float32 (side
+    * side, P) are all regions of the place, `best` int (G,) the most similar of them for each. The grids have one
+    size."""
     side = math.isqrt(len(reference))
     back = (reference @ regions.T).argmax(axis=1)
     of_y, of_x = np.divmod(asking, side)

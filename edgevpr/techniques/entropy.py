@@ -31,7 +31,7 @@ _COUNT_LOG2 = np.arange(256, dtype=np.float32) * _LOG2[:256]
 def filled_bins(grey: Bytes, radius_px: int = DISC_RADIUS_PX) -> Singles:
     """Compute log2 of the number of different intensities in each disc, over 8: the algorithm printed in thesis 6.2.1.
 
-    `grey` is uint8 (H, W); the result is float32 (H, W) in 0..1.
+    `grey` is uint8 (H, W); returns float32 (H, W) in 0..1.
     """
     padded = _replicated(grey, radius_px)
     entropy = np.empty(grey.shape, np.float32)
@@ -44,8 +44,8 @@ def filled_bins(grey: Bytes, radius_px: int = DISC_RADIUS_PX) -> Singles:
 def shannon(grey: Bytes, radius_px: int = DISC_RADIUS_PX) -> Array:
     """Compute the Shannon entropy (bits) of the intensities in each disc, over 8, from a 100x100 copy scaled back up.
 
-    The authors' public code computes this, but the thesis's text `filled_bins`. `grey` is uint8 (H, W); returns
-    float32.
+    The authors' public code computes this, where the thesis's text has `filled_bins`. `grey` is uint8 (H, W); returns
+    float32 (H, W) in 0..1.
     """
     height, width = grey.shape
     small = _shannon_copy(grey)

@@ -223,8 +223,8 @@ def slow_patterns(bins: int) -> Singles:
 @lru_cache
 def waves(bins: int) -> Singles:
     """Return the real Fourier series over `bins` orientations: float32 (bins, bins), one wave per row, each of length
-    1. The constant comes first, then cosine and sine of each frequency. The highest of an even number of bins is a
-    cosine only."""
+    1. The constant comes first, then cosine and sine of each frequency. The highest of an even number has a cosine
+    only."""
     turn = 2 * np.pi * np.arange(bins) / bins
     frequency, number = _frequencies(bins), np.arange(bins)
     series = np.cos(frequency[:, None] * turn - np.pi / 2 * (number[:, None] % 2 == 0) * (number[:, None] > 0))

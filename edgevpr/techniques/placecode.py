@@ -113,8 +113,7 @@ def scan_ahead(asked: Singles, codes: Bytes) -> Singles:
 
 @lru_cache
 def _blurred() -> Singles:
-    """Return float32 (E, S): the weights by which all S shifts are averaged around each of the E with even dx and
-    dy."""
+    """Return float32 (E, S): the weights of all S shifts in the mean around each of the E shifts of even dx and dy."""
     kept = SHIFTS[(SHIFTS % 2 == 0).all(axis=1)]
     weight = np.maximum(1 - abs(kept[:, None] - SHIFTS) / 2, 0).prod(axis=2)
     weights: Singles = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)

@@ -151,8 +151,7 @@ def load(name: str) -> Singles:
 
 
 def turned_words(words: Singles) -> Singles:
-    """Return `words` float32 (K, 20), each turned counter-clockwise by 0, 90, 180 and 270 degrees: float32 (4 K,
-    20)."""
+    """Return `words` float32 (K, 20), each turned counter-clockwise by 0, 90, 180, 270 degrees: float32 (4 K, 20)."""
     quarter = _quarter_turn()
     turned = [words]
     for _ in range(1, QUARTERS):
@@ -186,8 +185,7 @@ def _turned_block(blocks: Singles) -> Singles:
 
 @lru_cache
 def _quarter_turn() -> Singles:
-    """Return the matrix that turns patterns counter-clockwise by 90 degrees, multiplied from the right: float32 (20,
-    20)."""
+    """Return the matrix float32 (20, 20) that turns rows of patterns, multiplied from the right, by 90 degrees."""
     kept = slow_patterns(BINS)
     turn: Array = kept.T @ _turned_block(np.eye(len(kept), dtype=np.float32)) @ kept
     return turn

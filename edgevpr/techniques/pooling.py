@@ -1,5 +1,5 @@
-"""Pooling of a feature map to one vector, for `network` and `regions`. Feature maps are float32 (channels, height,
-width)."""
+"""Pooling of a feature map to one vector, for `network` and `regions`. A feature map is float32 (channels, rows,
+columns)."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -77,8 +77,7 @@ def pyramid(features: Singles, levels: Iterable[int]) -> Singles:
 @dataclass(frozen=True, slots=True)
 class Projection:
     """Gaussian random projection of n values to `length` values, in a form that fits a small board: `spectrum`
-    complex128 (n // 2 + 1,), the conjugate Fourier transform of a Gaussian vector, and `signs` float32 (n,) of -1 and
-    1.
+    complex128 (n // 2 + 1,), the conjugate Fourier transform of a Gaussian vector, and `signs` float32 (n,), -1 or 1.
 
     A matrix of Gaussian values keeps the angles between vectors to about 1 / sqrt(dimensions). For the 43 008
     activations of CALC and 1064 dimensions it takes 183 MB, and drawing it anew for each picture takes far longer than
@@ -131,8 +130,7 @@ def gaussian_row(size: int, seed: int) -> tuple[Doubles, Singles]:
 
 
 def square_regions(height: int, width: int) -> list[Square]:
-    """Return the squares (top, left, side) of R-MAC at three scales over a feature map (Tolias et al. 2016, section
-    3.2).
+    """Return the squares of R-MAC at three scales over a feature map (Tolias et al. 2016, section 3.2), in its cells.
 
     At scale l the squares are 2 min(H, W) / (l + 1) wide. There are l along the short side and l + m - 1 along the long
     one, evenly spaced. m is the number that brings the overlap of two neighbours at the first scale closest to 40 %.

@@ -10,8 +10,7 @@ region. Its energy is their mean. The regions of the highest energy over all cha
 Both describe a region by the activations of all channels under it, summed or averaged. Here the activations in the box
 around the region are summed, as in the public code of Region-VLAD. The result is scaled to length 1, which makes sum
 and mean equal. Without this scaling a large region outweighs all others, and both techniques find fewer places on
-corridor and aerial_caliterra, the data sets used for tuning. The pixels of the region alone do worse there than its
-box.
+corridor and aerial_caliterra, the data sets used for tuning. They also do without the box.
 """
 
 from collections.abc import Callable
@@ -92,8 +91,7 @@ def cross_region_bow(
     *, model: str = "calc", form: str = "float", threads: int = 1, regions: int = 200, words: int = 10_000
 ) -> RegionTechnique:
     """Make `cross_region_bow`: the `regions` regions of the highest energy of a feature map, scanned as a bag of
-    `words` visual words. `model` is the card of the network, `form` that of the bag in RAM; `threads` are
-    onnxruntime's.
+    `words` visual words. `model` is the card of the network, `form` the form of the bag in RAM.
 
     Chen, Maffra, Sa and Chli, "Only Look Once, Mining Distinctive Landmarks from ConvNet for Visual Place Recognition",
     IROS 2017, in the form of thesis 4.2.1. The paper finds regions in `conv5_3` of VGG-16 and describes them from

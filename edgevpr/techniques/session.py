@@ -156,8 +156,7 @@ def _run(card: Card, output: str, session: Any, image: Image) -> Singles:
 
 
 def run_outputs(card: Card, session: Any, names: list[str], pictures: Singles) -> list[Array]:
-    """Run a session of `open_session` on prepared pictures, float32 (N, ...); return the outputs in the order of
-    `names`.
+    """Run a session of `open_session` on prepared pictures, float32 (N, ...). Returns the outputs, ordered as `names`.
 
     Raises ModelError for a run that fails or takes more than 30 s, and for numbers that are not finite or beyond 1e12.
     """
@@ -224,7 +223,7 @@ def prepare(image: Array, rule: InputRule) -> Singles:
 
 
 def shares(image: Array, rule: InputRule) -> tuple[float, float]:
-    """Return the shares of the input's width and of its height that `prepare` fills with the picture, not with
+    """Return the shares of the input's width and of its height that `prepare` fills with the picture, without
     padding."""
     if rule.pad is None:
         return 1.0, 1.0

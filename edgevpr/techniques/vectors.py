@@ -96,7 +96,7 @@ class VectorTechnique:
 
     def pack(self, coarse: Array, mean: Singles) -> Array:
         """Make the rows in RAM of the forms `8bit` and `1bit`, (N, *row shape), from `coarse` float16 (N, D) and the
-        map's mean (D,). A row of `8bit` is D int8 numbers, then two float32: the step of the numbers, and the vector's
+        map's mean (D,). A row of `8bit` is D int8 numbers, then two float32: the step of the numbers, the vector's
         length."""
         rows = np.zeros((len(coarse), *self.spec.row.shape), self.spec.row.dtype)
         for block in _blocks(len(coarse), self._length):

@@ -147,7 +147,7 @@ def bag_of_words(local: Singles, words: Singles) -> Singles:
 
 
 def nearest(local: Singles, words: Singles) -> Ints:
-    """Return the number of the word nearest to each descriptor (the first of equally near ones): (N, D), (K, D) to int
+    """Return the number of the word nearest to each descriptor, the first of equally near ones: (N, D), (K, D) to int
     (N,)."""
     numbers: Ints = _closeness(local, words).argmax(axis=1)
     return numbers

@@ -46,8 +46,7 @@ class Canvas:
         return columns[None] * self.metres_per_pixel, ((self.shape[0] - rows) * self.metres_per_pixel)[:, None]
 
     def polygon(self, box: Box, points_m: ArrayLike) -> Floats:
-        """Return the share of each pixel of a box that a polygon covers (its edges are smooth): float32 (H, W) in
-        0..1."""
+        """Return the share of each pixel of a box that a polygon covers, float32 (H, W): its edges are smooth."""
         cover = np.zeros((box[0].stop - box[0].start, box[1].stop - box[1].start), np.uint8)
         corners = (self.pixels(points_m) - (box[1].start, box[0].start)) * 16
         cv2.fillPoly(cover, [corners.round().astype(np.int32)], 255, cv2.LINE_AA, 4)
@@ -85,15 +84,15 @@ def noise(rng: np.random.Generator, shape: tuple[int, int], first_px: float, oct
 
 
 def bgr_mix(low: tuple[int, int, int], high: tuple[int, int, int], share: Array) -> Array:
-    """Mix colour `low` (share 0) and colour `high` (share 1): (H, W) -> float32 (H, W, 3)."""
+    """Mix two colours by `share` (H, W), 0 for `low` and 1 for `high`: float32 (H, W, 3)."""
     first, last = np.asarray(low, np.float32), np.asarray(high, np.float32)
     mixed: Array = first + share[..., None] * (last - first)
     return mixed
 
 
 def smooth_step(values: Array, low: float, high: float) -> Array:
-    """Return 0 below `low`, 1 above `high`, and a straight ramp between. With low > high, the ramp falls from 1 to
-    0."""
+    """Return 0 below `low`, 1 above `high`, and a straight ramp between. With low > high: 1 below `high`, 0 above
+    `low`."""
     return np.clip((values - low) / (high - low), 0, 1)
 
 
@@ -118,8 +117,7 @@ def roof(
 
 
 def crown(rng: np.random.Generator, radius_px: int) -> Singles:
-    """Make the dome of one tree, float32 (2 r + 1, 2 r + 1) in 0..1.2, and 0 outside of its ragged outline; r is
-    `radius_px`."""
+    """Make the dome of one tree, float32 (2 `radius_px` + 1,) * 2 in 0..1.2, and 0 outside of its ragged outline."""
     axis = np.arange(-radius_px, radius_px + 1, dtype=np.float32) / radius_px
     lumps = noise(rng, (len(axis), len(axis)), max(radius_px * 0.7, 2.0), 2)
     leaves = noise(rng, (len(axis), len(axis)), 2.5, 2)
@@ -162,7 +160,7 @@ def parcels(
     """Cut the land by straight lines until every piece has about `field_m2` square metres. Returns
 
     * the pieces, convex polygons (N, 2),
-    * the cuts, each as its level and its two ends: level 0 crosses all the land, and each further level one piece.
+    * the cuts, each as (level, its two ends). The cut of level 0 crosses all the land, those of level 1 its halves, ...
     """
     fields, cuts = [], []
     todo = [(0, np.array([(-20, -20), (width_m + 20, -20), (width_m + 20, depth_m + 20), (-20, depth_m + 20)]))]
@@ -188,7 +186,7 @@ def longest_side(polygon: Doubles) -> Doubles:
 
 
 class Bend:
-    """Bends straight lines by about `by_m` metres, everywhere in the same way, so that lines that touched still
+    """Bends straight lines by about `by_m` metres. Points near each other move alike: lines that touched still
     touch."""
 
     def __init__(self, rng: np.random.Generator, width_m: float, depth_m: float, by_m: float) -> None:

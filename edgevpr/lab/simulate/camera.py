@@ -72,8 +72,7 @@ def ground_to_pixel(pose: CameraPose, camera: Camera) -> Doubles:
 
 
 def lit(scene: Scene, light: Light, seed: int) -> Image:
-    """Light the scene: uint8 (H, W, 3) BGR with shaded slopes, cast shadows, and shadows of random clouds (by
-    `seed`)."""
+    """Light the scene: uint8 (H, W, 3) BGR with shaded slopes, cast shadows, and shadows of clouds made from `seed`."""
     azimuth, elevation = np.radians((light.sun_azimuth_deg, light.sun_elevation_deg))
     towards_sun = float(np.sin(azimuth)), float(-np.cos(azimuth))  # in columns and rows
     shadow = _cast_shadows(scene, towards_sun, float(np.tan(elevation)))
@@ -97,9 +96,9 @@ def lit(scene: Scene, light: Light, seed: int) -> Image:
 def _cast_shadows(scene: Scene, towards_sun: tuple[float, float], steepness: float) -> Array:
     """Compute the shadows, uint8 (H, W), 255 where something stands between the ground and the sun.
 
-    The ray from (x, y) to the sun is blocked where the maximum, over k, of the height k pixels towards the sun less k *
-    drop exceeds height(x, y). The maximum over 2k pixels is the larger of that over k pixels from here, and that from k
-    pixels further on: eight passes look 256 pixels far.
+    The sunlight of (x, y) is blocked if, for any k, the height k pixels towards the sun less k * drop exceeds height(x,
+    y). The maximum of these values over 2k pixels is the larger of the maximum over the first k pixels and that over
+    the next k: so eight passes look 256 pixels far.
     """
     drop_cm = 100 * scene.metres_per_pixel * steepness
     blocking, steps = scene.height_cm, 1
@@ -127,8 +126,7 @@ def _clouds(scene: Scene, cloud_frac: float, seed: int) -> Array:
 
 
 def view_on_ground(pose: CameraPose, camera: Camera) -> Doubles | None:
-    """Return the corners of the picture on the ground, (4, 2) metres east and north (None: the picture shows the
-    horizon)."""
+    """Return the corners of the picture on the ground, (4, 2) metres east and north. None: it shows the horizon."""
     corners = [(0, 0, 1), (camera.width - 1, 0, 1), (camera.width - 1, camera.height - 1, 1), (0, camera.height - 1, 1)]
     ground = np.linalg.solve(ground_to_pixel(pose, camera), np.array(corners, float).T).T
     return ground[:, :2] / ground[:, 2:] if (ground[:, 2] > 0).all() else None  # one over the distance ahead

@@ -158,8 +158,7 @@ def run_demo(folder: str | Path) -> DemoSummary:
 
 
 def _flown(folder: Path, queries: int) -> dict[str, Any]:
-    """Map the first flight of a demonstration and fly the second one; return the JSON report of the flight
-    controller."""
+    """Map the first flight of a demonstration and fly the second one; return the report of the flight controller."""
     map_path, log_path, port = folder / "map.gpkg", folder / "flight.jsonl", _free_udp_port()
     first, second = folder / "flight-1" / "images", folder / "flight-2" / "images"
     # The flight controller is started first: it listens long before the map is built.
@@ -253,8 +252,8 @@ def _apart_m(one: Position, other: Position) -> float:
 
 
 def _draw(path: Path, ground: Image, mapping: GeneratedFlight, answers: Sequence[JudgedAnswer]) -> None:
-    """Write a picture of both tracks on the lit landscape, uint8 (H, W, 3) BGR. Land outside of the map is darkened,
-    and a line joins each query to the place that was recognised."""
+    """Draw both tracks on the lit landscape `ground`, uint8 (H, W, 3) BGR, and write the picture to `path`. Land
+    outside of the map is darkened, and a line joins each query to the place that was recognised."""
     scale = _PICTURE_PX[0] / SCENE_WIDTH_M
 
     def pixels(points_m: ArrayLike) -> list[tuple[int, int]]:

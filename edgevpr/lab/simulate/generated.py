@@ -109,9 +109,9 @@ def write_flight(folder: str | Path, scene: Scene, flight: GeneratedFlight) -> I
 
 @contextmanager
 def picture_table(folder: Path, columns: tuple[str, ...]) -> Iterator[Callable[[Image, int, tuple[str, ...]], None]]:
-    """Context manager: open `folder`/positions.csv with a header of `columns`. Yields a function of a picture, uint8
-    (H, W, 3) BGR, a JPEG quality and a row, which begins with the picture's file name. It writes the picture to
-    `folder`/images, and the row."""
+    """Context manager: open `folder`/positions.csv with a header of `columns`. Yields the function write(picture,
+    quality, row). It saves a picture, uint8 (H, W, 3) BGR, as JPEG in `folder`/images, named row[0], and adds the row
+    to the table."""
     images = folder / "images"
     images.mkdir(parents=True, exist_ok=True)
     with open(folder / "positions.csv", "w", encoding="utf-8", newline="") as handle:

@@ -80,8 +80,8 @@ def make_scene(seed: int, width_m: float, depth_m: float, metres_per_pixel: floa
 
 
 def _border(rng: np.random.Generator, canvas: Canvas, line_m: Doubles, level: int) -> Doubles:
-    """Paint the border of two fields: a lane if `level` (see `parcels`) is 0 or 1, else a hedge, a wall or a grass
-    strip. Returns its trees."""
+    """Paint the border of two fields: a lane if the `level` of its cut (see `parcels`) is 0 or 1, else a hedge, a wall
+    or a grass strip. Returns its trees, (N, 4)."""
     box = canvas.box(line_m, 5.0)
     if canvas.height_cm[box].size == 0:
         return np.empty((0, 4))
@@ -197,7 +197,8 @@ def _mottle(rng: np.random.Generator, canvas: Canvas) -> None:
 def _plant(
     rng: np.random.Generator, canvas: Canvas, trees: Doubles, keep_off_m: Iterable[tuple[Doubles, float]]
 ) -> None:
-    """Set the trees, (N, 4) east, north, radius, top, except near the lines (or points) of `keep_off_m`."""
+    """Paint the trees (N, 4) on the canvas, except near the lines (or points) of `keep_off_m`, each with its
+    distance."""
     for line_m, clear_m in keep_off_m:
         gap_m = np.hypot(*(trees[:, None, :2] - line_m[None]).T).T
         trees = trees[(gap_m > clear_m).all(axis=1)]

@@ -43,10 +43,10 @@ class PlannedPicture:
 
 
 def read_shots(path: str | Path, height_m: float | None, every_m: float, speed_m_s: float) -> list[PlannedPicture]:
-    """Read a track from `path`. A positions.csv gives a picture for each line (columns lat and lon, and where present
-    height_m, roll_deg, pitch_deg, yaw_deg); a mission file gives one `every_m` along its waypoints. `height_m`
-    overrides the heights of the file (None: use them). Raises UsageError for a track that cannot be read, has no height
-    or no picture."""
+    """Read a track. A positions.csv gives a picture for each line (columns lat and lon, and where present height_m,
+    roll_deg, pitch_deg, yaw_deg); a mission file gives one `every_m` along its waypoints. `height_m` overrides the
+    heights of the file (None: use them). Raises UsageError for a track that cannot be read, or has no height or no
+    picture."""
     if Path(path).suffix.lower() == ".csv":
         planned = _of_lines(path, height_m)
     else:
@@ -143,8 +143,8 @@ WEATHERS = {
 
 
 def poses_of(planned: list[PlannedPicture], sway_deg: float, seed: int) -> list[CameraPose]:
-    """Return the pose of the camera for each picture, at 0 m east and north of its position. Where the track has
-    neither roll nor pitch, they vary slowly by up to `sway_deg`, and so does the heading."""
+    """Return the pose of the camera for each picture, with 0 m east and north. Where the track has neither roll nor
+    pitch, they vary slowly by up to `sway_deg`, and so does the heading."""
     rng = np.random.default_rng((seed, 4))
     sways = sway_deg * np.stack([wander(rng, len(planned)) for _ in range(3)])
     poses = []

@@ -1,5 +1,4 @@
 """Training from one's own pictures: the CALC autoencoder, visual words, and networks in 8-bit integers (`quantise`).
 
-All of it runs on a workstation, never in flight. PyTorch and onnx come with the extra `train` and are imported only
-here.
+It runs on a workstation, never in flight. PyTorch and onnx come with the extra `train` and are imported only here.
 """

@@ -5,13 +5,13 @@ definition). The target is the HOG of a picture. The input is the same ground fr
 and the L2 loss are the paper's. The target differs (see `pictures`), and so do the decoder and the optimiser: Adam with
 a rate that falls like a cosine instead of plain momentum.
 
-The network differs in three things, because the paper's saw 2.5 million pictures 42 times. First, batch normalisation
-follows each convolution: without it one or more of the four channels of the code become zero for good. It is folded
-into the weights after training, so the network that flies has the paper's layers and no others. Second, the decoder is
-three small convolutions, where the paper's is fully connected (1064, 1064, 2048, 3648). A change of view moves things
-only a little, and 130 000 weights learn that from fewer pictures than 11 million. Third, the second layer of the
-encoder has a threshold, so that fewer of its activations are above zero: regions are made of activations that touch,
-and where most are above zero, everything is one region.
+The network differs in three ways, because the paper trains on 2.5 million pictures, 42 times each. First, batch
+normalisation follows each convolution: without it one or more of the four channels of the code become zero for good. It
+is folded into the weights after training, so the network that flies has the paper's layers and no others. Second, the
+decoder is three small convolutions, where the paper's is fully connected (1064, 1064, 2048, 3648). A change of view
+moves things only a little. 130 000 weights learn that from fewer pictures than 11 million do. Third, the second layer
+of the encoder has a threshold, so that fewer of its activations are above zero: regions are made of activations that
+touch, and where most are above zero, everything is one region.
 """
 
 import copy
@@ -44,8 +44,8 @@ _STEPS_BETWEEN_CHECKPOINTS = 250
 
 
 class Encoder(nn.Module):
-    """The encoder: image float32 (N, 1, 120, 160) in 0..1 to descriptor (N, 1064) of length 1 and features (N, 128, 16,
-    21). Pooling rounds sizes up, as Caffe does: this gives the 1064 values."""
+    """The encoder: image float32 (N, 1, 120, 160) in 0..1 to descriptor (N, 1064), of length 1, and features (N, 128,
+    16, 21). Pooling rounds sizes up, as Caffe does: this gives the 1064 values."""
 
     def __init__(self, normalised: bool = False) -> None:
         """Make the layers; `normalised` adds batch normalisation and the threshold, for training."""
@@ -231,6 +231,6 @@ def _mean_target(pictures: Sequence[Image], seed: int) -> Singles:
 
 
 def _rate(step: int, steps: int) -> float:
-    """Return the learning rate of a step: it rises over the first 100, then falls like half a cosine to zero at
-    `steps`."""
+    """Return the learning rate of a step of `steps`: it rises over the first 100, then falls like half a cosine to
+    zero."""
     return _RATE * min(1, (step + 1) / _WARM_UP_STEPS) * (0.5 + 0.5 * math.cos(math.pi * step / steps))

@@ -38,12 +38,12 @@ class ModelFile:
 
 
 def write_model(file: ModelFile, network: torch.nn.Module, samples: Sequence[Singles], source: str, then: str) -> float:
-    """Write a network and its card. Each of `samples` is an input to compare with, float32 (N, ...); if the first has N
-    > 1, the file takes any number of pictures. `source` is written into the card.
+    """Write a network and its card. Each of `samples` is an input to compare with, float32 (N, ...). If N > 1 in the
+    first, the file takes any number of pictures. `source` is written into the card.
 
     Returns the largest difference between the outputs of the file and of PyTorch, as a share of the largest value (of
-    1, if that is larger). If it is more than 1e-4, raises EdgevprError, which ends with the advice `then`, and leaves
-    no file.
+    1, if that is larger). If it is more than 1e-4, writes no file and raises EdgevprError, which ends with the advice
+    `then`.
     """
     _write_onnx(file, network, samples[0])
     try:

@@ -1,5 +1,4 @@
-"""`edgevpr models quantise`: a network in 8-bit integers, a quarter of the size, faster on processors made for
-bytes."""
+"""`edgevpr models quantise`: a network in 8-bit integers, a quarter of the size, faster where bytes are fast."""
 
 from dataclasses import dataclass
 from pathlib import Path

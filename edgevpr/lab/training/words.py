@@ -151,7 +151,7 @@ def train_ground(folders: Sequence[str], out: Path, seed: int, unusable: list[Im
 
 
 def aligned(patterns: Singles) -> Singles:
-    """Turn `patterns` float32 (N, 20) by quarter turns until their main direction is within 45 degrees of orientation
+    """Turn `patterns` float32 (N, 20) by quarter turns to bring their main direction within 45 degrees of orientation
     0."""
     # The second and third pattern are the cosine and sine of the first frequency over the orientations.
     quarters = np.rint(np.arctan2(patterns[:, 2], patterns[:, 1]) / (np.pi / 2)).astype(np.intp) % placewords.QUARTERS
@@ -180,7 +180,11 @@ def kmeans(points: Singles, count: int, rounds: int, rng: np.random.Generator) -
 
 
 def _assigned(points: Singles, centres: Singles) -> tuple[Ints, Singles]:
-    """Find the nearest centre of each point, int (N,), and the square of its distance, float32 (N,)."""
+    """Find, for each point,
+
+    * the number of its nearest centre, int (N,),
+    * the square of the distance from it, float32 (N,).
+    """
     numbers = np.empty(len(points), np.intp)
     distance = np.empty(len(points), np.float32)
     half_squares = 0.5 * np.einsum("kd,kd->k", centres, centres)
