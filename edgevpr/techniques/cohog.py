@@ -188,8 +188,8 @@ class CoHog:
         only rotations within `spec.heading_within_deg` of it are tried (None or NaN: all). Returns
 
         * scores float32 (N,) in 0..1,
-        * the score of each hypothesis, float32 (N, 120): 24 rotations from each height, -inf where not tried (None:
-          forward).
+        * the score of each hypothesis, float32 (N, 120): 24 rotations from each height, -inf if not tried. None with
+          a forward camera.
         """
         views = self._views_of(query)
         if not self._is_nadir:
